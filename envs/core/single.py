@@ -217,7 +217,7 @@ class NPAEnv(gymnasium.Env[Any, Any]):
         if worlds.particle_reward is not None:
             info["particle_reward"] = self._out(worlds.particle_reward[0].clone())
         info |= self._extras("reset", "step")
-        if config.reward == "sparse":
+        if worlds.pays_last_step_alone:
             paid = ended or late or int(worlds.elapsed[0]) == config.episode_steps
             self._unpaid_steps = 0 if paid else self._unpaid_steps + 1
         self._show()

@@ -261,6 +261,12 @@ class Worlds(Batch):
         """Losses as they are, shape [B]."""
         return self.report.numbers[1]
 
+    @property
+    def pays_last_step_alone(self) -> bool:
+        """Whether an episode's last step is the only one that is paid."""
+        sparse: bool = self.task.config.reward == "sparse"
+        return sparse
+
     @torch.no_grad()
     def start(self, worlds: Tensor, keys: Tensor | None = None) -> Start:
         """Start episodes in some worlds, int64, shape [M], and return their particles.

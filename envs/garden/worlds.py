@@ -47,6 +47,11 @@ class LivingWorlds(Worlds):
         """What each world keeps of its start, as its task says, shape [B, M]."""
         self.restart = self._restart  # type: ignore[assignment]
 
+    @property
+    def pays_last_step_alone(self) -> bool:
+        """Whether an episode's last step is the only one that is paid."""
+        return super().pays_last_step_alone and not self.task.pays_each_step
+
     @torch.no_grad()
     def perceive(self, out: Tensor | None = None) -> Tensor:
         """Return what is seen of all worlds as they are, shape [B, ...], written to `out`."""
@@ -107,7 +112,7 @@ class LivingWorlds(Worlds):
     def _rewards(self) -> Tensor:
         """Return what worlds earn in this step, shape [B]."""
         earned = self.task.earned(self.x, self.s, self.loss, self.marks)
-        if self.task.config.reward == "dense" or self.task.pays_each_step:
+        if not self.pays_last_step_alone:
             return earned
         last = self.report.endings[0] | self.report.endings[1]
         if self.episode_steps is None:

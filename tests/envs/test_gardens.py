@@ -481,6 +481,19 @@ def test_rewards_of_goals_are_those_of_steps_and_of_any_other_goals(reward):
     assert paid == {0.0, -1.0} if reward == "sparse" else len(paid) > 30
 
 
+@pytest.mark.parametrize(("name", "warned"), [(GARDENER, True), (SHEPHERD, False)])
+def test_only_rewards_that_come_in_the_last_step_can_be_missed(name, warned):
+    env = make(name, reward="sparse")
+    env.reset(seed=0)
+    with warnings.catch_warnings(record=True) as told:
+        warnings.simplefilter("always")
+        _, reward, *_ = env.step(env.action_space.sample())
+        env.reset()
+    assert any("last sparse reward" in str(one.message) for one in told) == warned
+    # Away from its goal a creature is paid -1 in each step.
+    assert reward == (0.0 if warned else -1.0)
+
+
 def test_hindsight_experience_replay_runs_as_it_is():
     sb3 = pytest.importorskip("stable_baselines3")
     env = make(SHEPHERD, reward="sparse", max_episode_steps=6)
