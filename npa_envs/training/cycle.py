@@ -95,7 +95,13 @@ class TrainingCycle:
         )
         """Worlds of this process that live on between batches."""
         numbers = ranks.places(config.world_count)
-        self._fresh_count = int((numbers < config.fresh_count).sum())
+        # Where each world of a batch has a part of the pool to itself, they take turns.
+        turns = range(0, config.world_count if by_world else 1, config.fresh_count)
+        self._fresh = [
+            (((numbers - first) % config.world_count) < config.fresh_count).nonzero()[:, 0].to(device)
+            for first in turns
+        ]
+        """Which worlds of a batch begin anew, by turns."""
         count = len(numbers)
         batch = x[:count], s[:count]
         goals = None if goal is None else goal[:count]
@@ -155,7 +161,7 @@ class TrainingCycle:
                 self._grow_old()
         self._draw()
         if not config.ages and iteration % config.seed_interval == 0:
-            self._begin_anew(self._fresh_count)
+            self._begin_anew(self._fresh[iteration // config.seed_interval % len(self._fresh)])
         batch.run(steps)
         self.meter.begin(iteration + 1, steps)
         self._steps.fill_(steps)
@@ -291,12 +297,13 @@ class TrainingCycle:
         share = self._config.damage_share if self._config.damage else 0.0
         return self._places[self._index] < share * self._config.pool_size
 
-    def _begin_anew(self, count: int) -> None:
-        """Let the first worlds of the batch be fresh seeds."""
+    def _begin_anew(self, index: Tensor) -> None:
+        """Let some worlds of the batch, int64, shape [M], be fresh seeds."""
         batch = self.batch
-        batch.x0[:count], batch.s0[:count] = self._fresh_x[:count], self._fresh_s[:count]
+        batch.x0.index_copy_(0, index, self._fresh_x.index_select(0, index))
+        batch.s0.index_copy_(0, index, self._fresh_s.index_select(0, index))
         if batch.goal is not None and self._fresh_goal is not None:
-            batch.goal[:count] = self._fresh_goal[:count]
+            batch.goal.index_copy_(0, index, self._fresh_goal.index_select(0, index))
 
     @torch.no_grad()
     def _keep_worlds(self) -> None:

@@ -93,6 +93,24 @@ def test_two_processes_have_the_curve_of_one(tmp_path, fields):
         torch.testing.assert_close(pools[0][name], pools[1][name], rtol=1e-9, atol=1e-12)
 
 
+@pytest.mark.parametrize("fresh_share", [0.0, 0.25, 0.5, 0.75])
+def test_seeds_come_into_the_part_of_the_pool_of_every_world(tmp_path, fresh_share):
+    # A rule that moves nothing: only worlds that began anew are others than at the beginning.
+    fields = {"world_count": 4, "pool_size": 8, "seed_interval": 1, "fresh_share": fresh_share}
+    config = tiny(tmp_path, **fields, damage=False, learning_rate=1e-30)
+    task = Morphogenesis2D(config.task)
+    rule = task.make_rule(torch.Generator().manual_seed(0)).double()
+    torch.nn.init.zeros_(rule.output.weight)
+    cycle = TrainingCycle(
+        task, rule, config, torch.device("cpu"), torch.Generator(), by_world=True
+    )
+    before = cycle.pool.x.clone()
+    for iteration in range(4):
+        cycle.run(iteration)
+    changed = (cycle.pool.x - before).abs().amax(dim=(1, 2)) > 1e-3
+    assert changed.view(4, 2).any(dim=1).all()
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("name", TASKS)
 def test_every_task_has_the_same_curve_on_two_processes(tmp_path, name):
