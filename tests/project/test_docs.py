@@ -362,7 +362,7 @@ def test_the_code_about_datasets_runs(tmp_path, monkeypatch):
     assert np.array_equal(observation, names["episode"].observations[0])
     told = ", ".join(word.replace("=", '": ', 1) for word in small).replace("heart", '"heart"')
     told = '{"' + told.replace(", ", ', "') + "}"
-    second = second.replace('{"target": "heart"}', told).replace("4_000_000", "5_000")
+    second = second.replace('{"target": "heart"}', told).replace("8_000_000", "5_000")
     second = second.replace("episode_steps=256", "episode_steps=2")
     exec(second, names)
     assert names["clone"].rules is not None
