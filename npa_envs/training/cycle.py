@@ -96,10 +96,10 @@ class TrainingCycle:
         """Worlds of this process that live on between batches."""
         numbers = ranks.places(config.world_count)
         # Where each world of a batch has a part of the pool to itself, they take turns.
-        turns = range(0, config.world_count if by_world else 1, config.fresh_count)
+        whole, fresh = config.world_count, config.fresh_count
         self._fresh = [
-            (((numbers - first) % config.world_count) < config.fresh_count).nonzero()[:, 0].to(device)
-            for first in turns
+            ((numbers - first) % whole < fresh).nonzero()[:, 0].to(device)
+            for first in range(0, whole if by_world else 1, fresh)
         ]
         """Which worlds of a batch begin anew, by turns."""
         count = len(numbers)

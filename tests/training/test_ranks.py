@@ -101,9 +101,7 @@ def test_seeds_come_into_the_part_of_the_pool_of_every_world(tmp_path, fresh_sha
     task = Morphogenesis2D(config.task)
     rule = task.make_rule(torch.Generator().manual_seed(0)).double()
     torch.nn.init.zeros_(rule.output.weight)
-    cycle = TrainingCycle(
-        task, rule, config, torch.device("cpu"), torch.Generator(), by_world=True
-    )
+    cycle = TrainingCycle(task, rule, config, torch.device("cpu"), torch.Generator(), by_world=True)
     before = cycle.pool.x.clone()
     for iteration in range(4):
         cycle.run(iteration)
