@@ -13,7 +13,14 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
-from npa_envs.cli.output import OutFolder, parse_options, rule_of, torch_threads, writable_folder
+from npa_envs.cli.output import (
+    OutFolder,
+    named_values,
+    parse_options,
+    rule_of,
+    torch_threads,
+    writable_folder,
+)
 from npa_envs.errors import NPAError
 
 if TYPE_CHECKING:
@@ -39,6 +46,9 @@ class ViewOptions:
 
     policy: str = "zero"
     """What acts in an environment: "zero", "random", or a rule that fits it."""
+
+    options: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME=VALUE")] = ()
+    """Keywords of the environment, for example target=dots eps=0.3 eps0=0.3."""
 
     particle_count: int | None = None
     """Particles N; default: as trained."""
@@ -119,18 +129,18 @@ def world_maker(options: ViewOptions, device: torch.device) -> Callable[[], Live
     if options.what.startswith("npa/"):
         policy = options.policy
         policy = policy if policy in ("zero", "random") else rule_of(policy)
+        keywords = {"particle_count": options.particle_count}
+        keywords |= named_values("options", options.options)
 
         def make_world() -> LiveWorld:
-            env, acting = make_environment(
-                options.what, policy, device=str(device), particle_count=options.particle_count
-            )
+            env, acting = make_environment(options.what, policy, device=str(device), **keywords)
             return EnvironmentWorld(env, acting, seed=options.seed)
 
         return make_world
-    if options.policy != "zero":
+    if options.policy != "zero" or options.options:
+        name = "options" if options.options else "policy"
         raise NPAError(
-            f"policy is for environments, got --policy {options.policy} with a rule or a run: "
-            "leave it out"
+            f"{name} is for environments, got --{name} with a rule or a run: leave it out"
         )
     told: dict[str, Any] = {"device": device, "seed": options.seed}
     told["particle_count"] = options.particle_count

@@ -43,6 +43,13 @@ def test_the_environment_and_the_policy_of_the_commands_examples_fit():
     assert type(make(words[1], policy=words[-1])) is EnvironmentWorld
 
 
+def test_an_environment_gets_the_keywords_that_a_rule_needs():
+    keywords = ("target=dots", "eps=0.3", "eps0=0.3")
+    assert type(make("npa/Texture-v0", policy="dots", options=keywords)) is EnvironmentWorld
+    with pytest.raises(NPAError, match="must have the environment's eps0"):
+        make("npa/Texture-v0", policy="dots")
+
+
 @pytest.mark.parametrize(
     ("words", "error"),
     [
@@ -52,6 +59,9 @@ def test_the_environment_and_the_policy_of_the_commands_examples_fit():
         (["npa/Texture-v0", "--policy", "digits"], "got one of static particles"),
         (["nowhere.safetensors"], "the file 'nowhere.safetensors' does not exist"),
         (["gecko", "--policy", "random"], "policy is for environments"),
+        (["gecko", "--options", "eps=0.2"], "options is for environments"),
+        (["npa/Texture-v0", "--options", "eps"], "options must be NAME=VALUE, got 'eps'"),
+        (["npa/Texture-v0", "--options", "epps=0.2"], "epps"),
         (["gecko", "--threads", "0"], "threads must be in [1, 256], got 0"),
         (["gecko", "--port", "-1"], "port must be in [0, 65535], got -1"),
         (["gecko", "--host", "nowhere.invalid"], "host must be an address of this computer"),
