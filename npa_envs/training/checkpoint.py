@@ -170,10 +170,12 @@ def check_same_run(
         if name not in MAY_DIFFER and theirs.get(name) != ours.get(name)
     ]
     if differences:
+        rule = path.parent / "rule.safetensors"
+        start = f", from this rule with initial_rule={str(rule)!r}" if rule.is_file() else ""
         raise NPAError(
             f"the checkpoint {str(path)!r} is of another configuration ({'; '.join(differences)}): "
             f"resume with the configuration in {str(path.with_name('config.json'))!r}, or start a "
-            "new run in another folder"
+            f"new run in another folder{start}"
         )
     if content["iteration"] > config.total_iterations:
         raise NPAError(
