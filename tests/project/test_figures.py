@@ -252,18 +252,20 @@ def test_what_shac_brought_in_npa_bench_and_the_gradient_in_gardens_is_told() ->
     )
     assert told.split(" | ") == row.split(" | ")[:5]
     gardens = " ".join((ROOT / "docs" / "gardening.md").read_text(encoding="utf-8").split())
+
+    def a_step(method: str, task: str) -> str:
+        returns = bench_returns(rows / f"{method}.json", task)
+        return f"{mean(returns) / 32:.2f}".replace("-", "−")
+
+    gardener, shepherd = "Gardener2D", "Shepherd2D"
     a, b, c, d = (
-        f"{mean(bench_returns(rows / f'{method}.json', task)) / 32:.2f}".replace("-", "−")
-        for task in ("Gardener2D", "Shepherd2D")
-        for method in ("gradient", "scripted")
+        a_step(method, task) for task in (gardener, shepherd) for method in ("gradient", "scripted")
     )
     assert f"gradient earns {a} a step" in gardens
     assert f"script earns {b}, and {c} in" in gardens
     assert f"it earns {d}, in the 32" in gardens
     learned = [
-        f"{mean(bench_returns(rows / f'{method}.json', task)) / 32:.2f}".replace("-", "−")
-        for method in ("ppo_world", "sac")
-        for task in ("Gardener2D", "Shepherd2D")
+        a_step(method, task) for method in ("ppo_world", "sac") for task in (gardener, shepherd)
     ]
     assert f"PPO earns {learned[0]} a step in the garden (script {b})" in gardens
     assert f"and {learned[1]} with shepherds (script {d}), SAC {learned[2]} and" in gardens

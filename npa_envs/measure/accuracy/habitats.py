@@ -256,6 +256,17 @@ def endurance_checks(rules: Mapping[str, str] | None = None) -> list[Check]:
     ]
 
 
+def wrapped(x: Tensor, box: tuple[float, ...] | None) -> Tensor:
+    """Return positions [B, N, D] where a periodic box around the origin has them.
+
+    In open space they are as they are.
+    """
+    if box is None:
+        return x
+    sides = x.new_tensor(box)
+    return x - sides * torch.round(x / sides)
+
+
 def measured(home: Habitat, x: Tensor, s: Tensor, generator: torch.Generator) -> dict[str, float]:
     """Return the figures of worlds x [B, N, D], s [B, N, C], none of them compared with others.
 
@@ -269,10 +280,7 @@ def measured(home: Habitat, x: Tensor, s: Tensor, generator: torch.Generator) ->
         before = x, s
         for _ in range(ENERGY_STEPS):
             after = rollout(home.rule, *before, 1, generator=generator, **home.options())
-            moved = after[0] - before[0]
-            if home.task.box is not None:
-                sides = torch.tensor(home.task.box, dtype=x.dtype, device=x.device)
-                moved = moved - sides * torch.round(moved / sides)
+            moved = wrapped(after[0] - before[0], home.task.box)
             energy += (moved / home.task.eps).square().sum(-1).mean()
             energy += (after[1] - before[1]).square().mean()
             before = after

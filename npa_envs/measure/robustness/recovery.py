@@ -13,6 +13,7 @@ from statistics import median
 import torch
 from torch import Tensor
 
+from npa_envs.measure.accuracy.habitats import wrapped
 from npa_envs.measure.robustness.grounds import Ground, Home, courses
 from npa_envs.ops import world_mean
 from npa_envs.tasks.base import coded_states
@@ -41,17 +42,6 @@ class Damage:
     """Whether half of the particles are left; else all are."""
     beyond: bool = False
     """Whether it is beyond what rules are asked to heal."""
-
-
-def wrapped(x: Tensor, box: Box) -> Tensor:
-    """Return positions [B, N, D] where a periodic box around the origin has them.
-
-    In open space they are as they are.
-    """
-    if box is None:
-        return x
-    sides = x.new_tensor(box)
-    return x - sides * torch.round(x / sides)
 
 
 def erase(x: Tensor, s: Tensor, random: WorldRandom, box: Box) -> tuple[Tensor, Tensor]:
