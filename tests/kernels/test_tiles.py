@@ -47,4 +47,4 @@ def test_tiles_find_all_neighbours_of_all_particles(tmp_path):
     needed.append(function_of(access, "sum_up_to"))
     head = "namespace npa {\n" + "\n".join(needed) + "}\nusing std::fmaf;\n"
     (tmp_path / "native.h").write_text(head + tiles)
-    assert told_by("tiles_on_cpu.cpp", tmp_path) == "704 worlds, 0 particles wrong\n"
+    assert told_by("tiles_on_cpu.cpp", tmp_path) == "720 worlds, 0 particles wrong\n"

@@ -14,8 +14,8 @@ constexpr int TILE_UNROLLED = 4;
 constexpr int TILE_SPAN = 12;
 // Cells along each side of the smallest periodic box whose density is computed in tiles.
 constexpr int SMALLEST_TILED_BOX = 7;
-// Where nobody is: differences from there overflow when they are squared.
-constexpr float NOWHERE = 1e30f;
+// Where nobody is near: any finite place is legal.
+constexpr float NOWHERE = INFINITY;
 
 template <int CAPACITY> struct TileMemory {
     // Candidates that are there at once: with long lists fewer, so that a processor has room for 32
