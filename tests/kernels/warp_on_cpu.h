@@ -135,6 +135,7 @@ inline unsigned __float_as_uint(float value)
     // A GPU has one NaN, without a sign.
     return value != value ? 0x7fffffffu : std::bit_cast<unsigned>(value);
 }
+inline float __uint_as_float(unsigned bits) { return std::bit_cast<float>(bits); }
 inline float __saturatef(float value) { return value > 0.0f ? min(value, 1.0f) : 0.0f; }
 
 namespace wp {

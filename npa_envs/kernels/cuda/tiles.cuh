@@ -14,8 +14,9 @@ constexpr int TILE_UNROLLED = 4;
 constexpr int TILE_SPAN = 12;
 // Cells along each side of the smallest periodic box whose density is computed in tiles.
 constexpr int SMALLEST_TILED_BOX = 7;
-// Where nobody is near: any finite place is legal.
-constexpr float NOWHERE = INFINITY;
+
+// Infinity, where nobody is near: any finite place is legal.
+__device__ inline float nowhere() { return __uint_as_float(0x7f800000u); }
 
 template <int CAPACITY> struct TileMemory {
     // Candidates that are there at once: with long lists fewer, so that a processor has room for 32
@@ -106,7 +107,7 @@ __device__ inline int fetch_window(
     }
     const int padded = (count + TOGETHER - 1) / TOGETHER * TOGETHER;
     const int i = count + (threadIdx.x & 31);
-    if (i < padded) memory.positions[i] = make_float2(NOWHERE, NOWHERE);
+    if (i < padded) memory.positions[i] = make_float2(nowhere(), nowhere());
     await_fetched();
     if (PERIODIC) {
         for (int i = begin; i < end; i += run.copiers) {
@@ -191,7 +192,7 @@ __device__ inline float density_of_tile(
         // Not the first particle's position, which may be no number.
         const float2 origin = make_float2(
             (left + 0.5f) * domain.box[0] / nx, (line + 0.5f) * domain.box[1] / ny);
-        float2 centre = make_float2(-NOWHERE, -NOWHERE);
+        float2 centre = make_float2(-nowhere(), -nowhere());
         if (members >> lane & 1) {
             centre = PERIODIC ? image_near(domain, position, origin) : position;
         }
