@@ -52,6 +52,9 @@ SLOT_ENTRIES = 32
 """Neighbours that a slot has room for; longer neighbourhoods are summed in several rounds. A pair
 for every lane, some times over."""
 
+CANDIDATES = 16
+"""Candidates of a particle that are asked for together where its neighbours are searched for."""
+
 load_record = make_wide_load(RECORD, wp.float32)
 
 
@@ -107,6 +110,7 @@ def listed_perception(
     share_rows = wp.types.vector(share_width * space_dim, scalar)
     team = lanes
     lanes *= teams
+    ahead = max(CANDIDATES // lanes, 1)
     square = wp.types.matrix((space_dim, space_dim), scalar)
     cell_vector = wp.types.vector(space_dim, wp.int32)
     topic = "listed_smoothing"
@@ -129,6 +133,7 @@ def listed_perception(
     states_together = wp.types.matrix((TOGETHER, share_width), scalar)
     places_of_pair = wp.types.vector(PAIR, wp.int32)
     records_of_pair = wp.types.matrix((PAIR, 4), scalar)
+    candidates_ahead = wp.types.matrix((ahead, space_dim), scalar)
     corrected = make_corrected(space_dim, scalar, share_width, moment_inverse)
     stage_share, stage_rows = make_stage(share), make_stage(share_rows)
     entry_type = wp.types.vector(space_dim + 2, wp.float32)
@@ -262,22 +267,30 @@ def listed_perception(
     ):
         """Weigh the neighbours whose numbers are in the slot, from `begin` to `count`."""
         meet_warp()
-        for entry in range(lane, padded(count), wp.static(lanes)):
-            listed = entry >= begin and entry < count
-            j = wp.where(listed, number_at(slot, entry), k)
-            kernel_sum, moment, density_gradient = weigh(
-                domain,
-                state_place,
-                slot,
-                entry,
-                j,
-                centre,
-                load_record(records, j),
-                listed,
-                kernel_sum,
-                moment,
-                density_gradient,
-            )
+        for entry in range(lane, padded(count), wp.static(PAIR * lanes)):
+            places = places_of_pair()
+            found = records_of_pair()
+            for a in range(wp.static(PAIR)):
+                own = entry + a * wp.static(lanes)
+                listed = own >= begin and own < count
+                places[a] = wp.where(listed, number_at(slot, own), k)
+            for a in range(wp.static(PAIR)):
+                found[a] = load_record(records, places[a])
+            for a in range(wp.static(PAIR)):
+                own = entry + a * wp.static(lanes)
+                kernel_sum, moment, density_gradient = weigh(
+                    domain,
+                    state_place,
+                    slot,
+                    own,
+                    places[a],
+                    centre,
+                    found[a],
+                    own >= begin and own < count,
+                    kernel_sum,
+                    moment,
+                    density_gradient,
+                )
         meet_warp()
         return kernel_sum, moment, density_gradient
 
@@ -516,16 +529,22 @@ def listed_perception(
                     j = of_lane(run_begin, turn, wp.uint32(lanes)) + lane
                     end = of_lane(run_end, turn, wp.uint32(lanes))
                     run += 1
-                inside = j < end
-                neighbour = load_vector(sorted_positions, wp.where(inside, j, wp.int32(0)))
-                offset = neighbour - position
-                if wp.static(periodic):
-                    offset = periodic_image(domain, offset)
-                near = wp.dot(offset, offset) < domain.squared_eps
-                count = append_number(slot, count, inside and near, j)
-                j += wp.static(lanes)
+                seen = candidates_ahead()
+                for a in range(wp.static(ahead)):
+                    candidate = j + a * wp.static(lanes)
+                    place = wp.where(candidate < end, candidate, wp.int32(0))
+                    seen[a] = load_vector(sorted_positions, place)
+                for a in range(wp.static(ahead)):
+                    candidate = j + a * wp.static(lanes)
+                    offset = seen[a] - position
+                    if wp.static(periodic):
+                        offset = periodic_image(domain, offset)
+                    near = wp.dot(offset, offset) < domain.squared_eps
+                    count = append_number(slot, count, candidate < end and near, candidate)
+                j += wp.static(ahead * lanes)
                 working = run < run_count or any_in_warp(j - lane < end)
-                filling = working and not any_in_warp(count > wp.static(SLOT_ENTRIES - lanes))
+                crowded = any_in_warp(count > wp.static(SLOT_ENTRIES - ahead * lanes))
+                filling = working and not crowded
             kernel_sum, moment, wide_sum = weigh_found(
                 domain,
                 records,
