@@ -143,7 +143,7 @@ def _read_rows_backward(
     chiral: bool,
 ) -> tuple[Tensor, Tensor]:
     count, mixed_count, space_dim = mixed.shape
-    total, rows_bar = mixed_bar.clone(), mixed.new_empty(count, width)
+    total, rows_bar = torch.empty_like(mixed), mixed.new_empty(count, width)
     kernels, device = _kernels(mixed, space_dim), mixed.device
     launch(
         kernels.pull_back_products,
@@ -153,6 +153,7 @@ def _read_rows_backward(
         int(chiral),
         mixed,
         inputs_bar,
+        mixed_bar,
         total,
     )
     launch(

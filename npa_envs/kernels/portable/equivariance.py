@@ -70,24 +70,24 @@ def equivariance_kernels(space_dim: int, scalar: type) -> SimpleNamespace:
         inputs: numbers,
     ):
         """Write scalars, products, what is at column `one` of a row, and zeros."""
-        # A thread has the pairs that begin with its vector, and some of the scalars.
+        # A thread has the pairs that end with its vector, and some of the scalars: those beside it
+        # write beside it.
         t = range_start + wp.tid()
         count = mixed.shape[1]
         row = t / count
-        a = t - row * count
-        u = mixed[row, a]
-        for column in range(a, scalars, count):
+        b = t - row * count
+        u = mixed[row, b]
+        for column in range(b, scalars, count):
             inputs[row, column] = rows[row, column]
-        place = scalars + place_of(a, a, 0, count)
-        for b in range(a, count):
-            inputs[row, place + b - a] = wp.dot(u, mixed[row, b])
         end = scalars + count * (count + 1) / 2
+        for a in range(b + 1):
+            other = mixed[row, a]
+            inputs[row, scalars + place_of(a, b, 0, count)] = wp.dot(other, u)
+            if chiral != 0 and a < b:
+                inputs[row, end + place_of(a, b, 1, count)] = wp.dot(turned(other), u)
         if chiral != 0:
-            place = end + place_of(a, a + 1, 1, count)
-            for b in range(a + 1, count):
-                inputs[row, place + b - a - 1] = wp.dot(turned(u), mixed[row, b])
             end += count * (count - 1) / 2
-        if a == 0:
+        if b == 0:
             inputs[row, end] = rows[row, one]
             for column in range(end + 1, inputs.shape[1]):
                 inputs[row, column] = scalar(0.0)
@@ -100,10 +100,11 @@ def equivariance_kernels(space_dim: int, scalar: type) -> SimpleNamespace:
         chiral: wp.int32,
         mixed: vectors,
         inputs_bar: numbers,
-        # changed in place
         mixed_bar: vectors,
+        # outputs
+        whole_bar: vectors,
     ):
-        """Add what the products pull at each mixed vector."""
+        """Write the cotangent of each mixed vector and what the products pull at it together."""
         t = range_start + wp.tid()
         count = mixed.shape[1]
         row = t / count
@@ -122,7 +123,7 @@ def equivariance_kernels(space_dim: int, scalar: type) -> SimpleNamespace:
                 if a < b:
                     bar = -bar
                 total += bar * turned(other)
-        mixed_bar[row, a] = total
+        whole_bar[row, a] = total
 
     @in_ranges(ELEMENTS)
     @wp.kernel(enable_backward=False, module=module)
@@ -165,21 +166,29 @@ def equivariance_kernels(space_dim: int, scalar: type) -> SimpleNamespace:
     ):
         """Write the updates of gates and state changes; what is beyond these is zero."""
         t = range_start + wp.tid()
-        width = update.shape[1]
-        row = t / width
-        column = t - row * width
+        # All directions first: threads beside each other take the same way, and equally long.
+        directions = update.shape[0] * wp.static(space_dim)
+        turning = t < directions
+        span = update.shape[1] - wp.static(space_dim)
+        if turning:
+            span = wp.int32(wp.static(space_dim))
+        else:
+            t -= directions
+        row = t / span
+        column = t - row * span
         count = mixed.shape[1]
         value = scalar(0.0)
-        place = column - wp.static(space_dim) + gate_count
-        if column < wp.static(space_dim):
+        if turning:
             for g in range(gate_count):
                 gate = wp.max(output[row, g], scalar(0.0)) * steering[g]
                 if g < count:
                     value += gate * mixed[row, g][column]
                 else:
                     value += gate * turned(mixed[row, g - count])[column]
-        elif place < output.shape[1]:
-            value = output[row, place]
+        else:
+            if gate_count + column < output.shape[1]:
+                value = output[row, gate_count + column]
+            column += wp.static(space_dim)
         update[row, column] = value
 
     @in_ranges(ELEMENTS)
