@@ -338,6 +338,33 @@ def test_two_rows_of_npa_bench_from_a_cpu_and_a_gpu_are_told() -> None:
         assert again["returns"] == pytest.approx(first["returns"], abs=5e-5)
 
 
+def test_learners_of_npa_bench_from_cpus_and_a_gpu_are_told() -> None:
+    page = (ROOT / "docs" / "npa_bench.md").read_text(encoding="utf-8")
+    rows = content(RESULTS / "npa_bench_learners_two_machines.json")
+    far = []
+    for first, second in zip(rows[::2], rows[1::2], strict=True):
+        assert (first["id"], first["method"]) == (second["id"], second["method"])
+        held = content(RESULTS / "npa_bench_v0" / f"{second['method']}.json")
+        runs = {run["seed"]: run["returns"] for run in held["runs"] if run["id"] == first["id"]}
+        kept = {seed: round(mean(runs[int(seed)]), 5) for seed in second["returns"]}
+        assert second["returns"] == kept
+        assert first["returns"].keys() == kept.keys()
+        cells, both = [], (first, second)
+        for row in both:
+            values = list(row["returns"].values())
+            assert row["mean"] == pytest.approx(mean(values), abs=1e-5)
+            error = stdev(values) / len(values) ** 0.5
+            assert row["standard_error"] == pytest.approx(error, abs=1e-5)
+            cells.append(f"{row['mean']:.4f} ± {row['standard_error']:.4f}")
+        error = math.hypot(*(row["standard_error"] for row in both))
+        apart = abs(first["mean"] - second["mean"]) / error
+        line = f"| `{first['method']}`, `{first['id']}` | {len(kept)} | {' | '.join(cells)} |"
+        if len(kept) > 2:
+            assert f"{line} {apart:.1f} |" in page
+            far += [(first["method"], first["id"])] if apart > 2.0 else []
+    assert far == [("ppo_world", "npa/Morphogenesis2DSmall-v0")]
+
+
 def test_what_is_said_of_the_small_suite_is_in_its_table() -> None:
     page = (ROOT / "docs" / "npa_bench.md").read_text(encoding="utf-8")
     page = page[page.index("### On a laptop") : page.index("### On a GPU")]
