@@ -474,12 +474,15 @@ class TestGeometryLimits:
         torch.testing.assert_close(z[0, 50, 3:6], s[0, 0])
         assert z[0, 50, 6:].abs().max() == 0
 
-    def test_coincident_particles_far_away_are_neighbours(self, device):
-        x = torch.full((1, 4, 2), 3.0e8, device=device)
+    @pytest.mark.parametrize("place", [3.0e8, -1.0e30, 3.4e38])
+    def test_coincident_particles_far_away_are_neighbours(self, place, device):
+        x = torch.full((1, 4, 2), place, device=device)
         s = torch.arange(4.0, device=device)[None, :, None]
         fields = npa_envs.perception_fields(x, s, 0.1)
         torch.testing.assert_close(fields.blur, torch.full_like(fields.blur, 1.5))
         assert fields.grad0.abs().max() == 0
+        (gradient,) = torch.autograd.grad(npa_envs.perceive(x, s.requires_grad_(), 0.1)[0, 0, 1], s)
+        torch.testing.assert_close(gradient, torch.full_like(s, 0.25))
 
     def test_neighbours_across_a_million_are_found(self, device):
         generator = torch.Generator().manual_seed(5)

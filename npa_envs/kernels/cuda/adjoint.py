@@ -56,8 +56,8 @@ BLOCK = 4096
 """Rows whose cotangents are summed before they are added to the others: of a million summed one
 after the other, too much is rounded away."""
 
-LARGEST_LENGTH = 3e38
-"""Farther than any particle [length units]."""
+LARGEST_LENGTH = 3.4028234663852886e38
+"""As far as any particle can be: the largest float32 [length units]."""
 
 SLACK = 1.0 + 1e-5
 """Rows are listed within this much more than eps^2, whatever was rounded on the way."""
@@ -349,7 +349,7 @@ def listed_adjoint(
         """Whether all coordinates are numbers."""
         finite = wp.bool(True)
         for d in range(wp.static(space_dim)):
-            finite = finite and wp.abs(position[d]) < scalar(LARGEST_LENGTH)
+            finite = finite and wp.isfinite(position[d])
         return finite
 
     @wp.kernel(
