@@ -94,13 +94,13 @@ class RuleSet(nn.Module):
 
         Args:
             problem: Where they are to act: they need not come from there, but have to fit.
-            source: A rule, a shipped rule's name or a rule's file, for all species or one for each;
-                or a folder that `save` wrote.
+            source: A rule, or what `npa_envs.load_rule` takes, for all species or one for each; or
+                a folder that `save` wrote.
 
         Raises:
             NPAError: A rule cannot be loaded or does not fit, or there are too few or too many.
         """
-        if isinstance(source, str | Path) and Path(source).is_dir():
+        if isinstance(source, str | Path) and (Path(source) / _file_name(0)).is_file():
             source = [Path(source) / _file_name(k) for k in range(len(problem.counts))]
         single = isinstance(source, Source)
         given: Sequence[Source] = [source] * len(problem.counts) if single else list(source)  # type: ignore[arg-type, list-item]

@@ -12,7 +12,6 @@ from npa_envs.cli.output import (
     OutFolder,
     StepBar,
     parse_options,
-    rule_of,
     torch_threads,
     writable_folder,
 )
@@ -127,9 +126,8 @@ def grow_and_heal(options: DemoOptions, report: Report) -> None:
     from npa_envs.training.trained_tasks import task_of_rule
 
     device = check_device(options.device)
-    source = rule_of(options.rule)
-    rule = load_rule(source, device=device).float()
-    trained = task_of_rule(source, rule, device)
+    rule = load_rule(options.rule, device=device).float()
+    trained = task_of_rule(options.rule, rule, device)
     task = trained.task
     generator = torch.Generator(device).manual_seed(options.seed)
     x, s = task.seed(1, generator=generator, device=device)

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from npa_envs.cli.output import RuleOptions, StepBar, check_numbers, parse_options, rule_of
+from npa_envs.cli.output import RuleOptions, StepBar, check_numbers, parse_options
 from npa_envs.errors import NPAError, shown
 
 if TYPE_CHECKING:
@@ -66,12 +66,11 @@ def main(arguments: Sequence[str]) -> int:
     check_steps("checkpoints", checkpoints)
     check_numbers(options, seed_count=1)
     device = check_device(options.device)
-    source = rule_of(options.rule)
-    rule = load_rule(source, device=device).float()
+    rule = load_rule(options.rule, device=device).float()
     world = options.world() | {"data_folder": options.data_folder}
     if rule.codes is not None and options.target is None:
-        return evaluate_pictures(options, source, rule, device)
-    trained = task_of_rule(source, rule, device, **world)
+        return evaluate_pictures(options, rule, device)
+    trained = task_of_rule(options.rule, rule, device, **world)
     if trained.doubt is not None:
         raise NPAError(
             f"cannot measure {options.rule!r}: {trained.doubt}: "
@@ -106,9 +105,7 @@ def main(arguments: Sequence[str]) -> int:
     return 0
 
 
-def evaluate_pictures(
-    options: EvaluateOptions, source: str, rule: NPARule, device: torch.device
-) -> int:
+def evaluate_pictures(options: EvaluateOptions, rule: NPARule, device: torch.device) -> int:
     """Measure and print what each code of a rule of many pictures grows.
 
     Raises:
@@ -127,7 +124,7 @@ def evaluate_pictures(
             f"{len(rule.codes)}: give --target {shown(rule.codes.names[0])}"
         )
     checkpoints = options.checkpoints or PICTURE_CHECKPOINTS
-    tasks = tasks_of_codes(source, rule, device, **options.world())
+    tasks = tasks_of_codes(options.rule, rule, device, **options.world())
     with StepBar(None, show=options.progress) as bar:
         rows = picture_rows(
             rule,

@@ -9,7 +9,7 @@ from typing import Annotated
 
 import tyro
 
-from npa_envs.cli.output import parse_options, rule_of
+from npa_envs.cli.output import parse_options
 from npa_envs.errors import NPAError
 
 
@@ -45,7 +45,7 @@ def main(arguments: Sequence[str]) -> int:
     from npa_envs.web.export import export_web
     from npa_envs.web.rule_world import name_of
 
-    sources = [rule_of(source) for source in options.rules]
+    sources = list(options.rules)
     title = options.title
     if options.gallery and not sources:
         sources = [name for name in shipped_rules() if load_rule(name).space_dim == 2]

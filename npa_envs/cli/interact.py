@@ -17,7 +17,6 @@ from npa_envs.cli.output import (
     StepBar,
     check_numbers,
     parse_options,
-    rule_of,
     writable_folder,
 )
 from npa_envs.errors import NPAError
@@ -163,7 +162,7 @@ def _organisms(
     from npa_envs.tasks.morphogenesis2d import Morphogenesis2D
     from npa_envs.training.trained_tasks import task_of_rule
 
-    sources = list(dict.fromkeys(map(rule_of, options.rules)))
+    sources = list(dict.fromkeys(options.rules))
     sources = sources or list(shipped_rules(TASK))[: 2 if options.quick else None]
     organisms: list[Organism] = []
     counts = []

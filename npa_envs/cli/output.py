@@ -170,19 +170,6 @@ class RuleOptions(RunOptions):
         return {name: getattr(self, name) for name in names}
 
 
-def rule_of(source: str) -> str:
-    """Return what `load_rule` takes: the rule of a run where `source` is its folder.
-
-    Raises:
-        NPAError: The folder holds no rule, or those of several species.
-    """
-    from npa_envs.rule.files import rule_in, shipped_rules
-
-    if not Path(source).is_dir() or source in shipped_rules():
-        return source
-    return str(rule_in(source))
-
-
 def told_rules(words: Iterable[str]) -> dict[str, str]:
     """Return the rules that words name: name -> what `load_rule` takes, the package's own first.
 
@@ -191,7 +178,7 @@ def told_rules(words: Iterable[str]) -> dict[str, str]:
             of runs.
 
     Raises:
-        NPAError: A name is not known, or as for `rule_of`.
+        NPAError: A name is not known.
     """
     from npa_envs.rule.files import first_rules, shipped_rules
     from npa_envs.web.rule_world import name_of
@@ -201,7 +188,7 @@ def told_rules(words: Iterable[str]) -> dict[str, str]:
     files = [w for w in words if w not in own and (w.endswith(".safetensors") or Path(w).is_dir())]
     named = [word for word in words if word not in files]
     found = {name: name for name in (chosen_names("rule", named, own) if named else ())}
-    for source in map(rule_of, files):
+    for source in files:
         found.setdefault(name_of(source), source)
     return found
 

@@ -17,7 +17,6 @@ from npa_envs.cli.output import (
     check_numbers,
     named_values,
     parse_options,
-    rule_of,
     writable_folder,
 )
 from npa_envs.errors import NPAError
@@ -154,6 +153,4 @@ def policy_of(options: RecordOptions, problem: Problem) -> Callable[[Any], Any]:
         raise NPAError(
             f"policy must be one of {known} or a file sac.zip or ppo.zip, got {source!r}"
         )
-    if not (Path(source) / "rule-0.safetensors").is_file():
-        source = rule_of(source)
     return RuleSet.of(problem, source).to(options.device).policy()

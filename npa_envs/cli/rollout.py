@@ -14,7 +14,6 @@ from npa_envs.cli.output import (
     RuleOptions,
     StepBar,
     parse_options,
-    rule_of,
     writable_folder,
 )
 from npa_envs.errors import NPAError
@@ -103,14 +102,19 @@ def main(arguments: Sequence[str]) -> int:
             f"damage must come before the last of {options.steps} steps, got step {late[0].step}: "
             f"raise --steps above {late[0].step}"
         )
-    source = rule_of(options.rule)
-    rule = load_rule(source, device=device).float()
+    rule = load_rule(options.rule, device=device).float()
     world = options.world()
-    trained = task_of_rule(source, rule, device, **world)
+    trained = task_of_rule(options.rule, rule, device, **world)
     # Drawn as asked for; measured as trained, so that the figures can be compared.
     task = trained.task
     shown = large_task(
-        task, source, rule, device, resolution=options.resolution, style=options.style, **world
+        task,
+        options.rule,
+        rule,
+        device,
+        resolution=options.resolution,
+        style=options.style,
+        **world,
     )
     folder = writable_folder(options.out)
     generator = torch.Generator(device).manual_seed(options.seed)

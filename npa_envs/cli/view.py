@@ -17,7 +17,6 @@ from npa_envs.cli.output import (
     OutFolder,
     named_values,
     parse_options,
-    rule_of,
     torch_threads,
     writable_folder,
 )
@@ -128,7 +127,6 @@ def world_maker(options: ViewOptions, device: torch.device) -> Callable[[], Live
 
     if options.what.startswith("npa/"):
         policy = options.policy
-        policy = policy if policy in ("zero", "random") else rule_of(policy)
         keywords = {"particle_count": options.particle_count}
         keywords |= named_values("options", options.options)
 
@@ -147,5 +145,4 @@ def world_maker(options: ViewOptions, device: torch.device) -> Callable[[], Live
     folder = Path(options.what)
     if folder.is_dir() and any((folder / name).exists() for name in RUN_FILES):
         return lambda: RunWorld(folder, **told)
-    source = rule_of(options.what)
-    return lambda: RuleWorld(source, **told)
+    return lambda: RuleWorld(options.what, **told)

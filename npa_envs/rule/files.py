@@ -221,6 +221,18 @@ def rule_metadata(path: str | Path) -> dict[str, str]:
         raise NPAError(f"cannot read the header of {shown(str(path))}: {error}") from error
 
 
+def rule_file(source: str | Path) -> Path:
+    """Return the file of a rule.
+
+    Args:
+        source: As for `load_rule`.
+
+    Raises:
+        NPAError: The name is unknown, it is no such path, or a folder without one rule.
+    """
+    return _locate(source)[0]
+
+
 def _locate(source: str | Path) -> tuple[Path, str | None]:
     """Find the file that `source` means, and the name after '#'."""
     if not isinstance(source, str | os.PathLike):
@@ -240,7 +252,7 @@ def _locate(source: str | Path) -> tuple[Path, str | None]:
     if text in named:
         return named[text], None
     if os.path.isdir(text):
-        return rule_in(text), None
+        return _rule_in(Path(text)), None
     base, mark, name = text.rpartition("#")
     path, inner = (Path(base), name) if mark and base.endswith(".json") else (Path(text), None)
     if path.suffix in _SUFFIXES:
@@ -253,19 +265,12 @@ def _locate(source: str | Path) -> tuple[Path, str | None]:
     )
 
 
-def rule_in(folder: str | Path) -> Path:
-    """Return the file of the rule in a training run's folder.
-
-    Args:
-        folder: The folder, which exists.
-
-    Raises:
-        NPAError: It holds no rule, or those of several species.
-    """
-    rule = Path(folder) / "rule.safetensors"
+def _rule_in(folder: Path) -> Path:
+    """Return the file of the rule in a training run's folder, which exists."""
+    rule = folder / "rule.safetensors"
     if rule.is_file():
         return rule
-    others = sorted(Path(folder).glob("rule-*.safetensors"))
+    others = sorted(folder.glob("rule-*.safetensors"))
     cure = f"name one of its rules, such as {str(others[0])!r}" if others else "name another one"
     raise NPAError(f"a folder must hold the {rule.name} of a run, {str(folder)!r} does not: {cure}")
 

@@ -12,7 +12,7 @@ import torch
 from npa_envs.errors import NPAError, shown
 from npa_envs.files import parse_json
 from npa_envs.rule.codes import Codes
-from npa_envs.rule.files import first_rules, rule_metadata, shipped_rules
+from npa_envs.rule.files import rule_file, rule_metadata
 from npa_envs.rule.rule import NPARule
 from npa_envs.tasks.base import PictureTask, task_for_rule
 from npa_envs.tasks.many_pictures import named_targets
@@ -60,7 +60,7 @@ def task_of_rule(
     Raises:
         NPAError: The rule does not fit the task, or a field is wrong.
     """
-    path = (shipped_rules() | first_rules()).get(source, Path(source))
+    path = rule_file(source)
     metadata = rule_metadata(path) if path.suffix == ".safetensors" else {}
     task_name = metadata.get("task", "morphogenesis2d")
     entry = task_entry(task_name)
@@ -165,7 +165,7 @@ def sources_of_codes(source: str, codes: Codes) -> dict[str, str]:
         source: What the rule was loaded from.
         codes: Its codes.
     """
-    path = (shipped_rules() | first_rules()).get(source, Path(source))
+    path = rule_file(source)
     metadata = rule_metadata(path) if path.suffix == ".safetensors" else {}
     targets = trained_config(path, metadata).task.targets if "config" in metadata else ()
     sources = _named(targets)

@@ -425,6 +425,8 @@ def name_of(source: str) -> str:
     if "#" in source:
         return source.rpartition("#")[2]
     path = Path(source)
+    if path.is_dir():
+        return path.resolve().name
     return path.resolve().parent.name if path.name == "rule.safetensors" else path.stem
 
 

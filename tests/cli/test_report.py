@@ -78,10 +78,9 @@ def test_the_figures_of_a_report_are_those_of_the_command_that_it_names(tmp_path
     _, *command = held["command"].split()
     assert main([*command, "--no-progress", "--json", str(tmp_path / "again.json")]) == 0
     assert json.loads((tmp_path / "again.json").read_text())["growth"] == held["growth"]
-    rule = load_rule(tmp_path / "run" / "rule.safetensors")
-    task = task_of_rule(
-        str(tmp_path / "run" / "rule.safetensors"), rule, report.torch.device("cpu")
-    )
+    folder = str(tmp_path / "run")  # stands for its rule
+    rule = load_rule(folder)
+    task = task_of_rule(folder, rule, report.torch.device("cpu"))
     seeds = (report.FIRST_SEED, report.FIRST_SEED + 1)
     (row,) = evaluate(rule, task.task, checkpoints=(8,), seeds=seeds)
     assert row.loss == held["growth"][0]["loss"]

@@ -299,7 +299,7 @@ def test_rules_of_every_kind_in_files_are_checked_by_themselves(fields, tmp_path
     config = preset("tiny", **fields, iterations=2, device=str(device), out=tmp_path / "mine")
     train(config, progress=False)
     sources = told_rules([str(tmp_path / "mine")])
-    assert sources == {"mine": str(tmp_path / "mine" / "rule.safetensors")}
+    assert sources == {"mine": str(tmp_path / "mine")}
     checks = suite.all_checks(quick=True, rules=sources)
     assert [check.name for check in checks] == [
         "time/mine",

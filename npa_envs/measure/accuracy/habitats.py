@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import torch
@@ -13,7 +12,7 @@ from torch import Tensor
 
 from npa_envs.errors import NPAError
 from npa_envs.measure.accuracy.checks import Check, Finding, Session, Skipped
-from npa_envs.rule.files import first_rules, load_rule, rule_metadata, shipped_rules
+from npa_envs.rule.files import load_rule, rule_file, rule_metadata, shipped_rules
 from npa_envs.rule.rule import NPARule
 from npa_envs.tasks.base import Task, seed_worlds, task_toward
 from npa_envs.training.trained_tasks import task_of_rule, trained_config
@@ -84,18 +83,13 @@ def rule_names() -> list[str]:
     return list(shipped_rules())
 
 
-def _file_of(rule: str) -> Path:
-    """Return the file of a rule of the package, or of a path."""
-    return (first_rules() | shipped_rules()).get(rule, Path(rule))
-
-
 def task_name(rule: str) -> str:
     """Return the name of the task that a rule of the package, or of a file of ours, was trained on.
 
     Raises:
         NPAError: The file is none of ours, or says nothing of a task.
     """
-    metadata = rule_metadata(_file_of(rule))
+    metadata = rule_metadata(rule_file(rule))
     if metadata.get("task") not in HORIZONS:
         raise NPAError(
             f"the rule's file must say on which task it was trained, {rule!r} says "
@@ -150,7 +144,7 @@ def _task(session: Session, name: str, particles: float, looks: bool) -> tuple[N
 
 def trained_particles(session: Session, name: str) -> int:
     """Return how many particles a world of a rule has where their number is not what is varied."""
-    path = _file_of(name)
+    path = rule_file(name)
     count = int(trained_config(path, rule_metadata(path)).task.particle_count)
     # Clouds are sampled farthest point by farthest point, all of them.
     most = QUICK_CLOUD if task_name(name) == "point_classification" else QUICK_PARTICLES
