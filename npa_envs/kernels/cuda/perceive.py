@@ -267,26 +267,26 @@ def listed_perception(
     ):
         """Weigh the neighbours whose numbers are in the slot, from `begin` to `count`."""
         meet_warp()
-        for entry in range(lane, padded(count), wp.static(PAIR * lanes)):
+        for first in range(lane, padded(count), wp.static(PAIR * lanes)):
             places = places_of_pair()
             found = records_of_pair()
             for a in range(wp.static(PAIR)):
-                own = entry + a * wp.static(lanes)
-                listed = own >= begin and own < count
-                places[a] = wp.where(listed, number_at(slot, own), k)
+                entry = first + a * wp.static(lanes)
+                listed = entry >= begin and entry < count
+                places[a] = wp.where(listed, number_at(slot, entry), k)
             for a in range(wp.static(PAIR)):
                 found[a] = load_record(records, places[a])
             for a in range(wp.static(PAIR)):
-                own = entry + a * wp.static(lanes)
+                entry = first + a * wp.static(lanes)
                 kernel_sum, moment, density_gradient = weigh(
                     domain,
                     state_place,
                     slot,
-                    own,
+                    entry,
                     places[a],
                     centre,
                     found[a],
-                    own >= begin and own < count,
+                    entry >= begin and entry < count,
                     kernel_sum,
                     moment,
                     density_gradient,
