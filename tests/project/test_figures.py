@@ -363,6 +363,14 @@ def test_learners_of_npa_bench_from_cpus_and_a_gpu_are_told() -> None:
             assert f"{line} {apart:.1f} |" in page
             far += [(first["method"], first["id"])] if apart > 2.0 else []
     assert far == [("ppo_world", "npa/Morphogenesis2DSmall-v0")]
+    first, _, second = content(RESULTS / "npa_bench_growth_again_cpu.json")
+    told = " ".join(page.split())
+    for row in (first, second):
+        values = list(row["returns"].values())
+        assert row["standard_error"] == pytest.approx(stdev(values) / 5**0.5, abs=1e-5)
+        assert f"returned {mean(values):.2f} ± {row['standard_error']:.2f} on an" in told
+    error = math.hypot(first["standard_error"], second["standard_error"])
+    assert f"{(first['mean'] - second['mean']) / error:.1f} standard errors less" in told
 
 
 def test_what_is_said_of_the_small_suite_is_in_its_table() -> None:
