@@ -101,7 +101,7 @@ class RuleSet(nn.Module):
             NPAError: A rule cannot be loaded or does not fit, or there are too few or too many.
         """
         if isinstance(source, str | Path) and (Path(source) / _file_name(0)).is_file():
-            source = [Path(source) / _file_name(k) for k in range(len(problem.counts))]
+            return cls.load(source, problem)
         single = isinstance(source, Source)
         given: Sequence[Source] = [source] * len(problem.counts) if single else list(source)  # type: ignore[arg-type, list-item]
         rules = [

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from npa_envs.errors import NPAError, shown, suggest
-from npa_envs.rule.files import load_rule, shipped_rules
+from npa_envs.rule.files import load_rule, rule_file, shipped_rules
 from npa_envs.rule.rule import NPARule
 from npa_envs.tasks.base import PictureTask, coded_states, seed_worlds, task_toward
 from npa_envs.tasks.checks import is_real
@@ -424,9 +424,7 @@ def name_of(source: str) -> str:
     """Return what the page calls a rule: its file's name, or that of the run it belongs to."""
     if "#" in source:
         return source.rpartition("#")[2]
-    path = Path(source)
-    if path.is_dir():
-        return path.resolve().name
+    path = rule_file(source)
     return path.resolve().parent.name if path.name == "rule.safetensors" else path.stem
 
 

@@ -3,7 +3,7 @@
 import json
 import math
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from pathlib import Path
 from statistics import mean, stdev
 from typing import Any
@@ -236,6 +236,11 @@ def test_the_table_of_searches_has_the_numbers_of_its_file() -> None:
         assert differences(row, rf"({NUMBER}) \(", [mean(column) for column in columns]) == []
 
 
+def standard_error(values: Collection[float]) -> float:
+    """Standard error of the mean of some values."""
+    return stdev(values) / len(values) ** 0.5
+
+
 def bench_returns(path: Path, task: str) -> list[float]:
     """Mean returns of the runs of a row of NPA-Bench, by the name of an id without its end."""
     runs = [run for run in content(path)["runs"] if run["id"] == f"npa/{task}Small-v0"]
@@ -287,7 +292,7 @@ def test_rows_of_npa_bench_on_two_machines_are_told_and_agree() -> None:
     rows = content(RESULTS / "npa_bench_small_two_machines.json")
     for first, second in (rows[:2], rows[2:4]):
         both = [list(row["returns"].values()) for row in (first, second)]
-        errors = [stdev(values) / len(values) ** 0.5 for values in both]
+        errors = [standard_error(values) for values in both]
         cells = [
             f"{mean(values):.4f} ± {error:.4f}, {len(values)} seeds"
             for values, error in zip(both, errors, strict=True)
@@ -298,7 +303,7 @@ def test_rows_of_npa_bench_on_two_machines_are_told_and_agree() -> None:
     for first, second in zip(rows[4::2], rows[5::2], strict=True):
         assert (first["id"], first["method"]) == (second["id"], second["method"])
         both = [list(row["returns"].values()) for row in (first, second)]
-        error = math.hypot(*(stdev(values) / len(values) ** 0.5 for values in both))
+        error = math.hypot(*map(standard_error, both))
         distance = abs(mean(both[0]) - mean(both[1]))
         apart[distance / error if error else 0.0] = [f"{mean(values):.4f}" for values in both]
     count = len(rows[4::2])
@@ -321,8 +326,9 @@ def test_two_rows_of_npa_bench_from_a_cpu_and_a_gpu_are_told() -> None:
         assert second["returns"] == {str(seed): round(mean(runs[seed]), 5) for seed in range(5)}
         for row in (first, second):
             values = list(row["returns"].values())
+            assert len(values) == 5
             assert row["mean"] == pytest.approx(mean(values), abs=1e-5)
-            assert row["standard_error"] == pytest.approx(stdev(values) / 5**0.5, abs=1e-5)
+            assert row["standard_error"] == pytest.approx(standard_error(values), abs=1e-5)
         if "Gardener" in first["id"] or "Shepherd" in first["id"]:
             cells = [f"{row['mean']:.3f} ± {row['standard_error']:.3f}" for row in (first, second)]
             assert f"| `{first['method']}`, `{first['id']}` | {' | '.join(cells)} |" in page
@@ -353,8 +359,7 @@ def test_learners_of_npa_bench_from_cpus_and_a_gpu_are_told() -> None:
         for row in both:
             values = list(row["returns"].values())
             assert row["mean"] == pytest.approx(mean(values), abs=1e-5)
-            error = stdev(values) / len(values) ** 0.5
-            assert row["standard_error"] == pytest.approx(error, abs=1e-5)
+            assert row["standard_error"] == pytest.approx(standard_error(values), abs=1e-5)
             cells.append(f"{row['mean']:.4f} ± {row['standard_error']:.4f}")
         error = math.hypot(*(row["standard_error"] for row in both))
         apart = abs(first["mean"] - second["mean"]) / error
@@ -367,7 +372,8 @@ def test_learners_of_npa_bench_from_cpus_and_a_gpu_are_told() -> None:
     told = " ".join(page.split())
     for row in (first, second):
         values = list(row["returns"].values())
-        assert row["standard_error"] == pytest.approx(stdev(values) / 5**0.5, abs=1e-5)
+        assert len(values) == 5
+        assert row["standard_error"] == pytest.approx(standard_error(values), abs=1e-5)
         assert f"returned {mean(values):.2f} ± {row['standard_error']:.2f} on an" in told
     error = math.hypot(first["standard_error"], second["standard_error"])
     assert f"{(first['mean'] - second['mean']) / error:.1f} standard errors less" in told
@@ -394,7 +400,7 @@ def earned(rows: list[dict[str, Any] | None]) -> str:
     if len(told) < len(rows):
         return ""
     values = [row["reward"] for row in told]
-    error = stdev(values) / len(values) ** 0.5
+    error = standard_error(values)
     share = f" ({100 * mean(r['success'] for r in told):.0f} %)" if "success" in told[0] else ""
     return f"{mean(values):.3f} ± {error:.3f}{share}".replace("-", "−")
 
@@ -464,7 +470,7 @@ def estimates(env_id: str) -> list[tuple[float, float] | None]:
     found: list[tuple[float, float] | None] = []
     for method in ("random", "scripted", "ppo", other_ppo(env_id)):
         values = returns(env_id, method)
-        error = stdev(values) / len(values) ** 0.5 if len(values) > 1 else 0.0
+        error = standard_error(values) if len(values) > 1 else 0.0
         found.append((mean(values), error) if values else None)
     return found
 
