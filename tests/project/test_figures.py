@@ -515,3 +515,34 @@ def test_the_table_of_the_test_of_best_has_the_numbers_of_its_file() -> None:
         cells += [f"{row['worlds_healed']} of {row['world_count']}" for row in run["healing"]]
         cells.append(f"{late['worlds_within']} of 8")
         assert told[run["picture"].replace("-", " ")].split(" | ") == cells
+
+
+def test_the_tables_of_second_lives_have_the_numbers_of_their_file() -> None:
+    page = (ROOT / "docs" / "recipes.md").read_text(encoding="utf-8")
+    section = page.split("## More second lives")[1].split("\n## ")[0]
+    told = dict(re.findall(r"^\| ([a-z0-9, -]+?)(?: \(`best`\))? \| (.*) \|$", section, re.MULTILINE))
+    record = content(RESULTS / "recipes_second_lives_h100.json")
+    aged = {row["picture"]: row for row in record["long"]}
+    steps = (64, 128, 512, 1024, 4096, 20_000)
+    arms: dict[str, list[Any]] = {}
+    for run in record["runs"]:
+        losses = {row["step"]: row["loss"] for row in run["growth"]}
+        if run["pictures"] == "development":
+            arms.setdefault(run["arm"], []).append((losses, run["healing_of_32"]))
+            continue
+        late = aged.pop(run["picture"])
+        cells = [f"{losses[step]:.3f}" for step in steps] + [f"{late['loss']['100000']:.3f}"]
+        cells += [f"{row['worlds_healed']} of 32" for row in run["healing_of_32"]]
+        cells.append(f"{late['worlds_within']} of 8")
+        assert told[run["picture"].replace("-", " ")].split(" | ") == cells
+    assert not aged
+    assert len(arms) == 3
+    for arm, runs in arms.items():
+        assert len(runs) == 4
+        cells = [f"{mean(losses[step] for losses, _ in runs):.3f}" for step in steps]
+        for damage in (0, 1):
+            healed = sum(healing[damage]["worlds_healed"] for _, healing in runs)
+            cells.append(f"{healed} of 128")
+        back = [healing[0]["end"] / healing[0]["before"] for _, healing in runs]
+        cells.append(f"{mean(back):.2f}")
+        assert told[arm].split(" | ") == cells
