@@ -546,3 +546,19 @@ def test_the_tables_of_second_lives_have_the_numbers_of_their_file() -> None:
         back = [healing[0]["end"] / healing[0]["before"] for _, healing in runs]
         cells.append(f"{mean(back):.2f}")
         assert told[arm].split(" | ") == cells
+
+
+def test_the_table_of_training_on_two_gpus_has_the_numbers_of_its_file() -> None:
+    page = (ROOT / "docs" / "scale.md").read_text(encoding="utf-8")
+    lines = (RESULTS / "scale_two_h100.jsonl").read_text(encoding="utf-8").splitlines()
+    rows = [row for row in map(json.loads, lines) if "loss" in row]
+    assert len(rows) == 3
+    for row in rows:
+        count = 1 if row["processes"] == "alone" else row["processes"]
+        waits = [f"{row['reduce_ms']:.3f}", f"{row['waited_ms']:.2f}"] if count > 1 else ["", ""]
+        cells = [str(count), str(row["worlds"]), f"{row['ms']:.2f}", *waits]
+        assert f"| {' | '.join(cells)} |".replace("  ", " ") in page
+    alone, twice, shared = (row["ms"] for row in rows)
+    assert f"take {100 * (twice / alone - 1):.0f} % longer" in page
+    assert f"weak scaling {100 * alone / twice:.0f} %" in page
+    assert f"{alone / shared:.2f} times as\nfast" in page
