@@ -347,7 +347,6 @@ def test_two_rows_of_npa_bench_from_a_cpu_and_a_gpu_are_told() -> None:
 def test_learners_of_npa_bench_from_cpus_and_a_gpu_are_told() -> None:
     page = (ROOT / "docs" / "npa_bench.md").read_text(encoding="utf-8")
     rows = content(RESULTS / "npa_bench_learners_two_machines.json")
-    far = []
     for first, second in zip(rows[::2], rows[1::2], strict=True):
         assert (first["id"], first["method"]) == (second["id"], second["method"])
         held = content(RESULTS / "npa_bench_v0" / f"{second['method']}.json")
@@ -366,8 +365,7 @@ def test_learners_of_npa_bench_from_cpus_and_a_gpu_are_told() -> None:
         line = f"| `{first['method']}`, `{first['id']}` | {len(kept)} | {' | '.join(cells)} |"
         if len(kept) > 2:
             assert f"{line} {apart:.1f} |" in page
-            far += [(first["method"], first["id"])] if apart > 2.0 else []
-    assert far == [("ppo_world", "npa/Morphogenesis2DSmall-v0")]
+            assert apart < 2.0
     first, _, second = content(RESULTS / "npa_bench_growth_again_cpu.json")
     told = " ".join(page.split())
     for row in (first, second):
@@ -520,7 +518,9 @@ def test_the_table_of_the_test_of_best_has_the_numbers_of_its_file() -> None:
 def test_the_tables_of_second_lives_have_the_numbers_of_their_file() -> None:
     page = (ROOT / "docs" / "recipes.md").read_text(encoding="utf-8")
     section = page.split("## More second lives")[1].split("\n## ")[0]
-    told = dict(re.findall(r"^\| ([a-z0-9, -]+?)(?: \(`best`\))? \| (.*) \|$", section, re.MULTILINE))
+    told = dict(
+        re.findall(r"^\| ([a-z0-9, -]+?)(?: \(`best`\))? \| (.*) \|$", section, re.MULTILINE)
+    )
     record = content(RESULTS / "recipes_second_lives_h100.json")
     aged = {row["picture"]: row for row in record["long"]}
     steps = (64, 128, 512, 1024, 4096, 20_000)
