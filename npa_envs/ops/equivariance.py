@@ -197,7 +197,8 @@ def _steer_rows_backward(
 ) -> tuple[Tensor, Tensor, Tensor]:
     gate_count = len(steering)
     output_bar, mixed_bar = torch.empty_like(output), torch.empty_like(mixed)
-    shares = output.new_empty(len(output), gate_count)
+    # By gate, so that each gate's shares lie side by side when they are summed.
+    shares = output.new_empty(gate_count, len(output))
     launch(
         _kernels(output, mixed.shape[2]).pull_back_steering,
         output.numel(),
@@ -216,7 +217,7 @@ def _steer_rows_backward(
 
 @_steer_rows_backward.register_fake
 def _(output: Tensor, mixed: Tensor, steering: Tensor, *rest: Any) -> tuple[Tensor, ...]:
-    shares = output.new_empty(output.shape[0], steering.shape[0])
+    shares = output.new_empty(steering.shape[0], output.shape[0])
     return torch.empty_like(output), torch.empty_like(mixed), shares
 
 
@@ -275,7 +276,7 @@ class _SteerRows(torch.autograd.Function):
         output_bar, mixed_bar, shares = _steer_rows_backward(
             output, mixed, steering, update_bar.contiguous()
         )
-        return output_bar, mixed_bar, shares.sum(dim=0), None
+        return output_bar, mixed_bar, shares.sum(dim=1), None
 
 
 def read_rows(rows: Tensor, mixing: Tensor, form: VectorForm, width: int) -> tuple[Tensor, Tensor]:

@@ -223,7 +223,7 @@ def equivariance_kernels(space_dim: int, scalar: type) -> SimpleNamespace:
             along = wp.dot(u, pull)
             if gate > scalar(0.0):
                 value = steering[column] * along
-            steering_shares[row, column] = wp.max(gate, scalar(0.0)) * along
+            steering_shares[column, row] = wp.max(gate, scalar(0.0)) * along
             if column < count:
                 total = wp.max(gate, scalar(0.0)) * steering[column] * pull
                 if gate_count > count:
