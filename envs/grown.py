@@ -45,7 +45,7 @@ class GrownConfig(Morphogenesis2DEnvConfig):
     learned. It needs a `seed_pool`: fresh worlds are told apart by the seeds of `reset`."""
 
     grow_steps: int = 256
-    """Steps of the rule from the seed to the grown world."""
+    """Steps of the rule from the seed to the grown world, of time step 1 and without noise."""
 
     def __post_init__(self) -> None:
         """Check every field."""

@@ -6,18 +6,26 @@ disk take parts of the same runs (`part_of`), each with a queue of its own.
 
 from __future__ import annotations
 
+import contextlib
 import math
+import signal
+import sys
+import threading
 import time
 from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass
-from typing import TypeVar
+from types import FrameType
+from typing import Any, TypeVar
 
 from npa_envs.errors import NPAError
 
 LOOK_SECONDS = 0.1
 """Pause between two looks at the processes [s]."""
+
+STOPPING = ("SIGINT", "SIGTERM", "SIGHUP")
+"""Signals that stop a queue: Ctrl-C, a scheduler, a terminal that is closed."""
 
 
 @dataclass(frozen=True)
@@ -53,9 +61,16 @@ class Child(ABC):
     def over(self) -> bool:
         """Whether it has ended by itself, in whatever way."""
 
+    def stop(self, *, at_once: bool) -> None:  # noqa: B027 - not all have something to save
+        """Ask it to end, and do not wait for it: `end` follows.
+
+        Args:
+            at_once: It has no time to save what it has done.
+        """
+
     @abstractmethod
     def end(self) -> None:
-        """End it, and leave nothing of it."""
+        """End it, or wait until it has ended after `stop`, and leave nothing of it."""
 
 
 SomeChild = TypeVar("SomeChild", bound=Child)
@@ -71,6 +86,8 @@ def run_children(
 ) -> None:
     """Run children until none is left; if this is interrupted, all of them are ended.
 
+    All are asked to end before one is waited for. A second signal ends them at once.
+
     Args:
         start: Returns the next child, given those that are not over; None where none is left, or
             those that are left wait for one that is not over.
@@ -78,6 +95,9 @@ def run_children(
         places: Where.
         ahead: Start as many children early, which get ready and wait.
         max_seconds: None begins after so long [s].
+
+    Raises:
+        KeyboardInterrupt: A signal of `STOPPING` has come.
     """
     ready, running = deque[SomeChild](), dict[int, SomeChild]()
     until = time.monotonic() + max_seconds
@@ -86,29 +106,92 @@ def run_children(
         late = time.monotonic() >= until
         return None if late else start([*ready, *running.values()])
 
+    with _Interruption() as interruption:
+        try:
+            while True:
+                interruption.check()
+                while ready and time.monotonic() >= until:
+                    _end([ready.pop()])
+                for number in range(places.jobs):
+                    one = None
+                    if number not in running:
+                        one = ready.popleft() if ready else next_child()
+                    if one is not None:
+                        running[number] = one
+                        one.go(places.device(number))
+                        interruption.check()
+                if not running:
+                    return
+                while ahead and len(ready) < places.jobs and (one := next_child()) is not None:
+                    ready.append(one)
+                    interruption.check()
+                for number, one in list(running.items()):
+                    if one.over:
+                        # The same signal may have ended it: then it is to be run again.
+                        interruption.check()
+                        del running[number]
+                        finished(one)
+                time.sleep(LOOK_SECONDS if running else 0.0)
+        finally:
+            interruption.came = True  # The next signal acts at once.
+            _end([*running.values(), *ready])
+
+
+def _end(children: Sequence[Child]) -> None:
+    """End children: all are asked first, so that they save what they have at the same time."""
     try:
-        while True:
-            while ready and time.monotonic() >= until:
-                ready.pop().end()
-            for number in range(places.jobs):
-                one = None
-                if number not in running:
-                    one = ready.popleft() if ready else next_child()
-                if one is not None:
-                    running[number] = one
-                    one.go(places.device(number))
-            if not running:
-                return
-            while ahead and len(ready) < places.jobs and (one := next_child()) is not None:
-                ready.append(one)
-            for number, one in list(running.items()):
-                if one.over:
-                    del running[number]
-                    finished(one)
-            time.sleep(LOOK_SECONDS if running else 0.0)
-    finally:
-        for one in [*running.values(), *ready]:
+        for one in children:
+            one.stop(at_once=False)
+        for one in children:
             one.end()
+    except BaseException:
+        for one in children:
+            one.stop(at_once=True)
+        for one in children:
+            one.end()
+        raise
+
+
+class _Interruption:
+    """Signals within a block: the first waits for `check`, the next one acts at once.
+
+    So the first never comes while a process is being started, which nobody would end then. Both
+    raise KeyboardInterrupt. Signals that are ignored, as by nohup, stay so. In a thread other than
+    the main one, where signals cannot be caught, nothing is changed.
+    """
+
+    def __init__(self) -> None:
+        self.came = False
+        """Whether the first has come."""
+        self._previous: dict[signal.Signals, Any] = {}
+
+    def __enter__(self) -> _Interruption:
+        if threading.current_thread() is not threading.main_thread():
+            return self
+        for name in STOPPING:
+            # Not every system has each of them.
+            number = getattr(signal, name, None)
+            # None: a handler that is not Python's, which could not be put back.
+            if number is not None and signal.getsignal(number) not in (None, signal.SIG_IGN):
+                self._previous[number] = signal.signal(number, self._note)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for number, handler in self._previous.items():
+            signal.signal(number, handler)
+
+    def _note(self, number: int, frame: FrameType | None) -> None:
+        if self.came:
+            raise KeyboardInterrupt
+        self.came = True
+
+    def check(self) -> None:
+        """Raise KeyboardInterrupt where a signal has come."""
+        if self.came:
+            # A terminal that was closed shows nothing.
+            with contextlib.suppress(OSError):
+                print("\nending all runs; once more to end them at once", file=sys.stderr)
+            raise KeyboardInterrupt
 
 
 Item = TypeVar("Item")

@@ -42,7 +42,9 @@ def quiet_warp() -> Iterator[None]:
         of_cache = isinstance(error, OSError | json.JSONDecodeError)
         if not of_cache and not str(error).startswith(_BROKEN_CACHE):
             raise
-        folder = wp.config.kernel_cache_dir or os.environ.get("WARP_CACHE_PATH", "Warp's cache")
+        # A second try names the version twice in the configuration.
+        folder = getattr(error, "filename", None) or wp.config.kernel_cache_dir
+        folder = folder or os.environ.get("WARP_CACHE_PATH", "Warp's cache")
         raise NPAError(
             "Warp's cache of compiled kernels must be a folder that can be written to, and whole, "
             f"but {shown(str(folder))} cannot be used ({shown(error)}): remove it, and kernels are "

@@ -400,11 +400,19 @@ class RowPolicy:
         model: The model; the policy follows when it is trained on.
         deterministic: Whether it acts by its mean instead of a draw.
         tag: What the model was told of the species behind each row, shape [K]; None: nothing.
+
+    Raises:
+        NPAError: The model is none.
     """
 
     def __init__(
         self, model: Any, *, deterministic: bool = False, tag: NDArray[np.float32] | None = None
     ) -> None:
+        if not callable(getattr(model, "predict", None)):
+            raise NPAError(
+                f"model must be one of Stable-Baselines3, got {shown(model)}: load it first, "
+                "stable_baselines3.PPO.load('model.zip')"
+            )
         self.model = model
         self.deterministic = deterministic
         self.tag = tag

@@ -148,6 +148,13 @@ def train(
         DivergedError: The rules' weights have become infinite or NaN.
         MissingDependencyError: The method needs a library that is not installed.
     """
+    for name, value, kind in (("problem", problem, Problem), ("budget", budget, Budget)):
+        if not isinstance(value, kind):
+            example = "env_id='npa/Mixing-v0', episode_steps=96"
+            cure = f"Problem({example})" if kind is Problem else "Budget(particle_steps=1e6)"
+            raise NPAError(
+                f"{name} must be a {kind.__name__}, got {shown(value)}: make it with {cure}"
+            )
     if problem.chooses_codes and method in GARDEN_METHODS | METHODS:
         raise NPAError(
             f"method {shown(method)} learns no codes, which are the actions in {problem.env_id}: "
@@ -171,13 +178,14 @@ def train(
         "problem": problem,
         "budget": budget,
         "device": place,
-        "evaluation_seeds": evaluation_seeds,
+        "evaluation_seeds": tuple(evaluation_seeds),
         "entries": entries,
         "on_entry": on_entry,
     }
     progress = Progress(**account)
     if out is not None:
         told = {"method": method, "problem": problem.to_json(), "seed": seed, "options": options}
+        told["started"] = start is not None
         progress = KeptProgress(
             RunFolder(Path(out)), told, resume=resume, overwrite=overwrite, **account
         )

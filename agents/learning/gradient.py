@@ -20,6 +20,7 @@ from npa_envs.errors import NPAError, shown
 from npa_envs.rule.network import FoldedRule
 from npa_envs.rule.rule import NPARule
 from npa_envs.tasks.base import Task
+from npa_envs.tasks.checks import check_fraction
 from npa_envs.tasks.train_config import TrainConfig
 from npa_envs.training.cycle import TrainingCycle
 from npa_envs.world.randomness import Randomness, WorldRandom
@@ -38,7 +39,7 @@ KEY_RANGE = -(2**63), 2**63 - 1
 
 @dataclass(frozen=True, kw_only=True)
 class GradientOptions:
-    """Options of `train`; they are checked where the trainer's configuration is made of them."""
+    """Options of `train`; most are checked where the trainer's configuration is made of them."""
 
     steps: tuple[int, int] | None = None
     """Range [lo, hi) that the number of steps of each rollout is drawn from; None: whole episodes
@@ -66,6 +67,10 @@ class GradientOptions:
 
     memory: Memory = "store"
     """What the backward pass reads: "store", "recompute" or "minimal", as in `rollout`."""
+
+    def __post_init__(self) -> None:
+        """Check what the trainer's configuration does not hold; raises NPAError."""
+        check_fraction(self, "last_rate")
 
 
 DEFAULTS = GradientOptions()

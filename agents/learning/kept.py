@@ -103,6 +103,8 @@ class KeptProgress(Progress):
                 if len(self.log) > entries:
                     entries = len(self.log)
                     self._save(rules, learner)
+            # What evaluates takes its time, and who asked to stop may not wait.
+            self._save(rules, learner)
             self.look(rules, force=True)
             self._save(rules, learner)
 
@@ -114,6 +116,9 @@ class KeptProgress(Progress):
         if resume:
             content = load_checkpoint(folder.checkpoint)
             held = content.get("learner")
+            if isinstance(held, dict):
+                # Runs of before 2026-11-25 do not say so.
+                held = {"started": self._told.get("started")} | held
             if held != self._told:
                 here = held if isinstance(held, dict) else {}
                 names = [name for name in self._told if here.get(name) != self._told[name]]

@@ -45,6 +45,10 @@ class SpeciesConfig(WorldConfig):
         "render_style": (SPECIES_STYLE, *STYLES),
     }
 
+    elsewhere = WorldConfig.elsewhere | {
+        "num_envs": "many worlds at once are made by multispecies_v0.batched(..., world_count=8)"
+    }
+
     species_count: int = 2
     """Species K."""
 

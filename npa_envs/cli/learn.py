@@ -175,6 +175,8 @@ def problem_of(options: LearnOptions) -> Problem:
     return Problem(
         env_id=options.env,
         keywords=named_values("keywords", options.keywords),
-        episode_steps=options.episode_steps or limits.get(options.env, 256),
+        episode_steps=(
+            limits.get(options.env, 256) if options.episode_steps is None else options.episode_steps
+        ),
         num_envs=options.worlds,
     )

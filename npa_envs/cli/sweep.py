@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import itertools
 import math
 import os
@@ -10,6 +11,7 @@ import shlex
 import subprocess
 import sys
 import time
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -29,7 +31,7 @@ RUN_FAILED = 1
 RECORD, OUTPUT, TABLE = "run.json", "output.txt", "sweep.md"
 """Files: what became of a run, what it printed, and of all of them together."""
 
-OWN = ("out", "device", "resume", "overwrite", "max-seconds", "processes", "gpus")
+OWN = ("out", "output", "device", "resume", "overwrite", "max-seconds", "processes", "gpus")
 """Options of `npa-envs train` that a sweep gives by itself, or that would break it."""
 
 PROGRAM = (sys.executable, "-m", "npa_envs", "train")
@@ -38,6 +40,9 @@ PROGRAM = (sys.executable, "-m", "npa_envs", "train")
 TOLD = 300
 """Characters at most of what a failed run said last."""
 
+HASH = 12
+"""Characters of a hash in a folder's name."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class SweepOptions:
@@ -45,7 +50,8 @@ class SweepOptions:
 
     The words after `--` are those of `npa-envs train` for all runs. A sweep that was stopped goes
     on where it was: runs that are over are left as they are, begun ones resume from their
-    checkpoints, and failed ones are tried again. Ends with code 1 where a run failed.
+    checkpoints, and failed ones are tried again. Ctrl-C or SIGTERM lets runs write checkpoints; a
+    second one ends them at once. Ends with code 1 where a run failed.
     """
 
     over: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME=A,B,C")]
@@ -84,11 +90,8 @@ class Run:
     words: Sequence[str]
     """All words after `npa-envs train`, but for the folder and the device."""
 
-    @property
-    def name(self) -> str:
-        """Name of its folder."""
-        parts = (f"{name}={value}" for name, value in self.values.items())
-        return re.sub(r"[^\w=,.+-]", "_", ",".join(parts))
+    name: str
+    """Name of its folder."""
 
 
 @dataclass(frozen=True)
@@ -120,13 +123,18 @@ def main(arguments: Sequence[str]) -> int:
             write_text(folder / TABLE, table(folder, runs))
             bar.advance(1)
 
-        run_children(
-            lambda _: _Training(folder, waiting.pop(0), places.threads) if waiting else None,
-            finished,
-            places,
-            ahead=False,
-            max_seconds=options.max_seconds,
-        )
+        try:
+            run_children(
+                lambda _: _Training(folder, waiting.pop(0), places.threads) if waiting else None,
+                finished,
+                places,
+                ahead=False,
+                max_seconds=options.max_seconds,
+            )
+        except KeyboardInterrupt:
+            left_count = sum(not is_over(folder, run) for run in mine)
+            print(f"interrupted; {left_count} runs are left: call again with the same words")
+            raise
     text = table(folder, runs)
     write_text(folder / TABLE, text)
     print(text, end="")
@@ -148,29 +156,54 @@ def combinations(over: Sequence[str], common: Sequence[str]) -> list[Run]:
         common: The words of all runs: a task, and options.
 
     Raises:
-        NPAError: A word is no such option, one is given twice, or there is no task.
+        NPAError: A word is no such option, an option or a value is given twice, or there is no
+            task.
     """
     from npa_envs.training import TASKS
 
     if not common or common[0] not in TASKS:
         told = suggest(common[0], TASKS) if common else ", ".join(TASKS)
         raise NPAError(f"the words after -- must begin with a task of npa-envs train: {told}")
+    given = {_option(word.partition("=")[0]) for word in common if word.startswith("--")}
     values: dict[str, list[str]] = {}
     for word in over:
         name, mark, listed = word.partition("=")
-        name = name.removeprefix("--").replace("_", "-")
+        name = _option(name)
         if not (mark and name and all(listed.split(","))):
             raise NPAError(f"over must be NAME=A,B,C, got {word!r}: seed=0,1,2")
-        if name in values or f"--{name}" in common:
+        if name in values or name in given:
             raise NPAError(f"--{name} must be given once, in --over or after --, got it twice")
         values[name] = listed.split(",")
+        twice = [value for value, count in Counter(values[name]).items() if count > 1]
+        if twice:
+            raise NPAError(f"over must name each value once, got {word!r}: leave out {twice[0]!r}")
     for name in OWN:
-        if name in values or f"--{name}" in common:
+        if name in values or name in given:
             raise NPAError(f"--{name} must not be given to the runs: a sweep does so by itself")
     chosen = [dict(zip(values, one, strict=True)) for one in itertools.product(*values.values())]
+    runs = []
+    for one, folder in zip(chosen, _folder_names(chosen), strict=True):
+        own = [word for name, value in one.items() for word in (f"--{name}", value)]
+        runs.append(Run(one, [*common, *own], folder))
+    return runs
+
+
+def _option(word: str) -> str:
+    """Return the name of an option as `npa-envs train` shows it: it reads - and _ alike."""
+    return word.removeprefix("--").replace("_", "-")
+
+
+def _folder_names(chosen: Sequence[Mapping[str, str]]) -> list[str]:
+    """Return a folder's name for each combination, no two of them alike.
+
+    Those that differ only in signs that a folder's name leaves out end with a hash of their values.
+    """
+    told = [",".join(f"{name}={value}" for name, value in one.items()) for one in chosen]
+    plain = [re.sub(r"[^\w=,.+-]", "_", words) for words in told]
+    count = Counter(plain)
     return [
-        Run(one, [*common, *(word for name, value in one.items() for word in (f"--{name}", value))])
-        for one in chosen
+        name if count[name] == 1 else f"{name}-{hashlib.sha256(words.encode()).hexdigest()[:HASH]}"
+        for name, words in zip(plain, told, strict=True)
     ]
 
 
@@ -212,6 +245,9 @@ class _Training(Child):
                 stdout=output,
                 stderr=output,
                 env=os.environ | {"OMP_NUM_THREADS": str(self._threads)},
+                # A terminal sends Ctrl-C to its whole group. `stop` would then be the second
+                # signal, after which a run ends without a checkpoint.
+                start_new_session=True,
             )
 
     @property
@@ -219,10 +255,16 @@ class _Training(Child):
         """Whether it has ended."""
         return self._process is not None and self._process.poll() is not None
 
-    def end(self) -> None:
-        """Let it write its checkpoint and end."""
-        if self._process is not None:
+    def stop(self, *, at_once: bool) -> None:
+        """Ask it to write its checkpoint and end, or only to end."""
+        if self._process is not None and at_once:
+            self._process.kill()
+        elif self._process is not None:
             self._process.terminate()
+
+    def end(self) -> None:
+        """Wait until it has ended after `stop`."""
+        if self._process is not None:
             self._process.wait()
 
     def write_record(self) -> None:

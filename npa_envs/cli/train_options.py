@@ -12,13 +12,14 @@ import tyro
 
 from npa_envs.cli.launch import with_device_of_gpus
 from npa_envs.cli.output import OutFolder, parse_options, settled_resume
-from npa_envs.errors import NPAError
+from npa_envs.errors import NPAError, shown
 from npa_envs.tasks.co_morphogenesis2d import CoMorphogenesis2DConfig
 from npa_envs.tasks.morphogenesis2d import Morphogenesis2DConfig
 from npa_envs.training import (
     JointTrainConfig,
     RunFolder,
     TrainConfig,
+    config_to_dict,
     load_config,
     override,
     preset,
@@ -93,6 +94,43 @@ def settled(task_name: str, words: Sequence[str]) -> list[str]:
     return settled_resume(with_device_of_gpus(words), out_of)
 
 
+def _check_preset(
+    name: str, run: TrainConfig[Any], task_name: str, folder: RunFolder, arguments: Sequence[str]
+) -> None:
+    """Check that a run that goes on is of the preset that was named.
+
+    Raises:
+        NPAError: It has other values of what presets differ in, none of which were said.
+    """
+    names = task_entry(task_name).presets
+    flat = {preset_name: _fields_of(preset(preset_name, task_name)) for preset_name in names}
+    wanted, held = flat[name], _fields_of(run)
+    said = {word.partition("=")[0].lstrip("-").replace("-", "_") for word in arguments}
+    said |= {word.removeprefix("no_") for word in said} | {"out", "device"}
+    others = [
+        field
+        for field, value in wanted.items()
+        if field not in said
+        and held.get(field) != value
+        and any(other.get(field) != value for other in flat.values())
+    ]
+    if others:
+        shown_fields = ", ".join(f"{field}: {shown(held.get(field))}" for field in others[:3])
+        more = f" and {len(others) - 3} more" if len(others) > 3 else ""
+        raise NPAError(
+            f"preset must be the one that the run in {shown(str(folder.path))} was begun with, "
+            f"but {name!r} differs from it ({shown_fields}{more} there): leave --preset out, and "
+            "it goes on as it was"
+        )
+
+
+def _fields_of(config: TrainConfig[Any]) -> dict[str, Any]:
+    """Return a configuration's own fields; those of its task may follow from its target."""
+    own = config_to_dict(config)
+    del own["task"]
+    return own
+
+
 def starting_configuration(task_name: str, arguments: Sequence[str]) -> TrainConfig[Any]:
     """Return the configuration that the options are laid over: preset, file, or the run resumed.
 
@@ -125,6 +163,8 @@ def starting_configuration(task_name: str, arguments: Sequence[str]) -> TrainCon
             # Fields of another task are unknown here; that it is another task says more.
             check_task(load_checkpoint(folder.checkpoint), task_name, folder.checkpoint)
             raise
+        if first.preset and first.config is None:
+            _check_preset(first.preset, base, task_name, folder, arguments)
     if first.config is not None:
         presets = task_entry(task_name).presets
         if first.preset or first.resume:

@@ -141,16 +141,24 @@ class NPARule(nn.Module):
         divides: bool = False,
     ) -> None:
         super().__init__()
-        widths = (state_dim, hidden_dim, readout_dim, readout_hidden_dim, mixed_vectors)
-        sizes = (space_dim, *widths, species_count, code_dim)
-        if any(isinstance(size, bool) or not isinstance(size, int) for size in sizes):
-            raise NPAError(f"dimensions of a rule must be integers, got {shown(sizes)}")
+        sizes = {
+            "space_dim": space_dim,
+            "state_dim": state_dim,
+            "hidden_dim": hidden_dim,
+            "readout_dim": readout_dim,
+            "readout_hidden_dim": readout_hidden_dim,
+            "mixed_vectors": mixed_vectors,
+            "species_count": species_count,
+            "code_dim": code_dim,
+        }
+        for name, size in sizes.items():
+            if isinstance(size, bool) or not isinstance(size, int):
+                raise NPAError(f"{name} must be an integer, got {shown(size)}: try 2")
         if space_dim not in (2, 3):
             raise NPAError(f"space_dim must be 2 or 3, got {shown(space_dim)}")
-        if max(sizes) > LARGEST_DIM:
-            raise NPAError(
-                f"dimensions of a rule must be at most {LARGEST_DIM}, got {shown(sizes)}"
-            )
+        for name, size in sizes.items():
+            if size > LARGEST_DIM:
+                raise NPAError(f"{name} must be at most {LARGEST_DIM}, got {shown(size)}")
         positive = {"state_dim": state_dim, "hidden_dim": hidden_dim}
         for name, value in (positive | {"mixed_vectors": mixed_vectors}).items():
             if value < 1:
@@ -414,8 +422,17 @@ class NPARule(nn.Module):
 
         Args:
             states: Particle states, dimensionless, shape [..., C], C at least 3 without read-out.
+
+        Raises:
+            NPAError: There are fewer than three outputs.
         """
-        return self.read_out(states)[..., -3:] + COLOUR_OFFSET
+        outputs = self.read_out(states)
+        if outputs.shape[-1] < 3:
+            raise NPAError(
+                f"colours are the last three outputs of a particle, got {outputs.shape[-1]}: "
+                "make the rule with state_dim=3 or more"
+            )
+        return outputs[..., -3:] + COLOUR_OFFSET
 
     def with_code(self, states: Tensor, code: Tensor) -> Tensor:
         """Return states that carry a code; all else of them stays as it is.

@@ -55,7 +55,8 @@ class Morphogenesis2DConfig(GrowthConfig):
     have one too. Without, each target's code is learned by itself."""
 
     switch_share: float = 0.1
-    """Probability of a world from the pool to become another one of `targets` in mid-life."""
+    """Probability of a world from the pool that is damaged to become another one of `targets` in
+    mid-life."""
 
     target_point_count: int = 4096
     """About how many opaque pixels the target is resampled to; as many as there are particles."""
@@ -120,7 +121,7 @@ class Morphogenesis2DConfig(GrowthConfig):
         check_positive(self, float, "sigma")
         check_non_negative(self, "splat_weight", "colour_weight", "drift_weight")
         check_non_negative(self, "seed_axis", "seed_across")
-        check_flag(self, "equivariant", "chiral", "encoder", "division")
+        check_flag(self, "equivariant", "chiral", "encoder", "division", "keep_background")
         self._check_targets()
         check_positive(self, int, "angles", at_least=4)
         if self.division and (self.equivariant or self.targets):

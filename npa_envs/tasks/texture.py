@@ -15,7 +15,13 @@ from npa_envs.errors import NPAError, shown
 from npa_envs.ops import periodic_splat
 from npa_envs.rule.rule import COLOUR_OFFSET
 from npa_envs.tasks.base import ParticleTask, TaskConfig, shares_of_loss
-from npa_envs.tasks.checks import check_non_negative, check_positive, check_seed, check_text
+from npa_envs.tasks.checks import (
+    check_flag,
+    check_non_negative,
+    check_positive,
+    check_seed,
+    check_text,
+)
 from npa_envs.tasks.damage import erase_state, random_particle
 from npa_envs.tasks.losses.texture import (
     DEFAULT_LOSS,
@@ -87,6 +93,7 @@ class TextureConfig(TaskConfig):
         """Check every field; raise NPAError where one has a wrong type or lies out of its range."""
         super().__post_init__()
         check_text(self, "target", "a built-in texture or a path")
+        check_flag(self, "target_tiles", "see_across")
         check_loss_name(self.loss)
         check_seed(self, "loss_seed")
         if not isinstance(self.vgg_weights, str):

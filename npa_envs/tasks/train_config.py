@@ -14,6 +14,7 @@ from npa_envs.devices import parse_device
 from npa_envs.errors import NPAError, shown
 from npa_envs.ops.checks import MomentInverse
 from npa_envs.tasks.checks import (
+    check_flag,
     check_fraction,
     check_non_negative,
     check_positive,
@@ -123,7 +124,8 @@ class TrainConfig(Generic[TaskConfigT]):
     """Every so many batches, the first world of the batch is a fresh seed. 1: in every batch."""
 
     fresh_share: float = 0.0
-    """Share of fresh seeds in a batch that has any; at least one world."""
+    """Share of fresh seeds in a batch that has any by `seed_interval`; at least one world. Without
+    effect where worlds have `lifetimes`, at the end of which seeds come."""
 
     lifetimes: tuple[int, int] = (0, 0)
     """Steps that a world of the pool lives until a fresh seed takes its place, or it is damaged and
@@ -220,6 +222,7 @@ class TrainConfig(Generic[TaskConfigT]):
                 f"picture_interval must be a whole number of at least 0, got {shown(interval)}"
             )
         check_seed(self, "seed")
+        check_flag(self, "normalise_gradients", "damage", "cuda_graph", "tensorboard")
         if not isinstance(self.initial_rule, str):
             raise NPAError(
                 f"initial_rule must be the name of a rule or of a file, or '' for none, got "
@@ -289,6 +292,13 @@ class TrainConfig(Generic[TaskConfigT]):
                     f"{name} needs worlds that have lifetimes, got {getattr(self, name)} without: "
                     "set lifetimes, for example to (256, 32768)"
                 )
+        falls = self.schedule != "milestones" or (self.decay < 1.0 and len(self.milestones) > 0)
+        if self.ageing_steps > 0 and not falls:
+            raise NPAError(
+                f"ageing_steps needs a learning rate that falls, got {self.ageing_steps} with "
+                f"decay={self.decay} and milestones={self.milestones}: worlds age as it falls; set "
+                "schedule='cosine', or milestones and a decay below 1"
+            )
         if self.second_lives > 0.0 and not self.damage:
             raise NPAError(
                 f"second_lives needs damage, got {self.second_lives} with damage=False: worlds "

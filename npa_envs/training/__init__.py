@@ -7,7 +7,7 @@ from dataclasses import replace
 from typing import Any
 
 from npa_envs.devices import check_device
-from npa_envs.errors import DivergedError
+from npa_envs.errors import DivergedError, NPAError, shown
 from npa_envs.tasks.base import PictureTask, Task
 from npa_envs.tasks.morphogenesis2d import Morphogenesis2DTrainConfig
 from npa_envs.tasks.train_config import JointTrainConfig, TrainConfig
@@ -15,7 +15,7 @@ from npa_envs.training.joint import JointRules, train_together
 from npa_envs.training.overrides import config_to_dict, load_config, override
 from npa_envs.training.presets import TASKS, TaskEntry, preset, task_entry
 from npa_envs.training.run_folder import JsonlLog, RunFolder
-from npa_envs.training.trainer import Trainer, TrainResult
+from npa_envs.training.trainer import Trainer, TrainResult, check_seconds
 
 __all__ = [
     "TASKS",
@@ -68,6 +68,17 @@ def train(
         DivergedError: The loss is not finite.
     """
     entry = task_entry(task_name)
+    if not isinstance(config, TrainConfig):
+        raise NPAError(
+            f"config must be a TrainConfig, got {shown(config)}: make one with preset('fast')"
+        )
+    kind = type(next(iter(entry.presets.values())).task)
+    if not isinstance(config.task, kind):
+        raise NPAError(
+            f"config must be one of the task {task_name!r}, got one with a "
+            f"{type(config.task).__name__}: make it with preset('fast', {task_name!r})"
+        )
+    check_seconds(max_seconds)
     if entry.joint:
         return train_together(
             config,

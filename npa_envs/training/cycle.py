@@ -173,6 +173,11 @@ class TrainingCycle:
         self.average.update(iteration)
         return steps
 
+    @property
+    def pool_bytes(self) -> int:
+        """Bytes of the pool's worlds, of this process."""
+        return self.pool.x.nbytes + self.pool.s.nbytes
+
     def state_dict(self) -> dict[str, Any]:
         """Return all that changes but the rule, for a checkpoint; of all processes on the first."""
         return {
@@ -327,7 +332,7 @@ class TrainingCycle:
         dtype = self._config.torch_dtype
         x, s, goal = seed_worlds(self.task, world_count, generator=random, device=random.device)
         lo, hi = map(math.log, self._config.vary_eps)
-        if lo < hi:
+        if (lo, hi) != (0.0, 0.0):
             # Scaling positions and ε alike is a symmetry: a larger ε is a smaller disk.
             share = (
                 random.uniform(1)[:, 0]

@@ -18,7 +18,7 @@ from npa_envs.tasks.base import differing_fields
 from npa_envs.tasks.co_morphogenesis2d import CoMorphogenesis2D, CoMorphogenesis2DConfig
 from npa_envs.tasks.train_config import JointTrainConfig, TrainConfig
 from npa_envs.training.iteration import RolloutOptions
-from npa_envs.training.trainer import Trainer, TrainResult
+from npa_envs.training.trainer import Trainer, TrainResult, rule_like
 from npa_envs.world.species import rollout_species
 
 TASK_NAME = "co_morphogenesis2d"
@@ -61,7 +61,7 @@ class _JointTrainer(Trainer):
         self._frozen: tuple[int, ...] = ()
         if isinstance(config, JointTrainConfig):
             self._frozen = config.frozen
-            if rules is None and config.initial_rules:
+            if rules is None and config.initial_rules and not resume:
                 self._given = [load_rule(source) for source in config.initial_rules]
         super().__init__(
             task,
@@ -79,11 +79,13 @@ class _JointTrainer(Trainer):
         rules = list(cast(JointRules, rule))
         return rollout_species(rules, x, s, steps, counts=counts, density_counts=counts, **options)
 
-    def _make_rule(self, generator: torch.Generator) -> NPARule:
+    def _make_rule(self, generator: torch.Generator, held: dict[str, Any] | None) -> NPARule:
         # The trainer asks of its rule what any module has, and for its hyper-parameters.
         made = self._species.make_rules(generator)
         for rule in made:
             rule.moment_inverse = self.config.moment_inverse
+        if held is not None:
+            self._given = [rule_like(own) for own in held["rules"]]
         if self._given is None:
             if self._frozen:
                 raise NPAError(

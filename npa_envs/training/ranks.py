@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import contextlib
 import gc
+import math
 import os
+import time
 import uuid
 from collections.abc import Iterator, Sequence
 from typing import Any, TypeVar
@@ -20,7 +22,11 @@ from npa_envs.training.heartbeat import Heartbeat
 ValueT = TypeVar("ValueT")
 
 AGREE_INTERVAL = 10
-"""Iterations from one question to all processes whether to stop to the next."""
+"""Iterations from one question to all processes whether to stop to the next, at most."""
+
+AGREE_SECONDS = 2.0
+"""Time from one question to the next [s], where one iteration does not take longer: launchers kill
+what has not stopped 30 s after they asked."""
 
 
 class Ranks:
@@ -43,6 +49,8 @@ class Ranks:
         self.together = together
         """Whether they are torch's default group."""
         self._parent = os.getppid()
+        self._asked_at: tuple[int, float] | None = None
+        self._next_question = 0
 
     @classmethod
     def current(cls) -> Ranks:
@@ -150,10 +158,19 @@ class Ranks:
         """
         if not self.together:
             return asked
-        if iteration % AGREE_INTERVAL:
+        if self._asked_at is not None and self._asked_at[0] < iteration < self._next_question:
             return False
+        now, took = time.monotonic(), math.inf
+        if self._asked_at is not None and iteration > self._asked_at[0]:
+            took = (now - self._asked_at[1]) / (iteration - self._asked_at[0])
         # Whoever started them would end them; where that one was killed, they end by themselves.
-        return self.any(asked or os.getppid() != self._parent)
+        wanted = asked or os.getppid() != self._parent
+        answer = torch.tensor([float(wanted), took], dtype=torch.float64)
+        with self._in_touch():
+            dist.all_reduce(answer, op=dist.ReduceOp.MAX)
+        interval = min(max(int(AGREE_SECONDS / max(float(answer[1]), 1e-9)), 1), AGREE_INTERVAL)
+        self._asked_at, self._next_question = (iteration, now), iteration + interval
+        return bool(answer[0])
 
     def reduce(self, means: Sequence[Tensor], total: Tensor | None = None) -> None:
         """Replace numbers by their means, and one by its sum, over all processes, in place.
@@ -235,13 +252,16 @@ def joined_ranks() -> Iterator[Ranks]:
     if not dist.is_available() or not dist.is_torchelastic_launched():
         yield Ranks()
         return
+    # Torch's builds for CUDA have NCCL on machines without a GPU too, and refuse it there. The
+    # driver's manager counts, which does not start CUDA.
+    has_gpus = torch.cuda.device_count() >= int(os.environ["LOCAL_WORLD_SIZE"])
+    backend = "cpu:gloo,cuda:nccl" if dist.is_nccl_available() and has_gpus else "gloo"
     _choose_device(int(os.environ["LOCAL_RANK"]))
-    backend = "cpu:gloo,cuda:nccl" if dist.is_nccl_available() else "gloo"
     try:
         dist.init_process_group(backend)
         ranks = Ranks.current()
         heartbeat = _heartbeat(ranks) if ranks.count > 1 else None
-    except RuntimeError as error:
+    except (RuntimeError, ValueError) as error:
         raise NPAError(
             f"the processes that torchrun starts must reach each other, but this one cannot "
             f"({shown(error)}): see its options --rdzv-endpoint and --master-addr"
@@ -271,7 +291,6 @@ def _heartbeat(ranks: Ranks) -> Heartbeat:
 
 def _choose_device(number: int) -> None:
     """Let this process see one CUDA device of those that it would see, or none beyond them."""
-    # This asks the driver's manager, and does not start CUDA.
     if torch.cuda.device_count() == 0:
         return
     seen = os.environ.get("CUDA_VISIBLE_DEVICES")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import json
 import math
 import time
@@ -14,11 +15,13 @@ import torch
 from tqdm import tqdm
 
 from npa_envs.devices import check_device
-from npa_envs.errors import NPAError, shown
+from npa_envs.errors import DivergedError, NPAError, shown
 from npa_envs.files import write_text
 from npa_envs.rule.files import first_rules, load_rule, save_rule
 from npa_envs.rule.rule import NPARule, dividing, with_codes
-from npa_envs.tasks.base import GoalTask, Task, differing_fields
+from npa_envs.tasks.base import GoalTask, Task, differing_fields, untrained_rule
+from npa_envs.tasks.checks import is_real
+from npa_envs.tasks.many_pictures import ManyPictures
 from npa_envs.tasks.train_config import TrainConfig
 from npa_envs.training.batch_picture import write_batch_picture
 from npa_envs.training.checkpoint import (
@@ -121,7 +124,8 @@ class Trainer:
         # While the host waits for the numbers, a GPU would have nothing to do; a CPU has done all.
         self._log_late = device.type == "cuda"
         schedule = torch.Generator().manual_seed(config.seed)
-        self.rule = self._make_rule(schedule).to(device, config.torch_dtype)
+        held = None if content is None else content["rule_hyper_parameters"]
+        self.rule = self._make_rule(schedule, held).to(device, config.torch_dtype)
         # A run that several processes have begun goes on as it was, if only one is left.
         by_world = ranks.together or (content is not None and drawn_by_world(content))
         if config.varied and (ranks.together or rollout is not None):
@@ -139,8 +143,7 @@ class Trainer:
         self.pool = self._cycle.pool
         if ranks.first:
             rule_bytes = sum(p.nbytes for p in self.rule.parameters())
-            pool_bytes = ranks.count * (self.pool.x.nbytes + self.pool.s.nbytes)
-            self.folder.prepare(pool_bytes + 16 * rule_bytes)
+            self.folder.prepare(ranks.count * self._cycle.pool_bytes + 16 * rule_bytes)
         with self._folder_locked():
             if ranks.first:
                 self.folder.tidy()
@@ -149,6 +152,12 @@ class Trainer:
             if ranks.first:
                 if content is None and overwrite:
                     self.folder.clear()
+                elif content is None and self._log.records():
+                    raise NPAError(
+                        f"out must be a folder without a run, but {shown(str(self.folder.path))} "
+                        "holds a log without its checkpoint: choose another folder (--out), or "
+                        "overwrite it (--overwrite)"
+                    )
                 # Before the first checkpoint, which cannot be resumed without it.
                 text = json.dumps(config_to_dict(config), indent=2)
                 write_text(self.folder.config, text + "\n")
@@ -174,6 +183,7 @@ class Trainer:
                 is intact. Or another trainer writes to the folder, or has done so since this one
                 was made.
         """
+        check_seconds(max_seconds)
         with self._folder_locked():
             return self._run(progress, max_seconds)
 
@@ -245,7 +255,12 @@ class Trainer:
     @property
     def kept_rule(self) -> NPARule:
         """The rule as a run keeps it: the mean of its weights, where there is one."""
-        return self._cycle.average.rule(self.rule)
+        rule = self._cycle.average.rule(self.rule)
+        if isinstance(self.task, ManyPictures) and self.config.task.encoder:
+            # The table has what the encoder said in the last iteration, before its last step.
+            rule = copy.deepcopy(rule) if rule is self.rule else rule
+            self.task.for_rule(rule)
+        return rule
 
     def save(self) -> None:
         """Write the checkpoint and the rule.
@@ -282,8 +297,10 @@ class Trainer:
             "rule_hyper_parameters": dict(self.rule.hyper_parameters()),
         }
 
-    def _make_rule(self, generator: torch.Generator) -> NPARule:
-        return initial_rule(self.config, self.task.make_rule(generator))
+    def _make_rule(self, generator: torch.Generator, held: dict[str, Any] | None) -> NPARule:
+        """Return the rule to begin with, or one of the shape that a checkpoint holds."""
+        made = self.task.make_rule(generator)
+        return initial_rule(self.config, made) if held is None else rule_like(held)
 
     def _due(self, interval: int) -> bool:
         return interval > 0 and self.iteration % interval == 0
@@ -356,8 +373,11 @@ class Trainer:
             snapshot[name] = self._ranks.collected(snapshot[name], section=1)
         error = None
         if self._ranks.first:
-            save_checkpoint(self.folder.diagnosis, self._origin() | snapshot)
             error = divergence_error(self.task, self.rule, snapshot, self.folder.diagnosis)
+            try:
+                save_checkpoint(self.folder.diagnosis, self._origin() | snapshot)
+            except NPAError as other:
+                error = DivergedError(f"{error}; but these were not written: {other}")
         error = self._ranks.told(error)
         assert error is not None, "made by the first process"
         raise error
@@ -402,6 +422,32 @@ class Trainer:
             raise unusable_checkpoint(path, f"random_states cannot be used ({error})") from error
         if self._ranks.first:
             self._log.truncate(self.iteration)
+
+
+def check_seconds(max_seconds: object) -> None:
+    """Check a time limit [s]; raises NPAError."""
+    if max_seconds is None or max_seconds == math.inf:
+        return
+    if not is_real(max_seconds) or max_seconds < 0:  # type: ignore[operator]
+        raise NPAError(
+            f"max_seconds must be a number of at least 0, or None for no limit, got "
+            f"{shown(max_seconds)}: try 60"
+        )
+
+
+def rule_like(held: dict[str, Any]) -> NPARule:
+    """Return a rule of the shape that a checkpoint tells, on the CPU; its weights are to follow.
+
+    Raises:
+        NPAError: There is no such rule.
+    """
+    try:
+        return untrained_rule(torch.Generator(), **held)
+    except (TypeError, RuntimeError, OverflowError) as error:
+        raise NPAError(
+            f"no rule has the hyper-parameters {shown(held)} of the checkpoint: it is damaged, or "
+            "of another version"
+        ) from error
 
 
 def initial_rule(config: TrainConfig[Any], untrained: NPARule) -> NPARule:

@@ -7,6 +7,7 @@ kind has a pool of its own, and on CUDA graphs of its own.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Unpack
@@ -25,7 +26,8 @@ from npa_envs.training.meter import Interval, LossMeter
 from npa_envs.training.presets import task_entry
 
 PLACES = {"vary_particles": (1, 0), "vary_update_prob": (2, 1), "vary_dt": (3, 3)}
-"""Stride and start of the walk of each factor through its range, so that no two go together."""
+"""Stride and start of the walk of each factor through its range, so that no two go together; the
+stride is the next one that comes to every place."""
 
 SEED_STEP = 7919
 """Between the seeds of two kinds' randomness."""
@@ -46,8 +48,11 @@ def variants_of(config: TrainConfig[Any]) -> list[Variant]:
     columns = []
     for name, (stride, start) in PLACES.items():
         lo, hi = getattr(config, name)
+        while math.gcd(stride, count) > 1:
+            stride += 1
         places = [(number * stride + start) % count for number in range(count)]
-        columns.append([lo * (hi / lo) ** (place / max(count - 1, 1)) for place in places])
+        shares = [place / (count - 1) for place in places] if count > 1 else [0.5]
+        columns.append([lo * (hi / lo) ** share for share in shares])
     return [Variant(*factors) for factors in zip(*columns, strict=True)]
 
 
@@ -134,6 +139,11 @@ class VariedCycle(TrainingCycle):
         if kind < count:
             return self._others[kind].run(iteration, share)
         return super().run(iteration, share)
+
+    @property
+    def pool_bytes(self) -> int:
+        """Bytes of the pools' worlds, of this process."""
+        return super().pool_bytes + sum(other.pool_bytes for other in self._others)
 
     def state_dict(self) -> dict[str, Any]:
         """Return all that changes but the rule, for a checkpoint."""

@@ -9,8 +9,8 @@ import gymnasium
 from torch import Tensor
 
 from npa_envs.agents.policies import RandomPolicy, RulePolicy, ZeroPolicy
-from npa_envs.errors import NPAError, suggest
-from npa_envs.registration import ENVIRONMENTS
+from npa_envs.errors import NPAError, shown, suggest
+from npa_envs.registration import ALL, CODED, GARDEN_IDS
 from npa_envs.rule.files import load_rule
 from npa_envs.rule.rule import COLOUR_OFFSET
 from npa_envs.tasks.damage import DAMAGE_SIZES, damage_worlds
@@ -33,9 +33,15 @@ def make_environment(
     Raises:
         NPAError: There is no such environment or rule, or the rule does not fit.
     """
-    known = [environment.id for environment in ENVIRONMENTS]
+    others = {*GARDEN_IDS, *(environment.id for environment in CODED)}
+    if id in others:
+        raise NPAError(
+            f"environments whose actions are updates of particles can be viewed, got {shown(id)}: "
+            "view the rule that runs its particles instead"
+        )
+    known = [environment.id for environment in ALL if environment.id not in others]
     if id not in known:
-        raise NPAError(f"unknown environment {id!r}: {suggest(id, known)}")
+        raise NPAError(f"unknown environment {shown(id)}: {suggest(id, known)}")
     simple = {"zero": ZeroPolicy, "random": RandomPolicy}
     rule = None if policy in simple else load_rule(policy, device=device).float()
     told = {name: value for name, value in keywords.items() if value is not None}

@@ -8,7 +8,7 @@ import html
 import io
 import json
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -134,6 +134,19 @@ def export_web(
             f"a page must end in .html, got {shown(str(path))}: "
             f"use {shown(str(path.with_suffix('.html')))}"
         )
+    if isinstance(sources, str | Path) or not isinstance(sources, Iterable):
+        raise NPAError(
+            f"sources must be a list of rules, got {shown(sources)}: give it in square brackets"
+        )
+    sources = list(sources)
+    for source in sources:
+        if not isinstance(source, str | Path):
+            raise NPAError(
+                f"sources must be names or files of rules, got a {type(source).__name__}: write it "
+                "to a file with npa_envs.save_rule, and give that"
+            )
+    if title is not None and not isinstance(title, str):
+        raise NPAError(f"title must be text, or None for the first rule's name, got {shown(title)}")
     names = [name_of(source) for source in sources]
     if not names or len(set(names)) < len(names):
         raise NPAError(f"a page needs rules of different names, got {shown(names)}")

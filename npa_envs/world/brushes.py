@@ -157,6 +157,11 @@ def inject(
         NPAError: A wrong shape or dtype, or a number out of its range.
     """
     check_world(x, s)
+    if not isinstance(state, Tensor):
+        raise NPAError(
+            f"state must be a tensor of shape [B, C] = {(s.shape[0], s.shape[2])}, got "
+            f"{shown(state)}: give one state for each world"
+        )
     if state.shape != (s.shape[0], s.shape[2]):
         raise NPAError(
             f"state must have shape [B, C] = {(s.shape[0], s.shape[2])}, got {tuple(state.shape)}: "
@@ -316,6 +321,11 @@ def _per_world(name: str, value: float | Tensor, x: Tensor, *, highest: float = 
 
 def _check_vector(name: str, vector: Tensor, x: Tensor) -> None:
     wanted = (x.shape[0], x.shape[2])
+    if not isinstance(vector, Tensor):
+        raise NPAError(
+            f"{name} must be a tensor of shape [B, D] = {wanted}, got {shown(vector)}: "
+            f"give one vector for each world, for example torch.zeros{wanted}"
+        )
     if vector.shape != wanted:
         raise NPAError(
             f"{name} must have shape [B, D] = {wanted}, got {tuple(vector.shape)}: "

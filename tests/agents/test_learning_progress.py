@@ -182,6 +182,8 @@ def test_learning_rates_fall_from_the_first_to_the_last():
         ),
         ("ppo", {"credit": "particle", "ratio": "world"}, "needs ratio='particle'"),
         ("ppo", {"gamma": 0.0}, r"gamma must lie in \(0, 1\], got 0.0"),
+        ("gradient", {"last_rate": -3.0}, r"last_rate must lie in \(0, 1\], got -3.0"),
+        ("clone", {"last_rate": 2.0}, r"last_rate must lie in \(0, 1\], got 2.0"),
         ("ppo", {"last_noise": 0.0}, r"last_noise must lie in \(0, 1\], got 0.0"),
         ("ppo", {"noise_decay_share": 0.0}, r"noise_decay_share must lie in \(0, 1\], got 0.0"),
         ("ppo", {"minibatches": 0}, "minibatches must be a whole number of at least 1"),

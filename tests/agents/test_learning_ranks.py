@@ -219,6 +219,22 @@ def test_a_folder_with_another_run_is_refused(method, given, message, finished):
         train(method, HEART, Budget(particle_steps=1), 0, out=finished, **given)
 
 
+def test_a_run_goes_on_with_rules_to_begin_with_if_it_began_with_some(tmp_path):
+    start = train("ppo", HEART, Budget(particle_steps=1), 1, **METHODS["ppo"]).rules
+    kept("ppo", tmp_path, 1, start=start)
+    with pytest.raises(NPAError, match="differs in started"):
+        kept("ppo", tmp_path, 2, resume=True)
+    kept("ppo", tmp_path, 2, resume=True, start=start)
+
+
+def test_seeds_of_evaluations_are_asked_for_once(tmp_path):
+    budget = Budget(particle_steps=ROUND["ppo"])
+    seeds = iter(range(500, 502))
+    train(
+        "ppo", HEART, budget, 0, evaluation_seeds=seeds, entries=2, out=tmp_path, **METHODS["ppo"]
+    )
+
+
 def test_a_checkpoint_that_was_changed_is_refused(finished):
     content = load_checkpoint(finished / "checkpoint.pt")
     spoilt = [{"curve": []}, {"iteration": -1}, {"part": "x"}, {"optimisers": {"actor": {}}}]

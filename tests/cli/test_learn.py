@@ -92,6 +92,7 @@ def test_a_killed_process_ends_a_run_and_a_signal_stops_it(tmp_path):
         (["--gpus", "2", "--processes", "2"], "gpus says how many processes there are"),
         (["--gpus=2", "--device=cpu"], "gpus goes with device 'cuda', got 'cpu'"),
         (["--gpus", "0"], "gpus must be at least 1, got 0"),
+        (["--episode-steps", "0"], "episode_steps must be"),
         (["--resume", "now"], "invalid choice: 'now'"),
         (["--resume", "auto", "--overwrite"], "resume and overwrite exclude each other"),
     ],

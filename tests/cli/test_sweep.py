@@ -1,13 +1,18 @@
 """Sweeps: each combination of options is a run, which may fail or stop by itself."""
 
 import json
+import os
+import signal
+import subprocess
 import sys
+import time
 
 import pytest
 
 from npa_envs.cli import main, sweep
 from npa_envs.cli.sweep import combinations
 from npa_envs.errors import NPAError
+from npa_envs.training.checkpoint import load_checkpoint
 
 CHILD = """
 import json, sys
@@ -44,6 +49,21 @@ def test_every_combination_is_a_run_with_its_own_words():
     assert runs[1].name == "seed=0,target=b_c.png"
 
 
+def test_runs_whose_folders_would_be_the_same_have_others_that_stay():
+    over = ["target=🦎,🦋,heart,p/a.png,p_a.png", "seed=0,1"]
+    names = {run.values["target"]: run.name for run in combinations(over, ["texture"])[::2]}
+    assert names == {
+        "🦎": "target=_,seed=0-c9cc5d3f719e",
+        "🦋": "target=_,seed=0-2bf41d93e564",
+        "heart": "target=heart,seed=0",
+        "p/a.png": "target=p_a.png,seed=0-76529b747e91",
+        "p_a.png": "target=p_a.png,seed=0-9e4251437d4a",
+    }
+    assert len({run.name for run in combinations(over, ["texture"])}) == 10
+    # One that no other is like keeps the name that it always had.
+    assert [run.name for run in combinations(["target=🦎"], ["texture"])] == ["target=_"]
+
+
 @pytest.mark.parametrize(
     ("over", "common", "words"),
     [
@@ -53,6 +73,17 @@ def test_every_combination_is_a_run_with_its_own_words():
         (["seed=0"], ["texture", "--seed", "1"], "must be given once"),
         (["out=a,b"], ["texture"], "by itself"),
         (["seed=0"], ["texture", "--device", "cuda"], "by itself"),
+        (["seed=0,1,0"], ["texture"], "each value once, got 'seed=0,1,0': leave out '0'"),
+        (["seed=0"], ["texture", "--seed=1"], "must be given once"),
+        (["world_count=2"], ["texture", "--world-count=3"], "must be given once"),
+        (["world-count=2"], ["texture", "--world_count", "3"], "must be given once"),
+        (["max_seconds=5,6"], ["texture"], "--max-seconds must not be given"),
+        (["output=a,b"], ["texture"], "--output must not be given"),
+        (["seed=0"], ["texture", "--max_seconds", "5"], "--max-seconds must not be given"),
+        (["seed=0"], ["texture", "--max-seconds=5"], "--max-seconds must not be given"),
+        (["seed=0"], ["texture", "--processes=2"], "--processes must not be given"),
+        (["seed=0"], ["texture", "--out=x"], "--out must not be given"),
+        (["seed=0"], ["texture", "--output", "x"], "--output must not be given"),
         (["seed=0"], ["texture2d"], "did you mean 'texture'"),
         (["seed=0"], [], "must begin with a task"),
     ],
@@ -99,6 +130,92 @@ def test_a_folder_with_runs_of_other_words_is_refused(tmp_path, child, capsys):
     words = ["sweep", "--over", "seed=0,1", "target=a,b", "--out", str(tmp_path)]
     assert main([*words, "--", "texture", "--preset", "fast"]) == 2
     assert "holds a run of other words" in capsys.readouterr().err
+
+
+SAVING = """
+import signal, sys, time
+from pathlib import Path
+
+asked = []
+def stop(number, frame):
+    # As a trainer does: the second signal ends it.
+    asked.append(number)
+    for number in (signal.SIGINT, signal.SIGTERM): signal.signal(number, signal.SIG_DFL)
+for number in (signal.SIGINT, signal.SIGTERM): signal.signal(number, stop)
+
+words = sys.argv[1:]
+out = Path(words[words.index("--out") + 1])
+(out / "begun").touch()
+end = time.monotonic() + 60
+while not asked and time.monotonic() < end: time.sleep(0.01)
+time.sleep(0.5)
+(out / "saved").touch()
+"""
+
+SWEEP = """
+import sys
+from npa_envs.cli import main, sweep
+
+if {program}: sweep.PROGRAM = {program}
+sys.exit(main(sys.argv[1:]))
+"""
+
+
+def in_a_terminal(tmp_path, words, program=()):
+    """A sweep of two runs at once, with a group of processes of its own as in a terminal."""
+    given = ["sweep", "--over", "seed=0,1,2", "--out", str(tmp_path), "--no-progress"]
+    return subprocess.Popen(
+        [sys.executable, "-c", SWEEP.format(program=program), *given, "--jobs", "2", "--", *words],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        start_new_session=True,
+    )
+
+
+def wait_for(process, condition):
+    end = time.monotonic() + 60
+    while not condition():
+        assert process.poll() is None, process.stdout.read()
+        assert time.monotonic() < end
+        time.sleep(0.05)
+
+
+@pytest.mark.parametrize(
+    ("send", "number"),
+    [(os.killpg, signal.SIGINT), (os.kill, signal.SIGTERM), (os.kill, signal.SIGHUP)],
+    ids=["ctrl-c", "SIGTERM", "SIGHUP"],
+)
+def test_a_sweep_that_is_stopped_lets_its_runs_save_what_they_have(tmp_path, send, number):
+    run = in_a_terminal(tmp_path, ["texture"], (sys.executable, "-c", SAVING))
+    try:
+        wait_for(run, lambda: len(list(tmp_path.glob("*/begun"))) == 2)
+        send(run.pid, number)
+        said, _ = run.communicate(timeout=30)
+    finally:
+        run.kill()
+    assert run.returncode == 130
+    assert "3 runs are left: call again with the same words" in said
+    assert {path.parent.name for path in tmp_path.glob("*/saved")} == {"seed=0", "seed=1"}
+    assert not list(tmp_path.glob("*/run.json"))
+
+
+@pytest.mark.slow
+def test_a_stopped_sweep_leaves_checkpoints_of_the_last_iteration(tmp_path):
+    words = ["morphogenesis2d", "--preset", "tiny", "--target", "heart", "--no-report"]
+    run = in_a_terminal(tmp_path, [*words, "--iterations", "1000000"])
+    logs = [tmp_path / f"seed={seed}" / "log.jsonl" for seed in (0, 1)]
+    try:
+        wait_for(run, lambda: all(log.exists() and log.read_text() for log in logs))
+        run.terminate()
+        said, _ = run.communicate(timeout=60)
+    finally:
+        run.kill()
+    assert run.returncode == 130, said
+    for log in logs:
+        last = json.loads(log.read_text().splitlines()[-1])["iteration"]
+        assert load_checkpoint(log.parent / "checkpoint.pt")["iteration"] == last > 0
+        assert "stopped at iteration" in (log.parent / "output.txt").read_text()
 
 
 @pytest.mark.slow

@@ -1,5 +1,7 @@
 """`npa-envs train` with `--processes` and `--resume auto`: what is decided before a start."""
 
+import json
+
 import pytest
 import torch
 from circle_task import circle_config
@@ -8,8 +10,9 @@ from training_runs import trainer_of
 from npa_envs.cli import main
 from npa_envs.cli.output import torch_threads
 from npa_envs.cli.train import TrainOptions, process_count, settled
+from npa_envs.cli.train_options import starting_configuration
 from npa_envs.errors import NPAError
-from npa_envs.training import RunFolder, preset
+from npa_envs.training import RunFolder, config_to_dict, preset
 from npa_envs.training.checkpoint import load_checkpoint, save_checkpoint
 
 TASK = "morphogenesis2d"
@@ -67,6 +70,19 @@ def test_a_run_that_was_begun_alone_goes_on_alone(tmp_path):
 def test_fewer_processes_than_one_are_refused():
     with pytest.raises(NPAError, match="processes must be at least 1, got 0"):
         process_count(TASK, TrainOptions(processes=0), preset("tiny"))
+
+
+def test_a_run_goes_on_with_its_own_preset_only(tmp_path):
+    words = ["--out", str(tmp_path), "--resume"]
+    config = preset("fast", out=tmp_path, target="ring", iterations=9)
+    (tmp_path / "checkpoint.pt").touch()
+    (tmp_path / "config.json").write_text(json.dumps(config_to_dict(config)), "utf-8")
+    assert starting_configuration(TASK, words) == config
+    same = [*words, "--preset", "fast", "--iterations", "9"]
+    assert starting_configuration(TASK, same) == config
+    for name in ("tiny", "best"):
+        with pytest.raises(NPAError, match=f"preset must be the one .* but '{name}' differs"):
+            starting_configuration(TASK, [*words, "--preset", name, "--iterations=9"])
 
 
 def test_gpus_are_processes_that_have_a_gpu_each():

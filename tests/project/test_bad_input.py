@@ -7,14 +7,19 @@ import torch
 
 import npa_envs
 from npa_envs import NPAError, NPARule, perceive, perception_fields, rollout
+from npa_envs.agents.learning import Budget, Problem
+from npa_envs.agents.learning import train as learn
+from npa_envs.envs import multispecies_v0
 from npa_envs.measure.quality import scores
 from npa_envs.ops import orbit, periodic_splat, splat
 from npa_envs.render import to_uint8, write_gif
 from npa_envs.tasks.damage import damage_worlds, parse_damage
 from npa_envs.tasks.seeds import uniform_ball, uniform_box
 from npa_envs.tasks.texture import TextureConfig
-from npa_envs.training import preset
-from npa_envs.wrappers import TorchNormalizeReward
+from npa_envs.training import preset, train
+from npa_envs.web.export import export_web
+from npa_envs.world.brushes import erase_state, inject
+from npa_envs.wrappers import RowPolicy, TorchNormalizeReward
 
 
 def world(**options):
@@ -100,6 +105,7 @@ def splatted(**options):
     return splat(torch.zeros(1, 4, 2), torch.zeros(1, 4, 3), **given)
 
 
+PROBLEM = Problem(env_id="npa/Morphogenesis2DSmall-v0", episode_steps=4)
 SPARSE = torch.zeros(1, 4, 2).to_sparse()
 META = torch.zeros(1, 4, 2, device="meta")
 
@@ -128,8 +134,38 @@ META = torch.zeros(1, 4, 2, device="meta")
         (lambda: NPARule(eps0=0.0), "eps0"),
         (lambda: NPARule(alpha=INF), "alpha"),
         (lambda: NPARule(readout_dim=3), "readout_hidden_dim"),
-        (lambda: NPARule(space_dim=2.0), "dimensions of a rule must be integers"),
-        (lambda: NPARule(hidden_dim=True), "dimensions of a rule must be integers"),
+        (lambda: NPARule(space_dim=2.0), "space_dim must be an integer, got 2.0"),
+        (lambda: NPARule(hidden_dim=True), "hidden_dim must be an integer, got True"),
+        (
+            lambda: NPARule(2, 16, 64, species_count="2"),
+            "species_count must be an integer, got '2'",
+        ),
+        (lambda: NPARule(state_dim=2).colour(S[..., :2]), "the last three outputs .* got 2"),
+        (lambda: train("fast"), "config must be a TrainConfig, got 'fast'"),
+        (lambda: train(preset("tiny"), "texture"), "config must be one of the task 'texture'"),
+        (lambda: train(preset("tiny"), max_seconds="3"), "max_seconds must be a number"),
+        (
+            lambda: learn("gradient", "npa/Mixing-v0", Budget(particle_steps=1), 0),
+            "problem must be a Problem, got 'npa/Mixing-v0'",
+        ),
+        (lambda: learn("gradient", PROBLEM, 1000, 0), "budget must be a Budget, got 1000"),
+        (lambda: export_web("gecko", "p.html"), "sources must be a list of rules, got 'gecko'"),
+        (lambda: export_web([NPARule()], "p.html"), "names or files of rules, got a NPARule"),
+        (lambda: export_web(["gecko"], "p.html", title=3), "title must be text"),
+        (lambda: erase_state(X, S, centre=(0.0, 0.0), radius=0.2), "centre must be a tensor"),
+        (
+            lambda: inject(X, S, centre=torch.zeros(1, 2), radius=0.2, state=0.5, strength=1.0),
+            "state must be a tensor",
+        ),
+        (lambda: RowPolicy("model.zip"), "model must be one of Stable-Baselines3"),
+        (
+            lambda: multispecies_v0.batched("npa/MixingSmall-v0", num_envs=2),
+            "'num_envs': many worlds at once .* world_count=8",
+        ),
+        (
+            lambda: multispecies_v0.parallel_env("npa/MixingSmal-v0"),
+            "did you mean 'npa/MixingSmall-v0'",
+        ),
         (lambda: NPARule(alpha=[]), "alpha must be a number"),
         (lambda: NPARule(hidden_dim=2**31), "at most 65536"),
         (lambda: npa_envs.save_rule(3, "a.safetensors"), "rule must be an NPARule"),

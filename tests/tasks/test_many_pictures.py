@@ -13,9 +13,10 @@ from npa_envs.cli import main
 from npa_envs.errors import NPAError
 from npa_envs.measure.codes import picture_rows
 from npa_envs.rule.codes import Codes
+from npa_envs.rule.files import load_rule
 from npa_envs.tasks.many_pictures import ManyPictures, named_targets
 from npa_envs.tasks.morphogenesis2d import Morphogenesis2D, Morphogenesis2DConfig
-from npa_envs.training import Trainer, preset
+from npa_envs.training import Trainer, preset, train
 from npa_envs.training.trained_tasks import task_of_rule
 
 SMALL = {
@@ -125,6 +126,18 @@ def test_training_changes_codes_and_keeps_them_with_their_worlds(encoder):
     assert torch.equal(x0[..., :3], s0[..., :3])
     assert x0[..., :3].unique(dim=1).shape[1] == 1
     assert goal.shape == (2,)
+
+
+@pytest.mark.parametrize("average", [0.0, 0.9])
+def test_a_rule_that_is_kept_has_the_codes_of_its_own_encoder(average, tmp_path):
+    config = preset(
+        "tiny", **SMALL, targets=TARGETS, encoder=True, average=average, out=tmp_path, iterations=3
+    )
+    rule = train(config, progress=False).rule
+    told = load_rule(tmp_path / "rule.safetensors").codes
+    read = rule.codes.encode(ManyPictures(config.task)._target_pictures)
+    assert torch.allclose(rule.codes.table, read, atol=1e-6)
+    assert torch.equal(told.table, rule.codes.table)
 
 
 def test_an_encoder_reads_the_pictures_once_in_an_iteration(monkeypatch):

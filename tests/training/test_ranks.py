@@ -2,9 +2,11 @@
 
 import os
 import signal
+import time
 
 import pytest
 import torch
+import torch.distributed as dist
 from processes import on_ranks
 from training_runs import log_of
 from worlds import assert_same
@@ -15,7 +17,7 @@ from npa_envs.tasks.morphogenesis2d import Morphogenesis2D
 from npa_envs.training import TASKS, Trainer, override, preset, train
 from npa_envs.training.checkpoint import load_checkpoint
 from npa_envs.training.cycle import TrainingCycle
-from npa_envs.training.ranks import Ranks
+from npa_envs.training.ranks import Ranks, joined_ranks
 
 PLAIN = {}
 """The preset as it is."""
@@ -220,6 +222,20 @@ def test_a_full_disk_ends_all_processes_and_leaves_the_checkpoint(tmp_path):
     assert load_checkpoint(tmp_path / "run" / "checkpoint.pt")["iteration"] == 2
 
 
+def test_processes_whose_iterations_take_long_ask_each_other_in_every_one(tmp_path, monkeypatch):
+    monkeypatch.setattr("npa_envs.training.ranks.AGREE_SECONDS", 0.05)
+
+    def slow():
+        ranks = Ranks.current()
+        for iteration in range(30):
+            if ranks.agree_to_stop(iteration >= 4 and not ranks.first, iteration):
+                return iteration
+            time.sleep(0.06)
+        return None
+
+    assert on_ranks(2, slow, tmp_path) == [4, 4]
+
+
 def test_all_processes_stop_after_the_same_iteration_where_one_is_asked_to(tmp_path):
     config = tiny(tmp_path / "run", iterations=60)
 
@@ -237,8 +253,35 @@ def test_all_processes_stop_after_the_same_iteration_where_one_is_asked_to(tmp_p
         trainer.iterate = stopping
         return trainer.run(progress=False).interrupted, trainer.iteration
 
-    assert on_ranks(2, asked, tmp_path) == [(True, 10), (True, 10)]
-    assert load_checkpoint(tmp_path / "run" / "checkpoint.pt")["iteration"] == 10
+    one, other = on_ranks(2, asked, tmp_path)
+    assert one == other
+    assert one[0]
+    assert 3 < one[1] <= 13
+    assert load_checkpoint(tmp_path / "run" / "checkpoint.pt")["iteration"] == one[1]
+
+
+@pytest.mark.parametrize(("gpus", "backend"), [(0, "gloo"), (1, "gloo"), (2, "cpu:gloo,cuda:nccl")])
+def test_processes_meet_through_nccl_only_where_each_has_a_gpu(gpus, backend, monkeypatch):
+    asked = []
+
+    def join(backend):
+        asked.append(backend)
+        raise ValueError("enough")
+
+    monkeypatch.setattr(dist, "is_torchelastic_launched", lambda: True)
+    # As torch's builds for CUDA say, also on machines without a GPU.
+    monkeypatch.setattr(dist, "is_nccl_available", lambda: True)
+    monkeypatch.setattr(dist, "init_process_group", join)
+    monkeypatch.setattr(torch.cuda, "device_count", lambda: gpus)
+    for name, value in (
+        ("LOCAL_RANK", "0"),
+        ("LOCAL_WORLD_SIZE", "2"),
+        ("CUDA_VISIBLE_DEVICES", "0,1"),
+    ):
+        monkeypatch.setenv(name, value)
+    with pytest.raises(NPAError, match="must reach each other"), joined_ranks():
+        pass
+    assert asked == [backend]
 
 
 def test_worlds_of_all_processes_are_diagnosed_when_the_loss_is_not_finite(tmp_path):

@@ -153,10 +153,25 @@ def test_each_wrong_value_is_named(field, value, rule):
         override(PAPER, **{field: value})
 
 
+@pytest.mark.parametrize("field", ["damage", "tensorboard", "cuda_graph", "keep_background"])
+def test_flags_are_true_or_false(field):
+    told = PAPER.task if field == "keep_background" else PAPER
+    with pytest.raises(NPAError, match=f"{field} must be True or False, got 'no'"):
+        dataclasses.replace(told, **{field: "no"})
+
+
 @pytest.mark.parametrize("field", ["ageing_steps", "rest_weight"])
 def test_what_needs_ages_needs_lifetimes(field):
     with pytest.raises(NPAError, match=f"{field} needs worlds that have lifetimes, got 64"):
         override(PAPER, **{field: 64})
+
+
+@pytest.mark.parametrize("fields", [{"decay": 1.0}, {"milestones": []}])
+def test_worlds_that_are_to_age_need_a_rate_that_falls(fields):
+    ages = {"ageing_steps": 64, "lifetimes": [64, 1024]}
+    with pytest.raises(NPAError, match="ageing_steps needs a learning rate that falls, got 64"):
+        override(PAPER, **ages, **fields)
+    assert override(PAPER, **ages, **fields, schedule="cosine").ageing_at(49_984) > 0
 
 
 def test_worlds_age_the_more_the_less_the_rule_changes():

@@ -36,6 +36,38 @@ def test_training_starts_from_an_initial_rule_of_its_shape(tmp_path):
         trainer_of(config)
 
 
+def test_a_run_goes_on_without_the_rule_that_it_began_with(tmp_path):
+    train(circle_config(tmp_path / "first", iterations=3))
+    path = tmp_path / "first" / "rule.safetensors"
+    whole = circle_config(tmp_path / "whole", iterations=6, initial_rule=str(path))
+    rule = train(whole).rule
+    broken = override(whole, out=tmp_path / "broken")
+    with pytest.raises(Killed):
+        train(broken, KilledTask(5, end=kill))
+    path.unlink()
+    assert_same(train(broken, resume=True).rule.state_dict(), rule.state_dict())
+    assert log_of(tmp_path / "broken") == log_of(tmp_path / "whole")
+
+
+def test_a_log_without_its_checkpoint_is_not_gone_on_with(tmp_path):
+    config = circle_config(tmp_path / "run")
+    train(config)
+    (tmp_path / "run" / "checkpoint.pt").unlink()
+    before = log_of(tmp_path / "run")
+    with pytest.raises(NPAError, match=r"out must be a folder without a run, .* holds a log with"):
+        trainer_of(config)
+    assert log_of(tmp_path / "run") == before
+    train(config, overwrite=True)
+    assert log_of(tmp_path / "run") == before
+
+
+def test_a_loss_that_is_not_finite_is_told_where_its_worlds_cannot_be_written(tmp_path):
+    (tmp_path / "run" / "diverged.pt").mkdir(parents=True)
+    config = circle_config(tmp_path / "run", learning_rate=1e30, normalise_gradients=False)
+    with pytest.raises(DivergedError, match=r"must stay finite.*not written: .*diverged.pt"):
+        train(config)
+
+
 @pytest.mark.parametrize(
     ("iteration", "fields"),
     [

@@ -12,6 +12,7 @@ from npa_envs.cli import main
 from npa_envs.errors import NPAError
 from npa_envs.tasks.morphogenesis2d import Morphogenesis2D
 from npa_envs.training import Trainer, preset
+from npa_envs.training.run_folder import RunFolder
 from npa_envs.training.variation import VariedCycle, variants_of
 
 VARIED = {
@@ -45,6 +46,34 @@ def test_kinds_are_spread_over_the_ranges():
     ]
     ranks = {tuple(sorted(range(5), key=values.__getitem__)) for values in orders}
     assert len(ranks) == 3
+
+
+@pytest.mark.parametrize("count", range(1, 10))
+def test_each_factor_takes_every_place_of_its_range(count):
+    kinds = variants_of(preset("tiny", **VARIED | {"variants": count}))
+    for name, (lo, hi) in (("particles", (0.25, 4)), ("update_prob", (0.5, 2)), ("dt", (0.5, 1.5))):
+        factors = sorted(getattr(kind, name) for kind in kinds)
+        shares = [k / (count - 1) for k in range(count)] if count > 1 else [0.5]
+        assert factors == pytest.approx([lo * (hi / lo) ** share for share in shares])
+
+
+def test_eps_of_one_factor_is_as_one_of_nearly_one(tmp_path):
+    radii = []
+    for lo in (1.999, 2.0):
+        trainer = trainer_of(tmp_path / str(lo), vary_eps=(lo, 2.0))
+        (kind, *_) = trainer._cycle._others
+        radii.append(kind._seeds(4, kind.random.worlds)[0].norm(dim=-1).amax().item())
+    assert radii[0] == pytest.approx(radii[1], rel=2e-3)
+
+
+def test_there_must_be_room_for_the_pools_of_all_kinds(tmp_path, monkeypatch):
+    asked = []
+    monkeypatch.setattr(RunFolder, "prepare", lambda self, size: asked.append(size))
+    (tmp_path / "run").mkdir()
+    (tmp_path / "run" / "pictures").mkdir()
+    trainer = trainer_of(tmp_path / "run", pool_size=64)
+    pools = [trainer.pool, *(other.pool for other in trainer._cycle._others)]
+    assert asked[0] >= sum(pool.x.nbytes + pool.s.nbytes for pool in pools)
 
 
 def test_a_batch_of_a_kind_is_a_batch_of_its_worlds(tmp_path, monkeypatch):

@@ -618,5 +618,8 @@ def test_environments_are_made_with_a_policy():
     world.close()
     with pytest.raises(NPAError, match="unknown environment 'npa/Nothing-v0'"):
         make_environment("npa/Nothing-v0")
+    with pytest.raises(NPAError, match="updates of particles can be viewed, got 'npa/Gardener2DSm"):
+        make_environment("npa/Gardener2DSmall-v0")
+    make_environment("npa/Morphogenesis2DSmall-v0")[0].close()
     with pytest.raises(NPAError, match="env must be an environment of npa_envs"):
         EnvironmentWorld(gymnasium.make("CartPole-v1"), lambda seen: 0)

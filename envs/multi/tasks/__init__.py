@@ -52,5 +52,6 @@ def task_type(name: str) -> type[SpeciesTask]:
         NPAError: There is no such task.
     """
     if not isinstance(name, str) or name not in TASKS:
-        raise NPAError(f"task must be a known word, got {shown(name)}: {suggest(name, TASKS)}")
+        known = [*TASKS, *ENVIRONMENTS, *(size.id for size in SPECIES_SIZES)]
+        raise NPAError(f"task must be a known word, got {shown(name)}: {suggest(name, known)}")
     return TASKS[name]
