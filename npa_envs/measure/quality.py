@@ -51,6 +51,9 @@ PROGRESS_STEPS = 32
 CHECKPOINTS = (64, 128, 256, 512, 1024, 2048, 4096)
 """Steps at which a rule is measured, unless others are asked for."""
 
+LOST = 10.0
+"""A world whose loss has risen to so many times its undamaged one has run away."""
+
 HEALED = 1.2
 """A world is healed once its loss is at most this many times the undamaged one."""
 
@@ -95,7 +98,8 @@ class HealingRow:
     steps_to_heal: int | None
     """Steps until the mean is within 20 % of `before`; None: not within the steps allowed."""
     worlds_healed: int
-    """Worlds whose own loss came within 20 % of their own undamaged one."""
+    """Worlds whose own loss came within 20 % of their own undamaged one, but for those that have run
+    away by the end, with ten times their undamaged loss."""
     world_count: int
     """Worlds damaged."""
     end: float
@@ -247,8 +251,9 @@ def healing(
 
 
 def _healing_row(name: str, before: Tensor, losses: Tensor, steps: list[int]) -> HealingRow:
-    mean_within = (losses.mean(1) <= HEALED * before.mean()).tolist()
-    worlds_within = (losses <= HEALED * before).any(0)
+    gone = ~(losses[-1] <= LOST * before)
+    mean_within = ((losses.mean(1) <= HEALED * before.mean()) & ~gone.all()).tolist()
+    worlds_within = (losses <= HEALED * before).any(0) & ~gone
     return HealingRow(
         damage=name,
         before=before.mean().item(),

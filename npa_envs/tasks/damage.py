@@ -5,7 +5,9 @@ Nothing here reads a value back from the device, so all of it may be captured in
 
 from __future__ import annotations
 
-from contextlib import suppress
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from contextvars import ContextVar
 from dataclasses import dataclass
 
 import torch
@@ -238,17 +240,41 @@ def _outside(ball: Tensor) -> Tensor:
     return ball * ((NEAREST + (FARTHEST - NEAREST) * length) / length.clamp_min(1e-12))
 
 
+_counting: ContextVar[Callable[[Tensor], Tensor] | None] = ContextVar("counting", default=None)
+"""What makes of a process's number of strays the mean over all processes; None: it is alone."""
+
+
+@contextmanager
+def counted_together(mean: Callable[[Tensor], Tensor]) -> Iterator[None]:
+    """Let losses in the block take their means over the strays of all processes of a run.
+
+    Args:
+        mean: Returns the mean of a tensor over all processes, each of which asks for it.
+    """
+    before = _counting.set(mean)
+    try:
+        yield
+    finally:
+        _counting.reset(before)
+
+
 def stray_motion(x: Tensor, path_length: Tensor) -> Tensor:
     """Return how far particles travelled that are outside of [-1, 1]^D, mean [length units], [].
 
-    It is 0 where there are none.
+    It is 0 where there are none. Within `counted_together` the mean of what all processes return
+    is the mean over the particles of all of them.
 
     Args:
         x: Particle positions [length units], shape [B, N, D].
         path_length: How far each particle travelled [length units], shape [B, N].
     """
     outside = (x.detach().abs().amax(dim=-1) > 1.0).to(x.dtype)
-    return (outside * path_length).sum() / outside.sum().clamp_min(1.0)
+    count, mean = outside.sum(), _counting.get()
+    if mean is not None:
+        # Of R processes it is 0 or at least 1 / R.
+        count = mean(count)
+        return (outside * path_length).sum() / torch.where(count > 0.0, count, 1.0)
+    return (outside * path_length).sum() / count.clamp_min(1.0)
 
 
 SHARE = 0.25

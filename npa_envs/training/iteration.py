@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+from collections.abc import Callable
 from typing import Any, Literal, Protocol, TypedDict, Unpack
 
 import torch
@@ -10,6 +12,7 @@ from torch import Tensor
 import npa_envs.world.rollout
 from npa_envs.rule.rule import LIFE, NPARule, fate_parameters
 from npa_envs.tasks.base import Task, coded_states, task_toward
+from npa_envs.tasks.damage import counted_together
 from npa_envs.tasks.train_config import TrainConfig
 from npa_envs.training.randomness import registered
 from npa_envs.world.cuda_graph import capture
@@ -57,6 +60,7 @@ class EagerIteration:
         rollout: The rollout to run; another one only in tests.
         goal: The worlds' goals, int64, shape [B], where the task has such.
         gradients: Where the gradients are written, one tensor a parameter; None: to new ones.
+        mean_over_processes: As `counted_together` takes it, where several processes share a run.
     """
 
     def __init__(
@@ -71,6 +75,7 @@ class EagerIteration:
         *,
         goal: Tensor | None = None,
         gradients: list[Tensor] | None = None,
+        mean_over_processes: Callable[[Tensor], Tensor] | None = None,
     ) -> None:
         self.goal = None if goal is None else goal.clone()
         """Goals of the worlds, int64, shape [B], or None; filled like `x0`."""
@@ -82,6 +87,7 @@ class EagerIteration:
         self.grown = torch.zeros_like(x[:, 0, 0], dtype=torch.bool)
         """Which worlds are grown and whole, and are to rest, shape [B]."""
         self._rest_weight = config.rest_weight
+        self._mean_over_processes = mean_over_processes
         self._divides = bool(fate_parameters(rule))
         self._task = task
         with torch.no_grad():
@@ -127,7 +133,9 @@ class EagerIteration:
             generator=self._generator,
             return_path_length=True,
         )
-        total, parts = self._loss(x, s, path_length)
+        mean = self._mean_over_processes
+        with contextlib.nullcontext() if mean is None else counted_together(mean):
+            total, parts = self._loss(x, s, path_length)
         # Not backward(): its accumulation nodes remember the stream they were first used on,
         # which a capture on another stream must not touch.
         gradients = torch.autograd.grad(

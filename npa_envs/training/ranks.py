@@ -197,6 +197,13 @@ class Ranks:
             mean.copy_(flat[first : first + mean.numel()].view(mean.shape))
             first += mean.numel()
 
+    def mean(self, value: Tensor) -> Tensor:
+        """Return the mean of a tensor over all processes, which all ask for it."""
+        total = value.detach().clone()
+        with self._in_touch():
+            dist.all_reduce(total)
+        return total / self.count
+
     def check_same(self, tensors: Sequence[Tensor]) -> None:
         """Check that tensors are the same on all processes, bit for bit.
 

@@ -103,6 +103,15 @@ def test_rule_that_does_nothing_never_heals_a_cut():
     assert (cut.steps_to_heal, cut.worlds_healed, erased.steps_to_heal) == (None, 0, 0)
 
 
+def test_worlds_that_run_away_have_not_healed(monkeypatch):
+    monkeypatch.setattr(npa_envs.measure.quality, "rollout", shrink(1.05))
+    steps = {"grow_steps": 10, "heal_steps": 100, "every": 25}
+    for row in healing(make_rule(0.0), CircleTask(), **steps, seeds=[0, 1, 2], cut_gap=0.1):
+        assert row.after < 1.2 * row.before
+        assert row.end > 10.0 * row.before
+        assert (row.steps_to_heal, row.worlds_healed) == (None, 0)
+
+
 def test_erased_disk_blanks_states_of_the_grown_world(monkeypatch):
     seen = []
 

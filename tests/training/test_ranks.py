@@ -45,6 +45,9 @@ SEEDED = {
 }
 """Batches with several fresh seeds; worlds of some places are damaged."""
 
+STRAYING = {"stray_share": 0.1, "stray_weight": 10.0, "world_count": 4, "pool_size": 8}
+"""Worlds that lose particles, some more than others."""
+
 
 def tiny(out, **fields):
     fields = {"iterations": 5, "milestones": [2], "dtype": "float64", "steps": (3, 6)} | fields
@@ -83,7 +86,11 @@ def assert_same_curve(folder, other):
         torch.testing.assert_close(one, two, rtol=1e-9, atol=1e-12)
 
 
-@pytest.mark.parametrize("fields", [PLAIN, LIVELY, SEEDED], ids=["plain", "lively", "seeded"])
+@pytest.mark.parametrize(
+    "fields",
+    [PLAIN, LIVELY, SEEDED, STRAYING],
+    ids=["plain", "lively", "seeded", "straying"],
+)
 def test_two_processes_have_the_curve_of_one(tmp_path, fields):
     for count in (1, 2):
         config = tiny(tmp_path / str(count), **fields)
