@@ -98,8 +98,8 @@ class HealingRow:
     steps_to_heal: int | None
     """Steps until the mean is within 20 % of `before`; None: not within the steps allowed."""
     worlds_healed: int
-    """Worlds whose own loss came within 20 % of their own undamaged one, but for those that have run
-    away by the end, with ten times their undamaged loss."""
+    """Worlds whose own loss came within 20 % of their own undamaged one, but for those that have by
+    the end run away, to ten times their undamaged loss."""
     world_count: int
     """Worlds damaged."""
     end: float
