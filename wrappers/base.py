@@ -158,8 +158,17 @@ def own_rewards(infos: dict[str, Any]) -> Any:
 
 
 def row_space(space: Any) -> Box:
-    """Return the space of one particle of a world's, a box of shape [N, ...]."""
-    assert isinstance(space, Box), "environments of this package have boxes"
+    """Return the space of one particle of a world's, a box of shape [N, ...].
+
+    Raises:
+        NPAError: The space has no rows.
+    """
+    if not isinstance(space, Box) or len(space.shape) < 2:
+        raise NPAError(
+            "rows need an environment that gives and takes one for each particle, got the space "
+            f"{shown(space)}: gardens and shapeshifters are for wrappers of worlds, such as "
+            "WorldVecEnv"
+        )
     return Box(space.low[0], space.high[0], dtype=np.float32)
 
 

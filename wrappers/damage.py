@@ -116,9 +116,9 @@ class DamageEvents(_DamagesWorlds, AnyWrapper):
     (`VectorDamageEvents`). An episode that is over is left alone, so put the wrapper around what
     `gym.make` returns, whose step limit it then sees.
 
-    On such steps `info` holds `loss_damage`, by how much the loss rose; `info["loss"]` and its
-    parts are those of the damaged world. A stack of these wrappers damages as one with all their
-    events, the innermost first.
+    On such steps `info` holds `loss_damage`, by how much the loss rose; `info["loss"]`, its parts
+    and all else that `info` tells of a world are those of the damaged one. A stack of these
+    wrappers damages as one with all their events, the innermost first.
 
     Args:
         env: An environment of this package, under no wrapper that changes observations.
@@ -170,7 +170,7 @@ class DamageEvents(_DamagesWorlds, AnyWrapper):
         damage = info.get("loss_damage", 0.0) + loss - before
         info = info | {"loss": loss, "loss_damage": damage}
         info |= {f"loss_{n}": value for n, value in zip(worlds.part_names, parts, strict=True)}
-        return observation, info
+        return observation, info | self._base._extras("reset")
 
 
 class VectorDamageEvents(_DamagesWorlds, EpisodeWrapper):
@@ -225,6 +225,8 @@ class VectorDamageEvents(_DamagesWorlds, EpisodeWrapper):
         if "loss_damage" in infos:
             told["loss_damage"] = told["loss_damage"] + infos["loss_damage"]
             told["_loss_damage"] = told["_loss_damage"] | infos["_loss_damage"]
+        fresh = base._extras("reset", None)
+        told |= {name: value for name, value in fresh.items() if not name.startswith("_")}
         return observations, infos | told
 
 

@@ -220,7 +220,13 @@ class NPAVectorEnv(VectorEnv[Any, Any, Any]):
         return self.form.seen(observation), numbers[0], flags[0], flags[1], infos
 
     def render(self) -> tuple[NDArray[np.uint8], ...] | None:
-        """Return a picture of each world, shape [R, R, 3], in the mode "rgb_array"."""
+        """Return a picture of each world, shape [R, R, 3], in the mode "rgb_array".
+
+        Raises:
+            NPAError: There is no world yet.
+        """
+        if not self._started:
+            raise NPAError("render needs worlds: call reset first")
         pictures = self._screen.render()
         return None if pictures is None else tuple(pictures)
 

@@ -231,10 +231,12 @@ def healing(
     )
     centre = random_particle(x, generator=runner.generator)
     damaged = {
-        f"cut, gap {cut_gap:g}": cut(x, s, centre=x.mean(1), normal=normal, gap=cut_gap),
+        f"cut, gap {cut_gap:g}": cut(
+            x, s, centre=x.mean(1), normal=normal, gap=cut_gap, box=task.box
+        ),
         f"erased disk, radius {erase_radius:g}": (
             x,
-            coded_states(task, erase_state(x, s, centre=centre, radius=erase_radius)),
+            coded_states(task, erase_state(x, s, centre=centre, radius=erase_radius, box=task.box)),
         ),
     }
     rows = []

@@ -156,10 +156,19 @@ def save_rule(
         metadata: More text for the header, for example how the rule was trained.
 
     Raises:
-        NPAError: The suffix is another one, the metadata is not text or takes a reserved name, a
-            weight is not finite, or the file cannot be written.
+        NPAError: The rule's network is not the one that files have; the suffix is another one, the
+            metadata is not text or takes a reserved name, a weight is not finite, or the file
+            cannot be written.
     """
     check_rule(rule)
+    # One that torch.compile has taken has its weights by other names.
+    rule = getattr(rule, "_orig_mod", rule)
+    shapes = {name: tuple(value.shape) for name, value in rule.state_dict().items()}
+    if type(rule).forward is not NPARule.forward or shapes != _shapes(rule.hyper_parameters()):
+        raise NPAError(
+            f"rule must have the network that NPARule makes, got a {type(rule).__name__} with one "
+            "of its own, which the file would not hold: keep its state_dict with torch.save"
+        )
     path = checked_path(path)
     if path.suffix != ".safetensors":
         raise NPAError(
@@ -348,6 +357,13 @@ def _parse(header: Mapping[str, str], name: str, kind: type) -> Any:
             f"the metadata's {name!r} must be a JSON {kind.__name__}, got {shown(header[name])}"
         )
     return value
+
+
+def _shapes(hyper_parameters: Mapping[str, Any]) -> dict[str, tuple[int, ...]]:
+    """Return the shapes of a rule's weights by their names."""
+    with torch.device("meta"):
+        rule = NPARule(**hyper_parameters)
+    return {name: tuple(value.shape) for name, value in rule.state_dict().items()}
 
 
 def _assemble(parts: RuleParts) -> NPARule:

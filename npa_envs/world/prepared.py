@@ -75,7 +75,9 @@ class PreparedSteps:
     ) -> None:
         # With all particles active there is a row for each.
         self._mask = torch.ones(worlds.x.shape[:2], dtype=torch.uint8) if masked else None
-        here = Worlds(*(torch.empty_like(value).copy_(value) for value in worlds))
+        # Whatever the strides of the worlds: what is made contiguous in a step is on no tape.
+        dense = torch.contiguous_format
+        here = Worlds(*(torch.empty_like(v, memory_format=dense).copy_(v) for v in worlds))
         there, after = self._record(advance, here, row_width, update_width)
         back, last = self._record(advance, after, row_width, update_width)
         for old, new in zip(last, here, strict=True):

@@ -122,6 +122,7 @@ def run_steps(
     memory: Memory,
     keep_every: int | None = None,
     watch: DivergenceWatch | None = None,
+    with_modules: bool = False,
 ) -> Worlds:
     """Repeat a step on checked worlds; return them in the caller's order.
 
@@ -134,18 +135,22 @@ def run_steps(
         keep_every: Return the worlds after each so many steps, one after the other in a first
             dimension; None: the last ones.
         watch: What looks at the worlds after each step, or None.
+        with_modules: A rule is run as a module, which may draw: recomputed steps draw the same.
 
     Raises:
         DivergedError: The watch has seen a world diverge.
     """
     interval = STORED_INTERVAL[memory] if torch.is_grad_enabled() else 1
     kept: list[Worlds] = []
+    # While a graph is recorded, torch's state cannot be read, and its draws are the graph's.
+    recorded = worlds.x.is_cuda and torch.cuda.is_current_stream_capturing()
+    redraw = with_modules and not recorded
     # Worlds keep their dtype under autocast: the kernels read what the rules write.
     with torch.autocast(worlds.x.device.type, enabled=False):
         for number, draws in enumerate(step.draws(worlds.x, steps, generator)):
             if (steps - 1 - number) % interval > 0:
                 worlds = checkpoint(
-                    step.advance, *worlds, *draws, use_reentrant=False, preserve_rng_state=False
+                    step.advance, *worlds, *draws, use_reentrant=False, preserve_rng_state=redraw
                 )
             else:
                 mask, noise, rows, births = draws
@@ -204,6 +209,7 @@ class RolloutCall(NamedTuple):
             memory=self.memory,
             keep_every=self.keep_every,
             watch=watch,
+            with_modules=network is None,
         )
 
     def _run_prepared(

@@ -255,6 +255,7 @@ class SpeciesCall(NamedTuple):
             memory=self.memory,
             keep_every=self.keep_every,
             watch=watch,
+            with_modules=not all(rule.has_network() for rule in rules),
         )
 
 

@@ -104,6 +104,30 @@ def test_saving_refuses_what_could_not_be_loaded(tmp_path, name, metadata, messa
     assert list(tmp_path.iterdir()) == []
 
 
+class Threefold(NPARule):
+    def forward(self, z: Tensor) -> Tensor:
+        return 3.0 * super().forward(z)
+
+
+def test_a_rule_that_was_compiled_is_saved_as_the_rule_that_it_is(tmp_path: Path) -> None:
+    rule = NPARule(2, 4, 8)
+    save_rule(torch.compile(rule, backend="eager"), tmp_path / "rule.safetensors")
+    loaded = load_rule(tmp_path / "rule.safetensors")
+    assert all(torch.equal(loaded.state_dict()[k], v) for k, v in rule.state_dict().items())
+
+
+def test_a_network_that_files_do_not_hold_is_refused_and_nothing_is_lost(tmp_path: Path) -> None:
+    path = tmp_path / "rule.safetensors"
+    save_rule(NPARule(2, 4, 8), path)
+    before = path.read_bytes()
+    normed = NPARule(2, 4, 8)
+    torch.nn.utils.parametrizations.weight_norm(normed.hidden)
+    for rule in (Threefold(2, 4, 8), normed):
+        with pytest.raises(NPAError, match="rule must have the network that NPARule makes"):
+            save_rule(rule, path)
+    assert path.read_bytes() == before
+
+
 def test_no_bit_flips_unnoticed(tmp_path: Path) -> None:
     rule, path = NPARule(2, 3, 8, eps0=0.1), tmp_path / "rule.safetensors"
     save_rule(rule, path, metadata={"trained": "10 000 iterations"})

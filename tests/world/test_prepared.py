@@ -63,6 +63,19 @@ def test_prepared_rollouts_are_the_launched_ones(options, dtype):
     assert_same(ready, launched)
 
 
+def test_worlds_that_lie_otherwise_in_memory_are_stepped_alike():
+    rule, (x, s) = make_rule(), worlds()
+    others = worlds(seed=8)
+    expected = [run(rule, x, s), run(rule, *others)]
+    views = x.transpose(0, 1).contiguous().transpose(0, 1), s.mT.contiguous().mT
+    assert not any(view.is_contiguous() for view in views)
+    prepared._kinds.clear()
+    for _ in range(4):
+        assert_same(run(rule, *views), expected[0])
+    # The same kind of worlds: what was prepared for views serves these too.
+    assert_same(run(rule, *others), expected[1])
+
+
 def test_equivariant_rules_are_prepared_too():
     rule, (x, s) = make_rule(equivariant=True, chiral=True), worlds()
     launched = [run(rule, x, s, seed=seed) for seed in (3, 4)]

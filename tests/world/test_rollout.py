@@ -278,6 +278,31 @@ def test_worlds_keep_their_precision_under_autocast(device):
     assert_same(values, expected)
 
 
+class Forgetful(npa_envs.NPARule):
+    def forward(self, z):
+        return torch.nn.functional.dropout(super().forward(z), 0.5)
+
+
+@pytest.mark.parametrize("memory", ["recompute", "minimal"])
+@pytest.mark.parametrize("species", [False, True])
+def test_recomputed_steps_of_a_rule_that_draws_draw_the_same(device, memory, species):
+    torch.manual_seed(0)
+    rule = Forgetful(2, 4, 8, eps0=0.3).to(device)
+    torch.nn.init.normal_(rule.output.weight)
+    x, s = random_world(1, 30, 2, 4, dtype=torch.float32, device=device)
+    found = []
+    for mode in ("store", memory):
+        torch.manual_seed(1)
+        options = {"generator": torch.Generator(device).manual_seed(2), "memory": mode}
+        if species:
+            ends = npa_envs.rollout_species([rule], x, s, 5, counts=[30], **options)
+        else:
+            ends = npa_envs.rollout(rule, x, s, 5, **options)
+        loss = sum(end.square().mean() for end in ends)
+        found.append(torch.autograd.grad(loss, list(rule.parameters())))
+    assert_same(found[1], found[0])
+
+
 @pytest.mark.parametrize("update_prob", [0.01, 0.05, 0.5, 0.95])
 @pytest.mark.parametrize("particle_total", [16, 512, 32768])
 def test_row_capacity_holds_far_more_than_ever_drawn(particle_total, update_prob):

@@ -255,3 +255,26 @@ def test_the_spec_says_what_is_done():
     env = DamageEvents(single(), ["3:cut", DamageEvent(5, "erase", 0.3)], every=4)
     wrapper = env.spec.additional_wrappers[-1]
     assert wrapper.kwargs == {"events": ["3:cut", "5:erase:0.3"], "every": 4}
+
+
+def test_what_is_told_of_a_damaged_world_is_told_of_it_as_it_is():
+    keywords = {"particle_count": 64, "grow_steps": 32}
+    env = DamageEvents(gym.make("npa/Shepherd2DSmall-v0", **keywords), "1:clump:0.6")
+    env.reset(seed=0)
+    observation, *_, info = env.step(env.action_space.sample())
+    assert info["loss_damage"] > 0.0
+    assert info["lost"] == pytest.approx(float(observation["achieved_goal"][2]), rel=1e-5)
+    vector = gym.make_vec("npa/Shepherd2DSmall-v0", num_envs=2, **keywords)
+    envs = VectorDamageEvents(vector, "1:clump:0.6")
+    envs.reset(seed=0)
+    observations, *_, infos = envs.step(envs.action_space.sample())
+    lost = observations["achieved_goal"][:, 2]
+    np.testing.assert_allclose(infos["lost"], lost, rtol=1e-5)
+
+
+def test_vector_environments_show_no_world_before_there_is_one():
+    envs = gym.make_vec("npa/Morphogenesis2DSmall-v0", num_envs=2, render_mode="rgb_array")
+    with pytest.raises(NPAError, match="render needs worlds: call reset first"):
+        envs.render()
+    envs.reset(seed=0)
+    assert len(envs.render()) == 2

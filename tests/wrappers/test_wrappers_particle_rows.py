@@ -71,3 +71,10 @@ def test_rows_close_their_worlds_once():
     rows.close()
     assert envs.closed
     rows.close()
+
+
+@pytest.mark.parametrize("name", ["Gardener2DSmall", "Shepherd2DSmall"])
+def test_environments_without_rows_are_refused(name):
+    envs = gym.make_vec(f"npa/{name}-v0", num_envs=2, autoreset_mode="next-step")
+    with pytest.raises(NPAError, match="rows need an environment that gives and takes one for"):
+        ParticleRows(envs)
