@@ -199,10 +199,9 @@ class Ranks:
 
     def mean(self, value: Tensor) -> Tensor:
         """Return the mean of a tensor over all processes, which all ask for it."""
-        total = value.detach().clone()
-        with self._in_touch():
-            dist.all_reduce(total)
-        return total / self.count
+        mean = value.detach().clone()
+        self.reduce([mean])
+        return mean
 
     def check_same(self, tensors: Sequence[Tensor]) -> None:
         """Check that tensors are the same on all processes, bit for bit.
