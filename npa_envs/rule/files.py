@@ -163,8 +163,9 @@ def save_rule(
     check_rule(rule)
     # One that torch.compile has taken has its weights by other names.
     rule = getattr(rule, "_orig_mod", rule)
-    shapes = {name: tuple(value.shape) for name, value in rule.state_dict().items()}
-    if type(rule).forward is not NPARule.forward or shapes != _shapes(rule.hyper_parameters()):
+    loaded = _without_weights(rule.hyper_parameters())
+    same_shapes = _shapes(rule.state_dict()) == _shapes(loaded.state_dict())
+    if type(rule).forward is not NPARule.forward or not same_shapes:
         raise NPAError(
             f"rule must have the network that NPARule makes, got a {type(rule).__name__} with one "
             "of its own, which the file would not hold: keep its state_dict with torch.save"
@@ -359,24 +360,25 @@ def _parse(header: Mapping[str, str], name: str, kind: type) -> Any:
     return value
 
 
-def _shapes(hyper_parameters: Mapping[str, Any]) -> dict[str, tuple[int, ...]]:
-    """Return the shapes of a rule's weights by their names."""
+def _without_weights(hyper_parameters: Mapping[str, Any]) -> NPARule:
+    """Return a rule whose weights have shapes and no memory."""
     with torch.device("meta"):
-        rule = NPARule(**hyper_parameters)
-    return {name: tuple(value.shape) for name, value in rule.state_dict().items()}
+        return NPARule(**hyper_parameters)
+
+
+def _shapes(weights: Mapping[str, Tensor]) -> dict[str, tuple[int, ...]]:
+    return {name: tuple(tensor.shape) for name, tensor in weights.items()}
 
 
 def _assemble(parts: RuleParts) -> NPARule:
     """Build the rule without drawing initial weights: shapes first, then the tensors themselves."""
     try:
-        with torch.device("meta"):
-            rule = NPARule(**parts.hyper_parameters)
+        rule = _without_weights(parts.hyper_parameters)
     except (RuntimeError, TypeError, OverflowError) as error:
         raise NPAError(
             f"no rule has the hyper-parameters {shown(parts.hyper_parameters)}"
         ) from error
-    expected = {name: tuple(tensor.shape) for name, tensor in rule.state_dict().items()}
-    got = {name: tuple(tensor.shape) for name, tensor in parts.weights.items()}
+    expected, got = _shapes(rule.state_dict()), _shapes(parts.weights)
     if got != expected:
         wrong = sorted(
             f"{name}: {got.get(name, 'missing')} instead of {expected.get(name, 'nothing')}"
