@@ -215,6 +215,20 @@ ARMS: Mapping[str, Fields] = {
     | {"second_lives": 0.6, "lifetimes": (16, 4096), "damage_share": 0.125},
     "eighth, second lives, from 16": EIGHTH
     | {"second_lives": 0.6, "lifetimes": (16, 16_384), "damage_share": 0.125},
+    "eighth, second lives, from 32, more cuts": EIGHTH
+    | {
+        "second_lives": 0.5,
+        "lifetimes": (32, 16_384),
+        "damage_share": 0.125,
+        "cut_share": 0.5,
+    },
+    "eighth, second lives, from 16, more cuts": EIGHTH
+    | {
+        "second_lives": 0.6,
+        "lifetimes": (16, 16_384),
+        "damage_share": 0.125,
+        "cut_share": 0.5,
+    },
     "eighth, from 32": EIGHTH | {"lifetimes": (32, 16_384), "damage_share": 0.125},
     "seventh, untrained, rate 3e-3": SEVENTH
     | {"initial_rule": "", "learning_rate": 3e-3, "steps": (48, 50), "iterations": 1500},

@@ -16,7 +16,7 @@ from torch import Tensor
 from npa_envs.errors import NPAError, shown, suggest
 from npa_envs.ops import world_mean
 from npa_envs.ops.checks import check_world, checked_number
-from npa_envs.tasks.checks import check_non_negative, is_real, is_whole
+from npa_envs.tasks.checks import check_fraction, check_non_negative, is_real, is_whole
 from npa_envs.tasks.seeds import drawn_indices, uniform_ball
 from npa_envs.world.brushes import clump, cut, erase_state
 from npa_envs.world.randomness import Randomness, check_generator, normal_draws, uniform_draws
@@ -293,7 +293,10 @@ class PoolDamage:
     the pool [length units]; 0: none."""
 
     cut_gap: float = 0.0
-    """Width of the slit through a quarter of the worlds from the pool [length units]; 0: none."""
+    """Width of the slit through `cut_share` of the worlds from the pool [length units]; 0: none."""
+
+    cut_share: float = SHARE
+    """Probability of a world from the pool to be cut (dimensionless)."""
 
     flake_radius: float = 0.0
     """Radius up to which a ball of particles is torn off and thrown out, in a quarter of the worlds
@@ -306,8 +309,9 @@ class PoolDamage:
         """Check every field.
 
         Raises:
-            NPAError: A field is no finite number of at least 0.
+            NPAError: A field is no finite number of at least 0, or `cut_share` above 1.
         """
+        check_fraction(self, "cut_share")
         check_non_negative(
             self, "damage_radius", "clump_radius", "cut_gap", "flake_radius", "stray_share"
         )
@@ -335,7 +339,7 @@ def hurt(
     if damage.cut_gap > 0.0:
         # Directions need not be spread evenly, and of a zero vector nothing is cut.
         normal = 2.0 * uniform_draws(generator, (len(x), x.shape[2]), x) - 1.0
-        hit = (uniform_draws(generator, (len(x), 1), x)[:, 0] < SHARE).to(x.dtype)
+        hit = (uniform_draws(generator, (len(x), 1), x)[:, 0] < damage.cut_share).to(x.dtype)
         x, s = cut(x, s, centre=world_mean(x), normal=normal, gap=damage.cut_gap * hit)
     if damage.flake_radius > 0.0:
         x = tear(x, radius=damage.flake_radius, chance=SHARE, generator=generator)

@@ -117,8 +117,7 @@ class TrainingCycle:
             self._rollout,
             goal=goals,
             gradients=None if beside is None else beside.batch.gradients,
-            # Not within a graph, where nobody would watch for a process that does not answer.
-            mean_over_processes=None if graphed or ranks.count == 1 else ranks.mean,
+            mean_over_processes=None if ranks.count == 1 else ranks.mean,
         )
         """Worlds before and after the last rollout, the loss and its gradients."""
         parameters = self.batch.parameters

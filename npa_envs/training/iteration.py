@@ -15,7 +15,7 @@ from npa_envs.tasks.base import Task, coded_states, task_toward
 from npa_envs.tasks.damage import counted_together
 from npa_envs.tasks.train_config import TrainConfig
 from npa_envs.training.randomness import registered
-from npa_envs.world.cuda_graph import capture
+from npa_envs.world.cuda_graph import Captured, between_graphs, capture
 from npa_envs.world.division import living
 from npa_envs.world.randomness import Randomness, WorldRandom
 from npa_envs.world.rollout import Memory
@@ -133,8 +133,8 @@ class EagerIteration:
             generator=self._generator,
             return_path_length=True,
         )
-        mean = self._mean_over_processes
-        with contextlib.nullcontext() if mean is None else counted_together(mean):
+        alone = self._mean_over_processes is None
+        with contextlib.nullcontext() if alone else counted_together(self._mean):
             total, parts = self._loss(x, s, path_length)
         # Not backward(): its accumulation nodes remember the stream they were first used on,
         # which a capture on another stream must not touch.
@@ -146,6 +146,14 @@ class EagerIteration:
         self.terms.copy_(torch.stack([total, *parts.values()]).detach())
         self.x.copy_(x.detach())
         self.s.copy_(s.detach())
+
+    def _mean(self, value: Tensor) -> Tensor:
+        """Return the mean of a tensor over all processes, taken between two graphs."""
+        assert self._mean_over_processes is not None, "shared by several processes"
+        own, over = value.detach().clone(), self._mean_over_processes
+        mean = torch.empty_like(own)
+        between_graphs(lambda: mean.copy_(over(own)))
+        return mean
 
     def _loss(self, x: Tensor, s: Tensor, path_length: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
         """Return the task's loss and its parts, and how far grown worlds are from rest."""
@@ -167,12 +175,14 @@ class GraphedIteration(EagerIteration):
 
     Launches of thousands of short kernels would otherwise take longer than the kernels do. All
     graphs share one memory pool: they never run at the same time, and everything that outlives a
-    replay lies in buffers outside that pool.
+    replay lies in buffers outside that pool. What processes take means of within an iteration, they
+    take between two graphs: torch does not watch what a graph replays for processes that do not
+    answer.
     """
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)
-        self._graphs: dict[int, torch.cuda.CUDAGraph] = {}
+        self._graphs: dict[int, Captured] = {}
         self._memory_pool = torch.cuda.graph_pool_handle()
 
     def run(self, steps: int) -> None:

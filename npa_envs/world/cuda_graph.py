@@ -8,6 +8,7 @@ import gc
 import inspect
 import weakref
 from collections.abc import Callable, Iterator
+from contextvars import ContextVar
 from typing import Any
 
 import torch
@@ -74,6 +75,67 @@ def prepare_capture(function: Callable[[], object], device: torch.device) -> Non
         torch.cuda.empty_cache()
 
 
+class Captured:
+    """Work that was recorded: CUDA graphs, one after the other, and what is done between them.
+
+    Args:
+        pool: Memory that the graphs share; None is a pool of their own.
+        generator: A generator that draws anew in each replay.
+    """
+
+    def __init__(self, pool: Any = None, generator: torch.Generator | None = None) -> None:
+        self._pool = pool
+        self._generator = generator
+        self._graphs: list[torch.cuda.CUDAGraph] = []
+        self._between: list[Callable[[], object]] = []
+
+    def replay(self) -> None:
+        """Do the work on the current stream; the host waits only for what it does in between."""
+        self._graphs[0].replay()
+        for work, graph in zip(self._between, self._graphs[1:], strict=True):
+            work()
+            graph.replay()
+
+    def begin(self) -> None:
+        """Record what the current stream is given from now on."""
+        graph = torch.cuda.CUDAGraph()
+        if self._generator is not None:
+            # Without this every replay would draw the numbers of the capture again.
+            graph.register_generator_state(self._generator)
+        self._graphs.append(graph)
+        # A backward pass runs on a thread of its own, whose calls the strict mode would refuse.
+        graph.capture_begin(pool=self._pool, capture_error_mode="thread_local")
+
+    def end(self) -> None:
+        """Record no more."""
+        self._graphs[-1].capture_end()
+
+    def pause(self, work: Callable[[], object]) -> None:
+        """End a graph, begin another one, and let `work` be done between them in every replay."""
+        self.end()
+        self._between.append(work)
+        if self._pool is None:
+            self._pool = self._graphs[0].pool()
+        self.begin()
+
+
+_capturing: ContextVar[Captured | None] = ContextVar("capturing", default=None)
+"""What this thread records, if anything."""
+
+
+def between_graphs(work: Callable[[], object]) -> None:
+    """Do what cannot be part of a graph: at once, or in a capture between two graphs, each replay.
+
+    Args:
+        work: Reads and writes tensors that stay where they are; what launches it keeps them.
+    """
+    captured = _capturing.get()
+    if captured is None:
+        work()
+    else:
+        captured.pause(work)
+
+
 def capture(
     function: Callable[[], object],
     device: torch.device,
@@ -81,8 +143,10 @@ def capture(
     pool: Any = None,
     generator: torch.Generator | None = None,
     warm_up: Callable[[], object] | None = None,
-) -> torch.cuda.CUDAGraph:
-    """Record what a function launches as a CUDA graph, without running it.
+) -> Captured:
+    """Record what a function launches as CUDA graphs, without running it.
+
+    It is one graph, unless the function calls `between_graphs`.
 
     Without a warm-up the host waits for nothing. `torch.cuda.graph` waits for the device, frees the
     allocator's cache and may collect garbage at each capture, which can take longer than the
@@ -98,7 +162,7 @@ def capture(
         warm_up: Run first, on the stream that is captured: loads kernels, allocates workspaces.
 
     Returns:
-        The graph, to be replayed on any stream.
+        What was recorded, to be replayed on any stream.
 
     Raises:
         Exception: Whatever the function raises; the device can be used as before.
@@ -108,50 +172,45 @@ def capture(
         if warm_up is not None:
             prepare_capture(warm_up, device)
         with contextlib.suppress(torch.OutOfMemoryError):
-            return _recorded(function, stream, pool, generator)
+            return _recorded(function, stream, Captured(pool, generator))
         # Only here: the error that is gone by now held the memory of the first attempt.
         torch.cuda.empty_cache()
-        return _recorded(function, stream, pool, generator)
+        return _recorded(function, stream, Captured(pool, generator))
 
 
 def _recorded(
-    function: Callable[[], object],
-    stream: torch.cuda.Stream,
-    pool: Any,
-    generator: torch.Generator | None,
-) -> torch.cuda.CUDAGraph:
+    function: Callable[[], object], stream: torch.cuda.Stream, captured: Captured
+) -> Captured:
     """Capture a stream while the function runs."""
     current = torch.cuda.current_stream()
-    graph = torch.cuda.CUDAGraph()
-    if generator is not None:
-        # Without this every replay would draw the numbers of the capture again.
-        graph.register_generator_state(generator)
     # A capture runs nothing, but for this: torch resets the generators' places on the device, which
     # the graphs before read and the next replay writes. So the two streams take turns.
     stream.wait_stream(current)
     try:
         with torch.cuda.stream(stream), no_garbage_collection():
-            _record(function, graph, pool)
+            _record(function, captured)
     except BaseException:
         with contextlib.suppress(RuntimeError):
             current.wait_stream(stream)
         raise
     current.wait_stream(stream)
-    return graph
+    return captured
 
 
-def _record(function: Callable[[], object], graph: torch.cuda.CUDAGraph, pool: Any) -> None:
+def _record(function: Callable[[], object], captured: Captured) -> None:
     """Capture the current stream while the function runs."""
-    # A backward pass runs on a thread of its own, whose calls the strict mode would refuse.
-    graph.capture_begin(pool=pool, capture_error_mode="thread_local")
+    before = _capturing.set(captured)
+    captured.begin()
     try:
         function()
     except BaseException:
         # What broke the capture says more than the complaint that it is broken.
         with contextlib.suppress(RuntimeError):
-            graph.capture_end()
+            captured.end()
         raise
-    graph.capture_end()
+    finally:
+        _capturing.reset(before)
+    captured.end()
 
 
 class WeakFunction:
@@ -215,7 +274,7 @@ class Replayed:
         self._recorded = recorded and device.type == "cuda"
         self._pool = pool
         self._warm = False
-        self._graph: torch.cuda.CUDAGraph | None = None
+        self._graph: Captured | None = None
 
     def __getstate__(self) -> dict[str, Any]:
         """Leave out the graph, which cannot be pickled: it is captured anew."""

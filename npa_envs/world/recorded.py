@@ -31,7 +31,7 @@ from npa_envs.errors import NPAError, shown
 from npa_envs.ops.checks import FiniteCheck, check_finite_positions
 from npa_envs.ops.opaque import once_differentiable
 from npa_envs.rule.rule import NPARule
-from npa_envs.world.cuda_graph import capture, current_stream, prepare_capture
+from npa_envs.world.cuda_graph import Captured, capture, current_stream, prepare_capture
 from npa_envs.world.divergence import DivergenceWatch
 from npa_envs.world.randomness import Randomness, WorldRandom
 
@@ -217,10 +217,10 @@ class _Lease:
 
 
 class _Graphs(NamedTuple):
-    forward: torch.cuda.CUDAGraph
+    forward: Captured
     worlds: list[Tensor]
     """Where its rollout leaves worlds."""
-    backward: torch.cuda.CUDAGraph | None
+    backward: Captured | None
     gradients: list[Tensor]
     """Where its backward pass leaves gradients, of those inputs that have one."""
 

@@ -42,6 +42,13 @@ def test_a_quarter_of_the_worlds_is_hit(what, space_dim):
     assert torch.equal(states, s)
 
 
+def test_as_many_worlds_are_cut_as_asked_for():
+    x, s = worlds(400, particles=60)
+    generator = torch.Generator().manual_seed(2)
+    found, _ = hurt(x, s, PoolDamage(cut_gap=0.5, cut_share=0.7), generator=generator)
+    assert 0.57 < float(changed(x, found).float().mean()) < 0.82
+
+
 def test_a_clump_is_one_point():
     x, s = worlds(40)
     generator = torch.Generator().manual_seed(2)

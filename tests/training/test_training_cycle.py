@@ -11,6 +11,7 @@ import npa_envs
 from npa_envs.tasks.morphogenesis2d import Morphogenesis2D
 from npa_envs.tasks.point_classification import PointClassification
 from npa_envs.training import preset
+from npa_envs.training.iteration import EagerIteration, GraphedIteration
 
 
 def circle_cycle(tmp_path, **fields):
@@ -95,3 +96,37 @@ def test_replayed_operations_train_the_same_rule_as_called_ones(tmp_path, make, 
     assert len(replayed._keep.recorded) > 5
     assert len(replayed._note.recorded) > 5
     assert (len(replayed._grow_old.recorded) > 5) == ("ageing_steps" in fields)
+
+
+@pytest.mark.gpu
+def test_recorded_iterations_take_means_over_processes_where_eager_ones_do(tmp_path):
+    straying = {"stray_share": 0.2, "stray_weight": 10.0, "cuda_graph": False}
+    config = preset("tiny", out=tmp_path, device="cuda", **straying)
+    task = Morphogenesis2D(config.task, device="cuda")
+    rule = task.make_rule(torch.Generator().manual_seed(1)).cuda()
+    torch.nn.init.normal_(rule.w2.weight, std=0.1)
+    generator = torch.Generator("cuda")
+    x, s = task.seed(4, generator=generator.manual_seed(2), device=rule.w2.weight.device)
+    found = []
+    for kind in (EagerIteration, GraphedIteration):
+        counts = []
+
+        def mean(count, counts=counts):
+            counts.append(float(count))
+            return 2.0 * count
+
+        iteration = kind(task, rule, config, x, s, generator, mean_over_processes=mean)
+        for number in range(3):
+            strayed = x.clone()
+            strayed[:, : 5 + number] += 3.0
+            iteration.x0.copy_(strayed)
+            generator.manual_seed(number)
+            iteration.run(6 + number % 2)
+            rows = [*iteration.gradients, iteration.terms, iteration.x, iteration.s]
+            found.append([row.clone() for row in rows])
+        # The first capture is after a run that loads kernels.
+        assert counts[-3:] == [20.0, 24.0, 28.0]
+    assert float(found[0][len(iteration.gradients)][iteration.term_names.index("stray")]) > 0.0
+    for eager, graphed in zip(found[:3], found[3:], strict=True):
+        for one, other in zip(eager, graphed, strict=True):
+            torch.testing.assert_close(one, other, rtol=1e-4, atol=1e-6)

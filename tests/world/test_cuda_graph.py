@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from npa_envs.world import cuda_graph
-from npa_envs.world.cuda_graph import Replayed, capture, no_garbage_collection
+from npa_envs.world.cuda_graph import Replayed, between_graphs, capture, no_garbage_collection
 
 CUDA = torch.device("cuda", 0)
 
@@ -44,6 +44,9 @@ def events(monkeypatch):
             seen.append("end")
             if "broken" in seen:
                 raise RuntimeError("the capture is not valid")
+
+        def pool(self):
+            return "pool"
 
         def replay(self):
             seen.append("replay")
@@ -90,7 +93,8 @@ def test_a_capture_waits_for_nothing_and_collects_nothing(events, monkeypatch):
         "begin None thread_local": "begin memory thread_local",
         "run": "run, collecting False",
     }
-    assert events == ["register dice", *(changed.get(event, event) for event in CAPTURED)]
+    expected = [changed.get(event, event) for event in CAPTURED]
+    assert events == [*expected[:2], "register dice", *expected[2:]]
 
 
 def test_what_a_warm_up_leaves_is_given_back_before_the_capture(events):
@@ -127,6 +131,33 @@ def test_a_capture_without_enough_memory_is_tried_again_once_room_is_made(events
     with pytest.raises(torch.OutOfMemoryError):
         capture(lambda: function(3), CUDA)
     assert events.count("run") == 2
+
+
+def test_what_is_done_between_graphs_is_done_in_every_replay(events):
+    def function():
+        events.append("first")
+        between_graphs(lambda: events.append("between"))
+        events.append("second")
+
+    function()
+    assert events == ["first", "between", "second"]
+    events.clear()
+    captured = capture(function, CUDA)
+    assert events[2:-2] == [
+        "begin None thread_local",
+        "first",
+        "end",
+        "begin pool thread_local",
+        "second",
+        "end",
+    ]
+    for _ in range(2):
+        events.clear()
+        captured.replay()
+        assert events == ["replay", "between", "replay"]
+    events.clear()
+    between_graphs(lambda: events.append("at once"))
+    assert events == ["at once"]
 
 
 def test_a_replayed_function_runs_once_is_captured_once_and_then_replayed(events):
@@ -240,3 +271,30 @@ def test_a_capture_with_a_backward_pass_does_not_wait_for_the_device():
     assert gradient.tolist() == [3.0] * 10
     graph.replay()
     assert gradient.tolist() == [6.0] * 10
+
+
+@pytest.mark.gpu
+def test_between_two_graphs_the_second_half_of_a_backward_pass_sees_what_was_done():
+    x = torch.arange(1.0, 11.0, device=CUDA, requires_grad=True)
+    gradient, seen = torch.zeros(10, device=CUDA), torch.zeros(10, device=CUDA)
+
+    def function():
+        cubes = x**3
+        count = cubes.detach().sum()
+        divisor = torch.empty_like(count)
+        between_graphs(lambda: divisor.copy_(count / 5.0))
+        (found,) = torch.autograd.grad((cubes / divisor).sum(), x)
+        gradient.copy_(found)
+        seen.copy_(torch.rand(10, generator=generator, device=CUDA))
+
+    generator = torch.Generator(CUDA).manual_seed(4)
+    captured = capture(function, CUDA, generator=generator, warm_up=function)
+    draws = []
+    for factor in (1.0, 2.0):
+        with torch.no_grad():
+            x.mul_(factor)
+        captured.replay()
+        cubes = x.detach() ** 3
+        assert torch.allclose(gradient, 3.0 * x.detach() ** 2 * 5.0 / cubes.sum())
+        draws.append(seen.clone())
+    assert not torch.equal(*draws)

@@ -16,7 +16,7 @@ from npa_envs.rule.files import load_rule, rule_file, rule_metadata, shipped_rul
 from npa_envs.rule.rule import NPARule
 from npa_envs.tasks.base import Task, seed_worlds, task_toward
 from npa_envs.training.trained_tasks import task_of_rule, trained_config
-from npa_envs.world.cuda_graph import capture
+from npa_envs.world.cuda_graph import Captured, capture
 from npa_envs.world.randomness import Randomness
 from npa_envs.world.rollout import rollout
 
@@ -166,7 +166,7 @@ class LongRun:
         self.eps: float = options["eps"]
         """Perception radius [length units]."""
         self._steps = chunk
-        self._graph: torch.cuda.CUDAGraph | None = None
+        self._graph: Captured | None = None
 
     def advance(self, steps: int) -> None:
         """Run some steps more."""
