@@ -103,10 +103,13 @@ def test_recorded_iterations_take_means_over_processes_where_eager_ones_do(tmp_p
     straying = {"stray_share": 0.2, "stray_weight": 10.0, "cuda_graph": False}
     config = preset("tiny", out=tmp_path, device="cuda", **straying)
     task = Morphogenesis2D(config.task, device="cuda")
-    rule = task.make_rule(torch.Generator().manual_seed(1)).cuda()
-    torch.nn.init.normal_(rule.w2.weight, std=0.1)
-    generator = torch.Generator("cuda")
-    x, s = task.seed(4, generator=generator.manual_seed(2), device=rule.w2.weight.device)
+    device = torch.device("cuda")
+    rule = task.make_rule(torch.Generator().manual_seed(1)).to(device)
+    with torch.no_grad():
+        for weights in rule.parameters():
+            weights.add_(0.05 * torch.randn_like(weights))
+    generator = torch.Generator(device)
+    x, s = task.seed(4, generator=generator.manual_seed(2), device=device)
     found = []
     for kind in (EagerIteration, GraphedIteration):
         counts = []
