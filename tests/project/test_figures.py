@@ -515,13 +515,20 @@ def test_the_table_of_the_test_of_best_has_the_numbers_of_its_file() -> None:
         assert told[run["picture"].replace("-", " ")].split(" | ") == cells
 
 
-def test_the_tables_of_second_lives_have_the_numbers_of_their_file() -> None:
+@pytest.mark.parametrize(
+    ("title", "name"),
+    [
+        ("\n## More second lives", "second_lives"),
+        ("\n### Long lives and more cuts", "from_16"),
+    ],
+)
+def test_the_tables_of_second_lives_have_the_numbers_of_their_files(title: str, name: str) -> None:
     page = (ROOT / "docs" / "recipes.md").read_text(encoding="utf-8")
-    section = page.split("## More second lives")[1].split("\n## ")[0]
+    section = re.split(r"\n##+ ", page.split(title)[1])[0]
     told = dict(
         re.findall(r"^\| ([a-z0-9, -]+?)(?: \(`best`\))? \| (.*) \|$", section, re.MULTILINE)
     )
-    record = content(RESULTS / "recipes_second_lives_h100.json")
+    record = content(RESULTS / f"recipes_{name}_h100.json")
     aged = {row["picture"]: row for row in record["long"]}
     steps = (64, 128, 512, 1024, 4096, 20_000)
     arms: dict[str, list[Any]] = {}
