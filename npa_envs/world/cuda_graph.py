@@ -199,8 +199,8 @@ def _recorded(
 
 def _record(function: Callable[[], object], captured: Captured) -> None:
     """Capture the current stream while the function runs."""
-    before = _capturing.set(captured)
     captured.begin()
+    before = _capturing.set(captured)
     try:
         function()
     except BaseException:
