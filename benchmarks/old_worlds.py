@@ -6,7 +6,9 @@ import argparse
 import json
 import math
 import statistics
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -15,9 +17,12 @@ from recipe_arms import SEEDS
 from torch import Tensor
 
 from npa_envs.measure.accuracy import habitats
+from npa_envs.measure.quality import healing
 from npa_envs.rule.files import load_rule
+from npa_envs.rule.rule import NPARule
 from npa_envs.tasks.morphogenesis2d import Morphogenesis2D
-from npa_envs.training import preset, task_entry
+from npa_envs.training import preset
+from npa_envs.world.recorded import release_recordings
 from npa_envs.world.rollout import rollout
 
 MOTIONS = ("place", "angle", "affine", "deformation")
@@ -134,14 +139,42 @@ def endurance(
     }
 
 
-def run_long(arguments: argparse.Namespace) -> None:
-    """Run the rules that `run` has left for very long, a line of JSON each."""
+def grown_rules(arguments: argparse.Namespace) -> Iterator[tuple[str, NPARule, Morphogenesis2D]]:
+    """Yield the rules that `run` has left: name of the picture, rule, and what it should grow."""
     device = torch.device(arguments.device)
     for path in sorted(arguments.out.glob("rule-*.safetensors")):
         picture = next(p for p in arguments.pictures.glob("*.png") if f"-{p.stem}-" in path.name)
         config = preset(arguments.preset, target=str(picture)).task
-        task = task_entry("morphogenesis2d").make(config, device)
         rule = load_rule(path, device=device).float().requires_grad_(False)
+        yield picture.stem, rule, Morphogenesis2D(config, device=device)
+
+
+def append_line(path: Path, line: dict[str, Any]) -> None:
+    """Append a line of JSON to a file."""
+    with path.open("a") as file:
+        file.write(json.dumps(line) + "\n")
+
+
+def run_healing(arguments: argparse.Namespace) -> None:
+    """Damage worlds of the rules that `run` has left, of many seeds, a line of JSON each."""
+    seeds = range(SEEDS[0], SEEDS[0] + arguments.count)
+    grow, heal = arguments.steps
+    for picture, rule, task in grown_rules(arguments):
+        rows = healing(
+            rule, task, grow_steps=grow, heal_steps=heal, seeds=seeds, device=arguments.device
+        )
+        if task.target_picture.is_cuda:
+            release_recordings()
+        line = {"picture": picture, "healing": [asdict(row) for row in rows]}
+        append_line(arguments.out / "healing.jsonl", line)
+        healed = [f"{row.damage}: {row.worlds_healed} of {row.world_count}" for row in rows]
+        print(f"{picture}: {', '.join(healed)}", flush=True)
+
+
+def run_long(arguments: argparse.Namespace) -> None:
+    """Run the rules that `run` has left for very long, a line of JSON each."""
+    device = torch.device(arguments.device)
+    for picture, rule, task in grown_rules(arguments):
         seeds = [
             task.seed(1, generator=torch.Generator(device).manual_seed(seed), device=device)
             for seed in SEEDS
@@ -149,7 +182,6 @@ def run_long(arguments: argparse.Namespace) -> None:
         x, s = (torch.cat(parts) for parts in zip(*seeds, strict=True))
         home = habitats.Habitat(rule, task, x.float(), s.float(), habitats.SETTLED)
         generators = [torch.Generator(device).manual_seed(seed) for seed in (1, 2)]
-        line = {"picture": picture.stem} | endurance(home, arguments.steps, generators)
-        with (arguments.out / "long.jsonl").open("a") as file:
-            file.write(json.dumps(line) + "\n")
-        print(f"{picture.stem}: {line['worlds_within']} of {len(SEEDS)} {line['over']}", flush=True)
+        line = {"picture": picture} | endurance(home, arguments.steps, generators)
+        append_line(arguments.out / "long.jsonl", line)
+        print(f"{picture}: {line['worlds_within']} of {len(SEEDS)} {line['over']}", flush=True)

@@ -7,7 +7,8 @@ JSON, so that a stopped call goes on where it was. `pictures` draws the emoji; `
 all kernels and tests that runs side by side learn bit for bit what they learn alone; `merge` makes
 one record, one sheet of pictures and one archive of rules of what several processes left; `report`
 prints the tables and draws the figure; `follow` says what the decay of a rule's world is; `long`
-runs finished rules for 100 000 steps within the bounds of `npa-envs stress`.
+runs finished rules for 100 000 steps within the bounds of `npa-envs stress`; `heal` damages worlds
+of 32 seeds.
 
     python benchmarks/recipes.py pictures --out PICTURES
     python benchmarks/recipes.py warm-up --device cuda --out OUT
@@ -16,6 +17,7 @@ runs finished rules for 100 000 steps within the bounds of `npa-envs stress`.
     python benchmarks/recipes.py report OUT/recipes.json --figure recipes.png
     python benchmarks/recipes.py follow RULE --target PICTURE.png
     python benchmarks/recipes.py long --pictures PICTURES/test --device cuda --out OUT
+    python benchmarks/recipes.py heal --pictures PICTURES/test --device cuda --out OUT
 """
 
 from __future__ import annotations
@@ -38,7 +40,7 @@ from typing import Any
 import numpy as np
 import torch
 from emoji_sets import draw_pictures
-from old_worlds import follow, run_long
+from old_worlds import follow, run_healing, run_long
 from PIL import Image
 from recipe_arms import ARMS, FAST_ARMS, SEEDS, SIZES, Run, configuration
 from side_by_side import iterate_together, on, stream_of
@@ -421,6 +423,16 @@ def main() -> None:
     own.add_argument("--device", default="cpu")
     own.add_argument("--preset", default="paper", help="what the world is like")
     own.add_argument("--steps", type=int, default=habitats.STEPS)
+    own = commands.add_parser("heal")
+    own.set_defaults(main=run_healing)
+    own.add_argument("--out", type=Path, required=True, help="folder of `run`")
+    own.add_argument("--pictures", type=Path, required=True, help="folder of PNG files")
+    own.add_argument("--device", default="cpu")
+    own.add_argument("--preset", default="paper", help="what the world is like")
+    own.add_argument("--count", type=int, default=32, help="seeds")
+    own.add_argument(
+        "--steps", type=int, nargs=2, default=[1024, 500], help="before and after the damage"
+    )
     own = commands.add_parser("report")
     own.set_defaults(main=report)
     own.add_argument("record", type=Path)
