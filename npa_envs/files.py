@@ -27,6 +27,7 @@ _DISK_FULL = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}
 _NO_PERMISSION = {errno.EACCES, errno.EPERM, errno.EROFS}
 _NEARLY_FULL_BYTES = 64 * 1024
 _TOKEN_BYTES = 6
+_STEM_BYTES = 100
 _MIB = 2**20
 
 
@@ -196,8 +197,8 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
         path: The file to write; an existing one is replaced, and its mode is kept.
 
     Raises:
-        NPAError: The folder is missing or cannot be written to, `path` is a folder, the disk is
-            full, or the system refuses the file for another reason.
+        NPAError: The folder is missing or cannot be written to, `path` is a folder, a pipe or a
+            device, the disk is full, or the system refuses the file for another reason.
     """
     given = checked_path(path)
     target = Path(os.path.realpath(given))
@@ -241,7 +242,9 @@ def remove_unfinished(path: Path) -> None:
 
 
 def _temporary_name(path: Path, token: str) -> str:
-    return f".{path.stem[:100]}.{token}.tmp{path.suffix}"
+    # Systems count bytes, not letters.
+    stem = path.stem.encode(errors="ignore")[:_STEM_BYTES].decode(errors="ignore")
+    return f".{stem}.{token}.tmp{path.suffix}"
 
 
 def write_bytes(path: str | Path, data: bytes) -> None:
@@ -278,6 +281,12 @@ def _check_target(given: Path, target: Path) -> None:
                 f"cannot write {shown(str(given))}: that is a folder: give the path of a file "
                 "inside it"
             )
+        # Asked of what was given: a link of the system to a pipe leads to a name that is none.
+        if given.exists() and not given.is_file():
+            raise NPAError(
+                f"cannot write {shown(str(given))}: that is a pipe or a device, which must not be "
+                "replaced by a file: give the path of a file"
+            )
         if not target.parent.exists():
             raise NPAError(
                 f"cannot write {shown(str(given))}: the folder {shown(str(target.parent))} does "
@@ -296,7 +305,8 @@ def _check_target(given: Path, target: Path) -> None:
 
 def _sync(path: Path) -> None:
     """Wait until the file or folder is on the disk; a late write error is raised here."""
-    descriptor = os.open(path, os.O_RDONLY)
+    # Windows brings only files that are open for writing to the disk; POSIX opens no folder so.
+    descriptor = os.open(path, os.O_RDONLY if path.is_dir() else os.O_RDWR)
     try:
         os.fsync(descriptor)
     finally:

@@ -121,6 +121,7 @@ def grow_and_heal(options: DemoOptions, report: Report) -> None:
     from npa_envs.cli.film import Film, film_world, write_film
     from npa_envs.measure.quality import measure
     from npa_envs.rule.files import load_rule
+    from npa_envs.tasks.base import coded_states, seed_worlds, task_toward
     from npa_envs.tasks.damage import DamageEvent, damage_worlds
     from npa_envs.training import check_device
     from npa_envs.training.trained_tasks import task_of_rule
@@ -128,9 +129,9 @@ def grow_and_heal(options: DemoOptions, report: Report) -> None:
     device = check_device(options.device)
     rule = load_rule(options.rule, device=device).float()
     trained = task_of_rule(options.rule, rule, device)
-    task = trained.task
     generator = torch.Generator(device).manual_seed(options.seed)
-    x, s = task.seed(1, generator=generator, device=device)
+    x, s, goal = seed_worlds(trained.task, 1, generator=generator, device=device)
+    task = task_toward(trained.task, goal)
     report.line(f"{options.rule}: {x.shape[1]} particles, {rule.weight_count} weights")
 
     def figures(step: int) -> str:
@@ -144,6 +145,7 @@ def grow_and_heal(options: DemoOptions, report: Report) -> None:
             if kind is not None:
                 damage = DamageEvent(step, kind)
                 x, s = damage_worlds(x, s, kind=kind, generator=generator)
+                s = coded_states(task, s)
                 film.shoot(task, x, s, f"step {step}: {damage.text}", mark=True)
                 lines.append(f"  {damage.text}: {figures(step)}")
             start = time.perf_counter()

@@ -9,7 +9,7 @@ from typing import Annotated
 
 import tyro
 
-from npa_envs.cli.output import parse_options
+from npa_envs.cli.output import check_numbers, parse_options
 from npa_envs.errors import NPAError
 
 
@@ -18,7 +18,7 @@ class ExportOptions:
     """Write one HTML file that runs rules in a browser, on a phone too, with brushes and sliders.
 
     It needs neither a server nor a network. A name that ends in .json writes the collection that
-    the authors' web demo reads instead.
+    the authors' web demo reads instead, with neither title nor gallery.
     """
 
     rules: Annotated[tuple[str, ...], tyro.conf.Positional, tyro.conf.arg(metavar="RULE")] = ()
@@ -34,17 +34,24 @@ class ExportOptions:
     """Title of the page; default: the first rule's name."""
 
     particle_count: int | None = None
-    """Particles N of each world; default: as trained."""
+    """Particles N of each world; default: as trained, and 4096 in a collection."""
 
 
 def main(arguments: Sequence[str]) -> int:
     """Write what the words after `npa-envs export-web` ask for; return 0."""
     options = parse_options(ExportOptions, "export-web", arguments)
+    check_numbers(options, particle_count=1)
     from npa_envs.rule.authors import save_demo_json
     from npa_envs.rule.files import load_rule, shipped_rules
-    from npa_envs.web.export import export_web
-    from npa_envs.web.rule_world import name_of
+    from npa_envs.web.export import distinct_names, export_web
 
+    collection = options.out.suffix == ".json"
+    for name in ("gallery", "title"):
+        if collection and getattr(options, name):
+            raise NPAError(
+                f"{name} is for pages, got --{name} with a collection, {str(options.out)!r}: "
+                "leave it out, or write an .html file"
+            )
     sources = list(options.rules)
     title = options.title
     if options.gallery and not sources:
@@ -52,8 +59,12 @@ def main(arguments: Sequence[str]) -> int:
         title = title or "Neural Particle Automata"
     if not sources:
         raise NPAError("name at least one RULE, or --gallery for all shipped 2D rules")
-    if options.out.suffix == ".json":
-        save_demo_json({name_of(source): load_rule(source) for source in sources}, options.out)
+    if collection:
+        names = distinct_names(sources, "a collection")
+        rules = [load_rule(source) for source in sources]
+        count = options.particle_count
+        counts = None if count is None else dict.fromkeys(names, count)
+        save_demo_json(dict(zip(names, rules, strict=True)), options.out, particle_counts=counts)
     else:
         export_web(
             sources,

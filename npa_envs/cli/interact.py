@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import functools
 import hashlib
-from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -105,12 +105,10 @@ def main(arguments: Sequence[str]) -> int:
     from npa_envs.measure.tables import table_text
     from npa_envs.render import write_filmstrip
 
-    check_numbers(options, seed_count=1)
     if options.quick:
-        unsaid = [
-            name for name in QUICK if getattr(options, name) == getattr(InteractOptions, name)
-        ]
-        options = replace(options, **{name: QUICK[name] for name in unsaid})
+        few = InteractOptions(**QUICK)
+        options = parse_options(InteractOptions, "interact", arguments, default=few)
+    check_numbers(options, seed_count=1)
     device = check_device(options.device)
     organisms, settings = _organisms(options, device)
     if len(organisms) < 2 and not options.itself:
@@ -127,6 +125,7 @@ def main(arguments: Sequence[str]) -> int:
         for second in organisms
         if options.itself or first is not second
     ]
+    files = _pair_names((first.name, second.name) for first, second in pairs)
     done = {(row.rule, row.beside) for row in rows}
     missing = [pair for pair in pairs if (pair[0].name, pair[1].name) not in done]
     if done:
@@ -139,7 +138,7 @@ def main(arguments: Sequence[str]) -> int:
         encounters.check(organisms)
         for first, second in missing:
             fresh, scenes = encounters.meet(first, second)
-            path = folder / f"{first.name}-{second.name}.png"
+            path = folder / f"{files[first.name, second.name]}.png"
             columns = len(scenes.frames) // len(fresh)
             write_filmstrip(path, scenes.frames, scenes.captions, columns=columns)
             rows += fresh
@@ -148,7 +147,7 @@ def main(arguments: Sequence[str]) -> int:
     print(f"wrote {folder / RESULTS} and a filmstrip of each pair")
     maps = write_plots(lambda: {"": heat_map(rows)}, folder / "interactions.png", "heat map")
     if len(settings.ratios) > 1 or len(settings.eps_factors) > 1:
-        maps += write_plots(lambda: _phases(rows), folder / "phases-*.png", "phase diagrams")
+        maps += write_plots(lambda: _phases(rows, files), folder / "phases-*.png", "phase diagrams")
     print("\n".join(maps))
     return 0
 
@@ -180,7 +179,7 @@ def _organisms(
         task_of = functools.partial(_task_of, source, rule, device)
         organisms.append(Organism(name, rule, functools.cache(task_of), trained.task.update_prob))
     settings = InteractionSettings(
-        particle_count=options.particle_count or max(counts),
+        particle_count=(max(counts) if options.particle_count is None else options.particle_count),
         distances=options.distances,
         ratios=options.ratios,
         eps_factors=options.eps_factors,
@@ -192,14 +191,29 @@ def _organisms(
     return organisms, settings
 
 
-def _phases(rows: Sequence[InteractionRow]) -> dict[str, bytes]:
-    """Return the phase diagram of each pair."""
+def _pair_names(pairs: Iterable[tuple[str, str]]) -> dict[tuple[str, str], str]:
+    """Return a name for the files of each pair, also where rules' names have hyphens."""
+    names: dict[tuple[str, str], str] = {}
+    for pair in pairs:
+        plain = name = "-".join(pair)
+        number = 1
+        while name in names.values():
+            number += 1
+            name = f"{plain}-{number}"
+        names[pair] = name
+    return names
+
+
+def _phases(
+    rows: Sequence[InteractionRow], names: Mapping[tuple[str, str], str]
+) -> dict[str, bytes]:
+    """Return the phase diagram of each pair, by the pair's name."""
     from npa_envs.measure.interaction import phase_diagram
 
-    pairs: dict[str, list[InteractionRow]] = {}
+    pairs: dict[tuple[str, str], list[InteractionRow]] = {}
     for row in rows:
-        pairs.setdefault(f"{row.rule}-{row.beside}", []).append(row)
-    return {name: phase_diagram(own) for name, own in pairs.items()}
+        pairs.setdefault((row.rule, row.beside), []).append(row)
+    return {names[pair]: phase_diagram(own) for pair, own in pairs.items()}
 
 
 def _task_of(source: str, rule: NPARule, device: torch.device, count: int) -> Any:

@@ -27,6 +27,9 @@ if TYPE_CHECKING:
 
     from npa_envs.web.live import LiveWorld
 
+OWN_KEYWORDS = ("id", "policy", "device", "output", "disable_env_checker")
+"""What the command says itself of an environment that it makes."""
+
 RUN_FILES = ("config.json", "log.jsonl", "checkpoint.pt")
 """What tells the folder of a run from others."""
 
@@ -127,8 +130,7 @@ def world_maker(options: ViewOptions, device: torch.device) -> Callable[[], Live
 
     if options.what.startswith("npa/"):
         policy = options.policy
-        keywords = {"particle_count": options.particle_count}
-        keywords |= named_values("options", options.options)
+        keywords = {"particle_count": options.particle_count} | _keywords(options)
 
         def make_world() -> LiveWorld:
             env, acting = make_environment(options.what, policy, device=str(device), **keywords)
@@ -146,3 +148,20 @@ def world_maker(options: ViewOptions, device: torch.device) -> Callable[[], Live
     if folder.is_dir() and any((folder / name).exists() for name in RUN_FILES):
         return lambda: RunWorld(folder, **told)
     return lambda: RuleWorld(options.what, **told)
+
+
+def _keywords(options: ViewOptions) -> dict[str, Any]:
+    """Return the keywords of the environment that were told.
+
+    Raises:
+        NPAError: One is the command's own.
+    """
+    told = named_values("options", options.options)
+    for name in OWN_KEYWORDS:
+        if name in told:
+            said = name in ("device", "policy")
+            cure = f"say --{name} {told[name]}" if said else "leave it out"
+            raise NPAError(
+                f"options must leave {name} to the command, got {name}={told[name]}: {cure}"
+            )
+    return told

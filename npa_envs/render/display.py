@@ -94,6 +94,10 @@ def show_worlds(
             "x and s must be tensors of shape [B, N, D] and [B, N, C], or with one dimension "
             "more at the front: give what rollout returns"
         )
+    if x.ndim == 4 and len(x) != len(s):
+        raise NPAError(
+            f"x and s must have as many steps, got {len(x)} and {len(s)}: give what rollout returns"
+        )
     steps = [(x, s)] if x.ndim != 4 else list(zip(x, s, strict=True))
     if not steps or 0 in x.shape:
         raise NPAError(f"x must hold at least one particle, got shape {tuple(x.shape)}")

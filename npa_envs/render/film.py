@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib
 import io
 import math
+import struct
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any, Literal
@@ -27,6 +28,9 @@ Frame = NDArray[np.uint8]
 
 GIF_HIGHEST_RATE = 50
 """Most frames a second that players show of a GIF."""
+
+GIF_LONGEST = 655.35
+"""Longest time that a GIF can show one frame [s]."""
 
 _PALETTE_SAMPLE = 2**20
 _MARGIN = 8
@@ -70,7 +74,8 @@ def write_gif(path: str | Path, frames: Iterable[Frame], fps: float = 25) -> Non
             single frames are rounded to them, the length of the film is not.
 
     Raises:
-        NPAError: No frames, a wrong shape, dtype or rate, or the file cannot be written.
+        NPAError: No frames, a wrong shape, dtype or rate, frames that are alike for longer than a
+            GIF can show one, or the file cannot be written.
     """
     pictures = checked_frames(frames)
     check_rate(fps, highest=GIF_HIGHEST_RATE)
@@ -87,10 +92,17 @@ def write_gif(path: str | Path, frames: Iterable[Frame], fps: float = 25) -> Non
     ends = [round(100 * (k + 1) / fps) for k in range(len(pictures))]
     durations = [10 * (end - start) for start, end in zip([0, *ends], ends, strict=False)]
     with atomic_path(path) as temporary:
-        indexed[0].save(
-            temporary, format="GIF", save_all=True, append_images=indexed[1:],
-            duration=durations, loop=0, optimize=False, disposal=1,
-        )  # fmt: skip
+        try:
+            indexed[0].save(
+                temporary, format="GIF", save_all=True, append_images=indexed[1:],
+                duration=durations, loop=0, optimize=False, disposal=1,
+            )  # fmt: skip
+        except (OverflowError, struct.error) as error:
+            # Pillow writes frames that are alike as one; its time has 16 bits.
+            raise NPAError(
+                f"frames may be alike for at most {GIF_LONGEST:.0f} s in a GIF, got more at "
+                f"fps={fps:g}: raise fps, or leave some of them out"
+            ) from error
 
 
 def write_webp(
@@ -183,11 +195,8 @@ def write_filmstrip(
     """
     pictures = checked_frames(frames)
     count = len(pictures)
-    if captions is not None and len(captions) != count:
-        raise NPAError(
-            f"captions must be as many as the frames, {count}, got {len(captions)}: "
-            "give one for each frame, or None"
-        )
+    if captions is not None:
+        captions = _checked_captions(captions, count)
     across = min(count, 8) if columns is None else columns
     if isinstance(across, bool) or not isinstance(across, int) or across < 1:
         raise NPAError(f"columns must be an integer of at least 1, got {shown(columns)}: try 4")
@@ -212,6 +221,21 @@ def write_filmstrip(
             draw.text(middle, captions[k], fill=ink, font=font, anchor="ma")
     with atomic_path(path) as temporary:
         strip.save(temporary, format="PNG", optimize=True)
+
+
+def _checked_captions(captions: Any, count: int) -> list[str]:
+    texts = [] if isinstance(captions, str) or not isinstance(captions, Iterable) else [*captions]
+    if not all(isinstance(text, str) for text in texts) or (not texts and captions != []):
+        raise NPAError(
+            f"captions must be texts, one for each frame, got {shown(captions)}: give a list of "
+            "str, or None"
+        )
+    if len(texts) != count:
+        raise NPAError(
+            f"captions must be as many as the frames, {count}, got {len(texts)}: "
+            "give one for each frame, or None"
+        )
+    return texts
 
 
 def check_rate(fps: float, *, highest: float = 1000) -> None:

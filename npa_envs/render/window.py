@@ -13,6 +13,7 @@ from typing import Any, Self
 import numpy as np
 
 from npa_envs.errors import MissingDependencyError, NPAError, shown
+from npa_envs.ops.checks import checked_count
 from npa_envs.render.film import Frame, check_rate
 
 _SETTINGS = {
@@ -49,12 +50,9 @@ class Window:
         self, title: str, size: int | tuple[int, int] = 512, *, fps: float | None = None
     ) -> None:
         global _shown
-        width, height = (size, size) if isinstance(size, int) else size
-        if min(width, height) < 1:
-            raise NPAError(f"size must be at least 1 pixel each way, got {shown(size)}: try 512")
         if fps is not None:
             check_rate(fps)
-        self.size = (width, height)
+        self.size = _checked_size(size)
         """Width and height [screen pixels]."""
         self.fps = fps
         """Most frames shown a second; None: no limit."""
@@ -154,6 +152,20 @@ class Window:
     ) -> None:
         """Close the window."""
         self.close()
+
+
+def _checked_size(size: Any) -> tuple[int, int]:
+    sides = size if isinstance(size, tuple | list) else (size, size)
+    try:
+        width, height = (checked_count("size", side) for side in sides)
+    except ValueError:
+        width = height = 0
+    if min(width, height) < 1:
+        raise NPAError(
+            f"size must be a whole number of pixels, at least 1, or two of them, got "
+            f"{shown(size)}: try 512"
+        )
+    return width, height
 
 
 def _import_pygame() -> Any:

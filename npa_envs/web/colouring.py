@@ -94,8 +94,10 @@ class Colouring:
 
     def _components(self, s: Tensor) -> Tensor:
         """Return the first three principal components as colours; the basis moves slowly."""
-        centred = (s - s.mean(dim=0)).double()
-        covariance = centred.T @ centred / len(s)
+        # One particle that is no number would end the basis of all, for good.
+        known = s[s.isfinite().all(dim=-1)].double()
+        mean = known.mean(dim=0)
+        covariance = (known - mean).T @ (known - mean) / max(len(known), 1)
         if self._covariance is None or self._covariance.shape != covariance.shape:
             self._covariance, self._basis = covariance, None
         self._covariance = BALANCE * self._covariance + (1.0 - BALANCE) * covariance
@@ -108,7 +110,7 @@ class Colouring:
             basis = basis * torch.where(sign == 0, 1.0, sign)
         self._basis = basis
         width = values[-count:].flip(0).clamp_min(1e-12).sqrt().to(s.device)
-        parts = 0.5 + 0.22 * (centred @ basis) / width
+        parts = 0.5 + 0.22 * ((s.double() - mean) @ basis) / width
         return torch.nn.functional.pad(parts, (0, 3 - count), value=0.5)
 
 

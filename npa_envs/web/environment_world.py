@@ -6,6 +6,7 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 import gymnasium
+import torch
 from torch import Tensor
 
 from npa_envs.agents.policies import RandomPolicy, RulePolicy, ZeroPolicy
@@ -13,6 +14,7 @@ from npa_envs.errors import NPAError, shown, suggest
 from npa_envs.registration import ALL, CODED, GARDEN_IDS
 from npa_envs.rule.files import load_rule
 from npa_envs.rule.rule import COLOUR_OFFSET
+from npa_envs.tasks.checks import is_whole
 from npa_envs.tasks.damage import DAMAGE_SIZES, damage_worlds
 from npa_envs.tasks.point_classification import PointClassification, class_colours
 from npa_envs.web.colouring import Colouring, Seen, shows_of
@@ -31,7 +33,8 @@ def make_environment(
         keywords: More of its keywords; None leaves one as it is.
 
     Raises:
-        NPAError: There is no such environment or rule, or the rule does not fit.
+        NPAError: There is no such environment or rule, the rule does not fit, or a keyword is
+            wrong.
     """
     others = {*GARDEN_IDS, *(environment.id for environment in CODED)}
     if id in others:
@@ -45,6 +48,12 @@ def make_environment(
     simple = {"zero": ZeroPolicy, "random": RandomPolicy}
     rule = None if policy in simple else load_rule(policy, device=device).float()
     told = {name: value for name, value in keywords.items() if value is not None}
+    limit = told.get("max_episode_steps", 1)
+    if not is_whole(limit) or limit < 1:
+        # Gymnasium checks this one itself, in its own words.
+        raise NPAError(
+            f"max_episode_steps must be a whole number of at least 1, got {shown(limit)}: try 512"
+        )
     env = gymnasium.make(id, disable_env_checker=True, device=device, output="torch", **told)
     return env, simple[policy](env) if rule is None else RulePolicy(rule, env)
 
@@ -134,8 +143,12 @@ class EnvironmentWorld(Live):
             self._return += float(reward)
             if before is not None:
                 physics = self._inner.worlds.physics
-                way = (self._inner.particles()[0] - before).norm(dim=-1)
-                self._travelled = way[None] / max(physics.reach, 1e-12)
+                way = self._inner.particles()[0] - before
+                if physics.box is not None:
+                    # Not across the whole box, but over its edge.
+                    sides = way.new_tensor(physics.box)
+                    way = way - sides * torch.round(way / sides)
+                self._travelled = way.norm(dim=-1)[None] / max(physics.reach, 1e-12)
             if ended or late:
                 self._ended = (
                     f"; the last one ended after {self.step} steps: "

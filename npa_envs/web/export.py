@@ -103,7 +103,7 @@ def _scope(module: str) -> str:
 
 
 def export_web(
-    sources: Sequence[str],
+    sources: Sequence[str | Path],
     path: str | Path,
     *,
     title: str | None = None,
@@ -147,18 +147,36 @@ def export_web(
             )
     if title is not None and not isinstance(title, str):
         raise NPAError(f"title must be text, or None for the first rule's name, got {shown(title)}")
-    names = [name_of(source) for source in sources]
-    if not names or len(set(names)) < len(names):
-        raise NPAError(f"a page needs rules of different names, got {shown(names)}")
+    words = [str(source) for source in sources]
+    names = distinct_names(words, "a page")
     seed = checked_seed(seed)
     # Where it cannot be written is told before previews are grown.
     with atomic_path(path) as temporary:
-        rules = [page_rule(source, particle_count=particle_count) for source in sources]
+        rules = [page_rule(source, particle_count=particle_count) for source in words]
         if previews:
-            for source, rule in zip(sources, rules, strict=True):
+            for source, rule in zip(words, rules, strict=True):
                 rule["preview"] = preview(source, particle_count=particle_count)
         text = page_text(rules, title=title or names[0], seed=seed)
         temporary.write_bytes(text.encode())
+
+
+def distinct_names(sources: Sequence[str], what: str) -> list[str]:
+    """Return what rules are called by their sources, in one file.
+
+    Args:
+        sources: Each as `load_rule` takes it.
+        what: What errors call that file.
+
+    Raises:
+        NPAError: There are none, or two have one name.
+    """
+    names = [name_of(source) for source in sources]
+    if not names or len(set(names)) < len(names):
+        raise NPAError(
+            f"{what} needs rules of different names, got {shown(names)}: leave one out, or give "
+            "its file another name"
+        )
+    return names
 
 
 def page_rule(source: str, *, particle_count: int | None = None) -> dict[str, Any]:

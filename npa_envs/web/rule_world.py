@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import time
 from collections.abc import Mapping
 from pathlib import Path
@@ -13,10 +14,17 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from npa_envs.errors import NPAError, shown, suggest
-from npa_envs.rule.files import load_rule, rule_file, shipped_rules
+from npa_envs.files import open_regular, parse_json
+from npa_envs.rule.files import load_rule, rule_file, rule_metadata, shipped_rules
 from npa_envs.rule.rule import NPARule
-from npa_envs.tasks.base import PictureTask, coded_states, seed_worlds, task_toward
-from npa_envs.tasks.checks import is_real
+from npa_envs.tasks.base import (
+    PictureTask,
+    coded_states,
+    seed_worlds,
+    task_for_rule,
+    task_toward,
+)
+from npa_envs.tasks.checks import is_real, is_whole
 from npa_envs.tasks.co_morphogenesis2d import CoMorphogenesis2DConfig
 from npa_envs.tasks.damage import DAMAGE_SIZES, damage_worlds
 from npa_envs.tasks.point_classification import PointClassification, class_colours
@@ -24,8 +32,8 @@ from npa_envs.tasks.seeds import uniform_ball
 from npa_envs.tasks.train_config import TrainConfig
 from npa_envs.training.overrides import load_config
 from npa_envs.training.presets import preset
-from npa_envs.training.run_folder import JsonlLog, RunFolder
-from npa_envs.training.trained_tasks import TrainedTask, task_of_rule
+from npa_envs.training.run_folder import RunFolder
+from npa_envs.training.trained_tasks import TrainedTask, task_of_rule, trained_config
 from npa_envs.web.colouring import Colouring, Seen, shows_of
 from npa_envs.web.live import Frame, Live, Range, Touch, brushed, checked_seed
 from npa_envs.world.brushes import erase_state, inside_ball, removed
@@ -44,6 +52,9 @@ SMALL_VIEWS = {"resolution": 64, "training_views": 1, "held_out_views": 6}
 
 MOST_TASKS = 8
 """Tasks that are kept, with their targets: a slider of N asks for many."""
+
+LARGEST_LOG = 2**29
+"""Bytes of a run's log, at most."""
 
 POLL_SECONDS = 1.0
 """Time between two looks into the folder of a run [s]."""
@@ -334,8 +345,7 @@ class RuleWorld(Live):
     def _damage(self, name: str) -> None:
         if self.x.shape[1]:
             self.x, s = damage_worlds(self.x, self.s, kind=name, generator=self._generator)
-            parts = zip(self.organisms, s.split_with_sizes(self.counts, dim=1), strict=True)
-            self.s = torch.cat([self._coded(organism, part) for organism, part in parts], dim=1)
+            self.s = self._all_coded(s)
 
     @torch.no_grad()
     def _brush(self, message: Mapping[str, Any]) -> bool:
@@ -378,6 +388,11 @@ class RuleWorld(Live):
         s = torch.cat((self.s, fresh), dim=1)
         self._arrange(x, s, torch.nn.functional.pad(self._species(), (0, count), value=number))
 
+    def _all_coded(self, s: Tensor) -> Tensor:
+        """Return states of all particles, each with the code of its species."""
+        parts = zip(self.organisms, s.split_with_sizes(self.counts, dim=1), strict=True)
+        return torch.cat([self._coded(organism, part) for organism, part in parts], dim=1)
+
     def _coded(self, organism: Organism, s: Tensor) -> Tensor:
         """Return states of a species with the code that its rule gives them, where it has such."""
         if organism.rule.codes is None:
@@ -412,6 +427,9 @@ class RuleWorld(Live):
     def _arrange(self, x: Tensor, s: Tensor, species: Tensor) -> None:
         """Take particles in any order, and put them species after species."""
         order = species.argsort(stable=True)
+        if not torch.equal(order, torch.arange(self.x.shape[1], device=order.device)):
+            # The page's tracers follow particles by their place.
+            self._news.append({"type": "reordered"})
         counts = torch.bincount(species, minlength=len(self.organisms)).tolist()
         living = [k for k, count in enumerate(counts) if count] or [0]
         self.x, self.s = x[:, order], s[:, order]
@@ -426,6 +444,62 @@ def name_of(source: str) -> str:
         return source.rpartition("#")[2]
     path = rule_file(source)
     return path.resolve().parent.name if path.name == "rule.safetensors" else path.stem
+
+
+class FollowedLog:
+    """The log of a run that goes on: each call reads what has been added since the last one.
+
+    Args:
+        path: The file that the run's `JsonlLog` writes.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._seen: tuple[int, ...] = ()
+        self._end = 0
+        self._last_line = b""
+        self.iteration = -1
+        """That of the last record; -1: there is none yet."""
+
+    def news(self) -> tuple[list[dict[str, Any]], bool]:
+        """Return the records that are new, and whether the log begins anew with them.
+
+        Lines that are no records are left out: the run itself complains of them.
+
+        Raises:
+            NPAError: The file cannot be read.
+        """
+        try:
+            now = self._path.stat()
+        except FileNotFoundError:
+            self._forget()
+            return [], False
+        if (seen := (now.st_ino, now.st_size, now.st_mtime_ns)) == self._seen:
+            return [], False
+        self._seen = seen
+        with open_regular(self._path, limit=LARGEST_LOG, what="the log") as file:
+            file.seek(self._end - len(self._last_line))
+            if file.read(len(self._last_line)) != self._last_line:
+                # A resumed run has gone back to its checkpoint, or another one has begun here.
+                self._forget()
+                file.seek(0)
+            text = file.read(LARGEST_LOG)
+        # What stands behind the last end of a line is being written.
+        text = text[: text.rfind(b"\n") + 1]
+        anew = self.iteration < 0
+        records = []
+        for line in text.splitlines(keepends=True):
+            self._end += len(line)
+            self._last_line = line
+            with contextlib.suppress(NPAError):
+                record = parse_json(line)
+                if isinstance(record, dict) and is_whole(record.get("iteration")):
+                    self.iteration = record["iteration"]
+                    records.append(record)
+        return records, anew
+
+    def _forget(self) -> None:
+        self._end, self._last_line, self.iteration = 0, b"", -1
 
 
 class RunWorld(RuleWorld):
@@ -450,7 +524,7 @@ class RunWorld(RuleWorld):
         particle_count: int | None = None,
     ) -> None:
         self._run_folder = RunFolder(folder)
-        self._log = JsonlLog(self._run_folder.log)
+        self._log = FollowedLog(self._run_folder.log)
         files = rules_of_run(self._run_folder)
         self._files = {name_of(str(path)): path for path in files}
         self._centres = [0.0]
@@ -460,13 +534,13 @@ class RunWorld(RuleWorld):
             self._centres = list(config.task.centres)
         self._each = None if particle_count is None else max(1, particle_count // len(files))
         self._written = self._stamp()
-        self._logged = 0
         self._iteration = 0
         self._due = 0.0
         choices = {name: str(path) for name, path in self._files.items()}
         super().__init__(
             str(files[0]), device=device, seed=seed, particle_count=self._each, choices=choices
         )
+        self._goals = self._told_goals()
 
     @torch.no_grad()
     def reset(self, seed: int | None) -> None:
@@ -519,25 +593,20 @@ class RunWorld(RuleWorld):
         return [path.stat().st_mtime_ns if path.exists() else 0 for path in self._files.values()]
 
     def _poll(self) -> None:
-        records = self._log.records()
-        if len(records) < self._logged:
-            # The run was begun anew, or went back to its checkpoint.
-            self._logged = 0
-        fresh = records[self._logged :]
+        fresh, anew = self._log.news()
         if fresh:
-            self._iteration = int(fresh[-1].get("iteration", 0))
+            self._iteration = self._log.iteration
             points = [
                 [record["iteration"], record["loss"]]
                 for record in fresh
-                if is_real(record.get("loss")) and is_real(record.get("iteration"))
+                if is_real(record.get("loss"))
             ]
             self._news.append(
                 {
                     "type": "curve", "name": "Training loss", "points": points,
-                    "append": self._logged > 0,
+                    "append": not anew,
                 }
             )  # fmt: skip
-            self._logged = len(records)
         written = self._stamp()
         fresher = written != self._written
         if fresher:
@@ -553,14 +622,33 @@ class RunWorld(RuleWorld):
             name: load_rule(path, device=self._device).float() for name, path in self._files.items()
         }
         own = {name: self._organism(name).rule for name in fresh}
-        if all(fresh[k].hyper_parameters() == own[k].hyper_parameters() for k in own):
+        goals = self._told_goals()
+        # What follows from the rules as they were, such as the codes of their targets.
+        self._trained.clear()
+        if goals == self._goals and all(
+            fresh[k].hyper_parameters() == own[k].hyper_parameters() for k in own
+        ):
             for name, rule in own.items():
                 rule.load_state_dict(fresh[name].state_dict())
+            task = task_for_rule(self.task, self.main.rule)
+            self.trained = TrainedTask(task, self.trained.doubt)
+            with torch.no_grad():
+                self.s = self._all_coded(self.s)
         else:
             # Another run has begun in this folder.
             self._rules.clear()
-            self._trained.clear()
             self._plant(self.main.name, self._each)
+            self._news.append({"type": "reordered"})
+        self._goals = goals
+
+    def _told_goals(self) -> list[Any]:
+        """Return what the rules' files say that they are trained on."""
+        found: list[Any] = []
+        for path in self._files.values():
+            metadata = rule_metadata(path)
+            held = trained_config(path, metadata).task if "config" in metadata else None
+            found.append((metadata.get("task"), held))
+        return found
 
 
 def joint_preset() -> TrainConfig[CoMorphogenesis2DConfig]:

@@ -18,7 +18,7 @@ import socket
 import struct
 import threading
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -413,20 +413,19 @@ class Session:
         threading.Thread(target=self._write_film, args=(film,), daemon=True).start()
 
     def _write_film(self, film: Film) -> None:
+        token = "" if self._site.token is None else f"?token={self._site.token}"
         try:
-            paths = film.write(self._site.films)
+            for path in film.write(self._site.films):
+                self._tell({"type": "file", "name": path.name, "url": f"films/{path.name}{token}"})
         except NPAError as error:
             self._tell({"type": "error", "message": str(error)})
-            return
-        token = "" if self._site.token is None else f"?token={self._site.token}"
-        for path in paths:
-            self._tell({"type": "file", "name": path.name, "url": f"films/{path.name}{token}"})
 
     def _add_picture(self, data: bytes) -> None:
         # Pictures that were on the way when the film ended are left out.
         if self._film is not None:
             self._film.add(data)
             if self._film.is_full:
+                self._tell({"type": "film", "action": "stop"})
                 self._end_film()
 
 
@@ -459,8 +458,8 @@ class Film:
             )
         self._pictures.append(data)
 
-    def write(self, folder: Path) -> list[Path]:
-        """Write the film as MP4 and as GIF, and return the files.
+    def write(self, folder: Path) -> Iterator[Path]:
+        """Write the film as GIF and as MP4; each file is given as soon as it is there.
 
         Raises:
             NPAError: It has no pictures, one is damaged, or a file cannot be written.
@@ -473,13 +472,17 @@ class Film:
                 for data in self._pictures
             ]
             folder.mkdir(parents=True, exist_ok=True)
-            name = time.strftime("film-%Y%m%d-%H%M%S")
-            paths = [folder / f"{name}.mp4", folder / f"{name}.gif"]
-            write_mp4(paths[0], frames, FILM_RATE)
-            write_gif(paths[1], frames, FILM_RATE)
+            # Readers may stop their films in one second.
+            name = f"{time.strftime('film-%Y%m%d-%H%M%S')}-{secrets.token_hex(3)}"
+            # A GIF needs no ffmpeg.
+            for suffix, write in ((".gif", write_gif), (".mp4", write_mp4)):
+                path = folder / f"{name}{suffix}"
+                write(path, frames, FILM_RATE)
+                yield path
+        except NPAError:
+            raise
         except (OSError, ValueError) as error:
             raise NPAError(f"the film cannot be written: {error}") from error
-        return paths
 
 
 def _parsed(text: str) -> dict[str, Any] | str:
@@ -513,9 +516,11 @@ def open_port(host: str, port: int | None) -> socket.socket:
         try:
             family, *_, address = socket.getaddrinfo(host, number, type=socket.SOCK_STREAM)[0]
             listener = socket.socket(family, socket.SOCK_STREAM)
-        except OSError as error:
+        except (OSError, UnicodeError) as error:
+            why = getattr(error, "strerror", None) or error
             raise NPAError(
-                f"host must be an address of this computer, got {shown(host)} ({error.strerror})"
+                f"host must be an address of this computer, got {shown(host)} ({shown(why)}): try "
+                "127.0.0.1"
             ) from error
         try:
             # The port of a server that has just ended may be taken at once, one that serves not.

@@ -14,8 +14,8 @@ import pytest
 import torch
 from PIL import Image
 
-from npa_envs.cli import COMMANDS, doctor, main
-from npa_envs.cli.film import Film
+from npa_envs.cli import COMMANDS, demo, doctor, main
+from npa_envs.cli.film import Film, film_world
 from npa_envs.cli.output import EXAMPLES, torch_threads
 from npa_envs.cli.train import thread_count
 from npa_envs.errors import NPAError
@@ -617,3 +617,29 @@ def test_demo_shows_growth_healing_and_training(tmp_path, rule, capsys):
     written = {Path(name) for name in re.findall(r"wrote (\S+)", text)}
     assert {path.suffix for path in written} == {".gif", ".mp4", ".png", ".txt", ".safetensors"}
     assert all(path.is_file() for path in written)
+
+
+@pytest.mark.parametrize("source", ["digits", "seven-pictures"])
+def test_demo_grows_rules_with_goals_and_with_codes(source, tmp_path, monkeypatch, capsys):
+    if source == "digits":
+        pytest.importorskip("sklearn")
+    seen = []
+
+    def watched(rule, task, x, s, steps, **told):
+        seen.append(s)
+        return film_world(rule, task, x, s, steps, **told)
+
+    monkeypatch.setattr("npa_envs.cli.film.film_world", watched)
+    monkeypatch.setattr(demo, "train_small", lambda *_: None)
+    for name in ("GROW_STEPS", "HEAL_STEPS"):
+        monkeypatch.setattr(demo, name, 8)
+    words = ["demo", "--rule", source, "--out", str(tmp_path), "--no-progress"]
+    assert main(words) == 0
+    assert "no figures" not in capsys.readouterr().out
+    assert len(seen) == 3
+    assert not torch.equal(seen[0], seen[1])
+    codes = load_rule(source).codes
+    if codes is not None:
+        # Damage has not taken it away.
+        for s in seen:
+            assert torch.equal(s[0, :, :8], codes[codes.names[0]].float().expand(s.shape[1], 8))

@@ -329,3 +329,33 @@ class TestCommand:
         assert main(["interact", str(unknown), "--out", str(tmp_path / "out")]) == 2
         assert "does not say what it grows: leave it out" in capsys.readouterr().err
         assert not (tmp_path / "out").exists()
+
+    def test_pairs_whose_names_look_alike_have_files_of_their_own(self, rules, tmp_path, capsys):
+        pytest.importorskip("matplotlib")
+        for number, name in enumerate(("p", "p-q", "q-r", "r")):
+            path = tmp_path / f"{name}.safetensors"
+            save_rule(make_rule(number), path, metadata=rules_metadata(rules))
+        paths = [str(tmp_path / f"{name}.safetensors") for name in ("p", "p-q", "q-r", "r")]
+        words = ["--seed-count", "1", "--steps", "2", "--distances", "0", "--no-itself"]
+        words += ["--eps-factors", "1", "1.5", "--out", str(tmp_path / "out"), "--no-progress"]
+        assert main(["interact", *paths, *words]) == 0
+        names = {path.name for path in (tmp_path / "out").glob("*.png")}
+        # 4 rules, each beside 3 others.
+        pairs = {name for name in names if not name.startswith(("phases-", "interactions"))}
+        assert len(pairs) == 12
+        assert {"p-q-r.png", "p-q-r-2.png"} < pairs
+        assert {f"phases-{name}" for name in pairs} < names
+
+    def test_quick_leaves_what_was_said(self, rules, tmp_path, capsys):
+        paths = [str(rules / f"{name}.safetensors") for name in ("one", "two")]
+        words = ["--quick", "--steps", "3", "--seed-count", "1", "--distances", "0", "0.5", "1"]
+        words += ["--out", str(tmp_path), "--no-progress"]
+        assert main(["interact", *paths, *words]) == 0
+        told = json.loads((tmp_path / "interactions.json").read_text())["settings"]
+        # The last is the default, and was said all the same.
+        assert (told["steps"], told["seeds"], told["distances"]) == (3, [1_000_000], [0, 0.5, 1])
+        assert told["particle_count"] == 512
+
+    def test_no_particles_are_refused(self, rules, tmp_path, capsys):
+        assert main(self.words(rules, tmp_path / "out", "--particle-count", "0")) == 2
+        assert "particle_count must be at least 2, got 0" in capsys.readouterr().err

@@ -4,6 +4,7 @@ import errno
 import os
 import shutil
 import signal
+import stat
 import subprocess
 import sys
 from pathlib import Path
@@ -12,7 +13,7 @@ from typing import Any
 import pytest
 
 from npa_envs.errors import NPAError
-from npa_envs.files import atomic_path, write_bytes, write_text
+from npa_envs.files import atomic_path, remove_unfinished, write_bytes, write_text
 
 
 def write_half_and_raise(target: Path, error: BaseException) -> None:
@@ -84,6 +85,45 @@ def test_what_cannot_be_written_to_is_named(tmp_path: Path) -> None:
         with pytest.raises(NPAError, match=message):
             write_bytes(path, b"1")
     assert list(tmp_path.iterdir()) == [tmp_path / "plain"]
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="needs pipes with a name")
+def test_pipes_and_devices_are_refused_and_stay_what_they_are(tmp_path: Path) -> None:
+    pipe = tmp_path / "pipe.json"
+    os.mkfifo(pipe)
+    (tmp_path / "link.json").symlink_to(os.devnull)
+    for path in (pipe, tmp_path / "link.json", Path(os.devnull)):
+        with pytest.raises(NPAError, match=f"{path.name}': that is a pipe or a device.*a file$"):
+            write_text(path, "{}")
+    assert pipe.is_fifo()
+    assert Path(os.devnull).is_char_device()
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["link.json", "pipe.json"]
+
+
+@pytest.mark.parametrize("stem", ["中" * 80, "é" * 120, "a" * 250], ids=len)
+def test_long_names_are_written_and_their_left_overs_found(tmp_path: Path, stem: str) -> None:
+    target = tmp_path / f"{stem}.txt"
+    with atomic_path(target) as temporary:
+        temporary.write_bytes(b"1")
+    # As a killed write leaves it behind.
+    temporary.write_bytes(b"half")
+    remove_unfinished(target)
+    assert target.read_bytes() == b"1"
+    assert list(tmp_path.iterdir()) == [target]
+
+
+def test_what_is_brought_to_the_disk_is_open_for_writing(tmp_path: Path, monkeypatch) -> None:
+    fcntl = pytest.importorskip("fcntl")
+    synced = []
+
+    def fsync(descriptor: int) -> None:
+        file = stat.S_ISREG(os.fstat(descriptor).st_mode)
+        synced.append((file, fcntl.fcntl(descriptor, fcntl.F_GETFL) & os.O_ACCMODE == os.O_RDWR))
+
+    monkeypatch.setattr(os, "fsync", fsync)
+    write_text(tmp_path / "a.txt", "1")
+    # Windows refuses to do it for a file that is open for reading only.
+    assert synced == [(True, True), (False, False)]
 
 
 def _fail_with(number: int) -> Any:

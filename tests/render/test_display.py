@@ -71,6 +71,8 @@ def test_what_cannot_be_shown_is_refused():
         show_worlds(x, s[0])
     with pytest.raises(NPAError, match="at least one particle"):
         show_worlds(x[:, :0], s[:, :0])
+    with pytest.raises(NPAError, match=r"as many steps, got 3 and 2: give what rollout returns"):
+        show_worlds(torch.stack([x] * 3), torch.stack([s] * 2))
     with pytest.raises(NPAError, match="fps must be in"):
         show_worlds(x, s, fps=0)
     with pytest.raises(NPAError, match="must be uint8"):

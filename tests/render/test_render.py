@@ -173,6 +173,14 @@ def test_mp4_holds_every_frame_at_an_even_size(tmp_path, height, width):
         assert np.abs(shown[:height, :width].astype(int) - frame).mean() < 4
 
 
+def test_a_gif_that_stands_still_for_longer_than_a_gif_can_is_refused(tmp_path):
+    still = [np.zeros((8, 8, 3), np.uint8)] * 70
+    write_gif(tmp_path / "still.gif", still[:65], fps=0.1)
+    with pytest.raises(NPAError, match=r"alike for at most 655 s in a GIF.*fps=0\.1: raise fps"):
+        write_gif(tmp_path / "long.gif", still, fps=0.1)
+    assert [path.name for path in tmp_path.iterdir()] == ["still.gif"]
+
+
 def test_filmstrip_holds_the_frames_exactly_in_rows(tmp_path):
     write_filmstrip(tmp_path / "strip.png", film(1))
     assert Image.open(tmp_path / "strip.png").size == (64 + 16, 48 + 16)
@@ -234,6 +242,9 @@ def test_wrong_rates_captions_and_columns_are_clear_errors(tmp_path):
         write_mp4(tmp_path / "film.mp4", film(), fps=0)
     with pytest.raises(NPAError, match="as many as the frames, 6, got 2"):
         write_filmstrip(tmp_path / "strip.png", film(), ["a", "b"])
+    for captions in (range(6), [None, *"abcde"], 6, "abcdef"):
+        with pytest.raises(NPAError, match="captions must be texts, one for each frame"):
+            write_filmstrip(tmp_path / "strip.png", film(), captions)
     with pytest.raises(NPAError, match="columns must be an integer of at least 1"):
         write_filmstrip(tmp_path / "strip.png", film(), columns=0)
     assert list(tmp_path.iterdir()) == []

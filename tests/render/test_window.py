@@ -151,7 +151,15 @@ def test_what_is_no_picture_is_refused(screen, frame):
         window.show(frame)
 
 
-@pytest.mark.parametrize("wrong", [{"size": 0}, {"size": (3, -1)}, {"fps": 0.0}])
+def test_a_size_may_be_one_of_numpys_integers(screen):
+    with Window("a world", np.int64(64)) as window:
+        assert window.size == (64, 64)
+
+
+WRONG_SIZES = (0, (3, -1), 12.5, "a", (1, 2, 3), (), None, True, (4.0, 4))
+
+
+@pytest.mark.parametrize("wrong", [*({"size": size} for size in WRONG_SIZES), {"fps": 0.0}])
 def test_sizes_and_rates_out_of_range_are_refused(screen, wrong):
     with pytest.raises(NPAError, match="must be"):
         Window("a world", **wrong)

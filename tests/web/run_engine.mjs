@@ -10,6 +10,7 @@ const { Physics, padded, plainKernels, prepareRule } = await load("physics.js");
 const { simdKernels } = await load("kernels_simd.js");
 const brushes = await load("brushes.js");
 const { LiveWorld } = await load("live_world.js");
+const { Colouring } = await load("colours.js");
 
 const floats = (text) => new Float32Array(Uint8Array.from(Buffer.from(text, "base64")).buffer);
 const text = (array) => Buffer.from(array.buffer, array.byteOffset, array.byteLength).toString("base64");
@@ -45,6 +46,16 @@ const acts = {
     }
     const inside = brushes.insideBall(x, dimension, at, radius, box);
     return { x: text(x), s: text(s), inside };
+  },
+
+  // Principal components of states, frame after frame.
+  components({ channels, frames }) {
+    const colouring = new Colouring(new Uint8Array(6));
+    return frames.map((s) => {
+      const bytes = new Uint8ClampedArray((3 * floats(s).length) / channels);
+      colouring.components(floats(s), channels, bytes);
+      return [...bytes];
+    });
   },
 
   // A live world: what it sends on messages and on going on.

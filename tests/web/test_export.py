@@ -318,6 +318,17 @@ def test_particles_have_the_colours_of_the_viewer(
     assert len(want.unique(dim=0)) > (0 if show == "species" else 1)
 
 
+def test_particles_that_are_no_number_leave_the_components_of_the_others_alone(run: Run) -> None:
+    s = torch.randn(40, 4, generator=torch.Generator().manual_seed(2))
+    broken = torch.cat((s, s[:2]))
+    broken[40, 1], broken[41, 0] = float("nan"), float("inf")
+    lost = torch.full_like(s, float("nan"))
+    told = run("components", channels=4, frames=[packed(part) for part in (broken, lost, s)])
+    (whole,) = run("components", channels=4, frames=[packed(s)])
+    assert told[0][:120] == whole
+    assert len(set(told[2])) > 20
+
+
 @pytest.mark.parametrize("name", ["duck", pytest.param("digits", marks=pytest.mark.slow)])
 def test_read_outs_have_the_colours_of_the_viewer(run: Run, name: str) -> None:
     if name == "digits":
@@ -401,6 +412,14 @@ def test_rules_that_a_browser_cannot_run_are_refused(rule: NPARule, message: str
         check_browser_rule(rule, "mine")
 
 
+def test_rules_are_named_by_paths_as_well(tmp_path: Path) -> None:
+    save_rule(load_rule("gecko"), tmp_path / "mine.safetensors")
+    export_web(
+        [tmp_path / "mine.safetensors"], tmp_path / "page.html", particle_count=64, previews=True
+    )
+    assert '"name":"mine"' in (tmp_path / "page.html").read_text()
+
+
 def test_bad_pages_are_refused(tmp_path: Path) -> None:
     for sources, path, message in (
         (["gecko"], "page.htm", r"must end in \.html"),
@@ -424,7 +443,8 @@ def test_the_command_writes_pages_and_collections(
     assert f"wrote {page}" in capsys.readouterr().out
     names = re.findall(r'"name":"(\w+)"', page.read_text())
     assert names == ["gecko", "run"]
-    assert main(["export-web", "gecko", "--out", str(collection)]) == 0
+    assert main(["export-web", "gecko", "--out", str(collection), "--particle-count", "77"]) == 0
+    assert '"N0": 77' in collection.read_text()
     assert torch.equal(
         load_rule(f"{collection}#gecko").output.weight, load_rule("gecko").output.weight
     )
@@ -433,6 +453,11 @@ def test_the_command_writes_pages_and_collections(
     for words, error in (
         ([], "RULE"),
         (["duck"], "runs rules with space_dim=2 only, 'duck' has 3"),
+        (["gecko", "heart", "gecko"], "a collection needs rules of different names"),
+        (["gecko", "--title", "mine"], "title is for pages, got --title with a collection"),
+        (["gecko", "--gallery"], "gallery is for pages, got --gallery with"),
+        (["--gallery"], "gallery is for pages, got --gallery with"),
+        (["gecko", "--particle-count", "0"], "particle_count must be at least 1"),
         ([str(tmp_path / "unfinished")], "must hold the rule.safetensors of a run"),
     ):
         assert main(["export-web", *words, "-o", str(collection)]) == 2

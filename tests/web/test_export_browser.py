@@ -66,9 +66,9 @@ def test_an_exported_page_lives_and_is_touched(
     # Another world may come before a frame of the last one was drawn.
     before = page.run(STEP)
     waits = page.run(
-        "document.page.fresh = true;"
+        "document.page.undrawn = 1;"
         "document.page.listen({ ...document.page.world, type: 'world', half_width: 2 });"
-        "document.page.fresh"
+        "document.page.undrawn"
     )
     assert not waits
     page.wait(f"{STEP} > {before} + 2")

@@ -14,10 +14,13 @@ import torch
 
 from npa_envs import NPAError, load_rule, rollout, rollout_species, save_rule
 from npa_envs.agents.policies import ZeroPolicy
-from npa_envs.rule.files import rule_metadata, shipped_rules
-from npa_envs.rule.rule import dividing
+from npa_envs.files import open_regular
+from npa_envs.rule.files import first_rules, rule_metadata, shipped_rules
+from npa_envs.rule.rule import NPARule, dividing
 from npa_envs.tasks.damage import DAMAGE_SIZES
 from npa_envs.training import config_to_dict, preset
+from npa_envs.training.run_folder import JsonlLog
+from npa_envs.web import rule_world
 from npa_envs.web.colouring import Colouring, Seen, signed_colours, species_colours
 from npa_envs.web.environment_world import EnvironmentWorld, make_environment
 from npa_envs.web.rule_world import RuleWorld, RunWorld
@@ -116,6 +119,9 @@ def test_erase_takes_particles_and_the_others_feel_it_nearby_only(world, gecko):
     assert not world.handle(brush("erase", at=[-0.2, 0.0], radius=0.15))
     frame = world.frame()
     assert 0 < len(frame.positions) < COUNT
+    assert world.news() == [{"type": "reordered"}]
+    world.handle(brush("erase", at=[5.0, 5.0]))
+    assert world.news() == []
     assert np.linalg.norm(frame.positions - [-0.2, 0.0], axis=1).min() > 0.15
     assert far.sum() > 3
     for live in (world, other):
@@ -219,6 +225,8 @@ def test_grafts_follow_the_other_rule(world):
     assert world.counts == [COUNT - inside.sum(), inside.sum()]
     # Species after species: those within follow the second.
     assert inside[world.counts[0] :].all()
+    # The page's tracers must know.
+    assert world.news() == [{"type": "reordered"}]
     world.advance()
     world.handle({"type": "set", "name": "show", "value": "species"})
     np.testing.assert_array_equal(
@@ -427,6 +435,20 @@ def test_components_do_not_flip_from_frame_to_frame():
     assert first.std() > 20
 
 
+def test_particles_that_are_no_number_leave_the_components_of_the_others_alone():
+    whole = seen()
+    s = torch.cat((whole.s, whole.s[:, :2]), dim=1)
+    s[0, 50, 1], s[0, 51, 2] = float("nan"), float("inf")
+    broken = seen(x=torch.cat((whole.x, whole.x[:, :2]), dim=1), s=s, counts=[52])
+    colouring = Colouring()
+    np.testing.assert_array_equal(
+        colouring("components", broken)[:50], Colouring()("components", whole)
+    )
+    # Nothing of it is remembered, nor does a world of nothing else end the page.
+    colouring("components", seen(s=torch.full_like(whole.s, float("nan"))))
+    assert colouring("components", whole).std() > 20
+
+
 def test_crowded_particles_are_brighter():
     crowd = torch.cat((0.01 * torch.rand(1, 25, 2), 1.0 + torch.rand(1, 25, 2)), dim=1)
     colours = Colouring()("density", seen(x=crowd)).astype(int).sum(axis=1)
@@ -442,15 +464,23 @@ def test_species_have_colours_of_their_own():
 # Runs.
 
 
-def write_run(folder: Path, name: str = "gecko") -> None:
+def write_run(folder: Path, name: str = "gecko", rule: NPARule | None = None) -> None:
     folder.mkdir(exist_ok=True)
-    path = shipped_rules()[name]
-    metadata = rule_metadata(path)
+    metadata = rule_metadata((shipped_rules() | first_rules())[name])
     told = {key: metadata[key] for key in ("task", "config") if key in metadata}
-    save_rule(load_rule(name), folder / "rule.safetensors", metadata=told)
+    save_rule(rule or load_rule(name), folder / "rule.safetensors", metadata=told)
     (folder / "config.json").write_text("{}")
     if not (folder / "log.jsonl").exists():
         log(folder, 0, 10)
+
+
+def trained_on(name: str) -> NPARule:
+    """A rule with other weights, as a run has it some iterations later."""
+    rule = load_rule(name)
+    with torch.no_grad():
+        for parameter in rule.parameters():
+            parameter.mul_(0.9)
+    return rule
 
 
 def log(folder: Path, first: int, end: int) -> None:
@@ -471,11 +501,14 @@ def test_a_run_is_followed(tmp_path):
     assert world.news() == []
     world.advance()
     x = world.x
-    write_run(folder, "heart")
+    newer = trained_on("gecko")
+    write_run(folder, rule=newer)
     log(folder, 10, 12)
     world._due = 0.0
     curve, told = (event for event in world.news() if event["type"] != "error")
-    assert torch.equal(world.main.rule.hidden.weight, load_rule("heart").hidden.weight)
+    assert (curve["points"], curve["append"]) == ([[10, 1.0 / 11], [11, 1.0 / 12]], True)
+    assert told["note"] == "a training run, iteration 11"
+    assert torch.equal(world.main.rule.hidden.weight, newer.hidden.weight)
     # The world lives on.
     assert world.x is x
     assert world.step == 1
@@ -506,7 +539,9 @@ def test_a_run_of_several_rules_is_one_world_of_them(tmp_path):
         )  # fmt: skip
     assert torch.equal(world.x, x)
     # A newer checkpoint.
-    save_rule(rules[0], folder / "rule-1.safetensors")
+    path = folder / "rule-1.safetensors"
+    told = {name: rule_metadata(path)[name] for name in ("task", "config")}
+    save_rule(rules[0], path, metadata=told)
     world._due = 0.0
     world.news()
     assert torch.equal(world.organisms[1].rule.hidden.weight, rules[0].hidden.weight)
@@ -520,18 +555,109 @@ def test_another_run_in_the_folder_is_another_world(tmp_path):
     world.news()
     write_run(tmp_path, "dots")
     world._due = 0.0
-    (told,) = world.news()
+    reordered, told = world.news()
+    assert reordered == {"type": "reordered"}
     assert told["box"] == [2.0, 2.0]
     world.advance()
     assert world.frame().step == 1
+
+
+def test_another_run_with_another_picture_is_another_world(tmp_path):
+    write_run(tmp_path)
+    world = RunWorld(tmp_path, device=CPU, particle_count=COUNT)
+    world.advance()
+    # Of the same sizes.
+    write_run(tmp_path, "heart")
+    world._due = 0.0
+    assert world.news()[-1]["type"] == "world"
+    assert world.task.config.target == "heart"
+    assert world.step == 0
+    world.advance()
+    write_run(tmp_path, "heart", trained_on("heart"))
+    world._due = 0.0
+    world.news()
+    assert world.step == 1
+
+
+def test_particles_carry_the_codes_of_the_newest_rule(tmp_path):
+    write_run(tmp_path, "seven-pictures")
+    world = RunWorld(tmp_path, device=CPU, particle_count=64)
+    world.advance()
+    newer = trained_on("seven-pictures")
+    code = newer.codes.table[0].detach()
+    assert not torch.equal(world.s[0, 0, :8], code)
+    rest = world.s[..., 8:].clone()
+    write_run(tmp_path, "seven-pictures", newer)
+    world._due = 0.0
+    world.news()
+    assert torch.equal(world.s[0, :, :8], code.expand(64, 8))
+    assert torch.equal(world.s[..., 8:], rest)
+    world.handle({"type": "reset"})
+    assert torch.equal(world.s[0, :, :8], code.expand(64, 8))
+
+
+def test_of_a_log_only_what_is_new_is_read(tmp_path, monkeypatch):
+    write_run(tmp_path)
+    world = RunWorld(tmp_path, device=CPU, particle_count=COUNT)
+    path = tmp_path / "log.jsonl"
+
+    def points():
+        world._due = 0.0
+        return [(event["append"], event["points"]) for event in world.news() if "points" in event]
+
+    assert len(points()[0][1]) == 10
+    opened = []
+    monkeypatch.setattr(
+        rule_world, "open_regular", lambda *a, **k: opened.append(a) or open_regular(*a, **k)
+    )
+    assert points() == []
+    assert opened == []
+    # What was read before is not looked at again.
+    with path.open("r+") as file:
+        file.write("X")
+    log(tmp_path, 10, 11)
+    assert points() == [(True, [[10, 1.0 / 11]])]
+    assert len(opened) == 1
+
+
+def test_a_log_that_begins_anew_or_goes_back_is_told_from_its_start(tmp_path):
+    write_run(tmp_path)
+    world = RunWorld(tmp_path, device=CPU, particle_count=COUNT)
+    path = tmp_path / "log.jsonl"
+
+    def points():
+        world._due = 0.0
+        return [(event["append"], event["points"]) for event in world.news() if "points" in event]
+
+    points()
+    # A resumed run drops the lines after its checkpoint.
+    JsonlLog(path).truncate(4)
+    assert points() == [(False, [[k, 1.0 / (k + 1)] for k in range(5)])]
+    # Another run, which may be written over the same place of the disk, and be longer already.
+    with path.open("r+") as file:
+        file.write("".join(f'{{"iteration": {k}, "loss": 2.0}}\n' for k in range(20)))
+    assert points() == [(False, [[k, 2.0] for k in range(20)])]
+    path.write_text("")
+    assert points() == []
+    log(tmp_path, 0, 2)
+    assert points() == [(False, [[0, 1.0], [1, 0.5]])]
+    path.unlink()
+    assert points() == []
+    log(tmp_path, 0, 1)
+    assert points() == [(False, [[0, 1.0]])]
 
 
 def test_a_line_that_is_being_written_waits(tmp_path):
     write_run(tmp_path)
     with (tmp_path / "log.jsonl").open("a") as file:
         file.write('{"iteration": 10, "lo')
-    curve = RunWorld(tmp_path, device=CPU, particle_count=COUNT).news()[0]
+    world = RunWorld(tmp_path, device=CPU, particle_count=COUNT)
+    curve = world.news()[0]
     assert curve["points"][-1] == [9, 0.1]
+    with (tmp_path / "log.jsonl").open("a") as file:
+        file.write('ss": 0.25}\n')
+    world._due = 0.0
+    assert world.news()[0]["points"] == [[10, 0.25]]
 
 
 def test_a_rule_that_is_damaged_meanwhile_is_told_and_the_world_lives_on(tmp_path):
@@ -560,6 +686,25 @@ def test_an_unfinished_run_is_refused_in_words(tmp_path):
 
 
 # Environments.
+
+
+def test_the_speed_of_a_step_across_an_edge_of_the_box_is_that_of_the_step():
+    env = gymnasium.make(
+        "npa/Texture-v0", particle_count=64, resolution=16, target="dots",
+        disable_env_checker=True,
+    )  # fmt: skip
+    action = np.zeros(env.action_space.shape, np.float32)
+    action[:, 0] = 1.0
+    world = EnvironmentWorld(env, lambda seen: action)
+    x, s = world._inner.particles()
+    x[:, 0] = 1.0 - 1e-4
+    world._place(x[None], s[None])
+    world.handle({"type": "set", "name": "show", "value": "speed"})
+    world.advance()
+    after = world._inner.particles()[0]
+    assert int((after[:, 0] < 0).sum()) > 10
+    assert 0.0 < float(world._travelled.max()) <= 1.0 + 1e-5
+    world.close()
 
 
 @pytest.fixture

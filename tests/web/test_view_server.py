@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from npa_envs import NPAError
+from npa_envs.errors import MissingDependencyError, NPAError
 from npa_envs.web.live import Frame
 
 pytest.importorskip("uvicorn")
@@ -99,6 +99,13 @@ def next_error(reader) -> str:
             return json.loads(message["text"])["message"]
         if "bytes" in message:
             reader.send_json({"type": "drawn"})
+
+
+def next_event(reader, *kinds) -> dict:
+    while True:
+        event = json.loads(reader.receive().get("text", "{}"))
+        if event.get("type") in kinds:
+            return event
 
 
 def test_the_page_and_its_files_are_served(client):
@@ -377,13 +384,47 @@ def test_a_film_that_is_long_enough_ends_by_itself(client, site, monkeypatch):
         reader.send_json({"type": "film", "action": "start"})
         for _ in range(5):
             reader.send_bytes(jpeg())
-        while True:
-            message = reader.receive()
-            if json.loads(message.get("text", "{}")).get("type") == "file":
-                break
+        told = [next_event(reader, "film", "file") for _ in range(2)]
+    # The page is told at once that it need send no more; the files may take long.
+    assert told[0] == {"type": "film", "action": "stop"}
+    assert told[1]["type"] == "file"
     (film,) = site.films.glob("*.gif")
     with Image.open(film) as frames:
         assert frames.info["duration"] * getattr(frames, "n_frames", 1) <= 120
+
+
+def film_of(colour) -> server.Film:
+    film = server.Film()
+    film.add(jpeg(colour=colour))
+    return film
+
+
+def test_films_of_one_moment_are_files_of_their_own(tmp_path, monkeypatch):
+    monkeypatch.setattr(server.time, "strftime", lambda pattern: "film-20260101-120000")
+    for colour in ((0, 0, 0), (255, 255, 255)):
+        *_, name = (path.name for path in film_of(colour).write(tmp_path))
+        assert name.startswith("film-20260101-120000-")
+    seen = set()
+    for gif in tmp_path.glob("*.gif"):
+        with Image.open(gif) as picture:
+            seen.add(picture.convert("RGB").getpixel((5, 5)))
+    assert seen == {(0, 0, 0), (255, 255, 255)}
+    assert len(list(tmp_path.glob("*.mp4"))) == 2
+
+
+def test_without_ffmpeg_there_is_a_gif(client, site, monkeypatch):
+    def refuse(*_):
+        raise MissingDependencyError("an MP4 file needs imageio with ffmpeg")
+
+    monkeypatch.setattr(server, "write_mp4", refuse)
+    with meet(client) as reader:
+        reader.send_json({"type": "film", "action": "start"})
+        reader.send_bytes(jpeg())
+        reader.send_json({"type": "film", "action": "stop"})
+        file, error = (next_event(reader, "file", "error") for _ in range(2))
+    assert error["message"] == "an MP4 file needs imageio with ffmpeg"
+    (gif,) = site.films.iterdir()
+    assert (file["name"], gif.suffix) == (gif.name, ".gif")
 
 
 @pytest.mark.parametrize(
@@ -421,6 +462,10 @@ def test_a_port_in_use_is_passed_over_or_named():
         ("127.0.0.1", 70000, r"port must be in \[0, 65535\], got 70000"),
         ("no.such.host.invalid", 0, "host must be an address of this computer"),
         ("203.0.113.7", 0, "cannot be bound"),
+        # What no name may be, and Python does not even ask the system about.
+        ("..", 0, r"host must be an address of this computer, got '\.\.'"),
+        ("a" * 70, 0, "host must be an address of this computer"),
+        ("a\0b", 0, "host must be an address of this computer"),
     ],
 )
 def test_wrong_addresses_are_named(host, port, error):

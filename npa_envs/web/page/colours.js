@@ -61,13 +61,18 @@ export class Colouring {
   // The first three principal components as colours; their basis moves slowly.
   components(s, channels, bytes) {
     const count = s.length / channels;
+    // One particle that is no number would end the basis of all, for good.
+    const known = [];
+    for (let i = 0; i < count; i++) {
+      if (s.subarray(i * channels, (i + 1) * channels).every(Number.isFinite)) known.push(i);
+    }
     const mean = new Float64Array(channels);
-    for (let k = 0; k < s.length; k++) mean[k % channels] += s[k] / count;
+    for (const i of known) for (let c = 0; c < channels; c++) mean[c] += s[i * channels + c] / known.length;
     const fresh = new Float64Array(channels * channels);
     const row = new Float64Array(channels);
-    for (let i = 0; i < count; i++) {
+    for (const i of known) {
       for (let c = 0; c < channels; c++) row[c] = s[i * channels + c] - mean[c];
-      for (let a = 0; a < channels; a++) for (let b = 0; b <= a; b++) fresh[a * channels + b] += (row[a] * row[b]) / count;
+      for (let a = 0; a < channels; a++) for (let b = 0; b <= a; b++) fresh[a * channels + b] += (row[a] * row[b]) / known.length;
     }
     for (let a = 0; a < channels; a++) for (let b = 0; b < a; b++) fresh[b * channels + a] = fresh[a * channels + b];
     if (this.covariance?.length !== fresh.length) {

@@ -3,12 +3,11 @@
 const WORDS = 6; // 32-bit numbers before a frame's positions
 const KIND = 1;
 
-// Connects to the server that the page came from. `settings` may hold its `address` and `token`.
+// Connects to the server that the page came from; it has no settings.
 export async function connect(settings, listener) {
-  const query = new URLSearchParams(location.search);
-  const address = new URL(settings.address ?? "socket", location.href);
+  const address = new URL("socket", location.href);
   address.protocol = address.protocol === "https:" ? "wss:" : "ws:";
-  const token = settings.token ?? query.get("token");
+  const token = new URLSearchParams(location.search).get("token");
   if (token) address.searchParams.set("token", token);
   const socket = new WebSocket(address);
   socket.binaryType = "arraybuffer";

@@ -1,5 +1,5 @@
 // The world behind the exported page: what its messages do, and the frames that it shows. Messages and
-// events are those of page.js, and what they do is what RuleWorld of npa_envs/web/live.py does.
+// events are those of page.js, and what they do is what RuleWorld of npa_envs/web/rule_world.py does.
 
 import { clump, cut, eraseState, inject, insideBall, push, stateAround } from "./brushes.js";
 import { Colouring, Look } from "./colours.js";
@@ -11,7 +11,7 @@ import { Random } from "./random.js";
 // Frames that are on the way to the page at most: a page that is slow or hidden holds the world.
 const FRAMES_AHEAD = 2;
 
-// Numbers of npa_envs/web/live.py and npa_envs/tasks/damage.py.
+// Numbers of npa_envs/web/live.py, npa_envs/web/rule_world.py and npa_envs/tasks/damage.py.
 const CLUMP_RATE = 0.25;
 const INJECT_RATE = 0.5;
 const CLUMP_FACTOR = 0.9;

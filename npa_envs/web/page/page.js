@@ -41,8 +41,10 @@
 //   {type: "frame", step, positions, colours, milliseconds, loss?}
 //       positions: Float32Array, count * dimension; colours: Uint8Array, count * 3 (red, green, blue);
 //       milliseconds: one step took so long; loss: where it was computed
+//   {type: "reordered"}                                            particles stand elsewhere in frames
 //   {type: "curve", name, points: [[x, y], ...], append?}          a plot of a training run
-//   {type: "file", name, url}                                      a film is ready
+//   {type: "film", action: "stop"}                                 the film is as long as it may be
+//   {type: "file", name, url}                                      a file of a film is ready
 //   {type: "error", message}
 //
 // index.html loads viewer.js, which starts the page over the socket. For the exported page modules are
@@ -110,6 +112,7 @@ class Page {
     this.waiting = [];
     this.world = { ...BLANK };
     this.frame = null;
+    this.undrawn = 0; // frames that came since the last one was drawn
     this.camera = new Camera(2, BLANK.half_width);
     this.canvas = $("world");
     const wanted = new URLSearchParams(location.search).get("painter");
@@ -140,14 +143,14 @@ class Page {
   listen(event) {
     if (event.type === "frame") {
       this.frame = event;
-      this.fresh = true;
+      this.undrawn++;
     } else if (event.type === "world") this.meet(event);
     else if (event.type === "curve") this.curve(event);
-    else if (event.type === "file") {
-      // Also one that was ended because it is long enough.
+    else if (event.type === "reordered") this.tracers.clear();
+    else if (event.type === "film") {
       if (this.recording?.picture) this.showRecording((this.recording = null));
-      this.offer(event.name, event.url);
     }
+    else if (event.type === "file") this.offer(event.name, event.url);
     else if (event.type === "error") this.complain(event.message);
   }
 
@@ -157,9 +160,8 @@ class Page {
     if (!this.met || before.dimension !== world.dimension || before.half_width !== world.half_width) {
       this.camera = new Camera(world.dimension, world.half_width, world.centre);
       this.frame = null;
-      // A frame of the world before that was not drawn yet; the engine waits to hear of it.
-      if (this.fresh) this.send({ type: "drawn" });
-      this.fresh = false;
+      // Frames of the world before that were not drawn yet; the engine waits to hear of them.
+      this.tellDrawn();
       const first = world.tools.includes("erase") && world.dimension === 2 ? "erase" : "look";
       const keep = before.dimension === world.dimension && world.tools.includes(this.tool);
       this.choose(keep ? this.tool : first);
@@ -332,7 +334,9 @@ class Page {
   slider(input, name, { value, low, high, scale, whole }) {
     const bend = scale === "log" ? Math.log : (v) => v, unbend = scale === "log" ? Math.exp : (v) => v;
     const told = input.parentElement.querySelector("output");
-    const read = () => (whole ? Math.round : (v) => +v.toPrecision(3))(unbend(+input.value));
+    // Three digits may lie beside the end of the range.
+    const read = () => Math.min(high, Math.max(low,
+      (whole ? Math.round : (v) => +v.toPrecision(3))(unbend(+input.value))));
     input.min = bend(low);
     input.max = bend(high);
     input.step = whole && scale !== "log" ? 1 : (bend(high) - bend(low)) / 200;
@@ -510,11 +514,16 @@ class Page {
       stroke.sent = stroke.at;
       this.brush(stroke.at, [0, 0]);
     }
-    if (!this.fresh && !this.dirty) return;
-    if (this.fresh) this.take();
+    if (!this.undrawn && !this.dirty) return;
+    if (this.undrawn) this.take();
     this.draw();
-    if (this.fresh) this.send({ type: "drawn" });
-    this.fresh = this.dirty = false;
+    this.tellDrawn();
+    this.dirty = false;
+  }
+
+  // Also of frames that later ones have replaced: the engine waits for each.
+  tellDrawn() {
+    for (; this.undrawn > 0; this.undrawn--) this.send({ type: "drawn" });
   }
 
   take() {

@@ -36,10 +36,6 @@ export class Plot {
     this.draw();
   }
 
-  remove() {
-    this.figure.remove();
-  }
-
   draw() {
     const { canvas, points } = this;
     this.value.textContent = points.length ? `${short(points.at(-1)[1])} ${this.unit}` : "–";
