@@ -134,14 +134,15 @@ class ScriptedGardener(BrushPolicy):
         places = self._lacking.places
         away = places[None] - places[:, None]
         near = (-0.5 * away.square().sum(dim=-1) / checked_positive("width", width) ** 2).exp()
-        self._ways = checked_positive("share", share) * near[..., None] * away
+        # In double precision: libraries add up one world in another order than many.
+        self._ways = (checked_positive("share", share) * near[..., None] * away).double()
 
     def act(self, world_count: int) -> Tensor:
         """Return what the brushes do about the worlds as they are."""
         worlds, action = self.worlds, self.still(world_count)
         lack = self._lacking(worlds.x, worlds.s, self.task.middle(worlds.x))
-        move = self._gain * lack[..., 1:3] + torch.einsum("bq,pqd->bpd", lack[..., 0], self._ways)
-        move = move.clamp(-1.0, 1.0)
+        ways = torch.einsum("bq,pqd->bpd", lack[..., 0].double(), self._ways).to(lack.dtype)
+        move = (self._gain * lack[..., 1:3] + ways).clamp(-1.0, 1.0)
         if self.config.actions == "grid":
             action[..., self.columns.push] = move
             return action

@@ -377,6 +377,12 @@ class SpreadPolicy(Policy):
         return torch.zeros_like(self.interface.states(observation))
 
 
+def target_colour(env: Any) -> Tensor | None:
+    """Return the mean colour of an environment's target, shape [3]; None where it has no target."""
+    target = getattr(getattr(unwrapped(env).task, "goal", None), "target", None)
+    return None if target is None else target.mean_colour
+
+
 class PaintPolicy(SpreadPolicy):
     """Spread out in one colour: the picture's extent and its mean colour, without any detail.
 
@@ -394,10 +400,9 @@ class PaintPolicy(SpreadPolicy):
     ) -> None:
         super().__init__(env, gain)
         if colour is None:
-            goal = getattr(unwrapped(env).task, "goal", None)
-            if goal is None:
+            colour = target_colour(env)
+            if colour is None:
                 raise NPAError("colour must be given where env has no target: colour=(0, 0.5, 0)")
-            colour = goal.target.mean_colour
         try:
             self._colour = torch.as_tensor(colour, dtype=torch.float32)
         except (TypeError, ValueError, RuntimeError, OverflowError) as error:
@@ -426,10 +431,15 @@ class MendPolicy(SpreadPolicy):
         env: The environment that it is to act in.
         blank: A particle is blank where the norm of its state is below this, dimensionless.
         gain: That of `SpreadPolicy`, small so that what is whole stays nearly as it is.
+
+    Raises:
+        NPAError: One of the numbers is not finite.
     """
 
     def __init__(self, env: Any, blank: float = 0.1, gain: float = 0.003) -> None:
         super().__init__(env, gain)
+        if not is_real(blank):
+            raise NPAError(f"blank must be a finite number, got {shown(blank)}: try 0.1")
         self._blank = blank
 
     def state_step(self, observation: Tensor) -> Tensor:

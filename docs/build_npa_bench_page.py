@@ -18,9 +18,7 @@ from page_parts import table, write_or_check
 
 from npa_envs.agents.comparison.npa_bench import (
     METHODS,
-    NOTHING,
     SUITES,
-    YARDSTICK,
     Row,
     Suite,
     read_rows,
@@ -28,6 +26,7 @@ from npa_envs.agents.comparison.npa_bench import (
     scores_in,
     task_name,
 )
+from npa_envs.agents.comparison.plan import NOTHING, YARDSTICK
 from npa_envs.measure.plots import draw_band, legend_of, new_figure, png
 from npa_envs.measure.tables import NONE
 

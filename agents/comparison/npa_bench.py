@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from npa_envs.agents.comparison.plan import Axis, Plan
+from npa_envs.agents.comparison.plan import NOTHING, YARDSTICK, Axis, Plan
 from npa_envs.agents.comparison.run import RunRecord
 from npa_envs.agents.learning import methods_for
 from npa_envs.agents.learning.problem import Problem
@@ -53,9 +53,6 @@ EXCESS = 1.25
 """A run may take so many times its budget, as the last iteration is not cut off."""
 
 SCHEMA = Path(__file__).with_name("npa_bench_v0.schema.json")
-
-NOTHING, YARDSTICK = "zero", "gradient"
-"""Methods whose mean returns have the scores 0 and 1."""
 
 
 class Entry(NamedTuple):
@@ -215,8 +212,11 @@ def write_rows(
 ) -> list[Path]:
     """Write a file for each method of a suite's plan, METHOD.json, and return the paths.
 
+    What a file holds of other problems and seeds is kept. It then names the commands, commits,
+    machines and versions of all of its runs, set apart by semicolons.
+
     Raises:
-        NPAError: A file cannot be written.
+        NPAError: A file cannot be written, or as for `check_rows`.
     """
     paths = []
     for method in dict.fromkeys(record.job.method for record in records):
@@ -234,8 +234,94 @@ def write_rows(
                 **facts,
                 "runs": [_run_object(suite, record) for record in some],
             }
-            write_record(paths[-1], row)
+            held = _held_row(suite, plan, method, folder)
+            write_record(paths[-1], row if held is None else _joined(suite, held, row))
     return paths
+
+
+def check_rows(suite: Suite, plan: Plan, folder: Path) -> None:
+    """Check that runs of a plan can be added to the rows in a folder, before any of them is run.
+
+    Raises:
+        NPAError: A row is of another suite, or of another method or other options under its name,
+            has other episodes, as quick runs do, or cannot be read.
+    """
+    for method in plan.methods:
+        _held_row(suite, plan, method, folder)
+
+
+def _held_row(suite: Suite, plan: Plan, method: str, folder: Path) -> dict[str, Any] | None:
+    """Return a method's row in a folder, None where there is none; errors of `check_rows`."""
+    path = folder / f"{method}.json"
+    if not path.exists():
+        return None
+    cure = "choose another folder with --out, or remove the row"
+    wanted = {"benchmark": suite.name, "method": method}
+    wanted["options"] = json.loads(json.dumps(plan.options.get(method, {})))
+    if method in plan.own:
+        wanted["about"] = plan.own[method]
+    try:
+        held: dict[str, Any] = read_json(path)
+        found = {"options": {}} | held
+        lengths = {len(run["returns"]) for run in held["runs"]}
+        for run in held["runs"]:
+            run["id"], run["seed"]
+        told = [held[name] for name in ("machine", "commit", "command", "date")]
+        if not all(isinstance(text, str) for text in told):
+            raise TypeError("machine, commit, command and date must be text")
+    except (TypeError, KeyError, AttributeError, NPAError) as error:
+        raise NPAError(
+            f"{str(path)!r} must be a row that runs can be added to, but cannot be read "
+            f"({shown(error)}): {cure}"
+        ) from error
+    for name, value in wanted.items():
+        if found.get(name) != value:
+            raise NPAError(
+                f"{str(path)!r} must have the {name} {shown(value)} for runs to be added, got "
+                f"{shown(found.get(name))}: {cure}, or give the method a name of its own"
+            )
+    if lengths - {0, plan.episodes}:
+        raise NPAError(
+            f"{str(path)!r} must have runs of {plan.episodes} episodes for runs to be added, got "
+            f"{max(lengths)}: {cure}"
+        )
+    return held
+
+
+def _joined(suite: Suite, held: Mapping[str, Any], row: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a row with those runs of an earlier one that it does not have."""
+    new = {(run["id"], run["seed"]) for run in row["runs"]}
+    kept = [dict(run) for run in held["runs"] if (run["id"], run["seed"]) not in new]
+    if not kept:
+        return dict(row)
+    added = [dict(run) for run in row["runs"]]
+    for some, where in ((kept, held["machine"]), (added, row["machine"])):
+        # A row of several machines says already where each run was.
+        if held["machine"] != row["machine"] and ";" not in where:
+            for run in some:
+                run.setdefault("machine", where)
+    order, runs = list(suite.entries), [*kept, *added]
+    runs.sort(key=lambda run: (run["seed"], order.index(run["id"]) if run["id"] in order else -1))
+    versions = {**held.get("versions", {}), **row["versions"]}
+    told = {name: _both(held[name], row[name]) for name in ("command", "commit", "machine")}
+    return {
+        **row,
+        **told,
+        "date": max(held["date"], row["date"]),
+        "versions": {
+            name: _both(held.get("versions", {}).get(name, version), version)
+            for name, version in versions.items()
+        },
+        "runs": runs,
+    }
+
+
+def _both(first: str | None, second: str | None) -> str | None:
+    """Return what both say, each part once, set apart by semicolons."""
+    if first == second:
+        return first
+    parts = [part for text in (first, second) for part in str(text).split("; ")]
+    return "; ".join(dict.fromkeys(parts))
 
 
 def _run_object(suite: Suite, record: RunRecord) -> dict[str, Any]:

@@ -108,6 +108,9 @@ def make_problem(name: str, *, quick: bool = False) -> Problem:
 # Every method on every task, from every seed, within every budget.
 
 
+NOTHING, YARDSTICK = "zero", "gradient"
+"""Methods whose mean returns count as 0 and as 1."""
+
 Axis = Literal["seconds", "particle-steps"]
 """What a comparison holds equal for all methods: wall time, or particle-steps."""
 

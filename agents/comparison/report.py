@@ -12,16 +12,13 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from npa_envs.agents.comparison.plan import AXES, Axis, Plan
+from npa_envs.agents.comparison.plan import AXES, NOTHING, YARDSTICK, Axis, Plan
 from npa_envs.agents.comparison.run import PICTURE, SIZE, Point, RunRecord
 from npa_envs.files import write_text
 from npa_envs.measure.plots import draw_band, legend_of, new_figure, png, write_plots
 from npa_envs.measure.record import write_record
 from npa_envs.measure.tables import NONE, csv_text, markdown_table, mean_with_error, short
 from npa_envs.render import write_filmstrip
-
-YARDSTICK, NOTHING = "gradient", "zero"
-"""Methods whose returns count as 1 and as 0."""
 
 LOST = ("diverged", "left the world")
 """Endings of episodes that diverged: of worlds, and of species."""

@@ -424,8 +424,8 @@ def run_jobs(
         written: Called with each record once it is in its place.
 
     Raises:
-        NPAError: A run would clone one that is neither among the jobs nor in the folder, or the
-            folder cannot be written to.
+        NPAError: A run would clone one that is neither among the jobs nor in the folder, or is
+            there with other settings, or the folder cannot be written to.
     """
     _check_teachers(plan, jobs, folder)
     waiting = list(jobs)
@@ -466,10 +466,16 @@ def run_jobs(
 
 
 def _check_teachers(plan: Plan, jobs: Collection[Job], folder: Path) -> None:
-    """Refuse runs whose teacher is not there and will not come, before anything is run."""
+    """Refuse runs whose teacher is not there and will not come, before anything is run.
+
+    One that is there must follow from the same settings.
+    """
     for job in jobs:
         teacher = plan.teacher(job)
-        if teacher is None or teacher in jobs or (folder / teacher.folder).is_dir():
+        if teacher is None or teacher in jobs:
+            continue
+        record = RunRecord.read(folder / teacher.folder, plan.facts(teacher))
+        if record is not None and record.status in MEASURED:
             continue
         raise NPAError(
             f"{job.method!r} clones the rules of {teacher.method!r} from the same seed, but "

@@ -17,12 +17,11 @@ from typing import Any, NamedTuple
 import torch
 
 from npa_envs.agents.learning.kept import KeptProgress
-from npa_envs.agents.learning.problem import EVALUATION_SEEDS, Problem
+from npa_envs.agents.learning.problem import EVALUATION_SEEDS, Problem, check_run_seed
 from npa_envs.agents.learning.progress import Budget, Entry, Progress, check_finite
 from npa_envs.agents.learning.rules import RuleSet, RuleSetPolicy, starting_rules
 from npa_envs.devices import check_device
 from npa_envs.errors import MissingDependencyError, NPAError, shown, suggest
-from npa_envs.tasks.checks import is_whole
 from npa_envs.training.ranks import Ranks
 from npa_envs.training.run_folder import RunFolder
 
@@ -115,6 +114,7 @@ def train(
     evaluation_seeds: Iterable[int] = EVALUATION_SEEDS,
     entries: int = 20,
     on_entry: Callable[[Entry], None] | None = None,
+    on_stop: Callable[[], None] = lambda: None,
     out: str | Path | None = None,
     resume: bool = False,
     overwrite: bool = False,
@@ -136,6 +136,7 @@ def train(
         evaluation_seeds: Of the episodes by which the learning curve is drawn.
         entries: Points of the curve besides the first, at equal shares of the budget.
         on_entry: Called with each point as soon as it is known.
+        on_stop: Called where a run that is kept is asked to stop before its budget is spent.
         out: Folder for checkpoint, rules and curve, by `KEPT_METHODS` only: there SIGTERM and
             Ctrl-C let a run stop in order. None: nothing is written.
         resume: Go on from the checkpoint in `out`, on any number of processes, with new episodes.
@@ -151,7 +152,7 @@ def train(
     for name, value, kind in (("problem", problem, Problem), ("budget", budget, Budget)):
         if not isinstance(value, kind):
             example = "env_id='npa/Mixing-v0', episode_steps=96"
-            cure = f"Problem({example})" if kind is Problem else "Budget(particle_steps=1e6)"
+            cure = f"Problem({example})" if kind is Problem else "Budget(particle_steps=10**6)"
             raise NPAError(
                 f"{name} must be a {kind.__name__}, got {shown(value)}: make it with {cure}"
             )
@@ -167,8 +168,7 @@ def train(
             raise NPAError(
                 f"method {shown(method)} has no option {shown(name)}: {suggest(name, known)}"
             )
-    if not is_whole(seed) or seed < 0:
-        raise NPAError(f"seed must be a whole number of at least 0, got {shown(seed)}: give seed=0")
+    check_run_seed(seed)
     place = check_device(device)
     if start is not None:
         start = starting_rules(problem, seed, place, start)
@@ -178,16 +178,22 @@ def train(
         "problem": problem,
         "budget": budget,
         "device": place,
-        "evaluation_seeds": tuple(evaluation_seeds),
+        "evaluation_seeds": evaluation_seeds,
         "entries": entries,
         "on_entry": on_entry,
     }
-    progress = Progress(**account)
-    if out is not None:
+    if out is None:
+        progress = Progress(**account)
+    else:
         told = {"method": method, "problem": problem.to_json(), "seed": seed, "options": options}
         told["started"] = start is not None
         progress = KeptProgress(
-            RunFolder(Path(out)), told, resume=resume, overwrite=overwrite, **account
+            RunFolder(Path(out)),
+            told,
+            resume=resume,
+            overwrite=overwrite,
+            on_stop=on_stop,
+            **account,
         )
     given = {"options": replace(declared, **options)} if declared is not None else options
     result = function(problem, progress, seed, device=place, start=start, **given)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import torch
@@ -18,8 +18,10 @@ from npa_envs.agents.policies import (
     RandomPolicy,
     SpreadPolicy,
     ZeroPolicy,
+    target_colour,
 )
-from npa_envs.errors import NPAError
+from npa_envs.errors import NPAError, shown
+from npa_envs.tasks.checks import is_real
 
 SCRIPTED: tuple[Callable[..., Policy], ...] = (PaintPolicy, SpreadPolicy, MendPolicy)
 """Policies to choose from."""
@@ -69,7 +71,7 @@ def train_scripted(
     *,
     device: torch.device,
     start: RuleSet | None = None,
-    gains: tuple[float, ...] = GAINS,
+    gains: Sequence[float] = GAINS,
 ) -> Policy:
     """Return the scripted policy that fits best.
 
@@ -79,9 +81,13 @@ def train_scripted(
     which may be doing nothing.
 
     Raises:
-        NPAError: There is something to start from.
+        NPAError: There is something to start from, or gains are no finite numbers.
     """
     _check_no_start(start)
+    if not isinstance(gains, list | tuple) or not all(map(is_real, gains)):
+        raise NPAError(
+            f"gains must be a list of finite numbers, got {shown(gains)}: for example [0.03, 0.1]"
+        )
     envs = problem.make_envs(device=device)
     seeds = world_seeds(seed, problem.num_envs)
     best: Policy = ZeroPolicy(envs)
@@ -105,11 +111,9 @@ def train_scripted(
     return best
 
 
-def _candidates(envs: Any, gains: tuple[float, ...]) -> Iterator[Policy]:
+def _candidates(envs: Any, gains: Sequence[float]) -> Iterator[Policy]:
     for make in SCRIPTED:
-        if make is PaintPolicy and not hasattr(envs.task, "goal"):
-            continue
-        if make is PaintPolicy and not hasattr(envs.task.goal, "target"):
+        if make is PaintPolicy and target_colour(envs) is None:
             continue
         for gain in gains:
             yield make(envs, gain=gain)

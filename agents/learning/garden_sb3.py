@@ -72,12 +72,13 @@ class PPOOptions(GardenOptions):
     """Steps of each world in a round."""
 
     batch_size: int = 64
-    """Steps of worlds in a minibatch."""
+    """Steps of worlds in a minibatch, at least 2."""
 
     def __post_init__(self) -> None:
         """Check every field; raises NPAError."""
         super().__post_init__()
-        check_positive(self, int, "steps", "batch_size")
+        check_positive(self, int, "steps")
+        check_positive(self, int, "batch_size", at_least=2)
 
 
 SAC_DEFAULTS, PPO_DEFAULTS = SACOptions(), PPOOptions()
@@ -113,7 +114,13 @@ def train_ppo(
     start: RuleSet | None = None,
     options: PPOOptions = PPO_DEFAULTS,
 ) -> GardenPolicy:
-    """Return what PPO (Schulman et al., arXiv 1707.06347) finds within a budget; as `train_sac`."""
+    """Return what PPO (Schulman et al., arXiv 1707.06347) finds within a budget.
+
+    Raises:
+        NPAError: There are rules to start from, or a round would be a single step of a world.
+    """
+    if options.steps * problem.num_envs < 2:
+        raise NPAError("steps must be at least 2 in a single world, got 1: give steps=32")
     told = {"n_steps": options.steps, "batch_size": options.batch_size}
     return _learned(PPO, told, problem, progress, seed, device, start, options)
 
@@ -182,7 +189,19 @@ class GardenPolicy:
         self.model = model
 
     def __call__(self, observation: Any) -> NDArray[np.float32]:
-        """Return actions of worlds, shape [B, K, W], for what is seen of them, [B, ...]."""
+        """Return actions of worlds, shape [B, K, W], for what is seen of them, [B, ...].
+
+        Raises:
+            NPAError: Something else is seen than where the policy has learned.
+        """
+        space = self.model.observation_space
+        wanted = _shapes(space.spaces if isinstance(space, Dict) else space)
+        found = {name: shape[1:] for name, shape in _shapes(observation).items()}
+        if wanted != found:
+            raise NPAError(
+                "observation must be of a garden like that which the policy has learned in, of "
+                f"shapes {wanted} by world, got {found}: take one that has learned in this garden"
+            )
         seen: Any = observation
         if isinstance(observation, dict):
             seen = dict(zip(observation, on_host(*observation.values()), strict=True))
@@ -202,7 +221,7 @@ class GardenPolicy:
         """Return what `save` wrote; Stable-Baselines3 unpickles it, so trust who made the file.
 
         Raises:
-            NPAError: The file is not called as `save` calls it, or is missing.
+            NPAError: The file is not called as `save` calls it, is missing, or cannot be read.
         """
         name = Path(path).stem
         if name not in ALGORITHMS:
@@ -215,4 +234,17 @@ class GardenPolicy:
                 f"path must be of a file that exists, got {shown(str(path))}: name one that "
                 "`save` or `npa-envs learn` wrote"
             )
-        return cls(ALGORITHMS[name].load(path, device="cpu"))
+        try:
+            return cls(ALGORITHMS[name].load(path, device="cpu"))
+        except Exception as error:
+            # What unpickling raises depends on what is in the file.
+            raise NPAError(
+                f"path must be of a file that {name}'s `save` wrote, got {shown(str(path))} "
+                f"({shown(error)}): save the policy again, or name another file"
+            ) from error
+
+
+def _shapes(parts: Any) -> dict[str, tuple[int, ...]]:
+    """Return the shapes of the parts of an observation or a space, or of what has none."""
+    named = parts if isinstance(parts, dict) else {"observation": parts}
+    return {name: tuple(part.shape) for name, part in named.items()}

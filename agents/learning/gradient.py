@@ -71,6 +71,15 @@ class GradientOptions:
     def __post_init__(self) -> None:
         """Check what the trainer's configuration does not hold; raises NPAError."""
         check_fraction(self, "last_rate")
+        # The trainer's configuration asks what numbers they are.
+        given: Any = self.steps
+        if given is not None:
+            if not isinstance(given, list | tuple) or len(given) != 2:
+                raise NPAError(
+                    f"steps must be a range [lo, hi) of two whole numbers, got {shown(given)}: "
+                    "steps=(32, 97), on the command line steps=[32,97]"
+                )
+            object.__setattr__(self, "steps", tuple(given))
 
 
 DEFAULTS = GradientOptions()
@@ -190,14 +199,15 @@ def _check_rules_of_play(problem: Problem, task: EnvTask[Any] | SpeciesTask) -> 
         return
     if type(task).settle is not SpeciesTask.settle:
         raise NPAError(
-            f"method='gradient' must have one loss to descend, but in {problem.env_id} species are "
-            "paid at each other's expense: learn by 'ppo' with what each particle is paid"
+            "a method that follows gradients must have one loss to descend, but in "
+            f"{problem.env_id} species are paid at each other's expense: learn by 'ppo' with what "
+            "each particle is paid"
         )
     if problem.keywords.get("deaths"):
         raise NPAError(
-            "method='gradient' must keep all particles, got "
-            f"deaths={shown(problem.keywords['deaths'])}:"
-            " leave deaths out, or learn by 'ppo' or 'evolution'"
+            "a method that follows gradients must keep all particles, got "
+            f"deaths={shown(problem.keywords['deaths'])}: "
+            "leave deaths out, or learn by 'ppo' or 'evolution'"
         )
 
 

@@ -41,6 +41,7 @@ class KeptProgress(Progress):
         told: What the run is of, as JSON has it: one that goes on must be of the same.
         resume: Go on from the checkpoint in the folder.
         overwrite: Begin anew although the folder holds a run; its files are removed.
+        on_stop: Called where the run is asked to stop before its budget is spent.
         given: Arguments of `Progress`.
 
     Raises:
@@ -55,9 +56,11 @@ class KeptProgress(Progress):
         *,
         resume: bool,
         overwrite: bool,
+        on_stop: Callable[[], None] = lambda: None,
         **given: Any,
     ) -> None:
         super().__init__(**given)
+        self._on_stop = on_stop
         self.folder = folder
         """Where the run is kept."""
         self._told = json.loads(json.dumps(told))
@@ -96,6 +99,7 @@ class KeptProgress(Progress):
             entries = len(self.log)
             while not self.over:
                 if self.ranks.agree_to_stop(stop.is_set(), self._iteration):
+                    self._on_stop()
                     break
                 self.advance(iteration())
                 self._iteration += 1
@@ -135,7 +139,14 @@ class KeptProgress(Progress):
         return content
 
     def _save(self, rules: RuleSet, learner: Learner) -> None:
-        """Write checkpoint, rules and curve, once all processes agree on what has learned."""
+        """Write checkpoint, rules and curve, once all processes agree on what has learned.
+
+        No time counts meanwhile.
+        """
+        with self._stopped_clock():
+            self._write(rules, learner)
+
+    def _write(self, rules: RuleSet, learner: Learner) -> None:
         state = learner_state(learner)
         learned = [value for held in state["modules"].values() for value in held.values()]
         self.ranks.check_same([value for value in learned if isinstance(value, Tensor)])

@@ -36,7 +36,7 @@ from npa_envs.agents.learning.progress import Budget, Progress
 from npa_envs.agents.learning.rules import RuleSet
 from npa_envs.envs.core.memory import free_bytes, needed_bytes
 from npa_envs.errors import NPAError
-from npa_envs.tasks.checks import check_non_negative, check_positive
+from npa_envs.tasks.checks import check_flag, check_non_negative, check_positive
 from npa_envs.training.randomness import registered, restart
 from npa_envs.training.ranks import ALONE, Ranks
 from npa_envs.world.cuda_graph import Replayed
@@ -87,6 +87,7 @@ class PPOOptions(CommonOptions):
         super().__post_init__()
         check_positive(self, int, "critic_width")
         check_non_negative(self, "critic_learning_rate")
+        check_flag(self, "masked")
         if self.clip is not None:
             check_positive(self, float, "clip")
         if self.worlds is not None:

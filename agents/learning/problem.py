@@ -19,6 +19,7 @@ from gymnasium.spaces import Box
 from gymnasium.vector import AutoresetMode
 from torch import Tensor
 
+from npa_envs.agents.evaluation import TIME_LIMIT
 from npa_envs.agents.learning.rules import RuleSet
 from npa_envs.agents.policies import Interface
 from npa_envs.devices import check_device
@@ -34,7 +35,7 @@ from npa_envs.envs.multi.vector import MultiSpeciesVectorEnv
 from npa_envs.envs.shapeshifter2d import ShapeshifterTask
 from npa_envs.errors import NPAError, shown, suggest
 from npa_envs.registration import ALL, SPECIES_SIZES
-from npa_envs.tasks.checks import check_positive
+from npa_envs.tasks.checks import check_positive, is_whole
 from npa_envs.world.actions import Physics
 from npa_envs.world.cuda_graph import sent
 
@@ -44,11 +45,17 @@ WORLDS_PER_SEED = 10_000
 FIRST_EVALUATION_SEED = 1_000_000
 """Seeds from here on are for evaluations."""
 
+RUNS = FIRST_EVALUATION_SEED // WORLDS_PER_SEED
+"""Runs that have worlds of their own: their seeds are below this."""
+
 EVALUATION_SEEDS = range(FIRST_EVALUATION_SEED, FIRST_EVALUATION_SEED + 16)
 """Seeds of evaluations, far from those that learners begin their worlds with."""
 
-TIME_LIMIT, LEFT = "time limit", "left the world"
-"""Why species are cut off, and why they end where they diverge."""
+LEFT = "left the world"
+"""Why species end where they diverge."""
+
+UNSAID_STEPS = 256
+"""Steps of an episode where an id is registered without a limit."""
 
 SPECIES = (*SPECIES_TASKS, *(size.id for size in SPECIES_SIZES))
 """Ids of species tasks."""
@@ -332,19 +339,41 @@ class Problem:
             raise NPAError(f"text must be JSON, got {shown(text)} ({error})") from error
 
 
+def registered_steps(env_id: str) -> int:
+    """Return the steps after which episodes of an id are cut off as it is registered.
+
+    256 where it says nothing, or is not known.
+    """
+    if env_id in SPECIES:
+        steps = task_settings(env_id)[1].get("max_cycles")
+    else:
+        steps = getattr(gymnasium.registry.get(env_id), "max_episode_steps", None)
+    return UNSAID_STEPS if steps is None else int(steps)
+
+
+def check_run_seed(seed: Any) -> None:
+    """Check the seed of a run: `RUNS` runs have worlds of their own.
+
+    Raises:
+        NPAError: It is no whole number from 0 on, or so large that its worlds would be those of
+            evaluations.
+    """
+    if not is_whole(seed) or not 0 <= seed < RUNS:
+        raise NPAError(
+            f"seed must be a whole number from 0 to {RUNS - 1}, as the worlds of later ones are "
+            f"those of evaluations, got {shown(seed)}: give seed=0"
+        )
+
+
 def world_seeds(seed: int, count: int, part: int = 0) -> list[int]:
     """Return the seeds of the worlds that a run learns in, which no other run has.
 
     Each part of a run, from one stop to the next, has others, as long as there are enough.
 
     Raises:
-        NPAError: There are too many, or the seed is so large that they are those of evaluations.
+        NPAError: There are too many, or as for `check_run_seed`.
     """
-    runs = FIRST_EVALUATION_SEED // WORLDS_PER_SEED
-    if seed >= runs:
-        raise NPAError(
-            f"seed must be below {runs}, got {seed}: later ones would have worlds of evaluations"
-        )
+    check_run_seed(seed)
     if count > WORLDS_PER_SEED:
         raise NPAError(
             f"worlds must be at most {WORLDS_PER_SEED}, got {count}: more would share their "

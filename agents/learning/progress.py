@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
 import time
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any, Protocol
 
@@ -18,7 +19,7 @@ from npa_envs.devices import check_device
 from npa_envs.errors import DivergedError, NPAError, shown
 from npa_envs.tasks.checks import is_real, is_whole
 from npa_envs.training.ranks import Ranks
-from npa_envs.world.randomness import Randomness
+from npa_envs.world.randomness import Randomness, WorldRandom
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -111,9 +112,9 @@ class Progress:
     progress.look(rules, force=True)
     ```
 
-    Neither what happens before `start` nor evaluations count. On CUDA the host waits for the device
-    only where it evaluates; besides, `advance` keeps it at most one iteration ahead, so that time
-    is what the device took.
+    Neither what happens before `start` nor evaluations count, nor what is written meanwhile. On
+    CUDA the host waits for the device only there; besides, `advance` keeps it at most one iteration
+    ahead, so that time is what the device took.
 
     Where torch has a default group of processes, each has an account, and all go by the clock of
     the first one. Each evaluates the same episodes, and the first one tells of them.
@@ -127,7 +128,7 @@ class Progress:
         on_entry: Called with each entry.
 
     Raises:
-        NPAError: There are no seeds, or the number of entries is not positive.
+        NPAError: There are no seeds or wrong ones, or the number of entries is not positive.
     """
 
     def __init__(
@@ -150,11 +151,19 @@ class Progress:
         """Evaluations so far."""
         self.ranks = Ranks.current()
         """The processes that share the run."""
+        given: Any = evaluation_seeds
+        if not isinstance(given, Iterable):
+            raise NPAError(
+                f"evaluation_seeds must be one for each episode, got {shown(given)}: "
+                "range(1_000_000, 1_000_016)"
+            )
         self._seeds = list(evaluation_seeds)
         if not self._seeds:
             raise NPAError(
                 "evaluation_seeds must hold at least one seed, got none: range(100, 132)"
             )
+        # Now, not in the first evaluation.
+        WorldRandom(self._seeds)
         if not is_whole(entries) or entries < 1:
             raise NPAError(
                 f"entries must be a whole number of at least 1, got {shown(entries)}: try 20"
@@ -256,11 +265,17 @@ class Progress:
         due = self.share >= (self._looks + 1) / self._entries
         if not fresh or not (force or due):
             return
+        with self._stopped_clock():
+            self._looks = int(self.share * self._entries)
+            self._evaluate(actor)
+
+    @contextlib.contextmanager
+    def _stopped_clock(self) -> Iterator[None]:
+        """Count no time while a block runs; all processes enter it."""
         self._wait()
         self._agree_on_time()
         self._seconds, self._since = self._elapsed, None
-        self._looks = int(self.share * self._entries)
-        self._evaluate(actor)
+        yield
         self._since = time.perf_counter()
 
     def _agree_on_time(self) -> None:

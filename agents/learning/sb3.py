@@ -26,7 +26,7 @@ from npa_envs.agents.learning.ppo_common import (
 from npa_envs.agents.learning.problem import Problem, world_seeds
 from npa_envs.agents.learning.progress import Progress
 from npa_envs.agents.learning.rules import RuleSet
-from npa_envs.errors import MissingDependencyError
+from npa_envs.errors import MissingDependencyError, NPAError
 from npa_envs.tasks.checks import check_positive
 from npa_envs.wrappers.sb3 import WorldVecEnv
 
@@ -77,9 +77,17 @@ def train(
     Stable-Baselines3 seeds torch and NumPy as a whole; what is seen goes through the host.
 
     Raises:
+        NPAError: A minibatch would be a single step of a world.
         DivergedError: The policy has diverged.
     """
     pace = options.pace(start)
+    seen = options.steps * problem.num_envs
+    batch_size = -(-seen // options.minibatches)
+    if batch_size < 2:
+        raise NPAError(
+            f"minibatches must leave at least 2 of the {seen} steps of worlds of a round for each, "
+            f"got {options.minibatches}: give fewer, more steps, or more worlds"
+        )
     env = WorldVecEnv(problem.make_envs(device=device))
     callback = ProgressCallback(progress, options, pace)
     model = PPO(
@@ -87,7 +95,7 @@ def train(
         env,
         learning_rate=lambda _: pace.learning_rate * callback.share_left,
         n_steps=options.steps,
-        batch_size=-(-options.steps * env.num_envs // options.minibatches),
+        batch_size=batch_size,
         n_epochs=options.epochs,
         gamma=options.gamma,
         gae_lambda=options.gae_lambda,

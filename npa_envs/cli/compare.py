@@ -8,6 +8,7 @@ import math
 import re
 import shlex
 import sys
+from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -31,6 +32,9 @@ if TYPE_CHECKING:
     from npa_envs.agents.comparison.run import RunRecord
 
 RUN_FAILED = 1
+
+ROWS = "rows"
+"""Folder of a suite's rows, below that of the comparison."""
 
 NEED_MORE = ("clone",)
 """Methods that are compared only when asked for: they need a teacher."""
@@ -56,12 +60,13 @@ class CompareOptions(MeasureOptions):
     """
 
     out: OutFolder = Path("comparison")
-    """Folder for AXIS/TASK/METHOD/seed-K/, comparison.md, .json and .csv, and pictures
-    (curves need the extra `bench`)."""
+    """Folder for AXIS/TASK/METHOD/seed-K/, and for comparison.md, .json, .csv and pictures of what
+    the command names (curves need the extra `bench`)."""
 
     suite: Literal["npa-bench-v0", "npa-bench-small-v0"] | None = None
     """Run a frozen benchmark, the small one on a laptop, with its own tasks, budgets and episodes;
-    write a row for each method, OUT/rows/METHOD.json."""
+    write a row for each method, OUT/rows/METHOD.json, and keep what it has of other tasks and
+    seeds."""
 
     tasks: tuple[str, ...] = ()
     """morphogenesis2d, regeneration2d, point_classification, mixing, or those of the suite, its ids
@@ -110,18 +115,20 @@ class CompareOptions(MeasureOptions):
 def main(arguments: Sequence[str]) -> int:
     """Run what is missing, print and write; return 1 where a run failed."""
     options = parse_options(CompareOptions, "compare", arguments)
-    from npa_envs.agents.comparison.npa_bench import SUITES, write_rows
+    from npa_envs.agents.comparison.npa_bench import SUITES, check_rows, write_rows
     from npa_envs.agents.comparison.report import write_pictures, write_table
     from npa_envs.agents.comparison.run import held_records, run_jobs
+    from npa_envs.measure.record import without_folders
     from npa_envs.processes import Places
 
-    # Records are not to tell where on which machine they were written.
-    words = ["OUT" if word == str(options.out) else word for word in arguments]
+    words = without_folders(arguments, "--out", "--output")
     command = shlex.join(["npa-envs", "compare", *words])
     plan = make_plan(options)
     folder = writable_folder(options.out)
     # All are read first: a record of other settings is refused before any work is done.
     records = held_records(plan, folder)
+    if options.suite is not None:
+        check_rows(SUITES[options.suite], plan, folder / ROWS)
     jobs = plan.jobs()
     mine = plan.part(options.part)
     missing = [job for job in mine if job not in records]
@@ -148,7 +155,7 @@ def main(arguments: Sequence[str]) -> int:
     told = [write_table(plan, whole(), folder, command), *write_pictures(whole(), folder)]
     if options.suite is not None:
         rows = write_rows(
-            SUITES[options.suite], plan, whole(), writable_folder(folder / "rows"), command
+            SUITES[options.suite], plan, whole(), writable_folder(folder / ROWS), command
         )
         told += [f"wrote {path}" for path in rows]
     failed = [record for record in whole() if record.status == "failed"]
@@ -167,8 +174,14 @@ def make_plan(options: CompareOptions) -> Plan:
     """
     from npa_envs.agents.comparison.plan import LEFT_OUT, PROBLEMS, Plan, make_problem
     from npa_envs.agents.learning import METHODS, REMOVED
+    from npa_envs.agents.learning.problem import RUNS
 
     check_numbers(options, seeds=1, episodes=1, jobs=1, threads=1)
+    if options.seeds is not None and options.seeds > RUNS:
+        raise NPAError(
+            f"seeds must be at most {RUNS}, got {options.seeds}: later runs would learn in the "
+            "worlds of evaluations"
+        )
     if options.suite is not None:
         return _suite_plan(options)
     if options.quick:
@@ -262,7 +275,12 @@ def _chosen_methods(words: Sequence[str], known: Iterable[str]) -> tuple[list[st
     from npa_envs.agents.learning import method_options
 
     known = list(known)
-    own = dict(word.split("=", 1) for word in words if "=" in word)
+    named = [word.split("=", 1) for word in words if "=" in word]
+    own = dict(named)
+    for name, count in Counter(name for name, _ in named).items():
+        if count > 1:
+            told = " and ".join(word for word in words if word.startswith(f"{name}="))
+            raise NPAError(f"methods must have names of their own, got {told}: rename one")
     for name, method in own.items():
         if not re.fullmatch("[a-z0-9_]+", name) or name in known:
             raise NPAError(

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-import hashlib
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -225,11 +224,7 @@ def _task_of(source: str, rule: NPARule, device: torch.device, count: int) -> An
 def _told(organisms: Sequence[Organism], settings: InteractionSettings) -> dict[str, Any]:
     """Return what rows follow from, as JSON can hold it."""
     from npa_envs.files import plain_numbers
+    from npa_envs.rule.files import rule_digest
 
-    weights = {}
-    for organism in organisms:
-        digest = hashlib.sha256()
-        for parameter in organism.rule.state_dict().values():
-            digest.update(parameter.cpu().numpy().tobytes())
-        weights[organism.name] = digest.hexdigest()[:16]
+    weights = {organism.name: rule_digest(organism.rule) for organism in organisms}
     return {**plain_numbers(asdict(settings)), "rules": weights}

@@ -6,7 +6,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
@@ -24,6 +24,10 @@ from npa_envs.errors import NPAError
 if TYPE_CHECKING:
     from npa_envs.agents.learning import Entry, Problem
     from npa_envs.training.ranks import Ranks
+
+
+WORLDS = 16
+"""Worlds to act in, and at most to be evaluated in, where nothing is said."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -47,10 +51,11 @@ class LearnOptions(RunOptions):
     """Options of the method, likewise: steps=32 (docs/learning.md)."""
 
     episode_steps: int | None = None
-    """Steps after which an episode is cut off; default: as registered, 256 of several species."""
+    """Steps after which an episode is cut off; default: as registered, or 256."""
 
-    worlds: int = 16
-    """Worlds to act in, of all processes; on CUDA ppo takes more where it can."""
+    worlds: int | None = None
+    """Worlds to act in, of all processes; default: 16, of shac 8. On CUDA ppo takes more where it
+    can."""
 
     seed: int = 0
     """Of everything that is drawn, from 0 to 99."""
@@ -139,8 +144,12 @@ def run(options: LearnOptions, ranks: Ranks) -> int:
                 flush=True,
             )
 
+    given = named_values("options", options.options)
+    if options.method == "shac" and options.worlds is not None:
+        given.setdefault("world_count", options.worlds)
+    stopped: list[bool] = []
     budget = Budget(seconds=options.seconds, particle_steps=None if steps is None else int(steps))
-    found = train(
+    train(
         options.method,
         problem_of(options),
         budget,
@@ -149,17 +158,16 @@ def run(options: LearnOptions, ranks: Ranks) -> int:
         evaluation_seeds=range(FIRST_EVALUATION_SEED, FIRST_EVALUATION_SEED + options.episodes),
         entries=options.entries,
         on_entry=told,
+        on_stop=lambda: stopped.append(True),
         out=options.out,
         resume=options.resume,
         overwrite=options.overwrite,
-        **named_values("options", options.options),
+        **given,
     )
-    last = found.log[-1]
-    finished = budget.share(last.seconds, last.particle_steps) >= 1.0
     if ranks.first:
-        end = "finished" if finished else "stopped; the same words with --resume go on"
+        end = "stopped; the same words with --resume go on" if stopped else "finished"
         print(f"{end}: rules, curve and checkpoint are in {options.out}/")
-    return 0 if finished else INTERRUPTED
+    return INTERRUPTED if stopped else 0
 
 
 def problem_of(options: LearnOptions) -> Problem:
@@ -168,15 +176,12 @@ def problem_of(options: LearnOptions) -> Problem:
     Raises:
         NPAError: There is no such environment or keyword, or a number is out of its range.
     """
-    from npa_envs.agents.learning import Problem
-    from npa_envs.registration import ALL
+    from npa_envs.agents.learning.problem import Problem, registered_steps
 
-    limits: dict[str, Any] = {known.id: known.max_episode_steps for known in ALL}
+    steps = options.episode_steps
     return Problem(
         env_id=options.env,
         keywords=named_values("keywords", options.keywords),
-        episode_steps=(
-            limits.get(options.env, 256) if options.episode_steps is None else options.episode_steps
-        ),
-        num_envs=options.worlds,
+        episode_steps=registered_steps(options.env) if steps is None else steps,
+        num_envs=WORLDS if options.worlds is None else options.worlds,
     )

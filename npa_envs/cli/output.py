@@ -178,7 +178,7 @@ def told_rules(words: Iterable[str]) -> dict[str, str]:
             of runs.
 
     Raises:
-        NPAError: A name is not known.
+        NPAError: A name is not known, or two rules have the same.
     """
     from npa_envs.rule.files import first_rules, shipped_rules
     from npa_envs.web.rule_world import name_of
@@ -189,7 +189,13 @@ def told_rules(words: Iterable[str]) -> dict[str, str]:
     named = [word for word in words if word not in files]
     found = {name: name for name in (chosen_names("rule", named, own) if named else ())}
     for source in files:
-        found.setdefault(name_of(source), source)
+        name = name_of(source)
+        if found.setdefault(name, source) != source:
+            raise NPAError(
+                f"rules must have names of their own, but {found[name]!r} and {source!r} are both "
+                f"called {name!r}: rename a file or folder, or measure them one by one, each with "
+                "its own --out"
+            )
     return found
 
 
@@ -201,8 +207,12 @@ def duration(seconds: float) -> str:
     return f"{max(seconds, 1.0):.0f} s"
 
 
-def writable_folder(path: Path) -> Path:
+def writable_folder(path: Path, name: str = "out") -> Path:
     """Create a folder where missing, and check that files can be made in it, before work is done.
+
+    Args:
+        path: It.
+        name: The option that names it, for errors.
 
     Raises:
         NPAError: It cannot be created, or files in it cannot.
@@ -215,7 +225,7 @@ def writable_folder(path: Path) -> Path:
             pass
     except OSError as error:
         raise NPAError(
-            f"out must be a folder that can be {must}, got {str(path)!r} "
+            f"{name} must be a folder that can be {must}, got {str(path)!r} "
             f"({error.strerror or error}): choose another one"
         ) from error
     return path

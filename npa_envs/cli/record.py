@@ -70,17 +70,17 @@ def main(arguments: Sequence[str]) -> int:
     options = parse_options(RecordOptions, "record", arguments)
     check_numbers(options, episodes=1, worlds=1)
     from npa_envs.agents.evaluation import policy_in
+    from npa_envs.measure.record import without_folders
     from npa_envs.wrappers.minari import ROOT, record_episodes, spec_of, write_dataset
 
     problem = problem_of(options)
     envs: Any = problem.make_envs(device=options.device)
     policy = policy_in(envs, policy_of(options, problem))
-    # Datasets are not to tell where on which machine they were written.
-    words = ["ROOT" if word == str(options.root) else word for word in arguments]
+    words = without_folders(arguments, "--root")
     seeds = range(options.first_seed, options.first_seed + options.episodes)
     returns: list[float] = []
     if options.root is not None:
-        os.environ[ROOT] = str(writable_folder(options.root).resolve())
+        os.environ[ROOT] = str(writable_folder(options.root, "root").resolve())
     with StepBar(options.episodes, show=options.progress, unit="episode") as bar:
 
         def episodes() -> Iterator[Any]:
@@ -106,15 +106,13 @@ def problem_of(options: RecordOptions) -> Problem:
     Raises:
         NPAError: There is no such environment, or it has several species or no such keyword.
     """
-    from npa_envs.agents.learning import Problem
-    from npa_envs.registration import ALL
+    from npa_envs.agents.learning.problem import Problem, registered_steps
 
-    limits = {known.id: known.max_episode_steps for known in ALL}
     worlds = min(options.worlds, options.episodes)
     problem = Problem(
         env_id=options.env,
         keywords=named_values("options", options.options),
-        episode_steps=limits.get(options.env, 1),
+        episode_steps=registered_steps(options.env),
         num_envs=worlds,
     )
     if problem.is_species:
@@ -139,7 +137,7 @@ def policy_of(options: RecordOptions, problem: Problem) -> Callable[[Any], Any]:
             options.policy,
             problem,
             Budget(particle_steps=10**12),
-            0,
+            _choice_seed(options) if options.policy == "scripted" else 0,
             device=options.device,
             evaluation_seeds=[FIRST_CHOICE_SEED],
             entries=1,
@@ -154,3 +152,21 @@ def policy_of(options: RecordOptions, problem: Problem) -> Callable[[Any], Any]:
             f"policy must be one of {known} or a file sac.zip or ppo.zip, got {source!r}"
         )
     return RuleSet.of(problem, source).to(options.device).policy()
+
+
+def _choice_seed(options: RecordOptions) -> int:
+    """Return the seed of a run that plays in none of the worlds that are recorded.
+
+    Raises:
+        NPAError: They are those of all runs.
+    """
+    from npa_envs.agents.learning.problem import RUNS, WORLDS_PER_SEED
+
+    first, last = options.first_seed, options.first_seed + options.episodes - 1
+    for seed in range(RUNS):
+        if last < seed * WORLDS_PER_SEED or first >= (seed + 1) * WORLDS_PER_SEED:
+            return seed
+    raise NPAError(
+        f"episodes must leave {WORLDS_PER_SEED} seeds below {RUNS * WORLDS_PER_SEED} to choose a "
+        f"scripted policy by, got seeds {first} to {last}: record fewer"
+    )

@@ -71,8 +71,9 @@ def main(arguments: Sequence[str]) -> int:
     options = parse_options(RobustnessOptions, "robustness", arguments)
     from npa_envs.devices import check_device
     from npa_envs.measure.accuracy.habitats import rule_names, task_name
-    from npa_envs.measure.record import measured_facts, time_limit
+    from npa_envs.measure.record import measured_facts, time_limit, without_folders
     from npa_envs.measure.robustness.study import MOST_PARTICLES, RuleRecord, measure_rule, tables
+    from npa_envs.rule.files import load_rule, rule_digest
 
     check_numbers(options, seed_count=1, first_seed=0, most_particles=1, threads=1)
     enough = time_limit(options.max_seconds)
@@ -85,15 +86,18 @@ def main(arguments: Sequence[str]) -> int:
     device = check_device(options.device)
     most = options.most_particles or MOST_PARTICLES[device.type]
     seeds = _seeds(options)
-    facts = measured_facts(
+    common = measured_facts(
         device, options.commit, quick=options.quick, seeds=list(seeds), most_particles=most
     )
+    # A rule's name stays where it is trained anew.
+    facts = {name: common | {"weights": rule_digest(load_rule(sources[name]))} for name in names}
     folder = options.out
     if folder is not None:
         writable_folder(folder)
     paths = {name: folder / f"robustness_{name}.json" for name in names} if folder else {}
     # All are read first: a file of other settings is refused before any work is done.
-    before = {name: RuleRecord.read(path, facts) for name, path in paths.items()}
+    before = {name: RuleRecord.read(path, facts[name]) for name, path in paths.items()}
+    words = without_folders(arguments, "--out", "--output")
     records = []
     with (
         StepBar(len(names), show=options.progress, unit="rule") as bar,
@@ -106,8 +110,8 @@ def main(arguments: Sequence[str]) -> int:
                     name,
                     _ground(options, sources[name], device),
                     most,
-                    facts=facts,
-                    command=shlex.join(["npa-envs", "robustness", *arguments]),
+                    facts=facts[name],
+                    command=shlex.join(["npa-envs", "robustness", *words]),
                     before=record,
                     path=paths.get(name),
                     enough=enough,

@@ -82,6 +82,8 @@ def main(arguments: Sequence[str]) -> int:
         name = f"stress_{device.type}{'_quick' * options.quick}.json"
         path = writable_folder(options.out) / name
         record = suite.Record.read(path, facts)
+    weights = suite.rule_weights(chosen)
+    record.drop_other_rules(weights)
     before = sum(record.done(check.name) for check in chosen)
     if before:
         print(f"{before} of {len(chosen)} checks were done before")
@@ -99,6 +101,7 @@ def main(arguments: Sequence[str]) -> int:
             Session(device, quick=options.quick, seed=options.seed),
             record,
             max_seconds=options.max_seconds,
+            weights=weights,
             written=written,
             progress=bar.advance,
         )

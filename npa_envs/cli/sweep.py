@@ -15,12 +15,12 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import tyro
 
 from npa_envs.cli.output import OutFolder, StepBar, check_numbers, parse_options, writable_folder
-from npa_envs.errors import NPAError, suggest
+from npa_envs.errors import NPAError, shown, suggest
 from npa_envs.files import read_json, write_text
 from npa_envs.measure.record import write_record
 from npa_envs.measure.tables import NONE, markdown_table
@@ -211,18 +211,36 @@ def is_over(folder: Path, run: Run) -> bool:
     """Return whether a run has ended well.
 
     Raises:
-        NPAError: Its folder holds one of other words.
+        NPAError: Its folder holds one of other words, or a record that cannot be read.
     """
     path = folder / run.name / RECORD
-    if not path.exists():
+    held = _held(path)
+    if held is None:
         return False
-    held: Any = read_json(path)
-    if list(held["words"]) != list(run.words):
+    if list(held.words) != list(run.words):
         raise NPAError(
-            f"{str(path)!r} holds a run of other words, {shlex.join(held['words'])}: choose "
+            f"{str(path)!r} holds a run of other words, {shlex.join(held.words)}: choose "
             "another folder with --out"
         )
-    return bool(held["code"] == 0)
+    return held.code == 0
+
+
+def _held(path: Path) -> RunRecord | None:
+    """Return what became of a run, None where nothing says so.
+
+    Raises:
+        NPAError: The file does not say it.
+    """
+    if not path.exists():
+        return None
+    try:
+        held = RunRecord(**read_json(path))
+        return RunRecord([str(word) for word in held.words], int(held.code), float(held.seconds))
+    except (TypeError, ValueError) as error:
+        raise NPAError(
+            f"{str(path)!r} must be a record of npa-envs sweep, but cannot be read "
+            f"({shown(error)}): remove it, or choose another folder with --out"
+        ) from error
 
 
 class _Training(Child):
@@ -283,10 +301,10 @@ def table(folder: Path, runs: Sequence[Run]) -> str:
     for run in runs:
         path = folder / run.name / RECORD
         state, seconds, scores = "not run", NONE, NONE
-        if path.exists():
-            held: Any = read_json(path)
-            state = "done" if held["code"] == 0 else f"failed with code {held['code']}"
-            seconds = f"{held['seconds']:.0f}"
+        held = _held(path)
+        if held is not None:
+            state = "done" if held.code == 0 else f"failed with code {held.code}"
+            seconds = f"{held.seconds:.0f}"
             reports = sorted((folder / run.name / "report").glob("rule*.json"))
             scores = "; ".join(score_line(read_json(report)) for report in reports) or NONE
         lines.append([*run.values.values(), state, seconds, scores])

@@ -390,7 +390,7 @@ def changes_of_mind(
         NPAError: A number of steps is out of range, or half of all clouds or more are of one class.
     """
     check_steps("settle_steps", [settle_steps])
-    check_steps("steps", [1 + step for step in steps])
+    check_steps("steps", steps, at_least=0)
     runner = Runner(rule, task, task.clouds.x.device, seed, progress)
     places, classes = task.clouds.x.to(runner.dtype), task.clouds.label
     partner = _partners(classes)
@@ -567,20 +567,21 @@ def _sums(*figures: Tensor) -> Tensor:
     return torch.stack([figure.double().sum() for figure in figures]).cpu()
 
 
-def check_steps(name: str, steps: Sequence[int]) -> None:
-    """Check that numbers of steps are positive and increasing.
+def check_steps(name: str, steps: Sequence[int], at_least: int = 1) -> None:
+    """Check that numbers of steps are increasing and not too small.
 
     Args:
         name: What the caller calls them.
         steps: The numbers.
+        at_least: The smallest that is allowed.
 
     Raises:
         NPAError: They are not, or there are none.
     """
     ordered = all(a < b for a, b in itertools.pairwise(steps))
-    if not steps or min(steps) < 1 or not ordered:
+    if not steps or min(steps) < at_least or not ordered:
         raise NPAError(
-            f"{name} must be whole numbers of at least 1, increasing, got {tuple(steps)}: "
+            f"{name} must be whole numbers of at least {at_least}, increasing, got {tuple(steps)}: "
             f"for example {CHECKPOINTS}"
         )
 

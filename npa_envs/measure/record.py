@@ -14,7 +14,7 @@ import platform
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from datetime import date
 from pathlib import Path
 from typing import Any, TypeVar
@@ -113,6 +113,28 @@ def measured_facts(device: torch.device, commit: str | None, **settings: Any) ->
         "commit": commit or current_commit(),
         "versions": versions(),
     }
+
+
+def without_folders(words: Sequence[str], *options: str) -> list[str]:
+    """Return a command's words with the values of some options replaced by the options' names.
+
+    Records are not to tell where on which machine they were written.
+
+    Args:
+        words: "--out", "PATH" or "--out=PATH" becomes "--out", "OUT" or "--out=OUT".
+        options: Names with their dashes.
+    """
+    told: list[str] = []
+    before = ""
+    for word in words:
+        name, mark, _ = word.partition("=")
+        if before in options:
+            word = before.lstrip("-").upper()
+        elif mark and name in options:
+            word = f"{name}={name.lstrip('-').upper()}"
+        told.append(word)
+        before = word
+    return told
 
 
 def script_parser(description: str | None) -> argparse.ArgumentParser:

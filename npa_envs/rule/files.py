@@ -231,6 +231,18 @@ def rule_metadata(path: str | Path) -> dict[str, str]:
         raise NPAError(f"cannot read the header of {shown(str(path))}: {error}") from error
 
 
+def rule_digest(rule: NPARule) -> str:
+    """Return 16 hexadecimal digits by which the weights of a rule are known: SHA-256 of them.
+
+    Args:
+        rule: The rule, on any device.
+    """
+    found = hashlib.sha256()
+    for weight in rule.state_dict().values():
+        found.update(weight.cpu().numpy().tobytes())
+    return found.hexdigest()[:16]
+
+
 def rule_file(source: str | Path) -> Path:
     """Return the file of a rule.
 

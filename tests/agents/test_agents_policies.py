@@ -196,6 +196,7 @@ def fitted(rule, **keywords):
         (lambda _: ZeroPolicy(gymnasium.make("CartPole-v1")), "an environment of npa_envs"),
         (lambda env: RandomPolicy(env, seed=-1), "a seed"),
         (lambda env: PaintPolicy(env, colour=(0.5,)), "colour must have three numbers"),
+        (lambda env: MendPolicy(env, blank="x"), "blank must be a finite number, got 'x'"),
         *(
             (lambda env, shape=shape: ZeroPolicy(env)(np.zeros(shape, np.float32)), "P = 66")
             for shape in ((64,), (64, 65), (1, 1, 64, 66))
@@ -206,6 +207,12 @@ def test_what_does_not_fit_is_refused(use, message):
     env = make(particle_count=64)
     with pytest.raises(NPAError, match=message):
         use(env)
+
+
+def test_paint_needs_a_colour_where_a_goal_is_no_picture():
+    env = gymnasium.make("npa/PointClassificationSmall-v0")
+    with pytest.raises(NPAError, match="colour must be given where env has no target"):
+        PaintPolicy(env)
 
 
 def test_random_actions_repeat_by_seed_and_each_world_has_its_own():

@@ -4,6 +4,7 @@ import dataclasses
 import json
 import math
 import os
+import shutil
 import subprocess
 import sys
 import time
@@ -183,6 +184,8 @@ def test_the_command_line_becomes_a_plan():
         ({"seconds": 0.0}, "seconds must be positive"),
         ({"particle_steps": 0.5}, "particle-steps must be positive"),
         ({"seconds": 1.0, "seeds": 0}, "seeds must be at least 1"),
+        ({"seconds": 1.0, "seeds": 101}, "seeds must be at most 100, got 101"),
+        ({"seconds": 1.0, "methods": ("a=zero", "a=random")}, "got a=zero and a=random: rename"),
         ({"seconds": 1.0, "tasks": ("mixin",)}, "did you mean 'mixing'"),
         ({"seconds": 1.0, "methods": ("pp",)}, "did you mean 'ppo'"),
         ({"seconds": 1.0, "options": ("evolution=3",)}, "METHOD.NAME=VALUE"),
@@ -355,8 +358,14 @@ def test_a_run_that_clones_is_refused_where_its_teacher_will_never_be(tmp_path, 
     with pytest.raises(NPAError, match=r"clones the rules of 'gradient'.*add --methods gradient"):
         run_jobs(made, made.jobs(), tmp_path, Places(("cpu",), jobs=1))
     assert list(tmp_path.iterdir()) == []
-    # What an earlier call has run serves as well.
-    (tmp_path / made.teacher(made.jobs()[0]).folder).mkdir(parents=True)
+    # What an earlier call has run serves as well, from the same settings.
+    taught = plan(methods=["gradient"], seeds=(0,), options={"gradient": {"world_count": 2}})
+    run_jobs(taught, taught.jobs(), tmp_path, Places(("cpu",), jobs=1))
+    with pytest.raises(NPAError, match=r"of other settings: options was \{'world_count': 2\}, now"):
+        run_jobs(made, made.jobs(), tmp_path, Places(("cpu",), jobs=1))
+    shutil.rmtree(tmp_path / taught.jobs()[0].folder)
+    taught = plan(methods=["gradient"], seeds=(0,))
+    run_jobs(taught, taught.jobs(), tmp_path, Places(("cpu",), jobs=1))
     run_jobs(made, made.jobs(), tmp_path, Places(("cpu",), jobs=1))
     assert (tmp_path / made.jobs()[0].folder / "run.json").exists()
 

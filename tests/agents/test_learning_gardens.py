@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from learning_problems import heart
 
 from npa_envs.agents import evaluate_policy
 from npa_envs.agents.evaluation import policy_in
@@ -67,6 +68,32 @@ def test_algorithms_as_they_come_learn_within_their_budget_and_can_be_loaded(
     kind = baselines.SAC if method == "sac" else baselines.PPO
     trained.policy.model = kind.load(path)
     assert np.array_equal(trained.policy(observation), action)
+
+
+def test_a_policy_of_another_garden_or_a_file_of_something_else_is_refused(tmp_path):
+    pytest.importorskip("stable_baselines3")
+    from npa_envs.agents.learning.garden_sb3 import GardenPolicy
+
+    problem = garden()
+    (path,) = learned("sac", problem, 1, learning_starts=2).save(tmp_path)
+    seen, _ = problem.make_envs().reset(seed=0)
+    assert GardenPolicy.load(path)(seen).shape[0] == 2
+    seen, _ = garden("Shepherd2DSmall").make_envs().reset(seed=0)
+    with pytest.raises(NPAError, match="observation must be of a garden like that which"):
+        GardenPolicy.load(path)(seen)
+    path.write_text("no archive")
+    with pytest.raises(NPAError, match=r"path must be of a file that sac's `save` wrote, got"):
+        GardenPolicy.load(path)
+
+
+def test_rounds_that_stable_baselines_cannot_learn_from_are_refused():
+    pytest.importorskip("stable_baselines3")
+    with pytest.raises(NPAError, match="batch_size must be a whole number of at least 2"):
+        learned("ppo_world", garden(), batch_size=1)
+    with pytest.raises(NPAError, match="steps must be at least 2 in a single world"):
+        learned("ppo_world", replace(garden(), num_envs=1), steps=1)
+    with pytest.raises(NPAError, match="minibatches must leave at least 2 of the 4 steps"):
+        learned("ppo_world", heart(num_envs=1), steps=4)
 
 
 def test_a_garden_is_learned_by_its_own_methods_and_from_no_rules():

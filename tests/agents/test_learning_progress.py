@@ -54,6 +54,12 @@ def learn_nothing(progress, rules, pause=0.0):
         (Budget, {"particle_steps": 1.5}, "particle_steps must be"),
         (progress_of, {"problem": PROBLEM, "particle_steps": 10, "entries": 0}, "entries"),
         (progress_of, {"problem": PROBLEM, "particle_steps": 10, "seeds": []}, "seed"),
+        (
+            progress_of,
+            {"problem": PROBLEM, "particle_steps": 10, "seeds": 4},
+            "evaluation_seeds must be one for each episode, got 4",
+        ),
+        (progress_of, {"problem": PROBLEM, "particle_steps": 10, "seeds": ["a"]}, "seed"),
     ],
 )
 def test_a_budget_or_a_curve_that_means_nothing_is_refused(make, fields, message):
@@ -164,7 +170,14 @@ def test_learning_rates_fall_from_the_first_to_the_last():
         ("gradient", {"learning_rat": 1.0}, "did you mean 'learning_rate'"),
         ("zero", {"learning_rate": 1.0}, "has no option 'learning_rate'"),
         ("zero", {"device": "tpu"}, "device"),
-        ("zero", {"seed": -1}, "seed must be"),
+        ("zero", {"seed": -1}, "seed must be a whole number from 0 to 99, .* got -1"),
+        ("zero", {"seed": 100}, "seed must be a whole number from 0 to 99, .* got 100"),
+        ("zero", {"evaluation_seeds": 4}, "evaluation_seeds must be one for each episode, got 4"),
+        ("scripted", {"gains": 0.1}, "gains must be a list of finite numbers, got 0.1"),
+        ("scripted", {"gains": [0.1, "a"]}, "gains must be a list of finite numbers"),
+        ("ppo", {"masked": "False"}, "masked must be True or False, got 'False'"),
+        ("gradient", {"steps": 5}, "steps must be a range .* of two whole numbers, got 5"),
+        ("gradient", {"steps": [5, 2]}, "steps must be two whole numbers"),
         ("zero", {"start": heart().new_rules(0)}, "start must be None"),
         ("evolution", {"population": 2}, "population must be a whole number of at least 4"),
         ("evolution", {"sigma": 0.0}, "sigma must be a finite number greater than 0"),
@@ -196,6 +209,21 @@ def test_wrong_methods_and_options_are_refused(method, options, message):
     options = {name: value for name, value in options.items() if name != "seed"}
     with pytest.raises(NPAError, match=message):
         train(method, heart(), Budget(particle_steps=10), seed, **options)
+
+
+def test_a_problem_or_a_budget_that_is_none_is_refused_with_a_cure_that_works():
+    with pytest.raises(
+        NPAError, match=r"budget must be a Budget, got 3: .* Budget\((.*)\)$"
+    ) as told:
+        train("zero", heart(), 3, 0)
+    assert str(told.value).endswith("Budget(particle_steps=10**6)")
+    assert Budget(particle_steps=10**6).share(0.0, 10**6) == 1.0
+
+
+def test_a_range_of_steps_may_be_a_list_as_command_lines_give_it():
+    log = train("gradient", heart(), Budget(particle_steps=1), 0, steps=[2, 3], entries=1).log
+    # Eight worlds of 48 particles, two steps.
+    assert log[-1].particle_steps == 8 * 48 * 2
 
 
 def test_options_are_named_with_their_defaults():

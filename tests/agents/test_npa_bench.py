@@ -1,5 +1,6 @@
 """NPA-Bench: rows are files that anybody can write, and scores follow from them alone."""
 
+import dataclasses
 import json
 import math
 
@@ -11,6 +12,7 @@ from npa_envs.agents.comparison.npa_bench import (
     SUITES,
     Row,
     Run,
+    check_rows,
     normalised,
     read_row,
     read_rows,
@@ -190,6 +192,55 @@ def test_runs_of_a_row_from_several_machines_say_where_they_ran(tmp_path):
     held["runs"][0]["machine"] = "slide rule"
     path.write_text(json.dumps(held))
     assert [run.machine for run in read_row(path).runs[:2]] == ["slide rule", ""]
+
+
+def test_a_narrower_call_keeps_the_rest_of_a_row(tmp_path):
+    made = plan_of(methods=("zero",))
+    (path,) = write_rows(SUITE, made, records(made), tmp_path, "first")
+    whole = json.loads(path.read_text())
+    fewer = plan_of(methods=("zero",), tasks=("MixingSmall-v0",))
+    fewer = dataclasses.replace(
+        fewer, settings=fewer.settings | {"commit": "decade", "machine": "abacus"}
+    )
+    write_rows(SUITE, fewer, records(fewer), tmp_path, "second")
+    held = json.loads(path.read_text())
+    assert (held["command"], held["commit"]) == ("first; second", "c0ffee; decade")
+    assert held["machine"] == f"{whole['machine']}; abacus"
+    assert held["versions"] == whole["versions"]
+    assert [(run["id"], run["seed"]) for run in held["runs"]] == [
+        (run["id"], run["seed"]) for run in whole["runs"]
+    ]
+    read = read_row(path)
+    where = {run.env_id: run.machine for run in read.runs}
+    assert where.pop("npa/MixingSmall-v0") == "abacus"
+    assert set(where.values()) == {whole["machine"]}
+    # What holds all of it takes its place.
+    write_rows(SUITE, made, records(made), tmp_path, "first")
+    assert json.loads(path.read_text()) == whole
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda held: held.update(benchmark="npa-bench-small-v0"), "must have the benchmark"),
+        (lambda held: held.update(options={"a": 1}), r"must have the options \{\} for runs to be"),
+        (lambda held: held.update(about="other:train"), "must have the about 'zero'"),
+        (lambda held: held["runs"][0].update(returns=[1.0]), "must have runs of 32 episodes"),
+        (lambda held: held.pop("runs"), "cannot be read"),
+        (lambda held: held["runs"][0].pop("seed"), "cannot be read"),
+        (lambda held: held.update(machine=None), "cannot be read"),
+    ],
+)
+def test_runs_are_not_added_to_a_row_of_something_else(tmp_path, change, words):
+    made = plan_of(methods=("mine=zero",))
+    check_rows(SUITE, made, tmp_path)
+    (path,) = write_rows(SUITE, made, records(made), tmp_path, "it")
+    check_rows(SUITE, made, tmp_path)
+    held = json.loads(path.read_text())
+    change(held)
+    path.write_text(json.dumps(held))
+    with pytest.raises(NPAError, match=words):
+        check_rows(SUITE, made, tmp_path)
 
 
 def test_a_row_of_another_suite_is_refused(tmp_path):

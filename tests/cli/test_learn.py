@@ -10,7 +10,9 @@ from pathlib import Path
 
 import pytest
 
+from npa_envs.agents.learning.kept import KeptProgress
 from npa_envs.cli import main
+from npa_envs.cli.learn import parse, problem_of
 from npa_envs.training.checkpoint import load_checkpoint
 
 WORDS = [
@@ -100,6 +102,44 @@ def test_a_killed_process_ends_a_run_and_a_signal_stops_it(tmp_path):
 def test_mistakes_are_told(words, message, tmp_path, capsys):
     assert main([*WORDS, "--particle-steps", "9", "--out", str(tmp_path), *words]) == 2
     assert message in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("env", "steps"),
+    [
+        ("npa/MixingSmall-v0", 32),
+        ("npa/MixingLarge-v0", 256),
+        ("npa/Mixing-v0", 256),
+        ("npa/Morphogenesis2DSmall-v0", 32),
+    ],
+)
+def test_episodes_are_as_long_as_registered(env, steps):
+    assert problem_of(parse(["ppo", env])).episode_steps == steps
+    assert problem_of(parse(["ppo", env, "--episode-steps", "5"])).episode_steps == 5
+
+
+def test_worlds_are_those_of_shac_where_they_are_told(tmp_path):
+    words = ["learn", "shac", "npa/MixingSmall-v0", "--particle-steps", "1", "--episodes", "1"]
+    words += ["--entries", "1", "--episode-steps", "2", "--no-progress", "--out"]
+    for name, worlds, count in (("told", ["--worlds", "3"], 3), ("default", [], 8)):
+        assert main([*words, str(tmp_path / name), *worlds]) == 0
+        last = json.loads((tmp_path / name / "log.jsonl").read_text().splitlines()[-1])
+        assert last["particle_steps"] == count * 2 * 64
+
+
+def test_what_is_written_takes_no_time_and_what_is_over_has_finished(tmp_path, monkeypatch):
+    write = KeptProgress._write
+
+    def slow(progress, *given):
+        time.sleep(0.4)
+        write(progress, *given)
+
+    monkeypatch.setattr(KeptProgress, "_write", slow)
+    words = [*WORDS, "--seconds", "0.3", "--no-progress", "--out", str(tmp_path)]
+    assert main(words) == 0
+    seconds = [json.loads(line)["seconds"] for line in (tmp_path / "log.jsonl").open()]
+    assert 0.3 <= seconds[-1] < 0.6
+    assert len(seconds) > 2
 
 
 def test_a_run_needs_a_budget(tmp_path, capsys):

@@ -111,6 +111,14 @@ def test_a_run_that_fails_is_tried_again_and_those_that_are_over_are_left(tmp_pa
     assert (tmp_path / "sweep.md").read_text().count("done") == 4
 
 
+@pytest.mark.parametrize("text", ["{}", "[]", '{"words": 1, "code": 0, "seconds": 1}', "x"])
+def test_a_record_that_cannot_be_read_is_told(tmp_path, child, capsys, text):
+    (tmp_path / "seed=0,target=a").mkdir()
+    (tmp_path / "seed=0,target=a" / "run.json").write_text(text)
+    assert call(tmp_path) == 2
+    assert "must be a record of npa-envs sweep" in capsys.readouterr().err
+
+
 def test_parts_and_time_limits_leave_runs_to_other_calls(tmp_path, child, capsys):
     assert call(tmp_path, "--max-seconds", "1e-9") == 0
     assert "4 runs are left" in capsys.readouterr().out

@@ -26,6 +26,7 @@ from npa_envs.measure.accuracy.suite import (
     run_check,
     run_checks,
 )
+from npa_envs.rule.files import load_rule, rule_digest, rule_file, rule_metadata, save_rule
 from npa_envs.rule.rule import NPARule
 from npa_envs.training import preset, train
 
@@ -353,6 +354,43 @@ def test_the_command_writes_a_record_draws_it_and_goes_on(tmp_path, capsys, monk
     assert "values/nan_position failed: x 1 (at most 0)" in capsys.readouterr().out
     assert main([*words, "--only", "values"]) == 0
     assert "1 of 1 checks were done before" in capsys.readouterr().out
+
+
+def test_checks_of_a_rule_that_was_trained_anew_are_run_again(tmp_path, capsys):
+    rule = load_rule("heart")
+    metadata = {"task": "morphogenesis2d", "config": rule_metadata(rule_file("heart"))["config"]}
+    path = tmp_path / "mine.safetensors"
+    save_rule(rule, path, metadata=metadata)
+    words = ["stress", str(path), "--quick", "--no-progress", "--out", str(tmp_path)]
+    words += ["--commit", "x", "--only", "gradients/norm"]
+
+    def verdict():
+        main(words)
+        (entry,) = json.loads((tmp_path / "stress_cpu_quick.json").read_text())["checks"]
+        return entry["weights"], entry["verdict"]
+
+    assert verdict() == (rule_digest(rule), "pass")
+    capsys.readouterr()
+    assert verdict() == (rule_digest(rule), "pass")
+    assert "1 of 1 checks were done before" in capsys.readouterr().out
+    before = rule_digest(rule)
+    with torch.no_grad():
+        rule.output.weight.mul_(1.01)
+    save_rule(rule, path, metadata=metadata)
+    assert verdict() == (rule_digest(rule), "pass")
+    assert rule_digest(rule) != before
+    assert "done before" not in capsys.readouterr().out
+
+
+def test_two_rules_of_one_name_are_refused(tmp_path):
+    for folder in ("a", "b"):
+        (tmp_path / folder).mkdir()
+        save_rule(load_rule("heart"), tmp_path / folder / "heart.safetensors")
+    first, second = (str(tmp_path / name / "heart.safetensors") for name in ("a", "b"))
+    assert told_rules([first, first]) == {"heart": first}
+    for words in ([first, second], ["heart", second]):
+        with pytest.raises(NPAError, match=r"names of their own, but .* are both called 'heart'"):
+            told_rules(words)
 
 
 def test_the_command_lists_its_checks(capsys):

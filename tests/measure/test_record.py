@@ -18,6 +18,7 @@ from npa_envs.measure.record import (
     script_facts,
     script_parser,
     time_limit,
+    without_folders,
     write_record,
 )
 from npa_envs.measure.tables import csv_text, markdown_table, mean_with_error, table_text
@@ -65,6 +66,12 @@ def test_facts_name_the_machine_the_commit_and_the_versions():
     assert facts["commit"] == current_commit()
     assert torch.__version__.startswith(facts["versions"]["torch"])
     assert measured_facts(torch.device("cpu"), "abc")["commit"] == "abc"
+
+
+def test_a_commands_folders_are_not_told():
+    words = ["heart", "--out", "a/b", "--output=c", "--seed", "a/b"]
+    told = ["heart", "--out", "OUT", "--output=OUTPUT", "--seed", "a/b"]
+    assert without_folders(words, "--out", "--output") == told
 
 
 def test_a_time_limit_passes_once_and_never_without_one():

@@ -43,7 +43,14 @@ from npa_envs.measure.robustness.study import (
     where_it_works,
     working_range,
 )
-from npa_envs.rule.files import rule_metadata, shipped_rules
+from npa_envs.rule.files import (
+    load_rule,
+    rule_digest,
+    rule_file,
+    rule_metadata,
+    save_rule,
+    shipped_rules,
+)
 from npa_envs.tasks.damage import random_particle
 from npa_envs.training.trained_tasks import task_of_rule, trained_config
 from npa_envs.world.randomness import WorldRandom
@@ -417,6 +424,28 @@ def test_the_command_measures_writes_and_goes_on(tmp_path, capsys, monkeypatch):
     (path,) = whole.glob("*.json")
     whole = json.loads(path.read_text())
     assert (whole["courses"], whole["responses"]) == (held["courses"], held["responses"])
+
+
+def test_a_record_of_a_rule_that_was_trained_anew_is_refused(tmp_path, capsys, monkeypatch):
+    rule = load_rule("heart")
+    metadata = {"task": "morphogenesis2d", "config": rule_metadata(rule_file("heart"))["config"]}
+    (tmp_path / "mine").mkdir()
+    path = tmp_path / "mine" / "rule.safetensors"
+    save_rule(rule, path, metadata=metadata)
+    words = ["robustness", str(path.parent), "--quick", "--no-progress", "--commit", "0"]
+    words += ["--max-seconds", "1e-9", f"--out={tmp_path / 'out'}"]
+    monkeypatch.setattr(
+        "npa_envs.measure.record.time_limit", lambda _: iter([False, True]).__next__
+    )
+    assert main(words) == 0
+    held = json.loads((tmp_path / "out" / "robustness_mine.json").read_text())
+    assert held["facts"]["weights"] == rule_digest(rule)
+    assert str(tmp_path / "out") not in held["command"]
+    with torch.no_grad():
+        rule.output.weight.mul_(1.01)
+    save_rule(rule, path, metadata=metadata)
+    assert main(words) == 2
+    assert "holds figures of other settings: weights was" in capsys.readouterr().err
 
 
 def test_rules_that_runs_begin_with_are_known_by_name():

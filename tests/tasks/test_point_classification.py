@@ -254,6 +254,8 @@ def test_particles_learn_to_say_what_they_form(trained):
     assert changes["all mutated", 0].majority_before >= 0.9
     assert changes["all mutated", 16].majority >= 0.7
     assert changes["all mutated", 16].majority > changes["upper half mutated", 16].majority
+    with pytest.raises(NPAError, match=r"steps must be .* at least 0, .* got \(0, 32, 16\)"):
+        changes_of_mind(rule, task, steps=(0, 32, 16))
 
 
 def test_the_commands_measure_and_film_a_rule_that_classifies(trained, tmp_path, capsys):

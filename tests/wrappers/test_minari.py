@@ -1,12 +1,17 @@
 """Datasets of Minari: episodes as they were, to be played again and to be learned from."""
 
+from types import SimpleNamespace
+
+import gymnasium
 import numpy as np
 import pytest
 from learning_problems import heart, wild_rules
 
 from npa_envs.agents import evaluate_policy
 from npa_envs.agents.learning import Budget, Problem, RuleSet, train
-from npa_envs.cli import main
+from npa_envs.agents.learning.problem import registered_steps, world_seeds
+from npa_envs.cli import main, record
+from npa_envs.cli.record import RecordOptions
 from npa_envs.errors import DivergedError, NPAError
 
 minari = pytest.importorskip("minari")
@@ -126,6 +131,68 @@ def test_the_command_records_any_policy(root, capsys, env, policy, names):
     first = dataset[0]
     assert bool(first.actions.any()) == (policy != "zero")
     assert names is None or first.observations.keys() == names
+
+
+def test_the_folder_of_datasets_is_not_published_however_it_is_told(root, capsys):
+    words = ["record", "npa/Gardener2DSmall-v0", "--policy", "zero", "--episodes", "1"]
+    words += ["--no-progress"]
+    words += ["--options", "particle_count=32", "seed_pool=1"]
+    for number, told in enumerate(([f"--root={root}"], ["--root", f"{root}/./"])):
+        assert main([*words, "--dataset", f"npa/it-v{number}", *told]) == 0
+        described = minari.load_dataset(f"npa/it-v{number}").storage.metadata["description"]
+        assert str(root) not in described
+        assert "ROOT" in described
+    (root / "file").touch()
+    assert main([*words, "--dataset", "npa/it-v2", "--root", str(root / "file")]) == 2
+    assert "root must be a folder that can be" in capsys.readouterr().err
+
+
+def test_episodes_of_an_environment_of_ones_own_are_as_long_as_it_is_registered():
+    small = gymnasium.spec("npa/Morphogenesis2DSmall-v0")
+    gymnasium.register(
+        id="mine/Growth-v0",
+        entry_point=small.entry_point,
+        vector_entry_point=small.vector_entry_point,
+        max_episode_steps=3,
+        kwargs=small.kwargs,
+    )
+    try:
+        assert registered_steps("mine/Growth-v0") == 3
+        words = ["record", "mine/Growth-v0", "--policy", "zero", "--episodes", "2", "--no-progress"]
+        assert main([*words, "--dataset", "npa/own-v0"]) == 0
+        assert minari.load_dataset("npa/own-v0").total_steps == 6
+    finally:
+        del gymnasium.registry["mine/Growth-v0"]
+
+
+@pytest.mark.parametrize(
+    ("first", "count", "seed"),
+    [(0, 16, 1), (10_000, 16, 0), (9_999, 1, 1), (9_999, 2, 2), (2_000_000, 16, 0)],
+)
+def test_a_scripted_policy_is_chosen_in_worlds_that_are_not_recorded(first, count, seed):
+    options = RecordOptions(
+        env="npa/Morphogenesis2DSmall-v0", dataset="a/b-v0", first_seed=first, episodes=count
+    )
+    assert record._choice_seed(options) == seed
+    recorded = set(range(first, first + count))
+    assert recorded.isdisjoint(world_seeds(seed, 16))
+
+
+def test_only_a_scripted_policy_is_chosen_elsewhere(monkeypatch):
+    asked = []
+
+    def train(method, problem, budget, seed, **_):
+        asked.append((method, seed))
+        return SimpleNamespace(policy=None)
+
+    monkeypatch.setattr("npa_envs.agents.learning.train", train)
+    words = {"env": "npa/Morphogenesis2DSmall-v0", "dataset": "a/b-v0"}
+    for policy in ("scripted", "random"):
+        options = RecordOptions(**words, policy=policy)
+        record.policy_of(options, record.problem_of(options))
+    assert asked == [("scripted", 1), ("random", 0)]
+    with pytest.raises(NPAError, match="episodes must leave 10000 seeds below 1000000"):
+        record._choice_seed(RecordOptions(**words, episodes=10**6))
 
 
 @pytest.mark.parametrize(

@@ -93,6 +93,8 @@ class Check:
     name: str
     expected: str
     run: Callable[[Session], Finding]
+    rule: str = ""
+    """What `load_rule` takes, of a check of a rule."""
 
     @property
     def group(self) -> str:

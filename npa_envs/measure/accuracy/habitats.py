@@ -246,7 +246,8 @@ def endurance_checks(rules: Mapping[str, str] | None = None) -> list[Check]:
     )
     sources = rules or {name: name for name in rule_names()}
     return [
-        Check(f"time/{name}", expected, partial(_run, source)) for name, source in sources.items()
+        Check(f"time/{name}", expected, partial(_run, source), source)
+        for name, source in sources.items()
     ]
 
 

@@ -86,12 +86,14 @@ def gradients_checks(*, quick: bool, rules: Mapping[str, str] | None = None) -> 
                 "gradients of a functional by weights and by states at the start are finite "
                 "whatever the number of steps; their norms are told",
                 partial(_run_norm, source),
+                source,
             ),
             Check(
                 f"gradients/float32/{name}",
                 "one step in float32 is within 1e-5 of one in float64, also its gradients; after "
                 "how many steps they still agree to 1e-2 is told",
                 partial(_run_float32, source),
+                source,
             ),
         ]
     for space_dim in () if rules else (2, 3):
@@ -257,6 +259,7 @@ def precision_checks(*, quick: bool, rules: Mapping[str, str] | None = None) -> 
             f"the rule at its horizon is finite, its metric at most {WORKS:g} times that of "
             f"float32, with {PRECISIONS[name].summary}",
             partial(_run_short, PRECISIONS[name], source),
+            source,
         )
         for name in SHORT
         for rule, source in (rules or _named(QUICK_SHORT_RULES if quick else SHORT_RULES)).items()

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -27,6 +27,7 @@ from npa_envs.measure.accuracy.numerics import gradients_checks, precision_check
 from npa_envs.measure.plots import draw_matrix, new_figure, png
 from npa_envs.measure.record import read_record, time_limit, write_record
 from npa_envs.measure.tables import table_text
+from npa_envs.rule.files import load_rule, rule_digest
 
 MEASURED = ("pass", "range")
 """Verdicts of checks that a resumed run does not repeat."""
@@ -87,6 +88,8 @@ class Entry:
     """The reason to skip it, the message of its error, or what else there is to know."""
     seconds: float = 0.0
     """How long it took [s]."""
+    weights: str = ""
+    """Of a check of a rule: what `rule_digest` says of it; older records do not tell."""
 
     @classmethod
     def of(cls, check: Check, finding: Finding, seconds: float) -> Entry:
@@ -173,6 +176,16 @@ class Record:
         """Return whether a check need not be run again."""
         return name in self.entries and self.entries[name].verdict in MEASURED
 
+    def drop_other_rules(self, weights: Mapping[str, str]) -> None:
+        """Drop what was found of rules that have been trained anew.
+
+        Args:
+            weights: What `rule_digest` says now of the rules of checks, by the checks' names.
+        """
+        for name, digest in weights.items():
+            if name in self.entries and self.entries[name].weights != digest:
+                del self.entries[name]
+
     def counts(self) -> dict[str, int]:
         """Return how many checks came to each verdict."""
         found = [entry.verdict for entry in self.entries.values()]
@@ -238,14 +251,15 @@ def run_checks(
     record: Record,
     *,
     max_seconds: float | None = None,
+    weights: Mapping[str, str] | None = None,
     written: Callable[[Record], None] = lambda record: None,
     progress: Callable[[int], None] = lambda done: None,
 ) -> None:
     """Run checks that the record does not have yet, and put what came of them there.
 
     No check begins after `max_seconds`; those that are left out are skipped, but for what an
-    earlier run found of them. After each check `written` is called with the record, `progress`
-    with 1.
+    earlier run found of them. `weights` are those of checks of rules, as `rule_weights` returns
+    them. After each check `written` is called with the record, `progress` with 1.
     """
     time_is_up = time_limit(max_seconds)
     for check in checks:
@@ -254,9 +268,22 @@ def run_checks(
                 left = Entry(check.name, check.expected, "skipped", note="no time was left for it")
                 record.entries.setdefault(check.name, left)
             else:
-                record.entries[check.name] = run_check(check, session)
+                found = run_check(check, session)
+                told = (weights or {}).get(check.name, "")
+                record.entries[check.name] = replace(found, weights=told)
             written(record)
         progress(1)
+
+
+def rule_weights(checks: Iterable[Check]) -> dict[str, str]:
+    """Return what `rule_digest` says of the rules of checks of one, by the checks' names.
+
+    Raises:
+        NPAError: A rule cannot be loaded.
+    """
+    some = [check for check in checks if check.rule]
+    known = {rule: rule_digest(load_rule(rule)) for rule in {check.rule for check in some}}
+    return {check.name: known[check.rule] for check in some}
 
 
 def run_check(check: Check, session: Session) -> Entry:

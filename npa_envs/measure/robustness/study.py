@@ -61,7 +61,8 @@ class RuleRecord:
     update_prob: float
     """Probability of an update as trained."""
     facts: Mapping[str, Any]
-    """What the figures follow from: device, machine, size, seeds, commit, versions."""
+    """What the figures follow from: the rule's weights, device, machine, size, seeds, commit,
+    versions."""
     courses: tuple[Course, ...]
     """After each damage, the control first."""
     responses: tuple[Response, ...]
