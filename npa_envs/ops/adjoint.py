@@ -6,12 +6,13 @@ from typing import Any, NamedTuple
 
 from torch import Tensor
 
+from npa_envs.errors import NPAError
 from npa_envs.kernels.access import WARP
 from npa_envs.kernels.cuda.adjoint import SHARE, TILE, listed_adjoint
 from npa_envs.kernels.portable.adjoint import adjoint_kernels
 from npa_envs.ops.launch import launch
 from npa_envs.ops.opaque import opaque
-from npa_envs.ops.sort import Plan, density_scale, make_plan
+from npa_envs.ops.sort import LARGEST_INDEX, Plan, density_scale, make_plan
 
 
 class SavedPerception(NamedTuple):
@@ -125,6 +126,12 @@ def _unscale(
 ) -> RowCotangents:
     """Pull the cotangents of rows back through their scaling."""
     entries, space_dim = plan.row_capacity * plan.group_count, plan.space_dim
+    largest = entries * space_dim * plan.width
+    if largest >= LARGEST_INDEX:
+        raise NPAError(
+            f"gradients must stay below {LARGEST_INDEX} numbers in one batch, got {largest}: split "
+            "the batch, or take float32 and detach_positions=True"
+        )
     cotangents = RowCotangents(
         bar,
         bar.new_empty(entries, plan.width),

@@ -16,8 +16,14 @@ from npa_envs.errors import NPAError, shown
 
 DTYPES = (torch.float32, torch.float64)
 
-LENGTH_RANGE = {torch.float32: (1e-8, 1e8), torch.float64: (1e-60, 1e60)}
-"""Perception radii [length units] whose powers in the kernels stay numbers of the dtype."""
+LENGTH_RANGE = {
+    (2, torch.float32): (1e-8, 1e8),
+    (3, torch.float32): (1e-6, 1e6),
+    (2, torch.float64): (1e-60, 1e60),
+    (3, torch.float64): (1e-50, 1e50),
+}
+"""Perception radii [length units] whose powers in the kernels stay numbers of the dtype, by space
+dimension and dtype."""
 
 LARGEST_SIDE = 16384
 """Pixels along a side of a picture, at most."""
@@ -266,12 +272,13 @@ def number_tensor(name: str, value: Any) -> Tensor:
     return made
 
 
-def checked_eps(name: str, eps: float, dtype: torch.dtype) -> float:
+def checked_eps(name: str, eps: float, space_dim: int, dtype: torch.dtype) -> float:
     """Return a perception radius as a float [length units].
 
     Args:
         name: What the caller calls it.
         eps: The radius.
+        space_dim: Space dimension D of the worlds.
         dtype: Floating dtype of the worlds, in which powers of the radius must not overflow.
 
     Raises:
@@ -280,11 +287,11 @@ def checked_eps(name: str, eps: float, dtype: torch.dtype) -> float:
     value = checked_number(name, eps)
     if not (math.isfinite(value) and value > 0.0):
         raise NPAError(f"{name} must be positive and finite [length units], got {shown(eps)}")
-    low, high = LENGTH_RANGE[dtype]
+    low, high = LENGTH_RANGE[space_dim, dtype]
     if not low <= value <= high:
         raise NPAError(
-            f"{name} must lie in [{low:g}, {high:g}] length units for {dtype}, got {shown(eps)}: "
-            f"choose another unit of length"
+            f"{name} must lie in [{low:g}, {high:g}] length units for {dtype} in {space_dim}D, got "
+            f"{shown(eps)}: choose another unit of length"
         )
     return value
 
@@ -296,20 +303,23 @@ def check_scale(eps: float, eps0: float, space_dim: int, dtype: torch.dtype) -> 
         NPAError: It over- or underflows.
     """
     limits = torch.finfo(dtype)
-    scale = (eps / eps0) ** (1 + space_dim)
-    if not 1e6 * limits.tiny < scale < 1e-6 * limits.max:
+    # As logarithms: the power of a ratio may be beyond any number.
+    scale = (1 + space_dim) * (math.log(eps) - math.log(eps0))
+    if not math.log(1e6 * limits.tiny) < scale < math.log(1e-6 * limits.max):
         raise NPAError(
             f"eps / eps0 must be a moderate ratio, got {eps:g} / {eps0:g}: perceive at a radius "
             f"nearer to the one that the rule was trained with"
         )
 
 
-def checked_box(box: Box, space_dim: int, eps: float) -> tuple[float, ...] | None:
+def checked_box(
+    box: Box, space_dim: int, eps: float, dtype: torch.dtype
+) -> tuple[float, ...] | None:
     """Return the sides of a periodic box as a tuple of D floats, or None in open space.
 
     Raises:
-        NPAError: No numbers, a wrong number of sides, or a side below 2 eps, where a particle would
-            see another one twice.
+        NPAError: No numbers, a wrong number of sides, a side below 2 eps, where a particle would
+            see another one twice, or one too large for the dtype of the worlds.
     """
     if box is None:
         return None
@@ -325,5 +335,11 @@ def checked_box(box: Box, space_dim: int, eps: float) -> tuple[float, ...] | Non
         raise NPAError(
             f"box sides must be finite and at least 2 eps = {2.0 * eps:g}, got {shown(sides)}: "
             f"enlarge the box or perceive at a smaller eps"
+        )
+    largest = 1e-6 * torch.finfo(dtype).max
+    if max(sides) > largest:
+        raise NPAError(
+            f"box sides must be at most {largest:g} length units for {dtype}, got {shown(sides)}: "
+            "use open space, box=None"
         )
     return sides

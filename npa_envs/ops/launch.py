@@ -408,6 +408,17 @@ class PreparedLaunch:
         self._arguments.run(self._size)
 
 
+def aligned(tensor: Tensor) -> Tensor:
+    """Return a contiguous tensor that can be read 16 bytes at a time."""
+    tensor = tensor.contiguous()
+    return tensor if tensor.data_ptr() % 16 == 0 else tensor.clone()
+
+
+def is_recorded() -> bool:
+    """Return whether a tape records what this thread launches."""
+    return _ready.tape is not None
+
+
 class LaunchTape:
     """Launches that are recorded once and made again and again, between tensors that stay."""
 

@@ -17,7 +17,7 @@ from npa_envs.kernels.cuda.network import (
     weight_gradient_kernels,
 )
 from npa_envs.ops.backend import Request, choose, processor_count
-from npa_envs.ops.launch import launch
+from npa_envs.ops.launch import aligned, launch
 from npa_envs.ops.opaque import once_differentiable, opaque
 
 
@@ -161,12 +161,6 @@ SIGN_UNITS = 128
 """Hidden units whose signs are one word for each of the four lanes that share a row."""
 
 
-def _aligned(rows: Tensor) -> Tensor:
-    """Return contiguous rows, which are read 16 bytes at a time, moved if they begin elsewhere."""
-    rows = rows.contiguous()
-    return rows if rows.data_ptr() % 16 == 0 else rows.clone()
-
-
 def _map_rows(
     rows: Tensor,
     arranged: list[Tensor],
@@ -184,7 +178,7 @@ def _map_rows(
         -(-warps * WARP // LAYER_BLOCK) * LAYER_BLOCK,
         rows.device,
         unit_count,
-        _aligned(rows),
+        aligned(rows),
         *arranged[:3],
         signs,
         output,
@@ -254,8 +248,8 @@ def _weight_gradients(
         rows.device,
         unit_count,
         share_rows,
-        _aligned(rows),
-        _aligned(update_bar),
+        aligned(rows),
+        aligned(update_bar),
         signs,
         *arranged[3:],
         partial_sums,

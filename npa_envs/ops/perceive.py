@@ -98,10 +98,10 @@ def perceive(
             not positive and finite, a box side is below 2 eps, or `moment_inverse` is another word.
     """
     check_world(x, s)
-    radius = checked_eps("eps", eps, x.dtype)
-    radius0 = radius if eps0 is None else checked_eps("eps0", eps0, x.dtype)
+    radius = checked_eps("eps", eps, x.shape[2], x.dtype)
+    radius0 = radius if eps0 is None else checked_eps("eps0", eps0, x.shape[2], x.dtype)
     check_scale(radius, radius0, x.shape[2], x.dtype)
-    sides = checked_box(box, x.shape[2], radius)
+    sides = checked_box(box, x.shape[2], radius, x.dtype)
     check_finite_positions(x)
     inverse = checked_moment_inverse(moment_inverse)
     terms = Terms(
@@ -146,8 +146,8 @@ def perception_fields(
     """
     terms = Terms(moment_inverse=checked_moment_inverse(moment_inverse))
     check_world(x, s)
-    radius = checked_eps("eps", eps, x.dtype)
-    sides = checked_box(box, x.shape[2], radius)
+    radius = checked_eps("eps", eps, x.shape[2], x.dtype)
+    sides = checked_box(box, x.shape[2], radius, x.dtype)
     check_finite_positions(x)
     x, s = x.contiguous(), s.contiguous()
     world_count, particle_count, space_dim = x.shape

@@ -22,7 +22,7 @@ from npa_envs.ops.backend import (
     processor_count,
     rollout_listing,
 )
-from npa_envs.ops.launch import channel_width, launch, scalar_type
+from npa_envs.ops.launch import channel_width, is_recorded, launch, scalar_type
 
 LARGEST_INDEX = 2**31 - 1
 """Kernels index with 32 bits."""
@@ -197,6 +197,11 @@ def mean_neighbours(particle_count: int, eps: float, box: Sequence[float] | None
     return particle_count * ball / math.prod(box)
 
 
+def sorts_at_once(world_count: int, particle_count: int) -> bool:
+    """Return whether a CPU sorts small worlds in one launch, whatever the mask."""
+    return _earlier(world_count, world_count * particle_count) <= LARGEST_THREAD_MASK
+
+
 def sort_worlds(
     plan: Plan, x: Tensor, s: Tensor | None, mask: Tensor | None, *, with_rows: bool = True
 ) -> SortedWorlds:
@@ -204,11 +209,13 @@ def sort_worlds(
 
     What is left out is empty: states without `s`, everything about rows without `with_rows`.
     """
-    capacity = 0 if _earlier(plan) > LARGEST_MASK else block_capacity(plan.request, x, s, mask)
+    earlier = _earlier(plan.world_count, plan.total) if plan.masked else 0
+    capacity = 0 if earlier > LARGEST_MASK else block_capacity(plan.request, x, s, mask)
     if capacity:
         return _sort_by_blocks(plan, capacity, x, s, mask, with_rows)
-    if plan.runs("sort") == "world" and _earlier(plan) <= LARGEST_THREAD_MASK:
+    if plan.runs("sort") == "world" and earlier <= LARGEST_THREAD_MASK:
         return _sort_by_threads(plan, x, s, mask, with_rows)
+    assert not is_recorded(), "what torch does between these launches is on no tape"
     kernels = sort_kernels(plan.space_dim, plan.scalar, plan.width)
     device, total = x.device, plan.total
     cell, arrival = torch.empty(2, total, dtype=torch.int32, device=device).unbind()
@@ -295,9 +302,9 @@ def slice_count(device: torch.device, world_count: int, particle_count: int) -> 
     return max(min(idle, particle_count // SMALLEST_SLICE), 1)
 
 
-def _earlier(plan: Plan) -> int:
+def _earlier(world_count: int, total: int) -> int:
     """Return how many entries of masks are read where each world counts the rows before it."""
-    return plan.world_count * plan.total if plan.masked else 0
+    return world_count * total
 
 
 def _sort_by_threads(

@@ -171,8 +171,8 @@ def species_fields(
     """
     check_world(x, x)
     checked = checked_counts(counts, x.shape[1])
-    radius = checked_eps("eps", eps, x.dtype)
-    sides = checked_box(box, x.shape[2], radius)
+    radius = checked_eps("eps", eps, x.shape[2], x.dtype)
+    sides = checked_box(box, x.shape[2], radius, x.dtype)
     check_finite_positions(x)
     return SpeciesFields(
         *_gather_species(
@@ -219,10 +219,10 @@ def perceive_species(
     """
     check_world(x, s)
     checked = checked_counts(counts, x.shape[1])
-    radius = checked_eps("eps", eps, x.dtype)
-    radius0 = radius if eps0 is None else checked_eps("eps0", eps0, x.dtype)
+    radius = checked_eps("eps", eps, x.shape[2], x.dtype)
+    radius0 = radius if eps0 is None else checked_eps("eps0", eps0, x.shape[2], x.dtype)
     check_scale(radius, radius0, x.shape[2], x.dtype)
-    sides = checked_box(box, x.shape[2], radius)
+    sides = checked_box(box, x.shape[2], radius, x.dtype)
     shared = perceive(x, s, radius, radius0, sides, detach_positions)
     appended = perceive_by_species(x, checked, eps=radius, eps0=radius0, box=sides)
     return torch.cat((shared, appended), dim=-1)

@@ -18,7 +18,7 @@ import torch
 from torch import Tensor
 
 from npa_envs.errors import NPAError, shown
-from npa_envs.ops.checks import check_world, checked_number
+from npa_envs.ops.checks import check_world, checked_number, entries
 
 Sides = tuple[float, ...] | None
 
@@ -32,12 +32,15 @@ def offsets_from(x: Tensor, centre: Tensor, box: Sides = None) -> Tensor:
         box: Sides of the periodic box [length units], or None.
 
     Raises:
-        NPAError: `centre` has another shape, dtype or device than x asks for.
+        NPAError: x is no positions of worlds, `centre` has another shape, dtype or device than x
+            asks for, or the box has not a side for each coordinate.
     """
     _check_vector("centre", centre, x)
     offset = x - centre[:, None]
     if box is None:
         return offset
+    if len(entries(box) or ()) != x.shape[2]:
+        raise NPAError(f"box must have {x.shape[2]} sides, got {shown(box)}: give one for each")
     # Side by side: a tensor of the sides would be a copy to the device.
     parts = zip(offset.unbind(dim=-1), box, strict=True)
     return torch.stack([part - side * torch.round(part / side) for part, side in parts], dim=-1)
@@ -86,11 +89,11 @@ def removed(x: Tensor, s: Tensor, *, gone: Tensor) -> tuple[Tensor, Tensor]:
         NPAError: A wrong shape or dtype, or worlds would not keep equally many particles.
     """
     check_world(x, s)
+    wanted = f"gone must be a bool tensor of shape [B, N] = {list(x.shape[:2])}"
+    if not isinstance(gone, Tensor):
+        raise NPAError(f"{wanted}, got {shown(gone)}: take inside_ball")
     if gone.shape != x.shape[:2] or gone.dtype != torch.bool:
-        raise NPAError(
-            f"gone must be bool of shape [B, N] = {list(x.shape[:2])}, got {gone.dtype} "
-            f"{list(gone.shape)}: take inside_ball"
-        )
+        raise NPAError(f"{wanted}, got {gone.dtype} {list(gone.shape)}: take inside_ball")
     counts = gone.sum(dim=1).tolist()
     if len(set(counts)) > 1:
         raise NPAError(
@@ -167,6 +170,7 @@ def inject(
             f"state must have shape [B, C] = {(s.shape[0], s.shape[2])}, got {tuple(state.shape)}: "
             "give one state for each world"
         )
+    _check_alike("state", state, s, "s")
     share = _per_world("strength", strength, x, highest=1.0)
     return s + share * softness(x, centre=centre, radius=radius, box=box) * (state[:, None] - s)
 
@@ -240,7 +244,8 @@ def cut(
         normal: Direction across the line, of any length, shape [B, D]; a zero vector cuts nothing.
         gap: Width of the slit [length units], a number or a tensor of shape [B].
         along: From `centre` to one end of the slit, and back to the other end [length units], shape
-            [B, D]; None: it has no ends. In 3D it ends there too, and goes on across.
+            [B, D]; a zero vector cuts nothing. None: it has no ends. In 3D it ends there too, and
+            goes on across.
         box: Sides of the periodic box [length units], or None.
 
     Returns:
@@ -264,7 +269,7 @@ def cut(
         _check_vector("along", along, x)
         reach = along.square().sum(dim=-1, keepdim=True)[:, None]
         place = (offset * along[:, None]).sum(dim=-1, keepdim=True)
-        shift = torch.where(place.abs() <= reach, shift, 0.0)
+        shift = torch.where((place.abs() <= reach) & (reach > 0.0), shift, 0.0)
     return x + shift * direction[:, None], s
 
 
@@ -320,6 +325,8 @@ def _per_world(name: str, value: float | Tensor, x: Tensor, *, highest: float = 
 
 
 def _check_vector(name: str, vector: Tensor, x: Tensor) -> None:
+    if x.ndim != 3:
+        raise NPAError(f"x must have shape [B, N, D], got {tuple(x.shape)}: add a world, x[None]")
     wanted = (x.shape[0], x.shape[2])
     if not isinstance(vector, Tensor):
         raise NPAError(
@@ -331,8 +338,12 @@ def _check_vector(name: str, vector: Tensor, x: Tensor) -> None:
             f"{name} must have shape [B, D] = {wanted}, got {tuple(vector.shape)}: "
             f"give one vector for each world, for example {name}.expand{wanted}"
         )
-    if vector.device != x.device or vector.dtype != x.dtype:
+    _check_alike(name, vector, x, "x")
+
+
+def _check_alike(name: str, value: Tensor, other: Tensor, other_name: str) -> None:
+    if value.device != other.device or value.dtype != other.dtype:
         raise NPAError(
-            f"{name} must be {x.dtype} on {x.device} like x, got {vector.dtype} on "
-            f"{vector.device}: convert it with {name}.to(x)"
+            f"{name} must be {other.dtype} on {other.device} like {other_name}, got {value.dtype} "
+            f"on {value.device}: convert it with {name}.to({other_name})"
         )

@@ -18,6 +18,7 @@ from torch import Tensor
 from torch.utils._python_dispatch import is_in_torch_dispatch_mode
 
 from npa_envs.ops.launch import LaunchTape
+from npa_envs.ops.sort import sorts_at_once
 from npa_envs.rule.network import Network
 from npa_envs.world.recorded import LAUNCHED_FIRST, Worlds
 
@@ -144,6 +145,7 @@ def may_prepare(worlds: Worlds) -> bool:
         and not torch.is_grad_enabled()
         and x.device.type == "cpu"
         and x.shape[0] * x.shape[1] <= LARGEST_TOTAL
+        and sorts_at_once(*x.shape[:2])
         and type(x) is Tensor
         and type(s) is Tensor
         and not is_in_torch_dispatch_mode()

@@ -103,7 +103,7 @@ def check_cuda_graph(cuda_graph: CudaGraph) -> None:
     Raises:
         NPAError: It is neither "auto" nor True nor False.
     """
-    if not isinstance(cuda_graph, bool) and cuda_graph != "auto":
+    if not isinstance(cuda_graph, bool | str) or cuda_graph not in (True, False, "auto"):
         raise NPAError(f"cuda_graph must be 'auto', True or False, got {shown(cuda_graph)}")
 
 

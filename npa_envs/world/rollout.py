@@ -94,7 +94,7 @@ def _checked_numbers(
     position_noise: float,
     detach_positions: bool,
 ) -> StepOptions:
-    radius = checked_eps("eps", eps0 if eps is None else eps, dtype)
+    radius = checked_eps("eps", eps0 if eps is None else eps, space_dim, dtype)
     check_scale(radius, eps0, space_dim, dtype)
     update_prob = checked_number("update_prob", update_prob)
     dt = checked_number("dt", dt)
@@ -106,7 +106,7 @@ def _checked_numbers(
     if not (math.isfinite(position_noise) and position_noise >= 0.0):
         raise NPAError(f"position_noise must be finite and not negative, got {position_noise}")
     detach_positions = checked_flag("detach_positions", detach_positions)
-    sides = checked_box(box, space_dim, radius)
+    sides = checked_box(box, space_dim, radius, dtype)
     return StepOptions(radius, sides, update_prob, dt, position_noise, detach_positions)
 
 
@@ -160,6 +160,9 @@ def run_steps(
                 watch.look(seen.x, seen.s)
             if keep_every is not None and (number + 1) % keep_every == 0:
                 kept.append(step.ordered(worlds))
+        if steps == 0:
+            # What is returned is the caller's to write to.
+            worlds = Worlds(*(value.clone() for value in worlds))
         if keep_every is None:
             worlds = step.ordered(worlds)
         else:

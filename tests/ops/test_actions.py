@@ -210,6 +210,14 @@ def test_tensors_that_do_not_fit_are_clear_errors(change, message):
         apply_actions(**GIVEN | given | change)
 
 
+def test_a_direction_with_a_hole_takes_no_particle_far(device):
+    action = torch.tensor([[[math.nan, 1000.0, 0.0]]], device=device)
+    x, s = torch.full((1, 1, 2), 0.3, device=device), torch.zeros(1, 1, 1, device=device)
+    after, _, diverged = applied(action, x, s)
+    assert after.tolist() == [[[0.0, 0.0]]]
+    assert diverged.tolist() == [1]
+
+
 def prepared(x, s, **options):
     """Return the actions on copies of a world, with these copies, and what switches them off."""
     x, s = x.clone(), s.clone()

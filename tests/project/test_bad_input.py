@@ -115,6 +115,10 @@ META = torch.zeros(1, 4, 2, device="meta")
     [
         (lambda: rollout(3, *world(), 1), "rule must be an NPARule, got int"),
         (lambda: rollout(NPARule(), *world(), 1, memory=[]), "memory must be 'store'"),
+        (
+            lambda: rollout(NPARule(), *world(), 1, cuda_graph=np.array([1, 2])),
+            "cuda_graph must be 'auto', True or False",
+        ),
         (lambda: perceive(SPARSE, SPARSE, 0.1), "x must be a dense tensor"),
         (lambda: perceive(META, META, 0.1), "x must be a dense tensor on 'cpu' or 'cuda'"),
         (
@@ -126,7 +130,16 @@ META = torch.zeros(1, 4, 2, device="meta")
             "counts must hold one number",
         ),
         (lambda: npa_envs.rollout_species(np.array(1.0), *world(), 1, counts=[4]), "rules must"),
-        (lambda: perceive(torch.zeros(1, 4, 3), S, 1e7, 1e-7), "eps / eps0 must be a moderate"),
+        (lambda: perceive(X, S, 1e7, 1e-7), "eps / eps0 must be a moderate"),
+        (
+            lambda: perceive(X.double(), S.double(), 1e60, 1e-60),
+            "eps / eps0 must be a moderate",
+        ),
+        (
+            lambda: perceive(torch.zeros(1, 4, 3), S, 1e-7),
+            r"eps must lie in \[1e-06, 1e\+06\] length units for torch\.float32 in 3D",
+        ),
+        (lambda: perceive(X, S, 0.1, box=1e39), "box sides must be at most 3.40282e\\+32"),
         (lambda: perceive(X, S, 0.1, 0.0), "eps0 must be positive"),
         (lambda: NPARule(space_dim=4), "space_dim must be 2 or 3"),
         (lambda: NPARule(state_dim=0), "state_dim must be at least 1"),

@@ -66,7 +66,7 @@ def test_worlds_of_a_batch_must_lose_as_many_particles():
     gone[0, 3] = True
     with pytest.raises(NPAError, match=r"as many particles from each world, got \[1, 0\]"):
         removed(x, s, gone=gone)
-    with pytest.raises(NPAError, match=r"gone must be bool of shape \[B, N\] = \[2, 12\]"):
+    with pytest.raises(NPAError, match=r"gone must be a bool tensor of shape \[B, N\] = \[2, 12\]"):
         removed(x, s, gone=gone.float())
 
 
@@ -131,6 +131,8 @@ def test_a_cut_with_ends_opens_only_between_them():
     assert torch.equal(after[0, 2], x[0, 2])
     whole, _ = cut(x, x, centre=centre, normal=normal, gap=0.1)
     torch.testing.assert_close(whole[0, 2, 1], torch.tensor(0.055, dtype=x.dtype))
+    nothing, _ = cut(x, x, centre=centre, normal=normal, gap=0.1, along=torch.zeros_like(centre))
+    assert torch.equal(nothing, x)
 
 
 def test_clump_and_erase_reach_across_the_edges_of_a_box():
@@ -195,3 +197,23 @@ def test_wrong_numbers_of_a_brush_are_named(wrong, message):
     right = {"centre": places(x), "move": places(x), "radius": 0.1, "strength": 1.0}
     with pytest.raises(NPAError, match=message):
         push(x, **(right | wrong))
+
+
+def test_a_state_of_another_dtype_is_refused_as_places_are():
+    x, s = worlds()
+    with pytest.raises(NPAError, match=r"state must be torch\.float64 on cpu like s"):
+        inject(x, s, centre=places(x), radius=0.1, state=s[:, 0].float())
+
+
+def test_what_goes_must_be_a_tensor():
+    with pytest.raises(NPAError, match=r"gone must be a bool tensor of shape .* got None"):
+        removed(*worlds(), gone=None)
+
+
+@pytest.mark.parametrize("box", [2.0, (2.0, 2.0, 2.0)])
+def test_a_box_has_a_side_for_each_coordinate(box):
+    x, _ = worlds()
+    with pytest.raises(NPAError, match="box must have 2 sides"):
+        inside_ball(x, centre=places(x), radius=0.1, box=box)
+    with pytest.raises(NPAError, match=r"x must have shape \[B, N, D\]"):
+        inside_ball(x[0], centre=places(x), radius=0.1)

@@ -312,3 +312,14 @@ def test_row_capacity_holds_far_more_than_ever_drawn(particle_total, update_prob
     assert draws.max() <= capacity <= particle_total
     if particle_total == 32768:
         assert capacity <= particle_total * update_prob + 12.0 * 181.0 * 0.5 + 24.0
+
+
+def test_a_rollout_of_no_steps_returns_worlds_of_its_own():
+    rule = lively_rule("cpu", torch.float32)
+    x, s = random_world(1, 20, 2, 5, dtype=torch.float32, device="cpu")
+    before = x.clone(), s.clone()
+    after = npa_envs.rollout(rule, x, s, 0)
+    assert_same(after, before)
+    for tensor in after:
+        tensor.zero_()
+    assert_same((x, s), before)

@@ -23,6 +23,7 @@ from npa_envs.kernels.access import (
 )
 from npa_envs.kernels.domain import domain_types, kernel_module
 from npa_envs.kernels.mathematics import falloff_within, smoothing_of
+from npa_envs.kernels.portable.density import BLOCK
 
 AHEAD, SHARED_AHEAD = 6, 5
 """Candidates that a thread looks at together: alone with a particle, and one of several lanes."""
@@ -45,9 +46,6 @@ SHARE_OF_LIST = 2
 LIST_END = wp.types.vector(2, wp.uint32)
 """Where the next entry of a list goes, and how far it is from there to the one after it."""
 
-BLOCK = 4096
-"""Candidates whose weights are summed before they are added to the others: of a million summed one
-after the other, too much is rounded away."""
 
 SLACK = 1.0 + 1e-5
 """Cells are left out beyond this much more than eps^2, whatever was rounded on the way."""

@@ -16,14 +16,11 @@ from npa_envs.kernels.access import (
     await_earlier,
     load_integer,
     make_read_channels,
-    make_wide_load,
     make_wide_store,
 )
 from npa_envs.kernels.cpu import PARTICLES, WORLDS, in_ranges
 from npa_envs.kernels.domain import domain_types, kernel_module
 
-store_integer = make_wide_store(wp.int32, wp.int32)
-load_pair = make_wide_load(wp.vec2i, wp.int32)
 store_pair = make_wide_store(wp.vec2i, wp.int32)
 
 

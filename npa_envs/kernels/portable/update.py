@@ -322,7 +322,8 @@ def update_kernels(space_dim: int, scalar: type) -> SimpleNamespace:
                 if moving != 0 and acting != wp.uint8(0):
                     length = wp.length(direction)
                     step = largest_step
-                    if length > wp.float64(1.0):
+                    # So written, one coordinate that is not a number makes all of them so.
+                    if not (length <= wp.float64(1.0)):
                         step = largest_step / length
                     position = displaced(position, step, direction)
                 if periodic != 0:

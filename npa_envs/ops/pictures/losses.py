@@ -12,12 +12,11 @@ from npa_envs.kernels.access import CUDA_BLOCK
 from npa_envs.kernels.pictures.errors import BLOCK_TILES, TURN_TILES, gather_errors, sum_errors
 from npa_envs.kernels.pictures.splat import CHANNELS, make_lens
 from npa_envs.ops.backend import processor_count
-from npa_envs.ops.launch import launch, scalar_type
+from npa_envs.ops.launch import aligned, launch, scalar_type
 from npa_envs.ops.mean import average_sums
 from npa_envs.ops.opaque import opaque
 from npa_envs.ops.pictures.splat import (
     Splats,
-    aligned,
     check_particles,
     checked_window,
     scatter_splats,

@@ -31,7 +31,7 @@ from npa_envs.ops.checks import (
     checked_positive,
     checked_side,
 )
-from npa_envs.ops.launch import launch, scalar_type
+from npa_envs.ops.launch import aligned, launch, scalar_type
 from npa_envs.ops.mean import world_mean
 from npa_envs.ops.opaque import once_differentiable, opaque
 from npa_envs.ops.sort import LARGEST_INDEX, block_capacity, slice_count
@@ -85,12 +85,6 @@ def gather_threads(world_count: int, resolution: int, device: torch.device) -> i
     """Return how many threads gather pictures."""
     group = GROUP_WIDTH * GROUP_HEIGHT * splat_lanes(device)
     return world_count * group_count(resolution) * group
-
-
-def aligned(tensor: Tensor) -> Tensor:
-    """Return a contiguous tensor that can be read 16 bytes at a time."""
-    tensor = tensor.contiguous()
-    return tensor if tensor.data_ptr() % 16 == 0 else tensor.clone()
 
 
 def _check_size(largest: int, world_count: int, lens: Any) -> None:
