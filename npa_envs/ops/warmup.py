@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from typing import Any
 
 import torch
 
+from npa_envs.devices import check_device
+from npa_envs.errors import NPAError, shown
 from npa_envs.ops.backend import SHARED_WORLD
+from npa_envs.ops.checks import DTYPES, entries
 from npa_envs.ops.draws import bernoulli_draw, integer_draw, normal_draw, uniform_draw
 from npa_envs.ops.episodes import EpisodeRules, PreparedJudgement
 from npa_envs.ops.equivariance import VectorForm, read_rows, steer_rows
@@ -34,7 +38,13 @@ def warmup(
         space_dims: Space dimensions, 2 or 3 each.
         dtypes: `torch.float32`, `torch.float64` or both.
         state_dim: State channels C; kernels serve groups of 4, 8 or 16 channels.
+
+    Raises:
+        NPAError: There is no such device, or no such kernels.
     """
+    device = check_device(device)
+    space_dims = _chosen("space_dims", space_dims, (2, 3))
+    dtypes = _chosen("dtypes", dtypes, DTYPES)
     keys = torch.zeros(1, dtype=torch.int64, device=device)
     counts = torch.zeros(1, dtype=torch.int32, device=device)
     bernoulli_draw(keys, counts, counts, 0, 1, 0.5)
@@ -57,6 +67,14 @@ def warmup(
             _warm_observation(x, s)
             if space_dim == 2:
                 _warm_pictures(x)
+
+
+def _chosen(name: str, given: Any, known: tuple[Any, ...]) -> list[Any]:
+    """Return some of what there is."""
+    chosen = entries(given)
+    if not chosen or not all(value in known for value in chosen):
+        raise NPAError(f"{name} must be some of {known}, got {shown(given)}: name one or both")
+    return chosen
 
 
 def _warm_judgement(elapsed: torch.Tensor) -> None:

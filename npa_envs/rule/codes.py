@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from itertools import pairwise
 
 import torch
@@ -43,8 +43,7 @@ class Codes(nn.Module):
 
     def __init__(self, names: Sequence[str], dim: int, *, encoder: bool = False) -> None:
         super().__init__()
-        if isinstance(names, str) or not all(isinstance(name, str) for name in names):
-            raise NPAError(f"code_names must be a list of names, got {shown(names)}")
+        check_names(names)
         if len(set(names)) < len(names) or len(names) > LARGEST_CODE_COUNT:
             raise NPAError(
                 f"code_names must be different names, at most {LARGEST_CODE_COUNT}, got "
@@ -62,6 +61,14 @@ class Codes(nn.Module):
 
     def __len__(self) -> int:
         return len(self.names)
+
+    def __contains__(self, name: object) -> bool:
+        """Return whether a code has this name."""
+        return name in self.names
+
+    def __iter__(self) -> Iterator[str]:
+        """Return the names, one by one."""
+        return iter(self.names)
 
     def number(self, name: str) -> int:
         """Return the place of a name.
@@ -117,6 +124,23 @@ class Codes(nn.Module):
             )
         codes: Tensor = self.encoder(pictures)
         return codes
+
+
+def check_names(names: object) -> None:
+    """Check that what codes are to be called is several texts.
+
+    Raises:
+        NPAError: It is not.
+    """
+    if (
+        not isinstance(names, Collection)
+        or isinstance(names, str)
+        or not all(isinstance(name, str) for name in names)
+    ):
+        raise NPAError(
+            f"code_names must be a list of names, got {shown(names)}: for example ['gecko', "
+            "'heart'], or () for a rule without codes"
+        )
 
 
 class PictureEncoder(nn.Module):

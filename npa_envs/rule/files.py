@@ -32,8 +32,8 @@ from npa_envs.files import (
     write_bytes,
 )
 from npa_envs.rule.authors import read_demo_json, read_state_dict
-from npa_envs.rule.parts import RuleParts, check_finite
-from npa_envs.rule.rule import NPARule, RuleHyperParameters, check_rule
+from npa_envs.rule.parts import RuleParts, check_finite, check_precision
+from npa_envs.rule.rule import NPARule, RuleHyperParameters, check_rule, is_altered
 
 FORMAT_NAME = "npa-envs rule"
 FORMAT_VERSION = 1
@@ -157,18 +157,17 @@ def save_rule(
 
     Raises:
         NPAError: The rule's network is not the one that files have; the suffix is another one, the
-            metadata is not text or takes a reserved name, a weight is not finite, or the file
-            cannot be written.
+            metadata is not text or takes a reserved name, the weights are not finite or not all
+            float32 or all float64, or the file cannot be written.
     """
     check_rule(rule)
     # One that torch.compile has taken has its weights by other names.
     rule = getattr(rule, "_orig_mod", rule)
-    loaded = _without_weights(rule.hyper_parameters())
-    same_shapes = _shapes(rule.state_dict()) == _shapes(loaded.state_dict())
-    if type(rule).forward is not NPARule.forward or not same_shapes:
+    if not _is_as_made(rule):
         raise NPAError(
             f"rule must have the network that NPARule makes, got a {type(rule).__name__} with one "
-            "of its own, which the file would not hold: keep its state_dict with torch.save"
+            "of its own, which the file would not hold: remove its hooks, or keep its state_dict "
+            "with torch.save"
         )
     path = checked_path(path)
     if path.suffix != ".safetensors":
@@ -191,15 +190,42 @@ def save_rule(
             raise NPAError(
                 f"metadata must map text to text, got {shown(name)}: {shown(text)}: use str()"
             )
+        if not (_is_utf8(name) and _is_utf8(text)):
+            raise NPAError(
+                f"metadata must be text that UTF-8 can write, got {shown(name)}: {shown(text)}: "
+                "leave single surrogates out"
+            )
         if name in _RESERVED:
             raise NPAError(
                 f"metadata must not use the name {shown(name)}: the format holds it itself"
             )
         header[name] = text
     weights = {k: v.detach().cpu().contiguous() for k, v in rule.state_dict().items()}
+    check_precision(weights)
     check_finite(weights)
     header["checksum"] = _checksum(header, weights)
     write_bytes(path, _with_sorted_metadata(serialise(weights, metadata=header)))
+
+
+def _is_as_made(rule: NPARule) -> bool:
+    """Return whether a rule computes what the rule does that its file is loaded as."""
+    loaded = _without_weights(rule.hyper_parameters())
+    same_shapes = _shapes(rule.state_dict()) == _shapes(loaded.state_dict())
+    if type(rule).forward is not NPARule.forward or is_altered(rule) or not same_shapes:
+        return False
+    own = dict(rule.named_modules())
+    for name, part in loaded.named_modules():
+        if name and (type(own.get(name)) is not type(part) or is_altered(own[name])):
+            return False
+    return True
+
+
+def _is_utf8(text: str) -> bool:
+    try:
+        text.encode()
+    except UnicodeEncodeError:
+        return False
+    return True
 
 
 def _with_sorted_metadata(file: bytes) -> bytes:
@@ -398,12 +424,7 @@ def _assemble(parts: RuleParts) -> NPARule:
             if expected.get(name) != got.get(name)
         )
         raise NPAError(f"the weights must have the hyper-parameters' shapes, got {shown(wrong)}")
-    dtypes = {tensor.dtype for tensor in parts.weights.values()}
-    if len(dtypes) != 1 or not dtypes <= {torch.float32, torch.float64}:
-        raise NPAError(
-            "the weights must be all float32 or all float64, got "
-            f"{sorted(str(dtype) for dtype in dtypes)}: convert them and save the rule again"
-        )
+    check_precision(parts.weights)
     check_finite(parts.weights)
     rule.load_state_dict(dict(parts.weights), assign=True)
     return rule.requires_grad_()

@@ -24,6 +24,24 @@ class RuleParts:
     """Whether the file has one, by which damage of it is told."""
 
 
+def check_precision(weights: Mapping[str, Tensor]) -> None:
+    """Check that all weights are float32, or all float64.
+
+    Args:
+        weights: Weights by name.
+
+    Raises:
+        NPAError: They are of another dtype, or of several.
+    """
+    dtypes = {tensor.dtype for tensor in weights.values()}
+    if len(dtypes) != 1 or not dtypes <= {torch.float32, torch.float64}:
+        raise NPAError(
+            "the weights must be all float32 or all float64, got "
+            f"{sorted(str(dtype) for dtype in dtypes)}: convert them, as rule.float() does, and "
+            "save the rule again"
+        )
+
+
 def check_finite(weights: Mapping[str, Tensor]) -> None:
     """Check that every weight is finite.
 

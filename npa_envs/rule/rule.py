@@ -17,7 +17,7 @@ from npa_envs.ops.checks import (
     checked_positive,
 )
 from npa_envs.ops.equivariance import VectorForm, invariants, steered
-from npa_envs.rule.codes import Codes
+from npa_envs.rule.codes import Codes, check_names
 from npa_envs.rule.network import FOLD, FoldedInvariants, FoldedRule, Network, fold_weights
 
 COLOUR_OFFSET = 0.5
@@ -189,6 +189,7 @@ class NPARule(nn.Module):
         self.code_dim = code_dim
         self.divides = checked_flag("divides", divides)
         self._check_equivariance()
+        check_names(code_names)
         self._check_codes(len(code_names), checked_flag("encoder", encoder))
         self._check_division()
 
@@ -339,21 +340,22 @@ class NPARule(nn.Module):
     def is_plain(self) -> bool:
         """Return whether the rule is just its two layers, so that `folded` may stand in for it.
 
-        A rule that overrides the network, has hooks, or whose layers were replaced is not, nor is
-        an equivariant one.
+        A rule that overrides the network, has hooks, or whose layers or their `forward` were
+        replaced is not, nor is an equivariant one.
         """
         return not self.equivariant and self._is_unchanged()
 
     def _is_unchanged(self) -> bool:
         """Return whether the rule's network is the one that it was made with."""
         hidden, output = self.hidden, self.output
+        modules = (self, hidden, output)
         return (
             type(self).forward is NPARule.forward
-            and "forward" not in vars(self)
             and type(hidden) is nn.Linear
             and type(output) is nn.Linear
+            and getattr(hidden, "bias", None) is not None
             and getattr(output, "bias", None) is None
-            and not any(map(_is_hooked, (self, hidden, output)))
+            and not any(is_altered(module) or _has_backward_hooks(module) for module in modules)
         )
 
     def has_network(self) -> bool:
@@ -443,10 +445,15 @@ class NPARule(nn.Module):
                 particle, [B, N, K].
 
         Raises:
-            NPAError: The rule has no codes, or the shapes do not fit.
+            NPAError: The rule has no codes, the code is no tensor, or the shapes do not fit.
         """
         if self.code_dim == 0:
             raise NPAError("this rule has no codes: train one with targets (--targets)")
+        if not isinstance(code, Tensor):
+            raise NPAError(
+                f"code must be a tensor, got {shown(code)}: for example rule.codes[name], or "
+                "torch.tensor(numbers)"
+            )
         shape = (*states.shape[:-1], self.code_dim)
         try:
             carried = code.to(states).expand(shape)
@@ -524,14 +531,13 @@ class NPARule(nn.Module):
         return made
 
 
-def _is_hooked(module: nn.Module) -> bool:
-    """Return whether something runs before or after a module."""
-    return bool(
-        module._forward_hooks
-        or module._forward_pre_hooks
-        or module._backward_hooks
-        or module._backward_pre_hooks
-    )
+def is_altered(module: nn.Module) -> bool:
+    """Return whether a module was given another `forward`, or something before or after it."""
+    return bool("forward" in vars(module) or module._forward_hooks or module._forward_pre_hooks)
+
+
+def _has_backward_hooks(module: nn.Module) -> bool:
+    return bool(module._backward_hooks or module._backward_pre_hooks)
 
 
 @torch.no_grad()

@@ -11,7 +11,7 @@ from typing import Any, Generic, Protocol, Self, TypeVar, cast, runtime_checkabl
 import torch
 from torch import Tensor
 
-from npa_envs.errors import NPAError
+from npa_envs.errors import NPAError, shown
 from npa_envs.ops import Cameras, world_mean
 from npa_envs.rule.rule import NPARule
 from npa_envs.tasks.appearance import Gaussians
@@ -314,6 +314,28 @@ def task_toward(task: TaskT, goal: Tensor | None) -> TaskT:
     return (
         task if goal is None or not isinstance(task, GoalTask) else cast(TaskT, task.toward(goal))
     )
+
+
+def check_goal(goal: Tensor, count: int) -> None:
+    """Check the goals of worlds; their range only on a CPU, as no task may wait for a CUDA device.
+
+    Args:
+        goal: What is to be the worlds' goals, int64, shape [B].
+        count: How many goals there are to choose from.
+
+    Raises:
+        NPAError: It is no such tensor, or there is no such goal.
+    """
+    if not isinstance(goal, Tensor) or goal.dtype != torch.int64 or goal.ndim != 1:
+        came = f"{goal.dtype} {tuple(goal.shape)}" if isinstance(goal, Tensor) else shown(goal)
+        raise NPAError(
+            f"goal must be an int64 tensor of shape [B], got {came}: for example torch.tensor([0])"
+        )
+    if goal.device.type == "cpu" and not bool(((goal >= 0) & (goal < count)).all()):
+        raise NPAError(
+            f"goal must hold numbers of at least 0 and below {count}, got {shown(goal.tolist())}: "
+            "for example torch.tensor([0])"
+        )
 
 
 def coded_states(task: Task, s: Tensor) -> Tensor:

@@ -14,7 +14,7 @@ from npa_envs.errors import NPAError, shown
 from npa_envs.files import home_path
 from npa_envs.rule.codes import Codes
 from npa_envs.rule.rule import NPARule
-from npa_envs.tasks.base import untrained_rule
+from npa_envs.tasks.base import check_goal, untrained_rule
 from npa_envs.tasks.morphogenesis2d import Morphogenesis2D, Morphogenesis2DConfig
 from npa_envs.tasks.seeds import drawn_indices
 from npa_envs.tasks.targets.images import looks_like_path
@@ -138,7 +138,12 @@ class ManyPictures(Morphogenesis2D):
         return self._with(_codes=rule.codes)
 
     def toward(self, goal: Tensor) -> Self:
-        """Return the task with loss and metric for worlds of these targets, int64, shape [B]."""
+        """Return the task with loss and metric for worlds of these targets, int64, shape [B].
+
+        Raises:
+            NPAError: They are no such tensor; or, on a CPU, there is no such target.
+        """
+        check_goal(goal, len(self.names))
         return self._with(_goal=goal)
 
     def seed(

@@ -16,7 +16,7 @@ from torch import Tensor
 from npa_envs.errors import NPAError
 from npa_envs.ops import splat, world_mean
 from npa_envs.rule.rule import NPARule
-from npa_envs.tasks.base import ParticleTask, TaskConfig
+from npa_envs.tasks.base import ParticleTask, TaskConfig, check_goal
 from npa_envs.tasks.checks import check_non_negative, check_positive, check_seed, check_text
 from npa_envs.tasks.seeds import drawn_indices
 from npa_envs.tasks.targets.clouds import (
@@ -179,7 +179,12 @@ class PointClassification(ParticleTask[PointClassificationConfig]):
         return other
 
     def toward(self, goal: Tensor) -> Self:
-        """Return the task with loss and metric for worlds of these classes, shape [B]."""
+        """Return the task with loss and metric for worlds of these classes, int64, shape [B].
+
+        Raises:
+            NPAError: They are no such tensor; or, on a CPU, there is no such class.
+        """
+        check_goal(goal, self.config.class_count)
         return self._with(_goal=goal)
 
     def seed(

@@ -11,7 +11,7 @@ from npa_envs.agents.learning import Budget, Problem
 from npa_envs.agents.learning import train as learn
 from npa_envs.envs import multispecies_v0
 from npa_envs.measure.quality import scores
-from npa_envs.ops import orbit, periodic_splat, splat
+from npa_envs.ops import orbit, periodic_splat, splat, warmup
 from npa_envs.render import to_uint8, write_gif
 from npa_envs.tasks.damage import damage_worlds, parse_damage
 from npa_envs.tasks.seeds import uniform_ball, uniform_box
@@ -115,6 +115,9 @@ META = torch.zeros(1, 4, 2, device="meta")
     [
         (lambda: rollout(3, *world(), 1), "rule must be an NPARule, got int"),
         (lambda: rollout(NPARule(), *world(), 1, memory=[]), "memory must be 'store'"),
+        (lambda: warmup(space_dims=2), r"space_dims must be some of \(2, 3\), got 2"),
+        (lambda: warmup(dtypes=[torch.float16]), "dtypes must be some of"),
+        (lambda: warmup("tpu"), "device must"),
         (
             lambda: rollout(NPARule(), *world(), 1, cuda_graph=np.array([1, 2])),
             "cuda_graph must be 'auto', True or False",

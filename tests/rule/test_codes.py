@@ -68,6 +68,8 @@ def test_a_part_of_the_particles_can_carry_another_code():
     assert torch.equal(carried[..., 3:], s[..., 3:])
     with pytest.raises(NPAError, match=r"code must have shape \[K\]"):
         rule.with_code(s, torch.zeros(4))
+    with pytest.raises(NPAError, match=r"code must be a tensor, got \[1\.0, 2\.0, 3\.0\]: for"):
+        rule.with_code(s, [1.0, 2.0, 3.0])
     with pytest.raises(NPAError, match="has no codes"):
         lively_rule("cpu").with_code(s, torch.zeros(3))
 
@@ -76,6 +78,10 @@ def test_codes_are_read_by_name_and_blended_by_shares():
     codes = coded().codes
     assert codes.names == NAMES
     assert torch.equal(codes["heart"], codes.table[1])
+    assert list(codes) == list(NAMES)
+    assert "heart" in codes
+    assert "hart" not in codes
+    assert 0 not in codes
     blend = codes.blend({"gecko": 1.0, "ring": 3.0})
     assert_near(blend, 0.25 * codes.table[0] + 0.75 * codes.table[2], 1e-12)
     with pytest.raises(NPAError, match=r"unknown code 'hart'.*heart"):
@@ -112,6 +118,11 @@ def test_a_file_holds_codes_names_and_encoder(encoder, tmp_path):
         ({"code_dim": 0}, "go together"),
         ({"code_names": ()}, "go together"),
         ({"code_names": ("a", "a")}, "must be different names"),
+        ({"code_names": None}, "code_names must be a list of names, got None: for example"),
+        ({"code_names": 3}, "code_names must be a list of names, got 3: for example"),
+        ({"code_names": "abc"}, "code_names must be a list of names, got 'abc': for example"),
+        ({"code_names": ("a", 1)}, r"code_names must be a list of names, got \('a', 1\): for"),
+        ({"code_names": None, "code_dim": 0}, "code_names must be a list of names, got None"),
         ({"equivariant": True}, "an equivariant rule has no codes"),
     ],
 )

@@ -92,6 +92,8 @@ def test_metadata_is_kept_and_holds_every_hyper_parameter(tmp_path: Path) -> Non
         ("rule.pth", {}, r"must end in \.safetensors"),
         ("rule.safetensors", {"eps0": "1"}, "must not use the name 'eps0'"),
         ("rule.safetensors", {"steps": 3}, "must map text to text"),
+        ("rule.safetensors", {"a": "\ud800"}, r"UTF-8 can write, got 'a': '\\ud800': leave"),
+        ("rule.safetensors", {"\ud800": "a"}, r"UTF-8 can write, got '\\ud800': 'a': leave"),
         ("rule.safetensors", {}, r"2 of 2304 numbers in 'output.weight'"),
     ],
 )
@@ -126,6 +128,77 @@ def test_a_network_that_files_do_not_hold_is_refused_and_nothing_is_lost(tmp_pat
         with pytest.raises(NPAError, match="rule must have the network that NPARule makes"):
             save_rule(rule, path)
     assert path.read_bytes() == before
+
+
+class Sine(torch.nn.Linear):
+    def forward(self, z: Tensor) -> Tensor:
+        return torch.sin(super().forward(z))
+
+
+def replace_hidden(rule: NPARule) -> None:
+    rule.hidden = Sine(rule.input_dim, rule.hidden_dim)
+
+
+def replace_activation(rule: NPARule) -> None:
+    assert rule.readout is not None
+    rule.readout[1] = torch.nn.Tanh()
+
+
+ALTERED: dict[str, Callable[[NPARule], Any]] = {
+    "a layer of another class": replace_hidden,
+    "another activation": replace_activation,
+    "a replaced forward": lambda rule: vars(rule).update(forward=torch.sin),
+    "a layer's replaced forward": lambda rule: vars(rule.hidden).update(forward=torch.sin),
+    "a hook of a layer": lambda rule: rule.hidden.register_forward_hook(lambda m, i, o: 2.0 * o),
+    "a hook before a layer": lambda rule: rule.readout[0].register_forward_pre_hook(lambda m, i: i),
+    "a hook of the rule": lambda rule: rule.register_forward_hook(lambda m, i, o: 2.0 * o),
+    "no biases": lambda rule: setattr(rule.hidden, "bias", None),
+}
+
+
+@pytest.mark.parametrize("kind", ALTERED)
+@pytest.mark.parametrize("equivariant", [False, True])
+def test_a_network_that_would_be_loaded_as_another_is_refused(tmp_path, kind, equivariant):
+    rule = NPARule(2, 4, 8, readout_dim=3, readout_hidden_dim=5, equivariant=equivariant)
+    ALTERED[kind](rule)
+    with pytest.raises(NPAError, match=r"network that NPARule makes.*remove its hooks, or keep"):
+        save_rule(rule, tmp_path / "rule.safetensors")
+    assert list(tmp_path.iterdir()) == []
+
+
+class Told(NPARule):
+    """A rule that computes what its file holds, and has something beside it."""
+
+    def __init__(self, *sizes: int) -> None:
+        super().__init__(*sizes)
+        self.noted = torch.nn.ReLU()
+
+
+def test_what_does_not_change_a_network_does_not_keep_it_from_its_file(tmp_path: Path) -> None:
+    rule = Told(2, 4, 8)
+    rule.noted.register_forward_hook(lambda m, i, o: None)
+    rule.hidden.register_full_backward_hook(lambda m, i, o: None)
+    save_rule(rule, tmp_path / "rule.safetensors")
+    assert_same_rule(load_rule(tmp_path / "rule.safetensors"), rule)
+
+
+@pytest.mark.parametrize(
+    ("convert", "got"),
+    [
+        (NPARule.half, "'torch.float16'"),
+        (NPARule.bfloat16, "'torch.bfloat16'"),
+        (lambda rule: rule.output.double(), "'torch.float32', 'torch.float64'"),
+    ],
+)
+def test_weights_that_are_not_of_one_precision_are_not_saved(tmp_path, convert, got):
+    rule = NPARule(2, 4, 8)
+    convert(rule)
+    message = rf"all float32 or all float64, got .{got}.: convert them, as rule\.float\(\) does"
+    with pytest.raises(NPAError, match=message):
+        save_rule(rule, tmp_path / "rule.safetensors")
+    assert list(tmp_path.iterdir()) == []
+    save_rule(rule.float(), tmp_path / "rule.safetensors")
+    assert_same_rule(load_rule(tmp_path / "rule.safetensors"), rule)
 
 
 def test_no_bit_flips_unnoticed(tmp_path: Path) -> None:

@@ -134,6 +134,30 @@ def test_points_lie_on_the_ink_and_the_first_row_is_the_highest():
         sample_ink(np.stack([ink[0], 0 * ink[0]]), 10)
 
 
+def test_coverage_is_the_share_of_the_unit_square(tmp_path):
+    cpu = torch.device("cpu")
+    for name, shape in (("square", (12, 12)), ("wide", (3, 12)), ("high", (12, 6))):
+        folder = tmp_path / name
+        folder.mkdir()
+        images, label = np.full((2, *shape), 255, np.uint8), np.arange(2, dtype=np.uint8)
+        (folder / "train-images-idx3-ubyte").write_bytes(idx(images))
+        (folder / "train-labels-idx1-ubyte").write_bytes(idx(label))
+        clouds = load_clouds(str(folder), "train", 20, device=cpu)
+        assert clouds.coverage == shape[0] * shape[1] / 144
+    # In a square picture it is the share of the picture, to the last bit.
+    images, _ = pictures(COUNTS["train"], 0)
+    clouds = load_clouds(str(write_idx(tmp_path / "idx")), "train", 20, device=cpu)
+    assert clouds.coverage == sample_ink((images / 255.0).astype(np.float32), 20)[1]
+
+
+def test_a_tilde_is_the_users_home(tmp_path, monkeypatch):
+    monkeypatch.setenv("HOME", str(tmp_path))
+    monkeypatch.setenv("USERPROFILE", str(tmp_path))
+    write_idx(tmp_path / "idx")
+    read = load_pictures("~/idx", "test")
+    assert np.array_equal(read.label, load_pictures(str(tmp_path / "idx"), "test").label)
+
+
 def test_points_are_spread_evenly():
     x, coverage = sample_ink(np.ones((1, 8, 8), np.float32), 256)
     assert coverage == 1.0

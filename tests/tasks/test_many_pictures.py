@@ -80,6 +80,14 @@ def test_each_world_is_compared_with_its_own_target(device):
         assert float(own[..., 3].sum()) == pytest.approx(float(alone[..., 3].sum()), rel=0.1)
 
 
+@pytest.mark.parametrize("number", [-1, 3])
+def test_targets_that_do_not_exist_are_refused(number):
+    with pytest.raises(NPAError, match=f"goal must hold .* below 3, got .{number}, 0.: for"):
+        task_of("cpu").toward(torch.tensor([number, 0]))
+    with pytest.raises(NPAError, match=r"goal must be an int64 tensor of shape .*float32 \(3,\)"):
+        task_of("cpu").toward(torch.zeros(3))
+
+
 def test_gradients_of_the_loss_reach_the_worlds_codes_alone(device):
     task = task_of(device)
     rule = task.make_rule(generator()).to(device)

@@ -124,6 +124,23 @@ def test_without_read_out_the_last_channels_are_the_classes(task, device):
         task.outputs(s[..., :2])
 
 
+@pytest.mark.parametrize(
+    ("goal", "message"),
+    [
+        (torch.tensor([0, 3]), r"at least 0 and below 3, got \[0, 3\]: for example"),
+        (torch.tensor([0, -1]), r"at least 0 and below 3, got \[0, -1\]: for example"),
+        (torch.tensor([0, 1], dtype=torch.int32), r"int64 .* got torch.int32 \(2,\): for"),
+        (torch.tensor([0.0]), r"int64 tensor of shape \[B\], got torch.float32 \(1,\)"),
+        (torch.tensor(0), r"int64 tensor of shape \[B\], got torch.int64 \(\)"),
+        ([0, 1], r"int64 tensor of shape \[B\], got \[0, 1\]"),
+    ],
+)
+def test_classes_that_do_not_exist_are_refused(folder, goal, message):
+    task = PointClassification(PointClassificationConfig(data=folder, **SMALL))
+    with pytest.raises(NPAError, match=f"goal must .*{message}"):
+        task.toward(goal)
+
+
 def test_data_of_more_classes_than_told_are_refused(folder):
     task = PointClassification(PointClassificationConfig(data=folder, **SMALL | {"class_count": 2}))
     with pytest.raises(NPAError, match="more than the highest class of the data, 2, got 2"):

@@ -161,6 +161,44 @@ def test_grey_starts_and_empty_places_have_finite_slopes(name):
 
 
 @pytest.mark.parametrize("name", JOINT)
+def test_worlds_may_be_of_another_precision_than_the_target(name):
+    target, images = target_of("hearts", 24, torch.float32), noise(2, 4, 24, 24).requires_grad_()
+    loss = make_texture_loss(name, target)
+    values = loss(images)
+    (slopes,) = torch.autograd.grad(values.sum(), images)
+    assert values.dtype == torch.float64
+    # Worst error measured: 4e-7.
+    torch.testing.assert_close(loss(images.float()).double(), values, rtol=1e-5, atol=0.0)
+    assert torch.isfinite(slopes).all()
+    task = Texture(dataclasses.replace(SMALL, loss=name))
+    x, s = task.seed(1, generator=torch.Generator().manual_seed(0))
+    found = task.metric(x.double(), s.double())
+    torch.testing.assert_close(found, task.metric(x, s).double(), rtol=1e-5, atol=0.0)
+
+
+@pytest.mark.parametrize("name", JOINT)
+def test_an_empty_target_can_be_compared_with(name):
+    loss = make_texture_loss(name, torch.zeros(4, 24, 24))
+    empty, full = torch.zeros(1, 4, 24, 24), noise(1, 4, 24, 24).float()
+    for images in (empty, full, 100.0 * full):
+        images.requires_grad_()
+        value = loss(images)
+        (slope,) = torch.autograd.grad(value.sum(), images)
+        assert torch.isfinite(value).all()
+        # What optimisers normalise by.
+        assert torch.isfinite(slope.norm())
+    assert float(loss(full).detach()) > float(loss(empty).detach()) >= 0.0
+    weightless = Texture(
+        dataclasses.replace(SMALL, loss=name, colour_weight=0.0, density_weight=0.0)
+    )
+    x, s = weightless.seed(1, generator=torch.Generator().manual_seed(0))
+    metric = weightless.metric(x.requires_grad_(), s)
+    (slope,) = torch.autograd.grad(metric.sum(), x)
+    assert torch.isfinite(metric).all()
+    assert torch.isfinite(slope).all()
+
+
+@pytest.mark.parametrize("name", JOINT)
 @pytest.mark.parametrize("resolution", [13, 24])
 def test_losses_do_not_depend_on_the_batch(name, resolution, device):
     target = target_of("cells", resolution, torch.float32).to(device)
@@ -215,6 +253,8 @@ def test_targets_that_are_too_small_are_refused(name):
         make_texture_loss(name, noise(4, 10, 10))
     with pytest.raises(NPAError, match=r"images must have shape \[B, K, R, R\]"):
         make_texture_loss(name, noise(4, 16, 16))(noise(1, 3, 16, 16))
+    with pytest.raises(NPAError, match=r"a tensor of shape \[K, R, R\], got ndarray"):
+        make_texture_loss(name, np.zeros((4, 16, 16), np.float32))
 
 
 def test_names_joined_by_a_plus_are_summed():
@@ -227,6 +267,7 @@ def test_names_joined_by_a_plus_are_summed():
         ("patch_ot+filter_op", "did you mean 'filter_ot'"),
         ("patch_ot+patch_swd", "summed must be joint ones.*joint_swd"),
         ("patch_ot+", "must be a texture loss that exists"),
+        (["patch_ot"], r"must be a texture loss that exists, got \['patch_ot'\]: known"),
     ):
         with pytest.raises(NPAError, match=message):
             TextureConfig(loss=name)

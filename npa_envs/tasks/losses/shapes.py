@@ -223,6 +223,9 @@ class RectifiedWavelets:
 SHIFTS = ((0, 0), (0, 2), (2, 0), (2, 2), (2, -2), (0, 5), (5, 0))
 """Places between two features whose products are averaged, rows and columns."""
 
+LEAST_SQUARE = 1e-6
+"""Divisor of Gram losses at least: targets that are not empty have some thousand times as much."""
+
 
 class GramMatrices(TextureDistance):
     """The distance of images from a target in how features go together; satisfies `TextureLoss`.
@@ -255,14 +258,17 @@ class GramMatrices(TextureDistance):
         self._shifts = shifts
         field = features(target[None], wrap=tiles)
         sizes = field.square().mean(dim=(0, 2, 3)).sqrt()
-        self._scales = (1.0 / (sizes + 0.3 * sizes.mean() + 1e-6))[:, None, None]
+        scales = 1.0 / (sizes + 0.3 * sizes.mean() + 1e-6)
+        # Features of an empty target have no size that others could be told by.
+        self._scales = torch.where(sizes.any(), scales, 1.0)[:, None, None]
         # Features move round the torus; where the target is none, a few products lie wrong.
         self._expected = self._statistics(field)
+        self._square = self._expected.square().mean().clamp_min(LEAST_SQUARE)
 
     def compare(self, images: Tensor) -> Tensor:
         """Return the distance of each of some checked images, [B]."""
         found = self._statistics(self._features(images, wrap=True))
-        return (found - self._expected).square().mean(1) / self._expected.square().mean()
+        return (found - self._expected).square().mean(1) / self._square
 
     def _statistics(self, field: Tensor) -> Tensor:
         field = field * self._scales
@@ -298,7 +304,8 @@ class FeatureTransport(TextureDistance):
     def compare(self, images: Tensor) -> Tensor:
         """Return the distance of each of some checked images, [B]."""
         found = self._rows(self._features(images, wrap=True))
-        return relaxed_transport(found, self._expected) + moment_distance(found, self._expected)
+        expected = self._expected.to(found)
+        return relaxed_transport(found, expected) + moment_distance(found, expected)
 
     @staticmethod
     def _rows(field: Tensor) -> Tensor:

@@ -156,7 +156,7 @@ def check_loss_name(name: str) -> None:
     """
     parts = name.split("+") if isinstance(name, str) else []
     for part in parts or [name]:
-        if part not in TEXTURE_LOSSES:
+        if not isinstance(part, str) or part not in TEXTURE_LOSSES:
             hint = suggest(part, TEXTURE_LOSSES)
             raise NPAError(f"loss must be a texture loss that exists, got {shown(name)}: {hint}")
     if len(parts) > 1 and not all(TEXTURE_LOSSES[part].joint for part in parts):
@@ -200,6 +200,11 @@ def make_texture_loss(
             needs are missing or damaged.
     """
     check_loss_name(name)
+    if not isinstance(target, Tensor):
+        raise NPAError(
+            f"target must be a tensor of shape [K, R, R], got {type(target).__name__}: for example "
+            "torch.as_tensor(target)"
+        )
     if target.ndim != 3 or target.shape[1] != target.shape[2] or not target.is_floating_point():
         raise NPAError(
             f"target must be a floating tensor of shape [K, R, R], got {target.dtype} "

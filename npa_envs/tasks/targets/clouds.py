@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from npa_envs.errors import MissingDependencyError, NPAError, shown, suggest
-from npa_envs.files import open_regular
+from npa_envs.files import home_path, open_regular
 from npa_envs.world.randomness import Randomness, normal_draws, uniform_draws
 
 Split = Literal["train", "test"]
@@ -86,7 +86,9 @@ def load_clouds(
         NPAError: The data cannot be loaded, or a picture has no ink.
     """
     pictures = load_pictures(data, split, folder=folder)
-    x, coverage = sample_ink(pictures.ink, particle_count, sample_seed=sample_seed, device=device)
+    x, share = sample_ink(pictures.ink, particle_count, sample_seed=sample_seed, device=device)
+    height, width = pictures.ink.shape[1:]
+    coverage = share * (height * width / max(height, width) ** 2)
     return PointClouds(x, torch.from_numpy(pictures.label).to(device), coverage)
 
 
@@ -109,7 +111,8 @@ def sample_ink(
         device: Where points are chosen.
 
     Returns:
-        Positions in [0, 1]² [length units], shape [M, N, 2], and the mean share of ink.
+        Positions in [0, 1]² [length units], shape [M, N, 2], and the mean share of each picture
+        that has ink.
 
     Raises:
         NPAError: A picture has no ink.
@@ -287,7 +290,7 @@ def load_pictures(data: str, split: Split = "train", *, folder: str = "data") ->
         return _digits(split)
     if data == "mnist":
         return _mnist(split, folder)
-    path = Path(data)
+    path = home_path(data)
     if not os.path.isdir(path):
         raise NPAError(
             f"data must be a known data set or a folder of IDX files, got {shown(data)}: "
