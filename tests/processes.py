@@ -46,6 +46,8 @@ def _run(rank, count, function, store, pipe):
         dist.init_process_group(
             "gloo", store=dist.FileStore(store, count), rank=rank, world_size=count
         )
+        # One that ends at once would end while another one still connects to it.
+        dist.barrier()
         pipe.send(function())
     except NPAError as error:
         pipe.send(str(error))
