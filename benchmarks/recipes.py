@@ -40,7 +40,7 @@ from typing import Any
 import numpy as np
 import torch
 from emoji_sets import draw_pictures
-from old_worlds import follow, run_healing, run_long
+from old_worlds import append_line, follow, run_healing, run_long
 from PIL import Image
 from recipe_arms import ARMS, FAST_ARMS, SEEDS, SIZES, Run, configuration
 from side_by_side import iterate_together, on, stream_of
@@ -239,8 +239,7 @@ def run_all(arguments: argparse.Namespace) -> None:
                     Image.fromarray(strip(trainer, steps)).save(out / f"strip-{run.name}.png")
                     if arguments.device.startswith("cuda"):
                         release_recordings()
-                with (out / f"runs-{arguments.process}.jsonl").open("a") as file:
-                    file.write(json.dumps(line) + "\n")
+                append_line(out / f"runs-{arguments.process}.jsonl", line)
                 losses = " ".join(f"{r['step']}:{r['loss']:.3f}" for r in line["growth"])
                 print(f"{run.name} {seconds:.0f} s  {losses}", flush=True)
             del trainers
@@ -416,21 +415,16 @@ def main() -> None:
     own.add_argument("--target", required=True)
     own.add_argument("--preset", default="paper", help="what the world is like")
     own.add_argument("--steps", type=int, nargs="+", default=[512, 4096, 20_000])
-    own = commands.add_parser("long")
-    own.set_defaults(main=run_long)
-    own.add_argument("--out", type=Path, required=True, help="folder of `run`")
-    own.add_argument("--pictures", type=Path, required=True, help="folder of PNG files")
-    own.add_argument("--device", default="cpu")
-    own.add_argument("--preset", default="paper", help="what the world is like")
-    own.add_argument("--steps", type=int, default=habitats.STEPS)
-    own = commands.add_parser("heal")
-    own.set_defaults(main=run_healing)
-    own.add_argument("--out", type=Path, required=True, help="folder of `run`")
-    own.add_argument("--pictures", type=Path, required=True, help="folder of PNG files")
-    own.add_argument("--device", default="cpu")
-    own.add_argument("--preset", default="paper", help="what the world is like")
-    own.add_argument("--count", type=int, default=32, help="seeds")
-    own.add_argument(
+    long, heal = commands.add_parser("long"), commands.add_parser("heal")
+    for own, run in ((long, run_long), (heal, run_healing)):
+        own.set_defaults(main=run)
+        own.add_argument("--out", type=Path, required=True, help="folder of `run`")
+        own.add_argument("--pictures", type=Path, required=True, help="folder of PNG files")
+        own.add_argument("--device", default="cpu")
+        own.add_argument("--preset", default="paper", help="what the world is like")
+    long.add_argument("--steps", type=int, default=habitats.STEPS)
+    heal.add_argument("--count", type=int, default=32, help="seeds")
+    heal.add_argument(
         "--steps", type=int, nargs=2, default=[1024, 500], help="before and after the damage"
     )
     own = commands.add_parser("report")

@@ -187,6 +187,8 @@ class GardenPolicy:
 
     def __init__(self, model: Any) -> None:
         self.model = model
+        space = model.observation_space
+        self._shapes = _shapes(space.spaces if isinstance(space, Dict) else space)
 
     def __call__(self, observation: Any) -> NDArray[np.float32]:
         """Return actions of worlds, shape [B, K, W], for what is seen of them, [B, ...].
@@ -194,8 +196,7 @@ class GardenPolicy:
         Raises:
             NPAError: Something else is seen than where the policy has learned.
         """
-        space = self.model.observation_space
-        wanted = _shapes(space.spaces if isinstance(space, Dict) else space)
+        wanted = self._shapes
         found = {name: shape[1:] for name, shape in _shapes(observation).items()}
         if wanted != found:
             raise NPAError(

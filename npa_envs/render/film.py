@@ -224,8 +224,9 @@ def write_filmstrip(
 
 
 def _checked_captions(captions: Any, count: int) -> list[str]:
-    texts = [] if isinstance(captions, str) or not isinstance(captions, Iterable) else [*captions]
-    if not all(isinstance(text, str) for text in texts) or (not texts and captions != []):
+    several = isinstance(captions, Iterable) and not isinstance(captions, str)
+    texts = list(captions) if several else []
+    if not several or not all(isinstance(text, str) for text in texts):
         raise NPAError(
             f"captions must be texts, one for each frame, got {shown(captions)}: give a list of "
             "str, or None"

@@ -24,7 +24,8 @@ try:
 except ImportError:  # Windows
     fcntl = None  # type: ignore[assignment]
 
-_LARGEST_LOG = 2**29
+LARGEST_LOG = 2**29
+"""Bytes of a run's log, at most."""
 
 
 def check_choice(*, resume: bool, overwrite: bool) -> None:
@@ -248,7 +249,7 @@ class JsonlLog:
         """
         if not os.path.exists(self.path):
             return []
-        content = read_bytes(self.path, limit=_LARGEST_LOG, what="the log")
+        content = read_bytes(self.path, limit=LARGEST_LOG, what="the log")
         lines = content.decode("utf-8", errors="replace").split("\n")
         # What stands behind the last end of a line was cut short; mostly nothing does.
         if _parsed_record(lines[-1]) is None:

@@ -6,7 +6,6 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 import gymnasium
-import torch
 from torch import Tensor
 
 from npa_envs.agents.policies import RandomPolicy, RulePolicy, ZeroPolicy
@@ -19,6 +18,7 @@ from npa_envs.tasks.damage import DAMAGE_SIZES, damage_worlds
 from npa_envs.tasks.point_classification import PointClassification, class_colours
 from npa_envs.web.colouring import Colouring, Seen, shows_of
 from npa_envs.web.live import Frame, Live, Touch, brushed, checked_seed
+from npa_envs.world.brushes import nearest_image
 
 
 def make_environment(
@@ -143,11 +143,8 @@ class EnvironmentWorld(Live):
             self._return += float(reward)
             if before is not None:
                 physics = self._inner.worlds.physics
-                way = self._inner.particles()[0] - before
-                if physics.box is not None:
-                    # Not across the whole box, but over its edge.
-                    sides = way.new_tensor(physics.box)
-                    way = way - sides * torch.round(way / sides)
+                # Over the edge of a box, not all across it.
+                way = nearest_image(self._inner.particles()[0] - before, physics.box)
                 self._travelled = way.norm(dim=-1)[None] / max(physics.reach, 1e-12)
             if ended or late:
                 self._ended = (

@@ -32,7 +32,7 @@ from npa_envs.tasks.seeds import uniform_ball
 from npa_envs.tasks.train_config import TrainConfig
 from npa_envs.training.overrides import load_config
 from npa_envs.training.presets import preset
-from npa_envs.training.run_folder import RunFolder
+from npa_envs.training.run_folder import LARGEST_LOG, RunFolder
 from npa_envs.training.trained_tasks import TrainedTask, task_of_rule, trained_config
 from npa_envs.web.colouring import Colouring, Seen, shows_of
 from npa_envs.web.live import Frame, Live, Range, Touch, brushed, checked_seed
@@ -52,9 +52,6 @@ SMALL_VIEWS = {"resolution": 64, "training_views": 1, "held_out_views": 6}
 
 MOST_TASKS = 8
 """Tasks that are kept, with their targets: a slider of N asks for many."""
-
-LARGEST_LOG = 2**29
-"""Bytes of a run's log, at most."""
 
 POLL_SECONDS = 1.0
 """Time between two looks into the folder of a run [s]."""

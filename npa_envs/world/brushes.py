@@ -36,13 +36,22 @@ def offsets_from(x: Tensor, centre: Tensor, box: Sides = None) -> Tensor:
             asks for, or the box has not a side for each coordinate.
     """
     _check_vector("centre", centre, x)
-    offset = x - centre[:, None]
-    if box is None:
-        return offset
-    if len(entries(box) or ()) != x.shape[2]:
+    if box is not None and len(entries(box) or ()) != x.shape[2]:
         raise NPAError(f"box must have {x.shape[2]} sides, got {shown(box)}: give one for each")
+    return nearest_image(x - centre[:, None], box)
+
+
+def nearest_image(way: Tensor, box: Sides) -> Tensor:
+    """Return ways, or places, as their images nearest to the origin have them, [..., D].
+
+    Args:
+        way: From one place to another [length units], shape [..., D].
+        box: Sides of the periodic box [length units]; None: they are as they are.
+    """
+    if box is None:
+        return way
     # Side by side: a tensor of the sides would be a copy to the device.
-    parts = zip(offset.unbind(dim=-1), box, strict=True)
+    parts = zip(way.unbind(dim=-1), box, strict=True)
     return torch.stack([part - side * torch.round(part / side) for part, side in parts], dim=-1)
 
 

@@ -30,7 +30,6 @@ from npa_envs.measure.robustness.recovery import (
     Course,
     healing,
     recovery_step,
-    wrapped,
 )
 from npa_envs.measure.robustness.study import (
     Response,
@@ -53,6 +52,7 @@ from npa_envs.rule.files import (
 )
 from npa_envs.tasks.damage import random_particle
 from npa_envs.training.trained_tasks import task_of_rule, trained_config
+from npa_envs.world.brushes import nearest_image
 from npa_envs.world.randomness import WorldRandom
 
 SIDE = 2.0
@@ -100,7 +100,7 @@ def plainly(name, x, s, random, box):
         return [part[kept].view(3, COUNT // 2, -1) for part in (x, s)]
     middle = name == "cut" and box is None
     centre = (x.mean(1) if middle else random_particle(x, random))[:, None]
-    away = wrapped(x - centre, box)
+    away = nearest_image(x - centre, box)
     near = away.norm(dim=-1, keepdim=True) <= 0.2
     if name == "erase":
         return x, torch.where(near, 0.0, s)
@@ -119,7 +119,7 @@ def test_a_damage_does_to_each_world_what_it_says(worlds, name):
     x, s, box = worlds
     found_x, found_s = damaged(name, x, s, box)
     expected_x, expected_s = plainly(name, x, s, WorldRandom([1, 2, 3], device=x.device), box)
-    assert float(wrapped(found_x - expected_x, box).abs().max()) < 1e-5
+    assert float(nearest_image(found_x - expected_x, box).abs().max()) < 1e-5
     assert torch.equal(found_s, expected_s)
     assert box is None or float(found_x.abs().max()) <= 0.5 * SIDE + 1e-6
     if name in ("cut", "clump"):

@@ -16,6 +16,7 @@ from npa_envs.rule.files import load_rule, rule_file, rule_metadata, shipped_rul
 from npa_envs.rule.rule import NPARule
 from npa_envs.tasks.base import Task, seed_worlds, task_toward
 from npa_envs.training.trained_tasks import task_of_rule, trained_config
+from npa_envs.world.brushes import nearest_image
 from npa_envs.world.cuda_graph import Captured, capture
 from npa_envs.world.randomness import Randomness
 from npa_envs.world.rollout import rollout
@@ -251,17 +252,6 @@ def endurance_checks(rules: Mapping[str, str] | None = None) -> list[Check]:
     ]
 
 
-def wrapped(x: Tensor, box: tuple[float, ...] | None) -> Tensor:
-    """Return positions [B, N, D] where a periodic box around the origin has them.
-
-    In open space they are as they are.
-    """
-    if box is None:
-        return x
-    sides = x.new_tensor(box)
-    return x - sides * torch.round(x / sides)
-
-
 def measured(home: Habitat, x: Tensor, s: Tensor, generator: torch.Generator) -> dict[str, float]:
     """Return the figures of worlds x [B, N, D], s [B, N, C], none of them compared with others.
 
@@ -275,7 +265,7 @@ def measured(home: Habitat, x: Tensor, s: Tensor, generator: torch.Generator) ->
         before = x, s
         for _ in range(ENERGY_STEPS):
             after = rollout(home.rule, *before, 1, generator=generator, **home.options())
-            moved = wrapped(after[0] - before[0], home.task.box)
+            moved = nearest_image(after[0] - before[0], home.task.box)
             energy += (moved / home.task.eps).square().sum(-1).mean()
             energy += (after[1] - before[1]).square().mean()
             before = after

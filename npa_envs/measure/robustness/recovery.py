@@ -13,11 +13,11 @@ from statistics import median
 import torch
 from torch import Tensor
 
-from npa_envs.measure.accuracy.habitats import wrapped
 from npa_envs.measure.robustness.grounds import Ground, Home, courses
 from npa_envs.ops import world_mean
 from npa_envs.tasks.base import coded_states
 from npa_envs.tasks.damage import DAMAGE_SIZES, clump, cut, erase_state, random_particle
+from npa_envs.world.brushes import nearest_image, offsets_from
 from npa_envs.world.randomness import Purpose, WorldRandom
 
 STATE_NOISE = 0.3
@@ -46,7 +46,7 @@ class Damage:
 
 def erase(x: Tensor, s: Tensor, random: WorldRandom, box: Box) -> tuple[Tensor, Tensor]:
     """Set all states in a disk around a random particle to zero, a ball in 3D."""
-    away = wrapped(x - random_particle(x, random)[:, None], box)
+    away = offsets_from(x, random_particle(x, random), box)
     centre = torch.zeros_like(x[:, 0])
     return x, erase_state(away, s, centre=centre, radius=DAMAGE_SIZES["erase"])
 
@@ -55,19 +55,19 @@ def slit(x: Tensor, s: Tensor, random: WorldRandom, box: Box) -> tuple[Tensor, T
     """Open a slit at a random angle: through the middle, in a box through a random particle."""
     centre = world_mean(x) if box is None else random_particle(x, random)
     normal = random.normal(x.shape[2], dtype=x.dtype)
-    away = wrapped(x - centre[:, None], box)
+    away = offsets_from(x, centre, box)
     origin = torch.zeros_like(centre)
     away, s = cut(away, s, centre=origin, normal=normal, gap=DAMAGE_SIZES["cut"])
-    return wrapped(away + centre[:, None], box), s
+    return nearest_image(away + centre[:, None], box), s
 
 
 def pull_together(x: Tensor, s: Tensor, random: WorldRandom, box: Box) -> tuple[Tensor, Tensor]:
     """Pull all particles in a disk around a random one to its place."""
     centre = random_particle(x, random)
-    away = wrapped(x - centre[:, None], box)
+    away = offsets_from(x, centre, box)
     origin = torch.zeros_like(centre)
     away, s = clump(away, s, centre=origin, radius=DAMAGE_SIZES["clump"], factor=1.0)
-    return wrapped(away + centre[:, None], box), s
+    return nearest_image(away + centre[:, None], box), s
 
 
 def add_state_noise(x: Tensor, s: Tensor, random: WorldRandom, box: Box) -> tuple[Tensor, Tensor]:
