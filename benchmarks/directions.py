@@ -76,6 +76,7 @@ def train(arguments: argparse.Namespace) -> None:
                 fields["iterations"] = arguments.iterations
             if arguments.initial_rule:
                 fields["initial_rule"] = arguments.initial_rule
+            fields["optimiser"] = arguments.optimiser
             if arguments.learning_rate:
                 fields["learning_rate"] = arguments.learning_rate
             fields |= {"repeats": 1, "tensorboard": False, "picture_interval": 0}
@@ -225,6 +226,7 @@ def main() -> None:
     parser.add_argument("--runs", nargs="*", default=(), help="such as gecko-plain; default: all")
     parser.add_argument("--size", default="small")
     parser.add_argument("--iterations", type=int, default=0)
+    parser.add_argument("--optimiser", default="adamw")
     parser.add_argument("--learning-rate", type=float, default=0.0)
     parser.add_argument("--initial-rule", default="", help="file of a rule of the same kind")
     parser.add_argument("--longest", type=float, default=math.inf)

@@ -121,6 +121,9 @@ EIGHTH: Fields = {
 }
 """The eighth candidate: grown worlds are to rest."""
 
+MUON: Fields = {"optimiser": "muon", "learning_rate": 5e-3}
+"""Orthogonal steps, and their rate at full size."""
+
 FAST_BEFORE: Fields = {
     **NO_STRAYS,
     "learning_rate": 2e-3,
@@ -208,6 +211,14 @@ ARMS: Mapping[str, Fields] = {
     "eighth, share 0.5": EIGHTH | {"damage_share": 0.5},
     "eighth, steps 32 to 64": EIGHTH | {"steps": (32, 64), "lifetimes": (32, 16_384)},
     "eighth, damage 0.1": EIGHTH | {"damage_radius": 0.1},
+    "eighth, muon": EIGHTH | MUON,
+    "eighth, muon, rate 1e-2": EIGHTH | MUON | {"learning_rate": 1e-2},
+    "eighth, muon, to 4096": EIGHTH
+    | MUON
+    | {"second_lives": 0.6, "lifetimes": (16, 4096), "damage_share": 0.125},
+    "eighth, muon, from 16": EIGHTH
+    | MUON
+    | {"second_lives": 0.6, "lifetimes": (16, 16_384), "damage_share": 0.125},
     "eighth, second lives": EIGHTH | {"second_lives": 0.5},
     "eighth, second lives, from 32": EIGHTH
     | {"second_lives": 0.5, "lifetimes": (32, 16_384), "damage_share": 0.125},

@@ -11,9 +11,8 @@ from typing import Any
 import numpy as np
 import torch
 from torch import Tensor
-from torch.nn.functional import avg_pool2d, pad
 
-from npa_envs.errors import MissingDependencyError, NPAError, shown
+from npa_envs.errors import NPAError, shown
 from npa_envs.ops import Cameras, world_mean
 from npa_envs.rule.rule import NPARule
 from npa_envs.tasks.appearance import OUTPUTS, RENDERERS, Appearance, Gaussians
@@ -26,6 +25,7 @@ from npa_envs.tasks.checks import (
     check_text,
 )
 from npa_envs.tasks.growth import GrowthConfig, GrowthTask
+from npa_envs.tasks.losses.similarity import MultiScaleSimilarity
 from npa_envs.tasks.targets.views import ViewTarget, load_views, nearest_camera, over, some_views
 from npa_envs.tasks.train_config import TrainConfig, fast_run, tiny_run
 from npa_envs.world.cuda_graph import sent
@@ -142,7 +142,7 @@ class Morphogenesis3D(GrowthTask[Morphogenesis3DConfig]):
 
     Raises:
         NPAError: The target cannot be loaded, or its views have another size.
-        MissingDependencyError: A library that the configuration asks for is not installed.
+        MissingDependencyError: The library that reads a mesh file is not installed.
     """
 
     space_dim = 3
@@ -162,7 +162,7 @@ class Morphogenesis3D(GrowthTask[Morphogenesis3DConfig]):
         side = config.resolution
         self._similarity = None
         if config.ssim_weight > 0.0:
-            self._similarity = MultiScaleSimilarity(side, 4, device=device)
+            self._similarity = MultiScaleSimilarity(side, device=device)
         if target is None:
             target = load_views(
                 config.target,
@@ -294,11 +294,8 @@ class Morphogenesis3D(GrowthTask[Morphogenesis3DConfig]):
         size = (found - wanted).abs()
         compared = {"views": world_mean(size.flatten(1)[..., None])[:, 0]}
         if self._similarity is not None:
-            goal = wanted.expand_as(found)
-            alike = self._similarity(
-                *(views.flatten(0, 1).movedim(-1, 1) for views in (found, goal))
-            )
-            compared["structure"] = 1.0 - alike.view(found.shape[:2]).mean(dim=1)
+            alike = self._similarity(found.movedim(-1, 2), wanted.movedim(-1, 1))
+            compared["structure"] = 1.0 - alike.mean(dim=(1, 2))
         return compared
 
     def _weighted(self, parts: dict[str, Tensor]) -> Tensor:
@@ -481,91 +478,3 @@ MORPHOGENESIS3D_PRESETS: Mapping[str, TrainConfig[Morphogenesis3DConfig]] = {
 }
 """`paper` (arXiv 2601.16096), `best` (any mesh, one run of minutes on a GPU), `fast` (on one core),
 `tiny` (tests)."""
-
-
-# MS-SSIM: how alike the structure of pictures is at several sizes (Wang et al. 2003).
-
-SSIM_WEIGHTS = (0.0448, 0.2856, 0.3001, 0.2363, 0.1333)
-"""Powers of the sizes, from fine to coarse (Wang et al. 2003)."""
-
-SSIM_WINDOW = 11
-"""Pixels along each side of the window, at most."""
-
-SSIM_SPREAD = 1.5
-"""Standard deviation of a window of 11 pixels [pixels]; smaller ones keep the proportion."""
-
-SSIM_FLOOR = 1e-4
-"""Least similarity of a size: below it, where the power is steep, nothing is learned from it."""
-
-
-def _halved(pictures: Tensor) -> Tensor:
-    """Return pictures of half the size, an odd side rounded up, means of 2 x 2 pixels.
-
-    Zeros are put before the first row or column of an odd side; with the padding of `avg_pool2d`
-    itself gradients are wrong on CUDA where channels lie innermost (torch 2.11).
-    """
-    odd_rows, odd_columns = (side % 2 for side in pictures.shape[2:])
-    return avg_pool2d(pad(pictures, (odd_columns, 0, odd_rows, 0)), kernel_size=2)
-
-
-class MultiScaleSimilarity:
-    """MS-SSIM of pictures in [0, 1]; windows and sums are pytorch-msssim's.
-
-    The library's own MS-SSIM multiplies the sizes by `torch.prod`, whose derivative waits for the
-    device and so cannot be captured, and its derivative is not finite where a size's similarity
-    is 0; here their logarithms are added.
-
-    Args:
-        resolution: Pixels along each side of the pictures, at least 16.
-        channels: Channels of the pictures.
-        device: Where they are.
-
-    Raises:
-        MissingDependencyError: pytorch-msssim is not installed.
-        NPAError: The pictures are too small.
-    """
-
-    def __init__(
-        self, resolution: int, channels: int, *, device: str | torch.device = "cpu"
-    ) -> None:
-        try:
-            from pytorch_msssim.ssim import _ssim
-        except ImportError as error:
-            raise MissingDependencyError(
-                "comparing views by MS-SSIM needs pytorch-msssim, which is not installed: "
-                "pip install 'npa-envs[views]', or set ssim_weight to 0"
-            ) from error
-        self._compare: Any = _ssim
-        if resolution < 2 ** len(SSIM_WEIGHTS[1:]):
-            raise NPAError(
-                f"resolution must be at least {2 ** len(SSIM_WEIGHTS[1:])} pixels for MS-SSIM, got "
-                f"{resolution}: raise it, or set ssim_weight to 0"
-            )
-        self._windows = []
-        size = resolution
-        for _ in SSIM_WEIGHTS:
-            width = min(SSIM_WINDOW, size - 1 + size % 2)
-            place = torch.arange(width, dtype=torch.float64, device=device) - width // 2
-            window = torch.exp(-0.5 * (place * (SSIM_WINDOW / (SSIM_SPREAD * width))) ** 2)
-            window /= window.sum()
-            self._windows.append(window.float().expand(channels, 1, 1, width).contiguous())
-            size = (size + 1) // 2
-
-    def __call__(self, found: Tensor, wanted: Tensor) -> Tensor:
-        """Return the similarity of each picture, at most 1, the mean of its channels, shape [B].
-
-        Args:
-            found: Pictures, shape [B, K, R, R].
-            wanted: What they are to be, likewise.
-        """
-        total = found.new_zeros(found.shape[:2])
-        last = len(SSIM_WEIGHTS) - 1
-        for size, (weight, window) in enumerate(zip(SSIM_WEIGHTS, self._windows, strict=True)):
-            whole, contrast = self._compare(
-                found, wanted, data_range=1.0, win=window.to(found.dtype), size_average=False
-            )
-            share = whole if size == last else contrast
-            total = total + weight * share.clamp_min(SSIM_FLOOR).log()
-            if size < last:
-                found, wanted = _halved(found), _halved(wanted)
-        return total.exp().mean(dim=1)

@@ -29,6 +29,9 @@ TaskConfigT = TypeVar("TaskConfigT")
 Schedule = Literal["milestones", "cosine"]
 """How a learning rate falls."""
 
+OptimiserName = Literal["adamw", "muon"]
+"""What takes the steps along gradients."""
+
 RISE = 0.01
 """Share of a repeat in which the learning rate of the schedule "cosine" rises."""
 
@@ -93,8 +96,12 @@ class TrainConfig(Generic[TaskConfigT]):
     steps: tuple[int, int] = (32, 96)
     """Range [lo, hi) that the number of steps of a rollout is drawn from, uniformly."""
 
+    optimiser: OptimiserName = "adamw"
+    """What takes the steps: "adamw" as in the paper, or "muon", which makes the steps of layers'
+    matrices orthogonal (Jordan et al. 2024) and gives biases and codes to AdamW."""
+
     learning_rate: float = 5e-4
-    """AdamW's learning rate at the start of each repeat."""
+    """The optimiser's learning rate at the start of each repeat."""
 
     schedule: Schedule = "milestones"
     """How the learning rate falls in a repeat: at `milestones`, or by "cosine", along half a cosine
@@ -107,7 +114,7 @@ class TrainConfig(Generic[TaskConfigT]):
     """Factor on the learning rate at each milestone, in (0, 1]."""
 
     weight_decay: float = 0.0
-    """AdamW's weight decay."""
+    """The optimiser's weight decay."""
 
     fate_rate: float = 0.02
     """Share of the learning rate with which rules whose particles divide learn when to divide and
@@ -237,6 +244,7 @@ class TrainConfig(Generic[TaskConfigT]):
             )
         self._check_lifetimes()
         self._check_variants()
+        self._check_choice("optimiser", get_args(OptimiserName))
         self._check_choice("schedule", get_args(Schedule))
         self._check_choice("dtype", ("float32", "float64"))
         self._check_choice("memory", get_args(Memory))

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 import npa_envs.world.rollout
-from npa_envs.rule.rule import NPARule, fate_parameters
+from npa_envs.rule.rule import NPARule
 from npa_envs.tasks.base import (
     GoalTask,
     ScheduledTask,
@@ -122,9 +122,7 @@ class TrainingCycle:
         """Worlds before and after the last rollout, the loss and its gradients."""
         parameters = self.batch.parameters
         self.optimiser: RuleOptimiser = (
-            RuleOptimiser(parameters, config, fate_parameters(rule))
-            if beside is None
-            else beside.optimiser
+            RuleOptimiser(parameters, config, rule) if beside is None else beside.optimiser
         )
         """Changes the rule."""
         self.average: WeightAverage = (

@@ -1,19 +1,22 @@
-"""From gradients to new weights: normalised gradients, AdamW, the running mean of the weights."""
+"""From gradients to new weights: normalised gradients, an optimiser, the weights' running mean."""
 
 from __future__ import annotations
 
 import copy
 import itertools
 import math
-import operator
 from collections.abc import Sequence
 from typing import Any
 
 import torch
 from torch import Tensor, nn
+from torch.optim import Optimizer
 
-from npa_envs.rule.rule import NPARule
+from npa_envs.rule.rule import NPARule, fate_parameters
 from npa_envs.tasks.train_config import TrainConfig
+
+MUON_MOMENTUM = 0.9
+"""What Muon keeps of the mean of the gradients in an iteration; its usual 0.95 learns less well."""
 
 NORM_FLOOR = 1e-8
 """Added to a gradient's norm before it is divided by it: a zero gradient stays zero."""
@@ -35,26 +38,50 @@ def clear_non_finite(gradient: Tensor) -> None:
     gradient.masked_fill_(~(largest < math.inf), 0.0)
 
 
+def layer_weights(rules: nn.Module) -> list[nn.Parameter]:
+    """Return the matrices of a rule's layers, or of several rules' in a module.
+
+    Biases, codes and fates are none of them.
+    """
+    fates = set(map(id, fate_parameters(rules)))
+    found = []
+    for module in rules.modules():
+        if isinstance(module, nn.Linear):
+            found.append(module.weight)
+        elif isinstance(module, NPARule) and module.equivariant:
+            found.append(module.mixing)
+    return [weight for weight in found if id(weight) not in fates]
+
+
 class RuleOptimiser:
-    """AdamW on prepared gradients, with a learning rate that is a function of the iteration.
+    """A step along prepared gradients, at a learning rate that is a function of the iteration.
+
+    With the optimiser "muon" the matrices of layers take Muon's steps: the mean of the gradients
+    made orthogonal, as long as AdamW's steps are (Jordan et al. 2024; Liu et al., arXiv
+    2502.16982). All else takes AdamW's.
 
     Args:
-        parameters: The rule's parameters; their `.grad` is set before `prepare_gradients`.
-        config: Learning rates, weight decay, gradient normalisation.
-        fates: Which of `parameters` learn at the share `fate_rate` of the learning rate.
+        parameters: What is trained; its `.grad` is set before `prepare_gradients`.
+        config: Optimiser, learning rates, weight decay, gradient normalisation.
+        rules: The rule that they are of, or a module of several.
     """
 
     def __init__(
-        self,
-        parameters: Sequence[nn.Parameter],
-        config: TrainConfig[Any],
-        fates: Sequence[nn.Parameter] = (),
+        self, parameters: Sequence[nn.Parameter], config: TrainConfig[Any], rules: nn.Module
     ) -> None:
         self._parameters = list(parameters)
         self._config = config
-        slow = set(map(id, fates))
-        self._shares = [config.fate_rate if id(p) in slow else 1.0 for p in self._parameters]
-        self._adamw = self._fresh()
+        fates, matrices = (set(map(id, of(rules))) for of in (fate_parameters, layer_weights))
+        self._shares = [config.fate_rate if id(p) in fates else 1.0 for p in self._parameters]
+        muon = config.optimiser == "muon"
+        self._orthogonal = [muon and id(p) in matrices for p in self._parameters]
+        self._optimisers = self._fresh(self._parameters)
+
+    @property
+    def rates(self) -> list[float]:
+        """Learning rates of the last step, one for each group of parameters."""
+        groups = (group for optimiser, _ in self._optimisers for group in optimiser.param_groups)
+        return [group["lr"] for group in groups]
 
     def prepare_gradients(self) -> None:
         """Normalise the gradients, where that is asked for; what is not finite becomes 0."""
@@ -73,43 +100,67 @@ class RuleOptimiser:
             share: As for `TrainConfig.learning_rate_at`.
         """
         if iteration > 0 and iteration % self._config.iterations == 0:
-            self._adamw = self._fresh()
+            self._optimisers = self._fresh(self._parameters)
         rate = self._config.learning_rate_at(iteration, share)
-        for group in self._adamw.param_groups:
-            group["lr"] = rate * group["rate_share"]
-        self._adamw.step()
+        for optimiser, _ in self._optimisers:
+            for group in optimiser.param_groups:
+                group["lr"] = rate * group.get("rate_share", 1.0)
+            optimiser.step()
 
     def state_dict(self) -> dict[str, Any]:
-        """Return AdamW's moments and step counts, for a checkpoint."""
-        return self._adamw.state_dict()
+        """Return moments and step counts by the number of a parameter, for a checkpoint."""
+        return {"state": _moments(self._optimisers)}
 
     def moments_like(self) -> dict[int, dict[str, Tensor]]:
         """Return moments and step counts as a first step makes them, by parameter; all are 0."""
         twins = [nn.Parameter(torch.zeros_like(p)) for p in self._parameters]
+        optimisers = self._fresh(twins)
         for twin in twins:
             twin.grad = torch.zeros_like(twin)
-        adamw = torch.optim.AdamW(twins)
-        adamw.step()
-        moments: dict[int, dict[str, Tensor]] = adamw.state_dict()["state"]
-        return moments
+        for optimiser, _ in optimisers:
+            optimiser.step()
+        return _moments(optimisers)
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Go on from the `state` of what `state_dict` returned; all else is the configuration's."""
-        groups = self._adamw.state_dict()["param_groups"]
-        self._adamw.load_state_dict({"state": state["state"], "param_groups": groups})
+        moments = state["state"]
+        for optimiser, numbers in self._optimisers:
+            own = {at: moments[number] for at, number in enumerate(numbers) if number in moments}
+            groups = optimiser.state_dict()["param_groups"]
+            optimiser.load_state_dict({"state": own, "param_groups": groups})
 
-    def _fresh(self) -> torch.optim.AdamW:
-        runs = itertools.groupby(
-            zip(self._shares, self._parameters, strict=True), operator.itemgetter(0)
-        )
-        groups = [{"rate_share": share, "params": [p for _, p in run]} for share, run in runs]
-        return torch.optim.AdamW(
-            groups,
-            lr=self._config.learning_rate,
-            weight_decay=self._config.weight_decay,
+    def _fresh(self, parameters: list[nn.Parameter]) -> list[tuple[Optimizer, list[int]]]:
+        """Return optimisers without moments, with the numbers of the parameters that each has."""
+        decay, made = self._config.weight_decay, list[tuple[Optimizer, list[int]]]()
+        numbers = [number for number, own in enumerate(self._orthogonal) if own]
+        if numbers:
+            # Steps as long as AdamW's are, so that one learning rate serves both.
+            muon = torch.optim.Muon(
+                [parameters[number] for number in numbers],
+                weight_decay=decay,
+                momentum=MUON_MOMENTUM,
+                adjust_lr_fn="match_rms_adamw",
+            )
+            made.append((muon, numbers))
+        numbers = [number for number, own in enumerate(self._orthogonal) if not own]
+        if numbers:
+            groups = [
+                {"rate_share": share, "params": [parameters[number] for number in run]}
+                for share, run in itertools.groupby(numbers, self._shares.__getitem__)
+            ]
             # One kernel for all parameters; the CPU's own loop is as fast there.
-            fused=self._parameters[0].is_cuda,
-        )
+            fused = parameters[0].is_cuda
+            made.append((torch.optim.AdamW(groups, weight_decay=decay, fused=fused), numbers))
+        return made
+
+
+def _moments(optimisers: list[tuple[Optimizer, list[int]]]) -> dict[int, dict[str, Tensor]]:
+    """Return the states of all parameters, by their numbers."""
+    return {
+        numbers[at]: state
+        for optimiser, numbers in optimisers
+        for at, state in optimiser.state_dict()["state"].items()
+    }
 
 
 class WeightAverage:

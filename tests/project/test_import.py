@@ -12,7 +12,6 @@ from learning_problems import heart
 from npa_envs.agents.learning import Budget, train
 from npa_envs.errors import MissingDependencyError
 from npa_envs.render import Window, write_mp4
-from npa_envs.tasks.morphogenesis3d import MultiScaleSimilarity
 from npa_envs.tasks.targets.clouds import load_pictures
 from npa_envs.tasks.targets.meshes import load_mesh
 
@@ -142,7 +141,6 @@ EXTRA = r"pip install 'npa-envs\[{}\]'"
         ("sklearn.datasets", EXTRA.format("points"), lambda _: load_pictures("digits")),
         ("torchvision.datasets", "pip install torchvision", lambda _: load_pictures("mnist")),
         ("trimesh", EXTRA.format("meshes"), load_mesh),
-        ("pytorch_msssim.ssim", EXTRA.format("views"), lambda _: MultiScaleSimilarity(64, 4)),
         ("pygame", EXTRA.format("human"), lambda _: Window("a world", 32)),
         ("imageio_ffmpeg", r"pip install 'imageio\[ffmpeg\]'", lambda p: write_mp4(p, [FRAME])),
     ],

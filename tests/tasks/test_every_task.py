@@ -74,8 +74,6 @@ def worlds(task, world_count, dtype=torch.float64):
 @pytest.mark.parametrize(("name", "fields"), VARIANTS[1:])
 def test_gradients_equal_finite_differences(tiny, name, fields):
     """By positions, by states, and by the read-out's own weights."""
-    if fields.get("ssim_weight"):
-        pytest.importorskip("pytorch_msssim")
     task = task_of(name, tiny(name, **fields))
     rule = lively_rule(task, torch.float64)
     task = task_for_rule(task, rule)
@@ -124,8 +122,6 @@ WEIGHED = {
 @pytest.mark.parametrize("name", WEIGHED)
 def test_loss_is_the_weighted_sum_of_its_parts(tiny, name):
     fields, weights = WEIGHED[name]
-    if "ssim_weight" in fields:
-        pytest.importorskip("pytorch_msssim")
     task = task_of(name, tiny(name, **fields))
     task = task_for_rule(task, lively_rule(task))
     x, s = worlds(task, 2, torch.float32)

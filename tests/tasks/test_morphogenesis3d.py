@@ -204,7 +204,6 @@ def test_shares_average_to_the_loss_and_tell_what_opacity_changes(task):
 def test_what_does_not_fit_is_refused(target):
     with pytest.raises(NPAError, match="views must have 32 x 32 pixels"):
         Morphogenesis3D(dataclasses.replace(SMALL, resolution=32), target=target)
-    pytest.importorskip("pytorch_msssim")
     with pytest.raises(NPAError, match="at least 16 pixels for MS-SSIM"):
         Morphogenesis3D(dataclasses.replace(SMALL, resolution=12, ssim_weight=0.2))
 

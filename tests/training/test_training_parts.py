@@ -11,6 +11,7 @@ from torch import nn
 
 from npa_envs.devices import check_device, parse_device
 from npa_envs.errors import NPAError
+from npa_envs.rule.rule import NPARule, fate_parameters
 from npa_envs.training.checkpoint import check_same_run, load_checkpoint, save_checkpoint
 from npa_envs.training.iteration import EagerIteration
 from npa_envs.training.meter import Interval, LossMeter
@@ -18,6 +19,7 @@ from npa_envs.training.optimiser import (
     RuleOptimiser,
     WeightAverage,
     clear_non_finite,
+    layer_weights,
     normalise_gradients,
 )
 from npa_envs.training.overrides import config_to_dict
@@ -111,7 +113,7 @@ def test_first_step_of_each_repeat_has_the_full_learning_rate_and_fresh_moments(
     config = circle_config(tmp_path, iterations=3, repeats=2, milestones=[1], decay=0.1)
     path = []
     parameter = nn.Parameter(torch.zeros(1))
-    optimiser = RuleOptimiser([parameter], config)
+    optimiser = RuleOptimiser([parameter], config, nn.Identity())
     for iteration, value in enumerate((1.0, 1.0, 1.0, -1.0)):
         parameter.grad = torch.tensor([value])
         optimiser.prepare_gradients()
@@ -124,8 +126,44 @@ def test_first_step_of_each_repeat_has_the_full_learning_rate_and_fresh_moments(
     # Weights without gradient decay.
     parameter, config = nn.Parameter(torch.ones(1)), circle_config(tmp_path, weight_decay=0.5)
     parameter.grad = torch.zeros(1)
-    RuleOptimiser([parameter], config).step(0)
+    RuleOptimiser([parameter], config, nn.Identity()).step(0)
     assert parameter.item() == pytest.approx(1 - 0.01 * 0.5)
+
+
+@pytest.mark.parametrize("kind", [{"divides": True}, {"code_names": ("a", "b"), "code_dim": 2}])
+def test_muon_makes_steps_of_matrices_orthogonal_and_leaves_all_else_to_adamw(tmp_path, kind):
+    config = circle_config(tmp_path, optimiser="muon", learning_rate=1e-2, weight_decay=0.5)
+    rule = NPARule(2, 4, 8, eps0=0.1, **kind)
+    matrices = layer_weights(rule)
+    assert [p.shape for p in matrices] == [rule.hidden.weight.shape, rule.output.weight.shape]
+    parameters = list(rule.parameters())
+    before = [p.detach().clone() for p in parameters]
+    for p in parameters:
+        p.grad = torch.randn_like(p)
+    optimiser = RuleOptimiser(parameters, config, rule)
+    optimiser.prepare_gradients()
+    optimiser.step(0)
+    fates = set(map(id, fate_parameters(rule)))
+    for parameter, old in zip(parameters, before, strict=True):
+        rate = 1e-2 * (config.fate_rate if id(parameter) in fates else 1.0)
+        step = (1.0 - 0.5 * rate) * old - parameter.detach()
+        if any(parameter is matrix for matrix in matrices):
+            # Newton and Schulz's iteration leaves singular values near 1; so long are AdamW's steps
+            # in the mean of a matrix's entries.
+            sizes = torch.linalg.svdvals(step) / (0.2 * max(step.shape) ** 0.5 * rate)
+            assert sizes.min() > 0.6
+            assert sizes.max() < 1.3
+            turned = torch.linalg.svdvals(parameter.grad.T @ step)
+            assert torch.trace(parameter.grad.T @ step) > 0.95 * turned.sum()
+        else:
+            assert torch.allclose(step, rate * parameter.grad.sign(), rtol=1e-2, atol=1e-6)
+
+
+def test_rules_that_know_no_direction_have_one_matrix_more():
+    rule = NPARule(2, 8, 8, eps0=0.1, equivariant=True)
+    assert rule.mixing in set(layer_weights(rule))
+    assert len(layer_weights(rule)) == 3
+    assert len(layer_weights(nn.ModuleList([rule, NPARule(2, 4, 8, eps0=0.1)]))) == 5
 
 
 def test_average_of_weights_forgets_the_first_ones_soon():
