@@ -212,6 +212,7 @@ ARMS: Mapping[str, Fields] = {
     "eighth, steps 32 to 64": EIGHTH | {"steps": (32, 64), "lifetimes": (32, 16_384)},
     "eighth, damage 0.1": EIGHTH | {"damage_radius": 0.1},
     "eighth, muon": EIGHTH | MUON,
+    "eighth, muon, rate 2.5e-3": EIGHTH | MUON | {"learning_rate": 2.5e-3},
     "eighth, muon, rate 1e-2": EIGHTH | MUON | {"learning_rate": 1e-2},
     "eighth, muon, to 4096": EIGHTH
     | MUON
