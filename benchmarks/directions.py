@@ -47,9 +47,11 @@ KINDS: Mapping[str, Mapping[str, Any]] = {
     "chiral": {"equivariant": True},
     "mirrored": {"equivariant": True, "chiral": False},
     "framed": {"equivariant": True, "seed_across": 0.5},
+    "upright": {"equivariant": True, "seed_across": 0.5, "angles": 0},
 }
 """Rules: plain, equivariant, equivariant without telling left from right, and equivariant with
-seeds that have a left and a right besides a head and a tail."""
+seeds that have a left and a right besides a head and a tail, compared at the best angle or
+upright."""
 
 SEEDS = tuple(range(1000, 1008))
 """Seeds of the worlds that rules are measured on."""
@@ -91,7 +93,12 @@ def train(arguments: argparse.Namespace) -> None:
 def tasks_of(config: Morphogenesis2DConfig, device: str) -> tuple[Morphogenesis2D, Morphogenesis2D]:
     """Return the task of a run, and the same with worlds compared at the best angle."""
     task = Morphogenesis2D(config, device=device)
-    blind = replace(config, equivariant=True, chiral=config.chiral or not config.equivariant)
+    blind = replace(
+        config,
+        equivariant=True,
+        chiral=config.chiral or not config.equivariant,
+        angles=config.angles or 16,
+    )
     return task, Morphogenesis2D(blind, device=device)
 
 

@@ -87,7 +87,8 @@ class Morphogenesis2DConfig(GrowthConfig):
     """Weight of the centroids' distance from the origin, where worlds begin (per length unit)."""
 
     equivariant: bool = False
-    """The rule knows no direction, and each world is compared at the angle that suits it best."""
+    """The rule knows no direction, and each world is compared at the angle that suits it best, or,
+    where `angles` is 0, as it lies."""
 
     chiral: bool = True
     """An equivariant rule tells left from right. Without, a mirrored picture is as good."""
@@ -105,7 +106,9 @@ class Morphogenesis2DConfig(GrowthConfig):
 
     angles: int = 16
     """Angles that are tried first for an equivariant rule's world, evenly spread. Sixteen more near
-    the best of them are tried next: 1/39 of the step between the first ones remains."""
+    the best of them are tried next: 1/39 of the step between the first ones remains. 0: none; all
+    seeds point one way, and what grows is to stand upright there. A rule that knows no direction
+    then grows as well from seeds that are turned."""
 
     def __post_init__(self) -> None:
         """Check every field; raise NPAError where one has a wrong type or lies out of its range."""
@@ -123,7 +126,13 @@ class Morphogenesis2DConfig(GrowthConfig):
         check_non_negative(self, "seed_axis", "seed_across")
         check_flag(self, "equivariant", "chiral", "encoder", "division", "keep_background")
         self._check_targets()
-        check_positive(self, int, "angles", at_least=4)
+        check_positive(self, int, "angles", at_least=0)
+        if 0 < self.angles < 4:
+            raise NPAError(f"angles must be 0 or at least 4, got {self.angles}: the usual 16 do")
+        if self.equivariant and self.angles == 0 and not max(self.seed_axis, self.seed_across):
+            raise NPAError(
+                "angles=0 needs seeds that have a direction: set seed_axis, seed_across or angles"
+            )
         if self.division and (self.equivariant or self.targets):
             raise NPAError(
                 "division goes neither with equivariant, because one particle has no axis, nor "
@@ -259,7 +268,7 @@ class Morphogenesis2D(GrowthTask[Morphogenesis2DConfig]):
                 if isinstance(generator, WorldRandom)
                 else torch.rand(world_count, 1, generator=generator, device=x.device, dtype=x.dtype)
             )
-            angle = 2.0 * math.pi * share
+            angle = 2.0 * math.pi * (share if config.angles > 0 else torch.zeros_like(share))
             cos, sin = angle.cos(), angle.sin()
             along = x[..., 0] * cos + x[..., 1] * sin
             across = x[..., 1] * cos - x[..., 0] * sin
@@ -327,7 +336,7 @@ class Morphogenesis2D(GrowthTask[Morphogenesis2DConfig]):
         """
         wanted = torch.is_grad_enabled() and (x.requires_grad or s.requires_grad)
         if not (wanted or self.config.division):
-            if self.config.equivariant:
+            if self._turns:
                 x = turned(x, self.best_turn(x, s))
             return self._picture_losses(x, s)
         return self._mean_errors(x, s)
@@ -371,7 +380,7 @@ class Morphogenesis2D(GrowthTask[Morphogenesis2DConfig]):
 
         A circle that holds the target at every angle then stands for the square.
         """
-        if not self.config.equivariant:
+        if not self._turns:
             return x
         return x.square().sum(dim=-1, keepdim=True).add(1e-12).sqrt() / self._reach
 
@@ -417,9 +426,11 @@ class Morphogenesis2D(GrowthTask[Morphogenesis2DConfig]):
             s: States, dimensionless, shape [B, N, C].
 
         Returns:
-            Matrices, shape [B, 2, 2]; without gradient.
+            Matrices, shape [B, 2, 2]; without gradient. Where no angles are tried, the identity.
         """
         config = self.config
+        if config.angles == 0:
+            return torch.eye(2, device=x.device, dtype=x.dtype).expand(len(x), 2, 2)
         step = 2.0 * math.pi / config.angles
         tried = torch.arange(config.angles, device=x.device, dtype=x.dtype) * step
         handed = torch.ones_like(tried)
@@ -457,9 +468,14 @@ class Morphogenesis2D(GrowthTask[Morphogenesis2DConfig]):
             sigma=self.config.sigma,
         )
 
+    @property
+    def _turns(self) -> bool:
+        """Whether worlds are compared at the angle that suits them best."""
+        return self.config.equivariant and self.config.angles > 0
+
     def _placed(self, x: Tensor, s: Tensor) -> Tensor:
         """Return positions where they are compared with the target."""
-        if self.config.equivariant:
+        if self._turns:
             x = turned(x, self.best_turn(x, s))
         return x - world_mean(x)[:, None] + self._target_mean.to(x)
 

@@ -121,6 +121,20 @@ def test_seeds_have_a_left_and_a_right_across_their_axis():
     assert alone[1][..., 0].abs().max() == 0.0
 
 
+def test_without_angles_seeds_point_one_way_and_worlds_are_compared_as_they_lie():
+    task, plain = task_of(angles=0, seed_across=0.25), task_of(equivariant=False)
+    x, s = task.seed(3, generator=torch.Generator().manual_seed(0))
+    radius = task.config.seed_radius
+    assert torch.allclose(s[..., 0], 0.5 * x[..., 0] / radius)
+    assert torch.allclose(s[..., 1], 0.25 * x[..., 1] / radius)
+    x, s = grown(task)
+    for angle in ANGLES:
+        other = turned(x, turn_of(angle)).requires_grad_()
+        assert torch.equal(task.metric(other, s), plain.metric(other, s))
+        assert torch.equal(task.bounded(other), other)
+        assert torch.equal(task.best_turn(other, s), torch.eye(2)[None].double())
+
+
 def test_penalties_know_no_direction_either():
     task = task_of(stray_weight=1.0, bound_weight=1.0)
     generator = torch.Generator().manual_seed(0)
@@ -143,7 +157,9 @@ def test_penalties_know_no_direction_either():
         ({"chiral": 1}, "chiral must be True or False, got 1"),
         ({"seed_axis": -1.0}, "seed_axis must be a finite number of at least 0"),
         ({"seed_across": -1.0}, "seed_across must be a finite number of at least 0"),
-        ({"angles": 3}, "angles must be a whole number of at least 4, got 3"),
+        ({"angles": -1}, "angles must be a whole number of at least 0, got -1"),
+        ({"angles": 3}, "angles must be 0 or at least 4, got 3"),
+        ({"angles": 0, "seed_axis": 0.0}, "angles=0 needs seeds that have a direction"),
     ],
 )
 def test_what_is_no_choice_is_refused(fields, message):
