@@ -122,10 +122,15 @@ EIGHTH: Fields = {
 """The eighth candidate: grown worlds are to rest."""
 
 MUON: Fields = {"optimiser": "muon", "learning_rate": 5e-3}
-"""Orthogonal steps, and their rate at full size."""
+"""Orthogonal steps, and a rate; `best` has 3e-3."""
 
 FAST_BEFORE: Fields = {
     **NO_STRAYS,
+    "optimiser": "adamw",
+    "lifetimes": (0, 0),
+    "damage_share": 1.0,
+    "rest_age": 512,
+    "rest_weight": 0.0,
     "learning_rate": 2e-3,
     "schedule": "milestones",
     "milestones": (1500, 2100),
@@ -287,13 +292,14 @@ FAST_ARMS: Mapping[str, Fields] = {
     "sixth, rate 2e-3": FAST_SIXTH | {"learning_rate": 2e-3},
     "sixth, share 0.5": FAST_SIXTH | {"damage_share": 0.5},
     "eighth": FAST_EIGHTH,
+    "eighth, muon": FAST_EIGHTH | MUON,
     "eighth, rate 4e-3": FAST_EIGHTH | {"learning_rate": 4e-3},
     "eighth, no rest": FAST_EIGHTH | {"rest_weight": 0.0},
     "eighth, rest 2": FAST_EIGHTH | {"rest_weight": 2.0},
     "eighth, to 4096": FAST_EIGHTH | {"lifetimes": (24, 4096), "rest_age": 512},
     "sixth, untrained": FAST_SIXTH | {"initial_rule": ""},
 }
-"""Arms of `fast`: what each changes of it as it was; the preset is the sixth now."""
+"""Arms of `fast`: what each changes of it as it was first; the preset is "eighth, muon" now."""
 
 
 @dataclass(frozen=True)

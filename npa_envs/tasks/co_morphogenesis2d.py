@@ -6,6 +6,7 @@ import dataclasses
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -189,8 +190,28 @@ DISTANCE = 0.8
 """Distance between the seeds' centres in every preset [length units]: the pictures overlap."""
 
 
+_MEASURED: Mapping[str, Mapping[str, Any]] = {
+    "best": {
+        "optimiser": "adamw",
+        "learning_rate": 2e-3,
+        "lifetimes": (64, 16_384),
+        "second_lives": 0.0,
+        "damage_share": 0.25,
+    },
+    "fast": {
+        "optimiser": "adamw",
+        "learning_rate": 4e-3,
+        "seed_interval": 1,
+        "lifetimes": (0, 0),
+        "damage_share": 1.0,
+        "rest_weight": 0.0,
+    },
+}
+"""What presets had when several species were measured (docs/species.md); Muon was not."""
+
+
 def _beside(
-    alone: Morphogenesis2DTrainConfig, neighbour: str
+    name: str, alone: Morphogenesis2DTrainConfig, neighbour: str
 ) -> JointTrainConfig[CoMorphogenesis2DConfig]:
     """Return a run of one species, with another one of the same kind beside it."""
     species = (alone.task, dataclasses.replace(alone.task, target=neighbour))
@@ -198,10 +219,10 @@ def _beside(
     run["task"] = CoMorphogenesis2DConfig(species=species, distance=DISTANCE)
     # As many rules as there are species would have to be named.
     run |= {"initial_rule": "", "out": Path("runs/co_morphogenesis2d")}
-    return JointTrainConfig(**run)
+    return JointTrainConfig(**run | _MEASURED.get(name, {}))
 
 
 CO_MORPHOGENESIS2D_PRESETS: Mapping[str, JointTrainConfig[CoMorphogenesis2DConfig]] = {
-    name: _beside(alone, "heart") for name, alone in MORPHOGENESIS2D_PRESETS.items()
+    name: _beside(name, alone, "heart") for name, alone in MORPHOGENESIS2D_PRESETS.items()
 }
-"""Each preset of 2D morphogenesis, with as many particles of a second species: same schedule."""
+"""Each preset of 2D morphogenesis, with as many particles of a second species, by AdamW."""

@@ -91,11 +91,13 @@ class Morphogenesis2DConfig(GrowthConfig):
     where `angles` is 0, as it lies."""
 
     chiral: bool = True
-    """An equivariant rule tells left from right. Without, a mirrored picture is as good."""
+    """An equivariant rule tells left from right. Without, a mirrored picture is as good, where
+    angles are tried."""
 
     seed_axis: float = 0.5
     """Seeds of an equivariant rule have a head and a tail: across the disk, the first state goes
-    from minus this to this (dimensionless), along a direction drawn for each world. 0: no such."""
+    from minus this to this (dimensionless), along a direction drawn for each world; along x where
+    `angles` is 0. 0: no such."""
 
     seed_across: float = 0.0
     """And a left and a right: the second state goes from minus this to this (dimensionless), across
@@ -129,9 +131,12 @@ class Morphogenesis2DConfig(GrowthConfig):
         check_positive(self, int, "angles", at_least=0)
         if 0 < self.angles < 4:
             raise NPAError(f"angles must be 0 or at least 4, got {self.angles}: the usual 16 do")
-        if self.equivariant and self.angles == 0 and not max(self.seed_axis, self.seed_across):
+        upright = self.seed_across > 0.0 or (self.chiral and self.seed_axis > 0.0)
+        if self.equivariant and self.angles == 0 and not upright:
             raise NPAError(
-                "angles=0 needs seeds that have a direction: set seed_axis, seed_across or angles"
+                "angles=0 needs seeds that tell how a world is to stand, got "
+                f"seed_axis={self.seed_axis}, seed_across={self.seed_across} and chiral="
+                f"{self.chiral}: set seed_across=0.5, or angles=16"
             )
         if self.division and (self.equivariant or self.targets):
             raise NPAError(
@@ -565,7 +570,8 @@ MORPHOGENESIS2D_PRESETS: Mapping[str, Morphogenesis2DTrainConfig] = {
         initial_rule="heart-v0",
         out=_OUT,
     ),
-    # A few particles that see far; half of the worlds are seeds: docs/recipes.md.
+    # A few particles that see far; of two worlds one is young, one grown and at rest:
+    # docs/recipes.md.
     "fast": fast_run(
         Morphogenesis2DConfig(
             target_point_count=512,
@@ -580,9 +586,13 @@ MORPHOGENESIS2D_PRESETS: Mapping[str, Morphogenesis2DTrainConfig] = {
         iterations=2400,
         pool_size=32,
         steps=(16, 32),
-        learning_rate=4e-3,
+        optimiser="muon",
+        learning_rate=5e-3,
         schedule="cosine",
-        seed_interval=1,
+        lifetimes=(24, 256),
+        damage_share=0.5,
+        rest_age=64,
+        rest_weight=0.5,
         initial_rule="gecko-512",
         picture_interval=200,
         out=_OUT,

@@ -98,7 +98,7 @@ class TrainConfig(Generic[TaskConfigT]):
 
     optimiser: OptimiserName = "adamw"
     """What takes the steps: "adamw" as in the paper, or "muon", which makes the steps of layers'
-    matrices orthogonal (Jordan et al. 2024) and gives biases and codes to AdamW."""
+    matrices orthogonal (Jordan et al. 2024) and gives all else, such as biases, to AdamW."""
 
     learning_rate: float = 5e-4
     """The optimiser's learning rate at the start of each repeat."""
@@ -309,8 +309,8 @@ class TrainConfig(Generic[TaskConfigT]):
             )
         if self.second_lives > 0.0 and not self.damage:
             raise NPAError(
-                f"second_lives needs damage, got {self.second_lives} with damage=False: worlds "
-                "that live again are damaged first"
+                f"second_lives needs damage, got {self.second_lives} with damage=False, because "
+                "worlds that live again are damaged first: set second_lives=0"
             )
 
     def _check_variants(self) -> None:

@@ -57,8 +57,8 @@ class RuleOptimiser:
     """A step along prepared gradients, at a learning rate that is a function of the iteration.
 
     With the optimiser "muon" the matrices of layers take Muon's steps: the mean of the gradients
-    made orthogonal, as long as AdamW's steps are (Jordan et al. 2024; Liu et al., arXiv
-    2502.16982). All else takes AdamW's.
+    made orthogonal, in bfloat16 whatever their precision, as long as AdamW's steps are (Jordan et
+    al. 2024; Liu et al., arXiv 2502.16982). All else takes AdamW's.
 
     Args:
         parameters: What is trained; its `.grad` is set before `prepare_gradients`.
@@ -76,12 +76,6 @@ class RuleOptimiser:
         muon = config.optimiser == "muon"
         self._orthogonal = [muon and id(p) in matrices for p in self._parameters]
         self._optimisers = self._fresh(self._parameters)
-
-    @property
-    def rates(self) -> list[float]:
-        """Learning rates of the last step, one for each group of parameters."""
-        groups = (group for optimiser, _ in self._optimisers for group in optimiser.param_groups)
-        return [group["lr"] for group in groups]
 
     def prepare_gradients(self) -> None:
         """Normalise the gradients, where that is asked for; what is not finite becomes 0."""

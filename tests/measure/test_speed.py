@@ -324,8 +324,8 @@ def test_one_species_is_compared_with_the_rollout_that_it_is():
     assert [(row.workload, row.what, row.calls) for row in rows] == [
         ("2D (1, 256, 2)", what, "eager") for what in ("inference", "training")
     ]
-    # What it costs is measured, on a machine that may have other work.
-    assert all(row.rollout_us.median > 0 and row.ratio > 0 for row in rows)
+    # What it costs is measured, here on a machine that may have other work.
+    assert all(row.rollout_us.median > 0 and 1 / 30 < row.ratio < 30 for row in rows)
     x, s = TINY.worlds(here.device)
     rule = TINY.rule(here.device)
     outcomes = [

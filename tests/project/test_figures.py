@@ -3,6 +3,7 @@
 import json
 import math
 import re
+import statistics
 from collections.abc import Callable, Collection
 from pathlib import Path
 from statistics import mean, stdev
@@ -500,7 +501,7 @@ def test_ppo_is_above_what_learns_nothing_in_small_worlds_by_three_standard_erro
 
 def test_the_table_of_the_test_of_best_has_the_numbers_of_its_file() -> None:
     page = (ROOT / "docs" / "recipes.md").read_text(encoding="utf-8")
-    section = page.split("## The test of `best`")[1].split("![")[0]
+    section = page.split("## The test of `best` with AdamW")[1].split("![")[0]
     told = dict(re.findall(r"^\| ([a-z -]+) \| (.*) \|$", section, re.MULTILINE))
     record = content(RESULTS / "recipes_best_test_h200.json")
     aged = {row["picture"]: row for row in record["long"]}
@@ -513,6 +514,29 @@ def test_the_table_of_the_test_of_best_has_the_numbers_of_its_file() -> None:
         cells += [f"{row['worlds_healed']} of {row['world_count']}" for row in run["healing"]]
         cells.append(f"{late['worlds_within']} of 8")
         assert told[run["picture"].replace("-", " ")].split(" | ") == cells
+
+
+def test_the_tables_of_muon_have_the_numbers_of_their_file() -> None:
+    page = (ROOT / "docs" / "recipes.md").read_text(encoding="utf-8")
+    section = page.split("\n## Muon\n")[1].split("### In `fast`")[0]
+    told = dict(re.findall(r"^\| ([a-z0-9., -]+?)(?: \(.*\))? \| (.*) \|$", section, re.MULTILINE))
+    record = content(RESULTS / "recipes_muon_h100.json")
+    steps = ("64", "128", "512", "1024", "4096", "20000")
+    aged = {row["picture"]: row for row in record["long"]}
+    assert len(record["test"]) == len(aged) == 12
+    for run in record["test"]:
+        late = aged[run["picture"]]
+        cells = [f"{run['losses'][step]:.3f}" for step in steps]
+        cells.append(f"{late['loss']['100000']:.3f}")
+        healing = run["healing_of_32"]
+        cells += [f"{row['worlds_healed']} of {row['world_count']}" for row in healing]
+        cells.append(f"{late['worlds_within']} of 8")
+        assert told[run["picture"].replace("-", " ")].split(" | ") == cells
+    for arm in {run["arm"] for run in record["small"]} - {"eighth, muon, rate 1e-2"}:
+        losses = [run["losses"] for run in record["small"] if run["arm"] == arm]
+        means = [statistics.mean(own[step] for own in losses) for step in steps]
+        # The runs printed three digits.
+        assert [float(cell) for cell in told[arm].split(" | ")] == pytest.approx(means, abs=6e-4)
 
 
 @pytest.mark.parametrize(

@@ -159,7 +159,8 @@ def test_penalties_know_no_direction_either():
         ({"seed_across": -1.0}, "seed_across must be a finite number of at least 0"),
         ({"angles": -1}, "angles must be a whole number of at least 0, got -1"),
         ({"angles": 3}, "angles must be 0 or at least 4, got 3"),
-        ({"angles": 0, "seed_axis": 0.0}, "angles=0 needs seeds that have a direction"),
+        ({"angles": 0, "seed_axis": 0.0}, "angles=0 needs seeds that tell how a world is to stand"),
+        ({"angles": 0, "chiral": False}, "seed_across=0.0 and chiral=False: set seed_across=0.5"),
     ],
 )
 def test_what_is_no_choice_is_refused(fields, message):

@@ -102,6 +102,15 @@ def test_two_processes_have_the_curve_of_one(tmp_path, fields):
         torch.testing.assert_close(pools[0][name], pools[1][name], rtol=1e-9, atol=1e-12)
 
 
+def test_processes_take_muons_steps_together(tmp_path):
+    """What rounds to another number of 16 bits on one process would be refused as another rule."""
+    for count in (1, 2):
+        config = tiny(tmp_path / str(count), optimiser="muon", learning_rate=5e-3)
+        assert on_ranks(count, lambda c=config: trained(c), tmp_path) == [False] * count
+    for one, two in zip(log_of(tmp_path / "1"), log_of(tmp_path / "2"), strict=True):
+        assert one["loss"] == pytest.approx(two["loss"], rel=1e-2)
+
+
 @pytest.mark.parametrize("fresh_share", [0.0, 0.25, 0.5, 0.75])
 def test_seeds_come_into_the_part_of_the_pool_of_every_world(tmp_path, fresh_share):
     # A rule that moves nothing: only worlds that began anew are others than at the beginning.
