@@ -219,7 +219,7 @@ def _beside(
     run["task"] = CoMorphogenesis2DConfig(species=species, distance=DISTANCE)
     # As many rules as there are species would have to be named.
     run |= {"initial_rule": "", "out": Path("runs/co_morphogenesis2d")}
-    return JointTrainConfig(**run | _MEASURED.get(name, {}))
+    return JointTrainConfig(**{**run, **_MEASURED.get(name, {})})
 
 
 CO_MORPHOGENESIS2D_PRESETS: Mapping[str, JointTrainConfig[CoMorphogenesis2DConfig]] = {

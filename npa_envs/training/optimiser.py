@@ -38,13 +38,13 @@ def clear_non_finite(gradient: Tensor) -> None:
     gradient.masked_fill_(~(largest < math.inf), 0.0)
 
 
-def layer_weights(rules: nn.Module) -> list[nn.Parameter]:
+def layer_weights(rules: nn.Module) -> list[Tensor]:
     """Return the matrices of a rule's layers, or of several rules' in a module.
 
     Biases, codes and fates are none of them.
     """
     fates = set(map(id, fate_parameters(rules)))
-    found = []
+    found: list[Tensor] = []
     for module in rules.modules():
         if isinstance(module, nn.Linear):
             found.append(module.weight)
