@@ -22,7 +22,6 @@ EXTRAS = {
     "bench": "plots of measurements, scores of NPA-Bench",
     "evolution": "evolution strategies",
     "points": "the digits of point_classification",
-    "views": "the loss of morphogenesis3d",
     "meshes": "mesh files",
     "minari": "episodes as datasets",
 }
