@@ -97,7 +97,7 @@ def tasks_of(config: Morphogenesis2DConfig, device: str) -> tuple[Morphogenesis2
         config,
         equivariant=True,
         chiral=config.chiral or not config.equivariant,
-        angles=config.angles or 16,
+        angles=config.angles or Morphogenesis2DConfig.angles,
     )
     return task, Morphogenesis2D(blind, device=device)
 

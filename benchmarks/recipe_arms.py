@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from npa_envs.tasks.morphogenesis2d import Morphogenesis2DTrainConfig
+from npa_envs.tasks.morphogenesis2d import HALF_SEEDS, Morphogenesis2DTrainConfig
 from npa_envs.training import preset
 
 SEEDS = tuple(range(1000, 1008))
@@ -124,13 +124,15 @@ EIGHTH: Fields = {
 MUON: Fields = {"optimiser": "muon", "learning_rate": 5e-3}
 """Orthogonal steps, and a rate; `best` has 3e-3."""
 
+FROM_32: Fields = {"second_lives": 0.5, "lifetimes": (32, 16_384), "damage_share": 0.125}
+TO_4096: Fields = {"second_lives": 0.6, "lifetimes": (16, 4096), "damage_share": 0.125}
+FROM_16: Fields = {"second_lives": 0.6, "lifetimes": (16, 16_384), "damage_share": 0.125}
+"""Second lives, with shorter ones that bring back the seeds."""
+
 FAST_BEFORE: Fields = {
     **NO_STRAYS,
-    "optimiser": "adamw",
-    "lifetimes": (0, 0),
-    "damage_share": 1.0,
+    **HALF_SEEDS,
     "rest_age": 512,
-    "rest_weight": 0.0,
     "learning_rate": 2e-3,
     "schedule": "milestones",
     "milestones": (1500, 2100),
@@ -219,33 +221,14 @@ ARMS: Mapping[str, Fields] = {
     "eighth, muon": EIGHTH | MUON,
     "eighth, muon, rate 2.5e-3": EIGHTH | MUON | {"learning_rate": 2.5e-3},
     "eighth, muon, rate 1e-2": EIGHTH | MUON | {"learning_rate": 1e-2},
-    "eighth, muon, to 4096": EIGHTH
-    | MUON
-    | {"second_lives": 0.6, "lifetimes": (16, 4096), "damage_share": 0.125},
-    "eighth, muon, from 16": EIGHTH
-    | MUON
-    | {"second_lives": 0.6, "lifetimes": (16, 16_384), "damage_share": 0.125},
+    "eighth, muon, to 4096": EIGHTH | MUON | TO_4096,
+    "eighth, muon, from 16": EIGHTH | MUON | FROM_16,
     "eighth, second lives": EIGHTH | {"second_lives": 0.5},
-    "eighth, second lives, from 32": EIGHTH
-    | {"second_lives": 0.5, "lifetimes": (32, 16_384), "damage_share": 0.125},
-    "eighth, second lives, to 4096": EIGHTH
-    | {"second_lives": 0.6, "lifetimes": (16, 4096), "damage_share": 0.125},
-    "eighth, second lives, from 16": EIGHTH
-    | {"second_lives": 0.6, "lifetimes": (16, 16_384), "damage_share": 0.125},
-    "eighth, second lives, from 32, more cuts": EIGHTH
-    | {
-        "second_lives": 0.5,
-        "lifetimes": (32, 16_384),
-        "damage_share": 0.125,
-        "cut_share": 0.5,
-    },
-    "eighth, second lives, from 16, more cuts": EIGHTH
-    | {
-        "second_lives": 0.6,
-        "lifetimes": (16, 16_384),
-        "damage_share": 0.125,
-        "cut_share": 0.5,
-    },
+    "eighth, second lives, from 32": EIGHTH | FROM_32,
+    "eighth, second lives, to 4096": EIGHTH | TO_4096,
+    "eighth, second lives, from 16": EIGHTH | FROM_16,
+    "eighth, second lives, from 32, more cuts": EIGHTH | FROM_32 | {"cut_share": 0.5},
+    "eighth, second lives, from 16, more cuts": EIGHTH | FROM_16 | {"cut_share": 0.5},
     "eighth, from 32": EIGHTH | {"lifetimes": (32, 16_384), "damage_share": 0.125},
     "seventh, untrained, rate 3e-3": SEVENTH
     | {"initial_rule": "", "learning_rate": 3e-3, "steps": (48, 50), "iterations": 1500},

@@ -15,6 +15,7 @@ from npa_envs.errors import NPAError
 from npa_envs.rule.rule import COLOUR_OFFSET, NPARule
 from npa_envs.tasks.checks import check_non_negative
 from npa_envs.tasks.morphogenesis2d import (
+    HALF_SEEDS,
     MORPHOGENESIS2D_PRESETS,
     Morphogenesis2D,
     Morphogenesis2DConfig,
@@ -198,14 +199,7 @@ _MEASURED: Mapping[str, Mapping[str, Any]] = {
         "second_lives": 0.0,
         "damage_share": 0.25,
     },
-    "fast": {
-        "optimiser": "adamw",
-        "learning_rate": 4e-3,
-        "seed_interval": 1,
-        "lifetimes": (0, 0),
-        "damage_share": 1.0,
-        "rest_weight": 0.0,
-    },
+    "fast": {**HALF_SEEDS, "learning_rate": 4e-3},
 }
 """What presets had when several species were measured (docs/species.md); Muon was not."""
 

@@ -547,6 +547,15 @@ _TOGETHER: Mapping[str, Any] = {
 }
 """What keeps worlds together for long, and heals clumps and cuts (docs/stability.md)."""
 
+HALF_SEEDS: Mapping[str, Any] = {
+    "optimiser": "adamw",
+    "seed_interval": 1,
+    "lifetimes": (0, 0),
+    "damage_share": 1.0,
+    "rest_weight": 0.0,
+}
+"""What `fast` had before Muon: half of its worlds are seeds, and none has to rest."""
+
 MORPHOGENESIS2D_PRESETS: Mapping[str, Morphogenesis2DTrainConfig] = {
     "paper": TrainConfig(task=Morphogenesis2DConfig(), out=_OUT),
     # Found by experiment on pictures that nobody tuned for: docs/recipes.md.

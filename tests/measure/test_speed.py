@@ -319,13 +319,13 @@ def test_calls_are_compared_in_turn_and_each_pair_the_other_way_round(device):
 
 
 def test_one_species_is_compared_with_the_rollout_that_it_is():
-    here = Session(torch.device("cpu"), repeats=3, small=True)
+    here = Session(torch.device("cpu"), repeats=9, small=True)
     rows = suites.SUITES["species"](here)["one_species"]
     assert [(row.workload, row.what, row.calls) for row in rows] == [
         ("2D (1, 256, 2)", what, "eager") for what in ("inference", "training")
     ]
-    # What it costs is measured, here on a machine that may have other work.
-    assert all(row.rollout_us.median > 0 and 1 / 30 < row.ratio < 30 for row in rows)
+    # What it costs is measured; that it is not another rollout is known.
+    assert all(row.rollout_us.median > 0 and 1 / 3 < row.ratio < 3 for row in rows)
     x, s = TINY.worlds(here.device)
     rule = TINY.rule(here.device)
     outcomes = [
