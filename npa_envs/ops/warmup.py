@@ -18,8 +18,11 @@ from npa_envs.ops.mean import world_mean
 from npa_envs.ops.network import arrange_weights, run_network
 from npa_envs.ops.passes import Terms
 from npa_envs.ops.perceive import Rows, perceive, perceive_rows, survey
+from npa_envs.ops.pictures.cameras import orbit
+from npa_envs.ops.pictures.gaussians import render_gaussians
 from npa_envs.ops.pictures.losses import picture_losses
 from npa_envs.ops.pictures.splat import splat
+from npa_envs.ops.pictures.triangles import nearest_triangles
 from npa_envs.ops.static import prepare_static, static_rows
 from npa_envs.ops.update import ActionRules, PreparedActions, update_particles
 
@@ -67,6 +70,8 @@ def warmup(
             _warm_observation(x, s)
             if space_dim == 2:
                 _warm_pictures(x)
+            else:
+                _warm_views(x)
 
 
 def _chosen(name: str, given: Any, known: tuple[Any, ...]) -> list[Any]:
@@ -180,6 +185,25 @@ def _warm_pictures(x: torch.Tensor) -> None:
         places = x.detach()[:, :1].expand(-1, particle_count, -1)
         states = colours[:, :1].expand(-1, particle_count, -1)
         picture_losses(places, states, target, goal=middle, shift=0.0, pixel_size=0.1)
+
+
+def _warm_views(x: torch.Tensor) -> None:
+    """What cameras see of worlds, and of the meshes that are targets."""
+    cameras = orbit(1, width=16, height=16)
+    scales, colours = x.new_ones(x.shape), x.new_zeros(*x.shape[:2], 4, 3)
+    turns = x.new_ones(*x.shape[:2], 4)
+    seen = render_gaussians(x, scales, turns, x.new_ones(x.shape[:2]), colours, cameras.to(x))
+    _pull_back(seen.image)
+    corners = torch.zeros(1, 3, dtype=torch.float64)
+    nearest_triangles(
+        corners[..., None].expand(-1, -1, 2).contiguous(),
+        corners,
+        corners[0, :, None].expand(-1, 3).contiguous(),
+        torch.arange(3, dtype=torch.int32)[None],
+        torch.ones(1, 1, dtype=torch.bool),
+        width=1,
+        height=1,
+    )
 
 
 def _warm_observation(x: torch.Tensor, s: torch.Tensor) -> None:

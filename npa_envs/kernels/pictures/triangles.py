@@ -1,0 +1,77 @@
+"""Pictures of coloured triangles: at every pixel the nearest one, by a depth of each pixel.
+
+They are targets, drawn once on the CPU before training, in float64.
+"""
+
+import warp as wp
+
+from npa_envs.kernels.cpu import WORLDS, in_ranges
+
+module = wp.get_module("npa_envs.kernels.triangles")
+
+
+@wp.func
+def twice_area(a: wp.vec2d, b: wp.vec2d, p: wp.vec2d):
+    """Return twice the signed area of the triangle a, b, p."""
+    return (b[0] - a[0]) * (p[1] - a[1]) - (b[1] - a[1]) * (p[0] - a[0])
+
+
+@in_ranges(WORLDS)
+@wp.kernel(enable_backward=False, module=module)
+def draw_triangles(
+    range_start: wp.int32,
+    width: wp.int32,
+    height: wp.int32,
+    place: wp.array(dtype=wp.vec2d, ndim=2),
+    nearness: wp.array(dtype=wp.float64, ndim=2),
+    colours: wp.array(dtype=wp.vec3d),
+    faces: wp.array(dtype=wp.vec3i),
+    seen: wp.array(dtype=wp.uint8, ndim=2),
+    # outputs
+    nearest: wp.array(dtype=wp.float64, ndim=2),
+    picture: wp.array(dtype=wp.vec4d, ndim=2),
+):
+    """Draw all triangles that a camera sees, each wherever it covers a pixel's middle."""
+    camera = range_start + wp.tid()
+    zero, half = wp.float64(0.0), wp.float64(0.5)
+    for face in range(faces.shape[0]):
+        if seen[camera, face] == wp.uint8(0):
+            continue
+        corners = faces[face]
+        a = place[camera, corners[0]]
+        b = place[camera, corners[1]]
+        c = place[camera, corners[2]]
+        area = twice_area(a, b, c)
+        if area == zero:
+            continue
+        low = wp.min(wp.min(a, b), c)
+        high = wp.max(wp.max(a, b), c)
+        # Bounded before they become integers.
+        left = wp.int32(wp.floor(wp.clamp(low[0] - half, zero, wp.float64(width))))
+        top = wp.int32(wp.floor(wp.clamp(low[1] - half, zero, wp.float64(height))))
+        right = wp.int32(wp.ceil(wp.clamp(high[0] - half, -half, wp.float64(width - 1))))
+        bottom = wp.int32(wp.ceil(wp.clamp(high[1] - half, -half, wp.float64(height - 1))))
+        for row in range(top, bottom + 1):
+            for column in range(left, right + 1):
+                middle = wp.vec2d(wp.float64(column) + half, wp.float64(row) + half)
+                # Inside, all three have the sign of the whole; the sides belong to it.
+                u = twice_area(b, c, middle) / area
+                v = twice_area(c, a, middle) / area
+                w = twice_area(a, b, middle) / area
+                if u >= zero and v >= zero and w >= zero:
+                    # Linear on the picture is what is divided by the depth.
+                    u *= nearness[camera, corners[0]]
+                    v *= nearness[camera, corners[1]]
+                    w *= nearness[camera, corners[2]]
+                    near = u + v + w
+                    pixel = row * width + column
+                    if near > nearest[camera, pixel]:
+                        nearest[camera, pixel] = near
+                        colour = (
+                            u * colours[corners[0]]
+                            + v * colours[corners[1]]
+                            + w * colours[corners[2]]
+                        ) / near
+                        picture[camera, pixel] = wp.vec4d(
+                            colour[0], colour[1], colour[2], wp.float64(1.0)
+                        )
