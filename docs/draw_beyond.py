@@ -3,6 +3,7 @@
     python docs/draw_beyond.py directions PLAIN EQUIVARIANT    # files of rules
     python docs/draw_beyond.py directions_full PLAIN EQUIVARIANT [PLAIN EQUIVARIANT ...]
     python docs/draw_beyond.py directions_framed RULE ...       # equivariant: --seed-across 0.5
+    python docs/draw_beyond.py directions_upright RULE ...      # besides --angles 0
     python docs/draw_beyond.py sizes TRAINED VARIED             # or sizes_full
     python docs/draw_beyond.py division RULE                    # or division_full
     python docs/draw_beyond.py pictures MANY
@@ -245,6 +246,7 @@ def main() -> None:
         "directions": directions,
         "directions_full": directions_full,
         "directions_framed": directions_framed,
+        "directions_upright": directions_framed,
         "sizes": sizes,
         "sizes_full": sizes,
         "division": division,
