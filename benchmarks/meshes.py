@@ -108,6 +108,26 @@ ARMS: Mapping[str, Fields] = {
 }
 """What each arm changes of `RECIPE`; `best` is the preset itself."""
 
+FAST_BEFORE: Fields = {
+    "iterations": 1200,
+    "pool_size": 8,
+    "optimiser": "adamw",
+    "learning_rate": 2e-3,
+    "schedule": "milestones",
+    "seed_interval": 1,
+    "lifetimes": (0, 0),
+    "damage_share": 1.0,
+    "rest_age": 512,
+    "rest_weight": 0.0,
+    "anisotropy": 0.1,
+    "isotropy_weight": 0.5,
+    "stray_share": 0.0,
+    "stray_weight": 0.0,
+    "clump_radius": 0.0,
+    "cut_gap": 0.0,
+}
+"""The preset `fast` as it was before Muon, over which its arms are laid."""
+
 FAST_TOGETHER: Fields = {
     "schedule": "cosine",
     "stray_share": 1e-3,
@@ -125,16 +145,38 @@ FAST_REST: Fields = {
 }
 """Of two worlds one is young and damaged, one is grown and to rest."""
 
+FAST_MUON: Fields = {
+    "schedule": "cosine",
+    "optimiser": "muon",
+    "learning_rate": 5e-3,
+    "anisotropy": 1.0,
+    "isotropy_weight": 0.02,
+}
+"""Muon, and particles that may stretch."""
+
+FAST_NOW: Fields = {
+    **FAST_TOGETHER,
+    **FAST_MUON,
+    "pool_size": 32,
+    "lifetimes": (16, 256),
+    "damage_share": 0.5,
+    "rest_age": 48,
+    "rest_weight": 0.5,
+}
+"""The preset `fast` of today, but for its iterations."""
+
 FAST_ARMS: Mapping[str, Fields] = {
     "fast": {},
     "cosine": {"schedule": "cosine"},
     "cosine, rate 4e-3": {"schedule": "cosine", "learning_rate": 4e-3},
     "together": FAST_TOGETHER,
     "rest": FAST_REST,
+    "muon": FAST_MUON,
+    "muon, rest": FAST_NOW,
     "sigma 0.045": {"schedule": "cosine", "sigma": 0.045, "opacity": 0.6},
     "state 24": {"schedule": "cosine", "state_dim": 24},
 }
-"""What each arm changes of the preset `fast`."""
+"""What each arm changes of `FAST_BEFORE`."""
 
 
 def make_knot() -> Mesh:
@@ -285,7 +327,8 @@ def rule_for(source: str, eps: float, folder: Path) -> str:
 
 def own_changes(arguments: argparse.Namespace, arm: str) -> dict[str, Any]:
     """Return what a run changes of its preset."""
-    own = RECIPE | ARMS[arm] if arguments.size == "full" else FAST_ARMS[arm]
+    fast = arguments.size == "fast"
+    own = FAST_BEFORE | FAST_ARMS[arm] if fast else RECIPE | ARMS[arm]
     if arm == "best":
         own = {}
     changes = {**own, **json.loads(arguments.fields)}

@@ -88,7 +88,7 @@ TASKS: Mapping[str, TaskEntry] = {
         presets=MORPHOGENESIS3D_PRESETS,
         make=lambda config, device: Morphogenesis3D(config, device=device),
         targets=builtin_meshes,
-        fast_seconds=250.0,
+        fast_seconds=290.0,
         space_dim=3,
     ),
     "texture": TaskEntry(
