@@ -163,7 +163,7 @@ FAST_NOW: Fields = {
     "rest_age": 48,
     "rest_weight": 0.5,
 }
-"""The preset `fast` of today, but for its iterations."""
+"""The preset `fast` of today, but for its iterations; seeds come by lifetimes."""
 
 FAST_ARMS: Mapping[str, Fields] = {
     "fast": {},

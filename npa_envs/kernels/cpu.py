@@ -20,6 +20,9 @@ PAIRS = 512
 WORLDS = 2
 """Smallest range of a kernel whose threads each go through a whole world."""
 
+CAMERAS = 1
+"""Smallest range of a kernel whose threads each draw all that a camera sees."""
+
 TILES = 4
 """Smallest range of a kernel whose threads each go through a tile of a picture."""
 

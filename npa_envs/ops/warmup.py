@@ -194,13 +194,13 @@ def _warm_views(x: torch.Tensor) -> None:
     turns = x.new_ones(*x.shape[:2], 4)
     seen = render_gaussians(x, scales, turns, x.new_ones(x.shape[:2]), colours, cameras.to(x))
     _pull_back(seen.image)
-    corners = torch.zeros(1, 3, dtype=torch.float64)
+    corners = torch.zeros(1, 3, dtype=torch.float64, device="cpu")
     nearest_triangles(
-        corners[..., None].expand(-1, -1, 2).contiguous(),
+        corners[..., None].expand(-1, -1, 2),
         corners,
-        corners[0, :, None].expand(-1, 3).contiguous(),
-        torch.arange(3, dtype=torch.int32)[None],
-        torch.ones(1, 1, dtype=torch.bool),
+        corners[0, :, None].expand(-1, 3),
+        torch.arange(3, device="cpu")[None],
+        corners[:, :1] == 0.0,
         width=1,
         height=1,
     )

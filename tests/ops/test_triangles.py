@@ -28,22 +28,22 @@ def brute_force(place, nearness, colours, faces, seen, width, height):
 
 
 def random_triangles(width, height):
-    """Return two cameras' random triangles, some partly or wholly beside the picture."""
+    """Return five cameras' random triangles, some partly or wholly beside the picture."""
     generator = torch.Generator().manual_seed(1)
 
     def drawn(*shape):
         return torch.rand(*shape, generator=generator, dtype=torch.float64)
 
-    place = torch.tensor([width, height]) * (2.0 * drawn(2, 18, 2) - 0.5)
+    place = torch.tensor([width, height]) * (2.0 * drawn(5, 18, 2) - 0.5)
     # One is far larger than the picture, two lie far from it.
     place[:, :3] = torch.tensor([[-1e12, -1e12], [1e12, -1e12], [0.0, 1e12]])
     place[:, 3:6] += 1e12
     place[:, 6:9] -= 1e12
-    nearness = 0.1 + drawn(2, 18)
+    nearness = 0.1 + drawn(5, 18)
     nearness[:, :3] = 0.01
-    seen = torch.ones(2, 6, dtype=torch.bool)
+    seen = torch.ones(5, 6, dtype=torch.bool)
     seen[1, 5] = False
-    faces = torch.arange(18, dtype=torch.int32).view(6, 3)
+    faces = torch.arange(18).view(6, 3)
     return place, nearness, drawn(18, 3), faces, seen
 
 
@@ -57,7 +57,7 @@ def test_each_pixel_shows_the_nearest_triangle():
     # Turned round, a triangle looks the same.
     place, nearness, colours, faces, seen = given
     again = nearest_triangles(
-        place, nearness, colours, faces.flip(1).contiguous(), seen, width=width, height=height
+        place, nearness, colours, faces.flip(1), seen, width=width, height=height
     )
     torch.testing.assert_close(again, found, rtol=1e-9, atol=1e-9)
 
@@ -65,7 +65,5 @@ def test_each_pixel_shows_the_nearest_triangle():
 def test_triangles_without_area_and_cameras_that_see_none_leave_pictures_empty():
     place, nearness, colours, faces, seen = random_triangles(4, 4)
     for flat, visible in ((place[:, :1].expand_as(place), seen), (place, seen & False)):
-        found = nearest_triangles(
-            flat.contiguous(), nearness, colours, faces, visible, width=4, height=4
-        )
+        found = nearest_triangles(flat, nearness, colours, faces, visible, width=4, height=4)
         assert not found.any()

@@ -5,7 +5,7 @@ They are targets, drawn once on the CPU before training, in float64.
 
 import warp as wp
 
-from npa_envs.kernels.cpu import WORLDS, in_ranges
+from npa_envs.kernels.cpu import CAMERAS, in_ranges
 
 module = wp.get_module("npa_envs.kernels.triangles")
 
@@ -16,7 +16,7 @@ def twice_area(a: wp.vec2d, b: wp.vec2d, p: wp.vec2d):
     return (b[0] - a[0]) * (p[1] - a[1]) - (b[1] - a[1]) * (p[0] - a[0])
 
 
-@in_ranges(WORLDS)
+@in_ranges(CAMERAS)
 @wp.kernel(enable_backward=False, module=module)
 def draw_triangles(
     range_start: wp.int32,

@@ -27,7 +27,7 @@ def nearest_triangles(
         place: Where V cameras see K corners [pixels], shape [V, K, 2].
         nearness: One over the corners' depth [1 / length units], shape [V, K].
         colours: Of the corners, shape [K, 3].
-        faces: Corners of each triangle, int32, shape [F, 3].
+        faces: Corners of each triangle, from 0 to K − 1, shape [F, 3].
         seen: Whether a camera sees a triangle, shape [V, F].
         width: Pixels across, W.
         height: Pixels down, H.
@@ -44,11 +44,11 @@ def nearest_triangles(
         torch.device("cpu"),
         width,
         height,
-        place,
-        nearness,
-        colours,
-        faces,
-        seen.to(torch.uint8),
+        place.contiguous(),
+        nearness.contiguous(),
+        colours.contiguous(),
+        faces.int().contiguous(),
+        seen.to(torch.uint8).contiguous(),
         nearest,
         picture,
     )

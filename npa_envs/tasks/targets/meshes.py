@@ -337,7 +337,8 @@ SAMPLES = 2
 """Samples along each side of a pixel."""
 
 TOGETHER = 2**22
-"""Samples of the views that are drawn at once, at most; one view may have more."""
+"""Samples of the views that are drawn at once, at most, and corners, and corners of triangles; one
+view may have more."""
 
 
 def draw_mesh(mesh: Mesh, cameras: Cameras) -> NDArray[np.float32]:
@@ -353,20 +354,24 @@ def draw_mesh(mesh: Mesh, cameras: Cameras) -> NDArray[np.float32]:
     light = np.asarray(LIGHT) / np.linalg.norm(LIGHT)
     lit = AMBIENT + (1.0 - AMBIENT) * (mesh.normals() @ light).clip(0.0, 1.0)
     # Copies: torch takes no array that is turned round or read-only.
-    arrays = (mesh.colours * lit[:, None], mesh.vertices, mesh.faces)
-    colours, vertices, faces = (torch.from_numpy(array.copy()) for array in arrays)
+    colours, vertices = (
+        torch.from_numpy(np.array(values, dtype=np.float64, order="C"))
+        for values in (mesh.colours * lit[:, None], mesh.vertices)
+    )
+    faces = torch.from_numpy(np.array(mesh.faces, dtype=np.int64, order="C"))
     motions = cameras.world_to_camera.double().cpu()
     lenses = SAMPLES * cameras.intrinsics.double().cpu().expand(len(motions), 4)[:, None]
     height, width = SAMPLES * cameras.height, SAMPLES * cameras.width
+    together = max(1, TOGETHER // max(height * width, len(vertices), 3 * len(faces)))
     pictures = []
-    for some in torch.arange(len(motions)).split(max(1, TOGETHER // (height * width))):
+    for some in torch.split(torch.arange(len(motions), device="cpu"), together):
         seen = vertices @ motions[some, :3, :3].mT + motions[some, None, :3, 3]
         depth = seen[..., 2].clamp(min=cameras.near)
         fine = nearest_triangles(
             seen[..., :2] / depth[..., None] * lenses[some, :, :2] + lenses[some, :, 2:],
             1.0 / depth,
             colours,
-            faces.int(),
+            faces,
             (seen[..., 2] >= cameras.near)[:, faces].all(dim=-1),
             width=width,
             height=height,
