@@ -161,8 +161,11 @@ time.sleep(0.5)
 """
 
 SWEEP = """
-import sys
+import signal, sys
 from npa_envs.cli import main, sweep
+
+# Tests that nohup started ignore it, and so would all that they start.
+signal.signal(signal.SIGHUP, signal.SIG_DFL)
 
 if {program}: sweep.PROGRAM = {program}
 sys.exit(main(sys.argv[1:]))
