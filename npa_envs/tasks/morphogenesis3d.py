@@ -382,6 +382,15 @@ def _weights(size: int, sigma: Tensor, like: Tensor) -> Tensor:
 
 _OUT = Path("runs/morphogenesis3d")
 
+_STRETCHED: Mapping[str, Any] = {
+    "anisotropy": 1.0,
+    "isotropy_weight": 0.02,
+    "stray_weight": 10.0,
+    "clump_radius": 0.2,
+    "cut_gap": 0.1,
+}
+"""Particles that may stretch, and what keeps worlds together and heals clumps and cuts."""
+
 MORPHOGENESIS3D_PRESETS: Mapping[str, TrainConfig[Morphogenesis3DConfig]] = {
     "paper": TrainConfig(
         task=Morphogenesis3DConfig(),
@@ -405,15 +414,11 @@ MORPHOGENESIS3D_PRESETS: Mapping[str, TrainConfig[Morphogenesis3DConfig]] = {
             seed_radius=0.7,
             views_per_iteration=8,
             sigma=0.014,
-            anisotropy=1.0,
             opacity=0.6,
             blur_sigma=0.0,
-            isotropy_weight=0.02,
             damage_radius=0.15,
             stray_share=5e-5,
-            stray_weight=10.0,
-            clump_radius=0.2,
-            cut_gap=0.1,
+            **_STRETCHED,
         ),
         iterations=9000,
         repeats=1,
@@ -444,15 +449,11 @@ MORPHOGENESIS3D_PRESETS: Mapping[str, TrainConfig[Morphogenesis3DConfig]] = {
             held_out_views=8,
             views_per_iteration=3,
             sigma=0.06,
-            anisotropy=1.0,
             opacity=0.5,
             blur_sigma=4.0,
             blur_iterations=100,
-            isotropy_weight=0.02,
             stray_share=1e-3,
-            stray_weight=10.0,
-            clump_radius=0.2,
-            cut_gap=0.1,
+            **_STRETCHED,
         ),
         iterations=2000,
         pool_size=32,

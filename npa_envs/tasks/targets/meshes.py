@@ -364,11 +364,12 @@ def draw_mesh(mesh: Mesh, cameras: Cameras) -> NDArray[np.float32]:
     height, width = SAMPLES * cameras.height, SAMPLES * cameras.width
     together = max(1, TOGETHER // max(height * width, len(vertices), 3 * len(faces)))
     pictures = []
-    for some in torch.split(torch.arange(len(motions), device="cpu"), together):
-        seen = vertices @ motions[some, :3, :3].mT + motions[some, None, :3, 3]
+    parts = (torch.split(each, together) for each in (motions, lenses))
+    for motion, lens in zip(*parts, strict=True):
+        seen = vertices @ motion[:, :3, :3].mT + motion[:, None, :3, 3]
         depth = seen[..., 2].clamp(min=cameras.near)
         fine = nearest_triangles(
-            seen[..., :2] / depth[..., None] * lenses[some, :, :2] + lenses[some, :, 2:],
+            seen[..., :2] / depth[..., None] * lens[..., :2] + lens[..., 2:],
             1.0 / depth,
             colours,
             faces,
