@@ -1,7 +1,7 @@
 """Rules whose particles divide, from one particle on, beside plain rules that begin with a disk.
 
-`train` goes on from the shipped rule of each target by the recipe of the preset `best`: once from a
-disk, as before, and once from one particle. `measure` runs rules on seeds that training never saw:
+`train` learns each target by the recipe of the preset `best`: once from a disk, as always, and once
+from one particle. `measure` runs rules on seeds that training never saw:
 losses and living particles over the steps, and then after half of the particles are taken away,
 each second one or those on one side.
 
@@ -44,10 +44,11 @@ KINDS: Mapping[str, Mapping[str, Any]] = {
     "disk": {},
     "division": {"division": True},
     "fixed": {"division": True, "fate_rate": 0.0},
-    "fixed-96": {"division": True, "fate_rate": 0.0, "steps": (95, 97)},
+    "disk-96": {"steps": (95, 97)},
+    "division-96": {"division": True, "steps": (95, 97)},
 }
-"""What `train` trains of each target: the control, a rule whose particles divide, and rules that do
-not learn when to, so that worlds are full after some 24 steps; the last one in longer rollouts."""
+"""What `train` trains of each target: the control, a rule whose particles divide, and one that does
+not learn when to, so that worlds are full after some 24 steps; the first two in longer rollouts."""
 
 
 def train(arguments: argparse.Namespace) -> None:
@@ -56,7 +57,7 @@ def train(arguments: argparse.Namespace) -> None:
     if arguments.particle_count:
         small = dict.fromkeys(("particle_count", "target_point_count"), arguments.particle_count)
     wanted = {
-        f"{target}-{kind}": {**small, **fields, "target": target, "initial_rule": target}
+        f"{target}-{kind}": {**small, **fields, "target": target}
         for target in arguments.targets
         for kind, fields in KINDS.items()
         if kind in arguments.kinds

@@ -60,6 +60,8 @@ MANY_FIELDS = (
     "hidden_dim",
     "code_dim",
     "switch_share",
+    "weight_decay",
+    "halfway_weight",
 )
 """What rules of many pictures may be told besides."""
 
@@ -421,7 +423,7 @@ def main() -> None:
     parser.add_argument("--optimiser", help="of all rules; default: the preset's")
     parser.add_argument("--share", type=int, nargs=2, default=(0, 1))
     for name in MANY_FIELDS:
-        kind = float if name.endswith(("share", "rate")) else int
+        kind = float if name.endswith(("share", "rate", "decay", "weight")) else int
         parser.add_argument(f"--{name.replace('_', '-')}", type=kind)
     arguments = parser.parse_args()
     arguments.out.mkdir(parents=True, exist_ok=True)
