@@ -61,7 +61,6 @@ MANY_FIELDS = (
     "code_dim",
     "switch_share",
     "weight_decay",
-    "halfway_weight",
 )
 """What rules of many pictures may be told besides."""
 
@@ -423,7 +422,7 @@ def main() -> None:
     parser.add_argument("--optimiser", help="of all rules; default: the preset's")
     parser.add_argument("--share", type=int, nargs=2, default=(0, 1))
     for name in MANY_FIELDS:
-        kind = float if name.endswith(("share", "rate", "decay", "weight")) else int
+        kind = float if name.endswith(("share", "rate", "decay")) else int
         parser.add_argument(f"--{name.replace('_', '-')}", type=kind)
     arguments = parser.parse_args()
     arguments.out.mkdir(parents=True, exist_ok=True)

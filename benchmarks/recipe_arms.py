@@ -223,12 +223,7 @@ ARMS: Mapping[str, Fields] = {
     "eighth, muon, rate 1e-2": EIGHTH | MUON | {"learning_rate": 1e-2},
     "eighth, muon, to 4096": EIGHTH | MUON | TO_4096,
     "eighth, muon, from 16": EIGHTH | MUON | FROM_16,
-    "eighth, muon, from 16, halfway 1": EIGHTH | MUON | FROM_16 | {"halfway_weight": 1.0},
     "eighth, muon, from 16, decay 0.1": EIGHTH | MUON | FROM_16 | {"weight_decay": 0.1},
-    "eighth, muon, from 16, halfway 1, decay 0.03": EIGHTH
-    | MUON
-    | FROM_16
-    | {"halfway_weight": 1.0, "weight_decay": 0.03},
     "eighth, second lives": EIGHTH | {"second_lives": 0.5},
     "eighth, second lives, from 32": EIGHTH | FROM_32,
     "eighth, second lives, to 4096": EIGHTH | TO_4096,

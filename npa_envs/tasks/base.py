@@ -206,11 +206,6 @@ class TaskConfig:
         return replace(self, particle_count=particle_count)
 
 
-def overflow(s: Tensor) -> Tensor:
-    """Return the mean |s − clip(s, −1, 1)| of states (dimensionless)."""
-    return (s - s.clamp(-1.0, 1.0)).abs().mean()
-
-
 ConfigT = TypeVar("ConfigT", bound=TaskConfig)
 
 
@@ -281,7 +276,8 @@ class ParticleTask(Generic[ConfigT]):
         self, x: Tensor, s: Tensor, path_length: Tensor
     ) -> dict[str, tuple[float, Tensor]]:
         """Return what the loss adds to `compare`: weight and term by name."""
-        return {"overflow": (self.config.overflow_weight, overflow(s))}
+        overflow = (s - s.clamp(-1.0, 1.0)).abs().mean()
+        return {"overflow": (self.config.overflow_weight, overflow)}
 
     def loss(self, x: Tensor, s: Tensor, path_length: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
         """Return the training loss and its named parts, unweighted.

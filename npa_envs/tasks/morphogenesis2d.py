@@ -571,6 +571,7 @@ MORPHOGENESIS2D_PRESETS: Mapping[str, Morphogenesis2DTrainConfig] = {
         steps=(48, 80),
         optimiser="muon",
         learning_rate=3e-3,
+        weight_decay=0.1,
         schedule="cosine",
         lifetimes=(16, 16_384),
         second_lives=0.6,

@@ -427,6 +427,7 @@ MORPHOGENESIS3D_PRESETS: Mapping[str, TrainConfig[Morphogenesis3DConfig]] = {
         steps=(30, 34),
         optimiser="muon",
         learning_rate=5e-3,
+        weight_decay=0.1,
         schedule="cosine",
         seed_interval=1,
         fresh_share=0.5,

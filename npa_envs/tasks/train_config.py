@@ -153,10 +153,6 @@ class TrainConfig(Generic[TaskConfigT]):
     ageing_interval: int = 16
     """Iterations from one such ageing to the next."""
 
-    halfway_weight: float = 0.0
-    """Weight of mean |s − clip(s, −1, 1)| halfway through each rollout (dimensionless), so that
-    growth stays gentle; the task's `overflow_weight` is for where rollouts end."""
-
     rest_weight: float = 0.0
     """Weight of what a rollout changes in grown worlds: the mean path length of their particles in
     perception radii, and the mean |Δs| from its start to its end; of all others it is 0
@@ -218,7 +214,6 @@ class TrainConfig(Generic[TaskConfigT]):
         check_positive(self, float, "learning_rate", "runaway_limit")
         check_fraction(self, "decay", "damage_share")
         check_non_negative(self, "weight_decay", "fresh_share", "average", "rest_weight")
-        check_non_negative(self, "halfway_weight")
         check_non_negative(self, "fate_rate", "second_lives")
         if self.average >= 1.0:
             raise NPAError(f"average must be below 1, got {self.average}: try 0.999")

@@ -11,7 +11,7 @@ from torch import Tensor
 
 import npa_envs.world.rollout
 from npa_envs.rule.rule import LIFE, NPARule, fate_parameters
-from npa_envs.tasks.base import Task, coded_states, overflow, task_toward
+from npa_envs.tasks.base import Task, coded_states, task_toward
 from npa_envs.tasks.damage import counted_together
 from npa_envs.tasks.train_config import TrainConfig
 from npa_envs.training.randomness import registered
@@ -86,12 +86,12 @@ class EagerIteration:
         """Worlds after the rollout."""
         self.grown = torch.zeros_like(x[:, 0, 0], dtype=torch.bool)
         """Which worlds are grown and whole, and are to rest, shape [B]."""
-        self._rest_weight, self._halfway_weight = config.rest_weight, config.halfway_weight
+        self._rest_weight = config.rest_weight
         self._mean_over_processes = mean_over_processes
         self._divides = bool(fate_parameters(rule))
         self._task = task
         with torch.no_grad():
-            total, parts = self._loss(x, s, torch.zeros_like(x[..., 0]), s)
+            total, parts = self._loss(x, s, torch.zeros_like(x[..., 0]))
         self.term_names: tuple[str, ...] = ("loss", *parts)
         """Names of `terms`."""
         self.terms = total.new_zeros(len(self.term_names))
@@ -121,10 +121,21 @@ class EagerIteration:
         s0 = coded_states(self._task, self.s0)
         if s0 is not self.s0:
             self.s0.copy_(s0.detach())
-        x, s, path_length, halfway = self._through(s0, steps)
+        x, s, path_length = self._rollout(
+            self._rule,
+            self.x0,
+            s0,
+            steps,
+            eps=self._task.eps,
+            box=self._task.box,
+            update_prob=self._task.update_prob,
+            memory=self._memory,
+            generator=self._generator,
+            return_path_length=True,
+        )
         alone = self._mean_over_processes is None
         with contextlib.nullcontext() if alone else counted_together(self._mean):
-            total, parts = self._loss(x, s, path_length, halfway)
+            total, parts = self._loss(x, s, path_length)
         # Not backward(): its accumulation nodes remember the stream they were first used on,
         # which a capture on another stream must not touch.
         gradients = torch.autograd.grad(
@@ -136,31 +147,6 @@ class EagerIteration:
         self.x.copy_(x.detach())
         self.s.copy_(s.detach())
 
-    def _through(self, s0: Tensor, steps: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Return positions, states and path lengths after a rollout, and the states halfway."""
-        first = steps - steps // 2 if self._halfway_weight > 0.0 else steps
-        x, s, path_length = self._steps(self.x0, s0, first)
-        halfway = s
-        if first < steps:
-            x, s, further = self._steps(x, s, steps - first)
-            path_length = path_length + further
-        return x, s, path_length, halfway
-
-    def _steps(self, x: Tensor, s: Tensor, steps: int) -> tuple[Tensor, Tensor, Tensor]:
-        """Return positions, states and path lengths some steps later."""
-        return self._rollout(
-            self._rule,
-            x,
-            s,
-            steps,
-            eps=self._task.eps,
-            box=self._task.box,
-            update_prob=self._task.update_prob,
-            memory=self._memory,
-            generator=self._generator,
-            return_path_length=True,
-        )
-
     def _mean(self, value: Tensor) -> Tensor:
         """Return the mean of a tensor over all processes, taken between two graphs."""
         assert self._mean_over_processes is not None, "shared by several processes"
@@ -169,17 +155,9 @@ class EagerIteration:
         between_graphs(lambda: mean.copy_(over(own)))
         return mean
 
-    def _loss(
-        self, x: Tensor, s: Tensor, path_length: Tensor, halfway: Tensor
-    ) -> tuple[Tensor, dict[str, Tensor]]:
-        """Return the task's loss and its parts, and what else the training asks of worlds.
-
-        How far states were beyond bounds halfway, and how far grown worlds are from rest.
-        """
+    def _loss(self, x: Tensor, s: Tensor, path_length: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
+        """Return the task's loss and its parts, and how far grown worlds are from rest."""
         total, parts = self._task.loss(x, s, path_length)
-        if self._halfway_weight > 0.0:
-            parts["halfway"] = overflow(halfway)
-            total = total + self._halfway_weight * parts["halfway"]
         if self._rest_weight > 0.0:
             change = s - self.s0
             if self._divides:

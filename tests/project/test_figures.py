@@ -516,22 +516,48 @@ def test_the_table_of_the_test_of_best_has_the_numbers_of_its_file() -> None:
         assert told[run["picture"].replace("-", " ")].split(" | ") == cells
 
 
-def test_the_tables_of_muon_have_the_numbers_of_their_file() -> None:
+MUON_ARM = "eighth, muon, from 16"
+"""The preset `best` of 2D before it had a weight decay."""
+
+
+def test_the_tables_of_muon_have_the_numbers_of_their_files() -> None:
     page = (ROOT / "docs" / "recipes.md").read_text(encoding="utf-8")
     section = page.split("\n## Muon\n")[1].split("### In `fast`")[0]
     told = dict(re.findall(r"^\| ([a-z0-9., -]+?)(?: \(.*\))? \| (.*) \|$", section, re.MULTILINE))
     record = content(RESULTS / "recipes_muon_h100.json")
     steps = ("64", "128", "512", "1024", "4096", "20000")
-    aged = {row["picture"]: row for row in record["long"]}
-    assert len(record["test"]) == len(aged) == 12
-    for run in record["test"]:
+    decayed = content(RESULTS / "recipes_decay_h200.json")
+    aged = {row["picture"]: row for row in decayed["long"]}
+    healed = {row["picture"]: row["healing"] for row in decayed["healing_of_32"]}
+    assert len(decayed["test"]) == len(aged) == len(healed) == 12
+    for run in decayed["test"]:
+        losses = {str(row["step"]): row["loss"] for row in run["growth"]}
         late = aged[run["picture"]]
-        cells = [f"{run['losses'][step]:.3f}" for step in steps]
-        cells.append(f"{late['loss']['100000']:.3f}")
-        healing = run["healing_of_32"]
-        cells += [f"{row['worlds_healed']} of {row['world_count']}" for row in healing]
+        cells = [f"{losses[step]:.3f}" for step in steps] + [f"{late['loss']['100000']:.3f}"]
+        cells += [f"{row['worlds_healed']} of 32" for row in healed[run["picture"]]]
         cells.append(f"{late['worlds_within']} of 8")
         assert told[run["picture"].replace("-", " ")].split(" | ") == cells
+    plain = record["test"]
+    means = [statistics.mean(run["losses"][step] for run in plain) for step in steps]
+    means.append(statistics.mean(row["loss"]["100000"] for row in record["long"]))
+    cells = [f"{mean:.3f}" for mean in means]
+    for kind in zip(*(run["healing_of_32"] for run in plain), strict=True):
+        cells.append(f"{sum(row['worlds_healed'] for row in kind)} of 384")
+    cells.append(f"{sum(row['worlds_within'] for row in record['long'])} of 96")
+    assert f"| (without weight decay) | {' | '.join(cells)} |" in section
+    arms: dict[str, dict[str, str]] = {}
+    known = content(RESULTS / "library_muon_h200.json")["arms"]
+    plain = [run | {"arm": MUON_ARM} for run in known if run["begins_with"] == "heart-v0"]
+    for run in decayed["first"] + decayed["second"] + plain:
+        own = {row["step"]: row["loss"] for row in run["growth"]}
+        cell = " / ".join(f"{own[step]:.3f}" for step in (128, 512, 20_000))
+        arms.setdefault(run["picture"].removesuffix("-knife"), {})[run["arm"]] = cell
+    endings = ("", ", decay 0.1", ", halfway 1", ", halfway 1, decay 0.03")
+    table = section.split("### Weight decay")[1]
+    for picture, found in arms.items():
+        absent = "fell apart" if picture == "gecko" else "–"
+        row = " | ".join(found.get(MUON_ARM + ending, absent) for ending in endings)
+        assert f"| {picture.replace('-', ' ')} | {row} |" in table
     for arm in {run["arm"] for run in record["small"]} - {"eighth, muon, rate 1e-2"}:
         losses = [run["losses"] for run in record["small"] if run["arm"] == arm]
         means = [statistics.mean(own[step] for own in losses) for step in steps]

@@ -265,39 +265,6 @@ def test_grown_worlds_are_to_rest(tmp_path):
     torch.testing.assert_close(iteration.terms[0], plain.terms[0] + 0.5 * iteration.terms[-1])
 
 
-def test_states_are_bounded_halfway(tmp_path):
-    fields = {"dtype": "float64", "halfway_weight": 0.5}
-    _, _, plain = make_iteration(circle_config(tmp_path, dtype="float64"))
-    task, rule, iteration = make_iteration(circle_config(tmp_path, **fields))
-    assert iteration.term_names == (*plain.term_names, "halfway")
-    for one in (plain, iteration):
-        one.s0.fill_(1.5)
-        one.run(7)
-    # The same world after the same steps, whose first half ends after the fourth.
-    assert torch.equal(iteration.x, plain.x)
-    assert torch.equal(iteration.s, plain.s)
-    middle = make_iteration(circle_config(tmp_path, dtype="float64"))[2]
-    middle.s0.fill_(1.5)
-    middle.run(4)
-    halfway = (middle.s.abs() - 1.0).clamp(min=0.0).mean()
-    assert halfway > 0.1
-    torch.testing.assert_close(iteration.terms[-1], halfway)
-    torch.testing.assert_close(iteration.terms[0], plain.terms[0] + 0.5 * halfway)
-    # The gradient is that of the sum.
-    parameter = rule.output.weight
-    nudge, place = 1e-6, (0, 0)
-    losses = []
-    for sign in (1.0, -1.0):
-        _, again, one = make_iteration(circle_config(tmp_path, **fields))
-        one.s0.fill_(1.5)
-        with torch.no_grad():
-            again.output.weight[place] += sign * nudge
-        one.run(7)
-        losses.append(one.terms[0].item())
-    slope = (losses[0] - losses[1]) / (2.0 * nudge)
-    assert parameter.grad[place].item() == pytest.approx(slope, rel=1e-4)
-
-
 def test_a_parameter_outside_the_loss_gets_a_zero_gradient(tmp_path):
     task = CircleTask()
     rule = task.make_rule(torch.Generator().manual_seed(1))
