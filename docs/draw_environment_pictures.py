@@ -86,8 +86,9 @@ FILMS = {
     "Regeneration2D": Film(
         steps=(0, 2, 8, 32, 64, 128),
         rows=({"damage": "erase"}, {"damage": "cut"}, {"damage": "clump"}),
-        caption="The shipped rule `gecko` heals what was erased, a cut, and a clump. Episodes go "
-        "on after success here, so that all of the healing can be seen.",
+        caption="The rule `gecko-v0`, which has grown these worlds, heals what was erased, a cut, "
+        "and a clump. Episodes go on after success here, so that all of the healing can be seen.",
+        rule="gecko-v0",
     ),
     "Texture": Film(
         steps=(0, 2, 8, 16, 32, 64, 128),

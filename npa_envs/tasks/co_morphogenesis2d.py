@@ -195,6 +195,7 @@ _MEASURED: Mapping[str, Mapping[str, Any]] = {
     "best": {
         "optimiser": "adamw",
         "learning_rate": 2e-3,
+        "weight_decay": 0.0,
         "lifetimes": (64, 16_384),
         "second_lives": 0.0,
         "damage_share": 0.25,

@@ -34,7 +34,8 @@ from four seeds: 1.2e-7, and none at all in states where matrix products round a
 
 @pytest.fixture(scope="module")
 def gecko():
-    return npa_envs.load_rule("gecko")
+    # It has grown the worlds of `npa/Regeneration2D`, and no action of it is clipped.
+    return npa_envs.load_rule("gecko-v0")
 
 
 def make(environment=MORPHOGENESIS, **keywords):

@@ -378,7 +378,7 @@ def test_a_world_of_a_pool_is_the_same_whenever_it_is_grown(device):
 
 
 def test_regeneration_starts_grown_and_damaged():
-    grown = npa_envs.load_rule("gecko")
+    grown = npa_envs.load_rule("gecko-v0")
     env = gymnasium.make(
         "npa/Regeneration2D-v0", particle_count=512, grow_steps=48, seed_pool=1, damage="erase"
     )

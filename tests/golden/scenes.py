@@ -33,6 +33,7 @@ RULES: dict[str, dict[str, Any]] = {
 
 KEPT_RULES = {
     "dots": GOLDEN.with_name("dots.safetensors"),
+    "gecko": "gecko-v0",
     "heart": "heart-v0",
 }
 """Rules that are no longer shipped as they were when their worlds were stored."""

@@ -537,6 +537,9 @@ def test_the_tables_of_muon_have_the_numbers_of_their_files() -> None:
         cells += [f"{row['worlds_healed']} of 32" for row in healed[run["picture"]]]
         cells.append(f"{late['worlds_within']} of 8")
         assert told[run["picture"].replace("-", " ")].split(" | ") == cells
+    grown = [{str(row["step"]): row["loss"] for row in run["growth"]} for run in decayed["test"]]
+    cells = [f"{statistics.mean(own[step] for own in grown):.3f}" for step in steps]
+    assert told["mean of 12, or sum"].split(" | ")[: len(steps)] == cells
     plain = record["test"]
     means = [statistics.mean(run["losses"][step] for run in plain) for step in steps]
     means.append(statistics.mean(row["loss"]["100000"] for row in record["long"]))

@@ -266,7 +266,7 @@ def test_a_configuration_survives_being_written_as_json(name, task, fields):
 @pytest.mark.parametrize("name", TASKS["co_morphogenesis2d"].presets)
 def test_presets_of_two_species_have_the_schedule_of_one_but_what_came_with_muon(name):
     came = {"optimiser", "learning_rate", "seed_interval", "lifetimes", "second_lives"}
-    came |= {"damage_share", "rest_weight"}
+    came |= {"damage_share", "rest_weight", "weight_decay"}
     alone, together = preset(name), preset(name, "co_morphogenesis2d")
     assert together.task.counts == (alone.task.particle_count,) * 2
     assert together.task.species[0] == alone.task
@@ -275,7 +275,7 @@ def test_presets_of_two_species_have_the_schedule_of_one_but_what_came_with_muon
         known = alone.optimiser == "adamw" or field.name not in came
         if known and field.name not in ("task", "out", "initial_rule"):
             assert getattr(together, field.name) == getattr(alone, field.name)
-    assert together.optimiser == "adamw"
+    assert (together.optimiser, together.weight_decay) == ("adamw", 0.0)
 
 
 @pytest.mark.parametrize("task", TASKS)
