@@ -143,10 +143,11 @@ class Regeneration2DEnv(NPAEnv):
     to change its state, so that the picture becomes whole again. As in `npa/Morphogenesis2D-v0`, a
     particle perceives only its neighbourhood. Nobody tells it that there was damage.
 
-    Update rules that grow pictures can also heal them. Such a rule has grown these worlds, so its
-    hidden states mean something to it: `npa_envs.agents.RulePolicy(npa_envs.load_rule("gecko-v0"),
-    env)` shows what it can do (`gecko-v0` is the gecko that was shipped when these worlds were frozen). Another policy cannot read these hidden states. With
-    `rule="picture"` episodes start from the target's own points instead, with blank hidden states.
+    Update rules that grow pictures can also heal them. The rule `gecko-v0`, the gecko that was
+    shipped when these worlds were frozen, has grown them, so their hidden states mean something to
+    it: `npa_envs.agents.RulePolicy(npa_envs.load_rule("gecko-v0"), env)` shows what it can do.
+    Another policy cannot read these hidden states. With `rule="picture"` episodes start from the
+    target's own points instead, with blank hidden states.
     Spaces, reward and `info` are those of `Morphogenesis2DEnv`.
 
     ## Starting state
