@@ -137,6 +137,7 @@ FAST_BEFORE: Fields = {
     "schedule": "milestones",
     "milestones": (1500, 2100),
     "seed_interval": 2,
+    "hidden_dim": 64,
     "initial_rule": "",
 }
 """The preset `fast` as it was when its arms were compared, laid over what it is."""
@@ -277,13 +278,17 @@ FAST_ARMS: Mapping[str, Fields] = {
     "sixth, share 0.5": FAST_SIXTH | {"damage_share": 0.5},
     "eighth": FAST_EIGHTH,
     "eighth, muon": FAST_EIGHTH | MUON,
+    "eighth, muon, hidden 128, rest 2": FAST_EIGHTH
+    | MUON
+    | {"hidden_dim": 128, "rest_weight": 2.0, "initial_rule": ""},
     "eighth, rate 4e-3": FAST_EIGHTH | {"learning_rate": 4e-3},
     "eighth, no rest": FAST_EIGHTH | {"rest_weight": 0.0},
     "eighth, rest 2": FAST_EIGHTH | {"rest_weight": 2.0},
     "eighth, to 4096": FAST_EIGHTH | {"lifetimes": (24, 4096), "rest_age": 512},
     "sixth, untrained": FAST_SIXTH | {"initial_rule": ""},
 }
-"""Arms of `fast`: what each changes of it as it was first; the preset is "eighth, muon" now."""
+"""Arms of `fast`: what each changes of it as it was first; the preset is now "eighth, muon, hidden
+128, rest 2"."""
 
 
 @dataclass(frozen=True)

@@ -204,12 +204,16 @@ _MEASURED: Mapping[str, Mapping[str, Any]] = {
 }
 """What presets had when several species were measured (docs/species.md); Muon was not."""
 
+_HIDDEN: Mapping[str, int] = {"fast": 64}
+"""Width of the hidden layer that they had then."""
+
 
 def _beside(
     name: str, alone: Morphogenesis2DTrainConfig, neighbour: str
 ) -> JointTrainConfig[CoMorphogenesis2DConfig]:
     """Return a run of one species, with another one of the same kind beside it."""
-    species = (alone.task, dataclasses.replace(alone.task, target=neighbour))
+    own = dataclasses.replace(alone.task, hidden_dim=_HIDDEN.get(name, alone.task.hidden_dim))
+    species = (own, dataclasses.replace(own, target=neighbour))
     run = {field.name: getattr(alone, field.name) for field in dataclasses.fields(alone)}
     run["task"] = CoMorphogenesis2DConfig(species=species, distance=DISTANCE)
     # As many rules as there are species would have to be named.

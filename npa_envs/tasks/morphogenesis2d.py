@@ -586,7 +586,6 @@ MORPHOGENESIS2D_PRESETS: Mapping[str, Morphogenesis2DTrainConfig] = {
         Morphogenesis2DConfig(
             target_point_count=512,
             particle_count=512,
-            hidden_dim=64,
             eps=0.2,
             seed_radius=0.4,
             resolution=64,
@@ -602,8 +601,7 @@ MORPHOGENESIS2D_PRESETS: Mapping[str, Morphogenesis2DTrainConfig] = {
         lifetimes=(24, 256),
         damage_share=0.5,
         rest_age=64,
-        rest_weight=0.5,
-        initial_rule="gecko-512",
+        rest_weight=2.0,
         picture_interval=200,
         out=_OUT,
     ),

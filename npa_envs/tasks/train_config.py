@@ -58,9 +58,8 @@ class TrainConfig(Generic[TaskConfigT]):
 
     initial_rule: str = ""
     """Start from this rule, a name, a file or a run's folder, instead of random weights; '': from
-    these. The preset `fast` of morphogenesis2d starts from `gecko-512`, which has grown a gecko in
-    its worlds, and `best` from a heart (`heart-v0`); `best` of morphogenesis3d from
-    `rocket-8192`."""
+    these. The preset `best` of morphogenesis2d starts from a heart (`heart-v0`), that of
+    morphogenesis3d from `rocket-8192`."""
 
     vary_particles: tuple[float, float] = (1.0, 1.0)
     """Range of factors on the number of particles. Half of the batches are as the task says, the
