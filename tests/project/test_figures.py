@@ -568,6 +568,20 @@ def test_the_tables_of_muon_have_the_numbers_of_their_files() -> None:
         assert [float(cell) for cell in told[arm].split(" | ")] == pytest.approx(means, abs=6e-4)
 
 
+def test_the_table_of_fast_has_the_numbers_of_its_file() -> None:
+    page = (ROOT / "docs" / "recipes.md").read_text(encoding="utf-8")
+    section = page.split("\n### The test of `fast`\n")[1]
+    runs = content(RESULTS / "recipes_fast_wide_cpu.json")["test"]
+    losses = [{row["step"]: row["loss"] for row in run["growth"]} for run in runs]
+    assert len(runs) == 12
+    for run, own in zip(runs, losses, strict=True):
+        cells = " | ".join(f"{own[step]:.3f}" for step in (128, 512, 1024, 4096))
+        assert f"| {run['picture'].replace('-', ' ')} | {cells} |" in section
+    means = (statistics.mean(own[step] for own in losses) for step in (128, 512, 1024, 4096))
+    told = " | ".join(f"{mean:.3f}" for mean in means)
+    assert f"| mean of 12 (aim 0.12 at 128, 0.15 at 1024) | {told} |" in section
+
+
 @pytest.mark.parametrize(
     ("title", "name"),
     [
