@@ -154,8 +154,8 @@ def fields_of(arguments: argparse.Namespace) -> dict[str, Any]:
     if arguments.size == "local":
         fields = dict(LOCAL)
     elif arguments.size == "fast":
-        # Few numbers of steps: few graphs. Wide rules cannot begin with the preset's rule.
-        fields = {"steps": (23, 25), "initial_rule": ""}
+        # Few numbers of steps: few graphs.
+        fields = {"steps": (23, 25)}
     else:
         fields = {**SECOND, **SIZES[arguments.size]}
         if arguments.size != "tiny":

@@ -22,7 +22,6 @@ HEAL_STEPS = 384
 FRAME_STEPS = 8
 
 SMALL_RUN: dict[str, Any] = {
-    "initial_rule": "",
     "world_count": 4,
     "seed_radius": 0.2,
     "particle_count": 256,

@@ -30,6 +30,11 @@ def content(path: Path) -> Any:
     return json.loads(path.read_text(encoding="utf-8"))
 
 
+def losses_of(run: dict[str, Any]) -> dict[int, float]:
+    """Losses of a run's worlds, by step."""
+    return {row["step"]: row["loss"] for row in run["growth"]}
+
+
 def rollout_times() -> list[float]:
     """Of two workloads in one call, and of one in a graph, inference and training: µs, ms, ms."""
     tables = content(ROLLOUTS)["tables"]
@@ -508,7 +513,7 @@ def test_the_table_of_the_test_of_best_has_the_numbers_of_its_file() -> None:
     steps = (64, 128, 512, 1024, 4096, 20_000)
     assert len(record["runs"]) == len(aged) == 12
     for run in record["runs"]:
-        losses = {row["step"]: row["loss"] for row in run["growth"]}
+        losses = losses_of(run)
         late = aged[run["picture"]]
         cells = [f"{losses[step]:.3f}" for step in steps] + [f"{late['loss']['100000']:.3f}"]
         cells += [f"{row['worlds_healed']} of {row['world_count']}" for row in run["healing"]]
@@ -529,16 +534,16 @@ def test_the_tables_of_muon_have_the_numbers_of_their_files() -> None:
     decayed = content(RESULTS / "recipes_decay_h200.json")
     aged = {row["picture"]: row for row in decayed["long"]}
     healed = {row["picture"]: row["healing"] for row in decayed["healing_of_32"]}
-    assert len(decayed["test"]) == len(aged) == len(healed) == 12
-    for run in decayed["test"]:
-        losses = {str(row["step"]): row["loss"] for row in run["growth"]}
-        late = aged[run["picture"]]
-        cells = [f"{losses[step]:.3f}" for step in steps] + [f"{late['loss']['100000']:.3f}"]
-        cells += [f"{row['worlds_healed']} of 32" for row in healed[run["picture"]]]
+    grown = {run["picture"]: losses_of(run) for run in decayed["test"]}
+    assert len(decayed["test"]) == len(grown) == len(aged) == len(healed) == 12
+    for picture, losses in grown.items():
+        late = aged[picture]
+        cells = [f"{losses[int(step)]:.3f}" for step in steps] + [f"{late['loss']['100000']:.3f}"]
+        cells += [f"{row['worlds_healed']} of 32" for row in healed[picture]]
         cells.append(f"{late['worlds_within']} of 8")
-        assert told[run["picture"].replace("-", " ")].split(" | ") == cells
-    grown = [{str(row["step"]): row["loss"] for row in run["growth"]} for run in decayed["test"]]
-    cells = [f"{statistics.mean(own[step] for own in grown):.3f}" for step in steps]
+        assert told[picture.replace("-", " ")].split(" | ") == cells
+    means = [statistics.mean(own[int(step)] for own in grown.values()) for step in steps]
+    cells = [f"{mean:.3f}" for mean in means]
     assert told["mean of 12, or sum"].split(" | ")[: len(steps)] == cells
     plain = record["test"]
     means = [statistics.mean(run["losses"][step] for run in plain) for step in steps]
@@ -552,7 +557,7 @@ def test_the_tables_of_muon_have_the_numbers_of_their_files() -> None:
     known = content(RESULTS / "library_muon_h200.json")["arms"]
     plain = [run | {"arm": MUON_ARM} for run in known if run["begins_with"] == "heart-v0"]
     for run in decayed["first"] + decayed["second"] + plain:
-        own = {row["step"]: row["loss"] for row in run["growth"]}
+        own = losses_of(run)
         cell = " / ".join(f"{own[step]:.3f}" for step in (128, 512, 20_000))
         arms.setdefault(run["picture"].removesuffix("-knife"), {})[run["arm"]] = cell
     endings = ("", ", decay 0.1", ", halfway 1", ", halfway 1, decay 0.03")
@@ -572,7 +577,7 @@ def test_the_table_of_fast_has_the_numbers_of_its_file() -> None:
     page = (ROOT / "docs" / "recipes.md").read_text(encoding="utf-8")
     section = page.split("\n### The test of `fast`\n")[1]
     runs = content(RESULTS / "recipes_fast_wide_cpu.json")["test"]
-    losses = [{row["step"]: row["loss"] for row in run["growth"]} for run in runs]
+    losses = [losses_of(run) for run in runs]
     assert len(runs) == 12
     for run, own in zip(runs, losses, strict=True):
         cells = " | ".join(f"{own[step]:.3f}" for step in (128, 512, 1024, 4096))
@@ -600,7 +605,7 @@ def test_the_tables_of_second_lives_have_the_numbers_of_their_files(title: str, 
     steps = (64, 128, 512, 1024, 4096, 20_000)
     arms: dict[str, list[Any]] = {}
     for run in record["runs"]:
-        losses = {row["step"]: row["loss"] for row in run["growth"]}
+        losses = losses_of(run)
         if run["pictures"] == "development":
             arms.setdefault(run["arm"], []).append((losses, run["healing_of_32"]))
             continue
