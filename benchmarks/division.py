@@ -12,6 +12,7 @@ each second one or those on one side.
 from __future__ import annotations
 
 import argparse
+import json
 import math
 import statistics
 from collections.abc import Mapping
@@ -66,7 +67,7 @@ def train(arguments: argparse.Namespace) -> None:
         preset(
             "best",
             # Few numbers of steps: few graphs.
-            **({"steps": (62, 64)} | fields),
+            **({"steps": (62, 64)} | fields | json.loads(arguments.fields)),
             iterations=arguments.iterations,
             tensorboard=False,
             picture_interval=0,
@@ -156,6 +157,7 @@ def main() -> None:
     training.add_argument("--seconds", type=float, default=math.inf, help="of a cosine by the time")
     training.add_argument("--longest", type=float, default=math.inf)
     training.add_argument("--particle-count", type=int, default=0)
+    training.add_argument("--fields", default="{}", help="JSON object of fields for all kinds")
     measuring = commands.add_parser("measure")
     measuring.set_defaults(run=measure)
     measuring.add_argument("out", type=Path)

@@ -521,6 +521,38 @@ def test_the_table_of_the_test_of_best_has_the_numbers_of_its_file() -> None:
         assert told[run["picture"].replace("-", " ")].split(" | ") == cells
 
 
+def test_the_tables_of_more_cuts_have_the_numbers_of_their_file() -> None:
+    page = (ROOT / "docs" / "recipes.md").read_text(encoding="utf-8")
+    section = page.split("### More cuts and later rest")[1].split("\n### ")[0]
+    record = content(RESULTS / "recipes_cuts_h200.json")
+    told = [line.split(" | ") for line in section.splitlines() if line.startswith("| ")]
+    arms: dict[str, list[dict[str, Any]]] = {}
+    for row in record["development"]:
+        arms.setdefault(row["arm"], []).append(row)
+    cells = []
+    for rows in arms.values():
+        losses = [
+            statistics.mean(row["loss_of_32"][step] for row in rows) for step in ("512", "4096")
+        ]
+        counts = [
+            sum(row[name] for row in rows)
+            for name in ("cuts_healed", "disks_healed", "within_4096_steps")
+        ]
+        most = max(row["most_energies"][0] for row in rows)
+        row = [f"{loss:.3f}" for loss in losses] + [f"{count} of 128" for count in counts]
+        cells.append([*row, f"{most:.1f} |"])
+    assert sorted(cells) == sorted(row[1:] for row in told if len(row) == 7 and "of" in row[3])
+    grown = [losses_of(run) for run in record["test"]]
+    steps = (64, 128, 512, 1024, 4096, 20_000)
+    means = [statistics.mean(own[step] for own in grown) for step in steps]
+    means.append(statistics.mean(row["loss"]["100000"] for row in record["long"]))
+    worst = max(own[step] for own in grown for step in own if step >= 128)
+    healed = sum(row["worlds_healed"] for own in record["healing_of_32"] for row in own["healing"])
+    within = sum(row["worlds_within"] for row in record["long"])
+    row = [f"{loss:.3f}" for loss in (*means, worst)]
+    assert [*row, f"{healed} of 768", f"{within} of 96 |"] in [cells[1:] for cells in told]
+
+
 MUON_ARM = "eighth, muon, from 16"
 """The preset `best` of 2D before it had a weight decay."""
 
