@@ -177,48 +177,41 @@ def _(
 
 
 @opaque("npa::steer_rows")
-def _steer_rows(
-    output: Tensor, mixed: Tensor, steering: Tensor, gate_count: int, width: int
-) -> Tensor:
+def _steer_rows(output: Tensor, mixed: Tensor, signs: Tensor, width: int) -> Tensor:
     update = output.new_empty(len(output), width)
     kernel = _kernels(output, mixed.shape[2]).steer
-    launch(kernel, update.numel(), output.device, gate_count, output, mixed, steering, update)
+    launch(kernel, update.numel(), output.device, len(signs), output, mixed, signs, update)
     return update
 
 
 @_steer_rows.register_fake
-def _(output: Tensor, mixed: Tensor, steering: Tensor, gate_count: int, width: int) -> Tensor:
+def _(output: Tensor, mixed: Tensor, signs: Tensor, width: int) -> Tensor:
     return output.new_empty(output.shape[0], width)
 
 
 @opaque("npa::steer_rows_backward")
 def _steer_rows_backward(
-    output: Tensor, mixed: Tensor, steering: Tensor, update_bar: Tensor
-) -> tuple[Tensor, Tensor, Tensor]:
-    gate_count = len(steering)
+    output: Tensor, mixed: Tensor, signs: Tensor, update_bar: Tensor
+) -> tuple[Tensor, Tensor]:
     output_bar, mixed_bar = torch.empty_like(output), torch.empty_like(mixed)
-    # By gate, so that each gate's shares lie side by side when they are summed.
-    shares = output.new_empty(gate_count, len(output))
     launch(
         _kernels(output, mixed.shape[2]).pull_back_steering,
         output.numel(),
         output.device,
-        gate_count,
+        len(signs),
         output,
         mixed,
-        steering,
+        signs,
         update_bar,
         output_bar,
         mixed_bar,
-        shares,
     )
-    return output_bar, mixed_bar, shares
+    return output_bar, mixed_bar
 
 
 @_steer_rows_backward.register_fake
-def _(output: Tensor, mixed: Tensor, steering: Tensor, *rest: Any) -> tuple[Tensor, ...]:
-    shares = output.new_empty(steering.shape[0], output.shape[0])
-    return torch.empty_like(output), torch.empty_like(mixed), shares
+def _(output: Tensor, mixed: Tensor, *rest: Any) -> tuple[Tensor, Tensor]:
+    return torch.empty_like(output), torch.empty_like(mixed)
 
 
 class _ReadRows(torch.autograd.Function):
@@ -264,19 +257,17 @@ class _SteerRows(torch.autograd.Function):
     """Updates of gates, mixed vectors and state changes."""
 
     @staticmethod
-    def forward(ctx: Any, output: Tensor, mixed: Tensor, steering: Tensor, width: int) -> Tensor:
-        ctx.save_for_backward(output, mixed, steering)
-        update: Tensor = _steer_rows(output, mixed, steering, len(steering), width)
+    def forward(ctx: Any, output: Tensor, mixed: Tensor, signs: Tensor, width: int) -> Tensor:
+        ctx.save_for_backward(output, mixed, signs)
+        update: Tensor = _steer_rows(output, mixed, signs, width)
         return update
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, update_bar: Tensor) -> tuple[Tensor | None, ...]:
-        output, mixed, steering = ctx.saved_tensors
-        output_bar, mixed_bar, shares = _steer_rows_backward(
-            output, mixed, steering, update_bar.contiguous()
-        )
-        return output_bar, mixed_bar, shares.sum(dim=1), None
+        output, mixed, signs = ctx.saved_tensors
+        output_bar, mixed_bar = _steer_rows_backward(output, mixed, signs, update_bar.contiguous())
+        return output_bar, mixed_bar, None, None
 
 
 def read_rows(rows: Tensor, mixing: Tensor, form: VectorForm, width: int) -> tuple[Tensor, Tensor]:
@@ -298,20 +289,38 @@ def read_rows(rows: Tensor, mixing: Tensor, form: VectorForm, width: int) -> tup
     return found
 
 
-def steer_rows(output: Tensor, mixed: Tensor, steering: Tensor, width: int) -> Tensor:
-    """Return what `steered` does, followed by zeros.
+def signed_gates(weight: Tensor, steering: Tensor) -> tuple[Tensor, Tensor]:
+    """Return weights of outputs whose gates are as large as they steer, and their signs.
+
+    relu(g) steering = sign(steering) relu(|steering| g): the products of rows with these weights
+    take in all of `steering` but its signs, so its gradient follows from theirs, without a sum over
+    rows.
+
+    Args:
+        weight: Weights of gates and then state changes, shape [gate_count + C, H].
+        steering: How far a gate of 1 moves along its vector, dimensionless, shape [gate_count].
+
+    Returns:
+        Weights of the same shape, and signs, without gradient, of the shape of `steering`.
+    """
+    factors = torch.nn.functional.pad(steering.abs(), (0, len(weight) - len(steering)), value=1.0)
+    return weight * factors[:, None], steering.detach().sign()
+
+
+def steer_rows(output: Tensor, mixed: Tensor, signs: Tensor, width: int) -> Tensor:
+    """Return what `steered` does, of gates by `signed_gates`, followed by zeros.
 
     Args:
         output: Gates and state changes [g | Δs | 0], dimensionless, shape [K, any].
         mixed: Mixed vectors, shape [K, mixed, D].
-        steering: How far a gate of 1 moves along its vector, shape [gate_count].
+        signs: Whether a gate moves along its vector or against it, shape [gate_count].
         width: Columns of the result.
 
     Returns:
         Raw updates [δ | Δs | 0], dimensionless, shape [K, width].
     """
-    tensors = output.contiguous(), mixed, steering.contiguous()
-    if not (torch.is_grad_enabled() and any(tensor.requires_grad for tensor in tensors)):
-        return _steer_rows(*tensors, len(steering), width)
-    update: Tensor = _SteerRows.apply(*tensors, width)  # type: ignore[no-untyped-call]
+    output = output.contiguous()
+    if not (torch.is_grad_enabled() and (output.requires_grad or mixed.requires_grad)):
+        return _steer_rows(output, mixed, signs, width)
+    update: Tensor = _SteerRows.apply(output, mixed, signs, width)  # type: ignore[no-untyped-call]
     return update

@@ -103,11 +103,12 @@ class FoldedInvariants(NamedTuple):
     """An equivariant rule's weights: two plain products between mixtures and gates."""
 
     products: FoldedRule
-    """The products, whose rows are scalars and products of mixed vectors."""
+    """The products, whose rows are scalars and products of mixed vectors, and whose gates are as
+    large as they steer."""
     mixing: Tensor
     """Weights of the mixtures."""
-    steering: Tensor
-    """How far a gate of 1 moves along its vector."""
+    signs: Tensor
+    """Whether a gate moves along its vector or against it."""
     form: VectorForm
     """What of a row is a vector."""
     row_width: int
@@ -119,9 +120,9 @@ class FoldedInvariants(NamedTuple):
         """Map rows [z | 1 | 0], shape [K, row_width], to raw updates [y | 0], shape [K, A']."""
         mixed, inputs = read_rows(rows, self.mixing, self.form, self.products.row_width)
         output = self.products(inputs)
-        if len(self.steering) == 0:
+        if len(self.signs) == 0:
             return output
-        return steer_rows(output, mixed, self.steering, self.update_width)
+        return steer_rows(output, mixed, self.signs, self.update_width)
 
 
 def fold_weights(hidden_weight: Tensor, output_weight: Tensor) -> FoldedRule:

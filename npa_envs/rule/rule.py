@@ -16,7 +16,7 @@ from npa_envs.ops.checks import (
     checked_moment_inverse,
     checked_positive,
 )
-from npa_envs.ops.equivariance import VectorForm, invariants, steered
+from npa_envs.ops.equivariance import VectorForm, invariants, signed_gates, steered
 from npa_envs.rule.codes import Codes, check_names
 from npa_envs.rule.network import FOLD, FoldedInvariants, FoldedRule, Network, fold_weights
 
@@ -371,10 +371,11 @@ class NPARule(nn.Module):
     def _folded_invariants(self) -> FoldedInvariants:
         """Return the weights of an equivariant rule, differentiable in them."""
         width = self.perception_dim + 1
+        weight, signs = signed_gates(self.output.weight, self.steering)
         return FoldedInvariants(
-            self.folded(),
+            self._folded(weight),
             self.mixing,
-            self.steering,
+            signs,
             self.vector_form,
             row_width=width + -width % FOLD,
             update_width=self.update_dim + -self.update_dim % FOLD,
@@ -388,9 +389,11 @@ class NPARule(nn.Module):
 
     def folded(self) -> FoldedRule:
         """Return the weights as two plain products, differentiable in the parameters."""
+        return self._folded(self.update_weight)
+
+    def _folded(self, update_weight: Tensor) -> FoldedRule:
         padding = -(self.input_dim + 1) % FOLD
         weight = torch.cat((self.hidden.weight, self.hidden.bias[:, None]), dim=1)
-        update_weight = self.update_weight
         output_weight = nn.functional.pad(update_weight, (0, 0, 0, -len(update_weight) % FOLD))
         hidden_weight = nn.functional.pad(weight, (0, padding))
         return fold_weights(hidden_weight, output_weight)

@@ -160,7 +160,7 @@ def equivariance_kernels(space_dim: int, scalar: type) -> SimpleNamespace:
         gate_count: wp.int32,
         output: numbers,
         mixed: vectors,
-        steering: wp.array(dtype=scalar),
+        signs: wp.array(dtype=scalar),
         # outputs
         update: numbers,
     ):
@@ -180,7 +180,7 @@ def equivariance_kernels(space_dim: int, scalar: type) -> SimpleNamespace:
         value = scalar(0.0)
         if turning:
             for g in range(gate_count):
-                gate = wp.max(output[row, g], scalar(0.0)) * steering[g]
+                gate = wp.max(output[row, g], scalar(0.0)) * signs[g]
                 if g < count:
                     value += gate * mixed[row, g][column]
                 else:
@@ -198,14 +198,13 @@ def equivariance_kernels(space_dim: int, scalar: type) -> SimpleNamespace:
         gate_count: wp.int32,
         output: numbers,
         mixed: vectors,
-        steering: wp.array(dtype=scalar),
+        signs: wp.array(dtype=scalar),
         update_bar: numbers,
         # outputs
         output_bar: numbers,
         mixed_bar: vectors,
-        steering_shares: numbers,
     ):
-        """Write cotangents of a row's outputs and mixed vectors, and its share of steering's."""
+        """Write cotangents of a row's outputs and mixed vectors."""
         t = range_start + wp.tid()
         width = output.shape[1]
         row = t / width
@@ -220,15 +219,13 @@ def equivariance_kernels(space_dim: int, scalar: type) -> SimpleNamespace:
             u = mixed[row, column % count]
             if column >= count:
                 u = turned(u)
-            along = wp.dot(u, pull)
             if gate > scalar(0.0):
-                value = steering[column] * along
-            steering_shares[column, row] = wp.max(gate, scalar(0.0)) * along
+                value = signs[column] * wp.dot(u, pull)
             if column < count:
-                total = wp.max(gate, scalar(0.0)) * steering[column] * pull
+                total = wp.max(gate, scalar(0.0)) * signs[column] * pull
                 if gate_count > count:
                     other = wp.max(output[row, count + column], scalar(0.0))
-                    total -= other * steering[count + column] * turned(pull)
+                    total -= other * signs[count + column] * turned(pull)
                 mixed_bar[row, column] = total
         else:
             place = column - gate_count + wp.static(space_dim)
