@@ -33,7 +33,7 @@ LARGEST_DIM = 65536
 LIFE = 0
 """State channel of particles that divide: 1 where they live, 0 where they are dead."""
 
-FIRST_FATES = (2.0, -8.0)
+FIRST_FATES = (5.0, -8.0)
 """Log odds of an untrained rule's particles to divide and to die, over staying."""
 
 MIXED_VECTORS = 8

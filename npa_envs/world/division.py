@@ -33,7 +33,7 @@ class Births(NamedTuple):
     chance: Tensor
     """Decides on each particle's fate, uniform in [0, 1), shape [B, N]."""
     direction: Tensor
-    """Where a child goes, standard normal, shape [B, N, D]."""
+    """Where the child of a particle goes, standard normal, shape [B, N, D]."""
 
 
 def living(s: Tensor) -> Tensor:
@@ -75,10 +75,11 @@ def divided(
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Let updated particles divide, stay or die; differentiable.
 
-    A child takes its parent's position and state, and moves a little. The k-th child of a world
-    takes its k-th dead slot; where there are more children than slots, the last are not born. The
-    last living particle of a world does not die. Dead slots get states of 0, and the mean position
-    of the living, so that means over all slots are those of the living.
+    A child takes its parent's state; they move apart from where the parent was, each half of the
+    way, so that mean positions stay. The k-th child of a world takes its k-th dead slot; where
+    there are more children than slots, the last are not born. The last living particle of a world
+    does not die. Dead slots get states of 0, and the mean position of the living, so that means
+    over all slots are those of the living.
 
     Fates are discrete. What is differentiable is life: its value stays 1, and at each update it is
     multiplied by m / m', with m = 1 + p - d the expected number of particles that come of one, p
@@ -96,7 +97,7 @@ def divided(
         eps: Perception radius [length units].
 
     Returns:
-        Positions, states and path lengths.
+        Positions, states and path lengths, to which division adds nothing.
     """
     count, space_dim = x.shape[1:]
     alive = living(s)
@@ -122,8 +123,9 @@ def divided(
     s = torch.cat((life[..., None], s[..., LIFE + 1 :]), dim=-1)
     s = torch.where((alive & ~dying)[..., None], s, 0.0)
     s = s.gather(1, source[..., None].expand_as(s))
-    move = CHILD_DISTANCE * eps / space_dim**0.5 * births.direction
-    x = x.gather(1, source[..., None].expand_as(x)) + torch.where(born[..., None], move, 0.0)
+    half_way = 0.5 * CHILD_DISTANCE * eps / space_dim**0.5 * births.direction
+    children_x = (x + half_way).gather(1, source[..., None].expand_as(x))
+    x = torch.where(born[..., None], children_x, x - torch.where(parents[..., None], half_way, 0.0))
     alive = (alive & ~dying) | born
     return _dead_amidst(x, alive), s, torch.where(alive & ~born, path_length, 0.0)
 

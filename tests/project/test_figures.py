@@ -521,6 +521,28 @@ def test_the_table_of_the_test_of_best_has_the_numbers_of_its_file() -> None:
         assert told[run["picture"].replace("-", " ")].split(" | ") == cells
 
 
+def test_the_tables_of_births_have_the_numbers_of_their_files() -> None:
+    page = (ROOT / "docs" / "beyond.md").read_text(encoding="utf-8")
+
+    def mean(row: dict[str, Any]) -> str:
+        return f"{statistics.mean(row['loss']):.3f}"
+
+    rules = content(RESULTS / "division_births_cpu.json")["rules"]
+    found: dict[str, list[list[str]]] = {}
+    for name, rule in rules.items():
+        cells = [mean(rule["grown"][step]) for step in ("64", "128", "512")]
+        cells += [mean(rule[half]["256"]) for half in ("each second", "one side")]
+        seeds = {"plain-s1": "division128b", "fast-s1": "fast"}
+        found.setdefault(seeds.get(name, name), []).append(cells)
+    section = page.split("### How children are born")[1].split("\n### ")[0]
+    for rows in found.values():
+        told = " | ".join(", ".join(cells) for cells in zip(*rows, strict=True))
+        assert f"| {told} |" in section
+    for name, rule in content(RESULTS / "division_blank_h200.json")["rules"].items():
+        row = " | ".join(mean(cells) for cells in rule["grown"].values())
+        assert f"| {row} |" in page, name
+
+
 def test_the_tables_of_more_cuts_have_the_numbers_of_their_file() -> None:
     page = (ROOT / "docs" / "recipes.md").read_text(encoding="utf-8")
     section = page.split("### More cuts and later rest")[1].split("\n### ")[0]

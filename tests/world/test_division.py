@@ -106,10 +106,11 @@ def test_children_take_the_first_dead_slots_in_order(device):
     parents = [3, 6]
     after_x, after_s, path_length = divide(x, s, parents)
     assert_same(after_s[:, [1, 2]], s[:, parents])
-    moved = x[:, parents] + 0.5 * EPS / 2**0.5 * births_of(x).direction[:, [1, 2]]
-    assert_near([after_x[:, [1, 2]]], [moved], 1e-12)
-    old = [0, 3, 6]
-    assert_same((after_x[:, old], after_s[:, old]), (x[:, old], s[:, old]))
+    half_way = 0.25 * EPS / 2**0.5 * births_of(x).direction[:, parents]
+    assert_near([after_x[:, [1, 2]]], [x[:, parents] + half_way], 1e-12)
+    assert_near([after_x[:, parents]], [x[:, parents] - half_way], 1e-12)
+    assert_same(after_s[:, [0, 3, 6]], s[:, [0, 3, 6]])
+    assert_same(after_x[:, 0], x[:, 0])
     assert living(after_s).sum(dim=1).tolist() == [5, 5]
     assert path_length[0].tolist() == [1, 0, 0, 1, 0, 0, 1, 0, 0]
 
