@@ -49,7 +49,7 @@ KINDS: Mapping[str, Mapping[str, Any]] = {
     "division-96": {"division": True, "steps": (95, 97)},
 }
 """What `train` trains of each target: the control, a rule whose particles divide, and one that does
-not learn when to, so that worlds are full after some 24 steps; the first two in longer rollouts."""
+not learn when to; the first two in longer rollouts."""
 
 
 def train(arguments: argparse.Namespace) -> None:

@@ -17,6 +17,9 @@ from npa_envs.kernels.portable.equivariance import equivariance_kernels
 from npa_envs.ops.launch import launch, scalar_type
 from npa_envs.ops.opaque import once_differentiable, opaque
 
+LEAST_STEERING = 1e-19
+"""How far a gate of 1 moves that is not to move anything (dimensionless)."""
+
 
 class VectorForm(NamedTuple):
     """How the perception vector is made of scalars and vectors, and what is made of these."""
@@ -294,7 +297,7 @@ def signed_gates(weight: Tensor, steering: Tensor) -> tuple[Tensor, Tensor]:
 
     relu(g) steering = sign(steering) relu(|steering| g): the products of rows with these weights
     take in all of `steering` but its signs, so its gradient follows from theirs, without a sum over
-    rows.
+    rows. Where it is 0 a gate is as good as closed, but not quite: so it still learns.
 
     Args:
         weight: Weights of gates and then state changes, shape [gate_count + C, H].
@@ -303,6 +306,7 @@ def signed_gates(weight: Tensor, steering: Tensor) -> tuple[Tensor, Tensor]:
     Returns:
         Weights of the same shape, and signs, without gradient, of the shape of `steering`.
     """
+    steering = torch.where(steering == 0.0, steering + LEAST_STEERING, steering)
     factors = torch.nn.functional.pad(steering.abs(), (0, len(weight) - len(steering)), value=1.0)
     return weight * factors[:, None], steering.detach().sign()
 

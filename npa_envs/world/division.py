@@ -76,10 +76,10 @@ def divided(
     """Let updated particles divide, stay or die; differentiable.
 
     A child takes its parent's state; they move apart from where the parent was, each half of the
-    way, so that mean positions stay. The k-th child of a world takes its k-th dead slot; where
-    there are more children than slots, the last are not born. The last living particle of a world
-    does not die. Dead slots get states of 0, and the mean position of the living, so that means
-    over all slots are those of the living.
+    way. The k-th child of a world takes its k-th dead slot; where there are more children than
+    slots, the last are not born, and their parents stay where they are. The last living particle of
+    a world does not die. Dead slots get states of 0, and the mean position of the living, so that
+    means over all slots are those of the living.
 
     Fates are discrete. What is differentiable is life: its value stays 1, and at each update it is
     multiplied by m / m', with m = 1 + p - d the expected number of particles that come of one, p
@@ -97,7 +97,7 @@ def divided(
         eps: Perception radius [length units].
 
     Returns:
-        Positions, states and path lengths, to which division adds nothing.
+        Positions, states and path lengths, which do not count how parent and child move apart.
     """
     count, space_dim = x.shape[1:]
     alive = living(s)

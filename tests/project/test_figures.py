@@ -521,26 +521,58 @@ def test_the_table_of_the_test_of_best_has_the_numbers_of_its_file() -> None:
         assert told[run["picture"].replace("-", " ")].split(" | ") == cells
 
 
+BIRTHS = (
+    ("division128b plain-s1", "a = 2", "inherit, and only they move"),
+    ("sym", "a = 2", "apart"),
+    ("sym1", "a = 2", "apart, twice as far"),
+    ("sym25", "a = 2", "apart, half as far"),
+    ("blank", "a = 2", "blank"),
+    ("blanksym", "a = 2", "blank, apart"),
+    ("blanksym25", "a = 2", "blank, apart, half as far"),
+    ("thin", "a = 2", "blank, apart, thinned"),
+    ("fastplain", "a = 5", "inherit, and only they move"),
+    ("fastsym", "**a = 5**", "**apart**"),
+    ("fastsymthin", "a = 5", "apart, thinned"),
+    ("fastblank", "a = 5", "blank"),
+    ("fast fast-s1", "a = 5", "blank, apart"),
+    ("fast25", "a = 5", "blank, apart, half as far"),
+    ("fastthin", "a = 5", "blank, apart, thinned"),
+)
+"""Rows of the table of births: rules of its record, how fates begin, what children do."""
+
+
 def test_the_tables_of_births_have_the_numbers_of_their_files() -> None:
     page = (ROOT / "docs" / "beyond.md").read_text(encoding="utf-8")
 
-    def mean(row: dict[str, Any]) -> str:
-        return f"{statistics.mean(row['loss']):.3f}"
+    def mean(row: dict[str, Any]) -> float:
+        return statistics.mean(row["loss"])
 
     rules = content(RESULTS / "division_births_cpu.json")["rules"]
-    found: dict[str, list[list[str]]] = {}
-    for name, rule in rules.items():
-        cells = [mean(rule["grown"][step]) for step in ("64", "128", "512")]
-        cells += [mean(rule[half]["256"]) for half in ("each second", "one side")]
-        seeds = {"plain-s1": "division128b", "fast-s1": "fast"}
-        found.setdefault(seeds.get(name, name), []).append(cells)
+    disk = content(RESULTS / "division_muon_cpu.json")["rules"]["big-disk128"]
     section = page.split("### How children are born")[1].split("\n### ")[0]
-    for rows in found.values():
-        told = " | ".join(", ".join(cells) for cells in zip(*rows, strict=True))
-        assert f"| {told} |" in section
-    for name, rule in content(RESULTS / "division_blank_h200.json")["rules"].items():
-        row = " | ".join(mean(cells) for cells in rule["grown"].values())
-        assert f"| {row} |" in page, name
+    lines = [line for line in section.splitlines() if re.match(r"\| \*{0,2}a = ", line)]
+    ratios = {}
+    for line, (names, fates, children) in zip(lines, BIRTHS, strict=True):
+        found = [rules.pop(name) for name in names.split()]
+        cells = []
+        for when in ("64", "128", "512", "each second", "one side"):
+            rows = [rule[when]["256"] if " " in when else rule["grown"][when] for rule in found]
+            cells.append(", ".join(f"{mean(row):.3f}" for row in rows))
+        assert line == f"| {fates} | {children} | {' | '.join(cells)} |"
+        grown = statistics.mean(mean(rule["grown"]["512"]) for rule in found)
+        ratios[names] = f"{grown / mean(disk['grown']['512']):.2f} times"
+    assert not rules
+    for name in ("fastsym", "fast fast-s1", "fastthin"):
+        assert ratios[name] in section
+    full = content(RESULTS / "division_blank_h200.json")["rules"]
+    section = page.split("**From one particle to 4096**")[1].split("\n### ")[0]
+    for rule in full.values():
+        row = " | ".join(f"{mean(cells):.3f}" for cells in rule["grown"].values())
+        assert f" | {row} |" in section
+    late = [mean(full[f"heart-{kind}"]["grown"]["512"]) for kind in ("division", "disk")]
+    assert f"{late[0] / late[1]:.2f} times" in section
+    for half in ("each second", "one side"):
+        assert f"{mean(full['heart-division'][half]['256']):.3f} instead of" in section
 
 
 def test_the_tables_of_more_cuts_have_the_numbers_of_their_file() -> None:

@@ -121,9 +121,10 @@ def test_a_full_world_has_no_children_and_only_updated_particles_divide(device):
     s[..., LIFE] = 1.0
     assert_same(divide(x, s, everyone)[:2], (x, s))
     s[:, 1, LIFE] = 0.0
-    after_s = divide(x, s, everyone)[1]
+    after_x, after_s, _ = divide(x, s, everyone)
     assert living(after_s).all()
     assert_same(after_s[:, 1], s[:, 0])
+    assert_same(after_x[:, 2:], x[:, 2:])
     nobody = torch.zeros(2, 9, dtype=torch.bool, device=device)
     assert living(divide(x, s, everyone, updated=nobody)[1]).sum().item() == 16
 
