@@ -538,6 +538,8 @@ BIRTHS = (
     ("fast25", "a = 5", "blank, apart, half as far"),
     ("fastthin", "a = 5", "blank, apart, thinned"),
     ("fastthin2000", "a = 5", "blank, apart, thinned, 2000 iterations"),
+    ("fastallthin", "a = 5", "blank, apart, all thinned"),
+    ("fasthalf", "a = 5", "half inherited, apart, thinned"),
 )
 """Rows of the table of births: rules of its record, how fates begin, what children do."""
 
@@ -563,7 +565,7 @@ def test_the_tables_of_births_have_the_numbers_of_their_files() -> None:
         grown = statistics.mean(mean(rule["grown"]["512"]) for rule in found)
         ratios[names] = f"{grown / mean(disk['grown']['512']):.2f} times"
     assert not rules
-    for name in ("fastsym", "fast fast-s1", "fastthin", "fastthin2000"):
+    for name in ("fastsym", "fast fast-s1", "fastthin", "fastthin2000", "fastallthin"):
         assert ratios[name] in section
     full = content(RESULTS / "division_blank_h200.json")["rules"]
     section = page.split("**From one particle to 4096**")[1].split("\n### ")[0]
