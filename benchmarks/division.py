@@ -54,11 +54,11 @@ not learn when to; the first two in longer rollouts."""
 
 def train(arguments: argparse.Namespace) -> None:
     """Train the rules of all targets side by side."""
-    small: dict[str, Any] = {}
-    if arguments.particle_count:
-        small = dict.fromkeys(("particle_count", "target_point_count"), arguments.particle_count)
+    # Few numbers of steps: few graphs.
+    shared = {"steps": (62, 64)}
+    changes = json.loads(arguments.fields)
     wanted = {
-        f"{target}-{kind}": {**small, **fields, "target": target}
+        f"{target}-{kind}": {**shared, **fields, **changes, "target": target}
         for target in arguments.targets
         for kind, fields in KINDS.items()
         if kind in arguments.kinds
@@ -66,8 +66,7 @@ def train(arguments: argparse.Namespace) -> None:
     configs = [
         preset(
             "best",
-            # Few numbers of steps: few graphs.
-            **({"steps": (62, 64)} | fields | json.loads(arguments.fields)),
+            **fields,
             iterations=arguments.iterations,
             tensorboard=False,
             picture_interval=0,
@@ -156,7 +155,6 @@ def main() -> None:
     training.add_argument("--iterations", type=int, default=2500)
     training.add_argument("--seconds", type=float, default=math.inf, help="of a cosine by the time")
     training.add_argument("--longest", type=float, default=math.inf)
-    training.add_argument("--particle-count", type=int, default=0)
     training.add_argument("--fields", default="{}", help="JSON object of fields for all kinds")
     measuring = commands.add_parser("measure")
     measuring.set_defaults(run=measure)

@@ -124,8 +124,9 @@ def divided(
     s = torch.where((alive & ~dying)[..., None], s, 0.0)
     s = s.gather(1, source[..., None].expand_as(s))
     half_way = 0.5 * CHILD_DISTANCE * eps / space_dim**0.5 * births.direction
+    half_way = torch.where(parents[..., None], half_way, 0.0)
     children_x = (x + half_way).gather(1, source[..., None].expand_as(x))
-    x = torch.where(born[..., None], children_x, x - torch.where(parents[..., None], half_way, 0.0))
+    x = torch.where(born[..., None], children_x, x - half_way)
     alive = (alive & ~dying) | born
     return _dead_amidst(x, alive), s, torch.where(alive & ~born, path_length, 0.0)
 
