@@ -159,6 +159,10 @@ class TrainConfig(Generic[TaskConfigT]):
     the pool is not damaged in every batch. It ends the slow flow by which worlds lose their shape.
     Needs `lifetimes`."""
 
+    rest_power: float = 1.0
+    """Power of the means over particles and states in `rest_weight`: (mean |a|^power)^(1/power), at
+    least 1. The larger it is, the more the few particles tell that move most."""
+
     rest_age: int = 512
     """Steps from the seed, or from the damage before another life, after which a world is grown."""
 
@@ -211,9 +215,14 @@ class TrainConfig(Generic[TaskConfigT]):
         check_positive(self, int, "ageing_interval", "rest_age")
         check_positive(self, int, "ageing_steps", at_least=0)
         check_positive(self, float, "learning_rate", "runaway_limit")
+        check_positive(self, float, "rest_power")
         check_fraction(self, "decay", "damage_share")
         check_non_negative(self, "weight_decay", "fresh_share", "average", "rest_weight")
         check_non_negative(self, "fate_rate", "second_lives")
+        if self.rest_power < 1.0:
+            raise NPAError(
+                f"rest_power must be at least 1, got {self.rest_power}: 1 for plain means"
+            )
         if self.average >= 1.0:
             raise NPAError(f"average must be below 1, got {self.average}: try 0.999")
         if self.fresh_share > 1.0:

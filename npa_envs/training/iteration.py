@@ -87,6 +87,7 @@ class EagerIteration:
         self.grown = torch.zeros_like(x[:, 0, 0], dtype=torch.bool)
         """Which worlds are grown and whole, and are to rest, shape [B]."""
         self._rest_weight = config.rest_weight
+        self._rest_power = config.rest_power
         self._mean_over_processes = mean_over_processes
         self._divides = bool(fate_parameters(rule))
         self._task = task
@@ -164,10 +165,17 @@ class EagerIteration:
                 # Births and deaths are no unrest; who lives is the business of the task's loss.
                 stayed = (living(s) & living(self.s0))[..., None]
                 change = torch.where(stayed, change, 0.0)[..., LIFE + 1 :]
-            unrest = path_length.mean(dim=1) / self._task.eps + change.abs().mean(dim=(1, 2))
+            unrest = self._power_mean(path_length) / self._task.eps + self._power_mean(change)
             parts["rest"] = (self.grown.to(x.dtype) * unrest).mean()
             total = total + self._rest_weight * parts["rest"]
         return total, parts
+
+    def _power_mean(self, values: Tensor) -> Tensor:
+        """Return (mean |a|^power)^(1/power) of each world's values [B, ...], shape [B]."""
+        power = self._rest_power
+        each = values.flatten(1)
+        # A vector's norm has a gradient of 0 where all is at rest.
+        return torch.linalg.vector_norm(each, power, dim=1) / each.shape[1] ** (1.0 / power)
 
 
 class GraphedIteration(EagerIteration):

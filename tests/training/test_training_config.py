@@ -128,6 +128,7 @@ def test_no_field_of_the_run_hides_one_of_the_task():
         ("second_lives", 1.0, "second_lives must be below 1, got 1.0"),
         ("second_lives", 0.5, "second_lives needs worlds that have lifetimes, got 0.5 without"),
         ("damage_share", 0.0, r"damage_share must lie in \(0, 1\], got 0.0"),
+        ("rest_power", 0.5, "rest_power must be at least 1, got 0.5"),
         ("average", 1.0, "average must be below 1, got 1.0"),
         ("schedule", "linear", "schedule must be one of milestones, cosine, got 'linear'"),
         ("blur_levels", 7, "blur_levels must leave pictures of at least 4 pixels a side, got 7"),

@@ -246,10 +246,12 @@ def test_iteration_leaves_the_worlds_the_terms_and_the_gradients(tmp_path):
     assert not torch.equal(iteration.x, x.detach())
 
 
-def test_grown_worlds_are_to_rest(tmp_path):
+@pytest.mark.parametrize("power", [1.0, 2.0, 4.0])
+def test_grown_worlds_are_to_rest(tmp_path, power):
     fields = {"dtype": "float64", "lifetimes": (8, 64), "pool_size": 9}
     _, _, plain = make_iteration(circle_config(tmp_path, **fields))
-    task, _, iteration = make_iteration(circle_config(tmp_path, rest_weight=0.5, **fields))
+    fields |= {"rest_weight": 0.5, "rest_power": power}
+    task, _, iteration = make_iteration(circle_config(tmp_path, **fields))
     assert iteration.term_names == (*plain.term_names, "rest")
     # The second of three worlds is grown; both iterations draw the same masks.
     iteration.grown[1] = True
@@ -257,12 +259,27 @@ def test_grown_worlds_are_to_rest(tmp_path):
         one.run(6)
     assert torch.equal(iteration.x, plain.x)
     # Particles of this task go straight on, so that their path is as long as their way.
-    way = (iteration.x - iteration.x0)[1].norm(dim=-1).mean() / task.eps
-    change = (iteration.s - iteration.s0)[1].abs().mean()
+    way = (iteration.x - iteration.x0)[1].norm(dim=-1) / task.eps
+    change = (iteration.s - iteration.s0)[1].abs()
+    way, change = (each.pow(power).mean() ** (1.0 / power) for each in (way, change))
     rest = 3.0 * iteration.terms[-1]
     assert rest >= way + change - 1e-12
     assert rest < 3.0 * (way + change)
     torch.testing.assert_close(iteration.terms[0], plain.terms[0] + 0.5 * iteration.terms[-1])
+
+
+@pytest.mark.parametrize("power", [1.0, 2.0, 4.0])
+def test_worlds_that_do_not_move_have_finite_gradients_of_rest(tmp_path, power):
+    config = circle_config(
+        tmp_path, lifetimes=(8, 64), pool_size=9, rest_weight=0.5, rest_power=power
+    )
+    _, rule, iteration = make_iteration(config)
+    with torch.no_grad():
+        rule.output.weight.zero_()
+    iteration.grown[:] = True
+    iteration.run(3)
+    assert torch.equal(iteration.x, iteration.x0)
+    assert all(gradient.isfinite().all() for gradient in iteration.gradients)
 
 
 def test_a_parameter_outside_the_loss_gets_a_zero_gradient(tmp_path):
