@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import math
 from collections.abc import Callable
 from typing import Any, Literal, Protocol, TypedDict, Unpack
 
@@ -175,7 +176,8 @@ class EagerIteration:
         power = self._rest_power
         each = values.flatten(1)
         # A vector's norm has a gradient of 0 where all is at rest.
-        return torch.linalg.vector_norm(each, power, dim=1) / each.shape[1] ** (1.0 / power)
+        norm: Tensor = torch.linalg.vector_norm(each, power, dim=1)
+        return norm / math.pow(each.shape[1], 1.0 / power)
 
 
 class GraphedIteration(EagerIteration):
