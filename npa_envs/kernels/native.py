@@ -24,6 +24,7 @@ CUDA_ONLY = (
     "cuda/perceive.cuh",
     "cuda/adjoint.cuh",
     "cuda/network.cuh",
+    "cuda/equivariance.cuh",
     "pictures/blending.cuh",
     "pictures/errors.cuh",
 )

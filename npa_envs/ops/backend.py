@@ -15,9 +15,10 @@ from typing import Literal, NamedTuple
 
 import torch
 
+from npa_envs.kernels.cuda.equivariance import fits_block
 from npa_envs.kernels.cuda.tiles import SMALLEST_SIDE
 
-Operator = Literal["sort", "density", "perceive", "adjoint", "network", "update"]
+Operator = Literal["sort", "density", "perceive", "adjoint", "vectors", "network", "update"]
 
 LARGEST_ROW, LARGEST_UPDATE, LARGEST_HIDDEN = 128, 32, 512
 """Widest rows and updates, and most hidden units, that the fused network takes."""
@@ -65,6 +66,8 @@ class Request(NamedTuple):
     """Columns of an update."""
     hidden_dim: int = 0
     """Hidden units of the rule H."""
+    vectors: tuple[int, int, int, int, bool] | None = None
+    """Of an equivariant rule: D, scalars, perceived and mixed vectors, whether it is chiral."""
 
 
 class Implementation(NamedTuple):
@@ -132,6 +135,10 @@ def _fused(request: Request) -> bool:
     )
 
 
+def _warps(request: Request) -> bool:
+    return request.vectors is not None and _cuda(request) and fits_block(*request.vectors)
+
+
 def _always(request: Request) -> bool:
     return True
 
@@ -192,6 +199,14 @@ TABLE: tuple[Implementation, ...] = (
     ),
     Implementation("adjoint", "portable", "kernels/portable/adjoint.py", "otherwise", _always),
     Implementation(
+        "vectors",
+        "cuda",
+        "kernels/cuda/equivariance.py",
+        f"{_MODERN}, rows that a block has room for: a warp has a few rows of an equivariant rule",
+        _warps,
+    ),
+    Implementation("vectors", "portable", "kernels/portable/equivariance.py", "otherwise", _always),
+    Implementation(
         "network",
         "cuda",
         "kernels/cuda/network.py",
@@ -213,7 +228,12 @@ def choose(operator: Operator, request: Request) -> Implementation:
 
 def describe(request: Request) -> list[str]:
     """Return a line for each operator: what a call like this takes, where it stands, and why."""
-    chosen = [row for row in TABLE if row == choose(row.operator, request)]
+    chosen = [
+        row
+        for row in TABLE
+        if row == choose(row.operator, request)
+        and (row.operator != "vectors" or request.vectors is not None)
+    ]
     return [f"{row.operator:8}  {row.name:8}  {row.where:28}  {row.condition}" for row in chosen]
 
 

@@ -13,9 +13,23 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
+from npa_envs.kernels.access import WARP
+from npa_envs.kernels.cuda.equivariance import (
+    PULL_WARPS,
+    READ_WARPS,
+    STEER_WARPS,
+    SUM_WARPS,
+    row_kernels,
+    rows_of_warp,
+    steering_kernels,
+)
 from npa_envs.kernels.portable.equivariance import equivariance_kernels
+from npa_envs.ops.backend import Request, choose, processor_count
 from npa_envs.ops.launch import launch, scalar_type
 from npa_envs.ops.opaque import once_differentiable, opaque
+
+MIXED_VECTORS = 8
+"""Mixed vectors of an equivariant rule where nothing is said."""
 
 LEAST_STEERING = 1e-19
 """How far a gate of 1 moves that is not to move anything (dimensionless)."""
@@ -104,6 +118,20 @@ def _kernels(like: Tensor, space_dim: int) -> Any:
     return equivariance_kernels(space_dim, scalar_type(like.dtype))
 
 
+def _is_for_warps(like: Tensor, form: tuple[int, int, int, int, bool]) -> bool:
+    """Return whether rows of a form have kernels of their own where a tensor is."""
+    return choose("vectors", Request(like.device, like.dtype, vectors=form)).name == "cuda"
+
+
+BLOCKS_PER_PROCESSOR = 2
+"""Blocks of a multiprocessor that pull back to rows, where there are many rows."""
+
+
+def _block_count(row_count: int, mixed: int, warps: int) -> int:
+    """Return how many blocks of so many warps have all rows."""
+    return -(-row_count // (rows_of_warp(mixed) * warps))
+
+
 @opaque("npa::read_rows")
 def _read_rows(
     rows: Tensor, mixing: Tensor, width: int, space_dim: int, scalars: int, chiral: bool
@@ -111,7 +139,14 @@ def _read_rows(
     perceived, count = mixing.shape
     mixed = rows.new_empty(len(rows), count, space_dim)
     inputs = rows.new_empty(len(rows), width)
-    kernels, device = _kernels(rows, space_dim), rows.device
+    device, form = rows.device, (space_dim, scalars, perceived, count, chiral)
+    if _is_for_warps(rows, form):
+        block = READ_WARPS * WARP
+        size = _block_count(len(rows), count, READ_WARPS) * block
+        kernel = row_kernels(*form).read_rows
+        launch(kernel, size, device, rows, mixing, mixed, inputs, block_dim=block)
+        return mixed, inputs
+    kernels = _kernels(rows, space_dim)
     launch(kernels.mix_vectors, len(rows) * count, device, scalars, rows, mixing, mixed)
     launch(
         kernels.write_inputs,
@@ -137,20 +172,44 @@ def _(
 
 @opaque("npa::read_rows_backward")
 def _read_rows_backward(
-    mixed: Tensor,
+    rows: Tensor,
     mixing: Tensor,
+    mixed: Tensor,
     mixed_bar: Tensor,
     inputs_bar: Tensor,
-    width: int,
     scalars: int,
     chiral: bool,
+    with_mixing: bool,
 ) -> tuple[Tensor, Tensor]:
-    count, mixed_count, space_dim = mixed.shape
-    total, rows_bar = torch.empty_like(mixed), mixed.new_empty(count, width)
-    kernels, device = _kernels(mixed, space_dim), mixed.device
+    row_count, count, space_dim = mixed.shape
+    device, form = rows.device, (space_dim, scalars, len(mixing), count, chiral)
+    rows_bar = torch.empty_like(rows)
+    if _is_for_warps(rows, form):
+        blocks = _block_count(row_count, count, PULL_WARPS)
+        blocks = min(blocks, BLOCKS_PER_PROCESSOR * processor_count(device))
+        partial_sums, mixing_bar = rows.new_empty(blocks, mixing.numel()), torch.empty_like(mixing)
+        kernels, block = row_kernels(*form), PULL_WARPS * WARP
+        launch(
+            kernels.pull_back_rows,
+            blocks * block,
+            device,
+            rows,
+            mixing,
+            mixed,
+            mixed_bar,
+            inputs_bar,
+            rows_bar,
+            partial_sums,
+            block_dim=block,
+        )
+        block = SUM_WARPS * WARP
+        size = -(-mixing.numel() // WARP) * block * with_mixing
+        launch(kernels.add_blocks, size, device, partial_sums, mixing_bar, block_dim=block)
+        return rows_bar, mixing_bar
+    kernels, total = _kernels(mixed, space_dim), torch.empty_like(mixed)
     launch(
         kernels.pull_back_products,
-        count * mixed_count,
+        row_count * count,
         device,
         scalars,
         int(chiral),
@@ -161,7 +220,7 @@ def _read_rows_backward(
     )
     launch(
         kernels.pull_back_rows,
-        count * len(mixing),
+        row_count * len(mixing),
         device,
         scalars,
         mixing,
@@ -169,19 +228,36 @@ def _read_rows_backward(
         total,
         rows_bar,
     )
-    return total, rows_bar
+    if not with_mixing:
+        return rows_bar, torch.empty_like(mixing)
+    # One product for all pairs of axes, of which those of an axis with itself count.
+    seen = rows[:, scalars : scalars + len(mixing) * space_dim]
+    pairs = (seen.T @ total.view(row_count, -1)).view(len(mixing), space_dim, count, space_dim)
+    return rows_bar, pairs.diagonal(dim1=1, dim2=3).sum(dim=-1)
 
 
 @_read_rows_backward.register_fake
-def _(
-    mixed: Tensor, mixing: Tensor, mixed_bar: Tensor, inputs_bar: Tensor, width: int, *rest: Any
-) -> tuple[Tensor, Tensor]:
-    return torch.empty_like(mixed), mixed.new_empty(mixed.shape[0], width)
+def _(rows: Tensor, mixing: Tensor, *rest: Any) -> tuple[Tensor, Tensor]:
+    return torch.empty_like(rows), torch.empty_like(mixing)
+
+
+def _steers_by_warps(mixed: Tensor, gate_count: int) -> tuple[int, int, bool] | None:
+    """Return the form of steering that has kernels of its own, None where it has none."""
+    count, space_dim = mixed.shape[1:]
+    chiral = gate_count > count
+    steered_alone = (space_dim, 0, 1, count, chiral)
+    return (space_dim, count, chiral) if _is_for_warps(mixed, steered_alone) else None
 
 
 @opaque("npa::steer_rows")
 def _steer_rows(output: Tensor, mixed: Tensor, signs: Tensor, width: int) -> Tensor:
     update = output.new_empty(len(output), width)
+    form = _steers_by_warps(mixed, len(signs))
+    if form is not None:
+        kernel, block = steering_kernels(*form).steer, STEER_WARPS * WARP
+        size = -(-len(output) // STEER_WARPS) * block
+        launch(kernel, size, output.device, output, mixed, signs, update, block_dim=block)
+        return update
     kernel = _kernels(output, mixed.shape[2]).steer
     launch(kernel, update.numel(), output.device, len(signs), output, mixed, signs, update)
     return update
@@ -197,18 +273,15 @@ def _steer_rows_backward(
     output: Tensor, mixed: Tensor, signs: Tensor, update_bar: Tensor
 ) -> tuple[Tensor, Tensor]:
     output_bar, mixed_bar = torch.empty_like(output), torch.empty_like(mixed)
-    launch(
-        _kernels(output, mixed.shape[2]).pull_back_steering,
-        output.numel(),
-        output.device,
-        len(signs),
-        output,
-        mixed,
-        signs,
-        update_bar,
-        output_bar,
-        mixed_bar,
-    )
+    tensors = output, mixed, signs, update_bar, output_bar, mixed_bar
+    form = _steers_by_warps(mixed, len(signs))
+    if form is not None:
+        kernel, block = steering_kernels(*form).pull_back_steering, STEER_WARPS * WARP
+        size = -(-len(output) // STEER_WARPS) * block
+        launch(kernel, size, output.device, *tensors, block_dim=block)
+        return output_bar, mixed_bar
+    kernel = _kernels(output, mixed.shape[2]).pull_back_steering
+    launch(kernel, output.numel(), output.device, len(signs), *tensors)
     return output_bar, mixed_bar
 
 
@@ -236,24 +309,17 @@ class _ReadRows(torch.autograd.Function):
     def backward(ctx: Any, mixed_bar: Tensor, inputs_bar: Tensor) -> tuple[Tensor | None, ...]:
         rows, mixing, mixed = ctx.saved_tensors
         form: VectorForm = ctx.form
-        total, rows_bar = _read_rows_backward(
-            mixed,
+        rows_bar, mixing_bar = _read_rows_backward(
+            rows,
             mixing,
+            mixed,
             mixed_bar.contiguous(),
             inputs_bar.contiguous(),
-            rows.shape[1],
             form.scalars,
             form.chiral,
+            ctx.needs_input_grad[1],
         )
-        mixing_bar = None
-        if ctx.needs_input_grad[1]:
-            # One product for all pairs of axes, of which those of an axis with itself count.
-            pairs = rows[:, form.scalars : form.perception_dim].T @ total.flatten(1).view(
-                len(rows), -1
-            )
-            axes = pairs.view(form.perceived, form.space_dim, form.mixed, form.space_dim)
-            mixing_bar = axes.diagonal(dim1=1, dim2=3).sum(dim=-1)
-        return rows_bar, mixing_bar, None, None
+        return rows_bar, mixing_bar if ctx.needs_input_grad[1] else None, None, None
 
 
 class _SteerRows(torch.autograd.Function):

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from npa_envs.kernels.access import WARP
 from npa_envs.kernels.cuda.network import (
+    SUM_WARPS,
     UNIT_GROUP,
     WARP_UNITS,
     arrangement_kernels,
@@ -258,10 +259,11 @@ def _weight_gradients(
     total = rows.new_empty(partial_sums.shape[1])
     launch(
         kernels.add_shares,
-        -(-total.shape[0] // WARP) * 4 * WARP,
+        -(-total.shape[0] // WARP) * SUM_WARPS * WARP,
         rows.device,
         partial_sums,
         total,
+        block_dim=SUM_WARPS * WARP,
     )
     return total
 

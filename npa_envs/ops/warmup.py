@@ -13,7 +13,7 @@ from npa_envs.ops.backend import SHARED_WORLD
 from npa_envs.ops.checks import DTYPES, entries
 from npa_envs.ops.draws import bernoulli_draw, integer_draw, normal_draw, uniform_draw
 from npa_envs.ops.episodes import EpisodeRules, PreparedJudgement
-from npa_envs.ops.equivariance import VectorForm, read_rows, steer_rows
+from npa_envs.ops.equivariance import MIXED_VECTORS, VectorForm, read_rows, steer_rows
 from npa_envs.ops.mean import world_mean
 from npa_envs.ops.network import arrange_weights, run_network
 from npa_envs.ops.passes import Terms
@@ -168,7 +168,7 @@ def _warm_products(x: torch.Tensor, width: int, out: int) -> None:
 
 def _warm_invariants(x: torch.Tensor, s: torch.Tensor) -> None:
     """What equivariant rules make of vectors."""
-    form = VectorForm(x.shape[2], 2 * s.shape[2], s.shape[2] + 1, 2, chiral=False)
+    form = VectorForm(x.shape[2], 2 * s.shape[2], s.shape[2] + 1, MIXED_VECTORS, chiral=False)
     rows = x.new_zeros(1, form.perception_dim + 1).requires_grad_()
     mixing = x.new_zeros(form.perceived, form.mixed)
     mixed, inputs = read_rows(rows, mixing, form, form.input_dim + 1)

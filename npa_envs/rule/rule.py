@@ -16,7 +16,7 @@ from npa_envs.ops.checks import (
     checked_moment_inverse,
     checked_positive,
 )
-from npa_envs.ops.equivariance import VectorForm, invariants, signed_gates, steered
+from npa_envs.ops.equivariance import MIXED_VECTORS, VectorForm, invariants, signed_gates, steered
 from npa_envs.rule.codes import Codes, check_names
 from npa_envs.rule.network import FOLD, FoldedInvariants, FoldedRule, Network, fold_weights
 
@@ -35,9 +35,6 @@ LIFE = 0
 
 FIRST_FATES = (5.0, -8.0)
 """Log odds of an untrained rule's particles to divide and to die, over staying."""
-
-MIXED_VECTORS = 8
-"""Mixed vectors of an equivariant rule where nothing is said."""
 
 
 class NamedAlways(TypedDict):

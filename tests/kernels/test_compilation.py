@@ -10,6 +10,7 @@ import warp as wp
 from npa_envs.kernels import native
 from npa_envs.kernels.cuda.adjoint import listed_adjoint
 from npa_envs.kernels.cuda.density import listed_density
+from npa_envs.kernels.cuda.equivariance import row_kernels, steering_kernels
 from npa_envs.kernels.cuda.network import (
     arrangement_kernels,
     two_layer_kernel,
@@ -35,6 +36,8 @@ VARIANTS: dict[str, Callable[[], Any]] = {
     "adjoint": lambda: listed_adjoint(3, 16, True, True, True).gather_state_cotangents,
     "network": lambda: two_layer_kernel(4, 2, "note"),
     "network's gradients": lambda: weight_gradient_kernels(4, 8, 2, 4, 1, 4).add_shares,
+    "vectors": lambda: row_kernels(2, 32, 17, 8, True).pull_back_rows,
+    "steering": lambda: steering_kernels(2, 8, True).steer,
     "pictures": lambda: block_kernels(wp.float32).pull_back_blocks,
     "errors of pictures": lambda: gather_errors(wp.float64),
 }
@@ -87,6 +90,9 @@ def cuda_engine():
     for mode in ("rectify", "note", "mask"):
         yield two_layer_kernel(5, 3, mode)
     yield weight_gradient_kernels(5, 9, 3, 4, 1, 4).sum_weight_gradients
+    for space_dim in (2, 3):
+        yield row_kernels(space_dim, 32, 17, 8, space_dim == 2).read_rows
+        yield steering_kernels(space_dim, 8, space_dim == 2).steer
 
 
 @pytest.mark.parametrize("capability", [TURING, MODERN[-1]])

@@ -1,5 +1,6 @@
 """Rules that know no direction: turned starts, kernels, files, and who runs such rules."""
 
+import copy
 import json
 import math
 
@@ -11,6 +12,7 @@ from worlds import assert_near, lively_rule, random_world, relative_error
 
 import npa_envs
 from npa_envs.cli import main
+from npa_envs.ops.equivariance import VectorForm, read_rows
 from npa_envs.rule.files import rule_metadata
 from npa_envs.rule.rule import NPARule
 
@@ -77,29 +79,50 @@ def test_plain_rules_and_mirrors_tell_where_it_ends():
     assert largest_difference(equivariant(chiral=True), x, s, mirror)[0] > 1e-3
 
 
+@pytest.mark.parametrize(("count", "mixed_vectors"), [(50, 8), (203, 8), (1, 8), (9, 33), (23, 5)])
+@pytest.mark.parametrize(("dtype", "bound"), [(torch.float64, 1e-13), (torch.float32, 1e-5)])
 @pytest.mark.parametrize("static", [False, True])
 @pytest.mark.parametrize("kind", KINDS)
-def test_kernels_of_rows_are_the_formulas(kind, static, device):
-    rule = equivariant(device, static=static, **KINDS[kind])
+def test_kernels_of_rows_are_the_formulas(kind, static, dtype, bound, count, mixed_vectors, device):
+    options = KINDS[kind] | {"mixed_vectors": mixed_vectors}
+    exact = equivariant(device, static=static, **options)
     with torch.no_grad():
         # What moves nothing learns to.
-        rule.steering[:1] = 0.0
+        exact.steering[:1] = 0.0
+    rule = copy.deepcopy(exact).to(dtype)
     network = rule.network()
-    z = torch.randn(50, rule.perception_dim, generator=torch.Generator().manual_seed(2)).double()
+    z = torch.randn(count, rule.perception_dim, generator=torch.Generator().manual_seed(2))
     rows = torch.nn.functional.pad(z, (0, network.row_width - rule.perception_dim))
     rows[:, rule.perception_dim] = 1.0
     rows = rows.to(device)
     found = []
-    for run, wide in ((network, rows), (rule, rows[:, : rule.perception_dim])):
+    for run, wide in ((network, rows.to(dtype)), (exact, rows[:, : rule.perception_dim].double())):
         wide = wide.clone().requires_grad_()
         update = run(wide)[:, : rule.update_dim]
-        weights = rule.network_weights()[: 4 if static else 5]
-        bar = torch.linspace(-1.0, 1.0, update.numel(), device=device).double().view_as(update)
+        weights = (exact if run is exact else rule).network_weights()[: 4 if static else 5]
+        bar = torch.linspace(-1.0, 1.0, update.numel(), device=device).to(update).view_as(update)
         gradients = torch.autograd.grad(update, (wide, *weights), bar)
         by_rows = gradients[0][:, : rule.perception_dim]
         found.append([update.detach(), by_rows, *gradients[1:]])
     for ours, theirs in zip(*found, strict=True):
-        assert relative_error(ours, theirs) < 1e-13
+        assert relative_error(ours.double(), theirs) < bound
+
+
+def test_rows_in_plenty_are_all_read(device):
+    form = VectorForm(2, 10, 6, 8, chiral=True)
+    generator = torch.Generator().manual_seed(4)
+    rows, mixing = (
+        torch.randn(*shape, generator=generator, dtype=torch.float64).to(device)
+        for shape in ((20_001, 24), (form.perceived, form.mixed))
+    )
+    found = []
+    for dtype in (torch.float32, torch.float64):
+        leaves = [value.to(dtype).requires_grad_() for value in (rows, mixing)]
+        mixed, inputs = read_rows(*leaves, form, form.input_dim + 3)
+        loss = (mixed.square().sum() + inputs.square().sum()) / len(rows)
+        found.append([mixed, inputs, *torch.autograd.grad(loss, leaves)])
+    for ours, theirs in zip(*found, strict=True):
+        assert relative_error(ours, theirs) < 1e-6
 
 
 @pytest.mark.parametrize("kind", ["chiral", "3D"])

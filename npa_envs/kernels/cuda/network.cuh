@@ -408,23 +408,31 @@ __device__ inline void weight_sums(
     }
 }
 
+template <int WARPS>
 __device__ inline void add_partial_sums(
     const wp::array_t<float>& partial_sums, const wp::array_t<float>& total)
 {
-    __shared__ float sums[4][32];
+    __shared__ float sums[WARPS][32];
     const int column = blockIdx.x * 32 + threadIdx.x % 32, warp = threadIdx.x / 32;
     const int count = partial_sums.shape[0], width = partial_sums.shape[1];
     float sum = 0.0f;
     if (column < width) {
         const float* from = partial_sums.data + column;
         #pragma unroll 8
-        for (int share = warp; share < count; share += 4) sum += from[(size_t)share * width];
+        for (int share = warp; share < count; share += WARPS) sum += from[(size_t)share * width];
     }
     sums[warp][threadIdx.x % 32] = sum;
     __syncthreads();
     if (warp == 0 && column < width) {
-        const int i = threadIdx.x;
-        total.data[column] = (sums[0][i] + sums[1][i]) + (sums[2][i] + sums[3][i]);
+        float parts[WARPS];
+        #pragma unroll
+        for (int k = 0; k < WARPS; ++k) parts[k] = sums[k][threadIdx.x];
+        #pragma unroll
+        for (int step = 1; step < WARPS; step *= 2) {
+            #pragma unroll
+            for (int k = 0; k + step < WARPS; k += 2 * step) parts[k] += parts[k + step];
+        }
+        total.data[column] = parts[0];
     }
 }
 

@@ -6,6 +6,7 @@ lie in a warp. float16 has little range, so a row is first scaled by a power of 
 
 import functools
 from types import SimpleNamespace
+from typing import Any
 
 import warp as wp
 
@@ -143,6 +144,8 @@ def weight_gradient_kernels(
             partial_sums,
         )
 
+    add_partial_sums = make_share_sum(SUM_WARPS)
+
     @wp.kernel(enable_backward=False, module=module)
     def add_shares(
         partial_sums: wp.array(dtype=wp.float32, ndim=2),
@@ -157,11 +160,21 @@ def weight_gradient_kernels(
     return SimpleNamespace(sum_weight_gradients=sum_weight_gradients, add_shares=add_shares)
 
 
-@native.func_native()
-def add_partial_sums(
-    partial_sums: wp.array(dtype=wp.float32, ndim=2), total: wp.array(dtype=wp.float32)
-):
-    """Add what the shares of rows summed, in a fixed order; blocks of 128 threads, 32 columns."""
+SUM_WARPS = 4
+"""Warps of a block that adds up what shares of the rows summed."""
+
+
+@functools.cache
+def make_share_sum(warps: int) -> Any:
+    """Return a Warp function that adds shares' sums; a block has so many warps, and 32 columns."""
+
+    @native.func_native(warps)
+    def add_partial_sums(
+        partial_sums: wp.array(dtype=wp.float32, ndim=2), total: wp.array(dtype=wp.float32)
+    ):
+        """Add what the shares of rows summed, in a fixed order."""
+
+    return add_partial_sums
 
 
 @native.func_native()

@@ -1,0 +1,180 @@
+"""Vectors of equivariant rules on CUDA, in float32: a warp shares a few rows.
+
+The formulas are those of `npa_envs/ops/equivariance.py`, as in `kernels/portable/equivariance.py`:
+fewer passes over the rows, and the gradient of the mixing weights on the way.
+"""
+
+import functools
+from types import SimpleNamespace
+
+import warp as wp
+
+from npa_envs.kernels import native
+from npa_envs.kernels.access import WARP, await_earlier
+from npa_envs.kernels.cuda.network import make_share_sum
+
+READ_WARPS, PULL_WARPS, STEER_WARPS, SUM_WARPS = 4, 8, 4, 16
+"""Warps of a block that reads rows, pulls back to them, steers, and adds up blocks' sums."""
+
+LARGEST_MIXING = 1024
+"""Most mixing weights: each thread sums gradients of every 32nd of them."""
+
+SHARED_BYTES = 48 * 1024
+"""Memory that a block may share without asking the driver for more."""
+
+
+def rows_of_warp(mixed: int) -> int:
+    """Return how many rows a warp has at a time."""
+    return min(max(WARP // mixed, 1), 4)
+
+
+def fits_block(space_dim: int, scalars: int, perceived: int, mixed: int, chiral: bool) -> bool:
+    """Return whether blocks have room for rows of such vectors."""
+    weights = perceived * mixed
+    products = mixed * (mixed + 1) // 2 + chiral * (mixed * (mixed - 1) // 2)
+    row = scalars + products + (perceived + 2 * mixed) * space_dim
+    floats = weights + PULL_WARPS * (weights + rows_of_warp(mixed) * row)
+    return weights <= LARGEST_MIXING and mixed < 256 and 4 * floats <= SHARED_BYTES
+
+
+@functools.cache
+def row_kernels(
+    space_dim: int, scalars: int, perceived: int, mixed: int, chiral: bool
+) -> SimpleNamespace:
+    """Return the kernels between rows and inputs of one form, dimensionless all of them.
+
+    Rows are [scalars | perceived vectors | 1 | 0], inputs [scalars | products | 1 | 0]; mixed
+    vectors [K, mixed, D] and mixing weights [perceived, mixed] are flat.
+
+    Args:
+        space_dim: Space dimension D.
+        scalars: Entries of a row before the first vector.
+        perceived: Vectors of a row.
+        mixed: Mixed vectors.
+        chiral: Whether there are cross products.
+    """
+    form = space_dim, scalars, perceived, mixed, chiral
+    module = native.module(f"npa_envs.kernels.vector_rows_{'_'.join(str(int(k)) for k in form)}")
+
+    @native.func_native(*form, READ_WARPS)
+    def read_vectors(
+        rows: wp.array(dtype=wp.float32, ndim=2),
+        mixing: wp.array(dtype=wp.float32),
+        mixed: wp.array(dtype=wp.float32),
+        inputs: wp.array(dtype=wp.float32, ndim=2),
+    ): ...
+
+    @native.func_native(*form, PULL_WARPS)
+    def pull_back_vectors(
+        rows: wp.array(dtype=wp.float32, ndim=2),
+        mixing: wp.array(dtype=wp.float32),
+        mixed: wp.array(dtype=wp.float32),
+        mixed_bar: wp.array(dtype=wp.float32),
+        inputs_bar: wp.array(dtype=wp.float32, ndim=2),
+        rows_bar: wp.array(dtype=wp.float32, ndim=2),
+        partial_sums: wp.array(dtype=wp.float32, ndim=2),
+    ): ...
+
+    add_partial_sums = make_share_sum(SUM_WARPS)
+
+    @wp.kernel(enable_backward=False, module=module)
+    def read_rows(
+        rows: wp.array(dtype=wp.float32, ndim=2),
+        mixing: wp.array(dtype=wp.float32),
+        # outputs
+        mixed: wp.array(dtype=wp.float32),
+        inputs: wp.array(dtype=wp.float32, ndim=2),
+    ):
+        """Write the mixed vectors and the inputs of rows."""
+        await_earlier()
+        read_vectors(rows, mixing, mixed, inputs)
+
+    @wp.kernel(enable_backward=False, module=module)
+    def pull_back_rows(
+        rows: wp.array(dtype=wp.float32, ndim=2),
+        mixing: wp.array(dtype=wp.float32),
+        mixed: wp.array(dtype=wp.float32),
+        mixed_bar: wp.array(dtype=wp.float32),
+        inputs_bar: wp.array(dtype=wp.float32, ndim=2),
+        # outputs
+        rows_bar: wp.array(dtype=wp.float32, ndim=2),
+        partial_sums: wp.array(dtype=wp.float32, ndim=2),
+    ):
+        """Write cotangents of rows, and each block's sum of those of the mixing weights."""
+        await_earlier()
+        pull_back_vectors(rows, mixing, mixed, mixed_bar, inputs_bar, rows_bar, partial_sums)
+
+    @wp.kernel(enable_backward=False, module=module, launch_bounds=SUM_WARPS * WARP)
+    def add_blocks(
+        partial_sums: wp.array(dtype=wp.float32, ndim=2),
+        # outputs
+        total: wp.array(dtype=wp.float32),
+    ):
+        """Add the blocks' sums."""
+        await_earlier()
+        add_partial_sums(partial_sums, total)
+
+    return SimpleNamespace(
+        read_rows=read_rows, pull_back_rows=pull_back_rows, add_blocks=add_blocks
+    )
+
+
+@functools.cache
+def steering_kernels(space_dim: int, mixed: int, chiral: bool) -> SimpleNamespace:
+    """Return the kernels between outputs and updates; a warp has a row.
+
+    Outputs are [gates | state changes | 0], updates [displacement | state changes | 0].
+
+    Args:
+        space_dim: Space dimension D.
+        mixed: Mixed vectors.
+        chiral: Whether there is a second gate for each mixed vector.
+    """
+    form = space_dim, mixed, chiral
+    module = native.module(f"npa_envs.kernels.steering_{'_'.join(str(int(k)) for k in form)}")
+
+    @native.func_native(*form, STEER_WARPS)
+    def steer_by_gates(
+        output: wp.array(dtype=wp.float32, ndim=2),
+        mixed: wp.array(dtype=wp.float32),
+        signs: wp.array(dtype=wp.float32),
+        update: wp.array(dtype=wp.float32, ndim=2),
+    ): ...
+
+    @native.func_native(*form, STEER_WARPS)
+    def pull_back_gates(
+        output: wp.array(dtype=wp.float32, ndim=2),
+        mixed: wp.array(dtype=wp.float32),
+        signs: wp.array(dtype=wp.float32),
+        update_bar: wp.array(dtype=wp.float32, ndim=2),
+        output_bar: wp.array(dtype=wp.float32, ndim=2),
+        mixed_bar: wp.array(dtype=wp.float32),
+    ): ...
+
+    @wp.kernel(enable_backward=False, module=module)
+    def steer(
+        output: wp.array(dtype=wp.float32, ndim=2),
+        mixed: wp.array(dtype=wp.float32),
+        signs: wp.array(dtype=wp.float32),
+        # outputs
+        update: wp.array(dtype=wp.float32, ndim=2),
+    ):
+        """Write the updates of gates and state changes."""
+        await_earlier()
+        steer_by_gates(output, mixed, signs, update)
+
+    @wp.kernel(enable_backward=False, module=module)
+    def pull_back_steering(
+        output: wp.array(dtype=wp.float32, ndim=2),
+        mixed: wp.array(dtype=wp.float32),
+        signs: wp.array(dtype=wp.float32),
+        update_bar: wp.array(dtype=wp.float32, ndim=2),
+        # outputs
+        output_bar: wp.array(dtype=wp.float32, ndim=2),
+        mixed_bar: wp.array(dtype=wp.float32),
+    ):
+        """Write cotangents of outputs and mixed vectors."""
+        await_earlier()
+        pull_back_gates(output, mixed, signs, update_bar, output_bar, mixed_bar)
+
+    return SimpleNamespace(steer=steer, pull_back_steering=pull_back_steering)
