@@ -610,13 +610,125 @@ def test_the_tables_of_more_cuts_have_the_numbers_of_their_file() -> None:
     assert [*row, f"{healed} of 768", f"{within} of 96 |"] in [cells[1:] for cells in told]
 
 
+REST_ARMS = {
+    "p2": "`--rest-power 2`",
+    "p4": "`--rest-power 4`",
+    "p2a1024": "`--rest-power 2 --rest-age 1024`",
+    "p4a1024": "**`--rest-power 4 --rest-age 1024`**",
+    "p2a2048": "`--rest-power 2 --rest-age 2048`",
+    "p4a2048": "`--rest-power 4 --rest-age 2048`",
+    "cuts8a2048": "`--rest-weight 8 --rest-age 2048`",
+}
+"""Rows of the table of rest, by the arms of its record that were looked at in full."""
+
+
+def test_the_table_of_rest_has_the_numbers_of_its_file() -> None:
+    page = (ROOT / "docs" / "recipes.md").read_text(encoding="utf-8")
+    section = page.split("### Rest of the fastest particles")[1].split("\n#### ")[0]
+    rows = content(RESULTS / "recipes_rest_h200.json")["development"]
+    looked = [row for row in rows if "worlds_within" in row]
+    for arm, changed in REST_ARMS.items():
+        own = [row for row in looked if row["arm"] == arm]
+        assert len(own) == 4
+        cells = []
+        for step in ("512", "5146", "100000"):
+            cells.append(f"{mean(row['loss_of_32'][step] for row in own):.3f}")
+        for name in ("cuts_healed", "disks_healed", "worlds_within"):
+            cells.append(f"{sum(row[name] for row in own)} of 128")
+        cells.append(f"{max(row['most_energies'][0] for row in own):.1f}")
+        assert f"| {changed} | {' | '.join(cells)} |" in section
+    stopped = [row for row in looked if row["arm"] not in REST_ARMS]
+    assert [row["arm"] for row in stopped] == ["p2w8a2048", "p2w8a2048", "p4w8a2048"]
+    assert f"({sum(row['worlds_within'] for row in stopped)} of these 96 worlds" in section
+    late = []
+    for arm in ("p2w8a2048", "p4w8a2048", "p4w8a1024", "p4a1024"):
+        late.append(mean(row["growth"]["512"] for row in rows if row["arm"] == arm))
+    told = re.findall(r"0\.\d{3}", section.split("of 8 seeds they have")[1])
+    assert told[:4] == [f"{loss:.3f}" for loss in late]
+
+
+def test_the_table_of_the_test_of_today_has_the_numbers_of_its_file() -> None:
+    page = (ROOT / "docs" / "recipes.md").read_text(encoding="utf-8")
+    section = page.split("#### The test of `best`\n")[1].split("\n### ")[0]
+    told = dict(re.findall(r"^\| (\S.*?) \| (.*) \|$", section, re.MULTILINE))
+    names = {
+        "mean of 12, or sum": "rest",
+        "(more cuts, `--rest-age 2048`)": "cuts",
+        "(`best` as it was)": "decay",
+    }
+    steps = (64, 128, 512, 1024, 4096, 20_000)
+    restless = {}
+    for title, name in names.items():
+        record = content(RESULTS / f"recipes_{name}_h200.json")
+        aged = {row["picture"]: row for row in record["long"]}
+        healed = {row["picture"]: row["healing"] for row in record["healing_of_32"]}
+        grown = {run["picture"]: losses_of(run) for run in record["test"]}
+        assert len(record["test"]) == len(grown) == len(aged) == len(healed) == 12
+        pictures: list[list[float]] = []
+        counts: list[list[int]] = []
+        for picture, losses in grown.items():
+            late = aged[picture]
+            pictures.append([losses[step] for step in steps] + [late["loss"]["100000"]])
+            counts.append([row["worlds_healed"] for row in healed[picture]])
+            counts[-1].append(late["worlds_within"])
+            if name == "rest":
+                cells = [f"{loss:.3f}" for loss in pictures[-1]]
+                pairs = zip(counts[-1], (32, 32, 8), strict=True)
+                cells += [f"{count} of {every}" for count, every in pairs]
+                assert told[picture.replace("-", " ")].split(" | ") == cells
+        cells = [f"{mean(column):.3f}" for column in zip(*pictures, strict=True)]
+        sums = [sum(column) for column in zip(*counts, strict=True)]
+        cells += [f"{count} of {every}" for count, every in zip(sums, (384, 384, 96), strict=True)]
+        assert told[title].split(" | ") == cells
+        worlds = [world for row in record["long"] for world in row["worlds"]]
+        restless[name] = sum(world["energy"] > 1.01 for world in worlds)
+        if name == "rest":
+            found, today, all_healed = grown, sums, sums[0] + sums[1]
+    assert f"{restless['rest']} of 96 ever have more than 1.01 times" in section
+    assert f"as it was, {restless['decay']} had" in section
+    # What the page says first is of this test as well.
+    reached = page.split("## What it reaches")[1].split("\n## ")[0]
+    worst = max(own[step] for own in found.values() for step in own if step >= 128)
+    means = {step: mean(own[step] for own in found.values()) for step in steps}
+    first = dict(re.findall(r"^\| (.*?) \|[^|]*\| (.*?) \|", reached, re.MULTILINE))
+    names = {"step 64": 64, "128": 128, "512": 512, "1024": 1024, "4096": 4096, "20 000": 20_000}
+    for title, step in names.items():
+        assert first[title] == f"{means[step]:.3f}"
+    assert first["worst picture from 128 on"] == f"{worst:.3f}"
+    healing = f"{100 * all_healed / 768:.1f} %"
+    assert first["damaged worlds healed in 500 steps"] == healing
+    assert f"{healing} ({all_healed} of 768)" in section
+    bounds = "worlds within the bounds of `npa-envs stress` for 100 000 steps"
+    assert first[bounds] == f"{today[2]} of 96"
+
+
+def test_the_table_of_the_library_has_the_numbers_of_its_file() -> None:
+    page = (ROOT / "docs" / "recipes.md").read_text(encoding="utf-8")
+    section = page.split("#### With rest of the fastest particles\n")[1].split("\n#### ")[0]
+    runs = content(RESULTS / "library_rest_h200.json")["runs"]
+    lines = [line for line in section.splitlines() if re.match(r"\| (`|shipped)", line)]
+    assert len(runs) == 6
+    for run, new, old in zip(runs, lines[::2], lines[1::2], strict=True):
+        for line, measured in ((new, run), (old, run["before"])):
+            losses = losses_of(measured)
+            cells = [f"{losses[step]:.3f}" for step in (64, 128, 512, 1024, 2048, 4096)]
+            cells += [f"{row['worlds_healed']} of 8" for row in measured["healing"]]
+            cells.append(str(run["command_seconds"]) if line is new else "")
+            name = f"`{run['target']}`, the one command" if line is new else "shipped before"
+            assert line == f"| {name} | {' | '.join(cells)} |"
+        card = run["target"] in ("butterfly", "flower", "octopus")
+        kept = run if card else run["before"]
+        shipped = {row["step"]: row["loss"] for row in scores(run["target"])["growth"]}
+        assert shipped == pytest.approx(losses_of(kept), rel=2e-3)
+
+
 MUON_ARM = "eighth, muon, from 16"
 """The preset `best` of 2D before it had a weight decay."""
 
 
 def test_the_tables_of_muon_have_the_numbers_of_their_files() -> None:
     page = (ROOT / "docs" / "recipes.md").read_text(encoding="utf-8")
-    section = page.split("\n## Muon\n")[1].split("### In `fast`")[0]
+    section = page.split("\n## Muon\n")[1].split("### More cuts and later rest")[0]
     told = dict(re.findall(r"^\| ([a-z0-9., -]+?)(?: \(.*\))? \| (.*) \|$", section, re.MULTILINE))
     record = content(RESULTS / "recipes_muon_h100.json")
     steps = ("64", "128", "512", "1024", "4096", "20000")
