@@ -18,6 +18,7 @@ from npa_envs.kernels.cuda.equivariance import (
     PULL_WARPS,
     READ_WARPS,
     STEER_WARPS,
+    STEERED_ROWS,
     SUM_WARPS,
     row_kernels,
     rows_of_warp,
@@ -123,7 +124,7 @@ def _is_for_warps(like: Tensor, form: tuple[int, int, int, int, bool]) -> bool:
     return choose("vectors", Request(like.device, like.dtype, vectors=form)).name == "cuda"
 
 
-BLOCKS_PER_PROCESSOR = 2
+BLOCKS_PER_PROCESSOR = 5
 """Blocks of a multiprocessor that pull back to rows, where there are many rows."""
 
 
@@ -255,7 +256,7 @@ def _steer_rows(output: Tensor, mixed: Tensor, signs: Tensor, width: int) -> Ten
     form = _steers_by_warps(mixed, len(signs))
     if form is not None:
         kernel, block = steering_kernels(*form).steer, STEER_WARPS * WARP
-        size = -(-len(output) // STEER_WARPS) * block
+        size = -(-len(output) // (STEERED_ROWS * STEER_WARPS)) * block
         launch(kernel, size, output.device, output, mixed, signs, update, block_dim=block)
         return update
     kernel = _kernels(output, mixed.shape[2]).steer
@@ -277,7 +278,7 @@ def _steer_rows_backward(
     form = _steers_by_warps(mixed, len(signs))
     if form is not None:
         kernel, block = steering_kernels(*form).pull_back_steering, STEER_WARPS * WARP
-        size = -(-len(output) // STEER_WARPS) * block
+        size = -(-len(output) // (STEERED_ROWS * STEER_WARPS)) * block
         launch(kernel, size, output.device, *tensors, block_dim=block)
         return output_bar, mixed_bar
     kernel = _kernels(output, mixed.shape[2]).pull_back_steering

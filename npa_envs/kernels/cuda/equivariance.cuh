@@ -24,6 +24,29 @@ template <int D, int SCALARS, int PERCEIVED, int MIXED, int CHIRAL> struct Vecto
     }
 };
 
+// Some columns of a warp's rows on their way to the memory that its block shares: all of them at
+// once, because a thread that stores what it has loaded waits for it. Of rows beyond the last: zeros.
+template <int ROWS, int COLUMNS> struct RowsOnTheWay {
+    float values[(ROWS * COLUMNS + 31) / 32];
+
+    __device__ void load(const float* from, int width, int count, int lane)
+    {
+        #pragma unroll
+        for (int k = 0; k < (ROWS * COLUMNS + 31) / 32; ++k) {
+            const int row = (lane + 32 * k) / COLUMNS, column = (lane + 32 * k) % COLUMNS;
+            values[k] = row < count ? from[(size_t)row * width + column] : 0.0f;
+        }
+    }
+
+    __device__ void store(float* to, int lane) const
+    {
+        #pragma unroll
+        for (int k = 0; k < (ROWS * COLUMNS + 31) / 32; ++k) {
+            if (lane + 32 * k < ROWS * COLUMNS) to[lane + 32 * k] = values[k];
+        }
+    }
+};
+
 // Write the mixed vectors of rows, and [scalars | products | 1 | 0].
 template <int D, int SCALARS, int PERCEIVED, int MIXED, int CHIRAL, int WARPS>
 __device__ inline void read_vectors(
@@ -37,21 +60,22 @@ __device__ inline void read_vectors(
     __shared__ float weights[Form::WEIGHTS];
     __shared__ unsigned short pairs[Form::DOTS + Form::CROSSES];
     __shared__ float row_of[WARPS][ROWS][ENTRIES], vectors_of[WARPS][ROWS][MIXED * D];
+    const int warp = threadIdx.x / 32, lane = threadIdx.x % 32;
+    const int width = rows.shape[1], out_width = inputs.shape[1];
+    const int first = (blockIdx.x * WARPS + warp) * ROWS;
+    const int count = max(min(ROWS, rows.shape[0] - first), 0);
+    RowsOnTheWay<ROWS, ENTRIES> seen;
+    seen.load(rows.data + (size_t)first * width, width, count, lane);
     for (int i = threadIdx.x; i < Form::WEIGHTS; i += blockDim.x) weights[i] = mixing.data[i];
     for (int i = threadIdx.x; i < MIXED * MIXED; i += blockDim.x) {
         const int a = i / MIXED, b = i % MIXED;
         if (a <= b) pairs[Form::dot_of(a, b)] = a << 8 | b;
         if (CHIRAL && a < b) pairs[Form::DOTS + Form::cross_of(a, b)] = a << 8 | b;
     }
-    const int warp = threadIdx.x / 32, lane = threadIdx.x % 32;
-    const int width = rows.shape[1], out_width = inputs.shape[1];
-    const int first = (blockIdx.x * WARPS + warp) * ROWS, count = min(ROWS, rows.shape[0] - first);
-    for (int r = 0; r < count; ++r) {
-        const float* from = rows.data + (size_t)(first + r) * width;
-        for (int i = lane; i < ENTRIES; i += 32) row_of[warp][r][i] = from[i];
-    }
+    seen.store(row_of[warp][0], lane);
     __syncthreads();
-    for (int i = lane; i < count * MIXED; i += 32) {
+    #pragma unroll
+    for (int i = lane; i < ROWS * MIXED; i += 32) {
         const int r = i / MIXED, a = i % MIXED;
         const float* vectors = row_of[warp][r] + SCALARS;
         float sum[D] = {};
@@ -63,17 +87,19 @@ __device__ inline void read_vectors(
         }
         float* to = mixed.data + (size_t)first * MIXED * D + i * D;
         #pragma unroll
-        for (int d = 0; d < D; ++d) to[d] = vectors_of[warp][r][a * D + d] = sum[d];
+        for (int d = 0; d < D; ++d) {
+            vectors_of[warp][r][a * D + d] = sum[d];
+            if (r < count) to[d] = sum[d];
+        }
     }
     __syncwarp();
-    for (int r = 0; r < count; ++r) {
-        float* to = inputs.data + (size_t)(first + r) * out_width;
-        for (int i = lane; i < out_width; i += 32) {
+    for (int i = lane; i < out_width; i += 32) {
+        const bool product = i >= SCALARS && i < Form::PRODUCTS_END;
+        const int pair = product ? pairs[i - SCALARS] : 0;
+        #pragma unroll
+        for (int r = 0; r < ROWS; ++r) {
             float value = 0.0f;
-            if (i < SCALARS) {
-                value = row_of[warp][r][i];
-            } else if (i < Form::PRODUCTS_END) {
-                const int pair = pairs[i - SCALARS];
+            if (product) {
                 const float* u = vectors_of[warp][r] + (pair >> 8) * D;
                 const float* v = vectors_of[warp][r] + (pair & 255) * D;
                 if (CHIRAL && i >= Form::FIRST_CROSS) {
@@ -82,10 +108,10 @@ __device__ inline void read_vectors(
                     #pragma unroll
                     for (int d = 0; d < D; ++d) value += u[d] * v[d];
                 }
-            } else if (i == Form::PRODUCTS_END) {
-                value = row_of[warp][r][Form::ROW_END];
+            } else if (i <= Form::PRODUCTS_END) {
+                value = row_of[warp][r][i < SCALARS ? i : Form::ROW_END];
             }
-            to[i] = value;
+            if (r < count) inputs.data[(size_t)(first + r) * out_width + i] = value;
         }
     }
 }
@@ -103,10 +129,11 @@ __device__ inline void pull_back_vectors(
 {
     using Form = VectorForm<D, SCALARS, PERCEIVED, MIXED, CHIRAL>;
     constexpr int ROWS = Form::ROWS, OWN = (Form::WEIGHTS + 31) / 32;
+    constexpr int TASKS = (ROWS * MIXED + 31) / 32, VECTORS = MIXED * D;
     // The weights of a mixed vector beside each other, as those who read them lie.
     __shared__ float weights[Form::WEIGHTS], sums[WARPS][Form::WEIGHTS];
     __shared__ float bar_of[WARPS][ROWS][Form::PRODUCTS_END], seen_of[WARPS][ROWS][PERCEIVED * D];
-    __shared__ float vectors_of[WARPS][ROWS][MIXED * D], total_of[WARPS][ROWS][MIXED * D];
+    __shared__ float vectors_of[WARPS][ROWS][VECTORS], total_of[WARPS][ROWS][VECTORS];
     for (int i = threadIdx.x; i < Form::WEIGHTS; i += blockDim.x) {
         weights[i % MIXED * PERCEIVED + i / MIXED] = mixing.data[i];
     }
@@ -117,55 +144,65 @@ __device__ inline void pull_back_vectors(
     const int stride = gridDim.x * WARPS * ROWS;
     for (int first = (blockIdx.x * WARPS + warp) * ROWS; first < rows.shape[0]; first += stride) {
         const int count = min(ROWS, rows.shape[0] - first);
-        for (int r = 0; r < count; ++r) {
-            const float* bars = inputs_bar.data + (size_t)(first + r) * in_width;
-            for (int i = lane; i < Form::PRODUCTS_END; i += 32) bar_of[warp][r][i] = bars[i];
-            const float* seen = rows.data + (size_t)(first + r) * width + SCALARS;
-            for (int i = lane; i < PERCEIVED * D; i += 32) seen_of[warp][r][i] = seen[i];
-        }
-        const size_t place = (size_t)first * MIXED * D;
-        for (int i = lane; i < count * MIXED * D; i += 32) {
-            vectors_of[warp][i / (MIXED * D)][i % (MIXED * D)] = mixed.data[place + i];
-        }
-        __syncwarp();
-        for (int i = lane; i < count * MIXED; i += 32) {
-            const int r = i / MIXED, a = i % MIXED;
-            const float* bars = bar_of[warp][r];
-            float total[D];
+        RowsOnTheWay<ROWS, Form::PRODUCTS_END> bars;
+        RowsOnTheWay<ROWS, PERCEIVED * D> seen;
+        RowsOnTheWay<ROWS, VECTORS> vectors;
+        bars.load(inputs_bar.data + (size_t)first * in_width, in_width, count, lane);
+        seen.load(rows.data + (size_t)first * width + SCALARS, width, count, lane);
+        vectors.load(mixed.data + (size_t)first * VECTORS, VECTORS, count, lane);
+        float total[TASKS][D];
+        #pragma unroll
+        for (int k = 0; k < TASKS; ++k) {
+            const int i = lane + 32 * k;
             #pragma unroll
-            for (int d = 0; d < D; ++d) total[d] = mixed_bar.data[place + i * D + d];
+            for (int d = 0; d < D; ++d) {
+                const bool there = i < count * MIXED;
+                total[k][d] = there ? mixed_bar.data[((size_t)first * MIXED + i) * D + d] : 0.0f;
+            }
+        }
+        bars.store(bar_of[warp][0], lane);
+        seen.store(seen_of[warp][0], lane);
+        vectors.store(vectors_of[warp][0], lane);
+        __syncwarp();
+        #pragma unroll
+        for (int k = 0; k < TASKS; ++k) {
+            const int r = (lane + 32 * k) / MIXED, a = (lane + 32 * k) % MIXED;
+            if (r >= ROWS) break;
+            const float* bars_of = bar_of[warp][r];
             #pragma unroll
             for (int b = 0; b < MIXED; ++b) {
                 const float* other = vectors_of[warp][r] + b * D;
-                float bar = bars[SCALARS + Form::dot_of(a, b)];
+                float bar = bars_of[SCALARS + Form::dot_of(a, b)];
                 if (a == b) bar += bar;
                 #pragma unroll
-                for (int d = 0; d < D; ++d) total[d] += bar * other[d];
+                for (int d = 0; d < D; ++d) total[k][d] += bar * other[d];
                 if (CHIRAL && a != b) {
-                    bar = bars[Form::FIRST_CROSS + Form::cross_of(a, b)];
+                    bar = bars_of[Form::FIRST_CROSS + Form::cross_of(a, b)];
                     if (a > b) bar = -bar;
-                    total[0] += bar * other[1];
-                    total[1] -= bar * other[0];
+                    total[k][0] += bar * other[1];
+                    total[k][1] -= bar * other[0];
                 }
             }
             #pragma unroll
-            for (int d = 0; d < D; ++d) total_of[warp][r][a * D + d] = total[d];
+            for (int d = 0; d < D; ++d) total_of[warp][r][a * D + d] = total[k][d];
         }
         __syncwarp();
-        for (int r = 0; r < count; ++r) {
-            float* to = rows_bar.data + (size_t)(first + r) * width;
-            for (int i = lane; i < SCALARS; i += 32) to[i] = bar_of[warp][r][i];
-            for (int i = Form::ROW_END + lane; i < width; i += 32) to[i] = 0.0f;
+        #pragma unroll
+        for (int r = 0; r < ROWS; ++r) {
             #pragma unroll
             for (int k = 0; k < OWN; ++k) {
                 const int weight = lane + 32 * k;
                 if (weight < Form::WEIGHTS) {
-                    const float* seen = seen_of[warp][r] + weight / MIXED * D;
-                    const float* total = total_of[warp][r] + weight % MIXED * D;
+                    const float* from = seen_of[warp][r] + weight / MIXED * D;
+                    const float* to = total_of[warp][r] + weight % MIXED * D;
                     #pragma unroll
-                    for (int d = 0; d < D; ++d) own[k] += seen[d] * total[d];
+                    for (int d = 0; d < D; ++d) own[k] += from[d] * to[d];
                 }
             }
+            if (r >= count) continue;
+            float* to = rows_bar.data + (size_t)(first + r) * width;
+            for (int i = lane; i < SCALARS; i += 32) to[i] = bar_of[warp][r][i];
+            for (int i = Form::ROW_END + lane; i < width; i += 32) to[i] = 0.0f;
         }
         for (int i = lane; i < count * PERCEIVED; i += 32) {
             const int r = i / PERCEIVED, k = i % PERCEIVED;
@@ -195,8 +232,9 @@ __device__ inline void pull_back_vectors(
     }
 }
 
-// Write updates [δ | Δs | 0] of gates and state changes [g | Δs | 0]: a warp has a row.
-template <int D, int MIXED, int CHIRAL, int WARPS>
+// Write updates [δ | Δs | 0] of gates and state changes [g | Δs | 0]. A warp has a few rows, whose
+// loads are on their way together.
+template <int D, int MIXED, int CHIRAL, int WARPS, int ROWS>
 __device__ inline void steer_by_gates(
     const wp::array_t<float>& output,
     const wp::array_t<float>& mixed,
@@ -204,40 +242,57 @@ __device__ inline void steer_by_gates(
     const wp::array_t<float>& update)
 {
     constexpr int GATES = CHIRAL ? 2 * MIXED : MIXED;
-    const int row = blockIdx.x * WARPS + threadIdx.x / 32, lane = threadIdx.x % 32;
-    if (row >= output.shape[0]) return;
+    const int first = (blockIdx.x * WARPS + threadIdx.x / 32) * ROWS, lane = threadIdx.x % 32;
+    const int count = min(ROWS, output.shape[0] - first);
+    if (count <= 0) return;
     const int in_width = output.shape[1], width = update.shape[1];
-    const float* from = output.data + (size_t)row * in_width;
-    const float* vectors = mixed.data + (size_t)row * MIXED * D;
-    float* to = update.data + (size_t)row * width;
+    const float* from = output.data + (size_t)first * in_width;
+    const float* vectors = mixed.data + (size_t)first * MIXED * D;
+    float* to = update.data + (size_t)first * width;
+    float sum[ROWS][D] = {};
+    for (int g = lane; g < GATES; g += 32) {
+        const float sign = signs.data[g];
+        #pragma unroll
+        for (int r = 0; r < ROWS; ++r) {
+            if (r >= count) continue;
+            const float gate = fmaxf(from[r * in_width + g], 0.0f) * sign;
+            const float* u = vectors + (r * MIXED + g % MIXED) * D;
+            if (CHIRAL && g >= MIXED) {
+                sum[r][0] -= gate * u[1];
+                sum[r][1] += gate * u[0];
+            } else {
+                #pragma unroll
+                for (int d = 0; d < D; ++d) sum[r][d] += gate * u[d];
+            }
+        }
+    }
     for (int i = D + lane; i < width; i += 32) {
         const int place = GATES + i - D;
-        to[i] = place < in_width ? from[place] : 0.0f;
-    }
-    float sum[D] = {};
-    for (int g = lane; g < GATES; g += 32) {
-        const float gate = fmaxf(from[g], 0.0f) * signs.data[g];
-        const float* u = vectors + g % MIXED * D;
-        if (CHIRAL && g >= MIXED) {
-            sum[0] -= gate * u[1];
-            sum[1] += gate * u[0];
-        } else {
-            #pragma unroll
-            for (int d = 0; d < D; ++d) sum[d] += gate * u[d];
+        float change[ROWS];
+        #pragma unroll
+        for (int r = 0; r < ROWS; ++r) {
+            change[r] = r < count && place < in_width ? from[r * in_width + place] : 0.0f;
+        }
+        #pragma unroll
+        for (int r = 0; r < ROWS; ++r) {
+            if (r < count) to[r * width + i] = change[r];
         }
     }
     #pragma unroll
-    for (int d = 0; d < D; ++d) {
+    for (int r = 0; r < ROWS; ++r) {
         #pragma unroll
-        for (int offset = 16; offset > 0; offset >>= 1) {
-            sum[d] += __shfl_xor_sync(~0u, sum[d], offset);
+        for (int d = 0; d < D; ++d) {
+            #pragma unroll
+            for (int offset = 16; offset > 0; offset >>= 1) {
+                sum[r][d] += __shfl_xor_sync(~0u, sum[r][d], offset);
+            }
+            if (lane == d && r < count) to[r * width + d] = sum[r][d];
         }
-        if (lane == d) to[d] = sum[d];
     }
 }
 
 // Write the cotangents of what `steer_by_gates` reads.
-template <int D, int MIXED, int CHIRAL, int WARPS>
+template <int D, int MIXED, int CHIRAL, int WARPS, int ROWS>
 __device__ inline void pull_back_gates(
     const wp::array_t<float>& output,
     const wp::array_t<float>& mixed,
@@ -247,40 +302,65 @@ __device__ inline void pull_back_gates(
     const wp::array_t<float>& mixed_bar)
 {
     constexpr int GATES = CHIRAL ? 2 * MIXED : MIXED;
-    const int row = blockIdx.x * WARPS + threadIdx.x / 32, lane = threadIdx.x % 32;
-    if (row >= output.shape[0]) return;
+    const int first = (blockIdx.x * WARPS + threadIdx.x / 32) * ROWS, lane = threadIdx.x % 32;
+    const int count = min(ROWS, output.shape[0] - first);
+    if (count <= 0) return;
     const int in_width = output.shape[1], width = update_bar.shape[1];
-    const float* from = output.data + (size_t)row * in_width;
-    const float* vectors = mixed.data + (size_t)row * MIXED * D;
-    const float* bars = update_bar.data + (size_t)row * width;
-    float* to = output_bar.data + (size_t)row * in_width;
-    float pull[D];
+    const float* from = output.data + (size_t)first * in_width;
+    const float* vectors = mixed.data + (size_t)first * MIXED * D;
+    const float* bars = update_bar.data + (size_t)first * width;
+    float* to = output_bar.data + (size_t)first * in_width;
+    float* vectors_to = mixed_bar.data + (size_t)first * MIXED * D;
+    float pull[ROWS][D] = {};
     #pragma unroll
-    for (int d = 0; d < D; ++d) pull[d] = bars[d];
-    for (int i = lane; i < in_width; i += 32) {
-        float value = 0.0f;
-        if (i >= GATES) {
-            if (i - GATES + D < width) value = bars[i - GATES + D];
-        } else if (from[i] > 0.0f) {
-            const float* u = vectors + i % MIXED * D;
-            if (CHIRAL && i >= MIXED) {
-                value = u[0] * pull[1] - u[1] * pull[0];
-            } else {
-                #pragma unroll
-                for (int d = 0; d < D; ++d) value += u[d] * pull[d];
-            }
-            value *= signs.data[i];
+    for (int r = 0; r < ROWS; ++r) {
+        #pragma unroll
+        for (int d = 0; d < D; ++d) {
+            if (r < count) pull[r][d] = bars[r * width + d];
         }
-        to[i] = value;
+    }
+    for (int i = lane; i < in_width; i += 32) {
+        const float sign = i < GATES ? signs.data[i] : 0.0f;
+        float value[ROWS] = {};
+        #pragma unroll
+        for (int r = 0; r < ROWS; ++r) {
+            if (r >= count) continue;
+            if (i >= GATES) {
+                if (i - GATES + D < width) value[r] = bars[r * width + i - GATES + D];
+            } else {
+                const float* u = vectors + (r * MIXED + i % MIXED) * D;
+                if (CHIRAL && i >= MIXED) {
+                    value[r] = u[0] * pull[r][1] - u[1] * pull[r][0];
+                } else {
+                    #pragma unroll
+                    for (int d = 0; d < D; ++d) value[r] += u[d] * pull[r][d];
+                }
+                value[r] = from[r * in_width + i] > 0.0f ? sign * value[r] : 0.0f;
+            }
+        }
+        #pragma unroll
+        for (int r = 0; r < ROWS; ++r) {
+            if (r < count) to[r * in_width + i] = value[r];
+        }
     }
     for (int i = lane; i < MIXED * D; i += 32) {
         const int a = i / D, d = i % D;
-        float value = fmaxf(from[a], 0.0f) * signs.data[a] * bars[d];
-        if (CHIRAL) {
-            const float turned = d == 0 ? -pull[1] : pull[0];
-            value -= fmaxf(from[MIXED + a], 0.0f) * signs.data[MIXED + a] * turned;
+        const float sign = signs.data[a], turned_sign = CHIRAL ? signs.data[MIXED + a] : 0.0f;
+        float value[ROWS];
+        #pragma unroll
+        for (int r = 0; r < ROWS; ++r) {
+            if (r >= count) continue;
+            const float* gates = from + r * in_width;
+            value[r] = fmaxf(gates[a], 0.0f) * sign * bars[r * width + d];
+            if (CHIRAL) {
+                const float turned = d == 0 ? -pull[r][1] : pull[r][0];
+                value[r] -= fmaxf(gates[MIXED + a], 0.0f) * turned_sign * turned;
+            }
         }
-        mixed_bar.data[(size_t)row * MIXED * D + i] = value;
+        #pragma unroll
+        for (int r = 0; r < ROWS; ++r) {
+            if (r < count) vectors_to[r * MIXED * D + i] = value[r];
+        }
     }
 }
 

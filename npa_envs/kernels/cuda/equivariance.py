@@ -13,8 +13,11 @@ from npa_envs.kernels import native
 from npa_envs.kernels.access import WARP, await_earlier
 from npa_envs.kernels.cuda.network import make_share_sum
 
-READ_WARPS, PULL_WARPS, STEER_WARPS, SUM_WARPS = 4, 8, 4, 16
+READ_WARPS, PULL_WARPS, STEER_WARPS, SUM_WARPS = 4, 4, 4, 16
 """Warps of a block that reads rows, pulls back to them, steers, and adds up blocks' sums."""
+
+STEERED_ROWS = 2
+"""Rows that a warp steers."""
 
 LARGEST_MIXING = 1024
 """Most mixing weights: each thread sums gradients of every 32nd of them."""
@@ -121,7 +124,7 @@ def row_kernels(
 
 @functools.cache
 def steering_kernels(space_dim: int, mixed: int, chiral: bool) -> SimpleNamespace:
-    """Return the kernels between outputs and updates; a warp has a row.
+    """Return the kernels between outputs and updates; a warp has `STEERED_ROWS` rows.
 
     Outputs are [gates | state changes | 0], updates [displacement | state changes | 0].
 
@@ -133,7 +136,7 @@ def steering_kernels(space_dim: int, mixed: int, chiral: bool) -> SimpleNamespac
     form = space_dim, mixed, chiral
     module = native.module(f"npa_envs.kernels.steering_{'_'.join(str(int(k)) for k in form)}")
 
-    @native.func_native(*form, STEER_WARPS)
+    @native.func_native(*form, STEER_WARPS, STEERED_ROWS)
     def steer_by_gates(
         output: wp.array(dtype=wp.float32, ndim=2),
         mixed: wp.array(dtype=wp.float32),
@@ -141,7 +144,7 @@ def steering_kernels(space_dim: int, mixed: int, chiral: bool) -> SimpleNamespac
         update: wp.array(dtype=wp.float32, ndim=2),
     ): ...
 
-    @native.func_native(*form, STEER_WARPS)
+    @native.func_native(*form, STEER_WARPS, STEERED_ROWS)
     def pull_back_gates(
         output: wp.array(dtype=wp.float32, ndim=2),
         mixed: wp.array(dtype=wp.float32),
