@@ -199,20 +199,22 @@ _MEASURED: Mapping[str, Mapping[str, Any]] = {
         "lifetimes": (64, 16_384),
         "second_lives": 0.0,
         "damage_share": 0.25,
+        "rest_age": 512,
+        "rest_power": 1.0,
     },
     "fast": {**HALF_SEEDS, "learning_rate": 4e-3},
 }
 """What presets had when several species were measured (docs/species.md); Muon was not."""
 
-_HIDDEN: Mapping[str, int] = {"fast": 64}
-"""Width of the hidden layer that they had then."""
+_OWN: Mapping[str, Mapping[str, Any]] = {"best": {"cut_share": 0.25}, "fast": {"hidden_dim": 64}}
+"""What each species had then."""
 
 
 def _beside(
     name: str, alone: Morphogenesis2DTrainConfig, neighbour: str
 ) -> JointTrainConfig[CoMorphogenesis2DConfig]:
     """Return a run of one species, with another one of the same kind beside it."""
-    own = dataclasses.replace(alone.task, hidden_dim=_HIDDEN.get(name, alone.task.hidden_dim))
+    own = dataclasses.replace(alone.task, **_OWN.get(name, {}))
     species = (own, dataclasses.replace(own, target=neighbour))
     run = {field.name: getattr(alone, field.name) for field in dataclasses.fields(alone)}
     run["task"] = CoMorphogenesis2DConfig(species=species, distance=DISTANCE)
