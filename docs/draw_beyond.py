@@ -43,7 +43,7 @@ COUNTS, RADII = (0.125, 0.25, 1.0, 4.0, 8.0), (0.5, 0.7, 1.0, 1.4, 2.0)
 GROWTH = (4, 8, 12, 16, 24, 32, 64, 128)
 """Steps at which worlds that grow from one particle are drawn."""
 
-HEALING = 64
+HEALING = (16, 128)
 """Steps after half of their particles are gone."""
 
 COLUMNS = 5
@@ -174,7 +174,7 @@ def sizes(paths: list[str]) -> Shots:
 
 
 def division(paths: list[str]) -> Shots:
-    """Return a world that grows from one particle, loses one half, and grows it again."""
+    """Return a world that grows from one particle, loses a half, and grows it again."""
     rule = npa_envs.load_rule(paths[0])
     task = task_of(paths[0], rule)
     x, s = task.seed(1, generator=torch.Generator())
@@ -184,12 +184,15 @@ def division(paths: list[str]) -> Shots:
         x, s = run(rule, task, x, s, steps - step, seed=SEEDS[0] + steps)
         step = steps
         shots.append((f"step {step}: {int(living(s).sum())}", as_it_lies(task, x, s)))
-    middle = x[living(s)][:, 0].median()
-    s = torch.where((x[..., :1] > middle) & living(s)[..., None], 0.0, s)
-    shots.append((f"half is gone: {int(living(s).sum())}", as_it_lies(task, x, s)))
-    for steps in (8, 16, HEALING):
-        y, u = run(rule, task, x, s, steps, seed=SEEDS[1])
-        shots.append((f"{steps} later: {int(living(u).sum())}", as_it_lies(task, y, u)))
+    alive = living(s)
+    second = alive.cumsum(dim=1) % 2 == 0
+    side = x[..., 0] > x[alive][:, 0].median()
+    for name, gone in (("each second gone", second), ("one side gone", side)):
+        y, u = x, torch.where(gone[..., None], 0.0, s)
+        shots.append((f"{name}: {int(living(u).sum())}", as_it_lies(task, y, u)))
+        for later, before in zip(HEALING, (0, *HEALING), strict=False):
+            y, u = run(rule, task, y, u, later - before, seed=SEEDS[1] + later)
+            shots.append((f"{later} later: {int(living(u).sum())}", as_it_lies(task, y, u)))
     return shots
 
 

@@ -23,7 +23,7 @@ from npa_envs.tasks.targets.images import LARGEST_POINT_COUNT
 from npa_envs.tasks.targets.points import PointTarget, load_target
 from npa_envs.tasks.train_config import TrainConfig, fast_run, tiny_run
 from npa_envs.world.division import living
-from npa_envs.world.randomness import Randomness, WorldRandom
+from npa_envs.world.randomness import Randomness, WorldRandom, uniform_draws
 
 LARGEST_CODE = 1024
 """Numbers of a code, at most."""
@@ -65,7 +65,8 @@ class Morphogenesis2DConfig(GrowthConfig):
     """Grow the picture's whole rectangle, white where it is transparent: for photographs."""
 
     damage_radius: float = 0.1
-    """Radius of the disk whose state is erased in worlds from the pool [length units]; 0: none."""
+    """Radius of the disk whose state is erased in worlds from the pool [length units]; 0: none. Of
+    worlds that divide each particle dies with probability one half instead, wherever it is."""
 
     resolution: int = 256
     """Pixels on each side of the picture that the loss compares, R."""
@@ -169,6 +170,9 @@ FINER_STEP = 0.4
 
 FINER_TIMES = 4
 """How often that is done."""
+
+SURVIVING = 0.5
+"""Probability of a particle to survive damage, in worlds whose particles divide (dimensionless)."""
 
 UNSEEN = 1e3
 """Coordinate of what no picture shows [length units]."""
@@ -292,9 +296,12 @@ class Morphogenesis2D(GrowthTask[Morphogenesis2DConfig]):
         return torch.cat((code, s[..., len(self._code) :]), dim=-1)
 
     def damage(self, x: Tensor, s: Tensor, generator: Randomness) -> tuple[Tensor, Tensor]:
-        """Return the worlds damaged; what is erased of one that divides is dead, but never all."""
+        """Return the worlds damaged; of one that divides particles die, but never all."""
         damaged_x, damaged_s = super().damage(x, s, generator)
-        if self.config.division:
+        if self.config.division and self.config.damage_radius > 0.0:
+            # Children of a crowd that is thinned learn who they are among its grown particles.
+            stay = uniform_draws(generator, x.shape[:2], x) < SURVIVING
+            damaged_s = torch.where(stay[..., None], s, 0.0)
             left = living(damaged_s).any(dim=1)[:, None, None]
             damaged_s = torch.where(left, damaged_s, s)
         return damaged_x, damaged_s

@@ -75,17 +75,18 @@ def divided(
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Let updated particles divide, stay or die; differentiable.
 
-    A child takes its parent's state; they move apart from where the parent was, each half of the
-    way. The k-th child of a world takes its k-th dead slot; where there are more children than
-    slots, the last are not born, and their parents stay where they are. The last living particle of
-    a world does not die. Dead slots get states of 0, and the mean position of the living, so that
-    means over all slots are those of the living.
+    A child is born with states of 0: who it is it learns from those around it. Parent and child
+    move apart from where the parent was, each half of the way. The k-th child of a world takes its
+    k-th dead slot; where there are more children than slots, the last are not born, and their
+    parents stay where they are. The last living particle of a world does not die. Dead slots get
+    states of 0, and the mean position of the living, so that means over all slots are those of the
+    living.
 
     Fates are discrete. What is differentiable is life: its value stays 1, and at each update it is
     multiplied by m / m', with m = 1 + p - d the expected number of particles that come of one, p
-    and d its probabilities to divide and to die, and m' the same without gradient. Children inherit
-    it. So the gradient of a sum over the living, weighted by life, is on average that of its
-    expected value, as long as particles do not feel each other.
+    and d its probabilities to divide and to die, and m' the same without gradient. It is all that
+    children inherit. So the gradient of a sum over the living, weighted by life, is on average that
+    of its expected value, as long as particles do not feel each other.
 
     Args:
         x: Positions after the update [length units], shape [B, N, D].
@@ -120,9 +121,9 @@ def divided(
     room = parents | (children < slots)
     offspring = (1.0 + torch.where(room, divide, 0.0) - die).clamp_min(FEWEST_OFFSPRING)
     life = s[..., LIFE] * torch.where(updated, offspring / offspring.detach(), 1.0)
-    s = torch.cat((life[..., None], s[..., LIFE + 1 :]), dim=-1)
-    s = torch.where((alive & ~dying)[..., None], s, 0.0)
-    s = s.gather(1, source[..., None].expand_as(s))
+    life = torch.where(alive & ~dying, life, 0.0).gather(1, source)
+    states = torch.where((alive & ~dying)[..., None], s[..., LIFE + 1 :], 0.0)
+    s = torch.cat((life[..., None], states), dim=-1)
     half_way = 0.5 * CHILD_DISTANCE * eps / space_dim**0.5 * births.direction
     half_way = torch.where(parents[..., None], half_way, 0.0)
     children_x = (x + half_way).gather(1, source[..., None].expand_as(x))

@@ -531,14 +531,16 @@ BIRTHS = (
     ("blanksym25", "a = 2", "blank, apart, half as far"),
     ("thin", "a = 2", "blank, apart, thinned"),
     ("fastplain", "a = 5", "inherit, and only they move"),
-    ("fastsym", "**a = 5**", "**apart**"),
+    ("fastsym", "a = 5", "apart"),
     ("fastsymthin", "a = 5", "apart, thinned"),
     ("fastblank", "a = 5", "blank"),
     ("fast fast-s1", "a = 5", "blank, apart"),
     ("fast25", "a = 5", "blank, apart, half as far"),
     ("fastthin", "a = 5", "blank, apart, thinned"),
     ("fastthin2000", "a = 5", "blank, apart, thinned, 2000 iterations"),
-    ("fastallthin", "a = 5", "blank, apart, all thinned"),
+    ("fastallthin", "**a = 5**", "**blank, apart, all thinned**"),
+    ("fastside", "a = 5", "blank, apart, half thinned, half one side"),
+    ("fastallside", "a = 5", "blank, apart, all one side"),
     ("fasthalf", "a = 5", "half inherited, apart, thinned"),
 )
 """Rows of the table of births: rules of its record, how fates begin, what children do."""
@@ -567,15 +569,61 @@ def test_the_tables_of_births_have_the_numbers_of_their_files() -> None:
     assert not rules
     for name in ("fastsym", "fast fast-s1", "fastthin", "fastthin2000", "fastallthin"):
         assert ratios[name] in section
-    full = content(RESULTS / "division_blank_h200.json")["rules"]
+
+
+def test_the_tables_of_division_at_full_size_have_the_numbers_of_their_files() -> None:
+    page = (ROOT / "docs" / "beyond.md").read_text(encoding="utf-8")
     section = page.split("**From one particle to 4096**")[1].split("\n### ")[0]
-    for rule in full.values():
-        row = " | ".join(f"{mean(cells):.3f}" for cells in rule["grown"].values())
-        assert f" | {row} |" in section
-    late = [mean(full[f"heart-{kind}"]["grown"]["512"]) for kind in ("division", "disk")]
-    assert f"{late[0] / late[1]:.2f} times" in section
+
+    def mean(row: dict[str, Any]) -> float:
+        return statistics.mean(row["loss"])
+
+    def cells(rows: dict[str, Any]) -> str:
+        return " | ".join(f"{mean(row):.3f}" for row in rows.values())
+
+    for name in ("division_blank_h200", "division_thinned_h200"):
+        rules = content(RESULTS / f"{name}.json")["rules"]
+        for rule in rules.values():
+            assert f" | {cells(rule['grown'])} |" in section
+        disk = mean(rules["heart-disk"]["grown"]["512"])
+        for kind, rule in rules.items():
+            if kind in ("heart-division", "heart-division-inheriting"):
+                assert f"{mean(rule['grown']['512']) / disk:.2f} times" in section
+    inheriting = rules["heart-division-inheriting"]
+    for rule in (rules["heart-division"], inheriting):
+        for half, told in (("each second", "each second one"), ("one side", "one side")):
+            assert f"| {told} | {cells(rule[half])} |" in section
+    healed = rules["heart-division"]["each second"]["256"]
+    grown = rules["heart-division"]["grown"]["512"]
+    assert f"{mean(healed):.3f} after 128 steps, {mean(healed) / mean(grown):.2f} times" in section
+    blank = content(RESULTS / "division_blank_h200.json")["rules"]["heart-division"]
     for half in ("each second", "one side"):
-        assert f"{mean(full['heart-division'][half]['256']):.3f} instead of" in section
+        assert f"{mean(blank[half]['256']):.3f} instead of" in section
+
+
+def test_the_times_of_rules_that_know_no_direction_are_those_of_their_file() -> None:
+    page = (ROOT / "docs" / "beyond.md").read_text(encoding="utf-8")
+    (table,) = re.findall(r"\| rule \| H200, b4f51e9.*?\n\n", page, re.DOTALL)
+    lines = table.strip().splitlines()[2:]
+    runs = content(RESULTS / "directions_time_warps.json")["runs"]
+
+    def span(numbers: list[float], places: int) -> str:
+        ends = sorted({f"{min(numbers):.{places}f}", f"{max(numbers):.{places}f}"}, key=float)
+        return "–".join(ends)
+
+    for line, told in zip(lines, ("plain", "mirrored", "chiral"), strict=True):
+        cells = []
+        for commit in ("b4f51e9", "b48e29b"):
+            for way in ("inference", "training"):
+                found = [run["steps"] for run in runs if run["commit"] == commit]
+                times = [steps[f"8 x 4096, {told}"][way] for steps in found]
+                ratios = [
+                    time / steps["8 x 4096, plain"][way]
+                    for time, steps in zip(times, found, strict=True)
+                ]
+                ratio = "" if told == "plain" else f" ({span(ratios, 2)})"
+                cells.append(f"{span(times, 0)}{ratio}")
+        assert line.split("| ", 2)[2] == " | ".join(cells) + " |"
 
 
 def test_the_tables_of_more_cuts_have_the_numbers_of_their_file() -> None:
