@@ -567,6 +567,15 @@ def test_the_tables_of_births_have_the_numbers_of_their_files() -> None:
         grown = statistics.mean(mean(rule["grown"]["512"]) for rule in found)
         ratios[names] = f"{grown / mean(disk['grown']['512']):.2f} times"
     assert not rules
+    record = content(RESULTS / "division_births_cpu.json")
+    blank, inheriting = (record[f"of_256_particles{kind}"] for kind in ("_born_blank", ""))
+    alone = content(RESULTS / "division_muon_cpu.json")["rules"]["disk128"]
+    grown = mean(blank["grown"]["512"])
+    times = grown / mean(alone["grown"]["512"])
+    assert f"bring {grown:.3f} at step 512, {times:.2f} times" in section
+    for half in ("each second", "one side"):
+        told = f"{mean(blank[half]['256']):.3f} instead of {mean(inheriting[half]['256']):.3f}"
+        assert told in section
     for name in ("fastsym", "fast fast-s1", "fastthin", "fastthin2000", "fastallthin"):
         assert ratios[name] in section
 
