@@ -15,11 +15,12 @@ from torch import Tensor
 
 from npa_envs.kernels.access import WARP
 from npa_envs.kernels.cuda.equivariance import (
+    MIXING_SUM_WARPS,
     PULL_WARPS,
     READ_WARPS,
     STEER_WARPS,
     STEERED_ROWS,
-    SUM_WARPS,
+    mixing_sum,
     row_kernels,
     rows_of_warp,
     steering_kernels,
@@ -189,9 +190,9 @@ def _read_rows_backward(
         blocks = _block_count(row_count, count, PULL_WARPS)
         blocks = min(blocks, BLOCKS_PER_PROCESSOR * processor_count(device))
         partial_sums, mixing_bar = rows.new_empty(blocks, mixing.numel()), torch.empty_like(mixing)
-        kernels, block = row_kernels(*form), PULL_WARPS * WARP
+        kernel, block = row_kernels(*form).pull_back_rows, PULL_WARPS * WARP
         launch(
-            kernels.pull_back_rows,
+            kernel,
             blocks * block,
             device,
             rows,
@@ -203,9 +204,10 @@ def _read_rows_backward(
             partial_sums,
             block_dim=block,
         )
-        block = SUM_WARPS * WARP
-        size = -(-mixing.numel() // WARP) * block * with_mixing
-        launch(kernels.add_blocks, size, device, partial_sums, mixing_bar, block_dim=block)
+        if with_mixing:
+            block = MIXING_SUM_WARPS * WARP
+            size = -(-mixing.numel() // WARP) * block
+            launch(mixing_sum(), size, device, partial_sums, mixing_bar, block_dim=block)
         return rows_bar, mixing_bar
     kernels, total = _kernels(mixed, space_dim), torch.empty_like(mixed)
     launch(
@@ -233,7 +235,7 @@ def _read_rows_backward(
         return rows_bar, torch.empty_like(mixing)
     # One product for all pairs of axes, of which those of an axis with itself count.
     seen = rows[:, scalars : scalars + len(mixing) * space_dim]
-    pairs = (seen.T @ total.view(row_count, -1)).view(len(mixing), space_dim, count, space_dim)
+    pairs = (seen.T @ total.flatten(1)).view(len(mixing), space_dim, count, space_dim)
     return rows_bar, pairs.diagonal(dim1=1, dim2=3).sum(dim=-1)
 
 
@@ -246,8 +248,9 @@ def _steers_by_warps(mixed: Tensor, gate_count: int) -> tuple[int, int, bool] | 
     """Return the form of steering that has kernels of its own, None where it has none."""
     count, space_dim = mixed.shape[1:]
     chiral = gate_count > count
-    steered_alone = (space_dim, 0, 1, count, chiral)
-    return (space_dim, count, chiral) if _is_for_warps(mixed, steered_alone) else None
+    # Steering shares no memory: rows of one vector and no scalars fit wherever any do.
+    least = (space_dim, 0, 1, count, chiral)
+    return (space_dim, count, chiral) if _is_for_warps(mixed, least) else None
 
 
 @opaque("npa::steer_rows")

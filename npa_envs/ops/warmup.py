@@ -168,11 +168,14 @@ def _warm_products(x: torch.Tensor, width: int, out: int) -> None:
 
 def _warm_invariants(x: torch.Tensor, s: torch.Tensor) -> None:
     """What equivariant rules make of vectors."""
-    form = VectorForm(x.shape[2], 2 * s.shape[2], s.shape[2] + 1, MIXED_VECTORS, chiral=False)
-    rows = x.new_zeros(1, form.perception_dim + 1).requires_grad_()
-    mixing = x.new_zeros(form.perceived, form.mixed)
-    mixed, inputs = read_rows(rows, mixing, form, form.input_dim + 1)
-    _pull_back(steer_rows(inputs, mixed, mixing[0], form.input_dim))
+    space_dim, state_dim = x.shape[2], s.shape[2]
+    for chiral in (False, True)[: 4 - space_dim]:
+        form = VectorForm(space_dim, 2 * state_dim, state_dim + 1, MIXED_VECTORS, chiral)
+        rows = x.new_zeros(1, form.perception_dim + 1).requires_grad_()
+        mixing = x.new_zeros(form.perceived, form.mixed).requires_grad_()
+        mixed, inputs = read_rows(rows, mixing, form, form.input_dim + 1)
+        signs = x.new_ones(form.gate_count)
+        _pull_back(steer_rows(inputs, mixed, signs, form.input_dim))
 
 
 def _warm_pictures(x: torch.Tensor) -> None:

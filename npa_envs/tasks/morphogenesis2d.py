@@ -18,6 +18,7 @@ from npa_envs.ops import splat, world_mean
 from npa_envs.ops.pictures.losses import picture_losses
 from npa_envs.rule.rule import COLOUR_OFFSET, LIFE, NPARule
 from npa_envs.tasks.checks import check_flag, check_non_negative, check_positive, check_text
+from npa_envs.tasks.damage import hurt
 from npa_envs.tasks.growth import GrowthConfig, GrowthTask
 from npa_envs.tasks.targets.images import LARGEST_POINT_COUNT
 from npa_envs.tasks.targets.points import PointTarget, load_target
@@ -66,7 +67,7 @@ class Morphogenesis2DConfig(GrowthConfig):
 
     damage_radius: float = 0.1
     """Radius of the disk whose state is erased in worlds from the pool [length units]; 0: none. Of
-    worlds that divide each particle dies with probability one half instead, wherever it is."""
+    worlds that divide each particle dies with probability one half instead."""
 
     resolution: int = 256
     """Pixels on each side of the picture that the loss compares, R."""
@@ -297,14 +298,13 @@ class Morphogenesis2D(GrowthTask[Morphogenesis2DConfig]):
 
     def damage(self, x: Tensor, s: Tensor, generator: Randomness) -> tuple[Tensor, Tensor]:
         """Return the worlds damaged; of one that divides particles die, but never all."""
-        damaged_x, damaged_s = super().damage(x, s, generator)
-        if self.config.division and self.config.damage_radius > 0.0:
-            # Children of a crowd that is thinned learn who they are among its grown particles.
-            stay = uniform_draws(generator, x.shape[:2], x) < SURVIVING
-            damaged_s = torch.where(stay[..., None], s, 0.0)
-            left = living(damaged_s).any(dim=1)[:, None, None]
-            damaged_s = torch.where(left, damaged_s, s)
-        return damaged_x, damaged_s
+        if not (self.config.division and self.config.damage_radius > 0.0):
+            return super().damage(x, s, generator)
+        # Children of a crowd that is thinned learn who they are among its grown particles.
+        stay = uniform_draws(generator, x.shape[:2], x) < SURVIVING
+        left = torch.where(stay[..., None], s, 0.0)
+        left = torch.where(living(left).any(dim=1)[:, None, None], left, s)
+        return hurt(x, left, replace(self.config, damage_radius=0.0), generator=generator)
 
     def picture(self, x: Tensor, s: Tensor, *, centred: bool = True) -> Tensor:
         """Return each world's picture: colour sums and density, dimensionless, shape [B, R, R, 4].

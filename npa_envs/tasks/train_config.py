@@ -41,6 +41,9 @@ LOWEST = 0.01
 VARIED = ("vary_particles", "vary_eps", "vary_update_prob", "vary_dt")
 """Fields that say what of worlds is varied."""
 
+LARGEST_POWER = 8.0
+"""Largest power of the mean of what grown worlds change: float32 rounds higher ones to 0."""
+
 AGEING_BLOCK = 64
 """Steps that worlds are aged by at a time: on CUDA, what one graph replays."""
 
@@ -161,7 +164,7 @@ class TrainConfig(Generic[TaskConfigT]):
 
     rest_power: float = 1.0
     """Power of the means over particles and states in `rest_weight`: (mean |a|^power)^(1/power), at
-    least 1. The larger it is, the more the few particles tell that move most."""
+    least 1 and at most 8. The larger it is, the more the few particles tell that move most."""
 
     rest_age: int = 512
     """Steps from the seed, or from the damage before another life, after which a world is grown."""
@@ -219,9 +222,11 @@ class TrainConfig(Generic[TaskConfigT]):
         check_fraction(self, "decay", "damage_share")
         check_non_negative(self, "weight_decay", "fresh_share", "average", "rest_weight")
         check_non_negative(self, "fate_rate", "second_lives")
-        if self.rest_power < 1.0:
+        if not 1.0 <= self.rest_power <= LARGEST_POWER:
+            # Of larger ones float32 makes zeros.
             raise NPAError(
-                f"rest_power must be at least 1, got {self.rest_power}: 1 for plain means"
+                f"rest_power must be at least 1 and at most {LARGEST_POWER:g}, got "
+                f"{self.rest_power}: 1 for plain means"
             )
         if self.average >= 1.0:
             raise NPAError(f"average must be below 1, got {self.average}: try 0.999")

@@ -45,6 +45,19 @@ class Rollout(Protocol):
         """Return positions, states and path lengths after `steps` steps."""
 
 
+def power_mean(values: Tensor, power: float) -> Tensor:
+    """Return (mean |a|^power)^(1/power) of each world's values, shape [B].
+
+    Args:
+        values: Numbers, shape [B, ...].
+        power: At least 1 and at most `LARGEST_POWER`.
+    """
+    each = values.flatten(1)
+    # A vector's norm has a gradient of 0 where all is at rest.
+    norm: Tensor = torch.linalg.vector_norm(each, power, dim=1)
+    return norm / math.pow(each.shape[1], 1.0 / power)
+
+
 class EagerIteration:
     """One iteration up to the gradients, launched kernel by kernel.
 
@@ -166,18 +179,11 @@ class EagerIteration:
                 # Births and deaths are no unrest; who lives is the business of the task's loss.
                 stayed = (living(s) & living(self.s0))[..., None]
                 change = torch.where(stayed, change, 0.0)[..., LIFE + 1 :]
-            unrest = self._power_mean(path_length) / self._task.eps + self._power_mean(change)
+            moved, changed = (power_mean(each, self._rest_power) for each in (path_length, change))
+            unrest = moved / self._task.eps + changed
             parts["rest"] = (self.grown.to(x.dtype) * unrest).mean()
             total = total + self._rest_weight * parts["rest"]
         return total, parts
-
-    def _power_mean(self, values: Tensor) -> Tensor:
-        """Return (mean |a|^power)^(1/power) of each world's values [B, ...], shape [B]."""
-        power = self._rest_power
-        each = values.flatten(1)
-        # A vector's norm has a gradient of 0 where all is at rest.
-        norm: Tensor = torch.linalg.vector_norm(each, power, dim=1)
-        return norm / math.pow(each.shape[1], 1.0 / power)
 
 
 class GraphedIteration(EagerIteration):

@@ -86,7 +86,8 @@ def divided(
     multiplied by m / m', with m = 1 + p - d the expected number of particles that come of one, p
     and d its probabilities to divide and to die, and m' the same without gradient. It is all that
     children inherit. So the gradient of a sum over the living, weighted by life, is on average that
-    of its expected value, as long as particles do not feel each other.
+    of its expected value, as long as particles do not feel each other and of what parent and child
+    share: a birth is credited as if the child were like its parent.
 
     Args:
         x: Positions after the update [length units], shape [B, N, D].

@@ -10,7 +10,7 @@ import warp as wp
 from npa_envs.kernels import native
 from npa_envs.kernels.cuda.adjoint import listed_adjoint
 from npa_envs.kernels.cuda.density import listed_density
-from npa_envs.kernels.cuda.equivariance import row_kernels, steering_kernels
+from npa_envs.kernels.cuda.equivariance import mixing_sum, row_kernels, steering_kernels
 from npa_envs.kernels.cuda.network import (
     arrangement_kernels,
     two_layer_kernel,
@@ -37,6 +37,7 @@ VARIANTS: dict[str, Callable[[], Any]] = {
     "network": lambda: two_layer_kernel(4, 2, "note"),
     "network's gradients": lambda: weight_gradient_kernels(4, 8, 2, 4, 1, 4).add_shares,
     "vectors": lambda: row_kernels(2, 32, 17, 8, True).pull_back_rows,
+    "sums of vectors": mixing_sum,
     "steering": lambda: steering_kernels(2, 8, True).steer,
     "pictures": lambda: block_kernels(wp.float32).pull_back_blocks,
     "errors of pictures": lambda: gather_errors(wp.float64),
@@ -90,6 +91,7 @@ def cuda_engine():
     for mode in ("rectify", "note", "mask"):
         yield two_layer_kernel(5, 3, mode)
     yield weight_gradient_kernels(5, 9, 3, 4, 1, 4).sum_weight_gradients
+    yield mixing_sum()
     for space_dim in (2, 3):
         yield row_kernels(space_dim, 32, 17, 8, space_dim == 2).read_rows
         yield steering_kernels(space_dim, 8, space_dim == 2).steer

@@ -568,6 +568,9 @@ def test_the_tables_of_births_have_the_numbers_of_their_files() -> None:
         ratios[names] = f"{grown / mean(disk['grown']['512']):.2f} times"
     assert not rules
     record = content(RESULTS / "division_births_cpu.json")
+    room = record["where_there_is_room"]
+    healed = " and ".join(f"{mean(room[half]['256']):.3f}" for half in ("each second", "one side"))
+    assert f"{mean(room['grown']['512']):.3f} at step 512, and {healed} after" in section
     blank, inheriting = (record[f"of_256_particles{kind}"] for kind in ("_born_blank", ""))
     alone = content(RESULTS / "division_muon_cpu.json")["rules"]["disk128"]
     grown = mean(blank["grown"]["512"])
@@ -602,7 +605,7 @@ def test_the_tables_of_division_at_full_size_have_the_numbers_of_their_files() -
     for rule in (rules["heart-division"], inheriting):
         for half, told in (("each second", "each second one"), ("one side", "one side")):
             assert f"| {told} | {cells(rule[half])} |" in section
-    healed = rules["heart-division"]["each second"]["256"]
+    healed = rules["heart-division"]["each second"]["128"]
     grown = rules["heart-division"]["grown"]["512"]
     assert f"{mean(healed):.3f} after 128 steps, {mean(healed) / mean(grown):.2f} times" in section
     blank = content(RESULTS / "division_blank_h200.json")["rules"]["heart-division"]

@@ -12,6 +12,7 @@ from worlds import assert_near, lively_rule, random_world, relative_error
 
 import npa_envs
 from npa_envs.cli import main
+from npa_envs.kernels.cuda.equivariance import fits_block, rows_of_warp
 from npa_envs.ops.equivariance import VectorForm, read_rows
 from npa_envs.rule.files import rule_metadata
 from npa_envs.rule.rule import NPARule
@@ -106,6 +107,33 @@ def test_kernels_of_rows_are_the_formulas(kind, static, dtype, bound, count, mix
         found.append([update.detach(), by_rows, *gradients[1:]])
     for ours, theirs in zip(*found, strict=True):
         assert relative_error(ours.double(), theirs) < bound
+
+
+def test_forms_that_a_block_of_cuda_has_room_for():
+    assert fits_block(2, 32, 17, 8, True)
+    assert fits_block(3, 48, 25, 8, False)
+    # Too many mixing weights, too many products, numbers of vectors beyond a byte.
+    assert not fits_block(3, 256, 129, 8, False)
+    assert not fits_block(2, 32, 17, 48, True)
+    assert not fits_block(2, 0, 1, 256, False)
+    assert [rows_of_warp(mixed) for mixed in (1, 8, 9, 16, 17, 33)] == [4, 4, 3, 2, 1, 1]
+
+
+@pytest.mark.parametrize("count", [0, 5])
+def test_gradients_are_taken_of_what_needs_them(count, device):
+    form = VectorForm(2, 10, 6, 8, chiral=True)
+    rows, mixing = torch.randn(count, 24, device=device), torch.randn(6, 8, device=device)
+    found = []
+    for wanted in ("rows", "mixing", "both"):
+        leaves = [rows.clone(), mixing.clone()]
+        wanted_leaves = leaves if wanted == "both" else leaves[wanted == "mixing" :][:1]
+        for leaf in wanted_leaves:
+            leaf.requires_grad_()
+        mixed, inputs = read_rows(*leaves, form, form.input_dim + 3)
+        found.append(torch.autograd.grad((mixed.sum() + inputs).sum(), wanted_leaves))
+    assert torch.equal(found[0][0], found[2][0])
+    assert torch.equal(found[1][0], found[2][1])
+    assert bool(found[1][0].any()) == (count > 0)
 
 
 def test_rows_in_plenty_are_all_read(device):

@@ -128,7 +128,8 @@ def test_no_field_of_the_run_hides_one_of_the_task():
         ("second_lives", 1.0, "second_lives must be below 1, got 1.0"),
         ("second_lives", 0.5, "second_lives needs worlds that have lifetimes, got 0.5 without"),
         ("damage_share", 0.0, r"damage_share must lie in \(0, 1\], got 0.0"),
-        ("rest_power", 0.5, "rest_power must be at least 1, got 0.5"),
+        ("rest_power", 0.5, "rest_power must be at least 1 and at most 8, got 0.5"),
+        ("rest_power", 16, "rest_power must be at least 1 and at most 8, got 16"),
         ("average", 1.0, "average must be below 1, got 1.0"),
         ("schedule", "linear", "schedule must be one of milestones, cosine, got 'linear'"),
         ("blur_levels", 7, "blur_levels must leave pictures of at least 4 pixels a side, got 7"),
@@ -267,13 +268,13 @@ def test_a_configuration_survives_being_written_as_json(name, task, fields):
 @pytest.mark.parametrize("name", TASKS["co_morphogenesis2d"].presets)
 def test_presets_of_two_species_have_the_schedule_of_one_but_what_came_with_muon(name):
     came = {"optimiser", "learning_rate", "seed_interval", "lifetimes", "second_lives"}
-    came |= {"damage_share", "rest_weight", "weight_decay"}
+    came |= {"damage_share", "rest_weight", "weight_decay", "rest_age", "rest_power"}
     alone, together = preset(name), preset(name, "co_morphogenesis2d")
     assert together.task.counts == (alone.task.particle_count,) * 2
     own = together.task.species[0]
-    # Several species were measured with as wide rules as one had before Muon.
-    assert own == dataclasses.replace(alone.task, hidden_dim=own.hidden_dim)
-    assert own.hidden_dim == (64 if name == "fast" else alone.task.hidden_dim)
+    # Several species were measured with as wide rules, and as many cuts, as one had before Muon.
+    then = {"best": {"cut_share": 0.25}, "fast": {"hidden_dim": 64}}.get(name, {})
+    assert own == dataclasses.replace(alone.task, **then)
     assert together.task.distance == 0.8
     for field in dataclasses.fields(TrainConfig):
         known = alone.optimiser == "adamw" or field.name not in came

@@ -13,7 +13,7 @@ from npa_envs.devices import check_device, parse_device
 from npa_envs.errors import NPAError
 from npa_envs.rule.rule import NPARule, fate_parameters
 from npa_envs.training.checkpoint import check_same_run, load_checkpoint, save_checkpoint
-from npa_envs.training.iteration import EagerIteration
+from npa_envs.training.iteration import EagerIteration, power_mean
 from npa_envs.training.meter import Interval, LossMeter
 from npa_envs.training.optimiser import (
     RuleOptimiser,
@@ -266,6 +266,15 @@ def test_grown_worlds_are_to_rest(tmp_path, power):
     assert rest >= way + change - 1e-12
     assert rest < 3.0 * (way + change)
     torch.testing.assert_close(iteration.terms[0], plain.terms[0] + 0.5 * iteration.terms[-1])
+
+
+@pytest.mark.parametrize("power", [1.0, 4.0, 8.0])
+def test_power_means_of_small_motions_are_right_in_float32(power):
+    values = torch.linspace(-1e-4, 1e-4, 900).view(3, 300).requires_grad_()
+    mean = power_mean(values, power)
+    expected = values.detach().double().abs().pow(power).mean(dim=1).pow(1.0 / power)
+    torch.testing.assert_close(mean.double(), expected, rtol=1e-4, atol=0.0)
+    assert torch.autograd.grad(mean.sum(), values)[0].abs().max() > 1e-3
 
 
 @pytest.mark.parametrize("power", [1.0, 2.0, 4.0])

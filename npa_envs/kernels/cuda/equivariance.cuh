@@ -7,8 +7,6 @@ template <int D, int SCALARS, int PERCEIVED, int MIXED, int CHIRAL> struct Vecto
     static constexpr int DOTS = MIXED * (MIXED + 1) / 2, CROSSES = CHIRAL ? DOTS - MIXED : 0;
     static constexpr int FIRST_CROSS = SCALARS + DOTS, PRODUCTS_END = FIRST_CROSS + CROSSES;
     static constexpr int ROW_END = SCALARS + PERCEIVED * D, WEIGHTS = PERCEIVED * MIXED;
-    // Rows of a warp: as many as have a thread for each of their mixed vectors, at most four.
-    static constexpr int ROWS = MIXED >= 32 ? 1 : 32 / MIXED < 4 ? 32 / MIXED : 4;
 
     // Number of the dot product of a and b, and of the cross product.
     static __device__ int dot_of(int a, int b)
@@ -48,7 +46,7 @@ template <int ROWS, int COLUMNS> struct RowsOnTheWay {
 };
 
 // Write the mixed vectors of rows, and [scalars | products | 1 | 0].
-template <int D, int SCALARS, int PERCEIVED, int MIXED, int CHIRAL, int WARPS>
+template <int D, int SCALARS, int PERCEIVED, int MIXED, int CHIRAL, int WARPS, int ROWS>
 __device__ inline void read_vectors(
     const wp::array_t<float>& rows,
     const wp::array_t<float>& mixing,
@@ -56,7 +54,7 @@ __device__ inline void read_vectors(
     const wp::array_t<float>& inputs)
 {
     using Form = VectorForm<D, SCALARS, PERCEIVED, MIXED, CHIRAL>;
-    constexpr int ROWS = Form::ROWS, ENTRIES = Form::ROW_END + 1;
+    constexpr int ENTRIES = Form::ROW_END + 1;
     __shared__ float weights[Form::WEIGHTS];
     __shared__ unsigned short pairs[Form::DOTS + Form::CROSSES];
     __shared__ float row_of[WARPS][ROWS][ENTRIES], vectors_of[WARPS][ROWS][MIXED * D];
@@ -117,7 +115,7 @@ __device__ inline void read_vectors(
 }
 
 // Write the cotangents of rows, and each block's sum over its rows of those of the mixing weights.
-template <int D, int SCALARS, int PERCEIVED, int MIXED, int CHIRAL, int WARPS>
+template <int D, int SCALARS, int PERCEIVED, int MIXED, int CHIRAL, int WARPS, int ROWS>
 __device__ inline void pull_back_vectors(
     const wp::array_t<float>& rows,
     const wp::array_t<float>& mixing,
@@ -128,7 +126,7 @@ __device__ inline void pull_back_vectors(
     const wp::array_t<float>& partial_sums)
 {
     using Form = VectorForm<D, SCALARS, PERCEIVED, MIXED, CHIRAL>;
-    constexpr int ROWS = Form::ROWS, OWN = (Form::WEIGHTS + 31) / 32;
+    constexpr int OWN = (Form::WEIGHTS + 31) / 32;
     constexpr int TASKS = (ROWS * MIXED + 31) / 32, VECTORS = MIXED * D;
     // The weights of a mixed vector beside each other, as those who read them lie.
     __shared__ float weights[Form::WEIGHTS], sums[WARPS][Form::WEIGHTS];

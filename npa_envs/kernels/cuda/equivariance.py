@@ -13,7 +13,7 @@ from npa_envs.kernels import native
 from npa_envs.kernels.access import WARP, await_earlier
 from npa_envs.kernels.cuda.network import make_share_sum
 
-READ_WARPS, PULL_WARPS, STEER_WARPS, SUM_WARPS = 4, 4, 4, 16
+READ_WARPS, PULL_WARPS, STEER_WARPS, MIXING_SUM_WARPS = 4, 4, 4, 16
 """Warps of a block that reads rows, pulls back to them, steers, and adds up blocks' sums."""
 
 STEERED_ROWS = 2
@@ -27,7 +27,7 @@ SHARED_BYTES = 48 * 1024
 
 
 def rows_of_warp(mixed: int) -> int:
-    """Return how many rows a warp has at a time."""
+    """Return how many rows a warp has: a thread for each of their mixed vectors, at most four."""
     return min(max(WARP // mixed, 1), 4)
 
 
@@ -59,7 +59,9 @@ def row_kernels(
     form = space_dim, scalars, perceived, mixed, chiral
     module = native.module(f"npa_envs.kernels.vector_rows_{'_'.join(str(int(k)) for k in form)}")
 
-    @native.func_native(*form, READ_WARPS)
+    rows = rows_of_warp(mixed)
+
+    @native.func_native(*form, READ_WARPS, rows)
     def read_vectors(
         rows: wp.array(dtype=wp.float32, ndim=2),
         mixing: wp.array(dtype=wp.float32),
@@ -67,7 +69,7 @@ def row_kernels(
         inputs: wp.array(dtype=wp.float32, ndim=2),
     ): ...
 
-    @native.func_native(*form, PULL_WARPS)
+    @native.func_native(*form, PULL_WARPS, rows)
     def pull_back_vectors(
         rows: wp.array(dtype=wp.float32, ndim=2),
         mixing: wp.array(dtype=wp.float32),
@@ -77,8 +79,6 @@ def row_kernels(
         rows_bar: wp.array(dtype=wp.float32, ndim=2),
         partial_sums: wp.array(dtype=wp.float32, ndim=2),
     ): ...
-
-    add_partial_sums = make_share_sum(SUM_WARPS)
 
     @wp.kernel(enable_backward=False, module=module)
     def read_rows(
@@ -107,7 +107,19 @@ def row_kernels(
         await_earlier()
         pull_back_vectors(rows, mixing, mixed, mixed_bar, inputs_bar, rows_bar, partial_sums)
 
-    @wp.kernel(enable_backward=False, module=module, launch_bounds=SUM_WARPS * WARP)
+    return SimpleNamespace(read_rows=read_rows, pull_back_rows=pull_back_rows)
+
+
+@functools.cache
+def mixing_sum() -> wp.Kernel:
+    """Return the kernel that adds blocks' sums; its blocks are larger than those of the others."""
+    add_partial_sums = make_share_sum(MIXING_SUM_WARPS)
+
+    @wp.kernel(
+        enable_backward=False,
+        module=native.module("npa_envs.kernels.vector_sums"),
+        launch_bounds=MIXING_SUM_WARPS * WARP,
+    )
     def add_blocks(
         partial_sums: wp.array(dtype=wp.float32, ndim=2),
         # outputs
@@ -117,9 +129,7 @@ def row_kernels(
         await_earlier()
         add_partial_sums(partial_sums, total)
 
-    return SimpleNamespace(
-        read_rows=read_rows, pull_back_rows=pull_back_rows, add_blocks=add_blocks
-    )
+    return add_blocks
 
 
 @functools.cache

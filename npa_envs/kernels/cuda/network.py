@@ -27,6 +27,9 @@ ROW_TILE = 32
 WARP_UNITS = 32
 """Hidden units whose weight gradients a warp sums."""
 
+SUM_WARPS = 4
+"""Warps of a block that adds up what shares of the rows summed."""
+
 LAYER_REGISTERS, GRADIENT_REGISTERS = 168, 255
 """Registers of a thread of the two kinds of kernels."""
 
@@ -158,10 +161,6 @@ def weight_gradient_kernels(
         add_partial_sums(partial_sums, total)
 
     return SimpleNamespace(sum_weight_gradients=sum_weight_gradients, add_shares=add_shares)
-
-
-SUM_WARPS = 4
-"""Warps of a block that adds up what shares of the rows summed."""
 
 
 @functools.cache
