@@ -76,7 +76,7 @@ RECIPE: Fields = {
     "damage_radius": 0.15,
     "clump_radius": 0.2,
     "cut_gap": 0.1,
-    "initial_rule": "duck",
+    "initial_rule": "duck-v0",
     "sigma": 0.012,
     "opacity": 0.4,
 }

@@ -1,7 +1,7 @@
 """The project's own renderer against gsplat, where that can be built (CUDA); in one run.
 
-Four worlds of the shipped duck, 16 384 Gaussians each, seen by four cameras at 192 x 192 pixels:
-the seed, and the world at step 128. Prints the relative differences of pictures and gradients, and
+Four worlds of `duck-v0`, 16 384 Gaussians each, seen by four cameras at 192 x 192 pixels: the
+seed, and the world at step 128. Prints the relative differences of pictures and gradients, and
 medians of 20 times [µs], twice, in turn. gsplat draws one world after the other, and cannot be
 recorded in a CUDA graph.
 
@@ -86,8 +86,8 @@ def compared(task: object, x: Tensor, s: Tensor, cameras: object) -> dict[str, o
 def main() -> None:
     """Print what both renderers make of a seed and of a grown world."""
     print(f"gsplat {gsplat.__version__}, torch {torch.__version__}, {torch.cuda.get_device_name()}")
-    rule = npa_envs.load_rule("duck", device=DEVICE).requires_grad_(False)
-    task = task_of_rule("duck", rule, DEVICE).task
+    rule = npa_envs.load_rule("duck-v0", device=DEVICE).requires_grad_(False)
+    task = task_of_rule("duck-v0", rule, DEVICE).task
     generator = torch.Generator(DEVICE).manual_seed(1)
     x, s = task.seed(4, generator=generator, device=DEVICE)
     with torch.no_grad():

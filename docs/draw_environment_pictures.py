@@ -107,7 +107,7 @@ FILMS = {
         rows=(
             {
                 "target": "duck",
-                "readout": "duck",
+                "readout": "duck-v0",
                 "particle_count": 16384,
                 "eps": 0.1,
                 "eps0": 0.1,
@@ -118,8 +118,8 @@ FILMS = {
                 "opacity": 0.15,
             },
         ),
-        caption="An episode of the shipped rule `duck`, while the camera goes round.",
-        rule="duck",
+        caption="An episode of the rule `duck-v0`, while the camera goes round.",
+        rule="duck-v0",
     ),
     "Gardener2D": Film(
         steps=(0, 4, 8, 16, 24, 32),

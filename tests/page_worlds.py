@@ -80,7 +80,7 @@ WORLDS: dict[str, tuple[str | Callable[[], NPARule], int, Box, float]] = {
     "gecko at another radius": ("gecko", 300, None, 0.13),
     "cells in their box": ("cells", 400, (1.1, 0.9), 0.2),
     "cells in the smallest box": ("cells", 200, (0.4, 0.4), 0.2),
-    "duck": ("duck", 300, None, 0.1),
+    "duck": ("duck", 300, None, 0.126),
     "duck in a box": ("duck", 300, (0.5, 0.4, 0.3), 0.1),
     "digits, which stay": ("digits", 300, None, 0.1),
     "smooth inverse": (lambda: NPARule(2, 5, 9, moment_inverse="smooth"), 200, None, 0.1),

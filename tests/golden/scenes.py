@@ -33,6 +33,7 @@ RULES: dict[str, dict[str, Any]] = {
 
 KEPT_RULES = {
     "dots": GOLDEN.with_name("dots.safetensors"),
+    "duck": "duck-v0",
     "gecko": "gecko-v0",
     "heart": "heart-v0",
 }

@@ -782,6 +782,43 @@ def test_the_table_of_the_library_has_the_numbers_of_its_file() -> None:
         assert shipped == pytest.approx(losses_of(kept), rel=2e-3)
 
 
+def test_the_tables_of_shipped_things_have_the_numbers_of_their_files() -> None:
+    page = (ROOT / "docs" / "morphogenesis3d.md").read_text(encoding="utf-8")
+    first = page.split("Three rules are shipped")[1].split("\n## ")[0]
+    for name in shipped_rules("morphogenesis3d"):
+        psnr = {row["step"]: f"{row['psnr']:.1f} dB" for row in scores(name)["growth"]}
+        cells = (psnr.get(step, "") for step in (64, 128, 256, 512, 1024, 4096))
+        told = re.findall(rf"^\| `{name}` \|(.*)\|$", first, re.MULTILINE)
+        assert [[cell.strip() for cell in row.split("|")] for row in told] == [[*cells]]
+    section = page.split("#### The library with the one command\n")[1].split("\n### ")[0]
+    runs = content(RESULTS / "library_3d_h200.json")["runs"]
+    lines = [line for line in section.splitlines() if re.match(r"\| (`|shipped)", line)]
+    assert [run["target"] for run in runs] == ["duck", "mushroom"]
+    for run, new, old in zip(runs, lines[::2], lines[1::2], strict=True):
+        for line, measured in ((new, run), (old, run["before"])):
+            psnr = {row["step"]: f"{row['psnr']:.1f} dB" for row in measured["growth"]}
+            row = [psnr.get(step, "") for step in (64, 128, 256, 512, 1024, 2048, 4096)]
+            row.append(f"{losses_of(measured)[128]:.4f}")
+            healed = [f"{row['worlds_healed']} of 8" for row in measured.get("healing", [])]
+            row += [*(healed or ["", ""]), str(measured.get("command_seconds", ""))]
+            name = f"`{run['target']}`, the one command" if line is new else "shipped before"
+            assert [cell.strip() for cell in line.split("|")[1:-1]] == [name, *row]
+        kept = run if run["target"] == "duck" else run["before"]
+        shipped = {row["step"]: row["loss"] for row in scores(run["target"])["growth"]}
+        assert shipped == pytest.approx(losses_of(kept), rel=2e-3)
+    duck, mushroom = runs
+    first_psnr, middle, last = (
+        row["psnr"] for row in duck["growth"] if row["step"] in (128, 2048, 4096)
+    )
+    assert f"it loses {first_psnr - last:.1f} dB, and {first_psnr - middle:.1f} of them" in section
+    whole = losses_of(duck["before"])[512]
+    assert f"cut its loss is {duck['healing'][0]['end']:.4f}, less than the {whole:.4f}" in section
+    cut = mushroom["healing"][0]
+    assert f"is {cut['end']:.4f} after 1000 steps instead of {cut['before']:.4f}" in section
+    seconds = [str(run["training_seconds"]) for run in runs]
+    assert f"{' and '.join(seconds)} s of these were training" in section
+
+
 MUON_ARM = "eighth, muon, from 16"
 """The preset `best` of 2D before it had a weight decay."""
 

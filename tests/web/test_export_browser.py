@@ -162,7 +162,7 @@ def test_solid_and_still_worlds_live_in_a_page(
     export_web([name], tmp_path / "page.html")
     page.open((tmp_path / "page.html").as_uri())
     page.wait(f"{STEP} >= 3", 120)
-    count = {"duck": 16384, "digits": 512}[name]
+    count = {"duck": 8192, "digits": 512}[name]
     told = page.run("document.getElementById('step').textContent")
     assert re.fullmatch(rf"step \d+ · {count} particles", told)
     alone(page)
