@@ -190,7 +190,7 @@ def division(paths: list[str]) -> Shots:
     for name, gone in (("each second gone", second), ("one side gone", side)):
         y, u = x, torch.where(gone[..., None], 0.0, s)
         shots.append((f"{name}: {int(living(u).sum())}", as_it_lies(task, y, u)))
-        for later, before in zip(HEALING, (0, *HEALING), strict=False):
+        for before, later in pairwise((0, *HEALING)):
             y, u = run(rule, task, y, u, later - before, seed=SEEDS[1] + later)
             shots.append((f"{later} later: {int(living(u).sum())}", as_it_lies(task, y, u)))
     return shots

@@ -139,6 +139,10 @@ def _warps(request: Request) -> bool:
     return request.vectors is not None and _cuda(request) and fits_block(*request.vectors)
 
 
+def _has_vectors(request: Request) -> bool:
+    return request.vectors is not None
+
+
 def _always(request: Request) -> bool:
     return True
 
@@ -205,7 +209,9 @@ TABLE: tuple[Implementation, ...] = (
         f"{_MODERN}, rows that a block has room for: a warp has a few rows of an equivariant rule",
         _warps,
     ),
-    Implementation("vectors", "portable", "kernels/portable/equivariance.py", "otherwise", _always),
+    Implementation(
+        "vectors", "portable", "kernels/portable/equivariance.py", "otherwise", _has_vectors
+    ),
     Implementation(
         "network",
         "cuda",
@@ -228,13 +234,14 @@ def choose(operator: Operator, request: Request) -> Implementation:
 
 def describe(request: Request) -> list[str]:
     """Return a line for each operator: what a call like this takes, where it stands, and why."""
-    chosen = [
-        row
-        for row in TABLE
-        if row == choose(row.operator, request)
-        and (row.operator != "vectors" or request.vectors is not None)
+    chosen: dict[Operator, Implementation] = {}
+    for row in TABLE:
+        if row.holds(request):
+            chosen.setdefault(row.operator, row)
+    return [
+        f"{row.operator:8}  {row.name:8}  {row.where:28}  {row.condition}"
+        for row in chosen.values()
     ]
-    return [f"{row.operator:8}  {row.name:8}  {row.where:28}  {row.condition}" for row in chosen]
 
 
 class Listing(NamedTuple):

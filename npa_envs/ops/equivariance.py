@@ -129,9 +129,15 @@ BLOCKS_PER_PROCESSOR = 5
 """Blocks of a multiprocessor that pull back to rows, where there are many rows."""
 
 
-def _block_count(row_count: int, mixed: int, warps: int) -> int:
-    """Return how many blocks of so many warps have all rows."""
-    return -(-row_count // (rows_of_warp(mixed) * warps))
+def _block_count(row_count: int, rows: int, warps: int) -> int:
+    """Return how many blocks of so many warps, each with so many rows, have all of them."""
+    return -(-row_count // (rows * warps))
+
+
+def _launch_blocks(kernel: Any, blocks: int, warps: int, *tensors: Tensor) -> None:
+    """Launch a kernel of CUDA in so many blocks of so many warps."""
+    block = warps * WARP
+    launch(kernel, blocks * block, tensors[0].device, *tensors, block_dim=block)
 
 
 @opaque("npa::read_rows")
@@ -143,10 +149,9 @@ def _read_rows(
     inputs = rows.new_empty(len(rows), width)
     device, form = rows.device, (space_dim, scalars, perceived, count, chiral)
     if _is_for_warps(rows, form):
-        block = READ_WARPS * WARP
-        size = _block_count(len(rows), count, READ_WARPS) * block
+        blocks = _block_count(len(rows), rows_of_warp(count), READ_WARPS)
         kernel = row_kernels(*form).read_rows
-        launch(kernel, size, device, rows, mixing, mixed, inputs, block_dim=block)
+        _launch_blocks(kernel, blocks, READ_WARPS, rows, mixing, mixed, inputs)
         return mixed, inputs
     kernels = _kernels(rows, space_dim)
     launch(kernels.mix_vectors, len(rows) * count, device, scalars, rows, mixing, mixed)
@@ -187,27 +192,15 @@ def _read_rows_backward(
     device, form = rows.device, (space_dim, scalars, len(mixing), count, chiral)
     rows_bar = torch.empty_like(rows)
     if _is_for_warps(rows, form):
-        blocks = _block_count(row_count, count, PULL_WARPS)
+        blocks = _block_count(row_count, rows_of_warp(count), PULL_WARPS)
         blocks = min(blocks, BLOCKS_PER_PROCESSOR * processor_count(device))
         partial_sums, mixing_bar = rows.new_empty(blocks, mixing.numel()), torch.empty_like(mixing)
-        kernel, block = row_kernels(*form).pull_back_rows, PULL_WARPS * WARP
-        launch(
-            kernel,
-            blocks * block,
-            device,
-            rows,
-            mixing,
-            mixed,
-            mixed_bar,
-            inputs_bar,
-            rows_bar,
-            partial_sums,
-            block_dim=block,
-        )
+        kernel = row_kernels(*form).pull_back_rows
+        tensors = rows, mixing, mixed, mixed_bar, inputs_bar, rows_bar, partial_sums
+        _launch_blocks(kernel, blocks, PULL_WARPS, *tensors)
         if with_mixing:
-            block = MIXING_SUM_WARPS * WARP
-            size = -(-mixing.numel() // WARP) * block
-            launch(mixing_sum(), size, device, partial_sums, mixing_bar, block_dim=block)
+            columns = -(-mixing.numel() // WARP)
+            _launch_blocks(mixing_sum(), columns, MIXING_SUM_WARPS, partial_sums, mixing_bar)
         return rows_bar, mixing_bar
     kernels, total = _kernels(mixed, space_dim), torch.empty_like(mixed)
     launch(
@@ -258,9 +251,9 @@ def _steer_rows(output: Tensor, mixed: Tensor, signs: Tensor, width: int) -> Ten
     update = output.new_empty(len(output), width)
     form = _steers_by_warps(mixed, len(signs))
     if form is not None:
-        kernel, block = steering_kernels(*form).steer, STEER_WARPS * WARP
-        size = -(-len(output) // (STEERED_ROWS * STEER_WARPS)) * block
-        launch(kernel, size, output.device, output, mixed, signs, update, block_dim=block)
+        blocks = _block_count(len(output), STEERED_ROWS, STEER_WARPS)
+        kernel = steering_kernels(*form).steer
+        _launch_blocks(kernel, blocks, STEER_WARPS, output, mixed, signs, update)
         return update
     kernel = _kernels(output, mixed.shape[2]).steer
     launch(kernel, update.numel(), output.device, len(signs), output, mixed, signs, update)
@@ -280,9 +273,8 @@ def _steer_rows_backward(
     tensors = output, mixed, signs, update_bar, output_bar, mixed_bar
     form = _steers_by_warps(mixed, len(signs))
     if form is not None:
-        kernel, block = steering_kernels(*form).pull_back_steering, STEER_WARPS * WARP
-        size = -(-len(output) // (STEERED_ROWS * STEER_WARPS)) * block
-        launch(kernel, size, output.device, *tensors, block_dim=block)
+        blocks = _block_count(len(output), STEERED_ROWS, STEER_WARPS)
+        _launch_blocks(steering_kernels(*form).pull_back_steering, blocks, STEER_WARPS, *tensors)
         return output_bar, mixed_bar
     kernel = _kernels(output, mixed.shape[2]).pull_back_steering
     launch(kernel, output.numel(), output.device, len(signs), *tensors)

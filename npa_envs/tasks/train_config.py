@@ -223,7 +223,6 @@ class TrainConfig(Generic[TaskConfigT]):
         check_non_negative(self, "weight_decay", "fresh_share", "average", "rest_weight")
         check_non_negative(self, "fate_rate", "second_lives")
         if not 1.0 <= self.rest_power <= LARGEST_POWER:
-            # Of larger ones float32 makes zeros.
             raise NPAError(
                 f"rest_power must be at least 1 and at most {LARGEST_POWER:g}, got "
                 f"{self.rest_power}: 1 for plain means"

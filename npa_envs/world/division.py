@@ -122,14 +122,15 @@ def divided(
     room = parents | (children < slots)
     offspring = (1.0 + torch.where(room, divide, 0.0) - die).clamp_min(FEWEST_OFFSPRING)
     life = s[..., LIFE] * torch.where(updated, offspring / offspring.detach(), 1.0)
-    life = torch.where(alive & ~dying, life, 0.0).gather(1, source)
-    states = torch.where((alive & ~dying)[..., None], s[..., LIFE + 1 :], 0.0)
+    stays = alive & ~dying
+    life = torch.where(stays, life, 0.0).gather(1, source)
+    states = torch.where(stays[..., None], s[..., LIFE + 1 :], 0.0)
     s = torch.cat((life[..., None], states), dim=-1)
     half_way = 0.5 * CHILD_DISTANCE * eps / space_dim**0.5 * births.direction
     half_way = torch.where(parents[..., None], half_way, 0.0)
     children_x = (x + half_way).gather(1, source[..., None].expand_as(x))
     x = torch.where(born[..., None], children_x, x - half_way)
-    alive = (alive & ~dying) | born
+    alive = stays | born
     return _dead_amidst(x, alive), s, torch.where(alive & ~born, path_length, 0.0)
 
 

@@ -30,6 +30,11 @@ def content(path: Path) -> Any:
     return json.loads(path.read_text(encoding="utf-8"))
 
 
+def mean_loss(row: dict[str, Any]) -> float:
+    """Mean loss of the worlds of a row of benchmarks/division.py."""
+    return statistics.mean(row["loss"])
+
+
 def losses_of(run: dict[str, Any]) -> dict[int, float]:
     """Losses of a run's worlds, by step."""
     return {row["step"]: row["loss"] for row in run["growth"]}
@@ -549,9 +554,6 @@ BIRTHS = (
 def test_the_tables_of_births_have_the_numbers_of_their_files() -> None:
     page = (ROOT / "docs" / "beyond.md").read_text(encoding="utf-8")
 
-    def mean(row: dict[str, Any]) -> float:
-        return statistics.mean(row["loss"])
-
     rules = content(RESULTS / "division_births_cpu.json")["rules"]
     disk = content(RESULTS / "division_muon_cpu.json")["rules"]["big-disk128"]
     section = page.split("### How children are born")[1].split("\n### ")[0]
@@ -562,22 +564,25 @@ def test_the_tables_of_births_have_the_numbers_of_their_files() -> None:
         cells = []
         for when in ("64", "128", "512", "each second", "one side"):
             rows = [rule[when]["256"] if " " in when else rule["grown"][when] for rule in found]
-            cells.append(", ".join(f"{mean(row):.3f}" for row in rows))
+            cells.append(", ".join(f"{mean_loss(row):.3f}" for row in rows))
         assert line == f"| {fates} | {children} | {' | '.join(cells)} |"
-        grown = statistics.mean(mean(rule["grown"]["512"]) for rule in found)
-        ratios[names] = f"{grown / mean(disk['grown']['512']):.2f} times"
+        grown = statistics.mean(mean_loss(rule["grown"]["512"]) for rule in found)
+        ratios[names] = f"{grown / mean_loss(disk['grown']['512']):.2f} times"
     assert not rules
     record = content(RESULTS / "division_births_cpu.json")
     room = record["where_there_is_room"]
-    healed = " and ".join(f"{mean(room[half]['256']):.3f}" for half in ("each second", "one side"))
-    assert f"{mean(room['grown']['512']):.3f} at step 512, and {healed} after" in section
+    healed = " and ".join(
+        f"{mean_loss(room[half]['256']):.3f}" for half in ("each second", "one side")
+    )
+    assert f"{mean_loss(room['grown']['512']):.3f} at step 512, and {healed} after" in section
     blank, inheriting = (record[f"of_256_particles{kind}"] for kind in ("_born_blank", ""))
     alone = content(RESULTS / "division_muon_cpu.json")["rules"]["disk128"]
-    grown = mean(blank["grown"]["512"])
-    times = grown / mean(alone["grown"]["512"])
+    grown = mean_loss(blank["grown"]["512"])
+    times = grown / mean_loss(alone["grown"]["512"])
     assert f"bring {grown:.3f} at step 512, {times:.2f} times" in section
     for half in ("each second", "one side"):
-        told = f"{mean(blank[half]['256']):.3f} instead of {mean(inheriting[half]['256']):.3f}"
+        losses = [f"{mean_loss(rule[half]['256']):.3f}" for rule in (blank, inheriting)]
+        told = " instead of ".join(losses)
         assert told in section
     for name in ("fastsym", "fast fast-s1", "fastthin", "fastthin2000", "fastallthin"):
         assert ratios[name] in section
@@ -587,30 +592,30 @@ def test_the_tables_of_division_at_full_size_have_the_numbers_of_their_files() -
     page = (ROOT / "docs" / "beyond.md").read_text(encoding="utf-8")
     section = page.split("**From one particle to 4096**")[1].split("\n### ")[0]
 
-    def mean(row: dict[str, Any]) -> float:
-        return statistics.mean(row["loss"])
-
     def cells(rows: dict[str, Any]) -> str:
-        return " | ".join(f"{mean(row):.3f}" for row in rows.values())
+        return " | ".join(f"{mean_loss(row):.3f}" for row in rows.values())
 
     for name in ("division_blank_h200", "division_thinned_h200"):
         rules = content(RESULTS / f"{name}.json")["rules"]
         for rule in rules.values():
             assert f" | {cells(rule['grown'])} |" in section
-        disk = mean(rules["heart-disk"]["grown"]["512"])
+        disk = mean_loss(rules["heart-disk"]["grown"]["512"])
         for kind, rule in rules.items():
             if kind in ("heart-division", "heart-division-inheriting"):
-                assert f"{mean(rule['grown']['512']) / disk:.2f} times" in section
+                assert f"{mean_loss(rule['grown']['512']) / disk:.2f} times" in section
     inheriting = rules["heart-division-inheriting"]
     for rule in (rules["heart-division"], inheriting):
         for half, told in (("each second", "each second one"), ("one side", "one side")):
             assert f"| {told} | {cells(rule[half])} |" in section
     healed = rules["heart-division"]["each second"]["128"]
     grown = rules["heart-division"]["grown"]["512"]
-    assert f"{mean(healed):.3f} after 128 steps, {mean(healed) / mean(grown):.2f} times" in section
+    assert (
+        f"{mean_loss(healed):.3f} after 128 steps, {mean_loss(healed) / mean_loss(grown):.2f} times"
+        in section
+    )
     blank = content(RESULTS / "division_blank_h200.json")["rules"]["heart-division"]
     for half in ("each second", "one side"):
-        assert f"{mean(blank[half]['256']):.3f} instead of" in section
+        assert f"{mean_loss(blank[half]['256']):.3f} instead of" in section
 
 
 def test_the_times_of_rules_that_know_no_direction_are_those_of_their_file() -> None:

@@ -25,12 +25,13 @@ template <int D, int SCALARS, int PERCEIVED, int MIXED, int CHIRAL> struct Vecto
 // Some columns of a warp's rows on their way to the memory that its block shares: all of them at
 // once, because a thread that stores what it has loaded waits for it. Of rows beyond the last: zeros.
 template <int ROWS, int COLUMNS> struct RowsOnTheWay {
-    float values[(ROWS * COLUMNS + 31) / 32];
+    static constexpr int EACH = (ROWS * COLUMNS + 31) / 32;
+    float values[EACH];
 
     __device__ void load(const float* from, int width, int count, int lane)
     {
         #pragma unroll
-        for (int k = 0; k < (ROWS * COLUMNS + 31) / 32; ++k) {
+        for (int k = 0; k < EACH; ++k) {
             const int row = (lane + 32 * k) / COLUMNS, column = (lane + 32 * k) % COLUMNS;
             values[k] = row < count ? from[(size_t)row * width + column] : 0.0f;
         }
@@ -39,7 +40,7 @@ template <int ROWS, int COLUMNS> struct RowsOnTheWay {
     __device__ void store(float* to, int lane) const
     {
         #pragma unroll
-        for (int k = 0; k < (ROWS * COLUMNS + 31) / 32; ++k) {
+        for (int k = 0; k < EACH; ++k) {
             if (lane + 32 * k < ROWS * COLUMNS) to[lane + 32 * k] = values[k];
         }
     }
