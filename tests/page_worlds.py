@@ -30,7 +30,8 @@ def unpacked(text: str, shape: Sequence[int]) -> Tensor:
 
 def described(rule: NPARule) -> dict[str, Any]:
     weights = {name: packed(tensor.detach()) for name, tensor in rule.state_dict().items()}
-    return {**{"moment_inverse": "threshold"} | rule.hyper_parameters(), "weights": weights}
+    left_out = {"moment_inverse": "threshold", "dead_zone": 0.0}
+    return {**left_out | rule.hyper_parameters(), "weights": weights}
 
 
 def scattered(count: int, dimension: int, channels: int, box: Box) -> tuple[Tensor, Tensor]:
@@ -83,6 +84,7 @@ WORLDS: dict[str, tuple[str | Callable[[], NPARule], int, Box, float]] = {
     "duck": ("duck", 300, None, 0.126),
     "duck in a box": ("duck", 300, (0.5, 0.4, 0.3), 0.1),
     "digits, which stay": ("digits", 300, None, 0.1),
+    "dead zone": (lambda: NPARule(2, 5, 9, dead_zone=0.2), 200, None, 0.1),
     "smooth inverse": (lambda: NPARule(2, 5, 9, moment_inverse="smooth"), 200, None, 0.1),
 }
 

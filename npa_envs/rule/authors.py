@@ -50,6 +50,7 @@ _DEMO_KIND = {
     "equivariant": False,
     "code_dim": 0,
     "divides": False,
+    "dead_zone": 0.0,
 }
 """What rules of the web demo are like; its files do not say it."""
 

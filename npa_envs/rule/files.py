@@ -46,6 +46,9 @@ CODED_VERSION = 3
 DIVIDING_VERSION = 4
 """The format's version in files of rules that divide."""
 
+RESTING_VERSION = 5
+"""The format's version in files of rules with a dead zone."""
+
 _PLAIN: dict[Any, type] = {Literal: str, tuple: tuple}
 _FIELDS = {
     name: _PLAIN.get(get_origin(kind), kind)
@@ -178,6 +181,7 @@ def save_rule(
     version = EQUIVARIANT_VERSION if rule.equivariant else FORMAT_VERSION
     version = CODED_VERSION if rule.codes is not None else version
     version = DIVIDING_VERSION if rule.divides else version
+    version = RESTING_VERSION if rule.dead_zone else version
     header = {"format": FORMAT_NAME, "version": str(version)}
     header |= {name: json.dumps(value) for name, value in rule.hyper_parameters().items()}
     if not isinstance(metadata, Mapping | None):
@@ -337,7 +341,7 @@ def _read_header(path: Path) -> dict[str, str]:
             f"the metadata's format must be {FORMAT_NAME!r}, got {shown(header.get('format'))}: "
             "this safetensors file was not written by npa_envs.save_rule"
         )
-    known = [str(version) for version in range(FORMAT_VERSION, DIVIDING_VERSION + 1)]
+    known = [str(version) for version in range(FORMAT_VERSION, RESTING_VERSION + 1)]
     if header.get("version") not in known:
         raise NPAError(
             f"the metadata's version must be one of {', '.join(known)}, got "

@@ -47,6 +47,11 @@ class _TwoLayers(torch.autograd.Function):
         return rows_bar, hidden_bar.T @ rows, update_bar.T @ hidden
 
 
+def without_small(update: Tensor, dead_zone: float) -> Tensor:
+    """Return updates with 0 in place of all numbers y with |y| <= `dead_zone`."""
+    return torch.nn.functional.hardshrink(update, dead_zone) if dead_zone > 0.0 else update
+
+
 class Network(Protocol):
     """What maps rows of perception to updates."""
 
@@ -77,6 +82,8 @@ class FoldedRule(NamedTuple):
     """Both as the fused kernels read them, where there are such for their device and sizes."""
     joined: Tensor | None = None
     """Both one after the other where there are: gradients of many steps are added up at once."""
+    dead_zone: float = 0.0
+    """Outputs of this size or smaller are 0."""
 
     @property
     def row_width(self) -> int:
@@ -90,6 +97,9 @@ class FoldedRule(NamedTuple):
 
     def __call__(self, rows: Tensor) -> Tensor:
         """Map rows [z | 1 | 0], shape [K, row_width], to raw updates [y | 0], shape [K, A']."""
+        return without_small(self._product(rows), self.dead_zone)
+
+    def _product(self, rows: Tensor) -> Tensor:
         if self.arranged is not None and self.joined is not None:
             return run_network(rows, self.joined, self.output_weight.shape, self.arranged)
         if not torch.is_grad_enabled():
@@ -125,15 +135,18 @@ class FoldedInvariants(NamedTuple):
         return steer_rows(output, mixed, self.signs, self.update_width)
 
 
-def fold_weights(hidden_weight: Tensor, output_weight: Tensor) -> FoldedRule:
+def fold_weights(
+    hidden_weight: Tensor, output_weight: Tensor, dead_zone: float = 0.0
+) -> FoldedRule:
     """Return folded weights as they are run on their device, differentiable in both.
 
     Args:
         hidden_weight: [W1 | b1 | 0], shape [H, row_width].
         output_weight: W2 and rows of zeros up to a multiple of `FOLD`, shape [A', H].
+        dead_zone: Outputs of this size or smaller are 0.
     """
     arranged = arrange_weights(hidden_weight, output_weight)
     if arranged is None:
-        return FoldedRule(hidden_weight, output_weight)
+        return FoldedRule(hidden_weight, output_weight, dead_zone=dead_zone)
     joined = torch.cat((hidden_weight.flatten(), output_weight.flatten()))
-    return FoldedRule(hidden_weight, output_weight, arranged, joined)
+    return FoldedRule(hidden_weight, output_weight, arranged, joined, dead_zone)

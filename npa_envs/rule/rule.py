@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import math
 from collections.abc import Sequence
 from typing import Any, TypedDict
 
@@ -14,11 +15,19 @@ from npa_envs.ops.checks import (
     MomentInverse,
     checked_flag,
     checked_moment_inverse,
+    checked_number,
     checked_positive,
 )
 from npa_envs.ops.equivariance import MIXED_VECTORS, VectorForm, invariants, signed_gates, steered
 from npa_envs.rule.codes import Codes, check_names
-from npa_envs.rule.network import FOLD, FoldedInvariants, FoldedRule, Network, fold_weights
+from npa_envs.rule.network import (
+    FOLD,
+    FoldedInvariants,
+    FoldedRule,
+    Network,
+    fold_weights,
+    without_small,
+)
 
 COLOUR_OFFSET = 0.5
 """A particle's colour is its last three outputs plus this, dimensionless."""
@@ -65,6 +74,7 @@ class RuleHyperParameters(NamedAlways, total=False):
     code_names: tuple[str, ...]
     encoder: bool
     divides: bool
+    dead_zone: float
 
 
 class NPARule(nn.Module):
@@ -107,6 +117,8 @@ class NPARule(nn.Module):
         encoder: The rule reads codes from pictures (`codes.encode`).
         divides: Particles divide and die, with odds that follow from their states. Their first
             state is 1 where they live and 0 where they are dead (`npa_envs.world.division`).
+        dead_zone: Each number y of an update with |y| <= `dead_zone` counts as 0 (dimensionless).
+            Worlds that hardly change then come to rest and stay as they are, bit for bit.
 
     Raises:
         NPAError: A dimension or a length is out of range, `moment_inverse` is another word, or what
@@ -136,6 +148,7 @@ class NPARule(nn.Module):
         code_names: Sequence[str] = (),
         encoder: bool = False,
         divides: bool = False,
+        dead_zone: float = 0.0,
     ) -> None:
         super().__init__()
         sizes = {
@@ -185,6 +198,7 @@ class NPARule(nn.Module):
         self.mixed_vectors = mixed_vectors
         self.code_dim = code_dim
         self.divides = checked_flag("divides", divides)
+        self.dead_zone = checked_dead_zone(dead_zone, self.equivariant)
         self._check_equivariance()
         check_names(code_names)
         self._check_codes(len(code_names), checked_flag("encoder", encoder))
@@ -312,7 +326,8 @@ class NPARule(nn.Module):
         """
         if self.equivariant:
             return self._update_by_invariants(perception)
-        update: Tensor = self.output(torch.relu(self.hidden(perception)))
+        output: Tensor = self.output(torch.relu(self.hidden(perception)))
+        update = without_small(output, self.dead_zone)
         if self.code_dim == 0:
             return update
         moves, states = update.tensor_split([self.update_dim - self.state_dim], dim=-1)
@@ -393,7 +408,7 @@ class NPARule(nn.Module):
         weight = torch.cat((self.hidden.weight, self.hidden.bias[:, None]), dim=1)
         output_weight = nn.functional.pad(update_weight, (0, 0, 0, -len(update_weight) % FOLD))
         hidden_weight = nn.functional.pad(weight, (0, padding))
-        return fold_weights(hidden_weight, output_weight)
+        return fold_weights(hidden_weight, output_weight, self.dead_zone)
 
     def fates(self, states: Tensor) -> tuple[Tensor, Tensor]:
         """Return the probabilities with which updated particles divide and die, shape [...] each.
@@ -528,7 +543,29 @@ class NPARule(nn.Module):
             made["encoder"] = self.codes.encoder is not None
         if self.divides:
             made["divides"] = True
+        if self.dead_zone:
+            made["dead_zone"] = self.dead_zone
         return made
+
+
+def checked_dead_zone(value: Any, equivariant: bool) -> float:
+    """Return a rule's dead zone as a float.
+
+    Raises:
+        NPAError: It is no finite number of at least 0, or an equivariant rule is to have one.
+    """
+    zone = checked_number("dead_zone", value)
+    if not (0.0 <= zone < math.inf):
+        raise NPAError(
+            f"dead_zone must be a finite number of at least 0 (dimensionless), got {shown(value)}: "
+            "try 0.001"
+        )
+    if zone and equivariant:
+        raise NPAError(
+            f"an equivariant rule has no dead zone, whose edges would be directions, got dead_zone="
+            f"{shown(value)} and equivariant=True: leave one of the two out"
+        )
+    return zone
 
 
 def is_altered(module: nn.Module) -> bool:

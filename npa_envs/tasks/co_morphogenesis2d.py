@@ -201,6 +201,7 @@ _MEASURED: Mapping[str, Mapping[str, Any]] = {
         "damage_share": 0.25,
         "rest_age": 512,
         "rest_power": 1.0,
+        "dead_zone": 0.0,
     },
     "fast": {**HALF_SEEDS, "learning_rate": 4e-3},
 }

@@ -587,6 +587,7 @@ MORPHOGENESIS2D_PRESETS: Mapping[str, Morphogenesis2DTrainConfig] = {
         rest_age=1024,
         rest_weight=2.0,
         rest_power=4.0,
+        dead_zone=1e-3,
         initial_rule="heart-v0",
         out=_OUT,
     ),

@@ -83,6 +83,11 @@ class TrainConfig(Generic[TaskConfigT]):
     moment_inverse: MomentInverse = "threshold"
     """How the rule's state gradients are corrected: "threshold", the paper's, or "smooth"."""
 
+    dead_zone: float = 0.0
+    """Each number y of an update with |y| <= `dead_zone` counts as 0 (dimensionless): worlds that
+    hardly change then come to rest. A rule that the run begins with takes it over; of several that
+    learn together, those that are given keep theirs."""
+
     iterations: int = 10_000
     """Optimiser steps in one repeat."""
 
@@ -221,6 +226,7 @@ class TrainConfig(Generic[TaskConfigT]):
         check_positive(self, float, "rest_power")
         check_fraction(self, "decay", "damage_share")
         check_non_negative(self, "weight_decay", "fresh_share", "average", "rest_weight")
+        check_non_negative(self, "dead_zone")
         check_non_negative(self, "fate_rate", "second_lives")
         if not 1.0 <= self.rest_power <= LARGEST_POWER:
             raise NPAError(

@@ -18,7 +18,7 @@ from npa_envs.devices import check_device
 from npa_envs.errors import DivergedError, NPAError, shown
 from npa_envs.files import write_text
 from npa_envs.rule.files import first_rules, load_rule, save_rule
-from npa_envs.rule.rule import NPARule, dividing, with_codes
+from npa_envs.rule.rule import NPARule, checked_dead_zone, dividing, with_codes
 from npa_envs.tasks.base import GoalTask, Task, differing_fields, untrained_rule
 from npa_envs.tasks.checks import is_real
 from npa_envs.tasks.many_pictures import ManyPictures
@@ -451,7 +451,7 @@ def rule_like(held: dict[str, Any]) -> NPARule:
 
 
 def initial_rule(config: TrainConfig[Any], untrained: NPARule) -> NPARule:
-    """Return the rule that a run starts from, with the configuration's `moment_inverse`.
+    """Return the rule that a run starts from, with its `moment_inverse` and `dead_zone`.
 
     Where particles divide, the rule may be one whose particles did not.
 
@@ -464,9 +464,11 @@ def initial_rule(config: TrainConfig[Any], untrained: NPARule) -> NPARule:
 
     Raises:
         NPAError: The configuration's rule cannot be loaded, has another shape, or was trained with
-            another `moment_inverse` than the paper's and the configuration's.
+            another `moment_inverse` than the paper's and the configuration's; or an equivariant
+            rule is to have a dead zone.
     """
     untrained.moment_inverse = config.moment_inverse
+    untrained.dead_zone = checked_dead_zone(config.dead_zone, untrained.equivariant)
     if not config.initial_rule or (untrained.equivariant and config.initial_rule in first_rules()):
         return untrained
     source = config.initial_rule
@@ -475,6 +477,7 @@ def initial_rule(config: TrainConfig[Any], untrained: NPARule) -> NPARule:
         rule = with_codes(rule, untrained)
     if rule.moment_inverse == "threshold":
         rule.moment_inverse = config.moment_inverse
+    rule.dead_zone = untrained.dead_zone
     if untrained.divides and not rule.divides:
         rule = dividing(rule)
     wrong = differing_fields(rule, untrained)

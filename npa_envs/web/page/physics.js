@@ -452,17 +452,20 @@ export class Physics {
     }
   }
 
-  // x ← x + dt α ε δ / (1 + |δ|), s ← s + dt Δs for one particle, whose δ and Δs begin at `from`.
+  // x ← x + dt α ε δ / (1 + |δ|), s ← s + dt Δs for one particle, whose δ and Δs begin at `from`; what
+  // of both lies in the rule's dead zone is 0.
   update({ x, s }, rule, particle, updates, from, eps, dt) {
     const { dimension, channels } = this;
+    const zone = rule.dead_zone;
+    const felt = (at) => (Math.abs(updates[at]) > zone ? updates[at] : 0);
     if (!rule.static) {
       let squared = 0;
-      for (let d = 0; d < dimension; d++) squared += updates[from + d] ** 2;
+      for (let d = 0; d < dimension; d++) squared += felt(from + d) ** 2;
       const share = (dt * rule.alpha * eps) / (1 + Math.sqrt(squared));
-      for (let d = 0; d < dimension; d++) x[particle * dimension + d] += share * updates[from + d];
+      for (let d = 0; d < dimension; d++) x[particle * dimension + d] += share * felt(from + d);
       from += dimension;
     }
-    for (let c = 0; c < channels; c++) s[particle * channels + c] += dt * updates[from + c];
+    for (let c = 0; c < channels; c++) s[particle * channels + c] += dt * felt(from + c);
   }
 }
 

@@ -1,0 +1,169 @@
+"""Rules with a dead zone: their updates, gradients, worlds at rest, files, training, environments."""
+
+import gymnasium
+import pytest
+import torch
+from circle_task import CircleTask, circle_config
+from training_runs import train
+from worlds import assert_near, lively_rule, random_world
+
+import npa_envs
+from npa_envs import NPAError, NPARule
+from npa_envs import reference as oracle
+from npa_envs.agents import RulePolicy
+from npa_envs.rule.authors import save_demo_json
+from npa_envs.training import load_config
+from npa_envs.training.trainer import initial_rule
+
+ZONE = 0.05
+
+
+def without_zone(rule: NPARule) -> NPARule:
+    other = NPARule(**rule.hyper_parameters() | {"dead_zone": 0.0}).to(rule.hidden.weight)
+    other.load_state_dict(rule.state_dict())
+    return other
+
+
+def by_hand(rule, x, s, steps, eps):
+    """All particles updated in each step: the network's numbers beyond the zone, in plain torch."""
+    for _ in range(steps):
+        y = rule.output(torch.relu(rule.hidden(oracle.perceive(x, s, eps, rule.eps0))))
+        y = torch.where(y.abs() > rule.dead_zone, y, torch.zeros_like(y))
+        delta = y[..., : rule.space_dim]
+        x = x + rule.alpha * eps * delta / (1.0 + delta.norm(dim=-1, keepdim=True))
+        s = s + y[..., rule.space_dim :]
+    return x, s
+
+
+@pytest.mark.parametrize("space_dim", [2, 3])
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float32], ids=("float64", "float32"))
+def test_numbers_in_the_zone_are_zero_and_others_stay(space_dim, dtype, device):
+    rule = lively_rule(device, dtype, space_dim, dead_zone=ZONE)
+    z = torch.randn(200, rule.perception_dim, generator=torch.Generator().manual_seed(1))
+    raw, felt = without_zone(rule)(z.to(device, dtype)), rule(z.to(device, dtype))
+    small = raw.abs() <= ZONE
+    assert 0.1 < float(small.double().mean()) < 0.9
+    assert torch.equal(felt, raw.masked_fill(small, 0.0))
+
+
+@pytest.mark.parametrize("space_dim", [2, 3])
+def test_a_rollout_follows_the_reference_and_so_do_its_gradients(space_dim, device):
+    rule = lively_rule(device, space_dim=space_dim, dead_zone=ZONE)
+    x, s = random_world(2, 40, space_dim, 5, dtype=torch.float64, device=device)
+    weights = list(rule.parameters())
+    ways = []
+    for by in (
+        lambda: npa_envs.rollout(rule, x, s, 3, eps=0.3, update_prob=1.0),
+        lambda: by_hand(rule, x, s, 3, 0.3),
+    ):
+        found = by()
+        loss = found[0].square().sum() + found[1].square().sum()
+        ways.append([*found, *torch.autograd.grad(loss, weights)])
+    plain = npa_envs.rollout(without_zone(rule), x, s, 3, eps=0.3, update_prob=1.0)
+    assert float((plain[0] - ways[0][0]).abs().max()) > 1e-3
+    assert_near(ways[0], ways[1], 1e-10)
+
+
+def test_gradients_by_weights_are_finite_differences(device):
+    rule = lively_rule(device, dead_zone=ZONE)
+    x, s = random_world(1, 30, 2, 5, dtype=torch.float64, device=device)
+
+    def loss():
+        after = npa_envs.rollout(rule, x, s, 1, eps=0.3, update_prob=1.0)
+        return after[0].square().sum() + after[1].square().sum()
+
+    weights = [rule.hidden.weight, rule.hidden.bias, rule.output.weight]
+    gradients = torch.autograd.grad(loss(), weights)
+    generator = torch.Generator().manual_seed(2)
+    for weight, gradient in zip(weights, gradients, strict=True):
+        way = torch.randn(weight.shape, generator=generator, dtype=torch.float64).to(device)
+        with torch.no_grad():
+            weight += 1e-6 * way
+            above = loss()
+            weight -= 2e-6 * way
+            below = loss()
+            weight += 1e-6 * way
+        slope = float((above - below) / 2e-6)
+        assert float((gradient * way).sum()) == pytest.approx(slope, rel=1e-5)
+
+
+def test_a_world_whose_updates_are_in_the_zone_stays_as_it_is(device):
+    rule = lively_rule(device, torch.float32, dead_zone=1e6)
+    x, s = random_world(2, 64, 2, 5, dtype=torch.float32, device=device)
+    with torch.no_grad():
+        # From the third call on worlds on a CPU are prepared, and those on CUDA are recorded.
+        for _ in range(4):
+            after = npa_envs.rollout(rule, x, s, 5, eps=0.3)
+            assert torch.equal(after[0], x)
+            assert torch.equal(after[1], s)
+        rule.dead_zone = 0.0
+        moved, _ = npa_envs.rollout(rule, x, s, 5, eps=0.3)
+        assert not torch.equal(moved, x)
+
+
+def test_species_have_zones_of_their_own(device):
+    zones = (1e6, 0.0)
+    rules = [lively_rule(device, torch.float32, dead_zone=zone) for zone in zones]
+    x, s = random_world(1, 60, 2, 5, dtype=torch.float32, device=device)
+    with torch.no_grad():
+        after, _ = npa_envs.rollout_species(rules, x, s, 4, counts=(30, 30), eps=0.3)
+    still = (after == x).all(dim=-1)[0]
+    assert still[:30].all()
+    assert still[30:].double().mean() < 0.5
+
+
+def test_a_file_says_the_zone_and_older_files_have_none(tmp_path):
+    npa_envs.save_rule(NPARule(dead_zone=0.001), tmp_path / "rule.safetensors")
+    assert npa_envs.load_rule(tmp_path / "rule.safetensors").dead_zone == 0.001
+    # Versions of the package that know no zone refuse the file.
+    assert b'"version":"5"' in (tmp_path / "rule.safetensors").read_bytes()
+    npa_envs.save_rule(NPARule(), tmp_path / "plain.safetensors")
+    assert b"dead_zone" not in (tmp_path / "plain.safetensors").read_bytes()
+    assert npa_envs.load_rule("heart-v0").dead_zone == 0.0
+    with pytest.raises(NPAError, match=r"dead_zone=0\.0 only, 'mine' has 0\.001"):
+        save_demo_json({"mine": NPARule(dead_zone=0.001)}, tmp_path / "models.json")
+
+
+@pytest.mark.parametrize("zone", [-1e-3, float("nan"), float("inf"), "wide"])
+def test_zones_that_are_none_are_refused(zone, tmp_path):
+    with pytest.raises(NPAError, match="dead_zone must be a"):
+        NPARule(dead_zone=zone)
+    with pytest.raises(NPAError, match="dead_zone must be (a finite number|of type float)"):
+        circle_config(tmp_path, dead_zone=zone)
+
+
+def test_equivariant_rules_have_none(tmp_path):
+    with pytest.raises(NPAError, match="an equivariant rule has no dead zone"):
+        NPARule(equivariant=True, dead_zone=0.001)
+    config = circle_config(tmp_path, dead_zone=0.001)
+    with pytest.raises(NPAError, match="an equivariant rule has no dead zone"):
+        initial_rule(config, NPARule(equivariant=True))
+
+
+@pytest.mark.parametrize("begun", [0.0, 0.5])
+def test_training_gives_its_rule_the_zone(tmp_path, begun):
+    untrained = CircleTask().make_rule(torch.Generator())
+    initial = NPARule(**untrained.hyper_parameters() | {"dead_zone": begun})
+    npa_envs.save_rule(initial, tmp_path / "rule.safetensors")
+    config = circle_config(
+        tmp_path / "run",
+        iterations=2,
+        dead_zone=0.01,
+        initial_rule=str(tmp_path / "rule.safetensors"),
+    )
+    rule = initial_rule(config, untrained)
+    assert rule.dead_zone == 0.01
+    assert torch.equal(rule.hidden.weight, initial.hidden.weight)
+    train(config)
+    assert npa_envs.load_rule(tmp_path / "run" / "rule.safetensors").dead_zone == 0.01
+    assert load_config(tmp_path / "run" / "config.json", circle_config(tmp_path)) == config
+
+
+def test_a_rule_acts_in_an_environment_as_in_a_rollout():
+    rule = NPARule(2, 16, 32, dead_zone=1e6)
+    env = gymnasium.make("npa/Morphogenesis2D-v0", particle_count=64, disable_env_checker=True)
+    observation, _ = env.reset(seed=1)
+    action = RulePolicy(rule, env)(observation)
+    assert not action.any()
+    rule.dead_zone = 0.0
+    assert RulePolicy(rule, env)(observation).any()
