@@ -1,4 +1,4 @@
-"""Rules with a dead zone: their updates, gradients, worlds at rest, files, training, environments."""
+"""Rules with a dead zone: updates, gradients, worlds at rest, files, training, environments."""
 
 import gymnasium
 import pytest
@@ -128,7 +128,7 @@ def test_a_file_says_the_zone_and_older_files_have_none(tmp_path):
 def test_zones_that_are_none_are_refused(zone, tmp_path):
     with pytest.raises(NPAError, match="dead_zone must be a"):
         NPARule(dead_zone=zone)
-    with pytest.raises(NPAError, match="dead_zone must be (a finite number|of type float)"):
+    with pytest.raises(NPAError, match=r"dead_zone must be (a finite number|of type float)"):
         circle_config(tmp_path, dead_zone=zone)
 
 
