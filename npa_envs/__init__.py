@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from npa_envs.rule.rule import NPARule
     from npa_envs.world.divergence import describe_divergence, divergence
     from npa_envs.world.randomness import WorldRandom
-    from npa_envs.world.rollout import rollout, step
+    from npa_envs.world.rollout import at_rest, rollout, step
     from npa_envs.world.species import rollout_species
 
 _extend_path(__path__, __file__)
@@ -43,6 +43,7 @@ __all__ = [
     "PerceptionFields",
     "SpeciesFields",
     "WorldRandom",
+    "at_rest",
     "describe_divergence",
     "divergence",
     "load_rule",
@@ -64,7 +65,7 @@ _HOMES = {
     "rule.rule": {"NPARule"},
     "world.divergence": {"describe_divergence", "divergence"},
     "world.randomness": {"WorldRandom"},
-    "world.rollout": {"rollout", "step"},
+    "world.rollout": {"at_rest", "rollout", "step"},
     "world.species": {"rollout_species"},
 }
 """Where the names are; all others are of `npa_envs.ops`."""

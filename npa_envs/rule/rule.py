@@ -198,7 +198,7 @@ class NPARule(nn.Module):
         self.mixed_vectors = mixed_vectors
         self.code_dim = code_dim
         self.divides = checked_flag("divides", divides)
-        self.dead_zone = checked_dead_zone(dead_zone, self.equivariant)
+        self.dead_zone = _checked_dead_zone(dead_zone, self.equivariant)
         self._check_equivariance()
         check_names(code_names)
         self._check_codes(len(code_names), checked_flag("encoder", encoder))
@@ -548,7 +548,7 @@ class NPARule(nn.Module):
         return made
 
 
-def checked_dead_zone(value: Any, equivariant: bool) -> float:
+def _checked_dead_zone(value: Any, equivariant: bool) -> float:
     """Return a rule's dead zone as a float.
 
     Raises:

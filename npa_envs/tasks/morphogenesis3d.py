@@ -118,7 +118,7 @@ class Morphogenesis3DConfig(GrowthConfig):
         if self.opacity == 1.0:
             raise NPAError("opacity must lie below 1, got 1: for example opacity=0.99")
         check_seed(self, "view_seed", bits=31)
-        if self.renderer not in RENDERERS:
+        if not isinstance(self.renderer, str) or self.renderer not in RENDERERS:
             raise NPAError(f"renderer must be 'own' or 'gsplat', got {shown(self.renderer)}")
 
 

@@ -86,7 +86,7 @@ class TrainConfig(Generic[TaskConfigT]):
     dead_zone: float = 0.0
     """Each number y of an update with |y| <= `dead_zone` counts as 0 (dimensionless): worlds that
     hardly change then come to rest. A rule that the run begins with takes it over; of several that
-    learn together, those that are given keep theirs."""
+    learn together, those that are given keep theirs. Equivariant rules have none."""
 
     iterations: int = 10_000
     """Optimiser steps in one repeat."""

@@ -13,7 +13,7 @@ from torch import Tensor, nn
 from npa_envs.devices import check_device
 from npa_envs.errors import NPAError, shown
 from npa_envs.rule.files import load_rule, save_rule
-from npa_envs.rule.rule import NPARule, checked_dead_zone
+from npa_envs.rule.rule import NPARule
 from npa_envs.tasks.base import differing_fields
 from npa_envs.tasks.co_morphogenesis2d import CoMorphogenesis2D, CoMorphogenesis2DConfig
 from npa_envs.tasks.train_config import JointTrainConfig, TrainConfig
@@ -84,7 +84,7 @@ class _JointTrainer(Trainer):
         made = self._species.make_rules(generator)
         for rule in made:
             rule.moment_inverse = self.config.moment_inverse
-            rule.dead_zone = checked_dead_zone(self.config.dead_zone, rule.equivariant)
+            rule.dead_zone = 0.0 if rule.equivariant else self.config.dead_zone
         if held is not None:
             self._given = [rule_like(own) for own in held["rules"]]
         if self._given is None:

@@ -18,7 +18,7 @@ from npa_envs.devices import check_device
 from npa_envs.errors import DivergedError, NPAError, shown
 from npa_envs.files import write_text
 from npa_envs.rule.files import first_rules, load_rule, save_rule
-from npa_envs.rule.rule import NPARule, checked_dead_zone, dividing, with_codes
+from npa_envs.rule.rule import NPARule, dividing, with_codes
 from npa_envs.tasks.base import GoalTask, Task, differing_fields, untrained_rule
 from npa_envs.tasks.checks import is_real
 from npa_envs.tasks.many_pictures import ManyPictures
@@ -455,8 +455,9 @@ def initial_rule(config: TrainConfig[Any], untrained: NPARule) -> NPARule:
 
     Where particles divide, the rule may be one whose particles did not.
 
-    An equivariant rule starts from random weights where the configuration names a first rule, which
-    knows directions, as presets do. A rule with codes may start from one without.
+    An equivariant rule has no dead zone, and starts from random weights where the configuration
+    names a first rule, which knows directions, as presets do. A rule with codes may start from one
+    without.
 
     Args:
         config: The run's configuration.
@@ -464,11 +465,10 @@ def initial_rule(config: TrainConfig[Any], untrained: NPARule) -> NPARule:
 
     Raises:
         NPAError: The configuration's rule cannot be loaded, has another shape, or was trained with
-            another `moment_inverse` than the paper's and the configuration's; or an equivariant
-            rule is to have a dead zone.
+            another `moment_inverse` than the paper's and the configuration's.
     """
     untrained.moment_inverse = config.moment_inverse
-    untrained.dead_zone = checked_dead_zone(config.dead_zone, untrained.equivariant)
+    untrained.dead_zone = 0.0 if untrained.equivariant else config.dead_zone
     if not config.initial_rule or (untrained.equivariant and config.initial_rule in first_rules()):
         return untrained
     source = config.initial_rule

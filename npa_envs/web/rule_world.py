@@ -38,7 +38,7 @@ from npa_envs.web.colouring import Colouring, Seen, shows_of
 from npa_envs.web.live import Frame, Live, Range, Touch, brushed, checked_seed
 from npa_envs.world.brushes import erase_state, inside_ball, removed
 from npa_envs.world.division import living
-from npa_envs.world.rollout import rollout
+from npa_envs.world.rollout import at_rest, rollout
 from npa_envs.world.species import AGREEMENTS, rollout_species
 
 MOST_PARTICLES = {"cpu": 16384, "cuda": 131072}
@@ -52,6 +52,9 @@ SMALL_VIEWS = {"resolution": 64, "training_views": 1, "held_out_views": 6}
 
 MOST_TASKS = 8
 """Tasks that are kept, with their targets: a slider of N asks for many."""
+
+REST_LOOK = 64
+"""Steps from one question whether the world is at rest to the next."""
 
 POLL_SECONDS = 1.0
 """Time between two looks into the folder of a run [s]."""
@@ -149,6 +152,10 @@ class RuleWorld(Live):
         self._travelled: Tensor | None = None
         self._updated: Tensor | None = None
         self.step, self._milliseconds, self._loss_due = 0, 0.0, 0.0
+        self._still: tuple[Any, ...] = ()
+        """What was at rest, and under what."""
+        self._looked = 0
+        """When that was asked last [steps]."""
 
     @property
     def task(self) -> PictureTask:
@@ -274,11 +281,13 @@ class RuleWorld(Live):
         self.step += steps
         if self.x.shape[1] == 0:
             return
+        watched = self.show in ("mask", "speed")
+        if not watched and self._rests():
+            return
         told: dict[str, Any] = {
             "eps": self.eps, "box": self.task.box, "update_prob": self.update_prob,
             "position_noise": self.noise, "generator": self._generator,
         }  # fmt: skip
-        watched = self.show in ("mask", "speed")
         if watched and steps > 1:
             # Shown is the last step alone.
             self._go(steps - 1, told)
@@ -289,6 +298,24 @@ class RuleWorld(Live):
             self._travelled, self._updated = travelled / reach, (self.s != before).any(dim=-1)
         if self._device.type == "cuda":
             torch.cuda.synchronize(self._device)
+
+    def _rests(self) -> bool:
+        """Return whether the rule's own world is at rest, which is asked now and then."""
+        rule = self.main.rule
+        alone = self.counts == [self.full] and self._divisors == [float(self.full)]
+        if rule.dead_zone == 0.0 or rule.divides or self.noise > 0.0 or not alone:
+            return False
+        worlds = self.x, self.s
+        now = (*map(id, worlds), *(value._version for value in worlds), rule, self.eps)
+        if self._still and now == self._still[2:]:
+            return True
+        if self.step < self._looked + REST_LOOK:
+            return False
+        self._looked = self.step
+        if bool(at_rest(rule, *worlds, eps=self.eps, box=self.task.box)):
+            # The worlds are kept, so that nothing else gets their ids.
+            self._still = (*worlds, *now)
+        return bool(self._still) and now == self._still[2:]
 
     def _go(self, steps: int, told: Mapping[str, Any], *, path: bool = False) -> Tensor | None:
         rules = [organism.rule for organism in self.organisms]

@@ -44,6 +44,12 @@ STORED_INTERVAL: dict[Memory, float] = {"store": 1, "recompute": 3, "minimal": m
 FEWEST_STATIC = 3
 """Steps from which on it pays to prepare worlds whose particles never move."""
 
+FEWEST_RESTING = 256
+"""Steps from which on it pays to ask whether worlds are at rest."""
+
+FIRST_PART = 64
+"""Steps after which that is asked again; the next parts are twice as long each."""
+
 
 def check_memory(memory: Memory) -> None:
     """Check what the backward pass shall read."""
@@ -260,6 +266,59 @@ def _prepare_static(
     )
 
 
+def _check_one_species(rule: NPARule) -> None:
+    if rule.species_count:
+        raise NPAError(
+            f"the rule must not perceive species by themselves, got species_count="
+            f"{rule.species_count}: run it with npa_envs.rollout_species"
+        )
+
+
+def _resting(rule: NPARule, worlds: Worlds, options: StepOptions, cuda_graph: CudaGraph) -> Tensor:
+    """Return which worlds stay as they are if all particles are updated, bool, shape [B]."""
+    call = RolloutCall(1, options._replace(update_prob=1.0), "store", None)
+    x, s, _ = worlds
+    with torch.no_grad():
+        after = run_call(call, (rule,), x, s, None, cuda_graph=cuda_graph, watch=None)
+    return (after.x == x).flatten(1).all(dim=1) & (after.s == s).flatten(1).all(dim=1)
+
+
+def _may_rest(call: RolloutCall, rule: NPARule, x: Tensor) -> bool:
+    """Return whether a rollout asks whether its worlds are at rest: their steps are left out."""
+    return (
+        rule.dead_zone > 0.0
+        and rule.has_network()
+        and not rule.divides
+        and call.steps >= FEWEST_RESTING
+        and call.keep_every is None
+        and call.options.position_noise == 0.0
+        and not torch.is_grad_enabled()
+        and not torch.compiler.is_compiling()
+        and not (x.is_cuda and torch.cuda.is_current_stream_capturing())
+    )
+
+
+def _run_until_rest(
+    call: RolloutCall,
+    rule: NPARule,
+    worlds: Worlds,
+    generator: Randomness | None,
+    cuda_graph: CudaGraph,
+) -> Worlds:
+    """Run a rollout in parts, and leave out what comes when all worlds are at rest."""
+    left, part = call.steps, FIRST_PART
+    while left and not _resting(rule, worlds, call.options, cuda_graph).all():
+        own = call._replace(steps=min(part, left))
+        x, s, _ = worlds
+        worlds = run_call(own, (rule,), x, s, generator, cuda_graph=cuda_graph, watch=None)
+        left, part = left - own.steps, 2 * part
+    # Whoever draws next gets what comes after all steps.
+    for _ in RuleStep(rule, None, call.options).draws(worlds.x, left, generator):
+        pass
+    # What is returned is the caller's to write to.
+    return Worlds(*(value.clone() for value in worlds)) if left == call.steps else worlds
+
+
 def checked_keep_every(keep_every: int | None, steps: int) -> int | None:
     """Return after how many steps worlds are kept, each time.
 
@@ -312,6 +371,45 @@ def step(
         on_divergence=on_divergence,
         cuda_graph=cuda_graph,
     )
+
+
+def at_rest(
+    rule: NPARule,
+    x: Tensor,
+    s: Tensor,
+    *,
+    eps: float | None = None,
+    box: Box = None,
+    dt: float = 1.0,
+) -> Tensor:
+    """Return which worlds no step changes any more.
+
+    All particles of such a world are updated at once and stay as they are, bit for bit, so they
+    stay whichever of them a step updates. Rules with a `dead_zone` bring worlds to rest.
+
+    Args:
+        rule: The rule, one whose particles do not divide; dtype and device of x.
+        x: Particle positions [length units], shape [B, N, D].
+        s: Particle states, dimensionless, shape [B, N, C].
+        eps: As for `rollout`.
+        box: As for `rollout`; in one, only positions within it can be at rest.
+        dt: As for `rollout`.
+
+    Returns:
+        Bool, shape [B], on x's device.
+
+    Raises:
+        NPAError: As `rollout`, or the rule divides.
+    """
+    check_rule(rule)
+    if rule.divides:
+        raise NPAError(
+            "at_rest is for rules whose particles do not divide, got one with divides=True: its "
+            "worlds change by chance"
+        )
+    _check_one_species(rule)
+    options = checked_options(rule, x, s, eps, box, 1.0, dt, 0.0, True)
+    return _resting(rule, Worlds(x, s, x.new_zeros(x.shape[:2])), options, "auto")
 
 
 @overload
@@ -433,11 +531,7 @@ def rollout(
     check_memory(memory)
     check_cuda_graph(cuda_graph)
     check_rule(rule)
-    if rule.species_count:
-        raise NPAError(
-            f"the rule must not perceive species by themselves, got species_count="
-            f"{rule.species_count}: run it with npa_envs.rollout_species"
-        )
+    _check_one_species(rule)
     options = checked_options(
         rule, x, s, eps, box, update_prob, dt, position_noise, detach_positions
     )
@@ -447,13 +541,11 @@ def rollout(
             f"box must be None where particles divide, got {shown(box)}: the dead need a place far "
             "from all others"
         )
-    after = run_call(
-        RolloutCall(steps, options, memory, kept),
-        (rule,),
-        x,
-        s,
-        generator,
-        cuda_graph=cuda_graph,
-        watch=make_watch(on_divergence, x, s),
-    )
+    call = RolloutCall(steps, options, memory, kept)
+    watch = make_watch(on_divergence, x, s)
+    if watch is None and not return_path_length and _may_rest(call, rule, x):
+        worlds = Worlds(x, s, x.new_zeros(x.shape[:2]))
+        after = _run_until_rest(call, rule, worlds, generator, cuda_graph)
+    else:
+        after = run_call(call, (rule,), x, s, generator, cuda_graph=cuda_graph, watch=watch)
     return (after.x, after.s, after.path_length) if return_path_length else (after.x, after.s)

@@ -5,7 +5,7 @@ import pytest
 import torch
 from circle_task import CircleTask, circle_config
 from training_runs import train
-from worlds import assert_near, lively_rule, random_world
+from worlds import assert_near, assert_same, lively_rule, random_world
 
 import npa_envs
 from npa_envs import NPAError, NPARule
@@ -14,6 +14,7 @@ from npa_envs.agents import RulePolicy
 from npa_envs.rule.authors import save_demo_json
 from npa_envs.training import load_config
 from npa_envs.training.trainer import initial_rule
+from npa_envs.world import rollout as rollout_module
 
 ZONE = 0.05
 
@@ -135,9 +136,9 @@ def test_zones_that_are_none_are_refused(zone, tmp_path):
 def test_equivariant_rules_have_none(tmp_path):
     with pytest.raises(NPAError, match="an equivariant rule has no dead zone"):
         NPARule(equivariant=True, dead_zone=0.001)
+    # That of a preset is not for them.
     config = circle_config(tmp_path, dead_zone=0.001)
-    with pytest.raises(NPAError, match="an equivariant rule has no dead zone"):
-        initial_rule(config, NPARule(equivariant=True))
+    assert initial_rule(config, NPARule(equivariant=True)).dead_zone == 0.0
 
 
 @pytest.mark.parametrize("begun", [0.0, 0.5])
@@ -167,3 +168,92 @@ def test_a_rule_acts_in_an_environment_as_in_a_rollout():
     assert not action.any()
     rule.dead_zone = 0.0
     assert RulePolicy(rule, env)(observation).any()
+
+
+class TestRest:
+    """Worlds that come to rest: each particle goes on until its states are near 1, then stays."""
+
+    @pytest.fixture
+    def rule(self, device):
+        rule = NPARule(2, 4, 8, eps0=0.3, dead_zone=0.02)
+        with torch.no_grad():
+            rule.hidden.weight.zero_()
+            rule.output.weight.zero_()
+            # Δs = 0.2 relu(1 - s), and a first step to the right as long as that lasts.
+            for channel in range(4):
+                rule.hidden.weight[channel, channel] = -1.0
+                rule.hidden.bias[channel] = 1.0
+                rule.output.weight[2 + channel, channel] = 0.2
+            rule.output.weight[0] = 0.02
+        return rule.to(device)
+
+    @pytest.fixture
+    def worlds(self, device):
+        return random_world(2, 50, 2, 4, dtype=torch.float32, device=device)
+
+    @staticmethod
+    def generator(device):
+        return torch.Generator(device).manual_seed(5)
+
+    def test_worlds_at_rest_are_told(self, rule, worlds):
+        x, s = worlds
+        assert not npa_envs.at_rest(rule, x, s, eps=0.3).any()
+        with torch.no_grad():
+            still, states = npa_envs.rollout(rule, x, s, 200, eps=0.3)
+        assert npa_envs.at_rest(rule, still, states, eps=0.3).all()
+        states[1, 7, 2] = 0.0
+        assert npa_envs.at_rest(rule, still, states, eps=0.3).tolist() == [True, False]
+
+    @pytest.mark.parametrize("by_world", [False, True])
+    def test_a_rollout_leaves_them_out_and_ends_and_draws_as_if_it_did_not(
+        self, rule, worlds, device, monkeypatch, by_world
+    ):
+        x, s = worlds
+        ways = []
+        for fewest in (10**9, 256):
+            monkeypatch.setattr(rollout_module, "FEWEST_RESTING", fewest)
+            generator = self.generator(device)
+            if by_world:
+                generator = npa_envs.WorldRandom([3, 4], device=device)
+            with torch.no_grad():
+                after = npa_envs.rollout(rule, x, s, 600, eps=0.3, generator=generator)
+                later = npa_envs.rollout(rule, x, s, 3, eps=0.3, generator=generator)
+            ways.append((*after, *later))
+        assert_same(*ways)
+
+    def test_it_runs_no_step_of_worlds_that_begin_at_rest(self, rule, worlds, monkeypatch):
+        x, s = worlds
+        with torch.no_grad():
+            x, s = npa_envs.rollout(rule, x, s, 200, eps=0.3)
+            asked = []
+            own = rollout_module.run_call
+
+            def noted(call, *args, **options):
+                asked.append(call.steps)
+                return own(call, *args, **options)
+
+            monkeypatch.setattr(rollout_module, "run_call", noted)
+            after = npa_envs.rollout(rule, x, s, 10_000, eps=0.3)
+        assert asked == [1]
+        assert_same(after, (x, s))
+        after[0].zero_()
+        assert x.any()
+
+    @pytest.mark.parametrize(
+        "options", [{"keep_every": 64}, {"return_path_length": True}, {"position_noise": 1e-3}]
+    )
+    def test_what_needs_each_step_runs_each_step(self, rule, worlds, options):
+        x, s = worlds
+        with torch.no_grad():
+            x, s = npa_envs.rollout(rule, x, s, 200, eps=0.3)
+            after = npa_envs.rollout(rule, x, s, 256, eps=0.3, **options)
+        if "keep_every" in options:
+            assert after[0].shape == (4, *x.shape)
+        elif "position_noise" in options:
+            assert not torch.equal(after[0], x)
+        else:
+            assert not after[2].any()
+
+    def test_rules_that_divide_are_refused(self, worlds):
+        with pytest.raises(NPAError, match="at_rest is for rules whose particles do not divide"):
+            npa_envs.at_rest(NPARule(2, 4, 8, divides=True), *worlds)

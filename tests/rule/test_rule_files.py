@@ -253,7 +253,10 @@ def write_ours(path: Path, change: Callable[[dict, dict], None]) -> None:
 
 
 BAD_HEADERS: dict[str, tuple[Callable[[dict, dict], Any], str]] = {
-    "unknown version": (lambda h, w: h.update(version="5"), "one of 1, 2, 3, 4, got '5'.*upgrade"),
+    "unknown version": (
+        lambda h, w: h.update(version="6"),
+        "one of 1, 2, 3, 4, 5, got '6'.*upgrade",
+    ),
     "another format": (lambda h, w: h.update(format="llama"), "format must be 'npa-envs rule'"),
     "no format": (lambda h, w: h.pop("format"), "format must be 'npa-envs rule', got None"),
     "a missing key": (lambda h, w: h.pop("alpha"), "lacks 'alpha'"),

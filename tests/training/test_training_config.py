@@ -268,7 +268,7 @@ def test_a_configuration_survives_being_written_as_json(name, task, fields):
 @pytest.mark.parametrize("name", TASKS["co_morphogenesis2d"].presets)
 def test_presets_of_two_species_have_the_schedule_of_one_but_what_came_with_muon(name):
     came = {"optimiser", "learning_rate", "seed_interval", "lifetimes", "second_lives"}
-    came |= {"damage_share", "rest_weight", "weight_decay", "rest_age", "rest_power"}
+    came |= {"damage_share", "rest_weight", "weight_decay", "rest_age", "rest_power", "dead_zone"}
     alone, together = preset(name), preset(name, "co_morphogenesis2d")
     assert together.task.counts == (alone.task.particle_count,) * 2
     own = together.task.species[0]

@@ -144,6 +144,39 @@ def test_a_world_without_particles_goes_on(world):
     assert world.describe()["species"] == ["heart"]
 
 
+def test_a_world_at_rest_is_not_stepped_until_something_changes_it(tmp_path, device, monkeypatch):
+    rule = load_rule("gecko")
+    # Nothing but a state that is large leaves the zone.
+    rule.dead_zone = 40.0
+    config = config_to_dict(preset("paper", particle_count=COUNT))
+    told = {name: config[name] for name in config if name not in ("out", "device")}
+    save_rule(
+        rule, path := tmp_path / "resting.safetensors",
+        metadata={"task": "morphogenesis2d", "config": json.dumps(told)},
+    )  # fmt: skip
+    world = RuleWorld(str(path), device=device)
+    asked = []
+
+    def noted(*args, **options):
+        asked.append(args[3])
+        return rollout(*args, **options)
+
+    monkeypatch.setattr(rule_world, "rollout", noted)
+    world.handle({"type": "set", "name": "speed", "value": 16})
+    for _ in range(8):
+        world.advance()
+    assert asked == [16] * 3
+    assert world.step == 128
+    world.s[0, 3] = 1e4
+    world.advance()
+    assert asked == [16] * 4
+    world.handle({"type": "reset"})
+    world.handle({"type": "set", "name": "noise", "value": 0.002})
+    for _ in range(8):
+        world.advance()
+    assert asked == [16] * 12
+
+
 def test_a_world_that_divides_shows_its_living_particles(tmp_path, device):
     config = config_to_dict(preset("paper", division=True, particle_count=64))
     told = {name: config[name] for name in config if name not in ("out", "device")}
