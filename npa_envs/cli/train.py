@@ -43,7 +43,7 @@ PAIRED_SECONDS = 60.0
 """Shortest run of one process that two share unasked [s]: the start of the second one costs 4."""
 
 PAIRED_TIME = 0.8
-"""Time of two processes as a share of one's, where batches are small (docs/recipes.md)."""
+"""Time of two processes as a share of one's, where batches are small (docs/recipes_history.md)."""
 
 
 def main(arguments: Sequence[str]) -> int:

@@ -13,6 +13,7 @@ import pytest
 
 from npa_envs.measure.quality import scores
 from npa_envs.rule.files import shipped_rules
+from npa_envs.tasks.morphogenesis2d import MORPHOGENESIS2D_PRESETS
 
 ROOT = Path(__file__).resolve().parents[2]
 RESULTS = ROOT / "benchmarks" / "results"
@@ -510,7 +511,7 @@ def test_ppo_is_above_what_learns_nothing_in_small_worlds_by_three_standard_erro
 
 
 def test_the_table_of_the_test_of_best_has_the_numbers_of_its_file() -> None:
-    page = (ROOT / "docs" / "recipes.md").read_text(encoding="utf-8")
+    page = (ROOT / "docs" / "recipes_history.md").read_text(encoding="utf-8")
     section = page.split("## The test of `best` with AdamW")[1].split("![")[0]
     told = dict(re.findall(r"^\| ([a-z -]+) \| (.*) \|$", section, re.MULTILINE))
     record = content(RESULTS / "recipes_best_test_h200.json")
@@ -669,8 +670,8 @@ def test_the_times_of_rules_that_know_no_direction_are_those_of_their_files() ->
 
 
 def test_the_tables_of_more_cuts_have_the_numbers_of_their_file() -> None:
-    page = (ROOT / "docs" / "recipes.md").read_text(encoding="utf-8")
-    section = page.split("### More cuts and later rest")[1].split("\n### ")[0]
+    page = (ROOT / "docs" / "recipes_history.md").read_text(encoding="utf-8")
+    section = page.split("\n## More cuts and later rest\n")[1].split("\n## ")[0]
     record = content(RESULTS / "recipes_cuts_h200.json")
     told = [line.split(" | ") for line in section.splitlines() if line.startswith("| ")]
     arms: dict[str, list[dict[str, Any]]] = {}
@@ -713,8 +714,8 @@ REST_ARMS = {
 
 
 def test_the_table_of_rest_has_the_numbers_of_its_file() -> None:
-    page = (ROOT / "docs" / "recipes.md").read_text(encoding="utf-8")
-    section = page.split("### Rest of the fastest particles")[1].split("\n#### ")[0]
+    page = (ROOT / "docs" / "recipes_history.md").read_text(encoding="utf-8")
+    section = page.split("\n## Rest of the fastest particles\n")[1].split("\n### ")[0]
     rows = content(RESULTS / "recipes_rest_h200.json")["development"]
     looked = [row for row in rows if "worlds_within" in row]
     for arm, changed in REST_ARMS.items():
@@ -738,30 +739,31 @@ def test_the_table_of_rest_has_the_numbers_of_its_file() -> None:
 
 
 TESTS = {
-    "#### The test with rest of the fastest particles\n": {
+    ("recipes_history", "\n### The test with rest of the fastest particles\n"): {
         "mean of 12, or sum": "rest_h200",
         "(more cuts, `--rest-age 2048`)": "cuts_h200",
         "(`best` as it was)": "decay_h200",
     },
-    "#### The test of `best`\n": {
+    ("recipes", "\n## The test of `best`\n"): {
         "mean of 12, or sum": "dead_zone_h100",
         "(without a dead zone)": "rest_h200",
     },
 }
-"""Records of rows of the tables of the test, by title; the first one's pictures have rows, too."""
+"""Records of rows of the tables of the test, by page and title; the first one's pictures have
+rows, too."""
 
 STEPS = (64, 128, 512, 1024, 4096, 20_000)
 """Steps of the tables of the test, before that of 100 000."""
 
 
-@pytest.mark.parametrize("title", TESTS)
-def test_the_tables_of_the_test_have_the_numbers_of_their_files(title: str) -> None:
-    page = (ROOT / "docs" / "recipes.md").read_text(encoding="utf-8")
-    section = page.split(title)[1].split("\n### ")[0]
+@pytest.mark.parametrize(("name", "title"), TESTS)
+def test_the_tables_of_the_test_have_the_numbers_of_their_files(name: str, title: str) -> None:
+    page = (ROOT / "docs" / f"{name}.md").read_text(encoding="utf-8")
+    section = re.split(r"\n##+ ", page.split(title)[1])[0]
     told = dict(re.findall(r"^\| (\S.*?) \| (.*) \|$", section, re.MULTILINE))
     restless = []
-    for row_title, name in TESTS[title].items():
-        record = content(RESULTS / f"recipes_{name}.json")
+    for row_title, measured in TESTS[name, title].items():
+        record = content(RESULTS / f"recipes_{measured}.json")
         aged = {row["picture"]: row for row in record["long"]}
         healed = {row["picture"]: row["healing"] for row in record["healing_of_32"]}
         grown = {run["picture"]: losses_of(run) for run in record["test"]}
@@ -813,6 +815,52 @@ def test_what_best_reaches_is_what_its_test_measured() -> None:
     assert cells["one command, from start to end"] == f"[{seconds} s](#the-one-command), an H100"
 
 
+UNTOLD = ("out", "tensorboard", "picture_interval", "checkpoint_interval")
+"""Fields of presets that the tables of choices leave out: they change no rule."""
+
+
+@pytest.mark.parametrize("preset", ["best", "fast"])
+def test_the_tables_of_choices_tell_the_presets(preset: str) -> None:
+    page = (ROOT / "docs" / "recipes.md").read_text(encoding="utf-8")
+    section = page.split(f"\n## What `{preset}` consists of\n")[1].split("\n## ")[0]
+    told = {}
+    for cell in re.findall(r"^\| `--([^`]+)`", section, re.MULTILINE):
+        for option in cell.split(" --"):
+            name, *values = option.split()
+            told[name.replace("-", "_")] = [as_number(value) for value in values]
+    chosen, paper = (MORPHOGENESIS2D_PRESETS[name] for name in (preset, "paper"))
+    fields = dict(vars(chosen.task)) | vars(chosen)
+    assert set(told) - {"hidden_dim"} == {
+        name
+        for name, value in (dict(vars(paper.task)) | vars(paper)).items()
+        if fields[name] != value and name not in ("task", *UNTOLD)
+    }
+    for name, values in told.items():
+        value = fields[name]
+        assert values == list(value if isinstance(value, tuple) else (value,)), name
+
+
+def as_number(word: str) -> float | str:
+    """A word of a command as a number, where it is one."""
+    try:
+        return float(word)
+    except ValueError:
+        return word
+
+
+def test_the_table_of_shipped_pictures_has_the_numbers_of_their_files() -> None:
+    page = (ROOT / "docs" / "recipes.md").read_text(encoding="utf-8")
+    section = page.split("\n## The library\n")[1]
+    rows = re.findall(r"^\| \[`([^`]+)`\]\(\S+\) \| [^|]+ \| (.*) \|$", section, re.MULTILINE)
+    assert sorted(name for name, _ in rows) == sorted(shipped_rules("morphogenesis2d"))
+    for name, cells in rows:
+        measured = scores(name)
+        losses = losses_of(measured)
+        told = [f"{losses[step]:.3f}" for step in (64, 128, 512, 1024, 2048, 4096)]
+        told += [f"{row['worlds_healed']} of {row['world_count']}" for row in measured["healing"]]
+        assert cells.split(" | ") == told
+
+
 ZONE_ARMS = {
     "p4": "nothing (printed)",
     "p4w4": "`--rest-weight 4` (printed)",
@@ -827,8 +875,8 @@ ZONE_ARMS = {
 
 
 def test_the_table_of_dead_zones_has_the_numbers_of_its_file() -> None:
-    page = (ROOT / "docs" / "recipes.md").read_text(encoding="utf-8")
-    section = page.split("### A dead zone\n")[1].split("\n#### ")[0]
+    page = (ROOT / "docs" / "recipes_history.md").read_text(encoding="utf-8")
+    section = page.split("\n## A dead zone\n")[1].split("\n### ")[0]
     record = content(RESULTS / "recipes_dead_zone_h100.json")
     rows = record["printed_only"]["looks"] + record["development"]
     looked = [row for row in rows if "worlds_within" in row]
@@ -854,7 +902,7 @@ def test_the_table_of_dead_zones_has_the_numbers_of_its_file() -> None:
     steps = [int(then.split()[-1]) for then in over]
     assert f"between steps {min(steps)} and {max(steps)}." in section
     # The claim of 128 of 128 worlds, by 32 seeds, says how many more seeds tell.
-    before = page.split("### Rest of the fastest particles")[1].split("\n#### ")[0]
+    before = page.split("\n## Rest of the fastest particles\n")[1].split("\n### ")[0]
     assert f"of 512 worlds the same four rules keep [{kept[0]}](#a-dead-zone)" in before
     unlooked = [row for row in rows if row["arm"] == "z1w1"]
     for arm in (unlooked, [row for row in rows if row["arm"] == "z1"]):
@@ -862,8 +910,8 @@ def test_the_table_of_dead_zones_has_the_numbers_of_its_file() -> None:
 
 
 def test_the_gecko_with_a_dead_zone_is_worse_than_the_shipped_one() -> None:
-    page = (ROOT / "docs" / "recipes.md").read_text(encoding="utf-8")
-    section = page.split("#### With a dead zone\n")[1].split("\n#### ")[0]
+    page = (ROOT / "docs" / "recipes_history.md").read_text(encoding="utf-8")
+    section = page.split("\n### The library with a dead zone\n")[1].split("\n### ")[0]
     losses = losses_of(content(RESULTS / "recipes_dead_zone_h100.json")["one_command"])
     (shipped,) = (
         losses_of(run["before"])
@@ -880,8 +928,10 @@ def test_the_gecko_with_a_dead_zone_is_worse_than_the_shipped_one() -> None:
 
 
 def test_the_table_of_the_library_has_the_numbers_of_its_file() -> None:
-    page = (ROOT / "docs" / "recipes.md").read_text(encoding="utf-8")
-    section = page.split("#### With rest of the fastest particles\n")[1].split("\n#### ")[0]
+    page = (ROOT / "docs" / "recipes_history.md").read_text(encoding="utf-8")
+    section = re.split(
+        r"\n##+ ", page.split("\n### The library with rest of the fastest particles\n")[1]
+    )[0]
     runs = content(RESULTS / "library_rest_h200.json")["runs"]
     lines = [line for line in section.splitlines() if re.match(r"\| (`|shipped)", line)]
     assert len(runs) == 6
@@ -941,9 +991,13 @@ MUON_ARM = "eighth, muon, from 16"
 
 
 def test_the_tables_of_muon_have_the_numbers_of_their_files() -> None:
-    page = (ROOT / "docs" / "recipes.md").read_text(encoding="utf-8")
-    section = page.split("\n## Muon\n")[1].split("### More cuts and later rest")[0]
-    told = dict(re.findall(r"^\| ([a-z0-9., -]+?)(?: \(.*\))? \| (.*) \|$", section, re.MULTILINE))
+    page = (ROOT / "docs" / "recipes_history.md").read_text(encoding="utf-8")
+    first, table, section = (
+        page.split(title)[1].split("\n### ")[0]
+        for title in ("\n## Muon\n", "\n## Weight decay\n", "\n### The test with weight decay\n")
+    )
+    pattern = re.compile(r"^\| ([a-z0-9., -]+?)(?: \(.*\))? \| (.*) \|$", re.MULTILINE)
+    small, told = (dict(pattern.findall(part)) for part in (first, section))
     record = content(RESULTS / "recipes_muon_h100.json")
     steps = ("64", "128", "512", "1024", "4096", "20000")
     decayed = content(RESULTS / "recipes_decay_h200.json")
@@ -976,21 +1030,20 @@ def test_the_tables_of_muon_have_the_numbers_of_their_files() -> None:
         cell = " / ".join(f"{own[step]:.3f}" for step in (128, 512, 20_000))
         arms.setdefault(run["picture"].removesuffix("-knife"), {})[run["arm"]] = cell
     endings = ("", ", decay 0.1", ", halfway 1", ", halfway 1, decay 0.03")
-    table = section.split("### Weight decay")[1]
     for picture, found in arms.items():
         absent = "fell apart" if picture == "gecko" else "–"
-        row = " | ".join(found.get(MUON_ARM + ending, absent) for ending in endings)
-        assert f"| {picture.replace('-', ' ')} | {row} |" in table
+        cells = [found.get(MUON_ARM + ending, absent) for ending in endings]
+        assert f"| {picture.replace('-', ' ')} | {' | '.join(cells)} |" in table
     for arm in {run["arm"] for run in record["small"]} - {"eighth, muon, rate 1e-2"}:
         losses = [run["losses"] for run in record["small"] if run["arm"] == arm]
         means = [statistics.mean(own[step] for own in losses) for step in steps]
         # The runs printed three digits.
-        assert [float(cell) for cell in told[arm].split(" | ")] == pytest.approx(means, abs=6e-4)
+        assert [float(cell) for cell in small[arm].split(" | ")] == pytest.approx(means, abs=6e-4)
 
 
 def test_the_table_of_fast_has_the_numbers_of_its_file() -> None:
     page = (ROOT / "docs" / "recipes.md").read_text(encoding="utf-8")
-    section = page.split("\n### The test of `fast`\n")[1]
+    section = page.split("\n## The test of `fast`\n")[1].split("\n## ")[0]
     runs = content(RESULTS / "recipes_fast_wide_cpu.json")["test"]
     losses = [losses_of(run) for run in runs]
     assert len(runs) == 12
@@ -1010,7 +1063,7 @@ def test_the_table_of_fast_has_the_numbers_of_its_file() -> None:
     ],
 )
 def test_the_tables_of_second_lives_have_the_numbers_of_their_files(title: str, name: str) -> None:
-    page = (ROOT / "docs" / "recipes.md").read_text(encoding="utf-8")
+    page = (ROOT / "docs" / "recipes_history.md").read_text(encoding="utf-8")
     section = re.split(r"\n##+ ", page.split(title)[1])[0]
     told = dict(
         re.findall(r"^\| ([a-z0-9, -]+?)(?: \(`best`\))? \| (.*) \|$", section, re.MULTILINE)
