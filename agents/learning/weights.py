@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from npa_envs.errors import NPAError
+from npa_envs.rule.network import without_small
 from npa_envs.rule.rule import NPARule
 
 MOST_HIDDEN = 2**27
@@ -85,4 +86,4 @@ def updates_of(rule: NPARule, weights: Tensor, rows: Tensor) -> Tensor:
         some = slice(k, k + at_once)
         hidden = torch.baddbmm(bias[some, None], rows[some], first[some].mT).relu_()
         updates.append(torch.bmm(hidden, second[some].mT))
-    return torch.cat(updates)
+    return without_small(torch.cat(updates), rule.dead_zone)

@@ -177,7 +177,8 @@ def _card(
     read_out = f", read-out to {rule.readout_dim}" if rule.readout_dim else ""
     used = versions()
     world = f"N {config.particle_count}, C {rule.state_dim}, ε {task.eps:g}, {moves}"
-    sizes = f"{wide} → {rule.hidden_dim} → {narrow}{read_out}, {rule.weight_count} weights"
+    zone = f", dead zone {rule.dead_zone:g}" if rule.dead_zone else ""
+    sizes = f"{wide} → {rule.hidden_dim} → {narrow}{read_out}, {rule.weight_count} weights{zone}"
     rows = [
         ("task", f"{rule.space_dim}D, {space}, {world}, p {task.update_prob:g}"),
         ("network", sizes),

@@ -118,7 +118,7 @@ class NPARule(nn.Module):
         divides: Particles divide and die, with odds that follow from their states. Their first
             state is 1 where they live and 0 where they are dead (`npa_envs.world.division`).
         dead_zone: Each number y of an update with |y| <= `dead_zone` counts as 0 (dimensionless).
-            Worlds that hardly change then come to rest and stay as they are, bit for bit.
+            Worlds that hardly change then come to rest (`at_rest`).
 
     Raises:
         NPAError: A dimension or a length is out of range, `moment_inverse` is another word, or what
@@ -496,6 +496,8 @@ class NPARule(nn.Module):
             "state": f"{self.state_dim} channels",
             "network": f"{self.hidden_dim} hidden units, {self.weight_count} weights",
         }
+        if self.dead_zone:
+            rows["dead zone"] = f"{self.dead_zone:g}: smaller numbers count as 0"
         if self.readout is not None:
             rows["read-out"] = f"{self.readout_dim} outputs"
         cells = "".join(f"<tr><th>{name}</th><td>{text}</td></tr>" for name, text in rows.items())

@@ -85,8 +85,9 @@ class TrainConfig(Generic[TaskConfigT]):
 
     dead_zone: float = 0.0
     """Each number y of an update with |y| <= `dead_zone` counts as 0 (dimensionless): worlds that
-    hardly change then come to rest. A rule that the run begins with takes it over; of several that
-    learn together, those that are given keep theirs. Equivariant rules have none."""
+    hardly change then come to rest. It replaces that of `initial_rule`, also where it is 0; of
+    several rules that learn together, those that are given keep theirs. Equivariant rules have
+    none, whatever is said here."""
 
     iterations: int = 10_000
     """Optimiser steps in one repeat."""

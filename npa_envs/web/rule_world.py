@@ -642,6 +642,7 @@ class RunWorld(RuleWorld):
 
     def _take_rules(self) -> None:
         """Take the rules as they are now: the world goes on under them, if they fit."""
+        self._still = ()
         fresh = {
             name: load_rule(path, device=self._device).float() for name, path in self._files.items()
         }

@@ -312,6 +312,9 @@ def _run_until_rest(
         x, s, _ = worlds
         worlds = run_call(own, (rule,), x, s, generator, cuda_graph=cuda_graph, watch=None)
         left, part = left - own.steps, 2 * part
+        if left and not worlds.x.isfinite().all():
+            # A world has diverged, which the next call refuses, and not this one.
+            return call._replace(steps=left).run((rule,), worlds, generator)
     # Whoever draws next gets what comes after all steps.
     for _ in RuleStep(rule, None, call.options).draws(worlds.x, left, generator):
         pass
@@ -384,8 +387,10 @@ def at_rest(
 ) -> Tensor:
     """Return which worlds no step changes any more.
 
-    All particles of such a world are updated at once and stay as they are, bit for bit, so they
-    stay whichever of them a step updates. Rules with a `dead_zone` bring worlds to rest.
+    All particles of such a world are updated at once and stay as they are, so they stay whichever
+    of them a step updates. On CUDA in float32 that is exact; elsewhere torch's products over fewer
+    rows may round an update otherwise that lies on the edge of the dead zone. Rules with a
+    `dead_zone` bring worlds to rest.
 
     Args:
         rule: The rule, one whose particles do not divide; dtype and device of x.
@@ -480,6 +485,10 @@ def rollout(
     Each step draws m ~ Bernoulli(update_prob) for every particle, perceives the particles with
     m = 1 and updates them: x ← x + m dt Δx (+ noise), s ← s + m dt Δs, with
     Δx = alpha eps δ / (1 + |δ|) and [δ ; Δs] = rule(z) (arXiv 2601.16096, section 3).
+
+    Without gradients, steps of worlds that a rule with a `dead_zone` has brought to rest are left
+    out of rollouts of 256 steps or more (`at_rest` tells which those are); on CUDA such rollouts
+    wait for the answer at the beginning and after 64, 192, 448, ... steps.
 
     With a rule that `divides`, particle i is slot i, whose particle may die and be replaced by
     another one's child (`npa_envs.world.division`).

@@ -70,6 +70,18 @@ def test_a_candidate_acts_in_its_own_worlds_as_its_rules_do(problem, device):
         observation, *_ = envs.step(actions)
 
 
+def test_candidates_have_the_dead_zone_of_their_rules(problem, device):
+    rules = problem.new_rules(0).to(device)
+    weights = 0.5 * torch.randn(2, len(Population(rules).vector()), device=device)
+    population = Population(rules)
+    envs = problem.make_envs(4, device=device)
+    observation, _ = envs.reset(seed=3)
+    assert population.actions(weights, observation).any()
+    for rule in rules:
+        rule.dead_zone = 1e6
+    assert not population.actions(weights, observation).any()
+
+
 def test_candidates_act_alike_however_many_are_computed_at_once(monkeypatch, device):
     problem = PROBLEMS["mixing"]
     population, weights = candidates_of(problem, device, 5)

@@ -121,6 +121,8 @@ def test_a_precision_keeps_weights_and_rounds_what_it_says():
         assert (1e-4 < error < 2e-2) if name == "mixed" else (error < 1e-6)
         rounded = s.bfloat16().float() if name == "bf16_storage" else s
         assert torch.equal(precision.kept(s), rounded)
+    rule.dead_zone = 1e6
+    assert not any(own.rule(rule)(z.to(own.dtype)).any() for own in PRECISIONS.values())
     # The fused path does not see torch's switch.
     assert not PRECISIONS["tf32"].rule(rule).is_plain()
     before = torch.backends.cuda.matmul.allow_tf32

@@ -1109,3 +1109,23 @@ def test_the_table_of_training_on_two_gpus_has_the_numbers_of_its_file() -> None
     assert f"take {100 * (twice / alone - 1):.0f} % longer" in page
     assert f"weak scaling {100 * alone / twice:.0f} %" in page
     assert f"{alone / shared:.2f} times as\nfast" in page
+
+
+def test_the_table_of_worlds_at_rest_has_the_numbers_of_its_file() -> None:
+    page = (ROOT / "docs" / "skipping.md").read_text(encoding="utf-8")
+    section = page[page.index("## Worlds at rest") :]
+    told = [
+        [cell.strip() for cell in line.split("|")[2:6]]
+        for line in section.splitlines()
+        if re.match(r"\|[^|]*\| \d", line)
+    ]
+    gecko, paperclip = content(RESULTS / "resting_cpu.json")["resting"]
+    expected = []
+    for world, ages, places in ((gecko, (0, 1024, 2048, 4096), 2), (paperclip, (0, 512, 2048), 3)):
+        for row in world["ages"]:
+            if row["age"] in ages:
+                rests, called = row["at_rest"], row["as_called_s"]
+                short = f"{called:.3f}" if rests else f"{called:.{places}f}"
+                every = f"{row['every_step_s']:.{places}f}"
+                expected.append([str(row["age"]), "yes" if rests else "no", every, short])
+    assert told == expected

@@ -61,7 +61,7 @@ def test_a_rollout_follows_the_reference_and_so_do_its_gradients(space_dim, devi
         loss = found[0].square().sum() + found[1].square().sum()
         ways.append([*found, *torch.autograd.grad(loss, weights)])
     plain = npa_envs.rollout(without_zone(rule), x, s, 3, eps=0.3, update_prob=1.0)
-    assert float((plain[0] - ways[0][0]).abs().max()) > 1e-3
+    assert float((plain[0] - ways[0][0]).detach().abs().max()) > 1e-3
     assert_near(ways[0], ways[1], 1e-10)
 
 
@@ -221,18 +221,24 @@ class TestRest:
             ways.append((*after, *later))
         assert_same(*ways)
 
-    def test_it_runs_no_step_of_worlds_that_begin_at_rest(self, rule, worlds, monkeypatch):
+    @pytest.fixture
+    def asked(self, monkeypatch):
+        """The steps of each part that is run, of which 1 is a question."""
+        asked = []
+        own = rollout_module.run_call
+
+        def noted(call, *args, **options):
+            asked.append(call.steps)
+            return own(call, *args, **options)
+
+        monkeypatch.setattr(rollout_module, "run_call", noted)
+        return asked
+
+    def test_it_runs_no_step_of_worlds_that_begin_at_rest(self, rule, worlds, asked):
         x, s = worlds
         with torch.no_grad():
             x, s = npa_envs.rollout(rule, x, s, 200, eps=0.3)
-            asked = []
-            own = rollout_module.run_call
-
-            def noted(call, *args, **options):
-                asked.append(call.steps)
-                return own(call, *args, **options)
-
-            monkeypatch.setattr(rollout_module, "run_call", noted)
+            asked.clear()
             after = npa_envs.rollout(rule, x, s, 10_000, eps=0.3)
         assert asked == [1]
         assert_same(after, (x, s))
@@ -240,19 +246,51 @@ class TestRest:
         assert x.any()
 
     @pytest.mark.parametrize(
-        "options", [{"keep_every": 64}, {"return_path_length": True}, {"position_noise": 1e-3}]
+        "options",
+        [
+            {"keep_every": 64},
+            {"return_path_length": True},
+            {"position_noise": 1e-3},
+            {"on_divergence": "raise"},
+        ],
+        ids=lambda options: next(iter(options)),
     )
-    def test_what_needs_each_step_runs_each_step(self, rule, worlds, options):
+    def test_what_needs_each_step_runs_each_step(self, rule, worlds, asked, options):
         x, s = worlds
         with torch.no_grad():
-            x, s = npa_envs.rollout(rule, x, s, 200, eps=0.3)
-            after = npa_envs.rollout(rule, x, s, 256, eps=0.3, **options)
-        if "keep_every" in options:
-            assert after[0].shape == (4, *x.shape)
-        elif "position_noise" in options:
-            assert not torch.equal(after[0], x)
-        else:
-            assert not after[2].any()
+            npa_envs.rollout(rule, x, s, 256, eps=0.3, **options)
+        assert asked == [256]
+
+    def test_so_do_gradients_and_rules_with_a_network_of_their_own(self, rule, worlds, asked):
+        class Own(NPARule):
+            def forward(self, perception):
+                return super().forward(perception)
+
+        x, s = worlds
+        npa_envs.rollout(rule, x, s, 256, eps=0.3)
+        with torch.no_grad():
+            own = Own(**rule.hyper_parameters()).to(x.device)
+            npa_envs.rollout(own, x, s, 256, eps=0.3)
+        assert asked == [256, 256]
+
+    def test_worlds_that_diverge_are_returned_as_without_a_zone(self, rule, worlds, asked, device):
+        with torch.no_grad():
+            # Beyond 3 a state grows more from step to step, and takes the particle along.
+            rule.hidden.weight[7, 3] = 1.0
+            rule.hidden.bias[7] = -3.0
+            rule.output.weight[5, 7] = rule.output.weight[0, 7] = 2.0
+        x, s = worlds
+        s[1, 5, 3] = 4.0
+        ways = []
+        for zone in (0.02, 0.0):
+            rule.dead_zone = zone
+            with torch.no_grad():
+                after = npa_envs.rollout(rule, x, s, 600, eps=0.3, generator=self.generator(device))
+            ways.append(after)
+        assert asked[:2] == [1, 64]
+        assert asked[-1] == 600
+        for x, _ in ways:
+            assert x.isfinite().flatten(1).all(dim=1).tolist() == [True, False]
 
     def test_rules_that_divide_are_refused(self, worlds):
         with pytest.raises(NPAError, match="at_rest is for rules whose particles do not divide"):

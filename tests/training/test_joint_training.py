@@ -112,6 +112,16 @@ class TestRun:
             assert [rule.moment_inverse for rule in result.rule] == ["smooth", "smooth"]
         assert load_rule(tmp_path / "run" / "rule-1.safetensors").moment_inverse == "smooth"
 
+    def test_rules_get_the_dead_zone_but_those_that_are_given_keep_theirs(self, tmp_path):
+        config = run_config(tmp_path / "run", iterations=1, dead_zone=0.01)
+        made = train_together(config, None, overwrite=True, progress=False).rule
+        assert [rule.dead_zone for rule in made] == [0.01, 0.01]
+        given = CoMorphogenesis2D(pair()).make_rules(torch.Generator())
+        given[1].dead_zone = 0.5
+        kept = train_together(config, given, overwrite=True, progress=False).rule
+        assert [rule.dead_zone for rule in kept] == [0.0, 0.5]
+        assert load_rule(tmp_path / "run" / "rule-1.safetensors").dead_zone == 0.5
+
     def test_rules_that_do_not_fit_are_refused(self, tmp_path):
         rules = CoMorphogenesis2D(pair()).make_rules(torch.Generator())
         with pytest.raises(NPAError, match="one for each of 2 species, got 1"):

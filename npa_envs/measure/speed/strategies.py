@@ -15,6 +15,7 @@ from npa_envs import reference
 from npa_envs.measure.speed.hash_grid import grid_fields
 from npa_envs.ops import perceive, perception_fields
 from npa_envs.ops.equivariance import invariants, steered
+from npa_envs.rule.network import without_small
 from npa_envs.rule.rule import NPARule
 
 NEIGHBOUR_CAP = 32
@@ -175,7 +176,7 @@ class MixedRule(NPARule):
     def forward(self, perception: Tensor) -> Tensor:
         """Map perception vectors, shape [..., P], to raw updates, shape [..., A]."""
         if not self.equivariant:
-            return self._outputs(perception, self.update_weight)
+            return without_small(self._outputs(perception, self.update_weight), self.dead_zone)
         mixed, inputs = invariants(perception, self.mixing, self.vector_form)
         output = self._outputs(inputs, self.output.weight)
         return output if self.static else steered(output, mixed, self.steering, self.vector_form)

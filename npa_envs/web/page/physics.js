@@ -456,16 +456,19 @@ export class Physics {
   // of both lies in the rule's dead zone is 0.
   update({ x, s }, rule, particle, updates, from, eps, dt) {
     const { dimension, channels } = this;
-    const zone = rule.dead_zone;
-    const felt = (at) => (Math.abs(updates[at]) > zone ? updates[at] : 0);
+    if (rule.dead_zone > 0) {
+      for (let a = from; a < from + rule.outputs; a++) {
+        if (Math.abs(updates[a]) <= rule.dead_zone) updates[a] = 0;
+      }
+    }
     if (!rule.static) {
       let squared = 0;
-      for (let d = 0; d < dimension; d++) squared += felt(from + d) ** 2;
+      for (let d = 0; d < dimension; d++) squared += updates[from + d] ** 2;
       const share = (dt * rule.alpha * eps) / (1 + Math.sqrt(squared));
-      for (let d = 0; d < dimension; d++) x[particle * dimension + d] += share * felt(from + d);
+      for (let d = 0; d < dimension; d++) x[particle * dimension + d] += share * updates[from + d];
       from += dimension;
     }
-    for (let c = 0; c < channels; c++) s[particle * channels + c] += dt * felt(from + c);
+    for (let c = 0; c < channels; c++) s[particle * channels + c] += dt * updates[from + c];
   }
 }
 
