@@ -3,8 +3,8 @@
 Ours holds the weights under `NPARule`'s own names and, in the header's metadata, the format's name
 and version, every hyper-parameter and a checksum, so that a file is all that is needed to run a
 rule. The checksum is SHA-256 over all else that the file says; older files have none. Version 2 is
-for equivariant rules alone, version 3 for rules with codes, version 4 for rules that divide, version 5
-for those with a dead zone: older versions of the package cannot run them.
+for equivariant rules alone, version 3 for rules with codes, version 4 for rules that divide,
+version 5 for those with a dead zone: older versions of the package cannot run them.
 """
 
 from __future__ import annotations
