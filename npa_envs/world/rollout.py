@@ -486,9 +486,9 @@ def rollout(
     m = 1 and updates them: x ← x + m dt Δx (+ noise), s ← s + m dt Δs, with
     Δx = alpha eps δ / (1 + |δ|) and [δ ; Δs] = rule(z) (arXiv 2601.16096, section 3).
 
-    Without gradients, steps of worlds that a rule with a `dead_zone` has brought to rest are left
-    out of rollouts of 256 steps or more (`at_rest` tells which those are); on CUDA such rollouts
-    wait for the answer at the beginning and after 64, 192, 448, ... steps.
+    With gradients disabled, rollouts of 256 steps or more leave out the steps of worlds that a rule
+    with a `dead_zone` has brought to rest (`at_rest` tells which those are). On CUDA they wait for
+    the answer at the beginning and after 64, 192, 448, ... steps.
 
     With a rule that `divides`, particle i is slot i, whose particle may die and be replaced by
     another one's child (`npa_envs.world.division`).
