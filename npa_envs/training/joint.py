@@ -18,7 +18,7 @@ from npa_envs.tasks.base import differing_fields
 from npa_envs.tasks.co_morphogenesis2d import CoMorphogenesis2D, CoMorphogenesis2DConfig
 from npa_envs.tasks.train_config import JointTrainConfig, TrainConfig
 from npa_envs.training.iteration import RolloutOptions
-from npa_envs.training.trainer import Trainer, TrainResult, rule_like
+from npa_envs.training.trainer import Trainer, TrainResult, rule_like, take_options
 from npa_envs.world.species import rollout_species
 
 TASK_NAME = "co_morphogenesis2d"
@@ -83,8 +83,7 @@ class _JointTrainer(Trainer):
         # The trainer asks of its rule what any module has, and for its hyper-parameters.
         made = self._species.make_rules(generator)
         for rule in made:
-            rule.moment_inverse = self.config.moment_inverse
-            rule.dead_zone = 0.0 if rule.equivariant else self.config.dead_zone
+            take_options(rule, self.config)
         if held is not None:
             self._given = [rule_like(own) for own in held["rules"]]
         if self._given is None:

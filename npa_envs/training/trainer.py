@@ -450,6 +450,12 @@ def rule_like(held: dict[str, Any]) -> NPARule:
         ) from error
 
 
+def take_options(rule: NPARule, config: TrainConfig[Any]) -> None:
+    """Give an untrained rule what the configuration says of its perception and its updates."""
+    rule.moment_inverse = config.moment_inverse
+    rule.dead_zone = 0.0 if rule.equivariant else config.dead_zone
+
+
 def initial_rule(config: TrainConfig[Any], untrained: NPARule) -> NPARule:
     """Return the rule that a run starts from, with its `moment_inverse` and `dead_zone`.
 
@@ -467,8 +473,7 @@ def initial_rule(config: TrainConfig[Any], untrained: NPARule) -> NPARule:
         NPAError: The configuration's rule cannot be loaded, has another shape, or was trained with
             another `moment_inverse` than the paper's and the configuration's.
     """
-    untrained.moment_inverse = config.moment_inverse
-    untrained.dead_zone = 0.0 if untrained.equivariant else config.dead_zone
+    take_options(untrained, config)
     if not config.initial_rule or (untrained.equivariant and config.initial_rule in first_rules()):
         return untrained
     source = config.initial_rule

@@ -302,24 +302,28 @@ class RuleWorld(Live):
     def _rests(self) -> bool:
         """Return whether the rule's own world is at rest, which is asked now and then."""
         rule = self.main.rule
-        alone = self.counts == [self.full] and self._divisors == [float(self.full)]
-        if rule.dead_zone == 0.0 or rule.divides or self.noise > 0.0 or not alone:
+        if not rule.dead_zone or rule.divides or self.noise > 0.0 or not self._is_as_planted():
             return False
         worlds = self.x, self.s
         now = (*map(id, worlds), *(value._version for value in worlds), rule, self.eps)
-        if self._still and now == self._still[2:]:
+        if now == self._still[2:]:
             return True
         if self.step < self._looked + REST_LOOK:
             return False
         self._looked = self.step
-        if bool(at_rest(rule, *worlds, eps=self.eps, box=self.task.box)):
+        rests = bool(at_rest(rule, *worlds, eps=self.eps, box=self.task.box))
+        if rests:
             # The worlds are kept, so that nothing else gets their ids.
             self._still = (*worlds, *now)
-        return bool(self._still) and now == self._still[2:]
+        return rests
+
+    def _is_as_planted(self) -> bool:
+        """Return whether the particles are those of a fresh world of one rule."""
+        return self.counts == [self.full] and self._divisors == [float(self.full)]
 
     def _go(self, steps: int, told: Mapping[str, Any], *, path: bool = False) -> Tensor | None:
         rules = [organism.rule for organism in self.organisms]
-        if self.counts == [self.full] and self._divisors == [float(self.full)]:
+        if self._is_as_planted():
             self.x, self.s, travelled = rollout(
                 rules[0], self.x, self.s, steps, return_path_length=True, **told
             )
