@@ -117,9 +117,13 @@ class WorldRandom:
         """Worlds B."""
         return self.keys.shape[0]
 
-    def advance(self) -> None:
-        """Begin the next step of every world, in place; its draws begin anew."""
-        self.steps += 1
+    def advance(self, steps: int = 1) -> None:
+        """Begin a later step of every world, in place; its draws begin anew.
+
+        Args:
+            steps: How many steps later.
+        """
+        self.steps += steps
         self._draw_count = 0
 
     def restart(self) -> None:
@@ -255,6 +259,14 @@ class WorldRandom:
 
 Randomness = torch.Generator | WorldRandom
 """What random draws can come from."""
+
+
+def torch_generator(generator: Randomness | None, device: torch.device) -> torch.Generator:
+    """Return what torch draws from on a CUDA device: the given generator, or torch's own."""
+    if generator is None:
+        return torch.cuda.default_generators[device.index]
+    assert isinstance(generator, torch.Generator)
+    return generator
 
 
 def check_generator(generator: Randomness | None, device: torch.device, world_count: int) -> None:

@@ -33,7 +33,7 @@ from npa_envs.ops.opaque import once_differentiable
 from npa_envs.rule.rule import NPARule
 from npa_envs.world.cuda_graph import Captured, capture, current_stream, prepare_capture
 from npa_envs.world.divergence import DivergenceWatch
-from npa_envs.world.randomness import Randomness, WorldRandom
+from npa_envs.world.randomness import Randomness, WorldRandom, torch_generator
 
 CudaGraph = bool | Literal["auto"]
 """Whether rollouts record themselves on CUDA: "auto" records plain rules."""
@@ -409,14 +409,14 @@ class _Recording:
             assert isinstance(generator, WorldRandom)
             generator.follow(self._streams, steps)
         else:
-            _torch_generator(generator, self.device).set_offset(self._generator.get_offset())
+            torch_generator(generator, self.device).set_offset(self._generator.get_offset())
 
     def _load_draws(self, generator: Randomness | None) -> None:
         if self._streams is not None:
             assert isinstance(generator, WorldRandom)
             self._streams.put(slice(None), generator)
         else:
-            source = _torch_generator(generator, self.device)
+            source = torch_generator(generator, self.device)
             self._generator.manual_seed(source.initial_seed())
             self._generator.set_offset(source.get_offset())
 
@@ -456,13 +456,6 @@ def _copies(tensors: list[Tensor]) -> list[Tensor]:
     copies = [torch.empty_like(tensor) for tensor in tensors]
     torch._foreach_copy_(copies, tensors)
     return copies
-
-
-def _torch_generator(generator: Randomness | None, device: torch.device) -> torch.Generator:
-    if generator is None:
-        return torch.cuda.default_generators[device.index]
-    assert isinstance(generator, torch.Generator)
-    return generator
 
 
 def _reserved(device: torch.device) -> int:

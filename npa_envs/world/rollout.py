@@ -34,7 +34,14 @@ from npa_envs.world.randomness import (
     check_generator,
 )
 from npa_envs.world.recorded import CudaGraph, Worlds, check_cuda_graph, rule_form, run_call
-from npa_envs.world.steps import DivisionStep, RuleStep, Step, StepOptions, rule_terms
+from npa_envs.world.steps import (
+    DivisionStep,
+    RuleStep,
+    Step,
+    StepOptions,
+    leave_out_draws,
+    rule_terms,
+)
 
 Memory = Literal["store", "recompute", "minimal"]
 
@@ -47,8 +54,9 @@ FEWEST_STATIC = 3
 FEWEST_RESTING = 256
 """Steps from which on it pays to ask whether worlds are at rest."""
 
-FIRST_PART = 64
-"""Steps after which that is asked again; the next parts are twice as long each."""
+FIRST_PART = {"cpu": 64, "cuda": 1024}
+"""Steps after which that is asked again, by device; the next parts are twice as long each. A GPU
+idles while it is asked."""
 
 
 def check_memory(memory: Memory) -> None:
@@ -306,7 +314,7 @@ def _run_until_rest(
     cuda_graph: CudaGraph,
 ) -> Worlds:
     """Run a rollout in parts, and leave out what comes when all worlds are at rest."""
-    left, part = call.steps, FIRST_PART
+    left, part = call.steps, FIRST_PART[worlds.x.device.type]
     while left and not _resting(rule, worlds, call.options, cuda_graph).all():
         own = call._replace(steps=min(part, left))
         x, s, _ = worlds
@@ -316,8 +324,7 @@ def _run_until_rest(
             # A world has diverged, which the next call refuses, and not this one.
             return call._replace(steps=left).run((rule,), worlds, generator)
     # Whoever draws next gets what comes after all steps.
-    for _ in RuleStep(rule, None, call.options).draws(worlds.x, left, generator):
-        pass
+    leave_out_draws(worlds.x, call.options, left, generator)
     # What is returned is the caller's to write to.
     return Worlds(*(value.clone() for value in worlds)) if left == call.steps else worlds
 

@@ -22,7 +22,13 @@ from npa_envs.rule.network import Network
 from npa_envs.rule.rule import LIFE, NPARule
 from npa_envs.world.cuda_graph import Beside
 from npa_envs.world.division import Births, divided, living, parked
-from npa_envs.world.randomness import Randomness, WorldRandom, normal_draws, uniform_draws
+from npa_envs.world.randomness import (
+    Randomness,
+    WorldRandom,
+    normal_draws,
+    torch_generator,
+    uniform_draws,
+)
 from npa_envs.world.recorded import Worlds
 
 ROWS_TOGETHER = 2**24
@@ -135,6 +141,27 @@ def drawn_steps(draw: Callable[[], Draws], like: Tensor, steps: int) -> Iterator
         beside.join()
         ready, rest = coming, rest - count
     yield from ready
+
+
+def leave_out_draws(
+    x: Tensor, options: StepOptions, steps: int, generator: Randomness | None
+) -> None:
+    """Let a source of draws go on where some steps of worlds at x would leave it."""
+    if steps == 0:
+        return
+    if isinstance(generator, WorldRandom):
+        generator.advance(steps - 1)
+        draw_step(x, options, generator)
+    elif x.is_cuda:
+        # There torch counts what it has drawn, as many for each of equal draws.
+        source = torch_generator(generator, x.device)
+        before = source.get_offset()
+        draw_step(x, options, generator)
+        after = source.get_offset()
+        source.set_offset(after + (steps - 1) * (after - before))
+    else:
+        for _ in range(steps):
+            draw_step(x, options, generator)
 
 
 def rule_terms(rule: NPARule) -> Terms:

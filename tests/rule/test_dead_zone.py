@@ -15,6 +15,7 @@ from npa_envs.rule.authors import save_demo_json
 from npa_envs.training import load_config
 from npa_envs.training.trainer import initial_rule
 from npa_envs.world import rollout as rollout_module
+from npa_envs.world.randomness import uniform_draws
 
 ZONE = 0.05
 
@@ -208,22 +209,26 @@ class TestRest:
     def test_a_rollout_leaves_them_out_and_ends_and_draws_as_if_it_did_not(
         self, rule, worlds, device, monkeypatch, by_world
     ):
-        x, s = worlds
         ways = []
         for fewest in (10**9, 256):
             monkeypatch.setattr(rollout_module, "FEWEST_RESTING", fewest)
             generator = self.generator(device)
             if by_world:
                 generator = npa_envs.WorldRandom([3, 4], device=device)
+            told, (x, s) = [], worlds
             with torch.no_grad():
-                after = npa_envs.rollout(rule, x, s, 600, eps=0.3, generator=generator)
-                later = npa_envs.rollout(rule, x, s, 3, eps=0.3, generator=generator)
-            ways.append((*after, *later))
+                # They come to rest in the first, and begin so in the second.
+                for steps in (600, 300, 1):
+                    x, s = npa_envs.rollout(rule, x, s, steps, eps=0.3, generator=generator)
+                    told += [x, s]
+                told.append(uniform_draws(generator, (2, 50), x))
+            ways.append(told)
         assert_same(*ways)
 
     @pytest.fixture
     def asked(self, monkeypatch):
         """The steps of each part that is run, of which 1 is a question."""
+        monkeypatch.setattr(rollout_module, "FIRST_PART", {"cpu": 64, "cuda": 64})
         asked = []
         own = rollout_module.run_call
 
