@@ -1,13 +1,13 @@
 """Draw what the shipped rules grow, `docs/images/rules_*.png`, each beside its target.
 
-    python docs/draw_rules.py
+    python docs/draw_rules.py [2d] [3d] [textures]
 
-It takes some minutes on a CPU. Draw anew when a rule changes. What textures grow is drawn by
-`benchmarks/textures.py figures`.
+It takes some minutes on a CPU, textures half an hour. Draw anew when a rule changes.
 """
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -80,10 +80,27 @@ def things() -> Shots:
     return shots
 
 
+@torch.no_grad()
+def textures() -> Shots:
+    """Return the target and three moments of each texture, and the last as two by two tiles."""
+    steps = (64, 512, 4096)
+    shots: Shots = []
+    for name in shipped_rules("texture"):
+        task, worlds = grown(name, steps)
+        frames = [to_uint8(task.picture(x, s)[0]) for x, s in worlds]
+        shots.append((name, to_uint8(task.target_picture)))
+        shots += [(f"step {step}", frame) for step, frame in zip(steps, frames, strict=True)]
+        shots.append((f"step {steps[-1]}, 2 x 2", np.tile(frames[-1], (2, 2, 1))[::2, ::2]))
+    return shots
+
+
+DRAWN = {"2d": pictures, "3d": things, "textures": textures}
+
+
 def main() -> None:
-    """Draw all pictures."""
-    for name, draw in (("2d", pictures), ("3d", things)):
-        captions, frames = zip(*draw(), strict=True)
+    """Draw what is named, or everything."""
+    for name in sys.argv[1:] or DRAWN:
+        captions, frames = zip(*DRAWN[name](), strict=True)
         write_filmstrip(IMAGES / f"rules_{name}.png", frames, captions, columns=5)
 
 

@@ -494,8 +494,8 @@ def rollout(
     Δx = alpha eps δ / (1 + |δ|) and [δ ; Δs] = rule(z) (arXiv 2601.16096, section 3).
 
     With gradients disabled, rollouts of 256 steps or more leave out the steps of worlds that a rule
-    with a `dead_zone` has brought to rest (`at_rest` tells which those are). On CUDA they wait for
-    the answer at the beginning and after 64, 192, 448, ... steps.
+    with a `dead_zone` has brought to rest (`at_rest` tells which those are). They wait for the
+    answer at the beginning and after 64, 192, 448, ... steps, on CUDA after 1024, 3072, ...
 
     With a rule that `divides`, particle i is slot i, whose particle may die and be replaced by
     another one's child (`npa_envs.world.division`).
