@@ -92,7 +92,7 @@ FILMS = {
     ),
     "Texture": Film(
         steps=(0, 2, 8, 16, 32, 64, 128),
-        rows=({"target": "cells", "particle_count": 4096},),
+        rows=({"target": "cells", "particle_count": 2048},),
         caption="An episode of the shipped rule `cells`.",
         rule="cells",
     ),

@@ -1,13 +1,13 @@
 """Draw what the shipped rules grow, `docs/images/rules_*.png`, each beside its target.
 
-    python docs/draw_rules.py [2d] [3d] [textures]
+    python docs/draw_rules.py [--only {2d,3d,textures} ...]
 
 It takes some minutes on a CPU, textures half an hour. Draw anew when a rule changes.
 """
 
 from __future__ import annotations
 
-import sys
+import argparse
 from pathlib import Path
 from typing import Any
 
@@ -99,7 +99,9 @@ DRAWN = {"2d": pictures, "3d": things, "textures": textures}
 
 def main() -> None:
     """Draw what is named, or everything."""
-    for name in sys.argv[1:] or DRAWN:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
+    parser.add_argument("--only", nargs="+", choices=DRAWN, default=DRAWN, help="default: all")
+    for name in parser.parse_args().only:
         captions, frames = zip(*DRAWN[name](), strict=True)
         write_filmstrip(IMAGES / f"rules_{name}.png", frames, captions, columns=5)
 

@@ -118,12 +118,15 @@ class WorldRandom:
         return self.keys.shape[0]
 
     def advance(self, steps: int = 1) -> None:
-        """Begin a later step of every world, in place; its draws begin anew.
+        """Begin the step that comes so many steps later, in place; its draws begin anew.
 
         Args:
-            steps: How many steps later.
+            steps: How many steps, of every world; with 0 the same step begins again.
+
+        Raises:
+            NPAError: It is no integer of at least 0.
         """
-        self.steps += steps
+        self.steps += checked_count("steps", steps)
         self._draw_count = 0
 
     def restart(self) -> None:

@@ -495,7 +495,8 @@ def rollout(
 
     With gradients disabled, rollouts of 256 steps or more leave out the steps of worlds that a rule
     with a `dead_zone` has brought to rest (`at_rest` tells which those are). They wait for the
-    answer at the beginning and after 64, 192, 448, ... steps, on CUDA after 1024, 3072, ...
+    answer at the beginning, and then after 64, 192, 448, ... steps on a CPU and after 1024, 3072,
+    ... on CUDA.
 
     With a rule that `divides`, particle i is slot i, whose particle may die and be replaced by
     another one's child (`npa_envs.world.division`).

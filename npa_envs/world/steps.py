@@ -146,14 +146,21 @@ def drawn_steps(draw: Callable[[], Draws], like: Tensor, steps: int) -> Iterator
 def leave_out_draws(
     x: Tensor, options: StepOptions, steps: int, generator: Randomness | None
 ) -> None:
-    """Let a source of draws go on where some steps of worlds at x would leave it."""
+    """Bring a source of draws to where it would be after some steps of worlds at x.
+
+    Args:
+        x: Positions, of which the shape, the dtype and the device count.
+        options: What the steps draw.
+        steps: Number of steps.
+        generator: The source.
+    """
     if steps == 0:
         return
     if isinstance(generator, WorldRandom):
         generator.advance(steps - 1)
         draw_step(x, options, generator)
     elif x.is_cuda:
-        # There torch counts what it has drawn, as many for each of equal draws.
+        # On CUDA torch counts what it has drawn, and equal draws count the same.
         source = torch_generator(generator, x.device)
         before = source.get_offset()
         draw_step(x, options, generator)

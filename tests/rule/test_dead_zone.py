@@ -209,6 +209,7 @@ class TestRest:
     def test_a_rollout_leaves_them_out_and_ends_and_draws_as_if_it_did_not(
         self, rule, worlds, device, monkeypatch, by_world
     ):
+        monkeypatch.setattr(rollout_module, "FIRST_PART", {"cpu": 64, "cuda": 64})
         ways = []
         for fewest in (10**9, 256):
             monkeypatch.setattr(rollout_module, "FEWEST_RESTING", fewest)
@@ -217,7 +218,7 @@ class TestRest:
                 generator = npa_envs.WorldRandom([3, 4], device=device)
             told, (x, s) = [], worlds
             with torch.no_grad():
-                # They come to rest in the first, and begin so in the second.
+                # They come to rest within the first, and are so when the second begins.
                 for steps in (600, 300, 1):
                     x, s = npa_envs.rollout(rule, x, s, steps, eps=0.3, generator=generator)
                     told += [x, s]

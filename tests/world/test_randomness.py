@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 import torch
-from worlds import lively_rule, random_world
+from worlds import assert_same, lively_rule, random_world
 
 import npa_envs
 from npa_envs import WorldRandom
@@ -13,7 +13,8 @@ from npa_envs.errors import NPAError
 from npa_envs.tasks.damage import random_particle
 from npa_envs.tasks.morphogenesis2d import Morphogenesis2D, Morphogenesis2DConfig
 from npa_envs.tasks.seeds import uniform_ball
-from npa_envs.world.randomness import Purpose, check_generator
+from npa_envs.world.randomness import Purpose, check_generator, uniform_draws
+from npa_envs.world.steps import StepOptions, draw_step, leave_out_draws
 
 SIZE = 1001
 """Numbers of a world in a draw."""
@@ -240,6 +241,31 @@ def test_the_mask_of_a_step_is_the_streams_first_draw(device):
     assert torch.equal((moved != x).any(dim=-1), mask == 1)
 
 
+@pytest.mark.parametrize("update_prob", [0.5, 1.0])
+@pytest.mark.parametrize("position_noise", [0.0, 0.1])
+@pytest.mark.parametrize("source", ["worlds", "generator", "torch's own"])
+def test_draws_that_are_left_out_are_as_if_drawn(source, position_noise, update_prob, device):
+    x = torch.zeros(2, 70_001, 2, device=device)
+    options = StepOptions(0.1, None, update_prob, 1.0, position_noise, True)
+    ways = []
+    for leave_out in (False, True):
+        torch.manual_seed(4)
+        generator = {
+            "worlds": lambda: WorldRandom([3, 8], device=device),
+            "generator": lambda: torch.Generator(device).manual_seed(4),
+            "torch's own": lambda: None,
+        }[source]()
+        draw_step(x, options, generator)
+        if leave_out:
+            leave_out_draws(x, options, 5, generator)
+            leave_out_draws(x, options, 0, generator)
+        else:
+            for _ in range(5):
+                draw_step(x, options, generator)
+        ways.append([uniform_draws(generator, (2, 9), x) for _ in range(2)])
+    assert_same(*ways)
+
+
 def test_points_of_a_ball_are_uniform_in_it(space_dim, device):
     random = WorldRandom(range(4), device=device)
     points = uniform_ball(
@@ -287,6 +313,7 @@ def test_shapes_may_be_empty(device):
         (lambda: WorldRandom([]), "seeds must hold at least one seed, got none"),
         (lambda: WorldRandom.from_keys(torch.zeros(3)), "keys must be an int64 .* got torch.flo"),
         (lambda: WorldRandom.from_keys([1]), "keys must be an int64 tensor .* got list"),
+        (lambda: WorldRandom(1).advance(-1), "steps must be an integer of at least 0, got -1"),
         (lambda: WorldRandom(1).beside(-1), "purpose must be an integer of at least 0, got -1"),
         (lambda: WorldRandom(1).beside("x"), "purpose must be an integer of at least 0, got 'x'"),
         (lambda: WorldRandom(1).uniform(-1), "a size must be an integer of at least 0, got -1"),
