@@ -8,6 +8,7 @@ import functools
 import json
 import os
 import sys
+import tempfile
 import weakref
 from collections.abc import Iterator
 from pathlib import Path
@@ -20,6 +21,9 @@ try:
     import fcntl
 except ImportError:  # Windows
     fcntl = None  # type: ignore[assignment]
+
+_NO_DRIVER = b"Could not find or load the NVIDIA CUDA driver"
+"""What Warp's native code says on every computer without such a card; `npa-envs doctor`, too."""
 
 _BROKEN_CACHE = ("Failed to load CPU", "Failed to load CUDA")
 """How what Warp says about object files that it cannot load begins."""
@@ -54,10 +58,31 @@ def quiet_warp() -> Iterator[None]:
         wp.config.log_level = level
 
 
+@contextlib.contextmanager
+def without_line(unwanted: bytes) -> Iterator[None]:
+    """Keep a line out of what native code writes to standard error in the block."""
+    try:
+        own = os.dup(2)
+    except OSError:  # There is none.
+        yield
+        return
+    with tempfile.TemporaryFile() as told:
+        os.dup2(told.fileno(), 2)
+        try:
+            yield
+        finally:
+            os.dup2(own, 2)
+            os.close(own)
+            told.seek(0)
+            for line in told:
+                if unwanted not in line:
+                    os.write(2, line)
+
+
 @functools.cache
 def start_warp() -> None:
     """Start Warp, quietly; does nothing from the second call on."""
-    with quiet_warp():
+    with without_line(_NO_DRIVER), quiet_warp():
         wp.init()  # type: ignore[no-untyped-call]
     # Handlers go in the reverse order: the one that warns has to be there before this one.
     weakref.finalize(wp, int).detach()

@@ -44,7 +44,7 @@ class EvaluateOptions(RuleOptions):
 
     judge: bool = False
     """Textures only: also judge worlds by three distances from the target that no loss compares, as
-    ratios, of which 1 is what particles make of the target itself."""
+    ratios: at 1 they differ from it as drawings of it by particles do."""
 
     json: Path | None = None
     """Also write the table to this JSON file."""
@@ -57,7 +57,7 @@ def main(arguments: Sequence[str]) -> int:
     from npa_envs.files import write_text
     from npa_envs.measure.judge import Judge, JudgeRow
     from npa_envs.measure.quality import CHECKPOINTS, check_steps, tables_of
-    from npa_envs.measure.tables import table_text, tables_json
+    from npa_envs.measure.tables import UNMEASURED, table_text, tables_json
     from npa_envs.rule.files import load_rule
     from npa_envs.tasks.point_classification import PointClassification
     from npa_envs.training.trained_tasks import task_of_rule
@@ -98,7 +98,7 @@ def main(arguments: Sequence[str]) -> int:
         what = f"{len(trained.task.clouds.label)} {trained.task.split} clouds"
     print(f"{options.rule}: {what}, loss: {trained.task.metric_name}")
     for name, rows in tables.items():
-        print(table_text(rows, missing="-" if name == "growth" else "never"))
+        print(table_text(rows, missing=UNMEASURED if name == "growth" else "never"))
     if options.json is not None:
         write_text(options.json, tables_json(tables, metric=trained.task.metric_name))
         print(f"wrote {options.json}")

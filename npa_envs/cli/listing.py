@@ -32,7 +32,7 @@ def main(arguments: Sequence[str]) -> int:
             repeats = "" if config.repeats == 1 else f" ({config.repeats} x {config.iterations})"
             print(
                 f"    {preset}: {config.total_iterations} iterations{repeats} of "
-                f"{config.world_count} worlds, about {duration(seconds)} on a CPU"
+                f"{config.world_count} worlds, about {duration(seconds)} on one core"
             )
     print("environments (import npa_envs; gymnasium.make(NAME) or make_vec(NAME, num_envs=64))")
     for environment in ALL:

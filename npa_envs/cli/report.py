@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -20,7 +21,7 @@ from npa_envs.measure.codes import picture_rows
 from npa_envs.measure.judge import Judge, JudgeRow
 from npa_envs.measure.quality import CHECKPOINTS, CLOUD_CHECKPOINTS, score_line, tables_of
 from npa_envs.measure.record import current_commit, machine, versions
-from npa_envs.measure.tables import markdown_table, table_markdown, tables_json
+from npa_envs.measure.tables import UNMEASURED, markdown_table, table_markdown, tables_json
 from npa_envs.rule.files import load_rule
 from npa_envs.tasks.base import PictureTask, ViewTask, seed_worlds
 from npa_envs.tasks.damage import DamageEvent
@@ -44,7 +45,7 @@ TITLES: Mapping[str, str] = {
     "growth": "",
     "healing": "Damaged, and left to themselves:",
     "pictures": "Each picture by its own code, and by that of the next one, shuffled:",
-    "judge": "Judged by what no loss compares, as ratios of which 1 is the target itself:",
+    "judge": "Judged by what no loss compares; at 1 worlds differ as drawings of the target do:",
     "accuracy": "",
     "changes": "Some steps after something was done to the clouds:",
 }
@@ -95,7 +96,7 @@ def write_report(
     clouds = isinstance(task, PointClassification)
     checkpoints = (CLOUD_CHECKPOINTS if clouds else CHECKPOINTS)[: None if thorough else 5]
     count = 8 if thorough else 2
-    judge = Judge(task) if thorough and isinstance(task, Texture) else None
+    judge = Judge(task) if isinstance(task, Texture) else None
     judged: list[JudgeRow] = []
     not_filmed = ""
     with StepBar(None, show=progress) as bar:
@@ -128,8 +129,24 @@ def write_report(
     text = tables_json(tables, **facts)
     write_text(folder / f"{path.stem}.json", text)
     card = folder / f"{path.stem}.md"
-    write_text(card, _card(rule, task, training, facts, tables))
-    return card, score_line(json.loads(text)) + not_filmed
+    strip = folder / f"{path.stem}-filmstrip.png"
+    seen = f"\n![A world from the seed on.]({strip.name})\n" if strip.exists() else ""
+    write_text(card, _card(rule, task, training, facts, tables) + seen)
+    return card, score_line(json.loads(text)) + _decay(tables.get("growth", ())) + not_filmed
+
+
+DECAYED = 4.0
+"""Loss at the last look, as a multiple of the least one, from which on a rule does not hold."""
+
+
+def _decay(rows: Sequence[Any]) -> str:
+    """Return words for worlds that fall apart as they grow old; none where they hold."""
+    losses = [row.loss for row in rows]
+    least = min(filter(math.isfinite, losses), default=math.nan)
+    # No comparison with NaN holds.
+    if not losses or losses[-1] <= DECAYED * least:
+        return ""
+    return f"; worlds do not hold: at step {rows[-1].step} their loss is many times the least"
 
 
 def _film(
@@ -194,9 +211,9 @@ def _card(
         f"Commit {facts['commit']}: {training.iterations} iterations in {training.seconds:.0f} s.",
         f"```sh\n{shlex.join(['npa-envs', *training.words])}\n```",
         "## Measured",
-        f"`{facts['command']}`, seeds that training never saw; the loss is the {task.metric_name}.",
+        f"`{facts['command']}`, seeds that training never saw. Loss: {task.metric_name}.",
     ]
     for name, table in tables.items():
         parts += [TITLES[name]] if TITLES[name] else []
-        parts.append(table_markdown(table, missing="-" if name == "growth" else "never"))
+        parts.append(table_markdown(table, missing=UNMEASURED if name == "growth" else "never"))
     return "\n\n".join(parts) + "\n"

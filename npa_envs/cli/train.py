@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 import math
 import shlex
 from collections.abc import Sequence
@@ -36,14 +37,14 @@ from npa_envs.training import (
 from npa_envs.training.checkpoint import drawn_by_world, load_checkpoint
 from npa_envs.training.ranks import Ranks, joined_ranks
 
+VIEWER = ("starlette", "uvicorn")
+"""Packages that `npa-envs view` needs."""
+
 THREADED_BATCH = 4096
 """Particles of a batch from which on two threads train faster than one (docs/performance.md)."""
 
 PAIRED_SECONDS = 60.0
 """Shortest run of one process that two share unasked [s]: the start of the second one costs 4."""
-
-PAIRED_TIME = 0.8
-"""Time of two processes as a share of one's, where batches are small (docs/recipes_history.md)."""
 
 
 def main(arguments: Sequence[str]) -> int:
@@ -159,7 +160,11 @@ def run(
                 print(f"  no report   {error}")
     if meet:
         print(f"  together    {meet}")
-    print(f"  look at it  npa-envs view {shlex.quote(str(folder.path))}")
+    shown_path = shlex.quote(str(folder.path))
+    if any(importlib.util.find_spec(name) is None for name in VIEWER):
+        print(f"  look at it  npa-envs rollout {shown_path} (live: pip install 'npa-envs[view]')")
+    else:
+        print(f"  look at it  npa-envs view {shown_path}")
     return INTERRUPTED if result.interrupted else 0
 
 
@@ -227,7 +232,7 @@ def announcement(
     source = f"preset {named}" if options.config is None else str(options.config)
     expected = task_entry(task_name).expected_seconds(config)
     if process_count == 2 and thread_count(config) == 1 and expected is not None:
-        expected *= PAIRED_TIME
+        expected *= task_entry(task_name).paired_time
     elif process_count > 1:
         expected = None
     if expected is None:
@@ -241,8 +246,8 @@ def announcement(
         where = f"{process_count} processes ({config.device})"
     return (
         f"{task_name}: learns {' and '.join(goals)} ({'goes on' if options.resume else source})",
-        f"{config.total_iterations} iterations on {where}, each of {config.world_count} "
-        f"worlds of {particles} particles: {time}",
+        f"{config.total_iterations} iterations, each of {config.world_count} worlds of "
+        f"{particles} particles, on {where}: {time}",
     )
 
 

@@ -83,10 +83,14 @@ def main(arguments: Sequence[str]) -> int:
     if not 1 <= options.threads <= 256:
         raise NPAError(f"threads must be in [1, 256], got {options.threads}")
     from npa_envs.devices import check_device
-    from npa_envs.web.server import address_of, make_site, open_port, serve
 
     device = check_device(options.device)
     make_world = world_maker(options, device)
+    with torch_threads(options.threads):
+        # Made once before the server starts: what is wrong with it is said here.
+        make_world().close()
+    from npa_envs.web.server import address_of, make_site, open_port, serve
+
     site = make_site(
         make_world,
         films=writable_folder(options.out),
@@ -95,8 +99,6 @@ def main(arguments: Sequence[str]) -> int:
     )
     listener = open_port(options.host, options.port)
     with contextlib.closing(listener), torch_threads(options.threads):
-        # Made once before the server starts: what is wrong with it is said here.
-        make_world().close()
         address = address_of(site, listener)
         print(f"{options.what}: {address}  (Ctrl-C ends it)", flush=True)
         if options.browser and not open_browser(address):

@@ -1,7 +1,7 @@
 """The judge of textures, which nobody trains on: three distances from the target, as ratios.
 
-Each is divided by what the target itself comes to when particles draw it, so that 1 is as good as
-particles can be, and grey noise is 50 or less.
+Each is divided by what another drawing of the target by particles comes to, at least by 2 % of what
+grey noise does: smaller differences do not count. So grey noise is 50 or less.
 """
 
 from __future__ import annotations
@@ -59,7 +59,7 @@ LEAST = 0.02
 
 @dataclass(frozen=True)
 class JudgeRow:
-    """Several worlds after a number of steps, judged; ratios, of which 1 is the target itself."""
+    """Several worlds after some steps, judged; at a ratio of 1 they differ as drawings do."""
 
     step: int
     """Steps from the seed."""

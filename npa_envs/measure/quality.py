@@ -637,4 +637,10 @@ def score_line(measured: Mapping[str, Any]) -> str:
 
 
 def _at_steps(rows: Sequence[Mapping[str, Any]], column: str, form: str, unit: str) -> str:
-    return ", ".join(f"{format(row[column], form)}{unit} at {row['step']}" for row in rows)
+    told = []
+    for row in rows:
+        value = row[column]
+        # JSON has no numbers that are not finite.
+        said = "no finite number" if value is None else format(value, form) + unit
+        told.append(f"{said} at {row['step']}")
+    return ", ".join(told)

@@ -11,6 +11,9 @@ from typing import Any
 
 from npa_envs.files import json_text
 
+UNMEASURED = "-"
+"""What tables show where nothing was measured."""
+
 NONE = "–"
 """What Markdown shows where nothing was measured."""
 
@@ -20,7 +23,7 @@ def table_text(rows: Sequence[Any], *, missing: str = "never") -> str:
 
     Args:
         rows: Instances of one dataclass, for example those that `evaluate` returns.
-        missing: What a None is shown as.
+        missing: What a None is shown as; `UNMEASURED`: columns of that alone are left out.
     """
     if not rows:
         return ""
@@ -37,7 +40,7 @@ def table_markdown(rows: Sequence[Any], *, missing: str = "never") -> str:
 
     Args:
         rows: Instances of one dataclass, one at least.
-        missing: What a None is shown as.
+        missing: As for `table_text`.
     """
     heads, *lines = _cells(rows, missing)
     return markdown_table(heads, lines)
@@ -46,6 +49,8 @@ def table_markdown(rows: Sequence[Any], *, missing: str = "never") -> str:
 def _cells(rows: Sequence[Any], missing: str) -> list[list[str]]:
     """Return headings, and the cells of each row."""
     names = [field.name for field in dataclasses.fields(rows[0])]
+    if missing == UNMEASURED:
+        names = [name for name in names if any(getattr(row, name) is not None for row in rows)]
     heads = [name.replace("_", " ") for name in names]
     return [heads, *([_cell(getattr(row, name), missing) for name in names] for row in rows)]
 

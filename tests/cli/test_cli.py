@@ -251,7 +251,7 @@ def test_train_says_what_it_learns_and_writes_a_rule_that_loads(tmp_path, capsys
     text = capsys.readouterr().out
     learns, size, where = text.splitlines()[:3]
     assert learns == "morphogenesis2d: learns heart (preset tiny)"
-    assert size.startswith("10 iterations on cpu, each of 2 worlds of 128 particles: about 1 s")
+    assert size.startswith("10 iterations, each of 2 worlds of 128 particles, on cpu: about 1 s")
     assert where.startswith(f"writing to {folder}/")
     assert "finished: 10 iterations" in text
     for name in ("rule.safetensors", "log.jsonl", "pictures"):

@@ -1,7 +1,10 @@
 """A training run ends with its report: figures, a film and a card, for every task."""
 
+import importlib
 import json
+import math
 import re
+from dataclasses import replace
 
 import pytest
 from PIL import Image
@@ -61,7 +64,7 @@ def test_a_run_of_every_task_ends_with_a_card_of_each_rule(task, tmp_path, capsy
         rows = held["accuracy" if clouds else "growth"]
         assert [row["step"] for row in rows] == ([8, 32] if clouds else [8, 128])
         for row in rows:
-            (line,) = re.findall(rf"^\| {row['step']} \| (.*?) \|", card, re.MULTILINE)
+            line, *_ = re.findall(rf"^\| {row['step']} \| (.*?) \|", card, re.MULTILINE)
             assert float(line) == pytest.approx(row["majority" if clouds else "loss"], rel=1e-3)
         with Image.open(run / "report" / f"{stem}.gif") as film:
             assert film.n_frames == 7
@@ -111,6 +114,29 @@ def test_a_report_without_ffmpeg_has_all_but_the_film_that_needs_it(tmp_path, ca
     )
     files = {path.name for path in (tmp_path / "run" / "report").iterdir()}
     assert files == {"rule.md", "rule.json", "rule.gif", "rule-filmstrip.png"}
+
+
+@pytest.mark.parametrize(("factor", "holds"), [(1.0, True), (10.0, False), (math.nan, False)])
+def test_a_report_says_where_worlds_do_not_hold(factor, holds, tmp_path, capsys, monkeypatch):
+    measure = report.tables_of
+
+    def measured(*told, **options):
+        tables = measure(*told, **options)
+        first, last = tables["growth"]
+        return {"growth": [first, replace(last, loss=factor * first.loss)]}
+
+    monkeypatch.setattr(report, "tables_of", measured)
+    assert main(words_of("morphogenesis2d", tmp_path)) == 0
+    said = "; worlds do not hold: at step 128 their loss is many times the least"
+    assert (said in capsys.readouterr().out) is not holds
+
+
+def test_a_run_names_what_shows_it_where_the_viewer_is_not_installed(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(importlib.import_module("npa_envs.cli.train"), "VIEWER", ("no_such_thing",))
+    words = words_of("morphogenesis2d", tmp_path)
+    assert main([*words, "--no-report"]) == 0
+    (line,) = (line for line in capsys.readouterr().out.splitlines() if "look at it" in line)
+    assert f"npa-envs rollout {words[-1]} (live: pip install 'npa-envs[view]')" in line
 
 
 def test_a_rule_that_cannot_be_measured_is_kept_and_said_to_have_no_report(

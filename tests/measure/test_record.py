@@ -21,7 +21,13 @@ from npa_envs.measure.record import (
     without_folders,
     write_record,
 )
-from npa_envs.measure.tables import csv_text, markdown_table, mean_with_error, table_text
+from npa_envs.measure.tables import (
+    UNMEASURED,
+    csv_text,
+    markdown_table,
+    mean_with_error,
+    table_text,
+)
 
 RESULTS = Path(__file__).resolve().parents[2] / "benchmarks" / "results"
 FACTS = {"commit": "0", "seeds": (1, 2)}
@@ -100,11 +106,13 @@ class Row:
 
 def test_tables_as_text_markdown_and_comma_separated_values():
     rows = [Row(64, 31.41592), Row(128, None)]
-    assert table_text(rows, missing="-").splitlines() == [
+    assert table_text(rows, missing=UNMEASURED).splitlines() == [
         "step  mean loss",
         "  64      31.42",
         " 128          -",
     ]
+    assert table_text(rows[1:], missing=UNMEASURED).splitlines() == ["step", " 128"]
+    assert table_text(rows[1:]).splitlines() == ["step  mean loss", " 128      never"]
     assert table_text([]) == ""
     assert markdown_table(["a", "b"], [["1", "2"]]) == "| a | b |\n| --- | --- |\n| 1 | 2 |"
     assert csv_text(["a", "b"], [["x", 125.0], [1, math.nan]]) == "a,b\nx,125\n1,nan\n"

@@ -130,6 +130,16 @@ def test_folders_that_kernels_are_compiled_in_are_removed_without_a_warning() ->
     assert not Path(done.stdout.splitlines()[-1]).exists()
 
 
+def test_warp_starts_without_a_word_about_a_missing_driver_and_keeps_all_others() -> None:
+    program = (
+        "import os\nfrom npa_envs.runtime import start_warp, without_line\n"
+        "with without_line(b'one'):\n    os.write(2, b'one\\ntwo\\n')\nstart_warp()"
+    )
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
+    assert done.stderr.splitlines()[0] == "two"
+    assert "CUDA driver" not in done.stderr
+
+
 FRAME, ONE_STEP = np.zeros((4, 4, 3), np.uint8), Budget(particle_steps=1)
 EXTRA = r"pip install 'npa-envs\[{}\]'"
 

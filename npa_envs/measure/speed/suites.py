@@ -44,7 +44,7 @@ from npa_envs.measure.speed.throughput import (
 )
 from npa_envs.measure.speed.timing import LeftOut, Session, Tables
 from npa_envs.measure.speed.workloads import Workload
-from npa_envs.measure.tables import as_objects, table_text
+from npa_envs.measure.tables import UNMEASURED, as_objects, table_text
 from npa_envs.world.rollout import step
 
 
@@ -127,7 +127,7 @@ class Report:
         """Return the tables as plain text."""
         parts = [f"{self.suite} on {machine(self.device)}, commit {self.commit}"]
         for name, rows in self.tables.items():
-            parts.append(f"{name}:\n{table_text(rows, missing='-')}")
+            parts.append(f"{name}:\n{table_text(rows, missing=UNMEASURED)}")
         if self.ratios:
             lines = [f"  {name}: {value:.3g}" for name, value in self.ratios.items()]
             parts.append("\n".join(["times faster:", *lines]))
