@@ -52,15 +52,20 @@ def grown(name: str, steps: tuple[int, ...]) -> tuple[Any, list[tuple[Tensor, Te
     return task, worlds
 
 
+@torch.no_grad()
+def moments(name: str, steps: tuple[int, ...]) -> Shots:
+    """Return the target of a rule whose worlds are pictures, and a world at some moments."""
+    task, worlds = grown(name, steps)
+    frames = [to_uint8(task.picture(x, s)[0]) for x, s in worlds]
+    told = [f"step {step}" for step in steps]
+    return [(name, to_uint8(task.target_picture)), *zip(told, frames, strict=True)]
+
+
 def pictures() -> Shots:
     """Return the target and four moments of each rule of 2D morphogenesis."""
-    steps = (16, 64, 512, 2048)
     shots: Shots = []
     for name in shipped_rules("morphogenesis2d"):
-        task, worlds = grown(name, steps)
-        shots.append((name, to_uint8(task.target_picture)))
-        frames = [to_uint8(task.picture(x, s)[0]) for x, s in worlds]
-        shots += [(f"step {step}", frame) for step, frame in zip(steps, frames, strict=True)]
+        shots += moments(name, (16, 64, 512, 2048))
     return shots
 
 
@@ -80,17 +85,13 @@ def things() -> Shots:
     return shots
 
 
-@torch.no_grad()
 def textures() -> Shots:
     """Return the target and three moments of each texture, and the last as two by two tiles."""
-    steps = (64, 512, 4096)
     shots: Shots = []
     for name in shipped_rules("texture"):
-        task, worlds = grown(name, steps)
-        frames = [to_uint8(task.picture(x, s)[0]) for x, s in worlds]
-        shots.append((name, to_uint8(task.target_picture)))
-        shots += [(f"step {step}", frame) for step, frame in zip(steps, frames, strict=True)]
-        shots.append((f"step {steps[-1]}, 2 x 2", np.tile(frames[-1], (2, 2, 1))[::2, ::2]))
+        shots += moments(name, (64, 512, 4096))
+        told, last = shots[-1]
+        shots.append((f"{told}, 2 x 2", np.tile(last, (2, 2, 1))[::2, ::2]))
     return shots
 
 

@@ -31,6 +31,12 @@ def content(path: Path) -> Any:
     return json.loads(path.read_text(encoding="utf-8"))
 
 
+def section_of(title: str, name: str = "recipes_history") -> str:
+    """Return what stands under a title of a page, up to the next one of any level."""
+    page = (ROOT / "docs" / f"{name}.md").read_text(encoding="utf-8")
+    return re.split(r"\n##+ ", page.split(f"\n{title}")[1])[0]
+
+
 def mean_loss(row: dict[str, Any]) -> float:
     """Mean loss of the worlds of a row of benchmarks/division.py."""
     return statistics.mean(row["loss"])
@@ -714,8 +720,7 @@ REST_ARMS = {
 
 
 def test_the_table_of_rest_has_the_numbers_of_its_file() -> None:
-    page = (ROOT / "docs" / "recipes_history.md").read_text(encoding="utf-8")
-    section = page.split("\n## Rest of the fastest particles\n")[1].split("\n### ")[0]
+    section = section_of("## Rest of the fastest particles\n")
     rows = content(RESULTS / "recipes_rest_h200.json")["development"]
     looked = [row for row in rows if "worlds_within" in row]
     for arm, changed in REST_ARMS.items():
@@ -739,12 +744,12 @@ def test_the_table_of_rest_has_the_numbers_of_its_file() -> None:
 
 
 TESTS = {
-    ("recipes_history", "\n### The test with rest of the fastest particles\n"): {
+    ("recipes_history", "### The test with rest of the fastest particles\n"): {
         "mean of 12, or sum": "rest_h200",
         "(more cuts, `--rest-age 2048`)": "cuts_h200",
         "(`best` as it was)": "decay_h200",
     },
-    ("recipes", "\n## The test of `best`\n"): {
+    ("recipes", "## The test of `best`\n"): {
         "mean of 12, or sum": "dead_zone_h100",
         "(without a dead zone)": "rest_h200",
     },
@@ -758,8 +763,7 @@ STEPS = (64, 128, 512, 1024, 4096, 20_000)
 
 @pytest.mark.parametrize(("name", "title"), TESTS)
 def test_the_tables_of_the_test_have_the_numbers_of_their_files(name: str, title: str) -> None:
-    page = (ROOT / "docs" / f"{name}.md").read_text(encoding="utf-8")
-    section = re.split(r"\n##+ ", page.split(title)[1])[0]
+    section = section_of(title, name)
     told = dict(re.findall(r"^\| (\S.*?) \| (.*) \|$", section, re.MULTILINE))
     restless = []
     for row_title, measured in TESTS[name, title].items():
@@ -875,8 +879,7 @@ ZONE_ARMS = {
 
 
 def test_the_table_of_dead_zones_has_the_numbers_of_its_file() -> None:
-    page = (ROOT / "docs" / "recipes_history.md").read_text(encoding="utf-8")
-    section = page.split("\n## A dead zone\n")[1].split("\n### ")[0]
+    section = section_of("## A dead zone\n")
     record = content(RESULTS / "recipes_dead_zone_h100.json")
     rows = record["printed_only"]["looks"] + record["development"]
     looked = [row for row in rows if "worlds_within" in row]
@@ -902,7 +905,7 @@ def test_the_table_of_dead_zones_has_the_numbers_of_its_file() -> None:
     steps = [int(then.split()[-1]) for then in over]
     assert f"between steps {min(steps)} and {max(steps)}." in section
     # The claim of 128 of 128 worlds, by 32 seeds, says how many more seeds tell.
-    before = page.split("\n## Rest of the fastest particles\n")[1].split("\n### ")[0]
+    before = section_of("## Rest of the fastest particles\n")
     assert f"of 512 worlds the same four rules keep [{kept[0]}](#a-dead-zone)" in before
     unlooked = [row for row in rows if row["arm"] == "z1w1"]
     for arm in (unlooked, [row for row in rows if row["arm"] == "z1"]):
@@ -910,8 +913,7 @@ def test_the_table_of_dead_zones_has_the_numbers_of_its_file() -> None:
 
 
 def test_the_library_with_a_dead_zone_has_the_numbers_of_its_files() -> None:
-    page = (ROOT / "docs" / "recipes_history.md").read_text(encoding="utf-8")
-    section = page.split("\n### The library with a dead zone\n")[1].split("\n### ")[0]
+    section = section_of("### The library with a dead zone\n")
     runs = {
         run["target"]: (losses_of(run["after"]), losses_of(run["before"]))
         for run in content(RESULTS / "library_dead_zone_h100.json")["runs"]
@@ -935,10 +937,7 @@ def test_the_library_with_a_dead_zone_has_the_numbers_of_its_files() -> None:
 
 
 def test_the_table_of_the_library_has_the_numbers_of_its_file() -> None:
-    page = (ROOT / "docs" / "recipes_history.md").read_text(encoding="utf-8")
-    section = re.split(
-        r"\n##+ ", page.split("\n### The library with rest of the fastest particles\n")[1]
-    )[0]
+    section = section_of("### The library with rest of the fastest particles\n")
     runs = content(RESULTS / "library_rest_h200.json")["runs"]
     lines = [line for line in section.splitlines() if re.match(r"\| (`|shipped)", line)]
     assert len(runs) == 6
@@ -1065,13 +1064,12 @@ def test_the_table_of_fast_has_the_numbers_of_its_file() -> None:
 @pytest.mark.parametrize(
     ("title", "name"),
     [
-        ("\n## More second lives", "second_lives"),
-        ("\n### Long lives and more cuts", "from_16"),
+        ("## More second lives", "second_lives"),
+        ("### Long lives and more cuts", "from_16"),
     ],
 )
 def test_the_tables_of_second_lives_have_the_numbers_of_their_files(title: str, name: str) -> None:
-    page = (ROOT / "docs" / "recipes_history.md").read_text(encoding="utf-8")
-    section = re.split(r"\n##+ ", page.split(title)[1])[0]
+    section = section_of(title)
     told = dict(
         re.findall(r"^\| ([a-z0-9, -]+?)(?: \(`best`\))? \| (.*) \|$", section, re.MULTILINE)
     )
