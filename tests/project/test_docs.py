@@ -447,7 +447,7 @@ def test_the_code_of_the_first_minutes_and_about_graphics_cards_runs():
     (block,) = code_blocks(DOCS / "first_minutes.md")
     exec(compile(block, "first_minutes.md", "exec"), names)
     assert names["x"].shape == (1, 1024, 2)
-    worlds, environments = code_blocks(DOCS / "gpu.md")
+    worlds, environments, _ = code_blocks(DOCS / "gpu.md")
     small_worlds = worlds.replace("8, 4096", "2, 256").replace("steps=64", "steps=2")
     exec(compile(small_worlds, "gpu.md", "exec"), names)
     assert names["x"].shape == (2, 256, 2)

@@ -170,6 +170,6 @@ def test_the_extras_are_told_as_they_are() -> None:
 def test_the_entries_for_lists_name_the_tested_versions() -> None:
     lines = (ROOT / "constraints.txt").read_text()
     pinned = dict(re.findall(r"^(\S+)==(\S+)$", lines, re.MULTILINE))
-    page = (ROOT / "docs/farama.md").read_text()
+    page = (ROOT / "docs/integrations.md").read_text()
     badges = dict(re.findall(r"badge/(\w+)-v([\d.]+)-blue", page))
     assert badges == {"Gymnasium": pinned["gymnasium"], "PettingZoo": pinned["pettingzoo"]}
