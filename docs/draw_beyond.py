@@ -1,11 +1,9 @@
-"""Draw what rules do that go beyond the paper, `docs/images/beyond_*.png`.
+"""Draw what rules do that go beyond the paper, `docs/images/beyond_*.webp`.
 
     python docs/draw_beyond.py directions PLAIN EQUIVARIANT    # files of rules
-    python docs/draw_beyond.py directions_full PLAIN EQUIVARIANT [PLAIN EQUIVARIANT ...]
-    python docs/draw_beyond.py directions_framed RULE ...       # equivariant: --seed-across 0.5
-    python docs/draw_beyond.py directions_upright RULE ...      # besides --angles 0
-    python docs/draw_beyond.py sizes TRAINED VARIED             # or sizes_full
-    python docs/draw_beyond.py division RULE                    # or division_full
+    python docs/draw_beyond.py directions_upright RULE ...      # --seed-across 0.5 --angles 0
+    python docs/draw_beyond.py sizes TRAINED VARIED
+    python docs/draw_beyond.py division RULE
     python docs/draw_beyond.py pictures MANY
     python docs/draw_beyond.py sixty MANY                       # whose pictures lie where they lay
 
@@ -107,33 +105,11 @@ def directions(paths: list[str]) -> Shots:
     return shots
 
 
-def directions_full(paths: list[str]) -> Shots:
-    """Return targets, and what rules in pairs of a plain and an equivariant one grow of them.
-
-    Beside each the same world, turned by 90 degrees and some steps later; moved as the loss does,
-    half as large as it is compared.
-    """
-    shots: Shots = []
-    quarter = turns(torch.tensor([0.5 * math.pi]), torch.ones(1))
-    for place, path in enumerate(paths):
-        rule = npa_envs.load_rule(path)
-        task = task_of(path, rule)
-        if place % 2 == 0:
-            shots.append(("target", enlarged(task.target_picture)[::2, ::2]))
-        kind = "equivariant" if rule.equivariant else "plain"
-        generator = torch.Generator().manual_seed(SEEDS[0])
-        x, s = run(rule, task, *task.seed(1, generator=generator), GROWN, seed=SEEDS[0])
-        shots.append((f"{kind}, step {GROWN}", as_it_lies(task, x, s)[::2, ::2]))
-        x, s = run(rule, task, turned(x, quarter), s, AFTER, seed=SEEDS[1])
-        shots.append((f"turned, {AFTER} later", as_it_lies(task, x, s)[::2, ::2]))
-    return shots
-
-
-def directions_framed(paths: list[str]) -> Shots:
+def directions_upright(paths: list[str]) -> Shots:
     """Return targets, and what equivariant rules grow of them.
 
-    Beside each the same world, turned by 90 degrees and some steps later, and left alone; as in
-    `directions_full`.
+    After each the same world, turned by 90 degrees and some steps later, and left alone; moved as
+    the loss does, half as large as it is compared.
     """
     shots: Shots = []
     quarter = turns(torch.tensor([0.5 * math.pi]), torch.ones(1))
@@ -243,22 +219,18 @@ def main() -> None:
     """Draw what the command line asks for."""
     what, *rest = sys.argv[1:]
     if what == "sixty":
-        sixty(rest[0]).quantize(128).save(IMAGES / "beyond_sixty.png", optimize=True)
+        sixty(rest[0]).save(IMAGES / "beyond_sixty.webp", quality=88, method=6)
         return
     kinds = {
         "directions": directions,
-        "directions_full": directions_full,
-        "directions_framed": directions_framed,
-        "directions_upright": directions_framed,
+        "directions_upright": directions_upright,
         "sizes": sizes,
-        "sizes_full": sizes,
         "division": division,
-        "division_full": division,
         "pictures": pictures,
     }
     draw = kinds[what]
     captions, frames = zip(*draw(rest), strict=True)
-    write_filmstrip(IMAGES / f"beyond_{what}.png", frames, captions, columns=COLUMNS)
+    write_filmstrip(IMAGES / f"beyond_{what}.webp", frames, captions, columns=COLUMNS)
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""Draw the figures of the page on concepts, `docs/images/concept_*.png`, from a growing gecko.
+"""Draw the figures of the page on concepts, `docs/images/concept_*.webp`, from a growing gecko.
 
     python docs/draw_concepts.py
 
@@ -81,8 +81,10 @@ def arrow(axes: Axes, start: Tensor, along: Tensor, length: float, colour: str) 
 def save(figure: Figure, name: str) -> None:
     """Write a figure to the pages' images."""
     figure.tight_layout()
-    with atomic_path(IMAGES / f"concept_{name}.png") as temporary:
-        figure.savefig(temporary, format="png", facecolor="white")
+    with atomic_path(IMAGES / f"concept_{name}.webp") as temporary:
+        figure.savefig(
+            temporary, format="webp", facecolor="white", pil_kwargs={"quality": 88, "method": 6}
+        )
     plt.close(figure)
 
 

@@ -2,8 +2,8 @@
 
     python docs/draw_environment_pictures.py [NAME ...]
 
-It writes `docs/images/env_*.png` and `docs/images/env_*.webp` and takes five minutes on a CPU. Draw
-anew when an environment changes.
+It writes `docs/images/env_*_strip.webp` and `docs/images/env_*.webp` and takes five minutes on a
+CPU. Draw anew when an environment changes.
 """
 
 from __future__ import annotations
@@ -150,12 +150,12 @@ FILMS = {
 
 def picture_path(registration: Registration) -> Path:
     """Return where the picture of an environment is."""
-    return IMAGES / f"env_{registration.name.lower()}.png"
+    return IMAGES / f"env_{registration.name.lower()}_strip.webp"
 
 
 def film_path(registration: Registration) -> Path:
     """Return where the film of an environment is."""
-    return picture_path(registration).with_suffix(".webp")
+    return IMAGES / f"env_{registration.name.lower()}.webp"
 
 
 def film_episode(registration: Registration, film: Film, row: int, size: int) -> dict[int, Frame]:

@@ -1,4 +1,4 @@
-"""Draw what the shipped rules grow, `docs/images/rules_*.png`, each beside its target.
+"""Draw what the shipped rules grow, `docs/images/rules_*.webp`, each beside its target.
 
     python docs/draw_rules.py [--only {2d,3d,textures} ...]
 
@@ -104,7 +104,7 @@ def main() -> None:
     parser.add_argument("--only", nargs="+", choices=DRAWN, default=DRAWN, help="default: all")
     for name in parser.parse_args().only:
         captions, frames = zip(*DRAWN[name](), strict=True)
-        write_filmstrip(IMAGES / f"rules_{name}.png", frames, captions, columns=5)
+        write_filmstrip(IMAGES / f"rules_{name}.webp", frames, captions, columns=5)
 
 
 if __name__ == "__main__":

@@ -18,7 +18,8 @@ from npa_envs.agents import RulePolicy
 from npa_envs.envs import multispecies_v0
 from npa_envs.render import write_filmstrip, write_webp
 
-IMAGE = IMAGES / "env_multispecies.png"
+IMAGE = IMAGES / "env_multispecies_strip.webp"
+FILM = IMAGES / "env_multispecies.webp"
 STEPS = (0, 8, 16, 32, 64, 128)
 CAPTION = (
     "The shipped rule `gecko` acts. First world: two species grow their geckos side by side. "
@@ -60,7 +61,7 @@ if __name__ == "__main__":
     )
     worlds = [film(task, keywords, FILM_SIZE[len(WORLDS)]) for task, keywords in WORLDS]
     write_webp(
-        IMAGE.with_suffix(".webp"),
+        FILM,
         [np.hstack([frames[step] for frames in worlds]) for step in film_steps(max(STEPS))],
         FPS,
     )

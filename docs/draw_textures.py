@@ -1,4 +1,4 @@
-"""Draw the built-in textures, `docs/images/textures.png`: each as two by two tiles.
+"""Draw the built-in textures, `docs/images/textures.webp`: each as two by two tiles.
 
 python docs/draw_textures.py
 """
@@ -12,7 +12,7 @@ import numpy as np
 from npa_envs.render import to_uint8, write_filmstrip
 from npa_envs.tasks.targets.textures import builtin_textures, load_texture
 
-PICTURE = Path(__file__).resolve().parent / "images" / "textures.png"
+PICTURE = Path(__file__).resolve().parent / "images" / "textures.webp"
 RESOLUTION = 128
 
 

@@ -18,7 +18,8 @@ from npa_envs.envs import gardeners_v0
 from npa_envs.render import write_filmstrip, write_webp
 
 NAME = "Gardeners"
-IMAGE = IMAGES / "env_gardeners.png"
+IMAGE = IMAGES / "env_gardeners_strip.webp"
+FILM = IMAGES / "env_gardeners.webp"
 STEPS = (0, 4, 8, 16, 24, 32)
 CAPTION = (
     "The raider pushes at random. In the first world the keeper does nothing, in the second it is "
@@ -57,7 +58,7 @@ def page() -> str:
         ],
     )
     made = NOTE.format(script="docs/build_environment_pages.py", source="docstrings")
-    shown = film_and_strip(CAPTION, IMAGE.with_suffix(".webp").name, IMAGE.name)
+    shown = film_and_strip(CAPTION, FILM.name, IMAGE.name)
     opening = ("# npa_envs.envs.gardeners_v0", text.pop(""), shown, facts, EXAMPLE)
     body = [f"## {heading}\n\n{content}" for heading, content in text.items()]
     return "\n\n".join((made, *opening, *body)) + "\n"

@@ -5,7 +5,7 @@ from __future__ import annotations
 import typing
 from dataclasses import fields
 
-from draw_species_pictures import CAPTION, IMAGE
+from draw_species_pictures import CAPTION, FILM, IMAGE
 from page_parts import (
     NOTE,
     default_text,
@@ -110,7 +110,7 @@ def page(name: str) -> str:
     )
     short = module.__name__.rpartition(".")[2]
     example = EXAMPLE.format(module=short) + (RULES if name == "MultiSpecies" else "")
-    film = IMAGE.with_suffix(".webp").name
+    film = FILM.name
     picture = film_and_strip(CAPTION, film, IMAGE.name)
     shown = picture if name == "MultiSpecies" else f"![{SAME}](../images/{film})\n\n*{SAME}*"
     opening = (f"# npa_envs.envs.{short}", text.pop(""), shown, facts, example)

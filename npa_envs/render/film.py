@@ -178,12 +178,12 @@ def write_filmstrip(
     columns: int | None = None,
     background: Background = "white",
 ) -> None:
-    """Write frames side by side into one PNG, each with a caption below.
+    """Write frames side by side into one picture, each with a caption below.
 
     Where a caption is wider than the frames, background on either side of each makes room for it.
 
     Args:
-        path: The PNG file.
+        path: A PNG file, or a WebP file where the name ends in `.webp`.
         frames: Pictures of one size, uint8, shape [H, W, 3] each.
         captions: One text for each frame, or None for none.
         columns: Frames in a row; None is all of them, at most 8.
@@ -220,7 +220,10 @@ def write_filmstrip(
             middle = (left + cell / 2, upper + height + _MARGIN / 2)
             draw.text(middle, captions[k], fill=ink, font=font, anchor="ma")
     with atomic_path(path) as temporary:
-        strip.save(temporary, format="PNG", optimize=True)
+        if Path(path).suffix.lower() == ".webp":
+            strip.save(temporary, format="WebP", quality=88, method=6)
+        else:
+            strip.save(temporary, format="PNG", optimize=True)
 
 
 def _checked_captions(captions: Any, count: int) -> list[str]:

@@ -193,6 +193,16 @@ def test_filmstrip_holds_the_frames_exactly_in_rows(tmp_path):
         np.testing.assert_array_equal(strip[top : top + 48, left : left + 64], frame)
 
 
+def test_a_filmstrip_is_webp_where_its_name_says_so(tmp_path):
+    write_filmstrip(tmp_path / "strip.webp", film(2))
+    write_filmstrip(tmp_path / "strip.png", film(2))
+    with Image.open(tmp_path / "strip.webp") as small, Image.open(tmp_path / "strip.png") as exact:
+        assert (small.format, exact.format) == ("WEBP", "PNG")
+        assert small.size == exact.size
+        difference = np.asarray(small.convert("RGB"), float) - np.asarray(exact.convert("RGB"))
+    assert abs(difference).mean() < 4.0
+
+
 def test_filmstrip_writes_a_caption_below_each_frame_and_none_beside_it(tmp_path):
     frames = [np.full((64, 96, 3), 255, np.uint8)] * 3
     write_filmstrip(tmp_path / "strip.png", frames, ["step 0", "", "a caption far too long"])
