@@ -636,9 +636,9 @@ def test_the_map_names_what_is_there():
             assert there, f"{file} has no {name}"
 
 
-def test_the_page_on_benchmarks_shows_the_backend_table():
+def test_the_page_on_what_is_measured_shows_the_backend_table():
     chosen = describe(Request(torch.device("cpu"), torch.float32))
-    assert "\n".join(f"  {line}" for line in chosen) in (DOCS / "benchmarks.md").read_text()
+    assert "\n".join(f"  {line}" for line in chosen) in (DOCS / "measured.md").read_text()
 
 
 def test_the_index_leads_to_every_page():

@@ -18,7 +18,6 @@ caption: no
 <!-- /table -->
 """
 NOT_YET = (
-    "benchmarks",
     "beyond",
     "datasets",
     "export_web",
@@ -27,11 +26,9 @@ NOT_YET = (
     "learners_compared",
     "learning",
     "mathematics",
-    "measured",
     "morphogenesis3d",
     "npa_bench",
     "own_task",
-    "performance",
     "point_classification",
     "recipes",
     "recipes_history",
