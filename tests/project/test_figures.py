@@ -36,7 +36,6 @@ NOT_YET = (
     "search",
     "skipping",
     "species",
-    "stability",
     "textures",
     "training",
     "tutorial",
