@@ -107,7 +107,12 @@ def option(value: float | None, digits: str) -> str:
     return "–" if value is None else format(value, digits)
 
 
-HELPERS: dict[str, Callable[..., Any]] = {"Fields": Fields, "mean": mean, "error": error, "option": option}
+HELPERS: dict[str, Callable[..., Any]] = {
+    "Fields": Fields,
+    "mean": mean,
+    "error": error,
+    "option": option,
+}
 
 
 def paths_of(names: str) -> list[Path]:
@@ -137,8 +142,9 @@ def caption_of(paths: Sequence[Path], records: Sequence[Any], folder: Path) -> s
     if len(links) > 3:
         links = [f"`{paths[0].parent.relative_to(ROOT).as_posix()}/`, {len(links)} files"]
     found: list[dict[str, Any]] = []
-    for record in records:
-        own = record if isinstance(record, dict) else {}
+    for own in (
+        row for record in records for row in (record if isinstance(record, list) else [record])
+    ):
         facts = own.get("facts", {})
         found.append({**facts.get("settings", {}), **facts, **own})
     told = []

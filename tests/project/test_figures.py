@@ -32,7 +32,6 @@ NOT_YET = (
     "point_classification",
     "recipes",
     "recipes_history",
-    "scale",
     "search",
     "skipping",
     "species",
