@@ -30,8 +30,6 @@ NOT_YET = (
     "npa_bench",
     "own_task",
     "point_classification",
-    "recipes",
-    "recipes_history",
     "search",
     "skipping",
     "species",
