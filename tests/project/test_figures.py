@@ -27,7 +27,6 @@ NOT_YET = (
     "learning",
     "mathematics",
     "morphogenesis3d",
-    "npa_bench",
     "own_task",
     "point_classification",
     "search",
