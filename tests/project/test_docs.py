@@ -479,7 +479,7 @@ def test_the_code_about_learning_runs(tmp_path, monkeypatch, capsys):
     ]  # fmt: skip
     page = (DOCS / "learning.md").read_text()
     random, scripted = (float(line.split()[1]) for line in told[1:3])
-    (printed,) = re.findall(r"^\| `random` \| (\d\.\d+) ±", page, re.MULTILINE)
+    (printed,) = re.findall(r"^random: (\d\.\d+) ±", page, re.MULTILINE)
     assert random == pytest.approx(float(printed), abs=0.02)
     # Its search pays for episodes too, and ends early here.
     assert scripted > random

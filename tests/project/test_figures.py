@@ -23,8 +23,6 @@ NOT_YET = (
     "export_web",
     "gardening",
     "integrations",
-    "learners_compared",
-    "learning",
     "mathematics",
     "morphogenesis3d",
     "own_task",
