@@ -20,13 +20,12 @@ OPENING = """\
 # Gallery
 
 The rules that come with the library. Each film is made by one rule: particles start as a blank
-disk, ball or random cloud, and nobody tells them where they are. A name stands for the file
-wherever a rule is wanted, in commands and in `npa_envs.load_rule`.
+disk, ball or random cloud, and know nothing of their places. A rule's name stands for its file in
+commands and in `npa_envs.load_rule`. `npa-envs view NAME` opens a rule in the browser, and
+`npa-envs export-web --gallery -o gallery.html` writes one page that runs all 2D rules.
 
-The figures are means over seeds that training never saw, each after so many steps; a lower loss is
-better. A card tells how the rule was trained and all that was measured.
-`npa-envs export-web --gallery -o gallery.html` writes one page that runs all 2D rules in a
-browser."""
+Figures are means over seeds that training never saw; a lower loss is better. A card says how the
+rule was trained, and all that was measured."""
 HEADINGS = {
     "morphogenesis2d": "Pictures",
     "morphogenesis3d": "Things in 3D",
@@ -40,34 +39,24 @@ SHOWN = {
     "point_classification": "Four clouds agree on what they are; the colour is the class.",
 }
 COMMANDS = {
-    "morphogenesis2d": (
-        "npa-envs view {name}",
-        "npa-envs rollout {name} --steps 700 --damage 512:cut --out runs/{name}",
-    ),
-    "morphogenesis3d": (
-        "npa-envs view {name}",
-        "npa-envs rollout {name} --steps 128 --out runs/{name}",
-    ),
-    "texture": (
-        "npa-envs view {name}",
-        "npa-envs rollout {name} --steps 512 --out runs/{name}",
-    ),
-    "point_classification": ("npa-envs view {name}", "npa-envs evaluate {name}"),
+    "morphogenesis2d": "npa-envs rollout NAME --steps 700 --damage 512:cut --out runs/NAME",
+    "morphogenesis3d": "npa-envs rollout NAME --steps 128 --out runs/NAME",
+    "texture": "npa-envs rollout NAME --steps 512 --out runs/NAME",
+    "point_classification": "npa-envs evaluate digits",
 }
+"""How to make films or figures of the rules of a task, by the task's name."""
 
 
 def entry(task: str, name: str) -> str:
     """Return what the page says of a rule, Markdown."""
     caption = SHOWN[task].format(name=name.capitalize())
     sentence = (CARDS / f"{name}.md").read_text(encoding="utf-8").split("\n\n")[1]
-    commands = "\n".join(command.format(name=name) for command in COMMANDS[task])
     score = score_line(scores(name))
     return "\n\n".join(
         (
             f"### {name}",
             f"![{caption}](images/gallery/{name}.webp)",
             f"{sentence} Measured: {score}.",
-            f"```sh\n{commands}\n```",
             f"- [The card of {name}](../npa_envs/rule/shipped/{name}.md)",
         )
     )
@@ -77,7 +66,8 @@ def page() -> str:
     """Return the page, Markdown."""
     parts = [NOTE.format(script="docs/build_gallery_page.py", source="cards and scores"), OPENING]
     for task, heading in HEADINGS.items():
-        parts += [f"## {heading}", *(entry(task, name) for name in shipped_rules(task))]
+        parts += [f"## {heading}", f"```sh\n{COMMANDS[task]}\n```"]
+        parts += [entry(task, name) for name in shipped_rules(task)]
     return "\n\n".join(parts) + "\n"
 
 

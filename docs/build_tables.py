@@ -107,7 +107,12 @@ def option(value: float | None, digits: str) -> str:
     return "–" if value is None else format(value, digits)
 
 
-HELPERS: dict[str, Callable[..., Any]] = {"mean": mean, "error": error, "option": option}
+HELPERS: dict[str, Callable[..., Any]] = {
+    "Fields": Fields,
+    "mean": mean,
+    "error": error,
+    "option": option,
+}
 
 
 def paths_of(names: str) -> list[Path]:
@@ -132,19 +137,28 @@ def read(path: Path) -> Any:
 
 
 def caption_of(paths: Sequence[Path], records: Sequence[Any], folder: Path) -> str:
-    """Return a line that links to records and says what the first one says of itself."""
+    """Return a line that links to records, and says what all of them say of themselves."""
     links = [f"[{p.name}]({Path(os.path.relpath(p, folder)).as_posix()})" for p in paths]
     if len(links) > 3:
-        there = Path(os.path.relpath(paths[0].parent, folder)).as_posix()
-        links = [f"[{len(links)} files]({there})"]
-    first = records[0] if isinstance(records[0], dict) else {}
-    facts = {**first.get("facts", {}).get("settings", {}), **first.get("facts", {}), **first}
-    told = [str(facts[key]) for key in ("machine", "date") if isinstance(facts.get(key), str)]
-    if isinstance(facts.get("commit"), str):
-        told.append(f"commit {facts['commit']}")
-    command = facts.get("command")
-    told += [f"`{command}`"] if isinstance(command, str) else []
-    return "Measured: " + ", ".join(links + told) + "."
+        links = [f"`{paths[0].parent.relative_to(ROOT).as_posix()}/`, {len(links)} files"]
+    found: list[dict[str, Any]] = []
+    for own in (
+        row for record in records for row in (record if isinstance(record, list) else [record])
+    ):
+        facts = own.get("facts", {})
+        found.append({**facts.get("settings", {}), **facts, **own})
+    told = []
+    for key, shown in (
+        ("machine", "{}"),
+        ("date", "{}"),
+        ("commit", "commit {}"),
+        ("command", "`{}`"),
+    ):
+        values = {
+            str(facts.get(key)) for facts in found if not isinstance(facts.get(key), (list, dict))
+        }
+        told += [shown.format(*values)] if len(values) == 1 and values != {"None"} else []
+    return f"Measured: {', '.join(links + told)}."
 
 
 def short(text: str) -> str:

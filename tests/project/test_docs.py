@@ -479,7 +479,7 @@ def test_the_code_about_learning_runs(tmp_path, monkeypatch, capsys):
     ]  # fmt: skip
     page = (DOCS / "learning.md").read_text()
     random, scripted = (float(line.split()[1]) for line in told[1:3])
-    (printed,) = re.findall(r"^\| `random` \| (\d\.\d+) ±", page, re.MULTILINE)
+    (printed,) = re.findall(r"^random: (\d\.\d+) ±", page, re.MULTILINE)
     assert random == pytest.approx(float(printed), abs=0.02)
     # Its search pays for episodes too, and ends early here.
     assert scripted > random
@@ -636,9 +636,9 @@ def test_the_map_names_what_is_there():
             assert there, f"{file} has no {name}"
 
 
-def test_the_page_on_benchmarks_shows_the_backend_table():
+def test_the_page_on_what_is_measured_shows_the_backend_table():
     chosen = describe(Request(torch.device("cpu"), torch.float32))
-    assert "\n".join(f"  {line}" for line in chosen) in (DOCS / "benchmarks.md").read_text()
+    assert "\n".join(f"  {line}" for line in chosen) in (DOCS / "measured.md").read_text()
 
 
 def test_the_index_leads_to_every_page():
