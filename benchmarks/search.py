@@ -31,7 +31,7 @@ from npa_envs.measure.plots import draw_band, legend_of, new_figure, png
 from npa_envs.measure.record import script_facts, script_parser, write_record
 from npa_envs.measure.tables import markdown_table
 
-IMAGE = Path(__file__).resolve().parents[1] / "docs" / "images" / "search_growth.png"
+IMAGE = Path("runs/search_growth.png")
 
 FRESH_SEEDS = (1_000_000, 1_000_001)
 """Worlds that no search saw."""
