@@ -22,7 +22,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import texture_candidates  # noqa: F401  names more losses
 import torch
 from PIL import Image
 from side_by_side import iterate_together, on, stream_of

@@ -163,7 +163,8 @@ def caption_of(paths: Sequence[Path], records: Sequence[Any], folder: Path) -> s
 
 def short(text: str) -> str:
     """Return a text whose powers of ten have no signs and zeros that say nothing."""
-    return re.sub(r"(?<=\d)e([+-])0?(\d+)", lambda m: f"e{m[1].strip('+')}{m[2]}", text)
+    text = re.sub(r"(?<=\d)e([+-])0?(\d+)", lambda m: f"e{m[1].strip('+')}{m[2]}", text)
+    return re.sub(r"\b0(\.0+)?e0\b", "0", text)
 
 
 def made_of(name: str, text: str, folder: Path) -> Made:
