@@ -6,7 +6,8 @@
 A page is the docstring of an environment's class. Added are the spaces' numbers, which are computed
 from the default configuration, and the tables of arguments, whose meanings are the docstrings of
 the configuration's fields. After each section comes what `NPAEnv` says there of all environments; a
-section that an environment has not is that of `Morphogenesis2DEnv`.
+section that an environment has not is that of `Morphogenesis2DEnv`. What is long and the same for
+all stands on the first page alone, and the others link to it.
 """
 
 from __future__ import annotations
@@ -53,6 +54,14 @@ observation, reward, terminated, truncated, info = env.step(env.action_space.sam
 # Eight worlds as one batch; device="cuda" puts it on a GPU.
 envs = gym.make_vec("{id}", num_envs=8)
 ```"""
+FIRST = ENVIRONMENTS[0]
+ONCE = {
+    "Reward": "The values of `reward` mean the same in [every environment]({page}#reward).",
+    "Vectorized environment": "Batches of worlds and the arguments of `gym.make_vec` are those of "
+    "[every environment]({page}#vectorized-environment).",
+}
+"""Sections whose common part is on the first page alone, and what the others have instead."""
+
 COLUMNS = re.compile(r"\| `([^`]+) : ([^`]+)` \|")
 
 
@@ -67,7 +76,7 @@ def environment_class(registration: Registration) -> type[NPAEnv]:
 def resolved_sections(env_class: type) -> dict[str, str]:
     """Return the sections with what is said of all environments, in one order."""
     own = sections(env_class)
-    first = sections(environment_class(ENVIRONMENTS[0]))
+    first = sections(environment_class(FIRST))
     shared = sections(NPAEnv)
     order = [name for name in (first | shared) if name]
     if issubclass(env_class.worlds_type, LivingWorlds):
@@ -76,6 +85,12 @@ def resolved_sections(env_class: type) -> dict[str, str]:
         first = {}
         if issubclass(env_class, GardenEnv):
             shared |= sections(GardenEnv)
+    if env_class is not environment_class(FIRST):
+        shared |= {
+            heading: told.format(page=f"{FIRST.name}.md")
+            for heading, told in ONCE.items()
+            if heading in shared
+        }
     found = {"": own[""]}
     for heading in order:
         parts = own.get(heading) or first.get(heading), shared.get(heading)
@@ -99,8 +114,11 @@ def argument_tables(config_type: type[EnvConfig]) -> str:
         changed = any(field.name in cls.__annotations__ for cls in task_bases(config_type))
         (own if changed else shared).append(row)
     heading = ("Name", "Type", "Default", "Meaning")
-    tables = ("Of this task:", table(heading, own), "Of every environment:", table(heading, shared))
-    return "\n\n".join(tables)
+    listed, opening = table(heading, shared), "Of every environment:"
+    if config_type is not environment_class(FIRST).task_type.config_type:
+        listed = table(heading[:3], [row[:3] for row in shared])
+        opening = f"Of every environment, with their [meanings]({FIRST.name}.md#arguments):"
+    return "\n\n".join(("Of this task:", table(heading, own), opening, listed))
 
 
 def small_forms(registration: Registration) -> str:
@@ -178,7 +196,8 @@ def page(registration: Registration) -> str:
             text[heading] = numbered_columns(text[heading], letters, space.shape[1])
     text["Arguments"] += "\n\n" + argument_tables(task.config_type)
     text["Arguments"] += small_forms(registration)
-    text["Vectorized environment"] += "\n\n" + vector_table()
+    if registration is FIRST:
+        text["Vectorized environment"] += "\n\n" + vector_table()
     facts = table(
         ("", "By default"),
         [

@@ -265,6 +265,17 @@ def test_a_page_has_every_section(page):
     assert not re.search(r"As in `\w+Env`", page.read_text())
 
 
+def test_the_first_page_alone_explains_what_all_environments_share():
+    meaning = "Standard deviation of the noise added to every position in a step"
+    shared = ("Dense rewards telescope", "| `num_envs` |", meaning)
+    first, *others = (page.read_text() for page in PAGES)
+    assert all(text in first for text in shared)
+    for page in others:
+        assert not any(text in page for text in shared)
+        for heading in ("reward", "arguments", "vectorized-environment"):
+            assert f"({PAGES[0].name}#{heading})" in page
+
+
 @pytest.mark.parametrize("registration", ENVIRONMENTS, ids=lambda row: row.name)
 def test_a_page_lists_the_arguments_with_their_defaults(registration, builder):
     page = DOCS / "environments" / f"{registration.name}.md"
