@@ -24,6 +24,7 @@ from npa_envs.envs.multi import TASKS as TABLE
 from npa_envs.ops.backend import Request, describe
 from npa_envs.registration import ENVIRONMENTS, GARDEN_IDS
 from npa_envs.rule.files import shipped_rules
+from npa_envs.tasks.morphogenesis2d import MORPHOGENESIS2D_PRESETS
 from npa_envs.training import TASKS as TRAINED
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -197,6 +198,37 @@ def test_commands_in_blocks_of_shell_have_the_options_that_they_are_given(capsys
             main([*command, "--help"])
         told = set(re.findall(r"(?<![\w-])--?[\w-]+", capsys.readouterr().out))
         assert options <= told, command
+
+
+UNLISTED = ("out", "tensorboard", "picture_interval", "checkpoint_interval")
+"""Fields of presets that the tables of options leave out: they change no rule."""
+
+
+def as_number(word: str) -> float | str:
+    """Return a word of a command as a number, where it is one."""
+    try:
+        return float(word)
+    except ValueError:
+        return word
+
+
+@pytest.mark.parametrize("preset", ["best", "fast"])
+def test_the_tables_of_options_are_what_the_presets_choose(preset):
+    text = section(DOCS / "recipes.md", f"What `{preset}` consists of")
+    listed = {}
+    for cell in re.findall(r"^\| `--([^`]+)`", text, re.MULTILINE):
+        for option in cell.split(" --"):
+            name, *values = option.split()
+            listed[name.replace("-", "_")] = [as_number(value) for value in values]
+    chosen, paper = (
+        vars(MORPHOGENESIS2D_PRESETS[name].task) | vars(MORPHOGENESIS2D_PRESETS[name])
+        for name in (preset, "paper")
+    )
+    changed = {name for name in paper if chosen[name] != paper[name]}
+    assert set(listed) - {"hidden_dim"} == changed - {"task", *UNLISTED}
+    for name, values in listed.items():
+        value = chosen[name]
+        assert values == list(value if isinstance(value, tuple) else (value,)), name
 
 
 @pytest.mark.parametrize(
