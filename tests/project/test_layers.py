@@ -39,6 +39,7 @@ LADDER = {
     "npa_envs.registration": rung(0, "gymnasium"),
     "npa_envs.devices": rung(1, "torch"),
     "npa_envs.files": rung(1),
+    "npa_envs.once": rung(0),
     "npa_envs.processes": rung(1),
     "npa_envs.runtime": rung(1, "warp"),
     "npa_envs.reference": rung(1, "torch"),
