@@ -16,7 +16,8 @@ pytest.importorskip("stable_baselines3")
 
 def program(page: Path = TUTORIAL) -> str:
     """Return the page's only block of Python."""
-    (block,) = re.findall(r"^```python\n(.*?)^```", page.read_text(), re.MULTILINE | re.DOTALL)
+    text = page.read_text(encoding="utf-8")
+    (block,) = re.findall(r"^```python\n(.*?)^```", text, re.MULTILINE | re.DOTALL)
     return block
 
 
