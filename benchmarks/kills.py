@@ -62,7 +62,7 @@ def killed(
         [sys.executable, "-m", "npa_envs", *words],
         stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT,
-        text=True,
+        encoding="utf-8",
     )
     begun = time.monotonic()
     while last_iteration(folder) <= before + told.interval:

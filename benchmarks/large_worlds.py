@@ -140,7 +140,7 @@ def main() -> None:
         print(json.dumps(line | {"seconds": round(time.perf_counter() - begun, 1)}), flush=True)
         lines.append(line)
         if told.out is not None:
-            told.out.write_text(json.dumps(lines, indent=1) + "\n")
+            told.out.write_text(json.dumps(lines, indent=1) + "\n", encoding="utf-8")
 
 
 if __name__ == "__main__":

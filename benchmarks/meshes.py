@@ -401,7 +401,7 @@ def measure(
     line |= {"fields": own_changes(arguments, arm), "iterations": trainer.iteration}
     line |= {"seconds": round(seconds, 1), "together": together, "clock": arguments.clock}
     line |= {"growth": as_objects(rows), **origin(arguments)}
-    with (out / "meshes.jsonl").open("a") as file:
+    with (out / "meshes.jsonl").open("a", encoding="utf-8") as file:
         file.write(json.dumps(line) + "\n")
     told = "  ".join(f"{row.step}: {row.psnr:.2f}" for row in rows)
     print(f"{config.out.name:32s} {trainer.iteration} in {seconds:.0f} s  {told}", flush=True)
@@ -450,7 +450,7 @@ def particles(arguments: argparse.Namespace) -> None:
                 psnr = task.view_psnr(x, s).item()
             line = {"target": Path(target).stem, "sigma": sigma, "opacity": opacity, "psnr": psnr}
             line |= {"iterations": arguments.iterations, **origin(arguments)}
-            with (arguments.out / "particles.jsonl").open("a") as file:
+            with (arguments.out / "particles.jsonl").open("a", encoding="utf-8") as file:
                 file.write(json.dumps(line) + "\n")
             print(f"{target:10s} sigma {sigma:g}, opacity {opacity:g}: {psnr:.2f} dB", flush=True)
 
@@ -473,7 +473,7 @@ def report(arguments: argparse.Namespace) -> None:
     """Print the PSNR of all runs as a table."""
     print("| arm | mesh | iterations | seconds | " + " | ".join(map(str, arguments.steps)) + " |")
     print("|---|---|---|---|" + "---|" * len(arguments.steps))
-    for text in (arguments.out / "meshes.jsonl").read_text().splitlines():
+    for text in (arguments.out / "meshes.jsonl").read_text(encoding="utf-8").splitlines():
         line = json.loads(text)
         by_step = {row["step"]: row["psnr"] for row in line["growth"]}
         cells = " | ".join(f"{by_step[s]:.1f}" if s in by_step else "" for s in arguments.steps)

@@ -151,7 +151,7 @@ def grown_rules(arguments: argparse.Namespace) -> Iterator[tuple[str, NPARule, M
 
 def append_line(path: Path, line: dict[str, Any]) -> None:
     """Append a line of JSON to a file."""
-    with path.open("a") as file:
+    with path.open("a", encoding="utf-8") as file:
         file.write(json.dumps(line) + "\n")
 
 

@@ -208,7 +208,8 @@ def run_all(arguments: argparse.Namespace) -> None:
         for picture in chosen
     ]
     together = arguments.together
-    if (out / "check.json").exists() and not json.loads((out / "check.json").read_text())["same"]:
+    check = out / "check.json"
+    if check.exists() and not json.loads(check.read_text(encoding="utf-8"))["same"]:
         together = 1
     longest = 0.0
     for group in groups_of((run for run in runs if run not in done), together):
@@ -285,7 +286,7 @@ def warm_up(arguments: argparse.Namespace) -> None:
                 many = [config(size, f"{name}-{k}", iterations=60) for k in range(count)]
                 found[f"{name}: seconds"] = train_side_by_side(many)[1]
         write_record(arguments.out / "check.json", found)
-    print((arguments.out / "check.json").read_text(), flush=True)
+    print((arguments.out / "check.json").read_text(encoding="utf-8"), flush=True)
 
 
 def merge(arguments: argparse.Namespace) -> None:
@@ -305,7 +306,9 @@ def merge(arguments: argparse.Namespace) -> None:
         width = max(row.shape[1] for row in rows)
         rows = [np.pad(r, ((0, 4), (0, width - r.shape[1]), (0, 0))) for r in rows]
         Image.fromarray(np.concatenate(rows)).save(out / "strips.png")
-        (out / "strips.txt").write_text("\n".join(path.stem for path in strips) + "\n")
+        (out / "strips.txt").write_text(
+            "\n".join(path.stem for path in strips) + "\n", encoding="utf-8"
+        )
     for path in strips:
         path.unlink()
 

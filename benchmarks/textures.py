@@ -113,7 +113,7 @@ def run(arguments: argparse.Namespace) -> None:
             "particles": told_task.particle_count,
             "fields": changes,
         }
-        with (out / "runs.jsonl").open("a") as file:
+        with (out / "runs.jsonl").open("a", encoding="utf-8") as file:
             file.write(json.dumps(line) + "\n")
         print(f"{name:24s} {told(tables)}  {time.perf_counter() - begun:.1f} s", flush=True)
     for name in arguments.rules:
@@ -121,7 +121,7 @@ def run(arguments: argparse.Namespace) -> None:
         trained: Any = task_of_rule(name, rule, torch.device(arguments.device)).task
         tables, strip = measured(rule, trained, arguments.steps, arguments.device, seeds)
         Image.fromarray(strip).save(out / f"strip-{name}-shipped.png")
-        with (out / "runs.jsonl").open("a") as file:
+        with (out / "runs.jsonl").open("a", encoding="utf-8") as file:
             file.write(json.dumps({"name": f"{name}-shipped", **tables}) + "\n")
         print(f"{name:24s} {told(tables)}", flush=True)
 
@@ -160,7 +160,7 @@ def particles(arguments: argparse.Namespace) -> None:
             line = {"target": target, "loss": loss, "value": value.item(), "seconds": seconds}
             line |= {"iterations": arguments.iterations, "fields": changes}
             line |= {"judge": asdict(found), "device": str(device)}
-            with (out / "particles.jsonl").open("a") as file:
+            with (out / "particles.jsonl").open("a", encoding="utf-8") as file:
                 file.write(json.dumps(line) + "\n")
             print(
                 f"{target:9s} {loss:13s} {found.ratio:6.2f} ({found.patches:.1f} "
@@ -207,7 +207,7 @@ def report(arguments: argparse.Namespace) -> None:
     """Print the ratios of all runs as a table."""
     print("| run | iterations | " + " | ".join(str(step) for step in arguments.steps) + " |")
     print("|---|---|" + "---|" * len(arguments.steps))
-    for text in (arguments.out / "runs.jsonl").read_text().splitlines():
+    for text in (arguments.out / "runs.jsonl").read_text(encoding="utf-8").splitlines():
         line = json.loads(text)
         by_step = {row["step"]: row["ratio"] for row in line["judge"]}
         cells = " | ".join(f"{by_step[s]:.2f}" if s in by_step else "" for s in arguments.steps)

@@ -31,7 +31,7 @@ def run(path: Path) -> None:
         "language_info": {"name": "python"},
     }
     nbformat.validate(notebook)
-    path.write_text(nbformat.writes(notebook) + "\n")
+    path.write_text(nbformat.writes(notebook) + "\n", encoding="utf-8")
     print(f"{path.name}: {path.stat().st_size / 1000:.0f} kB")
 
 

@@ -25,10 +25,12 @@ from npa_envs.errors import NPAError, shown
 
 _DISK_FULL = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}
 _NO_PERMISSION = {errno.EACCES, errno.EPERM, errno.EROFS}
-_NEARLY_FULL_BYTES = 64 * 1024
 _TOKEN_BYTES = 6
 _STEM_BYTES = 100
 _MIB = 2**20
+
+NEARLY_FULL_BYTES = 64 * 1024
+"""A disk with less room counts as full."""
 
 
 def checked_path(path: str | Path) -> Path:
@@ -228,6 +230,27 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
             temporary.unlink(missing_ok=True)
 
 
+@contextlib.contextmanager
+def made_folder(path: Path) -> Iterator[None]:
+    """Create a folder and its parents where missing; remove those that a failed block leaves empty.
+
+    Args:
+        path: The folder.
+
+    Raises:
+        OSError: It cannot be created.
+    """
+    missing = [folder for folder in (path, *path.parents) if not folder.exists()]
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+        yield
+    except BaseException:
+        for folder in missing:
+            with contextlib.suppress(OSError):
+                folder.rmdir()
+        raise
+
+
 def remove_unfinished(path: Path) -> None:
     """Remove the temporary files that killed writes of a file have left beside it.
 
@@ -320,7 +343,7 @@ def _concerns_another_file(error: OSError, temporary: Path, target: Path) -> boo
 
 def _disk_is_full(folder: Path) -> bool:
     try:
-        return shutil.disk_usage(folder).free < _NEARLY_FULL_BYTES
+        return shutil.disk_usage(folder).free < NEARLY_FULL_BYTES
     except OSError:
         return False
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import atexit
 import contextlib
-import functools
 import json
 import os
 import sys
@@ -16,6 +15,7 @@ from pathlib import Path
 import warp as wp
 
 from npa_envs.errors import NPAError, shown
+from npa_envs.once import made_once
 
 try:
     import fcntl
@@ -79,7 +79,7 @@ def without_line(unwanted: bytes) -> Iterator[None]:
                     os.write(2, line)
 
 
-@functools.cache
+@made_once()
 def start_warp() -> None:
     """Start Warp, quietly; does nothing from the second call on."""
     with without_line(_NO_DRIVER), quiet_warp():

@@ -13,6 +13,7 @@ from torch import Tensor, nn
 
 from npa_envs.agents.policies import Interface, Policy, bounded_update, check_rule_fits
 from npa_envs.errors import NPAError, shown
+from npa_envs.files import made_folder
 from npa_envs.rule.files import load_rule, save_rule
 from npa_envs.rule.rule import NPARule
 from npa_envs.tasks.checks import is_whole
@@ -136,15 +137,15 @@ class RuleSet(nn.Module):
         """
         paths = [Path(folder) / _file_name(k) for k in range(len(self.rules))]
         try:
-            Path(folder).mkdir(parents=True, exist_ok=True)
+            with made_folder(Path(folder)):
+                for rule, path in zip(self, paths, strict=True):
+                    save_rule(rule, path)
         except OSError as error:
             raise NPAError(
                 f"folder must be one that can be made, got {shown(str(folder))} "
                 f"({error.strerror}): "
                 "choose another place"
             ) from error
-        for rule, path in zip(self, paths, strict=True):
-            save_rule(rule, path)
         return paths
 
     def __iter__(self) -> Iterator[NPARule]:

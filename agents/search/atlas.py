@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from npa_envs.agents.search.run import Elite, Search
 from npa_envs.agents.search.worlds import SEED_RADIUS, UPDATE_PROB, Axis, Trials
-from npa_envs.files import write_text
+from npa_envs.files import made_folder, write_text
 from npa_envs.measure.plots import new_figure, png
 from npa_envs.render import draw_worlds
 from npa_envs.render.film import encode_frame
@@ -52,12 +52,12 @@ def write_elites(search: Search, folder: Path) -> Pictures:
         trials = search.candidates.try_all(elite.solution[None])
         place = folder / ELITES / elite.name
         if search.world.kind == "rule":
-            place.parent.mkdir(parents=True, exist_ok=True)
-            save_rule(
-                rules[0],
-                place.with_name(f"{elite.name}.safetensors"),
-                metadata=_metadata(search, elite),
-            )
+            with made_folder(place.parent):
+                save_rule(
+                    rules[0],
+                    place.with_name(f"{elite.name}.safetensors"),
+                    metadata=_metadata(search, elite),
+                )
         else:
             _write_pair(search, elite, rules, place)
         pictures[elite.cell] = _picture(search, trials)

@@ -43,8 +43,8 @@ def import_ribs() -> Any:
     try:
         import cma  # noqa: F401
         import ribs.archives
-        import ribs.emitters
-        import ribs.schedulers
+        import ribs.emitters  # noqa: F401
+        import ribs.schedulers  # noqa: F401
     except ImportError as error:
         raise MissingDependencyError(
             "the search needs pyribs and cma, which are not both installed: "

@@ -7,7 +7,6 @@ bit, that world alone.
 from __future__ import annotations
 
 import contextlib
-import os
 from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple
 
@@ -50,12 +49,6 @@ FEW_PARTICLES = 8192
 
 FLAGS = ("success", "diverged")
 """Names of the first two endings in `info`."""
-
-
-# Torch's pool of threads does not survive a fork: a forked worker, as Gymnasium's AsyncVectorEnv
-# starts them, would wait for it for ever.
-if hasattr(os, "register_at_fork"):
-    os.register_at_fork(after_in_child=lambda: torch.set_num_threads(1))
 
 
 def total(parts: Tensor) -> Tensor:

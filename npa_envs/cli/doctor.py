@@ -12,8 +12,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from npa_envs.cli.output import parse_options
-
 EXTRAS = {
     "envs": "several species, and particles as agents (PettingZoo)",
     "sb3": "Stable-Baselines3",
@@ -42,7 +40,11 @@ class DoctorOptions:
 
 def main(arguments: Sequence[str]) -> int:
     """Print the report; return 1 where something is broken."""
-    parse_options(DoctorOptions, "doctor", arguments)
+    if arguments:
+        # A report that needs the parser would be missing where that is broken.
+        from npa_envs.cli.output import parse_options
+
+        parse_options(DoctorOptions, "doctor", arguments)
     findings = examine()
     width = max(len(finding.subject) for finding in findings)
     for finding in findings:
@@ -120,13 +122,19 @@ class Requirement:
 
     def finding(self) -> str | None:
         """Return what is wrong with the package as it is installed, None: nothing."""
-        from npa_envs.measure.record import installed_version
-
-        version = installed_version(self.name)
+        version = _version(self.name)
         if version is None:
             return "not installed"
         if _numbers(version) < _numbers(self.oldest):
             return f"{version} is older than {self.oldest}"
+        return None
+
+
+def _version(name: str) -> str | None:
+    """Return the version of a distribution, None where it is not installed."""
+    try:
+        return importlib.metadata.version(name)
+    except importlib.metadata.PackageNotFoundError:
         return None
 
 
@@ -154,9 +162,7 @@ def _requirements() -> list[Requirement]:
 
 
 def _packages() -> list[Finding]:
-    from npa_envs.measure.record import installed_version
-
-    version = installed_version("npa-envs")
+    version = _version("npa-envs")
     if version is None:
         text = "not installed, imported from a folder"
         return [Finding("npa-envs", text, "pip install -e . in the clone", optional=True)]
@@ -164,15 +170,13 @@ def _packages() -> list[Finding]:
     for needed in _requirements():
         if needed.extra is None:
             wrong = needed.finding()
-            text = wrong or installed_version(needed.name) or ""
+            text = wrong or _version(needed.name) or ""
             cure = f"pip install -U '{needed.name}>={needed.oldest}'" if wrong else None
             findings.append(Finding(needed.name, text, cure))
     return findings
 
 
 def _extras() -> list[Finding]:
-    from npa_envs.measure.record import installed_version
-
     requirements = _requirements()
     findings = []
     for extra, purpose in EXTRAS.items():
@@ -180,7 +184,7 @@ def _extras() -> list[Finding]:
         if not needed:
             continue
         wrong = [f"{one.name} {text}" for one in needed if (text := one.finding()) is not None]
-        have = ", ".join(f"{one.name} {installed_version(one.name)}" for one in needed)
+        have = ", ".join(f"{one.name} {_version(one.name)}" for one in needed)
         findings.append(
             Finding(
                 f"[{extra}]",
@@ -217,7 +221,9 @@ def _cards() -> list[tuple[str, str]]:
     """Return name and driver version of each card that NVIDIA's own program lists."""
     command = ["nvidia-smi", "--query-gpu=name,driver_version", "--format=csv,noheader"]
     try:
-        done = subprocess.run(command, capture_output=True, text=True, check=True, timeout=20)
+        done = subprocess.run(
+            command, capture_output=True, encoding="utf-8", errors="replace", check=True, timeout=20
+        )
     except (OSError, subprocess.SubprocessError):
         return []
     rows = [line.rpartition(", ") for line in done.stdout.splitlines()]
@@ -296,15 +302,21 @@ def _ffmpeg() -> list[Finding]:
         program = Path(imageio_ffmpeg.get_ffmpeg_exe())
     except RuntimeError as error:
         return [Finding("ffmpeg", f"not found ({error})", "pip install -U imageio-ffmpeg")]
-    done = subprocess.run([program, "-version"], capture_output=True, text=True, check=False)
+    done = subprocess.run(
+        [program, "-version"], capture_output=True, encoding="utf-8", errors="replace", check=False
+    )
     if done.returncode:
         return [Finding("ffmpeg", f"{program} does not run", "pip install -U imageio-ffmpeg")]
     return [Finding("ffmpeg", f"{done.stdout.splitlines()[0]} ({program})")]
 
 
-def _browser() -> list[Finding]:
-    from npa_envs.cli.view import has_screen
+def has_screen() -> bool:
+    """Return whether a browser can be shown on this computer."""
+    screens = ("DISPLAY", "WAYLAND_DISPLAY")
+    return not sys.platform.startswith("linux") or any(map(os.environ.get, screens))
 
+
+def _browser() -> list[Finding]:
     if has_screen():
         return [Finding("browser", "there is a screen")]
     cure = (

@@ -18,6 +18,7 @@ import tyro
 from tqdm import tqdm
 
 from npa_envs.errors import NPAError, suggest
+from npa_envs.files import NEARLY_FULL_BYTES, made_folder
 
 OptionsT = TypeVar("OptionsT")
 
@@ -219,10 +220,11 @@ def writable_folder(path: Path, name: str = "out") -> Path:
     """
     must = "created"
     try:
-        path.mkdir(parents=True, exist_ok=True)
-        must = "written to"
-        with tempfile.TemporaryFile(dir=path):
-            pass
+        with made_folder(path):
+            must = "written to"
+            with tempfile.TemporaryFile(dir=path) as file:
+                # A full disk still makes files, without content.
+                file.write(bytes(NEARLY_FULL_BYTES))
     except OSError as error:
         raise NPAError(
             f"{name} must be a folder that can be {must}, got {str(path)!r} "

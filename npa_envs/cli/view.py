@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import os
-import sys
 import webbrowser
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -13,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
+from npa_envs.cli.doctor import has_screen
 from npa_envs.cli.output import (
     OutFolder,
     named_values,
@@ -113,12 +112,6 @@ def open_browser(address: str) -> bool:
     Where there is no screen, a browser for the terminal would take the terminal.
     """
     return has_screen() and webbrowser.open(address)
-
-
-def has_screen() -> bool:
-    """Return whether a browser can be shown here."""
-    screens = ("DISPLAY", "WAYLAND_DISPLAY")
-    return not sys.platform.startswith("linux") or any(map(os.environ.get, screens))
 
 
 def world_maker(options: ViewOptions, device: torch.device) -> Callable[[], LiveWorld]:

@@ -9,12 +9,12 @@ What the factories make is for both devices, as is `of_warp`; the rest is for wh
 all of a warp's threads must take the same way to it.
 """
 
-import functools
 from typing import Any
 
 import warp as wp
 
 from npa_envs.kernels import native
+from npa_envs.once import made_once
 
 CUDA_LANES = 4
 """Lanes of a particle on CUDA, a power of two; also the smallest channel group."""
@@ -45,7 +45,7 @@ def let_next_in():
     """
 
 
-@functools.cache
+@made_once()
 def make_wide_load(value_type: type, scalar: type) -> Any:
     """Return a Warp function that reads an entry of a flat array, on CUDA in few, wide loads.
 
@@ -67,7 +67,7 @@ load_integer = make_wide_load(wp.int32, wp.int32)
 load_scalar = make_wide_load(wp.float32, wp.float32)
 
 
-@functools.cache
+@made_once()
 def make_wide_store(value_type: type, scalar: type) -> Any:
     """Return a Warp function that writes an entry of a flat array, on CUDA in few, wide stores.
 
@@ -80,7 +80,7 @@ def make_wide_store(value_type: type, scalar: type) -> Any:
     return wide_store
 
 
-@functools.cache
+@made_once()
 def make_read_at(value_type: type, scalar: type, alignment: int) -> Any:
     """Return a Warp function that reads a vector from a place of an array of scalars.
 
@@ -97,7 +97,7 @@ def make_read_at(value_type: type, scalar: type, alignment: int) -> Any:
     return read_at
 
 
-@functools.cache
+@made_once()
 def make_read_channels(value_type: type, scalar: type) -> Any:
     """Return a Warp function that reads adjacent channels of a particle, zeros beyond its last one.
 
@@ -130,7 +130,7 @@ def make_read_channels(value_type: type, scalar: type) -> Any:
     return read_channels
 
 
-@functools.cache
+@made_once()
 def make_write_at(value_type: type, scalar: type) -> Any:
     """Return a Warp function that writes a vector to a place of an array of scalars.
 
@@ -154,7 +154,7 @@ def share_type(value_type: type, scalar: type, lanes: int) -> type:
     return wp.types.vector(share, scalar)
 
 
-@functools.cache
+@made_once()
 def make_lane_sum(
     value_type: type, scalar: type, lanes: int, whole_warps: bool = False, stride: int = 1
 ) -> Any:
@@ -174,7 +174,7 @@ def make_lane_sum(
     return lane_sum
 
 
-@functools.cache
+@made_once()
 def make_lane_collect(value_type: type, scalar: type, lanes: int) -> Any:
     """Return a Warp function that adds over the lanes; each gets its share of the columns.
 
@@ -195,7 +195,7 @@ def make_lane_collect(value_type: type, scalar: type, lanes: int) -> Any:
     return lane_collect
 
 
-@functools.cache
+@made_once()
 def make_kept(scalar: type) -> Any:
     """Return a Warp function that returns its argument, of `scalar`, and keeps it in a register.
 
@@ -208,7 +208,7 @@ def make_kept(scalar: type) -> Any:
     return kept
 
 
-@functools.cache
+@made_once()
 def make_warp_sum(value_type: type) -> Any:
     """Return a Warp function that adds a value over the 32 threads of a warp; each gets the sum.
 
@@ -224,7 +224,7 @@ def make_warp_sum(value_type: type) -> Any:
     return warp_sum
 
 
-@functools.cache
+@made_once()
 def make_shuffle(scalar: type) -> wp.Function:
     """Return a Warp function for a value that a thread of the warp has; on the CPU, the argument.
 

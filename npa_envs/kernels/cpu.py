@@ -5,11 +5,11 @@ launch's first dimension: 0 where it runs whole, as on CUDA. No range may read w
 writes, or count in it: Warp's atomics on the CPU are for one thread.
 """
 
-import functools
 from collections.abc import Callable
 from typing import Any
 
 from npa_envs.kernels import native
+from npa_envs.once import made_once
 
 SMALLEST_RANGES: dict[Any, int] = {}
 """For each such kernel, how many indices of the first dimension are worth a thread of their own."""
@@ -48,7 +48,7 @@ def in_ranges(smallest: int) -> Callable[[Any], Any]:
     return mark
 
 
-@functools.cache
+@made_once()
 def make_add_scaled(group: type, scalar: type) -> Any:
     """Return a Warp function for total + factor * value, rounded after each operation on the CPU.
 

@@ -15,6 +15,7 @@ from typing import Any
 import warp as wp
 
 from npa_envs.kernels import native
+from npa_envs.once import made_once
 
 CELL_SLACK = 1.0 + 2.0**-20
 """Cells are this much larger than eps / reach: rounding a cell index cannot lose a neighbour."""
@@ -28,7 +29,7 @@ def scalar_name(scalar: type) -> str:
     return {wp.float32: "f32", wp.float64: "f64"}[scalar]
 
 
-@functools.cache
+@made_once()
 def kernel_module(
     topic: str, space_dim: int, scalar: type, width: int = 0, lanes: int = 0
 ) -> wp.Module:
@@ -41,7 +42,7 @@ def kernel_module(
     return native.module(f"npa_envs.kernels.{topic}_{variant}")
 
 
-@functools.cache
+@made_once()
 def domain_types(space_dim: int, scalar: type) -> SimpleNamespace:
     """Return the vector types, the `Domain` struct and the functions on it of one variant.
 
@@ -216,7 +217,7 @@ def cell_grid(
     return tuple(shape)
 
 
-@functools.lru_cache(maxsize=256)
+@made_once(256)
 def make_domain(
     space_dim: int,
     scalar: type,

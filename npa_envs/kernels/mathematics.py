@@ -3,12 +3,12 @@
 Sources: arXiv 2601.16096, section 3 and appendix; `npa_envs.reference` has the same in plain torch.
 """
 
-import functools
 from typing import Any
 
 import warp as wp
 
 from npa_envs.kernels import native
+from npa_envs.once import made_once
 
 MOMENT_THRESHOLD = 1e-3
 """Smallest |det M| that is inverted, dimensionless; below it the gradient stays uncorrected."""
@@ -133,7 +133,7 @@ def log_scale_adjoint(scaled: Any, cotangent: Any):
     return result
 
 
-@functools.cache
+@made_once()
 def make_smooth_inverse(space_dim: int, scalar: type) -> wp.Function:
     """Return a Warp function of symmetric M: (det M adj M + τ² I) / (det² M + τ²).
 
@@ -173,7 +173,7 @@ def make_smooth_inverse(space_dim: int, scalar: type) -> wp.Function:
     return smooth_inverse
 
 
-@functools.cache
+@made_once()
 def make_corrected(space_dim: int, scalar: type, width: int, moment_inverse: str | None) -> Any:
     """Return a Warp function that multiplies state gradients [D, width] by an inverse of M.
 
@@ -202,7 +202,7 @@ def make_corrected(space_dim: int, scalar: type, width: int, moment_inverse: str
 # The same formulas in C++, of fewer instructions.
 
 
-@functools.cache
+@made_once()
 def make_fast_exp2(scalar: type) -> Any:
     """Return a Warp function for powers of two, in float32 on CUDA right to about 2e-7.
 
@@ -216,7 +216,7 @@ def make_fast_exp2(scalar: type) -> Any:
     return fast_exp2
 
 
-@functools.cache
+@made_once()
 def make_log_scale_pull(vector: type) -> Any:
     """Return `log_scale_adjoint` on CUDA for a vector type of float32."""
 

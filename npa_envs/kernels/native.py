@@ -5,13 +5,14 @@ then makes a Warp function of a C++ function: plain Warp has no loads of 16 byte
 warp, no memory shared by a few threads, and no tensor cores.
 """
 
-import functools
 import inspect
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import warp as wp
+
+from npa_envs.once import made_once
 
 BOTH_DEVICES = ("access.cuh", "mathematics.cuh")
 """Files that the CPU's compiler reads, too."""
@@ -31,12 +32,12 @@ CUDA_ONLY = (
 """The other files; what a file uses of another one stands before it."""
 
 
-@functools.cache
+@made_once()
 def build_options() -> wp.ModuleBuildOptions:
     """Return what puts the C++ functions into a module: their text, which its hash includes."""
     folder = Path(__file__).parent
-    for_cpu = "".join((folder / name).read_text() for name in BOTH_DEVICES)
-    for_cuda = for_cpu + "".join((folder / name).read_text() for name in CUDA_ONLY)
+    for_cpu = "".join((folder / name).read_text(encoding="utf-8") for name in BOTH_DEVICES)
+    for_cuda = for_cpu + "".join((folder / name).read_text(encoding="utf-8") for name in CUDA_ONLY)
     return wp.ModuleBuildOptions(extra_cpu_preamble=for_cpu, extra_cuda_preamble=for_cuda)
 
 

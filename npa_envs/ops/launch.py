@@ -22,6 +22,7 @@ from torch import Tensor
 
 from npa_envs.kernels.access import CUDA_BLOCK
 from npa_envs.kernels.cpu import SMALLEST_RANGES
+from npa_envs.once import alone, made_once
 from npa_envs.ops.driver import DriverLaunch
 from npa_envs.runtime import in_turn, quiet_warp, start_warp
 
@@ -48,7 +49,7 @@ def warp_device(device: torch.device) -> Any:
     return wp.device_from_torch(device)
 
 
-@functools.lru_cache(maxsize=64)
+@made_once(64)
 def _warp_stream(device: torch.device, handle: int) -> Any:
     return wp.Stream(wp.device_from_torch(device), cuda_stream=handle)
 
@@ -163,7 +164,7 @@ class _Arguments:
             _description(value, kind) if isinstance(value, Tensor) else value
             for value, kind in zip(arguments, types, strict=True)
         ]
-        with quiet_warp(), _first_load(kernel, device):
+        with alone, quiet_warp(), _first_load(kernel, device):
             self._launch = wp.launch(
                 kernel,
                 size,
@@ -173,7 +174,7 @@ class _Arguments:
                 record_tape=False,
                 record_cmd=True,
             )
-        launched.add((kernel, device))
+            launched.add((kernel, device))
         self._device = device
         self._bounds = {size: self._launch.bounds}
         made = self._launch.params[1:]
@@ -519,10 +520,14 @@ def _pool() -> ThreadPoolExecutor:
 
 
 def _leave_threads() -> None:
-    """Forget what a forked process has of its parent's threads: none of them runs here."""
+    """Forget what a forked process has of its parent's threads: none of them runs here.
+
+    Torch would wait for its own for ever.
+    """
     global _forked
     _forked = True
     _pool.cache_clear()
+    torch.set_num_threads(1)
 
 
 if hasattr(os, "register_at_fork"):

@@ -13,6 +13,7 @@ from typing import Any
 
 from npa_envs.errors import MissingDependencyError, NPAError
 from npa_envs.files import (
+    made_folder,
     read_bytes,
     remove_unfinished,
     write_text,
@@ -81,22 +82,22 @@ class RunFolder:
         Raises:
             NPAError: The folder cannot be created or written to, or its disk has too little room.
         """
+        # A new checkpoint is written beside the old one.
+        needed = 2 * byte_count
         try:
-            (self.pictures if pictures else self.path).mkdir(parents=True, exist_ok=True)
-            free = shutil.disk_usage(self.path).free
+            with made_folder(self.pictures if pictures else self.path):
+                free = shutil.disk_usage(self.path).free
+                if free < needed:
+                    raise NPAError(
+                        f"out must have room for two checkpoints ({needed / 2**20:.0f} MiB), but "
+                        f"the disk of {str(self.path)!r} has {free / 2**20:.0f} MiB free: make "
+                        "room, choose another folder, or lower pool_size"
+                    )
         except OSError as error:
             raise NPAError(
                 f"out must be a folder that can be created and written to, got {str(self.path)!r} "
                 f"({error.strerror or error}): choose another one or mend its permissions"
             ) from error
-        # A new checkpoint is written beside the old one.
-        needed = 2 * byte_count
-        if free < needed:
-            raise NPAError(
-                f"out must have room for two checkpoints ({needed / 2**20:.0f} MiB), but the disk "
-                f"of {str(self.path)!r} has {free / 2**20:.0f} MiB free: make room, choose another "
-                "folder, or lower pool_size"
-            )
 
     @contextlib.contextmanager
     def locked(self) -> Iterator[None]:

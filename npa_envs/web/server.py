@@ -27,6 +27,7 @@ import numpy as np
 from PIL import Image
 
 from npa_envs.errors import MissingDependencyError, NPAError, shown
+from npa_envs.files import made_folder
 from npa_envs.render import write_gif, write_mp4
 from npa_envs.web.live import Frame, LiveWorld
 
@@ -162,7 +163,7 @@ def make_app(site: Site) -> Starlette:
     async def part(request: Request) -> Response:
         path = PAGE / request.path_params["name"]
         # Of the folder itself: a name holds no slash, and may not lead out by dots.
-        if path.parent != PAGE or path.suffix not in (".js", ".css") or not path.is_file():
+        if path.parent != PAGE or path.suffix not in (".js", ".css") or not _is_file(path):
             return PlainTextResponse("no such file", 404, SECURITY)
         kind = "text/javascript" if path.suffix == ".js" else "text/css"
         return FileResponse(path, media_type=kind, headers=SECURITY)
@@ -171,7 +172,7 @@ def make_app(site: Site) -> Starlette:
         if not site.admits(request.query_params.get("token")):
             return _refused("films need the token of the page")
         path = site.films / request.path_params["name"]
-        if path.parent != site.films or path.suffix not in (".gif", ".mp4") or not path.is_file():
+        if path.parent != site.films or path.suffix not in (".gif", ".mp4") or not _is_file(path):
             return PlainTextResponse("no such film", 404, SECURITY)
         return FileResponse(path, headers=SECURITY)
 
@@ -218,6 +219,14 @@ class HostCheck:
                 name = self._site.host
                 return await _refused(f"ask for {name}, got {shown(host)}")(scope, receive, send)
         await self._app(scope, receive, send)
+
+
+def _is_file(path: Path) -> bool:
+    """Return whether there is a file; a name that no file can have is that of none."""
+    try:
+        return path.is_file()
+    except (OSError, ValueError):
+        return False
 
 
 def _refused(reason: str) -> Response:
@@ -471,14 +480,14 @@ class Film:
                 np.asarray(Image.open(io.BytesIO(data), formats=["JPEG"]).convert("RGB"))
                 for data in self._pictures
             ]
-            folder.mkdir(parents=True, exist_ok=True)
             # Readers may stop their films in one second.
             name = f"{time.strftime('film-%Y%m%d-%H%M%S')}-{secrets.token_hex(3)}"
-            # A GIF needs no ffmpeg.
-            for suffix, write in ((".gif", write_gif), (".mp4", write_mp4)):
-                path = folder / f"{name}{suffix}"
-                write(path, frames, FILM_RATE)
-                yield path
+            with made_folder(folder):
+                # A GIF needs no ffmpeg.
+                for suffix, write in ((".gif", write_gif), (".mp4", write_mp4)):
+                    path = folder / f"{name}{suffix}"
+                    write(path, frames, FILM_RATE)
+                    yield path
         except NPAError:
             raise
         except (OSError, ValueError) as error:

@@ -72,7 +72,7 @@ def test_a_killed_process_ends_a_run_and_a_signal_stops_it(tmp_path):
         return run
 
     run = begun(2)
-    workers = Path(f"/proc/{run.pid}/task/{run.pid}/children").read_text().split()
+    workers = Path(f"/proc/{run.pid}/task/{run.pid}/children").read_text(encoding="utf-8").split()
     os.kill(int(workers[1]), signal.SIGKILL)
     said, _ = run.communicate(timeout=60)
     assert run.returncode == 2

@@ -1,15 +1,20 @@
-"""Launches on the CPU in ranges: the same bits for every number of threads, also after a fork."""
+"""Threads: launches on the CPU in ranges, the first calls of several threads, forks."""
 
 import contextlib
 import multiprocessing
 import os
+import subprocess
+import sys
 import threading
+import time
+from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 import torch
 from worlds import assert_same, random_mask, random_world, rows_of, with_gradients
 
 import npa_envs
+from npa_envs.once import alone, made_once
 from npa_envs.ops import launch as bridge
 from npa_envs.ops import launch as threads
 from npa_envs.ops import orbit, render_gaussians
@@ -217,3 +222,97 @@ def perceive_after_a_fork():
 def test_a_forked_process_starts_threads_of_its_own(worker):
     """Its parent's are gone: what is handed to them would never run."""
     assert worker(perceive_after_a_fork)
+
+
+ROLLOUT = """
+import threading
+import torch, npa_envs
+rule = npa_envs.NPARule(2, 8, 32, eps0=0.3)
+x, s = torch.rand(2, 3000, 2), torch.rand(2, 3000, 8)
+"""
+
+FIRST_CALLS = """
+import sys
+sys.setswitchinterval(1e-5)
+barrier, finite = threading.Barrier(4), []
+def first():
+    barrier.wait()
+    finite.append(npa_envs.rollout(rule, x[:, :60], s[:, :60], 3)[0].isfinite().all().item())
+members = [threading.Thread(target=first) for _ in range(4)]
+for member in members:
+    member.start()
+for member in members:
+    member.join()
+print(finite)
+"""
+
+FORKED_POOL = """
+import multiprocessing
+def rolled(seed):
+    torch.manual_seed(seed)
+    x, s = torch.rand(2, 3000, 2), torch.rand(2, 3000, 8)
+    return npa_envs.rollout(rule, x, s, 3)[0].detach().numpy().tobytes()
+before = rolled(0)
+with multiprocessing.get_context("fork").Pool(2) as pool:
+    print([after == before for after in pool.map(rolled, [0, 0])])
+"""
+
+
+def printed(program, threads):
+    """Return the lines that a program prints in a process of its own."""
+    done = subprocess.run(
+        [sys.executable, "-c", ROLLOUT + program],
+        env={**os.environ, "OMP_NUM_THREADS": str(threads)},
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    return done.stdout.split("\n")[:-1]
+
+
+def test_several_threads_may_make_and_load_the_same_kernels_first():
+    assert printed(FIRST_CALLS, 1) == ["[True, True, True, True]"]
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="needs fork")
+def test_a_forked_pool_rolls_out_where_environments_were_never_imported():
+    assert printed(FORKED_POOL, 2) == ["[True, True]"]
+
+
+def test_what_several_threads_make_at_once_is_made_once():
+    barrier, made = threading.Barrier(4), []
+
+    @made_once()
+    def make(name):
+        made.append(name)
+        time.sleep(0.02)
+        return object()
+
+    def call(_):
+        barrier.wait(10.0)
+        return make("kernel")
+
+    with ThreadPoolExecutor(4) as pool:
+        assert len(set(pool.map(call, range(4)))) == 1
+    assert made == ["kernel"]
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="needs fork")
+def test_a_fork_waits_until_no_thread_is_making_kernels():
+    begun = threading.Event()
+
+    def hold():
+        with alone:
+            begun.set()
+            time.sleep(0.2)
+
+    holder = threading.Thread(target=hold)
+    holder.start()
+    assert begun.wait(10.0)
+    child = os.fork()
+    if child == 0:
+        os._exit(0 if alone.acquire(timeout=5.0) else 1)
+    holder.join()
+    assert os.waitpid(child, 0)[1] == 0

@@ -1,19 +1,27 @@
 """Files are written whole or not at all, whatever goes wrong in the middle."""
 
+import contextlib
 import errno
+import io
 import os
 import shutil
 import signal
 import stat
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
+from PIL import Image
 
+from npa_envs.agents.learning.rules import RuleSet
+from npa_envs.cli.output import writable_folder
 from npa_envs.errors import NPAError
-from npa_envs.files import atomic_path, remove_unfinished, write_bytes, write_text
+from npa_envs.files import atomic_path, made_folder, remove_unfinished, write_bytes, write_text
+from npa_envs.rule.rule import NPARule
+from npa_envs.training.run_folder import RunFolder
 
 
 def write_half_and_raise(target: Path, error: BaseException) -> None:
@@ -166,23 +174,76 @@ def test_a_read_only_folder_is_refused_before_any_work(tmp_path: Path) -> None:
         tmp_path.chmod(0o700)
 
 
-def test_a_real_full_disk_is_recognised_whatever_the_writer_raises(tmp_path: Path) -> None:
+@pytest.fixture
+def disk(tmp_path: Path) -> Iterator[Path]:
+    """A disk of 256 KiB."""
     disk = tmp_path / "disk"
     disk.mkdir()
     mount = ["mount", "-t", "tmpfs", "-o", "size=256k", "tmpfs", str(disk)]
     if shutil.which("mount") is None or subprocess.run(mount, capture_output=True).returncode:
         pytest.skip("no permission to mount a small tmpfs")
-    try:
-        target = disk / "a.bin"
-        target.write_bytes(b"old")
-        with pytest.raises(NPAError, match="disk is full"):
-            write_bytes(target, b"x" * 1_000_000)
-        with pytest.raises(NPAError, match="disk is full"):
-            fill_the_disk_and_raise_another_error(target)
-        assert target.read_bytes() == b"old"
-        assert list(disk.iterdir()) == [target]
-    finally:
-        subprocess.run(["umount", str(disk)], check=True)
+    yield disk
+    subprocess.run(["umount", str(disk)], check=True)
+
+
+def test_a_real_full_disk_is_recognised_whatever_the_writer_raises(disk: Path) -> None:
+    target = disk / "a.bin"
+    target.write_bytes(b"old")
+    with pytest.raises(NPAError, match="disk is full"):
+        write_bytes(target, b"x" * 1_000_000)
+    with pytest.raises(NPAError, match="disk is full"):
+        fill_the_disk_and_raise_another_error(target)
+    assert target.read_bytes() == b"old"
+    assert list(disk.iterdir()) == [target]
+
+
+def write_rules(folder: Path) -> None:
+    # Its interface tells observations and actions, which no file holds.
+    interface: Any = None
+    RuleSet([NPARule(2, 4, 8, eps0=0.1)], [1], interface).save(folder)
+
+
+def write_film(folder: Path) -> None:
+    server = pytest.importorskip("npa_envs.web.server")
+    picture = io.BytesIO()
+    Image.new("RGB", (64, 64)).save(picture, "JPEG")
+    film = server.Film()
+    film.add(picture.getvalue())
+    list(film.write(folder))
+
+
+@pytest.mark.parametrize(
+    "write",
+    [writable_folder, lambda folder: RunFolder(folder).prepare(2**20), write_rules, write_film],
+    ids=["command", "training run", "rules", "film"],
+)
+def test_a_full_disk_is_left_without_empty_folders(disk: Path, write: Any) -> None:
+    with contextlib.suppress(OSError), (disk / "full.bin").open("wb", buffering=0) as full:
+        while True:
+            full.write(bytes(4096))
+    with pytest.raises(NPAError):
+        write(disk / "runs" / "mine")
+    assert [path.name for path in disk.iterdir()] == ["full.bin"]
+
+
+def test_a_failed_block_removes_only_empty_folders_that_it_has_made(tmp_path: Path) -> None:
+    (tmp_path / "old").mkdir()
+
+    def fail_in(folder: Path, kept: Path | None = None) -> None:
+        with made_folder(folder):
+            if kept is not None:
+                kept.write_text("kept", encoding="utf-8")
+            raise ValueError("broken")
+
+    with pytest.raises(ValueError, match="broken"):
+        fail_in(tmp_path / "old" / "a" / "b", kept=tmp_path / "old" / "a" / "kept.txt")
+    assert not (tmp_path / "old" / "a" / "b").exists()
+    with pytest.raises(ValueError, match="broken"):
+        fail_in(tmp_path / "old")
+    with made_folder(tmp_path / "new" / "c"):
+        pass
+    kept = sorted(path.relative_to(tmp_path).as_posix() for path in tmp_path.rglob("*"))
+    assert kept == ["new", "new/c", "old", "old/a", "old/a/kept.txt"]
 
 
 def test_an_error_about_another_file_is_not_blamed_on_this_one(tmp_path: Path) -> None:

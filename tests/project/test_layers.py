@@ -39,6 +39,7 @@ LADDER = {
     "npa_envs.registration": rung(0, "gymnasium"),
     "npa_envs.devices": rung(1, "torch"),
     "npa_envs.files": rung(1),
+    "npa_envs.once": rung(0),
     "npa_envs.processes": rung(1),
     "npa_envs.runtime": rung(1, "warp"),
     "npa_envs.reference": rung(1, "torch"),
@@ -167,7 +168,8 @@ def violations(module: str, source: str, *, is_package: bool = False) -> list[st
 @pytest.mark.parametrize("path", source_files(), ids=lambda p: p.relative_to(ROOT).as_posix())
 def test_every_source_file_keeps_to_the_ladder(path: Path) -> None:
     is_package = path.name == "__init__.py"
-    assert violations(module_name(path), path.read_text(), is_package=is_package) == []
+    source = path.read_text(encoding="utf-8")
+    assert violations(module_name(path), source, is_package=is_package) == []
 
 
 def test_only_the_operators_and_the_benchmarked_hash_grid_know_both_warp_and_torch() -> None:

@@ -16,7 +16,9 @@ pytest.importorskip("stable_baselines3")
 
 def program(page: Path = TUTORIAL) -> str:
     """Return the page's last block of Python."""
-    *_, block = re.findall(r"^```python\n(.*?)^```", page.read_text(), re.MULTILINE | re.DOTALL)
+    text = page.read_text(encoding="utf-8")
+    *_, block = re.findall(r"^```python
+(.*?)^```", text, re.MULTILINE | re.DOTALL)
     return block
 
 

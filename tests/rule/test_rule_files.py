@@ -439,7 +439,7 @@ def write_state(path: Path, change: Callable[[dict], Any]) -> None:
 def write_entry(path: Path, change: Callable[[dict], Any]) -> None:
     entry = demo_entry(NPARule())
     change(entry)
-    path.write_text(json.dumps({"mine": entry}))
+    path.write_text(json.dumps({"mine": entry}), encoding="utf-8")
 
 
 FORMATS: dict[str, tuple[Callable[[Path, Any], None], dict[str, tuple[Any, str]], Any]] = {

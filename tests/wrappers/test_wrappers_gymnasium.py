@@ -28,10 +28,13 @@ ACTION = actions(0)
             ACTION,
         ),
         # The middles of five bins of [-1, 1].
-        (
+        pytest.param(
             lambda env: wrappers.DiscretizeAction(env, bins=5, multidiscrete=True),
             BINS,
             (0.4 * BINS - 0.8).astype(np.float32).reshape(64, ACTIONS),
+            marks=pytest.mark.skipif(
+                not hasattr(wrappers, "DiscretizeAction"), reason="Gymnasium before 1.2"
+            ),
         ),
         # In one row, as RLlib takes them.
         (

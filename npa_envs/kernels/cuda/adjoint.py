@@ -6,7 +6,6 @@ around them, and multiplies the rows' cotangents by the weights of all eight on 
 row's cotangents are so read once for eight particles.
 """
 
-import functools
 from types import SimpleNamespace
 
 import warp as wp
@@ -33,6 +32,7 @@ from npa_envs.kernels.access import (
 )
 from npa_envs.kernels.domain import domain_types, kernel_module
 from npa_envs.kernels.mathematics import make_log_scale_pull
+from npa_envs.once import made_once
 
 TILE = 8
 """Particles that a warp serves together, and rows of one product."""
@@ -66,7 +66,7 @@ load_channels = make_wide_load(CHANNELS, wp.float32)
 store_channels = make_wide_store(CHANNELS, wp.float32)
 
 
-@functools.cache
+@made_once()
 def make_sum_listed(space_dim: int, width: int, kinds: int, periodic: bool) -> wp.Function:
     """Return a Warp function that adds weighted channels of listed rows for a warp's particles.
 
@@ -99,7 +99,7 @@ def row_list_address() -> wp.uint32:
     """Where the warp's list of rows lies in fast memory."""
 
 
-@functools.cache
+@made_once()
 def make_read_columns(count: int) -> wp.Function:
     """Return a Warp function that reads some adjacent columns of a row, 0 from a last one on.
 
@@ -156,7 +156,7 @@ def smallest_in_tile(value: wp.float32) -> wp.float32:
 read_channels = make_read_columns(SHARE)
 
 
-@functools.cache
+@made_once()
 def listed_adjoint(
     space_dim: int,
     width: int,

@@ -8,8 +8,6 @@ entries first. It has room for so many; of a longer one, only the length is know
 Small worlds in 2D take `tiles.py`, whose lists lie one behind the other.
 """
 
-import functools
-
 import warp as wp
 
 from npa_envs.kernels import native
@@ -24,6 +22,7 @@ from npa_envs.kernels.access import (
 from npa_envs.kernels.domain import domain_types, kernel_module
 from npa_envs.kernels.mathematics import falloff_within, smoothing_of
 from npa_envs.kernels.portable.density import BLOCK
+from npa_envs.once import made_once
 
 AHEAD, SHARED_AHEAD = 6, 5
 """Candidates that a thread looks at together: alone with a particle, and one of several lanes."""
@@ -53,7 +52,7 @@ SLACK = 1.0 + 1e-5
 store_record = make_wide_store(RECORD, wp.float32)
 
 
-@functools.cache
+@made_once()
 def listed_density(
     space_dim: int, lanes: int, periodic: bool, capacity: int, masked: bool
 ) -> wp.Kernel:
@@ -253,7 +252,7 @@ def listed_density(
     return compute_density
 
 
-@functools.cache
+@made_once()
 def make_steps_at(capacity: int, tiled: bool) -> wp.Function:
     """Return a Warp function that reads two steps of a row's list, as the density pass left it.
 

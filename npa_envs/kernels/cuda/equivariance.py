@@ -4,7 +4,6 @@ The formulas are those of `npa_envs/ops/equivariance.py`, as in `kernels/portabl
 fewer passes over the rows, and the gradient of the mixing weights on the way.
 """
 
-import functools
 from types import SimpleNamespace
 
 import warp as wp
@@ -12,6 +11,7 @@ import warp as wp
 from npa_envs.kernels import native
 from npa_envs.kernels.access import WARP, await_earlier
 from npa_envs.kernels.cuda.network import make_share_sum
+from npa_envs.once import made_once
 
 READ_WARPS, PULL_WARPS, STEER_WARPS, MIXING_SUM_WARPS = 4, 4, 4, 16
 """Warps of a block that reads rows, pulls back to them, steers, and adds up blocks' sums."""
@@ -40,7 +40,7 @@ def fits_block(space_dim: int, scalars: int, perceived: int, mixed: int, chiral:
     return weights <= LARGEST_MIXING and mixed < 256 and 4 * floats <= SHARED_BYTES
 
 
-@functools.cache
+@made_once()
 def row_kernels(
     space_dim: int, scalars: int, perceived: int, mixed: int, chiral: bool
 ) -> SimpleNamespace:
@@ -110,7 +110,7 @@ def row_kernels(
     return SimpleNamespace(read_rows=read_rows, pull_back_rows=pull_back_rows)
 
 
-@functools.cache
+@made_once()
 def mixing_sum() -> wp.Kernel:
     """Return the kernel that adds blocks' sums; its blocks are larger than those of the others."""
     add_partial_sums = make_share_sum(MIXING_SUM_WARPS)
@@ -132,7 +132,7 @@ def mixing_sum() -> wp.Kernel:
     return add_blocks
 
 
-@functools.cache
+@made_once()
 def steering_kernels(space_dim: int, mixed: int, chiral: bool) -> SimpleNamespace:
     """Return the kernels between outputs and updates; a warp has `STEERED_ROWS` rows.
 

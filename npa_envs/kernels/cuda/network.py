@@ -4,7 +4,6 @@ Products are of numbers that are each split into two halves of 16 bits: `network
 lie in a warp. float16 has little range, so a row is first scaled by a power of two, which is exact.
 """
 
-import functools
 from types import SimpleNamespace
 from typing import Any
 
@@ -12,6 +11,7 @@ import warp as wp
 
 from npa_envs.kernels import native
 from npa_envs.kernels.access import WARP, await_earlier, let_next_in
+from npa_envs.once import made_once
 
 UNIT_GROUP = 16
 """Hidden units of one step: the inner extent of a product."""
@@ -37,7 +37,7 @@ WIDE, WIDE_REGISTERS = range(81, 97), 128
 """Columns of rows, 3D's with 16 channels, that want more warps instead of registers, and those."""
 
 
-@functools.cache
+@made_once()
 def two_layer_kernel(steps: int, tiles: int, mode: str) -> wp.Kernel:
     """Return the kernel of two products, row by row, for 16 rows a warp.
 
@@ -87,7 +87,7 @@ def two_layer_kernel(steps: int, tiles: int, mode: str) -> wp.Kernel:
     return network_layers
 
 
-@functools.cache
+@made_once()
 def weight_gradient_kernels(
     steps: int, tiles: int, out_tiles: int, warps: int, unit_blocks: int, words: int
 ) -> SimpleNamespace:
@@ -163,7 +163,7 @@ def weight_gradient_kernels(
     return SimpleNamespace(sum_weight_gradients=sum_weight_gradients, add_shares=add_shares)
 
 
-@functools.cache
+@made_once()
 def make_share_sum(warps: int) -> Any:
     """Return a Warp function that adds shares' sums; a block has so many warps, and 32 columns."""
 
@@ -181,7 +181,7 @@ def scale_to(size: wp.float32, target: wp.uint32) -> wp.float32:
     """The power of two by which a positive size comes to lie in [2^target, 2^(target + 1))."""
 
 
-@functools.cache
+@made_once()
 def arrangement_kernels() -> SimpleNamespace:
     """Return the kernels that lay out weights in the order in which the lanes of a warp read them.
 

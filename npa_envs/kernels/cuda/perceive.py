@@ -7,7 +7,6 @@ neighbour's state is read once, by adjacent lanes. Rows leave through fast memor
 transactions. A list that is too long was not kept: its neighbours are searched for again.
 """
 
-import functools
 import math
 
 import warp as wp
@@ -38,6 +37,7 @@ from npa_envs.kernels.mathematics import (
     spiky_factor_wide,
     within,
 )
+from npa_envs.once import made_once
 
 CUDA_REGISTERS, TEAM_REGISTERS = {2: 80, 3: 112}, 128
 """Registers of a thread of the perception pass: of one team, by dimension, and of several."""
@@ -58,7 +58,7 @@ CANDIDATES = 16
 load_record = make_wide_load(RECORD, wp.float32)
 
 
-@functools.cache
+@made_once()
 def listed_perception(
     space_dim: int,
     width: int,
@@ -620,7 +620,7 @@ def listed_perception(
     return perceive
 
 
-@functools.cache
+@made_once()
 def make_stage(value_type: type) -> wp.Function:
     """Return a Warp function that puts a value into a slot, a number of words from its beginning.
 

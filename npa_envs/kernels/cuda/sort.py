@@ -6,7 +6,6 @@ indices replace those. Where worlds are few, several blocks sort the same world,
 slice.
 """
 
-import functools
 from types import SimpleNamespace
 
 import warp as wp
@@ -26,6 +25,7 @@ from npa_envs.kernels.access import (
     thread_of_block,
 )
 from npa_envs.kernels.domain import domain_types, kernel_module
+from npa_envs.once import made_once
 
 load_pair = make_wide_load(wp.vec2i, wp.int32)
 
@@ -49,7 +49,7 @@ def count_active(mask: wp.array(dtype=wp.uint8), count: wp.int32) -> wp.int32:
     """A thread's part in counting the active ones of the first `count` particles of all worlds."""
 
 
-@functools.cache
+@made_once()
 def block_functions(capacity: int) -> SimpleNamespace:
     """Return what kernels do whose blocks each sort a world of up to `capacity` particles."""
     sizes = capacity, BLOCKS[capacity], LARGEST_GRID
@@ -106,7 +106,7 @@ def block_functions(capacity: int) -> SimpleNamespace:
     )
 
 
-@functools.cache
+@made_once()
 def sort_small_worlds(space_dim: int, capacity: int) -> wp.Kernel:
     """Return the kernel that sorts worlds of float32 and of up to `capacity` particles."""
     scalar = wp.float32
@@ -274,7 +274,7 @@ def sort_small_worlds(space_dim: int, capacity: int) -> wp.Kernel:
     return sort_worlds
 
 
-@functools.cache
+@made_once()
 def order_particles(space_dim: int, width: int) -> wp.Kernel:
     """Return the last kernel of sorting large worlds, which moves states a warp at a time.
 

@@ -4,8 +4,6 @@ The same footprints in the same order as those of `pictures/splat.py`. The block
 mean, too. Where worlds are few, several blocks sort the same world, and each writes a slice.
 """
 
-import functools
-
 import warp as wp
 
 from npa_envs.kernels import native
@@ -20,9 +18,10 @@ from npa_envs.kernels.access import (
 from npa_envs.kernels.cuda.sort import BLOCKS, RESIDENT_THREADS, block_functions, store_integer
 from npa_envs.kernels.pictures.splat import splat_functions, splat_types
 from npa_envs.kernels.portable.mean import CHUNK
+from npa_envs.once import made_once
 
 
-@functools.cache
+@made_once()
 def sort_small_splats(capacity: int) -> wp.Kernel:
     """Return the kernel that sorts splats of float32, of worlds of up to `capacity` particles."""
     scalar = wp.float32

@@ -9,8 +9,6 @@ and in worlds that fill a device a thread for each particle does as well. Worlds
 particles: steps of lists have 16 bits.
 """
 
-import functools
-
 import warp as wp
 
 from npa_envs.kernels import native
@@ -24,6 +22,7 @@ from npa_envs.kernels.access import (
 )
 from npa_envs.kernels.cuda.density import RECORD, store_record
 from npa_envs.kernels.domain import domain_types, kernel_module
+from npa_envs.once import made_once
 
 TILE = 8
 """Particles of a tile."""
@@ -39,7 +38,7 @@ CUDA_REGISTERS = 64
 """Registers of a thread: 32 warps of a processor."""
 
 
-@functools.cache
+@made_once()
 def tiled_density(periodic: bool, capacity: int, masked: bool) -> wp.Kernel:
     """Return the density kernel of one variant. A block is a warp, and serves a tile.
 

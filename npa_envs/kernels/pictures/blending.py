@@ -14,7 +14,6 @@ after the other, each at those pixels only that it reaches. Either way every pai
 Gaussian has a slot of its own for what the tile pulls: no sum depends on which thread came first.
 """
 
-import functools
 from types import SimpleNamespace
 
 import warp as wp
@@ -39,6 +38,7 @@ from npa_envs.kernels.pictures.gaussians import (
     gaussian_types,
     make_covered,
 )
+from npa_envs.once import made_once
 
 LARGEST_ALPHA = 0.99
 """What a Gaussian covers of a pixel, at most: the adjoint divides by the rest."""
@@ -59,7 +59,7 @@ TO_POWER_OF_TWO = -0.7213475204444817
 """-1/2 log2(e): of exp(-1/2 p) as a power of two."""
 
 
-@functools.cache
+@made_once()
 def blending_functions(scalar: type) -> SimpleNamespace:
     """Return what all kernels share: what one Gaussian does to one pixel, and its adjoint."""
     types = gaussian_types(scalar)
@@ -141,7 +141,7 @@ def blending_functions(scalar: type) -> SimpleNamespace:
     )
 
 
-@functools.cache
+@made_once()
 def tile_kernels(scalar: type) -> SimpleNamespace:
     """Return the kernels of one scalar type in which a thread serves a tile; for the CPU."""
     types = gaussian_types(scalar)
@@ -257,7 +257,7 @@ def tile_kernels(scalar: type) -> SimpleNamespace:
     return SimpleNamespace(draw_tiles=draw_tiles, pull_back_tiles=pull_back_tiles)
 
 
-@functools.cache
+@made_once()
 def block_kernels(scalar: type) -> SimpleNamespace:
     """Return the kernels of one scalar type in which a block serves a tile; for CUDA.
 

@@ -6,8 +6,6 @@ takes, and many tiles of a picture have none. So a block first ranks its tiles b
 Which threads serve a tile changes none of its sums. On the CPU a drawn picture is compared.
 """
 
-import functools
-
 import warp as wp
 
 from npa_envs.kernels import native
@@ -30,6 +28,7 @@ from npa_envs.kernels.pictures.splat import (
     gather_registers,
     splat_types,
 )
+from npa_envs.once import made_once
 
 BLOCK_TILES = CUDA_BLOCK
 """Tiles of a block, at most: each thread counts the particles around one."""
@@ -44,7 +43,7 @@ TURN_TILES = WARP_TILES * BLOCK_WARPS
 """Tiles that a block serves in a turn; it has one turn or several."""
 
 
-@functools.cache
+@made_once()
 def make_pixel_errors(scalar: type) -> wp.Function:
     """Return a Warp function for a pixel's density error, and three times its colour error."""
     colour_type = splat_types(scalar).colour
@@ -64,7 +63,7 @@ def make_pixel_errors(scalar: type) -> wp.Function:
     return pixel_errors
 
 
-@functools.cache
+@made_once()
 def gather_errors(scalar: type) -> wp.Kernel:
     """Return the kernel of one scalar type that gathers and compares; for CUDA."""
     types = splat_types(scalar)
@@ -145,7 +144,7 @@ def gather_errors(scalar: type) -> wp.Kernel:
     return gather_errors
 
 
-@functools.cache
+@made_once()
 def sum_errors(scalar: type) -> wp.Kernel:
     """Return the kernel of one scalar type that compares drawn pictures; for the CPU."""
     colour_type = splat_types(scalar).colour

@@ -10,7 +10,6 @@ picture. There its covariance is Q⁻¹ = J W P Wᵀ Jᵀ + dilation (Kerbl, equ
 projection's derivative at c, the local affine approximation (Zwicker).
 """
 
-import functools
 from types import SimpleNamespace
 from typing import Any
 
@@ -20,6 +19,7 @@ from npa_envs.kernels import native
 from npa_envs.kernels.access import make_wide_load, make_wide_store
 from npa_envs.kernels.cpu import PAIRS, in_ranges
 from npa_envs.kernels.domain import scalar_name
+from npa_envs.once import made_once
 
 TILE = 16
 """Pixels along each side of a tile."""
@@ -48,7 +48,7 @@ HARMONIC_0, HARMONIC_1 = 0.28209479177387814, 0.4886025119029199
 """Factors of the real spherical harmonics of degree 0 and 1."""
 
 
-@functools.cache
+@made_once()
 def gaussian_types(scalar: type) -> SimpleNamespace:
     """Return the `Frame` struct and the vector and matrix types of one scalar type."""
 
@@ -79,7 +79,7 @@ def gaussian_types(scalar: type) -> SimpleNamespace:
     )
 
 
-@functools.lru_cache(maxsize=256)
+@made_once(256)
 def make_frame(
     scalar: type,
     shape: tuple[int, int, int],
@@ -111,7 +111,7 @@ def tile_total(width: int, height: int) -> int:
     return -(-width // TILE) * -(-height // TILE)
 
 
-@functools.cache
+@made_once()
 def make_covered(scalar: type) -> wp.Function:
     """Return a Warp function for the pixels along one direction that a footprint covers."""
 
@@ -126,7 +126,7 @@ def make_covered(scalar: type) -> wp.Function:
     return covered
 
 
-@functools.cache
+@made_once()
 def gaussian_kernels(scalar: type) -> SimpleNamespace:
     """Return the kernels of one scalar type."""
     types = gaussian_types(scalar)

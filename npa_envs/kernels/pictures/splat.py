@@ -12,7 +12,6 @@ whole world, particle by particle. Either way a pixel's sum has an order that de
 world alone.
 """
 
-import functools
 import math
 from types import SimpleNamespace
 from typing import Any
@@ -32,6 +31,7 @@ from npa_envs.kernels.access import (
 from npa_envs.kernels.cpu import PAIRS, WORLDS, in_ranges
 from npa_envs.kernels.domain import scalar_name
 from npa_envs.kernels.mathematics import make_fast_exp2
+from npa_envs.once import made_once
 
 CHANNELS = 4
 """Red, green, blue and density."""
@@ -59,7 +59,7 @@ PATCH_SIGMAS = 3.0
 """A particle's patch reaches this many standard deviations from its centre."""
 
 
-@functools.cache
+@made_once()
 def splat_types(scalar: type) -> SimpleNamespace:
     """Return the vector types and the `Lens` struct of one scalar type."""
 
@@ -92,7 +92,7 @@ def splat_types(scalar: type) -> SimpleNamespace:
     )
 
 
-@functools.lru_cache(maxsize=256)
+@made_once(256)
 def make_lens(
     scalar: type, resolution: int, pixel_size: float, sigma: float, low: float, high: float
 ) -> Any:
@@ -137,7 +137,7 @@ def group_count(resolution: int) -> int:
     return across * -(-resolution // (TILE_HEIGHT * GROUP_HEIGHT))
 
 
-@functools.cache
+@made_once()
 def splat_functions(scalar: type) -> SimpleNamespace:
     """Return what several kernels share: where particles are drawn, and their footprints."""
     types = splat_types(scalar)
@@ -233,7 +233,7 @@ def splat_functions(scalar: type) -> SimpleNamespace:
     )
 
 
-@functools.cache
+@made_once()
 def gather_functions(scalar: type, lanes: int) -> SimpleNamespace:
     """Return what gathers pixels; one thread has a tile, or as many `lanes` as rows share it."""
     assert lanes in (1, TILE_HEIGHT)
@@ -326,7 +326,7 @@ def gather_functions(scalar: type, lanes: int) -> SimpleNamespace:
     return SimpleNamespace(candidate_count=candidate_count, gather_tile=gather_tile)
 
 
-@functools.cache
+@made_once()
 def splat_kernels(scalar: type, lanes: int) -> SimpleNamespace:
     """Return the kernels of one scalar type; `lanes` threads share a tile, or a particle."""
     types = splat_types(scalar)

@@ -11,7 +11,6 @@ Positions: pair (i, j) pulls r by
            with q the cotangent of the density gradient.
 """
 
-import functools
 from types import SimpleNamespace
 
 import warp as wp
@@ -27,12 +26,13 @@ from npa_envs.kernels.mathematics import (
     spiky_radial_slope,
 )
 from npa_envs.kernels.portable.search import make_search
+from npa_envs.once import made_once
 
 CUDA_REGISTERS = 64
 """Registers of a thread that gathers state cotangents: it mostly waits for memory."""
 
 
-@functools.cache
+@made_once()
 def adjoint_kernels(
     space_dim: int,
     scalar: type,

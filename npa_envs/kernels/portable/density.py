@@ -5,7 +5,6 @@ Sums run over sorted particles, run by run of cells.
 Source: arXiv 2601.16096, section 3.
 """
 
-import functools
 from types import SimpleNamespace
 
 import warp as wp
@@ -14,13 +13,14 @@ from npa_envs.kernels.cpu import PAIRS, in_ranges
 from npa_envs.kernels.domain import domain_types, kernel_module
 from npa_envs.kernels.mathematics import smoothing, spiky_factor_wide
 from npa_envs.kernels.portable.search import make_search
+from npa_envs.once import made_once
 
 BLOCK = 4096
 """Candidates whose weights are summed before they are added to the others: of a million summed one
 after the other, too much is rounded away."""
 
 
-@functools.cache
+@made_once()
 def density_kernels(space_dim: int, scalar: type, on_cpu: bool) -> SimpleNamespace:
     """Return the kernels of one variant: one thread a particle."""
     types = domain_types(space_dim, scalar)

@@ -6,13 +6,13 @@ else, so a world's draws depend neither on the other worlds nor on the device.
 Source: Salmon, Moraes, Dror and Shaw, "Parallel random numbers: as easy as 1, 2, 3" (SC 2011).
 """
 
-import functools
 import math
 from types import SimpleNamespace
 
 import warp as wp
 
 from npa_envs.kernels.domain import scalar_name
+from npa_envs.once import made_once
 
 # Typed here: a bare number in a kernel would be an int32 or a float32.
 MULTIPLIER_0 = wp.constant(wp.uint32(0xD2511F53))
@@ -80,7 +80,7 @@ def fraction_53(high: wp.uint32, low: wp.uint32):
     return wp.float64(joined(high, low) >> wp.uint64(11)) * ULP_53
 
 
-@functools.cache
+@made_once()
 def draw_kernels(scalar: type) -> SimpleNamespace:
     """Return the kernels that draw numbers of one floating type, and how many a thread draws."""
     module = wp.get_module(f"npa_envs.kernels.draws_{scalar_name(scalar)}")

@@ -3,16 +3,16 @@
 `npa_envs/ops/equivariance.py` has the formulas. A thread makes a few numbers of a row.
 """
 
-import functools
 from types import SimpleNamespace
 
 import warp as wp
 
 from npa_envs.kernels.cpu import ELEMENTS, in_ranges
 from npa_envs.kernels.domain import domain_types, kernel_module
+from npa_envs.once import made_once
 
 
-@functools.cache
+@made_once()
 def equivariance_kernels(space_dim: int, scalar: type) -> SimpleNamespace:
     """Return the kernels of one variant."""
     vector = domain_types(space_dim, scalar).vector

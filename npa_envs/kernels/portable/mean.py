@@ -3,7 +3,6 @@
 On CUDA the threads of a warp share a sum, first of a chunk of values, then of the chunks' sums.
 """
 
-import functools
 from types import SimpleNamespace
 
 import warp as wp
@@ -11,6 +10,7 @@ import warp as wp
 from npa_envs.kernels import native
 from npa_envs.kernels.access import await_earlier, make_warp_sum
 from npa_envs.kernels.domain import scalar_name
+from npa_envs.once import made_once
 
 CHUNK = 256
 """Values whose sum is one partial sum."""
@@ -19,7 +19,7 @@ MEAN_LANES = 32
 """CUDA threads that share a sum: a warp; one on the CPU."""
 
 
-@functools.cache
+@made_once()
 def mean_kernels(scalar: type, lanes: int) -> SimpleNamespace:
     """Return the kernels of one scalar type; `lanes` threads share a sum."""
     module = native.module(f"npa_envs.kernels.worlds_{scalar_name(scalar)}_l{lanes}")

@@ -6,7 +6,6 @@ by run of cells, or over neighbours listed before in the same order.
 Source: arXiv 2601.16096, section 3 (smoothing, gradients, moment matrix, scaling).
 """
 
-import functools
 from types import SimpleNamespace
 
 import warp as wp
@@ -21,12 +20,13 @@ from npa_envs.kernels.mathematics import (
     spiky_factor,
 )
 from npa_envs.kernels.portable.search import make_search
+from npa_envs.once import made_once
 
 CUDA_REGISTERS = 128
 """Registers of a thread of the perception pass: more threads in flight are worth a few spills."""
 
 
-@functools.cache
+@made_once()
 def perception_kernels(
     space_dim: int,
     scalar: type,

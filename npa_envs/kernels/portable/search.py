@@ -5,18 +5,18 @@ of the candidates are near: a branch for each is often predicted wrongly, and ke
 memory. On CUDA a sift takes a single candidate, so that this is such a branch.
 """
 
-import functools
 from types import SimpleNamespace
 
 import warp as wp
 
 from npa_envs.kernels.domain import domain_types
+from npa_envs.once import made_once
 
 SIFTED = 32
 """Candidates of a sift on the CPU."""
 
 
-@functools.cache
+@made_once()
 def make_search(
     space_dim: int, scalar: type, entry_type: type, on_cpu: bool, listed: bool = False
 ) -> SimpleNamespace:

@@ -7,7 +7,6 @@ provisional places; the last kernel replaces them by ranks among indices, which 
 sum run in the same order on every run and device.
 """
 
-import functools
 from types import SimpleNamespace
 
 import warp as wp
@@ -20,11 +19,12 @@ from npa_envs.kernels.access import (
 )
 from npa_envs.kernels.cpu import PARTICLES, WORLDS, in_ranges
 from npa_envs.kernels.domain import domain_types, kernel_module
+from npa_envs.once import made_once
 
 store_pair = make_wide_store(wp.vec2i, wp.int32)
 
 
-@functools.cache
+@made_once()
 def sort_kernels(space_dim: int, scalar: type, width: int) -> SimpleNamespace:
     """Return the kernels of one variant.
 
@@ -247,7 +247,7 @@ def sort_kernels(space_dim: int, scalar: type, width: int) -> SimpleNamespace:
     )
 
 
-@functools.cache
+@made_once()
 def give_rows(space_dim: int, scalar: type) -> wp.Kernel:
     """Return the kernel that gives active particles of worlds that are sorted already their rows.
 

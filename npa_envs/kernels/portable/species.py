@@ -7,16 +7,15 @@ fully where particles are dense.
 Sources: kernels of arXiv 2601.16096, section 3, summed over the particles of one species.
 """
 
-import functools
-
 import warp as wp
 
 from npa_envs.kernels.cpu import PAIRS, in_ranges
 from npa_envs.kernels.domain import domain_types, kernel_module
 from npa_envs.kernels.mathematics import log_scaled, smoothing, spiky_factor
+from npa_envs.once import made_once
 
 
-@functools.cache
+@made_once()
 def species_kernel(space_dim: int, scalar: type, species_count: int) -> wp.Kernel:
     """Return the kernel of one variant.
 

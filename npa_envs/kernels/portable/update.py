@@ -5,7 +5,6 @@ as a fraction of alpha eps.
 Source: arXiv 2601.16096, section 3.
 """
 
-import functools
 from types import SimpleNamespace
 
 import warp as wp
@@ -21,6 +20,7 @@ from npa_envs.kernels.access import (
 )
 from npa_envs.kernels.cpu import ELEMENTS, in_ranges
 from npa_envs.kernels.domain import domain_types, kernel_module, scalar_name
+from npa_envs.once import made_once
 
 CHANNEL_SHARE = 4
 """Adjacent channels of a particle, or columns of a row, that one thread changes."""
@@ -32,7 +32,7 @@ TEAM = 32
 """Particles that a warp moves; the next warps change their states."""
 
 
-@functools.cache
+@made_once()
 def update_kernels(space_dim: int, scalar: type) -> SimpleNamespace:
     """Return the kernels of one variant."""
     types = domain_types(space_dim, scalar)
@@ -348,7 +348,7 @@ VALUES_PER_THREAD = 8
 """Values that a thread looks at."""
 
 
-@functools.cache
+@made_once()
 def find_not_finite(scalar: type) -> wp.Kernel:
     """Return the kernel of one scalar type."""
     module = native.module(f"npa_envs.kernels.finite_{scalar_name(scalar)}")

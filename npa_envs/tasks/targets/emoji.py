@@ -115,8 +115,12 @@ def _fonts_of_fontconfig() -> Iterator[Path]:
     try:
         listing = subprocess.run(
             [program, "--format", "%{file}\n", ":color=true"],
-            capture_output=True, text=True, timeout=20, check=False,
-        ).stdout  # fmt: skip
+            capture_output=True,
+            encoding="utf-8",
+            errors="surrogateescape",
+            timeout=20,
+            check=False,
+        ).stdout
     except (OSError, subprocess.SubprocessError):
         return
     yield from (Path(line) for line in sorted(set(listing.splitlines())) if line)
