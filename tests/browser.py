@@ -52,7 +52,7 @@ class Page:
     def __init__(self, address: str) -> None:
         connect = pytest.importorskip("websockets.sync.client").connect
         self._open = contextlib.ExitStack()
-        self._socket = self._open.enter_context(connect(address, max_size=2**28, open_timeout=30))
+        self._socket = self._open.enter_context(connect(address, max_size=2**28, open_timeout=120))
         self._numbers = itertools.count(1)
         self.complaints: list[str] = []
         """What the page wrote to the console as warnings and errors, and what it failed to load;
@@ -65,7 +65,7 @@ class Page:
         number = next(self._numbers)
         self._socket.send(json.dumps({"id": number, "method": method, "params": parameters}))
         while True:
-            message = json.loads(self._socket.recv(timeout=60))
+            message = json.loads(self._socket.recv(timeout=120))
             if message.get("id") == number:
                 assert "error" not in message, message["error"]
                 return message["result"]
@@ -105,7 +105,7 @@ class Page:
         assert "exceptionDetails" not in done, done["exceptionDetails"]
         return done["result"].get("value")
 
-    def wait(self, script: str, seconds: float = 30.0) -> Any:
+    def wait(self, script: str, seconds: float = 120.0) -> Any:
         """Return the value of an expression as soon as it is true."""
         end = time.monotonic() + seconds
         while time.monotonic() < end:

@@ -1,9 +1,8 @@
 """Budgets, learning curves, and the table of methods."""
 
-import time
-
 import pytest
 import torch
+from clock import Clock
 from learning_problems import heart, wild_rules
 
 from npa_envs.agents import evaluate_policy
@@ -28,16 +27,23 @@ def rules():
     return PROBLEM.new_rules(0)
 
 
+@pytest.fixture
+def clock(monkeypatch):
+    clock = Clock()
+    monkeypatch.setattr("npa_envs.agents.learning.progress.time", clock)
+    return clock
+
+
 def progress_of(problem, seeds=range(100, 103), **given):
     budget = Budget(**{k: given.pop(k) for k in ("seconds", "particle_steps") if k in given})
     return Progress(problem, budget, device="cpu", evaluation_seeds=seeds, **given)
 
 
-def learn_nothing(progress, rules, pause=0.0):
+def learn_nothing(progress, rules, pause=lambda: None):
     """Spend a budget as a learner does."""
 
     def iteration():
-        time.sleep(pause)
+        pause()
         return ITERATION
 
     assert progress.run(rules, iteration) is rules
@@ -74,23 +80,16 @@ def test_particle_steps_are_kept_up_to_one_iteration(rules):
     assert [entry.particle_steps for entry in log] == [0, 2400, 4320, 6240, 8160, 10080]
 
 
-def test_time_is_kept_and_evaluations_take_none_of_it(rules):
-    def slow(entry):
-        time.sleep(0.2)
-
-    progress = progress_of(PROBLEM, seconds=0.2, entries=4, on_entry=slow)
-    begun = time.perf_counter()
-    log = learn_nothing(progress, rules, pause=0.01)
-    assert time.perf_counter() - begun > 5 * 0.2 + 0.2
-    assert len(log) == 5
-    assert log[0].seconds == 0.0
-    assert 0.2 <= log[-1].seconds < 0.3
-    assert [entry.seconds for entry in log] == sorted(entry.seconds for entry in log)
+def test_time_is_kept_and_evaluations_take_none_of_it(rules, clock):
+    progress = progress_of(PROBLEM, seconds=0.25, entries=4, on_entry=lambda _: clock.sleep(1.0))
+    log = learn_nothing(progress, rules, lambda: clock.sleep(1 / 64))
+    assert [entry.seconds for entry in log] == [0.0, 0.0625, 0.125, 0.1875, 0.25]
+    assert clock.now == 5 * 1.0 + 0.25
 
 
 @pytest.mark.parametrize("entries", [1, 3])
 def test_a_budget_of_seconds_makes_at_most_as_many_evaluations_as_it_says(
-    rules, monkeypatch, entries
+    rules, monkeypatch, clock, entries
 ):
     ran = []
     monkeypatch.setattr(
@@ -98,15 +97,19 @@ def test_a_budget_of_seconds_makes_at_most_as_many_evaluations_as_it_says(
         lambda *given: ran.append(given) or evaluate_policy(*given),
     )
     # Each iteration takes more than one share of the budget, or less.
-    for pause in (0.001, 0.03):
-        learn_nothing(progress_of(PROBLEM, seconds=0.05, entries=entries), rules, pause)
+    for pause in (1 / 512, 1 / 32):
+        progress = progress_of(PROBLEM, seconds=1 / 16, entries=entries)
+        learn_nothing(progress, rules, lambda pause=pause: clock.sleep(pause))
         assert 2 <= len(ran) <= entries + 2
         ran.clear()
 
 
-def test_whichever_is_spent_first_ends_it(rules):
-    progress = progress_of(PROBLEM, seconds=1000.0, particle_steps=1000)
-    assert learn_nothing(progress, rules)[-1].seconds < 10.0
+def test_whichever_is_spent_first_ends_it(rules, clock):
+    for seconds, iterations in ((1000.0, 3), (2.0, 2)):
+        progress = progress_of(PROBLEM, seconds=seconds, particle_steps=1000)
+        log = learn_nothing(progress, rules, lambda: clock.sleep(1.0))
+        assert log[-1].seconds == iterations
+        assert log[-1].particle_steps == iterations * ITERATION
 
 
 def test_entries_are_evaluations_from_the_seeds_given():

@@ -9,6 +9,7 @@ import time
 from pathlib import Path
 
 import pytest
+from clock import Clock
 
 from npa_envs.agents.learning.kept import KeptProgress
 from npa_envs.cli import main
@@ -128,17 +129,18 @@ def test_worlds_are_those_of_shac_where_they_are_told(tmp_path):
 
 
 def test_what_is_written_takes_no_time_and_what_is_over_has_finished(tmp_path, monkeypatch):
-    write = KeptProgress._write
+    clock, write = Clock(tick=1 / 64), KeptProgress._write
+    monkeypatch.setattr("npa_envs.agents.learning.progress.time", clock)
 
     def slow(progress, *given):
-        time.sleep(0.4)
+        clock.sleep(1.0)
         write(progress, *given)
 
     monkeypatch.setattr(KeptProgress, "_write", slow)
-    words = [*WORDS, "--seconds", "0.3", "--no-progress", "--out", str(tmp_path)]
+    words = [*WORDS, "--seconds", "0.5", "--no-progress", "--out", str(tmp_path)]
     assert main(words) == 0
     seconds = [json.loads(line)["seconds"] for line in (tmp_path / "log.jsonl").open()]
-    assert 0.3 <= seconds[-1] < 0.6
+    assert 0.5 <= seconds[-1] < 1.0
     assert len(seconds) > 2
 
 

@@ -27,7 +27,7 @@ def told_by(source, *folders):
     program = folders[0] / "program"
     options = ["-std=c++20", "-O2", "-w", *(f"-I{folder}" for folder in (HERE, *folders))]
     subprocess.run([compiler, *options, "-o", str(program), str(HERE / source)], check=True)
-    told = subprocess.run([str(program)], capture_output=True, text=True, timeout=120)
+    told = subprocess.run([str(program)], capture_output=True, text=True, timeout=300)
     assert told.returncode == 0, told.stdout
     return told.stdout
 

@@ -8,9 +8,9 @@ from npa_envs.rule.network import fold_weights
 from npa_envs.rule.rule import NPARule
 
 # Norms of errors over norms of answers, against float64; beside, the worst measured on an H200.
-FORWARD_TOLERANCE = 1e-6  # 2.5e-7
+FORWARD_TOLERANCE = 1.5e-6  # 2.9e-7
 # Of the update, of the gradients by rows (2.1e-7) and by both weights (6.9e-6).
-TOLERANCES = (FORWARD_TOLERANCE, 1e-6, 1e-5, 1e-5)
+TOLERANCES = (FORWARD_TOLERANCE, 1.5e-6, 3e-5, 3e-5)
 
 SIZES = [
     # space_dim, state_dim, hidden_dim, static

@@ -154,7 +154,7 @@ def test_threads_of_torch_and_of_a_pool_are_both_used(set_threads, monkeypatch):
     set_threads(2)
     for team in (threads._team, lambda: None):
         monkeypatch.setattr(threads, "_team", team)
-        meeting = threading.Barrier(2, timeout=10.0)
+        meeting = threading.Barrier(2, timeout=60.0)
         run_together([meeting.wait, meeting.wait])
 
 
@@ -167,7 +167,7 @@ def test_an_error_in_another_thread_is_raised_after_every_call(set_threads):
         raise ValueError("broken")
 
     def wait_for_it():
-        assert started.wait(10.0)
+        assert started.wait(60.0)
         done.append(True)
 
     with pytest.raises(ValueError, match="broken"):
@@ -181,7 +181,7 @@ def worker():
     with pytest.MonkeyPatch.context() as patch:
         patch.delenv("OMP_NUM_THREADS", raising=False)
         with multiprocessing.get_context("spawn").Pool(1) as pool:
-            yield lambda function: pool.apply_async(function).get(timeout=120)
+            yield lambda function: pool.apply_async(function).get(timeout=300)
 
 
 @contextlib.contextmanager

@@ -45,7 +45,8 @@ def test_a_turned_target_is_recognised_and_a_plain_loss_sees_another():
         assert task.metric(other, s).item() < 0.06
         if angle > 0.0:
             assert plain.metric(other, s).item() > 0.3
-    assert plain.metric(x, s).item() < 1e-6
+    # Worst value measured: 4.1e-7.
+    assert plain.metric(x, s).item() < 2e-6
 
 
 def test_mirrored_worlds_are_as_good_where_the_rule_is_not_chiral():

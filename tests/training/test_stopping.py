@@ -1,15 +1,16 @@
 """Signals that ask a run to stop: what counts as one request, and what comes after it."""
 
 import signal
-import time
 
 import pytest
+from clock import Clock
 
-from npa_envs.training.stopping import stop_flag
+from npa_envs.training.stopping import ONE_REQUEST, stop_flag
 
 
 def test_the_first_signal_sets_the_flag_and_one_much_later_acts_as_usual(monkeypatch, capfd):
-    monkeypatch.setattr("npa_envs.training.stopping.ONE_REQUEST", 0.1)
+    clock = Clock()
+    monkeypatch.setattr("npa_envs.training.stopping.time", clock)
     usual = signal.getsignal(signal.SIGINT)
     with stop_flag() as stop:
         assert not stop.is_set()
@@ -18,7 +19,7 @@ def test_the_first_signal_sets_the_flag_and_one_much_later_acts_as_usual(monkeyp
         # A launcher passes on what its scheduler has sent to all processes.
         signal.raise_signal(signal.SIGTERM)
         signal.raise_signal(signal.SIGINT)
-        time.sleep(0.2)
+        clock.sleep(2 * ONE_REQUEST)
         with pytest.raises(KeyboardInterrupt):
             signal.raise_signal(signal.SIGINT)
     assert signal.getsignal(signal.SIGINT) is usual
@@ -26,9 +27,10 @@ def test_the_first_signal_sets_the_flag_and_one_much_later_acts_as_usual(monkeyp
 
 
 def test_the_patient_are_asked_as_often_as_one_likes(monkeypatch):
-    monkeypatch.setattr("npa_envs.training.stopping.ONE_REQUEST", 0.0)
+    clock = Clock()
+    monkeypatch.setattr("npa_envs.training.stopping.time", clock)
     with stop_flag(patient=True) as stop:
         for _ in range(3):
             signal.raise_signal(signal.SIGTERM)
-            time.sleep(0.01)
+            clock.sleep(2 * ONE_REQUEST)
     assert stop.is_set()

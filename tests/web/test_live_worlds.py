@@ -422,6 +422,7 @@ def test_brushes_work_in_3d(device):
     assert world.frame().positions.shape[1] == 3
 
 
+@pytest.mark.slow
 @pytest.mark.gpu
 @pytest.mark.parametrize("name", ["gecko", "dots", "duck"])
 def test_a_gpu_makes_sixty_frames_a_second(name):

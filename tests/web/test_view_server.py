@@ -296,16 +296,37 @@ def test_a_world_that_breaks_says_so(tmp_path):
         assert next_error(reader) == "the world has ended: out of memory"
 
 
-def test_a_page_that_says_it_has_drawn_more_gets_no_more_ahead(client, worlds):
+def test_a_page_that_says_it_has_drawn_more_gets_no_more_ahead(tmp_path):
+    begun, told = threading.Event(), threading.Event()
+
+    class Held(Counter):
+        def advance(self):
+            if self.step == server.FRAMES_AHEAD:
+                begun.set()
+                assert told.wait(60)
+            super().advance()
+
+    site = server.make_site(Held, films=tmp_path)
+    client = testclient.TestClient(server.make_app(site), base_url=HERE)
     with meet(client) as reader:
         reader.receive_json()
+        reader.send_json({"type": "drawn"})
+        assert begun.wait(60)
         for _ in range(50):
             reader.send_json({"type": "drawn"})
+        # It is answered once all before it are read.
+        reader.send_text("no JSON")
+        frames = 0
+        while "text" not in reader.receive():
+            frames += 1
+        told.set()
+        while frames < 1 + 2 * server.FRAMES_AHEAD:
+            reader.receive_bytes()
+            frames += 1
+        # A frame more would come before the answer.
         time.sleep(0.3)
-        frames = worlds[0].step
-        time.sleep(0.2)
-        assert worlds[0].step == frames
-        assert frames < 50
+        reader.send_text("no JSON")
+        assert "text" in reader.receive()
 
 
 def test_each_reader_has_a_world_and_there_is_room_for_some(client, worlds):
@@ -317,7 +338,7 @@ def test_each_reader_has_a_world_and_there_is_room_for_some(client, worlds):
         late.receive_json()
     for reader in readers:
         reader.__exit__(None, None, None)
-    assert all(world.closed.wait(5) for world in worlds)
+    assert all(world.closed.wait(60) for world in worlds)
     with meet(client) as reader:
         assert reader.receive_json()["title"] == "counter"
 
