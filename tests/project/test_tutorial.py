@@ -17,8 +17,7 @@ pytest.importorskip("stable_baselines3")
 def program(page: Path = TUTORIAL) -> str:
     """Return the page's last block of Python."""
     text = page.read_text(encoding="utf-8")
-    *_, block = re.findall(r"^```python
-(.*?)^```", text, re.MULTILINE | re.DOTALL)
+    *_, block = re.findall(r"^```python\n(.*?)^```", text, re.MULTILINE | re.DOTALL)
     return block
 
 
