@@ -10,7 +10,7 @@ import functools
 import os
 import threading
 from collections.abc import Callable
-from typing import ParamSpec, TypeVar
+from typing import ParamSpec, TypeVar, cast
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -36,14 +36,13 @@ def made_once(kept: int | None = None) -> Callable[[Callable[P, R]], Callable[P,
     """
 
     def decorate(make: Callable[P, R]) -> Callable[P, R]:
-        made = functools.lru_cache(kept)(make)
+        made = cast("Callable[P, R]", functools.lru_cache(kept)(make))
 
-        @functools.lru_cache(kept)
         @functools.wraps(make)
         def make_alone(*arguments: P.args, **keywords: P.kwargs) -> R:
             with alone:
                 return made(*arguments, **keywords)
 
-        return make_alone
+        return cast("Callable[P, R]", functools.lru_cache(kept)(make_alone))
 
     return decorate

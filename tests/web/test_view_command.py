@@ -127,7 +127,7 @@ def test_the_link_is_printed_and_opened(host, capsys, monkeypatch, tmp_path):
 def test_no_browser_of_the_terminal_is_opened(monkeypatch):
     for name in ("DISPLAY", "WAYLAND_DISPLAY"):
         monkeypatch.delenv(name, raising=False)
-    monkeypatch.setattr(command.sys, "platform", "linux")
+    monkeypatch.setattr("sys.platform", "linux")
     monkeypatch.setattr(command.webbrowser, "open", lambda address: pytest.fail("opened"))
     assert not open_browser("http://127.0.0.1:1/")
     monkeypatch.setenv("DISPLAY", ":0")
