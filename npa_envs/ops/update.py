@@ -19,7 +19,7 @@ from npa_envs.kernels.portable.update import (
 )
 from npa_envs.ops.checks import check_world
 from npa_envs.ops.launch import PreparedLaunch, launch, scalar_type
-from npa_envs.ops.opaque import once_differentiable, opaque
+from npa_envs.ops.opaque import check_derivatives, once_differentiable, opaque
 from npa_envs.ops.perceive import Rows
 from npa_envs.ops.sort import LARGEST_INDEX
 
@@ -437,6 +437,7 @@ def _check_worlds(
     moving: bool,
 ) -> None:
     check_world(x, s)
+    check_derivatives(action=action, x=x, s=s, noise=noise)
     world_count, particle_count, space_dim = x.shape
     state_dim = s.shape[2]
     action_dim = state_dim + (space_dim if moving else 0)

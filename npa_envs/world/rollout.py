@@ -23,7 +23,9 @@ from npa_envs.ops.checks import (
     checked_flag,
     checked_number,
 )
+from npa_envs.ops.opaque import check_derivatives
 from npa_envs.ops.static import StaticWorlds, prepare_static
+from npa_envs.ops.update import wrapped
 from npa_envs.rule.network import Network
 from npa_envs.rule.rule import NPARule, check_rule
 from npa_envs.world.divergence import DivergenceWatch, OnDivergence, make_watch
@@ -33,6 +35,7 @@ from npa_envs.world.randomness import (
     Randomness,
     check_generator,
 )
+from npa_envs.world.recomputed import RecomputedSteps
 from npa_envs.world.recorded import CudaGraph, Worlds, check_cuda_graph, rule_form, run_call
 from npa_envs.world.steps import (
     DivisionStep,
@@ -78,6 +81,7 @@ def checked_options(
 ) -> StepOptions:
     """Check what `rollout` was given, and return what stays the same over it; its errors."""
     check_world(x, s)
+    check_derivatives(x=x, s=s, rule=rule)
     if (x.shape[2], s.shape[2]) != (rule.space_dim, rule.state_dim):
         raise NPAError(
             f"x and s must have the rule's {rule.space_dim} coordinates and {rule.state_dim} "
@@ -129,6 +133,7 @@ _known_numbers = functools.lru_cache(maxsize=256, typed=True)(_checked_numbers)
 
 def run_steps(
     step: Step,
+    rules: Sequence[NPARule],
     worlds: Worlds,
     steps: int,
     *,
@@ -142,6 +147,7 @@ def run_steps(
 
     Args:
         step: What to repeat.
+        rules: The rules that it runs.
         worlds: The worlds, in the order that the step takes them in.
         steps: Number of steps T.
         generator: Source of the draws.
@@ -159,12 +165,20 @@ def run_steps(
     # While a graph is recorded, torch's state cannot be read, and its draws are the graph's.
     recorded = worlds.x.is_cuda and torch.cuda.is_current_stream_capturing()
     redraw = with_modules and not recorded
+    again = None
+    # What a compiler has taken reads copies.
+    if interval > 1 and not torch.compiler.is_compiling():
+        again = RecomputedSteps(step.advance, rules, {"x": worlds.x, "s": worlds.s})
     # Worlds keep their dtype under autocast: the kernels read what the rules write.
     with torch.autocast(worlds.x.device.type, enabled=False):
         for number, draws in enumerate(step.draws(worlds.x, steps, generator)):
             if (steps - 1 - number) % interval > 0:
                 worlds = checkpoint(
-                    step.advance, *worlds, *draws, use_reentrant=False, preserve_rng_state=redraw
+                    again or step.advance,
+                    *worlds,
+                    *draws,
+                    use_reentrant=False,
+                    preserve_rng_state=redraw,
                 )
             else:
                 mask, noise, rows, births = draws
@@ -174,6 +188,8 @@ def run_steps(
                 watch.look(seen.x, seen.s)
             if keep_every is not None and (number + 1) % keep_every == 0:
                 kept.append(step.ordered(worlds))
+        if again is not None:
+            again.end_forward()
         if steps == 0:
             # What is returned is the caller's to write to.
             worlds = Worlds(*(value.clone() for value in worlds))
@@ -205,7 +221,12 @@ class RolloutCall(NamedTuple):
         (rule,) = rules
         # Any other rule runs as the module that it is.
         network = rule.network()
-        static = _prepare_static(rule, worlds.x, self.steps, self.options)
+        if _stays(rule, self.steps, self.options):
+            # Before all else: a rollout in parts prepares the later ones from wrapped positions.
+            worlds = worlds._replace(x=wrapped(worlds.x, self.options.box))
+            static = _prepare_static(rule, worlds.x, self.options)
+        else:
+            static = None
         preparable = network is not None and static is None and not rule.divides
         if network is not None and preparable and watch is None and may_prepare(worlds):
             prepared = self._run_prepared(rule, network, worlds, generator)
@@ -220,6 +241,7 @@ class RolloutCall(NamedTuple):
         own = RuleStep(rule, network, self.options, static)
         return run_steps(
             DivisionStep(own) if rule.divides else own,
+            rules,
             worlds,
             self.steps,
             generator=generator,
@@ -262,13 +284,14 @@ class RolloutCall(NamedTuple):
         return Worlds(*map(torch.stack, zip(*kept, strict=True)))
 
 
-def _prepare_static(
-    rule: NPARule, x: Tensor, steps: int, options: StepOptions
-) -> StaticWorlds | None:
-    """Compute what follows from positions, where they stay and it pays."""
+def _stays(rule: NPARule, steps: int, options: StepOptions) -> bool:
+    """Return whether positions stay where they are, and it pays to compute what follows of them."""
     moving = not rule.static or options.position_noise > 0.0 or not options.detach_positions
-    if moving or steps < FEWEST_STATIC:
-        return None
+    return not moving and steps >= FEWEST_STATIC
+
+
+def _prepare_static(rule: NPARule, x: Tensor, options: StepOptions) -> StaticWorlds:
+    """Compute what follows from positions that stay."""
     return prepare_static(
         x, rule.state_dim, eps=options.eps, box=options.box, terms=rule_terms(rule)
     )

@@ -249,6 +249,7 @@ class SpeciesCall(NamedTuple):
         )
         return run_steps(
             community,
+            rules,
             worlds,
             self.steps,
             generator=generator,
