@@ -24,6 +24,7 @@ from npa_envs.ops.checks import (
     checked_eps,
     checked_flag,
     checked_moment_inverse,
+    constant,
 )
 from npa_envs.ops.launch import PreparedLaunch, launch
 from npa_envs.ops.opaque import check_derivatives, once_differentiable, opaque
@@ -484,7 +485,8 @@ def perceive_rows(
         and which particles they stand for.
     """
     x, s = x.contiguous(), s.contiguous()
-    sides = None if box is None else list(box)
+    sides = None if box is None else [constant(side) for side in box]
+    eps, eps0 = constant(eps), constant(eps0)
     options = PerceptionOptions(row_capacity, row_width, eps, eps / eps0, sides, terms)
     if static is not None:
         rows = all_rows(static, x) if static_rows is None else static_rows

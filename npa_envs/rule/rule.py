@@ -18,6 +18,7 @@ from npa_envs.ops.checks import (
     checked_moment_inverse,
     checked_number,
     checked_positive,
+    constant,
 )
 from npa_envs.ops.equivariance import MIXED_VECTORS, VectorForm, invariants, signed_gates, steered
 from npa_envs.rule.codes import Codes, check_names
@@ -437,7 +438,7 @@ class NPARule(nn.Module):
         weight = torch.cat((self.hidden.weight, self.hidden.bias[:, None]), dim=1)
         output_weight = nn.functional.pad(update_weight, (0, 0, 0, -len(update_weight) % FOLD))
         hidden_weight = nn.functional.pad(weight, (0, padding))
-        return fold_weights(hidden_weight, output_weight, self.dead_zone)
+        return fold_weights(hidden_weight, output_weight, constant(self.dead_zone))
 
     def fates(self, states: Tensor) -> tuple[Tensor, Tensor]:
         """Return the probabilities with which updated particles divide and die, shape [...] each.

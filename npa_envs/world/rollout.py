@@ -22,6 +22,7 @@ from npa_envs.ops.checks import (
     checked_eps,
     checked_flag,
     checked_number,
+    constant,
 )
 from npa_envs.ops.opaque import check_derivatives
 from npa_envs.ops.static import StaticWorlds, prepare_static
@@ -48,7 +49,7 @@ from npa_envs.world.steps import (
 
 Memory = Literal["store", "recompute", "minimal"]
 
-STORED_INTERVAL: dict[Memory, float] = {"store": 1, "recompute": 3, "minimal": math.inf}
+STORED_INTERVAL: dict[Memory, int] = {"store": 1, "recompute": 3, "minimal": 2**31}
 """The last step and every so-manyth before it store what the backward pass reads."""
 
 FEWEST_STATIC = 3
@@ -95,15 +96,17 @@ def checked_options(
         )
     given = (eps, box, update_prob, dt, position_noise, detach_positions)
     # Numbers of other types may change, and tensors are no keys.
-    plain = all(type(value) in (float, int, bool, NoneType) for value in given)
+    own = (rule.eps0, rule.alpha)
+    plain = all(type(value) in (float, int, bool, NoneType) for value in (*own, *given))
     known = plain and not torch.compiler.is_compiling()
     check = _known_numbers if known else _checked_numbers
-    return check(rule.space_dim, rule.eps0, x.dtype, *given)
+    return check(rule.space_dim, *map(constant, own), x.dtype, *given)
 
 
 def _checked_numbers(
     space_dim: int,
     eps0: float,
+    alpha: float,
     dtype: torch.dtype,
     eps: float | None,
     box: Box,
@@ -125,7 +128,9 @@ def _checked_numbers(
         raise NPAError(f"position_noise must be finite and not negative, got {position_noise}")
     detach_positions = checked_flag("detach_positions", detach_positions)
     sides = checked_box(box, space_dim, radius, dtype)
-    return StepOptions(radius, sides, update_prob, dt, position_noise, detach_positions)
+    return StepOptions(
+        radius, sides, update_prob, dt, position_noise, detach_positions, eps0, alpha * radius
+    )
 
 
 _known_numbers = functools.lru_cache(maxsize=256, typed=True)(_checked_numbers)

@@ -53,6 +53,10 @@ class StepOptions(NamedTuple):
     dt: float
     position_noise: float
     detach_positions: bool
+    eps0: float
+    """Radius at which the rule was trained [length units]."""
+    reach: float
+    """Largest displacement alpha eps in a unit of time [length units]."""
 
 
 def row_capacity(particle_total: int, update_prob: float) -> int:
@@ -246,7 +250,7 @@ class RuleStep(NamedTuple):
         if huge and not torch.compiler.is_compiling():
             sides = None if options.box is None else list(options.box)
             asked = PerceptionOptions(
-                count, width, options.eps, options.eps / rule.eps0, sides, rule_terms(rule)
+                count, width, options.eps, options.eps / options.eps0, sides, rule_terms(rule)
             )
             update, active = update_some_at_a_time(x, s, mask, network, asked)
         else:
@@ -257,7 +261,7 @@ class RuleStep(NamedTuple):
                 row_capacity=count,
                 row_width=width,
                 eps=options.eps,
-                eps0=rule.eps0,
+                eps0=options.eps0,
                 box=options.box,
                 terms=rule_terms(rule),
                 static=self.static,
@@ -271,7 +275,7 @@ class RuleStep(NamedTuple):
                 s,
                 path_length,
                 rows=active,
-                reach=rule.alpha * options.eps,
+                reach=options.reach,
                 dt=options.dt,
                 moving=not rule.static,
                 box=options.box,
