@@ -224,12 +224,13 @@ class RolloutCall(NamedTuple):
     ) -> Worlds:
         """Launch the rollout of one rule."""
         (rule,) = rules
+        options = self.options.constants()
         # Any other rule runs as the module that it is.
         network = rule.network()
-        if _stays(rule, self.steps, self.options):
+        if _stays(rule, self.steps, options):
             # Before all else: a rollout in parts prepares the later ones from wrapped positions.
-            worlds = worlds._replace(x=wrapped(worlds.x, self.options.box))
-            static = _prepare_static(rule, worlds.x, self.options)
+            worlds = worlds._replace(x=wrapped(worlds.x, options.box))
+            static = _prepare_static(rule, worlds.x, options)
         else:
             static = None
         preparable = network is not None and static is None and not rule.divides
@@ -243,7 +244,7 @@ class RolloutCall(NamedTuple):
             # What lies in dead slots must not reach gradients either: 0 times NaN is NaN.
             blank = torch.where(living(worlds.s)[..., None], worlds.s, 0.0)
             worlds = worlds._replace(s=blank)
-        own = RuleStep(rule, network, self.options, static)
+        own = RuleStep(rule, network, options, static)
         return run_steps(
             DivisionStep(own) if rule.divides else own,
             rules,

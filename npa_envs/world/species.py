@@ -242,7 +242,7 @@ class SpeciesCall(NamedTuple):
         community = make_community(
             rules,
             self.counts,
-            self.options,
+            [own.constants() for own in self.options],
             self.density_counts,
             worlds.x,
             told_apart=self.told_apart,

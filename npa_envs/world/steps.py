@@ -10,6 +10,7 @@ from typing import NamedTuple, Protocol
 import torch
 from torch import Tensor
 
+from npa_envs.ops.checks import constant
 from npa_envs.ops.perceive import (
     PerceptionOptions,
     Terms,
@@ -57,6 +58,21 @@ class StepOptions(NamedTuple):
     """Radius at which the rule was trained [length units]."""
     reach: float
     """Largest displacement alpha eps in a unit of time [length units]."""
+
+    def constants(self) -> StepOptions:
+        """Return them with numbers that a compiler takes for constants."""
+        if not torch.compiler.is_compiling():
+            return self
+        return StepOptions(
+            constant(self.eps),
+            None if self.box is None else tuple([constant(side) for side in self.box]),
+            constant(self.update_prob),
+            constant(self.dt),
+            constant(self.position_noise),
+            self.detach_positions,
+            constant(self.eps0),
+            constant(self.reach),
+        )
 
 
 def row_capacity(particle_total: int, update_prob: float) -> int:
