@@ -387,12 +387,15 @@ class NPARule(nn.Module):
 
     def _is_unchanged(self) -> bool:
         """Return whether the rule's network is the one that it was made with."""
-        hidden, output = self.hidden, self.output
-        layers = (hidden, output, self.fate) if self.divides else (hidden, output)
+        names = ("hidden", "output", "fate") if self.divides else ("hidden", "output")
+        # Attributes of modules take the host longer.
+        layers = [own for own in map(self._modules.get, names) if type(own) is nn.Linear]
+        if len(layers) < len(names):
+            return False
+        hidden, output = layers[:2]
         return (
             (type(self) is NPARule or _steps_alike(type(self)))
             and STEP_PARTS.isdisjoint(vars(self))
-            and all(type(layer) is nn.Linear for layer in layers)
             and getattr(hidden, "bias", None) is not None
             and getattr(output, "bias", None) is None
             and not any(is_altered(module) or _has_backward_hooks(module) for module in layers)
