@@ -56,13 +56,15 @@ def check_derivatives(**given: Any) -> None:
 def _check_tangents(given: dict[str, Any]) -> None:
     """Check within a `dual_level` that no tensor carries a tangent."""
     for name, value in given.items():
-        if any(forward_ad.unpack_dual(tensor).tangent is not None for tensor in _tensors(value)):
-            raise NPAError(
-                f"{name} must carry no tangent of forward-mode derivatives "
-                "(torch.autograd.forward_ad, strategy='forward-mode'), got one: kernels have "
-                "backward passes alone; take backward(), torch.autograd.grad or "
-                f"strategy='reverse-mode', {CURE}"
-            )
+        for tensor in _tensors(value):
+            _, tangent = forward_ad.unpack_dual(tensor)  # type: ignore[no-untyped-call]
+            if tangent is not None:
+                raise NPAError(
+                    f"{name} must carry no tangent of forward-mode derivatives "
+                    "(torch.autograd.forward_ad, strategy='forward-mode'), got one: kernels have "
+                    "backward passes alone; take backward(), torch.autograd.grad or "
+                    f"strategy='reverse-mode', {CURE}"
+                )
 
 
 def _tensors(value: Any) -> Iterator[Tensor]:

@@ -400,7 +400,7 @@ class NPARule(nn.Module):
             and getattr(output, "bias", None) is None
             and not any(is_altered(module) or _has_backward_hooks(module) for module in layers)
             and not (is_altered(self) or _has_backward_hooks(self))
-            and not _has_any_global_hook()
+            and not _has_any_global_hook()  # type: ignore[no-untyped-call]
         )
 
     def has_network(self) -> bool:

@@ -100,7 +100,7 @@ def checked_options(
     plain = all(type(value) in (float, int, bool, NoneType) for value in (*own, *given))
     known = plain and not torch.compiler.is_compiling()
     check = _known_numbers if known else _checked_numbers
-    return check(rule.space_dim, *map(constant, own), x.dtype, *given)
+    return check(rule.space_dim, constant(own[0]), constant(own[1]), x.dtype, *given)
 
 
 def _checked_numbers(
