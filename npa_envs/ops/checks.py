@@ -157,6 +157,17 @@ def _side_stream(device: torch.device) -> torch.cuda.Stream:
     return torch.cuda.Stream(device)  # type: ignore[no-untyped-call]
 
 
+def constant(number: float) -> float:
+    """Return a number; one that `torch.compile(dynamic=True)` takes for a variable as a constant.
+
+    Kernels are told numbers, and the compiler loses its variables on the way to them.
+    """
+    if not torch.compiler.is_compiling():
+        return number
+    # The compiler computes these from values; most other functions give another variable.
+    return math.ldexp(*math.frexp(number))
+
+
 def checked_flag(name: str, value: Any) -> bool:
     """Return whether something is true.
 
@@ -192,7 +203,7 @@ def checked_number(name: str, value: Any) -> float:
     """
     if not isinstance(value, str | bytes | bool):
         with contextlib.suppress(TypeError, ValueError, RuntimeError, OverflowError):
-            return float(value)
+            return constant(float(value))
     raise NPAError(f"{name} must be a number, got {shown(value)}")
 
 

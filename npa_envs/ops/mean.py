@@ -11,7 +11,7 @@ from npa_envs.errors import NPAError
 from npa_envs.kernels.portable.mean import CHUNK, MEAN_LANES, mean_kernels
 from npa_envs.ops.checks import DTYPES, check_dense
 from npa_envs.ops.launch import launch, scalar_type
-from npa_envs.ops.opaque import opaque
+from npa_envs.ops.opaque import check_derivatives, opaque
 
 
 def average_sums(partial_sums: Tensor, value_count: int, like: Tensor) -> Tensor:
@@ -109,5 +109,6 @@ def world_mean(values: Tensor) -> Tensor:
             f"values must be float32 or float64, got {values.dtype}: convert it with .float()"
         )
     check_dense("values", values)
+    check_derivatives(values=values)
     means: Tensor = _WorldMean.apply(values)  # type: ignore[no-untyped-call]
     return means

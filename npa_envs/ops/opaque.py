@@ -1,22 +1,85 @@
 """Opaque torch operators: kernels that `torch.compile` calls and does not look into.
 
-Their derivatives are kernels as well, of which there are no derivatives.
+Their derivatives are kernels as well, of which there are no derivatives: gradients are computed
+backwards, one at a time. Whatever else torch can derive is refused.
 """
 
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable
-from typing import Any, Generic, ParamSpec, TypeVar
+import inspect
+from collections.abc import Callable, Iterator
+from typing import Any, Generic, NoReturn, ParamSpec, TypeVar
 
 import torch
 from torch import Tensor, nn
+from torch.autograd import forward_ad
 from torch.utils._python_dispatch import is_in_torch_dispatch_mode
 
 from npa_envs.errors import NPAError
 
 Arguments = ParamSpec("Arguments")
 Result = TypeVar("Result")
+
+
+_transforms_active = torch._C._are_functorch_transforms_active
+
+CURE = "or take small worlds with the slow operators of npa_envs.reference, which are plain torch"
+
+
+def check_derivatives(**given: Any) -> None:
+    """Check that torch derives nothing but backward passes from what kernels compute.
+
+    Forward-mode derivatives would vanish without a word where nothing requires a gradient.
+
+    Args:
+        given: What the caller was given, by name: tensors, sequences of them, and modules.
+
+    Raises:
+        NPAError: A tensor carries a tangent of forward-mode derivatives, or a function of
+            `torch.func` makes the call.
+    """
+    # Asked in this order: a compiler cannot trace the other questions.
+    if torch.compiler.is_compiling():
+        return
+    if _transforms_active():
+        raise NPAError(
+            f"{', '.join(given)} must not be given within a function of torch.func (grad, vjp, "
+            "jvp, jacrev, jacfwd, vmap, ...), which cannot look into kernels, got a call within "
+            "one: take torch.autograd.grad for derivatives and a batch of worlds [B, N, D] for "
+            f"vmap, {CURE}"
+        )
+    if forward_ad._current_level >= 0:
+        _check_tangents(given)
+
+
+def _check_tangents(given: dict[str, Any]) -> None:
+    """Check within a `dual_level` that no tensor carries a tangent."""
+    for name, value in given.items():
+        for tensor in _tensors(value):
+            _, tangent = forward_ad.unpack_dual(tensor)  # type: ignore[no-untyped-call]
+            if tangent is not None:
+                raise NPAError(
+                    f"{name} must carry no tangent of forward-mode derivatives "
+                    "(torch.autograd.forward_ad, strategy='forward-mode'), got one: kernels have "
+                    "backward passes alone; take backward(), torch.autograd.grad or "
+                    f"strategy='reverse-mode', {CURE}"
+                )
+
+
+def _tensors(value: Any) -> Iterator[Tensor]:
+    """Yield the tensors that something is or holds; a module's weights may be plain attributes."""
+    if isinstance(value, Tensor):
+        yield value
+    elif isinstance(value, nn.Module):
+        for module in value.modules():
+            yield from _tensors([*vars(module).values()])
+            yield from module.parameters(recurse=False)
+            yield from module.buffers(recurse=False)
+    elif isinstance(value, list | tuple):
+        for entry in value:
+            if isinstance(entry, Tensor | list | tuple):
+                yield from _tensors(entry)
 
 
 class Opaque(Generic[Arguments, Result]):
@@ -31,6 +94,7 @@ class Opaque(Generic[Arguments, Result]):
 
     def __init__(self, name: str, function: Callable[Arguments, Result]) -> None:
         self._function = function
+        self._names = tuple(inspect.signature(function).parameters)
         self._operator = torch.library.custom_op(name, function, mutates_args=())
         self.register_fake = self._operator.register_fake
 
@@ -40,6 +104,8 @@ class Opaque(Generic[Arguments, Result]):
         if torch.compiler.is_compiling() or not _is_plain(args[0]) or is_in_torch_dispatch_mode():
             result: Result = self._operator(*args, **kwargs)
             return result
+        if forward_ad._current_level >= 0:
+            _check_tangents(dict(zip(self._names, args, strict=False)) | kwargs)
         return self._function(*args, **kwargs)
 
 
@@ -59,7 +125,7 @@ def opaque(name: str) -> Callable[[Callable[Arguments, Result]], Opaque[Argument
 def once_differentiable(
     backward: Callable[Arguments, Result],
 ) -> Callable[Arguments, Result]:
-    """Return the backward pass of an autograd function, made to refuse second derivatives.
+    """Return the backward pass of an autograd function, made to refuse what it cannot derive.
 
     Torch's own `once_differentiable` says nothing where the cotangent needs no gradient, as that of
     a sum: second derivatives are then zero. Functions that `torch.compile` has taken refuse them by
@@ -69,7 +135,7 @@ def once_differentiable(
         backward: The backward pass, of a context and cotangents.
 
     Raises:
-        NPAError: When called with `create_graph=True`.
+        NPAError: When called with `create_graph=True`, or with several cotangents at once.
     """
 
     @functools.wraps(backward)
@@ -80,6 +146,20 @@ def once_differentiable(
                 "True: these have no second derivatives; leave it out, or take small worlds with "
                 "the slow operators of npa_envs.reference, which have"
             )
-        return backward(*args, **kwargs)
+        try:
+            return backward(*args, **kwargs)
+        except RuntimeError as error:
+            # A batch of cotangents has no memory that a kernel could read.
+            if any(map(torch._C._functorch.is_legacy_batchedtensor, _tensors(args))):
+                _refuse_batches(error)
+            raise
 
     return guarded
+
+
+def _refuse_batches(error: RuntimeError) -> NoReturn:
+    raise NPAError(
+        "is_grads_batched must be False where particles are perceived, moved or drawn, and "
+        "vectorize too, got several cotangents at once: run one backward pass for each, "
+        f"{CURE}"
+    ) from error

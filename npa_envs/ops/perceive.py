@@ -24,9 +24,10 @@ from npa_envs.ops.checks import (
     checked_eps,
     checked_flag,
     checked_moment_inverse,
+    constant,
 )
 from npa_envs.ops.launch import PreparedLaunch, launch
-from npa_envs.ops.opaque import once_differentiable, opaque
+from npa_envs.ops.opaque import check_derivatives, once_differentiable, opaque
 from npa_envs.ops.passes import (
     Terms,
     compute_densities,
@@ -98,6 +99,7 @@ def perceive(
             not positive and finite, a box side is below 2 eps, or `moment_inverse` is another word.
     """
     check_world(x, s)
+    check_derivatives(x=x, s=s)
     radius = checked_eps("eps", eps, x.shape[2], x.dtype)
     radius0 = radius if eps0 is None else checked_eps("eps0", eps0, x.shape[2], x.dtype)
     check_scale(radius, radius0, x.shape[2], x.dtype)
@@ -146,6 +148,7 @@ def perception_fields(
     """
     terms = Terms(moment_inverse=checked_moment_inverse(moment_inverse))
     check_world(x, s)
+    check_derivatives(x=x, s=s)
     radius = checked_eps("eps", eps, x.shape[2], x.dtype)
     sides = checked_box(box, x.shape[2], radius, x.dtype)
     check_finite_positions(x)
@@ -482,7 +485,8 @@ def perceive_rows(
         and which particles they stand for.
     """
     x, s = x.contiguous(), s.contiguous()
-    sides = None if box is None else list(box)
+    sides = None if box is None else [constant(side) for side in box]
+    eps, eps0 = constant(eps), constant(eps0)
     options = PerceptionOptions(row_capacity, row_width, eps, eps / eps0, sides, terms)
     if static is not None:
         rows = all_rows(static, x) if static_rows is None else static_rows

@@ -22,7 +22,7 @@ from npa_envs.ops.checks import (
     entries,
 )
 from npa_envs.ops.launch import launch, scalar_type
-from npa_envs.ops.opaque import opaque
+from npa_envs.ops.opaque import check_derivatives, opaque
 from npa_envs.ops.perceive import perceive
 from npa_envs.ops.sort import density_scale, make_plan, sort_worlds
 
@@ -170,6 +170,7 @@ def species_fields(
             finite, or a box side is below 2 eps.
     """
     check_world(x, x)
+    check_derivatives(x=x)
     checked = checked_counts(counts, x.shape[1])
     radius = checked_eps("eps", eps, x.shape[2], x.dtype)
     sides = checked_box(box, x.shape[2], radius, x.dtype)
@@ -218,6 +219,7 @@ def perceive_species(
         NPAError: As `perceive`, or the counts do not fit.
     """
     check_world(x, s)
+    check_derivatives(x=x, s=s)
     checked = checked_counts(counts, x.shape[1])
     radius = checked_eps("eps", eps, x.shape[2], x.dtype)
     radius0 = radius if eps0 is None else checked_eps("eps0", eps0, x.shape[2], x.dtype)

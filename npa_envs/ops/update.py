@@ -17,9 +17,9 @@ from npa_envs.kernels.portable.update import (
     find_not_finite,
     update_kernels,
 )
-from npa_envs.ops.checks import check_world
+from npa_envs.ops.checks import check_world, constant
 from npa_envs.ops.launch import PreparedLaunch, launch, scalar_type
-from npa_envs.ops.opaque import once_differentiable, opaque
+from npa_envs.ops.opaque import check_derivatives, once_differentiable, opaque
 from npa_envs.ops.perceive import Rows
 from npa_envs.ops.sort import LARGEST_INDEX
 
@@ -187,7 +187,8 @@ def update_particles(
         box: Sides of the periodic box, into which positions are wrapped, or None.
     """
     x, s = x.contiguous(), s.contiguous()
-    options = (reach, dt, moving, None if box is None else list(box))
+    sides = None if box is None else [constant(side) for side in box]
+    options = (constant(reach), constant(dt), moving, sides)
     tensors = (update, x, s, path_length)
     if not (torch.is_grad_enabled() and any(tensor.requires_grad for tensor in tensors)):
         return _update_particles(*tensors, rows.row_of, *options)
@@ -437,6 +438,7 @@ def _check_worlds(
     moving: bool,
 ) -> None:
     check_world(x, s)
+    check_derivatives(action=action, x=x, s=s, noise=noise)
     world_count, particle_count, space_dim = x.shape
     state_dim = s.shape[2]
     action_dim = state_dim + (space_dim if moving else 0)

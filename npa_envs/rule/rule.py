@@ -9,6 +9,7 @@ from typing import Any, TypedDict
 
 import torch
 from torch import Tensor, nn
+from torch.nn.modules.module import _has_any_global_hook
 
 from npa_envs.errors import NPAError, shown
 from npa_envs.ops.checks import (
@@ -17,6 +18,7 @@ from npa_envs.ops.checks import (
     checked_moment_inverse,
     checked_number,
     checked_positive,
+    constant,
 )
 from npa_envs.ops.equivariance import MIXED_VECTORS, VectorForm, invariants, signed_gates, steered
 from npa_envs.rule.codes import Codes, check_names
@@ -44,6 +46,31 @@ LIFE = 0
 
 FIRST_FATES = (5.0, -8.0)
 """Log odds of an untrained rule's particles to divide and to die, over staying."""
+
+
+STEP_PARTS = frozenset(
+    (
+        "__call__",
+        "__getattr__",
+        "__getattribute__",
+        "_call_impl",
+        "_folded",
+        "_folded_invariants",
+        "_update_by_invariants",
+        "fates",
+        "folded",
+        "forward",
+        "input_dim",
+        "network",
+        "network_weights",
+        "output_dim",
+        "perception_dim",
+        "update_dim",
+        "update_weight",
+        "vector_form",
+    )
+)
+"""What a step of a rule is made of: where a subclass changes any of it, the rule is not plain."""
 
 
 class NamedAlways(TypedDict):
@@ -352,22 +379,28 @@ class NPARule(nn.Module):
     def is_plain(self) -> bool:
         """Return whether the rule is just its two layers, so that `folded` may stand in for it.
 
-        A rule that overrides the network, has hooks, or whose layers or their `forward` were
-        replaced is not, nor is an equivariant one.
+        A rule of a subclass that changes what a step runs (`STEP_PARTS`) is not, nor is one that
+        was given such a part of its own, one whose layers or their `forward` were replaced, one
+        with hooks, or any while there are hooks of all modules; nor is an equivariant one.
         """
         return not self.equivariant and self._is_unchanged()
 
     def _is_unchanged(self) -> bool:
         """Return whether the rule's network is the one that it was made with."""
-        hidden, output = self.hidden, self.output
-        modules = (self, hidden, output)
+        names = ("hidden", "output", "fate") if self.divides else ("hidden", "output")
+        # Attributes of modules take the host longer.
+        layers = [own for own in map(self._modules.get, names) if type(own) is nn.Linear]
+        if len(layers) < len(names):
+            return False
+        hidden, output = layers[:2]
         return (
-            type(self).forward is NPARule.forward
-            and type(hidden) is nn.Linear
-            and type(output) is nn.Linear
+            (type(self) is NPARule or _steps_alike(type(self)))
+            and STEP_PARTS.isdisjoint(vars(self))
             and getattr(hidden, "bias", None) is not None
             and getattr(output, "bias", None) is None
-            and not any(is_altered(module) or _has_backward_hooks(module) for module in modules)
+            and not any(is_altered(module) or _has_backward_hooks(module) for module in layers)
+            and not (is_altered(self) or _has_backward_hooks(self))
+            and not _has_any_global_hook()  # type: ignore[no-untyped-call]
         )
 
     def has_network(self) -> bool:
@@ -408,7 +441,7 @@ class NPARule(nn.Module):
         weight = torch.cat((self.hidden.weight, self.hidden.bias[:, None]), dim=1)
         output_weight = nn.functional.pad(update_weight, (0, 0, 0, -len(update_weight) % FOLD))
         hidden_weight = nn.functional.pad(weight, (0, padding))
-        return fold_weights(hidden_weight, output_weight, self.dead_zone)
+        return fold_weights(hidden_weight, output_weight, constant(self.dead_zone))
 
     def fates(self, states: Tensor) -> tuple[Tensor, Tensor]:
         """Return the probabilities with which updated particles divide and die, shape [...] each.
@@ -568,6 +601,11 @@ def _checked_dead_zone(value: Any, equivariant: bool) -> float:
             f"{shown(value)} and equivariant=True: leave one of the two out"
         )
     return zone
+
+
+def _steps_alike(kind: type[NPARule]) -> bool:
+    """Return whether rules of a subclass make a step of nothing but what `NPARule` makes it of."""
+    return all(getattr(kind, name) is getattr(NPARule, name) for name in STEP_PARTS)
 
 
 def is_altered(module: nn.Module) -> bool:

@@ -22,8 +22,11 @@ from npa_envs.ops.checks import (
     checked_eps,
     checked_flag,
     checked_number,
+    constant,
 )
+from npa_envs.ops.opaque import check_derivatives
 from npa_envs.ops.static import StaticWorlds, prepare_static
+from npa_envs.ops.update import wrapped
 from npa_envs.rule.network import Network
 from npa_envs.rule.rule import NPARule, check_rule
 from npa_envs.world.divergence import DivergenceWatch, OnDivergence, make_watch
@@ -33,6 +36,7 @@ from npa_envs.world.randomness import (
     Randomness,
     check_generator,
 )
+from npa_envs.world.recomputed import RecomputedSteps
 from npa_envs.world.recorded import CudaGraph, Worlds, check_cuda_graph, rule_form, run_call
 from npa_envs.world.steps import (
     DivisionStep,
@@ -45,7 +49,7 @@ from npa_envs.world.steps import (
 
 Memory = Literal["store", "recompute", "minimal"]
 
-STORED_INTERVAL: dict[Memory, float] = {"store": 1, "recompute": 3, "minimal": math.inf}
+STORED_INTERVAL: dict[Memory, int] = {"store": 1, "recompute": 3, "minimal": 2**31}
 """The last step and every so-manyth before it store what the backward pass reads."""
 
 FEWEST_STATIC = 3
@@ -78,6 +82,7 @@ def checked_options(
 ) -> StepOptions:
     """Check what `rollout` was given, and return what stays the same over it; its errors."""
     check_world(x, s)
+    check_derivatives(x=x, s=s, rule=rule)
     if (x.shape[2], s.shape[2]) != (rule.space_dim, rule.state_dim):
         raise NPAError(
             f"x and s must have the rule's {rule.space_dim} coordinates and {rule.state_dim} "
@@ -91,15 +96,17 @@ def checked_options(
         )
     given = (eps, box, update_prob, dt, position_noise, detach_positions)
     # Numbers of other types may change, and tensors are no keys.
-    plain = all(type(value) in (float, int, bool, NoneType) for value in given)
+    own = (rule.eps0, rule.alpha)
+    plain = all(type(value) in (float, int, bool, NoneType) for value in (*own, *given))
     known = plain and not torch.compiler.is_compiling()
     check = _known_numbers if known else _checked_numbers
-    return check(rule.space_dim, rule.eps0, x.dtype, *given)
+    return check(rule.space_dim, constant(own[0]), constant(own[1]), x.dtype, *given)
 
 
 def _checked_numbers(
     space_dim: int,
     eps0: float,
+    alpha: float,
     dtype: torch.dtype,
     eps: float | None,
     box: Box,
@@ -121,7 +128,9 @@ def _checked_numbers(
         raise NPAError(f"position_noise must be finite and not negative, got {position_noise}")
     detach_positions = checked_flag("detach_positions", detach_positions)
     sides = checked_box(box, space_dim, radius, dtype)
-    return StepOptions(radius, sides, update_prob, dt, position_noise, detach_positions)
+    return StepOptions(
+        radius, sides, update_prob, dt, position_noise, detach_positions, eps0, alpha * radius
+    )
 
 
 _known_numbers = functools.lru_cache(maxsize=256, typed=True)(_checked_numbers)
@@ -129,6 +138,7 @@ _known_numbers = functools.lru_cache(maxsize=256, typed=True)(_checked_numbers)
 
 def run_steps(
     step: Step,
+    rules: Sequence[NPARule],
     worlds: Worlds,
     steps: int,
     *,
@@ -142,6 +152,7 @@ def run_steps(
 
     Args:
         step: What to repeat.
+        rules: The rules that it runs.
         worlds: The worlds, in the order that the step takes them in.
         steps: Number of steps T.
         generator: Source of the draws.
@@ -159,12 +170,20 @@ def run_steps(
     # While a graph is recorded, torch's state cannot be read, and its draws are the graph's.
     recorded = worlds.x.is_cuda and torch.cuda.is_current_stream_capturing()
     redraw = with_modules and not recorded
+    again = None
+    # What a compiler has taken reads copies.
+    if interval > 1 and not torch.compiler.is_compiling():
+        again = RecomputedSteps(step.advance, rules, {"x": worlds.x, "s": worlds.s})
     # Worlds keep their dtype under autocast: the kernels read what the rules write.
     with torch.autocast(worlds.x.device.type, enabled=False):
         for number, draws in enumerate(step.draws(worlds.x, steps, generator)):
             if (steps - 1 - number) % interval > 0:
                 worlds = checkpoint(
-                    step.advance, *worlds, *draws, use_reentrant=False, preserve_rng_state=redraw
+                    again or step.advance,
+                    *worlds,
+                    *draws,
+                    use_reentrant=False,
+                    preserve_rng_state=redraw,
                 )
             else:
                 mask, noise, rows, births = draws
@@ -174,6 +193,8 @@ def run_steps(
                 watch.look(seen.x, seen.s)
             if keep_every is not None and (number + 1) % keep_every == 0:
                 kept.append(step.ordered(worlds))
+        if again is not None:
+            again.end_forward()
         if steps == 0:
             # What is returned is the caller's to write to.
             worlds = Worlds(*(value.clone() for value in worlds))
@@ -203,9 +224,15 @@ class RolloutCall(NamedTuple):
     ) -> Worlds:
         """Launch the rollout of one rule."""
         (rule,) = rules
+        options = self.options.constants()
         # Any other rule runs as the module that it is.
         network = rule.network()
-        static = _prepare_static(rule, worlds.x, self.steps, self.options)
+        if _stays(rule, self.steps, options):
+            # Before all else: a rollout in parts prepares the later ones from wrapped positions.
+            worlds = worlds._replace(x=wrapped(worlds.x, options.box))
+            static = _prepare_static(rule, worlds.x, options)
+        else:
+            static = None
         preparable = network is not None and static is None and not rule.divides
         if network is not None and preparable and watch is None and may_prepare(worlds):
             prepared = self._run_prepared(rule, network, worlds, generator)
@@ -217,9 +244,10 @@ class RolloutCall(NamedTuple):
             # What lies in dead slots must not reach gradients either: 0 times NaN is NaN.
             blank = torch.where(living(worlds.s)[..., None], worlds.s, 0.0)
             worlds = worlds._replace(s=blank)
-        own = RuleStep(rule, network, self.options, static)
+        own = RuleStep(rule, network, options, static)
         return run_steps(
             DivisionStep(own) if rule.divides else own,
+            rules,
             worlds,
             self.steps,
             generator=generator,
@@ -262,13 +290,14 @@ class RolloutCall(NamedTuple):
         return Worlds(*map(torch.stack, zip(*kept, strict=True)))
 
 
-def _prepare_static(
-    rule: NPARule, x: Tensor, steps: int, options: StepOptions
-) -> StaticWorlds | None:
-    """Compute what follows from positions, where they stay and it pays."""
+def _stays(rule: NPARule, steps: int, options: StepOptions) -> bool:
+    """Return whether positions stay where they are, and it pays to compute what follows of them."""
     moving = not rule.static or options.position_noise > 0.0 or not options.detach_positions
-    if moving or steps < FEWEST_STATIC:
-        return None
+    return not moving and steps >= FEWEST_STATIC
+
+
+def _prepare_static(rule: NPARule, x: Tensor, options: StepOptions) -> StaticWorlds:
+    """Compute what follows from positions that stay."""
     return prepare_static(
         x, rule.state_dim, eps=options.eps, box=options.box, terms=rule_terms(rule)
     )

@@ -242,13 +242,14 @@ class SpeciesCall(NamedTuple):
         community = make_community(
             rules,
             self.counts,
-            self.options,
+            [own.constants() for own in self.options],
             self.density_counts,
             worlds.x,
             told_apart=self.told_apart,
         )
         return run_steps(
             community,
+            rules,
             worlds,
             self.steps,
             generator=generator,
@@ -358,7 +359,7 @@ class Community(NamedTuple):
     species: list[Species]
     counts: tuple[int, ...]
     options: StepOptions
-    """With the largest update probability."""
+    """With the largest update probability, and the largest reach."""
     keep: Tensor | None
     """Share of the updates so drawn that each particle keeps, shape [N]; None: all keep all."""
     told_apart: bool
@@ -407,14 +408,14 @@ class Community(NamedTuple):
             row_capacity=_row_total(self, x, mask),
             row_width=shared_width,
             eps=options.eps,
-            eps0=first.eps0,
+            eps0=options.eps0,
             box=options.box,
             terms=rule_terms(first),
         )
         appended = None
         if self.told_apart:
             appended = perceive_by_species(
-                x, self.counts, eps=options.eps, eps0=first.eps0, box=options.box
+                x, self.counts, eps=options.eps, eps0=options.eps0, box=options.box
             )
         row_count = len(perception)
         outputs, places = [], []
@@ -445,7 +446,7 @@ class Community(NamedTuple):
                 s,
                 path_length,
                 rows=active,
-                reach=max(own.rule.alpha for own in species) * options.eps,
+                reach=options.reach,
                 dt=options.dt,
                 moving=not first.static,
                 box=options.box,
@@ -502,7 +503,8 @@ def make_community(
                 for count, chance in zip(counts, probabilities, strict=True)
             ]
         )
-    return Community(species, counts, options[0]._replace(update_prob=highest), keep, told_apart)
+    shared = options[0]._replace(update_prob=highest, reach=max(own.reach for own in options))
+    return Community(species, counts, shared, keep, told_apart)
 
 
 def _row_total(community: Community, x: Tensor, mask: Tensor | None) -> int:

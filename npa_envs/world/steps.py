@@ -10,6 +10,7 @@ from typing import NamedTuple, Protocol
 import torch
 from torch import Tensor
 
+from npa_envs.ops.checks import constant
 from npa_envs.ops.perceive import (
     PerceptionOptions,
     Terms,
@@ -53,6 +54,25 @@ class StepOptions(NamedTuple):
     dt: float
     position_noise: float
     detach_positions: bool
+    eps0: float
+    """Radius at which the rule was trained [length units]."""
+    reach: float
+    """Largest displacement alpha eps in a unit of time [length units]."""
+
+    def constants(self) -> StepOptions:
+        """Return them with numbers that a compiler takes for constants."""
+        if not torch.compiler.is_compiling():
+            return self
+        return StepOptions(
+            constant(self.eps),
+            None if self.box is None else tuple([constant(side) for side in self.box]),
+            constant(self.update_prob),
+            constant(self.dt),
+            constant(self.position_noise),
+            self.detach_positions,
+            constant(self.eps0),
+            constant(self.reach),
+        )
 
 
 def row_capacity(particle_total: int, update_prob: float) -> int:
@@ -246,7 +266,7 @@ class RuleStep(NamedTuple):
         if huge and not torch.compiler.is_compiling():
             sides = None if options.box is None else list(options.box)
             asked = PerceptionOptions(
-                count, width, options.eps, options.eps / rule.eps0, sides, rule_terms(rule)
+                count, width, options.eps, options.eps / options.eps0, sides, rule_terms(rule)
             )
             update, active = update_some_at_a_time(x, s, mask, network, asked)
         else:
@@ -257,7 +277,7 @@ class RuleStep(NamedTuple):
                 row_capacity=count,
                 row_width=width,
                 eps=options.eps,
-                eps0=rule.eps0,
+                eps0=options.eps0,
                 box=options.box,
                 terms=rule_terms(rule),
                 static=self.static,
@@ -271,7 +291,7 @@ class RuleStep(NamedTuple):
                 s,
                 path_length,
                 rows=active,
-                reach=rule.alpha * options.eps,
+                reach=options.reach,
                 dt=options.dt,
                 moving=not rule.static,
                 box=options.box,

@@ -298,6 +298,25 @@ class TestRest:
         for x, _ in ways:
             assert x.isfinite().flatten(1).all(dim=1).tolist() == [True, False]
 
+    @pytest.mark.parametrize("steps", [257, 600])
+    def test_static_worlds_that_begin_outside_of_a_box_end_as_if_each_step_ran(
+        self, steps, device, monkeypatch
+    ):
+        monkeypatch.setattr(rollout_module, "FIRST_PART", {"cpu": 64, "cuda": 64})
+        rule = lively_rule(device, torch.float32, 2, 4, static=True, gain=2.0, dead_zone=1e-3)
+        x, s = random_world(2, 50, 2, 4, dtype=torch.float32, device=device)
+        ways = []
+        for options in ({}, {"return_path_length": True}):
+            with torch.no_grad():
+                after = npa_envs.rollout(
+                    rule, x + 3.3, 0.1 * s, steps, eps=0.3, box=1.4, dt=0.01,
+                    generator=self.generator(device), **options,
+                )  # fmt: skip
+            ways.append(after[:2])
+        assert_same(*ways)
+        assert float(ways[0][0].abs().max()) <= 0.7
+        assert float((ways[0][1] - 0.1 * s).abs().max()) > 1e-3
+
     def test_rules_that_divide_are_refused(self, worlds):
         with pytest.raises(NPAError, match="at_rest is for rules whose particles do not divide"):
             npa_envs.at_rest(NPARule(2, 4, 8, divides=True), *worlds)

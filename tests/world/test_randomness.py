@@ -246,7 +246,7 @@ def test_the_mask_of_a_step_is_the_streams_first_draw(device):
 @pytest.mark.parametrize("source", ["worlds", "generator", "torch's own"])
 def test_draws_that_are_left_out_are_as_if_drawn(source, position_noise, update_prob, device):
     x = torch.zeros(2, 70_001, 2, device=device)
-    options = StepOptions(0.1, None, update_prob, 1.0, position_noise, True)
+    options = StepOptions(0.1, None, update_prob, 1.0, position_noise, True, 0.1, 0.05)
     ways = []
     for leave_out in (False, True):
         torch.manual_seed(4)

@@ -323,3 +323,34 @@ def test_a_rollout_of_no_steps_returns_worlds_of_its_own():
     for tensor in after:
         tensor.zero_()
     assert_same((x, s), before)
+
+
+@pytest.mark.parametrize(
+    ("gradients", "options"),
+    [
+        (False, {}),
+        (True, {}),
+        (True, {"memory": "minimal", "box": 1.5, "eps": 0.25}),
+    ],
+    ids=("quiet", "stored", "recomputed"),
+)
+def test_a_rollout_compiled_for_all_sizes_is_a_rollout(gradients, options):
+    rule = lively_rule("cpu", torch.float32)
+
+    def outcome(x, s, eps0):
+        # Numbers that a compiler takes for variables.
+        rule.eps0 = eps0
+        return npa_envs.rollout(rule, x, s, 2, update_prob=1.0, **options)
+
+    compiled = torch.compile(outcome, backend="aot_eager", dynamic=True)
+    with torch.set_grad_enabled(gradients):
+        for world_count, particle_count, eps0 in ((1, 20, 0.2), (2, 30, 0.2), (2, 30, 0.3)):
+            x, s = random_world(
+                world_count, particle_count, 2, 5, dtype=torch.float32, device="cpu"
+            )
+            s.requires_grad_(gradients)
+            found, expected = compiled(x, s, eps0), outcome(x, s, eps0)
+            torch.testing.assert_close(found, expected, rtol=1e-5, atol=1e-6)
+            if gradients:
+                bars = [torch.autograd.grad(way[1].sum(), s)[0] for way in (found, expected)]
+                torch.testing.assert_close(*bars, rtol=1e-4, atol=1e-5)

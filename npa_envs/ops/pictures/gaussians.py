@@ -20,7 +20,7 @@ from npa_envs.kernels.pictures.gaussians import (
 )
 from npa_envs.ops.checks import DTYPES, check_dense, checked_count, checked_number
 from npa_envs.ops.launch import launch, scalar_type
-from npa_envs.ops.opaque import once_differentiable, opaque
+from npa_envs.ops.opaque import check_derivatives, once_differentiable, opaque
 from npa_envs.ops.pictures.cameras import Cameras
 from npa_envs.ops.sort import LARGEST_INDEX
 
@@ -59,6 +59,13 @@ def check_gaussians(
                 f"{name} must have shape {shape} with [B, N] = {list(lead)} as means has, "
                 f"got {tuple(tensor.shape)}"
             )
+    check_derivatives(
+        means=means,
+        scales=scales,
+        quaternions=quaternions,
+        opacities=opacities,
+        colours=colours,
+    )
     if scales.device.type == "cpu" and not torch.compiler.is_compiling():
         negative = scales.detach() < 0.0
         if bool(negative.any()):

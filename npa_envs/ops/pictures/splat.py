@@ -33,7 +33,7 @@ from npa_envs.ops.checks import (
 )
 from npa_envs.ops.launch import aligned, launch, scalar_type
 from npa_envs.ops.mean import world_mean
-from npa_envs.ops.opaque import once_differentiable, opaque
+from npa_envs.ops.opaque import check_derivatives, once_differentiable, opaque
 from npa_envs.ops.sort import LARGEST_INDEX, block_capacity, slice_count
 
 LARGEST_SPOT = 1e6
@@ -283,6 +283,7 @@ def splat(
 def check_particles(x: Tensor, colour: Tensor, width: int | None) -> None:
     """Check positions with colours of a width, or with states where that is None."""
     check_world(x, colour)
+    check_derivatives(x=x, colour=colour)
     fits = colour.shape[2] >= 3 if width is None else colour.shape[2] == width
     if x.shape[2] != 2 or not fits:
         names = "x and states" if width is None else "x and colour"
