@@ -57,7 +57,11 @@ class Regeneration2DEnvConfig(GrownConfig):
     the target's name when environments of version 0 were frozen. "picture" starts from the target's
     own points instead, with blank hidden states."""
 
-    split_damage: bool = False
+    seed_pool: int = 256
+    """As elsewhere: episodes start from one of so many grown worlds, each made once; 0: from a new
+    one each time."""
+
+    split_damage: bool = True
     """Damage of split="test" is drawn apart from that of "train", also where `reset` is given the
     same seeds."""
 
@@ -153,13 +157,13 @@ class Regeneration2DEnv(NPAEnv):
     ## Starting state
 
     The rule grows a world for `grow_steps` steps from a disk of blank particles. Then one kind of
-    damage is done to it. The worlds are made once: with the default `seed_pool=4` there are four,
-    and 256 in `npa/Regeneration2D-v1`. On a CPU each is grown when an episode first starts from it,
-    which takes 0.4 s of CPU time with 1024 particles; on CUDA the first reset grows all of them.
-    The damage is drawn anew for each episode.
+    damage is done to it. The worlds are made once: with the default `seed_pool=256` there are 256.
+    On a CPU each is grown when an episode first starts from it, which takes 0.4 s of CPU time with
+    1024 particles; on CUDA the first reset grows all of them. The damage is drawn anew for each
+    episode.
 
-    `split="test"` has grown worlds of its own, as many, and in v1 damage of its own as well: learn
-    with "train", evaluate with "test".
+    `split="test"` has grown worlds of its own, as many, and damage of its own: learn with "train",
+    evaluate with "test".
 
     | `damage` | What is done |
     |---|---|
@@ -177,10 +181,6 @@ class Regeneration2DEnv(NPAEnv):
     The damage adds to the loss. The episode ends in success once `healed_share` of this addition is
     gone. If you give `success_loss`, it ends once the loss is at most this instead. If damage
     raises the loss by less than 2 %, there is nothing to heal, and the episode runs to its limit.
-
-    ## Version history
-
-    - v1: 256 grown worlds instead of four, and damage that `split="test"` draws apart.
     """
 
     task_type = RegenerationTask

@@ -120,9 +120,6 @@ class KeptProgress(Progress):
         if resume:
             content = load_checkpoint(folder.checkpoint)
             held = content.get("learner")
-            if isinstance(held, dict):
-                # Runs of before 2026-11-25 do not say so.
-                held = {"started": self._told.get("started")} | held
             if held != self._told:
                 here = held if isinstance(held, dict) else {}
                 names = [name for name in self._told if here.get(name) != self._told[name]]

@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Literal
 
 from npa_envs.cli.output import (
     MeasureOptions,
-    OptionalOutFolder,
     StepBar,
     check_numbers,
     chosen_names,
@@ -50,7 +49,7 @@ class BenchOptions(MeasureOptions):
     repeats: int = 7
     """Readings of every time; tables show their median and range."""
 
-    out: OptionalOutFolder = None
+    out: Path | None = None
     """Folder for SUITE_DEVICE.json and plots; default: nothing is written."""
 
     max_seconds: float | None = None

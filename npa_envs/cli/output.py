@@ -6,7 +6,6 @@ import argparse
 import contextlib
 import inspect
 import json
-import sys
 import tempfile
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
@@ -20,14 +19,6 @@ from tqdm import tqdm
 from npa_envs.errors import NPAError, suggest
 
 OptionsT = TypeVar("OptionsT")
-
-_OLD_NAME = tyro.conf.arg(aliases=("--output",))
-
-OutFolder = Annotated[Path, _OLD_NAME]
-"""A folder to write to: one name in all commands, and the old one of some."""
-
-OptionalOutFolder = Annotated[Path | None, _OLD_NAME]
-"""The same, where nothing is written unless it is given."""
 
 EXAMPLES: dict[str, tuple[str, ...]] = {
     "bench": ("bench --quick", "bench --suite accuracy --out results --plots"),
@@ -112,8 +103,6 @@ def parse_options(
         description: What the help begins with instead.
         default: What the options are where nothing is said; None: as the dataclass has them.
     """
-    if any(word.partition("=")[0] == "--output" for word in arguments):
-        print("npa-envs: --output is now --out", file=sys.stderr)
     shown = "\n".join(f"  npa-envs {example}" for example in EXAMPLES[command])
     told: dict[str, Any] = {} if default is None else {"default": default}
     options: OptionsT = tyro.cli(

@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Literal
 
 from npa_envs.cli.output import (
-    OutFolder,
     RunOptions,
     StepBar,
     check_numbers,
@@ -73,7 +72,7 @@ class SearchOptions(RunOptions):
     max_seconds: float | None = None
     """Stop after this time; the same command goes on. Default: never."""
 
-    out: OutFolder = Path("runs/search")
+    out: Path = Path("runs/search")
     """Folder to write to; created where missing."""
 
 

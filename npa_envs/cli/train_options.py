@@ -11,7 +11,7 @@ from typing import Any, get_type_hints
 import tyro
 
 from npa_envs.cli.launch import with_device_of_gpus
-from npa_envs.cli.output import OutFolder, parse_options, settled_resume
+from npa_envs.cli.output import parse_options, settled_resume
 from npa_envs.errors import NPAError, shown
 from npa_envs.tasks.co_morphogenesis2d import CoMorphogenesis2DConfig
 from npa_envs.tasks.morphogenesis2d import Morphogenesis2DConfig
@@ -50,7 +50,7 @@ class TrainOptions:
     device: str = "cpu"
     """Where to train: cpu, cuda, cuda:1."""
 
-    out: OutFolder = Path()
+    out: Path = Path()
     """Folder that log, pictures, checkpoint and rule are written to; created where missing."""
 
     config: Path | None = None
@@ -143,7 +143,7 @@ def starting_configuration(task_name: str, arguments: Sequence[str]) -> TrainCon
     parser.add_argument("--config", type=Path)
     parser.add_argument("--device", default="cpu")
     parser.add_argument("--resume", action="store_true")
-    parser.add_argument("--out", "--output", type=Path)
+    parser.add_argument("--out", type=Path)
     try:
         first, _ = parser.parse_known_args(arguments)
     except argparse.ArgumentError as error:

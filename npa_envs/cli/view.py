@@ -14,7 +14,6 @@ from typing import TYPE_CHECKING, Annotated, Any
 import tyro
 
 from npa_envs.cli.output import (
-    OutFolder,
     named_values,
     parse_options,
     torch_threads,
@@ -73,7 +72,7 @@ class ViewOptions:
     browser: bool = True
     """Open the page in a browser."""
 
-    out: OutFolder = Path("runs/view")
+    out: Path = Path("runs/view")
     """Folder of recorded films; created where missing."""
 
 

@@ -406,7 +406,7 @@ class Trainer:
         path = self.folder.checkpoint
         self.iteration = content["iteration"]
         expected = {"rule": self.rule.state_dict(), **self._cycle.state_like(self.iteration)}
-        # An optimiser's groups are the configuration's, and not read: older checkpoints have them.
+        # An optimiser's groups are the configuration's, and not read.
         read = content | {"optimiser": {"state": content["optimiser"].get("state")}}
         if self._ranks.together:
             # The generators of a process alone are not read.

@@ -95,18 +95,6 @@ def test_the_help_of_train_begins_with_the_most_common_options(capsys):
     assert "default: dots" in common
 
 
-@pytest.mark.parametrize(
-    "words", ["bench --explain", "stress --list", "rollout RULE --steps 1", "evaluate RULE"]
-)
-def test_output_is_the_old_name_of_out(words, rule, tmp_path, capsys):
-    given = [str({"RULE": rule}.get(word, word)) for word in words.split()]
-    given += ["--checkpoints", "1", "--json"] if words.startswith("evaluate") else ["--output"]
-    assert main([*given, str(tmp_path / "here")]) == 0
-    told = "--output is now --out\n" in capsys.readouterr().err
-    assert told == ("--output" in given)
-    assert (tmp_path / "here" / "growth.gif").exists() == words.startswith("rollout")
-
-
 def test_no_command_is_a_usage_error_and_the_version_is_that_of_the_package(capsys):
     import npa_envs
 
@@ -125,7 +113,7 @@ def test_list_names_tasks_presets_targets_and_losses(capsys):
         "vgg_ot",
         "filter_swd",
         "bubbles, cells, dots, droplets, grid, hearts, maze, stars",
-        "npa/Regeneration2D-v1",
+        "npa/Regeneration2D-v0",
         "npa/Mixing-v0, npa/Segregation-v0",
         "npa/InvasionLarge-v0",
     ):
