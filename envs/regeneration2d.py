@@ -53,9 +53,9 @@ class Regeneration2DEnvConfig(GrownConfig):
     [length units]; None: 0.3, 0.1, 0.2 and 0.05."""
 
     rule: str | None = None
-    """What grows the worlds: a shipped rule, or a rule's file; None: the rule that was shipped with
-    the target's name when environments of version 0 were frozen. "picture" starts from the target's
-    own points instead, with blank hidden states."""
+    """What grows the worlds: a rule of the package or a rule's file; None: `heart-first` for the
+    target "heart", `gecko-v0` for "gecko", and the shipped rule of its name for another one.
+    "picture" starts from the target's own points instead, with blank hidden states."""
 
     seed_pool: int = 256
     """As elsewhere: episodes start from one of so many grown worlds, each made once; 0: from a new
@@ -147,9 +147,9 @@ class Regeneration2DEnv(NPAEnv):
     to change its state, so that the picture becomes whole again. As in `npa/Morphogenesis2D-v0`, a
     particle perceives only its neighbourhood. Nobody tells it that there was damage.
 
-    Update rules that grow pictures can also heal them. The rule `gecko-v0`, the gecko that was
-    shipped when these worlds were frozen, has grown them, so their hidden states mean something to
-    it: `npa_envs.agents.RulePolicy(npa_envs.load_rule("gecko-v0"), env)` shows what it can do.
+    Update rules that grow pictures can also heal them. The rule `gecko-v0` has grown these worlds,
+    so their hidden states mean something to it:
+    `npa_envs.agents.RulePolicy(npa_envs.load_rule("gecko-v0"), env)` shows what it can do.
     Another policy cannot read these hidden states. With `rule="picture"` episodes start from the
     target's own points instead, with blank hidden states.
     Spaces, reward and `info` are those of `Morphogenesis2DEnv`.

@@ -62,9 +62,6 @@ class GradientOptions:
     last_rate: float = 0.05
     """Learning rate at the end, as a share of the first."""
 
-    normalise_gradients: bool = True
-    """Divide each parameter's gradient by its own norm."""
-
     memory: Memory = "store"
     """What the backward pass reads: "store", "recompute" or "minimal", as in `rollout`."""
 
@@ -170,10 +167,9 @@ def _trainer_config(
         learning_rate=options.learning_rate,
         last_rate=options.last_rate,
         milestones=(),
-        normalise_gradients=options.normalise_gradients,
         seed_interval=1,
         fresh_share=options.fresh_share if pool_size else 1.0,
-        damage=False,
+        damage_share=0.0,
         seed=seed,
         device=str(device),
         memory=options.memory,

@@ -158,7 +158,7 @@ def starting_configuration(task_name: str, arguments: Sequence[str]) -> TrainCon
                 "folder of an earlier run with --out, or leave --resume out to start a new run"
             )
         try:
-            base = load_config(folder.config, base, whole=True)
+            base = load_config(folder.config, base)
         except NPAError:
             # Fields of another task are unknown here; that it is another task says more.
             check_task(load_checkpoint(folder.checkpoint), task_name, folder.checkpoint)

@@ -46,8 +46,8 @@ FIRST_FATES = (5.0, -8.0)
 """Log odds of an untrained rule's particles to divide and to die, over staying."""
 
 
-class NamedAlways(TypedDict):
-    """What every rule's file says."""
+class RuleHyperParameters(TypedDict):
+    """Everything besides its weights that makes an `NPARule`."""
 
     space_dim: int
     state_dim: int
@@ -60,11 +60,6 @@ class NamedAlways(TypedDict):
     moment_correction: bool
     state_gradient: bool
     density_gradient: bool
-
-
-class RuleHyperParameters(NamedAlways, total=False):
-    """Everything besides its weights that makes an `NPARule`."""
-
     species_count: int
     moment_inverse: MomentInverse
     equivariant: bool
@@ -517,7 +512,8 @@ class NPARule(nn.Module):
 
     def hyper_parameters(self) -> RuleHyperParameters:
         """Return all that `NPARule` takes: `NPARule(**rule.hyper_parameters())` has this shape."""
-        made = RuleHyperParameters(
+        codes = self.codes
+        return RuleHyperParameters(
             space_dim=self.space_dim,
             state_dim=self.state_dim,
             hidden_dim=self.hidden_dim,
@@ -529,25 +525,17 @@ class NPARule(nn.Module):
             moment_correction=self.moment_correction,
             state_gradient=self.state_gradient,
             density_gradient=self.density_gradient,
+            species_count=self.species_count,
+            moment_inverse=self.moment_inverse,
+            equivariant=self.equivariant,
+            chiral=self.chiral,
+            mixed_vectors=self.mixed_vectors,
+            code_dim=self.code_dim,
+            code_names=() if codes is None else codes.names,
+            encoder=codes is not None and codes.encoder is not None,
+            divides=self.divides,
+            dead_zone=self.dead_zone,
         )
-        # Left out where it says nothing: files and checkpoints stay those of all versions.
-        if self.species_count:
-            made["species_count"] = self.species_count
-        if self.moment_inverse != "threshold":
-            made["moment_inverse"] = self.moment_inverse
-        if self.equivariant:
-            made["equivariant"] = True
-            made["chiral"] = self.chiral
-            made["mixed_vectors"] = self.mixed_vectors
-        if self.codes is not None:
-            made["code_dim"] = self.code_dim
-            made["code_names"] = self.codes.names
-            made["encoder"] = self.codes.encoder is not None
-        if self.divides:
-            made["divides"] = True
-        if self.dead_zone:
-            made["dead_zone"] = self.dead_zone
-        return made
 
 
 def _checked_dead_zone(value: Any, equivariant: bool) -> float:

@@ -73,7 +73,6 @@ class EagerIteration:
         generator: Randomness of the update masks, on the worlds' device.
         rollout: The rollout to run; another one only in tests.
         goal: The worlds' goals, int64, shape [B], where the task has such.
-        gradients: Where the gradients are written, one tensor a parameter; None: to new ones.
         mean_over_processes: As `counted_together` takes it, where several processes share a run.
     """
 
@@ -88,7 +87,6 @@ class EagerIteration:
         rollout: Rollout | None = None,
         *,
         goal: Tensor | None = None,
-        gradients: list[Tensor] | None = None,
         mean_over_processes: Callable[[Tensor], Tensor] | None = None,
     ) -> None:
         self.goal = None if goal is None else goal.clone()
@@ -113,7 +111,7 @@ class EagerIteration:
         """The loss and then its named parts, shape [K]."""
         self.parameters = [p for p in rule.parameters() if p.requires_grad]
         """What the gradients are for."""
-        self.gradients = gradients or [torch.zeros_like(p) for p in self.parameters]
+        self.gradients = [torch.zeros_like(p) for p in self.parameters]
         """Their `.grad`."""
         for parameter, buffer in zip(self.parameters, self.gradients, strict=True):
             parameter.grad = buffer

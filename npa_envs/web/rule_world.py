@@ -558,7 +558,7 @@ class RunWorld(RuleWorld):
         self._centres = [0.0]
         if len(files) > 1:
             # Seeds lie in a row, as in training.
-            config = load_config(self._run_folder.config, joint_preset(), whole=True)
+            config = load_config(self._run_folder.config, joint_preset())
             self._centres = list(config.task.centres)
         self._each = None if particle_count is None else max(1, particle_count // len(files))
         self._written = self._stamp()

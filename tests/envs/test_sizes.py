@@ -1,5 +1,6 @@
 """Small and large forms of environments: frozen settings, checkers, batches."""
 
+import hashlib
 import json
 import warnings
 from pathlib import Path
@@ -13,10 +14,16 @@ from small_envs import assert_same, world_of
 
 from npa_envs.agents.learning import Budget, Problem, train
 from npa_envs.envs import multispecies_v0
+from npa_envs.envs.grown import GrownConfig, growing_rule
+from npa_envs.envs.regeneration2d import Regeneration2DEnvConfig
 from npa_envs.registration import ALL, ENVIRONMENTS, SIZES, SPECIES_SIZES
+from npa_envs.rule.files import rule_file, shipped_rules
 
 FROZEN = json.loads(Path(__file__).with_name("frozen_sizes.json").read_text())
 """Steps of an episode and keywords by id, as they were when the ids were made."""
+
+FROZEN_RULES = json.loads(Path(__file__).with_name("frozen_rules.json").read_text())
+"""SHA-256 of the file of the rule that runs or grows the worlds of an id, or of a target."""
 
 FEW = {"particle_count": 64, "resolution": 16, "view_count": 2}
 """What makes a check of a form quick that is not small already."""
@@ -30,6 +37,26 @@ def test_settings_are_what_they_were():
     now = {row.id: {"steps": row.max_episode_steps, **row.keywords} for row in SIZES}
     now |= {row.id: {"task": row.task, **row.keywords} for row in SPECIES_SIZES}
     assert json.loads(json.dumps(now)) == FROZEN
+
+
+def test_a_rule_that_is_trained_anew_changes_no_environment():
+    """The file that grows an id's worlds has the hash that it had when the id was made."""
+    grown = {
+        f"target={name}": Regeneration2DEnvConfig(target=name)
+        for name in shipped_rules("morphogenesis2d")
+    }
+    configs = {row.id: Problem(env_id=row.id, episode_steps=4).config for row in ALL} | grown
+    rules = {
+        name: growing_rule(config) if isinstance(config, GrownConfig) else config.rule
+        for name, config in configs.items()
+        if getattr(config, "rule", "") != ""
+    }
+    found = {
+        name: hashlib.sha256(rule_file(rule).read_bytes()).hexdigest()
+        for name, rule in rules.items()
+        if rule != "picture"
+    }
+    assert found == FROZEN_RULES
 
 
 def quick(row):
