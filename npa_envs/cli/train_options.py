@@ -31,6 +31,30 @@ COMMON = ("target", "iterations", "device", "out")
 """Fields of configurations that stand among the most common options, where a task has them."""
 
 
+SHOWN = frozenset(
+    {
+        "initial_rule",
+        "initial_rules",
+        "frozen",
+        "repeats",
+        "world_count",
+        "pool_size",
+        "steps",
+        "learning_rate",
+        "seed",
+        "targets",
+        "distance",
+        "particle_count",
+        "hidden_dim",
+        "eps",
+        "resolution",
+        "loss",
+        "data",
+    }
+)
+"""Fields of configurations that `--help` shows; `--help-all` shows all of them."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class TrainOptions:
     """What most runs are told; the paper's schedule, pool and world follow below."""
@@ -150,7 +174,7 @@ def starting_configuration(task_name: str, arguments: Sequence[str]) -> TrainCon
         raise NPAError(f"{error.argument_name}: {error.message}") from error
     device = first.device if first.config is None else "cpu"
     base = preset(first.preset or default_preset(task_name, device), task_name)
-    if first.resume and not {"-h", "--help"} & set(arguments):
+    if first.resume and not {"-h", "--help", "--help-all"} & set(arguments):
         folder = RunFolder(first.out or base.out)
         if not folder.checkpoint.is_file():
             raise NPAError(
@@ -183,7 +207,12 @@ def default_preset(task_name: str, device: str) -> str:
 def parse(
     task_name: str, base: TrainConfig[Any], arguments: Sequence[str]
 ) -> tuple[TrainOptions, TrainConfig[Any]]:
-    """Lay the command line's options over a configuration."""
+    """Lay the command line's options over a configuration.
+
+    Ends the process after `--help`, which shows the most used options, and `--help-all`.
+    """
+    whole = "--help-all" in arguments
+    arguments = ["--help" if word == "--help-all" else word for word in arguments]
 
     def read(defaults: Any) -> tuple[TrainOptions, Any]:
         # These stand first, as options of their own, and not once more below.
@@ -195,14 +224,16 @@ def parse(
             and not (name == "target" and isinstance(holder, SpeciesOptions))
         }
         common = _without(TrainOptions(**told), set(COMMON) - told.keys())
-        training = _without(replace(defaults, task=_without(defaults.task, told)), told)
+        task = _without(defaults.task, told, whole=whole)
+        training = _without(replace(defaults, task=task), told, whole=whole)
         kinds = [("common", type(common)), ("training", type(training))]
         command = make_dataclass("Command", kinds, frozen=True)
         parsed: Any = parse_options(
             command,
             f"train {task_name}",
             arguments,
-            description=f"Train on {task_name}. Defaults shown are those of the preset.",
+            description=f"Train on {task_name}. Defaults shown are those of the preset."
+            + ("" if whole else f" All options: npa-envs train {task_name} --help-all"),
             default=command(common, training),
         )
         task = _of_type(type(defaults.task), parsed.training.task)
@@ -214,12 +245,17 @@ def parse(
     return parse_joint(base, read) if isinstance(base, JointTrainConfig) else read(base)
 
 
-def _without(source: Any, names: Iterable[str]) -> Any:
-    """Return a dataclass of which some fields, where it has them, are no options."""
+def _without(source: Any, names: Iterable[str], *, whole: bool = True) -> Any:
+    """Return a dataclass of which some fields, where it has them, are no options.
+
+    Unless it is shown whole, fields that are not `SHOWN` are options that its help leaves out.
+    """
     kind: Any = type(source)
     fixed: Any = tyro.conf.Fixed
-    hints = get_type_hints(kind)
-    changed = {name: fixed[hints[name]] for name in names if name in hints}
+    hidden: Any = tyro.conf.Suppress
+    hints = get_type_hints(kind, include_extras=True)
+    changed = {} if whole else {name: hidden[hints[name]] for name in hints.keys() - SHOWN}
+    changed |= {name: fixed[hints[name]] for name in names if name in hints}
     if "task" in hints:
         changed["task"] = type(source.task)
     options = [(name, own, field(default=getattr(source, name))) for name, own in changed.items()]

@@ -95,6 +95,22 @@ def test_the_help_of_train_begins_with_the_most_common_options(capsys):
     assert "default: dots" in common
 
 
+def test_the_help_of_train_shows_the_most_used_options_and_help_all_all_of_them(
+    capsys, monkeypatch
+):
+    monkeypatch.setenv("COLUMNS", "80")
+    counts = []
+    for word in ("--help", "--help-all"):
+        with pytest.raises(SystemExit):
+            main(["train", "morphogenesis2d", word])
+        text = re.sub(r"\x1b\[[0-9;]*m", "", capsys.readouterr().out)
+        # Their explanations stand further to the right.
+        counts.append(len(set(re.findall(r"^[ │|]{1,3}(--[a-z][a-z-]+)", text, re.MULTILINE))))
+        assert ("--splat-weight" in text) == (word == "--help-all")
+    assert "--help-all" not in text.partition("Examples")[0]
+    assert counts == [25, 76]
+
+
 def test_no_command_is_a_usage_error_and_the_version_is_that_of_the_package(capsys):
     import npa_envs
 
