@@ -13,9 +13,9 @@ from npa_envs.envs.core.config import EnvConfig
 from npa_envs.envs.core.task import Start
 from npa_envs.envs.morphogenesis2d import Morphogenesis2DEnvConfig, PictureTask
 from npa_envs.errors import NPAError, shown
+from npa_envs.ops.checks import check_positive
 from npa_envs.rule.files import load_rule, shipped_rules
 from npa_envs.rule.rule import NPARule
-from npa_envs.tasks.checks import check_positive
 from npa_envs.tasks.targets.clouds import Split
 from npa_envs.world.randomness import Purpose, WorldRandom
 from npa_envs.world.rollout import rollout

@@ -13,7 +13,7 @@ from npa_envs.envs.core.config import EnvConfig
 from npa_envs.envs.core.single import NPAEnv
 from npa_envs.envs.core.task import GoalTask
 from npa_envs.envs.core.vector import NPAVectorEnv
-from npa_envs.tasks.checks import check_positive
+from npa_envs.ops.checks import check_positive
 from npa_envs.tasks.morphogenesis2d import Morphogenesis2D, Morphogenesis2DConfig
 from npa_envs.tasks.targets.images import LARGEST_POINT_COUNT
 

@@ -17,10 +17,10 @@ from npa_envs.envs.core.single import NPAEnv
 from npa_envs.envs.core.task import TURN, GoalTask
 from npa_envs.envs.core.vector import NPAVectorEnv
 from npa_envs.errors import NPAError, shown
+from npa_envs.ops.checks import check_positive
 from npa_envs.render import turntable_frames
 from npa_envs.rule.files import load_rule
 from npa_envs.rule.rule import NPARule
-from npa_envs.tasks.checks import check_positive
 from npa_envs.tasks.morphogenesis3d import Morphogenesis3D, Morphogenesis3DConfig
 
 PIXEL_BYTES = 200

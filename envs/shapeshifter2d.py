@@ -16,17 +16,17 @@ from torch import Tensor
 
 from npa_envs.envs.core.config import EnvConfig
 from npa_envs.envs.core.single import NPAEnv
-from npa_envs.envs.core.spaces import Rows, action_tensor, number_tensor
+from npa_envs.envs.core.spaces import Rows, action_tensor
 from npa_envs.envs.core.task import EnvTask, Start
 from npa_envs.envs.core.vector import NPAVectorEnv
 from npa_envs.envs.garden.config import GardenReward
 from npa_envs.envs.garden.worlds import LivingWorlds
 from npa_envs.envs.grown import run_rule
 from npa_envs.errors import NPAError
+from npa_envs.ops.checks import check_positive, number_tensor
 from npa_envs.rule.codes import Codes
 from npa_envs.rule.files import load_rule
 from npa_envs.rule.rule import NPARule
-from npa_envs.tasks.checks import check_positive
 from npa_envs.tasks.many_pictures import ManyPictures
 from npa_envs.tasks.morphogenesis2d import Morphogenesis2DConfig
 from npa_envs.training.trained_tasks import sources_of_codes

@@ -20,7 +20,7 @@ from npa_envs.envs.garden.environments import GardenEnv, GardenVectorEnv
 from npa_envs.envs.garden.forms import Brushes
 from npa_envs.envs.garden.task import SEEN_LIMIT, GardenTask, lost_share, marks_of_whole
 from npa_envs.errors import NPAError
-from npa_envs.tasks.checks import check_non_negative, check_positive
+from npa_envs.ops.checks import check_non_negative, check_positive
 from npa_envs.tasks.seeds import uniform_ball
 from npa_envs.world.actions import Physics
 from npa_envs.world.randomness import WorldRandom

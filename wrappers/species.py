@@ -16,7 +16,7 @@ from npa_envs.envs.core.single import NPAEnv
 from npa_envs.envs.core.spaces import to_output
 from npa_envs.envs.core.vector import NPAVectorEnv
 from npa_envs.errors import NPAError, shown, suggest
-from npa_envs.tasks.checks import is_real, is_whole
+from npa_envs.ops.checks import is_real, is_whole
 from npa_envs.world.randomness import Purpose, WorldRandom
 from npa_envs.wrappers.base import (
     AnyVectorEnv,

@@ -63,12 +63,12 @@ KEPT_METHODS = ("ppo", "shac")
 """Methods whose runs can be kept in a folder, go on from there, and be shared by processes."""
 
 GARDEN_METHODS: dict[str, str] = {
-    "gradient": "npa_envs.agents.learning.gardeners:train_gradient",
+    "gradient": "npa_envs.agents.learning.baselines:tend_gradient",
     "ppo_world": "npa_envs.agents.learning.garden_sb3:train_ppo",
     "sac": "npa_envs.agents.learning.garden_sb3:train_sac",
-    "random": "npa_envs.agents.learning.gardeners:train_random",
-    "zero": "npa_envs.agents.learning.gardeners:train_zero",
-    "scripted": "npa_envs.agents.learning.gardeners:train_scripted",
+    "random": "npa_envs.agents.learning.baselines:tend_random",
+    "zero": "npa_envs.agents.learning.baselines:tend_zero",
+    "scripted": "npa_envs.agents.learning.baselines:tend_scripted",
 }
 """The same for gardens, where a rule runs the particles: those that learn return policies."""
 

@@ -17,10 +17,10 @@ from npa_envs.agents.learning.rules import RuleSet, starting_rules
 from npa_envs.envs.core.task import EnvTask
 from npa_envs.envs.multi.task import Population, SpeciesConfig, SpeciesTask
 from npa_envs.errors import NPAError, shown
+from npa_envs.ops.checks import check_fraction
 from npa_envs.rule.network import FoldedRule
 from npa_envs.rule.rule import NPARule
 from npa_envs.tasks.base import Task
-from npa_envs.tasks.checks import check_fraction
 from npa_envs.tasks.train_config import TrainConfig
 from npa_envs.training.cycle import TrainingCycle
 from npa_envs.world.randomness import Randomness, WorldRandom

@@ -34,8 +34,8 @@ from npa_envs.envs.multi.tasks import task_type as species_task_type
 from npa_envs.envs.multi.vector import MultiSpeciesVectorEnv
 from npa_envs.envs.shapeshifter2d import ShapeshifterTask
 from npa_envs.errors import NPAError, shown, suggest
+from npa_envs.ops.checks import check_positive, is_whole
 from npa_envs.registration import ALL, SPECIES_SIZES
-from npa_envs.tasks.checks import check_positive, is_whole
 from npa_envs.world.actions import Physics
 from npa_envs.world.cuda_graph import sent
 

@@ -27,7 +27,7 @@ from npa_envs.agents.learning.problem import Problem, world_seeds
 from npa_envs.agents.learning.progress import Progress
 from npa_envs.agents.learning.rules import RuleSet
 from npa_envs.errors import MissingDependencyError, NPAError
-from npa_envs.tasks.checks import check_positive
+from npa_envs.ops.checks import check_positive
 from npa_envs.wrappers.sb3 import WorldVecEnv
 
 try:

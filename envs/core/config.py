@@ -12,14 +12,14 @@ from torch import Tensor
 
 from npa_envs.devices import check_device
 from npa_envs.errors import NPAError, UnknownKeywordError, shown, suggest
-from npa_envs.render import STYLES
-from npa_envs.tasks.checks import (
+from npa_envs.ops.checks import (
     check_fraction,
     check_non_negative,
     check_positive,
     is_real,
     is_whole,
 )
+from npa_envs.render import STYLES
 from npa_envs.world.actions import MomentInverse, Physics
 
 Boundary = Literal["open", "periodic"]

@@ -8,7 +8,7 @@ from typing import Literal, get_args
 from npa_envs.envs.core.config import EnvConfig
 from npa_envs.envs.grown import GrownConfig
 from npa_envs.errors import NPAError, shown, suggest
-from npa_envs.tasks.checks import check_positive, is_whole
+from npa_envs.ops.checks import check_positive, is_whole
 
 Actions = Literal["grid", "free", "discrete"]
 Observe = Literal["grid", "picture", "moments"]

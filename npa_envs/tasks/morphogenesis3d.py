@@ -14,16 +14,16 @@ from torch import Tensor
 
 from npa_envs.errors import NPAError, shown
 from npa_envs.ops import Cameras, world_mean
-from npa_envs.rule.rule import NPARule
-from npa_envs.tasks.appearance import OUTPUTS, RENDERERS, Appearance, Gaussians
-from npa_envs.tasks.base import shares_of_loss
-from npa_envs.tasks.checks import (
+from npa_envs.ops.checks import (
     check_fraction,
     check_non_negative,
     check_positive,
     check_seed,
     check_text,
 )
+from npa_envs.rule.rule import NPARule
+from npa_envs.tasks.appearance import OUTPUTS, RENDERERS, Appearance, Gaussians
+from npa_envs.tasks.base import shares_of_loss
 from npa_envs.tasks.growth import GrowthConfig, GrowthTask
 from npa_envs.tasks.losses.similarity import MultiScaleSimilarity
 from npa_envs.tasks.targets.views import ViewTarget, load_views, nearest_camera, over, some_views

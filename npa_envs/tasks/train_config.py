@@ -12,8 +12,8 @@ import torch
 
 from npa_envs.devices import parse_device
 from npa_envs.errors import NPAError, shown
-from npa_envs.ops.checks import MomentInverse
-from npa_envs.tasks.checks import (
+from npa_envs.ops.checks import (
+    MomentInverse,
     check_flag,
     check_non_negative,
     check_positive,

@@ -25,7 +25,7 @@ WARM_UP_STEPS = 2
 """Steps of the eager rollout that loads every kernel before the first capture."""
 
 
-class RolloutOptions(TypedDict):
+class TrainingOptions(TypedDict):
     """What the trainer tells a rollout by name."""
 
     eps: float
@@ -40,7 +40,7 @@ class Rollout(Protocol):
     """`npa_envs.rollout` as the trainer calls it."""
 
     def __call__(
-        self, rule: NPARule, x: Tensor, s: Tensor, steps: int, /, **options: Unpack[RolloutOptions]
+        self, rule: NPARule, x: Tensor, s: Tensor, steps: int, /, **options: Unpack[TrainingOptions]
     ) -> tuple[Tensor, Tensor, Tensor]:
         """Return positions, states and path lengths after `steps` steps."""
 

@@ -17,7 +17,7 @@ from npa_envs.files import (
     remove_unfinished,
     write_text,
 )
-from npa_envs.tasks.checks import is_real, is_whole
+from npa_envs.ops.checks import is_real, is_whole
 
 try:
     import fcntl

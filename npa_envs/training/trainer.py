@@ -17,10 +17,10 @@ from tqdm import tqdm
 from npa_envs.devices import check_device
 from npa_envs.errors import DivergedError, NPAError, shown
 from npa_envs.files import write_text
+from npa_envs.ops.checks import is_real
 from npa_envs.rule.files import first_rules, load_rule, save_rule
 from npa_envs.rule.rule import NPARule, dividing, with_codes
 from npa_envs.tasks.base import GoalTask, Task, differing_fields, untrained_rule
-from npa_envs.tasks.checks import is_real
 from npa_envs.tasks.many_pictures import ManyPictures
 from npa_envs.tasks.train_config import TrainConfig
 from npa_envs.training.batch_picture import write_batch_picture

@@ -15,6 +15,7 @@ from torch import Tensor
 
 from npa_envs.errors import NPAError, shown, suggest
 from npa_envs.files import open_regular, parse_json
+from npa_envs.ops.checks import is_real, is_whole
 from npa_envs.rule.files import load_rule, rule_file, rule_metadata, shipped_rules
 from npa_envs.rule.rule import NPARule
 from npa_envs.tasks.base import (
@@ -24,7 +25,6 @@ from npa_envs.tasks.base import (
     task_for_rule,
     task_toward,
 )
-from npa_envs.tasks.checks import is_real, is_whole
 from npa_envs.tasks.co_morphogenesis2d import CoMorphogenesis2DConfig
 from npa_envs.tasks.damage import DAMAGE_SIZES, damage_worlds
 from npa_envs.tasks.point_classification import PointClassification, class_colours

@@ -6,7 +6,7 @@ import functools
 import math
 from collections.abc import Sequence
 from types import NoneType
-from typing import Literal, NamedTuple, overload
+from typing import Literal, NamedTuple, TypedDict, Unpack, overload
 
 import torch
 from torch import Tensor
@@ -44,6 +44,22 @@ from npa_envs.world.steps import (
 )
 
 Memory = Literal["store", "recompute", "minimal"]
+
+
+class RolloutOptions(TypedDict, total=False):
+    """What rollouts of one rule and of several take by name; `rollout` says what it means."""
+
+    eps: float | None
+    box: Box
+    dt: float
+    position_noise: float
+    detach_positions: bool
+    memory: Memory
+    generator: Randomness | None
+    on_divergence: OnDivergence
+    keep_every: int | None
+    cuda_graph: CudaGraph
+
 
 STORED_INTERVAL: dict[Memory, float] = {"store": 1, "recompute": 3, "minimal": math.inf}
 """The last step and every so-manyth before it store what the backward pass reads."""
@@ -431,18 +447,9 @@ def rollout(
     s: Tensor,
     steps: int,
     *,
-    eps: float | None = ...,
-    box: Box = ...,
     update_prob: float = ...,
-    dt: float = ...,
-    position_noise: float = ...,
-    detach_positions: bool = ...,
-    memory: Memory = ...,
-    generator: Randomness | None = ...,
-    on_divergence: OnDivergence = ...,
-    keep_every: int | None = ...,
-    cuda_graph: CudaGraph = ...,
     return_path_length: Literal[False] = ...,
+    **options: Unpack[RolloutOptions],
 ) -> tuple[Tensor, Tensor]: ...
 
 
@@ -453,18 +460,9 @@ def rollout(
     s: Tensor,
     steps: int,
     *,
-    eps: float | None = ...,
-    box: Box = ...,
     update_prob: float = ...,
-    dt: float = ...,
-    position_noise: float = ...,
-    detach_positions: bool = ...,
-    memory: Memory = ...,
-    generator: Randomness | None = ...,
-    on_divergence: OnDivergence = ...,
-    keep_every: int | None = ...,
-    cuda_graph: CudaGraph = ...,
     return_path_length: Literal[True],
+    **options: Unpack[RolloutOptions],
 ) -> tuple[Tensor, Tensor, Tensor]: ...
 
 
