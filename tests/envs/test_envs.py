@@ -543,7 +543,7 @@ def test_bad_keyword_is_a_clear_error(name, keywords, message):
         (IDS[1], {"healed_share": 0.0}, "healed_share must lie in"),
         ("npa/Texture-v0", {"target": "cels"}, "did you mean 'cells'"),
         ("npa/Texture-v0", {"boundary": "open"}, "boundary must be 'periodic' for textures"),
-        ("npa/Texture-v0", {"loss": "swd"}, "did you mean 'patch_swd'|known: filter_gram"),
+        ("npa/Texture-v0", {"loss": "swd"}, "did you mean 'patch_swd'|known: filter_ot"),
         ("npa/Texture-v0", {"resolution": 8}, "resolution must be a whole number of at least 12"),
         ("npa/PointClassification-v0", {"data": "mnisd"}, "did you mean 'mnist'"),
         ("npa/PointClassification-v0", {"boundary": "periodic"}, "boundary must be 'open' for"),

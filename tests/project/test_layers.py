@@ -53,7 +53,7 @@ LADDER = {
     "npa_envs.rule.rule": rung(4, "torch"),
     "npa_envs.rule": rung(5, "torch safetensors", never=INSIDES),
     "npa_envs.world": rung(6, "torch", never=ORACLES),
-    "npa_envs.tasks": rung(7, "torch numpy PIL sklearn torchvision trimesh gsplat", never=ORACLES),
+    "npa_envs.tasks": rung(7, "torch numpy PIL sklearn torchvision trimesh", never=ORACLES),
     "npa_envs.render": rung(8, "torch numpy PIL imageio imageio_ffmpeg pygame", never=ORACLES),
     "npa_envs.training": rung(9, "torch numpy tqdm yaml tensorboard", never=ORACLES),
     "npa_envs": Rung(10, frozenset({COMPUTED_NAME}), never=ORACLES),
