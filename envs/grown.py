@@ -9,11 +9,11 @@ from typing import ClassVar, TypeVar, get_args
 import torch
 from torch import Tensor
 
+from npa_envs.checks import check_positive
 from npa_envs.envs.core.config import EnvConfig
 from npa_envs.envs.core.task import Start
 from npa_envs.envs.morphogenesis2d import Morphogenesis2DEnvConfig, PictureTask
 from npa_envs.errors import NPAError, shown
-from npa_envs.ops.checks import check_positive
 from npa_envs.rule.files import load_rule, shipped_rules
 from npa_envs.rule.rule import NPARule
 from npa_envs.tasks.targets.clouds import Split

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from npa_envs.checks import check_flag, check_fraction, check_positive
 from npa_envs.envs.core.single import NPAEnv
 from npa_envs.envs.core.task import Start
 from npa_envs.envs.core.vector import NPAVectorEnv
@@ -14,7 +15,6 @@ from npa_envs.envs.core.worlds import total
 from npa_envs.envs.grown import GrownConfig, GrownTask
 from npa_envs.envs.morphogenesis2d import PictureTask
 from npa_envs.errors import NPAError, shown, suggest
-from npa_envs.ops.checks import check_flag, check_fraction, check_positive
 from npa_envs.rule.rule import COLOUR_OFFSET
 from npa_envs.tasks.damage import damage_worlds
 from npa_envs.world.randomness import Purpose, WorldRandom

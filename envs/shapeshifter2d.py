@@ -14,6 +14,7 @@ import torch.nn.functional as F
 from gymnasium.spaces import Box, Discrete, Space
 from torch import Tensor
 
+from npa_envs.checks import check_positive, number_tensor
 from npa_envs.envs.core.config import EnvConfig
 from npa_envs.envs.core.single import NPAEnv
 from npa_envs.envs.core.spaces import Rows, action_tensor
@@ -23,7 +24,6 @@ from npa_envs.envs.garden.config import GardenReward
 from npa_envs.envs.garden.worlds import LivingWorlds
 from npa_envs.envs.grown import run_rule
 from npa_envs.errors import NPAError
-from npa_envs.ops.checks import check_positive, number_tensor
 from npa_envs.rule.codes import Codes
 from npa_envs.rule.files import load_rule
 from npa_envs.rule.rule import NPARule

@@ -29,9 +29,9 @@ from npa_envs.agents.policies import (
     ZeroPolicy,
     target_colour,
 )
+from npa_envs.checks import is_real
 from npa_envs.envs.shepherd2d import ShepherdTask
 from npa_envs.errors import NPAError, shown
-from npa_envs.ops.checks import is_real
 
 SCRIPTED: tuple[Callable[..., Policy], ...] = (PaintPolicy, SpreadPolicy, MendPolicy)
 """Policies to choose from."""

@@ -16,8 +16,8 @@ from npa_envs.agents.learning.baselines import check_no_garden_start
 from npa_envs.agents.learning.problem import Problem, world_seeds
 from npa_envs.agents.learning.progress import Progress
 from npa_envs.agents.learning.rules import RuleSet
+from npa_envs.checks import check_fraction, check_positive
 from npa_envs.errors import MissingDependencyError, NPAError, shown
-from npa_envs.ops.checks import check_fraction, check_positive
 from npa_envs.wrappers.sb3 import WorldVecEnv, on_host
 
 try:

@@ -14,10 +14,10 @@ import npa_envs
 from npa_envs.agents.learning.problem import Problem
 from npa_envs.agents.learning.progress import Progress, annealed
 from npa_envs.agents.learning.rules import RuleSet, starting_rules
+from npa_envs.checks import check_fraction
 from npa_envs.envs.core.task import EnvTask
 from npa_envs.envs.multi.task import Population, SpeciesConfig, SpeciesTask
 from npa_envs.errors import NPAError, shown
-from npa_envs.ops.checks import check_fraction
 from npa_envs.rule.network import FoldedRule
 from npa_envs.rule.rule import NPARule
 from npa_envs.tasks.base import Task

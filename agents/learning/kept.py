@@ -14,9 +14,9 @@ from torch import Tensor
 
 from npa_envs.agents.learning.progress import Entry, Learner, Progress
 from npa_envs.agents.learning.rules import RuleSet
+from npa_envs.checks import is_real
 from npa_envs.errors import NPAError, shown
 from npa_envs.files import json_text, write_text
-from npa_envs.ops.checks import is_real
 from npa_envs.training.checkpoint import (
     check_content,
     load_checkpoint,

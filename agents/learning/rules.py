@@ -12,8 +12,8 @@ import torch
 from torch import Tensor, nn
 
 from npa_envs.agents.policies import Interface, Policy, bounded_update, check_rule_fits
+from npa_envs.checks import is_whole
 from npa_envs.errors import NPAError, shown
-from npa_envs.ops.checks import is_whole
 from npa_envs.rule.files import load_rule, save_rule
 from npa_envs.rule.rule import NPARule
 

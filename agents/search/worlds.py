@@ -14,9 +14,9 @@ from torch import Tensor
 
 from npa_envs import NPARule, WorldRandom, perception_fields, rollout, rollout_species
 from npa_envs.agents.learning.weights import RuleWeights, updates_of
+from npa_envs.checks import check_non_negative, check_positive
 from npa_envs.errors import NPAError, shown
 from npa_envs.measure.interaction import mixing_index
-from npa_envs.ops.checks import check_non_negative, check_positive
 from npa_envs.tasks.seeds import uniform_ball
 
 Kind = Literal["rule", "pair"]

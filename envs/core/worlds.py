@@ -16,6 +16,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from npa_envs.checks import number_tensor
 from npa_envs.envs.core.answers import (
     GlobalDraws,
     check_finite,
@@ -28,7 +29,6 @@ from npa_envs.envs.core.config import EnvConfig, WorldConfig
 from npa_envs.envs.core.memory import check_memory
 from npa_envs.envs.core.task import EnvTask, Start, WorldTask
 from npa_envs.errors import DivergedError, NPAError, shown
-from npa_envs.ops.checks import number_tensor
 from npa_envs.world.actions import (
     DIVERGED,
     NOT_FINITE,

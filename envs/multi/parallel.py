@@ -11,9 +11,9 @@ from gymnasium.spaces import Box
 from numpy.typing import NDArray
 from torch import Tensor
 
+from npa_envs.checks import number_tensor
 from npa_envs.envs.multi.agents import AgentsEnv, joined_actions
 from npa_envs.errors import MissingDependencyError, NPAError, shown, suggest
-from npa_envs.ops.checks import number_tensor
 
 try:
     import pettingzoo

@@ -10,14 +10,14 @@ from typing import Any, TypedDict
 import torch
 from torch import Tensor, nn
 
-from npa_envs.errors import NPAError, shown
-from npa_envs.ops.checks import (
+from npa_envs.checks import (
     MomentInverse,
     checked_flag,
     checked_moment_inverse,
     checked_number,
     checked_positive,
 )
+from npa_envs.errors import NPAError, shown
 from npa_envs.ops.equivariance import MIXED_VECTORS, VectorForm, invariants, signed_gates, steered
 from npa_envs.rule.codes import Codes, check_names
 from npa_envs.rule.network import (

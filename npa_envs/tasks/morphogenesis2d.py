@@ -12,9 +12,9 @@ from typing import Any, Self
 import torch
 from torch import Tensor
 
+from npa_envs.checks import check_flag, check_non_negative, check_positive, check_text
 from npa_envs.errors import NPAError, shown
 from npa_envs.ops import splat, world_mean
-from npa_envs.ops.checks import check_flag, check_non_negative, check_positive, check_text
 from npa_envs.ops.pictures.losses import picture_losses
 from npa_envs.rule.rule import COLOUR_OFFSET, LIFE, NPARule
 from npa_envs.tasks.damage import hurt

@@ -12,15 +12,15 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from npa_envs.errors import NPAError
-from npa_envs.ops import Cameras, world_mean
-from npa_envs.ops.checks import (
+from npa_envs.checks import (
     check_fraction,
     check_non_negative,
     check_positive,
     check_seed,
     check_text,
 )
+from npa_envs.errors import NPAError
+from npa_envs.ops import Cameras, world_mean
 from npa_envs.rule.rule import NPARule
 from npa_envs.tasks.appearance import OUTPUTS, Appearance, Gaussians, draw_gaussians
 from npa_envs.tasks.base import shares_of_loss

@@ -10,9 +10,7 @@ from typing import Any, Generic, Literal, TypeVar, get_args
 
 import torch
 
-from npa_envs.devices import parse_device
-from npa_envs.errors import NPAError, shown
-from npa_envs.ops.checks import (
+from npa_envs.checks import (
     MomentInverse,
     check_flag,
     check_non_negative,
@@ -21,6 +19,8 @@ from npa_envs.ops.checks import (
     is_real,
     is_whole,
 )
+from npa_envs.devices import parse_device
+from npa_envs.errors import NPAError, shown
 from npa_envs.world.rollout import Memory
 
 TaskConfigT = TypeVar("TaskConfigT")

@@ -12,9 +12,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from npa_envs.checks import is_real, is_whole
 from npa_envs.errors import NPAError, shown
 from npa_envs.files import atomic_path, check_torch_archive, open_regular
-from npa_envs.ops.checks import is_real, is_whole
 from npa_envs.tasks.train_config import TrainConfig
 from npa_envs.training.overrides import config_to_dict
 

@@ -11,13 +11,13 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+from npa_envs.checks import is_real, is_whole
 from npa_envs.errors import MissingDependencyError, NPAError
 from npa_envs.files import (
     read_bytes,
     remove_unfinished,
     write_text,
 )
-from npa_envs.ops.checks import is_real, is_whole
 
 try:
     import fcntl

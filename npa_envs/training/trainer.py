@@ -14,10 +14,10 @@ from typing import Any
 import torch
 from tqdm import tqdm
 
+from npa_envs.checks import is_real
 from npa_envs.devices import check_device
 from npa_envs.errors import DivergedError, NPAError, shown
 from npa_envs.files import write_text
-from npa_envs.ops.checks import is_real
 from npa_envs.rule.files import first_rules, load_rule, save_rule
 from npa_envs.rule.rule import NPARule, dividing, with_codes
 from npa_envs.tasks.base import GoalTask, Task, differing_fields, untrained_rule

@@ -9,8 +9,8 @@ import gymnasium
 from torch import Tensor
 
 from npa_envs.agents.policies import RandomPolicy, RulePolicy, ZeroPolicy
+from npa_envs.checks import is_whole
 from npa_envs.errors import NPAError, shown, suggest
-from npa_envs.ops.checks import is_whole
 from npa_envs.registration import ALL, CODED, GARDEN_IDS
 from npa_envs.rule.files import load_rule
 from npa_envs.rule.rule import COLOUR_OFFSET

@@ -13,9 +13,9 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from npa_envs.checks import is_real, is_whole
 from npa_envs.errors import NPAError, shown, suggest
 from npa_envs.files import open_regular, parse_json
-from npa_envs.ops.checks import is_real, is_whole
 from npa_envs.rule.files import load_rule, rule_file, rule_metadata, shipped_rules
 from npa_envs.rule.rule import NPARule
 from npa_envs.tasks.base import (

@@ -27,8 +27,8 @@ from typing import Any, Literal, NamedTuple, Protocol, Self
 import torch
 from torch import Tensor
 
+from npa_envs.checks import FiniteCheck, check_finite_positions
 from npa_envs.errors import NPAError, shown
-from npa_envs.ops.checks import FiniteCheck, check_finite_positions
 from npa_envs.ops.opaque import once_differentiable
 from npa_envs.rule.rule import NPARule
 from npa_envs.world.cuda_graph import Captured, capture, current_stream, prepare_capture

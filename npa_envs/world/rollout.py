@@ -12,8 +12,7 @@ import torch
 from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
-from npa_envs.errors import NPAError, shown
-from npa_envs.ops.checks import (
+from npa_envs.checks import (
     Box,
     check_scale,
     check_world,
@@ -23,6 +22,7 @@ from npa_envs.ops.checks import (
     checked_flag,
     checked_number,
 )
+from npa_envs.errors import NPAError, shown
 from npa_envs.ops.static import StaticWorlds, prepare_static
 from npa_envs.rule.network import Network
 from npa_envs.rule.rule import NPARule, check_rule

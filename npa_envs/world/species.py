@@ -9,8 +9,8 @@ from typing import Any, Literal, NamedTuple, Unpack, overload
 import torch
 from torch import Tensor
 
+from npa_envs.checks import Box, check_world, checked_count, checked_number, entries
 from npa_envs.errors import NPAError, shown
-from npa_envs.ops.checks import Box, check_world, checked_count, checked_number, entries
 from npa_envs.ops.perceive import perceive_rows
 from npa_envs.ops.species import checked_counts, perceive_by_species
 from npa_envs.ops.static import StaticRows

@@ -37,6 +37,7 @@ LADDER = {
     "npa_envs._module_search": Rung(0, frozenset({COMPUTED_NAME})),
     "npa_envs.errors": rung(0),
     "npa_envs.registration": rung(0, "gymnasium"),
+    "npa_envs.checks": rung(1, "torch"),
     "npa_envs.devices": rung(1, "torch"),
     "npa_envs.files": rung(1),
     "npa_envs.processes": rung(1),

@@ -1,4 +1,4 @@
-"""Checks of arguments and of configurations: everything behind them may trust what it is given."""
+"""Checks of arguments and of configurations: what lies behind them may trust what it is given."""
 
 from __future__ import annotations
 
