@@ -51,7 +51,7 @@ EXAMPLES: dict[str, tuple[str, ...]] = {
     ),
     "search": (
         "search",
-        "search --kind pair --method cma-me --budget 5e7 --out runs/pairs",
+        "search --method cma-me --budget 5e7 --out runs/alive",
     ),
     "stress": ("stress --quick", "stress --only geometry --out results"),
     "sweep": (
