@@ -88,11 +88,11 @@ def perceived(strategy: Strategy, x: Tensor, s: Tensor, eps: float) -> Perceived
     z = strategy.perceive(x, s, eps)
     cotangent = None
     if strategy.differentiable:
-        cotangent = _cotangent(strategy, x, s, eps, functional_weights(z))
+        cotangent = _cotangent(strategy, x, s, eps, drawn_like(z))
     return Perceived(strategy.density(x, s, eps), z, cotangent)
 
 
-def functional_weights(like: Tensor) -> Tensor:
+def drawn_like(like: Tensor) -> Tensor:
     """Return the weights of a random linear functional, the same numbers in every dtype."""
     generator = torch.Generator(like.device).manual_seed(2)
     return torch.randn(like.shape, generator=generator, device=like.device).to(like.dtype)
@@ -118,7 +118,7 @@ def _perception_row(
     costs = [session.cost(lambda: strategy.perceive(x, s, eps), graph=graph)]
     cotangent = None
     if found.cotangent is not None and exact.cotangent is not None:
-        weights = functional_weights(found.perception)
+        weights = drawn_like(found.perception)
         costs.append(session.cost(lambda: _cotangent(strategy, x, s, eps, weights), graph=graph))
         cotangent = relative_error(found.cotangent, exact.cotangent)
     # States, smoothed states, state gradients, the density gradient.
@@ -206,8 +206,8 @@ class Runner:
         self.x = start.x.to(precision.dtype)
         self.s = precision.kept(start.s.to(precision.dtype))
         # Drawn here: a graph of the functional holds no draws of its own.
-        self._x_weights = functional_weights(self.x)
-        self._s_weights = functional_weights(self.s)
+        self._x_weights = drawn_like(self.x)
+        self._s_weights = drawn_like(self.s)
 
     def advanced(
         self, x: Tensor, s: Tensor, steps: int, generator: torch.Generator
@@ -444,7 +444,7 @@ def _outcome(
         for _ in range(workload.steps):
             mask = drawn_mask(x, workload.update_prob, generator)
             x, s = checkpoint(composed_step, peer, rule, x, s, mask, use_reentrant=False)
-    loss = (x * functional_weights(x)).sum() + (s * functional_weights(s)).sum()
+    loss = (x * drawn_like(x)).sum() + (s * drawn_like(s)).sum()
     by_states, *by_weights = torch.autograd.grad(loss, [states, *rule.parameters()])
     weights = torch.cat([gradient.flatten() for gradient in by_weights])
     return [tensor.detach() for tensor in (x, s, by_states, weights)]
