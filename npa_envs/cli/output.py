@@ -21,7 +21,7 @@ from npa_envs.errors import NPAError, suggest
 OptionsT = TypeVar("OptionsT")
 
 EXAMPLES: dict[str, tuple[str, ...]] = {
-    "bench": ("bench --quick", "bench --suite accuracy --out results --plots"),
+    "bench": ("bench --quick", "bench --suite scaling --out results --plots"),
     "compare": (
         "compare --quick --out quick",
         "compare --seconds 60 --methods gradient ppo --tasks morphogenesis2d",

@@ -211,7 +211,8 @@ def parse(
 
     Ends the process after `--help`, which shows the most used options, and `--help-all`.
     """
-    whole = "--help-all" in arguments
+    # What a help leaves out could not be given either.
+    whole = not {"-h", "--help"} & set(arguments)
     arguments = ["--help" if word == "--help-all" else word for word in arguments]
 
     def read(defaults: Any) -> tuple[TrainOptions, Any]:
@@ -248,7 +249,7 @@ def parse(
 def _without(source: Any, names: Iterable[str], *, whole: bool = True) -> Any:
     """Return a dataclass of which some fields, where it has them, are no options.
 
-    Unless it is shown whole, fields that are not `SHOWN` are options that its help leaves out.
+    Unless it is to be whole, fields that are not `SHOWN` are none either.
     """
     kind: Any = type(source)
     fixed: Any = tyro.conf.Fixed

@@ -61,14 +61,11 @@ LADDER = {
     "npa_envs.measure.record": rung(2, "torch", never=INSIDES),
     "npa_envs.measure.tables": rung(2),
     "npa_envs.measure.plots": rung(2, "matplotlib"),
-    "npa_envs.measure.speed.hash_grid": rung(3, "warp torch", never=("npa_envs.reference",)),
     "npa_envs.measure.judge": rung(10, "torch", never=INSIDES),
     "npa_envs.measure.quality": rung(10, "torch numpy tqdm", never=INSIDES),
     "npa_envs.measure.codes": rung(11, "torch", never=INSIDES),
     "npa_envs.measure.interaction": rung(11, "torch numpy matplotlib", never=ORACLES),
-    "npa_envs.measure.speed": rung(
-        13, "torch numpy matplotlib scipy warpSPHCore", never=("npa_envs.kernels",)
-    ),
+    "npa_envs.measure.speed": rung(13, "torch numpy matplotlib", never=("npa_envs.kernels",)),
     "npa_envs.measure.accuracy": rung(14, "torch matplotlib", never=("npa_envs.kernels",)),
     "npa_envs.measure.robustness": rung(15, "torch", never=ORACLES),
     "npa_envs.measure": rung(16),
@@ -90,7 +87,7 @@ LADDER = {
     "npa_envs.cli": rung(22, "torch numpy tqdm tyro imageio_ffmpeg", never=ORACLES),
     "npa_envs.__main__": rung(23),
 }
-WARP_AND_TORCH = {"npa_envs.ops", "npa_envs.measure.speed.hash_grid"}
+WARP_AND_TORCH = {"npa_envs.ops"}
 
 
 def source_files() -> list[Path]:
