@@ -73,7 +73,7 @@ docs: $(DOCS)
 	$(BIN)/sphinx-build -W --keep-going --quiet -b html -c docs -d build/docs-cache . build/docs
 
 bench-check: $(CORE)
-	OMP_NUM_THREADS=1 $(BIN)/npa-envs bench --quick --device cpu --check benchmarks/results/ratios.json --no-progress
+	OMP_NUM_THREADS=1 $(BIN)/python benchmarks/alternatives.py --quick --device cpu --check benchmarks/results/ratios.json
 
 clean:
 	rm -rf build dist demo *.egg-info .mypy_cache .pytest_cache .ruff_cache .hypothesis

@@ -9,11 +9,11 @@ import torch
 from torch import Tensor
 
 from npa_envs.agents.policies import unwrapped
+from npa_envs.checks import is_real
 from npa_envs.envs.garden.brushwork import Columns, grid_places
 from npa_envs.envs.garden.task import GardenTask, Lacking
 from npa_envs.envs.shepherd2d import ShepherdTask
 from npa_envs.errors import NPAError, shown
-from npa_envs.tasks.checks import is_real
 from npa_envs.world.randomness import Purpose, WorldRandom
 
 FREE_PLACES = 8

@@ -13,9 +13,9 @@ from gymnasium.vector import SyncVectorEnv, VectorEnv
 from numpy.typing import NDArray
 from torch import Tensor
 
+from npa_envs.checks import is_real, is_whole
 from npa_envs.errors import NPAError, shown
 from npa_envs.rule.rule import COLOUR_OFFSET, NPARule
-from npa_envs.tasks.checks import is_real, is_whole
 from npa_envs.world.randomness import Purpose, WorldRandom
 
 Array = TypeVar("Array", NDArray[Any], Tensor)

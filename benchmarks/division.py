@@ -44,12 +44,11 @@ AFTER = (32, 64, 128, 256)
 KINDS: Mapping[str, Mapping[str, Any]] = {
     "disk": {},
     "division": {"division": True},
-    "fixed": {"division": True, "fate_rate": 0.0},
     "disk-96": {"steps": (95, 97)},
     "division-96": {"division": True, "steps": (95, 97)},
 }
-"""What `train` trains of each target: the control, a rule whose particles divide, and one that does
-not learn when to; the first two in longer rollouts."""
+"""What `train` trains of each target: the control and a rule whose particles divide, also in longer
+rollouts."""
 
 
 def train(arguments: argparse.Namespace) -> None:

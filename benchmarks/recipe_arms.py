@@ -56,26 +56,17 @@ STRAYS: Fields = {
 
 NO_STRAYS: Fields = dict.fromkeys(STRAYS, 0.0) | {"bound_weight": 100.0}
 
-FIRST: Fields = {
+SECOND: Fields = {
     **STRAYS,
     "lifetimes": (64, 16_384),
     "pool_size": 64,
     "schedule": "cosine",
     "learning_rate": 1e-3,
-    "average": 0.999,
-    "blur_levels": 3,
     "steps": (48, 80),
-}
-"""The first candidate: worlds of all ages, all of them damaged."""
-
-SECOND: Fields = {
-    **FIRST,
-    "average": 0.0,
-    "blur_levels": 0,
     "damage_share": 0.5,
     "stray_share": 5e-5,
 }
-"""The second candidate: half of the worlds are left to themselves; what did not help is gone.
+"""The second candidate: worlds of all ages, of which half are left to themselves.
 
 Its damaged worlds were those of every other place of the pool, the longest-lived ones too."""
 
@@ -86,15 +77,6 @@ THIRD: Fields = SECOND | {
 }
 """The third candidate: fewer seeds, older worlds, and only worlds of short lives are damaged."""
 
-FIFTH: Fields = THIRD | {
-    "lifetimes": (128, 32_768),
-    "pool_size": 32,
-    "ageing_steps": 512,
-    "damage_radius": 0.2,
-    "initial_rule": "heart-v0",
-}
-"""The fifth candidate: a rule that has learned to grow and to last learns another picture."""
-
 SEVENTH: Fields = {
     **STRAYS,
     "seed_interval": 1,
@@ -103,7 +85,7 @@ SEVENTH: Fields = {
     "steps": (32, 64),
     "schedule": "cosine",
     "learning_rate": 2e-3,
-    "initial_rule": "heart-v0",
+    "initial_rule": "heart-first",
 }
 """What serves `fast`, in large: half of the worlds are seeds, none is old. Not at full size."""
 
@@ -117,7 +99,7 @@ EIGHTH: Fields = {
     "damage_share": 0.25,
     "damage_radius": 0.2,
     "rest_weight": 2.0,
-    "initial_rule": "heart-v0",
+    "initial_rule": "heart-first",
 }
 """The eighth candidate: grown worlds are to rest."""
 
@@ -142,16 +124,12 @@ FAST_BEFORE: Fields = {
 }
 """The preset `fast` as it was when its arms were compared, laid over what it is."""
 
-FAST_FIRST: Fields = {
+FAST_SECOND: Fields = {
     "lifetimes": (24, 2048),
     "pool_size": 16,
     "schedule": "cosine",
-    "average": 0.99,
-    "blur_levels": 2,
+    "damage_share": 0.5,
 }
-"""The first candidate in small."""
-
-FAST_SECOND: Fields = FAST_FIRST | {"average": 0.0, "blur_levels": 0, "damage_share": 0.5}
 """The second candidate in small."""
 
 FAST_STRAYS: Fields = STRAYS | {"stray_share": 1e-3}
@@ -181,18 +159,6 @@ FAST_EIGHTH: Fields = {
 ARMS: Mapping[str, Fields] = {
     "paper": {},
     "paper, seeds every 3rd": {"seed_interval": 3},
-    "first": FIRST,
-    "first, no ages, seeds every 3rd": {
-        **FIRST,
-        "lifetimes": (0, 0),
-        "pool_size": 512,
-        "seed_interval": 3,
-    },
-    "first, no average": FIRST | {"average": 0.0},
-    "first, no blur": FIRST | {"blur_levels": 0},
-    "first, no strays": FIRST | NO_STRAYS,
-    "first, milestones": FIRST | {"schedule": "milestones"},
-    "first, rate 2e-3": FIRST | {"learning_rate": 2e-3},
     "second": SECOND,
     "second, no strays": SECOND | NO_STRAYS,
     "second, share 0.25": SECOND | {"damage_share": 0.25},
@@ -205,10 +171,6 @@ ARMS: Mapping[str, Fields] = {
     "third": THIRD,
     "third, no strays": THIRD | NO_STRAYS,
     "third, lifetimes from 64": THIRD | {"lifetimes": (64, 32_768)},
-    "fifth": FIFTH,
-    "fifth, untrained": FIFTH | {"initial_rule": ""},
-    "fifth, no ageing": FIFTH | {"ageing_steps": 0},
-    "fifth, rate 5e-4": FIFTH | {"learning_rate": 5e-4},
     "seventh": SEVENTH,
     "eighth": EIGHTH,
     "eighth, rest 1": EIGHTH | {"rest_weight": 1.0},
@@ -241,16 +203,9 @@ FAST_ARMS: Mapping[str, Fields] = {
     "fast": {},
     "fast, share 0.5": {"damage_share": 0.5},
     "fast, rate 4e-3": {"learning_rate": 4e-3},
-    "first": FAST_FIRST,
-    "first, no ages": FAST_FIRST | {"lifetimes": (0, 0), "pool_size": 32},
-    "first, no average": FAST_FIRST | {"average": 0.0},
-    "first, no blur": FAST_FIRST | {"blur_levels": 0},
-    "first, milestones": FAST_FIRST | {"schedule": "milestones"},
-    "first, strays": FAST_FIRST | STRAYS,
-    "first, rate 1e-3": FAST_FIRST | {"learning_rate": 1e-3},
     "second": FAST_SECOND,
     "second, rate 4e-3": FAST_SECOND | {"learning_rate": 4e-3},
-    "second, no damage": FAST_SECOND | {"damage": False},
+    "second, no damage": FAST_SECOND | {"damage_share": 0.0},
     "second, strays": FAST_SECOND | FAST_STRAYS,
     "second, steps 32 to 48": FAST_SECOND | {"steps": (32, 48), "iterations": 1440},
     "second, 4 worlds": FAST_SECOND | {"world_count": 4, "iterations": 1200},

@@ -22,13 +22,48 @@ from torch import Tensor
 
 import npa_envs
 from npa_envs.measure.speed.timing import relative_error
-from npa_envs.tasks.appearance import RENDERERS
+from npa_envs.ops import Cameras
+from npa_envs.tasks.appearance import Gaussians, draw_gaussians
 from npa_envs.tasks.targets.views import some_views
 from npa_envs.training.trained_tasks import task_of_rule
 from npa_envs.world.cuda_graph import capture
 
 DEVICE = torch.device("cuda")
 NAMES = ("own", "gsplat")
+
+
+def gsplat_renderer(x: Tensor, gaussians: Gaussians, cameras: Cameras) -> tuple[Tensor, Tensor]:
+    """Draw with gsplat; not inside a CUDA graph, as it reads numbers back."""
+    fx, fy, cx, cy = cameras.intrinsics.to(x.dtype).expand(cameras.count, 4).unbind(dim=-1)
+    zero, one = torch.zeros_like(fx), torch.ones_like(fx)
+    lenses = torch.stack((fx, zero, cx, zero, fy, cy, zero, zero, one), dim=-1).view(-1, 3, 3)
+    # gsplat takes zero-length rotations for numbers that are none.
+    turned = gaussians.quaternions
+    upright = torch.nn.functional.pad(torch.ones_like(turned[..., :1]), (0, 3))
+    turned = torch.where((turned == 0.0).all(dim=-1, keepdim=True), upright, turned)
+    images, alphas = [], []
+    for world in range(len(x)):
+        image, alpha, _ = gsplat.rasterization(
+            x[world],
+            turned[world],
+            gaussians.scales[world],
+            gaussians.opacities[world],
+            gaussians.colours[world],
+            cameras.world_to_camera.to(x.dtype),
+            lenses,
+            cameras.width,
+            cameras.height,
+            near_plane=cameras.near,
+            sh_degree=1,
+            packed=False,
+        )
+        images.append(image)
+        alphas.append(alpha[..., 0])
+    return torch.stack(images), torch.stack(alphas)
+
+
+RENDERERS = {"own": draw_gaussians, "gsplat": gsplat_renderer}
+"""By name."""
 
 
 def median_time(call: Callable[[], object]) -> float:

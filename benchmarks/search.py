@@ -46,7 +46,7 @@ COLOURS = {"map-elites": "C0", "cma-me": "C1", "cma-es": "C2", "random": "C7"}
 
 def run(arguments: Any) -> None:
     """Run all searches, one seed after the other, and write what they came to after each."""
-    world = SearchWorld(kind=arguments.kind, particle_count=arguments.particles)
+    world = SearchWorld(particle_count=arguments.particles)
     facts = {
         **script_facts(arguments),
         "world": asdict(world),
@@ -56,7 +56,7 @@ def run(arguments: Any) -> None:
     runs: dict[str, list[dict[str, Any]]] = {method: [] for method in arguments.methods}
     for seed in range(arguments.seeds):
         for method in arguments.methods:
-            folder = arguments.out / f"{arguments.kind}-{method}-{seed}"
+            folder = arguments.out / f"rule-{method}-{seed}"
             folder.mkdir(parents=True, exist_ok=True)
             search = Search(
                 world,
@@ -132,7 +132,6 @@ def main() -> None:
     parser = script_parser(__doc__)
     parser.add_argument("command", choices=("run", "draw"))
     parser.add_argument("--out", type=Path, default=Path("runs/searches"))
-    parser.add_argument("--kind", choices=("rule", "pair"), default="rule")
     parser.add_argument("--methods", nargs="+", choices=list(METHODS), default=list(METHODS))
     parser.add_argument("--seeds", type=int, default=5)
     parser.add_argument("--particles", type=int, default=128)

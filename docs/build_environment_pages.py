@@ -38,7 +38,7 @@ from npa_envs.envs.core.single import NPAEnv
 from npa_envs.envs.core.vector import NPAVectorEnv
 from npa_envs.envs.garden.environments import GardenEnv
 from npa_envs.envs.garden.worlds import LivingWorlds
-from npa_envs.registration import CODED, ENVIRONMENTS, GARDENS, LATER, SIZES, SMALL, Registration
+from npa_envs.registration import CODED, ENVIRONMENTS, GARDENS, SIZES, SMALL, Registration
 
 DOCS = Path(__file__).resolve().parent
 PAGES = DOCS / "environments"
@@ -124,7 +124,7 @@ def argument_tables(config_type: type[EnvConfig]) -> str:
 def small_forms(registration: Registration) -> str:
     """Return what ids with other keywords there are of an environment, Markdown."""
     told = ""
-    for small in (*SMALL, *SIZES, *LATER):
+    for small in (*SMALL, *SIZES):
         if small.name == registration.name:
             given = ", ".join(
                 f"`{name}={default_text(value).strip('`')}`"

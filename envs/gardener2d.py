@@ -8,11 +8,11 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from npa_envs.checks import check_fraction, check_non_negative, check_positive
 from npa_envs.envs.core.task import Start
 from npa_envs.envs.garden.config import GardenConfig
 from npa_envs.envs.garden.environments import GardenEnv, GardenVectorEnv
 from npa_envs.envs.garden.task import GardenTask, lost_share, marks_of_whole
-from npa_envs.tasks.checks import check_fraction, check_non_negative, check_positive
 from npa_envs.tasks.damage import random_particle
 from npa_envs.world.brushes import erase_state, push
 from npa_envs.world.randomness import Purpose, WorldRandom

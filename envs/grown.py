@@ -9,16 +9,20 @@ from typing import ClassVar, TypeVar, get_args
 import torch
 from torch import Tensor
 
+from npa_envs.checks import check_positive
 from npa_envs.envs.core.config import EnvConfig
 from npa_envs.envs.core.task import Start
 from npa_envs.envs.morphogenesis2d import Morphogenesis2DEnvConfig, PictureTask
 from npa_envs.errors import NPAError, shown
-from npa_envs.rule.files import frozen_rule, load_rule, shipped_rules
+from npa_envs.rule.files import load_rule, shipped_rules
 from npa_envs.rule.rule import NPARule
-from npa_envs.tasks.checks import check_positive
 from npa_envs.tasks.targets.clouds import Split
 from npa_envs.world.randomness import Purpose, WorldRandom
 from npa_envs.world.rollout import rollout
+
+FIRST_RULES = {"gecko": "gecko-v0", "heart": "heart-first"}
+"""Rules that grow these targets where no rule is given; other targets are grown by the shipped rule
+of their name. A rule that is trained anew does not replace one of these."""
 
 FIRST_TEST_SEED = 1_000_000
 """Pools have no more worlds than this."""
@@ -36,9 +40,8 @@ class GrownConfig(Morphogenesis2DEnvConfig):
     which takes `grow_steps` steps of the rule."""
 
     rule: str | None = None
-    """What grows the worlds: a shipped rule or a rule's file; None: the rule that was shipped with
-    the target's name when environments of version 0 were frozen
-    (`npa_envs.rule.files.frozen_rule`)."""
+    """What grows the worlds: a rule of the package or a rule's file; None: `heart-first` for the
+    target "heart", `gecko-v0` for "gecko", and the shipped rule of its name for another one."""
 
     split: Split = "train"
     """Which grown worlds the pool holds: "train", or "test" for others that evaluate what was
@@ -166,13 +169,18 @@ def run_rule(
     )
 
 
+def growing_rule(config: GrownConfig) -> str:
+    """Return the name or the file of the rule that grows the worlds of a configuration."""
+    return config.rule or FIRST_RULES.get(config.target, config.target)
+
+
 def _load_rule(config: GrownConfig, device: torch.device) -> NPARule:
     if config.rule is None and config.target not in (known := shipped_rules("morphogenesis2d")):
         raise NPAError(
             "rule must say what grows the worlds, as no shipped rule grows "
             f"{shown(config.target)} ({', '.join(known)}): give rule='PATH'{config.without_rule}"
         )
-    rule = load_rule(config.rule or frozen_rule(config.target), device=device)
+    rule = load_rule(growing_rule(config), device=device)
     wanted = {
         "space_dim": 2,
         "state_dim": config.state_dim,

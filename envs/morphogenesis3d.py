@@ -12,6 +12,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from npa_envs.checks import check_positive
 from npa_envs.envs.core.config import EnvConfig
 from npa_envs.envs.core.single import NPAEnv
 from npa_envs.envs.core.task import TURN, GoalTask
@@ -20,7 +21,6 @@ from npa_envs.errors import NPAError, shown
 from npa_envs.render import turntable_frames
 from npa_envs.rule.files import load_rule
 from npa_envs.rule.rule import NPARule
-from npa_envs.tasks.checks import check_positive
 from npa_envs.tasks.morphogenesis3d import Morphogenesis3D, Morphogenesis3DConfig
 
 PIXEL_BYTES = 200
@@ -149,8 +149,8 @@ class Morphogenesis3DEnv(NPAEnv):
     `particle_count=16384`, `state_dim=24`, `eps` and `eps0` 0.1, `alpha=1.0`, `seed_radius` 0.7
     (the mushroom's 0.5), `sigma=0.02`, `opacity=0.15`. The duck needs `particle_count=8192`,
     `eps` and `eps0` 0.126, `sigma=0.014`, `opacity=0.6`, and views of `resolution=192`: its finer
-    particles are worse than those of `duck-v0`, the duck that was shipped before, in views of 48
-    pixels. `duck-v0` needs what the others need.
+    particles are worse than those of the rule `duck-v0` in views of 48 pixels. `duck-v0` needs
+    what the others need.
 
     ## Observation space
 

@@ -12,6 +12,7 @@ from gymnasium.spaces import Box
 from numpy.typing import NDArray
 from torch import Tensor
 
+from npa_envs.checks import check_flag, check_positive
 from npa_envs.envs.core.config import EnvConfig, WorldConfig
 from npa_envs.envs.core.memory import OBSERVATION_COPIES
 from npa_envs.envs.core.single import NPAEnv
@@ -21,7 +22,6 @@ from npa_envs.envs.core.vector import NPAVectorEnv
 from npa_envs.envs.core.worlds import Worlds
 from npa_envs.envs.morphogenesis2d import PictureConfig, PictureTask
 from npa_envs.errors import NPAError, shown
-from npa_envs.tasks.checks import check_flag, check_positive
 from npa_envs.tasks.many_pictures import ManyPictures, named_targets
 from npa_envs.tasks.morphogenesis2d import Morphogenesis2DConfig
 from npa_envs.tasks.targets.clouds import Split

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from npa_envs import world_mean
+from npa_envs.checks import check_positive
 from npa_envs.envs.core.config import EnvConfig
 from npa_envs.envs.core.single import NPAEnv
 from npa_envs.envs.core.task import GoalTask, Start
@@ -19,7 +20,6 @@ from npa_envs.envs.core.vector import NPAVectorEnv
 from npa_envs.errors import NPAError, shown
 from npa_envs.rule.files import load_rule
 from npa_envs.rule.rule import COLOUR_OFFSET, NPARule
-from npa_envs.tasks.checks import check_positive
 from npa_envs.tasks.point_classification import (
     PICTURE_MARGIN,
     PointClassification,

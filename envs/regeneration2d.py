@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from npa_envs.checks import check_flag, check_fraction, check_positive
 from npa_envs.envs.core.single import NPAEnv
 from npa_envs.envs.core.task import Start
 from npa_envs.envs.core.vector import NPAVectorEnv
@@ -15,7 +16,6 @@ from npa_envs.envs.grown import GrownConfig, GrownTask
 from npa_envs.envs.morphogenesis2d import PictureTask
 from npa_envs.errors import NPAError, shown, suggest
 from npa_envs.rule.rule import COLOUR_OFFSET
-from npa_envs.tasks.checks import check_flag, check_fraction, check_positive
 from npa_envs.tasks.damage import damage_worlds
 from npa_envs.world.randomness import Purpose, WorldRandom
 
@@ -53,11 +53,15 @@ class Regeneration2DEnvConfig(GrownConfig):
     [length units]; None: 0.3, 0.1, 0.2 and 0.05."""
 
     rule: str | None = None
-    """What grows the worlds: a shipped rule, or a rule's file; None: the rule that was shipped with
-    the target's name when environments of version 0 were frozen. "picture" starts from the target's
-    own points instead, with blank hidden states."""
+    """What grows the worlds: a rule of the package or a rule's file; None: `heart-first` for the
+    target "heart", `gecko-v0` for "gecko", and the shipped rule of its name for another one.
+    "picture" starts from the target's own points instead, with blank hidden states."""
 
-    split_damage: bool = False
+    seed_pool: int = 256
+    """As elsewhere: episodes start from one of so many grown worlds, each made once; 0: from a new
+    one each time."""
+
+    split_damage: bool = True
     """Damage of split="test" is drawn apart from that of "train", also where `reset` is given the
     same seeds."""
 
@@ -143,9 +147,9 @@ class Regeneration2DEnv(NPAEnv):
     to change its state, so that the picture becomes whole again. As in `npa/Morphogenesis2D-v0`, a
     particle perceives only its neighbourhood. Nobody tells it that there was damage.
 
-    Update rules that grow pictures can also heal them. The rule `gecko-v0`, the gecko that was
-    shipped when these worlds were frozen, has grown them, so their hidden states mean something to
-    it: `npa_envs.agents.RulePolicy(npa_envs.load_rule("gecko-v0"), env)` shows what it can do.
+    Update rules that grow pictures can also heal them. The rule `gecko-v0` has grown these worlds,
+    so their hidden states mean something to it:
+    `npa_envs.agents.RulePolicy(npa_envs.load_rule("gecko-v0"), env)` shows what it can do.
     Another policy cannot read these hidden states. With `rule="picture"` episodes start from the
     target's own points instead, with blank hidden states.
     Spaces, reward and `info` are those of `Morphogenesis2DEnv`.
@@ -153,13 +157,13 @@ class Regeneration2DEnv(NPAEnv):
     ## Starting state
 
     The rule grows a world for `grow_steps` steps from a disk of blank particles. Then one kind of
-    damage is done to it. The worlds are made once: with the default `seed_pool=4` there are four,
-    and 256 in `npa/Regeneration2D-v1`. On a CPU each is grown when an episode first starts from it,
-    which takes 0.4 s of CPU time with 1024 particles; on CUDA the first reset grows all of them.
-    The damage is drawn anew for each episode.
+    damage is done to it. The worlds are made once: with the default `seed_pool=256` there are 256.
+    On a CPU each is grown when an episode first starts from it, which takes 0.4 s of CPU time with
+    1024 particles; on CUDA the first reset grows all of them. The damage is drawn anew for each
+    episode.
 
-    `split="test"` has grown worlds of its own, as many, and in v1 damage of its own as well: learn
-    with "train", evaluate with "test".
+    `split="test"` has grown worlds of its own, as many, and damage of its own: learn with "train",
+    evaluate with "test".
 
     | `damage` | What is done |
     |---|---|
@@ -177,10 +181,6 @@ class Regeneration2DEnv(NPAEnv):
     The damage adds to the loss. The episode ends in success once `healed_share` of this addition is
     gone. If you give `success_loss`, it ends once the loss is at most this instead. If damage
     raises the loss by less than 2 %, there is nothing to heal, and the episode runs to its limit.
-
-    ## Version history
-
-    - v1: 256 grown worlds instead of four, and damage that `split="test"` draws apart.
     """
 
     task_type = RegenerationTask

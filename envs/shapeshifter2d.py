@@ -14,9 +14,10 @@ import torch.nn.functional as F
 from gymnasium.spaces import Box, Discrete, Space
 from torch import Tensor
 
+from npa_envs.checks import check_positive, number_tensor
 from npa_envs.envs.core.config import EnvConfig
 from npa_envs.envs.core.single import NPAEnv
-from npa_envs.envs.core.spaces import Rows, action_tensor, number_tensor
+from npa_envs.envs.core.spaces import Rows, action_tensor
 from npa_envs.envs.core.task import EnvTask, Start
 from npa_envs.envs.core.vector import NPAVectorEnv
 from npa_envs.envs.garden.config import GardenReward
@@ -26,7 +27,6 @@ from npa_envs.errors import NPAError
 from npa_envs.rule.codes import Codes
 from npa_envs.rule.files import load_rule
 from npa_envs.rule.rule import NPARule
-from npa_envs.tasks.checks import check_positive
 from npa_envs.tasks.many_pictures import ManyPictures
 from npa_envs.tasks.morphogenesis2d import Morphogenesis2DConfig
 from npa_envs.training.trained_tasks import sources_of_codes

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from npa_envs import world_mean
+from npa_envs.checks import check_non_negative, check_positive
 from npa_envs.envs.core.spaces import to_output
 from npa_envs.envs.core.task import Start
 from npa_envs.envs.garden.config import GardenConfig, GardenReward
@@ -20,7 +21,6 @@ from npa_envs.envs.garden.environments import GardenEnv, GardenVectorEnv
 from npa_envs.envs.garden.forms import Brushes
 from npa_envs.envs.garden.task import SEEN_LIMIT, GardenTask, lost_share, marks_of_whole
 from npa_envs.errors import NPAError
-from npa_envs.tasks.checks import check_non_negative, check_positive
 from npa_envs.tasks.seeds import uniform_ball
 from npa_envs.world.actions import Physics
 from npa_envs.world.randomness import WorldRandom

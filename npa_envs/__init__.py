@@ -8,7 +8,6 @@ from importlib import import_module as _import_module
 from typing import TYPE_CHECKING, Any
 
 from npa_envs._module_search import extend_path as _extend_path
-from npa_envs._module_search import keep_old_names as _keep_old_names
 from npa_envs.registration import register_environments as _register_environments
 
 if TYPE_CHECKING:
@@ -30,7 +29,6 @@ if TYPE_CHECKING:
     from npa_envs.world.species import rollout_species
 
 _extend_path(__path__, __file__)
-_keep_old_names()
 _register_environments()
 
 __version__ = "0.1.0"

@@ -146,10 +146,10 @@ _LARGE_INVASION: Mapping[str, Any] = {
 }
 
 
-def _form(name: str, size: str, steps: int, version: int = 0, **keywords: Any) -> Registration:
+def _form(name: str, size: str, steps: int, **keywords: Any) -> Registration:
     """Return a form of one of `ENVIRONMENTS` with other keywords."""
     usual = next(row for row in ENVIRONMENTS if row.name == name)
-    form_id = usual.id.replace("-v0", f"{size}-v{version}")
+    form_id = usual.id.replace("-v0", f"{size}-v0")
     return Registration(form_id, usual.module, name, steps, MappingProxyType(keywords))
 
 
@@ -199,15 +199,7 @@ SIZES = (
 """Worlds of few particles, in which PPO learns within minutes on a laptop, and of many, for a GPU.
 Settings are never changed under the same version."""
 
-_MANY_WOUNDS: Mapping[str, Any] = {"seed_pool": 256, "split_damage": True}
-
-LATER = (
-    _form("Regeneration2D", "", 128, 1, **_MANY_WOUNDS),
-    _form("Regeneration2D", "Large", 256, 1, particle_count=4096, resolution=128, **_MANY_WOUNDS),
-)
-"""Later versions, which begin otherwise than version 0; settings of both are never changed."""
-
-ALL = (*ENVIRONMENTS, *GARDENS, *CODED, *SMALL, *SIZES, *LATER)
+ALL = (*ENVIRONMENTS, *GARDENS, *CODED, *SMALL, *SIZES)
 """All that Gymnasium knows."""
 
 

@@ -30,8 +30,7 @@ def unpacked(text: str, shape: Sequence[int]) -> Tensor:
 
 def described(rule: NPARule) -> dict[str, Any]:
     weights = {name: packed(tensor.detach()) for name, tensor in rule.state_dict().items()}
-    left_out = {"moment_inverse": "threshold", "dead_zone": 0.0}
-    return {**left_out | rule.hyper_parameters(), "weights": weights}
+    return {**rule.hyper_parameters(), "weights": weights}
 
 
 def scattered(count: int, dimension: int, channels: int, box: Box) -> tuple[Tensor, Tensor]:

@@ -12,11 +12,11 @@ from gymnasium.utils import RecordConstructorArgs
 from numpy.typing import NDArray
 from torch import Tensor
 
+from npa_envs.checks import is_whole
 from npa_envs.envs.core.single import NPAEnv
 from npa_envs.envs.core.spaces import to_output
 from npa_envs.envs.core.vector import NPAVectorEnv
 from npa_envs.errors import NPAError, shown
-from npa_envs.tasks.checks import is_whole
 from npa_envs.tasks.damage import DamageEvent, damage_worlds, parse_damage
 from npa_envs.world.randomness import Purpose
 from npa_envs.wrappers.base import (

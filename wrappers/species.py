@@ -12,11 +12,11 @@ from gymnasium.spaces import Box, Space
 from gymnasium.utils import RecordConstructorArgs
 from torch import Tensor
 
+from npa_envs.checks import is_real, is_whole
 from npa_envs.envs.core.single import NPAEnv
 from npa_envs.envs.core.spaces import to_output
 from npa_envs.envs.core.vector import NPAVectorEnv
 from npa_envs.errors import NPAError, shown, suggest
-from npa_envs.tasks.checks import is_real, is_whole
 from npa_envs.world.randomness import Purpose, WorldRandom
 from npa_envs.wrappers.base import (
     AnyVectorEnv,

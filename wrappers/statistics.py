@@ -22,10 +22,10 @@ from gymnasium.vector import AutoresetMode
 from numpy.typing import NDArray
 from torch import Tensor
 
+from npa_envs.checks import is_real, is_whole
 from npa_envs.envs.core.single import NPAEnv
 from npa_envs.envs.core.vector import NPAVectorEnv
 from npa_envs.errors import NPAError, shown, suggest
-from npa_envs.tasks.checks import is_real, is_whole
 from npa_envs.world.actions import Physics
 from npa_envs.wrappers.base import (
     AnyVectorEnv,

@@ -63,21 +63,14 @@ KEPT_METHODS = ("ppo", "shac")
 """Methods whose runs can be kept in a folder, go on from there, and be shared by processes."""
 
 GARDEN_METHODS: dict[str, str] = {
-    "gradient": "npa_envs.agents.learning.gardeners:train_gradient",
+    "gradient": "npa_envs.agents.learning.baselines:tend_gradient",
     "ppo_world": "npa_envs.agents.learning.garden_sb3:train_ppo",
     "sac": "npa_envs.agents.learning.garden_sb3:train_sac",
-    "random": "npa_envs.agents.learning.gardeners:train_random",
-    "zero": "npa_envs.agents.learning.gardeners:train_zero",
-    "scripted": "npa_envs.agents.learning.gardeners:train_scripted",
+    "random": "npa_envs.agents.learning.baselines:tend_random",
+    "zero": "npa_envs.agents.learning.baselines:tend_zero",
+    "scripted": "npa_envs.agents.learning.baselines:tend_scripted",
 }
 """The same for gardens, where a rule runs the particles: those that learn return policies."""
-
-REMOVED = {
-    "ppo_rows": "take 'ppo_world', Stable-Baselines3's PPO with a likelihood a world, which in the "
-    "same 12 s on an H200 returned 0.615 instead of 0.302 in growth, 0.187 instead of 0.020 in "
-    "regeneration and 0.877 instead of 0.340 in mixing, from twice as many particle-steps",
-}
-"""Methods that there were, and what to take instead."""
 
 
 class Trained(NamedTuple):
@@ -254,8 +247,6 @@ def _declared(function: Callable[..., Any]) -> Any:
 
 
 def _function(method: str, table: dict[str, str]) -> Callable[..., Any]:
-    if method in REMOVED:
-        raise NPAError(f"method {shown(method)} is no more: {REMOVED[method]}")
     if not isinstance(method, str) or (method not in table and ":" not in method):
         raise NPAError(
             f"method must be a known word, got {shown(method)}: {suggest(method, table)}"

@@ -11,8 +11,8 @@ from torch import Tensor
 from npa_envs.agents.learning.problem import Problem, world_seeds
 from npa_envs.agents.learning.progress import Progress, annealed
 from npa_envs.agents.learning.rules import RuleSet, Source, starting_rules
+from npa_envs.checks import check_fraction, check_positive, is_real
 from npa_envs.errors import NPAError, shown
-from npa_envs.tasks.checks import check_fraction, check_positive, is_real
 
 VARIANCE_FLOOR = 1e-8
 """Added to the variance of the teacher's actions: what it never does is still to be learned."""

@@ -23,8 +23,8 @@ from npa_envs.agents.learning.progress import Progress
 from npa_envs.agents.learning.rules import RuleSet, starting_rules
 from npa_envs.agents.learning.weights import RuleWeights, layers_of, updates_of
 from npa_envs.agents.policies import bounded, perceived
+from npa_envs.checks import check_positive
 from npa_envs.errors import MissingDependencyError
-from npa_envs.tasks.checks import check_positive
 
 
 @dataclass(frozen=True, kw_only=True)

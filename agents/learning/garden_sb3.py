@@ -12,12 +12,12 @@ import torch
 from gymnasium.spaces import Dict
 from numpy.typing import NDArray
 
-from npa_envs.agents.learning.gardeners import check_no_start
+from npa_envs.agents.learning.baselines import check_no_garden_start
 from npa_envs.agents.learning.problem import Problem, world_seeds
 from npa_envs.agents.learning.progress import Progress
 from npa_envs.agents.learning.rules import RuleSet
+from npa_envs.checks import check_fraction, check_positive
 from npa_envs.errors import MissingDependencyError, NPAError, shown
-from npa_envs.tasks.checks import check_fraction, check_positive
 from npa_envs.wrappers.sb3 import WorldVecEnv, on_host
 
 try:
@@ -65,7 +65,7 @@ class SACOptions(GardenOptions):
 
 
 @dataclass(frozen=True, kw_only=True)
-class PPOOptions(GardenOptions):
+class GardenPPOOptions(GardenOptions):
     """Options of `train_ppo`."""
 
     steps: int = 32
@@ -81,7 +81,7 @@ class PPOOptions(GardenOptions):
         check_positive(self, int, "batch_size", at_least=2)
 
 
-SAC_DEFAULTS, PPO_DEFAULTS = SACOptions(), PPOOptions()
+SAC_DEFAULTS, PPO_DEFAULTS = SACOptions(), GardenPPOOptions()
 
 
 def train_sac(
@@ -112,7 +112,7 @@ def train_ppo(
     *,
     device: torch.device,
     start: RuleSet | None = None,
-    options: PPOOptions = PPO_DEFAULTS,
+    options: GardenPPOOptions = PPO_DEFAULTS,
 ) -> GardenPolicy:
     """Return what PPO (Schulman et al., arXiv 1707.06347) finds within a budget.
 
@@ -135,7 +135,7 @@ def _learned(
     start: RuleSet | None,
     options: GardenOptions,
 ) -> GardenPolicy:
-    check_no_start(start)
+    check_no_garden_start(start)
     env = WorldVecEnv(problem.make_envs(device=device))
     has_goals = isinstance(env.observation_space, Dict)
     model = algorithm(

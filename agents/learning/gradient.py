@@ -14,13 +14,13 @@ import npa_envs
 from npa_envs.agents.learning.problem import Problem
 from npa_envs.agents.learning.progress import Progress, annealed
 from npa_envs.agents.learning.rules import RuleSet, starting_rules
+from npa_envs.checks import check_fraction
 from npa_envs.envs.core.task import EnvTask
 from npa_envs.envs.multi.task import Population, SpeciesConfig, SpeciesTask
 from npa_envs.errors import NPAError, shown
 from npa_envs.rule.network import FoldedRule
 from npa_envs.rule.rule import NPARule
 from npa_envs.tasks.base import Task
-from npa_envs.tasks.checks import check_fraction
 from npa_envs.tasks.train_config import TrainConfig
 from npa_envs.training.cycle import TrainingCycle
 from npa_envs.world.randomness import Randomness, WorldRandom
@@ -61,9 +61,6 @@ class GradientOptions:
 
     last_rate: float = 0.05
     """Learning rate at the end, as a share of the first."""
-
-    normalise_gradients: bool = True
-    """Divide each parameter's gradient by its own norm."""
 
     memory: Memory = "store"
     """What the backward pass reads: "store", "recompute" or "minimal", as in `rollout`."""
@@ -170,10 +167,9 @@ def _trainer_config(
         learning_rate=options.learning_rate,
         last_rate=options.last_rate,
         milestones=(),
-        normalise_gradients=options.normalise_gradients,
         seed_interval=1,
         fresh_share=options.fresh_share if pool_size else 1.0,
-        damage=False,
+        damage_share=0.0,
         seed=seed,
         device=str(device),
         memory=options.memory,

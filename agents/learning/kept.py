@@ -14,9 +14,9 @@ from torch import Tensor
 
 from npa_envs.agents.learning.progress import Entry, Learner, Progress
 from npa_envs.agents.learning.rules import RuleSet
+from npa_envs.checks import is_real
 from npa_envs.errors import NPAError, shown
 from npa_envs.files import json_text, write_text
-from npa_envs.tasks.checks import is_real
 from npa_envs.training.checkpoint import (
     check_content,
     load_checkpoint,
@@ -120,9 +120,6 @@ class KeptProgress(Progress):
         if resume:
             content = load_checkpoint(folder.checkpoint)
             held = content.get("learner")
-            if isinstance(held, dict):
-                # Runs of before 2026-11-25 do not say so.
-                held = {"started": self._told.get("started")} | held
             if held != self._told:
                 here = held if isinstance(held, dict) else {}
                 names = [name for name in self._told if here.get(name) != self._told[name]]

@@ -13,8 +13,8 @@ from torch import Tensor, nn
 
 from npa_envs.agents.learning.problem import Problem
 from npa_envs.agents.learning.rules import RuleSet
+from npa_envs.checks import check_fraction, check_non_negative, check_positive
 from npa_envs.errors import NPAError, shown, suggest
-from npa_envs.tasks.checks import check_fraction, check_non_negative, check_positive
 from npa_envs.training.randomness import restart, world_streams
 from npa_envs.training.ranks import ALONE, Ranks
 from npa_envs.world.randomness import Randomness, WorldRandom, normal_draws

@@ -22,6 +22,7 @@ from torch import Tensor
 from npa_envs.agents.evaluation import TIME_LIMIT
 from npa_envs.agents.learning.rules import RuleSet
 from npa_envs.agents.policies import Interface
+from npa_envs.checks import check_positive, is_whole
 from npa_envs.devices import check_device
 from npa_envs.envs.core.config import EnvConfig
 from npa_envs.envs.core.task import EnvTask
@@ -35,7 +36,6 @@ from npa_envs.envs.multi.vector import MultiSpeciesVectorEnv
 from npa_envs.envs.shapeshifter2d import ShapeshifterTask
 from npa_envs.errors import NPAError, shown, suggest
 from npa_envs.registration import ALL, SPECIES_SIZES
-from npa_envs.tasks.checks import check_positive, is_whole
 from npa_envs.world.actions import Physics
 from npa_envs.world.cuda_graph import sent
 

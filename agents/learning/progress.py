@@ -15,9 +15,9 @@ from torch import nn
 from npa_envs.agents.evaluation import evaluate_policy
 from npa_envs.agents.learning.problem import Problem
 from npa_envs.agents.learning.rules import RuleSet
+from npa_envs.checks import is_real, is_whole
 from npa_envs.devices import check_device
 from npa_envs.errors import DivergedError, NPAError, shown
-from npa_envs.tasks.checks import is_real, is_whole
 from npa_envs.training.ranks import Ranks
 from npa_envs.world.randomness import Randomness, WorldRandom
 

@@ -12,11 +12,11 @@ import torch
 from torch import Tensor, nn
 
 from npa_envs.agents.policies import Interface, Policy, bounded_update, check_rule_fits
+from npa_envs.checks import is_whole
 from npa_envs.errors import NPAError, shown
 from npa_envs.files import made_folder
 from npa_envs.rule.files import load_rule, save_rule
 from npa_envs.rule.rule import NPARule
-from npa_envs.tasks.checks import is_whole
 
 if TYPE_CHECKING:
     from npa_envs.agents.learning.problem import Problem

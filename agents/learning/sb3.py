@@ -26,8 +26,8 @@ from npa_envs.agents.learning.ppo_common import (
 from npa_envs.agents.learning.problem import Problem, world_seeds
 from npa_envs.agents.learning.progress import Progress
 from npa_envs.agents.learning.rules import RuleSet
+from npa_envs.checks import check_positive
 from npa_envs.errors import MissingDependencyError, NPAError
-from npa_envs.tasks.checks import check_positive
 from npa_envs.wrappers.sb3 import WorldVecEnv
 
 try:

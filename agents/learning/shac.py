@@ -26,8 +26,8 @@ from npa_envs.agents.learning.ppo_common import (
 from npa_envs.agents.learning.problem import Problem
 from npa_envs.agents.learning.progress import Progress, annealed
 from npa_envs.agents.learning.rules import RuleSet
+from npa_envs.checks import check_fraction, check_non_negative, check_positive
 from npa_envs.tasks.base import Task, seed_worlds, task_toward
-from npa_envs.tasks.checks import check_fraction, check_non_negative, check_positive
 from npa_envs.training.optimiser import normalise_gradients
 from npa_envs.training.randomness import restart
 from npa_envs.training.ranks import ALONE, Ranks

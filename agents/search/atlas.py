@@ -14,15 +14,11 @@ from numpy.typing import NDArray
 
 from npa_envs.agents.search.run import Elite, Search
 from npa_envs.agents.search.worlds import SEED_RADIUS, UPDATE_PROB, Axis, Trials
-from npa_envs.files import made_folder, write_text
+from npa_envs.files import made_folder
 from npa_envs.measure.plots import new_figure, png
 from npa_envs.render import draw_worlds
 from npa_envs.render.film import encode_frame
 from npa_envs.rule.files import save_rule
-from npa_envs.rule.rule import NPARule
-from npa_envs.training.overrides import config_to_dict
-from npa_envs.training.presets import preset
-from npa_envs.training.run_folder import RunFolder
 
 ELITES, PAGE = "elites", "atlas.html"
 """Names in the folder of a search."""
@@ -38,28 +34,18 @@ Pictures = Mapping[tuple[int, ...], NDArray[np.uint8]]
 
 
 def write_elites(search: Search, folder: Path) -> Pictures:
-    """Write each elite's rules, and return what its first world looks like at the end.
-
-    One rule is `elites/CELL.safetensors`. A pair is the folder `elites/CELL`, laid out as a run of
-    joint training, so that `npa-envs view` shows both.
+    """Write each elite's rule as `elites/CELL.safetensors`, and return its first world's picture.
 
     Raises:
         NPAError: A file cannot be written.
     """
     pictures = {}
     for elite in search.elites():
-        rules = search.candidates.rules_of(elite.solution)
         trials = search.candidates.try_all(elite.solution[None])
-        place = folder / ELITES / elite.name
-        if search.world.kind == "rule":
-            with made_folder(place.parent):
-                save_rule(
-                    rules[0],
-                    place.with_name(f"{elite.name}.safetensors"),
-                    metadata=_metadata(search, elite),
-                )
-        else:
-            _write_pair(search, elite, rules, place)
+        place = folder / ELITES / f"{elite.name}.safetensors"
+        rule = search.candidates.rule_of(elite.solution)
+        with made_folder(place.parent):
+            save_rule(rule, place, metadata=_metadata(search, elite))
         pictures[elite.cell] = _picture(search, trials)
     return pictures
 
@@ -68,27 +54,9 @@ def _metadata(search: Search, elite: Elite) -> dict[str, str]:
     """Return what a rule's file says: in which world it was found, and what it was there."""
     names = [axis.name for axis in search.axes]
     told = {"quality": elite.found.quality, **dict(zip(names, elite.found.measures, strict=True))}
-    world: dict[str, float] = {"particle_count": search.world.counts[0]}
+    world: dict[str, float] = {"particle_count": search.world.particle_count}
     world |= {"update_prob": UPDATE_PROB, "seed_radius": SEED_RADIUS}
     return {"found": json.dumps(told), "world": json.dumps(world)}
-
-
-def _write_pair(search: Search, elite: Elite, rules: Sequence[NPARule], place: Path) -> None:
-    """Write two species as a run's folder; what they were to grow is only a place holder there."""
-    run, world = RunFolder(place), search.world
-    place.mkdir(parents=True, exist_ok=True)
-    for number, rule in enumerate(rules):
-        save_rule(rule, run.rule_of(number), metadata=_metadata(search, elite))
-    species = [
-        {
-            "target": "heart", "particle_count": count, "target_point_count": count,
-            "eps": world.eps, "update_prob": UPDATE_PROB, "seed_radius": SEED_RADIUS,
-            "state_dim": world.state_dim, "hidden_dim": world.hidden_dim,
-        }
-        for count in world.counts
-    ]  # fmt: skip
-    config = preset("fast", "co_morphogenesis2d", species=species, distance=world.distance)
-    write_text(run.config, json.dumps(config_to_dict(config), indent=2, default=str))
 
 
 def _picture(search: Search, trials: Trials) -> NDArray[np.uint8]:
@@ -98,7 +66,7 @@ def _picture(search: Search, trials: Trials) -> NDArray[np.uint8]:
         x,
         s,
         resolution=SIDE,
-        pixel_size=math.sqrt(math.pi / world.counts[0]) * SEED_RADIUS,
+        pixel_size=math.sqrt(math.pi / world.particle_count) * SEED_RADIUS,
         centre=x.mean(dim=1),
         half_width=HALF_WIDTH,
     )
@@ -153,7 +121,7 @@ def _cell(search: Search, elite: Elite | None, pictures: Pictures) -> str:
         return "<td></td>"
     told = zip(search.axes, elite.found.measures, strict=True)
     text = ", ".join(f"{axis.name} {value:.3f}" for axis, value in told)
-    file = f"{ELITES}/{elite.name}" + (".safetensors" if search.world.kind == "rule" else "")
+    file = f"{ELITES}/{elite.name}.safetensors"
     data = base64.b64encode(encode_frame(pictures[elite.cell], "JPEG")).decode()
     return (
         f'<td><a href="{file}"><img alt="{elite.name}" title="{elite.name}: quality '

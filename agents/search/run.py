@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 
 from npa_envs.agents.search.methods import METHODS, as_told, make_archive
 from npa_envs.agents.search.worlds import Axis, Candidates, Found, SearchWorld
+from npa_envs.checks import is_whole
 from npa_envs.errors import NPAError, shown, suggest
 from npa_envs.measure.record import installed_version, read_record, write_record
-from npa_envs.tasks.checks import is_whole
 
 RESULTS = "search.json"
 """The file that a stopped search goes on from."""

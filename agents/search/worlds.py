@@ -5,22 +5,18 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from npa_envs import NPARule, WorldRandom, perception_fields, rollout, rollout_species
+from npa_envs import NPARule, WorldRandom, perception_fields, rollout
 from npa_envs.agents.learning.weights import RuleWeights, updates_of
-from npa_envs.errors import NPAError, shown
-from npa_envs.measure.interaction import mixing_index
-from npa_envs.tasks.checks import check_non_negative, check_positive
+from npa_envs.checks import check_positive
+from npa_envs.errors import NPAError
 from npa_envs.tasks.seeds import uniform_ball
-
-Kind = Literal["rule", "pair"]
-"""What is searched: one rule, or two species that share a world."""
 
 SNAPSHOTS = 16
 """Moments at which a world is looked at, evenly spread; the later half of them counts."""
@@ -29,7 +25,7 @@ UPDATE_PROB = 0.5
 """Probability of a particle's update in a step (dimensionless)."""
 
 SEED_RADIUS = 0.2
-"""Radius of the disk that each species starts in [length units]."""
+"""Radius of the disk that particles start in [length units]."""
 
 LEAST_VARIANCE = 1e-12
 """Colours that vary no more than this are one colour."""
@@ -54,11 +50,8 @@ class Axis(NamedTuple):
 class SearchWorld:
     """The world that candidates live in."""
 
-    kind: Kind = "rule"
-    """What is searched: "rule", or "pair" for two species that share a world."""
-
     particle_count: int = 128
-    """Particles N, of both species together."""
+    """Particles N."""
 
     steps: int = 128
     """Steps from the seed, a multiple of 16."""
@@ -70,23 +63,17 @@ class SearchWorld:
     """State channels C, at least 3; the last three are the colour (less 0.5)."""
 
     hidden_dim: int = 8
-    """Hidden units of each rule."""
+    """Hidden units of a rule."""
 
     eps: float = 0.1
     """Perception radius ε [length units]."""
 
-    distance: float = 0.4
-    """Distance between the centres of two species' seeds [length units]."""
-
     def __post_init__(self) -> None:
         """Check every field; raises NPAError."""
-        if self.kind not in ("rule", "pair"):
-            raise NPAError(f"kind must be 'rule' or 'pair', got {shown(self.kind)}")
         check_positive(self, int, "particle_count", at_least=4)
         check_positive(self, int, "steps", "world_count", "hidden_dim")
         check_positive(self, int, "state_dim", at_least=3)
         check_positive(self, float, "eps")
-        check_non_negative(self, "distance")
         if self.steps % SNAPSHOTS:
             raise NPAError(
                 f"steps must be a multiple of {SNAPSHOTS}, got {self.steps}: "
@@ -94,24 +81,14 @@ class SearchWorld:
             )
 
     @property
-    def counts(self) -> tuple[int, ...]:
-        """Particles of each species."""
-        if self.kind == "rule":
-            return (self.particle_count,)
-        return (self.particle_count // 2, self.particle_count - self.particle_count // 2)
-
-    @property
     def particle_steps(self) -> int:
         """What one candidate costs: B N T."""
         return self.world_count * self.particle_count * self.steps
 
-    def make_rules(self) -> list[NPARule]:
-        """Return a rule for each species, whose weights are to be put in, on the CPU."""
+    def make_rule(self) -> NPARule:
+        """Return a rule whose weights are to be put in, on the CPU."""
         with torch.random.fork_rng(devices=()):
-            return [
-                NPARule(2, self.state_dim, self.hidden_dim, eps0=self.eps).requires_grad_(False)
-                for _ in self.counts
-            ]
+            return NPARule(2, self.state_dim, self.hidden_dim, eps0=self.eps).requires_grad_(False)
 
     def axes(self) -> tuple[Axis, ...]:
         """Return the descriptors.
@@ -119,11 +96,11 @@ class SearchWorld:
         `speed` is the mean path length of a step [ε], at most the rule's α times the probability
         of an update. `crowding` is log(ρ / ρ₁) / log N of the mean density ρ at particles, where
         ρ₁ is that of a particle alone: 0 where each is alone, 1 where all stand in one place.
-        `mixing` is, for two species, the mixing index. For one rule it is 1 − r of the correlation
-        r between particles' colours and those around them: 0 where neighbours look alike, 1 where
-        they have nothing in common. All are dimensionless but for the speed.
+        `mixing` is 1 − r of the correlation r between particles' colours and those around them: 0
+        where neighbours look alike, 1 where they have nothing in common. All are dimensionless but
+        for the speed.
         """
-        fastest = self.make_rules()[0].alpha * UPDATE_PROB
+        fastest = self.make_rule().alpha * UPDATE_PROB
         return (
             Axis("speed", 0.0, fastest, 10),
             Axis("crowding", 0.0, 1.0, 10),
@@ -198,8 +175,8 @@ class Candidates:
         self.device = device
         """Where worlds are computed."""
         self._seeds = tuple(range(world.world_count) if seeds is None else seeds)
-        self._rules = world.make_rules()
-        self.scales = RuleWeights(self._rules).scales()
+        self._rule = world.make_rule()
+        self.scales = RuleWeights([self._rule]).scales()
         """Size of each weight as Xavier would draw it, shape [W]: solutions are in these units."""
         alone = torch.zeros(1, 1, 2), torch.zeros(1, 1, 1)
         self._alone = float(perception_fields(*alone, eps=world.eps).rho)
@@ -209,15 +186,15 @@ class Candidates:
         """Numbers that a candidate is made of, W."""
         return len(self.scales)
 
-    def rules_of(self, solution: Numbers) -> list[NPARule]:
-        """Return a candidate's rules, one for each species, on the CPU.
+    def rule_of(self, solution: Numbers) -> NPARule:
+        """Return a candidate's rule, on the CPU.
 
         Args:
             solution: Its weights in units of `scales`, shape [W].
         """
-        rules = self.world.make_rules()
-        RuleWeights(rules).put(solution * self.scales)
-        return rules
+        rule = self.world.make_rule()
+        RuleWeights([rule]).put(solution * self.scales)
+        return rule
 
     @torch.no_grad()
     def try_all(self, solutions: Numbers) -> Trials:
@@ -241,17 +218,7 @@ class Candidates:
             "generator": random, "keep_every": every, "update_prob": UPDATE_PROB,
             "return_path_length": True,
         }  # fmt: skip
-        if world.kind == "rule":
-            stack = RuleStack(self._rules[0], weights)
-            xs, ss, path = rollout(stack, x, s, world.steps, **told)
-        else:
-            halves = weights.chunk(2, dim=1)
-            stacks = [RuleStack(*own) for own in zip(self._rules, halves, strict=True)]
-            counts = world.counts
-            # Each sees densities as it would alone.
-            xs, ss, path = rollout_species(
-                stacks, x, s, world.steps, counts=counts, density_counts=counts, **told
-            )
+        xs, ss, path = rollout(RuleStack(self._rule, weights), x, s, world.steps, **told)
         late = SNAPSHOTS // 2
         travelled = (path[-1] - path[late - 1]).mean(dim=1) / ((SNAPSHOTS - late) * every)
         late_x, late_s = (values[late:].unflatten(1, (count, -1)) for values in (xs, ss))
@@ -271,16 +238,16 @@ class Candidates:
         )
 
     def _seed(self, random: WorldRandom) -> tuple[Tensor, Tensor]:
-        """Return disks of blank particles, one for each species, in a row around the origin."""
+        """Return disks of blank particles."""
         world = self.world
-        parts = []
-        for number, count in enumerate(world.counts):
-            disk = uniform_ball(
-                random.world_count, count, 2, SEED_RADIUS, generator=random, device=self.device
-            )
-            disk[..., 0] += world.distance * (number - 0.5 * (len(world.counts) - 1))
-            parts.append(disk)
-        x = torch.cat(parts, dim=1)
+        x = uniform_ball(
+            random.world_count,
+            world.particle_count,
+            2,
+            SEED_RADIUS,
+            generator=random,
+            device=self.device,
+        )
         return x, x.new_zeros(*x.shape[:2], world.state_dim)
 
     def crowding_and_mixing(self, x: Tensor, s: Tensor) -> tuple[float, float]:
@@ -289,10 +256,7 @@ class Candidates:
         colours = _colours(s)
         fields = perception_fields(x, colours, eps=world.eps)
         crowding = math.log(float(fields.rho.mean()) / self._alone) / math.log(world.particle_count)
-        if world.kind == "pair":
-            mixing = mixing_index(x, world.counts, eps=world.eps)
-        else:
-            mixing = 1.0 - correlation(colours, fields.blur)
+        mixing = 1.0 - correlation(colours, fields.blur)
         return crowding, float(mixing.mean().clamp(0.0, 1.0))
 
 

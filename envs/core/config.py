@@ -10,16 +10,16 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from npa_envs.devices import check_device
-from npa_envs.errors import NPAError, UnknownKeywordError, shown, suggest
-from npa_envs.render import STYLES
-from npa_envs.tasks.checks import (
+from npa_envs.checks import (
     check_fraction,
     check_non_negative,
     check_positive,
     is_real,
     is_whole,
 )
+from npa_envs.devices import check_device
+from npa_envs.errors import NPAError, UnknownKeywordError, shown, suggest
+from npa_envs.render import STYLES
 from npa_envs.world.actions import MomentInverse, Physics
 
 Boundary = Literal["open", "periodic"]

@@ -13,8 +13,9 @@ from gymnasium.wrappers import OrderEnforcing, PassiveEnvChecker, TimeLimit
 from numpy.typing import NDArray
 from torch import Tensor
 
+from npa_envs.checks import number_tensor
 from npa_envs.envs.core.screen import Screen
-from npa_envs.envs.core.spaces import Rows, number_tensor, to_output
+from npa_envs.envs.core.spaces import Rows, to_output
 from npa_envs.envs.core.task import EnvTask
 from npa_envs.envs.core.vector import check_options, plain_seed, world_keys
 from npa_envs.envs.core.worlds import Worlds, reason

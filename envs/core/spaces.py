@@ -108,21 +108,3 @@ def action_tensor(
         )
     checked: Tensor = action.detach().to(torch.float32)
     return checked
-
-
-def number_tensor(name: str, value: Any) -> Tensor:
-    """Return real numbers of any library, which the caller calls so, as a dense tensor.
-
-    Raises:
-        NPAError: They are none.
-    """
-    try:
-        tensor = torch.as_tensor(value)
-    except (TypeError, ValueError, RuntimeError, OverflowError) as error:
-        raise NPAError(f"{name} must be an array of numbers, got {type(value).__name__}") from error
-    if tensor.dtype.is_complex or tensor.layout != torch.strided or tensor.is_meta:
-        raise NPAError(
-            f"{name} must be a dense array of real numbers, got {tensor.dtype}, {tensor.layout} on "
-            f"{tensor.device}"
-        )
-    return tensor

@@ -15,12 +15,12 @@ from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 from torch import Tensor
 
+from npa_envs.checks import is_whole, number_tensor
 from npa_envs.envs.core.screen import Screen
-from npa_envs.envs.core.spaces import Rows, number_tensor, to_output
+from npa_envs.envs.core.spaces import Rows, to_output
 from npa_envs.envs.core.task import EnvTask
 from npa_envs.envs.core.worlds import FLAGS, Report, Worlds, reason
 from npa_envs.errors import NPAError, shown, suggest
-from npa_envs.tasks.checks import is_whole
 from npa_envs.world.actions import TIME_LIMIT
 from npa_envs.world.cuda_graph import sent
 from npa_envs.world.randomness import WorldRandom

@@ -15,6 +15,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from npa_envs.checks import number_tensor
 from npa_envs.envs.core.answers import (
     GlobalDraws,
     check_finite,
@@ -25,7 +26,6 @@ from npa_envs.envs.core.answers import (
 )
 from npa_envs.envs.core.config import EnvConfig, WorldConfig
 from npa_envs.envs.core.memory import check_memory
-from npa_envs.envs.core.spaces import number_tensor
 from npa_envs.envs.core.task import EnvTask, Start, WorldTask
 from npa_envs.errors import DivergedError, NPAError, shown
 from npa_envs.world.actions import (

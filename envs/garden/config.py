@@ -5,10 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal, get_args
 
+from npa_envs.checks import check_positive, is_whole
 from npa_envs.envs.core.config import EnvConfig
 from npa_envs.envs.grown import GrownConfig
 from npa_envs.errors import NPAError, shown, suggest
-from npa_envs.tasks.checks import check_positive, is_whole
 
 Actions = Literal["grid", "free", "discrete"]
 Observe = Literal["grid", "picture", "moments"]

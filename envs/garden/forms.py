@@ -9,7 +9,8 @@ import torch
 from gymnasium.spaces import Box, MultiDiscrete, Space
 from torch import Tensor
 
-from npa_envs.envs.core.spaces import Rows, action_tensor, number_tensor
+from npa_envs.checks import number_tensor
+from npa_envs.envs.core.spaces import Rows, action_tensor
 from npa_envs.envs.garden.brushwork import Columns, grid_places, tool_table
 from npa_envs.envs.garden.config import GardenConfig
 from npa_envs.envs.garden.task import SEEN_AT_A_PLACE, SEEN_LIMIT

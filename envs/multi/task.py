@@ -14,12 +14,12 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from npa_envs.checks import check_non_negative, check_positive, is_whole
 from npa_envs.envs.core.config import WorldConfig, plain
 from npa_envs.envs.core.task import WorldTask
 from npa_envs.errors import NPAError, shown
 from npa_envs.render import STYLES
 from npa_envs.rule.rule import COLOUR_OFFSET
-from npa_envs.tasks.checks import check_non_negative, check_positive, is_whole
 from npa_envs.tasks.seeds import uniform_ball
 from npa_envs.world.randomness import WorldRandom
 

@@ -1,4 +1,4 @@
-"""`npa-envs bench`: run time against error, the paper's table, scaling, and a call explained."""
+"""`npa-envs bench`: the paper's table, scaling, and a call explained."""
 
 from __future__ import annotations
 
@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Literal
 
 from npa_envs.cli.output import (
     MeasureOptions,
-    OptionalOutFolder,
     StepBar,
     check_numbers,
     chosen_names,
@@ -25,32 +24,24 @@ if TYPE_CHECKING:
 
     from npa_envs.measure.speed.suites import Report
 
-CHECK_FAILED = 1
-
 QUICK = "quick"
-"""The suite that is run unless another one is asked for, and whose ratios are checked."""
+"""The suite that is run unless another one is asked for."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class BenchOptions(MeasureOptions):
-    """Measure run time against error, the paper's table or scaling; or explain what a step runs."""
+    """Measure the paper's table, scaling and other times; or explain what a step runs."""
 
     suite: str | None = None
-    """quick (the default), paper, accuracy, scaling, skips, species or kernels."""
+    """quick (the default), paper, scaling, skips, species or kernels."""
 
     quick: bool = False
     """Small worlds only: about a minute on a CPU."""
 
-    strategies: tuple[str, ...] = ()
-    """Ways to perceive: library, plain, hash_grid, dense, neighbour_cap; default: all."""
-
-    precisions: tuple[str, ...] = ()
-    """float64, float32, tf32, bf16_storage, mixed; default: all."""
-
     repeats: int = 7
     """Readings of every time; tables show their median and range."""
 
-    out: OptionalOutFolder = None
+    out: Path | None = None
     """Folder for SUITE_DEVICE.json and plots; default: nothing is written."""
 
     max_seconds: float | None = None
@@ -58,9 +49,6 @@ class BenchOptions(MeasureOptions):
 
     plots: bool = False
     """Also draw plots into the output folder; needs the extra `bench`."""
-
-    check: Path | None = None
-    """JSON of stored ratios: end with code 1 where one is missed threefold. Suite quick."""
 
     explain: bool = False
     """Measure nothing: say which kernels a step launches, and why. The options below tell which."""
@@ -91,20 +79,15 @@ class BenchOptions(MeasureOptions):
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Measure, print, write and check; return 1 where `--check` found a ratio that was missed."""
+    """Measure, print and write."""
     options = parse_options(BenchOptions, "bench", arguments)
     from npa_envs.devices import check_device
     from npa_envs.measure.plots import check_matplotlib
-    from npa_envs.measure.speed.suites import SUITES, missed_ratios, stored_ratios
+    from npa_envs.measure.speed.suites import SUITES
 
     check_numbers(options, repeats=1, threads=1, world_count=1, particle_count=1, state_dim=1)
     if options.plots and options.out is None:
         raise NPAError("plots need a folder to be written to: give --out DIR as well")
-    if options.check is not None and options.suite not in (None, QUICK):
-        raise NPAError(
-            f"check compares ratios of the suite quick, got suite {options.suite!r}: "
-            "leave --suite out"
-        )
     device = check_device(options.device)
     chosen_names("suite", [options.suite or QUICK], SUITES)
     if options.explain:
@@ -114,44 +97,29 @@ def main(arguments: Sequence[str]) -> int:
         writable_folder(options.out)
     if options.plots:
         check_matplotlib()
-    stored = {} if options.check is None else stored_ratios(options.check, device)
     report = measured_report(options, device, shlex.join(["npa-envs", "bench", *arguments]))
     print(report.text())
     if options.out is not None:
         _write(report, options.out, plots=options.plots)
-    if options.check is None:
-        return 0
-    missed = missed_ratios(report.ratios, stored)
-    print("\n".join(f"missed: {line}" for line in missed) or "ratios are held")
-    return CHECK_FAILED if missed else 0
+    return 0
 
 
 def measured_report(options: BenchOptions, device: torch.device, command: str) -> Report:
-    """Run a suite and return its report, with the command line in it.
-
-    Raises:
-        NPAError: There is no such strategy or precision.
-    """
+    """Run a suite and return its report, with the command line in it."""
     from npa_envs.measure.record import current_commit, time_limit
-    from npa_envs.measure.speed.strategies import PRECISIONS, STRATEGIES
-    from npa_envs.measure.speed.suites import SUITES, Report, ratios
+    from npa_envs.measure.speed.suites import SUITES, Report
     from npa_envs.measure.speed.timing import Session
 
     name = options.suite or QUICK
-    strategies = chosen_names("strategy", options.strategies, STRATEGIES)
-    precisions = chosen_names("precision", options.precisions, PRECISIONS)
     with StepBar(None, show=options.progress, unit="row") as bar, torch_threads(options.threads):
         session = Session(
             device=device,
             repeats=options.repeats,
             small=options.quick,
-            strategies=[STRATEGIES[name] for name in strategies],
-            precisions=[PRECISIONS[name] for name in precisions],
             progress=bar.advance,
             enough=time_limit(options.max_seconds),
         )
         tables = SUITES[name](session)
-        held = ratios(session) if name == QUICK else {}
     return Report(
         suite=name,
         command=command,
@@ -160,7 +128,6 @@ def measured_report(options: BenchOptions, device: torch.device, command: str) -
         threads=options.threads,
         tables=tables,
         left_out=session.left_out,
-        ratios=held,
     )
 
 

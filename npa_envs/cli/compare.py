@@ -18,7 +18,6 @@ import tyro
 
 from npa_envs.cli.output import (
     MeasureOptions,
-    OutFolder,
     StepBar,
     check_numbers,
     chosen_names,
@@ -59,7 +58,7 @@ class CompareOptions(MeasureOptions):
     where a run failed.
     """
 
-    out: OutFolder = Path("comparison")
+    out: Path = Path("comparison")
     """Folder for AXIS/TASK/METHOD/seed-K/, and for comparison.md, .json, .csv and pictures of what
     the command names (curves need the extra `bench`)."""
 
@@ -121,7 +120,7 @@ def main(arguments: Sequence[str]) -> int:
     from npa_envs.measure.record import without_folders
     from npa_envs.processes import Places
 
-    words = without_folders(arguments, "--out", "--output")
+    words = without_folders(arguments, "--out")
     command = shlex.join(["npa-envs", "compare", *words])
     plan = make_plan(options)
     folder = writable_folder(options.out)
@@ -173,7 +172,7 @@ def make_plan(options: CompareOptions) -> Plan:
         NPAError: As for `main`.
     """
     from npa_envs.agents.comparison.plan import LEFT_OUT, PROBLEMS, Plan, make_problem
-    from npa_envs.agents.learning import METHODS, REMOVED
+    from npa_envs.agents.learning import METHODS
     from npa_envs.agents.learning.problem import RUNS
 
     check_numbers(options, seeds=1, episodes=1, jobs=1, threads=1)
@@ -188,8 +187,6 @@ def make_plan(options: CompareOptions) -> Plan:
         told = {name: getattr(options, name) or few for name, few in QUICK.items()}
         options = replace(options, **told)
     tasks = chosen_names("task", options.tasks, PROBLEMS)
-    for name in REMOVED.keys() & set(options.methods):
-        raise NPAError(f"method {name!r} is no more: {REMOVED[name]}")
     methods, own = _chosen_methods(options.methods, METHODS)
     if not options.methods:
         methods = [name for name in methods if name not in NEED_MORE]

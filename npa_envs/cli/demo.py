@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any
 
 from npa_envs.cli.output import (
-    OutFolder,
     StepBar,
     parse_options,
     torch_threads,
@@ -45,7 +44,7 @@ class DemoOptions:
     """Grow a shipped rule from its seed, cut it, erase a part and let it heal each time; then train
     a small rule from a picture."""
 
-    out: OutFolder = Path("demo")
+    out: Path = Path("demo")
     """Folder to write to; created where missing."""
 
     rule: str = "gecko"

@@ -24,7 +24,7 @@ class ExportOptions:
     rules: Annotated[tuple[str, ...], tyro.conf.Positional, tyro.conf.arg(metavar="RULE")] = ()
     """Shipped rules (`npa-envs list`), folders of runs, or files of ours or the authors'."""
 
-    out: Annotated[Path, tyro.conf.arg(aliases=("-o", "--output"))] = Path("page.html")
+    out: Annotated[Path, tyro.conf.arg(aliases=("-o",))] = Path("page.html")
     """The file to write."""
 
     gallery: bool = False

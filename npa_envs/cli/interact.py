@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Annotated, Any
 import tyro
 
 from npa_envs.cli.output import (
-    OutFolder,
     RunOptions,
     StepBar,
     check_numbers,
@@ -91,7 +90,7 @@ class InteractOptions(RunOptions):
     """Two rules, worlds and distances, few particles and steps, unless said otherwise: figures that
     say nothing but that it runs."""
 
-    out: OutFolder = Path("runs/interact")
+    out: Path = Path("runs/interact")
     """Folder to write to; created where missing."""
 
 

@@ -12,7 +12,6 @@ import tyro
 
 from npa_envs.cli.launch import asked_count, launch, told_once, with_device_of_gpus
 from npa_envs.cli.output import (
-    OutFolder,
     RunOptions,
     check_numbers,
     named_values,
@@ -72,7 +71,7 @@ class LearnOptions(RunOptions):
     entries: int = 20
     """Points of the curve besides the first, and checkpoints."""
 
-    out: OutFolder = Path("runs/learn")
+    out: Path = Path("runs/learn")
     """Folder for checkpoint, rules and curve."""
 
     processes: int | None = None

@@ -6,7 +6,6 @@ import argparse
 import contextlib
 import inspect
 import json
-import sys
 import tempfile
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
@@ -22,16 +21,8 @@ from npa_envs.files import NEARLY_FULL_BYTES, made_folder
 
 OptionsT = TypeVar("OptionsT")
 
-_OLD_NAME = tyro.conf.arg(aliases=("--output",))
-
-OutFolder = Annotated[Path, _OLD_NAME]
-"""A folder to write to: one name in all commands, and the old one of some."""
-
-OptionalOutFolder = Annotated[Path | None, _OLD_NAME]
-"""The same, where nothing is written unless it is given."""
-
 EXAMPLES: dict[str, tuple[str, ...]] = {
-    "bench": ("bench --quick", "bench --suite accuracy --out results --plots"),
+    "bench": ("bench --quick", "bench --suite scaling --out results --plots"),
     "compare": (
         "compare --quick --out quick",
         "compare --seconds 60 --methods gradient ppo --tasks morphogenesis2d",
@@ -61,7 +52,7 @@ EXAMPLES: dict[str, tuple[str, ...]] = {
     ),
     "search": (
         "search",
-        "search --kind pair --method cma-me --budget 5e7 --out runs/pairs",
+        "search --method cma-me --budget 5e7 --out runs/alive",
     ),
     "stress": ("stress --quick", "stress --only geometry --out results"),
     "sweep": (
@@ -113,8 +104,6 @@ def parse_options(
         description: What the help begins with instead.
         default: What the options are where nothing is said; None: as the dataclass has them.
     """
-    if any(word.partition("=")[0] == "--output" for word in arguments):
-        print("npa-envs: --output is now --out", file=sys.stderr)
     shown = "\n".join(f"  npa-envs {example}" for example in EXAMPLES[command])
     told: dict[str, Any] = {} if default is None else {"default": default}
     options: OptionsT = tyro.cli(

@@ -12,7 +12,6 @@ import tyro
 
 from npa_envs.cli.output import (
     MeasureOptions,
-    OptionalOutFolder,
     StepBar,
     check_numbers,
     parse_options,
@@ -58,7 +57,7 @@ class RobustnessOptions(MeasureOptions):
     """Small worlds, few steps and values, a minute at most on two CPU cores: figures that say
     nothing but that it runs."""
 
-    out: OptionalOutFolder = None
+    out: Path | None = None
     """Folder for robustness_RULE.json, robustness.md, and curves (extra `bench`); default: nothing
     is written."""
 
@@ -97,7 +96,7 @@ def main(arguments: Sequence[str]) -> int:
     paths = {name: folder / f"robustness_{name}.json" for name in names} if folder else {}
     # All are read first: a file of other settings is refused before any work is done.
     before = {name: RuleRecord.read(path, facts[name]) for name, path in paths.items()}
-    words = without_folders(arguments, "--out", "--output")
+    words = without_folders(arguments, "--out")
     records = []
     with (
         StepBar(len(names), show=options.progress, unit="rule") as bar,

@@ -10,7 +10,6 @@ from typing import Annotated, Literal
 import tyro
 
 from npa_envs.cli.output import (
-    OutFolder,
     RuleOptions,
     StepBar,
     parse_options,
@@ -34,7 +33,7 @@ class RolloutOptions(RuleOptions):
     """Damage on the way, STEP:KIND or STEP:KIND:SIZE: 200:cut (gap 0.1), 300:erase (radius 0.2),
     400:clump (radius 0.2); sizes in length units."""
 
-    out: OutFolder = Path("runs/rollout")
+    out: Path = Path("runs/rollout")
     """Folder to write to; created where missing."""
 
     resolution: int | None = None

@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Literal
 
 from npa_envs.cli.output import (
-    OutFolder,
     RunOptions,
     StepBar,
     check_numbers,
@@ -21,17 +20,14 @@ from npa_envs.errors import NPAError
 
 @dataclass(frozen=True, kw_only=True)
 class SearchOptions(RunOptions):
-    """Search for rules, or pairs of species, that differ from each other and stay alive.
+    """Search for rules that differ from each other and stay alive.
 
     An archive keeps the best candidate of each kind: by speed, by how crowded particles stand, and
-    by how colours (or species) mix. Best is whose colours change most while states and positions
-    stay within [-1, 1]. The folder gets every elite as a rule's file (of a pair, a folder) that
+    by how colours mix. Best is whose colours change most while states and positions
+    stay within [-1, 1]. The folder gets every elite as a rule's file that
     `view` and `rollout` open, a page that shows them, and a record. The same command goes on where
     a search was stopped, and further with a larger budget.
     """
-
-    kind: Literal["rule", "pair"] = "rule"
-    """One rule, or two species that share a world."""
 
     method: Literal["map-elites", "cma-me", "cma-es", "random"] = "map-elites"
     """What proposes candidates: mutants of elites; CMA-ES rewarded for what is new, or for quality
@@ -41,7 +37,7 @@ class SearchOptions(RunOptions):
     """Particle-steps of the whole search: candidates times worlds, particles and steps."""
 
     particle_count: int = 128
-    """Particles N, of both species together."""
+    """Particles N."""
 
     steps: int = 128
     """Steps from the seed, a multiple of 16; the second half of them is judged."""
@@ -53,13 +49,10 @@ class SearchOptions(RunOptions):
     """State channels, at least 3."""
 
     hidden_dim: int = 8
-    """Hidden units of each rule."""
+    """Hidden units of a rule."""
 
     eps: float = 0.1
     """Perception radius [length units]."""
-
-    distance: float = 0.4
-    """Pairs only: distance between the centres of the two seeds [length units]."""
 
     batch_size: int = 20
     """Candidates that are proposed together."""
@@ -73,7 +66,7 @@ class SearchOptions(RunOptions):
     max_seconds: float | None = None
     """Stop after this time; the same command goes on. Default: never."""
 
-    out: OutFolder = Path("runs/search")
+    out: Path = Path("runs/search")
     """Folder to write to; created where missing."""
 
 

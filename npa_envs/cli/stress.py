@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
 from npa_envs.cli.output import (
     MeasureOptions,
-    OptionalOutFolder,
     StepBar,
     check_numbers,
     parse_options,
@@ -51,7 +51,7 @@ class StressOptions(MeasureOptions):
     seed: int = 0
     """What random worlds are drawn from."""
 
-    out: OptionalOutFolder = None
+    out: Path | None = None
     """Folder for stress_DEVICE.json and heat maps (extra `bench`); default: nothing is written."""
 
     list: bool = False

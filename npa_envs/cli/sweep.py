@@ -19,7 +19,7 @@ from typing import Annotated
 
 import tyro
 
-from npa_envs.cli.output import OutFolder, StepBar, check_numbers, parse_options, writable_folder
+from npa_envs.cli.output import StepBar, check_numbers, parse_options, writable_folder
 from npa_envs.errors import NPAError, shown, suggest
 from npa_envs.files import read_json, write_text
 from npa_envs.measure.record import write_record
@@ -31,7 +31,7 @@ RUN_FAILED = 1
 RECORD, OUTPUT, TABLE = "run.json", "output.txt", "sweep.md"
 """Files: what became of a run, what it printed, and of all of them together."""
 
-OWN = ("out", "output", "device", "resume", "overwrite", "max-seconds", "processes", "gpus")
+OWN = ("out", "device", "resume", "overwrite", "max-seconds", "processes", "gpus")
 """Options of `npa-envs train` that a sweep gives by itself, or that would break it."""
 
 PROGRAM = (sys.executable, "-m", "npa_envs", "train")
@@ -57,7 +57,7 @@ class SweepOptions:
     over: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME=A,B,C")]
     """Options of `npa-envs train` with the values to take: target=heart,ring seed=0,1,2."""
 
-    out: OutFolder = Path("runs/sweep")
+    out: Path = Path("runs/sweep")
     """Folder for a run's folder each, named by its values, and sweep.md, the table of all."""
 
     devices: tuple[str, ...] = ("cpu",)

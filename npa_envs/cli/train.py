@@ -192,7 +192,7 @@ def process_count(task_name: str, options: TrainOptions, config: TrainConfig[Any
         return asked
     seconds = task_entry(task_name).expected_seconds(config)
     idle = thread_count(config) < torch.get_num_threads() and dist.is_available()
-    if not idle or config.varied or seconds is None or seconds < PAIRED_SECONDS:
+    if not idle or seconds is None or seconds < PAIRED_SECONDS:
         return 1
     if options.resume and not drawn_by_world(load_checkpoint(RunFolder(config.out).checkpoint)):
         return 1

@@ -11,7 +11,7 @@ from typing import Any, get_type_hints
 import tyro
 
 from npa_envs.cli.launch import with_device_of_gpus
-from npa_envs.cli.output import OutFolder, parse_options, settled_resume
+from npa_envs.cli.output import parse_options, settled_resume
 from npa_envs.errors import NPAError, shown
 from npa_envs.tasks.co_morphogenesis2d import CoMorphogenesis2DConfig
 from npa_envs.tasks.morphogenesis2d import Morphogenesis2DConfig
@@ -29,6 +29,30 @@ from npa_envs.training.checkpoint import check_task, load_checkpoint
 
 COMMON = ("target", "iterations", "device", "out")
 """Fields of configurations that stand among the most common options, where a task has them."""
+
+
+SHOWN = frozenset(
+    {
+        "initial_rule",
+        "initial_rules",
+        "frozen",
+        "repeats",
+        "world_count",
+        "pool_size",
+        "steps",
+        "learning_rate",
+        "seed",
+        "targets",
+        "distance",
+        "particle_count",
+        "hidden_dim",
+        "eps",
+        "resolution",
+        "loss",
+        "data",
+    }
+)
+"""Fields of configurations that `--help` shows; `--help-all` shows all of them."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -50,7 +74,7 @@ class TrainOptions:
     device: str = "cpu"
     """Where to train: cpu, cuda, cuda:1."""
 
-    out: OutFolder = Path()
+    out: Path = Path()
     """Folder that log, pictures, checkpoint and rule are written to; created where missing."""
 
     config: Path | None = None
@@ -143,14 +167,14 @@ def starting_configuration(task_name: str, arguments: Sequence[str]) -> TrainCon
     parser.add_argument("--config", type=Path)
     parser.add_argument("--device", default="cpu")
     parser.add_argument("--resume", action="store_true")
-    parser.add_argument("--out", "--output", type=Path)
+    parser.add_argument("--out", type=Path)
     try:
         first, _ = parser.parse_known_args(arguments)
     except argparse.ArgumentError as error:
         raise NPAError(f"{error.argument_name}: {error.message}") from error
     device = first.device if first.config is None else "cpu"
     base = preset(first.preset or default_preset(task_name, device), task_name)
-    if first.resume and not {"-h", "--help"} & set(arguments):
+    if first.resume and not {"-h", "--help", "--help-all"} & set(arguments):
         folder = RunFolder(first.out or base.out)
         if not folder.checkpoint.is_file():
             raise NPAError(
@@ -158,7 +182,7 @@ def starting_configuration(task_name: str, arguments: Sequence[str]) -> TrainCon
                 "folder of an earlier run with --out, or leave --resume out to start a new run"
             )
         try:
-            base = load_config(folder.config, base, whole=True)
+            base = load_config(folder.config, base)
         except NPAError:
             # Fields of another task are unknown here; that it is another task says more.
             check_task(load_checkpoint(folder.checkpoint), task_name, folder.checkpoint)
@@ -183,7 +207,13 @@ def default_preset(task_name: str, device: str) -> str:
 def parse(
     task_name: str, base: TrainConfig[Any], arguments: Sequence[str]
 ) -> tuple[TrainOptions, TrainConfig[Any]]:
-    """Lay the command line's options over a configuration."""
+    """Lay the command line's options over a configuration.
+
+    Ends the process after `--help`, which shows the most used options, and `--help-all`.
+    """
+    # What a help leaves out could not be given either.
+    whole = not {"-h", "--help"} & set(arguments)
+    arguments = ["--help" if word == "--help-all" else word for word in arguments]
 
     def read(defaults: Any) -> tuple[TrainOptions, Any]:
         # These stand first, as options of their own, and not once more below.
@@ -195,14 +225,16 @@ def parse(
             and not (name == "target" and isinstance(holder, SpeciesOptions))
         }
         common = _without(TrainOptions(**told), set(COMMON) - told.keys())
-        training = _without(replace(defaults, task=_without(defaults.task, told)), told)
+        task = _without(defaults.task, told, whole=whole)
+        training = _without(replace(defaults, task=task), told, whole=whole)
         kinds = [("common", type(common)), ("training", type(training))]
         command = make_dataclass("Command", kinds, frozen=True)
         parsed: Any = parse_options(
             command,
             f"train {task_name}",
             arguments,
-            description=f"Train on {task_name}. Defaults shown are those of the preset.",
+            description=f"Train on {task_name}. Defaults shown are those of the preset."
+            + ("" if whole else f" All options: npa-envs train {task_name} --help-all"),
             default=command(common, training),
         )
         task = _of_type(type(defaults.task), parsed.training.task)
@@ -214,12 +246,17 @@ def parse(
     return parse_joint(base, read) if isinstance(base, JointTrainConfig) else read(base)
 
 
-def _without(source: Any, names: Iterable[str]) -> Any:
-    """Return a dataclass of which some fields, where it has them, are no options."""
+def _without(source: Any, names: Iterable[str], *, whole: bool = True) -> Any:
+    """Return a dataclass of which some fields, where it has them, are no options.
+
+    Unless it is to be whole, fields that are not `SHOWN` are none either.
+    """
     kind: Any = type(source)
     fixed: Any = tyro.conf.Fixed
-    hints = get_type_hints(kind)
-    changed = {name: fixed[hints[name]] for name in names if name in hints}
+    hidden: Any = tyro.conf.Suppress
+    hints = get_type_hints(kind, include_extras=True)
+    changed = {} if whole else {name: hidden[hints[name]] for name in hints.keys() - SHOWN}
+    changed |= {name: fixed[hints[name]] for name in names if name in hints}
     if "task" in hints:
         changed["task"] = type(source.task)
     options = [(name, own, field(default=getattr(source, name))) for name, own in changed.items()]

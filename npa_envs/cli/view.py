@@ -13,7 +13,6 @@ import tyro
 
 from npa_envs.cli.doctor import has_screen
 from npa_envs.cli.output import (
-    OutFolder,
     named_values,
     parse_options,
     torch_threads,
@@ -72,7 +71,7 @@ class ViewOptions:
     browser: bool = True
     """Open the page in a browser."""
 
-    out: OutFolder = Path("runs/view")
+    out: Path = Path("runs/view")
     """Folder of recorded films; created where missing."""
 
 

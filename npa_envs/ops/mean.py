@@ -7,9 +7,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from npa_envs.checks import DTYPES, check_dense
 from npa_envs.errors import NPAError
 from npa_envs.kernels.portable.mean import CHUNK, MEAN_LANES, mean_kernels
-from npa_envs.ops.checks import DTYPES, check_dense
 from npa_envs.ops.launch import launch, scalar_type
 from npa_envs.ops.opaque import check_derivatives, opaque
 

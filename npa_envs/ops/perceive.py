@@ -12,9 +12,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from npa_envs.ops.adjoint import SavedPerception, perceive_rows_backward
-from npa_envs.ops.backend import batch_listing
-from npa_envs.ops.checks import (
+from npa_envs.checks import (
     Box,
     MomentInverse,
     check_finite_positions,
@@ -26,6 +24,8 @@ from npa_envs.ops.checks import (
     checked_moment_inverse,
     constant,
 )
+from npa_envs.ops.adjoint import SavedPerception, perceive_rows_backward
+from npa_envs.ops.backend import batch_listing
 from npa_envs.ops.launch import PreparedLaunch, launch
 from npa_envs.ops.opaque import check_derivatives, once_differentiable, opaque
 from npa_envs.ops.passes import (

@@ -9,9 +9,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from npa_envs.errors import NPAError, shown
-from npa_envs.kernels.portable.species import species_kernel
-from npa_envs.ops.checks import (
+from npa_envs.checks import (
     Box,
     check_finite_positions,
     check_scale,
@@ -21,6 +19,8 @@ from npa_envs.ops.checks import (
     checked_eps,
     entries,
 )
+from npa_envs.errors import NPAError, shown
+from npa_envs.kernels.portable.species import species_kernel
 from npa_envs.ops.launch import launch, scalar_type
 from npa_envs.ops.opaque import check_derivatives, opaque
 from npa_envs.ops.perceive import perceive

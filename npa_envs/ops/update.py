@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
+from npa_envs.checks import check_world, constant
 from npa_envs.errors import NPAError
 from npa_envs.kernels.portable.update import (
     CHANNEL_SHARE,
@@ -17,7 +18,6 @@ from npa_envs.kernels.portable.update import (
     find_not_finite,
     update_kernels,
 )
-from npa_envs.ops.checks import check_world, constant
 from npa_envs.ops.launch import PreparedLaunch, launch, scalar_type
 from npa_envs.ops.opaque import check_derivatives, once_differentiable, opaque
 from npa_envs.ops.perceive import Rows

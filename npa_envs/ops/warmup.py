@@ -7,10 +7,10 @@ from typing import Any
 
 import torch
 
+from npa_envs.checks import DTYPES, entries
 from npa_envs.devices import check_device
 from npa_envs.errors import NPAError, shown
 from npa_envs.ops.backend import SHARED_WORLD
-from npa_envs.ops.checks import DTYPES, entries
 from npa_envs.ops.draws import bernoulli_draw, integer_draw, normal_draw, uniform_draw
 from npa_envs.ops.episodes import EpisodeRules, PreparedJudgement
 from npa_envs.ops.equivariance import MIXED_VECTORS, VectorForm, read_rows, steer_rows

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from PIL import ImageColor
 from torch import Tensor
 
+from npa_envs.checks import check_dense, checked_number, entries
 from npa_envs.errors import NPAError, shown
-from npa_envs.ops.checks import check_dense, checked_number, entries
 
 Background = str | tuple[float, float, float]
 

@@ -16,12 +16,11 @@ from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 from torch import Tensor
 
+from npa_envs.checks import checked_count, checked_finite, is_real
 from npa_envs.errors import MissingDependencyError, NPAError, shown
 from npa_envs.files import atomic_path
 from npa_envs.ops import Cameras, orbit
-from npa_envs.ops.checks import checked_count, checked_finite
 from npa_envs.render.colours import Background, background_colour, to_uint8
-from npa_envs.tasks.checks import is_real
 from npa_envs.tasks.targets.views import ANGLE, DISTANCE
 
 Frame = NDArray[np.uint8]

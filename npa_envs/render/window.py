@@ -12,8 +12,8 @@ from typing import Any, Self
 
 import numpy as np
 
+from npa_envs.checks import checked_count
 from npa_envs.errors import MissingDependencyError, NPAError, shown
-from npa_envs.ops.checks import checked_count
 from npa_envs.render.film import Frame, check_rate
 
 _SETTINGS = {

@@ -11,15 +11,15 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from npa_envs.errors import NPAError, shown, suggest
-from npa_envs.ops import periodic_splat, splat
-from npa_envs.ops.checks import (
+from npa_envs.checks import (
     check_world,
     checked_flag,
     checked_number,
     checked_positive,
     number_tensor,
 )
+from npa_envs.errors import NPAError, shown, suggest
+from npa_envs.ops import periodic_splat, splat
 from npa_envs.ops.pictures.splat import checked_window
 from npa_envs.render.colours import (
     Background,

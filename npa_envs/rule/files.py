@@ -2,9 +2,7 @@
 
 Ours holds the weights under `NPARule`'s own names and, in the header's metadata, the format's name
 and version, every hyper-parameter and a checksum, so that a file is all that is needed to run a
-rule. The checksum is SHA-256 over all else that the file says; older files have none. Version 2 is
-for equivariant rules alone, version 3 for rules with codes, version 4 for rules that divide,
-version 5 for those with a dead zone: older versions of the package cannot run them.
+rule. The checksum is SHA-256 over all else that the file says.
 """
 
 from __future__ import annotations
@@ -36,18 +34,7 @@ from npa_envs.rule.parts import RuleParts, check_finite, check_precision
 from npa_envs.rule.rule import NPARule, RuleHyperParameters, check_rule, is_altered
 
 FORMAT_NAME = "npa-envs rule"
-FORMAT_VERSION = 1
-EQUIVARIANT_VERSION = 2
-"""The format's version in files of equivariant rules."""
-
-CODED_VERSION = 3
-"""The format's version in files of rules with codes."""
-
-DIVIDING_VERSION = 4
-"""The format's version in files of rules that divide."""
-
-RESTING_VERSION = 5
-"""The format's version in files of rules with a dead zone."""
+FORMAT_VERSION = "1"
 
 _PLAIN: dict[Any, type] = {Literal: str, tuple: tuple}
 _FIELDS = {
@@ -81,25 +68,10 @@ def shipped_rules(task: str | None = None) -> dict[str, Path]:
 def first_rules() -> dict[str, Path]:
     """Return the rules that runs of presets and environments begin with: name -> file, by name.
 
-    Those named as a shipped rule and `-v0` are what was shipped under that name when environments
-    of version 0 were frozen (`frozen_rule`). Others have learned one picture in small worlds, or
-    several (`seven-pictures`), and are not shipped to be looked at.
+    They stay as they are when a shipped rule of the same picture is trained anew.
     """
     folder = Path(__file__).resolve().parent / "first"
     return {path.stem: path for path in sorted(folder.glob("*.safetensors"))}
-
-
-def frozen_rule(name: str) -> str:
-    """Return the name of the rule that grows a target in environments of version 0.
-
-    A shipped rule may be replaced by a better one; then the file that it was is kept as `NAME-v0`,
-    and environments still begin with the worlds that it grows.
-
-    Args:
-        name: A shipped rule's, for example "heart".
-    """
-    kept = f"{name}-v0"
-    return kept if kept in first_rules() else name
 
 
 def load_rule(source: str | Path, *, device: str | torch.device = "cpu") -> NPARule:
@@ -115,8 +87,8 @@ def load_rule(source: str | Path, *, device: str | torch.device = "cpu") -> NPAR
     Returns:
         The rule, its weights in the precision of the file (float32 or float64). Torch's random
         state is left alone. A file without a checksum is loaded with a `UserWarning`, as damage
-        cannot be told there: a `.safetensors` file of an older version, the authors' `.json`, and
-        a state dict that torch before 1.6 wrote, or that was saved in its format.
+        cannot be told there: the authors' `.json`, and a state dict that torch before 1.6 wrote,
+        or that was saved in its format.
 
     Raises:
         NPAError: The name is unknown, the file is missing, garbage, truncated, of an unknown
@@ -178,11 +150,7 @@ def save_rule(
             f"a rule's file must end in .safetensors, got {shown(str(path))}: "
             f"use {shown(str(path.with_suffix('.safetensors')))}"
         )
-    version = EQUIVARIANT_VERSION if rule.equivariant else FORMAT_VERSION
-    version = CODED_VERSION if rule.codes is not None else version
-    version = DIVIDING_VERSION if rule.divides else version
-    version = RESTING_VERSION if rule.dead_zone else version
-    header = {"format": FORMAT_NAME, "version": str(version)}
+    header = {"format": FORMAT_NAME, "version": FORMAT_VERSION}
     header |= {name: json.dumps(value) for name, value in rule.hyper_parameters().items()}
     if not isinstance(metadata, Mapping | None):
         raise NPAError(
@@ -341,10 +309,9 @@ def _read_header(path: Path) -> dict[str, str]:
             f"the metadata's format must be {FORMAT_NAME!r}, got {shown(header.get('format'))}: "
             "this safetensors file was not written by npa_envs.save_rule"
         )
-    known = [str(version) for version in range(FORMAT_VERSION, RESTING_VERSION + 1)]
-    if header.get("version") not in known:
+    if header.get("version") != FORMAT_VERSION:
         raise NPAError(
-            f"the metadata's version must be one of {', '.join(known)}, got "
+            f"the metadata's version must be {FORMAT_VERSION}, got "
             f"{shown(header.get('version'))}: upgrade with pip install -U npa-envs"
         )
     return header
@@ -352,17 +319,13 @@ def _read_header(path: Path) -> dict[str, str]:
 
 def _read_ours(path: Path) -> RuleParts:
     header = _read_header(path)
-    hyper_parameters = {
-        name: _parse(header, name, kind)
-        for name, kind in _FIELDS.items()
-        if name in header or name in RuleHyperParameters.__required_keys__
-    }
+    hyper_parameters = {name: _parse(header, name, kind) for name, kind in _FIELDS.items()}
     try:
         with safe_open(path, framework="pt") as file:
             weights = {name: file.get_tensor(name).clone() for name in file.keys()}  # noqa: SIM118
     except (OSError, SafetensorError) as error:
         raise NPAError(f"the weights cannot be read ({shown(error)})") from error
-    return RuleParts(hyper_parameters, weights, header, has_checksum="checksum" in header)
+    return RuleParts(hyper_parameters, weights, header, has_checksum=True)
 
 
 def _checksum(header: Mapping[str, str], weights: Mapping[str, Tensor]) -> str:
@@ -376,8 +339,8 @@ def _checksum(header: Mapping[str, str], weights: Mapping[str, Tensor]) -> str:
 
 
 def _verify(header: Mapping[str, str], weights: Mapping[str, Tensor]) -> None:
-    """Check that a file is as it was written, where it says what that was."""
-    if header.get("checksum", found := _checksum(header, weights)) != found:
+    """Check that a file is as it was written."""
+    if header.get("checksum") != _checksum(header, weights):
         raise NPAError(
             "the checksum must be that of the weights and of the metadata, got another one: the "
             "file is damaged, or another program has changed it; copy it again from where it came"

@@ -11,8 +11,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn.modules.module import _has_any_global_hook
 
-from npa_envs.errors import NPAError, shown
-from npa_envs.ops.checks import (
+from npa_envs.checks import (
     MomentInverse,
     checked_flag,
     checked_moment_inverse,
@@ -20,6 +19,7 @@ from npa_envs.ops.checks import (
     checked_positive,
     constant,
 )
+from npa_envs.errors import NPAError, shown
 from npa_envs.ops.equivariance import MIXED_VECTORS, VectorForm, invariants, signed_gates, steered
 from npa_envs.rule.codes import Codes, check_names
 from npa_envs.rule.network import (
@@ -73,8 +73,8 @@ STEP_PARTS = frozenset(
 """What a step of a rule is made of: where a subclass changes any of it, the rule is not plain."""
 
 
-class NamedAlways(TypedDict):
-    """What every rule's file says."""
+class RuleHyperParameters(TypedDict):
+    """Everything besides its weights that makes an `NPARule`."""
 
     space_dim: int
     state_dim: int
@@ -87,11 +87,6 @@ class NamedAlways(TypedDict):
     moment_correction: bool
     state_gradient: bool
     density_gradient: bool
-
-
-class RuleHyperParameters(NamedAlways, total=False):
-    """Everything besides its weights that makes an `NPARule`."""
-
     species_count: int
     moment_inverse: MomentInverse
     equivariant: bool
@@ -550,7 +545,8 @@ class NPARule(nn.Module):
 
     def hyper_parameters(self) -> RuleHyperParameters:
         """Return all that `NPARule` takes: `NPARule(**rule.hyper_parameters())` has this shape."""
-        made = RuleHyperParameters(
+        codes = self.codes
+        return RuleHyperParameters(
             space_dim=self.space_dim,
             state_dim=self.state_dim,
             hidden_dim=self.hidden_dim,
@@ -562,25 +558,17 @@ class NPARule(nn.Module):
             moment_correction=self.moment_correction,
             state_gradient=self.state_gradient,
             density_gradient=self.density_gradient,
+            species_count=self.species_count,
+            moment_inverse=self.moment_inverse,
+            equivariant=self.equivariant,
+            chiral=self.chiral,
+            mixed_vectors=self.mixed_vectors,
+            code_dim=self.code_dim,
+            code_names=() if codes is None else codes.names,
+            encoder=codes is not None and codes.encoder is not None,
+            divides=self.divides,
+            dead_zone=self.dead_zone,
         )
-        # Left out where it says nothing: files and checkpoints stay those of all versions.
-        if self.species_count:
-            made["species_count"] = self.species_count
-        if self.moment_inverse != "threshold":
-            made["moment_inverse"] = self.moment_inverse
-        if self.equivariant:
-            made["equivariant"] = True
-            made["chiral"] = self.chiral
-            made["mixed_vectors"] = self.mixed_vectors
-        if self.codes is not None:
-            made["code_dim"] = self.code_dim
-            made["code_names"] = self.codes.names
-            made["encoder"] = self.codes.encoder is not None
-        if self.divides:
-            made["divides"] = True
-        if self.dead_zone:
-            made["dead_zone"] = self.dead_zone
-        return made
 
 
 def _checked_dead_zone(value: Any, equivariant: bool) -> float:

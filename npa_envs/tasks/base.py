@@ -11,11 +11,11 @@ from typing import Any, Generic, Protocol, Self, TypeVar, cast, runtime_checkabl
 import torch
 from torch import Tensor
 
+from npa_envs.checks import check_fraction, check_non_negative, check_positive
 from npa_envs.errors import NPAError, shown
 from npa_envs.ops import Cameras, world_mean
 from npa_envs.rule.rule import NPARule
 from npa_envs.tasks.appearance import Gaussians
-from npa_envs.tasks.checks import check_fraction, check_non_negative, check_positive
 from npa_envs.world.randomness import Randomness
 
 

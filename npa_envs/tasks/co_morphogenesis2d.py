@@ -11,9 +11,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from npa_envs.checks import check_non_negative
 from npa_envs.errors import NPAError
 from npa_envs.rule.rule import COLOUR_OFFSET, NPARule
-from npa_envs.tasks.checks import check_non_negative
 from npa_envs.tasks.morphogenesis2d import (
     HALF_SEEDS,
     MORPHOGENESIS2D_PRESETS,

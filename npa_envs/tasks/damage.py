@@ -13,10 +13,16 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from npa_envs.checks import (
+    check_fraction,
+    check_non_negative,
+    check_world,
+    checked_number,
+    is_real,
+    is_whole,
+)
 from npa_envs.errors import NPAError, shown, suggest
 from npa_envs.ops import world_mean
-from npa_envs.ops.checks import check_world, checked_number
-from npa_envs.tasks.checks import check_fraction, check_non_negative, is_real, is_whole
 from npa_envs.tasks.seeds import drawn_indices, uniform_ball
 from npa_envs.world.brushes import clump, cut, erase_state
 from npa_envs.world.randomness import Randomness, check_generator, normal_draws, uniform_draws

@@ -8,8 +8,8 @@ from typing import Any, TypeVar
 import torch
 from torch import Tensor
 
+from npa_envs.checks import check_non_negative, check_positive
 from npa_envs.tasks.base import ParticleTask, TaskConfig
-from npa_envs.tasks.checks import check_non_negative, check_positive
 from npa_envs.tasks.damage import PoolDamage, hurt, stray_motion
 from npa_envs.tasks.seeds import uniform_ball
 from npa_envs.world.randomness import Randomness

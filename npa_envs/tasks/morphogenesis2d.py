@@ -10,14 +10,13 @@ from pathlib import Path
 from typing import Any, Self
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor
 
+from npa_envs.checks import check_flag, check_non_negative, check_positive, check_text
 from npa_envs.errors import NPAError, shown
 from npa_envs.ops import splat, world_mean
 from npa_envs.ops.pictures.losses import picture_losses
 from npa_envs.rule.rule import COLOUR_OFFSET, LIFE, NPARule
-from npa_envs.tasks.checks import check_flag, check_non_negative, check_positive, check_text
 from npa_envs.tasks.damage import hurt
 from npa_envs.tasks.growth import GrowthConfig, GrowthTask
 from npa_envs.tasks.targets.images import LARGEST_POINT_COUNT
@@ -28,9 +27,6 @@ from npa_envs.world.randomness import Randomness, WorldRandom, uniform_draws
 
 LARGEST_CODE = 1024
 """Numbers of a code, at most."""
-
-SMALLEST_PICTURE = 4
-"""Pixels a side of a picture that is blurred and halved, at least."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -81,10 +77,6 @@ class Morphogenesis2DConfig(GrowthConfig):
     colour_weight: float = 5.0
     """Weight of the colour term against the density term inside the splat loss (dimensionless)."""
 
-    blur_levels: int = 0
-    """How often pictures are blurred, halved and compared once more. Coarse pictures draw particles
-    from afar to where some are missing. The loss is the mean of all comparisons."""
-
     drift_weight: float = 0.0
     """Weight of the centroids' distance from the origin, where worlds begin (per length unit)."""
 
@@ -119,12 +111,6 @@ class Morphogenesis2DConfig(GrowthConfig):
         super().__post_init__()
         check_text(self, "target", "a built-in name, an emoji or a path")
         check_positive(self, int, "target_point_count", at_most=LARGEST_POINT_COUNT)
-        check_positive(self, int, "blur_levels", at_least=0)
-        if self.resolution >> self.blur_levels < SMALLEST_PICTURE:
-            raise NPAError(
-                f"blur_levels must leave pictures of at least {SMALLEST_PICTURE} pixels a side, "
-                f"got {self.blur_levels} for a resolution of {self.resolution}: lower it"
-            )
         check_positive(self, float, "sigma")
         check_non_negative(self, "splat_weight", "colour_weight", "drift_weight")
         check_non_negative(self, "seed_axis", "seed_across")
@@ -364,17 +350,7 @@ class Morphogenesis2D(GrowthTask[Morphogenesis2DConfig]):
 
     def compare(self, x: Tensor, s: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
         """Return the batch's splat loss, weighted, and its density and colour terms."""
-        levels = self.config.blur_levels
-        if levels == 0:
-            density, colour = (term.mean() for term in self.splat_losses(x, s))
-        else:
-            difference = self.picture(x, s) - self.target_picture.to(x)
-            density, colour = x.new_zeros(()), x.new_zeros(())
-            for level in range(levels + 1):
-                errors = _errors(difference)
-                density = density + errors[0].mean() / (levels + 1)
-                colour = colour + errors[1].mean() / (levels + 1)
-                difference = _halved(difference) if level < levels else difference
+        density, colour = (term.mean() for term in self.splat_losses(x, s))
         total = self.config.splat_weight * (density + self.config.colour_weight * colour)
         return total, {"density": density, "colour": colour}
 
@@ -524,12 +500,6 @@ def _errors(difference: Tensor) -> tuple[Tensor, Tensor]:
     return density, colour * torch.exp(-density.detach())
 
 
-def _halved(picture: Tensor) -> Tensor:
-    """Return pictures [B, R, R, 4] blurred and half as large: means of 4 x 4 pixels, every 2."""
-    channels_first = picture.permute(0, 3, 1, 2)
-    return F.avg_pool2d(channels_first, 4, stride=2, padding=1).permute(0, 2, 3, 1)
-
-
 def _growth(difference: Tensor) -> Tensor:
     """|d| + d^2 of every pixel: linear near the goal, quadratic far from it."""
     size = difference.abs()
@@ -588,7 +558,7 @@ MORPHOGENESIS2D_PRESETS: Mapping[str, Morphogenesis2DTrainConfig] = {
         rest_weight=2.0,
         rest_power=4.0,
         dead_zone=1e-3,
-        initial_rule="heart-v0",
+        initial_rule="heart-first",
         out=_OUT,
     ),
     # A few particles that see far; of two worlds one is young, one grown and at rest:

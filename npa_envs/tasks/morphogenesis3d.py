@@ -12,18 +12,18 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from npa_envs.errors import NPAError, shown
-from npa_envs.ops import Cameras, world_mean
-from npa_envs.rule.rule import NPARule
-from npa_envs.tasks.appearance import OUTPUTS, RENDERERS, Appearance, Gaussians
-from npa_envs.tasks.base import shares_of_loss
-from npa_envs.tasks.checks import (
+from npa_envs.checks import (
     check_fraction,
     check_non_negative,
     check_positive,
     check_seed,
     check_text,
 )
+from npa_envs.errors import NPAError
+from npa_envs.ops import Cameras, world_mean
+from npa_envs.rule.rule import NPARule
+from npa_envs.tasks.appearance import OUTPUTS, Appearance, Gaussians, draw_gaussians
+from npa_envs.tasks.base import shares_of_loss
 from npa_envs.tasks.growth import GrowthConfig, GrowthTask
 from npa_envs.tasks.losses.similarity import MultiScaleSimilarity
 from npa_envs.tasks.targets.views import ViewTarget, load_views, nearest_camera, over, some_views
@@ -102,9 +102,6 @@ class Morphogenesis3DConfig(GrowthConfig):
     bound_weight: float = 10.0
     """Weight of mean |x − clip(x, −1, 1)| (per length unit)."""
 
-    renderer: str = "own"
-    """What draws views: "own" kernels, or "gsplat" (CUDA, with `cuda_graph` off)."""
-
     def __post_init__(self) -> None:
         """Check every field; raise NPAError where one has a wrong type or lies out of its range."""
         super().__post_init__()
@@ -118,8 +115,6 @@ class Morphogenesis3DConfig(GrowthConfig):
         if self.opacity == 1.0:
             raise NPAError("opacity must lie below 1, got 1: for example opacity=0.99")
         check_seed(self, "view_seed", bits=31)
-        if not isinstance(self.renderer, str) or self.renderer not in RENDERERS:
-            raise NPAError(f"renderer must be 'own' or 'gsplat', got {shown(self.renderer)}")
 
 
 SHOWN_FROM = 20.0
@@ -282,7 +277,7 @@ class Morphogenesis3D(GrowthTask[Morphogenesis3DConfig]):
         return self._weighted(self._compare(found, wanted, x.new_full((3,), GREY)))
 
     def _draw(self, x: Tensor, gaussians: Gaussians, cameras: Cameras) -> Tensor:
-        image, alpha = RENDERERS[self.config.renderer](x, gaussians, cameras.to(x))
+        image, alpha = draw_gaussians(x, gaussians, cameras.to(x))
         return torch.cat((image, alpha[..., None]), dim=-1)
 
     def _compare(self, found: Tensor, wanted: Tensor, background: Tensor) -> dict[str, Tensor]:

@@ -13,11 +13,11 @@ from typing import Any, Self
 import torch
 from torch import Tensor
 
+from npa_envs.checks import check_non_negative, check_positive, check_seed, check_text
 from npa_envs.errors import NPAError
 from npa_envs.ops import splat, world_mean
 from npa_envs.rule.rule import NPARule
 from npa_envs.tasks.base import ParticleTask, TaskConfig, check_goal
-from npa_envs.tasks.checks import check_non_negative, check_positive, check_seed, check_text
 from npa_envs.tasks.seeds import drawn_indices
 from npa_envs.tasks.targets.clouds import (
     PointClouds,

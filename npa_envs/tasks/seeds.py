@@ -5,9 +5,9 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from npa_envs.checks import DTYPES, checked_count, checked_finite, entries
 from npa_envs.devices import check_device
 from npa_envs.errors import NPAError, shown
-from npa_envs.ops.checks import DTYPES, checked_count, checked_finite, entries
 from npa_envs.ops.sort import LARGEST_INDEX
 from npa_envs.world.randomness import Randomness, WorldRandom, check_generator
 

@@ -11,17 +11,17 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from npa_envs.errors import NPAError, shown
-from npa_envs.ops import periodic_splat
-from npa_envs.rule.rule import COLOUR_OFFSET
-from npa_envs.tasks.base import ParticleTask, TaskConfig, shares_of_loss
-from npa_envs.tasks.checks import (
+from npa_envs.checks import (
     check_flag,
     check_non_negative,
     check_positive,
     check_seed,
     check_text,
 )
+from npa_envs.errors import NPAError, shown
+from npa_envs.ops import periodic_splat
+from npa_envs.rule.rule import COLOUR_OFFSET
+from npa_envs.tasks.base import ParticleTask, TaskConfig, shares_of_loss
 from npa_envs.tasks.damage import erase_state, random_particle
 from npa_envs.tasks.losses.texture import (
     DEFAULT_LOSS,

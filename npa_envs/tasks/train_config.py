@@ -10,18 +10,17 @@ from typing import Any, Generic, Literal, TypeVar, get_args
 
 import torch
 
-from npa_envs.devices import parse_device
-from npa_envs.errors import NPAError, shown
-from npa_envs.ops.checks import MomentInverse
-from npa_envs.tasks.checks import (
+from npa_envs.checks import (
+    MomentInverse,
     check_flag,
-    check_fraction,
     check_non_negative,
     check_positive,
     check_seed,
     is_real,
     is_whole,
 )
+from npa_envs.devices import parse_device
+from npa_envs.errors import NPAError, shown
 from npa_envs.world.rollout import Memory
 
 TaskConfigT = TypeVar("TaskConfigT")
@@ -38,14 +37,11 @@ RISE = 0.01
 LOWEST = 0.01
 """What is left of the learning rate at the end of the schedule "cosine"."""
 
-VARIED = ("vary_particles", "vary_eps", "vary_update_prob", "vary_dt")
-"""Fields that say what of worlds is varied."""
+DECAY = 0.3
+"""Factor on the learning rate at each milestone."""
 
 LARGEST_POWER = 8.0
 """Largest power of the mean of what grown worlds change: float32 rounds higher ones to 0."""
-
-AGEING_BLOCK = 64
-"""Steps that worlds are aged by at a time: on CUDA, what one graph replays."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -61,24 +57,12 @@ class TrainConfig(Generic[TaskConfigT]):
 
     initial_rule: str = ""
     """Start from this rule, a name, a file or a run's folder, instead of random weights; '': from
-    these. The preset `best` of morphogenesis2d starts from a heart (`heart-v0`), that of
+    these. The preset `best` of morphogenesis2d starts from a heart (`heart-first`), that of
     morphogenesis3d from `rocket-8192`."""
 
-    vary_particles: tuple[float, float] = (1.0, 1.0)
-    """Range of factors on the number of particles. Half of the batches are as the task says, the
-    others of `variants` kinds of worlds, whose factors are spread evenly in the logarithm."""
-
     vary_eps: tuple[float, float] = (1.0, 1.0)
-    """Range of factors on ε, drawn anew for each fresh world among those, in open space."""
-
-    vary_update_prob: tuple[float, float] = (1.0, 1.0)
-    """Range of factors on the probability of updates; rollouts have as many updates in all."""
-
-    vary_dt: tuple[float, float] = (1.0, 1.0)
-    """Range of factors on the time step; rollouts take as much time in all."""
-
-    variants: int = 7
-    """Kinds of worlds, each with a pool of its own, where something is varied."""
+    """Range of factors on ε, in open space: one is drawn for each fresh world, evenly in the
+    logarithm. A world at a larger ε is one at the task's ε that begins as a smaller disk."""
 
     moment_inverse: MomentInverse = "threshold"
     """How the rule's state gradients are corrected: "threshold", the paper's, or "smooth"."""
@@ -116,24 +100,10 @@ class TrainConfig(Generic[TaskConfigT]):
     to a hundredth, whatever the length of the repeat."""
 
     milestones: tuple[int, ...] = (2_000, 4_000, 6_000, 8_000)
-    """Iterations of a repeat after which the learning rate is multiplied by `decay`."""
-
-    decay: float = 0.3
-    """Factor on the learning rate at each milestone, in (0, 1]."""
+    """Iterations of a repeat after which the learning rate falls to 0.3 of itself."""
 
     weight_decay: float = 0.0
     """The optimiser's weight decay."""
-
-    fate_rate: float = 0.02
-    """Share of the learning rate with which rules whose particles divide learn when to divide and
-    to die; 0: not at all, and such weights do not decay either."""
-
-    average: float = 0.0
-    """Share in [0, 1) that the kept rule, a running mean of the weights, keeps of itself in an
-    iteration (less in the first ones). 0: the weights themselves are kept."""
-
-    normalise_gradients: bool = True
-    """Every parameter's gradient is divided by its own norm before the optimiser's step."""
 
     seed_interval: int = 16
     """Every so many batches, the first world of the batch is a fresh seed. 1: in every batch."""
@@ -151,15 +121,7 @@ class TrainConfig(Generic[TaskConfigT]):
     second_lives: float = 0.0
     """Share in [0, 1) of the worlds whose time is over that are damaged at that moment and live as
     long again; a fresh seed takes the place of the others (dimensionless). So a rule learns what
-    comes of a damage long after it. Needs `lifetimes` and `damage`."""
-
-    ageing_steps: int = 0
-    """Steps that worlds of the longer-lived half of the pool's places are run without gradients,
-    every `ageing_interval` iterations, so that they grow old under the rule as it is. So many once
-    the learning rate has fallen to 0, fewer before, in blocks of 64; 0: none. Needs `lifetimes`."""
-
-    ageing_interval: int = 16
-    """Iterations from one such ageing to the next."""
+    comes of a damage long after it. Needs `lifetimes`."""
 
     rest_weight: float = 0.0
     """Weight of what a rollout changes in grown worlds: the mean path length of their particles in
@@ -175,16 +137,10 @@ class TrainConfig(Generic[TaskConfigT]):
     rest_age: int = 512
     """Steps from the seed, or from the damage before another life, after which a world is grown."""
 
-    damage: bool = True
-    """Worlds from the pool are damaged before the rollout, so that the rule learns to heal."""
-
     damage_share: float = 1.0
-    """Share of the pool's places whose worlds are damaged in every batch: the first places, which
-    with `lifetimes` are those of the shortest lives. All others are damaged by `second_lives`
-    alone."""
-
-    runaway_limit: float = 10.0
-    """A world with |x| or |s| above this, or not finite, is replaced by a seed in the pool."""
+    """Share in [0, 1] of the pool's places whose worlds are damaged in every batch, so that a rule
+    learns to heal: the first places, which with `lifetimes` are those of the shortest lives. All
+    others are damaged by `second_lives` alone."""
 
     seed: int = 0
     """Seed of every random number of the run, in [0, 2**63)."""
@@ -221,23 +177,18 @@ class TrainConfig(Generic[TaskConfigT]):
         """Check every field; raise NPAError where one has a wrong type or lies out of its range."""
         check_positive(self, int, "iterations", "repeats", "world_count", "pool_size")
         check_positive(self, int, "seed_interval", "log_interval", "checkpoint_interval")
-        check_positive(self, int, "ageing_interval", "rest_age")
-        check_positive(self, int, "ageing_steps", at_least=0)
-        check_positive(self, float, "learning_rate", "runaway_limit")
-        check_positive(self, float, "rest_power")
-        check_fraction(self, "decay", "damage_share")
-        check_non_negative(self, "weight_decay", "fresh_share", "average", "rest_weight")
-        check_non_negative(self, "dead_zone")
-        check_non_negative(self, "fate_rate", "second_lives")
+        check_positive(self, int, "rest_age")
+        check_positive(self, float, "learning_rate", "rest_power")
+        check_non_negative(self, "weight_decay", "fresh_share", "rest_weight")
+        check_non_negative(self, "dead_zone", "second_lives", "damage_share")
         if not 1.0 <= self.rest_power <= LARGEST_POWER:
             raise NPAError(
                 f"rest_power must be at least 1 and at most {LARGEST_POWER:g}, got "
                 f"{self.rest_power}: 1 for plain means"
             )
-        if self.average >= 1.0:
-            raise NPAError(f"average must be below 1, got {self.average}: try 0.999")
-        if self.fresh_share > 1.0:
-            raise NPAError(f"fresh_share must be at most 1, got {self.fresh_share}: try 0.5")
+        for name in ("fresh_share", "damage_share"):
+            if (share := getattr(self, name)) > 1.0:
+                raise NPAError(f"{name} must be at most 1, got {share}: try 0.5")
         if self.second_lives >= 1.0:
             raise NPAError(
                 f"second_lives must be below 1, got {self.second_lives}: with 1 there are no seeds"
@@ -248,7 +199,7 @@ class TrainConfig(Generic[TaskConfigT]):
                 f"picture_interval must be a whole number of at least 0, got {shown(interval)}"
             )
         check_seed(self, "seed")
-        check_flag(self, "normalise_gradients", "damage", "cuda_graph", "tensorboard")
+        check_flag(self, "cuda_graph", "tensorboard")
         if not isinstance(self.initial_rule, str):
             raise NPAError(
                 f"initial_rule must be the name of a rule or of a file, or '' for none, got "
@@ -262,7 +213,7 @@ class TrainConfig(Generic[TaskConfigT]):
                 f"set pool_size={self.world_count} or more"
             )
         self._check_lifetimes()
-        self._check_variants()
+        self._check_eps()
         self._check_choice("optimiser", get_args(OptimiserName))
         self._check_choice("schedule", get_args(Schedule))
         self._check_choice("dtype", ("float32", "float64"))
@@ -313,39 +264,25 @@ class TrainConfig(Generic[TaskConfigT]):
                 f"{self.pool_size} and {self.world_count}: set "
                 f"pool_size={self.pool_size // self.world_count * self.world_count}"
             )
-        for name in ("ageing_steps", "rest_weight", "second_lives"):
+        for name in ("rest_weight", "second_lives"):
             if getattr(self, name) > 0 and not self.ages:
                 raise NPAError(
                     f"{name} needs worlds that have lifetimes, got {getattr(self, name)} without: "
                     "set lifetimes, for example to (256, 32768)"
                 )
-        falls = self.schedule != "milestones" or (self.decay < 1.0 and len(self.milestones) > 0)
-        if self.ageing_steps > 0 and not falls:
-            raise NPAError(
-                f"ageing_steps needs a learning rate that falls, got {self.ageing_steps} with "
-                f"decay={self.decay} and milestones={self.milestones}: worlds age as it falls; set "
-                "schedule='cosine', or milestones and a decay below 1"
-            )
-        if self.second_lives > 0.0 and not self.damage:
-            raise NPAError(
-                f"second_lives needs damage, got {self.second_lives} with damage=False, because "
-                "worlds that live again are damaged first: set second_lives=0"
-            )
 
-    def _check_variants(self) -> None:
-        check_positive(self, int, "variants")
-        for name in VARIED:
-            factors = getattr(self, name)
-            if (
-                not isinstance(factors, tuple)
-                or len(factors) != 2
-                or not all(is_real(factor) for factor in factors)
-                or not 0.0 < factors[0] <= factors[1]
-            ):
-                raise NPAError(
-                    f"{name} must be two factors (lo, hi) with 0 < lo <= hi, got "
-                    f"{shown(factors)}: for example {name}=(0.5, 2.0)"
-                )
+    def _check_eps(self) -> None:
+        factors = self.vary_eps
+        if (
+            not isinstance(factors, tuple)
+            or len(factors) != 2
+            or not all(is_real(factor) for factor in factors)
+            or not 0.0 < factors[0] <= factors[1]
+        ):
+            raise NPAError(
+                f"vary_eps must be two factors (lo, hi) with 0 < lo <= hi, got {shown(factors)}: "
+                "for example vary_eps=(0.5, 2.0)"
+            )
 
     def _check_choice(self, name: str, choices: tuple[str, ...]) -> None:
         value = getattr(self, name)
@@ -355,14 +292,14 @@ class TrainConfig(Generic[TaskConfigT]):
             )
 
     @property
-    def varied(self) -> bool:
-        """Whether worlds of other kinds than the task's are trained on."""
-        return any(getattr(self, name) != (1.0, 1.0) for name in VARIED)
-
-    @property
     def ages(self) -> bool:
         """Whether worlds of the pool have lifetimes."""
         return self.lifetimes[1] > 0
+
+    @property
+    def damages(self) -> bool:
+        """Whether any world of the pool is ever damaged."""
+        return self.damage_share > 0.0 or self.second_lives > 0.0
 
     @property
     def fresh_count(self) -> int:
@@ -392,30 +329,13 @@ class TrainConfig(Generic[TaskConfigT]):
                 who counts seconds makes it fall with them.
         """
         within = iteration % self.iterations
-        rate = self.learning_rate * self._fall(within, share)
-        if self.schedule == "cosine":
-            rate *= min(1.0, (within + 1) / (RISE * self.iterations))
-        return rate
-
-    def ageing_at(self, iteration: int, share: float = 0.0) -> int:
-        """Return the steps without gradients before an iteration, counted from 0 over all repeats.
-
-        Args:
-            iteration: Iterations done so far in the run.
-            share: As for `learning_rate_at`.
-        """
-        if self.ageing_steps == 0 or iteration % self.ageing_interval:
-            return 0
-        fallen = 1.0 - self._fall(iteration % self.iterations, share)
-        return round(fallen * self.ageing_steps / AGEING_BLOCK) * AGEING_BLOCK
-
-    def _fall(self, within: int, share: float) -> float:
-        """Return what is left of the learning rate after some iterations of a repeat."""
-        if self.schedule == "cosine":
-            over = min(1.0, max(share, within / self.iterations))
-            fall = 0.5 + 0.5 * math.cos(math.pi * over)
-            return LOWEST + (1.0 - LOWEST) * fall
-        return float(self.decay ** sum(milestone <= within for milestone in self.milestones))
+        if self.schedule == "milestones":
+            passed = sum(milestone <= within for milestone in self.milestones)
+            return float(self.learning_rate * float(DECAY**passed))
+        over = min(1.0, max(share, within / self.iterations))
+        fall = 0.5 + 0.5 * math.cos(math.pi * over)
+        rate = self.learning_rate * (LOWEST + (1.0 - LOWEST) * fall)
+        return rate * min(1.0, (within + 1) / (RISE * self.iterations))
 
 
 @dataclass(frozen=True, kw_only=True)

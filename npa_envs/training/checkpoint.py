@@ -12,11 +12,11 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from npa_envs.checks import is_real, is_whole
 from npa_envs.errors import NPAError, shown
 from npa_envs.files import atomic_path, check_torch_archive, open_regular
-from npa_envs.tasks.checks import is_real, is_whole
 from npa_envs.tasks.train_config import TrainConfig
-from npa_envs.training.overrides import completed, config_to_dict
+from npa_envs.training.overrides import config_to_dict
 
 CHECKPOINT_FORMAT = "npa-envs checkpoint"
 """Marks a file as ours."""
@@ -162,7 +162,7 @@ def check_same_run(
     """
     _check_complete(content, path)
     check_task(content, task_name, path)
-    theirs = _flat(completed(content["config"], config))
+    theirs = _flat(content["config"])
     ours = _flat(config_to_dict(config))
     differences = [
         f"{name}: {shown(theirs.get(name, 'absent'))} there, {shown(ours.get(name, 'absent'))} here"

@@ -13,21 +13,20 @@ import torch
 from torch import Tensor
 
 import npa_envs.world.rollout
+from npa_envs.errors import NPAError
 from npa_envs.rule.rule import NPARule
 from npa_envs.tasks.base import (
     GoalTask,
     ScheduledTask,
     Task,
-    coded_states,
     seed_worlds,
     task_for_rule,
-    task_toward,
 )
-from npa_envs.tasks.train_config import AGEING_BLOCK, TrainConfig
+from npa_envs.tasks.train_config import TrainConfig
 from npa_envs.training.iteration import EagerIteration, GraphedIteration, Rollout
 from npa_envs.training.meter import LossMeter
-from npa_envs.training.optimiser import RuleOptimiser, WeightAverage
-from npa_envs.training.pool import WorldPool
+from npa_envs.training.optimiser import RuleOptimiser
+from npa_envs.training.pool import RUNAWAY_LIMIT, WorldPool
 from npa_envs.training.randomness import RunRandomness, registered, restart
 from npa_envs.training.ranks import Ranks
 from npa_envs.world.cuda_graph import Replayed
@@ -46,8 +45,9 @@ class TrainingCycle:
         rollout: The rollout to train through; None is the engine's.
         ranks: The processes that share the run; None: this one alone.
         by_world: Each world draws by itself, as several processes need it.
-        beside: A cycle of other worlds that train the same rule: optimiser, averaged weights and
-            gradients are shared with it.
+
+    Raises:
+        NPAError: ε is to vary where it cannot.
     """
 
     def __init__(
@@ -61,11 +61,10 @@ class TrainingCycle:
         *,
         ranks: Ranks | None = None,
         by_world: bool = False,
-        beside: TrainingCycle | None = None,
     ) -> None:
         self.task = task_for_rule(task, rule)
         """The task, as it is for worlds of this rule."""
-        self._rule = rule
+        _check_varied_eps(self.task, rule, config)
         self._config = config
         self._rollout: Rollout = npa_envs.world.rollout.rollout if rollout is None else rollout
         self._ranks = ranks = Ranks() if ranks is None else ranks
@@ -73,22 +72,20 @@ class TrainingCycle:
         if by_world:
             ranks.check(config)
         places = ranks.places(config.pool_size, self._section)
-        old = places >= config.pool_size // 2
         self.random = (
-            RunRandomness.by_world(config, device, schedule, ranks, places[old])
+            RunRandomness.by_world(config, device, schedule, ranks)
             if by_world
             else RunRandomness.of_batch(config, device, schedule)
         )
         """What the run draws from."""
         self._places = places.to(device)
-        self._old = old.nonzero()[:, 0].to(device)
         x, s, goal = self._seeds(len(places), self.random.pool)
         lifetimes = config.lifetimes if config.ages else None
         self.pool = WorldPool(
             x,
             s,
             goal,
-            runaway_limit=config.runaway_limit,
+            runaway_limit=RUNAWAY_LIMIT,
             lifetimes=lifetimes,
             places=places,
             total=config.pool_size,
@@ -116,19 +113,11 @@ class TrainingCycle:
             self.random.masks,
             self._rollout,
             goal=goals,
-            gradients=None if beside is None else beside.batch.gradients,
             mean_over_processes=None if ranks.count == 1 else ranks.mean,
         )
         """Worlds before and after the last rollout, the loss and its gradients."""
-        parameters = self.batch.parameters
-        self.optimiser: RuleOptimiser = (
-            RuleOptimiser(parameters, config, rule) if beside is None else beside.optimiser
-        )
+        self.optimiser = RuleOptimiser(self.batch.parameters, config, rule)
         """Changes the rule."""
-        self.average: WeightAverage = (
-            WeightAverage(parameters, config.average) if beside is None else beside.average
-        )
-        """The running mean of the weights, where the configuration asks for one."""
         self.meter = LossMeter(self.batch)
         """What happened since the last line of the log."""
         self._index = torch.zeros(count, dtype=torch.int64, device=device)
@@ -137,8 +126,7 @@ class TrainingCycle:
         self._lost = torch.zeros_like(self._index[0])
         self._fresh_x, self._fresh_s = (torch.empty_like(t) for t in batch)
         self._fresh_goal = None if goals is None else torch.empty_like(goals)
-        worlds, ageing = registered(self.random.worlds), registered(self.random.ageing)
-        self._grow_old = Replayed(self._age_worlds, device, ageing) if graphed else self._age_worlds
+        worlds = registered(self.random.worlds)
         self._draw = Replayed(self._draw_worlds, device, worlds) if graphed else self._draw_worlds
         self._keep = Replayed(self._keep_worlds, device) if graphed else self._keep_worlds
         self._note = Replayed(self._note_iteration, device) if graphed else self._note_iteration
@@ -155,9 +143,6 @@ class TrainingCycle:
         steps = int(torch.randint(lo, hi, (), generator=self.random.schedule))
         if isinstance(self.task, ScheduledTask):
             self.task.begin(iteration)
-        for _ in range(config.ageing_at(iteration, share) // AGEING_BLOCK):
-            if len(self._old) > 0:
-                self._grow_old()
         self._draw()
         if not config.ages and iteration % config.seed_interval == 0:
             self._begin_anew(self._fresh[iteration // config.seed_interval % len(self._fresh)])
@@ -169,7 +154,6 @@ class TrainingCycle:
         self._ranks.reduce([*batch.gradients, batch.terms], self._lost)
         self._note()
         self.optimiser.step(iteration, share)
-        self.average.update(iteration)
         return steps
 
     @property
@@ -188,7 +172,6 @@ class TrainingCycle:
             },
             "meter": self.meter.state_dict(),
             "random_states": self.random.state_dict(),
-            **self.average.state_dict(),
         }
 
     def state_like(self, iteration: int) -> dict[str, Any]:
@@ -205,7 +188,6 @@ class TrainingCycle:
             "pool": pool,
             "meter": self.meter.state_dict(),
             "random_states": self.random.state_dict(),
-            **self.average.state_dict(),
         }
 
     def load_state_dict(self, state: dict[str, Any], iteration: int) -> None:
@@ -215,33 +197,7 @@ class TrainingCycle:
             if tensor is not None:
                 tensor.copy_(self._ranks.own(state["pool"][name], self._section))
         self.meter.load_state_dict(state["meter"])
-        self.average.load_state_dict(state)
-        self.random.load_state_dict(state["random_states"], iteration, self._config)
-
-    @torch.no_grad()
-    def _age_worlds(self) -> None:
-        """Run the worlds of the longer-lived half of the pool for some steps, without gradients."""
-        pool, old, random = self.pool, self._old, self.random.ageing
-        assert pool.age is not None, "made with lifetimes"
-        restart(random)
-        x, s, goal = pool.read(old)
-        s = coded_states(task_toward(self.task, goal), s)
-        x, s, _ = self._rollout(
-            self._rule,
-            x,
-            s,
-            AGEING_BLOCK,
-            eps=self.task.eps,
-            box=self.task.box,
-            update_prob=self.task.update_prob,
-            memory=self._config.memory,
-            generator=random,
-            return_path_length=True,
-        )
-        fresh_x, fresh_s, fresh_goal = self._seeds(len(old), random)
-        goals = None if goal is None or fresh_goal is None else (goal, fresh_goal)
-        age = pool.age.index_select(0, old) + AGEING_BLOCK
-        self._lost += pool.write(old, x, s, fresh_x, fresh_s, goals, age).sum()
+        self.random.load_state_dict(state["random_states"], iteration)
 
     @torch.no_grad()
     def _draw_worlds(self) -> None:
@@ -258,7 +214,7 @@ class TrainingCycle:
         if config.second_lives > 0.0:
             again = over & (uniform_draws(worlds, (len(over), 1), x0)[:, 0] < config.second_lives)
             over, hit = over & ~again, hit | again
-        if config.damage:
+        if config.damages:
             x0, s0, goal = self._damaged(x0, s0, goal, hit)
         # Drawn in every iteration, needed or not: nobody on the host knows which worlds run away.
         fresh_x, fresh_s, fresh_goal = self._seeds(len(self._index), worlds)
@@ -298,8 +254,7 @@ class TrainingCycle:
 
     def _places_hurt(self) -> Tensor:
         """Return whether the batch's worlds come from places damaged each time, shape [B]."""
-        share = self._config.damage_share if self._config.damage else 0.0
-        return self._places[self._index] < share * self._config.pool_size
+        return self._places[self._index] < self._config.damage_share * self._config.pool_size
 
     def _begin_anew(self, index: Tensor) -> None:
         """Let some worlds of the batch, int64, shape [M], be fresh seeds."""
@@ -344,3 +299,20 @@ class TrainingCycle:
     def _pooled(self) -> list[tuple[str, Tensor | None]]:
         pool = self.pool
         return [("x", pool.x), ("s", pool.s), ("goal", pool.goal), ("age", pool.age)]
+
+
+def _check_varied_eps(task: Task, rule: NPARule, config: TrainConfig[Any]) -> None:
+    if config.vary_eps == (1.0, 1.0):
+        return
+    if not isinstance(rule, NPARule):
+        raise NPAError("vary_eps is for runs of one rule, got several: leave it out")
+    if task.box is not None or rule.static:
+        raise NPAError(
+            "vary_eps needs particles that move in open space, got a task in a box or whose "
+            "particles stay: leave it out"
+        )
+    if rule.divides:
+        raise NPAError(
+            "vary_eps needs seeds of more than one particle, whose size it varies, got a rule that "
+            "divides: leave it out"
+        )

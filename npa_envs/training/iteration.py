@@ -25,7 +25,7 @@ WARM_UP_STEPS = 2
 """Steps of the eager rollout that loads every kernel before the first capture."""
 
 
-class RolloutOptions(TypedDict):
+class TrainingOptions(TypedDict):
     """What the trainer tells a rollout by name."""
 
     eps: float
@@ -40,7 +40,7 @@ class Rollout(Protocol):
     """`npa_envs.rollout` as the trainer calls it."""
 
     def __call__(
-        self, rule: NPARule, x: Tensor, s: Tensor, steps: int, /, **options: Unpack[RolloutOptions]
+        self, rule: NPARule, x: Tensor, s: Tensor, steps: int, /, **options: Unpack[TrainingOptions]
     ) -> tuple[Tensor, Tensor, Tensor]:
         """Return positions, states and path lengths after `steps` steps."""
 
@@ -73,7 +73,6 @@ class EagerIteration:
         generator: Randomness of the update masks, on the worlds' device.
         rollout: The rollout to run; another one only in tests.
         goal: The worlds' goals, int64, shape [B], where the task has such.
-        gradients: Where the gradients are written, one tensor a parameter; None: to new ones.
         mean_over_processes: As `counted_together` takes it, where several processes share a run.
     """
 
@@ -88,7 +87,6 @@ class EagerIteration:
         rollout: Rollout | None = None,
         *,
         goal: Tensor | None = None,
-        gradients: list[Tensor] | None = None,
         mean_over_processes: Callable[[Tensor], Tensor] | None = None,
     ) -> None:
         self.goal = None if goal is None else goal.clone()
@@ -113,7 +111,7 @@ class EagerIteration:
         """The loss and then its named parts, shape [K]."""
         self.parameters = [p for p in rule.parameters() if p.requires_grad]
         """What the gradients are for."""
-        self.gradients = gradients or [torch.zeros_like(p) for p in self.parameters]
+        self.gradients = [torch.zeros_like(p) for p in self.parameters]
         """Their `.grad`."""
         for parameter, buffer in zip(self.parameters, self.gradients, strict=True):
             parameter.grad = buffer

@@ -17,7 +17,7 @@ from npa_envs.rule.rule import NPARule
 from npa_envs.tasks.base import differing_fields
 from npa_envs.tasks.co_morphogenesis2d import CoMorphogenesis2D, CoMorphogenesis2DConfig
 from npa_envs.tasks.train_config import JointTrainConfig, TrainConfig
-from npa_envs.training.iteration import RolloutOptions
+from npa_envs.training.iteration import TrainingOptions
 from npa_envs.training.trainer import Trainer, TrainResult, rule_like, take_options
 from npa_envs.world.species import rollout_species
 
@@ -73,7 +73,7 @@ class _JointTrainer(Trainer):
         )
 
     def _rollout_together(
-        self, rule: NPARule, x: Tensor, s: Tensor, steps: int, /, **options: Unpack[RolloutOptions]
+        self, rule: NPARule, x: Tensor, s: Tensor, steps: int, /, **options: Unpack[TrainingOptions]
     ) -> tuple[Tensor, Tensor, Tensor]:
         counts = self._species.config.counts
         rules = list(cast(JointRules, rule))

@@ -1,8 +1,7 @@
-"""From gradients to new weights: normalised gradients, an optimiser, the weights' running mean."""
+"""From gradients to new weights: normalised gradients, an optimiser."""
 
 from __future__ import annotations
 
-import copy
 import itertools
 import math
 from collections.abc import Sequence
@@ -14,6 +13,9 @@ from torch.optim import Optimizer
 
 from npa_envs.rule.rule import NPARule, fate_parameters
 from npa_envs.tasks.train_config import TrainConfig
+
+FATE_RATE = 0.02
+"""Share of the learning rate with which rules learn when particles divide and die."""
 
 MUON_MOMENTUM = 0.9
 """What Muon keeps of the mean of the gradients in an iteration; its usual 0.95 learns less well."""
@@ -30,12 +32,6 @@ def normalise_gradients(gradients: Sequence[Tensor]) -> None:
     norms += NORM_FLOOR
     for gradient, norm, is_bad in zip(gradients, norms.unbind(), bad.unbind(), strict=True):
         gradient.div_(norm).masked_fill_(is_bad, 0.0)
-
-
-def clear_non_finite(gradient: Tensor) -> None:
-    """Set a gradient to 0 in place where any of its entries is not finite."""
-    largest = torch.linalg.vector_norm(gradient, math.inf)
-    gradient.masked_fill_(~(largest < math.inf), 0.0)
 
 
 def layer_weights(rules: nn.Module) -> list[Tensor]:
@@ -62,7 +58,7 @@ class RuleOptimiser:
 
     Args:
         parameters: What is trained; its `.grad` is set before `prepare_gradients`.
-        config: Optimiser, learning rates, weight decay, gradient normalisation.
+        config: Optimiser, learning rates, weight decay.
         rules: The rule that they are of, or a module of several.
     """
 
@@ -72,19 +68,14 @@ class RuleOptimiser:
         self._parameters = list(parameters)
         self._config = config
         fates, matrices = (set(map(id, of(rules))) for of in (fate_parameters, layer_weights))
-        self._shares = [config.fate_rate if id(p) in fates else 1.0 for p in self._parameters]
+        self._shares = [FATE_RATE if id(p) in fates else 1.0 for p in self._parameters]
         muon = config.optimiser == "muon"
         self._orthogonal = [muon and id(p) in matrices for p in self._parameters]
         self._optimisers = self._fresh(self._parameters)
 
     def prepare_gradients(self) -> None:
-        """Normalise the gradients, where that is asked for; what is not finite becomes 0."""
-        gradients = [p.grad for p in self._parameters if p.grad is not None]
-        if self._config.normalise_gradients:
-            normalise_gradients(gradients)
-            return
-        for gradient in gradients:
-            clear_non_finite(gradient)
+        """Normalise the gradients; one that is not finite becomes 0."""
+        normalise_gradients([p.grad for p in self._parameters if p.grad is not None])
 
     def step(self, iteration: int, share: float = 0.0) -> None:
         """Take a step along the prepared gradients; at a repeat's start, with fresh moments.
@@ -155,46 +146,3 @@ def _moments(optimisers: list[tuple[Optimizer, list[int]]]) -> dict[int, dict[st
         for optimiser, numbers in optimisers
         for at, state in optimiser.state_dict()["state"].items()
     }
-
-
-class WeightAverage:
-    """A running mean of parameters: recent ones weigh more, exponentially.
-
-    Args:
-        parameters: What is averaged.
-        decay: Share of itself that the mean keeps in an iteration, in [0, 1); 0: there is none.
-    """
-
-    def __init__(self, parameters: Sequence[nn.Parameter], decay: float) -> None:
-        self._parameters: list[Tensor] = list(parameters)
-        self._decay = decay
-        self._means = [p.detach().clone() for p in parameters] if decay > 0.0 else []
-
-    @torch.no_grad()
-    def update(self, iteration: int) -> None:
-        """Take the parameters after an iteration, counted from 0, into the mean."""
-        if self._means:
-            # What untrained weights have to say is soon forgotten.
-            keep = min(self._decay, (1 + iteration) / (10 + iteration))
-            torch._foreach_lerp_(self._means, self._parameters, 1.0 - keep)
-
-    @torch.no_grad()
-    def rule(self, rule: NPARule) -> NPARule:
-        """Return a copy of the rule that has the parameters with their means; itself without."""
-        if not self._means:
-            return rule
-        averaged = copy.deepcopy(rule)
-        trained = [parameter for parameter in averaged.parameters() if parameter.requires_grad]
-        for parameter, mean in zip(trained, self._means, strict=True):
-            parameter.copy_(mean)
-        return averaged
-
-    def state_dict(self) -> dict[str, Any]:
-        """Return the means as the entry `average` of a checkpoint, or nothing."""
-        means = {str(number): mean for number, mean in enumerate(self._means)}
-        return {"average": means} if means else {}
-
-    def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Go on from a checkpoint with the entries of `state_dict`."""
-        for number, mean in enumerate(self._means):
-            mean.copy_(state["average"][str(number)])

@@ -65,7 +65,6 @@ def load_config(
     base: TrainConfig[TaskConfigT],
     *,
     presets: Mapping[str, TrainConfig[TaskConfigT]] | None = None,
-    whole: bool = False,
 ) -> TrainConfig[TaskConfigT]:
     """Return `base` with the fields that a YAML, TOML or JSON file sets.
 
@@ -76,8 +75,6 @@ def load_config(
         path: A file that ends in .yaml, .yml, .toml or .json.
         base: The configuration that gives every field the file does not, for example a preset.
         presets: Those that a `preset` of the file may name to stand for `base`; None: none.
-        whole: The file is all of a run's configuration: fields that are younger than it get their
-            defaults, not what `base` has.
 
     Raises:
         NPAError: The file cannot be read, is no such file, names an unknown field, or gives a
@@ -102,7 +99,7 @@ def load_config(
             if not isinstance(name, str) or name not in presets:
                 raise NPAError(f"unknown preset {name!r}: {suggest(name, presets)}")
             base = presets[name]
-        return override(base, **(completed(own, base) if whole else _without_retired(own)))
+        return override(base, **own)
     except NPAError as error:
         raise NPAError(f"in the configuration file {shown(str(path))}: {error}") from error
 
@@ -116,43 +113,6 @@ def config_to_dict(config: TrainConfig[Any]) -> dict[str, Any]:
     result = _plain(dataclasses.asdict(config))
     assert isinstance(result, dict)
     return result
-
-
-RETIRED = frozenset({"division_weight"})
-"""Fields that configurations had once: those that were kept are read without them."""
-
-
-def completed(held: Any, config: Any) -> Any:
-    """Return a configuration that was kept, as it is written now.
-
-    Fields that are younger than it have their defaults, and those that are no more are left out.
-
-    Args:
-        held: What `config_to_dict` once returned.
-        config: A configuration of the same kind as it is made now.
-    """
-    if dataclasses.is_dataclass(config) and isinstance(held, dict):
-        younger = {
-            field.name: _plain(field.default)
-            for field in dataclasses.fields(config)
-            if field.name not in held and field.default is not dataclasses.MISSING
-        }
-        now = {name: getattr(config, name, None) for name in held}
-        kept = _without_retired(held)
-        return younger | {name: completed(value, now[name]) for name, value in kept.items()}
-    if isinstance(config, tuple) and config and isinstance(held, list):
-        last = len(config) - 1
-        return [completed(one, config[min(k, last)]) for k, one in enumerate(held)]
-    return held
-
-
-def _without_retired(fields: Mapping[str, Any]) -> dict[str, Any]:
-    """Return fields of a configuration and of its task but those that are no more."""
-    return {
-        name: _without_retired(value) if isinstance(value, Mapping) else value
-        for name, value in fields.items()
-        if name not in RETIRED
-    }
 
 
 def _plain(value: Any) -> Any:

@@ -9,6 +9,9 @@ from torch import Tensor
 
 from npa_envs.world.randomness import Randomness, WorldRandom
 
+RUNAWAY_LIMIT = 10.0
+"""A world with a larger |x| or |s| is replaced by a seed."""
+
 
 class WorldPool:
     """Worlds that live on between batches, on the device, so that a rule learns to be stable.

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from npa_envs.tasks.train_config import AGEING_BLOCK, TrainConfig
+from npa_envs.tasks.train_config import TrainConfig
 from npa_envs.training.ranks import Ranks
 from npa_envs.world.randomness import Randomness, WorldRandom
 
@@ -33,8 +33,6 @@ class RunRandomness:
     """Which worlds a batch has, their damage, and fresh ones."""
     masks: Randomness
     """Update masks."""
-    ageing: Randomness
-    """Worlds that grow old without gradients."""
 
     @classmethod
     def of_batch(
@@ -43,7 +41,7 @@ class RunRandomness:
         """Return the randomness of a process alone."""
         worlds = torch.Generator(device).manual_seed(config.seed + 1)
         masks = torch.Generator(device).manual_seed(config.seed + 2)
-        return cls(schedule, worlds, worlds, masks, worlds)
+        return cls(schedule, worlds, worlds, masks)
 
     @classmethod
     def by_world(
@@ -52,7 +50,6 @@ class RunRandomness:
         device: torch.device,
         schedule: torch.Generator,
         ranks: Ranks,
-        ageing_places: Tensor,
     ) -> RunRandomness:
         """Return the randomness of worlds that several processes share.
 
@@ -61,7 +58,6 @@ class RunRandomness:
             device: Where the worlds are.
             schedule: Randomness of the numbers of steps.
             ranks: The processes.
-            ageing_places: Places in the whole pool of this process's worlds that grow old.
         """
         batch, pool = config.world_count, config.pool_size
 
@@ -74,7 +70,6 @@ class RunRandomness:
             pool=streams(0, pool, ranks.places(pool, pool // batch)),
             worlds=streams(1, batch, of_batch),
             masks=streams(2, batch, of_batch),
-            ageing=streams(3, pool, ageing_places),
         )
 
     def state_dict(self) -> dict[str, Tensor]:
@@ -86,9 +81,7 @@ class RunRandomness:
             if isinstance(source, torch.Generator)
         }
 
-    def load_state_dict(
-        self, states: Mapping[str, Tensor], iteration: int, config: TrainConfig[Any]
-    ) -> None:
+    def load_state_dict(self, states: Mapping[str, Tensor], iteration: int) -> None:
         """Go on after so many iterations from what `state_dict` returned."""
         self.schedule.set_state(states["schedule"])
         for name, source in (("worlds", self.worlds), ("masks", self.masks)):
@@ -96,9 +89,6 @@ class RunRandomness:
                 source.set_state(states[name])
             else:
                 source.episodes.fill_(iteration)
-        if isinstance(self.ageing, WorldRandom):
-            steps = sum(config.ageing_at(before) for before in range(iteration))
-            self.ageing.episodes.fill_(steps // AGEING_BLOCK)
 
 
 def world_streams(

@@ -11,6 +11,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+from npa_envs.checks import is_real, is_whole
 from npa_envs.errors import MissingDependencyError, NPAError
 from npa_envs.files import (
     made_folder,
@@ -18,7 +19,6 @@ from npa_envs.files import (
     remove_unfinished,
     write_text,
 )
-from npa_envs.tasks.checks import is_real, is_whole
 
 try:
     import fcntl

@@ -18,7 +18,7 @@ from npa_envs.tasks.base import PictureTask, task_for_rule
 from npa_envs.tasks.many_pictures import named_targets
 from npa_envs.tasks.morphogenesis2d import Morphogenesis2D, Morphogenesis2DConfig
 from npa_envs.tasks.point_classification import PointClassification
-from npa_envs.training.overrides import completed, override
+from npa_envs.training.overrides import override
 from npa_envs.training.presets import preset, task_entry
 
 
@@ -191,7 +191,7 @@ def trained_config(path: Path, metadata: Mapping[str, str]) -> Any:
         if not isinstance(fields, dict):
             raise NPAError(f"config must be an object, got {type(fields).__name__}")
         base = preset("paper", metadata.get("task", "morphogenesis2d"))
-        return override(base, **completed(fields, base))
+        return override(base, **fields)
     except (ValueError, TypeError) as error:
         raise NPAError(
             f"the metadata of {str(path)!r} must say how the rule was trained, but it is damaged "

@@ -14,13 +14,13 @@ from typing import Any
 import torch
 from tqdm import tqdm
 
+from npa_envs.checks import is_real
 from npa_envs.devices import check_device
 from npa_envs.errors import DivergedError, NPAError, shown
 from npa_envs.files import write_text
 from npa_envs.rule.files import first_rules, load_rule, save_rule
 from npa_envs.rule.rule import NPARule, dividing, with_codes
 from npa_envs.tasks.base import GoalTask, Task, differing_fields, untrained_rule
-from npa_envs.tasks.checks import is_real
 from npa_envs.tasks.many_pictures import ManyPictures
 from npa_envs.tasks.train_config import TrainConfig
 from npa_envs.training.batch_picture import write_batch_picture
@@ -39,7 +39,6 @@ from npa_envs.training.overrides import config_to_dict
 from npa_envs.training.ranks import Ranks
 from npa_envs.training.run_folder import JsonlLog, RunFolder, check_choice, open_tensorboard
 from npa_envs.training.stopping import stop_flag
-from npa_envs.training.variation import VariedCycle
 
 FIRST_PICTURE = 10
 """Iteration after which the first picture is written, where the interval is longer."""
@@ -50,7 +49,7 @@ class TrainResult:
     """What a run came to."""
 
     rule: NPARule
-    """The rule as it stands: the mean of its weights, where that is kept."""
+    """The rule as it stands."""
 
     iteration: int
     """Iterations done."""
@@ -128,17 +127,8 @@ class Trainer:
         self.rule = self._make_rule(schedule, held).to(device, config.torch_dtype)
         # A run that several processes have begun goes on as it was, if only one is left.
         by_world = ranks.together or (content is not None and drawn_by_world(content))
-        if config.varied and (ranks.together or rollout is not None):
-            raise NPAError(
-                "worlds are varied (vary_particles and others) in runs of one rule by one process "
-                "only: leave these fields out, or train on one device"
-            )
-        self._cycle = (
-            VariedCycle(task, self.rule, config, device, schedule, task_name=task_name)
-            if config.varied
-            else TrainingCycle(
-                task, self.rule, config, device, schedule, rollout, ranks=ranks, by_world=by_world
-            )
+        self._cycle = TrainingCycle(
+            task, self.rule, config, device, schedule, rollout, ranks=ranks, by_world=by_world
         )
         self.pool = self._cycle.pool
         if ranks.first:
@@ -254,11 +244,11 @@ class Trainer:
 
     @property
     def kept_rule(self) -> NPARule:
-        """The rule as a run keeps it: the mean of its weights, where there is one."""
-        rule = self._cycle.average.rule(self.rule)
+        """The rule as a run keeps it."""
+        rule = self.rule
         if isinstance(self.task, ManyPictures) and self.config.task.encoder:
             # The table has what the encoder said in the last iteration, before its last step.
-            rule = copy.deepcopy(rule) if rule is self.rule else rule
+            rule = copy.deepcopy(rule)
             self.task.for_rule(rule)
         return rule
 
@@ -406,8 +396,7 @@ class Trainer:
         path = self.folder.checkpoint
         self.iteration = content["iteration"]
         expected = {"rule": self.rule.state_dict(), **self._cycle.state_like(self.iteration)}
-        # An optimiser's groups are the configuration's, and not read: older checkpoints have them.
-        read = content | {"optimiser": {"state": content["optimiser"].get("state")}}
+        read = dict(content)
         if self._ranks.together:
             # The generators of a process alone are not read.
             states = content["random_states"]

@@ -9,11 +9,11 @@ import gymnasium
 from torch import Tensor
 
 from npa_envs.agents.policies import RandomPolicy, RulePolicy, ZeroPolicy
+from npa_envs.checks import is_whole
 from npa_envs.errors import NPAError, shown, suggest
 from npa_envs.registration import ALL, CODED, GARDEN_IDS
 from npa_envs.rule.files import load_rule
 from npa_envs.rule.rule import COLOUR_OFFSET
-from npa_envs.tasks.checks import is_whole
 from npa_envs.tasks.damage import DAMAGE_SIZES, damage_worlds
 from npa_envs.tasks.point_classification import PointClassification, class_colours
 from npa_envs.web.colouring import Colouring, Seen, shows_of

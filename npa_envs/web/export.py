@@ -209,7 +209,7 @@ def page_rule(source: str, *, particle_count: int | None = None) -> dict[str, An
     world = {name: value for name, value in live.describe().items() if name not in own}
     classes = {"palette": PALETTE, "undecided": UNDECIDED}
     return {
-        **{"moment_inverse": "threshold", "dead_zone": 0.0} | rule.hyper_parameters(),
+        **rule.hyper_parameters(),
         "name": live.main.name,
         "classes": classes if isinstance(task, PointClassification) else None,
         "weights": {name: _packed(tensor) for name, tensor in rule.state_dict().items()},

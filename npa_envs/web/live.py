@@ -16,8 +16,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from npa_envs.checks import is_real, is_whole
 from npa_envs.errors import NPAError, shown, suggest
-from npa_envs.tasks.checks import is_real, is_whole
 from npa_envs.tasks.damage import DAMAGE_SIZES
 from npa_envs.world.brushes import clump, cut, inject, push, state_around
 

@@ -13,6 +13,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from npa_envs.checks import is_real, is_whole
 from npa_envs.errors import NPAError, shown, suggest
 from npa_envs.files import open_regular, parse_json
 from npa_envs.rule.files import load_rule, rule_file, rule_metadata, shipped_rules
@@ -24,7 +25,6 @@ from npa_envs.tasks.base import (
     task_for_rule,
     task_toward,
 )
-from npa_envs.tasks.checks import is_real, is_whole
 from npa_envs.tasks.co_morphogenesis2d import CoMorphogenesis2DConfig
 from npa_envs.tasks.damage import DAMAGE_SIZES, damage_worlds
 from npa_envs.tasks.point_classification import PointClassification, class_colours
@@ -558,7 +558,7 @@ class RunWorld(RuleWorld):
         self._centres = [0.0]
         if len(files) > 1:
             # Seeds lie in a row, as in training.
-            config = load_config(self._run_folder.config, joint_preset(), whole=True)
+            config = load_config(self._run_folder.config, joint_preset())
             self._centres = list(config.task.centres)
         self._each = None if particle_count is None else max(1, particle_count // len(files))
         self._written = self._stamp()

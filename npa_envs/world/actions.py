@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from npa_envs.ops.checks import MomentInverse
+from npa_envs.checks import MomentInverse
 from npa_envs.ops.episodes import (
     DIVERGED,
     NOT_FINITE,

@@ -17,8 +17,8 @@ import math
 import torch
 from torch import Tensor
 
+from npa_envs.checks import check_world, checked_number, entries
 from npa_envs.errors import NPAError, shown
-from npa_envs.ops.checks import check_world, checked_number, entries
 
 Sides = tuple[float, ...] | None
 

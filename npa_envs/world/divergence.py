@@ -8,8 +8,8 @@ from typing import Literal, NamedTuple
 import torch
 from torch import Tensor
 
+from npa_envs.checks import check_world, checked_number
 from npa_envs.errors import DivergedError, NPAError, shown
-from npa_envs.ops.checks import check_world, checked_number
 
 OnDivergence = Literal["ignore", "raise"]
 """What a rollout does about worlds that diverge."""

@@ -20,7 +20,7 @@ from torch.utils._python_dispatch import is_in_torch_dispatch_mode
 from npa_envs.ops.launch import LaunchTape
 from npa_envs.ops.sort import sorts_at_once
 from npa_envs.rule.network import Network
-from npa_envs.world.recorded import LAUNCHED_FIRST, Worlds
+from npa_envs.world.recorded import LAUNCHED_FIRST, CallKind, Worlds, counted
 
 LARGEST_TOTAL = 4096
 """Particles of all worlds, at most: larger ones hide what is saved."""
@@ -123,15 +123,7 @@ class PreparedSteps:
         return kept
 
 
-class _Kind:
-    """Calls of one kind."""
-
-    def __init__(self) -> None:
-        self.calls = 0
-        self.free: collections.deque[PreparedSteps] = collections.deque()
-
-
-_kinds: collections.OrderedDict[Hashable, _Kind] = collections.OrderedDict()
+_kinds: collections.OrderedDict[Hashable, CallKind[PreparedSteps]] = collections.OrderedDict()
 """Kinds of calls so far, the least recently used first."""
 
 _lock = threading.Lock()
@@ -165,14 +157,7 @@ def run_prepared(
         run: Runs them.
     """
     with _lock:
-        kind = _kinds.get(key)
-        if kind is None:
-            kind = _kinds[key] = _Kind()
-            if len(_kinds) > MOST_KINDS:
-                _kinds.popitem(last=False)
-        else:
-            _kinds.move_to_end(key)
-        kind.calls += 1
+        kind = counted(_kinds, key, CallKind, _kinds.pop, MOST_KINDS)
     if kind.calls <= LAUNCHED_FIRST:
         return None
     # Another thread may have taken the last one meanwhile.

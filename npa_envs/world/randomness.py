@@ -11,9 +11,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from npa_envs.checks import DTYPES, check_dense, checked_count, checked_number
 from npa_envs.devices import check_device
 from npa_envs.errors import NPAError, shown
-from npa_envs.ops.checks import DTYPES, check_dense, checked_count, checked_number
 from npa_envs.ops.draws import bernoulli_draw, integer_draw, normal_draw, uniform_draw
 from npa_envs.ops.sort import LARGEST_INDEX
 

@@ -22,13 +22,13 @@ import logging
 import threading
 import weakref
 from collections.abc import Callable, Hashable, Sequence
-from typing import Any, Literal, NamedTuple, Protocol, Self
+from typing import Any, Generic, Literal, NamedTuple, Protocol, Self, TypeVar
 
 import torch
 from torch import Tensor
 
+from npa_envs.checks import FiniteCheck, check_finite_positions
 from npa_envs.errors import NPAError, shown
-from npa_envs.ops.checks import FiniteCheck, check_finite_positions
 from npa_envs.ops.opaque import once_differentiable
 from npa_envs.rule.rule import NPARule
 from npa_envs.world.cuda_graph import Captured, capture, current_stream, prepare_capture
@@ -193,21 +193,61 @@ def _twin(rule: NPARule, like: Tensor) -> NPARule:
     return twin.to(like.dtype).to_empty(device=like.device)
 
 
-class _Kind:
-    """Calls that may share recordings."""
+FreeT = TypeVar("FreeT")
+
+
+class CallKind(Generic[FreeT]):
+    """Calls of one kind: how many there were, and what is free to serve the next of them."""
 
     def __init__(self) -> None:
         self.calls = 0
+        self.free: collections.deque[FreeT] = collections.deque()
+
+
+KindT = TypeVar("KindT", bound=CallKind[Any])
+
+
+def counted(
+    kinds: collections.OrderedDict[Hashable, KindT],
+    key: Hashable,
+    make: Callable[[], KindT],
+    forget: Callable[[Hashable], object],
+    most: int,
+) -> KindT:
+    """Return the kind of a call, which is counted; the caller holds the lock of `kinds`.
+
+    Args:
+        kinds: Kinds of calls so far, the least recently used first.
+        key: What makes calls one kind.
+        make: Makes a kind.
+        forget: Takes a kind away, by its key, where there are more than `most`.
+        most: Kinds that are remembered.
+    """
+    kind = kinds.get(key)
+    if kind is None:
+        kind = kinds[key] = make()
+        if len(kinds) > most:
+            forget(next(iter(kinds)))
+    else:
+        kinds.move_to_end(key)
+    kind.calls += 1
+    return kind
+
+
+class _RecordedKind(CallKind["_Recording"]):
+    """Calls that may share recordings."""
+
+    def __init__(self) -> None:
+        super().__init__()
         self.refused = False
         """One of them could not be recorded."""
         self.recordings: list[_Recording] = []
-        self.free: collections.deque[_Recording] = collections.deque()
 
 
 class _Lease:
     """The right to a recording: given back when nobody can ask for a backward pass any more."""
 
-    def __init__(self, recording: _Recording, kind: _Kind) -> None:
+    def __init__(self, recording: _Recording, kind: _RecordedKind) -> None:
         self.recording = recording
         self._free = kind.free
 
@@ -462,25 +502,17 @@ def _reserved(device: torch.device) -> int:
     return int(torch.cuda.memory_reserved(device))
 
 
-_kinds: collections.OrderedDict[Hashable, _Kind] = collections.OrderedDict()
+_kinds: collections.OrderedDict[Hashable, _RecordedKind] = collections.OrderedDict()
 """Kinds of calls so far, the least recently used first."""
 
 _lock = threading.RLock()
 """Held while the above changes; graphs share one stream to be recorded on."""
 
 
-def _count(key: Hashable) -> _Kind:
+def _count(key: Hashable) -> _RecordedKind:
     """Return the kind of a call, which is counted."""
     with _lock:
-        kind = _kinds.get(key)
-        if kind is None:
-            kind = _kinds[key] = _Kind()
-            if len(_kinds) > MOST_KINDS:
-                _forget(next(iter(_kinds)))
-        else:
-            _kinds.move_to_end(key)
-        kind.calls += 1
-    return kind
+        return counted(_kinds, key, _RecordedKind, _forget, MOST_KINDS)
 
 
 def _forget(key: Hashable) -> None:
@@ -557,7 +589,7 @@ def _blocks(call: Call) -> list[int]:
 
 
 def _lease(
-    kind: _Kind, steps: set[int], make: Callable[[], _Recording], tensors: Sequence[Tensor]
+    kind: _RecordedKind, steps: set[int], make: Callable[[], _Recording], tensors: Sequence[Tensor]
 ) -> _Lease | None:
     """Return a recording that holds these numbers of steps; None where there can be none."""
     x, s, *weights = tensors

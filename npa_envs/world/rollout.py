@@ -6,14 +6,13 @@ import functools
 import math
 from collections.abc import Sequence
 from types import NoneType
-from typing import Literal, NamedTuple, overload
+from typing import Literal, NamedTuple, TypedDict, Unpack, overload
 
 import torch
 from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
-from npa_envs.errors import NPAError, shown
-from npa_envs.ops.checks import (
+from npa_envs.checks import (
     Box,
     check_scale,
     check_world,
@@ -24,6 +23,7 @@ from npa_envs.ops.checks import (
     checked_number,
     constant,
 )
+from npa_envs.errors import NPAError, shown
 from npa_envs.ops.opaque import check_derivatives
 from npa_envs.ops.static import StaticWorlds, prepare_static
 from npa_envs.ops.update import wrapped
@@ -48,6 +48,22 @@ from npa_envs.world.steps import (
 )
 
 Memory = Literal["store", "recompute", "minimal"]
+
+
+class RolloutOptions(TypedDict, total=False):
+    """What rollouts of one rule and of several take by name; `rollout` says what it means."""
+
+    eps: float | None
+    box: Box
+    dt: float
+    position_noise: float
+    detach_positions: bool
+    memory: Memory
+    generator: Randomness | None
+    on_divergence: OnDivergence
+    keep_every: int | None
+    cuda_graph: CudaGraph
+
 
 STORED_INTERVAL: dict[Memory, int] = {"store": 1, "recompute": 3, "minimal": 2**31}
 """The last step and every so-manyth before it store what the backward pass reads."""
@@ -460,18 +476,9 @@ def rollout(
     s: Tensor,
     steps: int,
     *,
-    eps: float | None = ...,
-    box: Box = ...,
     update_prob: float = ...,
-    dt: float = ...,
-    position_noise: float = ...,
-    detach_positions: bool = ...,
-    memory: Memory = ...,
-    generator: Randomness | None = ...,
-    on_divergence: OnDivergence = ...,
-    keep_every: int | None = ...,
-    cuda_graph: CudaGraph = ...,
     return_path_length: Literal[False] = ...,
+    **options: Unpack[RolloutOptions],
 ) -> tuple[Tensor, Tensor]: ...
 
 
@@ -482,18 +489,9 @@ def rollout(
     s: Tensor,
     steps: int,
     *,
-    eps: float | None = ...,
-    box: Box = ...,
     update_prob: float = ...,
-    dt: float = ...,
-    position_noise: float = ...,
-    detach_positions: bool = ...,
-    memory: Memory = ...,
-    generator: Randomness | None = ...,
-    on_divergence: OnDivergence = ...,
-    keep_every: int | None = ...,
-    cuda_graph: CudaGraph = ...,
     return_path_length: Literal[True],
+    **options: Unpack[RolloutOptions],
 ) -> tuple[Tensor, Tensor, Tensor]: ...
 
 

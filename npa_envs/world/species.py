@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from typing import Any, Literal, NamedTuple, overload
+from typing import Any, Literal, NamedTuple, Unpack, overload
 
 import torch
 from torch import Tensor
 
+from npa_envs.checks import Box, check_world, checked_count, checked_number, entries
 from npa_envs.errors import NPAError, shown
-from npa_envs.ops.checks import Box, check_world, checked_count, checked_number, entries
 from npa_envs.ops.perceive import perceive_rows
 from npa_envs.ops.species import checked_counts, perceive_by_species
 from npa_envs.ops.static import StaticRows
@@ -23,6 +23,7 @@ from npa_envs.world.randomness import Randomness, WorldRandom, check_generator
 from npa_envs.world.recorded import CudaGraph, Worlds, check_cuda_graph, run_call
 from npa_envs.world.rollout import (
     Memory,
+    RolloutOptions,
     check_memory,
     checked_keep_every,
     checked_options,
@@ -57,20 +58,11 @@ def rollout_species(
     steps: int,
     *,
     counts: Sequence[int],
-    eps: float | None = ...,
     update_prob: float | Sequence[float] = ...,
-    box: Box = ...,
-    dt: float = ...,
-    position_noise: float = ...,
-    generator: Randomness | None = ...,
-    detach_positions: bool = ...,
     perception: SpeciesPerception = ...,
     density_counts: Sequence[float] | None = ...,
-    memory: Memory = ...,
-    on_divergence: OnDivergence = ...,
-    keep_every: int | None = ...,
-    cuda_graph: CudaGraph = ...,
     return_path_length: Literal[False] = ...,
+    **options: Unpack[RolloutOptions],
 ) -> tuple[Tensor, Tensor]: ...
 
 
@@ -82,20 +74,11 @@ def rollout_species(
     steps: int,
     *,
     counts: Sequence[int],
-    eps: float | None = ...,
     update_prob: float | Sequence[float] = ...,
-    box: Box = ...,
-    dt: float = ...,
-    position_noise: float = ...,
-    generator: Randomness | None = ...,
-    detach_positions: bool = ...,
     perception: SpeciesPerception = ...,
     density_counts: Sequence[float] | None = ...,
-    memory: Memory = ...,
-    on_divergence: OnDivergence = ...,
-    keep_every: int | None = ...,
-    cuda_graph: CudaGraph = ...,
     return_path_length: Literal[True],
+    **options: Unpack[RolloutOptions],
 ) -> tuple[Tensor, Tensor, Tensor]: ...
 
 

@@ -10,7 +10,7 @@ from typing import NamedTuple, Protocol
 import torch
 from torch import Tensor
 
-from npa_envs.ops.checks import constant
+from npa_envs.checks import constant
 from npa_envs.ops.perceive import (
     PerceptionOptions,
     Terms,

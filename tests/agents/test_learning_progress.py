@@ -169,7 +169,6 @@ def test_learning_rates_fall_from_the_first_to_the_last():
     ("method", "options", "message"),
     [
         ("gradients", {}, "did you mean 'gradient'"),
-        ("ppo_rows", {}, r"is no more: take 'ppo_world'.* 0\.615 instead of 0\.302 in growth"),
         ("gradient", {"learning_rat": 1.0}, "did you mean 'learning_rate'"),
         ("zero", {"learning_rate": 1.0}, "has no option 'learning_rate'"),
         ("zero", {"device": "tpu"}, "device"),
@@ -233,8 +232,6 @@ def test_options_are_named_with_their_defaults():
     assert method_options("gradient")["world_count"] == 8
     assert method_options("ppo")["ratio"] == "particle"
     assert method_options("scripted").keys() == {"gains"}
-    with pytest.raises(NPAError, match="'ppo_rows' is no more: take 'ppo_world'"):
-        method_options("ppo_rows")
     assert method_options("zero") == {}
 
 

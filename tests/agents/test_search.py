@@ -25,7 +25,6 @@ from npa_envs.errors import MissingDependencyError, NPAError
 from npa_envs.rule.files import rule_metadata, save_rule
 from npa_envs.tasks.seeds import uniform_ball
 from npa_envs.training.trained_tasks import task_of_rule
-from npa_envs.web.rule_world import RunWorld
 from npa_envs.world.randomness import WorldRandom
 
 CPU = torch.device("cpu")
@@ -34,8 +33,8 @@ OPTIONS = ["--particle-count", "16", "--steps", "16", "--hidden-dim", "4", "--ba
 BATCH_COST = 4 * 16 * 16
 
 
-def candidates(kind="rule", device=CPU, **options):
-    return Candidates(SearchWorld(kind=kind, **SMALL | options), device=device)
+def candidates(device=CPU, **options):
+    return Candidates(SearchWorld(**SMALL | options), device=device)
 
 
 def solutions(tried, count, size=0.2, seed=0):
@@ -54,9 +53,8 @@ def needs_ribs():
 # Worlds
 
 
-@pytest.mark.parametrize("kind", ["rule", "pair"])
-def test_a_candidate_comes_to_the_same_alone_and_beside_others(kind, device):
-    tried = candidates(kind, device, world_count=2)
+def test_a_candidate_comes_to_the_same_alone_and_beside_others(device):
+    tried = candidates(device, world_count=2)
     given = solutions(tried, 3)
     together = tried.try_all(given)
     for number, one in enumerate(given):
@@ -74,7 +72,7 @@ def test_a_candidate_lives_as_its_rule_does_in_a_rollout(device):
     tried = candidates(device=device)
     (given,) = solutions(tried, 1)
     trials = tried.try_all(given[None])
-    (rule,) = tried.rules_of(given)
+    rule = tried.rule_of(given)
     random = WorldRandom([0], device=device)
     x = uniform_ball(1, 16, 2, SEED_RADIUS, generator=random, device=device)
     s = x.new_zeros(1, 16, 4)
@@ -96,7 +94,7 @@ def test_dead_and_exploding_rules_are_found_to_be_nothing():
 
 
 def test_descriptors_lie_within_their_axes():
-    world = SearchWorld(kind="pair", **SMALL)
+    world = SearchWorld(**SMALL)
     tried = Candidates(world, device=CPU)
     for found in tried.try_all(solutions(tried, 8, size=0.5)).found:
         if found is not None:
@@ -137,10 +135,8 @@ def test_the_correlation_is_that_of_numpy_and_one_where_all_are_alike():
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        ({"kind": "trio"}, "kind must be 'rule' or 'pair', got 'trio'"),
         ({"steps": 20}, f"steps must be a multiple of {SNAPSHOTS}, got 20: take 32"),
         ({"state_dim": 2}, "state_dim must be a whole number of at least 3"),
-        ({"distance": -1.0}, "distance must be"),
     ],
 )
 def test_worlds_refuse_what_cannot_be(options, words):
@@ -179,7 +175,7 @@ def test_a_stopped_search_goes_on_as_if_it_had_not_been(method, tmp_path):
 @pytest.mark.filterwarnings("error")
 def test_cma_adapts_the_steps_of_many_weights_without_complaint():
     needs_ribs()
-    done = search(method="cma-me", world={"kind": "pair", "hidden_dim": 8})
+    done = search(method="cma-me", world={"hidden_dim": 16})
     assert done.candidates.weight_count == 400
     done.run(8 * BATCH_COST)
     assert done.evaluations == 32
@@ -261,20 +257,8 @@ def test_the_command_leaves_elites_that_other_commands_open(tmp_path, capsys):
 
 def test_a_damaged_world_of_a_rule_is_an_error(tmp_path):
     path = tmp_path / "odd.safetensors"
-    (rule,) = SearchWorld(**SMALL).make_rules()
+    rule = SearchWorld(**SMALL).make_rule()
     for told, words in (("[1]", "must be a JSON object, got"), ('{"sides": 3}', "sides")):
         save_rule(rule, path, metadata={"world": told})
         with pytest.raises(NPAError, match=words):
             task_of_rule(str(path), rule, CPU)
-
-
-@pytest.mark.slow
-def test_a_pair_is_a_folder_that_the_viewer_opens(tmp_path):
-    needs_ribs()
-    words = ["search", *OPTIONS, "--kind", "pair", "--no-progress", "--out", str(tmp_path)]
-    assert main([*words, "--budget", str(BATCH_COST)]) == 0
-    world = RunWorld(min((tmp_path / "elites").iterdir()), device=CPU)
-    world.reset(0)
-    assert world.counts == [8, 8]
-    left, right = world.x[0].split(8)
-    assert float((right - left).mean(dim=0)[0]) == pytest.approx(0.4, abs=0.15)

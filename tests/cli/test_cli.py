@@ -96,16 +96,20 @@ def test_the_help_of_train_begins_with_the_most_common_options(capsys):
     assert "default: dots" in common
 
 
-@pytest.mark.parametrize(
-    "words", ["bench --explain", "stress --list", "rollout RULE --steps 1", "evaluate RULE"]
-)
-def test_output_is_the_old_name_of_out(words, rule, tmp_path, capsys):
-    given = [str({"RULE": rule}.get(word, word)) for word in words.split()]
-    given += ["--checkpoints", "1", "--json"] if words.startswith("evaluate") else ["--output"]
-    assert main([*given, str(tmp_path / "here")]) == 0
-    told = "--output is now --out\n" in capsys.readouterr().err
-    assert told == ("--output" in given)
-    assert (tmp_path / "here" / "growth.gif").exists() == words.startswith("rollout")
+def test_the_help_of_train_shows_the_most_used_options_and_help_all_all_of_them(
+    capsys, monkeypatch
+):
+    monkeypatch.setenv("COLUMNS", "80")
+    counts = []
+    for word in ("--help", "--help-all"):
+        with pytest.raises(SystemExit):
+            main(["train", "morphogenesis2d", word])
+        text = re.sub(r"\x1b\[[0-9;]*m", "", capsys.readouterr().out)
+        # Their explanations stand further to the right.
+        counts.append(len(set(re.findall(r"^[ │|]{1,3}(--[a-z][a-z-]+)", text, re.MULTILINE))))
+        assert ("--splat-weight" in text) == (word == "--help-all")
+    assert "--help-all" not in text.partition("Examples")[0]
+    assert counts == [25, 76]
 
 
 def test_no_command_is_a_usage_error_and_the_version_is_that_of_the_package(capsys):
@@ -126,7 +130,7 @@ def test_list_names_tasks_presets_targets_and_losses(capsys):
         "vgg_ot",
         "filter_swd",
         "bubbles, cells, dots, droplets, grid, hearts, maze, stars",
-        "npa/Regeneration2D-v1",
+        "npa/Regeneration2D-v0",
         "npa/Mixing-v0, npa/Segregation-v0",
         "npa/InvasionLarge-v0",
     ):

@@ -40,7 +40,6 @@ def test_resume_auto_begins_and_later_goes_on(tmp_path):
         ("fast", {"device": "cuda"}, 2, 1),
         ("fast", {"world_count": 3, "pool_size": 30}, 2, 1),
         ("fast", {"world_count": 4, "pool_size": 30, "lifetimes": (0, 0), "rest_weight": 0}, 2, 1),
-        ("fast", {"vary_eps": (0.5, 2.0)}, 2, 1),
         ("fast", {"iterations": 100}, 2, 1),
         ("paper", {}, 2, 1),
     ],

@@ -262,7 +262,7 @@ def test_particles_are_placed_in_worlds_that_exist_each_once(worlds):
 def test_worlds_to_place_particles_in_are_numbers():
     envs = make_vec(IDS[0], 3).unwrapped
     envs.reset(seed=0)
-    with pytest.raises(NPAError, match="worlds must be an array of numbers"):
+    with pytest.raises(NPAError, match="worlds must be numbers, got"):
         envs.place_particles(*envs.particles(), worlds="all")
 
 

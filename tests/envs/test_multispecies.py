@@ -339,7 +339,7 @@ def test_what_needs_a_world_says_so():
             call()
     env.reset()
     for x in ([[0.0, 0.0], [1.0]], "left", None, {}):
-        with pytest.raises(NPAError, match="x must be an array of numbers, got"):
+        with pytest.raises(NPAError, match="x must be numbers, got"):
             env.place_particles(x, np.zeros((41, 16)))
     with pytest.raises(NPAError, match=r"actions must be a dict .* got list"):
         env.step([])

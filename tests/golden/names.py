@@ -18,9 +18,9 @@ PACKAGES = (
     "npa_envs.agents",
     "npa_envs.agents.learning",
     "npa_envs.envs",
-    "npa_envs.envs.species",
+    "npa_envs.envs.multi",
+    "npa_envs.ops",
     "npa_envs.render",
-    "npa_envs.sph",
     "npa_envs.training",
     "npa_envs.wrappers",
 )
@@ -68,7 +68,7 @@ def options(*words: str) -> list[str]:
     """Return the options that a command's help names."""
     text = io.StringIO()
     with contextlib.redirect_stdout(text), contextlib.suppress(SystemExit):
-        main([*words, "--help"])
+        main([*words, "--help-all" if words[0] == "train" else "--help"])
     return sorted(set(re.findall(r"--[a-z][a-z0-9-]*[a-z0-9]", text.getvalue())))
 
 

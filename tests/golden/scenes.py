@@ -35,7 +35,7 @@ KEPT_RULES = {
     "dots": GOLDEN.with_name("dots.safetensors"),
     "duck": "duck-v0",
     "gecko": "gecko-v0",
-    "heart": "heart-v0",
+    "heart": "heart-first",
 }
 """Rules that are no longer shipped as they were when their worlds were stored."""
 
@@ -312,7 +312,12 @@ SMALL: dict[str, Any] = {
 }
 
 OWN: dict[str, dict[str, Any]] = {
-    "npa/Regeneration2D-v0": {"rule": "picture", "target": "ring"},
+    "npa/Regeneration2D-v0": {
+        "rule": "picture",
+        "target": "ring",
+        "seed_pool": 4,
+        "split_damage": False,
+    },
     "npa/PointClassification-v0": {"resolution": None},
     "npa/Morphogenesis3D-v0": {"seed_radius": 0.2, "view_count": 2, "target": "doughnut"},
 }

@@ -215,7 +215,7 @@ META = torch.zeros(1, 4, 2, device="meta")
         (lambda: damage_worlds(*world(), kind="erase", size={}), "size must be a number"),
         (lambda: damage_worlds(*world(), kind="erase", size=1e300), "at least 0"),
         (lambda: preset("tiny", 3), "unknown task 3"),
-        (lambda: preset("tiny", decay=10**400), "decay must be of type float"),
+        (lambda: preset("tiny", weight_decay=10**400), "weight_decay must be of type float"),
         (lambda: TextureConfig(eps=10**400), "eps must be a finite number"),
         (lambda: to_uint8(torch.zeros(2, 2, 4), background=2.0), "background must be red"),
         (lambda: write_gif("a.gif", 3), "frames must be a sequence"),

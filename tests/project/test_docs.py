@@ -196,7 +196,7 @@ def test_commands_in_blocks_of_shell_have_the_options_that_they_are_given(capsys
         if "TASK" in command:
             continue
         with contextlib.suppress(SystemExit):
-            main([*command, "--help"])
+            main([*command, "--help-all" if len(command) > 1 else "--help"])
         told = set(re.findall(r"(?<![\w-])--?[\w-]+", capsys.readouterr().out))
         assert options <= told, command
 

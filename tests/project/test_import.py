@@ -37,16 +37,6 @@ runtime = None if warp is None else sys.modules["warp._src.context"].runtime
 print("devices:", torch.cuda.is_initialized(), runtime)
 """
 
-OLD_NAMES = """
-import warnings; warnings.simplefilter('ignore')
-import npa_envs.sph, npa_envs.tasks.task, npa_envs.ops, npa_envs.tasks.base
-print(npa_envs.sph is npa_envs.ops, npa_envs.tasks.task is npa_envs.tasks.base)
-try:
-    import npa_envs.sph.perceive
-except ModuleNotFoundError as error:
-    print(error)
-"""
-
 WITHOUT_EXTRAS = """
 import sys
 for name in ("stable_baselines3", "pettingzoo", "ray", "torchrl", "rsl_rl"):
@@ -68,10 +58,6 @@ except MissingDependencyError as error:
 
 PROGRAMS = {
     "the package": (PACKAGE, "names: True\nsettings: True True\nextras: []\ndevices: False None\n"),
-    "old names": (
-        OLD_NAMES,
-        "True True\nno module npa_envs.sph.perceive: npa_envs.sph is now npa_envs.ops\n",
-    ),
     "without extras": (
         WITHOUT_EXTRAS,
         "False DamageEvents VectorSpeciesTags\nTrue\n"

@@ -37,6 +37,7 @@ LADDER = {
     "npa_envs._module_search": Rung(0, frozenset({COMPUTED_NAME})),
     "npa_envs.errors": rung(0),
     "npa_envs.registration": rung(0, "gymnasium"),
+    "npa_envs.checks": rung(1, "torch"),
     "npa_envs.devices": rung(1, "torch"),
     "npa_envs.files": rung(1),
     "npa_envs.once": rung(0),
@@ -54,21 +55,18 @@ LADDER = {
     "npa_envs.rule.rule": rung(4, "torch"),
     "npa_envs.rule": rung(5, "torch safetensors", never=INSIDES),
     "npa_envs.world": rung(6, "torch", never=ORACLES),
-    "npa_envs.tasks": rung(7, "torch numpy PIL sklearn torchvision trimesh gsplat", never=ORACLES),
+    "npa_envs.tasks": rung(7, "torch numpy PIL sklearn torchvision trimesh", never=ORACLES),
     "npa_envs.render": rung(8, "torch numpy PIL imageio imageio_ffmpeg pygame", never=ORACLES),
     "npa_envs.training": rung(9, "torch numpy tqdm yaml tensorboard", never=ORACLES),
     "npa_envs": Rung(10, frozenset({COMPUTED_NAME}), never=ORACLES),
     "npa_envs.measure.record": rung(2, "torch", never=INSIDES),
     "npa_envs.measure.tables": rung(2),
     "npa_envs.measure.plots": rung(2, "matplotlib"),
-    "npa_envs.measure.speed.hash_grid": rung(3, "warp torch", never=("npa_envs.reference",)),
     "npa_envs.measure.judge": rung(10, "torch", never=INSIDES),
     "npa_envs.measure.quality": rung(10, "torch numpy tqdm", never=INSIDES),
     "npa_envs.measure.codes": rung(11, "torch", never=INSIDES),
     "npa_envs.measure.interaction": rung(11, "torch numpy matplotlib", never=ORACLES),
-    "npa_envs.measure.speed": rung(
-        13, "torch numpy matplotlib scipy warpSPHCore", never=("npa_envs.kernels",)
-    ),
+    "npa_envs.measure.speed": rung(13, "torch numpy matplotlib", never=("npa_envs.kernels",)),
     "npa_envs.measure.accuracy": rung(14, "torch matplotlib", never=("npa_envs.kernels",)),
     "npa_envs.measure.robustness": rung(15, "torch", never=ORACLES),
     "npa_envs.measure": rung(16),
@@ -90,7 +88,7 @@ LADDER = {
     "npa_envs.cli": rung(22, "torch numpy tqdm tyro imageio_ffmpeg", never=ORACLES),
     "npa_envs.__main__": rung(23),
 }
-WARP_AND_TORCH = {"npa_envs.ops", "npa_envs.measure.speed.hash_grid"}
+WARP_AND_TORCH = {"npa_envs.ops"}
 
 
 def source_files() -> list[Path]:

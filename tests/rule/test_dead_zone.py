@@ -12,6 +12,7 @@ from npa_envs import NPAError, NPARule
 from npa_envs import reference as oracle
 from npa_envs.agents import RulePolicy
 from npa_envs.rule.authors import save_demo_json
+from npa_envs.rule.files import rule_metadata
 from npa_envs.training import load_config
 from npa_envs.training.trainer import initial_rule
 from npa_envs.world import rollout as rollout_module
@@ -114,14 +115,12 @@ def test_species_have_zones_of_their_own(device):
     assert still[30:].double().mean() < 0.5
 
 
-def test_a_file_says_the_zone_and_older_files_have_none(tmp_path):
+def test_a_file_says_the_zone(tmp_path):
     npa_envs.save_rule(NPARule(dead_zone=0.001), tmp_path / "rule.safetensors")
     assert npa_envs.load_rule(tmp_path / "rule.safetensors").dead_zone == 0.001
-    # Versions of the package that know no zone refuse the file.
-    assert b'"version":"5"' in (tmp_path / "rule.safetensors").read_bytes()
     npa_envs.save_rule(NPARule(), tmp_path / "plain.safetensors")
-    assert b"dead_zone" not in (tmp_path / "plain.safetensors").read_bytes()
-    assert npa_envs.load_rule("heart-v0").dead_zone == 0.0
+    assert rule_metadata(tmp_path / "plain.safetensors")["dead_zone"] == "0.0"
+    assert npa_envs.load_rule("heart-first").dead_zone == 0.0
     with pytest.raises(NPAError, match=r"dead_zone=0\.0 only, 'mine' has 0\.001"):
         save_demo_json({"mine": NPARule(dead_zone=0.001)}, tmp_path / "models.json")
 

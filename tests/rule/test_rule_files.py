@@ -16,8 +16,8 @@ from torch import Tensor
 
 from npa_envs.errors import NPAError
 from npa_envs.rule.authors import save_demo_json
-from npa_envs.rule.files import load_rule, rule_metadata, save_rule, shipped_rules
-from npa_envs.rule.rule import NPARule
+from npa_envs.rule.files import first_rules, load_rule, rule_metadata, save_rule, shipped_rules
+from npa_envs.rule.rule import NPARule, RuleHyperParameters
 
 RULES: dict[str, Callable[[], NPARule]] = {
     "plain 2D": lambda: NPARule(),
@@ -83,7 +83,7 @@ def test_metadata_is_kept_and_holds_every_hyper_parameter(tmp_path: Path) -> Non
     assert (metadata["format"], metadata["version"]) == ("npa-envs rule", "1")
     assert metadata["eps0"] == "0.125"
     assert metadata["static"] == "false"
-    assert set(NPARule().hyper_parameters()) <= set(metadata)
+    assert set(RuleHyperParameters.__required_keys__) <= set(metadata)
 
 
 @pytest.mark.parametrize(
@@ -229,16 +229,16 @@ def test_a_changed_weight_is_refused_with_the_cure(tmp_path: Path) -> None:
         load_rule(path)
 
 
-def test_a_file_without_a_checksum_is_loaded_with_a_warning(tmp_path: Path) -> None:
+def test_a_file_without_a_checksum_is_refused_and_those_of_the_package_are_loaded(
+    tmp_path: Path,
+) -> None:
     path = tmp_path / "rule.safetensors"
     write_ours(path, lambda h, w: h.pop("checksum"))
-    with pytest.warns(UserWarning, match=r"rule\.safetensors' has no checksum.*save it again"):
-        loaded = load_rule(path)
-    save_rule(loaded, path)
+    with pytest.raises(NPAError, match=r"checksum must be .* damaged.*copy it again"):
+        load_rule(path)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        load_rule(path)
-        for name in shipped_rules():
+        for name in shipped_rules() | first_rules():
             load_rule(name)
 
 
@@ -254,8 +254,8 @@ def write_ours(path: Path, change: Callable[[dict, dict], None]) -> None:
 
 BAD_HEADERS: dict[str, tuple[Callable[[dict, dict], Any], str]] = {
     "unknown version": (
-        lambda h, w: h.update(version="6"),
-        "one of 1, 2, 3, 4, 5, got '6'.*upgrade",
+        lambda h, w: h.update(version="2"),
+        "version must be 1, got '2'.*upgrade",
     ),
     "another format": (lambda h, w: h.update(format="llama"), "format must be 'npa-envs rule'"),
     "no format": (lambda h, w: h.pop("format"), "format must be 'npa-envs rule', got None"),

@@ -7,7 +7,7 @@ import npa_envs
 from npa_envs.errors import NPAError
 from npa_envs.rule.rule import FIRST_FATES, LIFE
 from npa_envs.tasks.morphogenesis2d import Morphogenesis2D, Morphogenesis2DConfig
-from npa_envs.training import Trainer, preset
+from npa_envs.training import Trainer, optimiser, preset
 from npa_envs.training.iteration import EagerIteration
 from npa_envs.world.division import living
 
@@ -121,16 +121,11 @@ def trained(tmp_path, iterations=4, **fields):
     return trainer.rule
 
 
-def test_fates_that_are_not_learned_stay_as_they_are(tmp_path):
-    rule = trained(tmp_path, fate_rate=0.0, weight_decay=0.1)
-    assert rule.fate.bias.tolist() == list(FIRST_FATES)
-    assert not rule.fate.weight.any()
-
-
-def test_rest_says_nothing_of_fates(tmp_path):
+def test_rest_says_nothing_of_fates(tmp_path, monkeypatch):
+    monkeypatch.setattr(optimiser, "FATE_RATE", 1.0)
     # Old worlds are to rest, but what is born in them is no unrest; pictures do not count.
-    rest = {"rest_weight": 1.0, "lifetimes": (12, 48), "rest_age": 12, "damage": False}
-    rule = trained(tmp_path, 8, fate_rate=1.0, splat_weight=0.0, drift_weight=0.0, **rest)
+    rest = {"rest_weight": 1.0, "lifetimes": (12, 48), "rest_age": 12, "damage_share": 0.0}
+    rule = trained(tmp_path, 8, splat_weight=0.0, drift_weight=0.0, **rest)
     assert rule.fate.bias.tolist() == list(FIRST_FATES)
     assert rule.output.weight.any()
 
@@ -156,10 +151,11 @@ def test_births_are_no_unrest(tmp_path):
     assert rest < 1e-6
 
 
-def test_fates_learn_at_their_share_of_the_learning_rate(tmp_path):
+def test_fates_learn_at_their_share_of_the_learning_rate(tmp_path, monkeypatch):
     changes = []
     for rate in (1.0, 0.01):
-        rule = trained(tmp_path / str(rate), 1, fate_rate=rate)
+        monkeypatch.setattr(optimiser, "FATE_RATE", rate)
+        rule = trained(tmp_path / str(rate), 1)
         changes.append((rule.fate.bias - torch.tensor(FIRST_FATES)).abs().max().item())
     # AdamW's first step is the learning rate.
     assert changes[0] == pytest.approx(1e-3, rel=0.01)

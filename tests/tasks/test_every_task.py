@@ -337,8 +337,6 @@ def test_losses_and_gradients_on_cuda_are_those_on_the_cpu(tiny, name, fields):
         ("morphogenesis3d", {"sigma": 0.0}, "sigma must be a finite number greater than 0"),
         ("morphogenesis3d", {"blur_sigma": -1.0}, "blur_sigma must be a finite number of at least"),
         ("morphogenesis3d", {"view_seed": -1}, "view_seed must be a whole number"),
-        ("morphogenesis3d", {"renderer": "opengl"}, "renderer must be 'own' or 'gsplat'"),
-        ("morphogenesis3d", {"renderer": []}, r"renderer must be 'own' or 'gsplat', got \[\]"),
         ("point_classification", {"data": ""}, "data must be a name or a path"),
         ("point_classification", {"stretch": 1.5}, "stretch must be at most 1"),
         ("point_classification", {"rotation": -1.0}, "rotation must be a finite number of at"),

@@ -2,20 +2,17 @@
 
 import dataclasses
 import math
-import sys
-import types
 
 import numpy as np
 import pytest
 import torch
 from training_runs import lively_rule
 
-from npa_envs.errors import MissingDependencyError, NPAError
+from npa_envs.errors import NPAError
 from npa_envs.measure.quality import measure
-from npa_envs.ops import orbit
 from npa_envs.render import turntable_frames, write_gaussians, write_points, write_splat
 from npa_envs.rule.rule import NPARule
-from npa_envs.tasks.appearance import FLAT, OUTPUTS, Appearance, gsplat_renderer, own_renderer
+from npa_envs.tasks.appearance import FLAT, OUTPUTS, Appearance
 from npa_envs.tasks.base import ReadOutTask, ScheduledTask, ViewTask
 from npa_envs.tasks.morphogenesis3d import Morphogenesis3D, Morphogenesis3DConfig
 from npa_envs.tasks.targets.meshes import AMBIENT, LIGHT, load_mesh
@@ -206,45 +203,6 @@ def test_what_does_not_fit_is_refused(target):
         Morphogenesis3D(dataclasses.replace(SMALL, resolution=32), target=target)
     with pytest.raises(NPAError, match="at least 16 pixels for MS-SSIM"):
         Morphogenesis3D(dataclasses.replace(SMALL, resolution=12, ssim_weight=0.2))
-
-
-def test_gsplat_is_called_with_what_it_takes(task, monkeypatch):
-    """gsplat itself needs CUDA; a stand-in for it draws what it is given with our own kernels."""
-    x, s = worlds(task, 2)
-    look = task.gaussians(s)
-    cameras = orbit(2, 20.0, 3.0, 45.0, width=20, height=24)
-    monkeypatch.setitem(sys.modules, "gsplat", None)
-    with pytest.raises(MissingDependencyError, match="pip install gsplat"):
-        gsplat_renderer(x, look, cameras)
-
-    def rasterization(
-        means, quats, scales, opacities, colors, viewmats, Ks, width, height, **options
-    ):
-        assert options == {"near_plane": 0.01, "sh_degree": 1, "packed": False}
-        assert torch.allclose(quats.norm(dim=-1), torch.ones(150))
-        lens = torch.stack((Ks[:, 0, 0], Ks[:, 1, 1], Ks[:, 0, 2], Ks[:, 1, 2]), dim=-1)
-        assert torch.equal(Ks[:, 2], torch.tensor([[0.0, 0.0, 1.0]]).expand(2, 3))
-        seen = dataclasses.replace(
-            cameras, world_to_camera=viewmats, intrinsics=lens, width=width, height=height
-        )
-        given = look._replace(
-            scales=scales[None],
-            quaternions=quats[None],
-            opacities=opacities[None],
-            colours=colors[None],
-        )
-        image, alpha = own_renderer(means[None], given, seen)
-        return image[0], alpha[0, ..., None], {}
-
-    monkeypatch.setitem(sys.modules, "gsplat", types.SimpleNamespace(rasterization=rasterization))
-    with pytest.raises(NPAError, match="draws worlds on CUDA, got cpu"):
-        gsplat_renderer(x, look, cameras)
-    monkeypatch.setattr(torch.Tensor, "is_cuda", True, raising=False)
-    drawn = gsplat_renderer(x, look, cameras)
-    monkeypatch.undo()
-    expected = own_renderer(x, look, cameras)
-    assert drawn[0].shape == (2, 2, 24, 20, 3)
-    assert all(torch.equal(a, b) for a, b in zip(drawn, expected, strict=True))
 
 
 def read_ply(path):

@@ -170,10 +170,11 @@ def cycle_of(folder, tmp_path, **fields):
 
 @pytest.mark.parametrize("mutated_share", [0.0, 0.6])
 @pytest.mark.parametrize("runaway_limit", [10.0, 1e-6])
-def test_classes_stay_with_their_worlds(folder, tmp_path, mutated_share, runaway_limit):
-    cycle, _ = cycle_of(
-        folder, tmp_path, mutated_share=mutated_share, runaway_limit=runaway_limit, world_count=6
-    )
+def test_classes_stay_with_their_worlds(
+    folder, tmp_path, monkeypatch, mutated_share, runaway_limit
+):
+    monkeypatch.setattr("npa_envs.training.cycle.RUNAWAY_LIMIT", runaway_limit)
+    cycle, _ = cycle_of(folder, tmp_path, mutated_share=mutated_share, world_count=6)
     before = cycle.pool.x.clone()
     for iteration in range(5):
         cycle.run(iteration)
@@ -184,7 +185,7 @@ def test_classes_stay_with_their_worlds(folder, tmp_path, mutated_share, runaway
 
 @pytest.mark.parametrize(("share", "count"), [(0.0, 1), (0.5, 3), (1.0, 6)])
 def test_so_many_worlds_of_a_batch_are_fresh_clouds(folder, tmp_path, share, count):
-    cycle, _ = cycle_of(folder, tmp_path, fresh_share=share, world_count=6, damage=False)
+    cycle, _ = cycle_of(folder, tmp_path, fresh_share=share, world_count=6, damage_share=0.0)
     cycle.pool.s += 0.5
     cycle.run(0)
     blank = (cycle.batch.s0 == 0.0).flatten(1).all(1)

@@ -24,12 +24,9 @@ PLAIN = {}
 
 LIVELY = {
     "lifetimes": (4, 400),
-    "ageing_steps": 64,
-    "ageing_interval": 2,
     "rest_weight": 1.0,
     "rest_age": 4,
     "damage_share": 0.5,
-    "average": 0.9,
     "world_count": 4,
     "pool_size": 16,
     "picture_interval": 2,
@@ -115,7 +112,7 @@ def test_processes_take_muons_steps_together(tmp_path):
 def test_seeds_come_into_the_part_of_the_pool_of_every_world(tmp_path, fresh_share):
     # A rule that moves nothing: only worlds that began anew are others than at the beginning.
     fields = {"world_count": 4, "pool_size": 8, "seed_interval": 1, "fresh_share": fresh_share}
-    config = tiny(tmp_path, **fields, damage=False, learning_rate=1e-30)
+    config = tiny(tmp_path, **fields, damage_share=0.0, learning_rate=1e-30)
     task = Morphogenesis2D(config.task)
     rule = task.make_rule(torch.Generator().manual_seed(0)).double()
     torch.nn.init.zeros_(rule.output.weight)

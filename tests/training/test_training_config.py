@@ -22,7 +22,6 @@ from npa_envs.training import (
     preset,
     task_entry,
 )
-from npa_envs.training.overrides import completed
 from npa_envs.training.trainer import initial_rule
 
 PAPER = preset("paper")
@@ -35,16 +34,15 @@ def test_paper_preset_is_the_designs_table():
     task |= {"motion_weight": 0.01, "overflow_weight": 100.0, "bound_weight": 100.0}
     run = {"pool_size": 512, "world_count": 8, "steps": (32, 96), "seed_interval": 16}
     run |= {"iterations": 10_000, "repeats": 3, "milestones": (2_000, 4_000, 6_000, 8_000)}
-    run |= {"learning_rate": 5e-4, "weight_decay": 0.0, "decay": 0.3}
-    run |= {"damage": True, "normalise_gradients": True}
+    run |= {"learning_rate": 5e-4, "weight_decay": 0.0, "damage_share": 1.0}
     assert task.items() <= vars(PAPER.task).items()
     assert run.items() <= vars(PAPER).items()
 
 
 def test_learning_rate_falls_at_milestones_and_starts_afresh_with_each_repeat():
-    config = override(PAPER, iterations=10, milestones=[2, 5], learning_rate=1.0, decay=0.5)
+    config = override(PAPER, iterations=10, milestones=[2, 5], learning_rate=1.0)
     rates = [config.learning_rate_at(k) for k in range(12)]
-    assert rates == [1, 1, 0.5, 0.5, 0.5, 0.25, 0.25, 0.25, 0.25, 0.25, 1, 1]
+    assert rates == [1, 1, 0.3, 0.3, 0.3, 0.09, 0.09, 0.09, 0.09, 0.09, 1, 1]
 
 
 @pytest.mark.parametrize("iterations", [10, 1000])
@@ -66,9 +64,7 @@ def test_a_cosine_falls_with_a_share_that_says_more_than_the_iterations():
     assert config.learning_rate_at(40, 0.2) == config.learning_rate_at(40)
     assert config.learning_rate_at(10, 0.4) == config.learning_rate_at(40)
     assert config.learning_rate_at(10, 1.0) == pytest.approx(0.01)
-    ageing = override(config, lifetimes=(64, 640), ageing_steps=640, ageing_interval=5)
-    assert ageing.ageing_at(5, 0.5) == ageing.ageing_at(50) == 320
-    stepwise = override(PAPER, iterations=100, learning_rate=1.0, milestones=(40,), decay=0.5)
+    stepwise = override(PAPER, iterations=100, learning_rate=1.0, milestones=(40,))
     assert stepwise.learning_rate_at(10, 1.0) == 1.0
 
 
@@ -78,30 +74,6 @@ def test_override_reaches_fields_of_the_run_and_of_the_task():
     assert config.task.eps == 1.0
     assert isinstance(config.task.eps, float)
     assert (PAPER.iterations, PAPER.task.target) == (10_000, "gecko")
-
-
-def test_configurations_that_were_kept_get_the_defaults_of_younger_fields(tmp_path):
-    config = preset("fast", "co_morphogenesis2d", average=0.5)
-    held = config_to_dict(config)
-    whole = json.loads(json.dumps(held))
-    del held["lifetimes"], held["average"], held["task"]["species"][1]["blur_levels"]
-    assert completed(held, config) == whole | {"average": 0.0}
-    assert completed(whole, config) == whole
-    (tmp_path / "config.json").write_text(json.dumps(held))
-    assert load_config(tmp_path / "config.json", config).average == 0.5
-    assert load_config(tmp_path / "config.json", config, whole=True).average == 0.0
-
-
-def test_configurations_that_were_kept_are_read_without_fields_that_are_no_more(tmp_path):
-    config = preset("fast", "morphogenesis2d")
-    held = json.loads(json.dumps(config_to_dict(config)))
-    held["task"]["division_weight"] = 0.02
-    assert completed(held, config) == json.loads(json.dumps(config_to_dict(config)))
-    (tmp_path / "config.json").write_text(json.dumps(held))
-    for whole in (False, True):
-        assert load_config(tmp_path / "config.json", config, whole=whole) == config
-    with pytest.raises(NPAError, match="division_weight"):
-        preset("fast", "morphogenesis2d", division_weight=0.02)
 
 
 def test_no_field_of_the_run_hides_one_of_the_task():
@@ -117,23 +89,20 @@ def test_no_field_of_the_run_hides_one_of_the_task():
         ("iterations", 2.5, "iterations must be of type int, got 2.5"),
         ("learning_rate", float("nan"), "learning_rate must be a finite number greater than 0"),
         ("learning_rate", "fast", "learning_rate must be of type float, got 'fast'"),
-        ("decay", 1.5, r"decay must lie in \(0, 1\], got 1.5"),
         ("weight_decay", -1, "weight_decay must be a finite number of at least 0, got -1.0"),
         ("steps", [5, 5], "steps must be two whole numbers"),
         ("steps", 5, "steps must be a list, got 5"),
         ("lifetimes", [5, 2], "lifetimes must be two whole numbers"),
         ("lifetimes", [0, 2], "lifetimes must be two whole numbers"),
-        ("ageing_steps", -64, "ageing_steps must be a whole number of at least 0, got -64"),
-        ("ageing_interval", 0, "ageing_interval must be a whole number of at least 1, got 0"),
         ("second_lives", 1.0, "second_lives must be below 1, got 1.0"),
         ("second_lives", 0.5, "second_lives needs worlds that have lifetimes, got 0.5 without"),
-        ("damage_share", 0.0, r"damage_share must lie in \(0, 1\], got 0.0"),
+        ("damage_share", 1.5, "damage_share must be at most 1, got 1.5"),
+        ("damage_share", -0.5, "damage_share must be a finite number of at least 0, got -0.5"),
+        ("vary_eps", (0.0, 1.0), "vary_eps must be two factors"),
+        ("vary_eps", (2.0, 1.0), r"vary_eps must be two factors .*lo <= hi"),
         ("rest_power", 0.5, "rest_power must be at least 1 and at most 8, got 0.5"),
         ("rest_power", 16, "rest_power must be at least 1 and at most 8, got 16"),
-        ("average", 1.0, "average must be below 1, got 1.0"),
         ("schedule", "linear", "schedule must be one of milestones, cosine, got 'linear'"),
-        ("blur_levels", 7, "blur_levels must leave pictures of at least 4 pixels a side, got 7"),
-        ("blur_levels", -1, "blur_levels must be a whole number of at least 0, got -1"),
         ("milestones", [5, 2], "milestones must be positive and increasing"),
         ("world_count", 1000, "world_count must be at most pool_size"),
         ("seed", -1, r"seed must be a whole number of at least 0 and below 2\*\*63, got -1"),
@@ -155,38 +124,16 @@ def test_each_wrong_value_is_named(field, value, rule):
         override(PAPER, **{field: value})
 
 
-@pytest.mark.parametrize("field", ["damage", "tensorboard", "cuda_graph", "keep_background"])
+@pytest.mark.parametrize("field", ["tensorboard", "cuda_graph", "keep_background"])
 def test_flags_are_true_or_false(field):
     told = PAPER.task if field == "keep_background" else PAPER
     with pytest.raises(NPAError, match=f"{field} must be True or False, got 'no'"):
         dataclasses.replace(told, **{field: "no"})
 
 
-@pytest.mark.parametrize("field", ["ageing_steps", "rest_weight"])
-def test_what_needs_ages_needs_lifetimes(field):
-    with pytest.raises(NPAError, match=f"{field} needs worlds that have lifetimes, got 64"):
-        override(PAPER, **{field: 64})
-
-
-@pytest.mark.parametrize("fields", [{"decay": 1.0}, {"milestones": []}])
-def test_worlds_that_are_to_age_need_a_rate_that_falls(fields):
-    ages = {"ageing_steps": 64, "lifetimes": [64, 1024]}
-    with pytest.raises(NPAError, match="ageing_steps needs a learning rate that falls, got 64"):
-        override(PAPER, **ages, **fields)
-    assert override(PAPER, **ages, **fields, schedule="cosine").ageing_at(49_984) > 0
-
-
-def test_worlds_age_the_more_the_less_the_rule_changes():
-    fields = {"lifetimes": (64, 128), "ageing_steps": 640, "ageing_interval": 5}
-    config = override(PAPER, iterations=100, schedule="cosine", **fields)
-    steps = [config.ageing_at(k) for k in range(200)]
-    assert steps[:100] == steps[100:]
-    assert {k % 5 for k, count in enumerate(steps) if count} == {0}
-    assert (steps[0], steps[5], steps[50], steps[95]) == (0, 0, 320, 640)
-    assert all(count % 64 == 0 for count in steps)
-    assert sorted(steps[:100:5]) == steps[:100:5]
-    stepwise = override(PAPER, iterations=100, milestones=(40,), decay=0.25, **fields)
-    assert [stepwise.ageing_at(k) for k in (0, 35, 40, 41, 95)] == [0, 0, 512, 0, 512]
+def test_what_needs_ages_needs_lifetimes():
+    with pytest.raises(NPAError, match="rest_weight needs worlds that have lifetimes, got 64"):
+        override(PAPER, rest_weight=64)
 
 
 def test_sections_of_a_pool_with_lifetimes_are_equal():

@@ -47,9 +47,6 @@ def clouds_cycle(tmp_path, by_world=False, **fields):
     return make_cycle(config, PointClassification(config.task), by_world=by_world)
 
 
-AGEING = {"lifetimes": (4, 400), "ageing_steps": 64, "ageing_interval": 1, "milestones": (1,)}
-
-
 def runaway():
     """A rollout that makes the second world run away each time it ran, so that it is replaced."""
 
@@ -64,25 +61,26 @@ def runaway():
     ("make", "fields"),
     [
         (circle_cycle, {}),
-        (circle_cycle, {"dtype": "float64", "damage": False, "normalise_gradients": False}),
+        (circle_cycle, {"dtype": "float64", "damage_share": 0.0}),
         (tiny_cycle, {}),
         (clouds_cycle, {"steps": (2, 4), "pool_size": 10}),
-        (tiny_cycle, {"lifetimes": (4, 40), "average": 0.9, "blur_levels": 2, "damage_share": 0.5}),
+        (tiny_cycle, {"lifetimes": (4, 40), "damage_share": 0.5}),
         (
             clouds_cycle,
             {"steps": (2, 4), "pool_size": 16, "lifetimes": (2, 6), "damage_share": 0.5},
         ),
         (tiny_cycle, {"lifetimes": (4, 40), "damage_share": 0.5, "second_lives": 0.5}),
-        (circle_cycle, AGEING | {"pool_size": 6}),
+        (tiny_cycle, {"lifetimes": (4, 40), "damage_share": 0.0, "second_lives": 0.5}),
+        (tiny_cycle, {"vary_eps": (0.5, 2.0)}),
         (world_cycle, {"damage_share": 0.5}),
-        (world_cycle, AGEING | {"average": 0.9}),
+        (world_cycle, {"lifetimes": (4, 400), "vary_eps": (0.5, 2.0)}),
         (clouds_cycle, {"by_world": True, "steps": (2, 4), "pool_size": 16}),
     ],
 )
 def test_replayed_operations_train_the_same_rule_as_called_ones(tmp_path, make, fields):
     (called, called_rule), (replayed, replayed_rule) = (make(tmp_path, **fields) for _ in range(2))
     replayed._draw, replayed._keep = Recording(replayed._draw), Recording(replayed._keep)
-    replayed._note, replayed._grow_old = Recording(replayed._note), Recording(replayed._grow_old)
+    replayed._note = Recording(replayed._note)
     for iteration in range(8):
         for cycle in (called, replayed):
             cycle.run(iteration)
@@ -95,7 +93,6 @@ def test_replayed_operations_train_the_same_rule_as_called_ones(tmp_path, make, 
     assert len(replayed._draw.recorded) > 5
     assert len(replayed._keep.recorded) > 5
     assert len(replayed._note.recorded) > 5
-    assert (len(replayed._grow_old.recorded) > 5) == ("ageing_steps" in fields)
 
 
 @pytest.mark.gpu

@@ -16,9 +16,8 @@ from npa_envs.training.checkpoint import check_same_run, load_checkpoint, save_c
 from npa_envs.training.iteration import EagerIteration, power_mean
 from npa_envs.training.meter import Interval, LossMeter
 from npa_envs.training.optimiser import (
+    FATE_RATE,
     RuleOptimiser,
-    WeightAverage,
-    clear_non_finite,
     layer_weights,
     normalise_gradients,
 )
@@ -103,14 +102,10 @@ def test_gradient_that_is_not_finite_becomes_zero_and_its_neighbour_stays(bad, d
     normalise_gradients(gradients)
     assert gradients[0].tolist() == [0.0, 0.0]
     assert gradients[1].tolist() == [1.0]
-    for entries, cleared in (([1.0, bad], [0.0, 0.0]), ([3.0, -2.0], [3.0, -2.0])):
-        gradient = torch.tensor(entries, device=device)
-        clear_non_finite(gradient)
-        assert gradient.tolist() == cleared
 
 
 def test_first_step_of_each_repeat_has_the_full_learning_rate_and_fresh_moments(tmp_path):
-    config = circle_config(tmp_path, iterations=3, repeats=2, milestones=[1], decay=0.1)
+    config = circle_config(tmp_path, iterations=3, repeats=2, milestones=[1])
     path = []
     parameter = nn.Parameter(torch.zeros(1))
     optimiser = RuleOptimiser([parameter], config, nn.Identity())
@@ -121,7 +116,7 @@ def test_first_step_of_each_repeat_has_the_full_learning_rate_and_fresh_moments(
         path.append(parameter.item())
     # With fresh moments AdamW's first step is the learning rate, against the gradient's sign.
     assert path[0] == pytest.approx(-0.01, rel=1e-3)
-    assert path[1] - path[0] == pytest.approx(-0.001, rel=1e-3)
+    assert path[1] - path[0] == pytest.approx(-0.003, rel=1e-3)
     assert path[3] - path[2] == pytest.approx(0.01, rel=1e-3)
     # Weights without gradient decay.
     parameter, config = nn.Parameter(torch.ones(1)), circle_config(tmp_path, weight_decay=0.5)
@@ -145,7 +140,7 @@ def test_muon_makes_steps_of_matrices_orthogonal_and_leaves_all_else_to_adamw(tm
     optimiser.step(0)
     fates = set(map(id, fate_parameters(rule)))
     for parameter, old in zip(parameters, before, strict=True):
-        rate = 1e-2 * (config.fate_rate if id(parameter) in fates else 1.0)
+        rate = 1e-2 * (FATE_RATE if id(parameter) in fates else 1.0)
         step = (1.0 - 0.5 * rate) * old - parameter.detach()
         if any(parameter is matrix for matrix in matrices):
             # Newton and Schulz's iteration leaves singular values near 1; so long are AdamW's steps
@@ -164,39 +159,6 @@ def test_rules_that_know_no_direction_have_one_matrix_more():
     assert rule.mixing in set(layer_weights(rule))
     assert len(layer_weights(rule)) == 3
     assert len(layer_weights(nn.ModuleList([rule, NPARule(2, 4, 8, eps0=0.1)]))) == 5
-
-
-def test_average_of_weights_forgets_the_first_ones_soon():
-    parameter = nn.Parameter(torch.tensor([8.0]))
-    average = WeightAverage([parameter], 0.75)
-    mean, share = 8.0, []
-    for iteration, value in enumerate([1.0, 5.0, 2.0] + 40 * [3.0]):
-        with torch.no_grad():
-            parameter.fill_(value)
-        average.update(iteration)
-        keep = min(0.75, (1 + iteration) / (10 + iteration))
-        mean = keep * mean + (1 - keep) * value
-        share.append(keep)
-        assert average.state_dict()["average"]["0"].item() == pytest.approx(mean, rel=1e-5)
-    assert (share[0], share[-1]) == (0.1, 0.75)
-    assert WeightAverage([parameter], 0.0).state_dict() == {}
-
-
-def test_the_rule_of_an_average_is_a_copy_and_leaves_frozen_weights():
-    rule = CircleTask().make_rule(torch.Generator().manual_seed(1))
-    frozen, *trained = rule.parameters()
-    frozen.requires_grad_(False)
-    average = WeightAverage(trained, 0.5)
-    before = [p.detach().clone() for p in rule.parameters()]
-    with torch.no_grad():
-        for parameter in rule.parameters():
-            parameter += 10.0
-    average.update(0)
-    first, *others = average.rule(rule).parameters()
-    assert torch.equal(first, before[0] + 10.0)
-    for own, old in zip(others, before[1:], strict=True):
-        torch.testing.assert_close(own, old + 9.0)
-    assert WeightAverage(trained, 0.0).rule(rule) is rule
 
 
 def make_iteration(config, kind=EagerIteration, device="cpu"):

@@ -207,7 +207,7 @@ def test_only_a_scripted_policy_is_chosen_elsewhere(monkeypatch):
         ("npa/Gardener2DSmall-v0 --policy none/sac.zip", "must be of a file that exists"),
         ("npa/Gardener2DSmall-v0 --policy best.zip", "must be of a file sac.zip or ppo.zip"),
         ("npa/Gardener2DSmall-v0 --episodes 1 --dataset heart", "must be an id with a version"),
-        ("npa/Gardener2DSmall-v0 --episodes 1 --dataset ../heart-v0", "must be an id"),
+        ("npa/Gardener2DSmall-v0 --episodes 1 --dataset ../heart-first", "must be an id"),
     ],
 )
 def test_what_cannot_be_recorded_is_told(words, told, capsys):

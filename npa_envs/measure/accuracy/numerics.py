@@ -25,7 +25,7 @@ from npa_envs.measure.accuracy.scenes import (
     relative_error,
     scenes,
 )
-from npa_envs.measure.speed.strategies import PRECISIONS, Precision
+from npa_envs.measure.speed.precisions import PRECISIONS, Precision
 from npa_envs.ops import perceive
 from npa_envs.rule.files import load_rule
 from npa_envs.rule.rule import NPARule

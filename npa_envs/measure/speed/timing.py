@@ -6,14 +6,13 @@ import gc
 import math
 import statistics
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any, TypeVar
 
 import torch
 from torch import Tensor
 
-from npa_envs.measure.speed.strategies import PRECISIONS, STRATEGIES, Precision, Strategy
 from npa_envs.world.cuda_graph import capture
 
 Sampled = tuple[Callable[[], object], torch.Generator]
@@ -157,10 +156,6 @@ class Session:
     """Readings of every time."""
     small: bool = False
     """Small sizes only: about a minute on a CPU."""
-    strategies: list[Strategy] = field(default_factory=lambda: list(STRATEGIES.values()))
-    """Strategies to measure."""
-    precisions: list[Precision] = field(default_factory=lambda: list(PRECISIONS.values()))
-    """Precisions to measure."""
     progress: Callable[[int], None] = lambda done: None
     """Called with 1 after each row."""
     left_out: list[LeftOut] = field(default_factory=list)
@@ -216,26 +211,6 @@ class Session:
         entry = LeftOut(what, why)
         if entry not in self.left_out:
             self.left_out.append(entry)
-
-    def usable_precisions(self) -> Iterator[Precision]:
-        """Yield the precisions that the device has."""
-        for precision in self.precisions:
-            why = precision.obstacle(self.device)
-            if why is None:
-                yield precision
-            else:
-                self.leave_out(precision.name, why)
-
-    def usable_strategies(self, x: Tensor) -> Iterator[Strategy]:
-        """Yield the strategies that have something to measure on worlds like `x`, [B, N, D]."""
-        for strategy in self.strategies:
-            why = strategy.obstacle(x)
-            if why is None:
-                yield strategy
-            else:
-                number = str(x.dtype).removeprefix("torch.")
-                shape = f"{x.shape[2]}D ({x.shape[0]}, {x.shape[1]})"
-                self.leave_out(f"{strategy.name}, {number}, {shape}", why)
 
 
 def relative_error(value: Tensor, expected: Tensor) -> float:

@@ -15,8 +15,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from npa_envs.errors import NPAError, shown
-from npa_envs.ops.checks import (
+from npa_envs.checks import (
     DTYPES,
     LARGEST_SIDE,
     check_dense,
@@ -26,6 +25,7 @@ from npa_envs.ops.checks import (
     checked_side,
     number_tensor,
 )
+from npa_envs.errors import NPAError, shown
 
 RIGID_TOLERANCE = 1e-3
 """How far R Rᵀ may be from the unit matrix, entry by entry, dimensionless."""

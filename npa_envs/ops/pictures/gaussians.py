@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
+from npa_envs.checks import DTYPES, check_dense, checked_count, checked_number
 from npa_envs.errors import NPAError, shown
 from npa_envs.kernels.pictures.blending import TILE_PIXELS, block_kernels, tile_kernels
 from npa_envs.kernels.pictures.gaussians import (
@@ -18,7 +19,6 @@ from npa_envs.kernels.pictures.gaussians import (
     make_frame,
     tile_total,
 )
-from npa_envs.ops.checks import DTYPES, check_dense, checked_count, checked_number
 from npa_envs.ops.launch import launch, scalar_type
 from npa_envs.ops.opaque import check_derivatives, once_differentiable, opaque
 from npa_envs.ops.pictures.cameras import Cameras

@@ -8,6 +8,14 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
+from npa_envs.checks import (
+    LARGEST_SIDE,
+    check_world,
+    checked_count,
+    checked_number,
+    checked_positive,
+    checked_side,
+)
 from npa_envs.errors import NPAError, shown
 from npa_envs.kernels.cuda.sort import BLOCKS
 from npa_envs.kernels.cuda.splat import sort_small_splats
@@ -23,14 +31,6 @@ from npa_envs.kernels.pictures.splat import (
     splat_kernels,
 )
 from npa_envs.ops.backend import Request
-from npa_envs.ops.checks import (
-    LARGEST_SIDE,
-    check_world,
-    checked_count,
-    checked_number,
-    checked_positive,
-    checked_side,
-)
 from npa_envs.ops.launch import aligned, launch, scalar_type
 from npa_envs.ops.mean import world_mean
 from npa_envs.ops.opaque import check_derivatives, once_differentiable, opaque

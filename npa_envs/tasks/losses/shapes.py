@@ -1,12 +1,9 @@
-"""Texture losses that see shapes: patches matched with patches, and how features go together.
+"""Texture losses that see shapes: patches matched with patches, and features with features.
 
 They compare all channels of an image at once, so that what lies inside of what counts, too.
 """
 
 from __future__ import annotations
-
-import math
-from typing import Protocol
 
 import torch
 from torch import Tensor
@@ -100,18 +97,6 @@ def _matched(found: Tensor, expected: Tensor) -> Tensor:
     return torch.maximum(both[0], both[1] + rest)
 
 
-class Features(Protocol):
-    """Numbers at each place of images."""
-
-    def __call__(self, images: Tensor, *, wrap: bool) -> Tensor:
-        """Return the fields of images [B, K, R, R], shape [B, F, H, W].
-
-        Args:
-            images: The images.
-            wrap: Whether their opposite edges meet; otherwise places near them are left out.
-        """
-
-
 FILTER_SIZES = (3, 5, 7, 11, 15, 23, 37, 55)
 """Pixels along each side of random filters, of an image of 128 pixels."""
 
@@ -148,137 +133,18 @@ class RandomFilters:
         """The filters' conjugate Fourier transforms."""
 
     def __call__(self, images: Tensor, *, wrap: bool) -> Tensor:
-        """Return the image's channels and the rectified answers at every second place."""
+        """Return the image's channels and the rectified answers at every second place.
+
+        Args:
+            images: The images, shape [B, K, R, R].
+            wrap: Whether their opposite edges meet; otherwise places near them are left out.
+        """
         waves = torch.fft.rfft2(images)
         answers = torch.einsum("bkrc,fkrc->bfrc", waves, self.filter_waves.to(waves))
         fields = torch.fft.irfft2(answers, s=images.shape[-2:]).relu()
         found = torch.cat((images, fields), dim=1)
         inside = images.shape[-1] - (0 if wrap else self._reach - 1)
         return found[..., :inside:2, :inside:2]
-
-
-SCALES = 4
-"""Scales of wavelets, each twice as long as the one before."""
-
-TURNS = 4
-"""Orientations of wavelets in half a turn."""
-
-PHASES = 4
-"""Phases that a wavelet's answer is rectified at."""
-
-HIGHEST = 0.36
-"""Wave number of the shortest wavelets [waves per pixel]."""
-
-
-class RectifiedWavelets:
-    """The image, its blur, and oriented wavelets of several scales, rectified at four phases.
-
-    The wavelets are those of a steerable pyramid (Portilla and Simoncelli 2000); covariances of
-    their rectified answers tell what is aligned with what (Brochard, Zhang and Mallat, arXiv
-    2203.07902).
-
-    Args:
-        like: An image of the shape that is to be described, [K, R, R], on the device.
-    """
-
-    def __init__(self, like: Tensor) -> None:
-        side = like.shape[-1]
-        waves = torch.fft.fftfreq(side, dtype=torch.float64)
-        down, across = torch.meshgrid(waves, waves, indexing="ij")
-        octave = torch.log2(torch.hypot(down, across).clamp_min(1e-9) / HIGHEST)
-        turn = torch.atan2(down, across)
-        count = max(1, min(SCALES, int(math.log2(side)) - 2))
-        bank = []
-        for scale in range(count):
-            away = octave + scale
-            band = torch.cos(0.5 * math.pi * away.clamp(-1.0, 1.0))
-            if scale == 0:
-                band = torch.where(away > 0.0, torch.ones_like(band), band)
-            for number in range(TURNS):
-                beside = torch.cos(turn - math.pi * number / TURNS).clamp_min(0.0)
-                bank.append(band * beside ** (TURNS - 1))
-        low = torch.cos(0.5 * math.pi * (octave + count).clamp(0.0, 1.0))
-        self._margin = side // 8
-        self.low = low.to(like)
-        """Gain of what is left beside all bands, by frequency."""
-        self.bank = torch.stack(bank).to(like)
-        """Gains of the oriented bands, by frequency."""
-
-    def __call__(self, images: Tensor, *, wrap: bool) -> Tensor:
-        """Return the image's channels, their blur, and the answers, at every second place."""
-        waves = torch.fft.fft2(images)
-        blur = torch.fft.ifft2(waves * self.low).real
-        answers = torch.fft.ifft2(waves[:, :, None] * self.bank).flatten(1, 2)
-        fields = [images, blur]
-        for phase in range(PHASES):
-            angle = 2.0 * math.pi * phase / PHASES
-            fields.append(
-                2.0 * (math.cos(angle) * answers.real + math.sin(angle) * answers.imag).relu()
-            )
-        found = torch.cat(fields, dim=1)
-        edge = 0 if wrap else self._margin
-        return found[..., edge : found.shape[-2] - edge : 2, edge : found.shape[-1] - edge : 2]
-
-
-SHIFTS = ((0, 0), (0, 2), (2, 0), (2, 2), (2, -2), (0, 5), (5, 0))
-"""Places between two features whose products are averaged, rows and columns."""
-
-LEAST_SQUARE = 1e-6
-"""Divisor of Gram losses at least: targets that are not empty have some thousand times as much."""
-
-
-class GramMatrices(TextureDistance):
-    """The distance of images from a target in how features go together; satisfies `TextureLoss`.
-
-    It is the squared difference of the features' means and of the means of their products, relative
-    to the target's own squares; each feature counts relative to its own root mean square in the
-    target. With shifts, of products of features at two places.
-
-    Args:
-        target: The texture (dimensionless), shape [K, R, R].
-        features: What is compared.
-        tiles: Whether the target's opposite edges meet.
-        shifts: Places between the two features of a product.
-
-    Raises:
-        NPAError: The target is too small.
-    """
-
-    def __init__(
-        self,
-        target: Tensor,
-        features: Features,
-        *,
-        tiles: bool,
-        shifts: tuple[tuple[int, int], ...] = ((0, 0),),
-    ) -> None:
-        check_size(target)
-        super().__init__(target)
-        self._features = features
-        self._shifts = shifts
-        field = features(target[None], wrap=tiles)
-        sizes = field.square().mean(dim=(0, 2, 3)).sqrt()
-        scales = 1.0 / (sizes + 0.3 * sizes.mean() + 1e-6)
-        # Features of an empty target have no size that others could be told by.
-        self._scales = torch.where(sizes.any(), scales, 1.0)[:, None, None]
-        # Features move round the torus; where the target is none, a few products lie wrong.
-        self._expected = self._statistics(field)
-        self._square = self._expected.square().mean().clamp_min(LEAST_SQUARE)
-
-    def compare(self, images: Tensor) -> Tensor:
-        """Return the distance of each of some checked images, [B]."""
-        found = self._statistics(self._features(images, wrap=True))
-        return (found - self._expected).square().mean(1) / self._square
-
-    def _statistics(self, field: Tensor) -> Tensor:
-        field = field * self._scales
-        rows = field.flatten(2)
-        count = rows.shape[2]
-        parts = [rows.mean(2) * math.sqrt(rows.shape[1] * len(self._shifts))]
-        for shift in self._shifts:
-            moved = field if shift == (0, 0) else field.roll(shift, (2, 3))
-            parts.append((rows @ moved.flatten(2).transpose(1, 2) / count).flatten(1))
-        return torch.cat(parts, dim=1)
 
 
 class FeatureTransport(TextureDistance):
@@ -295,7 +161,7 @@ class FeatureTransport(TextureDistance):
         NPAError: The target is too small.
     """
 
-    def __init__(self, target: Tensor, features: Features, *, tiles: bool) -> None:
+    def __init__(self, target: Tensor, features: RandomFilters, *, tiles: bool) -> None:
         check_size(target)
         super().__init__(target)
         self._features = features

@@ -31,12 +31,9 @@ from npa_envs.tasks.losses.pieces import (
     stride_of,
 )
 from npa_envs.tasks.losses.shapes import (
-    SHIFTS,
     FeatureTransport,
-    GramMatrices,
     PatchTransport,
     RandomFilters,
-    RectifiedWavelets,
 )
 
 DEFAULT_LOSS = "patch_swd"
@@ -116,31 +113,10 @@ TEXTURE_LOSSES: Mapping[str, LossEntry] = {
         lambda target, options: PatchTransport(target, tiles=options.tiles),
         joint=True,
     ),
-    "filter_gram": LossEntry(
-        "Gram matrix of one layer of random filters of many sizes",
-        lambda target, options: GramMatrices(
-            target, RandomFilters(target, seed=options.seed), tiles=options.tiles
-        ),
-        joint=True,
-    ),
     "filter_ot": LossEntry(
-        "relaxed optimal transport of the same filters",
+        "relaxed optimal transport of one layer of random filters of many sizes",
         lambda target, options: FeatureTransport(
             target, RandomFilters(target, seed=options.seed), tiles=options.tiles
-        ),
-        joint=True,
-    ),
-    "wavelet_gram": LossEntry(
-        "products of rectified wavelets at several distances",
-        lambda target, options: GramMatrices(
-            target, RectifiedWavelets(target), tiles=options.tiles, shifts=SHIFTS
-        ),
-        joint=True,
-    ),
-    "wavelet_ot": LossEntry(
-        "relaxed optimal transport of the same wavelets",
-        lambda target, options: FeatureTransport(
-            target, RectifiedWavelets(target), tiles=options.tiles
         ),
         joint=True,
     ),

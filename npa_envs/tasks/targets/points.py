@@ -16,9 +16,9 @@ from numpy.typing import NDArray
 from PIL import Image, ImageChops, ImageColor, ImageDraw
 from torch import Tensor
 
+from npa_envs.checks import check_count, is_real
 from npa_envs.errors import NPAError, shown, suggest
 from npa_envs.files import home_path
-from npa_envs.tasks.checks import check_count, is_real
 from npa_envs.tasks.targets.emoji import is_emoji, render_emoji
 from npa_envs.tasks.targets.images import (
     LARGEST_POINT_COUNT,

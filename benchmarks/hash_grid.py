@@ -85,9 +85,7 @@ def grid_kernels(space_dim: int, scalar: type, state_dim: int) -> SimpleNamespac
     square = wp.types.matrix((space_dim, space_dim), scalar)
     channels = wp.types.vector(state_dim, scalar)
     gradients = wp.types.matrix((state_dim, space_dim), scalar)
-    module = wp.get_module(
-        f"npa_envs.measure.speed.hash_grid_{space_dim}d_{scalar_name(scalar)}_c{state_dim}"
-    )
+    module = wp.get_module(f"hash_grid_{space_dim}d_{scalar_name(scalar)}_c{state_dim}")
 
     @wp.kernel(enable_backward=False, module=module)
     def sum_density(

@@ -1,34 +1,102 @@
-"""Errors of strategies and precisions beside their times: of perception, of rollouts, of drift.
+"""The library against other ways to perceive, other precisions and other libraries: time and error.
+
+    python benchmarks/alternatives.py --device cuda --output FILE --plot PNG
+    python benchmarks/alternatives.py --quick --check benchmarks/results/ratios.json
 
 Errors of perception are against the library in float64 on the same device; `dense` in float64 is an
 independent implementation and shows how far that can be trusted. Worlds are chaotic: two that
 differ in the last bit drift apart, and after enough steps distances say how long they have run, not
-how well each was computed. The picture grown says that.
+how well each was computed. The picture grown says that. `--check` ends with code 1 where the
+library is less than a third as many times faster than a stored ratio says.
 """
 
 from __future__ import annotations
 
-# One perception of every particle.
 import importlib
-from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass
+import json
+import math
+import sys
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from functools import partial
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import torch
+from hash_grid import grid_fields
+from strategies import STRATEGIES, Strategy
 from torch import Tensor
-from torch.utils.checkpoint import checkpoint
 
 from npa_envs import reference
+from npa_envs.devices import check_device
+from npa_envs.errors import NPAError, shown
+from npa_envs.files import read_json, write_bytes, write_text
+from npa_envs.measure.plots import new_figure, number_plainly, png
 from npa_envs.measure.quality import psnr
-from npa_envs.measure.speed.hash_grid import grid_fields
-from npa_envs.measure.speed.strategies import PRECISIONS, STRATEGIES, Precision, Strategy
-from npa_envs.measure.speed.timing import NO_TIME, Cost, Session, Timing, relative_error
+from npa_envs.measure.record import script_facts, script_parser
+from npa_envs.measure.speed.drift import drawn_like
+from npa_envs.measure.speed.precisions import PRECISIONS, Precision
+from npa_envs.measure.speed.suites import Report
+from npa_envs.measure.speed.timing import (
+    NO_TIME,
+    Cost,
+    Session,
+    Tables,
+    Timing,
+    relative_error,
+)
 from npa_envs.measure.speed.workloads import Gecko, Workload, gecko
 from npa_envs.ops import perception_fields
 from npa_envs.rule.rule import NPARule
 from npa_envs.runtime import quiet_warp, start_warp
-from npa_envs.world.rollout import rollout
+from npa_envs.world.rollout import rollout, step
+
+
+@dataclass
+class Alternatives(Session):
+    """A session that knows what to compare."""
+
+    strategies: list[Strategy] = field(default_factory=lambda: list(STRATEGIES.values()))
+    """Strategies to measure."""
+    precisions: list[Precision] = field(default_factory=lambda: list(PRECISIONS.values()))
+    """Precisions to measure."""
+
+    def usable_precisions(self) -> Iterator[Precision]:
+        """Yield the precisions that the device has."""
+        for precision in self.precisions:
+            why = precision.obstacle(self.device)
+            if why is None:
+                yield precision
+            else:
+                self.leave_out(precision.name, why)
+
+    def usable_strategies(self, x: Tensor) -> Iterator[Strategy]:
+        """Yield the strategies that have something to measure on worlds like `x`, [B, N, D]."""
+        for strategy in self.strategies:
+            why = strategy.obstacle(x)
+            if why is None:
+                yield strategy
+            else:
+                number = str(x.dtype).removeprefix("torch.")
+                shape = f"{x.shape[2]}D ({x.shape[0]}, {x.shape[1]})"
+                self.leave_out(f"{strategy.name}, {number}, {shape}", why)
+
+
+def accuracy(session: Alternatives) -> Tables:
+    """Return run time against error: of perception, of rollouts, of other libraries."""
+    geckos = [1024] if session.small else [1024, 4096]
+    flat = Workload(2, 1, 1024, 1)
+    compared = [flat, Workload(3, 1, 512 if session.small else 1024, 1)]
+    worlds = compared
+    if not session.small:
+        larger = [(2, 1, 4096), (2, 1, 65536 if session.cuda else 16384), (2, 8, 4096)]
+        worlds = [flat, *(Workload(*sizes, 1) for sizes in larger), compared[1]]
+        worlds.append(Workload(3, 1, 16384, 1))
+    return {
+        "perception": [row for world in worlds for row in perception_rows(session, world)],
+        "rollouts": [row for count in geckos for row in rollout_rows(session, count)],
+        "peers": [row for world in compared for row in peer_rows(session, world)],
+    }
 
 
 @dataclass(frozen=True)
@@ -64,7 +132,7 @@ class Perceived(NamedTuple):
     cotangent: Tensor | None
 
 
-def perception_rows(session: Session, workload: Workload) -> list[PerceptionRow]:
+def perception_rows(session: Alternatives, workload: Workload) -> list[PerceptionRow]:
     """Return a row for each strategy and for each precision that perception knows of."""
     x, s = workload.worlds(session.device)
     exact = perceived(STRATEGIES["library"], x.double(), s.double(), workload.eps)
@@ -88,14 +156,8 @@ def perceived(strategy: Strategy, x: Tensor, s: Tensor, eps: float) -> Perceived
     z = strategy.perceive(x, s, eps)
     cotangent = None
     if strategy.differentiable:
-        cotangent = _cotangent(strategy, x, s, eps, functional_weights(z))
+        cotangent = _cotangent(strategy, x, s, eps, drawn_like(z))
     return Perceived(strategy.density(x, s, eps), z, cotangent)
-
-
-def functional_weights(like: Tensor) -> Tensor:
-    """Return the weights of a random linear functional, the same numbers in every dtype."""
-    generator = torch.Generator(like.device).manual_seed(2)
-    return torch.randn(like.shape, generator=generator, device=like.device).to(like.dtype)
 
 
 def _cotangent(strategy: Strategy, x: Tensor, s: Tensor, eps: float, weights: Tensor) -> Tensor:
@@ -105,7 +167,7 @@ def _cotangent(strategy: Strategy, x: Tensor, s: Tensor, eps: float, weights: Te
 
 
 def _perception_row(
-    session: Session,
+    session: Alternatives,
     workload: Workload,
     strategy: Strategy,
     precision: str,
@@ -118,7 +180,7 @@ def _perception_row(
     costs = [session.cost(lambda: strategy.perceive(x, s, eps), graph=graph)]
     cotangent = None
     if found.cotangent is not None and exact.cotangent is not None:
-        weights = functional_weights(found.perception)
+        weights = drawn_like(found.perception)
         costs.append(session.cost(lambda: _cotangent(strategy, x, s, eps, weights), graph=graph))
         cotangent = relative_error(found.cotangent, exact.cotangent)
     # States, smoothed states, state gradients, the density gradient.
@@ -206,8 +268,8 @@ class Runner:
         self.x = start.x.to(precision.dtype)
         self.s = precision.kept(start.s.to(precision.dtype))
         # Drawn here: a graph of the functional holds no draws of its own.
-        self._x_weights = functional_weights(self.x)
-        self._s_weights = functional_weights(self.s)
+        self._x_weights = drawn_like(self.x)
+        self._s_weights = drawn_like(self.s)
 
     def advanced(
         self, x: Tensor, s: Tensor, steps: int, generator: torch.Generator
@@ -251,7 +313,7 @@ class Runner:
         gradients = torch.autograd.grad(loss, list(self.rule.parameters()))
         return torch.cat([gradient.flatten() for gradient in gradients])
 
-    def costs(self, session: Session) -> list[Cost]:
+    def costs(self, session: Alternatives) -> list[Cost]:
         """Return what a timed rollout costs: inference, then training where it can be trained."""
         generator = mask_source(self.x)
 
@@ -291,7 +353,7 @@ def composed_step(
     return x, s + active * update[..., rule.space_dim :]
 
 
-def rollout_rows(session: Session, particle_count: int) -> list[RolloutRow]:
+def rollout_rows(session: Alternatives, particle_count: int) -> list[RolloutRow]:
     """Return a row for each strategy and precision: the gecko's next steps, and its picture."""
     seed = gecko(1, particle_count, session.device)
     grown = seed.grown(GROWN_STEPS)
@@ -324,7 +386,7 @@ def mask_source(like: Tensor) -> torch.Generator:
 
 
 def _task_runner(
-    session: Session, strategy: Strategy, precision: Precision, seed: Gecko
+    session: Alternatives, strategy: Strategy, precision: Precision, seed: Gecko
 ) -> Runner | None:
     """Return what grows the picture; a run of 512 steps is left out where it takes too long."""
     particle_count = seed.x.shape[1]
@@ -337,7 +399,7 @@ def _task_runner(
 
 
 def _rollout_row(
-    session: Session,
+    session: Alternatives,
     runner: Runner,
     expected: tuple[list[tuple[Tensor, Tensor]], Tensor],
     task: Runner | None,
@@ -345,10 +407,10 @@ def _rollout_row(
     costs = runner.costs(session)
     worlds, weight_gradient = expected
     errors = {}
-    for step, (x, s), (right_x, right_s) in zip(MARKS, runner.marks(MARKS), worlds, strict=True):
+    for mark, (x, s), (right_x, right_s) in zip(MARKS, runner.marks(MARKS), worlds, strict=True):
         distance = (x.double() - right_x.double()).norm(dim=-1).max()
-        errors[f"x_{step}"] = float(distance) / runner.task.eps
-        errors[f"s_{step}"] = relative_error(s, right_s)
+        errors[f"x_{mark}"] = float(distance) / runner.task.eps
+        errors[f"s_{mark}"] = relative_error(s, right_s)
     weights = None
     if runner.strategy.differentiable:
         found = runner.weight_gradient(mask_source(runner.x))
@@ -364,90 +426,6 @@ def _rollout_row(
         weights=weights,
         psnr_512=None if task is None else task.psnr(),
     )
-
-
-# How far float32 has drifted from float64 at the end of the paper's rollouts.
-
-PEER = STRATEGIES["dense"]
-"""What any float32 errs by: no approximation, one torch operator after the other."""
-
-
-@dataclass(frozen=True)
-class DriftRow:
-    """Relative errors of float32 after all steps of a workload, with float64's update masks.
-
-    Gradients are those of a random linear functional by the states at the start and the weights.
-    Their errors come from few particles: where the input of a hidden unit is nearly 0, the unit is
-    on in one precision and off in the other, and its gradient is there or is not.
-    `state_gradient_median` is the median over the particles, each relative to its own.
-    """
-
-    workload: str
-    strategy: str
-    positions: float
-    states: float
-    state_gradient: float
-    state_gradient_median: float
-    weight_gradient: float
-
-
-def drift_rows(session: Session, workloads: Iterable[Workload]) -> list[DriftRow]:
-    """Return a row for each workload, and one of dense torch where it can be."""
-    rows: list[DriftRow] = []
-    for workload in workloads:
-        what = f"drift of {workload.name}"
-        for exact in session.attempt(what, partial(_outcome, workload, session, torch.float64)):
-            rows += session.attempt(what, partial(_drift_row, workload, session, exact))
-            why = PEER.obstacle(workload.worlds(session.device)[0])
-            if session.small or why is not None:
-                session.leave_out(f"{what}, dense", why or "its steps take too long")
-            else:
-                rows += session.attempt(what, partial(_drift_row, workload, session, exact, PEER))
-    return rows
-
-
-def _drift_row(
-    workload: Workload, session: Session, exact: list[Tensor], peer: Strategy | None = None
-) -> DriftRow:
-    found = _outcome(workload, session, torch.float32, peer)
-    positions, states, by_states, by_weights = (
-        relative_error(a, b) for a, b in zip(found, exact, strict=True)
-    )
-    distance = (found[2].double() - exact[2]).norm(dim=-1)
-    median = float((distance / exact[2].norm(dim=-1)).median())
-    name = "library" if peer is None else peer.name
-    return DriftRow(workload.name, name, positions, states, by_states, median, by_weights)
-
-
-def _outcome(
-    workload: Workload, session: Session, dtype: torch.dtype, peer: Strategy | None = None
-) -> list[Tensor]:
-    """Return positions and states at the end, and gradients by states and by weights."""
-    device = session.device
-    rule = workload.rule(device).to(dtype)
-    start, states = (tensor.to(dtype) for tensor in workload.worlds(device))
-    states.requires_grad_()
-    generator = torch.Generator(device).manual_seed(1)
-    if peer is None:
-        x, s = rollout(
-            rule,
-            start,
-            states,
-            workload.steps,
-            eps=workload.eps,
-            update_prob=workload.update_prob,
-            generator=generator,
-            memory="recompute",
-        )
-    else:
-        x, s = start, states
-        for _ in range(workload.steps):
-            mask = drawn_mask(x, workload.update_prob, generator)
-            x, s = checkpoint(composed_step, peer, rule, x, s, mask, use_reentrant=False)
-    loss = (x * functional_weights(x)).sum() + (s * functional_weights(s)).sum()
-    by_states, *by_weights = torch.autograd.grad(loss, [states, *rule.parameters()])
-    weights = torch.cat([gradient.flatten() for gradient in by_weights])
-    return [tensor.detach() for tensor in (x, s, by_states, weights)]
 
 
 # Other libraries on the same particles. One that is not installed, or breaks, is left out with the
@@ -484,7 +462,7 @@ class Call:
     capturable: bool = False
 
 
-def peer_rows(session: Session, workload: Workload) -> list[PeerRow]:
+def peer_rows(session: Alternatives, workload: Workload) -> list[PeerRow]:
     """Return rows of every peer that is there, on the first world of a workload."""
     x, s = (tensor[0] for tensor in workload.worlds(session.device))
     exact = _reference_fields(x.double(), s.double(), workload.eps)
@@ -503,7 +481,7 @@ def peer_rows(session: Session, workload: Workload) -> list[PeerRow]:
     return rows
 
 
-def _row(session: Session, name: str, call: Call, x: Tensor, exact: Fields) -> PeerRow:
+def _row(session: Alternatives, name: str, call: Call, x: Tensor, exact: Fields) -> PeerRow:
     errors = [relative_error(value, exact[field]) for field, value in call.run().items()]
     cost = session.cost(call.run, graph=call.capturable)
     return PeerRow(name, call.operation, x.shape[1], x.shape[0], cost.time, max(errors))
@@ -608,3 +586,230 @@ PEERS = {
     "warpSPHCore": _warp_sph_core,
 }
 """Every peer, and what makes its calls from x [N, D], s [N, C] and eps."""
+
+
+# Plots: fronts of run time against error.
+
+FLOOR = 1e-16
+"""Errors below this, as that of the float64 reference itself, are drawn here."""
+
+COLOURS = dict(zip(STRATEGIES, ("C0", "C4", "C1", "C2", "C3"), strict=True))
+"""Colour of each strategy."""
+
+MARKERS = dict(zip(PRECISIONS, ("s", "o", "^", "D", "v"), strict=True))
+"""Shape of each precision."""
+
+
+class Point(NamedTuple):
+    """One way to compute something: its error (dimensionless) and its time [µs]."""
+
+    error: float
+    time: float
+    strategy: str
+    precision: str
+
+
+def front(points: Iterable[Point]) -> list[Point]:
+    """Return the points that no other one beats in both time and error, by increasing error."""
+    best: list[Point] = []
+    for point in sorted(points, key=lambda point: (point.error, point.time)):
+        if not best or point.time < best[-1].time:
+            best.append(point)
+    return best
+
+
+def draw_fronts(perceptions: Sequence[Any], rollouts: Sequence[Any]) -> Any:
+    """Return a figure of time against error, of perceptions and of rollouts."""
+    largest = _largest_common(perceptions)
+    perception = [
+        Point(row.perception, row.forward_us.median, row.strategy, row.precision)
+        for row in perceptions
+        if (row.space_dim, row.worlds, row.particles) == (2, 1, largest)
+    ]
+    most = max(row.particles for row in rollouts)
+    steps = [
+        Point(row.s_8, row.step_us.median, row.strategy, row.precision)
+        for row in rollouts
+        if row.particles == most
+    ]
+    figure, (axes,) = new_figure(1, 2, (9.2, 3.8))
+    _draw_front(axes[0], perception, "relative error of perception z", "time [µs]")
+    axes[0].set_title(f"one perception, N {largest}")
+    _draw_front(axes[1], steps, "relative error of states after 8 steps", "time of a step [µs]")
+    axes[1].set_title(f"gecko, p 0.5, N {most}")
+    _add_legend(figure, [*perception, *steps])
+    return figure
+
+
+def _largest_common(rows: Sequence[Any]) -> int:
+    """Return the most particles of a 2D world that every strategy was measured on."""
+    counts: set[int] = {row.particles for row in rows if (row.space_dim, row.worlds) == (2, 1)}
+    names: dict[int, set[str]] = {count: set() for count in counts}
+    for row in rows:
+        if row.particles in counts:
+            names[row.particles].add(row.strategy)
+    return max(counts, key=lambda count: (len(names[count]), count))
+
+
+def _draw_front(axis: Any, points: Sequence[Point], across: str, up: str) -> None:
+    """Draw points, coloured by strategy and shaped by precision, over the front of the best."""
+    drawn = [point._replace(error=max(point.error, FLOOR)) for point in points]
+    best = front(drawn)
+    line = [point.error for point in best], [point.time for point in best]
+    axis.step(*line, where="post", color="0.8", zorder=1)
+    for point in drawn:
+        axis.scatter(
+            point.error,
+            point.time,
+            color=COLOURS[point.strategy],
+            marker=MARKERS[point.precision],
+            s=36,
+            zorder=2,
+        )
+    axis.set(xscale="log", yscale="log", xlabel=across, ylabel=up)
+    axis.margins(0.08)
+    number_plainly(axis.yaxis)
+    axis.grid(alpha=0.3)
+
+
+def _add_legend(figure: Any, points: Sequence[Point]) -> None:
+    """Say which colours and shapes stand for what."""
+    from matplotlib.lines import Line2D
+
+    strategies = dict.fromkeys(point.strategy for point in points)
+    precisions = dict.fromkeys(point.precision for point in points)
+    marks = [
+        *(
+            Line2D([], [], ls="", marker="o", color=COLOURS[name], label=name)
+            for name in strategies
+        ),
+        *(
+            Line2D([], [], ls="", marker=MARKERS[name], color="0.4", label=name)
+            for name in precisions
+        ),
+        Line2D([], [], color="0.8", label="front"),
+    ]
+    figure.legend(handles=marks, loc="outside lower center", ncols=5, fontsize=8)
+
+
+# Ratios of times within one run, which hold on any machine of a kind, and their check.
+
+WORKLOAD = Workload(2, 1, 1024, 1)
+"""Small enough for dense torch."""
+
+TOLERANCE = 3.0
+"""A ratio passes if it is at least the stored one divided by this: other machines, other loads."""
+
+
+def ratios(session: Alternatives) -> dict[str, float]:
+    """Return how many times faster the library is than each thing it is compared with."""
+    x, s = WORKLOAD.worlds(session.device)
+    rule = WORKLOAD.rule(session.device)
+    generator = torch.Generator(session.device).manual_seed(1)
+
+    def time_of(run: Any, graph: bool) -> float:
+        session.progress(1)
+        return session.cost(run, graph=graph, generator=generator).time.median
+
+    def perceive(name: str) -> float:
+        strategy = STRATEGIES[name]
+        return time_of(lambda: strategy.perceive(x, s, WORKLOAD.eps), strategy.capturable)
+
+    def pull_back(name: str) -> float:
+        strategy, states = STRATEGIES[name], s.clone().requires_grad_()
+        return time_of(
+            lambda: torch.autograd.grad(strategy.perceive(x, states, WORKLOAD.eps).sum(), states),
+            strategy.capturable,
+        )
+
+    @torch.no_grad()
+    def composed() -> None:
+        mask = drawn_mask(x, WORKLOAD.update_prob, generator)
+        composed_step(STRATEGIES["library"], rule, x, s, mask)
+
+    @torch.no_grad()
+    def fused() -> None:
+        step(rule, x, s, update_prob=WORKLOAD.update_prob, generator=generator)
+
+    own = perceive("library")
+    return {
+        "perceive: dense torch over library": perceive("dense") / own,
+        "perceive: hash grid over library": perceive("hash_grid") / own,
+        "gradient: dense torch over library": pull_back("dense") / pull_back("library"),
+        "step: composed in torch over fused": time_of(composed, True) / time_of(fused, True),
+    }
+
+
+def stored_ratios(path: Path, device: torch.device) -> dict[str, float]:
+    """Return the ratios that are to be held, of JSON {"cpu": {name: ratio}, "cuda": {...}}.
+
+    Raises:
+        NPAError: The file cannot be read or holds nothing for this kind of device.
+    """
+    cure = "take `ratios` from the JSON of `benchmarks/alternatives.py --quick --output FILE`"
+    try:
+        loaded = read_json(path)
+        return {str(name): float(value) for name, value in loaded[device.type].items()}
+    except (NPAError, ValueError, KeyError, TypeError, AttributeError, OverflowError) as error:
+        raise NPAError(
+            f"{str(path)!r} must hold ratios under {device.type!r}, got {shown(error)}: {cure}"
+        ) from error
+
+
+def missed_ratios(measured: Mapping[str, float], stored: Mapping[str, float]) -> list[str]:
+    """Return a line for each stored ratio that is missed; none where all are held."""
+    return [
+        f"{name}: {measured.get(name, math.nan):.3g}, stored {value:.3g}, "
+        f"at least {value / TOLERANCE:.3g} wanted"
+        for name, value in stored.items()
+        if not measured.get(name, math.nan) >= value / TOLERANCE
+    ]
+
+
+def main() -> int:
+    """Measure, print, write and check; return 1 where a ratio was missed."""
+    parser = script_parser(__doc__)
+    parser.add_argument("--quick", action="store_true", help="small worlds only")
+    parser.add_argument("--strategies", nargs="+", choices=list(STRATEGIES), default=[*STRATEGIES])
+    parser.add_argument("--precisions", nargs="+", choices=list(PRECISIONS), default=[*PRECISIONS])
+    parser.add_argument("--repeats", type=int, default=7, help="readings of every time")
+    parser.add_argument("--plot", type=Path, help="PNG of run time against error to write")
+    parser.add_argument("--check", type=Path, help="JSON of stored ratios")
+    arguments = parser.parse_args()
+    device = check_device(arguments.device)
+    torch.set_num_threads(arguments.threads)
+    stored = {} if arguments.check is None else stored_ratios(arguments.check, device)
+    session = Alternatives(
+        device=device,
+        repeats=arguments.repeats,
+        small=arguments.quick,
+        strategies=[STRATEGIES[name] for name in arguments.strategies],
+        precisions=[PRECISIONS[name] for name in arguments.precisions],
+    )
+    tables, held = accuracy(session), ratios(session)
+    facts = script_facts(arguments)
+    report = Report(
+        suite="alternatives",
+        command=facts["command"],
+        commit=facts["commit"],
+        device=device,
+        threads=arguments.threads,
+        tables=tables,
+        left_out=session.left_out,
+    )
+    print(report.text())
+    print("\ntimes faster:", *(f"  {name}: {value:.3g}" for name, value in held.items()), sep="\n")
+    if arguments.output is not None:
+        content = json.loads(report.json()) | {"ratios": held}
+        write_text(arguments.output, json.dumps(content, indent=1) + "\n")
+    if arguments.plot is not None:
+        write_bytes(arguments.plot, png(draw_fronts(tables["perception"], tables["rollouts"])))
+    if arguments.check is None:
+        return 0
+    missed = missed_ratios(held, stored)
+    print("\n".join(f"missed: {line}" for line in missed) or "ratios are held")
+    return 1 if missed else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,245 @@
+"""The library against its alternatives: real strategies, true errors, and a guard that bites."""
+
+import json
+import math
+import sys
+from pathlib import Path
+
+import alternatives
+import pytest
+import torch
+from alternatives import (
+    PEERS,
+    Alternatives,
+    Point,
+    RolloutRow,
+    composed_step,
+    draw_fronts,
+    drawn_mask,
+    front,
+    mask_source,
+    peer_rows,
+    perception_rows,
+    rollout_rows,
+)
+from strategies import NEIGHBOUR_CAP, STRATEGIES, nearest
+
+from npa_envs import reference
+from npa_envs.errors import NPAError
+from npa_envs.measure.plots import png
+from npa_envs.measure.speed.precisions import PRECISIONS
+from npa_envs.measure.speed.timing import LeftOut, Timing
+from npa_envs.measure.speed.workloads import Workload, gecko
+from npa_envs.world.rollout import rollout
+
+TINY = Workload(2, 2, 150, 2, hidden_dim=16, eps=0.2)
+FORWARD = 1e-5
+"""Relative error that float32 may have in one perception; the worst measured is 3.2e-7."""
+
+
+def session(**options) -> Alternatives:
+    return Alternatives(torch.device("cpu"), repeats=1, small=True, **options)
+
+
+def timing(median: float) -> Timing:
+    return Timing(median, median, median)
+
+
+@pytest.mark.parametrize("space_dim", [2, 3])
+@pytest.mark.parametrize("name", STRATEGIES)
+def test_every_strategy_perceives_what_the_reference_does(name, space_dim, device):
+    # So sparse that no particle has more neighbours than the cap.
+    workload = Workload(space_dim, 2, 150, 1, state_dim=5, eps=0.05 if space_dim == 2 else 0.1)
+    x, s = workload.worlds(device)
+    expected = reference.perceive(x.double(), s.double(), workload.eps, workload.eps)
+    for dtype, tolerance in ((torch.float32, FORWARD), (torch.float64, 1e-12)):
+        z = STRATEGIES[name].perceive(x.to(dtype), s.to(dtype), workload.eps)
+        assert z.dtype == dtype
+        assert float((z - expected).norm() / expected.norm()) < tolerance
+        rho = STRATEGIES[name].density(x.to(dtype), s.to(dtype), workload.eps)
+        exact = reference.fields(x.double(), s.double(), workload.eps).rho
+        assert float((rho - exact).norm() / exact.norm()) < tolerance
+
+
+def test_the_neighbour_cap_leaves_out_all_but_the_nearest():
+    x, s = Workload(2, 1, 400, 1).worlds(torch.device("cpu"))
+    index = nearest(x, 3)
+    distances = torch.cdist(x[0].double(), x[0].double())
+    assert torch.equal(index[0].sort().values, distances.topk(3, largest=False)[1].sort().values)
+    capped = STRATEGIES["neighbour_cap"].density(x, s, 0.1)
+    assert (capped <= STRATEGIES["dense"].density(x, s, 0.1) * (1 + 1e-5)).all()
+    crowded = (distances < 0.1).sum(1) > NEIGHBOUR_CAP
+    assert crowded.any()
+    lost = capped < 0.99 * STRATEGIES["dense"].density(x, s, 0.1)
+    assert not lost[0, ~crowded].any()
+
+
+def test_steps_composed_in_torch_are_those_of_the_library_with_the_same_masks():
+    start = gecko(1, 300, torch.device("cpu")).grown(3)
+    rule, x, s = start.rule.double(), start.x.double(), start.s.double()
+    own = rollout(rule, x, s, 3, update_prob=0.5, generator=mask_source(x))
+    generator = mask_source(x)
+    assert not torch.equal(own[0], x)
+    for _ in range(3):
+        mask = drawn_mask(x, 0.5, generator)
+        x, s = composed_step(STRATEGIES["dense"], rule, x, s, mask)
+    for value, expected in zip((x, s), own, strict=True):
+        torch.testing.assert_close(value, expected, rtol=1e-10, atol=1e-10)
+
+
+def test_a_precision_keeps_weights_and_rounds_what_it_says():
+    rule = gecko(1, 64, torch.device("cpu")).rule
+    generator = torch.Generator().manual_seed(0)
+    z = torch.randn(40, rule.perception_dim, generator=generator)
+    s = torch.randn(2, 3, 4, generator=generator)
+    expected = rule(z).detach()
+    for name, precision in PRECISIONS.items():
+        own = precision.rule(rule)
+        assert own.hidden.weight.dtype == precision.dtype
+        assert torch.equal(own.output.weight.float(), rule.output.weight)
+        value = own(z.to(precision.dtype)).detach()
+        assert value.dtype == precision.dtype
+        error = float((value - expected).norm() / expected.norm())
+        assert (1e-4 < error < 2e-2) if name == "mixed" else (error < 1e-6)
+        rounded = s.bfloat16().float() if name == "bf16_storage" else s
+        assert torch.equal(precision.kept(s), rounded)
+    rule.dead_zone = 1e6
+    assert not any(own.rule(rule)(z.to(own.dtype)).any() for own in PRECISIONS.values())
+    # The fused path does not see torch's switch.
+    assert not PRECISIONS["tf32"].rule(rule).is_plain()
+    before = torch.backends.cuda.matmul.allow_tf32
+    with PRECISIONS["tf32"].active():
+        assert torch.backends.cuda.matmul.allow_tf32
+    assert torch.backends.cuda.matmul.allow_tf32 == before
+
+
+def test_perception_in_float32_errs_little_and_the_reference_not_at_all():
+    here = session()
+    rows = perception_rows(here, TINY)
+    exact = [row for row in rows if (row.strategy, row.precision) == ("library", "float64")]
+    assert [row.perception for row in exact] == [0.0]
+    summed = [row for row in rows if row.strategy != "neighbour_cap"]
+    for row in (row for row in summed if row.precision == "float32"):
+        fields = (row.density, row.smoothed, row.state_gradient, row.density_gradient)
+        assert 0.0 < max(*fields, row.perception) < FORWARD
+    dense = next(row for row in rows if (row.strategy, row.precision) == ("dense", "float64"))
+    assert dense.perception < 1e-13
+    assert dense.cotangent < 1e-13
+    cut = next(row for row in rows if row.strategy == "neighbour_cap")
+    assert cut.perception > 1e-3
+    short = next(row for row in rows if row.precision == "bf16_storage")
+    assert 1e-5 < short.perception < 1e-2
+    left = {entry.what for entry in here.left_out}
+    assert {"tf32", "perception in mixed", "plain, float32, 2D (2, 150)"} <= left
+
+
+def test_rollouts_err_more_in_shorter_precisions():
+    chosen = [PRECISIONS[name] for name in ("float64", "float32", "bf16_storage", "mixed")]
+    here = session(strategies=[STRATEGIES["library"], STRATEGIES["dense"]], precisions=chosen)
+    exact, single, storage, mixed = rollout_rows(here, 200)
+    assert (exact.x_1, exact.s_64, exact.weights) == (0.0, 0.0, 0.0)
+    assert 0.0 < single.x_1 < FORWARD
+    assert single.s_1 < FORWARD
+    assert single.weights < 1e-4
+    for row in (storage, mixed):
+        assert 10 * single.s_8 < row.s_8 < 0.1
+    assert all(math.isfinite(row.psnr_512) for row in (exact, single, storage, mixed))
+    assert abs(exact.psnr_512 - single.psnr_512) < 1.0
+    assert {entry.what for entry in here.left_out} == {"rollouts of dense"}
+
+
+def test_peers_that_are_there_are_right_and_others_are_left_out_with_a_reason(monkeypatch):
+    def missing(*_):
+        raise ModuleNotFoundError("No module named 'absent'")
+
+    monkeypatch.setitem(PEERS, "absent", missing)
+    here = session()
+    rows = peer_rows(here, Workload(3, 1, 120, 1, eps=0.2))
+    assert {"npa-envs", "wp.HashGrid", "dense torch"} <= {row.peer for row in rows}
+    assert max(row.error for row in rows) < FORWARD
+    assert LeftOut("absent", "ModuleNotFoundError: No module named 'absent'") in here.left_out
+    measured = {row.peer for row in rows} | {entry.what for entry in here.left_out}
+    assert measured == set(PEERS)
+
+
+def test_the_front_holds_what_nothing_beats():
+    points = [Point(1e-7, 5.0, "a", ""), Point(1e-3, 2.0, "b", ""), Point(1e-2, 3.0, "c", "")]
+    points.append(Point(1e-7, 6.0, "d", ""))
+    assert [point.strategy for point in front(points)] == ["a", "b"]
+
+
+def rollout_row(**values) -> RolloutRow:
+    numbers = dict.fromkeys(("x_1", "s_1", "x_8", "s_8", "x_64", "s_64"), 1e-6)
+    usual = {"strategy": "library", "precision": "float32", "particles": 10, **numbers}
+    usual |= {"step_us": timing(3.0), "training_us": None, "peak_mib": None}
+    return RolloutRow(**usual | {"weights": None, "psnr_512": math.nan} | values)
+
+
+def test_pictures_are_drawn_of_what_was_measured():
+    pytest.importorskip("matplotlib")
+    tables = {
+        "perceptions": perception_rows(session(), Workload(2, 1, 60, 1)),
+        "rollouts": [rollout_row(), rollout_row(precision="mixed", s_8=1e-3)],
+    }
+    assert png(draw_fronts(**tables)).startswith(b"\x89PNG")
+
+
+def stored(tmp_path: Path, **values: float) -> Path:
+    path = tmp_path / "ratios.json"
+    path.write_text(json.dumps({"cpu": values}))
+    return path
+
+
+def test_a_ratio_is_held_down_to_a_third_and_missed_below(tmp_path):
+    path = stored(tmp_path, dense=30.0, grid=3.0)
+    wanted = alternatives.stored_ratios(path, torch.device("cpu"))
+    assert alternatives.missed_ratios({"dense": 10.1, "grid": 5.0}, wanted) == []
+    (line,) = alternatives.missed_ratios({"dense": 9.9, "grid": 5.0}, wanted)
+    assert line == "dense: 9.9, stored 30, at least 10 wanted"
+    assert len(alternatives.missed_ratios({"dense": math.nan}, wanted)) == 2
+
+
+def test_the_library_is_faster_than_dense_torch_and_stored_ratios_are_those_measured():
+    path = Path(__file__).resolve().parents[2] / "benchmarks" / "results" / "ratios.json"
+    measured = alternatives.ratios(session())
+    assert measured["perceive: dense torch over library"] > 3.0
+    assert all(value > 0.0 for value in measured.values())
+    assert sorted(json.loads(path.read_text())["cpu"]) == sorted(measured)
+
+
+def test_the_script_prints_tables_writes_what_it_says_and_checks_ratios(
+    tmp_path, monkeypatch, capsys
+):
+    monkeypatch.setattr(
+        alternatives, "accuracy", lambda here: {"perception": perception_rows(here, TINY)}
+    )
+    monkeypatch.setattr(alternatives, "WORKLOAD", Workload(2, 1, 100, 1, hidden_dim=16))
+
+    def script(*words):
+        given = ["alternatives.py", "--device", "cpu", "--repeats", "1", *words]
+        monkeypatch.setattr(sys, "argv", given)
+        return alternatives.main()
+
+    name, path = "perceive: dense torch over library", tmp_path / "record.json"
+    held = ["--check", str(stored(tmp_path, **{name: 1e-3}))]
+    assert script(*held, "--output", str(path), "--commit", "abc") == 0
+    text = capsys.readouterr().out
+    for word in ("perception:", "neighbour_cap", "bf16_storage", "left out:", "times faster:"):
+        assert word in text
+    assert text.endswith("ratios are held\n")
+    loaded = json.loads(path.read_text())
+    assert loaded["commit"] == "abc"
+    assert sorted(loaded["ratios"])[-1] == "step: composed in torch over fused"
+    strategies = {row["strategy"] for row in loaded["tables"]["perception"]}
+    assert strategies == set(STRATEGIES) - {"plain"}
+    missed = str(stored(tmp_path, **{name: 1e9}))
+    assert script("--strategies", "library", "--check", missed) == 1
+    assert f"missed: {name}" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("text", ["{}", "[]", "no json", '{"cpu": {"a": "fast"}}'])
+def test_a_file_without_ratios_is_refused(text, tmp_path):
+    path = tmp_path / "ratios.json"
+    path.write_text(text)
+    with pytest.raises(NPAError, match="must hold ratios under 'cpu'"):
+        alternatives.stored_ratios(path, torch.device("cpu"))
