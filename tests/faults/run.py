@@ -31,7 +31,7 @@ LIMIT = float(os.environ.get("LIMIT", "900"))
 OUTCOMES = {0: "MISSED", 1: "found"}
 """By pytest's exit code; all others are errors in tests, such as failing imports."""
 
-NO_COPY = shutil.ignore_patterns(".*", "build", "demo", "runs", "__pycache__", "*.egg-info")
+NO_COPY = shutil.ignore_patterns(".*", "build", "demo", "runs", "*.egg-info")
 
 
 def faults() -> list[dict[str, Any]]:
@@ -54,12 +54,7 @@ def stale(fault: dict[str, Any]) -> str | None:
 
 def run_tests(tree: Path, tests: list[str]) -> tuple[str, str]:
     """Run tests of a tree; return the outcome and what failed first."""
-    variables = os.environ | {
-        "OMP_NUM_THREADS": "1",
-        "PYTHONPATH": str(tree),
-        # Faults change files within a second, and may keep their size.
-        "PYTHONDONTWRITEBYTECODE": "1",
-    }
+    variables = os.environ | {"OMP_NUM_THREADS": "1", "PYTHONPATH": str(tree)}
     plain = ["-x", "-q", "--no-header", "--tb=line", "-p", "no:cacheprovider", "-W", "ignore"]
     command = [sys.executable, "-m", "pytest", *plain, "-m", "not slow", *tests]
     try:
@@ -80,12 +75,14 @@ def try_fault(fault: dict[str, Any], trees: "SimpleQueue[Path]") -> bool:
     if said is None:
         tree = trees.get()
         path = tree / fault["file"]
-        whole = path.read_text("utf-8")
+        whole, times = path.read_text("utf-8"), path.stat()
         path.write_text(whole.replace(fault["old"], fault["new"]), "utf-8")
         try:
             outcome, said = run_tests(tree, fault["tests"])
         finally:
             path.write_text(whole, "utf-8")
+            # So that Python takes what it compiled of the whole file, and not of the fault.
+            os.utime(path, ns=(times.st_atime_ns, times.st_mtime_ns))
             trees.put(tree)
     print(f"{outcome:8} {fault['name']} ({time.perf_counter() - began:.0f} s): {said}", flush=True)
     return outcome == "found"
