@@ -50,8 +50,8 @@ class Names:
     from npa_envs.world import brushes
 
     damages = ("erase", "cut", "clump", "noise")
-    old_ids: Mapping[str, str] = {}
-    """Ids and rules by the name that arrays have, where it is another one."""
+    renamed: Mapping[str, str] = {}
+    """What ids and rules are called now, by what the names of arrays call them."""
 
 
 def flat(value: Any, name: str, into: dict[str, np.ndarray]) -> None:
@@ -86,7 +86,7 @@ def gradients(value: torch.Tensor, rule: torch.nn.Module, **others: torch.Tensor
 
 def of_rule(name: str) -> Any:
     """Sixteen steps of a shipped rule from its task's seed, its loss, and gradients over three."""
-    rule = load_rule(Names.old_ids.get(name, name))
+    rule = load_rule(name)
     task = Names.task_of_rule(name, rule, torch.device("cpu"), particle_count=160).task
     options = {"eps": task.eps, "box": task.box}
     x, s, goal = Names.seed_worlds(
@@ -182,12 +182,12 @@ def drawn(random: np.random.Generator, space: gymnasium.spaces.Box) -> Any:
 
 def of_environment(name: str, world_count: int | None) -> Any:
     """Six steps of an environment, single or a batch of two that start anew after four."""
-    made_by, fields = Names.old_ids.get(name, name), fields_of(name)
+    fields = fields_of(name)
     if world_count is None:
-        env: Any = gymnasium.make(made_by, render_mode="rgb_array", **fields)
+        env: Any = gymnasium.make(name, render_mode="rgb_array", **fields)
     else:
         env = gymnasium.make_vec(
-            made_by,
+            name,
             world_count,
             vectorization_mode="vector_entry_point",
             max_episode_steps=4,
@@ -264,6 +264,7 @@ def resumed() -> Any:
 
 def of_learning(method: str, name: str, fields: dict[str, Any], **options: Any) -> Any:
     """A few updates of a learner: its curve and its rules."""
+    name = Names.renamed.get(name, name)
     problem = Names.Problem(env_id=name, keywords=fields, episode_steps=4, num_envs=2)
     few = Names.Budget(particle_steps=4096)
     done = Names.train(
@@ -277,14 +278,14 @@ def of_learning(method: str, name: str, fields: dict[str, Any], **options: Any) 
 def of_evaluation(rule: str, *words: str) -> Any:
     """What `npa-envs evaluate` measures."""
     out = ("--seed-count", "2", "--json", "table.json")
-    command("evaluate", Names.old_ids.get(rule, rule), *words, *out)
+    command("evaluate", Names.renamed.get(rule, rule), *words, *out)
     return json.loads(Path("table.json").read_text())
 
 
 def of_film(rule: str, *words: str) -> Any:
     """Bytes of what `npa-envs rollout` writes."""
     fixed = ("--steps", "24", "--particle-count", "200", "--every", "12", "--resolution", "48")
-    command("rollout", Names.old_ids.get(rule, rule), *fixed, "--out", "film", *words)
+    command("rollout", Names.renamed.get(rule, rule), *fixed, "--out", "film", *words)
     files = sorted(p for p in Path("film").iterdir() if p.suffix != ".mp4")
     return {path.name: np.frombuffer(path.read_bytes(), np.uint8) for path in files}
 
@@ -329,7 +330,7 @@ def scenes() -> dict[str, Callable[[], Any]]:
     small = "npa/Morphogenesis2DSmall-v0"
     learners = ("ppo", "shac", "gradient", "evolution")
     crowd: tuple[str, dict[str, Any]] = ("npa/MixingSmall-v0", {})
-    back = {new: old for old, new in Names.old_ids.items()}
+    back = {new: old for old, new in Names.renamed.items()}
     return {
         **{f"rule/{back.get(n, n)}": partial(of_rule, n) for n in npa_envs.shipped_rules()},
         **{f"kind/{name}": partial(of_kind, name) for name in KINDS},
@@ -351,18 +352,15 @@ def scenes() -> dict[str, Callable[[], Any]]:
         },
         "learn/ppo-species": partial(of_learning, "ppo", *crowd),
         "learn/shac-species": partial(of_learning, "shac", *crowd),
-        "evaluate/gecko": partial(
-            of_evaluation, "gecko", "--checkpoints", "8", "24", "--particle-count", "200"
-        ),
-        "evaluate/healing": partial(
+        **{
+            f"evaluate/{back.get(n, n)}": partial(
+                of_evaluation, n, "--checkpoints", "4", "12", "--particle-count", "128"
+            )
+            for n in npa_envs.shipped_rules()
+        },
+        "healing/heart": partial(
             of_evaluation,
             *("heart", "--checkpoints", "16", "--particle-count", "128", "--healing"),
-        ),
-        "evaluate/dots": partial(
-            of_evaluation, "dots", "--checkpoints", "8", "--particle-count", "200"
-        ),
-        "evaluate/doughnut": partial(
-            of_evaluation, "doughnut", "--checkpoints", "8", "--particle-count", "160"
         ),
         "film/gecko": partial(
             of_film, "gecko", "--damage", "8:cut", f"10:{Names.damages[0]}", "12:clump"
