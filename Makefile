@@ -6,6 +6,8 @@
 #   make check        ruff, formatting, types, spelling
 #   make docs         the documentation's site, in build/docs/; warnings are errors
 #   make bench-check  is the library still as much faster than its alternatives as it was?
+#   make golden-check is what it computes bit for bit what it was at the commit in tests/golden/commit?
+#   make faults       do the tests find the faults of tests/faults/faults.toml?
 # PIP_ARGS goes to pip: PIP_ARGS='--extra-index-url https://download.pytorch.org/whl/cpu' takes
 # torch's smaller CPU build.
 
@@ -24,7 +26,7 @@ INPUTS := pyproject.toml constraints.txt
 PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2
 CUDA_WORKERS ?= 8
 
-.PHONY: demo test test-all test-cuda check docs bench-check clean
+.PHONY: demo test test-all test-cuda check docs bench-check golden-check faults clean
 .DELETE_ON_ERROR:
 
 $(BIN)/python:
@@ -74,6 +76,12 @@ docs: $(DOCS)
 
 bench-check: $(CORE)
 	OMP_NUM_THREADS=1 $(BIN)/python benchmarks/alternatives.py --quick --device cpu --check benchmarks/results/ratios.json
+
+golden-check: $(DEV)
+	$(BIN)/python tests/golden/check.py
+
+faults: $(DEV)
+	$(BIN)/python tests/faults/run.py
 
 clean:
 	rm -rf build dist demo *.egg-info .mypy_cache .pytest_cache .ruff_cache .hypothesis

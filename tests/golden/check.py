@@ -1,0 +1,109 @@
+"""Is what the library computes bit for bit what it was at a commit? Run by `make golden-check`.
+
+The file `commit` beside this one names the reference: it is checked out into a temporary folder,
+both trees run `wide.py` at the same time, each its own where the reference has one, and all arrays
+are compared. Other words on the command line: a beginning of scenes' names, to run only those.
+"""
+
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+import numpy as np
+
+HERE = Path(__file__).resolve().parent
+ROOT = HERE.parents[1]
+
+ACCEPTED: dict[str, str] = {}
+"""Beginnings of names of arrays that may differ, or be there on one side alone, and why."""
+
+
+def start(tree: Path, script: Path, out: Path, only: str) -> "subprocess.Popen[bytes]":
+    """Run a script of scenes by the library of a tree."""
+    paths = os.pathsep.join(map(str, (tree, tree / "tests" / "golden")))
+    variables = os.environ | {"PYTHONPATH": paths, "OMP_NUM_THREADS": "1", "COLUMNS": "200"}
+    command = [sys.executable, "-P", "-W", "ignore", str(script), str(out), only]
+    return subprocess.Popen(command, cwd=out.parent, env=variables)
+
+
+def difference(left: np.ndarray, right: np.ndarray) -> str | None:
+    """Return in what two arrays differ, or None where all bits are the same."""
+    # Texts have types by their length.
+    if left.shape != right.shape or (left.dtype != right.dtype and left.dtype.kind != "U"):
+        return f"{left.dtype} {left.shape}, was {right.dtype} {right.shape}"
+    if left.dtype.kind == "U":
+        return None if np.array_equal(left, right) else f"{left}, was {right}"[:300]
+    if left.tobytes() == right.tobytes():
+        return None
+    if left.dtype == bool:
+        return f"{int((left != right).sum())} of {left.size} flags"
+    error = np.abs(left.astype(np.float64) - right.astype(np.float64))
+    return f"by up to {np.nanmax(error):.3g}, where the largest is {np.nanmax(np.abs(right)):.3g}"
+
+
+def compare(new: dict[str, np.ndarray], old: dict[str, np.ndarray]) -> list[tuple[str, str]]:
+    """Return names and differences: of arrays, of which are there, and scenes that failed."""
+    found = []
+    for name in sorted({*new, *old}):
+        if name.endswith("/EXCEPTION"):
+            sides = [
+                f"{word}: {side[name]}"
+                for word, side in (("new", new), ("old", old))
+                if name in side
+            ]
+            found.append((name, "; ".join(sides)))
+        elif name not in new or name not in old:
+            found.append((name, "is not there any more" if name in old else "was not there"))
+        elif (change := difference(new[name], old[name])) is not None:
+            found.append((name, change))
+    return found
+
+
+def read(path: Path) -> dict[str, np.ndarray]:
+    """Return the arrays of a file."""
+    with np.load(path) as file:
+        return {name.replace("|", "/"): file[name] for name in file.files}
+
+
+def main(only: str = "") -> int:
+    """Compare, and print what differs."""
+    began = time.perf_counter()
+    commit = (HERE / "commit").read_text().strip()
+    with tempfile.TemporaryDirectory() as place:
+        folder = Path(place)
+        tree = folder / "reference"
+        git = ["git", "-C", str(ROOT), "worktree"]
+        subprocess.run([*git, "add", "--quiet", "--detach", str(tree), commit], check=True)
+        try:
+            own = tree / "tests" / "golden" / "wide.py"
+            sides = {
+                "new": (ROOT, HERE / "wide.py"),
+                "old": (tree, own if own.is_file() else HERE / "wide.py"),
+            }
+            for name in sides:
+                (folder / name).mkdir()
+            runs = [start(*side, folder / name / "out.npz", only) for name, side in sides.items()]
+            codes = [run.wait() for run in runs]
+            if any(codes):
+                return 2
+            new, old = (read(folder / name / "out.npz") for name in sides)
+        finally:
+            subprocess.run([*git, "remove", "--force", str(tree)], check=True)
+    found = compare(new, old)
+    accepted = [name for name, _ in found if name.startswith(tuple(ACCEPTED))]
+    for name, said in found:
+        print(f"{'accepted' if name in accepted else 'DIFFERS '} {name}: {said}")
+    wrong = len(found) - len(accepted)
+    seconds = time.perf_counter() - began
+    print(
+        f"{len(new)} arrays, {sum(a.size for a in new.values())} numbers, against {commit}: "
+        f"{wrong} differ, {len(accepted)} accepted; {seconds:.0f} s"
+    )
+    return 1 if wrong or not new else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(*sys.argv[1:]))

@@ -1,0 +1,409 @@
+"""Results all over the library, for `make golden-check`: run by each of two trees on one machine.
+
+A scene returns whatever of numbers, arrays, tensors, lists and dictionaries; `flat` names each. The
+names of arrays must stay the same when the library's own names change, so the library is imported
+in `Names` alone, and commands are called by `command`. `python wide.py OUT.npz` writes all.
+"""
+
+import contextlib
+import gc
+import io
+import json
+import os
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Mapping
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy as np
+import torch
+
+import npa_envs
+from npa_envs import WorldRandom, load_rule, rollout
+
+SMALL = {"particle_count": 61, "eps": 0.3, "resolution": 16, "render_size": 24}
+OWN: dict[str, dict[str, Any]] = {
+    "Pictures2D": {"targets": ("heart", "ring"), "test_targets": ("letter-a",)},
+    "Regeneration2D": {"rule": "picture"},
+    "PointClassification": {"resolution": None},
+    "Morphogenesis3D": {"seed_radius": 0.2, "view_count": 2, "target": "doughnut"},
+}
+GARDEN = {"eps": 0.2, "picture_size": 8, "seed_pool": 2, "grow_steps": 4, "rule_steps": 2}
+SPECIES_TASKS = ("mixing", "segregation", "co_morphogenesis", "invasion", "symbiosis")
+TRAINED = ("morphogenesis2d", "co_morphogenesis2d", "morphogenesis3d", "texture")
+"""Tasks of `npa-envs train` besides `point_classification`, whose data are drawn elsewhere."""
+
+
+class Names:
+    """What the library calls things."""
+
+    from npa_envs.agents.learning import Budget, Problem, train
+    from npa_envs.cli import main
+    from npa_envs.envs import gardeners_v0, multispecies_v0, particles_v0
+    from npa_envs.tasks.base import seed_worlds, task_toward
+    from npa_envs.tasks.damage import damage_worlds
+    from npa_envs.training.trained_tasks import task_of_rule
+    from npa_envs.world import brushes
+
+    damages = ("erase", "cut", "clump", "noise")
+    renamed: Mapping[str, str] = {}
+    """What ids and rules are called now, by what the names of arrays call them."""
+
+
+def flat(value: Any, name: str, into: dict[str, np.ndarray]) -> None:
+    """Put what a scene returned under names."""
+    if isinstance(value, Mapping):
+        for key, part in value.items():
+            flat(part, f"{name}/{key}", into)
+    elif isinstance(value, torch.Tensor):
+        into[name] = value.detach().cpu().numpy()
+    elif isinstance(value, list | tuple) and not all(isinstance(v, int | float) for v in value):
+        for k, part in enumerate(value):
+            flat(part, f"{name}/{k}", into)
+    elif value is not None:
+        array = np.asarray(value)
+        into[name] = array.astype(str) if array.dtype == object else array
+
+
+def command(*words: str, codes: tuple[int, ...] = (0,)) -> None:
+    """Run a command of `npa-envs` in the current folder."""
+    with contextlib.redirect_stdout(io.StringIO()) as out:
+        code = Names.main([*words, "--no-progress"])
+    if code not in codes:
+        raise RuntimeError(f"{words} returned {code}: {out.getvalue()[-500:]}")
+
+
+def gradients(value: torch.Tensor, rule: torch.nn.Module, **others: torch.Tensor) -> Any:
+    """Return derivatives by all weights and some tensors."""
+    named = dict(rule.named_parameters()) | others
+    found = torch.autograd.grad(value, list(named.values()), allow_unused=True)
+    return dict(zip(named, found, strict=True))
+
+
+def of_rule(name: str) -> Any:
+    """Sixteen steps of a shipped rule from its task's seed, its loss, and gradients over three."""
+    rule = load_rule(name)
+    task = Names.task_of_rule(name, rule, torch.device("cpu"), particle_count=160).task
+    options = {"eps": task.eps, "box": task.box}
+    x, s, goal = Names.seed_worlds(
+        task, 2, generator=WorldRandom([3, 4]), device=torch.device("cpu")
+    )
+    task = Names.task_toward(task, goal)
+    with torch.no_grad():
+        x, s = rollout(rule, x, s, 16, generator=WorldRandom([5, 6]), **options)
+    results = {"x": x, "s": s, "colour": rule.colour(s), "picture": task.picture(x, s)}
+    x.requires_grad_()
+    s.requires_grad_()
+    after = rollout(
+        rule, x, s, 3, generator=WorldRandom([7, 8]), return_path_length=True, **options
+    )
+    loss, terms = task.loss(*after)
+    results |= {"loss": loss, "terms": terms, "metric": task.metric(*after[:2])}
+    return results | {"gradients": gradients(loss.sum(), rule, x=x, s=s)}
+
+
+KINDS: dict[str, tuple[dict[str, Any], dict[str, Any]]] = {
+    "plain": ({}, {"return_path_length": True}),
+    "periodic": ({}, {"box": (1.2, 0.9), "keep_every": 2}),
+    "static": ({"static": True}, {"update_prob": 0.7}),
+    "equivariant": ({"equivariant": True}, {}),
+    "chiral": ({"equivariant": True, "chiral": True}, {"box": (1.2, 0.9)}),
+    "divides": ({"divides": True}, {"memory": "recompute"}),
+    "dead-zone": ({"dead_zone": 0.02}, {"position_noise": 0.01}),
+    "smooth": ({"moment_inverse": "smooth"}, {"memory": "minimal", "dt": 0.5}),
+    "read-out": ({"readout_dim": 3, "readout_hidden_dim": 8}, {"update_prob": 1.0}),
+}
+"""Rules and rollouts of all kinds: options of a rule, and of its rollout."""
+
+
+def of_kind(name: str) -> Any:
+    """Some steps of an untrained rule, with and without gradients, in both precisions."""
+    of_rule, options = KINDS[name]
+    results: dict[str, Any] = {}
+    for dtype in (torch.float32, torch.float64):
+        random = np.random.default_rng(1)
+        x = torch.from_numpy(random.uniform(-0.45, 0.45, (3, 90, 2))).to(dtype)
+        s = torch.from_numpy(random.normal(0.4, 0.3, (3, 90, 8))).to(dtype)
+        torch.manual_seed(2)
+        rule = npa_envs.NPARule(2, 8, 24, eps0=0.2, **of_rule).to(dtype)
+        with torch.no_grad():
+            for parameter in rule.parameters():
+                noise = torch.from_numpy(random.normal(0.0, 0.05, parameter.shape))
+                parameter.add_(noise.to(dtype))
+            long = rollout(rule, x, s, 40, eps=0.22, generator=WorldRandom([1, 2, 3]), **options)
+        x.requires_grad_()
+        s.requires_grad_()
+        short = rollout(
+            rule,
+            x,
+            s,
+            4,
+            eps=0.22,
+            generator=torch.Generator().manual_seed(9),
+            detach_positions=False,
+            **options,
+        )
+        value = short[0].square().sum() + short[1].pow(3).sum()
+        word = str(dtype).removeprefix("torch.")
+        results[word] = {"long": long, "short": short, "d": gradients(value, rule, x=x, s=s)}
+    return results
+
+
+def at_rest() -> Any:
+    """A rollout whose steps are left out once the worlds are at rest."""
+    torch.manual_seed(3)
+    rule = npa_envs.NPARule(2, 8, 16, eps0=0.2, dead_zone=50.0)
+    x, s = torch.rand(2, 40, 2), torch.rand(2, 40, 8)
+    source = WorldRandom([1, 2])
+    with torch.no_grad():
+        return {"world": rollout(rule, x, s, 300, generator=source), "after": source.uniform(5)}
+
+
+def fields_of(name: str) -> dict[str, Any]:
+    """Return keywords of a small environment."""
+    if "Shapeshifter" in name:
+        return {"particle_count": 61}
+    if "Gardener" in name or "Shepherd" in name:
+        return GARDEN | {"particle_count": 61, "resolution": 16, "render_size": 24}
+    own = next((fields for word, fields in OWN.items() if word in name), {})
+    return {key: value for key, value in (SMALL | own).items() if value is not None}
+
+
+def drawn(random: np.random.Generator, space: gymnasium.spaces.Box) -> Any:
+    """Return an action in the inner part of a space."""
+    share = random.uniform(0.3, 0.7, space.shape)
+    low, high = np.maximum(space.low, -1.0), np.minimum(space.high, 1.0)
+    return (low + share * (high - low)).astype(space.dtype)
+
+
+def of_environment(name: str, world_count: int | None) -> Any:
+    """Six steps of an environment, single or a batch of two that start anew after four."""
+    fields = fields_of(name)
+    if world_count is None:
+        env: Any = gymnasium.make(name, render_mode="rgb_array", **fields)
+    else:
+        env = gymnasium.make_vec(
+            name,
+            world_count,
+            vectorization_mode="vector_entry_point",
+            max_episode_steps=4,
+            **fields,
+        )
+    random = np.random.default_rng(4)
+    steps: list[Any] = [env.reset(seed=11)]
+    for _ in range(6):
+        steps.append(env.step(drawn(random, env.action_space)))
+    results: dict[str, Any] = {"steps": steps}
+    if world_count is None:
+        results |= {"picture": env.render(), "world": env.unwrapped.particles()}
+    env.close()
+    return results
+
+
+def of_agents(env: Any) -> Any:
+    """Six steps of a parallel environment, or of a batch of worlds."""
+    random = np.random.default_rng(5)
+    steps: list[Any] = [env.reset(seed=12)]
+    spaces = getattr(env, "action_spaces", None)
+    for _ in range(6):
+        if not env.agents:
+            break
+        chosen = spaces if spaces else {a: env.action_space(a) for a in env.agents}
+        steps.append(env.step({a: drawn(random, chosen[a]) for a in env.agents}))
+    results = {"steps": steps}
+    if hasattr(env, "state"):
+        with contextlib.suppress(NotImplementedError):
+            results["state"] = env.state()
+    env.close()
+    return results
+
+
+def of_species(task: str, kind: str) -> Any:
+    """Several species: a world, a batch, or each particle an agent."""
+    fields: dict[str, Any] = {"task": task, "eps": 0.3, "particle_count": 48, "max_cycles": 5}
+    if task in ("co_morphogenesis", "invasion", "symbiosis"):
+        fields["resolution"] = 16
+    if kind == "parallel":
+        return of_agents(Names.multispecies_v0.parallel_env(**fields))
+    if kind == "batch":
+        return of_agents(Names.multispecies_v0.batched(world_count=2, **fields))
+    return of_agents(Names.particles_v0.parallel_env(**fields | {"particle_count": 10}))
+
+
+def two_gardeners() -> Any:
+    """The keeper and the raider of one garden."""
+    fields = GARDEN | {"particle_count": 61, "resolution": 16, "max_cycles": 5}
+    return of_agents(Names.gardeners_v0.parallel_env(**fields))
+
+
+def lines_of(path: Path) -> Any:
+    """Return a log's numbers without times."""
+    records = [json.loads(line) for line in path.read_text().splitlines()]
+    return [{k: v for k, v in record.items() if "second" not in k} for record in records]
+
+
+def of_training(task: str, *words: str) -> Any:
+    """Ten iterations of a task's tiny preset: the log, and the rules it ends with."""
+    last = ("--iterations", "10", "--no-report", "--out", "run")
+    command("train", task, "--preset", "tiny", *words, *last)
+    rules = [load_rule(path) for path in sorted(Path("run").glob("rule*.safetensors"))]
+    return {"log": lines_of(Path("run/log.jsonl")), "rules": [r.state_dict() for r in rules]}
+
+
+def resumed() -> Any:
+    """A run that is stopped somewhere and goes on: where it was stopped does not matter."""
+    words = ("train", "morphogenesis2d", "--preset", "tiny", "--no-report", "--out", "run")
+    command(*words, "--iterations", "30", "--max-seconds", "1", codes=(0, 1, 75, 130))
+    command(*words, "--iterations", "30", "--resume")
+    return lines_of(Path("run/log.jsonl"))
+
+
+def of_learning(method: str, name: str, fields: dict[str, Any], **options: Any) -> Any:
+    """A few updates of a learner: its curve and its rules."""
+    name = Names.renamed.get(name, name)
+    problem = Names.Problem(env_id=name, keywords=fields, episode_steps=4, num_envs=2)
+    few = Names.Budget(particle_steps=4096)
+    done = Names.train(
+        method, problem, few, 1, evaluation_seeds=range(100, 102), entries=2, **options
+    )
+    curve = [{k: v for k, v in vars(e).items() if "second" not in k} for e in done.log]
+    rules = None if done.rules is None else [rule.state_dict() for rule in done.rules.rules]
+    return {"curve": curve, "rules": rules}
+
+
+def of_evaluation(rule: str, *words: str) -> Any:
+    """What `npa-envs evaluate` measures."""
+    out = ("--seed-count", "2", "--json", "table.json")
+    command("evaluate", Names.renamed.get(rule, rule), *words, *out)
+    return json.loads(Path("table.json").read_text())
+
+
+def of_film(rule: str, *words: str) -> Any:
+    """Bytes of what `npa-envs rollout` writes."""
+    fixed = ("--steps", "24", "--particle-count", "200", "--every", "12", "--resolution", "48")
+    command("rollout", Names.renamed.get(rule, rule), *fixed, "--out", "film", *words)
+    files = sorted(p for p in Path("film").iterdir() if p.suffix != ".mp4")
+    return {path.name: np.frombuffer(path.read_bytes(), np.uint8) for path in files}
+
+
+def page() -> Any:
+    """The collection of rules that the authors' web demo reads."""
+    with contextlib.redirect_stdout(io.StringIO()):
+        Names.main(["export-web", "gecko", "dots", "-o", "models.json"])
+    return json.loads(Path("models.json").read_text())
+
+
+def brushed() -> Any:
+    """All brushes and damages, soft ones with gradients."""
+    brushes, results = Names.brushes, {}
+    random = np.random.default_rng(6)
+    x = torch.from_numpy(random.uniform(-0.5, 0.5, (2, 80, 2))).float().requires_grad_()
+    s = torch.from_numpy(random.normal(size=(2, 80, 4))).float().requires_grad_()
+    centre, move = torch.tensor([[0.1, 0.0], [-0.45, 0.4]]), torch.tensor([[0.1, 0.2], [0.0, 0.3]])
+    for word, box in (("open", None), ("box", (1.0, 1.0))):
+        at = {"centre": centre, "box": box}
+        found = {
+            "push": brushes.push(x, move=move, radius=0.3, strength=0.7, **at),
+            "inject": brushes.inject(x, s, radius=0.3, state=torch.ones(2, 4), strength=0.5, **at),
+            "around": brushes.state_around(x, s, radius=0.3, **at),
+            "wipe": brushes.erase_state(x, s, radius=0.3, **at),
+            "cut": brushes.cut(x, s, normal=move, gap=0.1, along=move, **at),
+            "clump": brushes.clump(x, s, radius=0.3, factor=0.6, **at),
+        }
+        d = torch.autograd.grad(found["push"].square().sum() + found["inject"].pow(3).sum(), (x, s))
+        results[word] = found | {"d": d}
+    for k, kind in enumerate(Names.damages):
+        source = WorldRandom([1, 2])
+        results[f"damage{k}"] = Names.damage_worlds(
+            x.detach(), s.detach(), kind=kind, generator=source
+        )
+    return results
+
+
+def scenes() -> dict[str, Callable[[], Any]]:
+    """Return all scenes by name."""
+    names = sorted(name for name in gymnasium.registry if name.startswith("npa/"))
+    small = "npa/Morphogenesis2DSmall-v0"
+    learners = ("ppo", "shac", "gradient", "evolution")
+    crowd: tuple[str, dict[str, Any]] = ("npa/MixingSmall-v0", {})
+    back = {new: old for old, new in Names.renamed.items()}
+    return {
+        **{f"rule/{back.get(n, n)}": partial(of_rule, n) for n in npa_envs.shipped_rules()},
+        **{f"kind/{name}": partial(of_kind, name) for name in KINDS},
+        "at-rest": at_rest,
+        **{f"env/{back.get(n, n)}": partial(of_environment, n, None) for n in names},
+        **{f"batch/{back.get(n, n)}": partial(of_environment, n, 2) for n in names},
+        **{
+            f"species/{task}/{kind}": partial(of_species, task, kind)
+            for task in SPECIES_TASKS
+            for kind in ("parallel", "batch", "particles")
+        },
+        "gardeners": two_gardeners,
+        **{f"train/{task}": partial(of_training, task) for task in TRAINED},
+        "train/points": partial(of_training, "point_classification", "--data", "digits"),
+        "train/resumed": resumed,
+        **{
+            f"learn/{method}": partial(of_learning, method, small, {"target": "ring"})
+            for method in learners
+        },
+        "learn/ppo-species": partial(of_learning, "ppo", *crowd),
+        "learn/shac-species": partial(of_learning, "shac", *crowd),
+        **{
+            f"evaluate/{back.get(n, n)}": partial(
+                of_evaluation, n, "--checkpoints", "4", "12", "--particle-count", "128"
+            )
+            for n in npa_envs.shipped_rules()
+        },
+        "healing/heart": partial(
+            of_evaluation,
+            *("heart", "--checkpoints", "16", "--particle-count", "128", "--healing"),
+        ),
+        "film/gecko": partial(
+            of_film, "gecko", "--damage", "8:cut", f"10:{Names.damages[0]}", "12:clump"
+        ),
+        "film/dots": partial(of_film, "dots", "--style", "points", "--background", "black"),
+        "film/duck": partial(of_film, "duck"),
+        "page": page,
+        "brushes": brushed,
+    }
+
+
+def main(out: Path, only: str = "") -> None:
+    """Compute what begins with a word, beginning with the golden scenes, and write it."""
+    torch.set_num_threads(1)
+    gymnasium.logger.min_level = gymnasium.logger.ERROR
+    import scenes as golden
+
+    root = Path(golden.__file__).resolve().parents[2]
+    assert Path(npa_envs.__file__).resolve().parents[1] == root, npa_envs.__file__
+    assert Path(Names.multispecies_v0.__file__).resolve().parents[1] == root, "envs of another tree"
+    found: dict[str, np.ndarray] = {}
+    every: dict[str, Callable[[], Any]] = scenes()
+    every |= {f"golden/{name}": scene for name, scene in golden.SCENES.items()}
+    for name, scene in every.items():
+        if not name.startswith(only):
+            continue
+        began, here = time.perf_counter(), os.getcwd()
+        # So that nothing that was drawn before matters.
+        torch.manual_seed(0)
+        np.random.seed(0)
+        with tempfile.TemporaryDirectory() as folder:
+            os.chdir(folder)
+            try:
+                flat(scene(), name, found)
+            except Exception as error:
+                found[f"{name}/EXCEPTION"] = np.asarray(f"{type(error).__name__}: {error}"[:400])
+            finally:
+                os.chdir(here)
+        gc.collect()
+        if only:
+            print(f"{name}: {time.perf_counter() - began:.1f} s")
+    np.savez(out, **{name.replace("/", "|"): array for name, array in found.items()})
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1]), *sys.argv[2:])

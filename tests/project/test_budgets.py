@@ -1,0 +1,194 @@
+"""How large the project may be: no measure exceeds its limit, which falls towards its goal.
+
+`python tests/project/test_budgets.py` prints the table. Limits are only ever lowered: to what is
+measured, once it has become less.
+"""
+
+import ast
+import contextlib
+import functools
+import io
+import os
+import re
+from collections import Counter
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import NamedTuple, TypeVar
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[2]
+PACKAGES = ("npa_envs", "envs", "wrappers", "agents")
+SOURCES = (".py", ".cuh", ".js", ".css", ".html")
+Node = TypeVar("Node", bound=ast.AST)
+IMAGES = (".png", ".gif", ".webp", ".jpg", ".svg", ".mp4")
+
+
+def files(*folders: str, suffixes: tuple[str, ...] = (".py",)) -> list[Path]:
+    """Return files below folders, but for those that running makes."""
+    found = [path for folder in folders for path in (ROOT / folder).rglob("*")]
+    return sorted(
+        path
+        for path in found
+        if path.suffix in suffixes and path.is_file() and "__pycache__" not in path.parts
+    )
+
+
+def lines(paths: list[Path]) -> int:
+    return sum(len(path.read_text("utf-8").splitlines()) for path in paths)
+
+
+def words(paths: list[Path]) -> int:
+    return sum(len(path.read_text("utf-8").split()) for path in paths)
+
+
+@functools.cache
+def trees() -> dict[Path, ast.Module]:
+    """Return the parsed modules of the library."""
+    return {path: ast.parse(path.read_text("utf-8")) for path in files(*PACKAGES)}
+
+
+def nodes(kind: type[Node]) -> Iterator[tuple[Path, Node]]:
+    """Yield all nodes of a kind, with their files."""
+    for path, tree in trees().items():
+        yield from ((path, node) for node in ast.walk(tree) if isinstance(node, kind))
+
+
+def functions_of_x_and_s() -> int:
+    """Count functions that take positions and states side by side."""
+    count = 0
+    for _, function in nodes(ast.FunctionDef):
+        given = function.args
+        names = {arg.arg for arg in (*given.posonlyargs, *given.args, *given.kwonlyargs)}
+        count += {"x", "s"} <= names
+    return count
+
+
+def files_of_path_length() -> int:
+    return sum("path_length" in path.read_text("utf-8") for path in trees())
+
+
+def task_classes() -> set[str]:
+    """Return the names of tasks, of their configurations and of protocols that some tasks have."""
+    found: set[str] = set()
+    classes = [
+        node for path, node in nodes(ast.ClassDef) if path.parent == ROOT / "npa_envs" / "tasks"
+    ]
+    for _ in range(4):
+        found |= {
+            node.name
+            for node in classes
+            if node.name.endswith(("Task", "Config")) or names_of(node.bases) & found
+        }
+    return found
+
+
+def names_of(parts: list[ast.expr]) -> set[str]:
+    """Return all names in expressions."""
+    return {n.id for part in parts for n in ast.walk(part) if isinstance(n, ast.Name)}
+
+
+def isinstance_on_tasks() -> int:
+    """Count places outside of tasks that ask which task one is."""
+    wanted, count = task_classes(), 0
+    for path, call in nodes(ast.Call):
+        inside = path.is_relative_to(ROOT / "npa_envs" / "tasks")
+        if not inside and getattr(call.func, "id", "") in ("isinstance", "issubclass"):
+            count += bool(names_of(call.args[1:]) & wanted)
+    return count
+
+
+def classes_named_twice() -> int:
+    """Count names that several classes of modules have."""
+    named = Counter(
+        node.name
+        for tree in trees().values()
+        for node in tree.body
+        if isinstance(node, ast.ClassDef)
+    )
+    return sum(count > 1 for count in named.values())
+
+
+def places_that_draw_masks() -> int:
+    """Count functions that draw update masks: ones with a probability."""
+    home = {"randomness.py", "draws.py"}
+    return sum(
+        any(
+            isinstance(n, ast.Attribute) and n.attr in ("bernoulli", "bernoulli_")
+            for n in ast.walk(function)
+        )
+        for path, function in nodes(ast.FunctionDef)
+        if path.name not in home
+    )
+
+
+def options_of_train() -> int:
+    """Count the options of `npa-envs train morphogenesis2d`, each once."""
+    from npa_envs.cli import main
+
+    text, columns = io.StringIO(), os.environ.get("COLUMNS")
+    # So narrow that options stand below each other, at the begin of a line.
+    os.environ["COLUMNS"] = "60"
+    try:
+        with contextlib.redirect_stdout(text), contextlib.suppress(SystemExit):
+            main(["train", "morphogenesis2d", "--help"])
+    finally:
+        os.environ.pop("COLUMNS")
+        if columns is not None:
+            os.environ["COLUMNS"] = columns
+    named = re.findall(r"(?m)^. (--[a-z][a-z0-9-]*)", text.getvalue())
+    return len(set(named) - {"--help"})
+
+
+class Budget(NamedTuple):
+    measure: Callable[[], int]
+    limit: int
+    goal: int
+
+
+BUDGETS = {
+    "functions that take x and s": Budget(functions_of_x_and_s, 229, 150),
+    "files with path_length": Budget(files_of_path_length, 21, 10),
+    "isinstance on tasks outside of tasks/": Budget(isinstance_on_tasks, 37, 3),
+    "names of classes used twice": Budget(classes_named_twice, 29, 0),
+    "places that draw masks": Budget(places_that_draw_masks, 3, 1),
+    "options of npa-envs train": Budget(options_of_train, 89, 76),
+    "source files": Budget(lambda: len(files(*PACKAGES, suffixes=SOURCES)), 316, 270),
+    "source lines": Budget(lambda: lines(files(*PACKAGES, suffixes=SOURCES)), 75_569, 58_000),
+    "test lines": Budget(lambda: lines(files("tests")), 39_712, 32_000),
+    "words of docs": Budget(
+        lambda: words([p for p in files("docs", suffixes=(".md",)) if p.parent.name == "docs"]),
+        104_399,
+        45_000,
+    ),
+    "words of docs/environments": Budget(
+        lambda: words(files("docs/environments", suffixes=(".md",))), 27_093, 18_000
+    ),
+    "lines of CHANGELOG": Budget(lambda: lines([ROOT / "CHANGELOG.md"]), 662, 60),
+    "bytes of images": Budget(
+        lambda: sum(p.stat().st_size for p in files("docs", "benchmarks", suffixes=IMAGES)),
+        20_245_692,
+        9_000_000,
+    ),
+    "files of results": Budget(
+        lambda: sum(p.is_file() for p in (ROOT / "benchmarks" / "results").rglob("*")), 204, 70
+    ),
+}
+"""What is counted, the most that there may be now, and the most that there is to be."""
+
+
+@pytest.mark.parametrize("name", BUDGETS)
+def test_a_budget_is_kept(name):
+    measure, limit, goal = BUDGETS[name]
+    assert goal <= limit, "a goal that is reached is the limit"
+    assert measure() <= limit, f"{name}: make it less, the limit is not raised"
+
+
+def main():
+    print(f"{'':40}{'now':>12}{'limit':>12}{'goal':>12}")
+    for name, (measure, limit, goal) in BUDGETS.items():
+        print(f"{name:40}{measure():12,}{limit:12,}{goal:12,}")
+
+
+if __name__ == "__main__":
+    main()
