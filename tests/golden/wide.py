@@ -242,7 +242,7 @@ def two_gardeners() -> Any:
 
 def lines_of(path: Path) -> Any:
     """Return a log's numbers without times."""
-    records = [json.loads(line) for line in path.read_text().splitlines()]
+    records = [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()]
     return [{k: v for k, v in record.items() if "second" not in k} for record in records]
 
 
@@ -279,7 +279,7 @@ def of_evaluation(rule: str, *words: str) -> Any:
     """What `npa-envs evaluate` measures."""
     out = ("--seed-count", "2", "--json", "table.json")
     command("evaluate", Names.renamed.get(rule, rule), *words, *out)
-    return json.loads(Path("table.json").read_text())
+    return json.loads(Path("table.json").read_text(encoding="utf-8"))
 
 
 def of_film(rule: str, *words: str) -> Any:
@@ -294,7 +294,7 @@ def page() -> Any:
     """The collection of rules that the authors' web demo reads."""
     with contextlib.redirect_stdout(io.StringIO()):
         Names.main(["export-web", "gecko", "dots", "-o", "models.json"])
-    return json.loads(Path("models.json").read_text())
+    return json.loads(Path("models.json").read_text(encoding="utf-8"))
 
 
 def brushed() -> Any:
