@@ -552,3 +552,11 @@ def test_only_the_perception_by_threshold_jumps(device):
 
     assert largest_jump("smooth") < 1e-2
     assert largest_jump("threshold") > 1.0
+
+
+def test_density_of_thousands_of_neighbours_counts_each_once(device):
+    x = torch.zeros(1, 9000, 2, dtype=torch.float64, device=device)
+    s = x.new_zeros(1, 9000, 3)
+    alone = npa_envs.perception_fields(x[:, :1], s[:, :1], 0.2).rho
+    together = npa_envs.perception_fields(x, s, 0.2).rho
+    torch.testing.assert_close(together, 9000 * alone.expand_as(together), rtol=1e-12, atol=0.0)

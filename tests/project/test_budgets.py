@@ -155,7 +155,7 @@ BUDGETS = {
     "options of npa-envs train": Budget(options_of_train, 89, 76),
     "source files": Budget(lambda: len(files(*PACKAGES, suffixes=SOURCES)), 316, 270),
     "source lines": Budget(lambda: lines(files(*PACKAGES, suffixes=SOURCES)), 75_569, 58_000),
-    "test lines": Budget(lambda: lines(files("tests")), 39_712, 32_000),
+    "test lines": Budget(lambda: lines(files("tests")), 39_755, 32_000),
     "words of docs": Budget(
         lambda: words([p for p in files("docs", suffixes=(".md",)) if p.parent.name == "docs"]),
         104_399,

@@ -188,6 +188,13 @@ def test_what_is_near_to_the_camera_covers_what_is_far(axis, azimuth, elevation,
     assert seen[front] > seen[2 - front] + 60
 
 
+def test_from_above_what_is_near_to_the_viewer_is_low_in_the_picture():
+    near = torch.tensor([[[0.0, 0.0, 0.6]]])
+    picture = draw_worlds(near, torch.tensor([[RED]]), elevation=45.0, azimuth=0.0, **VIEW)[0]
+    darkness = 255.0 - picture[..., 1].astype(float)
+    assert darkness[16:].sum() > 0.99 * darkness.sum() > 0.0
+
+
 @pytest.mark.parametrize("style", STYLES)
 def test_a_full_turn_changes_nothing(style):
     x, s = random_worlds(3)

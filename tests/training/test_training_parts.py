@@ -23,6 +23,7 @@ from npa_envs.training.optimiser import (
 )
 from npa_envs.training.overrides import config_to_dict
 from npa_envs.training.pool import WorldPool
+from npa_envs.training.randomness import RunRandomness
 from npa_envs.training.run_folder import JsonlLog
 
 
@@ -282,6 +283,25 @@ def test_meter_gives_the_means_of_the_interval(tmp_path, device):
     meter.send()
     expected = dict.fromkeys(iteration.term_names, 5.0) | {"steps": 7.0, "replaced_worlds": 0}
     assert meter.receive() == Interval(expected, None)
+
+
+def test_meter_goes_on_with_an_interval_that_was_kept(tmp_path):
+    _, _, iteration = make_iteration(circle_config(tmp_path))
+    first, second = LossMeter(iteration), LossMeter(iteration)
+    iteration.terms.fill_(3.0)
+    first.begin(1, 8)
+    first.observe(torch.tensor([True, True]))
+    second.load_state_dict(first.state_dict())
+    second.send()
+    expected = dict.fromkeys(iteration.term_names, 3.0) | {"steps": 8.0, "replaced_worlds": 2}
+    assert second.receive() == Interval(expected, None)
+
+
+def test_worlds_and_masks_are_drawn_independently(tmp_path):
+    drawn = RunRandomness.of_batch(
+        circle_config(tmp_path), torch.device("cpu"), torch.Generator().manual_seed(0)
+    )
+    assert torch.rand(4, generator=drawn.worlds).ne(torch.rand(4, generator=drawn.masks)).all()
 
 
 def test_meter_keeps_the_first_bad_iteration_and_not_a_later_one(tmp_path, device):

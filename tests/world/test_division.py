@@ -128,6 +128,7 @@ def test_a_full_world_has_no_children_and_only_updated_particles_divide(device):
     assert_same(after_x[:, 2:], x[:, 2:])
     nobody = torch.zeros(2, 9, dtype=torch.bool, device=device)
     assert living(divide(x, s, everyone, updated=nobody)[1]).sum().item() == 16
+    assert living(divide(x, s, dying=[3, 4], updated=nobody)[1]).sum().item() == 16
 
 
 def test_the_dead_have_no_state_and_lie_amidst_the_living(device):

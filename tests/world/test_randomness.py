@@ -266,8 +266,10 @@ def test_draws_that_are_left_out_are_as_if_drawn(source, position_noise, update_
     assert_same(*ways)
 
 
-def test_points_of_a_ball_are_uniform_in_it(space_dim, device):
-    random = WorldRandom(range(4), device=device)
+@pytest.mark.parametrize("by_world", [True, False])
+def test_points_of_a_ball_are_uniform_in_it(by_world, space_dim, device):
+    own, torchs = WorldRandom(range(4), device=device), torch.Generator(device).manual_seed(1)
+    random = own if by_world else torchs
     points = uniform_ball(
         4, 20_000, space_dim, 0.2, generator=random, device=device, dtype=torch.float64
     )
