@@ -26,6 +26,7 @@ from npa_envs.ops.checks import (
 from npa_envs.ops.static import StaticWorlds, prepare_static
 from npa_envs.rule.network import Network
 from npa_envs.rule.rule import NPARule, check_rule
+from npa_envs.world.cuda_graph import draws_alone
 from npa_envs.world.divergence import DivergenceWatch, OnDivergence, make_watch
 from npa_envs.world.division import living
 from npa_envs.world.prepared import PreparedSteps, may_prepare, run_prepared
@@ -159,6 +160,9 @@ def run_steps(
     # While a graph is recorded, torch's state cannot be read, and its draws are the graph's.
     recorded = worlds.x.is_cuda and torch.cuda.is_current_stream_capturing()
     redraw = with_modules and not recorded
+    if with_modules and recorded and not draws_alone():
+        # Recomputed, a module that draws would draw otherwise.
+        interval = 1
     # Worlds keep their dtype under autocast: the kernels read what the rules write.
     with torch.autocast(worlds.x.device.type, enabled=False):
         for number, draws in enumerate(step.draws(worlds.x, steps, generator)):
