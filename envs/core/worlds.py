@@ -46,6 +46,7 @@ from npa_envs.world.cuda_graph import (
     Replayed,
     WeakFunction,
     makes_plain_tensors,
+    pinned_like,
     sent,
 )
 from npa_envs.world.divergence import LARGEST_REPORT, term_name
@@ -262,7 +263,7 @@ class Worlds(Batch):
         told = (self._endings, self.report.numbers)
         if self.device.type == "cpu":
             return told
-        endings, numbers = (torch.empty_like(t, device="cpu", pin_memory=True) for t in told)
+        endings, numbers = map(pinned_like, told)
         return endings, numbers
 
     def limit_steps(self, episode_steps: int | None) -> None:
@@ -452,9 +453,7 @@ class Worlds(Batch):
             if self._perceived is None:
                 self._perceived = self.x.new_empty(*self.x.shape[:2], self.physics.perception_dim)
                 if self.world_count == 1 and self.task.config.output == "numpy":
-                    self._host_perceived = torch.empty_like(
-                        self._perceived, device="cpu", pin_memory=True
-                    )
+                    self._host_perceived = pinned_like(self._perceived)
             survey_worlds(self.x, self.s, self.physics).perceive(self._perceived)
             if self._host_perceived is not None:
                 self._host_perceived.copy_(self._perceived, non_blocking=True)

@@ -6,6 +6,7 @@ import contextlib
 import functools
 import gc
 import inspect
+import os
 import threading
 import weakref
 from collections.abc import Callable, Iterator
@@ -42,8 +43,29 @@ state of captures."""
 
 @functools.cache
 def can_capture() -> bool:
-    """Return whether torch's allocator lets graphs share memory and be freed: its own one does."""
-    return torch.cuda.get_allocator_backend() == "native"
+    """Return whether torch's allocator keeps memory for graphs: its own one does, if it caches."""
+    caching = "PYTORCH_NO_CUDA_MEMORY_CACHING" not in os.environ
+    return caching and torch.cuda.get_allocator_backend() == "native"
+
+
+CAPTURE_ATTEMPTS = 3
+"""How often a capture is tried where other threads may have ended it."""
+
+PINNED_OFFSET = 64
+"""Bytes by which pinned memory lies further than torch's allocator knows it."""
+
+
+def pinned_like(tensor: Tensor) -> Tensor:
+    """Return pinned memory of a tensor's form, to which captured work may write.
+
+    Torch's allocator notes which streams use its pinned memory, and asks them how far they are once
+    that is freed. A stream that another thread captures by then must not be asked.
+    """
+    whole = torch.empty(
+        PINNED_OFFSET + tensor.nbytes, dtype=torch.uint8, device="cpu", pin_memory=True
+    )
+    place = torch.from_numpy(whole.numpy()[PINNED_OFFSET:])
+    return place.view(tensor.dtype).view(tensor.shape)
 
 
 def _is_plain() -> bool:
@@ -314,6 +336,17 @@ def _record(function: Callable[[], object], captured: Captured) -> None:
     captured.end()
 
 
+def may_be_disturbed(attempts: int) -> bool:
+    """Return whether a capture that failed is worth another attempt.
+
+    A thread that waits for the whole device (`torch.cuda.synchronize`) ends all captures.
+
+    Args:
+        attempts: Attempts so far.
+    """
+    return threading.active_count() > 1 and attempts < CAPTURE_ATTEMPTS
+
+
 class WeakFunction:
     """A function that is kept, or a method whose object is not kept alive.
 
@@ -376,10 +409,11 @@ class Replayed:
         self._pool = pool
         self._warm = False
         self._graph: Captured | None = None
+        self._attempts = 0
 
     def __getstate__(self) -> dict[str, Any]:
         """Leave out the graph, which cannot be pickled: it is captured anew."""
-        return self.__dict__ | {"_warm": False, "_graph": None}
+        return self.__dict__ | {"_warm": False, "_graph": None, "_attempts": 0}
 
     def __call__(self) -> None:
         """Run the function.
@@ -393,9 +427,16 @@ class Replayed:
             self._warm = True
             return
         if self._graph is None:
-            self._graph = capture(
-                function, self._device, pool=self._pool, generator=self._generator, alone=True
-            )
+            self._attempts += 1
+            try:
+                self._graph = capture(
+                    function, self._device, pool=self._pool, generator=self._generator, alone=True
+                )
+            except RuntimeError:
+                if not may_be_disturbed(self._attempts):
+                    raise
+                function()
+                return
         self._graph.replay()
 
 

@@ -35,6 +35,7 @@ from npa_envs.world.cuda_graph import (
     can_capture,
     capture,
     current_stream,
+    may_be_disturbed,
     plain_tensors,
     prepare_capture,
     recording_lock,
@@ -151,6 +152,9 @@ def run_call(
         if recorded is not None:
             return recorded
     check_finite_positions(x)
+    if x.is_cuda and torch.is_grad_enabled():
+        # Gradients are added up as a recording adds them: first those of this rollout.
+        x, s = x.view_as(x), s.view_as(s)
     return call.run(rules, Worlds(x, s, x.new_zeros(x.shape[:2])), generator, watch)
 
 
@@ -234,6 +238,8 @@ class _Kind:
 
     def __init__(self) -> None:
         self.calls = 0
+        self.failures = 0
+        """Recordings that failed."""
         self.refused = False
         """One of them could not be recorded."""
         self.recordings: list[_Recording] = []
@@ -246,9 +252,11 @@ class _Lease:
     def __init__(self, recording: _Recording, kind: _Kind) -> None:
         self.recording = recording
         self._kind = kind
+        self.spoilt = False
+        """The recording is not to be used again."""
 
     def __del__(self) -> None:
-        if not self._kind.refused:
+        if not (self.spoilt or self._kind.refused):
             # Appending to a deque needs no lock: any thread may drop the last reference.
             self._kind.free.append(self.recording)
 
@@ -698,7 +706,8 @@ def _compared(
         shared = torch_generator(generator, x.device)
         source = torch.Generator(x.device).manual_seed(shared.initial_seed())
         source.set_offset(shared.get_offset())
-    launched = call.run(rules, Worlds(x, s, x.new_zeros(x.shape[:2])), generator)
+    worlds = Worlds(x.view_as(x), s.view_as(s), x.new_zeros(x.shape[:2]))
+    launched = call.run(rules, worlds, generator)
     with torch.no_grad():
         replayed = _replay_blocks(call, lease, blocks, [x, s, *own], source)
         pairs = zip((*launched, *weights), (*replayed, *own), strict=True)
@@ -763,6 +772,11 @@ def _lease(
                 with plain_tensors(), torch.autocast("cuda", enabled=False):
                     recording.record(missing, [x, s, recording.no_path, *weights])
         except Exception as error:
+            kind.failures += 1
+            if lease is not None and may_be_disturbed(kind.failures):
+                lease.spoilt = True
+                kind.recordings.remove(lease.recording)
+                return None
             drew = "CUDA generator" in str(error)
             reason = "forward draws from torch's own generator, as dropout does" if drew else error
             # A launched rollout says what is wrong if that cannot run either.
