@@ -121,7 +121,7 @@ def _description(tensor: Tensor, array_type: Any) -> Any:
         tensor = tensor.view(tensor.numel() // math.prod(entry), *entry)
     made = wp.from_torch(tensor, dtype=array_type.dtype, requires_grad=False, return_ctype=True)
     # Launches are kept; their first tensors would be kept with them.
-    made._data = None
+    made._ref = None
     return made
 
 

@@ -269,7 +269,7 @@ class _Graphs(NamedTuple):
     gradients: list[Tensor]
     """Where its backward pass leaves gradients, of those inputs that have one."""
     written: list[int]
-    """Inputs that the network itself changes, such as running means."""
+    """Inputs that the network itself may change, such as running means."""
 
 
 class _Recording:
@@ -371,7 +371,14 @@ class _Recording:
         draws = None if self._streams is not None else self._generator
         begin, versions = self._settings(), self._versions()
         forward_graph = capture(forward, self.device, pool=self._pool, generator=draws, alone=True)
-        written = [k for k, new in enumerate(self._versions()) if new != versions[k]]
+        own = {id(tensor) for rule in self._own for tensor in rule_tensors(rule, self.device)}
+        # Not every operator says that it writes to buffers.
+        written = [
+            k
+            for k, (tensor, version) in enumerate(zip(self._inputs, versions, strict=True))
+            if tensor._version != version
+            or (id(tensor) in own and not isinstance(tensor, torch.nn.Parameter))
+        ]
         versions = self._versions()
         backward_graph = None
         if self.differentiable:

@@ -1,19 +1,18 @@
 """Recorded rollouts among torch's modes, other threads and other work on the device."""
 
-import gc
 import os
 import subprocess
 import sys
 import threading
-import time
 
 import pytest
 import torch
 from test_recorded import DEVICE, is_recorded, make_rule, run, same, worlds
 
 import npa_envs
+from npa_envs.ops import launch
 from npa_envs.world import recorded
-from npa_envs.world.cuda_graph import plain_tensors
+from npa_envs.world.cuda_graph import capture, plain_tensors
 from npa_envs.world.randomness import give_back_draws, reserve_draws
 
 pytestmark = pytest.mark.gpu
@@ -132,27 +131,35 @@ def test_matrix_precision_chosen_in_the_new_way():
             torch.backends.cuda.matmul.fp32_precision = before
 
 
-def test_others_draw_while_rollouts_are_recorded():
-    stop = []
+def test_others_draw_while_something_is_recorded():
+    numbers = torch.zeros(10, device=DEVICE)
+    drawn = []
 
     def draw():
         with torch.cuda.stream(torch.cuda.Stream()):
-            while not stop:
-                torch.randn(1000, device=DEVICE)
-                time.sleep(0.002)
+            drawn.append(torch.randn(1000, device=DEVICE))
 
-    def roll():
-        try:
-            rule = make_rule()
-            for count in range(20):
-                x, s = worlds(particles=40 + count)
-                for _ in range(3):
-                    npa_envs.rollout(rule, x, s, 4)[1].sum().backward()
-        finally:
-            stop.append(True)
+    def function():
+        numbers.add_(1)
+        together(draw)
 
-    together(draw, roll)
-    assert is_recorded()
+    draw()
+    torch.cuda.manual_seed(0)
+    graph = capture(function, DEVICE, alone=True)
+    graph.replay()
+    draw()
+    torch.cuda.manual_seed(0)
+    draw()
+    draw()
+    assert torch.equal(drawn[1], drawn[3])
+    assert torch.equal(drawn[2], drawn[4])
+    assert numbers.tolist() == [1.0] * 10
+
+
+def test_what_draws_from_torchs_own_generator_is_not_recorded_alone():
+    with pytest.raises(RuntimeError, match="CUDA generator"):
+        capture(lambda: torch.randn(10, device=DEVICE), DEVICE, alone=True)
+    torch.randn(10, device=DEVICE)
 
 
 def test_two_rollouts_one_after_the_other_have_the_same_gradients():
@@ -172,22 +179,13 @@ def test_two_rollouts_one_after_the_other_have_the_same_gradients():
 
 def test_launches_keep_none_of_their_tensors():
     rule = make_rule()
-    with torch.no_grad():
-        npa_envs.rollout(rule, *worlds(), 3, cuda_graph=False)
-    gc.collect()
+    x, s = worlds(count=8, particles=20_000)
     torch.cuda.synchronize()
     before = torch.cuda.memory_allocated()
-
-    def work():
-        # A thread has launches of its own, which its first call makes.
-        with torch.no_grad():
-            x, s = worlds(count=8, particles=50_000)
-            npa_envs.rollout(rule, x, s, 3, eps=0.01, cuda_graph=False)
-            held.append(threading.get_ident())
-
-    held = []
-    together(work)
-    gc.collect()
+    # As in a process that launches these kernels for the first time.
+    launch._ready.by_kernel.clear()
+    with torch.no_grad():
+        npa_envs.rollout(rule, x, s, 3, eps=0.01, cuda_graph=False)
     torch.cuda.synchronize()
     assert torch.cuda.memory_allocated() <= before + 2**20
 

@@ -196,12 +196,12 @@ def test_gradients_are_those_of_what_was_dropped_within_a_graph_of_the_caller():
 @pytest.mark.gpu
 def test_eval_ends_dropout():
     rule = of_type(Dropping)
-    as_launched(rule.eval())
+    as_launched(rule.eval(), gradients=False)
     assert is_recorded()
     x, s = worlds()
     seen = [npa_envs.rollout(rule.train(), x, s, 6, cuda_graph=True)[1] for _ in range(3)]
     assert not torch.equal(seen[1], seen[2])
-    as_launched(rule.eval())
+    as_launched(rule.eval(), gradients=False)
 
 
 @pytest.mark.gpu
@@ -236,7 +236,7 @@ def test_a_rule_that_counts_its_calls_is_launched(kind, caplog):
         seen.append(calls)
     if kind is Counting:
         same(*seen)
-        assert "got other .count" in caplog.text
+        assert not is_recorded()
     else:
         # What records it calls it too, so that its count differs, and is not held.
         assert not torch.equal(seen[1][-1], seen[1][-3])
