@@ -109,7 +109,12 @@ def test_environments_in_threads_are_as_alone():
             rule = npa_envs.NPARule(2, 8, 32, eps0=0.3).to(device)
             with torch.cuda.stream(torch.cuda.Stream()):
                 for count in range(30):
-                    x, s = (torch.rand(2, 40 + count, width).to(device) for width in (2, 8))
+                    # Environments look whether torch's own generators move.
+                    random = torch.Generator().manual_seed(count)
+                    x, s = (
+                        torch.rand(2, 40 + count, width, generator=random).to(device)
+                        for width in (2, 8)
+                    )
                     for _ in range(3):
                         generator = torch.Generator(device).manual_seed(0)
                         npa_envs.rollout(rule, x, s, 4, generator=generator)[1].sum().backward()
