@@ -124,7 +124,7 @@ class FiniteCheck:
             stream = _side_stream(x.device)
             stream.wait_event(ready)
         with torch.cuda.stream(stream):
-            sent = torch.empty((), dtype=x.dtype, pin_memory=True)
+            sent = torch.empty((), dtype=x.dtype, device="cpu", pin_memory=True)
             self._answer = sent.copy_(_largest_size(self._x), non_blocking=True)
             self._arrival = torch.cuda.Event()  # type: ignore[no-untyped-call]
             self._arrival.record(stream)

@@ -225,7 +225,9 @@ def on_host(*given: Any) -> list[NDArray[Any]]:
     for values in given:
         tensor = as_tensor(values)
         # Pinned memory comes from torch's cache and goes back to it with the array.
-        copy = torch.empty(tensor.shape, dtype=tensor.dtype, pin_memory=tensor.is_cuda)
+        copy = torch.empty(
+            tensor.shape, dtype=tensor.dtype, device="cpu", pin_memory=tensor.is_cuda
+        )
         copies.append(copy.copy_(tensor, non_blocking=tensor.is_cuda))
     for device in {v.device for v in given if isinstance(v, Tensor) and v.is_cuda}:
         torch.cuda.current_stream(device).synchronize()

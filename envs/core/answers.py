@@ -12,6 +12,7 @@ from torch import Tensor
 
 from npa_envs.envs.core.task import EnvTask, Start
 from npa_envs.errors import NPAError, shown
+from npa_envs.world.cuda_graph import recording_lock
 
 
 def starter(task: EnvTask[Any]) -> str:
@@ -169,6 +170,8 @@ class GlobalDraws:
             "Python's": random.getstate(),
         }
         if self._task.device.type == "cuda":
-            state = torch.cuda.get_rng_state(self._task.device)
+            # A capture of another thread puts another generator in its place for a moment.
+            with recording_lock:
+                state = torch.cuda.get_rng_state(self._task.device)
             states["torch's on CUDA"] = state.numpy().tobytes()
         return states

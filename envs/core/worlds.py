@@ -40,7 +40,14 @@ from npa_envs.world.actions import (
     survey_worlds,
 )
 from npa_envs.world.credit import settled
-from npa_envs.world.cuda_graph import Beside, Replayed, WeakFunction, sent
+from npa_envs.world.cuda_graph import (
+    Beside,
+    Replayed,
+    WeakFunction,
+    makes_plain_tensors,
+    pinned_like,
+    sent,
+)
 from npa_envs.world.divergence import LARGEST_REPORT, term_name
 from npa_envs.world.randomness import WorldRandom
 
@@ -57,6 +64,20 @@ def total(parts: Tensor) -> Tensor:
     for part in rest:
         first = first + part
     return first
+
+
+def check_default_dtype() -> None:
+    """Check that what tasks make by default is float32, as the worlds are.
+
+    Raises:
+        NPAError: It is another dtype.
+    """
+    dtype = torch.get_default_dtype()
+    if dtype != torch.float32:
+        raise NPAError(
+            f"environments need torch's default dtype to be torch.float32, got {dtype}: call "
+            "torch.set_default_dtype(torch.float32), and give other tensors their dtype"
+        )
 
 
 class Batch:
@@ -81,6 +102,7 @@ class Batch:
         particle_count: int,
         extra_bytes: int,
     ) -> None:
+        check_default_dtype()
         self.device = device = config.torch_device
         self.world_count = world_count
         self.particle_count = particle_count
@@ -154,6 +176,7 @@ class Worlds(Batch):
         NPAError: The worlds do not fit into memory.
     """
 
+    @makes_plain_tensors
     def __init__(
         self,
         task_type: type[EnvTask[Any]],
@@ -233,7 +256,7 @@ class Worlds(Batch):
         told = (self._endings, self.report.numbers)
         if self.device.type == "cpu":
             return told
-        endings, numbers = (torch.empty_like(t, device="cpu", pin_memory=True) for t in told)
+        endings, numbers = map(pinned_like, told)
         return endings, numbers
 
     def limit_steps(self, episode_steps: int | None) -> None:
@@ -260,6 +283,7 @@ class Worlds(Batch):
         sparse: bool = self.task.config.reward == "sparse"
         return sparse
 
+    @makes_plain_tensors
     @torch.no_grad()
     def start(self, worlds: Tensor, keys: Tensor | None = None) -> Start:
         """Start episodes in some worlds, int64, shape [M], and return their particles.
@@ -267,6 +291,7 @@ class Worlds(Batch):
         Keys are those of `next_streams`.
         """
         random = self.next_streams(worlds, keys)
+        check_default_dtype()
         # The first start is not recorded: the host may look.
         task, first = self.task, not self.part_names
         draws = GlobalDraws(task) if first else None
@@ -294,6 +319,7 @@ class Worlds(Batch):
         start = self.start(worlds)
         return survey_worlds(start.x, start.s, self.physics, places=worlds)
 
+    @makes_plain_tensors
     @torch.no_grad()
     def place(self, worlds: Tensor, start: Start) -> None:
         """Put particles into some worlds, int64, shape [M], at no reward."""
@@ -324,11 +350,13 @@ class Worlds(Batch):
             self.particle_reward.index_fill_(0, worlds, 0.0)
         self.report.endings.index_fill_(1, worlds, False)
 
+    @makes_plain_tensors
     @torch.no_grad()
     def perceive(self, out: Tensor | None = None) -> Tensor:
         """Return what is perceived in all worlds as they are, shape [B, N, P], written to `out`."""
         return survey_worlds(self.x, self.s, self.physics).perceive(out)
 
+    @makes_plain_tensors
     @torch.no_grad()
     def reseed(self, worlds: NDArray[np.int64], observation: Tensor) -> None:
         """Start some worlds, [M], anew within their episodes; the last step's pay and flags stay.
@@ -385,6 +413,7 @@ class Worlds(Batch):
             )
         return endings, observation
 
+    @makes_plain_tensors
     @torch.no_grad()
     def queue(self, action: Tensor, out: Tensor | None = None) -> Tensor:
         """Do what `step` does but wait for the device, and return what is perceived there then."""
@@ -417,9 +446,7 @@ class Worlds(Batch):
             if self._perceived is None:
                 self._perceived = self.x.new_empty(*self.x.shape[:2], self.physics.perception_dim)
                 if self.world_count == 1 and self.task.config.output == "numpy":
-                    self._host_perceived = torch.empty_like(
-                        self._perceived, device="cpu", pin_memory=True
-                    )
+                    self._host_perceived = pinned_like(self._perceived)
             survey_worlds(self.x, self.s, self.physics).perceive(self._perceived)
             if self._host_perceived is not None:
                 self._host_perceived.copy_(self._perceived, non_blocking=True)
@@ -674,6 +701,7 @@ class Restarts:
         """Leave out recorded starts, which cannot be pickled."""
         return self.__dict__ | {"_chunks": {}}
 
+    @makes_plain_tensors
     def __call__(self, worlds: NDArray[np.int64], observation: Tensor) -> None:
         """Start the next episodes of some worlds, [M], and write what is perceived, [B, N, P]."""
         if not self._recorded:

@@ -13,7 +13,7 @@ from npa_envs.envs.core.config import EnvConfig
 from npa_envs.envs.core.task import EnvTask, Start
 from npa_envs.envs.core.worlds import Worlds
 from npa_envs.envs.garden.task import GardenTask
-from npa_envs.world.cuda_graph import sent
+from npa_envs.world.cuda_graph import makes_plain_tensors, sent
 from npa_envs.world.randomness import Purpose
 
 
@@ -35,6 +35,7 @@ class LivingWorlds(Worlds):
 
     task: GardenTask[Any]
 
+    @makes_plain_tensors
     def __init__(
         self,
         task_type: type[EnvTask[Any]],
@@ -52,6 +53,7 @@ class LivingWorlds(Worlds):
         """Whether an episode's last step is the only one that is paid."""
         return super().pays_last_step_alone and not self.task.pays_each_step
 
+    @makes_plain_tensors
     @torch.no_grad()
     def perceive(self, out: Tensor | None = None) -> Tensor:
         """Return what is seen of all worlds as they are, shape [B, ...], written to `out`."""
@@ -64,6 +66,7 @@ class LivingWorlds(Worlds):
         self.start(index)
         observation[index] = self.perceive()[index]
 
+    @makes_plain_tensors
     @torch.no_grad()
     def queue(self, action: Tensor, out: Tensor | None = None) -> Tensor:
         """Use the brushes, let the rule run, and judge; return what is seen, shape [B, ...]."""
@@ -119,6 +122,7 @@ class LivingWorlds(Worlds):
             last = last | (self.elapsed == self.task.config.episode_steps)
         return torch.where(last, earned, 0.0)
 
+    @makes_plain_tensors
     @torch.no_grad()
     def start(self, worlds: Tensor, keys: Tensor | None = None) -> Start:
         """Start episodes in some worlds, int64, shape [M], and return their particles."""

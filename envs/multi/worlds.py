@@ -27,7 +27,7 @@ from npa_envs.world.actions import (
     perceive_each_species,
     survey_worlds,
 )
-from npa_envs.world.cuda_graph import Beside, Replayed, sent
+from npa_envs.world.cuda_graph import Beside, Replayed, makes_plain_tensors, sent
 from npa_envs.world.divergence import LARGEST_REPORT
 from npa_envs.world.randomness import WorldRandom
 
@@ -106,7 +106,7 @@ class Episodes:
         self._last_step = np.array([deaths.get(int(k), 0) for k in self.species])
         self._beside = Beside(device) if device.type == "cuda" else None
         self._host_left = torch.zeros(
-            self.live.shape, dtype=torch.bool, pin_memory=device.type == "cuda"
+            self.live.shape, dtype=torch.bool, device="cpu", pin_memory=device.type == "cuda"
         )
 
     def __setstate__(self, state: dict[str, Any]) -> None:
@@ -317,6 +317,7 @@ class SpeciesWorlds(Batch):
         NPAError: The worlds do not fit into memory, or the task cannot be made.
     """
 
+    @makes_plain_tensors
     def __init__(
         self, task_type: type[SpeciesTask], config: Any, world_count: int, *, by_particle: bool
     ) -> None:
@@ -355,6 +356,7 @@ class SpeciesWorlds(Batch):
         """Agents of a world, A."""
         return self._judge.agent_count
 
+    @makes_plain_tensors
     @torch.no_grad()
     def start(self, worlds: NDArray[np.int64], keys: Tensor | None = None) -> Population:
         """Start episodes in some worlds, [M], and return their particles."""
@@ -369,6 +371,7 @@ class SpeciesWorlds(Batch):
         self.elapsed[worlds] = 0
         return self._whole.population._replace(x=x.contiguous(), s=s)
 
+    @makes_plain_tensors
     @torch.no_grad()
     def act(self, action: Tensor) -> None:
         """Apply actions to the worlds that go on; nothing waits for the device.
@@ -381,6 +384,7 @@ class SpeciesWorlds(Batch):
             cohort.act(action if cohort is self._whole else action[cohort.places])
         self.elapsed[self.open] += 1
 
+    @makes_plain_tensors
     @torch.no_grad()
     def perceived(self, *, stepped: bool = False) -> Tensor:
         """Return what particles perceive, shape [B, N, P]; zeros where they or their world ended.
@@ -395,6 +399,7 @@ class SpeciesWorlds(Batch):
             seen[cohort.places] = cohort.perceived(stepped=stepped)
         return seen
 
+    @makes_plain_tensors
     @torch.no_grad()
     def measured(self, *, stepped: bool = False) -> dict[str, Tensor]:
         """Return the parts of every agent's loss, float32, shape [B, A]; 0 of those that ended."""
@@ -406,12 +411,14 @@ class SpeciesWorlds(Batch):
                 found[name].index_copy_(0, cohort.worlds, part)
         return found
 
+    @makes_plain_tensors
     @torch.no_grad()
     def opened(self, population: Population) -> tuple[dict[str, Tensor], Tensor]:
         """Return losses, [M, A], and perception, [M, N, P], of worlds that `start` returned."""
         judge = self._judge
         return judge.measured(population, self._whole.columns), judge.perceived(population)
 
+    @makes_plain_tensors
     @torch.no_grad()
     def left(self) -> Tensor:
         """Return which agents have no particle within bounds after a step, bool, shape [B, A]."""
@@ -457,6 +464,7 @@ class SpeciesWorlds(Batch):
         x, s = self.x[world : world + 1, index], self.s[world : world + 1, index]
         return Population(x, s, tuple(counts.tolist()), sent(kind, self.device))
 
+    @makes_plain_tensors
     @torch.no_grad()
     def state(self) -> Tensor:
         """Return position, state and 1 of each particle, 0s of those gone, [B, N, 2 + C + 1]."""
@@ -479,6 +487,7 @@ class SpeciesWorlds(Batch):
                 self._cohorts = self._gathered()
         return self._cohorts
 
+    @makes_plain_tensors
     def _gathered(self) -> list[Cohort]:
         going_on = np.flatnonzero(self.open & self.there.any(axis=1))
         if not len(going_on):

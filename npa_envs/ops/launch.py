@@ -120,7 +120,10 @@ def _description(tensor: Tensor, array_type: Any) -> Any:
     if array_type.ndim == 1:
         entry = getattr(array_type.dtype, "_shape_", ())
         tensor = tensor.view(tensor.numel() // math.prod(entry), *entry)
-    return wp.from_torch(tensor, dtype=array_type.dtype, requires_grad=False, return_ctype=True)
+    made = wp.from_torch(tensor, dtype=array_type.dtype, requires_grad=False, return_ctype=True)
+    # Launches are kept; their first tensors would be kept with them.
+    made._ref = None
+    return made
 
 
 class _StructArgument:

@@ -122,6 +122,28 @@ def opaque(name: str) -> Callable[[Callable[Arguments, Result]], Opaque[Argument
     return lambda function: Opaque(name, function)
 
 
+def without_autocast(
+    backward: Callable[Arguments, Result],
+) -> Callable[Arguments, Result]:
+    """Return the backward pass of an autograd function, in its tensors' own dtypes.
+
+    Forward passes are run without autocast; a backward pass may be asked for within it.
+
+    Args:
+        backward: The backward pass, of a context and cotangents.
+    """
+
+    @functools.wraps(backward)
+    def guarded(*args: Arguments.args, **kwargs: Arguments.kwargs) -> Result:
+        for device in ("cuda", "cpu"):
+            if torch.is_autocast_enabled(device):
+                with torch.autocast(device, enabled=False):
+                    return guarded(*args, **kwargs)
+        return backward(*args, **kwargs)
+
+    return guarded
+
+
 def once_differentiable(
     backward: Callable[Arguments, Result],
 ) -> Callable[Arguments, Result]:
@@ -137,6 +159,7 @@ def once_differentiable(
     Raises:
         NPAError: When called with `create_graph=True`, or with several cotangents at once.
     """
+    backward = without_autocast(backward)
 
     @functools.wraps(backward)
     def guarded(*args: Arguments.args, **kwargs: Arguments.kwargs) -> Result:

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from npa_envs.ops.equivariance import VectorForm, read_rows, steer_rows
 from npa_envs.ops.network import ArrangedWeights, arrange_weights, run_network
+from npa_envs.ops.opaque import without_autocast
 
 FOLD = 4
 """Rows of products are padded to a multiple of this many columns: 16 bytes of float32."""
@@ -38,6 +39,7 @@ class _TwoLayers(torch.autograd.Function):
         return _blocked_product(hidden, output_weight)
 
     @staticmethod
+    @without_autocast
     def backward(ctx: Any, update_bar: Tensor) -> tuple[Tensor | None, ...]:
         rows, hidden, hidden_weight, output_weight = ctx.saved_tensors
         hidden_bar = torch.ops.aten.threshold_backward(update_bar @ output_weight, hidden, 0.0)

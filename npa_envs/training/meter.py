@@ -50,7 +50,9 @@ class LossMeter:
         self._count = 0
         self._step_sum = 0
         on_cuda = device.type == "cuda"
-        self._sent = torch.zeros(numbers.shape, dtype=numbers.dtype, pin_memory=on_cuda)
+        self._sent = torch.zeros(
+            numbers.shape, dtype=numbers.dtype, device="cpu", pin_memory=on_cuda
+        )
         self._sent_counts = (0, 0)
         self._arrival = torch.cuda.Event() if on_cuda else None  # type: ignore[no-untyped-call]
 

@@ -6,10 +6,12 @@ import contextlib
 import functools
 import gc
 import inspect
+import os
+import threading
 import weakref
 from collections.abc import Callable, Iterator
 from contextvars import ContextVar
-from typing import Any
+from typing import Any, ParamSpec, TypeVar
 
 import torch
 from numpy.typing import NDArray
@@ -26,6 +28,77 @@ def sent(values: NDArray[Any], device: torch.device) -> Tensor:
     tensor = torch.from_numpy(values)
     # Unpinned memory would be copied once the stream is idle, and the host would wait for that.
     return tensor.pin_memory().to(device, non_blocking=True) if device.type == "cuda" else tensor
+
+
+Arguments = ParamSpec("Arguments")
+Result = TypeVar("Result")
+
+ABANDONED_POOLS = 8
+"""Pools of graphs that are gone, at most, before their memory is given back."""
+
+recording_lock = threading.RLock()
+"""Held while something is captured or prepared for that: all graphs share one stream and torch's
+state of captures."""
+
+
+@functools.cache
+def can_capture() -> bool:
+    """Return whether torch's allocator keeps memory for graphs: its own one does, if it caches."""
+    caching = "PYTORCH_NO_CUDA_MEMORY_CACHING" not in os.environ
+    return caching and torch.cuda.get_allocator_backend() == "native"
+
+
+CAPTURE_ATTEMPTS = 3
+"""How often a capture is tried where other threads may have ended it."""
+
+PINNED_OFFSET = 64
+"""Bytes by which pinned memory lies further than torch's allocator knows it."""
+
+
+def pinned_like(tensor: Tensor) -> Tensor:
+    """Return pinned memory of a tensor's form, to which captured work may write.
+
+    Torch's allocator notes which streams use its pinned memory, and asks them how far they are once
+    that is freed. A stream that another thread captures by then must not be asked.
+    """
+    whole = torch.empty(
+        PINNED_OFFSET + tensor.nbytes, dtype=torch.uint8, device="cpu", pin_memory=True
+    )
+    place = torch.from_numpy(whole.numpy()[PINNED_OFFSET:])
+    return place.view(tensor.dtype).view(tensor.shape)
+
+
+def _is_plain() -> bool:
+    """Return whether tensors are made on the CPU by default, and not in inference mode."""
+    return not (torch.is_inference_mode_enabled() or torch._C._len_torch_function_stack())
+
+
+@contextlib.contextmanager
+def plain_tensors() -> Iterator[None]:
+    """Make tensors inside that can be written to anywhere, on the CPU unless a device is given.
+
+    The caller may be in inference mode, or have set another default device.
+    """
+    with contextlib.ExitStack() as modes:
+        if torch.is_inference_mode_enabled():
+            modes.enter_context(torch.inference_mode(False))
+            modes.enter_context(torch.no_grad())
+        if not _is_plain():
+            modes.enter_context(torch.device("cpu"))
+        yield
+
+
+def makes_plain_tensors(function: Callable[Arguments, Result]) -> Callable[Arguments, Result]:
+    """Return a function within `plain_tensors`."""
+
+    @functools.wraps(function)
+    def guarded(*args: Arguments.args, **kwargs: Arguments.kwargs) -> Result:
+        if _is_plain():
+            return function(*args, **kwargs)
+        with plain_tensors():
+            return function(*args, **kwargs)
+
+    return guarded
 
 
 @contextlib.contextmanager
@@ -66,7 +139,7 @@ def prepare_capture(function: Callable[[], object], device: torch.device) -> Non
         function: Launches kernels.
         device: A CUDA device, where it works.
     """
-    with torch.cuda.device(device):
+    with recording_lock, torch.cuda.device(device), plain_tensors():
         stream = _capture_stream(torch.cuda.current_device())
         stream.wait_stream(torch.cuda.current_stream())
         with torch.cuda.stream(stream):
@@ -81,11 +154,23 @@ class Captured:
     Args:
         pool: Memory that the graphs share; None is a pool of their own.
         generator: A generator that draws anew in each replay.
+        alone: Nothing is drawn from torch's own generator.
     """
 
-    def __init__(self, pool: Any = None, generator: torch.Generator | None = None) -> None:
+    abandoned = 0
+    """Pools of graphs that are gone since memory was given back."""
+
+    def __init__(
+        self,
+        pool: Any = None,
+        generator: torch.Generator | None = None,
+        *,
+        alone: bool = False,
+    ) -> None:
+        self._owns_pool = pool is None
         self._pool = pool
         self._generator = generator
+        self.alone = alone
         self._graphs: list[torch.cuda.CUDAGraph] = []
         self._between: list[Callable[[], object]] = []
 
@@ -103,8 +188,9 @@ class Captured:
             # Without this every replay would draw the numbers of the capture again.
             graph.register_generator_state(self._generator)
         self._graphs.append(graph)
-        # A backward pass runs on a thread of its own, whose calls the strict mode would refuse.
-        graph.capture_begin(pool=self._pool, capture_error_mode="thread_local")
+        with _stand_in(graph) if self.alone else contextlib.nullcontext():
+            # A backward pass runs on a thread of its own, whose calls the strict mode would refuse.
+            graph.capture_begin(pool=self._pool, capture_error_mode="thread_local")
 
     def end(self) -> None:
         """Record no more."""
@@ -117,6 +203,30 @@ class Captured:
         if self._pool is None:
             self._pool = self._graphs[0].pool()
         self.begin()
+
+    def __del__(self) -> None:
+        # Freed here, memory would be taken from captures of other threads.
+        Captured.abandoned += self._owns_pool and bool(self._graphs)
+
+
+@contextlib.contextmanager
+def _stand_in(graph: torch.cuda.CUDAGraph) -> Iterator[None]:
+    """Let a capture that begins inside register another generator than torch's own.
+
+    Torch registers its own one with every graph, and until the capture ends other threads could not
+    draw from it.
+    """
+    own = torch.cuda.default_generators[torch.cuda.current_device()]
+    stand_in = torch.Generator(own.device)
+    # What other threads draw meanwhile must not be the same each time.
+    stand_in.seed()
+    graph.register_generator_state(stand_in)
+    state = own.graphsafe_get_state()
+    own.graphsafe_set_state(stand_in)
+    try:
+        yield
+    finally:
+        own.graphsafe_set_state(state)
 
 
 _capturing: ContextVar[Captured | None] = ContextVar("capturing", default=None)
@@ -136,6 +246,12 @@ def between_graphs(work: Callable[[], object]) -> None:
         captured.pause(work)
 
 
+def draws_alone() -> bool:
+    """Return whether what this thread records cannot draw from torch's own generator."""
+    captured = _capturing.get()
+    return captured is not None and captured.alone
+
+
 def capture(
     function: Callable[[], object],
     device: torch.device,
@@ -143,6 +259,7 @@ def capture(
     pool: Any = None,
     generator: torch.Generator | None = None,
     warm_up: Callable[[], object] | None = None,
+    alone: bool = False,
 ) -> Captured:
     """Record what a function launches as CUDA graphs, without running it.
 
@@ -160,6 +277,8 @@ def capture(
             same time as this one; None is a new pool.
         generator: A CUDA generator that the function draws from: each replay draws anew.
         warm_up: Run first, on the stream that is captured: loads kernels, allocates workspaces.
+        alone: The function draws from the generator alone, and other threads may draw from torch's
+            own one meanwhile; a draw from that within the function is an error.
 
     Returns:
         What was recorded, to be replayed on any stream.
@@ -167,15 +286,19 @@ def capture(
     Raises:
         Exception: Whatever the function raises; the device can be used as before.
     """
-    with torch.cuda.device(device):
+    with recording_lock, torch.cuda.device(device), plain_tensors():
         stream = _capture_stream(torch.cuda.current_device())
+        if Captured.abandoned >= ABANDONED_POOLS:
+            # Torch keeps the memory of pools whose graphs are gone, and uses it for nothing else.
+            Captured.abandoned = 0
+            torch.cuda.empty_cache()
         if warm_up is not None:
             prepare_capture(warm_up, device)
         with contextlib.suppress(torch.OutOfMemoryError):
-            return _recorded(function, stream, Captured(pool, generator))
+            return _recorded(function, stream, Captured(pool, generator, alone=alone))
         # Only here: the error that is gone by now held the memory of the first attempt.
         torch.cuda.empty_cache()
-        return _recorded(function, stream, Captured(pool, generator))
+        return _recorded(function, stream, Captured(pool, generator, alone=alone))
 
 
 def _recorded(
@@ -211,6 +334,17 @@ def _record(function: Callable[[], object], captured: Captured) -> None:
     finally:
         _capturing.reset(before)
     captured.end()
+
+
+def may_be_disturbed(attempts: int) -> bool:
+    """Return whether a capture that failed is worth another attempt.
+
+    A thread that waits for the whole device (`torch.cuda.synchronize`) ends all captures.
+
+    Args:
+        attempts: Attempts so far.
+    """
+    return threading.active_count() > 1 and attempts < CAPTURE_ATTEMPTS
 
 
 class WeakFunction:
@@ -252,8 +386,8 @@ class Replayed:
         function: Reads and writes the same tensors in every call, and never waits for the device. A
             method's object has to be kept by others (`WeakFunction`).
         device: Where these are.
-        generator: A generator on the device that the function draws from; the numbers are the same
-            whether it is captured or not.
+        generator: The generator on the device that the function draws from, if any; the numbers
+            are the same whether it is captured or not.
         recorded: False: run it as it is on CUDA too.
         pool: Memory (`torch.cuda.graph_pool_handle()`) to share with functions that never run at
             the same time, and of whose work nothing is needed that lies there; None: its own.
@@ -271,14 +405,15 @@ class Replayed:
         self._function = WeakFunction(function)
         self._device = device
         self._generator = generator
-        self._recorded = recorded and device.type == "cuda"
+        self._recorded = recorded and device.type == "cuda" and can_capture()
         self._pool = pool
         self._warm = False
         self._graph: Captured | None = None
+        self._attempts = 0
 
     def __getstate__(self) -> dict[str, Any]:
         """Leave out the graph, which cannot be pickled: it is captured anew."""
-        return self.__dict__ | {"_warm": False, "_graph": None}
+        return self.__dict__ | {"_warm": False, "_graph": None, "_attempts": 0}
 
     def __call__(self) -> None:
         """Run the function.
@@ -292,9 +427,16 @@ class Replayed:
             self._warm = True
             return
         if self._graph is None:
-            self._graph = capture(
-                function, self._device, pool=self._pool, generator=self._generator
-            )
+            self._attempts += 1
+            try:
+                self._graph = capture(
+                    function, self._device, pool=self._pool, generator=self._generator, alone=True
+                )
+            except RuntimeError:
+                if not may_be_disturbed(self._attempts):
+                    raise
+                function()
+                return
         self._graph.replay()
 
 

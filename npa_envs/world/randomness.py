@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import enum
 import math
+import threading
 from collections.abc import Sequence
 from typing import Any
 
@@ -270,6 +271,30 @@ def torch_generator(generator: Randomness | None, device: torch.device) -> torch
         return torch.cuda.default_generators[device.index]
     assert isinstance(generator, torch.Generator)
     return generator
+
+
+_reserving = threading.Lock()
+"""Held while a generator's place is read and moved on: threads may share one."""
+
+
+def reserve_draws(source: torch.Generator, count: int) -> int:
+    """Move a CUDA generator on by what is to be drawn, and return where it stood.
+
+    Args:
+        source: The generator.
+        count: How far, as torch counts it (`get_offset`).
+    """
+    with _reserving:
+        begin = source.get_offset()
+        source.set_offset(begin + count)
+    return begin
+
+
+def give_back_draws(source: torch.Generator, begin: int, count: int) -> None:
+    """Undo `reserve_draws`, unless somebody has drawn since."""
+    with _reserving:
+        if source.get_offset() == begin + count:
+            source.set_offset(begin)
 
 
 def check_generator(generator: Randomness | None, device: torch.device, world_count: int) -> None:

@@ -19,7 +19,6 @@ import copy
 import functools
 import itertools
 import logging
-import threading
 import weakref
 from collections.abc import Callable, Hashable, Sequence
 from typing import Any, Generic, Literal, NamedTuple, Protocol, Self, TypeVar
@@ -31,9 +30,25 @@ from npa_envs.checks import FiniteCheck, check_finite_positions
 from npa_envs.errors import NPAError, shown
 from npa_envs.ops.opaque import once_differentiable
 from npa_envs.rule.rule import NPARule
-from npa_envs.world.cuda_graph import Captured, capture, current_stream, prepare_capture
+from npa_envs.world.cuda_graph import (
+    Captured,
+    can_capture,
+    capture,
+    current_stream,
+    may_be_disturbed,
+    plain_tensors,
+    prepare_capture,
+    recording_lock,
+)
 from npa_envs.world.divergence import DivergenceWatch
-from npa_envs.world.randomness import Randomness, WorldRandom, torch_generator
+from npa_envs.world.own_rules import rule_settings, rule_tensors
+from npa_envs.world.randomness import (
+    Randomness,
+    WorldRandom,
+    give_back_draws,
+    reserve_draws,
+    torch_generator,
+)
 
 CudaGraph = bool | Literal["auto"]
 """Whether rollouts record themselves on CUDA: "auto" records plain rules."""
@@ -137,6 +152,9 @@ def run_call(
         if recorded is not None:
             return recorded
     check_finite_positions(x)
+    if x.is_cuda and torch.is_grad_enabled():
+        # Gradients are added up as a recording adds them: first those of this rollout.
+        x, s = x.view_as(x), s.view_as(s)
     return call.run(rules, Worlds(x, s, x.new_zeros(x.shape[:2])), generator, watch)
 
 
@@ -159,7 +177,7 @@ def _can_record(call: Call, x: Tensor) -> bool:
     # Asked in this order: a compiler cannot trace what a stream does.
     if not x.is_cuda or torch.compiler.is_compiling() or call.steps == 0:
         return False
-    return not torch.cuda.is_current_stream_capturing()
+    return can_capture() and not torch.cuda.is_current_stream_capturing()
 
 
 def _hooked() -> bool:
@@ -178,8 +196,23 @@ def rule_form(rule: NPARule) -> Hashable:
 def _form(rule: NPARule, plain: bool) -> tuple[Hashable, list[Tensor]]:
     """Return what a recording depends on of a rule besides its weights, and what these are."""
     if not plain:
-        return weakref.ref(rule), [*rule.parameters(), *rule.buffers()]
-    return rule_form(rule), rule.network_weights()
+        device = rule.hidden.weight.device
+        settings = tuple(rule_settings(rule, device).items())
+        deterministic = torch.are_deterministic_algorithms_enabled()
+        return (weakref.ref(rule), settings, deterministic), rule_tensors(rule, device)
+    weights = rule.network_weights()
+    return (rule_form(rule), *[_memory_form(weight) for weight in weights]), weights
+
+
+def _memory_form(tensor: Tensor) -> Hashable:
+    return tensor.shape, tensor.dtype, tensor.device
+
+
+def _matmul_precision() -> str:
+    """Return how torch multiplies matrices of float32 on CUDA, in whichever way that was chosen."""
+    # Torch's own getter of old refuses a choice that was made in the new way.
+    precision: str = torch.backends.cuda.matmul.fp32_precision
+    return precision
 
 
 def _twin(rule: NPARule, like: Tensor) -> NPARule:
@@ -190,7 +223,14 @@ def _twin(rule: NPARule, like: Tensor) -> NPARule:
     # Without drawing first weights.
     with torch.device("meta"):
         twin = NPARule(**form)
-    return twin.to(like.dtype).to_empty(device=like.device)
+    twin = twin.to(like.dtype).to_empty(device=like.device)
+    forms = [list(map(_memory_form, each.network_weights())) for each in (rule, twin)]
+    if forms[0] != forms[1]:
+        raise NPAError(
+            f"a rule's weights must have the shapes of its sizes, {forms[1]}, got {forms[0]}: make "
+            "the rule anew with NPARule(...)"
+        )
+    return twin
 
 
 FreeT = TypeVar("FreeT")
@@ -239,6 +279,8 @@ class _RecordedKind(CallKind["_Recording"]):
 
     def __init__(self) -> None:
         super().__init__()
+        self.failures = 0
+        """Recordings that failed."""
         self.refused = False
         """One of them could not be recorded."""
         self.recordings: list[_Recording] = []
@@ -249,11 +291,14 @@ class _Lease:
 
     def __init__(self, recording: _Recording, kind: _RecordedKind) -> None:
         self.recording = recording
-        self._free = kind.free
+        self._kind = kind
+        self.spoilt = False
+        """The recording is not to be used again."""
 
     def __del__(self) -> None:
-        # Appending to a deque needs no lock: any thread may drop the last reference.
-        self._free.append(self.recording)
+        if not (self.spoilt or self._kind.refused):
+            # Appending to a deque needs no lock: any thread may drop the last reference.
+            self._kind.free.append(self.recording)
 
 
 class _Graphs(NamedTuple):
@@ -263,6 +308,8 @@ class _Graphs(NamedTuple):
     backward: Captured | None
     gradients: list[Tensor]
     """Where its backward pass leaves gradients, of those inputs that have one."""
+    written: list[int]
+    """Inputs that the network itself may change, such as running means."""
 
 
 class _Recording:
@@ -289,6 +336,7 @@ class _Recording:
         """When the worlds to begin with are there."""
         self._call = call
         self._rules = [_twin(rule, x) for rule in rules]
+        self._own = [rule for rule in self._rules if not rule.has_network()]
         weights = [weight for rule in self._rules for weight in _form(rule, rule.has_network())[1]]
         own = [
             torch.empty(value.shape, dtype=value.dtype, device=value.device)
@@ -308,6 +356,10 @@ class _Recording:
         self._bars: dict[int | None, list[Tensor]] = {}
         """Cotangents of the worlds that are kept, by their number."""
         self._graphs: collections.OrderedDict[int, _Graphs] = collections.OrderedDict()
+        self.compared: set[int] = set()
+        """Numbers of steps whose replay has given what a launched rollout gives."""
+        self._draws_a_step = 0
+        """How far a step moves a generator on."""
         self._pool = torch.cuda.graph_pool_handle()
         self._stream: torch.cuda.Stream | None = None
         self.token = torch.empty(0, device=self.device)
@@ -333,9 +385,16 @@ class _Recording:
             # What earlier, launched calls have left in the allocator's cache makes room.
             torch.cuda.synchronize(self.device)
             torch.cuda.empty_cache()
+            self._generator.set_offset(0)
+            shared = torch_generator(None, self.device)
+            place = shared.get_offset()
             prepare_capture(functools.partial(self._warm_up, first), self.device)
+            self._draws_a_step = self._generator.get_offset() // first.steps
+            if self._own:
+                # What their networks have drawn was for nobody.
+                shared.set_offset(place)
         elif len(self._graphs) >= MOST_GRAPHS:
-            self._graphs.popitem(last=False)
+            self.compared.discard(self._graphs.popitem(last=False)[0])
         call = self._call._replace(steps=steps)
         before = _reserved(self.device)
         results: list[Tensor] = []
@@ -350,15 +409,58 @@ class _Recording:
             gradients[:] = self._pull_back(results, self._bars_of(steps))
 
         draws = None if self._streams is not None else self._generator
-        forward_graph = capture(forward, self.device, pool=self._pool, generator=draws)
+        begin, versions = self._settings(), self._versions()
+        forward_graph = capture(forward, self.device, pool=self._pool, generator=draws, alone=True)
+        own = {id(tensor) for rule in self._own for tensor in rule_tensors(rule, self.device)}
+        # Not every operator says that it writes to buffers.
+        written = [
+            k
+            for k, (tensor, version) in enumerate(zip(self._inputs, versions, strict=True))
+            if tensor._version != version
+            or (id(tensor) in own and not isinstance(tensor, torch.nn.Parameter))
+        ]
+        versions = self._versions()
         backward_graph = None
         if self.differentiable:
             self._bars_of(steps)
-            backward_graph = capture(backward, self.device, pool=self._pool)
+            backward_graph = capture(backward, self.device, pool=self._pool, alone=True)
+        self._check_settings(begin)
+        if versions != self._versions():
+            raise NPAError("a rule's tensors must not change in its backward pass, but one does")
         self._graphs[steps] = _Graphs(
-            forward_graph, _places(results), backward_graph, _places(gradients)
+            forward_graph, _places(results), backward_graph, _places(gradients), written
         )
         self.bytes += max(_reserved(self.device) - before, 0)
+
+    def _settings(self) -> dict[tuple[int, str], Hashable]:
+        """Return what rules with a network of their own depend on besides their inputs."""
+        settings: dict[tuple[int, str], Hashable] = {}
+        for number, rule in enumerate(self._own):
+            for name, setting in rule_settings(rule, self.device).items():
+                settings[number, name] = setting
+            for tensor in rule_tensors(rule, self.device):
+                settings[id(tensor), "tensors"] = None
+        return settings
+
+    def _check_settings(self, begin: dict[tuple[int, str], Hashable]) -> None:
+        """Check that nothing but inputs has changed.
+
+        Raises:
+            NPAError: Something has.
+        """
+        now = self._settings()
+        changed = {key[1] for key in begin.keys() | now.keys() if begin.get(key) != now.get(key)}
+        # Of tensors their presence alone is noted.
+        changed |= {key[1] for key in begin.keys() ^ now.keys()}
+        if changed:
+            raise NPAError(
+                "forward must not change a rule's attributes, but for the numbers of its tensors, "
+                f"got other {', '.join(sorted(changed))}"
+            )
+
+    def _versions(self) -> list[int]:
+        """Return what changes with each write to an input."""
+        return [tensor._version for tensor in self._inputs]
 
     def _bars_of(self, steps: int) -> list[Tensor]:
         """Return cotangents of the worlds that so many steps keep, the same ones for each count."""
@@ -412,7 +514,7 @@ class _Recording:
         with self._placed():
             self._take_turns()
             torch._foreach_copy_(self._inputs, list(tensors))
-            self._load_draws(generator)
+            self._load_draws(generator, steps)
             graphs = self._graphs[steps]
             self._graphs.move_to_end(steps)
             graphs.forward.replay()
@@ -444,21 +546,36 @@ class _Recording:
             self._stream.synchronize()
 
     def end_draws(self, generator: Randomness | None, steps: int) -> None:
-        """Let the caller's source of draws go on where the rollout's ended."""
+        """Let the caller's streams of draws go on where the rollout's ended."""
         if self._streams is not None:
             assert isinstance(generator, WorldRandom)
             generator.follow(self._streams, steps)
-        else:
-            torch_generator(generator, self.device).set_offset(self._generator.get_offset())
 
-    def _load_draws(self, generator: Randomness | None) -> None:
+    def leave_draws(self, generator: Randomness | None, steps: int) -> None:
+        """Let the caller's source of draws go on where the rollout began."""
+        if self._streams is None:
+            count = steps * self._draws_a_step
+            source = torch_generator(generator, self.device)
+            give_back_draws(source, self._generator.get_offset() - count, count)
+
+    def _load_draws(self, generator: Randomness | None, steps: int) -> None:
         if self._streams is not None:
             assert isinstance(generator, WorldRandom)
             self._streams.put(slice(None), generator)
         else:
             source = torch_generator(generator, self.device)
             self._generator.manual_seed(source.initial_seed())
-            self._generator.set_offset(source.get_offset())
+            begin = reserve_draws(source, steps * self._draws_a_step)
+            self._generator.set_offset(begin)
+
+    def write_back(self, steps: int, tensors: Sequence[Tensor]) -> None:
+        """Write what the network has changed to the caller's tensors."""
+        written = self._graphs[steps].written
+        if written:
+            with torch.no_grad():
+                torch._foreach_copy_(
+                    [tensors[k] for k in written], [self._inputs[k] for k in written]
+                )
 
     def _placed(self) -> contextlib.AbstractContextManager[object]:
         """Return a context in which this device is the current one."""
@@ -505,8 +622,8 @@ def _reserved(device: torch.device) -> int:
 _kinds: collections.OrderedDict[Hashable, _RecordedKind] = collections.OrderedDict()
 """Kinds of calls so far, the least recently used first."""
 
-_lock = threading.RLock()
-"""Held while the above changes; graphs share one stream to be recorded on."""
+_lock = recording_lock
+"""Held while the above changes: with another lock, two threads could wait for each other."""
 
 
 def _count(key: Hashable) -> _RecordedKind:
@@ -541,7 +658,7 @@ def _run_recorded(
         asked: The caller asks for a recording.
     """
     plain = [rule.has_network() for rule in rules]
-    if not (asked or all(plain)):
+    if not all(plain) and (not asked or torch.is_autocast_enabled(x.device.type)):
         return None
     forms, weights = zip(*map(_form, rules, plain), strict=True)
     tensors = [x, s, *itertools.chain.from_iterable(weights)]
@@ -550,7 +667,7 @@ def _run_recorded(
         wanted = tuple(tensor.requires_grad for tensor in tensors)
         wanted = (*wanted[:2], False, *wanted[2:]) if any(wanted) else ()
     by_world = isinstance(generator, WorldRandom)
-    precision = torch.get_float32_matmul_precision()
+    precision = _matmul_precision()
     shape = (x.shape, s.shape[2], x.dtype, x.device)
     kind = _count((call._replace(steps=0), forms, shape, wanted, by_world, precision))
     if kind.refused or kind.calls <= (1 if asked else LAUNCHED_FIRST):
@@ -559,25 +676,100 @@ def _run_recorded(
         return None
     blocks = [call.steps] if wanted else _blocks(call)
     make = functools.partial(_Recording, call, rules, x, s, wanted, by_world)
-    lease = _lease(kind, set(blocks), make, tensors)
+    lease = _lease(kind, set(blocks), make, tensors, asked)
     if lease is None:
         return None
-    tensors.insert(2, lease.recording.no_path)
-    ready = lease.recording.ready
-    ready.record(current_stream(x.device))
+    if not all(plain) and not lease.recording.compared.issuperset(blocks):
+        return _compared(call, rules, kind, lease, blocks, tensors, generator)
+    return _replay_blocks(call, lease, blocks, tensors, generator)
+
+
+def _replay_blocks(
+    call: Call,
+    lease: _Lease,
+    blocks: Sequence[int],
+    tensors: Sequence[Tensor],
+    generator: Randomness | None,
+) -> Worlds:
+    """Replay the graphs of a rollout one after the other; what the network writes is written.
+
+    Raises:
+        NPAError: A position is not finite.
+    """
+    x, s, *weights = tensors
+    recording = lease.recording
+    given = [x, s, recording.no_path, *weights]
+    recording.ready.record(current_stream(x.device))
     found: list[Worlds] = []
     for steps in blocks:
-        after = _replay(lease, steps, tensors, generator)
+        after = _replay(lease, steps, given, generator)
         if not found:
             # Only now, when the device has work: this takes the host as long as the rest.
-            FiniteCheck(x, ready).wait()
-        lease.recording.end_draws(generator, steps)
+            try:
+                FiniteCheck(x, recording.ready).wait()
+            except NPAError:
+                recording.leave_draws(generator, steps)
+                raise
+        recording.end_draws(generator, steps)
+        recording.write_back(steps, given)
         found.append(after)
         last = after if call.keep_every is None else Worlds(*(value[-1] for value in after))
-        tensors[:3] = last
+        given[:3] = last
     if len(found) == 1:
         return found[0]
     return last if call.keep_every is None else Worlds(*map(torch.cat, zip(*found, strict=True)))
+
+
+def _compared(
+    call: Call,
+    rules: Sequence[NPARule],
+    kind: _Kind,
+    lease: _Lease,
+    blocks: Sequence[int],
+    tensors: Sequence[Tensor],
+    generator: Randomness | None,
+) -> Worlds:
+    """Launch a rollout, and compare it with its replay: Python code may read what nobody sees.
+
+    Calls of a kind whose replay gives other numbers are launched from then on.
+    """
+    x, s, *weights = tensors
+    check_finite_positions(x)
+    with torch.no_grad():
+        own = [weight.clone() for weight in weights]
+    source: Randomness
+    if isinstance(generator, WorldRandom):
+        source = generator.take(slice(None))
+    else:
+        # Other threads may draw from a shared one meanwhile: then nothing is recorded.
+        shared = torch_generator(generator, x.device)
+        source = torch.Generator(x.device).manual_seed(shared.initial_seed())
+        source.set_offset(shared.get_offset())
+    worlds = Worlds(x.view_as(x), s.view_as(s), x.new_zeros(x.shape[:2]))
+    launched = call.run(rules, worlds, generator)
+    with torch.no_grad():
+        replayed = _replay_blocks(call, lease, blocks, [x, s, *own], source)
+        pairs = zip((*launched, *weights), (*replayed, *own), strict=True)
+        same = all(bool(_same(*pair)) for pair in pairs)
+    if same:
+        lease.recording.compared.update(blocks)
+    else:
+        _refuse(kind, "a replay gives other numbers than forward, run by Python", asked=True)
+    return launched
+
+
+def _same(one: Tensor, other: Tensor) -> Tensor:
+    return ((one == other) | (one.isnan() & other.isnan())).all()
+
+
+def _refuse(kind: _Kind, reason: object, *, asked: bool) -> None:
+    """Launch all calls of a kind from now on."""
+    level = logging.WARNING if asked else logging.DEBUG
+    logger.log(level, "rollouts of this kind are launched, not recorded: %s", reason)
+    with _lock:
+        kind.refused = True
+        kind.recordings.clear()
+        kind.free.clear()
 
 
 def _blocks(call: Call) -> list[int]:
@@ -589,7 +781,11 @@ def _blocks(call: Call) -> list[int]:
 
 
 def _lease(
-    kind: _RecordedKind, steps: set[int], make: Callable[[], _Recording], tensors: Sequence[Tensor]
+    kind: _RecordedKind,
+    steps: set[int],
+    make: Callable[[], _Recording],
+    tensors: Sequence[Tensor],
+    asked: bool,
 ) -> _Lease | None:
     """Return a recording that holds these numbers of steps; None where there can be none."""
     x, s, *weights = tensors
@@ -600,7 +796,8 @@ def _lease(
             lease = _Lease(kind.free.pop(), kind)
         try:
             if lease is None:
-                recording = make()
+                with plain_tensors():
+                    recording = make()
                 kind.recordings.append(recording)
                 lease = _Lease(recording, kind)
             recording = lease.recording
@@ -610,15 +807,19 @@ def _lease(
                         "a rollout is launched: recordings have taken their share of memory"
                     )
                     return None
-                recording.record(missing, [x, s, recording.no_path, *weights])
+                # Whoever comes next may be in other modes.
+                with plain_tensors(), torch.autocast("cuda", enabled=False):
+                    recording.record(missing, [x, s, recording.no_path, *weights])
         except Exception as error:
+            kind.failures += 1
+            if lease is not None and may_be_disturbed(kind.failures):
+                lease.spoilt = True
+                kind.recordings.remove(lease.recording)
+                return None
+            drew = "CUDA generator" in str(error)
+            reason = "forward draws from torch's own generator, as dropout does" if drew else error
             # A launched rollout says what is wrong if that cannot run either.
-            logger.debug("rollouts of this kind are launched, not recorded: %s", error)
-            kind.refused = True
-            # It would return to the list of the free ones.
-            lease = None
-            kind.recordings.clear()
-            kind.free.clear()
+            _refuse(kind, reason, asked=asked)
             return None
         return lease
 

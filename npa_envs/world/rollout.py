@@ -29,6 +29,7 @@ from npa_envs.ops.static import StaticWorlds, prepare_static
 from npa_envs.ops.update import wrapped
 from npa_envs.rule.network import Network
 from npa_envs.rule.rule import NPARule, check_rule
+from npa_envs.world.cuda_graph import draws_alone
 from npa_envs.world.divergence import DivergenceWatch, OnDivergence, make_watch
 from npa_envs.world.division import living
 from npa_envs.world.prepared import PreparedSteps, may_prepare, run_prepared
@@ -186,6 +187,9 @@ def run_steps(
     # While a graph is recorded, torch's state cannot be read, and its draws are the graph's.
     recorded = worlds.x.is_cuda and torch.cuda.is_current_stream_capturing()
     redraw = with_modules and not recorded
+    if with_modules and recorded and not draws_alone():
+        # Recomputed, a module that draws would draw otherwise.
+        interval = 1
     again = None
     # What a compiler has taken reads copies.
     if interval > 1 and not torch.compiler.is_compiling():

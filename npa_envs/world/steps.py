@@ -27,6 +27,7 @@ from npa_envs.world.randomness import (
     Randomness,
     WorldRandom,
     normal_draws,
+    reserve_draws,
     torch_generator,
     uniform_draws,
 )
@@ -181,11 +182,9 @@ def leave_out_draws(
         draw_step(x, options, generator)
     elif x.is_cuda:
         # On CUDA torch counts what it has drawn, and equal draws count the same.
-        source = torch_generator(generator, x.device)
-        before = source.get_offset()
-        draw_step(x, options, generator)
-        after = source.get_offset()
-        source.set_offset(after + (steps - 1) * (after - before))
+        counter = torch.Generator(x.device)
+        draw_step(x, options, counter)
+        reserve_draws(torch_generator(generator, x.device), steps * counter.get_offset())
     else:
         for _ in range(steps):
             draw_step(x, options, generator)

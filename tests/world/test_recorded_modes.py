@@ -1,0 +1,244 @@
+"""Recorded rollouts among torch's modes, other threads and other work on the device."""
+
+import os
+import subprocess
+import sys
+import threading
+
+import pytest
+import torch
+from test_recorded import DEVICE, is_recorded, make_rule, run, same, worlds
+
+import npa_envs
+from npa_envs.ops import launch
+from npa_envs.world import recorded
+from npa_envs.world.cuda_graph import capture, plain_tensors
+from npa_envs.world.randomness import give_back_draws, reserve_draws
+
+pytestmark = pytest.mark.gpu
+
+
+@pytest.fixture(autouse=True)
+def _nothing_recorded():
+    recorded.release_recordings()
+    yield
+    recorded.release_recordings()
+
+
+def together(*works):
+    """Run works in threads of their own, and raise their first error."""
+    errors = []
+
+    def guarded(work):
+        try:
+            work()
+        except BaseException as error:
+            errors.append(error)
+
+    threads = [threading.Thread(target=guarded, args=(work,)) for work in works]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    if errors:
+        raise errors[0]
+
+
+@pytest.mark.parametrize("by_world", [False, True])
+def test_what_is_recorded_in_inference_mode_serves_other_calls(by_world):
+    rule = make_rule()
+    x, s = worlds()
+    expected = run(rule, x, s, cuda_graph=False, gradients=False, by_world=by_world)
+    for mode in (torch.inference_mode, torch.no_grad, torch.inference_mode):
+        for _ in range(4):
+            with mode():
+                generator = torch.Generator(DEVICE).manual_seed(0)
+                if by_world:
+                    generator = npa_envs.WorldRandom([0, 1, 2], device=DEVICE)
+                found = npa_envs.rollout(rule, x, s, 7, generator=generator)
+            same(list(found), expected[:2])
+    assert is_recorded()
+
+
+def test_threads_that_share_a_generator_draw_different_numbers():
+    rule = make_rule()
+    x, s = worlds()
+    with torch.no_grad():
+        for _ in range(4):
+            npa_envs.rollout(rule, x, s, 20)
+    found = []
+    start = threading.Barrier(4)
+
+    def work():
+        with torch.no_grad():
+            for _ in range(20):
+                start.wait()
+                found.append(npa_envs.rollout(rule, x, s, 20)[1])
+
+    together(*[work] * 4)
+    sums = {float(states.double().sum()) for states in found}
+    assert len(sums) == len(found) == 80
+
+
+def test_draws_are_reserved_and_given_back():
+    generator = torch.Generator(DEVICE).manual_seed(0)
+    begin = reserve_draws(generator, 8)
+    assert (begin, generator.get_offset()) == (0, 8)
+    give_back_draws(generator, begin, 8)
+    assert generator.get_offset() == 0
+    reserve_draws(generator, 8)
+    reserve_draws(generator, 4)
+    give_back_draws(generator, 0, 8)
+    assert generator.get_offset() == 12
+
+
+def test_with_cuda_as_default_device():
+    rule = make_rule()
+    x, s = worlds()
+    expected = [run(rule, x, s, seed=k, cuda_graph=False) for k in range(4)]
+    torch.set_default_device(DEVICE)
+    try:
+        for k in range(4):
+            same(run(rule, x, s, seed=k, cuda_graph="auto"), expected[k])
+        npa_envs.perceive(x, s, 0.3)
+    finally:
+        torch.set_default_device(None)
+    assert is_recorded()
+
+
+def test_plain_tensors_are_made_on_the_cpu_and_can_be_written_to():
+    torch.set_default_device(DEVICE)
+    try:
+        with torch.inference_mode(), plain_tensors():
+            made = torch.zeros(2)
+    finally:
+        torch.set_default_device(None)
+    assert made.device.type == "cpu"
+    made.add_(1)
+
+
+def test_matrix_precision_chosen_in_the_new_way():
+    rule = make_rule()
+    x, s = worlds()
+    before = torch.backends.cuda.matmul.fp32_precision
+    for precision in ("ieee", "tf32"):
+        torch.backends.cuda.matmul.fp32_precision = precision
+        try:
+            for call in range(4):
+                expected = run(rule, x, s, seed=call, cuda_graph=False)
+                same(run(rule, x, s, seed=call, cuda_graph="auto"), expected)
+        finally:
+            torch.backends.cuda.matmul.fp32_precision = before
+
+
+def test_others_draw_while_something_is_recorded():
+    numbers = torch.zeros(10, device=DEVICE)
+    drawn = []
+
+    def draw():
+        with torch.cuda.stream(torch.cuda.Stream()):
+            drawn.append(torch.randn(1000, device=DEVICE))
+
+    def function():
+        numbers.add_(1)
+        together(draw)
+
+    draw()
+    torch.cuda.manual_seed(0)
+    graph = capture(function, DEVICE, alone=True)
+    graph.replay()
+    draw()
+    torch.cuda.manual_seed(0)
+    draw()
+    draw()
+    assert torch.equal(drawn[1], drawn[3])
+    assert torch.equal(drawn[2], drawn[4])
+    assert numbers.tolist() == [1.0] * 10
+
+
+def test_what_draws_from_torchs_own_generator_is_not_recorded_alone():
+    with pytest.raises(RuntimeError, match="CUDA generator"):
+        capture(lambda: torch.randn(10, device=DEVICE), DEVICE, alone=True)
+    torch.randn(10, device=DEVICE)
+
+
+def test_two_rollouts_one_after_the_other_have_the_same_gradients():
+    """What is added up in another order is rounded otherwise."""
+    rule = make_rule()
+    for call in range(5):
+        x, s = worlds(seed=call)
+        found = []
+        for cuda_graph in (False, "auto"):
+            generator = torch.Generator(DEVICE).manual_seed(call)
+            middle = npa_envs.rollout(rule, x, s, 6, generator=generator, cuda_graph=cuda_graph)
+            last = npa_envs.rollout(rule, *middle, 6, generator=generator, cuda_graph=cuda_graph)
+            loss = (last[1] * middle[1]).sum()
+            found.append(torch.autograd.grad(loss, list(rule.parameters())))
+        same(*found)
+
+
+def test_launches_keep_none_of_their_tensors():
+    rule = make_rule()
+    x, s = worlds(count=8, particles=20_000)
+    torch.cuda.synchronize()
+    before = torch.cuda.memory_allocated()
+    # As in a process that launches these kernels for the first time.
+    launch._ready.by_kernel.clear()
+    with torch.no_grad():
+        npa_envs.rollout(rule, x, s, 3, eps=0.01, cuda_graph=False)
+    torch.cuda.synchronize()
+    assert torch.cuda.memory_allocated() <= before + 2**20
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("PYTORCH_CUDA_ALLOC_CONF", "backend:cudaMallocAsync"),
+        ("PYTORCH_CUDA_ALLOC_CONF", "expandable_segments:True"),
+        ("PYTORCH_NO_CUDA_MEMORY_CACHING", "1"),
+    ],
+)
+def test_other_ways_to_take_memory(name, value):
+    code = """
+import gymnasium, torch, npa_envs
+rule = npa_envs.NPARule(2, 8, 32, eps0=0.3).cuda()
+x, s = torch.rand(2, 60, 2, device="cuda"), torch.rand(2, 60, 8, device="cuda")
+for _ in range(4):
+    npa_envs.rollout(rule, x, s, 5)[1].sum().backward()
+envs = gymnasium.make_vec(
+    "npa/Morphogenesis2D-v0", num_envs=2, vectorization_mode="vector_entry_point",
+    particle_count=60, eps=0.3, device="cuda", output="torch",
+)
+envs.reset(seed=0)
+for _ in range(4):
+    envs.step(torch.zeros(envs.action_space.shape))
+"""
+    done = subprocess.run(
+        [sys.executable, "-c", code],
+        env=os.environ | {name: value},
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr[-2000:]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("gradients", [False, True])
+def test_compiled_with_graphs_of_its_own(gradients):
+    rule = make_rule()
+
+    def function(x, s):
+        after = npa_envs.rollout(rule, x, s, 3, update_prob=1.0)
+        return after[1].square().sum() + npa_envs.perceive(*after, 0.3).sum()
+
+    compiled = torch.compile(function, mode="reduce-overhead")
+    for call in range(4):
+        x, s = worlds(seed=call)
+        torch.compiler.cudagraph_mark_step_begin()
+        with torch.set_grad_enabled(gradients):
+            found = compiled(x, s)
+            assert torch.allclose(found, function(x, s), rtol=1e-4)
+            if gradients:
+                torch.autograd.grad(found, rule.hidden.weight)

@@ -1,0 +1,265 @@
+"""Recorded rules with a network of their own: changes are followed, or they are launched."""
+
+import pytest
+import torch
+from test_recorded import DEVICE, EPS, is_recorded, make_rule, run, same, worlds
+from torch import nn
+
+import npa_envs
+from npa_envs.world import recorded
+from npa_envs.world.own_rules import rule_settings, rule_tensors
+
+CPU = torch.device("cpu")
+
+
+@pytest.fixture(autouse=True)
+def _nothing_recorded():
+    if torch.cuda.is_available():
+        recorded.release_recordings()
+    yield
+    if torch.cuda.is_available():
+        recorded.release_recordings()
+
+
+class Scaled(npa_envs.NPARule):
+    """A rule that reads all kinds of attributes."""
+
+    def __init__(self, *args, **options):
+        super().__init__(*args, **options)
+        self.register_buffer("shift", torch.zeros(1))
+        self.factor = torch.ones(1)
+        self.number = 2.0
+        self.listed = [1, {"word": None}]
+
+    def forward(self, perception):
+        return self.number * self.factor * super().forward(perception) + self.shift
+
+
+class Dropping(npa_envs.NPARule):
+    """Changes of states are linear in `gain`: the gradient is the change over the gain."""
+
+    def __init__(self, *args, **options):
+        super().__init__(*args, **options)
+        self.gain = nn.Parameter(torch.ones(()))
+
+    def forward(self, perception):
+        ones = torch.ones(len(perception), self.state_dim, device=perception.device)
+        changes = nn.functional.dropout(ones, 0.5, self.training)
+        return self.gain * torch.cat((torch.zeros_like(perception[:, :2]), changes), dim=1)
+
+
+class Normed(npa_envs.NPARule):
+    def __init__(self, *args, **options):
+        super().__init__(*args, **options)
+        self.norm = nn.BatchNorm1d(self.perception_dim)
+
+    def forward(self, perception):
+        return super().forward(self.norm(perception))
+
+
+class Counting(npa_envs.NPARule):
+    count = 0
+
+    def forward(self, perception):
+        self.count += 1
+        return super().forward(perception) * (1.0 + 0.1 * self.count)
+
+
+class Watching(npa_envs.NPARule):
+    """Reads what nobody sees."""
+
+    seen = 0
+
+    def forward(self, perception):
+        Watching.seen += 1
+        return super().forward(perception) * (1.0 + 0.1 * Watching.seen)
+
+
+def of_type(kind, **options):
+    torch.manual_seed(0)
+    rule = kind(2, 8, 32, eps0=EPS, **options)
+    for parameter in rule.parameters():
+        nn.init.normal_(parameter, std=0.1)
+    rule = rule.to(DEVICE)
+    if kind is Scaled:
+        rule.factor = rule.factor.to(DEVICE)
+    return rule
+
+
+def as_launched(rule, calls=3, **options):
+    """Check that calls that may be recorded give what launched ones give."""
+    for call in range(calls):
+        x, s = worlds(seed=call)
+        expected = run(rule, x, s, seed=call, cuda_graph=False, **options)
+        same(run(rule, x, s, seed=call, cuda_graph=True, **options), expected)
+
+
+CHANGES = {
+    "a number": lambda rule: setattr(rule, "number", 3.0),
+    "a list": lambda rule: rule.listed.append(1),
+    "a dictionary in a list": lambda rule: rule.listed[1].update(word=1),
+    "a hook": lambda rule: rule.hidden.register_forward_hook(lambda _, __, output: 2.0 * output),
+    "a mode": lambda rule: rule.eval(),
+    "a module": lambda rule: setattr(rule, "output", nn.Linear(32, 10)),
+}
+
+
+@pytest.mark.parametrize("change", CHANGES)
+def test_what_a_network_depends_on_is_seen(change):
+    rule = Scaled(2, 8, 32, eps0=EPS)
+    before = rule_settings(rule, CPU)
+    assert rule_settings(rule, CPU) == before
+    CHANGES[change](rule)
+    assert rule_settings(rule, CPU) != before
+
+
+def test_tensors_of_a_rule_are_its_parameters_buffers_and_attributes():
+    rule = Scaled(2, 8, 32, eps0=EPS)
+    rule.same = rule.factor
+    found = rule_tensors(rule, CPU)
+    wanted = [rule.hidden.weight, rule.hidden.bias, rule.output.weight, rule.shift, rule.factor]
+    assert {id(tensor) for tensor in found} == {id(tensor) for tensor in wanted}
+    assert len(found) == len(wanted)
+
+
+@pytest.mark.gpu
+@pytest.mark.parametrize("change", [name for name in CHANGES if name != "a module"])
+def test_a_changed_rule_is_recorded_anew(change):
+    rule = of_type(Scaled)
+    as_launched(rule)
+    assert is_recorded()
+    CHANGES[change](rule)
+    as_launched(rule)
+
+
+@pytest.mark.gpu
+def test_tensors_that_change_in_place_are_read_anew():
+    rule = of_type(Scaled)
+    as_launched(rule)
+    rule.factor.fill_(3.0)
+    rule.shift.data.fill_(0.1)
+    as_launched(rule)
+    assert is_recorded()
+
+
+@pytest.mark.gpu
+@pytest.mark.parametrize("kind", [Scaled, npa_envs.NPARule])
+def test_layers_of_another_size_are_no_error(kind):
+    rule = of_type(kind)
+    as_launched(rule)
+    rule.hidden = nn.Linear(rule.hidden.in_features, 64).to(DEVICE)
+    rule.output = nn.Linear(64, rule.output.out_features, bias=False).to(DEVICE)
+    as_launched(rule)
+
+
+@pytest.mark.gpu
+@pytest.mark.parametrize("memory", ["store", "recompute", "minimal"])
+def test_gradients_are_those_of_what_was_dropped(memory, caplog):
+    rule = of_type(Dropping)
+    x, s = worlds()
+    drawn = []
+    for _ in range(4):
+        with torch.no_grad():
+            rule.gain.fill_(1.0)
+        after = npa_envs.rollout(rule, x, s, 6, memory=memory, cuda_graph=True)[1]
+        change = (after - s).double().sum()
+        (gradient,) = torch.autograd.grad(change, rule.gain)
+        assert float(gradient) == pytest.approx(float(change), rel=1e-4)
+        drawn.append(after.detach())
+    assert not torch.equal(drawn[2], drawn[3])
+    assert "forward draws from torch's own generator" in caplog.text
+
+
+@pytest.mark.gpu
+def test_gradients_are_those_of_what_was_dropped_within_a_graph_of_the_caller():
+    rule = of_type(Dropping)
+    with torch.no_grad():
+        rule.gain.fill_(1.0)
+    x, s = worlds()
+
+    def gradient():
+        after = npa_envs.rollout(rule, x, s, 6, memory="minimal")[1]
+        change = (after - s).double().sum()
+        return change.detach(), torch.autograd.grad(change, rule.gain)[0]
+
+    stream = torch.cuda.Stream()
+    with torch.cuda.stream(stream):
+        gradient()
+    torch.cuda.synchronize()
+    graph = torch.cuda.CUDAGraph()
+    with torch.cuda.graph(graph):
+        change, found = gradient()
+    graph.replay()
+    assert float(found) == pytest.approx(float(change), rel=1e-4)
+
+
+@pytest.mark.gpu
+def test_eval_ends_dropout():
+    rule = of_type(Dropping)
+    as_launched(rule.eval(), gradients=False)
+    assert is_recorded()
+    x, s = worlds()
+    seen = [npa_envs.rollout(rule.train(), x, s, 6, cuda_graph=True)[1] for _ in range(3)]
+    assert not torch.equal(seen[1], seen[2])
+    as_launched(rule.eval(), gradients=False)
+
+
+@pytest.mark.gpu
+@pytest.mark.parametrize("gradients", [True, False])
+def test_running_statistics_go_on(gradients):
+    states = []
+    for cuda_graph in (False, True):
+        rule = of_type(Normed)
+        for call in range(5):
+            x, s = worlds(seed=call)
+            with torch.set_grad_enabled(gradients):
+                npa_envs.rollout(rule, x, s, 70, update_prob=1.0, cuda_graph=cuda_graph)
+        states.append([rule.norm.running_mean, rule.norm.running_var])
+        assert int(rule.norm.num_batches_tracked) == 350
+    same(*states)
+    assert is_recorded()
+
+
+@pytest.mark.gpu
+@pytest.mark.parametrize("kind", [Counting, Watching])
+def test_a_rule_that_counts_its_calls_is_launched(kind, caplog):
+    rule = of_type(kind)
+    x, s = worlds()
+    seen = []
+    for cuda_graph in (False, True):
+        rule.count = Watching.seen = 0
+        calls = []
+        for _ in range(4):
+            with torch.no_grad():
+                generator = torch.Generator(DEVICE).manual_seed(0)
+                calls += npa_envs.rollout(rule, x, s, 3, generator=generator, cuda_graph=cuda_graph)
+        seen.append(calls)
+    if kind is Counting:
+        same(*seen)
+        assert not is_recorded()
+    else:
+        # What records it calls it too, so that its count differs, and is not held.
+        assert not torch.equal(seen[1][-1], seen[1][-3])
+        assert "a replay gives other numbers" in caplog.text
+
+
+@pytest.mark.gpu
+def test_within_autocast_own_networks_are_launched():
+    rule = of_type(Scaled)
+    with torch.autocast("cuda", dtype=torch.bfloat16):
+        as_launched(rule)
+    assert not is_recorded()
+    as_launched(rule)
+    assert is_recorded()
+
+
+@pytest.mark.gpu
+def test_a_backward_pass_within_autocast_is_as_outside():
+    rule = make_rule()
+    for _ in range(4):
+        x, s = worlds()
+        expected = run(rule, x, s, cuda_graph=False)
+        with torch.autocast("cuda", dtype=torch.bfloat16):
+            for cuda_graph in (False, "auto"):
+                same(run(rule, x, s, cuda_graph=cuda_graph), expected)
+        same(run(rule, x, s, cuda_graph="auto"), expected)
