@@ -283,8 +283,8 @@ class Worlds(Batch):
         sparse: bool = self.task.config.reward == "sparse"
         return sparse
 
-    @makes_plain_tensors
     @torch.no_grad()
+    @makes_plain_tensors
     def start(self, worlds: Tensor, keys: Tensor | None = None) -> Start:
         """Start episodes in some worlds, int64, shape [M], and return their particles.
 
@@ -319,8 +319,8 @@ class Worlds(Batch):
         start = self.start(worlds)
         return survey_worlds(start.x, start.s, self.physics, places=worlds)
 
-    @makes_plain_tensors
     @torch.no_grad()
+    @makes_plain_tensors
     def place(self, worlds: Tensor, start: Start) -> None:
         """Put particles into some worlds, int64, shape [M], at no reward."""
         x, s = start.x.contiguous(), start.s.contiguous()
@@ -350,14 +350,14 @@ class Worlds(Batch):
             self.particle_reward.index_fill_(0, worlds, 0.0)
         self.report.endings.index_fill_(1, worlds, False)
 
-    @makes_plain_tensors
     @torch.no_grad()
+    @makes_plain_tensors
     def perceive(self, out: Tensor | None = None) -> Tensor:
         """Return what is perceived in all worlds as they are, shape [B, N, P], written to `out`."""
         return survey_worlds(self.x, self.s, self.physics).perceive(out)
 
-    @makes_plain_tensors
     @torch.no_grad()
+    @makes_plain_tensors
     def reseed(self, worlds: NDArray[np.int64], observation: Tensor) -> None:
         """Start some worlds, [M], anew within their episodes; the last step's pay and flags stay.
 
@@ -413,8 +413,8 @@ class Worlds(Batch):
             )
         return endings, observation
 
-    @makes_plain_tensors
     @torch.no_grad()
+    @makes_plain_tensors
     def queue(self, action: Tensor, out: Tensor | None = None) -> Tensor:
         """Do what `step` does but wait for the device, and return what is perceived there then."""
         if self.x.is_cuda and self.x.shape[:2].numel() <= FEW_PARTICLES:

@@ -53,8 +53,8 @@ class LivingWorlds(Worlds):
         """Whether an episode's last step is the only one that is paid."""
         return super().pays_last_step_alone and not self.task.pays_each_step
 
-    @makes_plain_tensors
     @torch.no_grad()
+    @makes_plain_tensors
     def perceive(self, out: Tensor | None = None) -> Tensor:
         """Return what is seen of all worlds as they are, shape [B, ...], written to `out`."""
         seen = self.task.observe(self.x, self.s, self.loss, self.marks)
@@ -66,8 +66,8 @@ class LivingWorlds(Worlds):
         self.start(index)
         observation[index] = self.perceive()[index]
 
-    @makes_plain_tensors
     @torch.no_grad()
+    @makes_plain_tensors
     def queue(self, action: Tensor, out: Tensor | None = None) -> Tensor:
         """Use the brushes, let the rule run, and judge; return what is seen, shape [B, ...]."""
         action = action.to(self.device)
@@ -122,8 +122,8 @@ class LivingWorlds(Worlds):
             last = last | (self.elapsed == self.task.config.episode_steps)
         return torch.where(last, earned, 0.0)
 
-    @makes_plain_tensors
     @torch.no_grad()
+    @makes_plain_tensors
     def start(self, worlds: Tensor, keys: Tensor | None = None) -> Start:
         """Start episodes in some worlds, int64, shape [M], and return their particles."""
         start = super().start(worlds, keys)

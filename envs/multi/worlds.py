@@ -356,8 +356,8 @@ class SpeciesWorlds(Batch):
         """Agents of a world, A."""
         return self._judge.agent_count
 
-    @makes_plain_tensors
     @torch.no_grad()
+    @makes_plain_tensors
     def start(self, worlds: NDArray[np.int64], keys: Tensor | None = None) -> Population:
         """Start episodes in some worlds, [M], and return their particles."""
         self._disband()
@@ -371,8 +371,8 @@ class SpeciesWorlds(Batch):
         self.elapsed[worlds] = 0
         return self._whole.population._replace(x=x.contiguous(), s=s)
 
-    @makes_plain_tensors
     @torch.no_grad()
+    @makes_plain_tensors
     def act(self, action: Tensor) -> None:
         """Apply actions to the worlds that go on; nothing waits for the device.
 
@@ -384,8 +384,8 @@ class SpeciesWorlds(Batch):
             cohort.act(action if cohort is self._whole else action[cohort.places])
         self.elapsed[self.open] += 1
 
-    @makes_plain_tensors
     @torch.no_grad()
+    @makes_plain_tensors
     def perceived(self, *, stepped: bool = False) -> Tensor:
         """Return what particles perceive, shape [B, N, P]; zeros where they or their world ended.
 
@@ -399,8 +399,8 @@ class SpeciesWorlds(Batch):
             seen[cohort.places] = cohort.perceived(stepped=stepped)
         return seen
 
-    @makes_plain_tensors
     @torch.no_grad()
+    @makes_plain_tensors
     def measured(self, *, stepped: bool = False) -> dict[str, Tensor]:
         """Return the parts of every agent's loss, float32, shape [B, A]; 0 of those that ended."""
         found: dict[str, Tensor] = {}
@@ -411,15 +411,15 @@ class SpeciesWorlds(Batch):
                 found[name].index_copy_(0, cohort.worlds, part)
         return found
 
-    @makes_plain_tensors
     @torch.no_grad()
+    @makes_plain_tensors
     def opened(self, population: Population) -> tuple[dict[str, Tensor], Tensor]:
         """Return losses, [M, A], and perception, [M, N, P], of worlds that `start` returned."""
         judge = self._judge
         return judge.measured(population, self._whole.columns), judge.perceived(population)
 
-    @makes_plain_tensors
     @torch.no_grad()
+    @makes_plain_tensors
     def left(self) -> Tensor:
         """Return which agents have no particle within bounds after a step, bool, shape [B, A]."""
         gone = torch.zeros(self.world_count, self.agent_count, dtype=torch.bool, device=self.device)
@@ -464,8 +464,8 @@ class SpeciesWorlds(Batch):
         x, s = self.x[world : world + 1, index], self.s[world : world + 1, index]
         return Population(x, s, tuple(counts.tolist()), sent(kind, self.device))
 
-    @makes_plain_tensors
     @torch.no_grad()
+    @makes_plain_tensors
     def state(self) -> Tensor:
         """Return position, state and 1 of each particle, 0s of those gone, [B, N, 2 + C + 1]."""
         self._collect()

@@ -723,7 +723,7 @@ def _replay_blocks(
 def _compared(
     call: Call,
     rules: Sequence[NPARule],
-    kind: _Kind,
+    kind: _RecordedKind,
     lease: _Lease,
     blocks: Sequence[int],
     tensors: Sequence[Tensor],
@@ -762,7 +762,7 @@ def _same(one: Tensor, other: Tensor) -> Tensor:
     return ((one == other) | (one.isnan() & other.isnan())).all()
 
 
-def _refuse(kind: _Kind, reason: object, *, asked: bool) -> None:
+def _refuse(kind: _RecordedKind, reason: object, *, asked: bool) -> None:
     """Launch all calls of a kind from now on."""
     level = logging.WARNING if asked else logging.DEBUG
     logger.log(level, "rollouts of this kind are launched, not recorded: %s", reason)
