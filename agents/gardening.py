@@ -10,11 +10,11 @@ from torch import Tensor
 
 from npa_envs.agents.policies import unwrapped
 from npa_envs.checks import is_real
-from npa_envs.envs.garden.brushwork import Columns, grid_places
-from npa_envs.envs.garden.task import GardenTask, Lacking
+from npa_envs.envs.garden.brush_layout import BrushLayout, grid_places
+from npa_envs.envs.garden.task import GardenTask, TargetDeficit
 from npa_envs.envs.shepherd2d import ShepherdTask
 from npa_envs.errors import NPAError, shown
-from npa_envs.world.randomness import Purpose, WorldRandom
+from npa_envs.world.randomness import StreamId, WorldRandom
 
 FREE_PLACES = 8
 """Places on each side of the grid from which scripts choose where free brushes go."""
@@ -41,7 +41,7 @@ class BrushPolicy:
             )
         self._seen = inner.form.seen_dim
         self.config = self.task.config
-        self.columns = Columns.of(self.config)
+        self.columns = BrushLayout.of(self.config)
         self.shape = inner.form.rows_shape
         """Of what the brushes of a world do, (K, W)."""
 
@@ -83,7 +83,7 @@ class _Draws:
         """Return the source of the next step's numbers, from the start where worlds are others."""
         if self._random is None or self._random.world_count != world_count:
             seeds = range(self._seed, self._seed + world_count)
-            self._random = WorldRandom(seeds, device=self._device).beside(Purpose.POLICY)
+            self._random = WorldRandom(seeds, device=self._device).substream(StreamId.POLICY)
         self._random.advance()
         return self._random
 
@@ -130,7 +130,7 @@ class ScriptedGardener(BrushPolicy):
         if self.config.actions == "free":
             fine = replace(self.config, place_count=FREE_PLACES)
             places = grid_places(fine, self.task.device)
-            self._lacking = Lacking(places, self.task.goal.target, fine)
+            self._lacking = TargetDeficit(places, self.task.goal.target, fine)
         places = self._lacking.places
         away = places[None] - places[:, None]
         near = (-0.5 * away.square().sum(dim=-1) / checked_positive("width", width) ** 2).exp()
@@ -188,8 +188,8 @@ class ScriptedShepherd(BrushPolicy):
     def act(self, world_count: int) -> Tensor:
         """Return pushes towards the goals of the worlds as they are."""
         worlds, action = self.worlds, self.still(world_count)
-        achieved = self.task.achieved(worlds.x, worlds.s, worlds.marks)
-        missing = (self.task.desired(worlds.marks) - achieved)[:, None, :2]
+        achieved = self.task.achieved(worlds.x, worlds.s, worlds.context)
+        missing = (self.task.desired(worlds.context) - achieved)[:, None, :2]
         if self.config.aim == "move":
             way = missing.expand(-1, len(self._places), -1)
         elif self.config.aim == "reshape":
@@ -276,10 +276,10 @@ class GradientGardener(BrushPolicy):
         """Return what the worlds earn in the steps of a plan, [T, B, K, W], summed, [B]."""
         worlds, task = self.worlds, self.task
         x, s = worlds.x.detach(), worlds.s.detach()
-        random = draws.beside(Purpose.POLICY)
+        random = draws.substream(StreamId.POLICY)
         earned = torch.zeros(x.shape[0], device=x.device)
         for action in plan:
-            x, s = task.tended(x, s, action, random)
+            x, s = task.brush_and_roll(x, s, action, random)
             loss = sum(task.losses(x, s).values())
-            earned = earned + task.earned(x, s, loss, worlds.marks)
+            earned = earned + task.reward(x, s, loss, worlds.context)
         return earned

@@ -16,7 +16,7 @@ from torch import Tensor
 from npa_envs.checks import is_real, is_whole
 from npa_envs.errors import NPAError, shown
 from npa_envs.rule.rule import COLOUR_OFFSET, NPARule
-from npa_envs.world.randomness import Purpose, WorldRandom
+from npa_envs.world.randomness import StreamId, WorldRandom
 
 Array = TypeVar("Array", NDArray[Any], Tensor)
 
@@ -39,7 +39,7 @@ class Interface(NamedTuple):
     species_count: int = 0
     """Species whose densities and density gradients follow in an observation; 0: none."""
 
-    told_dim: int = 0
+    target_dim: int = 0
     """Columns at the end of an observation that tell of the world's target; policies leave them
     out."""
 
@@ -131,7 +131,7 @@ def interface_of(env: Any) -> Interface:
         physics.moving,
         physics.state_scale,
         appended // (1 + physics.space_dim),
-        getattr(worlds, "told_dim", 0),
+        getattr(worlds, "target_dim", 0),
     )
 
 
@@ -237,7 +237,7 @@ class Policy:
 
     def _act_on(self, observation: Tensor) -> Tensor:
         shape, columns = tuple(observation.shape), self.interface.perception_dim
-        whole = columns + self.interface.told_dim
+        whole = columns + self.interface.target_dim
         if len(shape) not in (2, 3) or shape[-1] != whole:
             raise NPAError(
                 f"observation must have shape [N, P] or [B, N, P] with P = {whole}, got {shape}: "
@@ -344,7 +344,7 @@ class RandomPolicy(Policy):
         if random is None or random.world_count != world_count:
             seeds = range(self._seed, self._seed + world_count)
             # Beside, as an environment with the same seed draws its masks from the very streams.
-            random = WorldRandom(seeds, device=observation.device).beside(Purpose.POLICY)
+            random = WorldRandom(seeds, device=observation.device).substream(StreamId.POLICY)
         self._random = random
         random.advance()
         return 2.0 * random.uniform(particle_count, self.interface.action_dim) - 1.0

@@ -36,13 +36,13 @@ from npa_envs.measure.quality import psnr
 from npa_envs.measure.record import script_facts, script_parser
 from npa_envs.measure.speed.drift import drawn_like
 from npa_envs.measure.speed.precisions import PRECISIONS, Precision
-from npa_envs.measure.speed.suites import Report
+from npa_envs.measure.speed.suites import BenchReport
 from npa_envs.measure.speed.timing import (
     NO_TIME,
     Cost,
-    Session,
     Tables,
     Timing,
+    TimingSession,
     relative_error,
 )
 from npa_envs.measure.speed.workloads import Gecko, Workload, gecko
@@ -53,7 +53,7 @@ from npa_envs.world.rollout import rollout, step
 
 
 @dataclass
-class Alternatives(Session):
+class Alternatives(TimingSession):
     """A session that knows what to compare."""
 
     strategies: list[Strategy] = field(default_factory=lambda: list(STRATEGIES.values()))
@@ -788,7 +788,7 @@ def main() -> int:
     )
     tables, held = accuracy(session), ratios(session)
     facts = script_facts(arguments)
-    report = Report(
+    report = BenchReport(
         suite="alternatives",
         command=facts["command"],
         commit=facts["commit"],

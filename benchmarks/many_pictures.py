@@ -166,8 +166,8 @@ def fields_of(arguments: argparse.Namespace) -> dict[str, Any]:
     fields |= {"repeats": 1, "tensorboard": False, "picture_interval": 0, "log_interval": 50}
     if arguments.optimiser:
         fields["optimiser"] = arguments.optimiser
-    if arguments.lifetimes:
-        fields |= {"lifetimes": tuple(arguments.lifetimes), "damage_share": 0.5}
+    if arguments.max_age_range:
+        fields |= {"max_age_range": tuple(arguments.max_age_range), "damage_share": 0.5}
     return fields | {"checkpoint_interval": 10**9, "device": arguments.device}
 
 
@@ -418,7 +418,7 @@ def main() -> None:
     parser.add_argument("--many-iterations", type=int, default=0)
     parser.add_argument("--longest", type=float, default=math.inf)
     parser.add_argument("--many-seconds", type=float, default=0.0)
-    parser.add_argument("--lifetimes", type=int, nargs=2, help="ages of worlds, of all rules")
+    parser.add_argument("--max-age-range", type=int, nargs=2, help="ages of worlds, of all rules")
     parser.add_argument("--optimiser", help="of all rules; default: the preset's")
     parser.add_argument("--share", type=int, nargs=2, default=(0, 1))
     for name in MANY_FIELDS:

@@ -68,11 +68,11 @@ RECIPE: Fields = {
     "steps": (30, 34),
     "schedule": "cosine",
     "learning_rate": 2e-3,
-    "lifetimes": (32, 4096),
+    "max_age_range": (32, 4096),
     "damage_share": 0.25,
-    "rest_weight": 0.5,
-    "stray_share": 5e-5,
-    "stray_weight": 10.0,
+    "stillness_weight": 0.5,
+    "escape_share": 5e-5,
+    "escape_weight": 10.0,
     "damage_radius": 0.15,
     "clump_radius": 0.2,
     "cut_gap": 0.1,
@@ -94,12 +94,12 @@ ARMS: Mapping[str, Fields] = {
     "4096": FEWEST,
     "4096, untrained": {**FEWEST, "initial_rule": "", "blur_sigma": 20.0, "blur_iterations": 200},
     "4096, rate 1e-3": {**FEWEST, "learning_rate": 1e-3},
-    "4096, rest 2": {**FEWEST, "rest_weight": 2.0},
-    "4096, no rest": {**FEWEST, "rest_weight": 0.0},
+    "4096, rest 2": {**FEWEST, "stillness_weight": 2.0},
+    "4096, no rest": {**FEWEST, "stillness_weight": 0.0},
     "4096, half seeds": {
         **FEWEST,
-        "lifetimes": (0, 0),
-        "rest_weight": 0.0,
+        "max_age_range": (0, 0),
+        "stillness_weight": 0.0,
         "seed_interval": 1,
         "fresh_share": 0.5,
     },
@@ -115,14 +115,14 @@ FAST_BEFORE: Fields = {
     "learning_rate": 2e-3,
     "schedule": "milestones",
     "seed_interval": 1,
-    "lifetimes": (0, 0),
+    "max_age_range": (0, 0),
     "damage_share": 1.0,
-    "rest_age": 512,
-    "rest_weight": 0.0,
+    "stillness_min_age": 512,
+    "stillness_weight": 0.0,
     "anisotropy": 0.1,
     "isotropy_weight": 0.5,
-    "stray_share": 0.0,
-    "stray_weight": 0.0,
+    "escape_share": 0.0,
+    "escape_weight": 0.0,
     "clump_radius": 0.0,
     "cut_gap": 0.0,
 }
@@ -130,8 +130,8 @@ FAST_BEFORE: Fields = {
 
 FAST_TOGETHER: Fields = {
     "schedule": "cosine",
-    "stray_share": 1e-3,
-    "stray_weight": 10.0,
+    "escape_share": 1e-3,
+    "escape_weight": 10.0,
     "clump_radius": 0.2,
     "cut_gap": 0.1,
 }
@@ -139,9 +139,9 @@ FAST_TOGETHER: Fields = {
 
 FAST_REST: Fields = {
     **FAST_TOGETHER,
-    "lifetimes": (16, 4096),
+    "max_age_range": (16, 4096),
     "damage_share": 0.5,
-    "rest_weight": 2.0,
+    "stillness_weight": 2.0,
 }
 """Of two worlds one is young and damaged, one is grown and to rest."""
 
@@ -158,12 +158,12 @@ FAST_NOW: Fields = {
     **FAST_TOGETHER,
     **FAST_MUON,
     "pool_size": 32,
-    "lifetimes": (16, 256),
+    "max_age_range": (16, 256),
     "damage_share": 0.5,
-    "rest_age": 48,
-    "rest_weight": 0.5,
+    "stillness_min_age": 48,
+    "stillness_weight": 0.5,
 }
-"""The preset `fast` of today, but for its iterations; seeds come by lifetimes."""
+"""The preset `fast` of today, but for its iterations; seeds come by max_age_range."""
 
 FAST_ARMS: Mapping[str, Fields] = {
     "fast": {},
@@ -377,7 +377,7 @@ def measure(
     """Measure what was trained, and write what became of it."""
     out, config = arguments.out, trainer.config
     rule = trainer.kept_rule
-    save_rule(rule, out / f"{config.out.name}.safetensors", metadata=told_of(trainer))
+    save_rule(rule, out / f"{config.out.name}.safetensors", metadata=context_info(trainer))
     task = trainer.task.for_rule(rule)
     worlds = []
 
@@ -407,7 +407,7 @@ def measure(
     print(f"{config.out.name:32s} {trainer.iteration} in {seconds:.0f} s  {told}", flush=True)
 
 
-def told_of(trainer: Trainer) -> dict[str, str]:
+def context_info(trainer: Trainer) -> dict[str, str]:
     """Return what a rule's file says of the task that it was trained on."""
     told = config_to_dict(trainer.config)
     told = {name: told[name] for name in told if name not in ("out", "device", "initial_rule")}

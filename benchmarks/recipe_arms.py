@@ -37,7 +37,7 @@ SIZES: Mapping[str, Fields] = {
         "eps": 0.3,
         "iterations": 6,
         "steps": (4, 6),
-        "lifetimes": (4, 64),
+        "max_age_range": (4, 64),
         "pool_size": 16,
     },
 }
@@ -45,8 +45,8 @@ SIZES: Mapping[str, Fields] = {
 begin in a disk as large, as they see; as in `fast`; and a test of the script."""
 
 STRAYS: Fields = {
-    "stray_share": 2e-4,
-    "stray_weight": 10.0,
+    "escape_share": 2e-4,
+    "escape_weight": 10.0,
     "bound_weight": 10.0,
     "drift_weight": 1.0,
     "clump_radius": 0.2,
@@ -58,22 +58,22 @@ NO_STRAYS: Fields = dict.fromkeys(STRAYS, 0.0) | {"bound_weight": 100.0}
 
 SECOND: Fields = {
     **STRAYS,
-    "lifetimes": (64, 16_384),
+    "max_age_range": (64, 16_384),
     "pool_size": 64,
     "schedule": "cosine",
     "learning_rate": 1e-3,
     "steps": (48, 80),
     "damage_share": 0.5,
-    "stray_share": 5e-5,
+    "escape_share": 5e-5,
 }
 """The second candidate: worlds of all ages, of which half are left to themselves.
 
 Its damaged worlds were those of every other place of the pool, the longest-lived ones too."""
 
 THIRD: Fields = SECOND | {
-    "lifetimes": (256, 32_768),
+    "max_age_range": (256, 32_768),
     "damage_share": 0.25,
-    "stray_share": 2e-4,
+    "escape_share": 2e-4,
 }
 """The third candidate: fewer seeds, older worlds, and only worlds of short lives are damaged."""
 
@@ -91,14 +91,14 @@ SEVENTH: Fields = {
 
 EIGHTH: Fields = {
     **STRAYS,
-    "lifetimes": (64, 16_384),
+    "max_age_range": (64, 16_384),
     "pool_size": 64,
     "steps": (48, 80),
     "schedule": "cosine",
     "learning_rate": 2e-3,
     "damage_share": 0.25,
     "damage_radius": 0.2,
-    "rest_weight": 2.0,
+    "stillness_weight": 2.0,
     "initial_rule": "heart-first",
 }
 """The eighth candidate: grown worlds are to rest."""
@@ -106,15 +106,23 @@ EIGHTH: Fields = {
 MUON: Fields = {"optimiser": "muon", "learning_rate": 5e-3}
 """Orthogonal steps, and a rate; `best` has 3e-3."""
 
-FROM_32: Fields = {"second_lives": 0.5, "lifetimes": (32, 16_384), "damage_share": 0.125}
-TO_4096: Fields = {"second_lives": 0.6, "lifetimes": (16, 4096), "damage_share": 0.125}
-FROM_16: Fields = {"second_lives": 0.6, "lifetimes": (16, 16_384), "damage_share": 0.125}
+FROM_32: Fields = {
+    "damage_and_keep_share": 0.5,
+    "max_age_range": (32, 16_384),
+    "damage_share": 0.125,
+}
+TO_4096: Fields = {"damage_and_keep_share": 0.6, "max_age_range": (16, 4096), "damage_share": 0.125}
+FROM_16: Fields = {
+    "damage_and_keep_share": 0.6,
+    "max_age_range": (16, 16_384),
+    "damage_share": 0.125,
+}
 """Second lives, with shorter ones that bring back the seeds."""
 
 FAST_BEFORE: Fields = {
     **NO_STRAYS,
     **HALF_SEEDS,
-    "rest_age": 512,
+    "stillness_min_age": 512,
     "learning_rate": 2e-3,
     "schedule": "milestones",
     "milestones": (1500, 2100),
@@ -125,14 +133,14 @@ FAST_BEFORE: Fields = {
 """The preset `fast` as it was when its arms were compared, laid over what it is."""
 
 FAST_SECOND: Fields = {
-    "lifetimes": (24, 2048),
+    "max_age_range": (24, 2048),
     "pool_size": 16,
     "schedule": "cosine",
     "damage_share": 0.5,
 }
 """The second candidate in small."""
 
-FAST_STRAYS: Fields = STRAYS | {"stray_share": 1e-3}
+FAST_STRAYS: Fields = STRAYS | {"escape_share": 1e-3}
 """As `STRAYS`, of fewer particles."""
 
 FAST_FIFTH: Fields = {
@@ -149,10 +157,10 @@ FAST_SIXTH: Fields = FAST_FIFTH | {"seed_interval": 1}
 FAST_EIGHTH: Fields = {
     **FAST_FIFTH,
     "learning_rate": 2e-3,
-    "lifetimes": (24, 256),
+    "max_age_range": (24, 256),
     "damage_share": 0.5,
-    "rest_age": 64,
-    "rest_weight": 0.5,
+    "stillness_min_age": 64,
+    "stillness_weight": 0.5,
 }
 """The eighth candidate in small: of two worlds one is young and damaged, one grown and at rest."""
 
@@ -165,21 +173,21 @@ ARMS: Mapping[str, Fields] = {
     "second, share 1": SECOND | {"damage_share": 1.0},
     "second, rate 2e-3": SECOND | {"learning_rate": 2e-3},
     "second, steps 96 to 128": SECOND | {"steps": (96, 128), "iterations": 1700},
-    "second, lifetimes to 65536": SECOND | {"lifetimes": (64, 65_536)},
+    "second, max_age_range to 65536": SECOND | {"max_age_range": (64, 65_536)},
     "second, hidden 256": SECOND | {"hidden_dim": 256},
     "second, 4 worlds": SECOND | {"world_count": 4, "iterations": 6000},
     "third": THIRD,
     "third, no strays": THIRD | NO_STRAYS,
-    "third, lifetimes from 64": THIRD | {"lifetimes": (64, 32_768)},
+    "third, max_age_range from 64": THIRD | {"max_age_range": (64, 32_768)},
     "seventh": SEVENTH,
     "eighth": EIGHTH,
-    "eighth, rest 1": EIGHTH | {"rest_weight": 1.0},
-    "eighth, no rest": EIGHTH | {"rest_weight": 0.0},
-    "eighth, rest 0.5": EIGHTH | {"rest_weight": 0.5},
+    "eighth, rest 1": EIGHTH | {"stillness_weight": 1.0},
+    "eighth, no rest": EIGHTH | {"stillness_weight": 0.0},
+    "eighth, rest 0.5": EIGHTH | {"stillness_weight": 0.5},
     "eighth, rate 1e-3": EIGHTH | {"learning_rate": 1e-3},
     "eighth, rate 4e-3": EIGHTH | {"learning_rate": 4e-3},
     "eighth, share 0.5": EIGHTH | {"damage_share": 0.5},
-    "eighth, steps 32 to 64": EIGHTH | {"steps": (32, 64), "lifetimes": (32, 16_384)},
+    "eighth, steps 32 to 64": EIGHTH | {"steps": (32, 64), "max_age_range": (32, 16_384)},
     "eighth, damage 0.1": EIGHTH | {"damage_radius": 0.1},
     "eighth, muon": EIGHTH | MUON,
     "eighth, muon, rate 2.5e-3": EIGHTH | MUON | {"learning_rate": 2.5e-3},
@@ -187,13 +195,13 @@ ARMS: Mapping[str, Fields] = {
     "eighth, muon, to 4096": EIGHTH | MUON | TO_4096,
     "eighth, muon, from 16": EIGHTH | MUON | FROM_16,
     "eighth, muon, from 16, decay 0.1": EIGHTH | MUON | FROM_16 | {"weight_decay": 0.1},
-    "eighth, second lives": EIGHTH | {"second_lives": 0.5},
+    "eighth, second lives": EIGHTH | {"damage_and_keep_share": 0.5},
     "eighth, second lives, from 32": EIGHTH | FROM_32,
     "eighth, second lives, to 4096": EIGHTH | TO_4096,
     "eighth, second lives, from 16": EIGHTH | FROM_16,
     "eighth, second lives, from 32, more cuts": EIGHTH | FROM_32 | {"cut_share": 0.5},
     "eighth, second lives, from 16, more cuts": EIGHTH | FROM_16 | {"cut_share": 0.5},
-    "eighth, from 32": EIGHTH | {"lifetimes": (32, 16_384), "damage_share": 0.125},
+    "eighth, from 32": EIGHTH | {"max_age_range": (32, 16_384), "damage_share": 0.125},
     "seventh, untrained, rate 3e-3": SEVENTH
     | {"initial_rule": "", "learning_rate": 3e-3, "steps": (48, 50), "iterations": 1500},
 }
@@ -209,7 +217,7 @@ FAST_ARMS: Mapping[str, Fields] = {
     "second, strays": FAST_SECOND | FAST_STRAYS,
     "second, steps 32 to 48": FAST_SECOND | {"steps": (32, 48), "iterations": 1440},
     "second, 4 worlds": FAST_SECOND | {"world_count": 4, "iterations": 1200},
-    "second, lifetimes from 96": FAST_SECOND | {"lifetimes": (96, 2048)},
+    "second, max_age_range from 96": FAST_SECOND | {"max_age_range": (96, 2048)},
     "second, hidden 128": FAST_SECOND | {"hidden_dim": 128},
     "fast, rate 8e-3": {"learning_rate": 8e-3},
     "fast, rate 4e-3, strays": FAST_STRAYS | {"learning_rate": 4e-3},
@@ -222,7 +230,7 @@ FAST_ARMS: Mapping[str, Fields] = {
         **FAST_SECOND,
         **FAST_STRAYS,
         "learning_rate": 4e-3,
-        "lifetimes": (96, 4096),
+        "max_age_range": (96, 4096),
         "steps": (24, 40),
         "iterations": 1800,
     },
@@ -235,11 +243,11 @@ FAST_ARMS: Mapping[str, Fields] = {
     "eighth, muon": FAST_EIGHTH | MUON,
     "eighth, muon, hidden 128, rest 2": FAST_EIGHTH
     | MUON
-    | {"hidden_dim": 128, "rest_weight": 2.0, "initial_rule": ""},
+    | {"hidden_dim": 128, "stillness_weight": 2.0, "initial_rule": ""},
     "eighth, rate 4e-3": FAST_EIGHTH | {"learning_rate": 4e-3},
-    "eighth, no rest": FAST_EIGHTH | {"rest_weight": 0.0},
-    "eighth, rest 2": FAST_EIGHTH | {"rest_weight": 2.0},
-    "eighth, to 4096": FAST_EIGHTH | {"lifetimes": (24, 4096), "rest_age": 512},
+    "eighth, no rest": FAST_EIGHTH | {"stillness_weight": 0.0},
+    "eighth, rest 2": FAST_EIGHTH | {"stillness_weight": 2.0},
+    "eighth, to 4096": FAST_EIGHTH | {"max_age_range": (24, 4096), "stillness_min_age": 512},
     "sixth, untrained": FAST_SIXTH | {"initial_rule": ""},
 }
 """Arms of `fast`: what each changes of it as it was first; the preset is now "eighth, muon, hidden

@@ -6,7 +6,7 @@ GPU several runs share the device, each on a stream of its own. Every finished r
 JSON, so that a stopped call goes on where it was. `pictures` draws the emoji; `warm-up` compiles
 all kernels and tests that runs side by side learn bit for bit what they learn alone; `merge` makes
 one record, one sheet of pictures and one archive of rules of what several processes left; `report`
-prints the tables and draws the figure; `follow` says what the decay of a rule's world is; `long`
+prints the tables and draws the figure; `sync_with` says what the decay of a rule's world is; `long`
 runs finished rules for 100 000 steps within the bounds of `npa-envs stress`; `heal` damages worlds
 of 32 seeds.
 
@@ -47,9 +47,9 @@ from side_by_side import iterate_together, on, stream_of
 
 from npa_envs.errors import NPAError
 from npa_envs.files import write_bytes
-from npa_envs.measure.accuracy import habitats
+from npa_envs.measure.accuracy import endurance
 from npa_envs.measure.plots import new_figure, number_plainly, png
-from npa_envs.measure.quality import Runner, evaluate, healing
+from npa_envs.measure.quality import RuleRunner, evaluate, healing
 from npa_envs.measure.record import machine, write_record
 from npa_envs.render.colours import to_uint8
 from npa_envs.rule.files import save_rule
@@ -148,7 +148,7 @@ def strip(trainer: Trainer, steps: Sequence[int]) -> np.ndarray[Any, Any]:
     task: Any = trainer.task
     rule = trainer.kept_rule
     device = torch.device(trainer.config.device)
-    runner = Runner(rule, task, device, SEEDS[0], None)
+    runner = RuleRunner(rule, task, device, SEEDS[0], None)
     x, s = task.seed(1, generator=torch.Generator(device).manual_seed(SEEDS[0]), device=device)
     frames, before = [task.target_picture[None]], 0
     for step in steps:
@@ -425,7 +425,7 @@ def main() -> None:
         own.add_argument("--pictures", type=Path, required=True, help="folder of PNG files")
         own.add_argument("--device", default="cpu")
         own.add_argument("--preset", default="paper", help="what the world is like")
-    long.add_argument("--steps", type=int, default=habitats.STEPS)
+    long.add_argument("--steps", type=int, default=endurance.STEPS)
     heal.add_argument("--count", type=int, default=32, help="seeds")
     heal.add_argument(
         "--steps", type=int, nargs=2, default=[1024, 500], help="before and after the damage"

@@ -26,7 +26,7 @@ import torch
 from PIL import Image
 from side_by_side import iterate_together, on, stream_of
 
-from npa_envs.measure.judge import Judge, JudgeRow
+from npa_envs.measure.judge import JudgeRow, TextureJudge
 from npa_envs.measure.quality import evaluate
 from npa_envs.measure.tables import as_objects
 from npa_envs.render import to_uint8, write_filmstrip
@@ -45,7 +45,7 @@ def measured(
     rule: NPARule, task: Texture, steps: Sequence[int], device: str, seeds: Sequence[int]
 ) -> tuple[dict[str, list[dict[str, Any]]], np.ndarray[Any, Any]]:
     """Return what `npa-envs evaluate --judge` says, and the target and a world side by side."""
-    judge = Judge(task)
+    judge = TextureJudge(task)
     judged: list[JudgeRow] = []
     frames = [task.target_picture[None].cpu()]
 
@@ -155,7 +155,9 @@ def particles(arguments: argparse.Namespace) -> None:
                 optimiser.zero_grad()
                 total.backward()
                 optimiser.step()
-            found = Judge(task).row((x.detach() + half) % (2.0 * half) - half, colour.detach(), 0)
+            found = TextureJudge(task).row(
+                (x.detach() + half) % (2.0 * half) - half, colour.detach(), 0
+            )
             seconds = time.perf_counter() - begun
             line = {"target": target, "loss": loss, "value": value.item(), "seconds": seconds}
             line |= {"iterations": arguments.iterations, "fields": changes}

@@ -19,7 +19,7 @@ from page_parts import table, write_or_check
 from npa_envs.agents.comparison.npa_bench import (
     METHODS,
     SUITES,
-    Row,
+    BenchRow,
     Suite,
     read_rows,
     score,
@@ -59,19 +59,19 @@ def problems(suite: Suite) -> str:
     return table(heads, lines)
 
 
-def ranked(rows: dict[str, Row]) -> list[str]:
+def ranked(rows: dict[str, BenchRow]) -> list[str]:
     """Return the methods: the library's own in their order, then all others by name."""
     own = list(METHODS)
     return sorted(rows, key=lambda name: (own.index(name) if name in own else len(own), name))
 
 
-def measured(suite: Suite, rows: dict[str, Row]) -> list[str]:
+def measured(suite: Suite, rows: dict[str, BenchRow]) -> list[str]:
     """Return the ids of the problems that have runs."""
     ran = {run.env_id for row in rows.values() for run in row.runs}
     return [env_id for env_id in suite.entries if env_id in ran]
 
 
-def scored(suite: Suite, rows: dict[str, Row], group: str) -> str:
+def scored(suite: Suite, rows: dict[str, BenchRow], group: str) -> str:
     """Return the scores of all methods on a group of problems, Markdown."""
     if not {NOTHING, YARDSTICK} <= rows.keys():
         return f"Scores need the rows `{NOTHING}` and `{YARDSTICK}`."
@@ -87,7 +87,7 @@ def scored(suite: Suite, rows: dict[str, Row], group: str) -> str:
     return table(heads, lines) if lines else NO_ROWS
 
 
-def returned(suite: Suite, rows: dict[str, Row]) -> str:
+def returned(suite: Suite, rows: dict[str, BenchRow]) -> str:
     """Return the mean returns with their standard errors over seeds, Markdown."""
     ids = measured(suite, rows)
     lines = []
@@ -104,7 +104,7 @@ def returned(suite: Suite, rows: dict[str, Row]) -> str:
     return table(("Method", *(f"`{task_name(env_id)}`" for env_id in ids)), lines)
 
 
-def described(rows: dict[str, Row]) -> str:
+def described(rows: dict[str, BenchRow]) -> str:
     """Return what the files say of their methods, Markdown."""
     lines = []
     for method in ranked(rows):
@@ -113,7 +113,7 @@ def described(rows: dict[str, Row]) -> str:
     return table(("Method", "What it is", "Runs"), lines)
 
 
-def results(suite: Suite, rows: dict[str, Row]) -> str:
+def results(suite: Suite, rows: dict[str, BenchRow]) -> str:
     """Return all tables of a suite's rows, and its picture, Markdown."""
     if not rows:
         return NO_ROWS
@@ -124,7 +124,7 @@ def results(suite: Suite, rows: dict[str, Row]) -> str:
     return "\n\n".join(told)
 
 
-def page(text: str, rows: dict[str, dict[str, Row]]) -> str:
+def page(text: str, rows: dict[str, dict[str, BenchRow]]) -> str:
     """Return a page with its tables made anew, from the rows of each suite."""
     parts = {f"problems of {name}": problems(suite) for name, suite in SUITES.items()}
     parts |= {f"results of {name}": results(suite, rows[name]) for name, suite in SUITES.items()}
@@ -137,7 +137,7 @@ def page(text: str, rows: dict[str, dict[str, Row]]) -> str:
     return text
 
 
-def curves(suite: Suite, rows: dict[str, Row]) -> bytes:
+def curves(suite: Suite, rows: dict[str, BenchRow]) -> bytes:
     """Return the learning curves of all problems as a PNG file; bands are standard errors."""
     ids = measured(suite, rows)
     lines = -(-len(ids) // PANELS)
@@ -155,7 +155,7 @@ def curves(suite: Suite, rows: dict[str, Row]) -> bytes:
     return png(figure)
 
 
-def draw_method(panel: object, row: Row, env_id: str, colour: str) -> None:
+def draw_method(panel: object, row: BenchRow, env_id: str, colour: str) -> None:
     """Draw the mean curve of a method; a dashed line where it does not learn."""
     found = [run.curve for run in row.runs if run.env_id == env_id and run.curve]
     if not found:

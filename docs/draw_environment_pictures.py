@@ -85,8 +85,8 @@ FILMS = {
     ),
     "Regeneration2D": Film(
         steps=(0, 2, 8, 32, 64, 128),
-        rows=({"damage": "erase"}, {"damage": "cut"}, {"damage": "clump"}),
-        caption="The rule `gecko-v0`, which has grown these worlds, heals what was erased, a cut, "
+        rows=({"damage": "wipe"}, {"damage": "cut"}, {"damage": "clump"}),
+        caption="The rule `gecko-v0`, which has grown these worlds, heals what was wiped, a cut, "
         "and a clump. Episodes go on after success here, so that all of the healing can be seen.",
         rule="gecko-v0",
     ),

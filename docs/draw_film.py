@@ -16,7 +16,7 @@ from torch import Tensor
 import npa_envs
 from npa_envs.render import draw_worlds, write_webp
 from npa_envs.training.trained_tasks import task_of_rule
-from npa_envs.world.brushes import cut, erase_state
+from npa_envs.world.brushes import cut, wipe_state
 
 SEED = 1_000_001
 RESOLUTION = 512
@@ -50,7 +50,7 @@ def frames() -> Iterator[Frame]:
         world.x, world.s, centre=place(0.0, 0.0), normal=place(0.8, 1.0), gap=0.16
     )
     yield from world.run(HEALING)
-    world.s = erase_state(world.x, world.s, centre=place(0.3, 0.3), radius=0.22)
+    world.s = wipe_state(world.x, world.s, centre=place(0.3, 0.3), radius=0.22)
     yield from world.run(HEALING + [0] * STILL)
 
 

@@ -14,8 +14,8 @@ from npa_envs.envs.garden.config import GardenConfig
 from npa_envs.envs.garden.environments import GardenEnv, GardenVectorEnv
 from npa_envs.envs.garden.task import GardenTask, lost_share, marks_of_whole
 from npa_envs.tasks.damage import random_particle
-from npa_envs.world.brushes import erase_state, push
-from npa_envs.world.randomness import Purpose, WorldRandom
+from npa_envs.world.brushes import push, wipe_state
+from npa_envs.world.randomness import StreamId, WorldRandom
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -40,10 +40,10 @@ class Gardener2DEnvConfig(GardenConfig):
     """How far it carries those in its middle [length units]."""
 
     blight_chance: float = 0.5
-    """Probability that states around a random particle are erased in a step (dimensionless)."""
+    """Probability that states around a random particle are wiped in a step (dimensionless)."""
 
     blight_radius: float = 0.3
-    """Radius within which they are erased [length units]."""
+    """Radius within which they are wiped [length units]."""
 
     def __post_init__(self) -> None:
         """Check every field."""
@@ -59,30 +59,30 @@ class GardenerTask(GardenTask[Gardener2DEnvConfig]):
     """A picture in bad weather."""
 
     config_type = Gardener2DEnvConfig
-    mark_count = 2
+    context_count = 2
 
-    def struck(self, x: Tensor, s: Tensor, random: WorldRandom) -> tuple[Tensor, Tensor]:
+    def disturb(self, x: Tensor, s: Tensor, random: WorldRandom) -> tuple[Tensor, Tensor]:
         """Return worlds after a gust and a blight, drawn beside the rule's own draws."""
-        config, draws = self.config, random.beside(Purpose.DAMAGE)
+        config, draws = self.config, random.substream(StreamId.DAMAGE)
         chance, angle = draws.uniform(2), 2.0 * math.pi * draws.uniform(1)
         centre = random_particle(x, draws)
         happens = (chance[:, :1] < config.gust_chance).to(x.dtype)
         move = config.gust_length * happens * torch.cat((angle.cos(), angle.sin()), dim=1)
         box = None if config.box is None else (config.box,) * 2
         x = push(x, centre=centre, move=move, radius=config.gust_radius, box=box)
-        # A ball outside of the world erases nothing.
+        # A ball outside of the world wipes nothing.
         centre = random_particle(x, draws)
         happens = chance[:, 1] < config.blight_chance
         radius = torch.where(happens, config.blight_radius, -1.0)
-        return x, erase_state(x, s, centre=centre, radius=radius, box=box)
+        return x, wipe_state(x, s, centre=centre, radius=radius, box=box)
 
-    def marked(self, start: Start, loss: Tensor, random: WorldRandom) -> Tensor:
+    def episode_context(self, start: Start, loss: Tensor, random: WorldRandom) -> Tensor:
         """Return the loss of the whole picture, and how much it rises if all of it turns grey."""
         return marks_of_whole(self, start, loss)
 
-    def earned(self, x: Tensor, s: Tensor, loss: Tensor, marks: Tensor) -> Tensor:
+    def reward(self, x: Tensor, s: Tensor, loss: Tensor, context: Tensor) -> Tensor:
         """Return how good worlds are: 1 as at their start, 0 as bad as grey, shape [B]."""
-        return (1.0 - lost_share(loss, marks)).clamp_min(-1.0)
+        return (1.0 - lost_share(loss, context)).clamp_min(-1.0)
 
 
 class Gardener2DEnv(GardenEnv):
@@ -91,9 +91,9 @@ class Gardener2DEnv(GardenEnv):
     ## Description
 
     A trained rule has grown a picture from N particles and goes on running them. Again and again a
-    gust carries some of them away, a blight erases the states of others, and noise shakes them all.
+    gust carries some of them away, a blight wipes the states of others, and noise shakes them all.
     The rule heals a part of it, too slowly. The agent helps from outside, as a gardener does: it
-    has brushes on a grid, which push particles; with other `tools` they erase or change states or
+    has brushes on a grid, which push particles; with other `tools` they wipe or change states or
     let particles live slower or faster. It sees what lacks at each place of the grid.
 
     `npa_envs.agents.gardening` has gardeners to compare with: `StillGardener` does nothing,
@@ -104,7 +104,7 @@ class Gardener2DEnv(GardenEnv):
 
     Worlds are compared with the target as in `npa/Morphogenesis2D-v0`, by a loss L. The reward is
     1 − (L − L₀) / (L₁ − L₀), and at least -1. L₀ is the loss at the episode's start, of the picture
-    that the rule has grown. L₁ is what it would be if all states were erased, grey, and at least
+    that the rule has grown. L₁ is what it would be if all states were wiped, grey, and at least
     1.1 L₀. So 1 is a picture as good as the rule's, 0 one as bad as a grey one; a picture nearer to
     the target than the rule's is worth more than 1.
 

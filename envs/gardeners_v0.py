@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from npa_envs.envs.core.vector import checked_count
-from npa_envs.envs.garden.forms import Brushes
+from npa_envs.envs.garden.spaces import BrushSpaces
 from npa_envs.envs.gardener2d import Gardener2DEnv
 from npa_envs.envs.multi.parallel import Outcome, in_turns, register
 from npa_envs.errors import NPAError, shown, suggest
@@ -25,7 +25,7 @@ from npa_envs.errors import NPAError, shown, suggest
 AGENTS = ("keeper_0", "raider_0")
 
 
-class _BothHands(Brushes):
+class _BothHands(BrushSpaces):
     """Brushes of both gardeners, used at once; what is seen is the same for both."""
 
     def action(self, action: Any, world_count: int | None) -> Tensor:

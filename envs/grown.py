@@ -12,12 +12,12 @@ from torch import Tensor
 from npa_envs.checks import check_positive
 from npa_envs.envs.core.config import EnvConfig
 from npa_envs.envs.core.task import Start
-from npa_envs.envs.morphogenesis2d import Morphogenesis2DEnvConfig, PictureTask
+from npa_envs.envs.morphogenesis2d import Morphogenesis2DEnvConfig, PictureEnvTask
 from npa_envs.errors import NPAError, shown
 from npa_envs.rule.files import load_rule, shipped_rules
 from npa_envs.rule.rule import NPARule
 from npa_envs.tasks.targets.clouds import Split
-from npa_envs.world.randomness import Purpose, WorldRandom
+from npa_envs.world.randomness import StreamId, WorldRandom
 from npa_envs.world.rollout import rollout
 
 FIRST_RULES = {"gecko": "gecko-v0", "heart": "heart-first"}
@@ -71,7 +71,7 @@ class GrownConfig(Morphogenesis2DEnvConfig):
 Config = TypeVar("Config", bound=GrownConfig)
 
 
-class GrownTask(PictureTask[Config]):
+class GrownTask(PictureEnvTask[Config]):
     """Pictures that a rule has grown."""
 
     config_type: ClassVar[type[GrownConfig]] = GrownConfig
@@ -129,7 +129,7 @@ class GrownTask(PictureTask[Config]):
             eps=self.config.eps,
             box=self.config.box,
             update_prob=self.config.update_prob,
-            generator=random.take(slice(k, k + 1)).beside(Purpose.GROWTH),
+            generator=random.take(slice(k, k + 1)).substream(StreamId.GROWTH),
         )
 
 

@@ -12,7 +12,7 @@ from torch import Tensor
 from npa_envs.checks import check_positive
 from npa_envs.envs.core.config import EnvConfig
 from npa_envs.envs.core.single import NPAEnv
-from npa_envs.envs.core.task import GoalTask
+from npa_envs.envs.core.task import TargetEnvTask
 from npa_envs.envs.core.vector import NPAVectorEnv
 from npa_envs.tasks.morphogenesis2d import Morphogenesis2D, Morphogenesis2DConfig
 from npa_envs.tasks.targets.images import LARGEST_POINT_COUNT
@@ -53,7 +53,7 @@ class Morphogenesis2DEnvConfig(PictureConfig):
 Config = TypeVar("Config", bound=PictureConfig)
 
 
-class PictureTask(GoalTask[Config]):
+class PictureEnvTask(TargetEnvTask[Config]):
     """A picture to grow, compared by the splat loss of `npa_envs.tasks.morphogenesis2d`."""
 
     config_type: ClassVar[type[PictureConfig]] = Morphogenesis2DEnvConfig
@@ -68,7 +68,7 @@ class PictureTask(GoalTask[Config]):
     @classmethod
     def extra_bytes(cls, config: Any, world_count: int) -> int:
         """Return about how much memory pool and pictures need [bytes]."""
-        copies = 4 if config.pays_particles else 1
+        copies = 4 if config.per_particle_reward else 1
         pictures = 16 * copies * world_count * config.resolution**2
         return super().extra_bytes(config, world_count) + int(pictures)
 
@@ -160,10 +160,10 @@ class Morphogenesis2DEnv(NPAEnv):
     | `reward_density`, `reward_colour` | step | how much each part improved in this step |
     """
 
-    task_type = PictureTask
+    task_type = PictureEnvTask
 
 
 class Morphogenesis2DVectorEnv(NPAVectorEnv):
     """Worlds of `Morphogenesis2DEnv`, batched on one device; its docstring describes both."""
 
-    task_type = PictureTask
+    task_type = PictureEnvTask

@@ -15,7 +15,7 @@ from torch import Tensor
 from npa_envs.checks import check_positive
 from npa_envs.envs.core.config import EnvConfig
 from npa_envs.envs.core.single import NPAEnv
-from npa_envs.envs.core.task import TURN, GoalTask
+from npa_envs.envs.core.task import TURN, TargetEnvTask
 from npa_envs.envs.core.vector import NPAVectorEnv
 from npa_envs.errors import NPAError, shown
 from npa_envs.render import turntable_frames
@@ -77,7 +77,7 @@ class Morphogenesis3DEnvConfig(EnvConfig):
         )
 
 
-class SolidTask(GoalTask[Morphogenesis3DEnvConfig]):
+class SolidTask(TargetEnvTask[Morphogenesis3DEnvConfig]):
     """A thing to grow, compared view by view as `npa_envs.tasks.morphogenesis3d` does."""
 
     config_type = Morphogenesis3DEnvConfig
@@ -94,7 +94,7 @@ class SolidTask(GoalTask[Morphogenesis3DEnvConfig]):
     def extra_bytes(cls, config: Any, world_count: int) -> int:
         """Return about how much memory pool and views need [bytes]."""
         view = PIXEL_BYTES * config.resolution**2 + SEEN_BYTES * config.particle_count
-        copies = 2 if config.pays_particles else 1
+        copies = 2 if config.per_particle_reward else 1
         views = copies * world_count * config.view_count * view
         return super().extra_bytes(config, world_count) + int(views)
 

@@ -16,17 +16,17 @@ from npa_envs.checks import check_flag, check_positive
 from npa_envs.envs.core.config import EnvConfig, WorldConfig
 from npa_envs.envs.core.memory import OBSERVATION_COPIES
 from npa_envs.envs.core.single import NPAEnv
-from npa_envs.envs.core.spaces import Rows
+from npa_envs.envs.core.spaces import ParticleSpaces
 from npa_envs.envs.core.task import EnvTask, Start
 from npa_envs.envs.core.vector import NPAVectorEnv
-from npa_envs.envs.core.worlds import Worlds
-from npa_envs.envs.morphogenesis2d import PictureConfig, PictureTask
+from npa_envs.envs.core.worlds import BatchedWorlds
+from npa_envs.envs.morphogenesis2d import PictureConfig, PictureEnvTask
 from npa_envs.errors import NPAError, shown
 from npa_envs.tasks.many_pictures import ManyPictures, named_targets
 from npa_envs.tasks.morphogenesis2d import Morphogenesis2DConfig
 from npa_envs.tasks.targets.clouds import Split
-from npa_envs.world.actions import Physics, survey_worlds
-from npa_envs.world.cuda_graph import sent
+from npa_envs.world.actions import Physics, find_neighbours
+from npa_envs.world.cuda_graph import to_device_async
 from npa_envs.world.randomness import WorldRandom
 
 CHANNELS = 4
@@ -84,7 +84,7 @@ class Pictures2DEnvConfig(PictureConfig):
         return self._goal_of(self.targets if self.split == "train" else self.test_targets)
 
     @property
-    def told_dim(self) -> int:
+    def target_dim(self) -> int:
         """Numbers that a row tells of the target, T; 0: none."""
         return CHANNELS * self.picture_size**2 if self.observe_target else 0
 
@@ -93,7 +93,7 @@ class Pictures2DEnvConfig(PictureConfig):
         return self.task_config(Morphogenesis2DConfig, targets=targets, target_point_count=count)
 
 
-class PicturesTask(PictureTask[Pictures2DEnvConfig]):
+class PicturesTask(PictureEnvTask[Pictures2DEnvConfig]):
     """Several pictures to grow, one asked for in each world."""
 
     config_type = Pictures2DEnvConfig
@@ -108,14 +108,14 @@ class PicturesTask(PictureTask[Pictures2DEnvConfig]):
         pictures = self.goal.toward(everyone).target_picture.permute(0, 3, 1, 2)
         small = F.avg_pool2d(pictures, config.resolution // config.picture_size)
         limit = config.observation_limit
-        self.told_rows = small.flatten(1).clamp(-limit, limit)
+        self.target_rows = small.flatten(1).clamp(-limit, limit)
         """What rows tell of each picture, dimensionless, shape [K, T]."""
         self._number = everyone[:1]
 
     @classmethod
     def extra_bytes(cls, config: Any, world_count: int) -> int:
         """Return about how much memory pool, pictures and what rows tell of them need [bytes]."""
-        numbers = OBSERVATION_COPIES * world_count * config.particle_count * config.told_dim
+        numbers = OBSERVATION_COPIES * world_count * config.particle_count * config.target_dim
         return super().extra_bytes(config, world_count) + int(4 * numbers)
 
     def fresh(self, random: WorldRandom) -> Start:
@@ -132,24 +132,24 @@ class PicturesTask(PictureTask[Pictures2DEnvConfig]):
         aimed._number = goal
         return aimed
 
-    def told(self, s: Tensor) -> dict[str, Tensor]:
+    def extra_info(self, s: Tensor) -> dict[str, Tensor]:
         """Return the number of each world's picture, int64, shape [B]."""
         return {"target": self._number.clone()}
 
 
-class PictureRows(Rows):
+class PictureSpaces(ParticleSpaces):
     """Rows of what particles perceive, with the numbers of the target behind, where asked."""
 
     def __init__(self, physics: Physics, config: WorldConfig) -> None:
         super().__init__(physics, config)
         assert isinstance(config, Pictures2DEnvConfig), "the environments' own configuration"
-        columns = physics.perception_dim + config.told_dim
+        columns = physics.perception_dim + config.target_dim
         limit = physics.perception_limit
         self.observation_space = Box(-limit, limit, (config.particle_count, columns), np.float32)
 
 
-class PictureWorlds(Worlds):
-    """B worlds, each with a picture that it is to grow; arguments and errors of `Worlds`."""
+class TargetWorlds(BatchedWorlds):
+    """B worlds, each with a picture that it is to grow; arguments and errors of `BatchedWorlds`."""
 
     task: PicturesTask
 
@@ -161,37 +161,37 @@ class PictureWorlds(Worlds):
         episode_steps: int | None = None,
     ) -> None:
         super().__init__(task_type, config, world_count, episode_steps)
-        self.told_dim = self.task.config.told_dim
+        self.target_dim = self.task.config.target_dim
         """Numbers that rows tell of the target besides what particles perceive, T."""
-        if self.told_dim:
+        if self.target_dim:
             self.restart = self._restart  # type: ignore[assignment]
 
     def perceive(self, out: Tensor | None = None) -> Tensor:
         """Return what is observed in all worlds as they are, [B, N, P + T], written to `out`."""
-        if not self.told_dim:
+        if not self.target_dim:
             return super().perceive(out)
         return self._with_target(super().perceive(), self._goal, out)
 
     def queue(self, action: Tensor, out: Tensor | None = None) -> Tensor:
         """Do what `step` does but wait for the device; return what is observed, [B, N, P + T]."""
-        if not self.told_dim:
+        if not self.target_dim:
             return super().queue(action, out)
         return self._with_target(super().queue(action), self._goal, out)
 
     def told_observation(self, observation: Tensor) -> Tensor:
         """Return what is observed in a single world after a step, shape [1, N, P + T]."""
-        return observation if self.told_dim else super().told_observation(observation)
+        return observation if self.target_dim else super().told_observation(observation)
 
     def _restart(self, worlds: NDArray[np.int64], observation: Tensor) -> None:
         """Start the next episodes of some worlds, [M], and write what is observed there."""
-        index = sent(worlds, self.device)
+        index = to_device_async(worlds, self.device)
         start = self.start(index)
-        rows = survey_worlds(start.x, start.s, self.physics).perceive()
+        rows = find_neighbours(start.x, start.s, self.physics).perceive()
         observation[index] = self._with_target(rows, self._goal[index], None)
 
     def _with_target(self, rows: Tensor, goal: Tensor, out: Tensor | None) -> Tensor:
         """Return rows, [M, N, P], with what they tell of the worlds' pictures, [M], behind."""
-        told = self.task.told_rows[goal][:, None].expand(-1, rows.shape[1], -1)
+        told = self.task.target_rows[goal][:, None].expand(-1, rows.shape[1], -1)
         wide = torch.cat((rows, told), dim=-1)
         return wide if out is None else out.copy_(wide)
 
@@ -253,13 +253,13 @@ class Pictures2DEnv(NPAEnv):
     """
 
     task_type = PicturesTask
-    worlds_type = PictureWorlds
-    form_type = PictureRows
+    worlds_type = TargetWorlds
+    form_type = PictureSpaces
 
 
 class Pictures2DVectorEnv(NPAVectorEnv):
     """Worlds of `Pictures2DEnv`, batched on one device; its docstring describes both."""
 
     task_type = PicturesTask
-    worlds_type = PictureWorlds
-    form_type = PictureRows
+    worlds_type = TargetWorlds
+    form_type = PictureSpaces

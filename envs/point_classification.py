@@ -15,7 +15,7 @@ from npa_envs import world_mean
 from npa_envs.checks import check_positive
 from npa_envs.envs.core.config import EnvConfig
 from npa_envs.envs.core.single import NPAEnv
-from npa_envs.envs.core.task import GoalTask, Start
+from npa_envs.envs.core.task import Start, TargetEnvTask
 from npa_envs.envs.core.vector import NPAVectorEnv
 from npa_envs.errors import NPAError, shown
 from npa_envs.rule.files import load_rule
@@ -93,7 +93,7 @@ class _WorldByWorld(NPARule):
         return torch.stack([super(_WorldByWorld, self).read_out(world) for world in states])
 
 
-class PointClassificationTask(GoalTask[PointClassificationEnvConfig]):
+class PointClassificationTask(TargetEnvTask[PointClassificationEnvConfig]):
     """Clouds of digits, and the error of what their particles say of them."""
 
     config_type = PointClassificationEnvConfig
@@ -134,7 +134,7 @@ class PointClassificationTask(GoalTask[PointClassificationEnvConfig]):
         """Return the share of each world's particles that say its class most loudly, [B]."""
         return 1.0 - world_mean(self.goal.mistakes(s)[..., None])[:, 0]
 
-    def told(self, s: Tensor) -> dict[str, Tensor]:
+    def extra_info(self, s: Tensor) -> dict[str, Tensor]:
         """Return each world's class, int64, and accuracy, shape [B] each."""
         return {"label": self.goal.wanted.clone(), "accuracy": self.accuracy(s)}
 

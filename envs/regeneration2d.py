@@ -13,19 +13,19 @@ from npa_envs.envs.core.task import Start
 from npa_envs.envs.core.vector import NPAVectorEnv
 from npa_envs.envs.core.worlds import total
 from npa_envs.envs.grown import GrownConfig, GrownTask
-from npa_envs.envs.morphogenesis2d import PictureTask
+from npa_envs.envs.morphogenesis2d import PictureEnvTask
 from npa_envs.errors import NPAError, shown, suggest
 from npa_envs.rule.rule import COLOUR_OFFSET
 from npa_envs.tasks.damage import damage_worlds
-from npa_envs.world.randomness import Purpose, WorldRandom
+from npa_envs.world.randomness import StreamId, WorldRandom
 
 RANDOM_DAMAGE = "random"
 """Each episode draws its kind of damage."""
 
-RANDOM_KINDS = ("erase", "cut", "clump")
+RANDOM_KINDS = ("wipe", "cut", "clump")
 """Kinds that it draws from."""
 
-SIZES = {"erase": 0.3, "cut": 0.1, "clump": 0.2, "noise": 0.05}
+SIZES = {"wipe": 0.3, "cut": 0.1, "clump": 0.2, "noise": 0.05}
 """Radius, width, radius and standard deviation where no size is given [length units]."""
 
 LEAST_RISE = 0.02
@@ -45,11 +45,11 @@ class Regeneration2DEnvConfig(GrownConfig):
     """As elsewhere; it equals the registered `max_episode_steps`."""
 
     damage: str = RANDOM_DAMAGE
-    """What is done to the worlds: "erase", "cut", "clump", "noise", or "random" for one of the
+    """What is done to the worlds: "wipe", "cut", "clump", "noise", or "random" for one of the
     first three."""
 
     damage_size: float | None = None
-    """Radius of the erased or clumped disk, width of the cut, or standard deviation of the noise
+    """Radius of the wiped or clumped disk, width of the cut, or standard deviation of the noise
     [length units]; None: 0.3, 0.1, 0.2 and 0.05."""
 
     rule: str | None = None
@@ -106,7 +106,7 @@ class RegenerationTask(GrownTask[Regeneration2DEnvConfig]):
         """Return damaged worlds; they are healed once their loss is near the undamaged one."""
         x, s, threshold, _ = super().start(random)
         if self.config.split_damage and self.config.split == "test":
-            random = random.beside(Purpose.TEST)
+            random = random.substream(StreamId.TEST)
         kinds = RANDOM_KINDS if self.config.damage == RANDOM_DAMAGE else (self.config.damage,)
         chosen = random.integers(len(kinds), 1, 1)
         hurt_x, hurt_s = x, s
@@ -129,7 +129,7 @@ class RegenerationTask(GrownTask[Regeneration2DEnvConfig]):
         return total(torch.stack(list(self.losses(x, s).values())))
 
     def _picture_worlds(self, random: WorldRandom) -> tuple[Tensor, Tensor]:
-        x, s = PictureTask.seed(self, random)
+        x, s = PictureEnvTask.seed(self, random)
         points, colours = self.goal.target.points, self.goal.target.colours
         # The target's points are about as many as the particles: some stand twice, or are left out.
         chosen = torch.linspace(0, len(points) - 1, x.shape[1], device=x.device).round().long()
@@ -167,7 +167,7 @@ class Regeneration2DEnv(NPAEnv):
 
     | `damage` | What is done |
     |---|---|
-    | `"erase"` | the states in a disk around a random particle become zero: grey |
+    | `"wipe"` | the states in a disk around a random particle become zero: grey |
     | `"cut"` | particles near a line through the middle, at a random angle, move off it |
     | `"clump"` | the particles in a disk around a random one come ten times nearer to its centre |
     | `"noise"` | every position gets normal noise |

@@ -17,11 +17,11 @@ from torch import Tensor
 from npa_envs.checks import check_positive, number_tensor
 from npa_envs.envs.core.config import EnvConfig
 from npa_envs.envs.core.single import NPAEnv
-from npa_envs.envs.core.spaces import Rows, action_tensor
+from npa_envs.envs.core.spaces import ParticleSpaces, action_tensor
 from npa_envs.envs.core.task import EnvTask, Start
 from npa_envs.envs.core.vector import NPAVectorEnv
 from npa_envs.envs.garden.config import GardenReward
-from npa_envs.envs.garden.worlds import LivingWorlds
+from npa_envs.envs.garden.worlds import BrushedWorlds
 from npa_envs.envs.grown import run_rule
 from npa_envs.errors import NPAError
 from npa_envs.rule.codes import Codes
@@ -31,7 +31,7 @@ from npa_envs.tasks.many_pictures import ManyPictures
 from npa_envs.tasks.morphogenesis2d import Morphogenesis2DConfig
 from npa_envs.training.trained_tasks import sources_of_codes
 from npa_envs.world.actions import Physics
-from npa_envs.world.randomness import Purpose, WorldRandom
+from npa_envs.world.randomness import StreamId, WorldRandom
 
 SEEN_LIMIT = 8.0
 """What is seen is clipped to plus and minus this (dimensionless)."""
@@ -139,7 +139,7 @@ class ShapeshifterTask(EnvTask[Shapeshifter2DEnvConfig]):
     """A picture that becomes others; what worlds keep are their goals, the present one first."""
 
     config_type = Shapeshifter2DEnvConfig
-    mark_count: ClassVar[int] = 1 + GOAL_COUNT
+    context_count: ClassVar[int] = 1 + GOAL_COUNT
     pays_each_step: ClassVar[bool] = False
 
     def __init__(self, config: Shapeshifter2DEnvConfig, device: torch.device) -> None:
@@ -201,7 +201,7 @@ class ShapeshifterTask(EnvTask[Shapeshifter2DEnvConfig]):
                 x[k : k + 1],
                 s[k : k + 1],
                 count,
-                random.take(slice(k, k + 1)).beside(Purpose.GROWTH),
+                random.take(slice(k, k + 1)).substream(StreamId.GROWTH),
             )
             for k in range(len(x))
         ]
@@ -224,7 +224,7 @@ class ShapeshifterTask(EnvTask[Shapeshifter2DEnvConfig]):
         density, colour = self.pictures.splat_losses(x, s)
         return {"density": density, "colour": self.config.colour_weight * colour}
 
-    def marked(self, start: Start, loss: Tensor, random: WorldRandom) -> Tensor:
+    def episode_context(self, start: Start, loss: Tensor, random: WorldRandom) -> Tensor:
         """Return the goals of an episode: the present one, then all of them in turn, [B, 1 + G]."""
         assert start.goal is not None, "made with goals"
         goals = [start.goal]
@@ -234,7 +234,7 @@ class ShapeshifterTask(EnvTask[Shapeshifter2DEnvConfig]):
         goals[-1] = torch.where(goals[-1] == goals[0], self._another(goals[0], random), goals[-1])
         return torch.stack([start.goal, *goals], dim=1).to(loss)
 
-    def lived(
+    def step(
         self, x: Tensor, s: Tensor, action: Tensor, random: WorldRandom
     ) -> tuple[Tensor, Tensor]:
         """Return worlds whose particles carry the code that was chosen, after the rule's steps.
@@ -249,25 +249,25 @@ class ShapeshifterTask(EnvTask[Shapeshifter2DEnvConfig]):
         coded = self.rule.with_code(s, action)
         return run_rule(self.rule, config, x, coded, config.rule_steps, random)
 
-    def earned(self, x: Tensor, s: Tensor, loss: Tensor, marks: Tensor) -> Tensor:
+    def reward(self, x: Tensor, s: Tensor, loss: Tensor, context: Tensor) -> Tensor:
         """Return how near worlds are to their goals: 1 there, 0 as a blank picture; shape [B]."""
-        blank = self.blank_losses.index_select(0, marks[:, 0].long())
+        blank = self.blank_losses.index_select(0, context[:, 0].long())
         return (1.0 - loss / blank).clamp_min(-1.0)
 
-    def told_of(self, x: Tensor, s: Tensor, marks: Tensor) -> dict[str, Tensor]:
+    def context_info(self, x: Tensor, s: Tensor, context: Tensor) -> dict[str, Tensor]:
         """Return the number of each world's goal, shape [B]."""
-        return {"goal": marks[:, 0].long()}
+        return {"goal": context[:, 0].long()}
 
-    def observe(self, x: Tensor, s: Tensor, loss: Tensor, marks: Tensor) -> Tensor:
+    def observe(self, x: Tensor, s: Tensor, loss: Tensor, context: Tensor) -> Tensor:
         """Return coarse pictures of worlds and of their goals, shape [B, 8 G²]."""
-        aimed = self.pictures.toward(marks[:, 0].long())
+        aimed = self.pictures.toward(context[:, 0].long())
         both = torch.cat((aimed.picture(x, s), aimed.target_picture), dim=-1)
         pixels = self.config.resolution // self.config.picture_size
         seen = F.avg_pool2d(both.permute(0, 3, 1, 2), pixels).flatten(1)
         return seen.clamp(-SEEN_LIMIT, SEEN_LIMIT)
 
 
-class ShiftingWorlds(LivingWorlds):
+class ShiftingWorlds(BrushedWorlds):
     """Living worlds whose goals change every `hold_steps` steps, after these have been paid."""
 
     task: Any
@@ -276,13 +276,13 @@ class ShiftingWorlds(LivingWorlds):
         """Return what worlds earn in this step, shape [B], and go on to the next goals."""
         rewards = super()._rewards()
         turn = (self.elapsed.long() // self.task.config.hold_steps) % GOAL_COUNT
-        goal = self.marks.gather(1, 1 + turn[:, None])
-        self.marks[:, :1] = goal
+        goal = self.context.gather(1, 1 + turn[:, None])
+        self.context[:, :1] = goal
         self._goal.copy_(goal[:, 0].long())
         return rewards
 
 
-class CodeForm(Rows):
+class CodeForm(ParticleSpaces):
     """Coarse pictures are seen; an action is a code, or the number of one.
 
     Args:

@@ -18,7 +18,7 @@ from npa_envs.envs.core.spaces import to_output
 from npa_envs.envs.core.task import Start
 from npa_envs.envs.garden.config import GardenConfig, GardenReward
 from npa_envs.envs.garden.environments import GardenEnv, GardenVectorEnv
-from npa_envs.envs.garden.forms import Brushes
+from npa_envs.envs.garden.spaces import BrushSpaces
 from npa_envs.envs.garden.task import SEEN_LIMIT, GardenTask, lost_share, marks_of_whole
 from npa_envs.errors import NPAError
 from npa_envs.tasks.seeds import uniform_ball
@@ -77,10 +77,10 @@ class ShepherdTask(GardenTask[Shepherd2DEnvConfig]):
 
     config_type = Shepherd2DEnvConfig
     # What it is when whole, the goal, then how it lay at the start: mean and second moments.
-    mark_count = 2 + 2 + 5
+    context_count = 2 + 2 + 5
     pays_each_step = True
 
-    def marked(self, start: Start, loss: Tensor, random: WorldRandom) -> Tensor:
+    def episode_context(self, start: Start, loss: Tensor, random: WorldRandom) -> Tensor:
         """Return what is whole, the goal, and how the creature lies at its start."""
         lies = lie_of(start.x)
         reach, width = self.config.goal_reach, 2
@@ -94,9 +94,9 @@ class ShepherdTask(GardenTask[Shepherd2DEnvConfig]):
             goal = 1.0 + drawn
         return torch.cat((marks_of_whole(self, start, loss), goal, lies), dim=1)
 
-    def achieved(self, x: Tensor, s: Tensor, marks: Tensor) -> Tensor:
+    def achieved(self, x: Tensor, s: Tensor, context: Tensor) -> Tensor:
         """Return what worlds have come to and what share of them is lost, shape [B, 3]."""
-        first, now = marks[:, 4:], lie_of(x)
+        first, now = context[:, 4:], lie_of(x)
         if self.config.aim == "move":
             got, undone = now[:, :2], x
         elif self.config.aim == "turn":
@@ -107,11 +107,13 @@ class ShepherdTask(GardenTask[Shepherd2DEnvConfig]):
             middle = now[:, None, :2]
             undone = middle + (x - middle) / got[:, None]
         loss = sum(self.losses(undone, s).values(), torch.zeros_like(got[:, 0]))
-        return torch.cat((got, lost_share(loss, marks)[:, None]), dim=1)
+        return torch.cat((got, lost_share(loss, context)[:, None]), dim=1)
 
-    def desired(self, marks: Tensor) -> Tensor:
+    def desired(self, context: Tensor) -> Tensor:
         """Return what worlds are to come to, and the share that may be lost, shape [B, 3]."""
-        return torch.cat((marks[:, 2:4], torch.full_like(marks[:, :1], self.config.lost_limit)), 1)
+        return torch.cat(
+            (context[:, 2:4], torch.full_like(context[:, :1], self.config.lost_limit)), 1
+        )
 
     def paid(self, achieved: Tensor, desired: Tensor) -> Tensor:
         """Return rewards, shape [...], of what was achieved and desired, [..., 3]."""
@@ -123,21 +125,21 @@ class ShepherdTask(GardenTask[Shepherd2DEnvConfig]):
         nearness = -away * (1.0 / self.config.goal_reach)
         return nearness - self.config.reward_weight * excess.clamp(min=0.0)
 
-    def earned(self, x: Tensor, s: Tensor, loss: Tensor, marks: Tensor) -> Tensor:
+    def reward(self, x: Tensor, s: Tensor, loss: Tensor, context: Tensor) -> Tensor:
         """Return what worlds are worth, shape [B]."""
-        return self.paid(self.achieved(x, s, marks), self.desired(marks)).to(torch.float32)
+        return self.paid(self.achieved(x, s, context), self.desired(context)).to(torch.float32)
 
-    def told_of(self, x: Tensor, s: Tensor, marks: Tensor) -> dict[str, Tensor]:
+    def context_info(self, x: Tensor, s: Tensor, context: Tensor) -> dict[str, Tensor]:
         """Return whether worlds are at their goals and whole, and what share is lost."""
-        achieved, desired = self.achieved(x, s, marks), self.desired(marks)
+        achieved, desired = self.achieved(x, s, context), self.desired(context)
         away = (achieved - desired)[:, :2].square().sum(dim=1).sqrt()
         there = (away <= self.config.tolerance) & (achieved[:, 2] <= desired[:, 2])
         return {"is_success": there, "distance": away, "lost": achieved[:, 2]}
 
-    def observe(self, x: Tensor, s: Tensor, loss: Tensor, marks: Tensor) -> Tensor:
+    def observe(self, x: Tensor, s: Tensor, loss: Tensor, context: Tensor) -> Tensor:
         """Return what is seen, then what is achieved, then what is desired, [B, O + 6]."""
-        seen = super().observe(x, s, loss, marks)
-        goals = torch.cat((self.achieved(x, s, marks), self.desired(marks)), dim=1)
+        seen = super().observe(x, s, loss, context)
+        goals = torch.cat((self.achieved(x, s, context), self.desired(context)), dim=1)
         return torch.cat((seen, goals.clamp(-SEEN_LIMIT, SEEN_LIMIT)), dim=1)
 
 
@@ -179,8 +181,8 @@ def turned_back(x: Tensor, middle: Tensor, turn: Tensor) -> Tensor:
     return middle[:, None] + back
 
 
-class GoalBrushes(Brushes):
-    """As `Brushes`, with what is seen, achieved and desired as a dictionary."""
+class GoalBrushes(BrushSpaces):
+    """As `BrushSpaces`, with what is seen, achieved and desired as a dictionary."""
 
     def __init__(self, physics: Physics, config: Shepherd2DEnvConfig) -> None:
         super().__init__(physics, config)

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from npa_envs.envs.core.config import Boundary, EnvConfig
 from npa_envs.envs.core.single import NPAEnv
-from npa_envs.envs.core.task import GoalTask
+from npa_envs.envs.core.task import TargetEnvTask
 from npa_envs.envs.core.vector import NPAVectorEnv
 from npa_envs.errors import NPAError, shown
 from npa_envs.tasks.texture import Texture, TextureConfig
@@ -56,7 +56,7 @@ class TextureEnvConfig(EnvConfig):
         return self.task_config(TextureConfig)
 
 
-class TextureTask(GoalTask[TextureEnvConfig]):
+class TextureTask(TargetEnvTask[TextureEnvConfig]):
     """A texture, compared by a loss of `npa_envs.tasks.losses.texture`."""
 
     config_type = TextureEnvConfig
@@ -69,7 +69,7 @@ class TextureTask(GoalTask[TextureEnvConfig]):
     @classmethod
     def extra_bytes(cls, config: Any, world_count: int) -> int:
         """Return about how much memory pool and loss need [bytes]."""
-        copies = 4 if config.pays_particles else 1
+        copies = 4 if config.per_particle_reward else 1
         pictures = LOSS_BYTES * copies * world_count * config.resolution**2
         return super().extra_bytes(config, world_count) + int(pictures)
 

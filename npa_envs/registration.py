@@ -168,7 +168,7 @@ SIZES = (
         eps0=0.2,
         target="heart",
         rule="picture",
-        damage="erase",
+        damage="wipe",
         damage_size=0.4,
         resolution=32,
     ),

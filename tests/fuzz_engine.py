@@ -126,7 +126,7 @@ def draw_numbers(seeds: Any, device: Any, method: Any, size: Any, extra: Any) ->
     streams = npa_envs.WorldRandom(seeds, device=device)
     extras = () if method in ("uniform", "normal") else (extra,)
     getattr(streams, method)(*extras, size)
-    streams.beside(extra).advance()
+    streams.substream(extra).advance()
 
 
 def streams(draw: random.Random) -> dict[str, Any]:
@@ -184,7 +184,7 @@ def films(draw: random.Random) -> dict[str, Any]:
 
 
 def damaged(draw: random.Random) -> dict[str, Any]:
-    kind = draw.choice(("erase", "cut", "clump", "noise"))
+    kind = draw.choice(("wipe", "cut", "clump", "noise"))
     return world(draw) | {"kind": kind, "size": 0.1, "generator": None}
 
 

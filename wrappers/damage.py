@@ -18,7 +18,7 @@ from npa_envs.envs.core.spaces import to_output
 from npa_envs.envs.core.vector import NPAVectorEnv
 from npa_envs.errors import NPAError, shown
 from npa_envs.tasks.damage import DamageEvent, damage_worlds, parse_damage
-from npa_envs.world.randomness import Purpose
+from npa_envs.world.randomness import StreamId
 from npa_envs.wrappers.base import (
     AnyVectorEnv,
     AnyWrapper,
@@ -100,7 +100,7 @@ class _DamagesWorlds(RecordConstructorArgs):
         for k, (event, mask) in enumerate(zip(self.schedule.events, due, strict=True), self._first):
             if mask.any():
                 chosen = world_indices(mask, x.device)
-                stream = worlds.random.take(chosen).beside(Purpose.DAMAGE).beside(k)
+                stream = worlds.random.take(chosen).substream(StreamId.DAMAGE).substream(k)
                 x[chosen], s[chosen] = damage_worlds(
                     x[chosen], s[chosen], kind=event.kind, size=event.size, generator=stream
                 )

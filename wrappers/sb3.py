@@ -240,7 +240,7 @@ class _EpisodeRows(RowVecEnv):
     bootstrap = True
     """Whether rows cut off by the step limit say so."""
 
-    pays_particles = True
+    per_particle_reward = True
     """Whether rows are paid what their particles are, where that is known."""
 
     def reset(self) -> Any:
@@ -261,7 +261,7 @@ class _EpisodeRows(RowVecEnv):
         shape = self.vector_env.single_action_space.shape
         actions = self.taken_actions().reshape(self.world_count, *shape)
         observations, rewards, terminations, truncations, infos = self.vector_env.step(actions)
-        own = own_rewards(infos) if self.pays_particles else None
+        own = own_rewards(infos) if self.per_particle_reward else None
         paid, ended, cut = on_host(rewards if own is None else own, terminations, truncations)
         if own is None:
             paid = np.repeat(paid, self.row_count)
@@ -376,7 +376,7 @@ class WorldVecEnv(_EpisodeRows):
         MissingDependencyError: Stable-Baselines3 is not installed (on import).
     """
 
-    pays_particles = False
+    per_particle_reward = False
 
     def __init__(self, env: Any) -> None:
         spaces: list[Any] = [

@@ -17,7 +17,7 @@ from npa_envs.envs.core.single import NPAEnv
 from npa_envs.envs.core.spaces import to_output
 from npa_envs.envs.core.vector import NPAVectorEnv
 from npa_envs.errors import NPAError, shown, suggest
-from npa_envs.world.randomness import Purpose, WorldRandom
+from npa_envs.world.randomness import StreamId, WorldRandom
 from npa_envs.wrappers.base import (
     AnyVectorEnv,
     Observations,
@@ -83,7 +83,7 @@ class SpeciesPlan:
         blocks = self.blocks.to(worlds.device)
         if not self.random:
             return blocks.expand(len(worlds), -1)
-        keys = random.take(worlds).beside(Purpose.SPECIES).uniform(len(blocks))
+        keys = random.take(worlds).substream(StreamId.SPECIES).uniform(len(blocks))
         return blocks[keys.argsort(dim=1, stable=True)]
 
     def space(self, space: Space[Any], wrapper: str) -> Box:

@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from npa_envs.agents.comparison.plan import NOTHING, YARDSTICK, Axis, Plan
+from npa_envs.agents.comparison.plan import NOTHING, YARDSTICK, Axis, ComparisonPlan
 from npa_envs.agents.comparison.run import RunRecord
 from npa_envs.agents.learning import methods_for
 from npa_envs.agents.learning.problem import Problem
@@ -55,7 +55,7 @@ EXCESS = 1.25
 SCHEMA = Path(__file__).with_name("npa_bench_v0.schema.json")
 
 
-class Entry(NamedTuple):
+class BenchProblem(NamedTuple):
     """A problem: episodes, worlds to learn in, the hidden layer of new rules, and the budget."""
 
     episode_steps: int
@@ -78,11 +78,11 @@ class Suite:
     """
 
     name: str
-    groups: Mapping[str, Mapping[str, Entry]]
+    groups: Mapping[str, Mapping[str, BenchProblem]]
     """Problems that are told together."""
 
     @property
-    def entries(self) -> dict[str, Entry]:
+    def entries(self) -> dict[str, BenchProblem]:
         """All problems by their ids."""
         return {env_id: entry for group in self.groups.values() for env_id, entry in group.items()}
 
@@ -133,29 +133,29 @@ def task_name(env_id: str) -> str:
 
 
 _PARTICLES = {
-    "npa/Morphogenesis2DSmall-v0": Entry(32, 16, 64, 5_000_000),
-    "npa/Regeneration2DSmall-v0": Entry(24, 16, 64, 5_000_000),
+    "npa/Morphogenesis2DSmall-v0": BenchProblem(32, 16, 64, 5_000_000),
+    "npa/Regeneration2DSmall-v0": BenchProblem(24, 16, 64, 5_000_000),
     # Its loss takes most of the time.
-    "npa/TextureSmall-v0": Entry(24, 16, 64, 1_000_000),
-    "npa/PointClassificationSmall-v0": Entry(16, 16, 64, 5_000_000),
-    "npa/MixingSmall-v0": Entry(32, 16, 64, 5_000_000),
+    "npa/TextureSmall-v0": BenchProblem(24, 16, 64, 1_000_000),
+    "npa/PointClassificationSmall-v0": BenchProblem(16, 16, 64, 5_000_000),
+    "npa/MixingSmall-v0": BenchProblem(32, 16, 64, 5_000_000),
 }
 
 _GARDENS = {
     # 48 828 steps of worlds, of 8 steps of the rule each.
-    "npa/Gardener2DSmall-v0": Entry(32, 64, 64, 100_000_000),
-    "npa/Shepherd2DSmall-v0": Entry(32, 64, 64, 100_000_000),
+    "npa/Gardener2DSmall-v0": BenchProblem(32, 64, 64, 100_000_000),
+    "npa/Shepherd2DSmall-v0": BenchProblem(32, 64, 64, 100_000_000),
 }
 
 _SMALL = {
-    "npa/Morphogenesis2DSmall-v0": Entry(32, 16, 64, 1_000_000),
-    "npa/Regeneration2DSmall-v0": Entry(24, 16, 64, 500_000),
-    "npa/TextureSmall-v0": Entry(24, 16, 64, 300_000),
-    "npa/PointClassificationSmall-v0": Entry(16, 16, 64, 1_000_000),
-    "npa/MixingSmall-v0": Entry(32, 16, 64, 500_000),
-    "npa/SegregationSmall-v0": Entry(32, 16, 64, 500_000),
-    "npa/CoMorphogenesisSmall-v0": Entry(32, 16, 64, 500_000),
-    "npa/SymbiosisSmall-v0": Entry(32, 16, 64, 1_500_000),
+    "npa/Morphogenesis2DSmall-v0": BenchProblem(32, 16, 64, 1_000_000),
+    "npa/Regeneration2DSmall-v0": BenchProblem(24, 16, 64, 500_000),
+    "npa/TextureSmall-v0": BenchProblem(24, 16, 64, 300_000),
+    "npa/PointClassificationSmall-v0": BenchProblem(16, 16, 64, 1_000_000),
+    "npa/MixingSmall-v0": BenchProblem(32, 16, 64, 500_000),
+    "npa/SegregationSmall-v0": BenchProblem(32, 16, 64, 500_000),
+    "npa/CoMorphogenesisSmall-v0": BenchProblem(32, 16, 64, 500_000),
+    "npa/SymbiosisSmall-v0": BenchProblem(32, 16, 64, 1_500_000),
 }
 """As many particle-steps as a core makes in a minute or less."""
 
@@ -174,7 +174,7 @@ particles, and its steps count."""
 
 
 @dataclass(frozen=True)
-class Run:
+class BenchRun:
     """What one run reached."""
 
     env_id: str
@@ -190,12 +190,12 @@ class Run:
 
 
 @dataclass(frozen=True)
-class Row:
+class BenchRow:
     """What a method reached in a suite."""
 
     suite: Suite
     method: str
-    runs: tuple[Run, ...]
+    runs: tuple[BenchRun, ...]
     about: str = ""
     """What the method is, in a sentence."""
     machine: str = ""
@@ -208,7 +208,7 @@ class Row:
 
 
 def write_rows(
-    suite: Suite, plan: Plan, records: Sequence[RunRecord], folder: Path, command: str
+    suite: Suite, plan: ComparisonPlan, records: Sequence[RunRecord], folder: Path, command: str
 ) -> list[Path]:
     """Write a file for each method of a suite's plan, METHOD.json, and return the paths.
 
@@ -239,7 +239,7 @@ def write_rows(
     return paths
 
 
-def check_rows(suite: Suite, plan: Plan, folder: Path) -> None:
+def check_rows(suite: Suite, plan: ComparisonPlan, folder: Path) -> None:
     """Check that runs of a plan can be added to the rows in a folder, before any of them is run.
 
     Raises:
@@ -250,7 +250,9 @@ def check_rows(suite: Suite, plan: Plan, folder: Path) -> None:
         _held_row(suite, plan, method, folder)
 
 
-def _held_row(suite: Suite, plan: Plan, method: str, folder: Path) -> dict[str, Any] | None:
+def _held_row(
+    suite: Suite, plan: ComparisonPlan, method: str, folder: Path
+) -> dict[str, Any] | None:
     """Return a method's row in a folder, None where there is none; errors of `check_rows`."""
     path = folder / f"{method}.json"
     if not path.exists():
@@ -336,7 +338,7 @@ def _run_object(suite: Suite, record: RunRecord) -> dict[str, Any]:
     }
 
 
-def read_row(path: Path) -> Row:
+def read_row(path: Path) -> BenchRow:
     """Return a row from its file.
 
     Raises:
@@ -358,20 +360,20 @@ def read_row(path: Path) -> Row:
         ) from error
     runs = tuple(_read_run(run) for run in held["runs"])
     suite, told = SUITES[held["benchmark"]], held.get("about", "")
-    row = Row(suite, held["method"], runs, told, held["machine"])
+    row = BenchRow(suite, held["method"], runs, told, held["machine"])
     _check_row(row, path.name)
     return row
 
 
-def _read_run(held: Mapping[str, Any]) -> Run:
+def _read_run(held: Mapping[str, Any]) -> BenchRun:
     returns = [math.nan if value is None else float(value) for value in held["returns"]]
     mean = sum(returns) / len(returns) if returns else math.nan
     curve = tuple((at, value) for at, value in held["curve"] if value is not None)
     where = held.get("machine", "")
-    return Run(held["id"], held["seed"], held["particle_steps"], mean, curve, where)
+    return BenchRun(held["id"], held["seed"], held["particle_steps"], mean, curve, where)
 
 
-def _check_row(row: Row, name: str) -> None:
+def _check_row(row: BenchRow, name: str) -> None:
     """Check what a schema cannot say; raises NPAError."""
     entries = row.suite.entries
     machines = row.machine.split("; ")
@@ -402,13 +404,13 @@ def _check_row(row: Row, name: str) -> None:
                 )
 
 
-def read_rows(suite: Suite, folder: Path) -> dict[str, Row]:
+def read_rows(suite: Suite, folder: Path) -> dict[str, BenchRow]:
     """Return all rows of a suite's folder by their methods.
 
     Raises:
         NPAError: As for `read_row`; or a file is of another suite, or two are of one method.
     """
-    rows: dict[str, Row] = {}
+    rows: dict[str, BenchRow] = {}
     for path in sorted(folder.glob("*.json")):
         row = read_row(path)
         if row.suite is not suite:
@@ -436,7 +438,7 @@ class Score(NamedTuple):
         return f"{self.middle:.2f} [{self.low:.2f}, {self.high:.2f}]"
 
 
-def normalised(rows: Mapping[str, Row], method: str, env_id: str) -> NDArray[np.float64]:
+def normalised(rows: Mapping[str, BenchRow], method: str, env_id: str) -> NDArray[np.float64]:
     """Return the score of each run: (R − R_zero) / (R_gradient − R_zero) of mean returns R.
 
     R_zero and R_gradient are means over their runs. A run that diverged has the score 0.
@@ -498,7 +500,7 @@ def score(samples: Sequence[NDArray[np.float64]], seed: int = 0) -> Score:
 
 
 def scores_in(
-    rows: Mapping[str, Row], method: str, env_ids: Iterable[str]
+    rows: Mapping[str, BenchRow], method: str, env_ids: Iterable[str]
 ) -> dict[str, NDArray[np.float64]]:
     """Return the scores of a method on those of some problems that it has runs of."""
     return {

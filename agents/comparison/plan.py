@@ -52,7 +52,7 @@ PROBLEMS: Mapping[str, Sizes] = {
     ),
     "regeneration2d": Sizes(
         "npa/Regeneration2D-v0",
-        {**GROWTH, "rule": "picture", "damage": "erase", "damage_size": 0.4},
+        {**GROWTH, "rule": "picture", "damage": "wipe", "damage_size": 0.4},
         32,
         64,
         SMALL,
@@ -138,7 +138,7 @@ class Job:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Plan:
+class ComparisonPlan:
     """A whole comparison."""
 
     tasks: Mapping[str, Mapping[str, Any]]

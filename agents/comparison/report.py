@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from npa_envs.agents.comparison.plan import AXES, NOTHING, YARDSTICK, Axis, Plan
-from npa_envs.agents.comparison.run import PICTURE, SIZE, Point, RunRecord
+from npa_envs.agents.comparison.plan import AXES, NOTHING, YARDSTICK, Axis, ComparisonPlan
+from npa_envs.agents.comparison.run import PICTURE, SIZE, ComparisonPoint, RunRecord
 from npa_envs.files import write_text
 from npa_envs.measure.plots import draw_band, legend_of, new_figure, png, write_plots
 from npa_envs.measure.record import write_record
@@ -32,7 +32,9 @@ TABLE, FIGURES, CURVES = "comparison.md", "comparison.json", "comparison.csv"
 """Names of the files of the table, and of the curves."""
 
 
-def write_table(plan: Plan, records: Sequence[RunRecord], folder: Path, command: str) -> str:
+def write_table(
+    plan: ComparisonPlan, records: Sequence[RunRecord], folder: Path, command: str
+) -> str:
     """Write the table, in Markdown and as JSON, and all curves; return the table in Markdown.
 
     Raises:
@@ -47,7 +49,7 @@ def write_table(plan: Plan, records: Sequence[RunRecord], folder: Path, command:
     return told
 
 
-def _sharing(plan: Plan) -> str:
+def _sharing(plan: ComparisonPlan) -> str:
     """Return what is to be said where runs of equal wall time were not alone; else nothing."""
     at_once = plan.settings.get("runs_at_once", 1)
     if "seconds" not in plan.budgets or at_once == 1:
@@ -99,7 +101,7 @@ def estimate(values: Iterable[float]) -> Estimate:
 
 
 @dataclass(frozen=True)
-class Row:
+class ReportRow:
     """What a method reached on a task, over its seeds."""
 
     axis: Axis
@@ -143,7 +145,7 @@ class Row:
         }
 
 
-def rows(records: Iterable[RunRecord]) -> list[Row]:
+def rows(records: Iterable[RunRecord]) -> list[ReportRow]:
     """Return a row for each method on each task for each axis, in the order of the records."""
     groups: dict[tuple[Axis, str, str], list[RunRecord]] = {}
     for record in records:
@@ -176,7 +178,7 @@ def fraction(reached: Estimate, nothing: Estimate, yardstick: Estimate) -> Estim
 
 def _row(
     records: Sequence[RunRecord], reached: Estimate, *, nothing: Estimate, yardstick: Estimate
-) -> Row:
+) -> ReportRow:
     job = records[0].job
     states = [record.status for record in records]
     lasts = [record.curve[-1] for record in records if record.curve]
@@ -186,7 +188,7 @@ def _row(
     share = fraction(reached, nothing, yardstick)
     if job.method == YARDSTICK and not math.isnan(share.mean):
         share = Estimate(1.0, math.nan)
-    return Row(
+    return ReportRow(
         axis=job.axis,
         task=job.task,
         method=job.method,
@@ -206,7 +208,7 @@ def _row(
 # Rows in words
 
 
-def text(table: Sequence[Row]) -> str:
+def text(table: Sequence[ReportRow]) -> str:
     """Return rows as tables in Markdown, one for each axis and task."""
     parts = []
     for axis in AXES:
@@ -223,17 +225,17 @@ def text(table: Sequence[Row]) -> str:
     return "\n\n".join(parts) + "\n"
 
 
-def _table(table: Sequence[Row]) -> str:
+def _table(table: Sequence[ReportRow]) -> str:
     heads = (
         "method", "runs", "return", "final loss", f"fraction of {YARDSTICK}", "seconds",
         "particle-steps",
     )  # fmt: skip
 
-    def rank(row: Row) -> float:
+    def rank(row: ReportRow) -> float:
         mean = row.final_return.mean
         return math.inf if math.isnan(mean) else -mean
 
-    def cells(row: Row) -> list[str]:
+    def cells(row: ReportRow) -> list[str]:
         partial = f" (of {row.counted} of {row.runs})" if row.counted < row.runs else ""
         numbers = (row.final_return, row.final_loss, row.fraction)
         shown = [str(n) if math.isnan(n.mean) else f"{n}{partial}" for n in numbers]
@@ -248,7 +250,7 @@ def _table(table: Sequence[Row]) -> str:
     return markdown_table(heads, map(cells, sorted(table, key=rank)))
 
 
-def _runs(row: Row) -> str:
+def _runs(row: ReportRow) -> str:
     """Return how many runs there are, and what went wrong."""
     parts = [f"{row.done}"]
     if row.diverged:
@@ -268,7 +270,14 @@ def curves(records: Iterable[RunRecord]) -> str:
 
     Of runs that failed these are the curves up to there.
     """
-    heads = ["axis", "task", "method", "seed", "status", *(field.name for field in fields(Point))]
+    heads = [
+        "axis",
+        "task",
+        "method",
+        "seed",
+        "status",
+        *(field.name for field in fields(ComparisonPoint)),
+    ]
     lines = [
         [*(r.job.axis, r.job.task, r.job.method, r.job.seed, r.status), *astuple(point)]
         for r in records
@@ -277,7 +286,7 @@ def curves(records: Iterable[RunRecord]) -> str:
     return csv_text(heads, lines)
 
 
-ACROSS: dict[str, Callable[[Point], float]] = {
+ACROSS: dict[str, Callable[[ComparisonPoint], float]] = {
     "wall time [s]": lambda point: point.seconds,
     "particle-steps": lambda point: point.particle_steps,
 }
@@ -298,7 +307,7 @@ class Curve(NamedTuple):
     """Its standard error, 0 for a single seed, shape [K]."""
 
 
-def curve(records: Sequence[RunRecord], across: Callable[[Point], float]) -> Curve | None:
+def curve(records: Sequence[RunRecord], across: Callable[[ComparisonPoint], float]) -> Curve | None:
     """Return the mean of learning curves where all of them are; None where they nowhere are.
 
     Between its points a curve is straight. What does not learn has a single point: its curve is

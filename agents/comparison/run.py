@@ -31,11 +31,11 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from npa_envs.agents.comparison.plan import Job, Plan
+from npa_envs.agents.comparison.plan import ComparisonPlan, Job
 from npa_envs.agents.evaluation import Episodes, evaluate_policy, policy_in
 from npa_envs.agents.learning import method_options, train
 from npa_envs.agents.learning.problem import Problem
-from npa_envs.agents.learning.progress import Budget, Entry
+from npa_envs.agents.learning.progress import Budget, CurvePoint
 from npa_envs.errors import DivergedError, NPAError
 from npa_envs.measure.record import number, read_record, write_record
 from npa_envs.processes import Child, Places, run_children
@@ -55,7 +55,7 @@ FIRST_TEST_SEED = 2_000_000
 
 
 @dataclass(frozen=True)
-class Point:
+class ComparisonPoint:
     """A place on a learning curve: training's wall time [s] and particles times steps so far, and
     the mean return of held-out episodes, its standard error, and their mean loss at the end.
     """
@@ -78,7 +78,7 @@ class RunRecord:
     """"done"; "diverged": numbers became infinite or NaN; "failed": an error of another kind."""
     error: str = ""
     """What was raised, where it is not done."""
-    curve: Sequence[Point] = ()
+    curve: Sequence[ComparisonPoint] = ()
     """What held-out episodes gave while it learned."""
     returns: Sequence[float] = ()
     """Returns of the held-out episodes at the end."""
@@ -122,7 +122,7 @@ class RunRecord:
             points = [{name: number(v) for name, v in row.items()} for row in held["curve"]]
             own = {
                 "job": Job(**held["job"]),
-                "curve": tuple(Point(**point) for point in points),
+                "curve": tuple(ComparisonPoint(**point) for point in points),
                 "returns": tuple(map(number, held["returns"])),
                 "final_losses": tuple(map(number, held["final_losses"])),
             }
@@ -136,7 +136,7 @@ def _mean(values: Sequence[float]) -> float:
 
 
 @dataclass(frozen=True)
-class Request:
+class RunRequest:
     """What a process is asked for."""
 
     job: Job
@@ -150,7 +150,7 @@ class Request:
     """Whether the process waits for another run afterwards."""
 
     @classmethod
-    def read(cls, folder: Path) -> Request:
+    def read(cls, folder: Path) -> RunRequest:
         """Return what a folder asks for."""
         held = json.loads((folder / REQUEST).read_text("utf-8"))
         return cls(**held | {"job": Job(**held["job"])})
@@ -191,10 +191,10 @@ def run(folder: Path, device: str) -> None:
 
     Whatever is raised is recorded, so that other runs can go on.
     """
-    request = Request.read(folder)
+    request = RunRequest.read(folder)
     torch.set_num_threads(request.threads)
     begin = time.perf_counter()
-    curve: list[Point] = []
+    curve: list[ComparisonPoint] = []
     try:
         episodes = _learn(request, folder, device, lambda entry: curve.append(_point(entry)))
     except Exception as error:
@@ -218,7 +218,7 @@ def run(folder: Path, device: str) -> None:
 
 
 def _learn(
-    request: Request, folder: Path, device: str, on_entry: Callable[[Entry], None]
+    request: RunRequest, folder: Path, device: str, on_entry: Callable[[CurvePoint], None]
 ) -> Episodes:
     """Learn, write what was learned, and return the held-out episodes."""
     problem, job, facts = request.problem, request.job, request.facts
@@ -244,8 +244,8 @@ def _learn(
     return episodes
 
 
-def _point(entry: Entry) -> Point:
-    return Point(
+def _point(entry: CurvePoint) -> ComparisonPoint:
+    return ComparisonPoint(
         entry.seconds,
         entry.particle_steps,
         entry.mean_return,
@@ -301,8 +301,8 @@ def main(folder: Path) -> None:
     threading.Thread(target=listen, daemon=True).start()
     # Loads what the method needs. Whatever breaks here breaks in `run` as well, which records it.
     with contextlib.suppress(Exception):
-        method_options(Request.read(folder).method)
-    lasts = Request.read(folder).lasts
+        method_options(RunRequest.read(folder).method)
+    lasts = RunRequest.read(folder).lasts
     run(folder, lines.get())
     while lasts:
         folder = Path(json.loads(lines.get()))
@@ -372,7 +372,7 @@ def _tell(process: subprocess.Popen[bytes], line: str) -> None:
         process.stdin.flush()
 
 
-def lasts(plan: Plan, job: Job) -> bool:
+def lasts(plan: ComparisonPlan, job: Job) -> bool:
     """Return whether the process of a run does others before and afterwards.
 
     One that is measured by time has a process of its own, so that all start alike, and so has a
@@ -383,7 +383,7 @@ def lasts(plan: Plan, job: Job) -> bool:
     return os.name == "posix" and job.axis == "particle-steps" and not own
 
 
-def held_records(plan: Plan, folder: Path) -> dict[Job, RunRecord]:
+def held_records(plan: ComparisonPlan, folder: Path) -> dict[Job, RunRecord]:
     """Return what an earlier comparison left in a folder, but for runs that failed.
 
     Raises:
@@ -398,7 +398,7 @@ def held_records(plan: Plan, folder: Path) -> dict[Job, RunRecord]:
 
 
 def run_jobs(
-    plan: Plan,
+    plan: ComparisonPlan,
     jobs: Sequence[Job],
     folder: Path,
     places: Places,
@@ -465,7 +465,7 @@ def run_jobs(
             process.communicate()
 
 
-def _check_teachers(plan: Plan, jobs: Collection[Job], folder: Path) -> None:
+def _check_teachers(plan: ComparisonPlan, jobs: Collection[Job], folder: Path) -> None:
     """Refuse runs whose teacher is not there and will not come, before anything is run.
 
     One that is there must follow from the same settings.
@@ -485,7 +485,7 @@ def _check_teachers(plan: Plan, jobs: Collection[Job], folder: Path) -> None:
 
 
 def _start(
-    plan: Plan,
+    plan: ComparisonPlan,
     job: Job,
     folder: Path,
     places: Places,
@@ -499,7 +499,7 @@ def _start(
     teacher = plan.teacher(job)
     taught = "" if teacher is None else str(folder / teacher.folder)
     lasting = lasts(plan, job)
-    request = Request(job, plan.facts(job), places.threads, command, taught, lasting)
+    request = RunRequest(job, plan.facts(job), places.threads, command, taught, lasting)
     write_record(part / REQUEST, asdict(request))
     if lasting and idle:
         # The process turns to this file itself, unless it dies before.
@@ -519,11 +519,11 @@ def _start(
     return _Process(job, part, process, lasts=lasting)
 
 
-def _finish(plan: Plan, one: _Process, folder: Path, command: str) -> RunRecord:
+def _finish(plan: ComparisonPlan, one: _Process, folder: Path, command: str) -> RunRecord:
     """Put the results of a run that is over into their place, and return its record."""
     if not one.lasts:
         one.process.communicate()
-    request = Request(one.job, plan.facts(one.job), command=command)
+    request = RunRequest(one.job, plan.facts(one.job), command=command)
     record = RunRecord.read(one.folder, request.facts)
     if record is None:
         code = one.process.returncode

@@ -18,7 +18,7 @@ import torch
 
 from npa_envs.agents.learning.kept import KeptProgress
 from npa_envs.agents.learning.problem import EVALUATION_SEEDS, Problem, check_run_seed
-from npa_envs.agents.learning.progress import Budget, Entry, Progress, check_finite
+from npa_envs.agents.learning.progress import Budget, CurvePoint, Progress, check_finite
 from npa_envs.agents.learning.rules import RuleSet, RuleSetPolicy, starting_rules
 from npa_envs.devices import check_device
 from npa_envs.errors import MissingDependencyError, NPAError, shown, suggest
@@ -30,7 +30,7 @@ __all__ = [
     "KEPT_METHODS",
     "METHODS",
     "Budget",
-    "Entry",
+    "CurvePoint",
     "Problem",
     "Progress",
     "RuleSet",
@@ -79,7 +79,7 @@ class Trained(NamedTuple):
     rules: RuleSet | None
     """The rules, on the run's device; None where a method has none."""
 
-    log: list[Entry]
+    log: list[CurvePoint]
     """The learning curve."""
 
     policy: Callable[[Any], Any]
@@ -106,7 +106,7 @@ def train(
     start: RuleSet | None = None,
     evaluation_seeds: Iterable[int] = EVALUATION_SEEDS,
     entries: int = 20,
-    on_entry: Callable[[Entry], None] | None = None,
+    on_entry: Callable[[CurvePoint], None] | None = None,
     on_stop: Callable[[], None] = lambda: None,
     out: str | Path | None = None,
     resume: bool = False,

@@ -68,7 +68,7 @@ def train(
         MissingDependencyError: cma is not installed.
     """
     rules = starting_rules(problem, seed, device, start)
-    candidates = Population(rules)
+    candidates = RulePopulation(rules)
     world_count = options.population * options.worlds_per_candidate
     envs = problem.make_envs(world_count, device=device, copy=False)
     draws = np.random.default_rng(seed)
@@ -86,7 +86,7 @@ def train(
     return progress.run(rules, generation)
 
 
-class Population(RuleWeights):
+class RulePopulation(RuleWeights):
     """Rules of one architecture whose weights are the rows of a matrix, as `RuleWeights` has them.
 
     Raises:
@@ -118,7 +118,7 @@ class Population(RuleWeights):
 
 
 def fitness(
-    envs: Any, candidates: Population, weights: Tensor, seeds: list[int], episode_steps: int
+    envs: Any, candidates: RulePopulation, weights: Tensor, seeds: list[int], episode_steps: int
 ) -> Tensor:
     """Return the mean return of each candidate over worlds from the same seeds, shape [K].
 
@@ -137,7 +137,9 @@ def fitness(
     return returns.view(len(weights), -1).mean(dim=1)
 
 
-def _strategy(candidates: Population, options: EvolutionOptions, draws: np.random.Generator) -> Any:
+def _strategy(
+    candidates: RulePopulation, options: EvolutionOptions, draws: np.random.Generator
+) -> Any:
     """Return the strategy: it proposes by `ask`, learns by `tell`, and its mean is `mean`."""
     try:
         import cma

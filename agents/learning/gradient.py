@@ -177,13 +177,13 @@ def _trainer_config(
     )
 
 
-def episode_task(problem: Problem, device: torch.device) -> EpisodeTask:
+def episode_task(problem: Problem, device: torch.device) -> EnvironmentTask:
     """Return a problem's task for the gradient's trainer.
 
     Raises:
         NPAError: The problem is a game or its species die, so that no gradient descends its loss.
     """
-    made = EpisodeTask(problem, device)
+    made = EnvironmentTask(problem, device)
     generator = torch.Generator(device).manual_seed(0)
     has_goals = not problem.is_species and made._start(1, generator, device)[3] is not None
     return GoalEpisodeTask(problem, device) if has_goals else made
@@ -207,7 +207,7 @@ def _check_rules_of_play(problem: Problem, task: EnvTask[Any] | SpeciesTask) -> 
         )
 
 
-class EpisodeTask:
+class EnvironmentTask:
     """Worlds as a problem's episodes start, and their loss; worlds move by the problem's physics.
 
     It is a `npa_envs.tasks.base.Task` as far as the training cycle asks for one.
@@ -331,7 +331,7 @@ class EpisodeTask:
             )
 
 
-class GoalEpisodeTask(EpisodeTask):
+class GoalEpisodeTask(EnvironmentTask):
     """The same for a task whose worlds have goals of their own, such as the class of a cloud."""
 
     def seed_with_goals(

@@ -12,7 +12,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from npa_envs.agents.learning.progress import Entry, Learner, Progress
+from npa_envs.agents.learning.progress import CurvePoint, Learner, Progress
 from npa_envs.agents.learning.rules import RuleSet
 from npa_envs.checks import is_real
 from npa_envs.errors import NPAError, shown
@@ -38,7 +38,7 @@ class KeptProgress(Progress):
 
     Args:
         folder: Where the run is kept.
-        told: What the run is of, as JSON has it: one that goes on must be of the same.
+        broadcast: What the run is of, as JSON has it: one that goes on must be of the same.
         resume: Go on from the checkpoint in the folder.
         overwrite: Begin anew although the folder holds a run; its files are removed.
         on_stop: Called where the run is asked to stop before its budget is spent.
@@ -70,7 +70,7 @@ class KeptProgress(Progress):
         content = None
         if self.ranks.first:
             content = self._opened(resume)
-        self._content: dict[str, Any] | None = self.ranks.told(content)
+        self._content: dict[str, Any] | None = self.ranks.broadcast(content)
 
     def run(
         self, rules: RuleSet, iteration: Callable[[], int], learner: Learner | None = None
@@ -170,7 +170,7 @@ class KeptProgress(Progress):
         check_content(content, like, path)
         curve = content.get("curve")
         try:
-            self.log = [Entry(**entry) for entry in curve or ()]
+            self.log = [CurvePoint(**entry) for entry in curve or ()]
             numbers = [value for entry in self.log for value in asdict(entry).values()]
             load_learner_state(learner, content)
         except (TypeError, RuntimeError) as error:

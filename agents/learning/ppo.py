@@ -22,9 +22,9 @@ from npa_envs.agents.learning.ppo_common import (
     GaussianRules,
     Minibatches,
     check_word,
-    first_rules,
     learner_random,
     noise_left,
+    zero_output_rules,
 )
 from npa_envs.agents.learning.problem import (
     ROW_REWARDS,
@@ -39,7 +39,7 @@ from npa_envs.envs.core.memory import free_bytes, needed_bytes
 from npa_envs.errors import NPAError
 from npa_envs.training.randomness import registered, restart
 from npa_envs.training.ranks import ALONE, Ranks
-from npa_envs.world.cuda_graph import Replayed
+from npa_envs.world.cuda_graph import GraphedCallable
 from npa_envs.wrappers.base import own_rewards
 
 MANY_PARTICLES = 2**17
@@ -126,8 +126,8 @@ def train(
         DivergedError: The policy has diverged.
     """
     ranks = progress.ranks
-    count = ranks.told(world_count(problem, options, device, progress.budget, ranks))
-    learner = Learner(problem, replace(options, worlds=count), seed, device, start, ranks)
+    count = ranks.broadcast(world_count(problem, options, device, progress.budget, ranks))
+    learner = PPOLearner(problem, replace(options, worlds=count), seed, device, start, ranks)
 
     def round_of_ppo() -> int:
         share_left = 1.0 - progress.share
@@ -138,7 +138,7 @@ def train(
     return progress.run(learner.actor.rules, round_of_ppo, learner)
 
 
-class Learner:
+class PPOLearner:
     """Rules, critic, worlds and what was seen of them; the seed is that of all that is drawn.
 
     Several processes each have a share of the worlds, draw for each of these by itself, and take
@@ -167,7 +167,7 @@ class Learner:
         )
         self.random = learner_random(seed, total, places, device, ranks)
         """What exploration and shuffles draw from."""
-        rules = first_rules(problem, seed, start)
+        rules = zero_output_rules(problem, seed, start)
         self.actor = GaussianRules(rules, self.pace.initial_std).to(device)
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(seed)
@@ -211,16 +211,16 @@ class Learner:
         self._minibatches = Minibatches(
             options.steps, len(places), (*rows, 1), options.minibatches, self.random
         )
-        self._act = Replayed(self._draw_actions, device, registered(self.random))
-        self._value = Replayed(self._find_values, device)
+        self._act = GraphedCallable(self._draw_actions, device, registered(self.random))
+        self._value = GraphedCallable(self._find_values, device)
         # A process alone records whole passes. Several record what lies between their reductions.
         shared = ranks.together
-        self._judge = Replayed(self._find_advantages, device, recorded=not shared)
-        self._learn_values = Replayed(self._improve_critic, device, recorded=not shared)
-        self._learn = Replayed(self._improve_both, device, recorded=not shared)
+        self._judge = GraphedCallable(self._find_advantages, device, recorded=not shared)
+        self._learn_values = GraphedCallable(self._improve_critic, device, recorded=not shared)
+        self._learn = GraphedCallable(self._improve_both, device, recorded=not shared)
         pool = torch.cuda.graph_pool_handle() if shared and device.type == "cuda" else None
         self._weigh_own, self._step, *self._find = (
-            Replayed(function, device, recorded=shared, pool=pool)
+            GraphedCallable(function, device, recorded=shared, pool=pool)
             for function in (
                 self._weigh_parts,
                 self._step_both,

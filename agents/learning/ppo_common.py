@@ -137,7 +137,7 @@ def check_word(name: str, word: object, words: Sequence[str]) -> None:
         raise NPAError(f"{name} must be a known word, got {shown(word)}: {suggest(word, words)}")
 
 
-def first_rules(problem: Problem, seed: int, start: RuleSet | None) -> RuleSet:
+def zero_output_rules(problem: Problem, seed: int, start: RuleSet | None) -> RuleSet:
     """Return the rules that PPO begins with: those given, or fresh ones that do nothing.
 
     Fresh rules have random output layers, and what they do in each step adds up: in

@@ -37,7 +37,7 @@ from npa_envs.envs.shapeshifter2d import ShapeshifterTask
 from npa_envs.errors import NPAError, shown, suggest
 from npa_envs.registration import ALL, SPECIES_SIZES
 from npa_envs.world.actions import Physics
-from npa_envs.world.cuda_graph import sent
+from npa_envs.world.cuda_graph import to_device_async
 
 WORLDS_PER_SEED = 10_000
 """Distance of the worlds' seeds of one run from those of the next."""
@@ -204,13 +204,13 @@ class Problem:
     def interface(self) -> Interface:
         """What observations and actions mean, column by column."""
         physics, config = self.physics, self.config
-        told_apart = isinstance(config, SpeciesConfig) and config.perception == "per_species"
+        by_species = isinstance(config, SpeciesConfig) and config.perception == "per_species"
         return Interface(
             physics.space_dim,
             physics.state_dim,
             physics.moving,
             physics.state_scale,
-            config.species_count if isinstance(config, SpeciesConfig) and told_apart else 0,
+            config.species_count if isinstance(config, SpeciesConfig) and by_species else 0,
         )
 
     @property
@@ -482,7 +482,7 @@ class ConcatenatedSpeciesEnv:
         chosen = worlds_to_reset(options, self.num_envs)
         self._reasons[chosen] = None
         # Nothing is said any more of species that have ended in worlds that go on.
-        losses, index = self._stacked(infos, "loss"), sent(chosen, self._loss.device)
+        losses, index = self._stacked(infos, "loss"), to_device_async(chosen, self._loss.device)
         self._loss = self._loss.index_copy(0, index, losses[index])
         return self._concatenated(rows), {"loss": self._loss.mean(dim=1)}
 

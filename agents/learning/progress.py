@@ -64,7 +64,7 @@ class Budget:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Entry:
+class CurvePoint:
     """One evaluation: a point of a learning curve."""
 
     seconds: float
@@ -139,7 +139,7 @@ class Progress:
         device: str | torch.device,
         evaluation_seeds: Iterable[int],
         entries: int = 20,
-        on_entry: Callable[[Entry], None] | None = None,
+        on_entry: Callable[[CurvePoint], None] | None = None,
     ) -> None:
         self.problem = problem
         """What is learned."""
@@ -147,7 +147,7 @@ class Progress:
         """What may be spent."""
         self.particle_steps = 0
         """Particle-steps spent so far."""
-        self.log: list[Entry] = []
+        self.log: list[CurvePoint] = []
         """Evaluations so far."""
         self.ranks = Ranks.current()
         """The processes that share the run."""
@@ -280,7 +280,7 @@ class Progress:
 
     def _agree_on_time(self) -> None:
         """Take down the time as the first process has it."""
-        self._elapsed = self.ranks.told(self.seconds)
+        self._elapsed = self.ranks.broadcast(self.seconds)
 
     def _check_started(self, caller: str) -> None:
         if not self._started:
@@ -296,7 +296,7 @@ class Progress:
             check_finite(actor, self.particle_steps)
             self.ranks.check_same(list(actor.parameters()))
         episodes = evaluate_policy(self._envs, policy, self._seeds)
-        entry = Entry(
+        entry = CurvePoint(
             seconds=self._seconds,
             particle_steps=self.particle_steps,
             mean_return=episodes.mean_return,

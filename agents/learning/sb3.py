@@ -20,8 +20,8 @@ from npa_envs.agents.learning.ppo_common import (
     CriticKind,
     GaussianRules,
     Pace,
-    first_rules,
     noise_left,
+    zero_output_rules,
 )
 from npa_envs.agents.learning.problem import Problem, world_seeds
 from npa_envs.agents.learning.progress import Progress
@@ -105,7 +105,7 @@ def train(
         target_kl=world_kl(pace.target_kl),
         tensorboard_log=options.tensorboard_log,
         policy_kwargs={
-            "rules": first_rules(problem, seed, start),
+            "rules": zero_output_rules(problem, seed, start),
             "initial_std": pace.initial_std,
             "critic": options.critic,
         },

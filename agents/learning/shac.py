@@ -14,14 +14,14 @@ from typing import NamedTuple, cast, get_args
 import torch
 from torch import Tensor
 
-from npa_envs.agents.learning.gradient import EpisodeTask, episode_task
+from npa_envs.agents.learning.gradient import EnvironmentTask, episode_task
 from npa_envs.agents.learning.ppo_common import (
     Critic,
     CriticKind,
     Minibatches,
     check_word,
-    first_rules,
     learner_random,
+    zero_output_rules,
 )
 from npa_envs.agents.learning.problem import Problem
 from npa_envs.agents.learning.progress import Progress, annealed
@@ -49,7 +49,7 @@ class SHACOptions:
     gamma: float = 0.97
     """Discount of a reward one step later (dimensionless)."""
 
-    foresight: float = 0.25
+    value_weight: float = 0.25
     """Weight of what the critic foresees in what rules ascend; 1: all of it, as in the source; 0:
     rules look no farther than their window (dimensionless)."""
 
@@ -93,7 +93,7 @@ class SHACOptions:
         check_word("critic", self.critic, get_args(CriticKind))
         check_positive(self, float, "learning_rate", "critic_learning_rate")
         check_fraction(self, "gamma", "td_lambda", "last_rate", "target_rate")
-        check_non_negative(self, "foresight")
+        check_non_negative(self, "value_weight")
 
 
 DEFAULTS = SHACOptions()
@@ -118,7 +118,7 @@ def train(
         NPAError: The environment's loss has no gradient.
         DivergedError: The rules' weights are not finite.
     """
-    learner = Learner(problem, options, seed, device, start, progress.ranks)
+    learner = SHACLearner(problem, options, seed, device, start, progress.ranks)
 
     def iteration() -> int:
         learner.learn(annealed(options.learning_rate, options.last_rate, progress.share))
@@ -127,7 +127,7 @@ def train(
     return progress.run(learner.rules, iteration, learner)
 
 
-class Window(NamedTuple):
+class StepWindow(NamedTuple):
     """What h steps of B worlds were."""
 
     features: Tensor
@@ -142,7 +142,7 @@ class Window(NamedTuple):
         return self.losses[:-1] - self.losses[1:]
 
 
-class Learner:
+class SHACLearner:
     """Rules, critic and worlds; the seed is that of all that is drawn.
 
     Several processes each have a share of the worlds, draw for each of these by itself, and take
@@ -161,7 +161,7 @@ class Learner:
         self.options, self.device, self.ranks = options, device, ranks
         ranks.check_dealt("world_count", options.world_count)
         places = ranks.places(options.world_count)
-        self.rules = first_rules(problem, seed, start).to(device)
+        self.rules = zero_output_rules(problem, seed, start).to(device)
         """What is learned."""
         count = -(-problem.episode_steps // options.steps)
         self.window = -(-problem.episode_steps // count)
@@ -222,9 +222,9 @@ class Learner:
         normalise_gradients(means)
         self._optimizer.param_groups[0]["lr"] = rate
         self._optimizer.step()
-        self.learn_values(Window(*(part.detach() for part in window)))
+        self.learn_values(StepWindow(*(part.detach() for part in window)))
 
-    def play(self) -> Window:
+    def play(self) -> StepWindow:
         """Run the rules for a window, differentiably, and begin episodes anew where one is over."""
         task, steps = self.task, self.window
         x0, s0 = self.x, self.s
@@ -245,7 +245,7 @@ class Learner:
         )
         x, s = torch.cat((x0[None], x)), torch.cat((s0[None], s))
         goals = None if self.goal is None else self.goal.repeat(steps + 1)
-        aimed = cast(EpisodeTask, task_toward(cast(Task, task), goals))
+        aimed = cast(EnvironmentTask, task_toward(cast(Task, task), goals))
         losses = aimed.world_losses(x.flatten(0, 1), s.flatten(0, 1))
         losses = losses.view(steps + 1, -1)
         told = losses[..., None, None].expand(*s.shape[:-1], 1)
@@ -256,7 +256,7 @@ class Learner:
             for last, limit in ((x[-1], self._limits[0]), (s[-1], self._limits[1]))
         )
         self._restart()
-        return Window(features, losses)
+        return StepWindow(features, losses)
 
     def _restart(self) -> None:
         """Begin the next episodes of worlds whose last window this was."""
@@ -282,15 +282,15 @@ class Learner:
         task = cast(Task, self.task)
         return seed_worlds(task, len(worlds), generator=random, device=self.device)
 
-    def gain(self, window: Window) -> Tensor:
+    def gain(self, window: StepWindow) -> Tensor:
         """Return the mean discounted reward of a window, and of what is foreseen after it."""
         gamma, steps = self.options.gamma, self.window
         discounts = gamma ** torch.arange(steps, device=self.device, dtype=torch.float32)
         paid = (discounts[:, None] * window.rewards).sum(dim=0)
         foreseen = values(self.target, window.features[-1])
-        return (paid + self.options.foresight * gamma**steps * foreseen).mean()
+        return (paid + self.options.value_weight * gamma**steps * foreseen).mean()
 
-    def learn_values(self, window: Window) -> None:
+    def learn_values(self, window: StepWindow) -> None:
         """Let the critic learn what the window was worth, and its copy follow."""
         options = self.options
         seen = window.features[:-1].flatten(0, 1)

@@ -55,7 +55,7 @@ class Elite(NamedTuple):
 
 
 @dataclass
-class Batch:
+class CandidateBatch:
     """Candidates that were tried together."""
 
     fingerprint: int
@@ -64,12 +64,12 @@ class Batch:
     """What each came to; None: nothing alive."""
 
     @classmethod
-    def of(cls, told: Mapping[str, Any]) -> Batch:
+    def of(cls, told: Mapping[str, Any]) -> CandidateBatch:
         """Return the batch that a record tells of."""
         found = [None if one is None else Found(one[0], tuple(one[1:])) for one in told["found"]]
         return cls(int(told["fingerprint"]), found)
 
-    def told(self) -> dict[str, Any]:
+    def to_dict(self) -> dict[str, Any]:
         """Return the batch as a record tells it: quality and descriptors of each candidate."""
         found = [None if one is None else [one.quality, *one.measures] for one in self.found]
         return {"fingerprint": self.fingerprint, "found": found}
@@ -129,7 +129,7 @@ class Search:
             "versions": {name: installed_version(name) for name in LIBRARIES},
         }
         """What the elites follow from."""
-        self._batches: list[Batch] = []
+        self._batches: list[CandidateBatch] = []
         self._path = path
         self.archive = make_archive(self.candidates.weight_count, self.axes, seed)
         """The elites, a `ribs.archives.GridArchive`."""
@@ -165,7 +165,7 @@ class Search:
         while self.particle_steps + batch_cost <= budget and not enough():
             solutions = self._proposals.ask()
             found = self.candidates.try_all(solutions).found
-            self._tell(Batch(_fingerprint(solutions), found))
+            self._tell(CandidateBatch(_fingerprint(solutions), found))
             progress(len(found) * self.world.particle_steps)
             if self._path is not None:
                 self._write(self._path)
@@ -186,7 +186,7 @@ class Search:
         ]
         return sorted(elites, key=lambda elite: elite.cell)
 
-    def _tell(self, batch: Batch) -> None:
+    def _tell(self, batch: CandidateBatch) -> None:
         self._proposals.tell(*as_told(batch.found, self.axes))
         self._batches.append(batch)
         self.growth.append(growth_of(self.archive, self.evaluations))
@@ -197,15 +197,15 @@ class Search:
             {
                 "facts": self.facts,
                 "growth": [list(step) for step in self.growth],
-                "batches": [batch.told() for batch in self._batches],
+                "batches": [batch.to_dict() for batch in self._batches],
             },
         )
 
     def _replay(self, path: Path) -> None:
         """Propose again what was tried before, and tell what it came to."""
 
-        def read(held: dict[str, Any]) -> list[Batch]:
-            return [Batch.of(told) for told in held["batches"]]
+        def read(held: dict[str, Any]) -> list[CandidateBatch]:
+            return [CandidateBatch.of(told) for told in held["batches"]]
 
         for batch in read_record(path, self.facts, read, command="search") or []:
             solutions = self._proposals.ask()

@@ -183,7 +183,7 @@ class WorldConfig:
             state_dim=self.state_dim,
             eps=self.eps,
             eps0=self.eps0,
-            reach=self.alpha * self.eps,
+            max_displacement=self.alpha * self.eps,
             state_scale=self.state_scale,
             update_prob=self.update_prob,
             dt=self.dt,
@@ -302,7 +302,7 @@ class EnvConfig(WorldConfig):
             )
 
     @property
-    def pays_particles(self) -> bool:
+    def per_particle_reward(self) -> bool:
         """Whether each particle has a reward of its own."""
         return self.reward in ("particle", "marginal")
 

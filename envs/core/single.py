@@ -15,10 +15,10 @@ from torch import Tensor
 
 from npa_envs.checks import number_tensor
 from npa_envs.envs.core.screen import Screen
-from npa_envs.envs.core.spaces import Rows, to_output
+from npa_envs.envs.core.spaces import ParticleSpaces, to_output
 from npa_envs.envs.core.task import EnvTask
-from npa_envs.envs.core.vector import check_options, plain_seed, world_keys
-from npa_envs.envs.core.worlds import Worlds, reason
+from npa_envs.envs.core.vector import check_options, plain_seed, rng_keys
+from npa_envs.envs.core.worlds import BatchedWorlds, reason
 from npa_envs.errors import NPAError
 from npa_envs.world.actions import DIVERGED, SUCCESS, TIME_LIMIT
 
@@ -123,10 +123,10 @@ class NPAEnv(gymnasium.Env[Any, Any]):
     task_type: ClassVar[type[EnvTask[Any]]]
     """What the environment is about."""
 
-    worlds_type: ClassVar[type[Worlds]] = Worlds
+    worlds_type: ClassVar[type[BatchedWorlds]] = BatchedWorlds
     """What moves the particles."""
 
-    form_type: ClassVar[type[Rows]] = Rows
+    form_type: ClassVar[type[ParticleSpaces]] = ParticleSpaces
     """How the world is seen and acted upon."""
 
     metadata: ClassVar[dict[str, Any]] = {  # type: ignore[misc]
@@ -176,8 +176,8 @@ class NPAEnv(gymnasium.Env[Any, Any]):
         keys = None
         if seed is not None or self.np_random is not self._keyed_from:
             self._keyed_from = self.np_random
-            keys = world_keys(None, 1, self.np_random)
-        with self.worlds.here():
+            keys = rng_keys(None, 1, self.np_random)
+        with self.worlds.device_context():
             self.worlds.start(self._world, keys)
             observation = self.worlds.perceive()
         self._started = True
@@ -204,12 +204,12 @@ class NPAEnv(gymnasium.Env[Any, Any]):
             raise NPAError("step needs a world: call reset first")
         worlds, config = self.worlds, self.config
         checked = self.form.action(action, None)
-        with worlds.here():
+        with worlds.device_context():
             endings, observation = worlds.step(checked)
             diverged = bool(endings[0] & DIVERGED)
             ending = int(worlds.guarded(endings, observation)[0])
         ended, late = ending & (SUCCESS | DIVERGED) != 0, ending & TIME_LIMIT != 0
-        names, numbers = worlds.part_names, worlds.told()
+        names, numbers = worlds.part_names, worlds.extra_info()
         info = self._losses(numbers)
         info |= {f"reward_{name}": numbers[2 + len(names) + k] for k, name in enumerate(names)}
         info |= {"success": bool(ending & SUCCESS), "diverged": diverged}
@@ -258,7 +258,7 @@ class NPAEnv(gymnasium.Env[Any, Any]):
             raise NPAError("particles need a world: call reset first")
         x, s = (number_tensor(name, value)[None] for name, value in (("x", x), ("s", s)))
         start = self.worlds.checked_particles(x, s, 1, self.config.particle_count)
-        with self.worlds.here():
+        with self.worlds.device_context():
             self.worlds.place(self._world, start)
             observation = self.worlds.perceive()
         self._show()

@@ -26,7 +26,7 @@ def action_space(physics: Physics, particle_count: int) -> Box:
     return Box(-1.0, 1.0, (particle_count, physics.action_dim), np.float32)
 
 
-class Rows:
+class ParticleSpaces:
     """How most worlds are seen and acted upon: one row for each particle.
 
     Args:

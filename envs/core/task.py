@@ -16,7 +16,7 @@ from npa_envs.errors import NPAError
 from npa_envs.render import draw_worlds
 from npa_envs.tasks.base import GoalTask as TrainedWithGoals
 from npa_envs.world.credit import marginal_gains
-from npa_envs.world.randomness import Purpose, WorldRandom
+from npa_envs.world.randomness import StreamId, WorldRandom
 
 AnyConfig = TypeVar("AnyConfig", bound=WorldConfig)
 Config = TypeVar("Config", bound=EnvConfig)
@@ -169,7 +169,7 @@ class EnvTask(WorldTask[Config]):
         """Return the named parts of each world's loss, shape [B] each; their sum is the loss."""
         raise NotImplementedError
 
-    def told(self, s: Tensor) -> dict[str, Tensor]:
+    def extra_info(self, s: Tensor) -> dict[str, Tensor]:
         """Return what infos tell of worlds besides, shape [B, ...] each; by default nothing."""
         return {}
 
@@ -248,7 +248,7 @@ class EnvTask(WorldTask[Config]):
         """Make worlds of the pool, each from a seed of its own."""
         seeds = [self.first_pool_seed + number for number in numbers]
         # Not the streams that episodes with these seeds go on with.
-        random = WorldRandom(seeds, device=self.device).beside(Purpose.GROWTH)
+        random = WorldRandom(seeds, device=self.device).substream(StreamId.GROWTH)
         return self._as_start("fresh", self.fresh(random))
 
     def draw(self, x: Tensor, s: Tensor, steps: NDArray[np.int64]) -> NDArray[np.uint8]:
@@ -273,7 +273,7 @@ class EnvTask(WorldTask[Config]):
         return float((volume / self.config.particle_count) ** (1.0 / self.space_dim))
 
 
-class GoalTask(EnvTask[Config]):
+class TargetEnvTask(EnvTask[Config]):
     """A task that rules are trained on, too: `npa_envs.tasks` has its targets and losses.
 
     Raises:

@@ -17,12 +17,12 @@ from torch import Tensor
 
 from npa_envs.checks import is_whole, number_tensor
 from npa_envs.envs.core.screen import Screen
-from npa_envs.envs.core.spaces import Rows, to_output
+from npa_envs.envs.core.spaces import ParticleSpaces, to_output
 from npa_envs.envs.core.task import EnvTask
-from npa_envs.envs.core.worlds import FLAGS, Report, Worlds, reason
+from npa_envs.envs.core.worlds import FLAGS, BatchedWorlds, StepReport, reason
 from npa_envs.errors import NPAError, shown, suggest
 from npa_envs.world.actions import TIME_LIMIT
-from npa_envs.world.cuda_graph import sent
+from npa_envs.world.cuda_graph import to_device_async
 from npa_envs.world.randomness import WorldRandom
 
 AUTORESET_MODES = {
@@ -57,10 +57,10 @@ class NPAVectorEnv(VectorEnv[Any, Any, Any]):
     task_type: ClassVar[type[EnvTask[Any]]]
     """What the environment is about."""
 
-    worlds_type: ClassVar[type[Worlds]] = Worlds
+    worlds_type: ClassVar[type[BatchedWorlds]] = BatchedWorlds
     """What moves the particles."""
 
-    form_type: ClassVar[type[Rows]] = Rows
+    form_type: ClassVar[type[ParticleSpaces]] = ParticleSpaces
     """How the worlds are seen and acted upon."""
 
     metadata: dict[str, Any] = {  # noqa: RUF012 (each instance gets a dictionary of its own)
@@ -139,9 +139,9 @@ class NPAVectorEnv(VectorEnv[Any, Any, Any]):
             raise NPAError("reset_mask needs worlds to leave alone: reset all of them first")
         keys = None
         if seed is not None or not self._started:
-            keys = world_keys(seed, self.num_envs, self.np_random)[chosen]
+            keys = rng_keys(seed, self.num_envs, self.np_random)[chosen]
         worlds = torch.from_numpy(chosen).to(self.task.device)
-        with self.worlds.here():
+        with self.worlds.device_context():
             self.worlds.start(worlds, keys)
             observation = self.worlds.perceive(self._buffer)
         if not self.copies:
@@ -172,7 +172,7 @@ class NPAVectorEnv(VectorEnv[Any, Any, Any]):
         if not self._started:
             raise NPAError("step needs worlds: call reset first")
         action = self.form.action(actions, self.num_envs)
-        with self.worlds.here():
+        with self.worlds.device_context():
             return self._step(action)
 
     def _step(self, action: Tensor) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
@@ -185,7 +185,7 @@ class NPAVectorEnv(VectorEnv[Any, Any, Any]):
         restarting = self.autoreset_mode is AutoresetMode.NEXT_STEP and bool(over.any())
         if restarting:
             action = action.clone()
-            action[sent(over, action.device)] = 0.0
+            action[to_device_async(over, action.device)] = 0.0
         endings, observation = self.worlds.step(action, self._buffer)
         stepped = None
         if restarting:
@@ -265,7 +265,7 @@ class NPAVectorEnv(VectorEnv[Any, Any, Any]):
         chosen = chosen.to(self.task.device)
         count = self.config.particle_count
         start = self.worlds.checked_particles(x, s, len(chosen), count)
-        with self.worlds.here():
+        with self.worlds.device_context():
             self.worlds.place(chosen, start)
             observation = self.worlds.perceive(self._buffer)
         self._show()
@@ -316,7 +316,7 @@ class NPAVectorEnv(VectorEnv[Any, Any, Any]):
         final = {name: which if name.startswith("_") else value for name, value in infos.items()}
         return final | {"reason": REASONS[endings], "_reason": which}
 
-    def _numbers(self, report: Report) -> list[Any]:
+    def _numbers(self, report: StepReport) -> list[Any]:
         """Return a report's numbers as handed out: arrays are float64, as Gymnasium's own are."""
         numbers = self._out(report.numbers)
         if isinstance(numbers, Tensor):
@@ -334,7 +334,7 @@ class NPAVectorEnv(VectorEnv[Any, Any, Any]):
     def _mask(self, mask: NDArray[np.bool_]) -> Any:
         """Return a mask of worlds as a new array to hand out."""
         given = mask.copy()
-        return given if self.config.output == "numpy" else sent(given, self.task.device)
+        return given if self.config.output == "numpy" else to_device_async(given, self.task.device)
 
     def _show(self) -> None:
         self._screen.show(self.spec.id if self.spec is not None else type(self).__name__)
@@ -441,7 +441,7 @@ def world_numbers(worlds: Any, world_count: int) -> Tensor:
     )
 
 
-def world_keys(
+def rng_keys(
     seed: int | Sequence[int] | None, world_count: int, np_random: np.random.Generator
 ) -> Tensor:
     """Return the key of each world's randomness, int64, shape [B].

@@ -16,7 +16,10 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from npa_envs.checks import number_tensor
-from npa_envs.envs.core.answers import (
+from npa_envs.envs.core.config import EnvConfig, WorldConfig
+from npa_envs.envs.core.memory import check_memory
+from npa_envs.envs.core.task import EnvTask, Start, WorldTask
+from npa_envs.envs.core.task_checks import (
     GlobalDraws,
     check_finite,
     check_start,
@@ -24,9 +27,6 @@ from npa_envs.envs.core.answers import (
     checked_shares,
     starter,
 )
-from npa_envs.envs.core.config import EnvConfig, WorldConfig
-from npa_envs.envs.core.memory import check_memory
-from npa_envs.envs.core.task import EnvTask, Start, WorldTask
 from npa_envs.errors import DivergedError, NPAError, shown
 from npa_envs.world.actions import (
     DIVERGED,
@@ -35,18 +35,18 @@ from npa_envs.world.actions import (
     TIME_LIMIT,
     Actions,
     EpisodeRules,
+    NeighbourState,
     PreparedJudgement,
-    SurveyedWorlds,
-    survey_worlds,
+    find_neighbours,
 )
-from npa_envs.world.credit import settled
+from npa_envs.world.credit import with_mean_reward
 from npa_envs.world.cuda_graph import (
-    Beside,
-    Replayed,
+    GraphedCallable,
+    SideStream,
     WeakFunction,
     makes_plain_tensors,
     pinned_like,
-    sent,
+    to_device_async,
 )
 from npa_envs.world.divergence import LARGEST_REPORT, term_name
 from npa_envs.world.randomness import WorldRandom
@@ -80,7 +80,7 @@ def check_default_dtype() -> None:
         )
 
 
-class Batch:
+class WorldState:
     """Particles of B worlds on a device, a stream of randomness for each world.
 
     Args:
@@ -156,14 +156,14 @@ class Batch:
             given.append(tensor)
         return Start(*given)
 
-    def here(self) -> contextlib.AbstractContextManager[Any]:
+    def device_context(self) -> contextlib.AbstractContextManager[Any]:
         """Return a context in which the worlds' device is the current one."""
         if not self.x.is_cuda or torch.cuda.current_device() == self.device.index:
             return contextlib.nullcontext()
         return torch.cuda.device(self.device)
 
 
-class Worlds(Batch):
+class BatchedWorlds(WorldState):
     """B worlds of one task, stepped together. All tensors stay where they are between steps.
 
     Args:
@@ -198,7 +198,7 @@ class Worlds(Batch):
         """Steps since the start of each episode, shape [B]."""
         self.particle_loss = zeros(count) if config.reward == "particle" else None
         """Each particle's share of the loss, shape [B, N], where rewards are shared out."""
-        self.particle_reward = zeros(count) if config.pays_particles else None
+        self.particle_reward = zeros(count) if config.per_particle_reward else None
         """Each particle's own reward of the last step, shape [B, N], where it has one."""
         paid_by_action = config.reward == "marginal"
         self._before = (self.x.clone(), self.s.clone()) if paid_by_action else None
@@ -210,7 +210,7 @@ class Worlds(Batch):
         self._enabled = torch.ones(1, dtype=torch.uint8, device=device)
         self.part_names: tuple[str, ...] = ()
         """Names of the parts of the loss, known once worlds have been placed."""
-        self.report = Report.empty(world_count, 0, device)
+        self.report = StepReport.empty(world_count, 0, device)
         """What a step hands out besides the observation."""
         # Each world's ending, then whether the actions were finite.
         self._endings = torch.zeros(world_count + 1, dtype=torch.uint8, device=device)
@@ -229,16 +229,16 @@ class Worlds(Batch):
             enabled=self._enabled,
             diverged=self._diverged,
         )
-        self._surveyed: SurveyedWorlds | None = None
+        self._surveyed: NeighbourState | None = None
         self._judgement: PreparedJudgement | None = None
-        self._draw = Replayed(self._actions.draw, device)
-        self._look = Replayed(self._judge_and_survey, device)
-        self._act = Replayed(self._act_and_look, device)
-        self.restart = Restarts(
-            self._start_and_survey, world_count, device, recorded=self.task.start_is_short
+        self._draw = GraphedCallable(self._actions.draw, device)
+        self._look = GraphedCallable(self._judge_and_sort, device)
+        self._act = GraphedCallable(self._act_and_look, device)
+        self.restart = GraphedResets(
+            self._start_and_sort, world_count, device, recorded=self.task.start_is_short
         )
         """Starts the next episodes of some worlds: restart(indices, observation)."""
-        self._beside = Beside(device) if device.type == "cuda" else None
+        self._side_stream = SideStream(device) if device.type == "cuda" else None
 
     def __getstate__(self) -> dict[str, Any]:
         """Leave out what only the next step needs, and which cannot be pickled."""
@@ -264,8 +264,8 @@ class Worlds(Batch):
         if episode_steps != self.episode_steps:
             self.episode_steps = episode_steps
             self._judgement = None
-            self._look = Replayed(self._judge_and_survey, self.device)
-            self._act = Replayed(self._act_and_look, self.device)
+            self._look = GraphedCallable(self._judge_and_sort, self.device)
+            self._act = GraphedCallable(self._act_and_look, self.device)
 
     @property
     def reward(self) -> Tensor:
@@ -315,9 +315,9 @@ class Worlds(Batch):
             self._success_loss[worlds] = start.success_loss
         return start
 
-    def _start_and_survey(self, worlds: Tensor) -> SurveyedWorlds:
+    def _start_and_sort(self, worlds: Tensor) -> NeighbourState:
         start = self.start(worlds)
-        return survey_worlds(start.x, start.s, self.physics, places=worlds)
+        return find_neighbours(start.x, start.s, self.physics, places=worlds)
 
     @torch.no_grad()
     @makes_plain_tensors
@@ -333,7 +333,7 @@ class Worlds(Batch):
         values = torch.stack(checked_losses(task, parts, len(x), self.part_names))
         if not self.part_names:
             self.part_names = tuple(parts)
-            self.report = Report.empty(self.world_count, len(parts), x.device)
+            self.report = StepReport.empty(self.world_count, len(parts), x.device)
             self._host_endings, self._host_numbers = self._for_host()
         self.x.index_copy_(0, worlds, x)
         self.s.index_copy_(0, worlds, s)
@@ -354,7 +354,7 @@ class Worlds(Batch):
     @makes_plain_tensors
     def perceive(self, out: Tensor | None = None) -> Tensor:
         """Return what is perceived in all worlds as they are, shape [B, N, P], written to `out`."""
-        return survey_worlds(self.x, self.s, self.physics).perceive(out)
+        return find_neighbours(self.x, self.s, self.physics).perceive(out)
 
     @torch.no_grad()
     @makes_plain_tensors
@@ -363,7 +363,7 @@ class Worlds(Batch):
 
         What is perceived in them is written into the observation of all, shape [B, N, P].
         """
-        index = sent(worlds, self.x.device)
+        index = to_device_async(worlds, self.x.device)
         self._told_perceived = False
         paid, elapsed = self.report.copy(), self.elapsed.clone()
         own = None if self.particle_reward is None else self.particle_reward.clone()
@@ -397,8 +397,8 @@ class Worlds(Batch):
             NPAError: The task's losses are not finite.
         """
         observation = self.queue(action, out)
-        if self._beside is not None:
-            self._beside.wait()
+        if self._side_stream is not None:
+            self._side_stream.wait()
         told: NDArray[np.uint8] = self._host_endings.numpy()
         if not told[-1]:
             self.random.steps -= 1
@@ -421,9 +421,9 @@ class Worlds(Batch):
             # To copy actions takes less than to launch what one graph then does.
             self._actions.hold(action)
             self._act()
-            assert self._beside is not None, "it was CUDA just now"
+            assert self._side_stream is not None, "it was CUDA just now"
             assert self._perceived is not None, "it was perceived just now"
-            self._beside.mark()
+            self._side_stream.mark()
             self._told_perceived = self._host_perceived is not None
             if out is not None:
                 return out.copy_(self._perceived)
@@ -432,9 +432,9 @@ class Worlds(Batch):
             self._draw()
             self._actions.apply(action)
             self._look()
-        if self._beside is not None:
+        if self._side_stream is not None:
             # The host learns the endings while the device perceives.
-            self._beside.mark()
+            self._side_stream.mark()
         assert self._surveyed is not None, "the worlds were sorted just now"
         return self._surveyed.perceive(out)
 
@@ -447,23 +447,23 @@ class Worlds(Batch):
                 self._perceived = self.x.new_empty(*self.x.shape[:2], self.physics.perception_dim)
                 if self.world_count == 1 and self.task.config.output == "numpy":
                     self._host_perceived = pinned_like(self._perceived)
-            survey_worlds(self.x, self.s, self.physics).perceive(self._perceived)
+            find_neighbours(self.x, self.s, self.physics).perceive(self._perceived)
             if self._host_perceived is not None:
                 self._host_perceived.copy_(self._perceived, non_blocking=True)
 
-    def _judge_and_survey(self) -> None:
+    def _judge_and_sort(self) -> None:
         """Judge the worlds and, beside that, sort them."""
         with self._judging_beside():
-            self._surveyed = survey_worlds(self.x, self.s, self.physics)
+            self._surveyed = find_neighbours(self.x, self.s, self.physics)
 
     @contextlib.contextmanager
     def _judging_beside(self) -> Iterator[None]:
         """Judge the worlds, on CUDA beside what is launched inside."""
-        with contextlib.nullcontext() if self._beside is None else self._beside.aside():
+        with contextlib.nullcontext() if self._side_stream is None else self._side_stream.overlap():
             self._judge_worlds()
         yield
-        if self._beside is not None:
-            self._beside.join()
+        if self._side_stream is not None:
+            self._side_stream.join()
 
     def _judge_worlds(self) -> None:
         """Write rewards, losses and endings of the worlds as they now are."""
@@ -478,13 +478,13 @@ class Worlds(Batch):
             own = self._particle_gains(task)
             self._judgement(parts, (~torch.isfinite(own).all(dim=1)).byte())
             if self._before is not None:
-                own = settled(own, self.reward)
+                own = with_mean_reward(own, self.reward)
             # Worlds that left their bounds are paid as a whole.
             whole = self._diverged.bool() & (self.task.config.on_divergence != "ignore")
             own = torch.where(whole[:, None], self.reward[:, None], own)
             happened = self._enabled.bool()
             self.particle_reward.copy_(torch.where(happened, own, self.particle_reward))
-        if self._beside is not None:
+        if self._side_stream is not None:
             self._host_endings.copy_(self._endings, non_blocking=True)
             if self.world_count == 1:
                 self._host_numbers.copy_(self.report.numbers, non_blocking=True)
@@ -522,7 +522,7 @@ class Worlds(Batch):
     def extras(self, when: str) -> dict[str, Tensor]:
         """Return what infos tell besides, shape [B, ...] each: since a "reset", or of a "step"."""
         if when == "reset":
-            return self._aimed.told(self.s)
+            return self._aimed.extra_info(self.s)
         return {"updated": self._actions.updated()} if self.task.config.tell_updated else {}
 
     def told_observation(self, observation: Tensor) -> Tensor:
@@ -537,7 +537,7 @@ class Worlds(Batch):
         # for others to wake, which can take milliseconds.
         return torch.from_numpy(told.numpy().copy())
 
-    def told(self) -> list[float]:
+    def extra_info(self) -> list[float]:
         """Return the numbers of a single world's report after a step."""
         numbers: list[float] = self._host_numbers.numpy()[:, 0].tolist()
         return numbers
@@ -619,7 +619,7 @@ class Worlds(Batch):
         )
 
 
-class Report(NamedTuple):
+class StepReport(NamedTuple):
     """What a step says of each world, in one buffer: it is handed out by one copy, not twenty."""
 
     buffer: Tensor
@@ -632,7 +632,7 @@ class Report(NamedTuple):
     """True for every world, bool, shape [B]."""
 
     @classmethod
-    def empty(cls, world_count: int, part_count: int, device: torch.device) -> Report:
+    def empty(cls, world_count: int, part_count: int, device: torch.device) -> StepReport:
         """Return the report of B worlds whose loss has K parts: zeros."""
         rows = 4 * (2 + 2 * part_count) + 3 + len(FLAGS)
         buffer = torch.zeros(rows * world_count, dtype=torch.uint8, device=device)
@@ -641,7 +641,7 @@ class Report(NamedTuple):
         return report
 
     @classmethod
-    def over(cls, buffer: Tensor, world_count: int) -> Report:
+    def over(cls, buffer: Tensor, world_count: int) -> StepReport:
         """Return the report that a buffer holds."""
         flag_rows = 3 + len(FLAGS)
         rows = buffer.view(-1, world_count)
@@ -651,9 +651,9 @@ class Report(NamedTuple):
 
     def __reduce__(self) -> tuple[Callable[..., Any], tuple[Any, ...]]:
         """Pickle the buffer alone: views that are pickled apart no longer share its memory."""
-        return Report.over, (self.buffer, len(self.everyone))
+        return StepReport.over, (self.buffer, len(self.everyone))
 
-    def copy(self) -> Report:
+    def copy(self) -> StepReport:
         """Return a copy that later steps leave alone."""
         return self.over(self.buffer.clone(), len(self.everyone))
 
@@ -668,7 +668,7 @@ GROWTH = 4
 """Each recorded size is so many times the one before it."""
 
 
-class Restarts:
+class GraphedResets:
     """Starts of next episodes, on CUDA as one graph and one launch instead of some hundred.
 
     A recorded start serves a fixed number of worlds. Fewer are filled up by repeating the last one:
@@ -685,7 +685,7 @@ class Restarts:
 
     def __init__(
         self,
-        start: Callable[[Tensor], SurveyedWorlds],
+        start: Callable[[Tensor], NeighbourState],
         world_count: int,
         device: torch.device,
         *,
@@ -695,7 +695,7 @@ class Restarts:
         self._world_count = world_count
         self._device = device
         self._recorded = recorded and device.type == "cuda"
-        self._chunks: dict[int, _Chunk] = {}
+        self._chunks: dict[int, _GraphedReset] = {}
 
     def __getstate__(self) -> dict[str, Any]:
         """Leave out recorded starts, which cannot be pickled."""
@@ -705,25 +705,25 @@ class Restarts:
     def __call__(self, worlds: NDArray[np.int64], observation: Tensor) -> None:
         """Start the next episodes of some worlds, [M], and write what is perceived, [B, N, P]."""
         if not self._recorded:
-            self._start()(sent(worlds, self._device)).perceive(observation)
+            self._start()(to_device_async(worlds, self._device)).perceive(observation)
             return
         size = 1
         while size < len(worlds):
             size = min(size * GROWTH, self._world_count)
         if size not in self._chunks:
-            self._chunks[size] = _Chunk(self._start, size, self._device)
+            self._chunks[size] = _GraphedReset(self._start, size, self._device)
         filled = np.full(size, worlds[-1])
         filled[: len(worlds)] = worlds
-        self._chunks[size].restart(sent(filled, self._device), observation)
+        self._chunks[size].restart(to_device_async(filled, self._device), observation)
 
 
-class _Chunk:
+class _GraphedReset:
     """The recorded start of a fixed number of worlds."""
 
     def __init__(self, start: WeakFunction, size: int, device: torch.device) -> None:
         self._start = start
         self._index = torch.zeros(size, dtype=torch.int64, device=device)
-        self._replayed = Replayed(self._run, device)
+        self._replayed = GraphedCallable(self._run, device)
 
     def restart(self, worlds: Tensor, observation: Tensor) -> None:
         """Start the next episodes of as many worlds as the chunk is for."""
@@ -732,4 +732,4 @@ class _Chunk:
         self._surveyed.perceive(observation)
 
     def _run(self) -> None:
-        self._surveyed: SurveyedWorlds = self._start()(self._index)
+        self._surveyed: NeighbourState = self._start()(self._index)

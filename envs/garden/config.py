@@ -14,7 +14,7 @@ Actions = Literal["grid", "free", "discrete"]
 Observe = Literal["grid", "picture", "moments"]
 GardenReward = Literal["dense", "sparse"]
 
-TOOLS = ("push", "erase", "inject", "rate")
+TOOLS = ("push", "wipe", "inject", "rate")
 """What a brush can do."""
 
 
@@ -52,7 +52,7 @@ class GardenConfig(GrownConfig):
     [length units]."""
 
     tools: tuple[str, ...] = ("push",)
-    """What brushes can do: some of "push", "erase", "inject" and "rate", in this order."""
+    """What brushes can do: some of "push", "wipe", "inject" and "rate", in this order."""
 
     push_length: float = 0.15
     """How far a push of 1 moves a particle in the middle of a brush [length units]."""

@@ -6,8 +6,8 @@ from typing import ClassVar
 
 from npa_envs.envs.core.single import NPAEnv
 from npa_envs.envs.core.vector import NPAVectorEnv
-from npa_envs.envs.garden.forms import Brushes
-from npa_envs.envs.garden.worlds import LivingWorlds
+from npa_envs.envs.garden.spaces import BrushSpaces
+from npa_envs.envs.garden.worlds import BrushedWorlds
 
 
 class GardenEnv(NPAEnv):
@@ -48,24 +48,24 @@ class GardenEnv(NPAEnv):
     | Columns | Action a | An action of 1 is | Effect where the brush holds w of a particle |
     |---|---|---|---|
     | 2, of `"push"` | how far to push | `push_length` | x ← x + w `push_length` a |
-    | 1, of `"erase"` | how much to erase | all of it | s ← s − w a s |
+    | 1, of `"wipe"` | how much to wipe | all of it | s ← s − w a s |
     | 1 a channel, of `"inject"` | what to inject | `state_scale` | s ← s + w `state_scale` a |
     | 1, of `"rate"` | how fast to live | twice as fast | steps of the rule count 1 + w a times |
 
     Columns of tools that `tools` leaves out are not there; the default has `"push"` alone.
     `"inject"` has one for each of `inject_channels`. w = (1 − r²)² at r brush radii from the brush,
-    0 outside: `npa_envs.world.brushes.softness`. What is erased is clipped to [0, 1] of a state,
+    0 outside: `npa_envs.world.brushes.softness`. What is wiped is clipped to [0, 1] of a state,
     rates to [0, 2]. Entries are clipped to [-1, 1]. A number that is not finite raises `NPAError`
     and leaves the world as it was. Worlds are differentiable in all numbers of all brushes, but for
     the correction of moments that [perception](../mathematics.md#perception) holds constant:
-    `env.unwrapped.task.lived(x, s, action, random)`.
+    `env.unwrapped.task.step(x, s, action, random)`.
 
     With `actions="free"`, `Box(-1, 1, (K, 2 + W), float32)`: there are K = `brush_count` brushes,
     and two columns more in front say where each is used, along x and y [length units].
 
     With `actions="discrete"`, `MultiDiscrete` with four numbers for each of K brushes: its place
     on the grid along x and along y; its tool, which is nothing, a push in one of eight directions,
-    erase, inject each channel up or down, stop, quicken, as far as there are such tools; and its
+    wipe, inject each channel up or down, stop, quicken, as far as there are such tools; and its
     strength, among `strength_count`.
 
     ## Info
@@ -89,12 +89,12 @@ class GardenEnv(NPAEnv):
     `particles()` and `place_particles(x, s)`.
     """
 
-    worlds_type = LivingWorlds
-    form_type: ClassVar[type[Brushes]] = Brushes
+    worlds_type = BrushedWorlds
+    form_type: ClassVar[type[BrushSpaces]] = BrushSpaces
 
 
 class GardenVectorEnv(NPAVectorEnv):
     """B living worlds, stepped together; subclasses name the task."""
 
-    worlds_type = LivingWorlds
-    form_type: ClassVar[type[Brushes]] = Brushes
+    worlds_type = BrushedWorlds
+    form_type: ClassVar[type[BrushSpaces]] = BrushSpaces

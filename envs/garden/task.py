@@ -11,7 +11,7 @@ from torch import Tensor
 
 from npa_envs import world_mean
 from npa_envs.envs.core.task import Start
-from npa_envs.envs.garden.brushwork import brushed, grid_places, holds, offsets
+from npa_envs.envs.garden.brush_layout import brushed, grid_places, holds, offsets
 from npa_envs.envs.garden.config import GardenConfig
 from npa_envs.envs.grown import GrownTask, run_rule
 from npa_envs.errors import NPAError
@@ -31,7 +31,7 @@ SEEN_SCALES = (2.0, 4.0, 4.0, 4.0, 4.0, 4.0)
 Config = TypeVar("Config", bound=GardenConfig)
 
 
-class Lacking:
+class TargetDeficit:
     """What lacks to a target at some places, as soft brushes there would hold it.
 
     Args:
@@ -97,7 +97,7 @@ class GardenTask(GrownTask[Config]):
                     f"{name}={getattr(self.rule, name)!r}, or another rule"
                 )
         self.rule.requires_grad_(False)
-        self.lacking = Lacking(grid_places(config, device), self.goal.target, config)
+        self.lacking = TargetDeficit(grid_places(config, device), self.goal.target, config)
         """What lacks at the places of the grid."""
 
     @classmethod
@@ -106,7 +106,7 @@ class GardenTask(GrownTask[Config]):
         told = SEEN_AT_A_PLACE * config.place_count**2 * config.particle_count
         return super().extra_bytes(config, world_count) + int(3 * 4 * told * world_count)
 
-    def lived(
+    def step(
         self,
         x: Tensor,
         s: Tensor,
@@ -117,12 +117,12 @@ class GardenTask(GrownTask[Config]):
     ) -> tuple[Tensor, Tensor]:
         """Return worlds after a step of the environment; differentiable.
 
-        Arguments are those of `tended`.
+        Arguments are those of `brush_and_roll`.
         """
-        tended = self.tended(x, s, action, random, detach_positions=detach_positions)
-        return self.struck(*tended, random)
+        tended = self.brush_and_roll(x, s, action, random, detach_positions=detach_positions)
+        return self.disturb(*tended, random)
 
-    def tended(
+    def brush_and_roll(
         self,
         x: Tensor,
         s: Tensor,
@@ -153,7 +153,7 @@ class GardenTask(GrownTask[Config]):
                 x, s = x + rate * (new_x - x), s + rate * (new_s - s)
         return x, s
 
-    def struck(self, x: Tensor, s: Tensor, random: WorldRandom) -> tuple[Tensor, Tensor]:
+    def disturb(self, x: Tensor, s: Tensor, random: WorldRandom) -> tuple[Tensor, Tensor]:
         """Return worlds with what befalls them at the end of a step; by default nothing."""
         return x, s
 
@@ -161,25 +161,25 @@ class GardenTask(GrownTask[Config]):
         """Return what brushes' places are counted from: the mean, less the target's, [B, 2]."""
         return world_mean(x) - self.goal.target.points.mean(dim=0)
 
-    mark_count: ClassVar[int]
+    context_count: ClassVar[int]
     """Numbers that a world keeps of its start, M."""
 
     pays_each_step: ClassVar[bool] = False
     """Whether a sparse reward is one of each step all the same."""
 
-    def marked(self, start: Start, loss: Tensor, random: WorldRandom) -> Tensor:
+    def episode_context(self, start: Start, loss: Tensor, random: WorldRandom) -> Tensor:
         """Return what worlds keep of their start, shape [B, M]; `loss` is theirs, [B]."""
         raise NotImplementedError
 
-    def earned(self, x: Tensor, s: Tensor, loss: Tensor, marks: Tensor) -> Tensor:
+    def reward(self, x: Tensor, s: Tensor, loss: Tensor, context: Tensor) -> Tensor:
         """Return what worlds are worth in a step, [B], of loss [B] and marks [B, M]."""
         raise NotImplementedError
 
-    def told_of(self, x: Tensor, s: Tensor, marks: Tensor) -> dict[str, Tensor]:
+    def context_info(self, x: Tensor, s: Tensor, context: Tensor) -> dict[str, Tensor]:
         """Return what infos tell of worlds besides, shape [B, ...] each."""
         return {}
 
-    def observe(self, x: Tensor, s: Tensor, loss: Tensor, marks: Tensor) -> Tensor:
+    def observe(self, x: Tensor, s: Tensor, loss: Tensor, context: Tensor) -> Tensor:
         """Return what is seen of worlds, shape [B, O]."""
         if self.config.observe == "grid":
             seen = self.lacking(x, s, self.middle(x))
@@ -224,11 +224,11 @@ def marks_of_whole(task: GardenTask[Config], start: Start, loss: Tensor) -> Tens
     return torch.stack((loss, (grey - loss).maximum(LEAST_RISE * loss)), dim=1)
 
 
-def lost_share(loss: Tensor, marks: Tensor) -> Tensor:
+def lost_share(loss: Tensor, context: Tensor) -> Tensor:
     """Return what share of pictures is lost: 0 of whole ones, 1 of grey ones, shape [B].
 
     Args:
         loss: Their losses, shape [B].
-        marks: What `marks_of_whole` gave, and maybe more, shape [B, M].
+        context: What `marks_of_whole` gave, and maybe more, shape [B, M].
     """
-    return (loss - marks[:, 0]) / marks[:, 1]
+    return (loss - context[:, 0]) / context[:, 1]

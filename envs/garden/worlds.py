@@ -11,13 +11,13 @@ from torch import Tensor
 
 from npa_envs.envs.core.config import EnvConfig
 from npa_envs.envs.core.task import EnvTask, Start
-from npa_envs.envs.core.worlds import Worlds
+from npa_envs.envs.core.worlds import BatchedWorlds
 from npa_envs.envs.garden.task import GardenTask
-from npa_envs.world.cuda_graph import makes_plain_tensors, sent
-from npa_envs.world.randomness import Purpose
+from npa_envs.world.cuda_graph import makes_plain_tensors, to_device_async
+from npa_envs.world.randomness import StreamId
 
 
-class LivingWorlds(Worlds):
+class BrushedWorlds(BatchedWorlds):
     """B worlds of one garden, stepped together.
 
     On a CPU worlds are stepped one after the other, as there a rule's products change in the last
@@ -44,7 +44,7 @@ class LivingWorlds(Worlds):
         episode_steps: int | None = None,
     ) -> None:
         super().__init__(task_type, config, world_count, episode_steps)
-        self.marks = torch.zeros(world_count, self.task.mark_count, device=self.device)
+        self.context = torch.zeros(world_count, self.task.context_count, device=self.device)
         """What each world keeps of its start, as its task says, shape [B, M]."""
         self.restart = self._restart  # type: ignore[assignment]
 
@@ -57,12 +57,12 @@ class LivingWorlds(Worlds):
     @makes_plain_tensors
     def perceive(self, out: Tensor | None = None) -> Tensor:
         """Return what is seen of all worlds as they are, shape [B, ...], written to `out`."""
-        seen = self.task.observe(self.x, self.s, self.loss, self.marks)
+        seen = self.task.observe(self.x, self.s, self.loss, self.context)
         return seen if out is None else out.copy_(seen)
 
     def _restart(self, worlds: NDArray[np.int64], observation: Tensor) -> None:
         """Start the next episodes of some worlds, [M], and write what is seen of them."""
-        index = sent(worlds, self.device)
+        index = to_device_async(worlds, self.device)
         self.start(index)
         observation[index] = self.perceive()[index]
 
@@ -76,19 +76,19 @@ class LivingWorlds(Worlds):
         x, s = self._lived(action)
         self._write(x, s)
         self._judge_worlds()
-        if self._beside is not None:
-            self._beside.mark()
+        if self._side_stream is not None:
+            self._side_stream.mark()
         return self.perceive(out)
 
     def _lived(self, action: Tensor) -> tuple[Tensor, Tensor]:
         if self.device.type != "cpu" or self.world_count == 1:
-            return self.task.lived(self.x, self.s, action, self.random)
+            return self.task.step(self.x, self.s, action, self.random)
         lived = []
         for k in range(self.world_count):
             one = slice(k, k + 1)
             random = self.random.take(one)
-            lived.append(self.task.lived(self.x[one], self.s[one], action[one], random))
-        self.random.follow(random, self.task.config.rule_steps)
+            lived.append(self.task.step(self.x[one], self.s[one], action[one], random))
+        self.random.sync_with(random, self.task.config.rule_steps)
         x, s = (torch.cat(part) for part in zip(*lived, strict=True))
         return x, s
 
@@ -109,12 +109,12 @@ class LivingWorlds(Worlds):
         """Write rewards, losses and endings of the worlds as they now are."""
         super()._judge_worlds()
         self.report.numbers[0].copy_(self._rewards())
-        if self._beside is not None and self.world_count == 1:
+        if self._side_stream is not None and self.world_count == 1:
             self._host_numbers.copy_(self.report.numbers, non_blocking=True)
 
     def _rewards(self) -> Tensor:
         """Return what worlds earn in this step, shape [B]."""
-        earned = self.task.earned(self.x, self.s, self.loss, self.marks)
+        earned = self.task.reward(self.x, self.s, self.loss, self.context)
         if not self.pays_last_step_alone:
             return earned
         last = self.report.endings[0] | self.report.endings[1]
@@ -127,10 +127,10 @@ class LivingWorlds(Worlds):
     def start(self, worlds: Tensor, keys: Tensor | None = None) -> Start:
         """Start episodes in some worlds, int64, shape [M], and return their particles."""
         start = super().start(worlds, keys)
-        random = self.random.take(worlds).beside(Purpose.GOAL)
-        self.marks[worlds] = self.task.marked(start, self.loss[worlds], random)
+        random = self.random.take(worlds).substream(StreamId.GOAL)
+        self.context[worlds] = self.task.episode_context(start, self.loss[worlds], random)
         return start
 
     def extras(self, when: str) -> dict[str, Tensor]:
         """Return what infos tell besides, shape [B, ...] each: since a "reset", or of a "step"."""
-        return self.task.told_of(self.x, self.s, self.marks) if when == "reset" else {}
+        return self.task.context_info(self.x, self.s, self.context) if when == "reset" else {}

@@ -14,8 +14,8 @@ from torch import Tensor
 
 from npa_envs.envs.core.screen import Screen
 from npa_envs.envs.core.spaces import action_tensor, to_output
-from npa_envs.envs.core.vector import plain_seed, world_keys
-from npa_envs.envs.multi.worlds import Episodes
+from npa_envs.envs.core.vector import plain_seed, rng_keys
+from npa_envs.envs.multi.worlds import AgentReferee
 from npa_envs.errors import DivergedError, NPAError, shown
 from npa_envs.world.actions import Physics
 
@@ -44,7 +44,9 @@ class AgentsEnv:
     def __init__(
         self, task: str, keywords: dict[str, Any], world_count: int, *, by_particle: bool
     ) -> None:
-        self._episodes = episodes = Episodes(task, keywords, world_count, by_particle=by_particle)
+        self._episodes = episodes = AgentReferee(
+            task, keywords, world_count, by_particle=by_particle
+        )
         self._by_particle = by_particle
         self._task_name = task
         self.config = episodes.config
@@ -89,12 +91,13 @@ class AgentsEnv:
         if seed is None and self._started:
             return None
         self.np_random, _ = seeding.np_random(plain_seed(first))
-        return world_keys(seed, self.worlds.world_count, self.np_random)
+        return rng_keys(seed, self.worlds.world_count, self.np_random)
 
     def _state(self) -> Tensor:
         if not self._started:
             raise NPAError("state needs a world: call reset first")
-        return self.worlds.state()
+        state: Tensor = self.worlds.state()
+        return state
 
     def _pictures(self) -> NDArray[np.uint8] | None:
         if not self._started:

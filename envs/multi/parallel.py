@@ -87,7 +87,7 @@ class CrowdEnv(AgentsEnv, pettingzoo.ParallelEnv):  # type: ignore[misc]
             gymnasium.error.Error: The seed is no integer of at least 0.
         """
         keys = self._next_keys(seed, seed)
-        with self.worlds.here():
+        with self.worlds.device_context():
             observation = self._episodes.start(np.arange(1), keys)
         self._count_agents()
         self._started = True
@@ -120,7 +120,7 @@ class CrowdEnv(AgentsEnv, pettingzoo.ParallelEnv):  # type: ignore[misc]
         worlds, acted, live = self.worlds, self.agents, self._live
         shapes = [self.action_spaces[agent].shape for agent in acted]
         action = joined_actions(actions, acted, shapes, worlds.device)
-        with worlds.here():
+        with worlds.device_context():
             outcome = self._episodes.step(self._everyones(action))
         ended, late = outcome.endings[0] > 0, bool(outcome.late[0])
         infos = self._infos(outcome.numbers)
@@ -169,7 +169,7 @@ class CrowdEnv(AgentsEnv, pettingzoo.ParallelEnv):  # type: ignore[misc]
         """
         if not self.agents:
             raise NPAError("particles need live agents: call reset first")
-        with self.worlds.here():
+        with self.worlds.device_context():
             self.worlds.place(number_tensor("x", x)[None], number_tensor("s", s)[None])
             observation = self._episodes.carry_over()
         self._show()

@@ -17,9 +17,9 @@ from torch import Tensor
 
 from npa_envs.envs.core.vector import checked_count, checked_mode, worlds_to_reset
 from npa_envs.envs.multi.agents import AgentsEnv, joined_actions
-from npa_envs.envs.multi.worlds import Outcome
+from npa_envs.envs.multi.worlds import AgentOutcome
 from npa_envs.errors import NPAError
-from npa_envs.world.cuda_graph import sent
+from npa_envs.world.cuda_graph import to_device_async
 
 ByAgent = dict[str, Any]
 """An array for each species, whose first dimension is the world."""
@@ -121,7 +121,7 @@ class MultiSpeciesVectorEnv(AgentsEnv):
             raise NPAError("reset_mask needs worlds to leave alone: reset all of them first")
         keys = self._next_keys(seed, int(seed) if isinstance(seed, int | np.integer) else None)
         keys = None if keys is None else keys[chosen]
-        with self.worlds.here():
+        with self.worlds.device_context():
             observation = self._episodes.start(chosen, keys)
             if len(chosen) < self.world_count:
                 observation = self.worlds.perceived()
@@ -155,7 +155,7 @@ class MultiSpeciesVectorEnv(AgentsEnv):
                 "them with reset(options={'reset_mask': ...})"
             )
         shapes = [(self.world_count, *space.shape) for space in self.single_action_spaces.values()]
-        with worlds.here():
+        with worlds.device_context():
             action = joined_actions(actions, self.possible_agents, shapes, worlds.device)
             rest = worlds.particle_count - action.shape[1]
             outcome = self._episodes.step(F.pad(action, (0, 0, 0, rest)) if rest else action)
@@ -164,7 +164,7 @@ class MultiSpeciesVectorEnv(AgentsEnv):
             if len(over) and self.autoreset_mode is AutoresetMode.SAME_STEP:
                 final = self._rows(observation), over
                 seen = self._episodes.start(over)
-                observation = observation.index_copy(0, sent(over, worlds.device), seen)
+                observation = observation.index_copy(0, to_device_async(over, worlds.device), seen)
         self._show()
         return (
             self._rows(observation),
@@ -193,7 +193,7 @@ class MultiSpeciesVectorEnv(AgentsEnv):
 
     def _infos(self, numbers: dict[str, Tensor], acted: NDArray[np.bool_]) -> Infos:
         """Return numbers of species that acted, 0 of the others, and who is live now."""
-        own = sent(acted, self.worlds.device)
+        own = to_device_async(acted, self.worlds.device)
         everyone = torch.stack(list(numbers.values())).float()
         rows = self._out(torch.where(own, everyone, 0.0).movedim(2, 0).contiguous())
         live = self._columns(self._sent(self._episodes.live.copy()))
@@ -203,7 +203,7 @@ class MultiSpeciesVectorEnv(AgentsEnv):
         }
 
     def _step_infos(
-        self, outcome: Outcome, final: tuple[ByAgent, NDArray[np.int64]] | None
+        self, outcome: AgentOutcome, final: tuple[ByAgent, NDArray[np.int64]] | None
     ) -> Infos:
         infos = self._infos(outcome.numbers, outcome.acted)
         acted = self._columns(self._sent(outcome.acted))
@@ -233,7 +233,7 @@ class MultiSpeciesVectorEnv(AgentsEnv):
     def _sent(self, values: NDArray[Any]) -> Tensor:
         """Return an array where results are wanted: on the device, or not."""
         return (
-            sent(values, self.worlds.device)
+            to_device_async(values, self.worlds.device)
             if self.config.output == "torch"
             else torch.from_numpy(values)
         )

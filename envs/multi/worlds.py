@@ -1,8 +1,8 @@
 """Worlds that several species share: episodes, pay, and particles that come and go.
 
-`Episodes` has agents step, pays them and ends them. `SpeciesWorlds` holds their particles: how they
-start, act, perceive, and leave. Neither Gymnasium nor PettingZoo is known here. A single world is a
-batch of one; world k of a batch is, bit for bit, that world alone.
+`AgentReferee` steps agents, pays them and ends them. `SpeciesBatch` holds their particles: how
+they start, act, perceive, and leave. It imports neither Gymnasium nor
+PettingZoo. A single world is a batch of one; world k of a batch is, bit for bit, that world alone.
 """
 
 from __future__ import annotations
@@ -16,18 +16,23 @@ from torch import Tensor
 
 from npa_envs import world_mean
 from npa_envs.envs.core.memory import OBSERVATION_COPIES
-from npa_envs.envs.core.worlds import Batch, total
+from npa_envs.envs.core.worlds import WorldState, total
 from npa_envs.envs.multi.task import Population, SpeciesTask
 from npa_envs.envs.multi.tasks import task_type
 from npa_envs.errors import DivergedError
 from npa_envs.world.actions import (
     Actions,
+    NeighbourState,
     Physics,
-    SurveyedWorlds,
+    find_neighbours,
     perceive_each_species,
-    survey_worlds,
 )
-from npa_envs.world.cuda_graph import Beside, Replayed, makes_plain_tensors, sent
+from npa_envs.world.cuda_graph import (
+    GraphedCallable,
+    SideStream,
+    makes_plain_tensors,
+    to_device_async,
+)
 from npa_envs.world.divergence import LARGEST_REPORT
 from npa_envs.world.randomness import WorldRandom
 
@@ -40,7 +45,7 @@ REASONS = np.array([None, "removed", "left the world", "no opponent", "time limi
 """The same in words, as `info["reason"]` has them; the last one is for worlds that are cut off."""
 
 
-class Outcome(NamedTuple):
+class AgentOutcome(NamedTuple):
     """What a step brought all agents of all worlds."""
 
     observation: Tensor
@@ -68,7 +73,7 @@ class Outcome(NamedTuple):
         return REASONS[np.where(self.endings > 0, self.endings, late)]
 
 
-class Episodes:
+class AgentReferee:
     """B worlds of a task with their agents, the same for every way in which agents are asked.
 
     Args:
@@ -87,7 +92,7 @@ class Episodes:
     ) -> None:
         found = task_type(task)
         self.config = config = found.config_type.from_keywords(keywords)
-        self.worlds = worlds = SpeciesWorlds(found, config, world_count, by_particle=by_particle)
+        self.worlds = worlds = SpeciesBatch(found, config, world_count, by_particle=by_particle)
         sizes = np.bincount(worlds.owner)
         ends = np.cumsum(sizes)
         self.spans = [slice(int(e - n), int(e)) for e, n in zip(ends, sizes, strict=True)]
@@ -97,14 +102,14 @@ class Episodes:
         self.live = np.zeros((world_count, len(sizes)), dtype=bool)
         """Which agents are to act next, shape [B, A]."""
         device = worlds.device
-        kinds = sent(self.species, device)
-        self.account = Account(worlds.task, kinds, world_count, team=config.reward == "team")
+        kinds = to_device_async(self.species, device)
+        self.account = AgentReturns(worlds.task, kinds, world_count, team=config.reward == "team")
         """The agents' losses."""
-        self._owner = sent(worlds.owner, device)
+        self._owner = to_device_async(worlds.owner, device)
         self._by_particle = by_particle
         deaths = dict(config.deaths)
         self._last_step = np.array([deaths.get(int(k), 0) for k in self.species])
-        self._beside = Beside(device) if device.type == "cuda" else None
+        self._side_stream = SideStream(device) if device.type == "cuda" else None
         self._host_left = torch.zeros(
             self.live.shape, dtype=torch.bool, device="cpu", pin_memory=device.type == "cuda"
         )
@@ -112,21 +117,22 @@ class Episodes:
     def __setstate__(self, state: dict[str, Any]) -> None:
         """Pin memory again that the device writes to."""
         self.__dict__.update(state)
-        if self._beside is not None:
+        if self._side_stream is not None:
             self._host_left = self._host_left.pin_memory()
 
     def start(self, worlds: NDArray[np.int64], keys: Tensor | None = None) -> Tensor:
         """Start episodes in some worlds, [M], with all agents; return what is perceived, [M, N, P].
 
-        Keys are those of `SpeciesWorlds.start`.
+        Keys are those of `SpeciesBatch.start`.
         """
         population = self.worlds.start(worlds, keys)
+        seen: Tensor
         parts, seen = self.worlds.opened(population)
-        self.account.open(parts, sent(worlds, self.worlds.device))
+        self.account.open(parts, to_device_async(worlds, self.worlds.device))
         self.live[worlds] = True
         return seen
 
-    def step(self, action: Tensor) -> Outcome:
+    def step(self, action: Tensor) -> AgentOutcome:
         """Apply actions, pay, and take agents that ended out of their worlds.
 
         What the host reads is whether agents left their worlds, one byte for each agent.
@@ -143,15 +149,15 @@ class Episodes:
         if self.config.on_divergence == "ignore":
             left = torch.zeros_like(left)
         self._host_left.copy_(left, non_blocking=True)
-        if self._beside is not None:
-            self._beside.mark()
-        live = sent(acted, worlds.device)
+        if self._side_stream is not None:
+            self._side_stream.mark()
+        live = to_device_async(acted, worlds.device)
         rewards = self.account.pay(worlds.measured(stepped=True), live, left & live)
         numbers = self.account.step_numbers()
         observation = worlds.perceived(stepped=True)
         # The device goes on while the host learns who left.
-        if self._beside is not None:
-            self._beside.wait()
+        if self._side_stream is not None:
+            self._side_stream.wait()
         fled = self._host_left.numpy() & acted
         if self.config.on_divergence == "raise" and fled.any():
             raise DivergedError(self._report(fled))
@@ -163,12 +169,13 @@ class Episodes:
         self.live[late] = False
         if (worlds.open & self._deserted()).any():
             worlds.close(self._deserted())
-        return Outcome(observation, rewards, numbers, acted, endings, late)
+        return AgentOutcome(observation, rewards, numbers, acted, endings, late)
 
     def carry_over(self) -> Tensor:
         """Count losses from now on, at no reward, and return what is perceived, [B, N, P]."""
         self.account.carry_over(self.worlds.measured())
-        return self.worlds.perceived()
+        seen: Tensor = self.worlds.perceived()
+        return seen
 
     def _deserted(self) -> NDArray[np.bool_]:
         """Return in which worlds no agent is to act, shape [B]."""
@@ -211,11 +218,11 @@ class Episodes:
         # What others lose or gain by a death is nobody's merit: the next step counts from here.
         seen = self.carry_over()
         stays = (endings == 0) & worlds.open[:, None]
-        where = sent(stays, worlds.device)[:, self._owner, None]
+        where = to_device_async(stays, worlds.device)[:, self._owner, None]
         return torch.where(where, seen, observation)
 
 
-class Account:
+class AgentReturns:
     """The losses of all agents in B worlds, now and before, and rewards for what fell.
 
     Args:
@@ -301,7 +308,7 @@ def _stacked(parts: Parts) -> Tensor:
     return torch.stack(list(parts.values())).double()
 
 
-class SpeciesWorlds(Batch):
+class SpeciesBatch(WorldState):
     """B worlds; particles of each species lie one after the other, and those removed are gone.
 
     A world that lost particles is computed without them. Worlds that have the same ones are
@@ -327,14 +334,14 @@ class SpeciesWorlds(Batch):
         if config.perception == "per_species":
             # Numbers that a particle perceives of species one by one.
             self._appended = config.species_count * (1 + task_type.space_dim)
-        told_apart = 4 * OBSERVATION_COPIES * world_count * count * self._appended
-        super().__init__(config, task_type, world_count, count, told_apart)
+        by_species = 4 * OBSERVATION_COPIES * world_count * count * self._appended
+        super().__init__(config, task_type, world_count, count, by_species)
         self.task = task_type(config, self.device)
         self.species = np.repeat(np.arange(config.species_count), config.counts)
         """Species of each particle that an episode starts with, int64, shape [N]."""
         self.owner = np.arange(count) if by_particle else self.species
         """Number of the agent that owns each of them, never falling, int64, shape [N]."""
-        self._judge = Judge(self.task, self.physics, self.owner, by_particle)
+        self._judge = AgentLosses(self.task, self.physics, self.owner, by_particle)
         self.there = np.zeros((world_count, self._judge.agent_count), dtype=bool)
         """Whether each agent's particles are in its world, shape [B, A]."""
         self.open = np.zeros(world_count, dtype=bool)
@@ -361,7 +368,7 @@ class SpeciesWorlds(Batch):
     def start(self, worlds: NDArray[np.int64], keys: Tensor | None = None) -> Population:
         """Start episodes in some worlds, [M], and return their particles."""
         self._disband()
-        index = sent(worlds, self.device)
+        index = to_device_async(worlds, self.device)
         random = self.next_streams(index, keys)
         x, s = self.task.start(random)
         self.random.put(index, random)
@@ -460,16 +467,16 @@ class SpeciesWorlds(Batch):
         columns = np.flatnonzero(self.there[world][self.owner])
         kind = self.species[columns]
         counts = np.bincount(kind, minlength=self.config.species_count)
-        index = sent(columns, self.device)
+        index = to_device_async(columns, self.device)
         x, s = self.x[world : world + 1, index], self.s[world : world + 1, index]
-        return Population(x, s, tuple(counts.tolist()), sent(kind, self.device))
+        return Population(x, s, tuple(counts.tolist()), to_device_async(kind, self.device))
 
     @torch.no_grad()
     @makes_plain_tensors
     def state(self) -> Tensor:
         """Return position, state and 1 of each particle, 0s of those gone, [B, N, 2 + C + 1]."""
         self._collect()
-        there = sent(self.there[:, self.owner], self.device)[..., None]
+        there = to_device_async(self.there[:, self.owner], self.device)[..., None]
         rows = torch.cat((self.x, self.s, there.float()), dim=-1)
         return torch.where(there, rows, 0.0)
 
@@ -497,8 +504,8 @@ class SpeciesWorlds(Batch):
         for k, kind in enumerate(kinds):
             worlds = going_on[number.reshape(-1) == k]
             columns = np.flatnonzero(kind[self.owner])
-            index = sent(worlds, self.device)
-            places = index[:, None], sent(columns, self.device)
+            index = to_device_async(worlds, self.device)
+            places = index[:, None], to_device_async(columns, self.device)
             x, s, random = self.x[places], self.s[places], self.random.take(index)
             cohorts.append(Cohort(self._judge, worlds, columns, x, s, random))
         return cohorts
@@ -533,7 +540,7 @@ class Cohort:
 
     def __init__(
         self,
-        judge: Judge,
+        judge: AgentLosses,
         worlds: NDArray[np.int64],
         columns: NDArray[np.int64],
         x: Tensor,
@@ -545,18 +552,18 @@ class Cohort:
         counts = np.bincount(kind, minlength=config.species_count)
         self._judge = judge
         self.random = random
-        self.worlds = sent(worlds, device)
-        self.columns = sent(columns, device)
+        self.worlds = to_device_async(worlds, device)
+        self.columns = to_device_async(columns, device)
         self.places = self.worlds[:, None], self.columns
         """Where the batch has the particles, as an index of two dimensions."""
-        self.population = Population(x, s, tuple(counts.tolist()), sent(kind, device))
+        self.population = Population(x, s, tuple(counts.tolist()), to_device_async(kind, device))
         """The particles."""
         self.parts: dict[str, Tensor] = {}
         """Parts of every agent's loss after the last step, shape [M, A]."""
         self.gone = torch.zeros(len(worlds), judge.agent_count, dtype=torch.bool, device=device)
         """Which agents have no particle within bounds after the last step, shape [M, A]."""
-        self._owners = sent(judge.owner[columns], device)
-        self._surveyed: SurveyedWorlds | None = None
+        self._owners = to_device_async(judge.owner[columns], device)
+        self._surveyed: NeighbourState | None = None
         self._actions = Actions(
             x,
             s,
@@ -565,8 +572,8 @@ class Cohort:
             enabled=torch.ones(1, dtype=torch.uint8, device=device),
             diverged=torch.zeros(len(worlds), dtype=torch.uint8, device=device),
         )
-        self._draw = Replayed(self._actions.draw, device)
-        self._look = Replayed(self._look_around, device)
+        self._draw = GraphedCallable(self._actions.draw, device)
+        self._look = GraphedCallable(self._look_around, device)
 
     def __getstate__(self) -> dict[str, Any]:
         """Leave out what only the next perception needs, and which cannot be pickled."""
@@ -597,10 +604,10 @@ class Cohort:
         count = torch.zeros(len(inside), self._judge.agent_count, device=inside.device)
         self.gone = count.index_add_(1, self._owners, inside.float()) == 0.0
         self.parts = self.measured()
-        self._surveyed = survey_worlds(x, s, physics)
+        self._surveyed = find_neighbours(x, s, physics)
 
 
-class Judge:
+class AgentLosses:
     """What is computed of worlds that have the same particles, whichever of a batch they are.
 
     Args:
@@ -633,14 +640,14 @@ class Judge:
             found[name].index_copy_(1, columns, loss)
         return found
 
-    def perceived(self, population: Population, surveyed: SurveyedWorlds | None = None) -> Tensor:
+    def perceived(self, population: Population, surveyed: NeighbourState | None = None) -> Tensor:
         """Return what particles perceive, by one pass for all species, shape [M, N now, P].
 
         Telling species apart takes another one, again for all of them. Worlds that are surveyed
         already are not sorted again.
         """
         x, s, physics = population.x, population.s, self.physics
-        seen = (surveyed or survey_worlds(x, s, physics)).perceive()
+        seen = (surveyed or find_neighbours(x, s, physics)).perceive()
         if self.task.config.perception == "per_species":
             apart = perceive_each_species(x, population.counts, physics)
             seen = torch.cat((seen, apart), dim=-1)

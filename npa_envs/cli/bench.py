@@ -22,7 +22,7 @@ from npa_envs.errors import NPAError
 if TYPE_CHECKING:
     import torch
 
-    from npa_envs.measure.speed.suites import Report
+    from npa_envs.measure.speed.suites import BenchReport
 
 QUICK = "quick"
 """The suite that is run unless another one is asked for."""
@@ -104,15 +104,15 @@ def main(arguments: Sequence[str]) -> int:
     return 0
 
 
-def measured_report(options: BenchOptions, device: torch.device, command: str) -> Report:
+def measured_report(options: BenchOptions, device: torch.device, command: str) -> BenchReport:
     """Run a suite and return its report, with the command line in it."""
     from npa_envs.measure.record import current_commit, time_limit
-    from npa_envs.measure.speed.suites import SUITES, Report
-    from npa_envs.measure.speed.timing import Session
+    from npa_envs.measure.speed.suites import SUITES, BenchReport
+    from npa_envs.measure.speed.timing import TimingSession
 
     name = options.suite or QUICK
     with StepBar(None, show=options.progress, unit="row") as bar, torch_threads(options.threads):
-        session = Session(
+        session = TimingSession(
             device=device,
             repeats=options.repeats,
             small=options.quick,
@@ -120,7 +120,7 @@ def measured_report(options: BenchOptions, device: torch.device, command: str) -
             enough=time_limit(options.max_seconds),
         )
         tables = SUITES[name](session)
-    return Report(
+    return BenchReport(
         suite=name,
         command=command,
         commit=options.commit or current_commit(),
@@ -131,7 +131,7 @@ def measured_report(options: BenchOptions, device: torch.device, command: str) -
     )
 
 
-def _write(report: Report, folder: Path, *, plots: bool) -> None:
+def _write(report: BenchReport, folder: Path, *, plots: bool) -> None:
     from npa_envs.files import write_text
     from npa_envs.measure.plots import write_plots
     from npa_envs.measure.speed.suites import pictures

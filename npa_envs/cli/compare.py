@@ -27,7 +27,7 @@ from npa_envs.cli.output import (
 from npa_envs.errors import NPAError, suggest
 
 if TYPE_CHECKING:
-    from npa_envs.agents.comparison.plan import Axis, Plan
+    from npa_envs.agents.comparison.plan import Axis, ComparisonPlan
     from npa_envs.agents.comparison.run import RunRecord
 
 RUN_FAILED = 1
@@ -165,13 +165,13 @@ def main(arguments: Sequence[str]) -> int:
     return RUN_FAILED if failed else 0
 
 
-def make_plan(options: CompareOptions) -> Plan:
+def make_plan(options: CompareOptions) -> ComparisonPlan:
     """Return what the command line asks for.
 
     Raises:
         NPAError: As for `main`.
     """
-    from npa_envs.agents.comparison.plan import LEFT_OUT, PROBLEMS, Plan, make_problem
+    from npa_envs.agents.comparison.plan import LEFT_OUT, PROBLEMS, ComparisonPlan, make_problem
     from npa_envs.agents.learning import METHODS
     from npa_envs.agents.learning.problem import RUNS
 
@@ -191,7 +191,7 @@ def make_plan(options: CompareOptions) -> Plan:
     if not options.methods:
         methods = [name for name in methods if name not in NEED_MORE]
     problems = {name: make_problem(name, quick=options.quick) for name in tasks}
-    return Plan(
+    return ComparisonPlan(
         tasks={name: json.loads(problem.to_json()) for name, problem in problems.items()},
         methods=methods,
         seeds=tuple(range(3 if options.seeds is None else options.seeds)),
@@ -204,10 +204,10 @@ def make_plan(options: CompareOptions) -> Plan:
     )
 
 
-def _suite_plan(options: CompareOptions) -> Plan:
+def _suite_plan(options: CompareOptions) -> ComparisonPlan:
     """Return the plan of NPA-Bench, of which some tasks, methods and seeds may be chosen."""
     from npa_envs.agents.comparison import npa_bench
-    from npa_envs.agents.comparison.plan import Plan
+    from npa_envs.agents.comparison.plan import ComparisonPlan
 
     assert options.suite is not None, "asked for by its caller"
     suite = npa_bench.SUITES[options.suite]
@@ -229,7 +229,7 @@ def _suite_plan(options: CompareOptions) -> Plan:
             f"--methods my_{name}={name} --options my_{name}.NAME=VALUE"
         )
     problems = {name: suite.problem_of(name) for name in tasks}
-    return Plan(
+    return ComparisonPlan(
         tasks={name: json.loads(problem.to_json()) for name, problem in problems.items()},
         methods=methods,
         seeds=tuple(range(options.seeds or (1 if quick else npa_bench.LEAST_SEEDS))),

@@ -41,7 +41,7 @@ SCREEN = 192
 
 @dataclass(frozen=True, kw_only=True)
 class DemoOptions:
-    """Grow a shipped rule from its seed, cut it, erase a part and let it heal each time; then train
+    """Grow a shipped rule from its seed, cut it, wipe a part and let it heal each time; then train
     a small rule from a picture."""
 
     out: Path = Path("demo")
@@ -75,7 +75,7 @@ def main(arguments: Sequence[str]) -> int:
         raise NPAError(f"train_seconds must lie in [1, 3600], got {options.train_seconds}")
     start = time.perf_counter()
     writable_folder(options.out)
-    report = Report()
+    report = DemoReport()
     # On worlds as small as these several threads gain little, and on a busy machine they wait for
     # each other at every operation: a step then takes several times as long.
     with torch_threads(1):
@@ -88,7 +88,7 @@ def main(arguments: Sequence[str]) -> int:
     return 0
 
 
-class Report:
+class DemoReport:
     """What the demo says, on the screen and in a file."""
 
     def __init__(self) -> None:
@@ -106,7 +106,7 @@ class Report:
             self.line(f"  wrote {path}")
 
 
-def grow_and_heal(options: DemoOptions, report: Report) -> None:
+def grow_and_heal(options: DemoOptions, report: DemoReport) -> None:
     """Grow the shipped rule, damage it twice, and film how it heals.
 
     Raises:
@@ -114,7 +114,7 @@ def grow_and_heal(options: DemoOptions, report: Report) -> None:
     """
     import torch
 
-    from npa_envs.cli.film import Film, film_world, write_film
+    from npa_envs.cli.film import WorldFilm, film_world, write_film
     from npa_envs.measure.quality import measure
     from npa_envs.rule.files import load_rule
     from npa_envs.tasks.base import coded_states, seed_worlds, task_toward
@@ -135,9 +135,9 @@ def grow_and_heal(options: DemoOptions, report: Report) -> None:
             return f"no figures ({trained.doubt})"
         return measure(task, x, s, step).figures
 
-    lines, film, step = [], Film(), 0
+    lines, film, step = [], WorldFilm(), 0
     with StepBar(GROW_STEPS + 2 * HEAL_STEPS, show=options.progress) as bar:
-        for kind, steps in ((None, GROW_STEPS), ("cut", HEAL_STEPS), ("erase", HEAL_STEPS)):
+        for kind, steps in ((None, GROW_STEPS), ("cut", HEAL_STEPS), ("wipe", HEAL_STEPS)):
             if kind is not None:
                 damage = DamageEvent(step, kind)
                 x, s = damage_worlds(x, s, kind=kind, generator=generator)
@@ -158,7 +158,7 @@ def grow_and_heal(options: DemoOptions, report: Report) -> None:
     report.wrote(*write_film(film, options.out, name))
 
 
-def train_small(options: DemoOptions, report: Report) -> None:
+def train_small(options: DemoOptions, report: DemoReport) -> None:
     """Train a small rule from a picture, and film what it learned.
 
     Raises:

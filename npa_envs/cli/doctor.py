@@ -59,7 +59,7 @@ def main(arguments: Sequence[str]) -> int:
 
 
 @dataclass(frozen=True)
-class Finding:
+class DoctorLine:
     """One line of the report."""
 
     subject: str
@@ -77,13 +77,13 @@ class Finding:
         return "-" if self.optional else "!"
 
 
-def examine() -> list[Finding]:
+def examine() -> list[DoctorLine]:
     """Look at packages, devices, the kernel cache, fonts and programs, in the order to read them.
 
     Starts Warp and, where there is one, asks CUDA for its devices. A check that fails in an
     unforeseen way is a finding itself.
     """
-    checks: dict[str, Callable[[], list[Finding]]] = {
+    checks: dict[str, Callable[[], list[DoctorLine]]] = {
         "python": _python,
         "packages": _packages,
         "extras": _extras,
@@ -101,14 +101,19 @@ def examine() -> list[Finding]:
             findings += check()
         except Exception as error:
             # A report that breaks where the machine is broken would be of no use.
-            findings.append(Finding(subject, f"{type(error).__name__}: {error}", "see the message"))
+            findings.append(
+                DoctorLine(subject, f"{type(error).__name__}: {error}", "see the message")
+            )
     return findings
 
 
-def _python() -> list[Finding]:
+def _python() -> list[DoctorLine]:
     version = f"{platform.python_version()} ({sys.executable})"
     system = f"{platform.system()} {platform.release()}, {platform.machine()}"
-    return [Finding("python", version), Finding("system", f"{system}, {os.cpu_count()} cores")]
+    return [
+        DoctorLine("python", version),
+        DoctorLine("system", f"{system}, {os.cpu_count()} cores"),
+    ]
 
 
 @dataclass(frozen=True)
@@ -161,22 +166,22 @@ def _requirements() -> list[Requirement]:
     return found
 
 
-def _packages() -> list[Finding]:
+def _packages() -> list[DoctorLine]:
     version = _version("npa-envs")
     if version is None:
         text = "not installed, imported from a folder"
-        return [Finding("npa-envs", text, "pip install -e . in the clone", optional=True)]
-    findings = [Finding("npa-envs", version)]
+        return [DoctorLine("npa-envs", text, "pip install -e . in the clone", optional=True)]
+    findings = [DoctorLine("npa-envs", version)]
     for needed in _requirements():
         if needed.extra is None:
             wrong = needed.finding()
             text = wrong or _version(needed.name) or ""
             cure = f"pip install -U '{needed.name}>={needed.oldest}'" if wrong else None
-            findings.append(Finding(needed.name, text, cure))
+            findings.append(DoctorLine(needed.name, text, cure))
     return findings
 
 
-def _extras() -> list[Finding]:
+def _extras() -> list[DoctorLine]:
     requirements = _requirements()
     findings = []
     for extra, purpose in EXTRAS.items():
@@ -186,7 +191,7 @@ def _extras() -> list[Finding]:
         wrong = [f"{one.name} {text}" for one in needed if (text := one.finding()) is not None]
         have = ", ".join(f"{one.name} {_version(one.name)}" for one in needed)
         findings.append(
-            Finding(
+            DoctorLine(
                 f"[{extra}]",
                 f"{purpose}: {', '.join(wrong) if wrong else have}",
                 f"pip install 'npa-envs[{extra}]'" if wrong else None,
@@ -196,13 +201,13 @@ def _extras() -> list[Finding]:
     return findings
 
 
-def _torch_devices() -> list[Finding]:
+def _torch_devices() -> list[DoctorLine]:
     import torch
 
     cores, threads = os.cpu_count() or 1, torch.get_num_threads()
     idle = cores >= 4 and threads < cores // 2
     cure = "more is faster for large worlds: set OMP_NUM_THREADS, or leave it out" if idle else None
-    findings = [Finding("cpu", f"{threads} threads of {cores} cores", cure, optional=True)]
+    findings = [DoctorLine("cpu", f"{threads} threads of {cores} cores", cure, optional=True)]
     if not torch.cuda.is_available():
         return [*findings, _no_cuda(torch.version.cuda, _cards())]
     for index in range(torch.cuda.device_count()):
@@ -213,7 +218,7 @@ def _torch_devices() -> list[Finding]:
         )
         slow = (device.major, device.minor) < FAST_CAPABILITY
         cure = "slow: the faster kernels need a card from 8.0 on (Ampere and newer)"
-        findings.append(Finding(f"cuda:{index}", text, cure if slow else None, optional=True))
+        findings.append(DoctorLine(f"cuda:{index}", text, cure if slow else None, optional=True))
     return findings
 
 
@@ -230,31 +235,33 @@ def _cards() -> list[tuple[str, str]]:
     return [(name, version) for name, _, version in rows if name]
 
 
-def _no_cuda(built: str | None, cards: list[tuple[str, str]]) -> Finding:
+def _no_cuda(built: str | None, cards: list[tuple[str, str]]) -> DoctorLine:
     """Return why torch, built for a version of CUDA or for none, uses none of these cards."""
     if not cards:
         cure = (
             "slow for large worlds: use the presets fast and tiny, which are made for CPUs, or a "
             "machine with an NVIDIA card"
         )
-        return Finding("cuda", "no NVIDIA card, or no driver for it", cure, optional=True)
+        return DoctorLine("cuda", "no NVIDIA card, or no driver for it", cure, optional=True)
     name, driver = cards[0]
     if built is None:
         cure = "pip uninstall torch, then install its CUDA build: https://pytorch.org/get-started"
-        return Finding("cuda", f"{name} is idle: this torch is a build for CPUs alone", cure)
+        return DoctorLine("cuda", f"{name} is idle: this torch is a build for CPUs alone", cure)
     oldest = OLDEST_DRIVERS.get(int(built.partition(".")[0]))
     if oldest is not None and _numbers(driver) < (oldest,):
         cure = f"install NVIDIA's driver {oldest} or newer, or a torch for an older CUDA"
-        return Finding("cuda", f"{name} is idle: driver {driver} is too old for CUDA {built}", cure)
+        return DoctorLine(
+            "cuda", f"{name} is idle: driver {driver} is too old for CUDA {built}", cure
+        )
     hidden = os.environ.get("CUDA_VISIBLE_DEVICES")
     if hidden is not None:
         cure = "unset CUDA_VISIBLE_DEVICES, or name the card there"
-        return Finding("cuda", f"{name} is idle: CUDA_VISIBLE_DEVICES is '{hidden}'", cure)
+        return DoctorLine("cuda", f"{name} is idle: CUDA_VISIBLE_DEVICES is '{hidden}'", cure)
     cure = 'see what python -c "import torch; torch.zeros(1).cuda()" says; often a reboot helps'
-    return Finding("cuda", f"{name} is idle: torch cannot use it (driver {driver})", cure)
+    return DoctorLine("cuda", f"{name} is idle: torch cannot use it (driver {driver})", cure)
 
 
-def _warp_devices() -> list[Finding]:
+def _warp_devices() -> list[DoctorLine]:
     import torch
 
     from npa_envs.runtime import warp_devices
@@ -264,10 +271,10 @@ def _warp_devices() -> list[Finding]:
     cure = None
     if torch.cuda.is_available() and not sees_cuda:
         cure = "torch sees a CUDA device and Warp does not: install a newer NVIDIA driver"
-    return [Finding("warp devices", "; ".join(lines), cure)]
+    return [DoctorLine("warp devices", "; ".join(lines), cure)]
 
 
-def _kernel_cache() -> list[Finding]:
+def _kernel_cache() -> list[DoctorLine]:
     from npa_envs.runtime import kernel_cache_folder
 
     folder = kernel_cache_folder()
@@ -275,39 +282,39 @@ def _kernel_cache() -> list[Finding]:
         cure = (
             "kernels would be compiled anew in each run: set WARP_CACHE_PATH to a folder of yours"
         )
-        return [Finding("kernel cache", f"{folder} (cannot be written to)", cure)]
+        return [DoctorLine("kernel cache", f"{folder} (cannot be written to)", cure)]
     size = sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())
     ours = len(list(folder.glob("wp_npa_envs*")))
     text = f"{folder} ({size / 2**20:.0f} MiB, {ours} modules of npa-envs)"
     cure = "the first use of each kernel compiles it; npa-envs warmup does so now"
-    return [Finding("kernel cache", text, None if ours else cure, optional=True)]
+    return [DoctorLine("kernel cache", text, None if ours else cure, optional=True)]
 
 
-def _emoji_font() -> list[Finding]:
+def _emoji_font() -> list[DoctorLine]:
     from npa_envs.tasks.targets.emoji import find_emoji_fonts
 
     fonts = find_emoji_fonts()
     if fonts:
-        return [Finding("emoji font", str(fonts[0]))]
+        return [DoctorLine("emoji font", str(fonts[0]))]
     cure = "for emoji as targets: apt install fonts-noto-color-emoji"
-    return [Finding("emoji font", "none", cure, optional=True)]
+    return [DoctorLine("emoji font", "none", cure, optional=True)]
 
 
-def _ffmpeg() -> list[Finding]:
+def _ffmpeg() -> list[DoctorLine]:
     try:
         import imageio_ffmpeg
     except ImportError as error:
-        return [Finding("ffmpeg", f"not found ({error})", "pip install 'imageio[ffmpeg]'")]
+        return [DoctorLine("ffmpeg", f"not found ({error})", "pip install 'imageio[ffmpeg]'")]
     try:
         program = Path(imageio_ffmpeg.get_ffmpeg_exe())
     except RuntimeError as error:
-        return [Finding("ffmpeg", f"not found ({error})", "pip install -U imageio-ffmpeg")]
+        return [DoctorLine("ffmpeg", f"not found ({error})", "pip install -U imageio-ffmpeg")]
     done = subprocess.run(
         [program, "-version"], capture_output=True, encoding="utf-8", errors="replace", check=False
     )
     if done.returncode:
-        return [Finding("ffmpeg", f"{program} does not run", "pip install -U imageio-ffmpeg")]
-    return [Finding("ffmpeg", f"{done.stdout.splitlines()[0]} ({program})")]
+        return [DoctorLine("ffmpeg", f"{program} does not run", "pip install -U imageio-ffmpeg")]
+    return [DoctorLine("ffmpeg", f"{done.stdout.splitlines()[0]} ({program})")]
 
 
 def has_screen() -> bool:
@@ -316,22 +323,22 @@ def has_screen() -> bool:
     return not sys.platform.startswith("linux") or any(map(os.environ.get, screens))
 
 
-def _browser() -> list[Finding]:
+def _browser() -> list[DoctorLine]:
     if has_screen():
-        return [Finding("browser", "there is a screen")]
+        return [DoctorLine("browser", "there is a screen")]
     cure = (
         "for npa-envs view: run ssh -L 8765:127.0.0.1:8765 THIS-COMPUTER on a computer that has "
         "one, and open the printed link there"
     )
-    return [Finding("browser", "no screen", cure, optional=True)]
+    return [DoctorLine("browser", "no screen", cure, optional=True)]
 
 
-def _shipped_rules() -> list[Finding]:
+def _shipped_rules() -> list[DoctorLine]:
     from npa_envs.rule.files import load_rule, shipped_rules
 
     names = list(shipped_rules())
     for name in names:
         load_rule(name)
     if not names:
-        return [Finding("shipped rules", "none", "install npa-envs again: its data is missing")]
-    return [Finding("shipped rules", ", ".join(names))]
+        return [DoctorLine("shipped rules", "none", "install npa-envs again: its data is missing")]
+    return [DoctorLine("shipped rules", ", ".join(names))]

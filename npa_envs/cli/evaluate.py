@@ -39,7 +39,7 @@ class EvaluateOptions(RuleOptions):
     """The first world's number; training uses others."""
 
     healing: bool = False
-    """Also cut the grown worlds and erase a part, and measure how they heal. Point clouds are
+    """Also cut the grown worlds and wipe a part, and measure how they heal. Point clouds are
     always cut and changed."""
 
     judge: bool = False
@@ -55,7 +55,7 @@ def main(arguments: Sequence[str]) -> int:
     options = parse_options(EvaluateOptions, "evaluate", arguments)
     from npa_envs.devices import check_device
     from npa_envs.files import write_text
-    from npa_envs.measure.judge import Judge, JudgeRow
+    from npa_envs.measure.judge import JudgeRow, TextureJudge
     from npa_envs.measure.quality import CHECKPOINTS, check_steps, tables_of
     from npa_envs.measure.tables import UNMEASURED, table_text, tables_json
     from npa_envs.rule.files import load_rule
@@ -76,7 +76,7 @@ def main(arguments: Sequence[str]) -> int:
             f"cannot measure {options.rule!r}: {trained.doubt}: "
             "give --target, a built-in name or a picture"
         )
-    judge = Judge(trained.task) if options.judge else None
+    judge = TextureJudge(trained.task) if options.judge else None
     judged: list[JudgeRow] = []
     clouds = isinstance(trained.task, PointClassification)
     known = not (clouds or options.healing)

@@ -51,7 +51,7 @@ EARLY_STEPS = (0, 16, 32, 64, 128)
 
 
 @dataclass
-class Film:
+class WorldFilm:
     """Frames of one world."""
 
     background: str = "white"
@@ -120,10 +120,10 @@ def film_world(
     damages: Sequence[DamageEvent] = (),
     every: int = 8,
     first_step: int = 0,
-    film: Film | None = None,
+    film: WorldFilm | None = None,
     progress: Callable[[int], None] = lambda _: None,
     stop: Callable[[], bool] = lambda: False,
-) -> tuple[Tensor, Tensor, Film]:
+) -> tuple[Tensor, Tensor, WorldFilm]:
     """Run one world x [1, N, D], s [1, N, C] with damages on the way, and take pictures of it.
 
     Args:
@@ -136,7 +136,7 @@ def film_world(
     Returns:
         Positions and states at the end, and the film.
     """
-    film = Film() if film is None else film
+    film = WorldFilm() if film is None else film
     last = first_step + steps
     hurts = {damage.step: [d for d in damages if d.step == damage.step] for damage in damages}
     stops = {step for step in hurts if first_step <= step < last}
@@ -207,7 +207,7 @@ def large_task(
     return task if told == world else task_of_rule(source, rule, device, **told).task
 
 
-def write_film(film: Film, folder: Path, name: str, *, fps: float = 25.0) -> list[Path]:
+def write_film(film: WorldFilm, folder: Path, name: str, *, fps: float = 25.0) -> list[Path]:
     """Write a film as GIF, MP4 and filmstrip, and return the files.
 
     Raises:

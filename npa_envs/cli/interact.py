@@ -22,7 +22,7 @@ from npa_envs.errors import NPAError
 if TYPE_CHECKING:
     import torch
 
-    from npa_envs.measure.interaction import InteractionRow, InteractionSettings, Organism
+    from npa_envs.measure.interaction import InteractionRow, InteractionSettings, RuleUnderTest
     from npa_envs.rule.rule import NPARule
 
 RESULTS = "interactions.json"
@@ -152,16 +152,16 @@ def main(arguments: Sequence[str]) -> int:
 
 def _organisms(
     options: InteractOptions, device: torch.device
-) -> tuple[list[Organism], InteractionSettings]:
+) -> tuple[list[RuleUnderTest], InteractionSettings]:
     """Load the rules, with what each grows, and settle how they meet."""
-    from npa_envs.measure.interaction import InteractionSettings, Organism
+    from npa_envs.measure.interaction import InteractionSettings, RuleUnderTest
     from npa_envs.rule.files import load_rule, shipped_rules
     from npa_envs.tasks.morphogenesis2d import Morphogenesis2D
     from npa_envs.training.trained_tasks import task_of_rule
 
     sources = list(dict.fromkeys(options.rules))
     sources = sources or list(shipped_rules(TASK))[: 2 if options.quick else None]
-    organisms: list[Organism] = []
+    organisms: list[RuleUnderTest] = []
     counts = []
     for source in sources:
         rule = load_rule(source, device=device).float().requires_grad_(False)
@@ -175,7 +175,9 @@ def _organisms(
             name = f"{name}-{len(organisms) + 1}"
         counts.append(trained.task.config.particle_count)
         task_of = functools.partial(_task_of, source, rule, device)
-        organisms.append(Organism(name, rule, functools.cache(task_of), trained.task.update_prob))
+        organisms.append(
+            RuleUnderTest(name, rule, functools.cache(task_of), trained.task.update_prob)
+        )
     settings = InteractionSettings(
         particle_count=(max(counts) if options.particle_count is None else options.particle_count),
         distances=options.distances,
@@ -220,7 +222,7 @@ def _task_of(source: str, rule: NPARule, device: torch.device, count: int) -> An
     return task_of_rule(source, rule, device, particle_count=count).task
 
 
-def _told(organisms: Sequence[Organism], settings: InteractionSettings) -> dict[str, Any]:
+def _told(organisms: Sequence[RuleUnderTest], settings: InteractionSettings) -> dict[str, Any]:
     """Return what rows follow from, as JSON can hold it."""
     from npa_envs.files import plain_numbers
     from npa_envs.rule.files import rule_digest

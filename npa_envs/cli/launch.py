@@ -134,7 +134,7 @@ def asked_count(gpus: int | None, processes: int | None, device: str) -> int | N
 
 
 @contextlib.contextmanager
-def told_once(ranks: Ranks) -> Iterator[None]:
+def print_once(ranks: Ranks) -> Iterator[None]:
     """Let the first process tell of an error, and leave that of another one to the launcher.
 
     Raises:

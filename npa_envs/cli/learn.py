@@ -10,18 +10,18 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from npa_envs.cli.launch import asked_count, launch, told_once, with_device_of_gpus
+from npa_envs.cli.launch import asked_count, launch, print_once, with_device_of_gpus
 from npa_envs.cli.output import (
     RunOptions,
     check_numbers,
     named_values,
     parse_options,
-    settled_resume,
+    resolve_resume,
 )
 from npa_envs.errors import NPAError
 
 if TYPE_CHECKING:
-    from npa_envs.agents.learning import Entry, Problem
+    from npa_envs.agents.learning import CurvePoint, Problem
     from npa_envs.training.ranks import Ranks
 
 
@@ -96,15 +96,15 @@ def main(arguments: Sequence[str]) -> int:
     with joined_ranks() as ranks:
         asked = None
         if ranks.first:
-            words = settled_resume(with_device_of_gpus(arguments), lambda words: parse(words).out)
+            words = resolve_resume(with_device_of_gpus(arguments), lambda words: parse(words).out)
             asked = words, parse(words)
-        asked = ranks.told(asked)
+        asked = ranks.broadcast(asked)
         assert asked is not None, "said by the first process"
         words, options = asked
         count = asked_count(options.gpus, options.processes, options.device) or 1
         if count > 1 and not ranks.together:
             return launch(count, ("learn", *words), options.out, options.device)
-        with told_once(ranks):
+        with print_once(ranks):
             return run(options, ranks)
 
 
@@ -135,7 +135,7 @@ def run(options: LearnOptions, ranks: Ranks) -> int:
     if steps is not None and not math.isfinite(steps):
         raise NPAError(f"particle_steps must be finite, got {steps}: try 1e8")
 
-    def told(entry: Entry) -> None:
+    def told(entry: CurvePoint) -> None:
         if options.progress:
             print(
                 f"{entry.seconds:8.1f} s  {entry.particle_steps:.3g} particle-steps  "

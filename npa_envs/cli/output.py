@@ -46,7 +46,7 @@ EXAMPLES: dict[str, tuple[str, ...]] = {
     ),
     "robustness": ("robustness heart --quick", "robustness --device cuda --out results"),
     "rollout": (
-        "rollout gecko --damage 300:cut 500:erase --steps 700",
+        "rollout gecko --damage 300:cut 500:wipe --steps 700",
         "rollout runs/heart",
         "rollout gecko --resolution 512 --style points --background black",
     ),
@@ -160,7 +160,7 @@ class RuleOptions(RunOptions):
         return {name: getattr(self, name) for name in names}
 
 
-def told_rules(words: Iterable[str]) -> dict[str, str]:
+def named_rules(words: Iterable[str]) -> dict[str, str]:
     """Return the rules that words name: name -> what `load_rule` takes, the package's own first.
 
     Args:
@@ -170,11 +170,11 @@ def told_rules(words: Iterable[str]) -> dict[str, str]:
     Raises:
         NPAError: A name is not known, or two rules have the same.
     """
-    from npa_envs.rule.files import first_rules, shipped_rules
+    from npa_envs.rule.files import preset_rules, shipped_rules
     from npa_envs.web.rule_world import name_of
 
     words = list(words)
-    own = [*shipped_rules(), *(name for name in first_rules() if name not in shipped_rules())]
+    own = [*shipped_rules(), *(name for name in preset_rules() if name not in shipped_rules())]
     files = [w for w in words if w not in own and (w.endswith(".safetensors") or Path(w).is_dir())]
     named = [word for word in words if word not in files]
     found = {name: name for name in (chosen_names("rule", named, own) if named else ())}
@@ -266,7 +266,7 @@ def named_values(name: str, words: Iterable[str]) -> dict[str, Any]:
     return found
 
 
-def settled_resume(words: Sequence[str], out_of: Callable[[Sequence[str]], Path]) -> list[str]:
+def resolve_resume(words: Sequence[str], out_of: Callable[[Sequence[str]], Path]) -> list[str]:
     """Return the words of a command with `--resume auto` decided: by the folder that they name.
 
     Args:

@@ -18,7 +18,7 @@ from npa_envs.cli.output import StepBar, writable_folder
 from npa_envs.errors import MissingDependencyError
 from npa_envs.files import write_text
 from npa_envs.measure.codes import picture_rows
-from npa_envs.measure.judge import Judge, JudgeRow
+from npa_envs.measure.judge import JudgeRow, TextureJudge
 from npa_envs.measure.quality import CHECKPOINTS, CLOUD_CHECKPOINTS, score_line, tables_of
 from npa_envs.measure.record import current_commit, machine, versions
 from npa_envs.measure.tables import UNMEASURED, markdown_table, table_markdown, tables_json
@@ -38,7 +38,7 @@ FIRST_SEED = 1_000_000
 FILM_STEPS = 512
 """Steps of the film."""
 
-FILM_DAMAGES = (DamageEvent(200, "cut"), DamageEvent(350, "erase"))
+FILM_DAMAGES = (DamageEvent(200, "cut"), DamageEvent(350, "wipe"))
 """What is done on the way to worlds that are to match their target pixel by pixel."""
 
 TITLES: Mapping[str, str] = {
@@ -96,7 +96,7 @@ def write_report(
     clouds = isinstance(task, PointClassification)
     checkpoints = (CLOUD_CHECKPOINTS if clouds else CHECKPOINTS)[: None if thorough else 5]
     count = 8 if thorough else 2
-    judge = Judge(task) if isinstance(task, Texture) else None
+    judge = TextureJudge(task) if isinstance(task, Texture) else None
     judged: list[JudgeRow] = []
     not_filmed = ""
     with StepBar(None, show=progress) as bar:

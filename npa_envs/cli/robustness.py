@@ -14,8 +14,8 @@ from npa_envs.cli.output import (
     MeasureOptions,
     StepBar,
     check_numbers,
+    named_rules,
     parse_options,
-    told_rules,
     torch_threads,
     writable_folder,
 )
@@ -23,8 +23,8 @@ from npa_envs.cli.output import (
 if TYPE_CHECKING:
     import torch
 
-    from npa_envs.measure.robustness.grounds import Ground
     from npa_envs.measure.robustness.study import RuleRecord
+    from npa_envs.measure.robustness.trials import RuleTrial
 
 QUICK_SEEDS, QUICK_PARTICLES = 2, 256
 """Seeds and particles of a quick run."""
@@ -69,7 +69,7 @@ def main(arguments: Sequence[str]) -> int:
     """Measure, print and write."""
     options = parse_options(RobustnessOptions, "robustness", arguments)
     from npa_envs.devices import check_device
-    from npa_envs.measure.accuracy.habitats import rule_names, task_name
+    from npa_envs.measure.accuracy.endurance import rule_names, task_name
     from npa_envs.measure.record import measured_facts, time_limit, without_folders
     from npa_envs.measure.robustness.study import MOST_PARTICLES, RuleRecord, measure_rule, tables
     from npa_envs.rule.files import load_rule, rule_digest
@@ -77,7 +77,7 @@ def main(arguments: Sequence[str]) -> int:
     check_numbers(options, seed_count=1, first_seed=0, most_particles=1, threads=1)
     enough = time_limit(options.max_seconds)
     # Rules that runs begin with are measured where they are named.
-    sources = told_rules(options.rules or rule_names())
+    sources = named_rules(options.rules or rule_names())
     names = list(sources)
     if options.quick and not options.rules:
         # One of each task.
@@ -135,15 +135,15 @@ def _seeds(options: RobustnessOptions) -> range:
     return range(options.first_seed, options.first_seed + count)
 
 
-def _ground(options: RobustnessOptions, name: str, device: torch.device) -> Ground:
-    from npa_envs.measure.accuracy.habitats import task_name
-    from npa_envs.measure.robustness.grounds import Ground
+def _ground(options: RobustnessOptions, name: str, device: torch.device) -> RuleTrial:
+    from npa_envs.measure.accuracy.endurance import task_name
     from npa_envs.measure.robustness.plans import PLANS, quick_plan
+    from npa_envs.measure.robustness.trials import RuleTrial
 
     task = task_name(name)
     plan = quick_plan(task) if options.quick else PLANS[task]
     small = QUICK_PARTICLES if options.quick else None
-    return Ground(name, device, plan, _seeds(options), small)
+    return RuleTrial(name, device, plan, _seeds(options), small)
 
 
 def _write(folder: Path, text: str, records: Sequence[RuleRecord]) -> list[str]:

@@ -19,7 +19,7 @@ from npa_envs.errors import NPAError
 
 
 @dataclass(frozen=True, kw_only=True)
-class RolloutOptions(RuleOptions):
+class RolloutCommand(RuleOptions):
     """Grow a rule from its seed, damage it on the way, and write a GIF, an MP4 and a filmstrip.
 
     Of a 3D world also a turntable GIF, and the grown cloud as points (PLY) and as Gaussians (PLY,
@@ -30,7 +30,7 @@ class RolloutOptions(RuleOptions):
     """Steps to run."""
 
     damage: Annotated[tuple[tuple[str, ...], ...], tyro.conf.UseAppendAction] = ()
-    """Damage on the way, STEP:KIND or STEP:KIND:SIZE: 200:cut (gap 0.1), 300:erase (radius 0.2),
+    """Damage on the way, STEP:KIND or STEP:KIND:SIZE: 200:cut (gap 0.1), 300:wipe (radius 0.2),
     400:clump (radius 0.2); sizes in length units."""
 
     out: Path = Path("runs/rollout")
@@ -72,12 +72,12 @@ class RolloutOptions(RuleOptions):
 
 def main(arguments: Sequence[str]) -> int:
     """Grow, film and write what the words after `npa-envs rollout` ask for; return 0."""
-    options = parse_options(RolloutOptions, "rollout", arguments)
+    options = parse_options(RolloutCommand, "rollout", arguments)
     import torch
 
     from npa_envs.cli.film import (
         SCREEN,
-        Film,
+        WorldFilm,
         film_world,
         frame_steps,
         large_task,
@@ -129,7 +129,7 @@ def main(arguments: Sequence[str]) -> int:
             generator=generator,
             damages=damages,
             every=options.every or frame_steps(options.steps),
-            film=Film(background=options.background),
+            film=WorldFilm(background=options.background),
             progress=bar.advance,
             stop=stop.is_set,
         )

@@ -13,8 +13,8 @@ from npa_envs.cli.output import (
     MeasureOptions,
     StepBar,
     check_numbers,
+    named_rules,
     parse_options,
-    told_rules,
     torch_threads,
     writable_folder,
 )
@@ -63,12 +63,12 @@ def main(arguments: Sequence[str]) -> int:
     options = parse_options(StressOptions, "stress", arguments)
     from npa_envs.devices import check_device
     from npa_envs.measure.accuracy import suite
-    from npa_envs.measure.accuracy.checks import Session
+    from npa_envs.measure.accuracy.checks import CheckSession
     from npa_envs.measure.plots import write_plots
     from npa_envs.measure.record import measured_facts
 
     check_numbers(options, seed=0, threads=1)
-    rules = told_rules(options.rules)
+    rules = named_rules(options.rules)
     checks = suite.all_checks(quick=options.quick, seed=options.seed, rules=rules)
     names = [check.name for check in checks]
     chosen = suite.chosen_checks(checks, options.only)
@@ -98,7 +98,7 @@ def main(arguments: Sequence[str]) -> int:
     ):
         suite.run_checks(
             chosen,
-            Session(device, quick=options.quick, seed=options.seed),
+            CheckSession(device, quick=options.quick, seed=options.seed),
             record,
             max_seconds=options.max_seconds,
             weights=weights,

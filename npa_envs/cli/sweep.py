@@ -81,7 +81,7 @@ class SweepOptions:
 
 
 @dataclass(frozen=True)
-class Run:
+class SweepRun:
     """One combination."""
 
     values: Mapping[str, str]
@@ -95,7 +95,7 @@ class Run:
 
 
 @dataclass(frozen=True)
-class RunRecord:
+class SweepRecord:
     """What became of a run."""
 
     words: Sequence[str]
@@ -148,7 +148,7 @@ def main(arguments: Sequence[str]) -> int:
     return RUN_FAILED if failed else 0
 
 
-def combinations(over: Sequence[str], common: Sequence[str]) -> list[Run]:
+def combinations(over: Sequence[str], common: Sequence[str]) -> list[SweepRun]:
     """Return a run for each combination of values.
 
     Args:
@@ -184,7 +184,7 @@ def combinations(over: Sequence[str], common: Sequence[str]) -> list[Run]:
     runs = []
     for one, folder in zip(chosen, _folder_names(chosen), strict=True):
         own = [word for name, value in one.items() for word in (f"--{name}", value)]
-        runs.append(Run(one, [*common, *own], folder))
+        runs.append(SweepRun(one, [*common, *own], folder))
     return runs
 
 
@@ -207,7 +207,7 @@ def _folder_names(chosen: Sequence[Mapping[str, str]]) -> list[str]:
     ]
 
 
-def is_over(folder: Path, run: Run) -> bool:
+def is_over(folder: Path, run: SweepRun) -> bool:
     """Return whether a run has ended well.
 
     Raises:
@@ -225,7 +225,7 @@ def is_over(folder: Path, run: Run) -> bool:
     return held.code == 0
 
 
-def _held(path: Path) -> RunRecord | None:
+def _held(path: Path) -> SweepRecord | None:
     """Return what became of a run, None where nothing says so.
 
     Raises:
@@ -234,8 +234,8 @@ def _held(path: Path) -> RunRecord | None:
     if not path.exists():
         return None
     try:
-        held = RunRecord(**read_json(path))
-        return RunRecord([str(word) for word in held.words], int(held.code), float(held.seconds))
+        held = SweepRecord(**read_json(path))
+        return SweepRecord([str(word) for word in held.words], int(held.code), float(held.seconds))
     except (TypeError, ValueError) as error:
         raise NPAError(
             f"{str(path)!r} must be a record of npa-envs sweep, but cannot be read "
@@ -246,7 +246,7 @@ def _held(path: Path) -> RunRecord | None:
 class _Training(Child):
     """A process that trains, or goes on training, in its folder."""
 
-    def __init__(self, folder: Path, run: Run, threads: int) -> None:
+    def __init__(self, folder: Path, run: SweepRun, threads: int) -> None:
         self._folder, self._run, self._threads = folder / run.name, run, threads
         self._process: subprocess.Popen[bytes] | None = None
         self._begin = 0.0
@@ -290,10 +290,10 @@ class _Training(Child):
         assert self._process is not None, "it is over"
         seconds = time.perf_counter() - self._begin
         code = int(self._process.returncode)
-        write_record(self._folder / RECORD, asdict(RunRecord(self._run.words, code, seconds)))
+        write_record(self._folder / RECORD, asdict(SweepRecord(self._run.words, code, seconds)))
 
 
-def table(folder: Path, runs: Sequence[Run]) -> str:
+def table(folder: Path, runs: Sequence[SweepRun]) -> str:
     """Return the runs with what their reports measured, Markdown."""
     from npa_envs.measure.quality import score_line
 

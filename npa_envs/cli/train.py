@@ -13,14 +13,14 @@ import torch
 import torch.distributed as dist
 
 from npa_envs.cli import INTERRUPTED
-from npa_envs.cli.launch import asked_count, launch, told_once
+from npa_envs.cli.launch import asked_count, launch, print_once
 from npa_envs.cli.output import duration, torch_threads
 from npa_envs.cli.report import Training, write_report
 from npa_envs.cli.train_options import (
     TrainOptions,
     default_preset,
     parse,
-    settled,
+    resolve_task,
     starting_configuration,
 )
 from npa_envs.errors import NPAError
@@ -69,10 +69,10 @@ def main(arguments: Sequence[str]) -> int:
     with joined_ranks() as ranks:
         asked = None
         if ranks.first:
-            words = settled(task_name, arguments[1:])
+            words = resolve_task(task_name, arguments[1:])
             asked = words, *parse(task_name, starting_configuration(task_name, words), words)
         # The first process alone reads files, so that all of them train the same.
-        asked = ranks.told(asked)
+        asked = ranks.broadcast(asked)
         assert asked is not None, "said by the first process"
         words, options, config = asked
         count = process_count(task_name, options, config)
@@ -81,7 +81,7 @@ def main(arguments: Sequence[str]) -> int:
             if options.processes is None and options.gpus is None:
                 told += ["--processes", str(count)]
             return launch(count, told, config.out, config.device)
-        with told_once(ranks):
+        with print_once(ranks):
             return run(task_name, options, config, (task_name, *words), ranks)
 
 

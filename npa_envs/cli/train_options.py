@@ -11,7 +11,7 @@ from typing import Any, get_type_hints
 import tyro
 
 from npa_envs.cli.launch import with_device_of_gpus
-from npa_envs.cli.output import parse_options, settled_resume
+from npa_envs.cli.output import parse_options, resolve_resume
 from npa_envs.errors import NPAError, shown
 from npa_envs.tasks.co_morphogenesis2d import CoMorphogenesis2DConfig
 from npa_envs.tasks.morphogenesis2d import Morphogenesis2DConfig
@@ -105,7 +105,7 @@ class TrainOptions:
     """End with a report in the folder `out`: figures, a film and a card of the rule."""
 
 
-def settled(task_name: str, words: Sequence[str]) -> list[str]:
+def resolve_task(task_name: str, words: Sequence[str]) -> list[str]:
     """Return the options with `--resume auto` decided, and with CUDA as the device of `--gpus`.
 
     Raises:
@@ -115,7 +115,7 @@ def settled(task_name: str, words: Sequence[str]) -> list[str]:
     def out_of(words: Sequence[str]) -> Path:
         return parse(task_name, starting_configuration(task_name, words), words)[1].out
 
-    return settled_resume(with_device_of_gpus(words), out_of)
+    return resolve_resume(with_device_of_gpus(words), out_of)
 
 
 def _check_preset(

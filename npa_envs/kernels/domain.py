@@ -66,7 +66,7 @@ def domain_types(space_dim: int, scalar: type) -> SimpleNamespace:
         cell_scale: double_vector
         cell_shape: cell_vector
         cell_count: wp.int32
-        reach: wp.int32
+        cell_reach: wp.int32
 
     @wp.func
     def cell_of(domain: Domain, position: vector):
@@ -107,7 +107,7 @@ def domain_types(space_dim: int, scalar: type) -> SimpleNamespace:
 
     @wp.func
     def row_width(domain: Domain, d: wp.int32):
-        return wp.min(wp.int32(2) * domain.reach + 1, domain.cell_shape[d])
+        return wp.min(wp.int32(2) * domain.cell_reach + 1, domain.cell_shape[d])
 
     @wp.func
     def wrapped(coordinate: wp.int32, count: wp.int32):
@@ -124,7 +124,7 @@ def domain_types(space_dim: int, scalar: type) -> SimpleNamespace:
         rows = wp.int32(1)
         for d in range(1, wp.static(space_dim)):
             rows *= row_width(domain, d)
-        first = wrapped(cell[0] - domain.reach, domain.cell_shape[0])
+        first = wrapped(cell[0] - domain.cell_reach, domain.cell_shape[0])
         if first + row_width(domain, 0) > domain.cell_shape[0]:
             rows *= 2
         return rows
@@ -134,7 +134,7 @@ def domain_types(space_dim: int, scalar: type) -> SimpleNamespace:
         """First cell and one past the last cell of a run, in row-major order within the world."""
         width = row_width(domain, 0)
         nx = domain.cell_shape[0]
-        first = wrapped(cell[0] - domain.reach, nx)
+        first = wrapped(cell[0] - domain.cell_reach, nx)
         row = segment
         begin = first
         end = first + width
@@ -151,9 +151,9 @@ def domain_types(space_dim: int, scalar: type) -> SimpleNamespace:
             last = wp.static(space_dim - 1)
             y_width = row_width(domain, 1)
             y_row = row % y_width
-            z = wrapped(cell[last] - domain.reach + row / y_width, domain.cell_shape[last])
+            z = wrapped(cell[last] - domain.cell_reach + row / y_width, domain.cell_shape[last])
             base = z * domain.cell_shape[1] * nx
-        base += wrapped(cell[1] - domain.reach + y_row, domain.cell_shape[1]) * nx
+        base += wrapped(cell[1] - domain.cell_reach + y_row, domain.cell_shape[1]) * nx
         return base + begin, base + end
 
     @wp.func
@@ -196,7 +196,7 @@ def domain_types(space_dim: int, scalar: type) -> SimpleNamespace:
 
 @functools.lru_cache(maxsize=256)
 def cell_grid(
-    space_dim: int, particle_count: int, eps: float, box: tuple[float, ...] | None, reach: int
+    space_dim: int, particle_count: int, eps: float, box: tuple[float, ...] | None, cell_reach: int
 ) -> tuple[int, ...]:
     """Return the number of cells along each dimension.
 
@@ -209,7 +209,7 @@ def cell_grid(
         open_side *= 2
     if box is None:
         return (open_side,) * space_dim
-    size = eps / reach * CELL_SLACK
+    size = eps / cell_reach * CELL_SLACK
     shape = [max(int(side / size), 1) for side in box]
     while math.prod(shape) > 4 * open_side**space_dim:
         longest = shape.index(max(shape))
@@ -224,7 +224,7 @@ def make_domain(
     eps: float,
     box: tuple[float, ...] | None,
     particle_count: int,
-    reach: int = 2,
+    cell_reach: int = 2,
 ) -> Any:
     """Return the `Domain` of worlds of `particle_count` particles.
 
@@ -234,7 +234,8 @@ def make_domain(
         eps: Perception radius [length units].
         box: Sides of the periodic box [length units], or None in open space.
         particle_count: Particles in each world N.
-        reach: Cells on each side of a cell in which its neighbours lie; a cell is eps / reach wide.
+        cell_reach: Cells on each side of a cell in which its neighbours lie; a cell is
+            eps / cell_reach wide.
     """
     types = domain_types(space_dim, scalar)
     domain = types.Domain()
@@ -244,14 +245,14 @@ def make_domain(
     smoothing_norm, spiky_norm = (4.0, 30.0) if space_dim == 2 else (315.0 / 64.0, 45.0)
     domain.smoothing_norm = smoothing_norm / (math.pi * eps**space_dim)
     domain.spiky_norm = spiky_norm / (math.pi * eps ** (space_dim + 1))
-    shape = cell_grid(space_dim, particle_count, eps, box, reach)
+    shape = cell_grid(space_dim, particle_count, eps, box, cell_reach)
     domain.periodic = 0 if box is None else 1
     domain.box = types.vector(*(box or (1.0,) * space_dim))
     domain.inverse_box = types.vector(*(1.0 / side for side in (box or (1.0,) * space_dim)))
-    scale = 1.0 / (eps / reach * CELL_SLACK)
+    scale = 1.0 / (eps / cell_reach * CELL_SLACK)
     scales = (scale,) * space_dim if box is None else tuple(1.0 / side for side in box)
     domain.cell_scale = wp.types.vector(space_dim, wp.float64)(*scales)
     domain.cell_shape = wp.types.vector(space_dim, wp.int32)(*shape)
     domain.cell_count = math.prod(shape)
-    domain.reach = reach
+    domain.cell_reach = cell_reach
     return domain

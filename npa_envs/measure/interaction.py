@@ -26,7 +26,7 @@ from npa_envs.ops import species_fields
 from npa_envs.render import draw_worlds
 from npa_envs.rule.rule import NPARule
 from npa_envs.tasks.base import PictureTask
-from npa_envs.world.randomness import Purpose, WorldRandom
+from npa_envs.world.randomness import StreamId, WorldRandom
 from npa_envs.world.species import rollout_species
 
 MARGIN = 0.2
@@ -188,7 +188,7 @@ FRAME_RESOLUTION = 160
 
 
 @dataclass(frozen=True)
-class Organism:
+class RuleUnderTest:
     """A trained rule that grows in 2D, and what it grows."""
 
     name: str
@@ -234,7 +234,7 @@ class Encounters:
         self._progress = progress
         self._solos: dict[tuple[str, int, float], _Solo] = {}
 
-    def check(self, organisms: Sequence[Organism]) -> None:
+    def check(self, organisms: Sequence[RuleUnderTest]) -> None:
         """Check that any two of the rules can share a world.
 
         Raises:
@@ -251,7 +251,9 @@ class Encounters:
                 ) from error
 
     @torch.no_grad()
-    def meet(self, first: Organism, second: Organism) -> tuple[list[InteractionRow], Scenes]:
+    def meet(
+        self, first: RuleUnderTest, second: RuleUnderTest
+    ) -> tuple[list[InteractionRow], Scenes]:
         """Grow one rule, which is measured, beside another or itself, at every setting.
 
         Returns:
@@ -266,8 +268,8 @@ class Encounters:
 
     def _row(
         self,
-        first: Organism,
-        second: Organism,
+        first: RuleUnderTest,
+        second: RuleUnderTest,
         ratio: float,
         distance: float,
         factor: float,
@@ -319,7 +321,7 @@ class Encounters:
             mixing_high=mixing_high,
         )
 
-    def _solo(self, organism: Organism, count: int, factor: float) -> _Solo:
+    def _solo(self, organism: RuleUnderTest, count: int, factor: float) -> _Solo:
         key = organism.name, count, factor
         if key not in self._solos:
             x, s, lost = self._grow([organism], (count,), 0.0, factor)
@@ -329,7 +331,7 @@ class Encounters:
 
     def _grow(
         self,
-        organisms: Sequence[Organism],
+        organisms: Sequence[RuleUnderTest],
         counts: tuple[int, ...],
         distance: float,
         factor: float,
@@ -342,7 +344,7 @@ class Encounters:
         """
         settings = self.settings
         random = WorldRandom(settings.seeds, device=self._device)
-        streams = (random, random.beside(Purpose.SPECIES))
+        streams = (random, random.substream(StreamId.SPECIES))
         parts = [
             organism.task_of(count).seed(len(settings.seeds), generator=stream, device=self._device)
             for organism, count, stream in zip(organisms, counts, streams, strict=False)

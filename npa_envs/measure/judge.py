@@ -75,7 +75,7 @@ class JudgeRow:
     """Ratio of the distances of co-occurring colours, mean of the worlds."""
 
 
-class Judge:
+class TextureJudge:
     """How far worlds of a texture task look from its target; no loss compares what it compares.
 
     All is counted in float64 with directions drawn from one seed, so that a CPU and a GPU agree.

@@ -20,7 +20,7 @@ from npa_envs.measure.tables import table_text, tables_json
 from npa_envs.rule.files import shipped_rules
 from npa_envs.rule.rule import NPARule
 from npa_envs.tasks.base import PictureTask, ViewTask, coded_states, task_for_rule
-from npa_envs.tasks.damage import cut, erase_state, random_particle
+from npa_envs.tasks.damage import cut, random_particle, wipe_state
 from npa_envs.tasks.point_classification import PointClassification, majority, particle_classes
 from npa_envs.world.rollout import rollout
 
@@ -193,7 +193,7 @@ def healing(
     heal_steps: int = 1000,
     every: int = 25,
     seeds: Sequence[int] = tuple(range(8)),
-    erase_radius: float = 0.2,
+    wipe_radius: float = 0.2,
     cut_gap: float = 0.1,
     device: str | torch.device = "cpu",
     progress: Callable[[int], None] | None = None,
@@ -201,7 +201,7 @@ def healing(
     """Grow worlds, damage them, and measure how long they take to be themselves again.
 
     Two damages, each on the same grown worlds: a slit through the middle at a random angle, and a
-    disk around a random particle whose state is erased. Damage that raises the loss by less than
+    disk around a random particle whose state is wiped. Damage that raises the loss by less than
     20 % counts as healed at step 0.
 
     Args:
@@ -211,7 +211,7 @@ def healing(
         heal_steps: Steps after the damage.
         every: Steps between two measurements.
         seeds: One number for each world.
-        erase_radius: Radius of the erased disk [length units].
+        wipe_radius: Radius of the wiped disk [length units].
         cut_gap: Width of the cut [length units].
         device: Where to run.
         progress: Called with the number of steps done since its last call.
@@ -234,9 +234,9 @@ def healing(
         f"cut, gap {cut_gap:g}": cut(
             x, s, centre=x.mean(1), normal=normal, gap=cut_gap, box=task.box
         ),
-        f"erased disk, radius {erase_radius:g}": (
+        f"wiped disk, radius {wipe_radius:g}": (
             x,
-            coded_states(task, erase_state(x, s, centre=centre, radius=erase_radius, box=task.box)),
+            coded_states(task, wipe_state(x, s, centre=centre, radius=wipe_radius, box=task.box)),
         ),
     }
     rows = []
@@ -339,7 +339,7 @@ def accuracies(
         NPAError: `checkpoints` are empty or out of order.
     """
     check_steps("checkpoints", checkpoints)
-    runner = Runner(rule, task, task.clouds.x.device, seed, progress)
+    runner = RuleRunner(rule, task, task.clouds.x.device, seed, progress)
     places = task.clouds.x.to(runner.dtype)
     sums = torch.zeros(len(checkpoints), 5, dtype=torch.float64)
     for index, label, blank in _batches(task):
@@ -391,7 +391,7 @@ def changes_of_mind(
     """
     check_steps("settle_steps", [settle_steps])
     check_steps("steps", steps, at_least=0)
-    runner = Runner(rule, task, task.clouds.x.device, seed, progress)
+    runner = RuleRunner(rule, task, task.clouds.x.device, seed, progress)
     places, classes = task.clouds.x.to(runner.dtype), task.clouds.label
     partner = _partners(classes)
     names = (f"{CUT_SHARE:.0%} cut off", "upper half mutated", "all mutated")
@@ -495,7 +495,7 @@ def tables_of(
 # The rule at work
 
 
-class Runner:
+class RuleRunner:
     """A rule on the worlds of a task, on the device and in the precision of the rule's copy.
 
     `progress` is called with the number of steps done since its last call.
@@ -542,11 +542,11 @@ def _from_seeds(
     seeds: Sequence[int],
     device: torch.device,
     progress: Callable[[int], None] | None,
-) -> tuple[Runner, Tensor, Tensor]:
+) -> tuple[RuleRunner, Tensor, Tensor]:
     """Return what runs one world for each of the seeds, and these, x [B, N, D] and s [B, N, C]."""
     if not seeds:
         raise NPAError("seeds must hold at least one number, got none: for example seeds=(0, 1)")
-    runner = Runner(rule, task, device, seeds[0] + len(seeds), progress)
+    runner = RuleRunner(rule, task, device, seeds[0] + len(seeds), progress)
     worlds = [
         task.seed(1, generator=torch.Generator(device).manual_seed(seed), device=device)
         for seed in seeds

@@ -12,7 +12,7 @@ from npa_envs.kernels.cuda.adjoint import SHARE, TILE, listed_adjoint
 from npa_envs.kernels.portable.adjoint import adjoint_kernels
 from npa_envs.ops.launch import launch
 from npa_envs.ops.opaque import opaque
-from npa_envs.ops.sort import LARGEST_INDEX, Plan, density_scale, make_plan
+from npa_envs.ops.sort import LARGEST_INDEX, KernelPlan, density_scale, make_plan
 
 
 class SavedPerception(NamedTuple):
@@ -118,7 +118,7 @@ def _(
 
 def _unscale(
     kernels: Any,
-    plan: Plan,
+    plan: KernelPlan,
     saved: SavedPerception,
     bar: Tensor,
     scale: float,
@@ -160,7 +160,7 @@ def _unscale(
 
 def _gather_states(
     kernels: Any,
-    plan: Plan,
+    plan: KernelPlan,
     saved: SavedPerception,
     listed: list[Tensor],
     cotangents: RowCotangents,
@@ -197,7 +197,7 @@ def _gather_states(
 
 
 def _gather_positions(
-    kernels: Any, plan: Plan, saved: SavedPerception, cotangents: RowCotangents
+    kernels: Any, plan: KernelPlan, saved: SavedPerception, cotangents: RowCotangents
 ) -> Tensor:
     """Return the cotangent of positions, [B N, D]."""
     bar = cotangents.bar
@@ -241,7 +241,7 @@ def _gather_positions(
 
 
 def _gather_by_tiles(
-    plan: Plan, saved: SavedPerception, bar: Tensor, scale: float, state_gradient: bool
+    plan: KernelPlan, saved: SavedPerception, bar: Tensor, scale: float, state_gradient: bool
 ) -> Tensor:
     """Return the cotangent of states, [B N, C], on CUDA in float32."""
     kernels = listed_adjoint(

@@ -43,7 +43,7 @@ SHARED_WORLD = 4096
 particle."""
 
 
-class Request(NamedTuple):
+class KernelRequest(NamedTuple):
     """What is known of a call before its data: all that the table asks for."""
 
     device: torch.device
@@ -81,7 +81,7 @@ class Implementation(NamedTuple):
     """Where it stands."""
     condition: str
     """When it runs, in words."""
-    holds: Callable[[Request], bool]
+    holds: Callable[[KernelRequest], bool]
     """Whether it runs."""
 
 
@@ -97,11 +97,11 @@ def processor_count(device: torch.device) -> int:
     return int(torch.cuda.get_device_properties(device).multi_processor_count)
 
 
-def _cuda(request: Request) -> bool:
+def _cuda(request: KernelRequest) -> bool:
     return request.dtype == torch.float32 and is_modern(request.device)
 
 
-def _block(request: Request) -> bool:
+def _block(request: KernelRequest) -> bool:
     return (
         _cuda(request)
         and request.aligned
@@ -110,7 +110,7 @@ def _block(request: Request) -> bool:
     )
 
 
-def _tiles(request: Request) -> bool:
+def _tiles(request: KernelRequest) -> bool:
     return (
         _cuda(request)
         and request.space_dim == 2
@@ -119,11 +119,11 @@ def _tiles(request: Request) -> bool:
     )
 
 
-def _world(request: Request) -> bool:
+def _world(request: KernelRequest) -> bool:
     return request.device.type == "cpu" and request.particle_count <= LARGEST_THREAD_WORLD
 
 
-def _fused(request: Request) -> bool:
+def _fused(request: KernelRequest) -> bool:
     widths = request.row_width, request.update_width
     return (
         _cuda(request)
@@ -135,15 +135,15 @@ def _fused(request: Request) -> bool:
     )
 
 
-def _warps(request: Request) -> bool:
+def _warps(request: KernelRequest) -> bool:
     return request.vectors is not None and _cuda(request) and fits_block(*request.vectors)
 
 
-def _has_vectors(request: Request) -> bool:
+def _has_vectors(request: KernelRequest) -> bool:
     return request.vectors is not None
 
 
-def _always(request: Request) -> bool:
+def _always(request: KernelRequest) -> bool:
     return True
 
 
@@ -227,12 +227,12 @@ TABLE: tuple[Implementation, ...] = (
 
 
 @functools.lru_cache(maxsize=4096)
-def choose(operator: Operator, request: Request) -> Implementation:
+def choose(operator: Operator, request: KernelRequest) -> Implementation:
     """Return the implementation of an operator that a call takes."""
     return next(row for row in TABLE if row.operator == operator and row.holds(request))
 
 
-def describe(request: Request) -> list[str]:
+def describe(request: KernelRequest) -> list[str]:
     """Return a line for each operator: what a call like this takes, where it stands, and why."""
     chosen: dict[Operator, Implementation] = {}
     for row in TABLE:
@@ -279,7 +279,7 @@ DENSITY_LANES = 4
 """Threads of a particle in the density pass of small worlds."""
 
 
-def rollout_listing(request: Request, mean_neighbours: float = 0.0) -> Listing:
+def rollout_listing(request: KernelRequest, mean_neighbours: float = 0.0) -> Listing:
     """Return how rollouts list neighbours: few worlds shall fill a GPU.
 
     Args:
@@ -297,7 +297,7 @@ def rollout_listing(request: Request, mean_neighbours: float = 0.0) -> Listing:
     return Listing(HUGE_CAPACITY if huge else LARGE_CAPACITY, lanes=1, teams=1)
 
 
-def batch_listing(request: Request) -> Listing:
+def batch_listing(request: KernelRequest) -> Listing:
     """Return how environments list neighbours: whole batches fill a device with less."""
     if request.particle_count <= SMALL_WORLD:
         return Listing(CAPACITY, lanes=1, teams=1)

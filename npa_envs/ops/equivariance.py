@@ -26,7 +26,7 @@ from npa_envs.kernels.cuda.equivariance import (
     steering_kernels,
 )
 from npa_envs.kernels.portable.equivariance import equivariance_kernels
-from npa_envs.ops.backend import Request, choose, processor_count
+from npa_envs.ops.backend import KernelRequest, choose, processor_count
 from npa_envs.ops.launch import launch, scalar_type
 from npa_envs.ops.opaque import once_differentiable, opaque
 
@@ -122,7 +122,7 @@ def _kernels(like: Tensor, space_dim: int) -> Any:
 
 def _is_for_warps(like: Tensor, form: tuple[int, int, int, int, bool]) -> bool:
     """Return whether rows of a form have kernels of their own where a tensor is."""
-    return choose("vectors", Request(like.device, like.dtype, vectors=form)).name == "cuda"
+    return choose("vectors", KernelRequest(like.device, like.dtype, vectors=form)).name == "cuda"
 
 
 BLOCKS_PER_PROCESSOR = 5

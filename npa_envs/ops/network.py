@@ -17,7 +17,7 @@ from npa_envs.kernels.cuda.network import (
     two_layer_kernel,
     weight_gradient_kernels,
 )
-from npa_envs.ops.backend import Request, choose, processor_count
+from npa_envs.ops.backend import KernelRequest, choose, processor_count
 from npa_envs.ops.launch import aligned, launch
 from npa_envs.ops.opaque import once_differentiable, opaque
 
@@ -39,7 +39,7 @@ def fits_network(hidden_weight: Tensor, output_weight: Tensor) -> bool:
         output_weight: Weights of the updates, shape [A', H].
     """
     hidden, width = hidden_weight.shape
-    request = Request(
+    request = KernelRequest(
         hidden_weight.device,
         hidden_weight.dtype,
         row_width=width,

@@ -15,7 +15,7 @@ from npa_envs.kernels.portable.density import density_kernels
 from npa_envs.kernels.portable.perceive import perception_kernels
 from npa_envs.ops.backend import Listing
 from npa_envs.ops.launch import launch
-from npa_envs.ops.sort import Plan, SortedWorlds, density_scale
+from npa_envs.ops.sort import KernelPlan, SortedWorlds, density_scale
 
 LISTS_TOGETHER = 32
 """Neighbour lists that lie together."""
@@ -78,7 +78,7 @@ class Densities(NamedTuple):
     """The neighbours of static worlds on a CPU."""
 
 
-def portable_kernels(plan: Plan, terms: Terms, listed: bool = False) -> Any:
+def portable_kernels(plan: KernelPlan, terms: Terms, listed: bool = False) -> Any:
     """Return the portable perception kernels of a plan."""
     return perception_kernels(
         plan.space_dim,
@@ -92,7 +92,7 @@ def portable_kernels(plan: Plan, terms: Terms, listed: bool = False) -> Any:
 
 
 def compute_densities(
-    plan: Plan,
+    plan: KernelPlan,
     ordered: SortedWorlds,
     terms: Terms,
     listing: Listing,
@@ -116,7 +116,7 @@ def compute_densities(
 
 
 def list_neighbours(
-    plan: Plan,
+    plan: KernelPlan,
     ordered: SortedWorlds,
     listing: Listing,
     state_place: Tensor | None,
@@ -165,7 +165,7 @@ def list_neighbours(
     return Densities(particles, no_gradient, NeighbourLists(listing, steps, lengths, records))
 
 
-def compute_density_gradients(plan: Plan, ordered: SortedWorlds, terms: Terms) -> Densities:
+def compute_density_gradients(plan: KernelPlan, ordered: SortedWorlds, terms: Terms) -> Densities:
     """Compute densities, and density gradients of the particles that have rows."""
     positions = ordered.positions
     particles = positions.new_empty(plan.total, plan.space_dim + 1)
@@ -188,7 +188,7 @@ def compute_density_gradients(plan: Plan, ordered: SortedWorlds, terms: Terms) -
 
 
 def perception_launch(
-    plan: Plan,
+    plan: KernelPlan,
     ordered: SortedWorlds,
     densities: Densities,
     terms: Terms,

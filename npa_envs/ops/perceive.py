@@ -565,8 +565,8 @@ def update_some_at_a_time(
 # For environments: every particle, in the caller's order, clipped, without gradients.
 
 
-class SurveyedWorlds:
-    """Worlds made ready for perception: sorted, their densities known; `survey` makes it.
+class NeighbourState:
+    """Worlds made ready for perception: sorted, their densities known; `build_neighbours` makes it.
 
     Args:
         launch_of: Returns what to give to a launch that writes rows into a tensor, [B N, P].
@@ -600,7 +600,7 @@ class SurveyedWorlds:
         return out
 
 
-def survey(
+def build_neighbours(
     x: Tensor,
     s: Tensor,
     *,
@@ -610,7 +610,7 @@ def survey(
     terms: Terms,
     limit: float,
     places: Tensor | None = None,
-) -> SurveyedWorlds:
+) -> NeighbourState:
     """Sort checked worlds and compute their densities.
 
     The result may read `s` where it is: it serves until the states change.
@@ -660,4 +660,4 @@ def survey(
         )
 
     perception_dim = terms.perception_dim(plan.space_dim, plan.state_dim)
-    return SurveyedWorlds(launch_of, (*x.shape[:2], perception_dim), x)
+    return NeighbourState(launch_of, (*x.shape[:2], perception_dim), x)

@@ -15,9 +15,9 @@ from npa_envs.kernels.cuda.sort import BLOCKS, STATE_SHARE, order_particles, sor
 from npa_envs.kernels.domain import cell_grid, make_domain
 from npa_envs.kernels.portable.sort import sort_kernels
 from npa_envs.ops.backend import (
+    KernelRequest,
     Listing,
     Operator,
-    Request,
     choose,
     processor_count,
     rollout_listing,
@@ -37,7 +37,7 @@ SMALLEST_SLICE = 128
 """Particles of a slice, at least."""
 
 
-class Plan(NamedTuple):
+class KernelPlan(NamedTuple):
     """What is known of an operator call before any of its data: variant, sizes, domain."""
 
     scalar: Any
@@ -49,7 +49,7 @@ class Plan(NamedTuple):
     row_capacity: int
     masked: bool
     domain: Any
-    request: Request
+    request: KernelRequest
     """What the backend table asks for."""
     listing: Listing
     """How rollouts list neighbours on CUDA."""
@@ -61,8 +61,8 @@ class Plan(NamedTuple):
 
         Args:
             operator: The operator.
-            aligned: As in `Request`.
-            position_gradient: As in `Request`.
+            aligned: As in `KernelRequest`.
+            position_gradient: As in `KernelRequest`.
         """
         request = self.request
         if not aligned or position_gradient:
@@ -146,7 +146,7 @@ def make_plan(
     masked: bool,
     eps: float,
     box: Sequence[float] | None,
-) -> Plan:
+) -> KernelPlan:
     """Return the plan of a call on positions of a shape [B, N, D] and `state_dim` channels.
 
     `like` is any tensor of the call: its dtype and device are the worlds'.
@@ -156,17 +156,17 @@ def make_plan(
     scalar = scalar_type(like.dtype)
     sides = None if box is None else tuple(box)
     # In 3D, more and smaller cells mean many short runs, which lanes share badly.
-    reach = 1 if space_dim == 3 and like.device.type == "cuda" else 2
-    domain = make_domain(space_dim, scalar, eps, sides, particle_count, reach)
-    request = Request(
+    cell_reach = 1 if space_dim == 3 and like.device.type == "cuda" else 2
+    domain = make_domain(space_dim, scalar, eps, sides, particle_count, cell_reach)
+    request = KernelRequest(
         like.device,
         like.dtype,
         particle_count,
         int(domain.cell_count),
         space_dim,
-        smallest_side=min(cell_grid(space_dim, particle_count, eps, sides, reach)),
+        smallest_side=min(cell_grid(space_dim, particle_count, eps, sides, cell_reach)),
     )
-    plan = Plan(
+    plan = KernelPlan(
         scalar=scalar,
         width=channel_width(int(state_dim)),
         world_count=world_count,
@@ -203,7 +203,7 @@ def sorts_at_once(world_count: int, particle_count: int) -> bool:
 
 
 def sort_worlds(
-    plan: Plan, x: Tensor, s: Tensor | None, mask: Tensor | None, *, with_rows: bool = True
+    plan: KernelPlan, x: Tensor, s: Tensor | None, mask: Tensor | None, *, with_rows: bool = True
 ) -> SortedWorlds:
     """Sort contiguous worlds into cells; `mask` (uint8, [B, N]) says which particles get rows.
 
@@ -273,7 +273,7 @@ def sort_worlds(
     return SortedWorlds(starts, *ordered)
 
 
-def _empty_worlds(plan: Plan, x: Tensor, s: Tensor | None, with_rows: bool) -> list[Tensor]:
+def _empty_worlds(plan: KernelPlan, x: Tensor, s: Tensor | None, with_rows: bool) -> list[Tensor]:
     """Return what sorting fills in: all of `SortedWorlds` but the starts."""
     total, device = plan.total, x.device
     source, sorted_cell = torch.empty(2, total, dtype=torch.int32, device=device).unbind()
@@ -288,7 +288,7 @@ def _empty_worlds(plan: Plan, x: Tensor, s: Tensor | None, with_rows: bool) -> l
     return [*integers, sorted_positions, row_positions, sorted_states]
 
 
-def block_capacity(request: Request, *tensors: Tensor | None) -> int:
+def block_capacity(request: KernelRequest, *tensors: Tensor | None) -> int:
     """Return how many particles a block that sorts such worlds has room for, 0 if none does."""
     aligned = not any(tensor is not None and tensor.data_ptr() % 16 for tensor in tensors)
     if choose("sort", request._replace(aligned=aligned)).name != "block":
@@ -308,7 +308,7 @@ def _earlier(world_count: int, total: int) -> int:
 
 
 def _sort_by_threads(
-    plan: Plan, x: Tensor, s: Tensor | None, mask: Tensor | None, with_rows: bool
+    plan: KernelPlan, x: Tensor, s: Tensor | None, mask: Tensor | None, with_rows: bool
 ) -> SortedWorlds:
     """Sort small worlds on a CPU in one launch."""
     ordered = _empty_worlds(plan, x, s, with_rows)
@@ -338,7 +338,12 @@ def _sort_by_threads(
 
 
 def _sort_by_blocks(
-    plan: Plan, capacity: int, x: Tensor, s: Tensor | None, mask: Tensor | None, with_rows: bool
+    plan: KernelPlan,
+    capacity: int,
+    x: Tensor,
+    s: Tensor | None,
+    mask: Tensor | None,
+    with_rows: bool,
 ) -> SortedWorlds:
     """Sort small worlds in one launch."""
     ordered = _empty_worlds(plan, x, s, with_rows)
@@ -369,7 +374,7 @@ def _sort_by_blocks(
     return SortedWorlds(starts, *ordered)
 
 
-def grouped_states(plan: Plan, s: Tensor) -> Tensor:
+def grouped_states(plan: KernelPlan, s: Tensor) -> Tensor:
     """Return states in sorted order as kernels read them, [B N G, W]: channels padded to groups."""
     width = plan.group_count * plan.width
     states = torch.nn.functional.pad(s, (0, width - plan.state_dim))

@@ -23,7 +23,7 @@ from npa_envs.ops.passes import (
     compute_densities,
 )
 from npa_envs.ops.sort import (
-    Plan,
+    KernelPlan,
     SortedWorlds,
     grouped_states,
     make_plan,
@@ -123,7 +123,7 @@ def _prepare_static(
     ).flat()
 
 
-def _list_neighbours(plan: Plan, starts: Tensor, particles: Tensor) -> list[Tensor]:
+def _list_neighbours(plan: KernelPlan, starts: Tensor, particles: Tensor) -> list[Tensor]:
     """List the neighbours of each particle on a CPU, where reading their number is free."""
     kernels = density_kernels(plan.space_dim, plan.scalar, plan.on_cpu)
     common = plan.total, particles.device, plan.domain, plan.particle_count, starts, particles
@@ -297,7 +297,7 @@ def all_rows(worlds: StaticWorlds, x: Tensor) -> StaticRows:
 
 
 def static_worlds(
-    plan: Plan, tensors: StaticTensors, rows: StaticRows, x: Tensor, s: Tensor
+    plan: KernelPlan, tensors: StaticTensors, rows: StaticRows, x: Tensor, s: Tensor
 ) -> tuple[SortedWorlds, Densities]:
     """Return what the perception pass of a step reads.
 

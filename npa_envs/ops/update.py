@@ -36,7 +36,7 @@ def _update_particles(
     s: Tensor,
     path_length: Tensor,
     row_of: Tensor,
-    reach: float,
+    max_displacement: float,
     dt: float,
     moving: bool,
     box: list[float] | None,
@@ -60,7 +60,7 @@ def _update_particles(
         kernels.apply_update,
         -(-total // TEAM) * TEAM * (1 + _sharers(state_dim)),
         x.device,
-        reach * dt,
+        max_displacement * dt,
         dt,
         int(box is not None),
         tuple(box) if box is not None else (1.0,) * space_dim,
@@ -94,7 +94,7 @@ def _update_particles_backward(
     row_source: Tensor,
     starts: Tensor,
     row_base: int,
-    reach: float,
+    max_displacement: float,
     dt: float,
     moving: bool,
 ) -> Tensor:
@@ -105,7 +105,7 @@ def _update_particles_backward(
         kernels.pull_back_update,
         update.shape[0] * _sharers(update.shape[1]),
         update.device,
-        reach * dt,
+        max_displacement * dt,
         dt,
         int(moving),
         row_base,
@@ -139,15 +139,15 @@ class _UpdateParticles(torch.autograd.Function):
         s: Tensor,
         path_length: Tensor,
         rows: Rows,
-        reach: float,
+        max_displacement: float,
         dt: float,
         moving: bool,
         box: list[float] | None,
     ) -> tuple[Tensor, Tensor, Tensor]:
-        ctx.options = (rows.row_base, reach, dt, moving)
+        ctx.options = (rows.row_base, max_displacement, dt, moving)
         ctx.save_for_backward(update, rows.row_source, rows.starts)
         outputs: tuple[Tensor, Tensor, Tensor] = _update_particles(
-            update, x, s, path_length, rows.row_of, reach, dt, moving, box
+            update, x, s, path_length, rows.row_of, max_displacement, dt, moving, box
         )
         return outputs
 
@@ -167,7 +167,7 @@ def update_particles(
     path_length: Tensor,
     *,
     rows: Rows,
-    reach: float,
+    max_displacement: float,
     dt: float,
     moving: bool,
     box: tuple[float, ...] | None,
@@ -181,14 +181,14 @@ def update_particles(
         s: States, dimensionless, shape [B, N, C].
         path_length: Length of each particle's path so far [length units], shape [B, N].
         rows: Which particles the rows stand for.
-        reach: Largest displacement alpha eps of a unit step [length units].
+        max_displacement: Largest displacement alpha eps of a unit step [length units].
         dt: Time step, dimensionless.
         moving: Updates begin with δ; otherwise there is none and positions stay.
         box: Sides of the periodic box, into which positions are wrapped, or None.
     """
     x, s = x.contiguous(), s.contiguous()
     sides = None if box is None else [constant(side) for side in box]
-    options = (constant(reach), constant(dt), moving, sides)
+    options = (constant(max_displacement), constant(dt), moving, sides)
     tensors = (update, x, s, path_length)
     if not (torch.is_grad_enabled() and any(tensor.requires_grad for tensor in tensors)):
         return _update_particles(*tensors, rows.row_of, *options)
@@ -212,7 +212,7 @@ def wrapped(x: Tensor, box: tuple[float, ...] | None) -> Tensor:
 class ActionRules(NamedTuple):
     """What actions do, the same in every step: the keywords of `apply_actions` of these names."""
 
-    reach: float
+    max_displacement: float
     """Largest displacement alpha eps in a unit of time [length units]."""
     dt: float
     """Time step, dimensionless."""
@@ -235,7 +235,7 @@ def apply_actions(
     *,
     mask: Tensor | None,
     noise: Tensor | None,
-    reach: float,
+    max_displacement: float,
     dt: float,
     state_scale: float,
     moving: bool,
@@ -259,7 +259,7 @@ def apply_actions(
         s: States, dimensionless, finite, shape [B, N, C]; changed.
         mask: Which particles act, uint8, shape [B, N]; None: all of them.
         noise: What is added to every position first [length units], shape [B, N, D], or None.
-        reach: Largest displacement alpha eps in a unit of time [length units].
+        max_displacement: Largest displacement alpha eps in a unit of time [length units].
         dt: Time step, dimensionless.
         state_scale: Largest change of a state in a unit of time, dimensionless.
         moving: Actions begin with a_x; otherwise there is none and only noise moves particles.
@@ -275,7 +275,9 @@ def apply_actions(
     """
     _check_worlds(action, x, s, mask, noise, enabled, diverged, moving)
     sides = None if box is None else tuple(box)
-    rules = ActionRules(reach, dt, state_scale, moving, sides, position_limit, state_limit)
+    rules = ActionRules(
+        max_displacement, dt, state_scale, moving, sides, position_limit, state_limit
+    )
     aligned = s.data_ptr() % 16 == 0 and action.data_ptr() % 16 == 0
     launch(*_launch_of(action, x, s, rules, mask, noise, enabled, diverged, aligned=aligned))
 
@@ -405,7 +407,7 @@ def _launch_of(
         world_count * particle_count * -(-state_dim // CHANNEL_SHARE),
         x.device,
         particle_count,
-        rules.reach * rules.dt,
+        rules.max_displacement * rules.dt,
         rules.state_scale * rules.dt,
         int(rules.box is not None),
         rules.box or (1.0,) * space_dim,

@@ -17,7 +17,7 @@ from npa_envs.ops.equivariance import MIXED_VECTORS, VectorForm, read_rows, stee
 from npa_envs.ops.mean import world_mean
 from npa_envs.ops.network import arrange_weights, run_network
 from npa_envs.ops.passes import Terms
-from npa_envs.ops.perceive import Rows, perceive, perceive_rows, survey
+from npa_envs.ops.perceive import Rows, build_neighbours, perceive, perceive_rows
 from npa_envs.ops.pictures.cameras import orbit
 from npa_envs.ops.pictures.gaussians import render_gaussians
 from npa_envs.ops.pictures.losses import picture_losses
@@ -214,7 +214,9 @@ def _warm_observation(x: torch.Tensor, s: torch.Tensor) -> None:
     for particle_count in (x.shape[1], 4096, 4097):
         places = x.detach()[:, :1].expand(-1, particle_count, -1)
         states = s.detach()[:, :1].expand(-1, particle_count, -1)
-        survey(places, states, eps=0.1, eps0=0.1, box=None, terms=Terms(), limit=1.0).perceive()
+        build_neighbours(
+            places, states, eps=0.1, eps0=0.1, box=None, terms=Terms(), limit=1.0
+        ).perceive()
 
 
 def _warm_update(x: torch.Tensor, s: torch.Tensor) -> None:
@@ -224,7 +226,15 @@ def _warm_update(x: torch.Tensor, s: torch.Tensor) -> None:
         x.shape[1], x.shape[2] + s.shape[2], dtype=x.dtype, device=x.device, requires_grad=True
     )
     moved = update_particles(
-        update, x, s, x.new_zeros(x.shape[:2]), rows=rows, reach=0.1, dt=1.0, moving=True, box=None
+        update,
+        x,
+        s,
+        x.new_zeros(x.shape[:2]),
+        rows=rows,
+        max_displacement=0.1,
+        dt=1.0,
+        moving=True,
+        box=None,
     )
     _pull_back(moved[0])
 

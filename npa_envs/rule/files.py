@@ -65,7 +65,7 @@ def shipped_rules(task: str | None = None) -> dict[str, Path]:
     return {name: path for name, path in rules.items() if rule_metadata(path).get("task") == task}
 
 
-def first_rules() -> dict[str, Path]:
+def preset_rules() -> dict[str, Path]:
     """Return the rules that runs of presets and environments begin with: name -> file, by name.
 
     They stay as they are when a shipped rule of the same picture is trained anew.
@@ -78,7 +78,7 @@ def load_rule(source: str | Path, *, device: str | torch.device = "cpu") -> NPAR
     """Load a rule: a shipped one by name, or a file in our format or one of the authors'.
 
     Args:
-        source: The name of a rule (`shipped_rules()`, `first_rules()`), or the path of a
+        source: The name of a rule (`shipped_rules()`, `preset_rules()`), or the path of a
             `.safetensors` file that `save_rule` wrote, of the authors' state dict (`.pth`, `.pt`;
             no code in it is run), or of their web demo's collection: `"models.json#name"`, or of a
             stack of rules without names `"models_digits.json#0"`; or a training run's folder.
@@ -268,7 +268,7 @@ def _locate(source: str | Path) -> tuple[Path, str | None]:
             "source must be the name of a shipped rule or the path of a file that ends in "
             f"{suffixes}, got '': names: {', '.join(known)}"
         )
-    named = known | first_rules()
+    named = known | preset_rules()
     if text in named:
         return named[text], None
     if os.path.isdir(text):

@@ -438,7 +438,7 @@ class NPARule(nn.Module):
         hidden_weight = nn.functional.pad(weight, (0, padding))
         return fold_weights(hidden_weight, output_weight, constant(self.dead_zone))
 
-    def fates(self, states: Tensor) -> tuple[Tensor, Tensor]:
+    def division_probabilities(self, states: Tensor) -> tuple[Tensor, Tensor]:
         """Return the probabilities with which updated particles divide and die, shape [...] each.
 
         They are the softmax of (a, 0, b), where (a, b) = W s + c and 0 is for staying.

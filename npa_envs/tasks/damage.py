@@ -24,7 +24,7 @@ from npa_envs.checks import (
 from npa_envs.errors import NPAError, shown, suggest
 from npa_envs.ops import world_mean
 from npa_envs.tasks.seeds import drawn_indices, uniform_ball
-from npa_envs.world.brushes import clump, cut, erase_state
+from npa_envs.world.brushes import clump, cut, wipe_state
 from npa_envs.world.randomness import Randomness, check_generator, normal_draws, uniform_draws
 
 __all__ = [
@@ -34,17 +34,17 @@ __all__ = [
     "PoolDamage",
     "clump",
     "cut",
+    "damage_pool",
     "damage_worlds",
-    "erase_state",
-    "hurt",
+    "displace",
+    "escape_motion",
     "parse_damage",
     "random_particle",
-    "scatter",
-    "stray_motion",
-    "tear",
+    "tear_off",
+    "wipe_state",
 ]
 
-DAMAGE_SIZES = {"erase": 0.2, "cut": 0.1, "clump": 0.2, "noise": 0.05}
+DAMAGE_SIZES = {"wipe": 0.2, "cut": 0.1, "clump": 0.2, "noise": 0.05}
 """Kinds of damage with their usual size: radius, gap, radius, standard deviation [length units]."""
 
 CLUMP_FACTOR = 0.9
@@ -96,7 +96,7 @@ def parse_damage(text: str) -> DamageEvent:
     """Read "STEP:KIND" or "STEP:KIND:SIZE".
 
     Args:
-        text: For example "300:cut" or "500:erase:0.3".
+        text: For example "300:cut" or "500:wipe:0.3".
 
     Raises:
         NPAError: It is written in another way, or the kind is unknown.
@@ -115,7 +115,7 @@ def parse_damage(text: str) -> DamageEvent:
             return DamageEvent(int(parts[0]), kind, size)
     raise NPAError(
         f"damage must be STEP:KIND or STEP:KIND:SIZE with a positive size, got {shown(text)}: "
-        "for example 300:cut or 500:erase:0.3"
+        "for example 300:cut or 500:wipe:0.3"
     )
 
 
@@ -132,7 +132,7 @@ def damage_worlds(
     Args:
         x: Particle positions [length units], shape [B, N, D].
         s: Particle states (dimensionless), shape [B, N, C].
-        kind: "erase", "cut", "clump", or "noise" on every position.
+        kind: "wipe", "cut", "clump", or "noise" on every position.
         size: Radius, gap or standard deviation [length units]; None is the usual one.
         generator: Where the place comes from, on the device of `x`; None is torch's own.
 
@@ -157,7 +157,7 @@ def damage_worlds(
     centre = random_particle(x, generator)
     if kind == "clump":
         return clump(x, s, centre=centre, radius=extent, factor=CLUMP_FACTOR)
-    return x, erase_state(x, s, centre=centre, radius=extent)
+    return x, wipe_state(x, s, centre=centre, radius=extent)
 
 
 def random_particle(x: Tensor, generator: Randomness | None = None) -> Tensor:
@@ -189,7 +189,7 @@ NEAREST, FARTHEST = 2.0, 4.0
 """Distances from the origin between which particles are thrown [length units]."""
 
 
-def scatter(x: Tensor, *, share: float, generator: Randomness | None = None) -> Tensor:
+def displace(x: Tensor, *, share: float, generator: Randomness | None = None) -> Tensor:
     """Return the positions with some particles thrown out, far from the others, on all sides.
 
     Nothing waits for the device.
@@ -213,7 +213,9 @@ def scatter(x: Tensor, *, share: float, generator: Randomness | None = None) -> 
     return torch.where(chance < share, _outside(ball), x)
 
 
-def tear(x: Tensor, *, radius: float, chance: float, generator: Randomness | None = None) -> Tensor:
+def tear_off(
+    x: Tensor, *, radius: float, chance: float, generator: Randomness | None = None
+) -> Tensor:
     """Return the positions with a flake of some worlds torn off and thrown out, as a whole.
 
     Particles that leave together see each other, and may walk on where a lone one has learned to
@@ -224,7 +226,7 @@ def tear(x: Tensor, *, radius: float, chance: float, generator: Randomness | Non
         radius: Flakes are disks (balls in 3D) around random particles, of any radius up to this
             [length units].
         chance: Probability of a world to lose one (dimensionless).
-        generator: Source of randomness, as for `scatter`.
+        generator: Source of randomness, as for `displace`.
 
     Raises:
         NPAError: The generator is on another device or for another number of worlds.
@@ -264,7 +266,7 @@ def counted_together(mean: Callable[[Tensor], Tensor]) -> Iterator[None]:
         _counting.reset(before)
 
 
-def stray_motion(x: Tensor, path_length: Tensor) -> Tensor:
+def escape_motion(x: Tensor, path_length: Tensor) -> Tensor:
     """Return how far particles travelled that are outside of [-1, 1]^D, mean [length units], [].
 
     It is 0 where there are none. Within `counted_together` the mean of what all processes return
@@ -292,7 +294,7 @@ class PoolDamage:
     """How much worlds of the pool are damaged; 0 is none."""
 
     damage_radius: float = 0.0
-    """Radius of the ball whose state is erased in worlds from the pool [length units]; 0: none."""
+    """Radius of the ball whose state is wiped in worlds from the pool [length units]; 0: none."""
 
     clump_radius: float = 0.0
     """Radius of the ball whose particles are pulled to one point, in a quarter of the worlds from
@@ -308,7 +310,7 @@ class PoolDamage:
     """Radius up to which a ball of particles is torn off and thrown out, in a quarter of the worlds
     from the pool [length units]; 0: none."""
 
-    stray_share: float = 0.0
+    escape_share: float = 0.0
     """Probability of each particle to be thrown out of worlds from the pool (dimensionless)."""
 
     def __post_init__(self) -> None:
@@ -319,11 +321,11 @@ class PoolDamage:
         """
         check_fraction(self, "cut_share")
         check_non_negative(
-            self, "damage_radius", "clump_radius", "cut_gap", "flake_radius", "stray_share"
+            self, "damage_radius", "clump_radius", "cut_gap", "flake_radius", "escape_share"
         )
 
 
-def hurt(
+def damage_pool(
     x: Tensor, s: Tensor, damage: PoolDamage, *, generator: Randomness
 ) -> tuple[Tensor, Tensor]:
     """Return worlds that are damaged at random places; nothing waits for the device.
@@ -337,7 +339,7 @@ def hurt(
     """
     if damage.damage_radius > 0.0:
         centre = random_particle(x, generator)
-        s = erase_state(x, s, centre=centre, radius=damage.damage_radius)
+        s = wipe_state(x, s, centre=centre, radius=damage.damage_radius)
     if damage.clump_radius > 0.0:
         centre = random_particle(x, generator)
         hit = (uniform_draws(generator, (len(x), 1), x)[:, 0] < SHARE).to(x.dtype)
@@ -348,7 +350,7 @@ def hurt(
         hit = (uniform_draws(generator, (len(x), 1), x)[:, 0] < damage.cut_share).to(x.dtype)
         x, s = cut(x, s, centre=world_mean(x), normal=normal, gap=damage.cut_gap * hit)
     if damage.flake_radius > 0.0:
-        x = tear(x, radius=damage.flake_radius, chance=SHARE, generator=generator)
-    if damage.stray_share > 0.0:
-        x = scatter(x, share=damage.stray_share, generator=generator)
+        x = tear_off(x, radius=damage.flake_radius, chance=SHARE, generator=generator)
+    if damage.escape_share > 0.0:
+        x = displace(x, share=damage.escape_share, generator=generator)
     return x, s

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from npa_envs.checks import check_non_negative, check_positive
 from npa_envs.tasks.base import ParticleTask, TaskConfig
-from npa_envs.tasks.damage import PoolDamage, hurt, stray_motion
+from npa_envs.tasks.damage import PoolDamage, damage_pool, escape_motion
 from npa_envs.tasks.seeds import uniform_ball
 from npa_envs.world.randomness import Randomness
 
@@ -34,7 +34,7 @@ class GrowthConfig(PoolDamage, TaskConfig):
     bound_weight: float = 100.0
     """Weight of mean |x − clip(x, −1, 1)| (per length unit)."""
 
-    stray_weight: float = 0.0
+    escape_weight: float = 0.0
     """Weight of the mean path length of particles outside of [−1, 1] (per length unit)."""
 
     def __post_init__(self) -> None:
@@ -44,7 +44,7 @@ class GrowthConfig(PoolDamage, TaskConfig):
         check_positive(self, int, "state_dim", at_least=3)
         check_positive(self, int, "resolution", at_least=8)
         check_positive(self, float, "alpha", "seed_radius")
-        check_non_negative(self, "motion_weight", "bound_weight", "stray_weight")
+        check_non_negative(self, "motion_weight", "bound_weight", "escape_weight")
 
 
 GrowthConfigT = TypeVar("GrowthConfigT", bound=GrowthConfig)
@@ -73,7 +73,7 @@ class GrowthTask(ParticleTask[GrowthConfigT]):
 
     def damage(self, x: Tensor, s: Tensor, generator: Randomness) -> tuple[Tensor, Tensor]:
         """Return the worlds damaged as the configuration says, each at a place of its own."""
-        return hurt(x, s, self.config, generator=generator)
+        return damage_pool(x, s, self.config, generator=generator)
 
     def penalties(
         self, x: Tensor, s: Tensor, path_length: Tensor
@@ -84,8 +84,8 @@ class GrowthTask(ParticleTask[GrowthConfigT]):
         terms |= super().penalties(x, s, path_length)
         inside = self.bounded(x)
         terms["bound"] = config.bound_weight, (inside - inside.clamp(-1.0, 1.0)).abs().mean()
-        if config.stray_weight > 0.0:
-            terms["stray"] = config.stray_weight, stray_motion(inside, path_length)
+        if config.escape_weight > 0.0:
+            terms["stray"] = config.escape_weight, escape_motion(inside, path_length)
         return terms
 
     def bounded(self, x: Tensor) -> Tensor:

@@ -17,7 +17,7 @@ from npa_envs.errors import NPAError, shown
 from npa_envs.ops import splat, world_mean
 from npa_envs.ops.pictures.losses import picture_losses
 from npa_envs.rule.rule import COLOUR_OFFSET, LIFE, NPARule
-from npa_envs.tasks.damage import hurt
+from npa_envs.tasks.damage import damage_pool
 from npa_envs.tasks.growth import GrowthConfig, GrowthTask
 from npa_envs.tasks.targets.images import LARGEST_POINT_COUNT
 from npa_envs.tasks.targets.points import PointTarget, load_target
@@ -62,7 +62,7 @@ class Morphogenesis2DConfig(GrowthConfig):
     """Grow the picture's whole rectangle, white where it is transparent: for photographs."""
 
     damage_radius: float = 0.1
-    """Radius of the disk whose state is erased in worlds from the pool [length units]; 0: none. Of
+    """Radius of the disk whose state is wiped in worlds from the pool [length units]; 0: none. Of
     worlds that divide each particle dies with probability one half instead."""
 
     resolution: int = 256
@@ -290,7 +290,7 @@ class Morphogenesis2D(GrowthTask[Morphogenesis2DConfig]):
         stay = uniform_draws(generator, x.shape[:2], x) < SURVIVING
         left = torch.where(stay[..., None], s, 0.0)
         left = torch.where(living(left).any(dim=1)[:, None, None], left, s)
-        return hurt(x, left, replace(self.config, damage_radius=0.0), generator=generator)
+        return damage_pool(x, left, replace(self.config, damage_radius=0.0), generator=generator)
 
     def picture(self, x: Tensor, s: Tensor, *, centred: bool = True) -> Tensor:
         """Return each world's picture: colour sums and density, dimensionless, shape [B, R, R, 4].
@@ -516,7 +516,7 @@ Morphogenesis2DTrainConfig = TrainConfig[Morphogenesis2DConfig]
 _OUT = Path("runs/morphogenesis2d")
 
 _TOGETHER: Mapping[str, Any] = {
-    "stray_weight": 10.0,
+    "escape_weight": 10.0,
     "bound_weight": 10.0,
     "drift_weight": 1.0,
     "clump_radius": 0.2,
@@ -527,9 +527,9 @@ _TOGETHER: Mapping[str, Any] = {
 HALF_SEEDS: Mapping[str, Any] = {
     "optimiser": "adamw",
     "seed_interval": 1,
-    "lifetimes": (0, 0),
+    "max_age_range": (0, 0),
     "damage_share": 1.0,
-    "rest_weight": 0.0,
+    "stillness_weight": 0.0,
 }
 """What `fast` had before Muon: half of its worlds are seeds, and none has to rest."""
 
@@ -538,7 +538,7 @@ MORPHOGENESIS2D_PRESETS: Mapping[str, Morphogenesis2DTrainConfig] = {
     # Found by experiment on pictures that nobody tuned for: docs/recipes.md.
     "best": TrainConfig(
         task=Morphogenesis2DConfig(
-            stray_share=2e-4,
+            escape_share=2e-4,
             damage_radius=0.2,
             cut_share=0.5,
             **_TOGETHER,
@@ -551,12 +551,12 @@ MORPHOGENESIS2D_PRESETS: Mapping[str, Morphogenesis2DTrainConfig] = {
         learning_rate=3e-3,
         weight_decay=0.1,
         schedule="cosine",
-        lifetimes=(16, 16_384),
-        second_lives=0.7,
+        max_age_range=(16, 16_384),
+        damage_and_keep_share=0.7,
         damage_share=0.125,
-        rest_age=1024,
-        rest_weight=2.0,
-        rest_power=4.0,
+        stillness_min_age=1024,
+        stillness_weight=2.0,
+        stillness_power=4.0,
         dead_zone=1e-3,
         initial_rule="heart-first",
         out=_OUT,
@@ -570,7 +570,7 @@ MORPHOGENESIS2D_PRESETS: Mapping[str, Morphogenesis2DTrainConfig] = {
             eps=0.2,
             seed_radius=0.4,
             resolution=64,
-            stray_share=1e-3,
+            escape_share=1e-3,
             **_TOGETHER,
         ),
         iterations=2400,
@@ -579,10 +579,10 @@ MORPHOGENESIS2D_PRESETS: Mapping[str, Morphogenesis2DTrainConfig] = {
         optimiser="muon",
         learning_rate=5e-3,
         schedule="cosine",
-        lifetimes=(24, 256),
+        max_age_range=(24, 256),
         damage_share=0.5,
-        rest_age=64,
-        rest_weight=2.0,
+        stillness_min_age=64,
+        stillness_weight=2.0,
         picture_interval=200,
         out=_OUT,
     ),

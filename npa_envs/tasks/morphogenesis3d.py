@@ -28,7 +28,7 @@ from npa_envs.tasks.growth import GrowthConfig, GrowthTask
 from npa_envs.tasks.losses.similarity import MultiScaleSimilarity
 from npa_envs.tasks.targets.views import ViewTarget, load_views, nearest_camera, over, some_views
 from npa_envs.tasks.train_config import TrainConfig, fast_run, tiny_run
-from npa_envs.world.cuda_graph import sent
+from npa_envs.world.cuda_graph import to_device_async
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -346,9 +346,9 @@ class ViewSchedule:
         left = max(0.0, 1.0 - iteration / self._blur_iterations)
         sigma = np.array(self._blur_sigma * left, dtype=np.float32)
         device = self.sigma.device
-        self.index.copy_(sent(index.astype(np.int64), device))
-        self.backgrounds.copy_(sent(backgrounds, device))
-        self.sigma.copy_(sent(sigma, device))
+        self.index.copy_(to_device_async(index.astype(np.int64), device))
+        self.backgrounds.copy_(to_device_async(backgrounds, device))
+        self.sigma.copy_(to_device_async(sigma, device))
 
 
 def blurred(pictures: Tensor, sigma: Tensor) -> Tensor:
@@ -380,7 +380,7 @@ _OUT = Path("runs/morphogenesis3d")
 _STRETCHED: Mapping[str, Any] = {
     "anisotropy": 1.0,
     "isotropy_weight": 0.02,
-    "stray_weight": 10.0,
+    "escape_weight": 10.0,
     "clump_radius": 0.2,
     "cut_gap": 0.1,
 }
@@ -412,7 +412,7 @@ MORPHOGENESIS3D_PRESETS: Mapping[str, TrainConfig[Morphogenesis3DConfig]] = {
             opacity=0.6,
             blur_sigma=0.0,
             damage_radius=0.15,
-            stray_share=5e-5,
+            escape_share=5e-5,
             **_STRETCHED,
         ),
         iterations=9000,
@@ -448,7 +448,7 @@ MORPHOGENESIS3D_PRESETS: Mapping[str, TrainConfig[Morphogenesis3DConfig]] = {
             opacity=0.5,
             blur_sigma=4.0,
             blur_iterations=100,
-            stray_share=1e-3,
+            escape_share=1e-3,
             **_STRETCHED,
         ),
         iterations=2000,
@@ -457,10 +457,10 @@ MORPHOGENESIS3D_PRESETS: Mapping[str, TrainConfig[Morphogenesis3DConfig]] = {
         optimiser="muon",
         learning_rate=5e-3,
         schedule="cosine",
-        lifetimes=(16, 256),
+        max_age_range=(16, 256),
         damage_share=0.5,
-        rest_age=48,
-        rest_weight=0.5,
+        stillness_min_age=48,
+        stillness_weight=0.5,
         out=_OUT,
         picture_interval=100,
     ),

@@ -22,7 +22,7 @@ from npa_envs.errors import NPAError, shown
 from npa_envs.ops import periodic_splat
 from npa_envs.rule.rule import COLOUR_OFFSET
 from npa_envs.tasks.base import ParticleTask, TaskConfig, shares_of_loss
-from npa_envs.tasks.damage import erase_state, random_particle
+from npa_envs.tasks.damage import random_particle, wipe_state
 from npa_envs.tasks.losses.texture import (
     DEFAULT_LOSS,
     LossOptions,
@@ -75,7 +75,7 @@ class TextureConfig(TaskConfig):
     """Side of the periodic box around the origin, which the target fills [length units]."""
 
     damage_radius: float = 0.1
-    """Radius of the disk whose state is erased in worlds from the pool [length units]; 0: none."""
+    """Radius of the disk whose state is wiped in worlds from the pool [length units]; 0: none."""
 
     sigma: float = 0.7
     """Standard deviation of a particle's splat, in distances between particles (dimensionless)."""
@@ -206,7 +206,7 @@ class Texture(ParticleTask[TextureConfig]):
         away = x - random_particle(x, generator)[:, None]
         away = away - side * (away / side).round()
         centre = torch.zeros_like(away[:, 0])
-        return x, erase_state(away, s, centre=centre, radius=self.config.damage_radius)
+        return x, wipe_state(away, s, centre=centre, radius=self.config.damage_radius)
 
     def picture(self, x: Tensor, s: Tensor) -> Tensor:
         """Return the picture of each world: colour sums and density, shape [B, R, R, 4]."""
@@ -389,7 +389,7 @@ _BEST = TrainConfig(
     learning_rate=3e-3,
     weight_decay=0.1,
     schedule="cosine",
-    lifetimes=(64, 8192),
+    max_age_range=(64, 8192),
     damage_share=0.5,
     out=_OUT,
 )

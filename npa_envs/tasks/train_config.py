@@ -110,37 +110,39 @@ class TrainConfig(Generic[TaskConfigT]):
 
     fresh_share: float = 0.0
     """Share of fresh seeds in a batch that has any by `seed_interval`; at least one world. Without
-    effect where worlds have `lifetimes`, at the end of which seeds come."""
+    effect where worlds have `max_age_range`, at the end of which seeds come."""
 
-    lifetimes: tuple[int, int] = (0, 0)
+    max_age_range: tuple[int, int] = (0, 0)
     """Steps that a world of the pool lives until a fresh seed takes its place, or it is damaged and
-    lives again (`second_lives`): the least, in the pool's first place, and the most, in its last;
-    evenly in the logarithm between them. A batch has one world from each of B equal sections of the
-    pool, so it holds young and old worlds. (0, 0): fresh seeds come by `seed_interval` instead."""
+    is kept (`damage_and_keep_share`): the least, in the pool's first place, and the most, in its
+    last; evenly in the logarithm between them. A batch has one world from each of B equal
+    sections of the pool, so it holds young and old worlds. (0, 0): fresh seeds come by
+    `seed_interval` instead."""
 
-    second_lives: float = 0.0
+    damage_and_keep_share: float = 0.0
     """Share in [0, 1) of the worlds whose time is over that are damaged at that moment and live as
     long again; a fresh seed takes the place of the others (dimensionless). So a rule learns what
-    comes of a damage long after it. Needs `lifetimes`."""
+    comes of a damage long after it. Needs `max_age_range`."""
 
-    rest_weight: float = 0.0
+    stillness_weight: float = 0.0
     """Weight of what a rollout changes in grown worlds: the mean path length of their particles in
     perception radii, and the mean |Δs| from its start to its end; of all others it is 0
-    (dimensionless). Births and deaths do not count. Grown are worlds of `rest_age` whose place in
-    the pool is not damaged in every batch. It ends the slow flow by which worlds lose their shape.
-    Needs `lifetimes`."""
+    (dimensionless). Births and deaths do not count. Grown are worlds of `stillness_min_age` whose
+    place in the pool is not damaged in every batch. It ends the slow flow by which worlds
+    lose their shape. Needs `max_age_range`."""
 
-    rest_power: float = 1.0
-    """Power of the means over particles and states in `rest_weight`: (mean |a|^power)^(1/power), at
-    least 1 and at most 8. The larger it is, the more the few particles tell that move most."""
+    stillness_power: float = 1.0
+    """Power of the means over particles and states in `stillness_weight`:
+    (mean |a|^power)^(1/power), at least 1 and at most 8. The larger it is, the more the few
+    particles weigh that move most."""
 
-    rest_age: int = 512
+    stillness_min_age: int = 512
     """Steps from the seed, or from the damage before another life, after which a world is grown."""
 
     damage_share: float = 1.0
     """Share in [0, 1] of the pool's places whose worlds are damaged in every batch, so that a rule
-    learns to heal: the first places, which with `lifetimes` are those of the shortest lives. All
-    others are damaged by `second_lives` alone."""
+    learns to heal: the first places, which with `max_age_range` are those of the shortest lives.
+    All others are damaged by `damage_and_keep_share` alone."""
 
     seed: int = 0
     """Seed of every random number of the run, in [0, 2**63)."""
@@ -177,21 +179,22 @@ class TrainConfig(Generic[TaskConfigT]):
         """Check every field; raise NPAError where one has a wrong type or lies out of its range."""
         check_positive(self, int, "iterations", "repeats", "world_count", "pool_size")
         check_positive(self, int, "seed_interval", "log_interval", "checkpoint_interval")
-        check_positive(self, int, "rest_age")
-        check_positive(self, float, "learning_rate", "rest_power")
-        check_non_negative(self, "weight_decay", "fresh_share", "rest_weight")
-        check_non_negative(self, "dead_zone", "second_lives", "damage_share")
-        if not 1.0 <= self.rest_power <= LARGEST_POWER:
+        check_positive(self, int, "stillness_min_age")
+        check_positive(self, float, "learning_rate", "stillness_power")
+        check_non_negative(self, "weight_decay", "fresh_share", "stillness_weight")
+        check_non_negative(self, "dead_zone", "damage_and_keep_share", "damage_share")
+        if not 1.0 <= self.stillness_power <= LARGEST_POWER:
             raise NPAError(
-                f"rest_power must be at least 1 and at most {LARGEST_POWER:g}, got "
-                f"{self.rest_power}: 1 for plain means"
+                f"stillness_power must be at least 1 and at most {LARGEST_POWER:g}, got "
+                f"{self.stillness_power}: 1 for plain means"
             )
         for name in ("fresh_share", "damage_share"):
             if (share := getattr(self, name)) > 1.0:
                 raise NPAError(f"{name} must be at most 1, got {share}: try 0.5")
-        if self.second_lives >= 1.0:
+        if self.damage_and_keep_share >= 1.0:
             raise NPAError(
-                f"second_lives must be below 1, got {self.second_lives}: with 1 there are no seeds"
+                f"damage_and_keep_share must be below 1, got {self.damage_and_keep_share}: with 1 "
+                "there are no seeds"
             )
         interval = self.picture_interval
         if not is_whole(interval) or interval < 0:
@@ -212,7 +215,7 @@ class TrainConfig(Generic[TaskConfigT]):
                 f"got world_count={self.world_count} and pool_size={self.pool_size}: "
                 f"set pool_size={self.world_count} or more"
             )
-        self._check_lifetimes()
+        self._check_max_age_range()
         self._check_eps()
         self._check_choice("optimiser", get_args(OptimiserName))
         self._check_choice("schedule", get_args(Schedule))
@@ -246,8 +249,8 @@ class TrainConfig(Generic[TaskConfigT]):
                 "for example milestones=(2000, 4000)"
             )
 
-    def _check_lifetimes(self) -> None:
-        times = self.lifetimes
+    def _check_max_age_range(self) -> None:
+        times = self.max_age_range
         if (
             not isinstance(times, tuple)
             or len(times) != 2
@@ -255,20 +258,20 @@ class TrainConfig(Generic[TaskConfigT]):
             or not (1 <= times[0] <= times[1] or times == (0, 0))
         ):
             raise NPAError(
-                "lifetimes must be two whole numbers (lo, hi) with 1 <= lo <= hi, or (0, 0), got "
-                f"{shown(times)}: for example lifetimes=(64, 16384)"
+                "max_age_range must be two whole numbers (lo, hi) with 1 <= lo <= hi, or (0, 0), "
+                f"got {shown(times)}: for example max_age_range=(64, 16384)"
             )
         if self.ages and self.pool_size % self.world_count:
             raise NPAError(
-                f"pool_size must be a multiple of world_count where lifetimes are set, got "
+                f"pool_size must be a multiple of world_count where max_age_range are set, got "
                 f"{self.pool_size} and {self.world_count}: set "
                 f"pool_size={self.pool_size // self.world_count * self.world_count}"
             )
-        for name in ("rest_weight", "second_lives"):
+        for name in ("stillness_weight", "damage_and_keep_share"):
             if getattr(self, name) > 0 and not self.ages:
                 raise NPAError(
-                    f"{name} needs worlds that have lifetimes, got {getattr(self, name)} without: "
-                    "set lifetimes, for example to (256, 32768)"
+                    f"{name} needs max_age_range, got {getattr(self, name)} without: "
+                    "set max_age_range, for example to (256, 32768)"
                 )
 
     def _check_eps(self) -> None:
@@ -293,13 +296,13 @@ class TrainConfig(Generic[TaskConfigT]):
 
     @property
     def ages(self) -> bool:
-        """Whether worlds of the pool have lifetimes."""
-        return self.lifetimes[1] > 0
+        """Whether worlds of the pool have max_age_range."""
+        return self.max_age_range[1] > 0
 
     @property
     def damages(self) -> bool:
         """Whether any world of the pool is ever damaged."""
-        return self.damage_share > 0.0 or self.second_lives > 0.0
+        return self.damage_share > 0.0 or self.damage_and_keep_share > 0.0
 
     @property
     def fresh_count(self) -> int:

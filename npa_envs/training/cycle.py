@@ -29,7 +29,7 @@ from npa_envs.training.optimiser import RuleOptimiser
 from npa_envs.training.pool import RUNAWAY_LIMIT, WorldPool
 from npa_envs.training.randomness import RunRandomness, registered, restart
 from npa_envs.training.ranks import Ranks
-from npa_envs.world.cuda_graph import Replayed
+from npa_envs.world.cuda_graph import GraphedCallable
 from npa_envs.world.randomness import Randomness, WorldRandom, uniform_draws
 
 
@@ -80,13 +80,13 @@ class TrainingCycle:
         """What the run draws from."""
         self._places = places.to(device)
         x, s, goal = self._seeds(len(places), self.random.pool)
-        lifetimes = config.lifetimes if config.ages else None
+        max_age_range = config.max_age_range if config.ages else None
         self.pool = WorldPool(
             x,
             s,
             goal,
             runaway_limit=RUNAWAY_LIMIT,
-            lifetimes=lifetimes,
+            max_age_range=max_age_range,
             places=places,
             total=config.pool_size,
         )
@@ -127,9 +127,13 @@ class TrainingCycle:
         self._fresh_x, self._fresh_s = (torch.empty_like(t) for t in batch)
         self._fresh_goal = None if goals is None else torch.empty_like(goals)
         worlds = registered(self.random.worlds)
-        self._draw = Replayed(self._draw_worlds, device, worlds) if graphed else self._draw_worlds
-        self._keep = Replayed(self._keep_worlds, device) if graphed else self._keep_worlds
-        self._note = Replayed(self._note_iteration, device) if graphed else self._note_iteration
+        self._draw = (
+            GraphedCallable(self._draw_worlds, device, worlds) if graphed else self._draw_worlds
+        )
+        self._keep = GraphedCallable(self._keep_worlds, device) if graphed else self._keep_worlds
+        self._note = (
+            GraphedCallable(self._note_iteration, device) if graphed else self._note_iteration
+        )
 
     def run(self, iteration: int, share: float = 0.0) -> int:
         """Train for one iteration, and return the steps of its rollout, T.
@@ -210,9 +214,11 @@ class TrainingCycle:
         if config.ages:
             age, over = self.pool.ages_of(self._index)
             self._age.copy_(age.masked_fill(over, 0))
-            self.batch.grown.copy_((self._age >= config.rest_age) & ~hit)
-        if config.second_lives > 0.0:
-            again = over & (uniform_draws(worlds, (len(over), 1), x0)[:, 0] < config.second_lives)
+            self.batch.grown.copy_((self._age >= config.stillness_min_age) & ~hit)
+        if config.damage_and_keep_share > 0.0:
+            again = over & (
+                uniform_draws(worlds, (len(over), 1), x0)[:, 0] < config.damage_and_keep_share
+            )
             over, hit = over & ~again, hit | again
         if config.damages:
             x0, s0, goal = self._damaged(x0, s0, goal, hit)

@@ -16,7 +16,7 @@ from npa_envs.tasks.base import Task, coded_states, task_toward
 from npa_envs.tasks.damage import counted_together
 from npa_envs.tasks.train_config import TrainConfig
 from npa_envs.training.randomness import registered
-from npa_envs.world.cuda_graph import Captured, between_graphs, capture
+from npa_envs.world.cuda_graph import GraphSequence, capture, host_call
 from npa_envs.world.division import living
 from npa_envs.world.randomness import Randomness, WorldRandom
 from npa_envs.world.rollout import Memory
@@ -98,8 +98,8 @@ class EagerIteration:
         """Worlds after the rollout."""
         self.grown = torch.zeros_like(x[:, 0, 0], dtype=torch.bool)
         """Which worlds are grown and whole, and are to rest, shape [B]."""
-        self._rest_weight = config.rest_weight
-        self._rest_power = config.rest_power
+        self._stillness_weight = config.stillness_weight
+        self._stillness_power = config.stillness_power
         self._mean_over_processes = mean_over_processes
         self._divides = bool(fate_parameters(rule))
         self._task = task
@@ -165,22 +165,24 @@ class EagerIteration:
         assert self._mean_over_processes is not None, "shared by several processes"
         own, over = value.detach().clone(), self._mean_over_processes
         mean = torch.empty_like(own)
-        between_graphs(lambda: mean.copy_(over(own)))
+        host_call(lambda: mean.copy_(over(own)))
         return mean
 
     def _loss(self, x: Tensor, s: Tensor, path_length: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
         """Return the task's loss and its parts, and how far grown worlds are from rest."""
         total, parts = self._task.loss(x, s, path_length)
-        if self._rest_weight > 0.0:
+        if self._stillness_weight > 0.0:
             change = s - self.s0
             if self._divides:
                 # Births and deaths are no unrest; who lives is the business of the task's loss.
                 stayed = (living(s) & living(self.s0))[..., None]
                 change = torch.where(stayed, change, 0.0)[..., LIFE + 1 :]
-            moved, changed = (power_mean(each, self._rest_power) for each in (path_length, change))
+            moved, changed = (
+                power_mean(each, self._stillness_power) for each in (path_length, change)
+            )
             unrest = moved / self._task.eps + changed
             parts["rest"] = (self.grown.to(x.dtype) * unrest).mean()
-            total = total + self._rest_weight * parts["rest"]
+            total = total + self._stillness_weight * parts["rest"]
         return total, parts
 
 
@@ -196,7 +198,7 @@ class GraphedIteration(EagerIteration):
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)
-        self._graphs: dict[int, Captured] = {}
+        self._graphs: dict[int, GraphSequence] = {}
         self._memory_pool = torch.cuda.graph_pool_handle()
 
     def run(self, steps: int) -> None:

@@ -21,8 +21,8 @@ class WorldPool:
         s: States, shape [W, N, C].
         goal: The goal of every world, shape [W], where the task has such.
         runaway_limit: A world with a larger |x| or |s|, or one that is not finite, is not kept.
-        lifetimes: Steps that the world in the first place lives, and that in the last, all others
-            between; None: for ever.
+        max_age_range: Steps that the world in the first place lives, and that in the last, all
+            others between; None: for ever.
         places: Places of these worlds among those of all processes, int64, shape [W]; None: they
             are all.
         total: Worlds of all processes; None: W.
@@ -35,7 +35,7 @@ class WorldPool:
         goal: Tensor | None = None,
         *,
         runaway_limit: float,
-        lifetimes: tuple[int, int] | None = None,
+        max_age_range: tuple[int, int] | None = None,
         places: Tensor | None = None,
         total: int | None = None,
     ) -> None:
@@ -45,12 +45,14 @@ class WorldPool:
         """States (dimensionless), shape [W, N, C]."""
         self.goal = goal
         """Goals, int64, shape [W], or None."""
-        self.age = None if lifetimes is None else torch.zeros_like(x[:, 0, 0], dtype=torch.int64)
+        self.age = (
+            None if max_age_range is None else torch.zeros_like(x[:, 0, 0], dtype=torch.int64)
+        )
         """Steps since the seed, or since a life began by damage, int64, shape [W], or None."""
         self.lifetime: Tensor | None = None
         """Age at which the world of each place has lived, int64, shape [W], or None."""
-        if lifetimes is not None:
-            lo, hi = map(math.log, lifetimes)
+        if max_age_range is not None:
+            lo, hi = map(math.log, max_age_range)
             logarithms = torch.linspace(lo, hi, total or len(x), dtype=torch.float64)
             own = logarithms if places is None else logarithms[places]
             self.lifetime = own.exp().round().to(x.device, torch.int64)
@@ -59,7 +61,7 @@ class WorldPool:
     def sample(self, world_count: int, generator: Randomness) -> Tensor:
         """Draw different worlds: one of each of B equal sections.
 
-        From a generator and where they have no lifetimes, B of all worlds instead.
+        From a generator and where they have no max_age_range, B of all worlds instead.
 
         Returns:
             Their indices, shape [B].
@@ -75,9 +77,9 @@ class WorldPool:
         return first + keys.view(world_count, size).argmax(dim=1)
 
     def ages_of(self, index: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the ages of worlds that have lifetimes, and which have lived, shape [B] each."""
-        assert self.age is not None, "made with lifetimes"
-        assert self.lifetime is not None, "made with lifetimes"
+        """Return worlds' ages, and which have reached their `max_age_range`, shape [B] each."""
+        assert self.age is not None, "made with max_age_range"
+        assert self.lifetime is not None, "made with max_age_range"
         age = self.age.index_select(0, index)
         return age, age >= self.lifetime.index_select(0, index)
 
@@ -105,7 +107,7 @@ class WorldPool:
             fresh_x: Positions of seeds, shape [B, N, D].
             fresh_s: States of seeds, shape [B, N, C].
             goals: Goals of the worlds and of the seeds, shape [B], where the pool has such.
-            age: Steps of the worlds since their seeds, int64, shape [B], where they have lifetimes.
+            age: Steps of the worlds since their seeds, int64, shape [B], with `max_age_range`.
 
         Returns:
             Which worlds were replaced, shape [B], bool.

@@ -131,7 +131,7 @@ class Ranks:
         sections = [part.view(-1, section, *part.shape[1:]) for part in parts]
         return torch.stack(sections, 1).flatten(0, 2)
 
-    def told(self, value: ValueT) -> ValueT:
+    def broadcast(self, value: ValueT) -> ValueT:
         """Return what the first process gives, on all of them."""
         if not self.together:
             return value
@@ -290,7 +290,7 @@ def _heartbeat(ranks: Ranks) -> Heartbeat:
     address, port = os.environ["MASTER_ADDR"], int(os.environ["MASTER_PORT"])
     store = dist.TCPStore(address, port, wait_for_workers=False)  # type: ignore[attr-defined]
     # Torchrun may keep the store where it starts processes again.
-    prefix = ranks.told(uuid.uuid4().hex)
+    prefix = ranks.broadcast(uuid.uuid4().hex)
     own = dist.PrefixStore(prefix, store)  # type: ignore[attr-defined]
     return Heartbeat(own, ranks.rank, ranks.count)
 

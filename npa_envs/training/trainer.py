@@ -18,7 +18,7 @@ from npa_envs.checks import is_real
 from npa_envs.devices import check_device
 from npa_envs.errors import DivergedError, NPAError, shown
 from npa_envs.files import write_text
-from npa_envs.rule.files import first_rules, load_rule, save_rule
+from npa_envs.rule.files import load_rule, preset_rules, save_rule
 from npa_envs.rule.rule import NPARule, dividing, with_codes
 from npa_envs.tasks.base import GoalTask, Task, differing_fields, untrained_rule
 from npa_envs.tasks.many_pictures import ManyPictures
@@ -117,7 +117,7 @@ class Trainer:
         content = None
         if ranks.first:
             content = self._open_folder(resume=resume, overwrite=overwrite)
-        content = ranks.told(content)
+        content = ranks.broadcast(content)
 
         device = check_device(config.device)
         # While the host waits for the numbers, a GPU would have nothing to do; a CPU has done all.
@@ -368,7 +368,7 @@ class Trainer:
                 save_checkpoint(self.folder.diagnosis, self._origin() | snapshot)
             except NPAError as other:
                 error = DivergedError(f"{error}; but these were not written: {other}")
-        error = self._ranks.told(error)
+        error = self._ranks.broadcast(error)
         assert error is not None, "made by the first process"
         raise error
 
@@ -463,7 +463,7 @@ def initial_rule(config: TrainConfig[Any], untrained: NPARule) -> NPARule:
             another `moment_inverse` than the paper's and the configuration's.
     """
     take_options(untrained, config)
-    if not config.initial_rule or (untrained.equivariant and config.initial_rule in first_rules()):
+    if not config.initial_rule or (untrained.equivariant and config.initial_rule in preset_rules()):
         return untrained
     source = config.initial_rule
     rule = load_rule(source)

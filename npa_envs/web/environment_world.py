@@ -17,7 +17,7 @@ from npa_envs.rule.rule import COLOUR_OFFSET
 from npa_envs.tasks.damage import DAMAGE_SIZES, damage_worlds
 from npa_envs.tasks.point_classification import PointClassification, class_colours
 from npa_envs.web.colouring import Colouring, Seen, shows_of
-from npa_envs.web.live import Frame, Live, Touch, brushed, checked_seed
+from npa_envs.web.live import Live, Touch, WorldView, brushed, checked_seed
 from npa_envs.world.brushes import nearest_image
 
 
@@ -124,7 +124,7 @@ class EnvironmentWorld(Live):
             "shows": self._shows(),
             "show": self.show,
             "tools": [*(("push", "clump", "cut") if physics.moving else ()), "inject"],
-            "damages": list(DAMAGE_SIZES) if physics.moving else ["erase"],
+            "damages": list(DAMAGE_SIZES) if physics.moving else ["wipe"],
             "settings": self._settings(),
             "capabilities": ["step", "reset", "film", "loss"],
             "playing": self.playing,
@@ -145,7 +145,7 @@ class EnvironmentWorld(Live):
                 physics = self._inner.worlds.physics
                 # Over the edge of a box, not all across it.
                 way = nearest_image(self._inner.particles()[0] - before, physics.box)
-                self._travelled = way.norm(dim=-1)[None] / max(physics.reach, 1e-12)
+                self._travelled = way.norm(dim=-1)[None] / max(physics.max_displacement, 1e-12)
             if ended or late:
                 self._ended = (
                     f"; the last one ended after {self.step} steps: "
@@ -161,7 +161,7 @@ class EnvironmentWorld(Live):
                 self._news.append(self.describe())
                 return
 
-    def frame(self) -> Frame:
+    def frame(self) -> WorldView:
         """Return what is seen now."""
         x, s = (part[None] for part in self._inner.particles())
         physics = self._inner.worlds.physics
@@ -170,7 +170,7 @@ class EnvironmentWorld(Live):
             x, s, self._own_colours, physics.eps, physics.box, [count], count, self._travelled, None
         )
         loss = self._info.get("loss") if self._loss_wanted else None
-        return Frame(
+        return WorldView(
             self.step,
             x[0].cpu().numpy(),
             self._colouring(self.show, seen),

@@ -40,7 +40,7 @@ LARGEST_RADIUS = 10.0
 """Largest radius of a brush [length units]."""
 
 
-class Frame(NamedTuple):
+class WorldView(NamedTuple):
     """What is seen of a world at a time."""
 
     step: int
@@ -74,7 +74,7 @@ class LiveWorld(Protocol):
     def advance(self) -> None:
         """Go on to the next frame."""
 
-    def frame(self) -> Frame:
+    def frame(self) -> WorldView:
         """Return what is seen now."""
 
     def news(self) -> list[dict[str, Any]]:
@@ -108,7 +108,7 @@ class Range(NamedTuple):
             )
         return int(value) if self.whole else float(value)
 
-    def told(self, value: float) -> dict[str, Any]:
+    def to_dict(self, value: float) -> dict[str, Any]:
         """Return the range and the present value as the page reads them."""
         told: dict[str, Any] = {"value": value, "low": self.low, "high": self.high}
         if self.scale is not None:
@@ -200,7 +200,7 @@ class Live:
         return bool(name != "loss")
 
     def _settings(self) -> dict[str, Any]:
-        return {"speed": SPEED.told(self.speed)}
+        return {"speed": SPEED.to_dict(self.speed)}
 
     def _shows(self) -> list[str]:
         raise NotImplementedError
@@ -248,7 +248,7 @@ class Touch(NamedTuple):
             NPAError: A tool or a number is missing or wrong.
         """
         tool = message.get("tool")
-        tools = ("erase", "push", "clump", "cut", "inject", "graft", "add")
+        tools = ("remove", "push", "clump", "cut", "inject", "graft", "add")
         if tool not in tools:
             raise NPAError(f"unknown tool {shown(tool)}: {suggest(tool, tools)}")
         at = _checked_vector("at", message.get("at"), x)

@@ -35,8 +35,8 @@ from npa_envs.training.presets import preset
 from npa_envs.training.run_folder import LARGEST_LOG, RunFolder
 from npa_envs.training.trained_tasks import TrainedTask, task_of_rule, trained_config
 from npa_envs.web.colouring import Colouring, Seen, shows_of
-from npa_envs.web.live import Frame, Live, Range, Touch, brushed, checked_seed
-from npa_envs.world.brushes import erase_state, inside_ball, removed
+from npa_envs.web.live import Live, Range, Touch, WorldView, brushed, checked_seed
+from npa_envs.world.brushes import inside_ball, removed, wipe_state
 from npa_envs.world.division import living
 from npa_envs.world.rollout import at_rest, rollout
 from npa_envs.world.species import AGREEMENTS, rollout_species
@@ -60,7 +60,7 @@ POLL_SECONDS = 1.0
 """Time between two looks into the folder of a run [s]."""
 
 
-class Organism(NamedTuple):
+class LiveRule(NamedTuple):
     """A rule by its name."""
 
     name: str
@@ -104,15 +104,15 @@ class RuleWorld(Live):
 
     # Which rule, and a fresh world of it.
 
-    def _organism(self, name: Any) -> Organism:
+    def _organism(self, name: Any) -> LiveRule:
         if not isinstance(name, str) or name not in self._choices:
             raise NPAError(f"unknown rule {shown(name)}: {suggest(name, self._choices)}")
         if name not in self._rules:
             rule = load_rule(self._choices[name], device=self._device).float()
             self._rules[name] = rule.requires_grad_(False)
-        return Organism(name, self._rules[name])
+        return LiveRule(name, self._rules[name])
 
-    def _task_of(self, organism: Organism, particle_count: int | None) -> TrainedTask:
+    def _task_of(self, organism: LiveRule, particle_count: int | None) -> TrainedTask:
         key = (organism.name, particle_count)
         if key not in self._trained:
             if len(self._trained) >= MOST_TASKS:
@@ -176,7 +176,7 @@ class RuleWorld(Live):
         elif isinstance(task, PointClassification):
             half_width, centre = 0.6, [0.5] * self.dimension
         alike = [name for name in self._choices if self._may_join(name)]
-        tools = ["erase", "push", "clump", "cut", "inject", "graft", "add"]
+        tools = ["remove", "push", "clump", "cut", "inject", "graft", "add"]
         if self.main.rule.static:
             tools.remove("add")
         if self.main.rule.divides:
@@ -253,7 +253,7 @@ class RuleWorld(Live):
         }  # fmt: skip
         if isinstance(self.task, PointClassification):
             del values["count"]
-        told = {name: ranges[name].told(value) for name, value in values.items()}
+        told = {name: ranges[name].to_dict(value) for name, value in values.items()}
         return super()._settings() | told
 
     def _shows(self) -> list[str]:
@@ -336,7 +336,7 @@ class RuleWorld(Live):
             )  # fmt: skip
         return travelled if path else None
 
-    def frame(self) -> Frame:
+    def frame(self) -> WorldView:
         """Return what is seen now."""
         x, s, travelled, updated = self.x, self.s, self._travelled, self._updated
         counts = self.counts
@@ -353,7 +353,7 @@ class RuleWorld(Live):
         positions: NDArray[np.float32] = x[0].cpu().numpy()
         alone = len(self.organisms) == 1 and positions.size and self._loss_offered()
         loss = self._loss(self._metric) if alone else None
-        return Frame(self.step, positions, colours, self._milliseconds, loss)
+        return WorldView(self.step, positions, colours, self._milliseconds, loss)
 
     def _own_colours(self, s: Tensor) -> Tensor:
         if isinstance(self.task, PointClassification):
@@ -380,9 +380,9 @@ class RuleWorld(Live):
         touch = Touch.read(message, self.x)
         before = [organism.name for organism in self.organisms]
         match touch.tool:
-            case "erase" if self.main.rule.divides:
-                self.s = erase_state(self.x, self.s, centre=touch.at, radius=touch.radius)
-            case "erase":
+            case "remove" if self.main.rule.divides:
+                self.s = wipe_state(self.x, self.s, centre=touch.at, radius=touch.radius)
+            case "remove":
                 gone = inside_ball(self.x, centre=touch.at, radius=touch.radius, box=self.task.box)
                 self._arrange(*removed(self.x, self.s, gone=gone), self._species()[~gone[0]])
             case "graft":
@@ -393,14 +393,14 @@ class RuleWorld(Live):
                 self.x, self.s = brushed(self.x, self.s, touch, self.task.box)
         return before != [organism.name for organism in self.organisms]
 
-    def _graft(self, touch: Touch, organism: Organism) -> None:
+    def _graft(self, touch: Touch, organism: LiveRule) -> None:
         inside = inside_ball(self.x, centre=touch.at, radius=touch.radius, box=self.task.box)
         # Among its hosts it sees densities as they do.
         number = self._number(organism, float(self.full))
         s = torch.where(inside[..., None], self._coded(organism, self.s), self.s)
         self._arrange(self.x, s, torch.where(inside[0], number, self._species()))
 
-    def _add(self, touch: Touch, organism: Organism) -> None:
+    def _add(self, touch: Touch, organism: LiveRule) -> None:
         count = max(16, round(touch.strength * SEED_SHARE * self.full))
         room = MOST_PARTICLES[self._device.type] - self.x.shape[1]
         if count > room:
@@ -421,14 +421,14 @@ class RuleWorld(Live):
         parts = zip(self.organisms, s.split_with_sizes(self.counts, dim=1), strict=True)
         return torch.cat([self._coded(organism, part) for organism, part in parts], dim=1)
 
-    def _coded(self, organism: Organism, s: Tensor) -> Tensor:
+    def _coded(self, organism: LiveRule, s: Tensor) -> Tensor:
         """Return states of a species with the code that its rule gives them, where it has such."""
         if organism.rule.codes is None:
             return s
         own = organism.name == self.main.name
         return coded_states(self.task if own else self._task_of(organism, None).task, s)
 
-    def _joining(self, name: Any) -> Organism:
+    def _joining(self, name: Any) -> LiveRule:
         organism = self._organism(name)
         if not self._may_join(organism.name):
             raise NPAError(
@@ -437,7 +437,7 @@ class RuleWorld(Live):
             )
         return organism
 
-    def _number(self, organism: Organism, divisor: float) -> int:
+    def _number(self, organism: LiveRule, divisor: float) -> int:
         """Return the number of a species, after giving a rule that is new here the next one."""
         names = [own.name for own in self.organisms]
         if organism.name not in names:
@@ -568,7 +568,7 @@ class RunWorld(RuleWorld):
         super().__init__(
             str(files[0]), device=device, seed=seed, particle_count=self._each, choices=choices
         )
-        self._goals = self._told_goals()
+        self._goals = self._goal_choices()
 
     @torch.no_grad()
     def reset(self, seed: int | None) -> None:
@@ -651,7 +651,7 @@ class RunWorld(RuleWorld):
             name: load_rule(path, device=self._device).float() for name, path in self._files.items()
         }
         own = {name: self._organism(name).rule for name in fresh}
-        goals = self._told_goals()
+        goals = self._goal_choices()
         # What follows from the rules as they were, such as the codes of their targets.
         self._trained.clear()
         if goals == self._goals and all(
@@ -670,7 +670,7 @@ class RunWorld(RuleWorld):
             self._news.append({"type": "reordered"})
         self._goals = goals
 
-    def _told_goals(self) -> list[Any]:
+    def _goal_choices(self) -> list[Any]:
         """Return what the rules' files say that they are trained on."""
         found: list[Any] = []
         for path in self._files.values():

@@ -29,7 +29,7 @@ from PIL import Image
 from npa_envs.errors import MissingDependencyError, NPAError, shown
 from npa_envs.files import made_folder
 from npa_envs.render import write_gif, write_mp4
-from npa_envs.web.live import Frame, LiveWorld
+from npa_envs.web.live import LiveWorld, WorldView
 
 try:
     import uvicorn
@@ -108,7 +108,7 @@ class Site:
     """Worlds take turns: on CUDA, work that one thread records must not meet another's."""
     turn: threading.Lock = field(default_factory=threading.Lock)
     """Held by the world whose turn it is."""
-    open_sessions: list[Session] = field(default_factory=list)
+    open_sessions: list[ViewerSession] = field(default_factory=list)
     """Readers that are here."""
 
     def alone(self) -> contextlib.AbstractContextManager[Any]:
@@ -186,7 +186,7 @@ def make_app(site: Site) -> Starlette:
         await reader.accept()
         if len(site.open_sessions) >= MOST_SESSIONS:
             return await reader.close(1013, f"{MOST_SESSIONS} worlds are open: close a page")
-        session = Session(site, reader, asyncio.get_running_loop())
+        session = ViewerSession(site, reader, asyncio.get_running_loop())
         site.open_sessions.append(session)
         try:
             await session.serve()
@@ -240,7 +240,7 @@ def _host_name(host: str) -> str:
     return host.partition(":")[0].lower()
 
 
-def frame_bytes(frame: Frame) -> bytes:
+def frame_bytes(frame: WorldView) -> bytes:
     """Return a frame as it is sent: header, positions, colours."""
     count, dimension = frame.positions.shape
     loss = float("nan") if frame.loss is None else frame.loss
@@ -249,7 +249,7 @@ def frame_bytes(frame: Frame) -> bytes:
     return header + positions + np.ascontiguousarray(frame.colours).tobytes()
 
 
-class Session:
+class ViewerSession:
     """One reader and their world, which lives in a thread of its own.
 
     The world waits for the page: at most `FRAMES_AHEAD` frames are on the way, so that a page that
@@ -267,7 +267,7 @@ class Session:
         self._outbox: asyncio.Queue[bytes | str | None] = asyncio.Queue()
         self._room = threading.BoundedSemaphore(FRAMES_AHEAD)
         self._stopped = threading.Event()
-        self._film: Film | None = None
+        self._film: PageFilm | None = None
 
     async def serve(self) -> None:
         """Read and write until the reader leaves or the server stops."""
@@ -410,7 +410,7 @@ class Session:
 
     def _direct(self, action: Any) -> None:
         if action == "start":
-            self._film = Film()
+            self._film = PageFilm()
         elif action == "stop" and self._film is not None:
             self._end_film()
         else:
@@ -421,7 +421,7 @@ class Session:
         # The world goes on meanwhile.
         threading.Thread(target=self._write_film, args=(film,), daemon=True).start()
 
-    def _write_film(self, film: Film) -> None:
+    def _write_film(self, film: PageFilm) -> None:
         token = "" if self._site.token is None else f"?token={self._site.token}"
         try:
             for path in film.write(self._site.films):
@@ -438,7 +438,7 @@ class Session:
                 self._end_film()
 
 
-class Film:
+class PageFilm:
     """Pictures that a page has drawn, as a film."""
 
     def __init__(self) -> None:

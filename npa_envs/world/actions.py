@@ -22,7 +22,7 @@ from npa_envs.ops.episodes import (
     PreparedJudgement,
 )
 from npa_envs.ops.passes import Terms
-from npa_envs.ops.perceive import SurveyedWorlds, survey
+from npa_envs.ops.perceive import NeighbourState, build_neighbours
 from npa_envs.ops.species import perceive_by_species
 from npa_envs.ops.update import ActionRules, PreparedActions
 from npa_envs.world.randomness import WorldRandom
@@ -35,11 +35,11 @@ __all__ = [
     "Actions",
     "EpisodeRules",
     "MomentInverse",
+    "NeighbourState",
     "Physics",
     "PreparedJudgement",
-    "SurveyedWorlds",
+    "find_neighbours",
     "perceive_each_species",
-    "survey_worlds",
 ]
 
 
@@ -59,7 +59,7 @@ class Physics:
     eps0: float
     """Radius that perception is scaled to, that of the rule's training [length units]."""
 
-    reach: float
+    max_displacement: float
     """Largest displacement of a step, α ε [length units]."""
 
     state_scale: float
@@ -103,9 +103,9 @@ class Physics:
         return self.state_dim + (self.space_dim if self.moving else 0)
 
 
-def survey_worlds(
+def find_neighbours(
     x: Tensor, s: Tensor, physics: Physics, places: Tensor | None = None
-) -> SurveyedWorlds:
+) -> NeighbourState:
     """Return worlds made ready for perception: sorted, their densities known.
 
     Args:
@@ -115,7 +115,7 @@ def survey_worlds(
         physics: The worlds' constants.
         places: Which worlds of a larger batch these are, int64, shape [B]; default: their own one.
     """
-    return survey(
+    return build_neighbours(
         x,
         s,
         eps=physics.eps,
@@ -128,7 +128,7 @@ def survey_worlds(
 
 
 def perceive_each_species(x: Tensor, counts: Sequence[int], physics: Physics) -> Tensor:
-    """Return what particles perceive of each species besides `survey_worlds`, clipped.
+    """Return what particles perceive of each species besides `find_neighbours`, clipped.
 
     Args:
         x: Positions [length units], shape [B, N, D], finite, species after species.
@@ -183,7 +183,7 @@ class Actions:
         if physics.position_noise > 0.0:
             self._noise = torch.zeros_like(x)
         rules = ActionRules(
-            reach=physics.reach,
+            max_displacement=physics.max_displacement,
             dt=physics.dt,
             state_scale=physics.state_scale,
             moving=physics.moving,

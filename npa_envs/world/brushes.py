@@ -107,7 +107,7 @@ def removed(x: Tensor, s: Tensor, *, gone: Tensor) -> tuple[Tensor, Tensor]:
     if len(set(counts)) > 1:
         raise NPAError(
             f"gone must take as many particles from each world, got {shown(counts)}: change one "
-            "world at a time, or set states with erase_state"
+            "world at a time, or set states with wipe_state"
         )
     left = ~gone
     kept = x.shape[1] - counts[0]
@@ -207,7 +207,7 @@ def state_around(
     return mean, holds[:, 0]
 
 
-def erase_state(
+def wipe_state(
     x: Tensor, s: Tensor, *, centre: Tensor, radius: float | Tensor, box: Sides = None
 ) -> Tensor:
     """Return the states with those of the particles inside a ball set to zero.

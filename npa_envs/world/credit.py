@@ -53,7 +53,7 @@ def marginal_gains(
     return gains * gains.shape[1]
 
 
-def settled(gains: Tensor, reward: Tensor) -> Tensor:
+def with_mean_reward(gains: Tensor, reward: Tensor) -> Tensor:
     """Return particles' gains, [B, N], with what they miss of the worlds' rewards, [B], shared."""
     missed = reward - world_mean(gains[..., None])[:, 0]
     return gains + missed[:, None]

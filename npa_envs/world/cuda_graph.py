@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 
-def sent(values: NDArray[Any], device: torch.device) -> Tensor:
+def to_device_async(values: NDArray[Any], device: torch.device) -> Tensor:
     """Return an array as a tensor on a device; the host does not wait for what the device does.
 
     Args:
@@ -148,7 +148,7 @@ def prepare_capture(function: Callable[[], object], device: torch.device) -> Non
         torch.cuda.empty_cache()
 
 
-class Captured:
+class GraphSequence:
     """Work that was recorded: CUDA graphs, one after the other, and what is done between them.
 
     Args:
@@ -206,7 +206,7 @@ class Captured:
 
     def __del__(self) -> None:
         # Freed here, memory would be taken from captures of other threads.
-        Captured.abandoned += self._owns_pool and bool(self._graphs)
+        GraphSequence.abandoned += self._owns_pool and bool(self._graphs)
 
 
 @contextlib.contextmanager
@@ -229,11 +229,11 @@ def _stand_in(graph: torch.cuda.CUDAGraph) -> Iterator[None]:
         own.graphsafe_set_state(state)
 
 
-_capturing: ContextVar[Captured | None] = ContextVar("capturing", default=None)
+_capturing: ContextVar[GraphSequence | None] = ContextVar("capturing", default=None)
 """What this thread records, if anything."""
 
 
-def between_graphs(work: Callable[[], object]) -> None:
+def host_call(work: Callable[[], object]) -> None:
     """Do what cannot be part of a graph: at once, or in a capture between two graphs, each replay.
 
     Args:
@@ -260,10 +260,10 @@ def capture(
     generator: torch.Generator | None = None,
     warm_up: Callable[[], object] | None = None,
     alone: bool = False,
-) -> Captured:
+) -> GraphSequence:
     """Record what a function launches as CUDA graphs, without running it.
 
-    It is one graph, unless the function calls `between_graphs`.
+    It is one graph, unless the function calls `host_call`.
 
     Without a warm-up the host waits for nothing. `torch.cuda.graph` waits for the device, frees the
     allocator's cache and may collect garbage at each capture, which can take longer than the
@@ -288,22 +288,22 @@ def capture(
     """
     with recording_lock, torch.cuda.device(device), plain_tensors():
         stream = _capture_stream(torch.cuda.current_device())
-        if Captured.abandoned >= ABANDONED_POOLS:
+        if GraphSequence.abandoned >= ABANDONED_POOLS:
             # Torch keeps the memory of pools whose graphs are gone, and uses it for nothing else.
-            Captured.abandoned = 0
+            GraphSequence.abandoned = 0
             torch.cuda.empty_cache()
         if warm_up is not None:
             prepare_capture(warm_up, device)
         with contextlib.suppress(torch.OutOfMemoryError):
-            return _recorded(function, stream, Captured(pool, generator, alone=alone))
+            return _recorded(function, stream, GraphSequence(pool, generator, alone=alone))
         # Only here: the error that is gone by now held the memory of the first attempt.
         torch.cuda.empty_cache()
-        return _recorded(function, stream, Captured(pool, generator, alone=alone))
+        return _recorded(function, stream, GraphSequence(pool, generator, alone=alone))
 
 
 def _recorded(
-    function: Callable[[], object], stream: torch.cuda.Stream, captured: Captured
-) -> Captured:
+    function: Callable[[], object], stream: torch.cuda.Stream, captured: GraphSequence
+) -> GraphSequence:
     """Capture a stream while the function runs."""
     current = torch.cuda.current_stream()
     # A capture runs nothing, but for this: torch resets the generators' places on the device, which
@@ -320,7 +320,7 @@ def _recorded(
     return captured
 
 
-def _record(function: Callable[[], object], captured: Captured) -> None:
+def _record(function: Callable[[], object], captured: GraphSequence) -> None:
     """Capture the current stream while the function runs."""
     captured.begin()
     before = _capturing.set(captured)
@@ -376,7 +376,7 @@ class WeakFunction:
         return function
 
 
-class Replayed:
+class GraphedCallable:
     """A function without arguments that is run as it is on a CPU, and as a CUDA graph on CUDA.
 
     Launches of many short kernels would otherwise take longer than the kernels do. The first call
@@ -408,7 +408,7 @@ class Replayed:
         self._recorded = recorded and device.type == "cuda" and can_capture()
         self._pool = pool
         self._warm = False
-        self._graph: Captured | None = None
+        self._graph: GraphSequence | None = None
         self._attempts = 0
 
     def __getstate__(self) -> dict[str, Any]:
@@ -440,7 +440,7 @@ class Replayed:
         self._graph.replay()
 
 
-class Beside:
+class SideStream:
     """Work on a stream of its own, beside what the current stream does meanwhile.
 
     Args:
@@ -454,21 +454,21 @@ class Beside:
 
     @staticmethod
     @functools.lru_cache(maxsize=64)
-    def of_thread(device: torch.device, thread: int) -> Beside:
+    def of_thread(device: torch.device, thread: int) -> SideStream:
         """Return the one of a thread, for captures: torch has 32 streams, which it gives in turn.
 
         Args:
             device: A CUDA device.
             thread: The thread's identifier.
         """
-        return Beside(device)
+        return SideStream(device)
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Pickle the device alone: streams and events are a process's own."""
-        return Beside, (self._device,)
+        return SideStream, (self._device,)
 
     @contextlib.contextmanager
-    def aside(self) -> Iterator[None]:
+    def overlap(self) -> Iterator[None]:
         """What is launched inside begins once the current stream has done its work so far."""
         self._begin.record(current_stream(self._device))
         self._stream.wait_event(self._begin)

@@ -30,7 +30,7 @@ PARKING_GAP = 2.5
 class Births(NamedTuple):
     """What a step draws where particles divide."""
 
-    chance: Tensor
+    uniform: Tensor
     """Decides on each particle's fate, uniform in [0, 1), shape [B, N]."""
     direction: Tensor
     """Where the child of a particle goes, standard normal, shape [B, N, D]."""
@@ -68,7 +68,7 @@ def divided(
     s: Tensor,
     path_length: Tensor,
     *,
-    fates: tuple[Tensor, Tensor],
+    division_probabilities: tuple[Tensor, Tensor],
     updated: Tensor,
     births: Births,
     eps: float,
@@ -93,7 +93,7 @@ def divided(
         x: Positions after the update [length units], shape [B, N, D].
         s: States after it, dimensionless, shape [B, N, C].
         path_length: How far each particle travelled [length units], shape [B, N]; of children 0.
-        fates: Probabilities of each particle to divide and to die, shape [B, N] each.
+        division_probabilities: Of each particle to divide and to die, shape [B, N] each.
         updated: Which living particles were updated, bool, shape [B, N].
         births: What was drawn.
         eps: Perception radius [length units].
@@ -103,9 +103,9 @@ def divided(
     """
     count, space_dim = x.shape[1:]
     alive = living(s)
-    divide, die = fates
-    dividing = updated & (births.chance < divide.detach())
-    dying = updated & (births.chance >= 1.0 - die.detach())
+    divide, die = division_probabilities
+    dividing = updated & (births.uniform < divide.detach())
+    dying = updated & (births.uniform >= 1.0 - die.detach())
     dying &= (alive & ~dying).any(dim=1, keepdim=True)
 
     # The k-th child of a world has rank k - 1, and so has the k-th dead slot.

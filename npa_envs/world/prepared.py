@@ -20,7 +20,7 @@ from torch.utils._python_dispatch import is_in_torch_dispatch_mode
 from npa_envs.ops.launch import LaunchTape
 from npa_envs.ops.sort import sorts_at_once
 from npa_envs.rule.network import Network
-from npa_envs.world.recorded import LAUNCHED_FIRST, CallKind, Worlds, counted
+from npa_envs.world.recorded import LAUNCHED_FIRST, CallKind, Particles, counted
 
 LARGEST_TOTAL = 4096
 """Particles of all worlds, at most: larger ones hide what is saved."""
@@ -29,7 +29,7 @@ MOST_KINDS = 32
 """Kinds of calls that are remembered."""
 
 
-Advance = Callable[[Network, Worlds, Tensor | None], Worlds]
+Advance = Callable[[Network, Particles, Tensor | None], Particles]
 """Launches one step of worlds with an update mask, [B, N], and a network."""
 
 
@@ -72,13 +72,13 @@ class PreparedSteps:
     """
 
     def __init__(
-        self, advance: Advance, worlds: Worlds, row_width: int, update_width: int, masked: bool
+        self, advance: Advance, worlds: Particles, row_width: int, update_width: int, masked: bool
     ) -> None:
         # With all particles active there is a row for each.
         self._mask = torch.ones(worlds.x.shape[:2], dtype=torch.uint8) if masked else None
         # Whatever the strides of the worlds: what is made contiguous in a step is on no tape.
         dense = torch.contiguous_format
-        here = Worlds(*(torch.empty_like(v, memory_format=dense).copy_(v) for v in worlds))
+        here = Particles(*(torch.empty_like(v, memory_format=dense).copy_(v) for v in worlds))
         there, after = self._record(advance, here, row_width, update_width)
         back, last = self._record(advance, after, row_width, update_width)
         for old, new in zip(last, here, strict=True):
@@ -87,8 +87,8 @@ class PreparedSteps:
         self._steps = there, back
 
     def _record(
-        self, advance: Advance, worlds: Worlds, row_width: int, update_width: int
-    ) -> tuple[_Step, Worlds]:
+        self, advance: Advance, worlds: Particles, row_width: int, update_width: int
+    ) -> tuple[_Step, Particles]:
         tape = LaunchTape()
         stand = _Stand(tape, row_width, update_width)
         with tape.recording():
@@ -98,14 +98,14 @@ class PreparedSteps:
     def run(
         self,
         network: Network,
-        worlds: Worlds,
+        worlds: Particles,
         masks: Iterable[Tensor | None],
         keep: Callable[[int], bool],
-    ) -> list[Worlds]:
+    ) -> list[Particles]:
         """Step worlds once with each mask; return copies of those to keep, by the steps done."""
         for place, value in zip(self._places[0], worlds, strict=True):
             place.copy_(value)
-        kept: list[Worlds] = []
+        kept: list[Particles] = []
         for number, mask in enumerate(masks):
             step = self._steps[number % 2]
             count = len(step.rows)
@@ -119,7 +119,7 @@ class PreparedSteps:
             step.tape.replay(step.split)
             if keep(number + 1):
                 after = self._places[(number + 1) % 2]
-                kept.append(Worlds(*(value.clone() for value in after)))
+                kept.append(Particles(*(value.clone() for value in after)))
         return kept
 
 
@@ -129,7 +129,7 @@ _kinds: collections.OrderedDict[Hashable, CallKind[PreparedSteps]] = collections
 _lock = threading.Lock()
 
 
-def may_prepare(worlds: Worlds) -> bool:
+def may_prepare(worlds: Particles) -> bool:
     """Return whether steps of worlds may be prepared: small, on a CPU, without gradients."""
     x, s, _ = worlds
     return (
@@ -147,8 +147,8 @@ def may_prepare(worlds: Worlds) -> bool:
 def run_prepared(
     key: Hashable,
     make: Callable[[], PreparedSteps],
-    run: Callable[[PreparedSteps], list[Worlds]],
-) -> list[Worlds] | None:
+    run: Callable[[PreparedSteps], list[Particles]],
+) -> list[Particles] | None:
     """Run prepared steps; None where calls of this kind are too few so far.
 
     Args:

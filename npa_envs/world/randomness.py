@@ -19,10 +19,10 @@ from npa_envs.ops.draws import bernoulli_draw, integer_draw, normal_draw, unifor
 from npa_envs.ops.sort import LARGEST_INDEX
 
 
-class Purpose(enum.IntEnum):
+class StreamId(enum.IntEnum):
     """What this package draws beside a world's own stream, each kind from streams of its own.
 
-    Numbers below 1000 are the package's; take others for `WorldRandom.beside` in your own code.
+    Numbers below 1000 are the package's; take others for `WorldRandom.substream` in your own code.
     """
 
     GROWTH = 1
@@ -149,14 +149,14 @@ class WorldRandom:
         made._draw_count = self._draw_count
         return made
 
-    def beside(self, purpose: int) -> WorldRandom:
+    def substream(self, purpose: int) -> WorldRandom:
         """Return streams beside these, independent of them and of those of other purposes.
 
         They stand where these stand now and go on by themselves. Their draws begin anew, so made
         twice within a step they give the same numbers twice. Nothing is drawn from these.
 
         Args:
-            purpose: Any integer of at least 0; the package's own are `Purpose`.
+            purpose: Any integer of at least 0; the package's own are `StreamId`.
 
         Raises:
             NPAError: It is none.
@@ -181,7 +181,7 @@ class WorldRandom:
         self.steps[worlds] = other.steps
         self._draw_count = max(self._draw_count, other._draw_count)
 
-    def follow(self, other: WorldRandom, steps: int) -> None:
+    def sync_with(self, other: WorldRandom, steps: int) -> None:
         """Go on where other streams stand that began where these do, in place.
 
         Args:

@@ -31,7 +31,7 @@ from npa_envs.errors import NPAError, shown
 from npa_envs.ops.opaque import once_differentiable
 from npa_envs.rule.rule import NPARule
 from npa_envs.world.cuda_graph import (
-    Captured,
+    GraphSequence,
     can_capture,
     capture,
     current_stream,
@@ -77,7 +77,7 @@ WARM_UP_STEPS = 4
 logger = logging.getLogger(__name__)
 
 
-class Worlds(NamedTuple):
+class Particles(NamedTuple):
     """Worlds between two steps of a rollout."""
 
     x: Tensor
@@ -88,7 +88,7 @@ class Worlds(NamedTuple):
     """Length of each particle's path so far [length units], shape [B, N]."""
 
 
-class Call(Protocol):
+class Rollout(Protocol):
     """What a checked call asks for besides its tensors; hashable, a named tuple."""
 
     @property
@@ -102,10 +102,10 @@ class Call(Protocol):
     def run(
         self,
         rules: Sequence[NPARule],
-        worlds: Worlds,
+        worlds: Particles,
         generator: Randomness | None,
         watch: DivergenceWatch | None = None,
-    ) -> Worlds:
+    ) -> Particles:
         """Launch the rollout."""
 
     def _replace(self, *, steps: int = ..., keep_every: int | None = ...) -> Self:
@@ -123,7 +123,7 @@ def check_cuda_graph(cuda_graph: CudaGraph) -> None:
 
 
 def run_call(
-    call: Call,
+    call: Rollout,
     rules: Sequence[NPARule],
     x: Tensor,
     s: Tensor,
@@ -131,7 +131,7 @@ def run_call(
     *,
     cuda_graph: CudaGraph,
     watch: DivergenceWatch | None,
-) -> Worlds:
+) -> Particles:
     """Run a checked rollout: recorded where that can be, launched otherwise; the same numbers.
 
     Args:
@@ -155,7 +155,7 @@ def run_call(
     if x.is_cuda and torch.is_grad_enabled():
         # Gradients are added up as a recording adds them: first those of this rollout.
         x, s = x.view_as(x), s.view_as(s)
-    return call.run(rules, Worlds(x, s, x.new_zeros(x.shape[:2])), generator, watch)
+    return call.run(rules, Particles(x, s, x.new_zeros(x.shape[:2])), generator, watch)
 
 
 def recorded_memory(device: torch.device) -> int:
@@ -173,7 +173,7 @@ def release_recordings() -> None:
     torch.cuda.empty_cache()
 
 
-def _can_record(call: Call, x: Tensor) -> bool:
+def _can_record(call: Rollout, x: Tensor) -> bool:
     # Asked in this order: a compiler cannot trace what a stream does.
     if not x.is_cuda or torch.compiler.is_compiling() or call.steps == 0:
         return False
@@ -302,10 +302,10 @@ class _Lease:
 
 
 class _Graphs(NamedTuple):
-    forward: Captured
+    forward: GraphSequence
     worlds: list[Tensor]
     """Where its rollout leaves worlds."""
-    backward: Captured | None
+    backward: GraphSequence | None
     gradients: list[Tensor]
     """Where its backward pass leaves gradients, of those inputs that have one."""
     written: list[int]
@@ -320,7 +320,7 @@ class _Recording:
 
     def __init__(
         self,
-        call: Call,
+        call: Rollout,
         rules: Sequence[NPARule],
         x: Tensor,
         s: Tensor,
@@ -472,12 +472,12 @@ class _Recording:
             self._bars[count] = [tensor.new_zeros(*first, *tensor.shape) for tensor in worlds]
         return self._bars[count]
 
-    def _warm_up(self, call: Call) -> None:
+    def _warm_up(self, call: Rollout) -> None:
         results = self._run(call, [])
         if self.differentiable:
             self._pull_back(results, [torch.zeros_like(result) for result in results])
 
-    def _run(self, call: Call, kept: list[Tensor]) -> Worlds:
+    def _run(self, call: Rollout, kept: list[Tensor]) -> Particles:
         """Launch a rollout; what its backward pass reads is kept."""
 
         def keep(tensor: Tensor) -> Tensor:
@@ -487,7 +487,7 @@ class _Recording:
         generator = self._generator if self._streams is None else self._streams
         hooks = torch.autograd.graph.saved_tensors_hooks(keep, lambda tensor: tensor)
         with torch.set_grad_enabled(self.differentiable), hooks:
-            return call.run(self._rules, Worlds(*self._inputs[:3]), generator)
+            return call.run(self._rules, Particles(*self._inputs[:3]), generator)
 
     def _pull_back(self, results: Sequence[Tensor], bars: list[Tensor]) -> list[Tensor]:
         """Launch the backward pass; return the gradients that are wanted."""
@@ -549,7 +549,7 @@ class _Recording:
         """Let the caller's streams of draws go on where the rollout's ended."""
         if self._streams is not None:
             assert isinstance(generator, WorldRandom)
-            generator.follow(self._streams, steps)
+            generator.sync_with(self._streams, steps)
 
     def leave_draws(self, generator: Randomness | None, steps: int) -> None:
         """Let the caller's source of draws go on where the rollout began."""
@@ -639,14 +639,14 @@ def _forget(key: Hashable) -> None:
 
 
 def _run_recorded(
-    call: Call,
+    call: Rollout,
     rules: Sequence[NPARule],
     x: Tensor,
     s: Tensor,
     generator: Randomness | None,
     *,
     asked: bool,
-) -> Worlds | None:
+) -> Particles | None:
     """Run a rollout by replaying it; None where it is to be launched.
 
     Args:
@@ -685,12 +685,12 @@ def _run_recorded(
 
 
 def _replay_blocks(
-    call: Call,
+    call: Rollout,
     lease: _Lease,
     blocks: Sequence[int],
     tensors: Sequence[Tensor],
     generator: Randomness | None,
-) -> Worlds:
+) -> Particles:
     """Replay the graphs of a rollout one after the other; what the network writes is written.
 
     Raises:
@@ -700,7 +700,7 @@ def _replay_blocks(
     recording = lease.recording
     given = [x, s, recording.no_path, *weights]
     recording.ready.record(current_stream(x.device))
-    found: list[Worlds] = []
+    found: list[Particles] = []
     for steps in blocks:
         after = _replay(lease, steps, given, generator)
         if not found:
@@ -713,22 +713,22 @@ def _replay_blocks(
         recording.end_draws(generator, steps)
         recording.write_back(steps, given)
         found.append(after)
-        last = after if call.keep_every is None else Worlds(*(value[-1] for value in after))
+        last = after if call.keep_every is None else Particles(*(value[-1] for value in after))
         given[:3] = last
     if len(found) == 1:
         return found[0]
-    return last if call.keep_every is None else Worlds(*map(torch.cat, zip(*found, strict=True)))
+    return last if call.keep_every is None else Particles(*map(torch.cat, zip(*found, strict=True)))
 
 
 def _compared(
-    call: Call,
+    call: Rollout,
     rules: Sequence[NPARule],
     kind: _RecordedKind,
     lease: _Lease,
     blocks: Sequence[int],
     tensors: Sequence[Tensor],
     generator: Randomness | None,
-) -> Worlds:
+) -> Particles:
     """Launch a rollout, and compare it with its replay: Python code may read what nobody sees.
 
     Calls of a kind whose replay gives other numbers are launched from then on.
@@ -745,7 +745,7 @@ def _compared(
         shared = torch_generator(generator, x.device)
         source = torch.Generator(x.device).manual_seed(shared.initial_seed())
         source.set_offset(shared.get_offset())
-    worlds = Worlds(x.view_as(x), s.view_as(s), x.new_zeros(x.shape[:2]))
+    worlds = Particles(x.view_as(x), s.view_as(s), x.new_zeros(x.shape[:2]))
     launched = call.run(rules, worlds, generator)
     with torch.no_grad():
         replayed = _replay_blocks(call, lease, blocks, [x, s, *own], source)
@@ -772,7 +772,7 @@ def _refuse(kind: _RecordedKind, reason: object, *, asked: bool) -> None:
         kind.free.clear()
 
 
-def _blocks(call: Call) -> list[int]:
+def _blocks(call: Rollout) -> list[int]:
     """Return the steps of the graphs that are replayed one after the other, without gradients."""
     kept = call.keep_every or 1
     block = max(BLOCK_STEPS // kept, 1) * kept
@@ -838,18 +838,18 @@ def _make_room(device: torch.device) -> bool:
 
 def _replay(
     lease: _Lease, steps: int, tensors: Sequence[Tensor], generator: Randomness | None
-) -> Worlds:
+) -> Particles:
     """Replay a rollout from worlds, with weights; differentiable where that was recorded."""
     recording = lease.recording
     if not recording.differentiable:
-        return Worlds(*recording.forward(steps, tensors, generator))
+        return Particles(*recording.forward(steps, tensors, generator))
     # The lease stands for what is saved, so it ends when autograd drops that: after a backward
     # pass, unless the graph is retained, or with the last result.
     hooks = torch.autograd.graph.saved_tensors_hooks(
         lambda _: lease, lambda saved: saved.recording.token
     )
     with hooks:
-        return Worlds(*_Replayed.apply(recording, steps, generator, *tensors))  # type: ignore[no-untyped-call]
+        return Particles(*_Replayed.apply(recording, steps, generator, *tensors))  # type: ignore[no-untyped-call]
 
 
 class _Replayed(torch.autograd.Function):

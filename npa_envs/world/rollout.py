@@ -38,14 +38,14 @@ from npa_envs.world.randomness import (
     check_generator,
 )
 from npa_envs.world.recomputed import RecomputedSteps
-from npa_envs.world.recorded import CudaGraph, Worlds, check_cuda_graph, rule_form, run_call
+from npa_envs.world.recorded import CudaGraph, Particles, check_cuda_graph, rule_form, run_call
 from npa_envs.world.steps import (
     DivisionStep,
     RuleStep,
     Step,
     StepOptions,
-    leave_out_draws,
     rule_terms,
+    skip_draws,
 )
 
 Memory = Literal["store", "recompute", "minimal"]
@@ -156,7 +156,7 @@ _known_numbers = functools.lru_cache(maxsize=256, typed=True)(_checked_numbers)
 def run_steps(
     step: Step,
     rules: Sequence[NPARule],
-    worlds: Worlds,
+    worlds: Particles,
     steps: int,
     *,
     generator: Randomness | None,
@@ -164,7 +164,7 @@ def run_steps(
     keep_every: int | None = None,
     watch: DivergenceWatch | None = None,
     with_modules: bool = False,
-) -> Worlds:
+) -> Particles:
     """Repeat a step on checked worlds; return them in the caller's order.
 
     Args:
@@ -183,7 +183,7 @@ def run_steps(
         DivergedError: The watch has seen a world diverge.
     """
     interval = STORED_INTERVAL[memory] if torch.is_grad_enabled() else 1
-    kept: list[Worlds] = []
+    kept: list[Particles] = []
     # While a graph is recorded, torch's state cannot be read, and its draws are the graph's.
     recorded = worlds.x.is_cuda and torch.cuda.is_current_stream_capturing()
     redraw = with_modules and not recorded
@@ -209,7 +209,7 @@ def run_steps(
                 mask, noise, rows, births = draws
                 worlds = step.advance(*worlds, mask, noise, rows, births)
             if watch is not None:
-                seen = step.ordered(Worlds(*(value.detach() for value in worlds)))
+                seen = step.ordered(Particles(*(value.detach() for value in worlds)))
                 watch.look(seen.x, seen.s)
             if keep_every is not None and (number + 1) % keep_every == 0:
                 kept.append(step.ordered(worlds))
@@ -217,11 +217,11 @@ def run_steps(
             again.end_forward()
         if steps == 0:
             # What is returned is the caller's to write to.
-            worlds = Worlds(*(value.clone() for value in worlds))
+            worlds = Particles(*(value.clone() for value in worlds))
         if keep_every is None:
             worlds = step.ordered(worlds)
         else:
-            worlds = Worlds(*map(torch.stack, zip(*kept, strict=True)))
+            worlds = Particles(*map(torch.stack, zip(*kept, strict=True)))
     if watch is not None:
         watch.raise_diverged()
     return worlds
@@ -238,10 +238,10 @@ class RolloutCall(NamedTuple):
     def run(
         self,
         rules: Sequence[NPARule],
-        worlds: Worlds,
+        worlds: Particles,
         generator: Randomness | None,
         watch: DivergenceWatch | None = None,
-    ) -> Worlds:
+    ) -> Particles:
         """Launch the rollout of one rule."""
         (rule,) = rules
         options = self.options.constants()
@@ -259,7 +259,7 @@ class RolloutCall(NamedTuple):
             if prepared is not None:
                 return prepared
         if static is not None:
-            worlds = Worlds(*map(static.sort, worlds))
+            worlds = Particles(*map(static.sort, worlds))
         if rule.divides:
             # What lies in dead slots must not reach gradients either: 0 times NaN is NaN.
             blank = torch.where(living(worlds.s)[..., None], worlds.s, 0.0)
@@ -278,15 +278,15 @@ class RolloutCall(NamedTuple):
         )
 
     def _run_prepared(
-        self, rule: NPARule, network: Network, worlds: Worlds, generator: Randomness | None
-    ) -> Worlds | None:
+        self, rule: NPARule, network: Network, worlds: Particles, generator: Randomness | None
+    ) -> Particles | None:
         """Run the rollout by prepared steps; None where it is to be launched."""
         options, steps, every = self.options, self.steps, self.keep_every or self.steps
         if options.position_noise > 0.0 or steps == 0:
             return None
         x, s, _ = worlds
 
-        def advance(network: Network, worlds: Worlds, mask: Tensor | None) -> Worlds:
+        def advance(network: Network, worlds: Particles, mask: Tensor | None) -> Particles:
             step = RuleStep(rule, network, options)
             return step.advance(*worlds, mask, None, None, None)
 
@@ -294,7 +294,7 @@ class RolloutCall(NamedTuple):
             widths = network.row_width, network.update_width
             return PreparedSteps(advance, worlds, *widths, options.update_prob < 1.0)
 
-        def run(prepared: PreparedSteps) -> list[Worlds]:
+        def run(prepared: PreparedSteps) -> list[Particles]:
             draws = RuleStep(rule, network, options).draws(x, steps, generator)
             with torch.autocast("cpu", enabled=False):
                 return prepared.run(
@@ -307,7 +307,7 @@ class RolloutCall(NamedTuple):
             return None
         if self.keep_every is None:
             return kept[0]
-        return Worlds(*map(torch.stack, zip(*kept, strict=True)))
+        return Particles(*map(torch.stack, zip(*kept, strict=True)))
 
 
 def _stays(rule: NPARule, steps: int, options: StepOptions) -> bool:
@@ -331,7 +331,9 @@ def _check_one_species(rule: NPARule) -> None:
         )
 
 
-def _resting(rule: NPARule, worlds: Worlds, options: StepOptions, cuda_graph: CudaGraph) -> Tensor:
+def _resting(
+    rule: NPARule, worlds: Particles, options: StepOptions, cuda_graph: CudaGraph
+) -> Tensor:
     """Return which worlds stay as they are if all particles are updated, bool, shape [B]."""
     call = RolloutCall(1, options._replace(update_prob=1.0), "store", None)
     x, s, _ = worlds
@@ -358,10 +360,10 @@ def _may_rest(call: RolloutCall, rule: NPARule, x: Tensor) -> bool:
 def _run_until_rest(
     call: RolloutCall,
     rule: NPARule,
-    worlds: Worlds,
+    worlds: Particles,
     generator: Randomness | None,
     cuda_graph: CudaGraph,
-) -> Worlds:
+) -> Particles:
     """Run a rollout in parts, and leave out what comes when all worlds are at rest."""
     left, part = call.steps, FIRST_PART[worlds.x.device.type]
     while left and not _resting(rule, worlds, call.options, cuda_graph).all():
@@ -373,9 +375,9 @@ def _run_until_rest(
             # A world has diverged, which the next call refuses, and not this one.
             return call._replace(steps=left).run((rule,), worlds, generator)
     # Whoever draws next gets what comes after all steps.
-    leave_out_draws(worlds.x, call.options, left, generator)
+    skip_draws(worlds.x, call.options, left, generator)
     # What is returned is the caller's to write to.
-    return Worlds(*(value.clone() for value in worlds)) if left == call.steps else worlds
+    return Particles(*(value.clone() for value in worlds)) if left == call.steps else worlds
 
 
 def checked_keep_every(keep_every: int | None, steps: int) -> int | None:
@@ -470,7 +472,7 @@ def at_rest(
         )
     _check_one_species(rule)
     options = checked_options(rule, x, s, eps, box, 1.0, dt, 0.0, True)
-    return _resting(rule, Worlds(x, s, x.new_zeros(x.shape[:2])), options, "auto")
+    return _resting(rule, Particles(x, s, x.new_zeros(x.shape[:2])), options, "auto")
 
 
 @overload
@@ -592,7 +594,7 @@ def rollout(
     call = RolloutCall(steps, options, memory, kept)
     watch = make_watch(on_divergence, x, s)
     if watch is None and not return_path_length and _may_rest(call, rule, x):
-        worlds = Worlds(x, s, x.new_zeros(x.shape[:2]))
+        worlds = Particles(x, s, x.new_zeros(x.shape[:2]))
         after = _run_until_rest(call, rule, worlds, generator, cuda_graph)
     else:
         after = run_call(call, (rule,), x, s, generator, cuda_graph=cuda_graph, watch=watch)

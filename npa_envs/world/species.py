@@ -20,7 +20,7 @@ from npa_envs.rule.rule import NPARule
 from npa_envs.world.divergence import DivergenceWatch, OnDivergence, make_watch
 from npa_envs.world.division import Births
 from npa_envs.world.randomness import Randomness, WorldRandom, check_generator
-from npa_envs.world.recorded import CudaGraph, Worlds, check_cuda_graph, run_call
+from npa_envs.world.recorded import CudaGraph, Particles, check_cuda_graph, run_call
 from npa_envs.world.rollout import (
     Memory,
     RolloutOptions,
@@ -212,23 +212,23 @@ class SpeciesCall(NamedTuple):
     keep_every: int | None
     counts: tuple[int, ...]
     density_counts: tuple[float, ...]
-    told_apart: bool
+    by_species: bool
 
     def run(
         self,
         rules: Sequence[NPARule],
-        worlds: Worlds,
+        worlds: Particles,
         generator: Randomness | None,
         watch: DivergenceWatch | None = None,
-    ) -> Worlds:
+    ) -> Particles:
         """Launch the rollout."""
-        community = make_community(
+        community = make_species_step(
             rules,
             self.counts,
             [own.constants() for own in self.options],
             self.density_counts,
             worlds.x,
-            told_apart=self.told_apart,
+            by_species=self.by_species,
         )
         return run_steps(
             community,
@@ -336,16 +336,16 @@ class Species(NamedTuple):
     """Particles of a world over those by which this species divides densities."""
 
 
-class Community(NamedTuple):
+class SpeciesStep(NamedTuple):
     """The step of several rules in one world: a common perception pass, then rule by rule."""
 
     species: list[Species]
     counts: tuple[int, ...]
     options: StepOptions
     """With the largest update probability, and the largest reach."""
-    keep: Tensor | None
+    update_share: Tensor | None
     """Share of the updates so drawn that each particle keeps, shape [N]; None: all keep all."""
-    told_apart: bool
+    by_species: bool
     """Rules perceive each species' density and density gradient."""
 
     def draws(self, x: Tensor, steps: int, generator: Randomness | None) -> Iterator[Draws]:
@@ -355,13 +355,13 @@ class Community(NamedTuple):
 
     def _draw(self, x: Tensor, generator: Randomness | None) -> Draws:
         mask, noise, *_ = draw_step(x, self.options, generator)
-        if self.keep is None:
+        if self.update_share is None:
             return Draws(mask, noise)
         if isinstance(generator, WorldRandom):
             drawn = generator.uniform(x.shape[1])
         else:
             drawn = torch.rand(x.shape[:2], device=x.device, generator=generator)
-        kept = (drawn < self.keep).to(torch.uint8)
+        kept = (drawn < self.update_share).to(torch.uint8)
         return Draws(kept if mask is None else mask * kept, noise)
 
     def advance(
@@ -373,13 +373,13 @@ class Community(NamedTuple):
         noise: Tensor | None,
         rows: StaticRows | None,
         births: Births | None,
-    ) -> Worlds:
+    ) -> Particles:
         """Advance checked worlds by one step whose random draws are given."""
         species, options = self.species, self.options
         first = species[0].rule
         shared_dim = rule_terms(first).perception_dim(first.space_dim, first.state_dim)
         shared_width = shared_dim
-        if not self.told_apart:
+        if not self.by_species:
             # A folded rule's own row: a one follows the perception vector, then zeros.
             shared_width = max(
                 own.network.row_width if own.network else shared_dim for own in species
@@ -396,7 +396,7 @@ class Community(NamedTuple):
             terms=rule_terms(first),
         )
         appended = None
-        if self.told_apart:
+        if self.by_species:
             appended = perceive_by_species(
                 x, self.counts, eps=options.eps, eps0=options.eps0, box=options.box
             )
@@ -422,34 +422,34 @@ class Community(NamedTuple):
         update = perception.new_zeros(row_count + 1, width).index_copy(
             0, torch.cat(places), torch.cat([output[:, :width] for output in outputs])
         )
-        return Worlds(
+        return Particles(
             *update_particles(
                 update[:row_count],
                 x if noise is None else x + noise,
                 s,
                 path_length,
                 rows=active,
-                reach=options.reach,
+                max_displacement=options.max_displacement,
                 dt=options.dt,
                 moving=not first.static,
                 box=options.box,
             )
         )
 
-    def ordered(self, worlds: Worlds) -> Worlds:
+    def ordered(self, worlds: Particles) -> Particles:
         """Return the worlds: they are in the caller's order."""
         return worlds
 
 
-def make_community(
+def make_species_step(
     rules: Sequence[NPARule],
     counts: tuple[int, ...],
     options: Sequence[StepOptions],
     density_counts: tuple[float, ...],
     x: Tensor,
     *,
-    told_apart: bool,
-) -> Community:
+    by_species: bool,
+) -> SpeciesStep:
     """Return what stays the same over a rollout of checked worlds.
 
     Args:
@@ -458,7 +458,7 @@ def make_community(
         options: What each species' particles are told.
         density_counts: Particles by which each species divides densities.
         x: Positions [length units], shape [B, N, D].
-        told_apart: Rules perceive each species' density and density gradient.
+        by_species: Rules perceive each species' density and density gradient.
     """
     species = []
     first = 0
@@ -478,19 +478,21 @@ def make_community(
         first += count
     probabilities = [own.update_prob for own in options]
     highest = max(probabilities)
-    keep = None
+    update_share = None
     if min(probabilities) < highest:
-        keep = torch.cat(
+        update_share = torch.cat(
             [
                 torch.full((count,), chance / highest, device=x.device)
                 for count, chance in zip(counts, probabilities, strict=True)
             ]
         )
-    shared = options[0]._replace(update_prob=highest, reach=max(own.reach for own in options))
-    return Community(species, counts, shared, keep, told_apart)
+    shared = options[0]._replace(
+        update_prob=highest, max_displacement=max(own.max_displacement for own in options)
+    )
+    return SpeciesStep(species, counts, shared, update_share, by_species)
 
 
-def _row_total(community: Community, x: Tensor, mask: Tensor | None) -> int:
+def _row_total(community: SpeciesStep, x: Tensor, mask: Tensor | None) -> int:
     """Return how many rows hold the active particles of all species."""
     total = x.shape[0] * x.shape[1]
     if mask is None:

@@ -21,7 +21,7 @@ from npa_envs.ops.static import StaticRows, StaticWorlds, static_rows
 from npa_envs.ops.update import update_particles
 from npa_envs.rule.network import Network
 from npa_envs.rule.rule import LIFE, NPARule
-from npa_envs.world.cuda_graph import Beside
+from npa_envs.world.cuda_graph import SideStream
 from npa_envs.world.division import Births, divided, living, parked
 from npa_envs.world.randomness import (
     Randomness,
@@ -31,7 +31,7 @@ from npa_envs.world.randomness import (
     torch_generator,
     uniform_draws,
 )
-from npa_envs.world.recorded import Worlds
+from npa_envs.world.recorded import Particles
 
 ROWS_TOGETHER = 2**24
 """Rows of static worlds that are given together, at most, if they are of several steps."""
@@ -57,7 +57,7 @@ class StepOptions(NamedTuple):
     detach_positions: bool
     eps0: float
     """Radius at which the rule was trained [length units]."""
-    reach: float
+    max_displacement: float
     """Largest displacement alpha eps in a unit of time [length units]."""
 
     def constants(self) -> StepOptions:
@@ -72,7 +72,7 @@ class StepOptions(NamedTuple):
             constant(self.position_noise),
             self.detach_positions,
             constant(self.eps0),
-            constant(self.reach),
+            constant(self.max_displacement),
         )
 
 
@@ -135,7 +135,7 @@ def draw_step(x: Tensor, options: StepOptions, generator: Randomness | None) -> 
     return Draws(mask, noise)
 
 
-def drawn_steps(draw: Callable[[], Draws], like: Tensor, steps: int) -> Iterator[Draws]:
+def iterate_draws(draw: Callable[[], Draws], like: Tensor, steps: int) -> Iterator[Draws]:
     """Yield what each of some steps draws, in the same order everywhere.
 
     In a CUDA graph some steps' draws are made while the steps before them run.
@@ -151,22 +151,20 @@ def drawn_steps(draw: Callable[[], Draws], like: Tensor, steps: int) -> Iterator
         for _ in range(steps):
             yield draw()
         return
-    beside = Beside.of_thread(like.device, threading.get_ident())
+    side_stream = SideStream.of_thread(like.device, threading.get_ident())
     ready, rest = [draw()], steps - 1
     while rest > 0:
         # Their memory comes from steps that are over by then: these streams take turns in it.
         count = min(3 * len(ready), MOST_AHEAD, rest)
-        with beside.aside():
+        with side_stream.overlap():
             coming = [draw() for _ in range(count)]
         yield from ready
-        beside.join()
+        side_stream.join()
         ready, rest = coming, rest - count
     yield from ready
 
 
-def leave_out_draws(
-    x: Tensor, options: StepOptions, steps: int, generator: Randomness | None
-) -> None:
+def skip_draws(x: Tensor, options: StepOptions, steps: int, generator: Randomness | None) -> None:
     """Bring a source of draws to where it would be after some steps of worlds at x.
 
     Args:
@@ -211,10 +209,10 @@ class Step(Protocol):
         noise: Tensor | None,
         rows: StaticRows | None,
         births: Births | None,
-    ) -> Worlds:
+    ) -> Particles:
         """Return the worlds after one step with these draws."""
 
-    def ordered(self, worlds: Worlds) -> Worlds:
+    def ordered(self, worlds: Particles) -> Particles:
         """Return worlds of the rollout in the caller's order of particles."""
 
 
@@ -231,7 +229,7 @@ class RuleStep(NamedTuple):
     def draws(self, x: Tensor, steps: int, generator: Randomness | None) -> Iterator[Draws]:
         """Draw each step's update mask and position noise."""
         if self.static is None:
-            yield from drawn_steps(lambda: draw_step(x, self.options, generator), x, steps)
+            yield from iterate_draws(lambda: draw_step(x, self.options, generator), x, steps)
             return
         # The rows of static worlds are given some steps at a time, in few launches.
         total = x.shape[0] * x.shape[1]
@@ -255,7 +253,7 @@ class RuleStep(NamedTuple):
         noise: Tensor | None,
         rows: StaticRows | None,
         births: Births | None,
-    ) -> Worlds:
+    ) -> Particles:
         """Return the worlds after one step with these draws."""
         rule, options = self.rule, self.options
         network = rule if self.network is None else self.network
@@ -283,23 +281,23 @@ class RuleStep(NamedTuple):
                 static_rows=rows,
             )
             update = network(perception)
-        return Worlds(
+        return Particles(
             *update_particles(
                 update,
                 x if noise is None else x + noise,
                 s,
                 path_length,
                 rows=active,
-                reach=options.reach,
+                max_displacement=options.max_displacement,
                 dt=options.dt,
                 moving=not rule.static,
                 box=options.box,
             )
         )
 
-    def ordered(self, worlds: Worlds) -> Worlds:
+    def ordered(self, worlds: Particles) -> Particles:
         """Return worlds of the rollout in the caller's order of particles."""
-        return worlds if self.static is None else Worlds(*map(self.static.unsort, worlds))
+        return worlds if self.static is None else Particles(*map(self.static.unsort, worlds))
 
 
 class DivisionStep(NamedTuple):
@@ -310,7 +308,7 @@ class DivisionStep(NamedTuple):
 
     def draws(self, x: Tensor, steps: int, generator: Randomness | None) -> Iterator[Draws]:
         """Draw each step's update mask, position noise, fates and directions of children."""
-        yield from drawn_steps(lambda: self._draw(x, generator), x, steps)
+        yield from iterate_draws(lambda: self._draw(x, generator), x, steps)
 
     def _draw(self, x: Tensor, generator: Randomness | None) -> Draws:
         drawn = draw_step(x, self.step.options, generator)
@@ -326,7 +324,7 @@ class DivisionStep(NamedTuple):
         noise: Tensor | None,
         rows: StaticRows | None,
         births: Births | None,
-    ) -> Worlds:
+    ) -> Particles:
         """Return the worlds after one step with these draws."""
         assert births is not None, "drawn above"
         eps = self.step.options.eps
@@ -340,18 +338,18 @@ class DivisionStep(NamedTuple):
         )
         # A rule does not change life.
         new_s = torch.cat((life, after.s[..., LIFE + 1 :]), dim=-1)
-        return Worlds(
+        return Particles(
             *divided(
                 after.x,
                 new_s,
                 after.path_length,
-                fates=self.step.rule.fates(new_s),
+                division_probabilities=self.step.rule.division_probabilities(new_s),
                 updated=updated,
                 births=births,
                 eps=eps,
             )
         )
 
-    def ordered(self, worlds: Worlds) -> Worlds:
+    def ordered(self, worlds: Particles) -> Particles:
         """Return worlds of the rollout in the caller's order of particles."""
         return worlds

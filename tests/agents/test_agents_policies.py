@@ -336,7 +336,7 @@ def test_episodes_are_the_same_in_every_form_of_an_environment(form, ending):
     np.testing.assert_allclose(found.returns, found.start_losses - found.final_losses, atol=1e-5)
 
 
-def test_environments_whose_episodes_cannot_be_told_apart_are_refused():
+def test_environments_whose_episodes_cannot_be_by_species_are_refused():
     agents = multispecies_v0.parallel_env(particle_count=8)
     with pytest.raises(NPAError, match=r"single or a vector .*make_envs"):
         evaluate_policy(agents, never, [0])

@@ -16,7 +16,7 @@ from PIL import Image
 
 from npa_envs.agents import RandomPolicy, ZeroPolicy
 from npa_envs.agents.comparison import run as one_run
-from npa_envs.agents.comparison.plan import LEFT_OUT, PROBLEMS, Job, Plan, make_problem
+from npa_envs.agents.comparison.plan import LEFT_OUT, PROBLEMS, ComparisonPlan, Job, make_problem
 from npa_envs.agents.comparison.report import (
     Estimate,
     curve,
@@ -31,7 +31,7 @@ from npa_envs.agents.comparison.report import (
 from npa_envs.agents.comparison.run import (
     PICTURE,
     SIZE,
-    Point,
+    ComparisonPoint,
     RunRecord,
     final_picture,
     held_records,
@@ -70,9 +70,11 @@ WRITE_PID = "import os; Path('{}', f'pid-{{os.getpid()}}').write_text(str(os.get
 """Code of a process that writes its number into a folder."""
 
 
-def plan(**changes) -> Plan:
+def plan(**changes) -> ComparisonPlan:
     fields = {"tasks": {"growth": {}}, "methods": ["one", "two"], "seeds": (0, 1)}
-    return Plan(**fields | {"budgets": {"seconds": {"growth": 1.0}}, "episodes": 2} | changes)
+    return ComparisonPlan(
+        **fields | {"budgets": {"seconds": {"growth": 1.0}}, "episodes": 2} | changes
+    )
 
 
 def record(method: str, seed: int, returns=(), *, axis="seconds", status="done", **fields):
@@ -85,9 +87,9 @@ def record(method: str, seed: int, returns=(), *, axis="seconds", status="done",
     return RunRecord(job=Job(axis, "growth", method, seed), status=status, **given | fields)
 
 
-def points(*pairs: tuple[float, float]) -> tuple[Point, ...]:
+def points(*pairs: tuple[float, float]) -> tuple[ComparisonPoint, ...]:
     """A curve of returns against seconds; a second is 100 particle-steps."""
-    return tuple(Point(at, 100.0 * at, value, 0.0, 1.0 - value) for at, value in pairs)
+    return tuple(ComparisonPoint(at, 100.0 * at, value, 0.0, 1.0 - value) for at, value in pairs)
 
 
 @pytest.fixture

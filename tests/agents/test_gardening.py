@@ -98,7 +98,7 @@ def test_gardeners_need_a_garden_whose_brushes_are_numbers():
     with pytest.raises(NPAError, match="env must be a garden with actions='grid' or 'free'"):
         StillGardener(make_vec(GARDENER, 2, actions="discrete"))
     with pytest.raises(NPAError, match="env must have brushes that push"):
-        ScriptedGardener(make_vec(GARDENER, 2, tools=("erase",)))
+        ScriptedGardener(make_vec(GARDENER, 2, tools=("wipe",)))
     with pytest.raises(NPAError, match="env must be npa/Shepherd2D-v0"):
         ScriptedShepherd(make_vec(GARDENER, 2))
     for given in ({"gain": 0.0}, {"share": -1.0}, {"width": float("nan")}):

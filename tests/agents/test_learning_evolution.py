@@ -9,7 +9,7 @@ from learning_problems import digits, heart, species
 
 from npa_envs.agents import evaluate_policy
 from npa_envs.agents.learning import Budget, Problem, RuleSet, train
-from npa_envs.agents.learning.evolution import Population, costs, fitness
+from npa_envs.agents.learning.evolution import RulePopulation, costs, fitness
 
 GROWTH = {"eps": 0.2, "eps0": 0.2, "colour_weight": 20.0, "resolution": 32, "state_scale": 0.1}
 SMALL = {
@@ -29,7 +29,7 @@ def problem(request):
 
 def candidates_of(problem: Problem, device: torch.device, count: int):
     """A population, and the weights of some candidates that differ much, one a row."""
-    population = Population(problem.new_rules(0).to(device))
+    population = RulePopulation(problem.new_rules(0).to(device))
     draws = np.random.default_rng(1)
     spread = draws.standard_normal((count, len(population.vector()))) * population.scales()
     weights = population.vector() + 0.5 * spread
@@ -38,7 +38,7 @@ def candidates_of(problem: Problem, device: torch.device, count: int):
 
 def rules_of(problem: Problem, device: torch.device, weights: torch.Tensor) -> RuleSet:
     rules = problem.new_rules(5).to(device)
-    Population(rules).put(weights.cpu().double().numpy())
+    RulePopulation(rules).put(weights.cpu().double().numpy())
     return rules
 
 
@@ -49,7 +49,7 @@ def test_scales_are_those_that_layers_are_drawn_with():
     torch.nn.init.xavier_normal_(rule.hidden.weight)
     torch.nn.init.xavier_normal_(rule.output.weight)
     torch.nn.init.zeros_(rule.hidden.bias)
-    population = Population(rules)
+    population = RulePopulation(rules)
     drawn = population.vector() / population.scales()
     hidden, output = rule.hidden.weight.numel(), rule.output.weight.numel()
     assert drawn[:hidden].std() == pytest.approx(1.0, abs=0.15)
@@ -72,8 +72,8 @@ def test_a_candidate_acts_in_its_own_worlds_as_its_rules_do(problem, device):
 
 def test_candidates_have_the_dead_zone_of_their_rules(problem, device):
     rules = problem.new_rules(0).to(device)
-    weights = 0.5 * torch.randn(2, len(Population(rules).vector()), device=device)
-    population = Population(rules)
+    weights = 0.5 * torch.randn(2, len(RulePopulation(rules).vector()), device=device)
+    population = RulePopulation(rules)
     envs = problem.make_envs(4, device=device)
     observation, _ = envs.reset(seed=3)
     assert population.actions(weights, observation).any()
@@ -135,11 +135,11 @@ def test_evolution_gets_better(device):
 def test_a_start_is_the_first_mean_and_stays_as_it_is():
     pytest.importorskip("cma")
     start = PROBLEMS["growth"].new_rules(9)
-    before = Population(start).vector()
+    before = RulePopulation(start).vector()
     options = {"population": 4, "sigma": 0.01, "evaluation_seeds": range(2)}
     trained = train(
         "evolution", PROBLEMS["growth"], Budget(particle_steps=1), 1, start=start, **options
     )
-    assert np.array_equal(Population(start).vector(), before)
-    far = np.abs(Population(trained.rules).vector() - before) / Population(start).scales()
+    assert np.array_equal(RulePopulation(start).vector(), before)
+    far = np.abs(RulePopulation(trained.rules).vector() - before) / RulePopulation(start).scales()
     assert 0.0 < far.max() < 0.1

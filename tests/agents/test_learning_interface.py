@@ -187,7 +187,7 @@ def test_rules_that_tell_species_apart_may_perceive_less_besides():
     torch.testing.assert_close(mean, torch.cat((displacement, update[..., 2:]), dim=-1))
 
 
-def test_what_is_told_of_species_leaves_scripted_policies_as_they_are():
+def test_what_is_context_info_species_leaves_scripted_policies_as_they_are():
     for step in range(3):
         acting = {}
         for perception in ("shared", "per_species"):

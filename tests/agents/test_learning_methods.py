@@ -21,7 +21,7 @@ from npa_envs.agents.learning.clone import Demonstrations, unexplained
 from npa_envs.agents.learning.gradient import ClampedRule, clamp_inward, episode_task
 from npa_envs.agents.learning.problem import FIRST_EVALUATION_SEED, world_seeds
 from npa_envs.envs.core.vector import NPAVectorEnv
-from npa_envs.envs.morphogenesis2d import PictureTask
+from npa_envs.envs.morphogenesis2d import PictureEnvTask
 from npa_envs.envs.multi.task import Population
 from npa_envs.errors import NPAError
 
@@ -38,7 +38,7 @@ def run(problem, method="gradient", iterations=30, seed=0, worlds=4, **options):
 
 
 def damaged(**keywords):
-    keywords = heart(**keywords).keywords | {"rule": "picture", "damage": "erase"}
+    keywords = heart(**keywords).keywords | {"rule": "picture", "damage": "wipe"}
     return replace(heart(), env_id="npa/Regeneration2D-v0", keywords=keywords)
 
 
@@ -252,8 +252,8 @@ def test_a_loss_without_a_gradient_is_refused(monkeypatch):
     def counted(self, x, s):
         return {"far": (x.norm(dim=-1) > 0.5).float().mean(dim=1)}
 
-    monkeypatch.setattr(PictureTask, "losses", counted)
-    with pytest.raises(NPAError, match="losses of PictureTask must be differentiable"):
+    monkeypatch.setattr(PictureEnvTask, "losses", counted)
+    with pytest.raises(NPAError, match="losses of PictureEnvTask must be differentiable"):
         run(heart())
 
 

@@ -13,7 +13,7 @@ from learning_problems import heart
 from npa_envs.agents import RandomPolicy, evaluate_policy
 from npa_envs.agents.learning import Budget, Problem, RuleSet, ppo, train
 from npa_envs.agents.learning.ppo import (
-    Learner,
+    PPOLearner,
     PPOOptions,
     clipped_gain,
     generalised_advantages,
@@ -59,7 +59,7 @@ EVERY_FORM = pytest.mark.parametrize("form", FORMS)
 
 
 def learner(problem=HEART, start=None, **options):
-    return Learner(problem, PPOOptions(**options), 0, torch.device("cpu"), start)
+    return PPOLearner(problem, PPOOptions(**options), 0, torch.device("cpu"), start)
 
 
 def run(form, problem, budget, seed=0, **keywords):
@@ -348,7 +348,7 @@ def test_recorded_rounds_are_those_of_kernels_one_by_one(
 
     def learned():
         how = PPOOptions(critic_rounds=3, **FORMS[form][1], **options)
-        given = Learner(problem, how, 0, device, None)
+        given = PPOLearner(problem, how, 0, device, None)
         # The third call of what is recorded is the first replay that nothing was recorded in.
         for share_left in (1.0, 0.9, 0.7, 0.5, 0.3, 0.1):
             batch = given.play()

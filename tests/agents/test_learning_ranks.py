@@ -58,7 +58,7 @@ def learned(form):
     """What a process has learned in some rounds, and what it has learned it from."""
     made, said = learner_of(form), []
     for share_left in (1.0, 0.5):
-        if isinstance(made, ppo.Learner):
+        if isinstance(made, ppo.PPOLearner):
             batch = made.play()
             made.improve(share_left)
             told = batch.advantages.square().mean(), batch.targets.mean()
@@ -164,14 +164,14 @@ def test_a_run_goes_on_alike_with_any_number_of_processes(method, tmp_path):
 
 
 def test_a_run_that_is_asked_to_stop_can_be_resumed(tmp_path, monkeypatch):
-    improve = ppo.Learner.improve
+    improve = ppo.PPOLearner.improve
 
     def asked(learner, share_left):
         improve(learner, share_left)
         if learner.rounds == 3 and not learner.ranks.rank:
             os.kill(os.getpid(), signal.SIGTERM)
 
-    monkeypatch.setattr(ppo.Learner, "improve", asked)
+    monkeypatch.setattr(ppo.PPOLearner, "improve", asked)
     assert kept("ppo", tmp_path, 8)[1] == [0, 3]
     assert load_checkpoint(tmp_path / "checkpoint.pt")["iteration"] == 3
     monkeypatch.undo()
@@ -281,7 +281,7 @@ def test_recorded_pieces_of_a_shared_round_are_those_of_kernels_one_by_one(
 
     def rounds():
         how = ppo.PPOOptions(steps=4, minibatches=2)
-        made = ppo.Learner(HEART, how, 0, device, None, Ranks.current())
+        made = ppo.PPOLearner(HEART, how, 0, device, None, Ranks.current())
         # The third call of what is recorded is the first replay that nothing was recorded in.
         for share_left in (1.0, 0.8, 0.6, 0.4):
             batch = made.play()

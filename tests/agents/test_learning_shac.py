@@ -5,7 +5,7 @@ import torch
 from learning_problems import digits, heart, species, wild_rules
 
 from npa_envs.agents.learning import Budget, Problem, train
-from npa_envs.agents.learning.shac import Learner, SHACOptions, td_lambda_targets, values
+from npa_envs.agents.learning.shac import SHACLearner, SHACOptions, td_lambda_targets, values
 from npa_envs.errors import NPAError
 
 CPU = torch.device("cpu")
@@ -13,7 +13,7 @@ CPU = torch.device("cpu")
 
 def learner(problem, **options):
     given = SHACOptions(**{"world_count": 3} | options)
-    return Learner(problem, given, 0, CPU, wild_rules(problem))
+    return SHACLearner(problem, given, 0, CPU, wild_rules(problem))
 
 
 @pytest.mark.parametrize("td_lambda", [0.0, 0.7, 1.0])
@@ -37,7 +37,7 @@ def test_targets_are_weighted_means_of_sums_over_one_step_two_steps_and_so_on(td
 def test_an_undiscounted_gain_is_what_the_windows_took_off_the_loss_and_what_is_foreseen(problem):
     if problem == digits():
         pytest.importorskip("sklearn")
-    made = learner(problem, steps=4, gamma=1.0, foresight=1.0)
+    made = learner(problem, steps=4, gamma=1.0, value_weight=1.0)
     window = made.play()
     assert window.losses.shape == (5, 3)
     fell = window.losses[0] - window.losses[-1]

@@ -10,8 +10,8 @@ import pytest
 from npa_envs.agents.comparison import npa_bench
 from npa_envs.agents.comparison.npa_bench import (
     SUITES,
-    Row,
-    Run,
+    BenchRow,
+    BenchRun,
     check_rows,
     normalised,
     read_row,
@@ -21,7 +21,7 @@ from npa_envs.agents.comparison.npa_bench import (
     write_rows,
 )
 from npa_envs.agents.comparison.plan import Job
-from npa_envs.agents.comparison.run import Point, RunRecord
+from npa_envs.agents.comparison.run import ComparisonPoint, RunRecord
 from npa_envs.agents.learning import methods_for
 from npa_envs.cli import main
 from npa_envs.cli.compare import CompareOptions, make_plan
@@ -35,8 +35,10 @@ SUITE = SUITES["npa-bench-v0"]
 FIRST = next(iter(SUITE.entries))
 
 
-def row(method: str, *means: float, env_id: str = FIRST) -> Row:
-    return Row(SUITE, method, tuple(Run(env_id, k, 0.0, mean) for k, mean in enumerate(means)))
+def row(method: str, *means: float, env_id: str = FIRST) -> BenchRow:
+    return BenchRow(
+        SUITE, method, tuple(BenchRun(env_id, k, 0.0, mean) for k, mean in enumerate(means))
+    )
 
 
 def plan_of(suite="npa-bench-v0", **changes):
@@ -51,7 +53,10 @@ def records(plan, status="done"):
             facts=plan.facts(job),
             status=status,
             returns=(float(job.seed),) * plan.episodes,
-            curve=(Point(0.0, 0.0, -1.0, 0.1, 1.0), Point(2.0, 1000.0, 0.5, 0.1, 1.0)),
+            curve=(
+                ComparisonPoint(0.0, 0.0, -1.0, 0.1, 1.0),
+                ComparisonPoint(2.0, 1000.0, 0.5, 0.1, 1.0),
+            ),
             date="2026-01-02",
         )
         for job in plan.jobs()

@@ -16,7 +16,7 @@ import torch
 from PIL import Image
 
 from npa_envs.cli import COMMANDS, demo, doctor, main
-from npa_envs.cli.film import Film, film_world
+from npa_envs.cli.film import WorldFilm, film_world
 from npa_envs.cli.output import EXAMPLES, torch_threads
 from npa_envs.cli.train import thread_count
 from npa_envs.errors import NPAError
@@ -194,9 +194,9 @@ def run_alone(program, *words, **environment):
 
 def test_doctor_tells_what_is_broken_from_what_is_slow_or_missing(capsys, monkeypatch):
     findings = [
-        doctor.Finding("torch", "2.13"),
-        doctor.Finding("ffmpeg", "none", "install it"),
-        doctor.Finding("browser", "none", "open the link elsewhere", optional=True),
+        doctor.DoctorLine("torch", "2.13"),
+        doctor.DoctorLine("ffmpeg", "none", "install it"),
+        doctor.DoctorLine("browser", "none", "open the link elsewhere", optional=True),
     ]
     monkeypatch.setattr(doctor, "examine", lambda: findings)
     assert main(["doctor"]) == 1
@@ -496,14 +496,14 @@ def test_ctrl_c_leaves_a_checkpoint_and_says_how_to_go_on(tmp_path, monkeypatch,
 def test_rollout_writes_films_that_open(tmp_path, rule, capsys):
     out = tmp_path / "a" / "film"
     words = ["rollout", rule, "--steps", "20", "--every", "5", "--damage", "0:cut", "8:cut"]
-    words += ["--damage", "10:erase:0.3", "10:clump", "--out", str(out), "--no-progress"]
+    words += ["--damage", "10:wipe:0.3", "10:clump", "--out", str(out), "--no-progress"]
     assert main(words) == 0
     text = capsys.readouterr().out
     assert re.search(r"step 20: loss \d+\.\d+, PSNR +\d+\.\d+ dB", text)
     with Image.open(out / "growth.gif") as film:
         # The rule was trained at 32 pixels.
         assert film.size == (256, 256)
-        # 0, cut, 5, 8, cut, 10, erase, clump, 15, 20
+        # 0, cut, 5, 8, cut, 10, wipe, clump, 15, 20
         assert getattr(film, "n_frames", 1) == 10
     assert (out / "growth.mp4").stat().st_size > 500
     with Image.open(out / "growth-filmstrip.png") as strip:
@@ -515,7 +515,7 @@ def test_rollout_writes_films_that_open(tmp_path, rule, capsys):
 def test_rollout_repeats_itself(tmp_path, rule):
     words = ["rollout", rule, "--steps", "12", "--resolution", "16", "--no-progress"]
     for name in ("a", "b"):
-        assert main([*words, "--damage", "6:erase", "--out", str(tmp_path / name)]) == 0
+        assert main([*words, "--damage", "6:wipe", "--out", str(tmp_path / name)]) == 0
     assert main([*words, "--seed", "1", "--out", str(tmp_path / "c")]) == 0
     films = [(tmp_path / name / "growth.gif").read_bytes() for name in "abc"]
     assert films[0] == films[1]
@@ -595,7 +595,7 @@ def test_rollout_makes_about_150_frames(tmp_path, rule):
     ],
 )
 def test_filmstrip_shows_growth_damage_and_the_end(steps, every, damages, shown):
-    film = Film()
+    film = WorldFilm()
     task = SimpleNamespace(picture=lambda *_: torch.zeros(1, 4, 4, 4))
     x = s = torch.zeros(1, 1, 2)
     for step in sorted({*range(0, steps, every), *damages, steps}):

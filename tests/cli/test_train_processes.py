@@ -9,7 +9,7 @@ from training_runs import trainer_of
 
 from npa_envs.cli import main
 from npa_envs.cli.output import torch_threads
-from npa_envs.cli.train import TrainOptions, process_count, settled
+from npa_envs.cli.train import TrainOptions, process_count, resolve_task
 from npa_envs.cli.train_options import starting_configuration
 from npa_envs.errors import NPAError
 from npa_envs.training import RunFolder, config_to_dict, preset
@@ -20,15 +20,15 @@ TASK = "morphogenesis2d"
 
 def test_resume_auto_begins_and_later_goes_on(tmp_path):
     for words in (["--resume", "auto"], ["--resume=auto"]):
-        assert settled(TASK, [*words, "--out", str(tmp_path)]) == ["--out", str(tmp_path)]
+        assert resolve_task(TASK, [*words, "--out", str(tmp_path)]) == ["--out", str(tmp_path)]
     trainer_of(circle_config(tmp_path))
     for words in (["--resume", "auto"], ["--resume=auto"]):
-        chosen = settled(TASK, ["--target", "ring", *words, "--out", str(tmp_path)])
+        chosen = resolve_task(TASK, ["--target", "ring", *words, "--out", str(tmp_path)])
         assert chosen == ["--target", "ring", "--out", str(tmp_path), "--resume"]
     # What is plain stays as it is.
-    assert settled(TASK, ["--resume", "--out", "x"]) == ["--resume", "--out", "x"]
+    assert resolve_task(TASK, ["--resume", "--out", "x"]) == ["--resume", "--out", "x"]
     with pytest.raises(NPAError, match="resume"):
-        settled(TASK, ["--resume", "never"])
+        resolve_task(TASK, ["--resume", "never"])
 
 
 @pytest.mark.parametrize(
@@ -39,7 +39,12 @@ def test_resume_auto_begins_and_later_goes_on(tmp_path):
         ("fast", {}, 1, 1),
         ("fast", {"device": "cuda"}, 2, 1),
         ("fast", {"world_count": 3, "pool_size": 30}, 2, 1),
-        ("fast", {"world_count": 4, "pool_size": 30, "lifetimes": (0, 0), "rest_weight": 0}, 2, 1),
+        (
+            "fast",
+            {"world_count": 4, "pool_size": 30, "max_age_range": (0, 0), "stillness_weight": 0},
+            2,
+            1,
+        ),
         ("fast", {"iterations": 100}, 2, 1),
         ("paper", {}, 2, 1),
     ],
@@ -87,9 +92,9 @@ def test_a_run_goes_on_with_its_own_preset_only(tmp_path):
 def test_gpus_are_processes_that_have_a_gpu_each():
     asked = TrainOptions(gpus=4)
     assert process_count(TASK, asked, preset("fast", device="cuda")) == 4
-    assert settled(TASK, ["--gpus", "4"]) == ["--gpus", "4", "--device", "cuda"]
+    assert resolve_task(TASK, ["--gpus", "4"]) == ["--gpus", "4", "--device", "cuda"]
     given = ["--gpus=4", "--device", "cuda"]
-    assert settled(TASK, given) == given
+    assert resolve_task(TASK, given) == given
     with pytest.raises(NPAError, match="gpus goes with device 'cuda', got 'cpu'"):
         process_count(TASK, asked, preset("fast"))
     with pytest.raises(NPAError, match="gpus must be at least 1, got 0"):

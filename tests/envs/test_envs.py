@@ -16,7 +16,7 @@ from small_envs import IDS, assert_same, make, make_vec, small
 import npa_envs
 from npa_envs.envs import multispecies_v0
 from npa_envs.errors import NPAError
-from npa_envs.world.randomness import Purpose
+from npa_envs.world.randomness import StreamId
 
 CLOSEST_CREDIT = 0.98
 """Correlation of marginal rewards with leave-one-out; the least measured over ids was 0.992."""
@@ -345,7 +345,7 @@ def test_regeneration_begins_with_many_worlds_and_evaluates_with_other_damage():
     tiny = {"particle_count": 32, "grow_steps": 2, "resolution": 16}
     starts = {}
     for count, given in ((4, {"seed_pool": 4}), (256, {})):
-        env = gymnasium.make("npa/Regeneration2D-v0", **tiny, **given, damage="erase")
+        env = gymnasium.make("npa/Regeneration2D-v0", **tiny, **given, damage="wipe")
         starts[count] = {
             env.reset(seed=seed) and env.unwrapped.particles()[0].numpy().tobytes()
             for seed in range(40)
@@ -380,24 +380,24 @@ def test_a_world_of_a_pool_is_the_same_whenever_it_is_grown(device):
 def test_regeneration_starts_grown_and_damaged():
     grown = npa_envs.load_rule("gecko-v0")
     env = gymnasium.make(
-        "npa/Regeneration2D-v0", particle_count=512, grow_steps=48, seed_pool=1, damage="erase"
+        "npa/Regeneration2D-v0", particle_count=512, grow_steps=48, seed_pool=1, damage="wipe"
     )
     env.reset(seed=0)
     x, s = env.unwrapped.particles()
-    erased = (s == 0).all(-1)
-    assert 10 < int(erased.sum()) < 400
+    wiped = (s == 0).all(-1)
+    assert 10 < int(wiped.sum()) < 400
     assert float((x.amax(0) - x.amin(0)).max()) > 1.0
     task = env.unwrapped.task
-    random = npa_envs.WorldRandom([0]).beside(Purpose.GROWTH)
+    random = npa_envs.WorldRandom([0]).substream(StreamId.GROWTH)
     start_x, start_s = task.goal.seed(1, generator=random)
-    growth = random.beside(Purpose.GROWTH)
+    growth = random.substream(StreamId.GROWTH)
     with torch.no_grad():
         expected = npa_envs.rollout(grown, start_x, start_s, 48, generator=growth)
     assert torch.equal(task.pooled(torch.tensor([0])).x, expected[0])
     assert torch.equal(x, expected[0][0])
 
 
-@pytest.mark.parametrize("damage", ["erase", "cut", "clump", "random"])
+@pytest.mark.parametrize("damage", ["wipe", "cut", "clump", "random"])
 def test_every_damage_raises_the_loss(damage):
     env = gymnasium.make(
         "npa/Regeneration2D-v0", particle_count=256, rule="picture", damage=damage, damage_size=0.4

@@ -14,7 +14,7 @@ from gymnasium.utils.env_checker import check_env
 from small_envs import assert_batch_of_singles, assert_same
 
 import npa_envs
-from npa_envs.envs.garden.brushwork import Columns, brushed, grid_places
+from npa_envs.envs.garden.brush_layout import BrushLayout, brushed, grid_places
 from npa_envs.errors import DivergedError, NPAError
 from npa_envs.registration import GARDEN_IDS, GARDENS
 from npa_envs.registration import SMALL as SMALL_FORMS
@@ -31,7 +31,7 @@ SMALL = {
     "grow_steps": 4,
     "rule_steps": 2,
 }
-TOOLS = ("push", "erase", "inject", "rate")
+TOOLS = ("push", "wipe", "inject", "rate")
 FORMS = (
     {"tools": TOOLS},
     {"actions": "discrete", "observe": "picture", "tools": TOOLS},
@@ -286,7 +286,7 @@ def test_bad_keywords_are_clear_errors(keywords, message):
 
 def brush(config, **numbers):
     """The row of one brush at the middle, for a world."""
-    row, columns = torch.zeros(1, 1, Columns.of(config).width), Columns.of(config)
+    row, columns = torch.zeros(1, 1, BrushLayout.of(config).width), BrushLayout.of(config)
     for tool, values in numbers.items():
         row[..., getattr(columns, tool)] = torch.tensor(values)
     return row
@@ -304,9 +304,9 @@ def test_brushes_do_what_the_documentation_says():
     assert torch.allclose(moved - x, torch.stack((0.0 * held, 0.15 * held), dim=-1)[None])
     assert torch.equal(same, s)
     assert torch.equal(rate, torch.ones(1, 3, 1))
-    _, erased, _ = brushed(x, s, brush(config, erase=0.5), middle, config)
-    assert torch.allclose(erased[0, :, 0], 1.0 - 0.5 * held)
-    _, kept, _ = brushed(x, s, brush(config, erase=-1.0), middle, config)
+    _, wiped, _ = brushed(x, s, brush(config, wipe=0.5), middle, config)
+    assert torch.allclose(wiped[0, :, 0], 1.0 - 0.5 * held)
+    _, kept, _ = brushed(x, s, brush(config, wipe=-1.0), middle, config)
     assert torch.equal(kept, s)
     _, dosed, _ = brushed(x, s, brush(config, inject=(1.0, 0.0, -0.5)), middle, config)
     assert torch.allclose(dosed[0, :, -3], 1.0 + 0.5 * held)
@@ -411,13 +411,13 @@ def test_the_whole_world_is_differentiable_by_every_number_of_a_brush():
     action = torch.rand(shape, generator=generator, dtype=torch.float64) - 0.2
 
     def worth(action):
-        new_x, new_s = task.lived(x, s, action, npa_envs.WorldRandom([4]))
+        new_x, new_s = task.step(x, s, action, npa_envs.WorldRandom([4]))
         return (torch.cat((new_x, new_s), dim=-1) * weights).sum()
 
     weights = torch.rand((1, 96, 18), generator=generator, dtype=torch.float64)
     given = action.clone().requires_grad_()
     (slope,) = torch.autograd.grad(worth(given), given)
-    columns = Columns.of(env.config)
+    columns = BrushLayout.of(env.config)
     for column in range(columns.width):
         assert float(slope[0, :, column].abs().sum()) > 0.0, column
     way = torch.rand(shape, generator=generator, dtype=torch.float64) - 0.5
@@ -518,7 +518,7 @@ def test_weather_comes_as_often_as_it_is_told_to():
         env.reset(seed=0)
         x, s = env.unwrapped.particles()
         task = env.unwrapped.task
-        new_x, new_s = task.struck(x[None], s[None], npa_envs.WorldRandom([3]))
+        new_x, new_s = task.disturb(x[None], s[None], npa_envs.WorldRandom([3]))
         assert bool((new_x != x).any()) == bool(expected[0])
         assert bool((new_s != s).any()) == bool(expected[1])
 
@@ -530,6 +530,6 @@ def test_the_reward_is_one_for_a_whole_picture_and_zero_for_a_grey_one():
     grey = sum(task.losses(worlds.x, torch.zeros_like(worlds.s)).values())
     assert grey > 1.2 * info["loss"]
     losses = torch.cat((grey, torch.tensor([info["loss"], info["loss"] - 1.0, 1e3])))
-    earned = task.earned(worlds.x, worlds.s, losses, worlds.marks.expand(4, -1))
+    earned = task.reward(worlds.x, worlds.s, losses, worlds.context.expand(4, -1))
     better = 1.0 + 1.0 / float(grey - info["loss"])
     assert torch.allclose(earned, torch.tensor([0.0, 1.0, better, -1.0]), rtol=1e-4, atol=1e-5)

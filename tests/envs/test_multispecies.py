@@ -11,7 +11,7 @@ from small_envs import assert_same
 import npa_envs
 from npa_envs.envs import multispecies_v0, particles_v0
 from npa_envs.errors import NPAError
-from npa_envs.world.randomness import Purpose
+from npa_envs.world.randomness import StreamId
 
 
 def test_turns_lead_to_the_same_world_as_acting_at_once():
@@ -135,7 +135,7 @@ def test_an_opponent_acts_as_agents_would_that_act_uniformly_at_random(device):
     for _ in range(4):
         actions = drawn(both, generator)
         shape = sum(len(actions[agent]) for agent in agents), actions["species_1"].shape[1]
-        random = both.worlds.random.beside(Purpose.OPPONENT)
+        random = both.worlds.random.substream(StreamId.OPPONENT)
         invaders = (2.0 * random.uniform(*shape)[0] - 1.0).cpu()
         actions["species_1"] = invaders[len(actions["species_0"]) :]
         moved += float(actions["species_1"].abs().mean())

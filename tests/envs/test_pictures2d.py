@@ -56,10 +56,10 @@ def test_rows_end_with_the_picture_that_is_asked_for(device):
     task = told.unwrapped.task
     pictures = task.goal.toward(torch.arange(2, device=device)).target_picture.cpu().numpy()
     for k, number in enumerate(infos["target"]):
-        told_of = wide[k, :, -TOLD:].reshape(-1, 4, 4, 4)
-        assert (told_of == told_of[0]).all()
+        context_info = wide[k, :, -TOLD:].reshape(-1, 4, 4, 4)
+        assert (context_info == context_info[0]).all()
         squares = pictures[number].reshape(4, 4, 4, 4, 4).mean(axis=(1, 3))
-        np.testing.assert_allclose(told_of[0], squares.transpose(2, 0, 1), atol=1e-6)
+        np.testing.assert_allclose(context_info[0], squares.transpose(2, 0, 1), atol=1e-6)
     action = told.action_space.sample()
     assert_same(told.step(action)[0][..., :-TOLD], plain.step(action)[0])
 

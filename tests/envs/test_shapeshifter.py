@@ -115,11 +115,11 @@ def test_a_step_is_paid_by_the_goal_that_was_seen_before_it(small):
 def test_a_goal_itself_earns_one_and_an_empty_picture_nothing(small):
     task = make(small, resolution=32).unwrapped.task
     single = task.pictures.toward(torch.tensor([1]))
-    marks = torch.tensor([[1.0]])
+    context = torch.tensor([[1.0]])
     no_loss, blank = torch.zeros(1), task.blank_losses[1:2]
     x = s = torch.zeros(1, 1, 1)
-    assert task.earned(x, s, no_loss, marks).tolist() == [1.0]
-    assert task.earned(x, s, blank, marks).tolist() == [0.0]
+    assert task.reward(x, s, no_loss, context).tolist() == [1.0]
+    assert task.reward(x, s, blank, context).tolist() == [0.0]
     density = single.target_picture[..., 3]
     assert float(blank) == pytest.approx(float((density + density * density).mean()), rel=1e-6)
 

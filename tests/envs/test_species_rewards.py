@@ -14,7 +14,7 @@ from crowds import (
     still,
 )
 
-from npa_envs.envs.multi.worlds import Account
+from npa_envs.envs.multi.worlds import AgentReturns
 from npa_envs.tasks.morphogenesis2d import Morphogenesis2D, Morphogenesis2DConfig
 
 
@@ -179,7 +179,7 @@ def test_leaving_does_not_give_back_what_came_at_no_charge():
 
 @pytest.mark.parametrize("carried", [3.0, 0.5, 1.0])
 def test_rewards_of_an_agent_that_left_never_add_up_to_more_than_zero(carried):
-    account = Account(make("mixing").worlds.task, torch.tensor([0, 1]), 1, team=False)
+    account = AgentReturns(make("mixing").worlds.task, torch.tensor([0, 1]), 1, team=False)
 
     def losses(*values):
         return {"loss": torch.tensor([values], dtype=torch.float64)}

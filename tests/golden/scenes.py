@@ -251,9 +251,9 @@ def together(perception: str, box: tuple[float, ...] | None, steps: int, **optio
     def scene(dtype: torch.dtype) -> Arrays:
         x, s = random_world(41, 96, (0.9, 0.7) if box is None else box, 5, dtype)
         torch.manual_seed(6)
-        told_apart = 0 if perception == "shared" else len(counts)
+        by_species = 0 if perception == "shared" else len(counts)
         rules = [
-            npa_envs.NPARule(2, 5, 16 + 8 * k, eps0=0.2, species_count=told_apart).to(dtype)
+            npa_envs.NPARule(2, 5, 16 + 8 * k, eps0=0.2, species_count=by_species).to(dtype)
             for k in range(len(counts))
         ]
         x.requires_grad_()
@@ -504,7 +504,7 @@ def randomness() -> Arrays:
         "f64/normal": random.normal(7, 2, dtype=torch.float64).numpy(),
         "mask": random.bernoulli(0.4, 30).numpy(),
         "integers": random.integers(10, 9).numpy(),
-        "beside": random.beside(2).uniform(4).numpy(),
+        "beside": random.substream(2).uniform(4).numpy(),
     }
 
 

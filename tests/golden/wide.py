@@ -49,7 +49,7 @@ class Names:
     from npa_envs.training.trained_tasks import task_of_rule
     from npa_envs.world import brushes
 
-    damages = ("erase", "cut", "clump", "noise")
+    damages = ("wipe", "cut", "clump", "noise")
     renamed: Mapping[str, str] = {}
     """What ids and rules are called now, by what the names of arrays call them."""
 
@@ -310,7 +310,7 @@ def brushed() -> Any:
             "push": brushes.push(x, move=move, radius=0.3, strength=0.7, **at),
             "inject": brushes.inject(x, s, radius=0.3, state=torch.ones(2, 4), strength=0.5, **at),
             "around": brushes.state_around(x, s, radius=0.3, **at),
-            "wipe": brushes.erase_state(x, s, radius=0.3, **at),
+            "wipe": brushes.wipe_state(x, s, radius=0.3, **at),
             "cut": brushes.cut(x, s, normal=move, gap=0.1, along=move, **at),
             "clump": brushes.clump(x, s, radius=0.3, factor=0.6, **at),
         }

@@ -11,15 +11,15 @@ from PIL import Image
 
 from npa_envs import reference
 from npa_envs.cli import main
-from npa_envs.cli.output import told_rules
+from npa_envs.cli.output import named_rules
 from npa_envs.errors import NPAError
-from npa_envs.measure.accuracy import habitats, hard_cases, numerics, suite
+from npa_envs.measure.accuracy import endurance, hard_cases, numerics, suite
 from npa_envs.measure.accuracy import scenes as accuracy
-from npa_envs.measure.accuracy.checks import GROUPS, Check, Finding, Session, Skipped
-from npa_envs.measure.accuracy.habitats import habitat
+from npa_envs.measure.accuracy.checks import GROUPS, Check, CheckResult, CheckSession, Skipped
+from npa_envs.measure.accuracy.endurance import habitat
 from npa_envs.measure.accuracy.scenes import EPS, scenes, threshold_scenes
 from npa_envs.measure.accuracy.suite import (
-    Entry,
+    CheckEntry,
     Record,
     chosen_checks,
     heat_maps,
@@ -34,13 +34,13 @@ CHECKS = {check.name: check for check in suite.all_checks(quick=True)}
 FACTS = {"device": "cpu", "commit": "0"}
 
 
-def session(device: torch.device | None = None) -> Session:
-    return Session(device or torch.device("cpu"), quick=True)
+def session(device: torch.device | None = None) -> CheckSession:
+    return CheckSession(device or torch.device("cpu"), quick=True)
 
 
 def told(name: str, **fields) -> Check:
     """A check that finds what it is told to."""
-    return Check(name, "as told", lambda session: Finding(**{"figures": {}, **fields}))
+    return Check(name, "as told", lambda session: CheckResult(**{"figures": {}, **fields}))
 
 
 # The registry
@@ -82,22 +82,22 @@ def test_checks_are_chosen_by_group_by_name_and_by_how_names_begin():
     ],
 )
 def test_a_figure_above_its_limit_not_a_number_or_missing_fails(figures, holds, verdict):
-    assert Finding({**figures, "other": 9.0}, {"error": 1.0}, holds).verdict == verdict
+    assert CheckResult({**figures, "other": 9.0}, {"error": 1.0}, holds).verdict == verdict
 
 
 def test_the_worst_figure_is_named():
-    entry = Entry.of(
-        told("a/b"), Finding({"x": 1.0, "y": 3.0}, {"x": 10.0, "y": 4.0, "z": 1.0}), 0.0
+    entry = CheckEntry.of(
+        told("a/b"), CheckResult({"x": 1.0, "y": 3.0}, {"x": 10.0, "y": 4.0, "z": 1.0}), 0.0
     )
     assert entry.worst() == "z nan (at most 1)"
     assert entry.share("y") == 0.75
-    assert Entry("a/b", "", "fail", {"x": 1.0}, {"x": 0.0}).share("x") == math.inf
-    assert Entry("a/b", "", "pass", {"x": 0.0}, {"x": 0.0}).share("x") == 0.0
+    assert CheckEntry("a/b", "", "fail", {"x": 1.0}, {"x": 0.0}).share("x") == math.inf
+    assert CheckEntry("a/b", "", "pass", {"x": 0.0}, {"x": 0.0}).share("x") == 0.0
 
 
 def test_what_raises_has_failed_and_the_others_go_on():
     def raising(error: Exception) -> Check:
-        def run(session: Session) -> Finding:
+        def run(session: CheckSession) -> CheckResult:
             raise error
 
         return Check(f"values/{type(error).__name__}", "no error", run)
@@ -123,7 +123,9 @@ def test_a_record_comes_back_as_it_was_written(tmp_path: Path):
     path = tmp_path / "record.json"
     assert Record.read(path, FACTS).entries == {}
     figures = {"a": 1.5, "b": math.inf, "c": math.nan}
-    record = Record(dict(FACTS), {"x/y": Entry("x/y", "s", "fail", figures, {"a": 1.0}, "", "n")})
+    record = Record(
+        dict(FACTS), {"x/y": CheckEntry("x/y", "s", "fail", figures, {"a": 1.0}, "", "n")}
+    )
     record.write(path)
     held = json.loads(path.read_text())
     assert held["counts"] == {"pass": 0, "range": 0, "fail": 1, "skipped": 0}
@@ -135,9 +137,9 @@ def test_a_run_goes_on_where_it_was_and_repeats_what_did_not_pass():
     ran: list[str] = []
 
     def counted(name: str, **fields) -> Check:
-        def run(session: Session) -> Finding:
+        def run(session: CheckSession) -> CheckResult:
             ran.append(name)
-            return Finding(**{"figures": {}, **fields})
+            return CheckResult(**{"figures": {}, **fields})
 
         return Check(name, "as told", run)
 
@@ -258,7 +260,7 @@ def test_a_rule_that_blows_up_is_found_out(factor, count, verdict, device, monke
             rule.output.weight *= factor
         return dataclasses.replace(home, rule=rule, x=home.x[:, :count], s=home.s[:, :count])
 
-    monkeypatch.setattr(habitats, "habitat", tampered)
+    monkeypatch.setattr(endurance, "habitat", tampered)
     entry = run_check(CHECKS["time/heart" if count == 1 else "time/dots"], session(device))
     if count == 1:
         # A world that extends nowhere is measured all the same.
@@ -270,10 +272,10 @@ def test_a_rule_that_blows_up_is_found_out(factor, count, verdict, device, monke
 
 def test_the_energy_of_a_world_at_rest_is_no_chance(device):
     home = habitat(session(device), "heart", looks=False)
-    run = habitats.LongRun(home, torch.Generator(device).manual_seed(0), home.options())
+    run = endurance.LongRun(home, torch.Generator(device).manual_seed(0), home.options())
     run.advance(512)
     draws = [torch.Generator(device).manual_seed(seed) for seed in range(8)]
-    energies = [habitats.measured(home, run.x, run.s, draw)["energy"] for draw in draws]
+    energies = [endurance.measured(home, run.x, run.s, draw)["energy"] for draw in draws]
     assert max(energies) < 2.0 * min(energies)
 
 
@@ -299,7 +301,7 @@ def test_what_grew_at_another_radius_is_measured_at_its_trained_size(device):
 def test_rules_of_every_kind_in_files_are_checked_by_themselves(fields, tmp_path, device):
     config = preset("tiny", **fields, iterations=2, device=str(device), out=tmp_path / "mine")
     train(config, progress=False)
-    sources = told_rules([str(tmp_path / "mine")])
+    sources = named_rules([str(tmp_path / "mine")])
     assert sources == {"mine": str(tmp_path / "mine")}
     checks = suite.all_checks(quick=True, rules=sources)
     assert [check.name for check in checks] == [
@@ -387,10 +389,10 @@ def test_two_rules_of_one_name_are_refused(tmp_path):
         (tmp_path / folder).mkdir()
         save_rule(load_rule("heart"), tmp_path / folder / "heart.safetensors")
     first, second = (str(tmp_path / name / "heart.safetensors") for name in ("a", "b"))
-    assert told_rules([first, first]) == {"heart": first}
+    assert named_rules([first, first]) == {"heart": first}
     for words in ([first, second], ["heart", second]):
         with pytest.raises(NPAError, match=r"names of their own, but .* are both called 'heart'"):
-            told_rules(words)
+            named_rules(words)
 
 
 def test_the_command_lists_its_checks(capsys):
@@ -411,10 +413,10 @@ def test_the_command_lists_its_checks(capsys):
 
 def test_heat_maps_are_drawn_of_what_has_limits():
     entries = [
-        Entry("geometry/one/2d/open", "", "fail", {"z": math.nan, "s": 0.5}, {"z": 1.0}),
-        Entry("geometry/nearest/2d", "", "range", {"z": 2.0}, {"z": 1.0, "s": 1.0}, "near"),
-        Entry("gradients/growth/heart", "", "range", {"norm": 1.0}, {}, "512 steps"),
-        Entry("values/nan_state", "", "skipped"),
+        CheckEntry("geometry/one/2d/open", "", "fail", {"z": math.nan, "s": 0.5}, {"z": 1.0}),
+        CheckEntry("geometry/nearest/2d", "", "range", {"z": 2.0}, {"z": 1.0, "s": 1.0}, "near"),
+        CheckEntry("gradients/growth/heart", "", "range", {"norm": 1.0}, {}, "512 steps"),
+        CheckEntry("values/nan_state", "", "skipped"),
     ]
     pictures = heat_maps(Record(dict(FACTS), {entry.name: entry for entry in entries}))
     assert set(pictures) == {"geometry"}

@@ -81,26 +81,26 @@ def shrink(rate):
 def test_healing_counts_the_steps_until_the_loss_is_back(monkeypatch):
     monkeypatch.setattr(npa_envs.measure.quality, "rollout", shrink(0.98))
     steps = {"grow_steps": 100, "heal_steps": 205, "every": 25}
-    cut, erased = healing(make_rule(0.0), CircleTask(), **steps, seeds=[0, 1, 2], cut_gap=1.0)
-    assert (cut.damage, erased.damage) == ("cut, gap 1", "erased disk, radius 0.2")
+    cut, wiped = healing(make_rule(0.0), CircleTask(), **steps, seeds=[0, 1, 2], cut_gap=1.0)
+    assert (cut.damage, wiped.damage) == ("cut, gap 1", "wiped disk, radius 0.2")
     # The loss is the mean square of the distances, so 25 steps multiply it by 0.98**50.
     needed = math.log(1.2 * cut.before / cut.after) / math.log(0.98) / 2
     assert cut.after > 3 * cut.before
     assert cut.steps_to_heal == 25 * math.ceil(needed / 25)
     assert (cut.worlds_healed, cut.world_count) == (3, 3)
     assert cut.end == pytest.approx(cut.after * 0.98**410, rel=1e-3)
-    # Only states were erased, which this task's loss does not see.
-    assert erased.after == erased.before == cut.before
-    assert erased.steps_to_heal == 0
+    # Only states were wiped, which this task's loss does not see.
+    assert wiped.after == wiped.before == cut.before
+    assert wiped.steps_to_heal == 0
 
 
 def test_rule_that_does_nothing_never_heals_a_cut():
-    cut, erased = healing(
+    cut, wiped = healing(
         make_rule(0.0), CircleTask(), grow_steps=1, heal_steps=4, every=2, seeds=[0, 1], cut_gap=3.0
     )
     assert cut.after > 1.2 * cut.before
     assert cut.end == pytest.approx(cut.after)
-    assert (cut.steps_to_heal, cut.worlds_healed, erased.steps_to_heal) == (None, 0, 0)
+    assert (cut.steps_to_heal, cut.worlds_healed, wiped.steps_to_heal) == (None, 0, 0)
 
 
 def test_worlds_that_run_away_have_not_healed(monkeypatch):
@@ -112,7 +112,7 @@ def test_worlds_that_run_away_have_not_healed(monkeypatch):
         assert (row.steps_to_heal, row.worlds_healed) == (None, 0)
 
 
-def test_erased_disk_blanks_states_of_the_grown_world(monkeypatch):
+def test_wiped_disk_blanks_states_of_the_grown_world(monkeypatch):
     seen = []
 
     def fill(rule, x, s, steps, **options):
@@ -121,7 +121,7 @@ def test_erased_disk_blanks_states_of_the_grown_world(monkeypatch):
 
     monkeypatch.setattr(npa_envs.measure.quality, "rollout", fill)
     steps = dict.fromkeys(("grow_steps", "heal_steps", "every"), 1)
-    healing(make_rule(0.0), CircleTask(), **steps, seeds=[0], erase_radius=0.1)
+    healing(make_rule(0.0), CircleTask(), **steps, seeds=[0], wipe_radius=0.1)
     blank_after_cut, blank_after_erasure = seen[1][0], seen[2][0]
     assert blank_after_cut == 0
     assert 1 / PARTICLE_COUNT <= blank_after_erasure < 1

@@ -17,7 +17,7 @@ from npa_envs.measure.interaction import (
     Encounters,
     InteractionRow,
     InteractionSettings,
-    Organism,
+    RuleUnderTest,
     heat_map,
     mixing_index,
     phase_diagram,
@@ -55,7 +55,7 @@ def make_rule(seed=0, scale=0.3, eps0=0.15):
 
 
 def organism(name="a", update_prob=0.5, **options):
-    return Organism(name, make_rule(**options), task_of, update_prob)
+    return RuleUnderTest(name, make_rule(**options), task_of, update_prob)
 
 
 def settings(**options):

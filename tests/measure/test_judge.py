@@ -10,7 +10,7 @@ import torch.nn.functional as F
 from npa_envs.cli import main
 from npa_envs.errors import NPAError
 from npa_envs.measure import judge as judges
-from npa_envs.measure.judge import Judge
+from npa_envs.measure.judge import TextureJudge
 from npa_envs.tasks.losses import pieces, shapes, texture
 from npa_envs.tasks.morphogenesis2d import Morphogenesis2D, Morphogenesis2DConfig
 from npa_envs.tasks.targets.textures import TextureTarget, draw_pattern
@@ -26,7 +26,7 @@ def task():
 
 @pytest.fixture(scope="module")
 def judge(task):
-    return Judge(task)
+    return TextureJudge(task)
 
 
 def wrong(picture):
@@ -68,7 +68,7 @@ def test_another_draw_of_scattered_things_is_near(task):
     config = dataclasses.replace(CONFIG, target="droplets")
     picture = torch.tensor(draw_pattern("droplets", 64, seed=7)).float()
     other = Texture(config, target=TextureTarget("droplets", picture, True))
-    judge = Judge(Texture(config))
+    judge = TextureJudge(Texture(config))
     assert float(judge(other.drawing(0)).mean()) < 3.0
     assert float(judge(task.drawing(0)).mean()) > 6.0
 
@@ -76,7 +76,7 @@ def test_another_draw_of_scattered_things_is_near(task):
 def test_a_world_is_judged_alone_and_always_alike(task, judge):
     pictures = torch.cat([task.drawing(number) for number in range(2)] + [torch.rand(1, 64, 64, 4)])
     together = judge(pictures)
-    assert torch.equal(together, Judge(task)(pictures))
+    assert torch.equal(together, TextureJudge(task)(pictures))
     for picture, ratios in zip(pictures, together, strict=True):
         assert torch.equal(judge(picture[None])[0], ratios)
     moved = judge(pictures.roll((9, -14), dims=(1, 2)))
@@ -85,7 +85,7 @@ def test_a_world_is_judged_alone_and_always_alike(task, judge):
 
 def test_devices_agree(task, judge, device):
     picture = task.drawing(3)
-    there = Judge(Texture(CONFIG, device=device))
+    there = TextureJudge(Texture(CONFIG, device=device))
     torch.testing.assert_close(there(picture).cpu(), judge(picture), rtol=1e-3, atol=1e-3)
 
 
@@ -94,9 +94,9 @@ def test_a_target_with_edges_is_not_read_across_them():
     half[:, :, 3] = 1.0
     half[:, :32, 0] = 1.0
     task = Texture(CONFIG, target=TextureTarget("half", half, False))
-    judge = Judge(task)
+    judge = TextureJudge(task)
     assert judge._patches.shape == (judges.DIRECTIONS, 64 * 64)
-    tiled = Judge(Texture(CONFIG, target=TextureTarget("half", half, True)))
+    tiled = TextureJudge(Texture(CONFIG, target=TextureTarget("half", half, True)))
     assert float(tiled(task.drawing(0)).mean()) < 1.1
     # Its left edge is red and its right one black: only a torus has that step twice.
     pair = judges.DISTANCES.index(9) * len(judges.AXES) + judges.AXES.index((0, 1))
@@ -122,9 +122,9 @@ def test_no_loss_compares_patches_of_the_judges_size():
 
 def test_only_textures_are_judged(task):
     with pytest.raises(NPAError, match="judge compares textures, got Morphogenesis2D"):
-        Judge(Morphogenesis2D(Morphogenesis2DConfig(target="ring", resolution=32)))
+        TextureJudge(Morphogenesis2D(Morphogenesis2DConfig(target="ring", resolution=32)))
     with pytest.raises(NPAError, match=r"pictures must have shape \[B, R, R, 4\]"):
-        Judge(task)(torch.zeros(1, 32, 32, 4))
+        TextureJudge(task)(torch.zeros(1, 32, 32, 4))
 
 
 def test_the_command_prints_ratios_and_writes_them(tmp_path, capsys):

@@ -9,16 +9,15 @@ import pytest
 import torch
 
 from npa_envs.cli import main
-from npa_envs.measure.accuracy.habitats import rule_names, task_name
+from npa_envs.measure.accuracy.endurance import rule_names, task_name
 from npa_envs.measure.robustness import study
-from npa_envs.measure.robustness.grounds import Ground, courses
 from npa_envs.measure.robustness.plans import (
     BLOB_DISTANCE,
     CONDITIONS,
     PLANS,
     SHAPES,
     SIZE_FACTOR,
-    Plan,
+    TrialPlan,
     disk,
     quick_plan,
     trained_value,
@@ -27,7 +26,7 @@ from npa_envs.measure.robustness.recovery import (
     CONTROL,
     DAMAGES,
     STATE_NOISE,
-    Course,
+    LossCurve,
     healing,
     recovery_step,
 )
@@ -42,6 +41,7 @@ from npa_envs.measure.robustness.study import (
     where_it_works,
     working_range,
 )
+from npa_envs.measure.robustness.trials import RuleTrial, loss_curves
 from npa_envs.rule.files import (
     load_rule,
     rule_digest,
@@ -57,7 +57,7 @@ from npa_envs.world.randomness import WorldRandom
 
 SIDE = 2.0
 COUNT = 501
-TINY = Plan(
+TINY = TrialPlan(
     grow_steps=8,
     heal_steps=(0, 4, 8),
     chunk=4,
@@ -65,8 +65,10 @@ TINY = Plan(
 )
 
 
-def ground(name: str, device: torch.device, plan: Plan = TINY, particles: int = 128) -> Ground:
-    return Ground(name, device, plan, range(5, 7), particles)
+def ground(
+    name: str, device: torch.device, plan: TrialPlan = TINY, particles: int = 128
+) -> RuleTrial:
+    return RuleTrial(name, device, plan, range(5, 7), particles)
 
 
 def damaged(name: str, x: torch.Tensor, s: torch.Tensor, box=None, seeds=(1, 2, 3)):
@@ -102,7 +104,7 @@ def plainly(name, x, s, random, box):
     centre = (x.mean(1) if middle else random_particle(x, random))[:, None]
     away = nearest_image(x - centre, box)
     near = away.norm(dim=-1, keepdim=True) <= 0.2
-    if name == "erase":
+    if name == "wipe":
         return x, torch.where(near, 0.0, s)
     if name == "clump":
         return torch.where(near, centre, x), s
@@ -124,7 +126,7 @@ def test_a_damage_does_to_each_world_what_it_says(worlds, name):
     assert box is None or float(found_x.abs().max()) <= 0.5 * SIDE + 1e-6
     if name in ("cut", "clump"):
         assert 0.0 < float((expected_x != x).any(-1).float().mean()) < 0.4
-    if name == "erase":
+    if name == "wipe":
         assert 3 < int((found_s == 0.0).all(-1).sum()) < 3 * COUNT // 2
 
 
@@ -182,16 +184,16 @@ def test_recovery_is_the_first_step_within_a_tenth_of_the_twin(losses, twins, st
 def test_a_course_counts_its_seeds():
     twins = ((1.0, 1.0, 1.0),) * 4
     losses = ((3.0, 1.0, 1.0), (3.0, 2.0, 1.0), (3.0, 1.05, 2.0), (3.0, 2.0, 2.0))
-    course = Course("erase", (0, 16, 32), losses, twins)
+    course = LossCurve("wipe", (0, 16, 32), losses, twins)
     assert course.recovery_steps() == [16, 32, 16, None]
     assert (course.recovered(), course.median_step(), course.within_at_end()) == (3, 16, 2)
     assert course.ratios(-1) == [1.0, 1.0, 2.0, 2.0]
     others = [dataclasses.replace(course, damage=name) for name in (CONTROL, "side")]
-    assert recovered_share([record(course, *others)], ["erase", "cut"]) == (3, 2, 4)
+    assert recovered_share([record(course, *others)], ["wipe", "cut"]) == (3, 2, 4)
     assert recovered_share([record(course, *others)], DAMAGES) == (6, 4, 8)
 
 
-def record(*found: Course, **changed) -> RuleRecord:
+def record(*found: LossCurve, **changed) -> RuleRecord:
     values = [("eps", 1.0), ("eps", 2.0), ("particles", 1.0), ("update_prob", 0.5)]
     told = tuple(Response(name, value, 8, (0.5, value)) for name, value in values)
     lost = Response("eps", 4.0, 8, (0.5, math.nan))
@@ -263,7 +265,7 @@ def test_damaged_worlds_go_beside_twins_with_the_same_masks(name, device):
     found = {course.damage: course for course in healing(place, home)}
     static = name == "digits"
     assert set(found) == {CONTROL, *(n for n, d in DAMAGES.items() if d.static or not static)}
-    twins = found["erase"].twins
+    twins = found["wipe"].twins
     assert twins == found[CONTROL].twins == found["noise"].twins
     assert tuple(curve[0] for curve in twins) == pytest.approx(trained.losses, rel=1e-6)
     # At first the control is its twin; then masks are others.
@@ -274,7 +276,7 @@ def test_damaged_worlds_go_beside_twins_with_the_same_masks(name, device):
     assert found["half"].twins == found["side"].twins != twins
     # What twins do is what the worlds do that go on alone.
     run = place.run(home, place.random(1001))
-    alone = place.by_seed(courses(home, run, place.plan.heal_steps)).T
+    alone = place.by_seed(loss_curves(home, run, place.plan.heal_steps)).T
     assert torch.allclose(alone, torch.tensor(twins, dtype=torch.float64).to(alone), rtol=1e-5)
 
 
@@ -299,7 +301,7 @@ def test_conditions_are_grown_for_as_many_updates_and_left_out_where_too_large(d
 def test_seeds_are_worlds_of_their_own_whatever_their_number(device):
     place = ground("heart", device)
     two = place.home(shape="ring")
-    one = Ground("heart", device, TINY, range(6, 7), 128).home(shape="ring")
+    one = RuleTrial("heart", device, TINY, range(6, 7), 128).home(shape="ring")
     assert torch.equal(two.x[1:], one.x)
     assert not torch.equal(two.x[0], two.x[1])
     half = place.home(share=0.5)
@@ -308,7 +310,7 @@ def test_seeds_are_worlds_of_their_own_whatever_their_number(device):
 
 
 def test_seeds_of_a_rule_of_many_pictures_grow_them_in_turn(device):
-    place = Ground("seven-pictures", device, TINY, range(5, 9), 128)
+    place = RuleTrial("seven-pictures", device, TINY, range(5, 9), 128)
     names = place.rule.codes.names
     home = place.home()
     for world, seed in enumerate(range(5, 9)):
@@ -324,20 +326,20 @@ def test_seeds_of_a_rule_of_many_pictures_grow_them_in_turn(device):
     # Copies grow what their worlds grow, and a seed alone what it grows among others.
     twice = home.with_worlds(home.x.repeat(2, 1, 1), home.s.repeat(2, 1, 1))
     assert torch.equal(twice.losses(twice.x, twice.s), losses.repeat(2))
-    one = Ground("seven-pictures", device, TINY, range(8, 9), 128).home(share=0.5)
+    one = RuleTrial("seven-pictures", device, TINY, range(8, 9), 128).home(share=0.5)
     assert torch.equal(one.s, place.home(share=0.5).s[3:])
     # What takes codes away gives them back.
-    courses = healing(place, grow(place)[0])
-    assert all(len(course.losses) == 4 for course in courses)
+    loss_curves = healing(place, grow(place)[0])
+    assert all(len(course.losses) == 4 for course in loss_curves)
 
 
 def test_a_world_that_is_lost_stays_lost_and_leaves_the_others_as_they_are(device):
     place = ground("heart", device)
     home, _ = grow(place)
-    whole = courses(home, place.run(home, place.random(9)), (0, 4, 8))
+    whole = loss_curves(home, place.run(home, place.random(9)), (0, 4, 8))
     run = place.run(home, place.random(9))
     run.s[0, :, 0] = math.nan
-    found = courses(home, run, (0, 4, 8))
+    found = loss_curves(home, run, (0, 4, 8))
     assert found[:, 0].isnan().all()
     assert torch.equal(found[:, 1], whole[:, 1])
 
@@ -368,7 +370,7 @@ def test_stored_records_give_the_stored_tables():
 
 
 def test_tables_say_what_was_not_measured_and_what_is_not_finite():
-    course = Course("erase", (0, 16), ((2.0, 1.0), (2.0, 3.0)), ((1.0, 1.0), (1.0, 1.0)))
+    course = LossCurve("wipe", (0, 16), ((2.0, 1.0), (2.0, 3.0)), ((1.0, 1.0), (1.0, 1.0)))
     text = tables([record(course), record(rule="dots")])
     ranges = "1 … 2 | 1 alone (not measured: 2) | 0.5 alone | – | – | – |"
     assert f"| heart | {ranges}\n| dots | {ranges}" in text
@@ -378,7 +380,7 @@ def test_tables_say_what_was_not_measured_and_what_is_not_finite():
 
 
 def test_records_come_back_as_they_were_written_and_curves_are_drawn_by_task(tmp_path):
-    course = Course("erase", (0, 16), ((2.0, 1.0), (2.0, math.nan)), ((1.0, 1.0), (1.0, 1.0)))
+    course = LossCurve("wipe", (0, 16), ((2.0, 1.0), (2.0, math.nan)), ((1.0, 1.0), (1.0, 1.0)))
     records = [record(course), record(course, task="texture", rule="dots")]
     path = tmp_path / "robustness_heart.json"
     records[0].write(path)

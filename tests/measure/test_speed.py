@@ -14,7 +14,7 @@ from npa_envs.cli import main
 from npa_envs.measure.speed import suites, throughput
 from npa_envs.measure.speed.drift import DriftRow, drift_rows
 from npa_envs.measure.speed.explain import Question, explain
-from npa_envs.measure.speed.suites import Report
+from npa_envs.measure.speed.suites import BenchReport
 from npa_envs.measure.speed.throughput import (
     PAPER,
     aim_rows,
@@ -25,7 +25,7 @@ from npa_envs.measure.speed.throughput import (
     throughput_rows,
     varied,
 )
-from npa_envs.measure.speed.timing import LeftOut, Session, Timing, compare
+from npa_envs.measure.speed.timing import LeftOut, Timing, TimingSession, compare
 from npa_envs.measure.speed.workloads import Workload
 from npa_envs.ops import perceive
 from npa_envs.ops.launch import noted_launches
@@ -36,8 +36,8 @@ FORWARD = 1e-5
 """Relative error that float32 may have in worlds after a few steps."""
 
 
-def session(**options) -> Session:
-    return Session(torch.device("cpu"), repeats=1, small=True, **options)
+def session(**options) -> TimingSession:
+    return TimingSession(torch.device("cpu"), repeats=1, small=True, **options)
 
 
 def timing(median: float) -> Timing:
@@ -49,7 +49,7 @@ def timing(median: float) -> Timing:
 
 def test_the_time_of_a_call_is_a_median_within_its_range():
     calls = []
-    cost = Session(torch.device("cpu"), repeats=5).cost(lambda: calls.append(0))
+    cost = TimingSession(torch.device("cpu"), repeats=5).cost(lambda: calls.append(0))
     assert 0.0 < cost.time.low <= cost.time.median <= cost.time.high
     assert len(calls) > 100
     assert cost.peak_mib is None
@@ -75,7 +75,9 @@ def test_workloads_have_the_neighbours_they_claim():
 
 
 def test_float32_drifts_little_from_float64_over_a_rollout(device):
-    rows = drift_rows(Session(device, repeats=1), [Workload(2, 2, 300, 8), Workload(3, 1, 300, 8)])
+    rows = drift_rows(
+        TimingSession(device, repeats=1), [Workload(2, 2, 300, 8), Workload(3, 1, 300, 8)]
+    )
     assert [row.workload for row in rows] == ["2D (2, 300, 8)", "3D (1, 300, 8)"]
     for row in rows:
         assert 0.0 < row.positions < FORWARD
@@ -147,14 +149,14 @@ def test_each_skip_is_measured_with_and_without():
 
 
 def test_kernels_are_cudas(device):
-    here = Session(device, repeats=1, small=True)
+    here = TimingSession(device, repeats=1, small=True)
     rows = suites.SUITES["kernels"](here)["kernels"]
     assert any("perceive" in row.kernel for row in rows) == (device.type == "cuda")
     assert [entry.what for entry in here.left_out] == ([] if rows else ["kernels"])
 
 
 def test_the_suites_measure_all_their_tables():
-    here = Session(torch.device("cpu"), repeats=1)
+    here = TimingSession(torch.device("cpu"), repeats=1)
     tables = suites.quick(here)
     assert list(tables) == ["throughput", "drift"]
     assert all(tables.values())
@@ -183,7 +185,7 @@ def test_calls_are_compared_in_turn_and_each_pair_the_other_way_round(device, mo
 
 
 def test_one_species_is_compared_with_the_rollout_that_it_is():
-    here = Session(torch.device("cpu"), repeats=9, small=True)
+    here = TimingSession(torch.device("cpu"), repeats=9, small=True)
     rows = suites.SUITES["species"](here)["one_species"]
     assert [(row.workload, row.what, row.calls) for row in rows] == [
         ("2D (1, 256, 2)", what, "eager") for what in ("inference", "training")
@@ -207,8 +209,10 @@ class TimeRow:
     step_us: Timing
 
 
-def report_of(tables, **options) -> Report:
-    return Report("quick", "npa-envs bench", "abc", torch.device("cpu"), 1, tables, (), **options)
+def report_of(tables, **options) -> BenchReport:
+    return BenchReport(
+        "quick", "npa-envs bench", "abc", torch.device("cpu"), 1, tables, (), **options
+    )
 
 
 def test_a_report_is_json_without_numbers_that_json_has_not():

@@ -19,7 +19,7 @@ from worlds import (
 import npa_envs
 from npa_envs import reference as oracle
 from npa_envs.ops import backend
-from npa_envs.ops.perceive import Terms, survey
+from npa_envs.ops.perceive import Terms, build_neighbours
 
 # The bound of the tests, then the worst error measured on CPUs and CUDA: a quarter of it at most.
 FORWARD = {torch.float32: 3e-6, torch.float64: 1e-14}  # 7.1e-7, 2e-15
@@ -156,7 +156,7 @@ def test_a_clump_takes_no_more_memory_than_the_same_particles_apart(space_dim):
 
 
 def observed(x, s, *, eps=0.2, eps0=0.2, box=None, limit=16.0, **terms):
-    return survey(x, s, eps=eps, eps0=eps0, box=box, terms=Terms(**terms), limit=limit)
+    return build_neighbours(x, s, eps=eps, eps0=eps0, box=box, terms=Terms(**terms), limit=limit)
 
 
 @both_inverses

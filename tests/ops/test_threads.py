@@ -19,7 +19,7 @@ from npa_envs.ops import launch as bridge
 from npa_envs.ops import launch as threads
 from npa_envs.ops import orbit, render_gaussians
 from npa_envs.ops.launch import even_ranges, run_together
-from npa_envs.ops.perceive import Terms, survey
+from npa_envs.ops.perceive import Terms, build_neighbours
 from npa_envs.ops.pictures.losses import picture_losses
 from npa_envs.ops.pictures.splat import splat
 from npa_envs.ops.update import ActionRules, PreparedActions, update_particles
@@ -85,7 +85,7 @@ def acted(x, s):
     for _ in range(2):
         shape = (*x.shape[:2], x.shape[2] + STATE_DIM)
         actions(torch.randn(shape, generator=generator, dtype=x.dtype))
-    surveyed = survey(x, s, eps=0.3, eps0=0.3, box=None, terms=Terms(), limit=1.0)
+    surveyed = build_neighbours(x, s, eps=0.3, eps0=0.3, box=None, terms=Terms(), limit=1.0)
     first = surveyed.perceive()
     return [x, s, diverged, first, surveyed.perceive(torch.empty_like(first))]
 

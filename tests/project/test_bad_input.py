@@ -18,7 +18,7 @@ from npa_envs.tasks.seeds import uniform_ball, uniform_box
 from npa_envs.tasks.texture import TextureConfig
 from npa_envs.training import preset, train
 from npa_envs.web.export import export_web
-from npa_envs.world.brushes import erase_state, inject
+from npa_envs.world.brushes import inject, wipe_state
 from npa_envs.wrappers import RowPolicy, TorchNormalizeReward
 
 
@@ -168,7 +168,7 @@ META = torch.zeros(1, 4, 2, device="meta")
         (lambda: export_web("gecko", "p.html"), "sources must be a list of rules, got 'gecko'"),
         (lambda: export_web([NPARule()], "p.html"), "names or files of rules, got a NPARule"),
         (lambda: export_web(["gecko"], "p.html", title=3), "title must be text"),
-        (lambda: erase_state(X, S, centre=(0.0, 0.0), radius=0.2), "centre must be a tensor"),
+        (lambda: wipe_state(X, S, centre=(0.0, 0.0), radius=0.2), "centre must be a tensor"),
         (
             lambda: inject(X, S, centre=torch.zeros(1, 2), radius=0.2, state=0.5, strength=1.0),
             "state must be a tensor",
@@ -212,8 +212,8 @@ META = torch.zeros(1, 4, 2, device="meta")
         (lambda: uniform_ball(2, 2**31, 2, 0.1), "coordinates must be at most"),
         (lambda: uniform_box(2, 3, 1.0), "box must hold a side"),
         (lambda: parse_damage(3), "damage must be text"),
-        (lambda: damage_worlds(*world(), kind="erase", size={}), "size must be a number"),
-        (lambda: damage_worlds(*world(), kind="erase", size=1e300), "at least 0"),
+        (lambda: damage_worlds(*world(), kind="wipe", size={}), "size must be a number"),
+        (lambda: damage_worlds(*world(), kind="wipe", size=1e300), "at least 0"),
         (lambda: preset("tiny", 3), "unknown task 3"),
         (lambda: preset("tiny", weight_decay=10**400), "weight_decay must be of type float"),
         (lambda: TextureConfig(eps=10**400), "eps must be a finite number"),

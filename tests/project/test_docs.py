@@ -21,7 +21,7 @@ from npa_envs.agents.learning import Budget, train
 from npa_envs.cli import COMMANDS, main
 from npa_envs.envs import multispecies_v0, particles_v0
 from npa_envs.envs.multi import TASKS as TABLE
-from npa_envs.ops.backend import Request, describe
+from npa_envs.ops.backend import KernelRequest, describe
 from npa_envs.registration import ENVIRONMENTS, GARDEN_IDS
 from npa_envs.rule.files import shipped_rules
 from npa_envs.tasks.morphogenesis2d import MORPHOGENESIS2D_PRESETS
@@ -100,15 +100,15 @@ def test_the_tables_of_the_benchmark_are_what_its_files_say(bench, tmp_path, cap
 
 
 def test_tables_and_curves_of_the_benchmark_show_all_rows(bench):
-    from npa_envs.agents.comparison.npa_bench import SUITES, Row, Run
+    from npa_envs.agents.comparison.npa_bench import SUITES, BenchRow, BenchRun
 
     suite = SUITES["npa-bench-v0"]
     first, second = list(suite.groups["gardens"])[:2]
 
     def row(method, *means):
         curve = ((0.0, 0.0), (9.0, means[-1])) if method == "other" else ((0.0, means[-1]),)
-        runs = [Run(first, seed, 9.0, mean, curve) for seed, mean in enumerate(means)]
-        return Row(suite, method, tuple(runs), f"it is {method}")
+        runs = [BenchRun(first, seed, 9.0, mean, curve) for seed, mean in enumerate(means)]
+        return BenchRow(suite, method, tuple(runs), f"it is {method}")
 
     rows = {name: row(name, *means) for name, means in {
         "other": (1.0, 2.0), "zero": (0.0, 0.0), "gradient": (4.0, 4.0), "sac": (3.0, 3.0),
@@ -681,7 +681,7 @@ def test_the_map_names_what_is_there():
 
 
 def test_the_page_on_what_is_measured_shows_the_backend_table():
-    chosen = describe(Request(torch.device("cpu"), torch.float32))
+    chosen = describe(KernelRequest(torch.device("cpu"), torch.float32))
     assert "\n".join(f"  {line}" for line in chosen) in (DOCS / "measured.md").read_text()
 
 

@@ -220,7 +220,7 @@ def test_filmstrip_writes_a_caption_below_each_frame_and_none_beside_it(tmp_path
 
 def test_filmstrip_of_small_frames_keeps_captions_apart(tmp_path):
     frames = [np.zeros((32, 32, 3), np.uint8)] * 3
-    write_filmstrip(tmp_path / "strip.png", frames, ["step 200: erase 0.2"] * 3)
+    write_filmstrip(tmp_path / "strip.png", frames, ["step 200: wipe 0.2"] * 3)
     strip = np.asarray(Image.open(tmp_path / "strip.png")).min(axis=-1)
     pitch = (strip.shape[1] - 8) // 3
     for k in range(4):

@@ -53,8 +53,8 @@ class Weighted(npa_envs.NPARule):
 
 
 class Fated(npa_envs.NPARule):
-    def fates(self, states):
-        divide, die = super().fates(states)
+    def division_probabilities(self, states):
+        divide, die = super().division_probabilities(states)
         return 0.0 * divide, 0.0 * die + 1.0
 
 
@@ -139,10 +139,10 @@ def test_a_subclass_that_changes_nothing_of_a_step_is_plain():
 @pytest.mark.parametrize("how", ["override", "attribute", "hook", "layer"])
 def test_fates_of_their_own_make_a_rule_that_is_not_plain(how):
     rule = (Fated if how == "override" else npa_envs.NPARule)(2, 4, 8, divides=True)
-    fates = npa_envs.NPARule(2, 4, 8, divides=True).fates
+    division_probabilities = npa_envs.NPARule(2, 4, 8, divides=True).division_probabilities
     assert npa_envs.NPARule(2, 4, 8, divides=True).is_plain()
     if how == "attribute":
-        rule.fates = lambda states: fates(states)[::-1]
+        rule.division_probabilities = lambda states: division_probabilities(states)[::-1]
     elif how == "hook":
         rule.fate.register_forward_hook(lambda own, inputs, output: -output)
     elif how == "layer":

@@ -301,7 +301,7 @@ def plain_stack(rules):
     return packed({name: tensor.detach() for name, tensor in tensors.items()})
 
 
-def test_stacks_of_plain_rules_are_told_apart_by_numbers(tmp_path):
+def test_stacks_of_plain_rules_are_by_species_by_numbers(tmp_path):
     torch.manual_seed(0)
     rules, path = [NPARule(2, 5, 8) for _ in range(3)], tmp_path / "models_digits.json"
     path.write_text(json.dumps(plain_stack(rules)))

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from npa_envs.errors import NPAError
 from npa_envs.rule.authors import save_demo_json
-from npa_envs.rule.files import first_rules, load_rule, rule_metadata, save_rule, shipped_rules
+from npa_envs.rule.files import load_rule, preset_rules, rule_metadata, save_rule, shipped_rules
 from npa_envs.rule.rule import NPARule, RuleHyperParameters
 
 RULES: dict[str, Callable[[], NPARule]] = {
@@ -238,7 +238,7 @@ def test_a_file_without_a_checksum_is_refused_and_those_of_the_package_are_loade
         load_rule(path)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        for name in shipped_rules() | first_rules():
+        for name in shipped_rules() | preset_rules():
             load_rule(name)
 
 

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from npa_envs.errors import NPAError
-from npa_envs.tasks.damage import clump, cut, erase_state, random_particle
+from npa_envs.tasks.damage import clump, cut, random_particle, wipe_state
 
 B, N, C = 3, 257, 5
 
@@ -22,22 +22,22 @@ def world(request, device) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
 def test_states_inside_the_ball_are_zero_and_the_others_untouched(world):
     x, s, centre = world
     before = s.clone()
-    erased = erase_state(x, s, centre=centre, radius=0.4)
+    wiped = wipe_state(x, s, centre=centre, radius=0.4)
     counted = 0
     for b in range(B):
         for i in range(N):
             if math.dist(x[b, i].tolist(), centre[b].tolist()) <= 0.4:
-                assert (erased[b, i] == 0).all()
+                assert (wiped[b, i] == 0).all()
                 counted += 1
             else:
-                assert torch.equal(erased[b, i], s[b, i])
+                assert torch.equal(wiped[b, i], s[b, i])
     assert counted > 10
     assert torch.equal(s, before)
     # Each world may have a radius of its own.
     radius = torch.tensor([0.0, 0.4, 9.0], dtype=x.dtype, device=x.device)
-    by_world = erase_state(x, s, centre=centre, radius=radius)
+    by_world = wipe_state(x, s, centre=centre, radius=radius)
     assert torch.equal(by_world[0], s[0])
-    assert torch.equal(by_world[1], erased[1])
+    assert torch.equal(by_world[1], wiped[1])
     assert (by_world[2] == 0).all()
 
 
@@ -93,15 +93,15 @@ def test_wrong_arguments_are_clear_errors():
     with pytest.raises(NPAError, match=r"x must be float32 or float64, got torch\.int64"):
         random_particle(x.long())
     with pytest.raises(NPAError, match="x and s must agree in worlds and particles"):
-        erase_state(x, s[:, :3], centre=centre, radius=0.1)
+        wipe_state(x, s[:, :3], centre=centre, radius=0.1)
     with pytest.raises(NPAError, match=r"centre must have shape \[B, D\] = \(2, 2\), got \(2,\)"):
-        erase_state(x, s, centre=centre[0], radius=0.1)
+        wipe_state(x, s, centre=centre[0], radius=0.1)
     with pytest.raises(NPAError, match=r"centre must be torch\.float32"):
-        erase_state(x, s, centre=centre.double(), radius=0.1)
+        wipe_state(x, s, centre=centre.double(), radius=0.1)
     with pytest.raises(NPAError, match=r"normal must have shape"):
         cut(x, s, centre=centre, normal=torch.zeros(2, 3), gap=0.1)
     with pytest.raises(NPAError, match=r"radius must be a number or a tensor of shape \[B\]"):
-        erase_state(x, s, centre=centre, radius=torch.zeros(3))
+        wipe_state(x, s, centre=centre, radius=torch.zeros(3))
     for radius in (-0.1, math.nan, math.inf):
         with pytest.raises(NPAError, match="radius must be finite and at least 0"):
             clump(x, s, centre=centre, radius=radius, factor=0.5)

@@ -124,7 +124,12 @@ def trained(tmp_path, iterations=4, **fields):
 def test_rest_says_nothing_of_fates(tmp_path, monkeypatch):
     monkeypatch.setattr(optimiser, "FATE_RATE", 1.0)
     # Old worlds are to rest, but what is born in them is no unrest; pictures do not count.
-    rest = {"rest_weight": 1.0, "lifetimes": (12, 48), "rest_age": 12, "damage_share": 0.0}
+    rest = {
+        "stillness_weight": 1.0,
+        "max_age_range": (12, 48),
+        "stillness_min_age": 12,
+        "damage_share": 0.0,
+    }
     rule = trained(tmp_path, 8, splat_weight=0.0, drift_weight=0.0, **rest)
     assert rule.fate.bias.tolist() == list(FIRST_FATES)
     assert rule.output.weight.any()
@@ -133,7 +138,7 @@ def test_rest_says_nothing_of_fates(tmp_path, monkeypatch):
 def test_births_are_no_unrest(tmp_path):
     config = preset(
         "tiny", "morphogenesis2d", division=True, particle_count=64, target_point_count=64,
-        world_count=1, lifetimes=(12, 48), rest_weight=1.0, out=tmp_path,
+        world_count=1, max_age_range=(12, 48), stillness_weight=1.0, out=tmp_path,
     )  # fmt: skip
     task = Morphogenesis2D(config.task)
     rule = task.make_rule(torch.Generator().manual_seed(0))

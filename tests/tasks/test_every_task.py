@@ -261,7 +261,7 @@ def test_commands_take_the_rule_of_a_task(tmp_path, capsys, name):
     for row in found["growth"]:
         assert row["loss"] > 0.0
         assert 10.0 < row["psnr"] < 40.0 if aligned else row["psnr"] is None
-    options = ["--steps", "6", "--every", "3", "--damage", "3:erase", "--no-progress"]
+    options = ["--steps", "6", "--every", "3", "--damage", "3:wipe", "--no-progress"]
     assert main(["rollout", rule, *options, *to_draw, "--out", str(tmp_path)]) == 0
     text = capsys.readouterr().out
     assert "step 6: " in text

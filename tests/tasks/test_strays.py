@@ -5,13 +5,13 @@ from dataclasses import replace
 import pytest
 import torch
 
-from npa_envs.tasks.damage import FARTHEST, NEAREST, scatter, stray_motion
+from npa_envs.tasks.damage import FARTHEST, NEAREST, displace, escape_motion
 from npa_envs.tasks.morphogenesis2d import Morphogenesis2D, Morphogenesis2DConfig
 from npa_envs.world.randomness import WorldRandom
 
 TINY = {"state_dim": 6, "hidden_dim": 24, "eps": 0.3, "resolution": 24, "particle_count": 96}
 SMALL = Morphogenesis2DConfig(
-    target="ring", target_point_count=96, stray_share=0.1, stray_weight=1.0, **TINY
+    target="ring", target_point_count=96, escape_share=0.1, escape_weight=1.0, **TINY
 )
 
 
@@ -23,7 +23,7 @@ def generators(device):
 @pytest.mark.parametrize("space_dim", [2, 3])
 def test_as_many_are_thrown_out_as_was_said_and_on_all_sides(device, which, space_dim):
     x = torch.zeros(2, 4000, space_dim, device=device)
-    found = scatter(x, share=0.25, generator=generators(device)[which])
+    found = displace(x, share=0.25, generator=generators(device)[which])
     distance = found.norm(dim=-1)
     out = distance > 0.0
     assert ((distance[out] >= NEAREST) & (distance[out] <= FARTHEST)).all()
@@ -36,11 +36,11 @@ def test_as_many_are_thrown_out_as_was_said_and_on_all_sides(device, which, spac
 def test_only_the_paths_of_those_outside_count():
     x = torch.tensor([[[0.5, 0.2], [1.5, 0.0], [0.0, -3.0]]])
     path = torch.tensor([[7.0, 1.0, 2.0]], requires_grad=True)
-    motion = stray_motion(x, path)
+    motion = escape_motion(x, path)
     assert float(motion.detach()) == 1.5
     motion.backward()
     assert path.grad.tolist() == [[0.0, 0.5, 0.5]]
-    assert float(stray_motion(x[:, :1], path[:, :1]).detach()) == 0.0
+    assert float(escape_motion(x[:, :1], path[:, :1]).detach()) == 0.0
 
 
 def test_a_share_throws_particles_of_the_pool_out_and_a_weight_counts_their_paths():
@@ -52,7 +52,7 @@ def test_a_share_throws_particles_of_the_pool_out_and_a_weight_counts_their_path
     assert 0 < int(out.sum()) < 60
     path = torch.ones(2, 96)
     total, parts = task.loss(hurt_x, s, path)
-    plain, without = Morphogenesis2D(replace(SMALL, stray_weight=0.0)).loss(hurt_x, s, path)
+    plain, without = Morphogenesis2D(replace(SMALL, escape_weight=0.0)).loss(hurt_x, s, path)
     assert float(parts["stray"]) == 1.0
     assert "stray" not in without
     assert float(total) == pytest.approx(float(plain) + 1.0)

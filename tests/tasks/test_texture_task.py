@@ -131,7 +131,7 @@ def test_particles_in_the_target_s_place_are_nearer_than_any_others():
     assert min(shuffled, blank) > 5.0 * drawn
 
 
-def test_damage_erases_a_disk_that_reaches_across_the_seam():
+def test_damage_wipes_a_disk_that_reaches_across_the_seam():
     task = Texture(dataclasses.replace(SMALL, damage_radius=0.4))
     x, _ = worlds(task, 1)
     x = x.new_tensor([[[0.95, -0.95]] * 50]) + 0.02 * x[:, :50]
@@ -140,9 +140,9 @@ def test_damage_erases_a_disk_that_reaches_across_the_seam():
     s = torch.ones(1, 54, 16)
     places, states = task.damage(x, s, torch.Generator().manual_seed(0))
     assert torch.equal(places, x)
-    erased = states[0, :, 0] == 0.0
+    wiped = states[0, :, 0] == 0.0
     # Drawn is one of the fifty in the corner, but for a chance of 4 in 54.
-    assert erased.tolist() == [True] * 52 + [False, False]
+    assert wiped.tolist() == [True] * 52 + [False, False]
     assert task.damage(x, s, torch.Generator())[1] is not s
     unhurt = Texture(dataclasses.replace(SMALL, damage_radius=0.0))
     assert unhurt.damage(x, s, torch.Generator())[1] is s

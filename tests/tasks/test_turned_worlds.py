@@ -137,7 +137,7 @@ def test_without_angles_seeds_point_one_way_and_worlds_are_compared_as_they_lie(
 
 
 def test_penalties_know_no_direction_either():
-    task = task_of(stray_weight=1.0, bound_weight=1.0)
+    task = task_of(escape_weight=1.0, bound_weight=1.0)
     generator = torch.Generator().manual_seed(0)
     x = torch.randn(2, 300, 2, generator=generator).double()
     path = torch.rand(2, 300, generator=generator).double()

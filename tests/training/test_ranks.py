@@ -23,9 +23,9 @@ PLAIN = {}
 """The preset as it is."""
 
 LIVELY = {
-    "lifetimes": (4, 400),
-    "rest_weight": 1.0,
-    "rest_age": 4,
+    "max_age_range": (4, 400),
+    "stillness_weight": 1.0,
+    "stillness_min_age": 4,
     "damage_share": 0.5,
     "world_count": 4,
     "pool_size": 16,
@@ -42,7 +42,7 @@ SEEDED = {
 }
 """Batches with several fresh seeds; worlds of some places are damaged."""
 
-STRAYING = {"stray_share": 0.1, "stray_weight": 10.0, "world_count": 4, "pool_size": 8}
+STRAYING = {"escape_share": 0.1, "escape_weight": 10.0, "world_count": 4, "pool_size": 8}
 """Worlds that lose particles, some more than others."""
 
 

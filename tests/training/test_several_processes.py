@@ -161,7 +161,7 @@ def test_processes_whose_launcher_was_killed_save_and_end(tmp_path):
     assert saved == last_iteration(tmp_path / "run")
 
 
-def test_a_mistake_is_told_once_and_ends_all(tmp_path):
+def test_a_mistake_is_print_once_and_ends_all(tmp_path):
     run = started(tmp_path / "run", "--world-count", "3")
     said, _ = run.communicate(timeout=60)
     assert run.returncode == 2

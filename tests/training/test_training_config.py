@@ -92,16 +92,20 @@ def test_no_field_of_the_run_hides_one_of_the_task():
         ("weight_decay", -1, "weight_decay must be a finite number of at least 0, got -1.0"),
         ("steps", [5, 5], "steps must be two whole numbers"),
         ("steps", 5, "steps must be a list, got 5"),
-        ("lifetimes", [5, 2], "lifetimes must be two whole numbers"),
-        ("lifetimes", [0, 2], "lifetimes must be two whole numbers"),
-        ("second_lives", 1.0, "second_lives must be below 1, got 1.0"),
-        ("second_lives", 0.5, "second_lives needs worlds that have lifetimes, got 0.5 without"),
+        ("max_age_range", [5, 2], "max_age_range must be two whole numbers"),
+        ("max_age_range", [0, 2], "max_age_range must be two whole numbers"),
+        ("damage_and_keep_share", 1.0, "damage_and_keep_share must be below 1, got 1.0"),
+        (
+            "damage_and_keep_share",
+            0.5,
+            "damage_and_keep_share needs worlds that have max_age_range, got 0.5 without",
+        ),
         ("damage_share", 1.5, "damage_share must be at most 1, got 1.5"),
         ("damage_share", -0.5, "damage_share must be a finite number of at least 0, got -0.5"),
         ("vary_eps", (0.0, 1.0), "vary_eps must be two factors"),
         ("vary_eps", (2.0, 1.0), r"vary_eps must be two factors .*lo <= hi"),
-        ("rest_power", 0.5, "rest_power must be at least 1 and at most 8, got 0.5"),
-        ("rest_power", 16, "rest_power must be at least 1 and at most 8, got 16"),
+        ("stillness_power", 0.5, "stillness_power must be at least 1 and at most 8, got 0.5"),
+        ("stillness_power", 16, "stillness_power must be at least 1 and at most 8, got 16"),
         ("schedule", "linear", "schedule must be one of milestones, cosine, got 'linear'"),
         ("milestones", [5, 2], "milestones must be positive and increasing"),
         ("world_count", 1000, "world_count must be at most pool_size"),
@@ -131,15 +135,17 @@ def test_flags_are_true_or_false(field):
         dataclasses.replace(told, **{field: "no"})
 
 
-def test_what_needs_ages_needs_lifetimes():
-    with pytest.raises(NPAError, match="rest_weight needs worlds that have lifetimes, got 64"):
-        override(PAPER, rest_weight=64)
+def test_what_needs_ages_needs_max_age_range():
+    with pytest.raises(
+        NPAError, match="stillness_weight needs worlds that have max_age_range, got 64"
+    ):
+        override(PAPER, stillness_weight=64)
 
 
-def test_sections_of_a_pool_with_lifetimes_are_equal():
+def test_sections_of_a_pool_with_max_age_range_are_equal():
     with pytest.raises(NPAError, match="pool_size must be a multiple of world_count where"):
-        override(PAPER, lifetimes=[64, 128], pool_size=36)
-    assert override(PAPER, lifetimes=[64, 128], pool_size=32).ages
+        override(PAPER, max_age_range=[64, 128], pool_size=36)
+    assert override(PAPER, max_age_range=[64, 128], pool_size=32).ages
     assert not override(PAPER, pool_size=36).ages
 
 
@@ -214,8 +220,15 @@ def test_a_configuration_survives_being_written_as_json(name, task, fields):
 
 @pytest.mark.parametrize("name", TASKS["co_morphogenesis2d"].presets)
 def test_presets_of_two_species_have_the_schedule_of_one_but_what_came_with_muon(name):
-    came = {"optimiser", "learning_rate", "seed_interval", "lifetimes", "second_lives"}
-    came |= {"damage_share", "rest_weight", "weight_decay", "rest_age", "rest_power", "dead_zone"}
+    came = {"optimiser", "learning_rate", "seed_interval", "max_age_range", "damage_and_keep_share"}
+    came |= {
+        "damage_share",
+        "stillness_weight",
+        "weight_decay",
+        "stillness_min_age",
+        "stillness_power",
+        "dead_zone",
+    }
     alone, together = preset(name), preset(name, "co_morphogenesis2d")
     assert together.task.counts == (alone.task.particle_count,) * 2
     own = together.task.species[0]

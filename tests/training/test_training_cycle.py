@@ -64,16 +64,16 @@ def runaway():
         (circle_cycle, {"dtype": "float64", "damage_share": 0.0}),
         (tiny_cycle, {}),
         (clouds_cycle, {"steps": (2, 4), "pool_size": 10}),
-        (tiny_cycle, {"lifetimes": (4, 40), "damage_share": 0.5}),
+        (tiny_cycle, {"max_age_range": (4, 40), "damage_share": 0.5}),
         (
             clouds_cycle,
-            {"steps": (2, 4), "pool_size": 16, "lifetimes": (2, 6), "damage_share": 0.5},
+            {"steps": (2, 4), "pool_size": 16, "max_age_range": (2, 6), "damage_share": 0.5},
         ),
-        (tiny_cycle, {"lifetimes": (4, 40), "damage_share": 0.5, "second_lives": 0.5}),
-        (tiny_cycle, {"lifetimes": (4, 40), "damage_share": 0.0, "second_lives": 0.5}),
+        (tiny_cycle, {"max_age_range": (4, 40), "damage_share": 0.5, "damage_and_keep_share": 0.5}),
+        (tiny_cycle, {"max_age_range": (4, 40), "damage_share": 0.0, "damage_and_keep_share": 0.5}),
         (tiny_cycle, {"vary_eps": (0.5, 2.0)}),
         (world_cycle, {"damage_share": 0.5}),
-        (world_cycle, {"lifetimes": (4, 400), "vary_eps": (0.5, 2.0)}),
+        (world_cycle, {"max_age_range": (4, 400), "vary_eps": (0.5, 2.0)}),
         (clouds_cycle, {"by_world": True, "steps": (2, 4), "pool_size": 16}),
     ],
 )
@@ -97,7 +97,7 @@ def test_replayed_operations_train_the_same_rule_as_called_ones(tmp_path, make, 
 
 @pytest.mark.gpu
 def test_recorded_iterations_take_means_over_processes_where_eager_ones_do(tmp_path):
-    straying = {"stray_share": 0.2, "stray_weight": 10.0, "cuda_graph": False}
+    straying = {"escape_share": 0.2, "escape_weight": 10.0, "cuda_graph": False}
     config = preset("tiny", out=tmp_path, device="cuda", **straying)
     task = Morphogenesis2D(config.task, device="cuda")
     device = torch.device("cuda")

@@ -51,12 +51,12 @@ def test_pool_draws_different_worlds_and_all_of_them_in_the_long_run():
     assert (pool.x[4, 0, 0], pool.s[2, 0, 0]) == (4, 2)
 
 
-def test_a_pool_with_lifetimes_draws_one_world_of_each_section():
+def test_a_pool_with_max_age_range_draws_one_world_of_each_section():
     x = torch.zeros(12, 2, 2)
-    pool = WorldPool(x, x.clone(), runaway_limit=1.0, lifetimes=(10, 1000))
-    lifetimes = pool.lifetime.tolist()
-    assert (lifetimes[0], lifetimes[-1]) == (10, 1000)
-    ratios = [b / a for a, b in itertools.pairwise(lifetimes)]
+    pool = WorldPool(x, x.clone(), runaway_limit=1.0, max_age_range=(10, 1000))
+    max_age_range = pool.lifetime.tolist()
+    assert (max_age_range[0], max_age_range[-1]) == (10, 1000)
+    ratios = [b / a for a, b in itertools.pairwise(max_age_range)]
     assert ratios == pytest.approx([100 ** (1 / 11)] * 11, rel=0.03)
     generator = torch.Generator().manual_seed(0)
     drawn = torch.stack([pool.sample(4, generator) for _ in range(60)])
@@ -66,7 +66,7 @@ def test_a_pool_with_lifetimes_draws_one_world_of_each_section():
 
 def test_worlds_age_and_are_new_when_they_run_away():
     x = torch.zeros(4, 2, 2)
-    pool = WorldPool(x, x.clone(), runaway_limit=1.0, lifetimes=(5, 40))
+    pool = WorldPool(x, x.clone(), runaway_limit=1.0, max_age_range=(5, 40))
     index = torch.tensor([0, 2, 3])
     after = torch.tensor([0.0, 0.0, 3.0])[:, None, None].expand(3, 2, 2)
     pool.write(index, after, after, x[:3], x[:3], age=torch.tensor([7, 8, 9]))
@@ -211,9 +211,9 @@ def test_iteration_leaves_the_worlds_the_terms_and_the_gradients(tmp_path):
 
 @pytest.mark.parametrize("power", [1.0, 2.0, 4.0])
 def test_grown_worlds_are_to_rest(tmp_path, power):
-    fields = {"dtype": "float64", "lifetimes": (8, 64), "pool_size": 9}
+    fields = {"dtype": "float64", "max_age_range": (8, 64), "pool_size": 9}
     _, _, plain = make_iteration(circle_config(tmp_path, **fields))
-    fields |= {"rest_weight": 0.5, "rest_power": power}
+    fields |= {"stillness_weight": 0.5, "stillness_power": power}
     task, _, iteration = make_iteration(circle_config(tmp_path, **fields))
     assert iteration.term_names == (*plain.term_names, "rest")
     # The second of three worlds is grown; both iterations draw the same masks.
@@ -243,7 +243,7 @@ def test_power_means_of_small_motions_are_right_in_float32(power):
 @pytest.mark.parametrize("power", [1.0, 2.0, 4.0])
 def test_worlds_that_do_not_move_have_finite_gradients_of_rest(tmp_path, power):
     config = circle_config(
-        tmp_path, lifetimes=(8, 64), pool_size=9, rest_weight=0.5, rest_power=power
+        tmp_path, max_age_range=(8, 64), pool_size=9, stillness_weight=0.5, stillness_power=power
     )
     _, rule, iteration = make_iteration(config)
     with torch.no_grad():

@@ -75,7 +75,7 @@ def test_a_loss_that_is_not_finite_is_told_where_its_worlds_cannot_be_written(tm
         (5, {}),
         (5, {"repeats": 2, "iterations": 3, "milestones": [1]}),
         (5, {"log_interval": 2, "checkpoint_interval": 3}),
-        (5, {"lifetimes": (3, 40), "pool_size": 9, "schedule": "cosine"}),
+        (5, {"max_age_range": (3, 40), "pool_size": 9, "schedule": "cosine"}),
         (5, {"dtype": "float64", "damage_share": 0.0}),
         (5, {"optimiser": "muon", "weight_decay": 0.1}),
     ],
@@ -186,7 +186,7 @@ def test_worlds_that_have_lived_are_replaced_by_seeds_and_all_others_grow_older(
         return task.make_rollout()(rule, x, s, count, **options)
 
     fields = {"iterations": 60, "world_count": 2, "pool_size": 2, "milestones": []}
-    fields |= {"lifetimes": (1, 40), "steps": (4, 8), "damage_share": 0.0}
+    fields |= {"max_age_range": (1, 40), "steps": (4, 8), "damage_share": 0.0}
     config = circle_config(tmp_path, **fields)
     trainer_of(config, task, rollout=rollout).run(progress=False)
     ages = [0, 0]
@@ -206,8 +206,8 @@ def test_worlds_that_are_old_and_never_damaged_count_as_grown(tmp_path, damage):
         seen.append(trainer._cycle.batch.grown.tolist())
         return plain_rollout(rule, x, s, 2, **options)
 
-    fields = {"iterations": 6, "world_count": 4, "pool_size": 4, "lifetimes": (200, 6000)}
-    fields |= {"steps": (256, 257), "damage_share": 0.5 * damage, "rest_weight": 1.0}
+    fields = {"iterations": 6, "world_count": 4, "pool_size": 4, "max_age_range": (200, 6000)}
+    fields |= {"steps": (256, 257), "damage_share": 0.5 * damage, "stillness_weight": 1.0}
     trainer = trainer_of(circle_config(tmp_path, **fields), rollout=rollout)
     trainer.run(progress=False)
     # Lives of 200, 621, 1931 and 6000 steps; the first two are damaged, where worlds are.
@@ -266,8 +266,13 @@ def test_worlds_whose_time_is_over_are_damaged_then_and_live_again(tmp_path, sha
         drawn.extend(zip(places, ages, kept, hurt, strict=True))
         return plain_rollout(rule, x, s, steps, **options)
 
-    fields = {"iterations": 150, "pool_size": 16, "world_count": 4, "lifetimes": (8, 32)}
-    fields |= {"damage_share": 1e-6, "milestones": [], "steps": (4, 5), "second_lives": share}
+    fields = {"iterations": 150, "pool_size": 16, "world_count": 4, "max_age_range": (8, 32)}
+    fields |= {
+        "damage_share": 1e-6,
+        "milestones": [],
+        "steps": (4, 5),
+        "damage_and_keep_share": share,
+    }
     config = circle_config(tmp_path, **fields)
     trainer = trainer_of(config, WatchedTask(), rollout=rollout)
     trainer.run(progress=False)

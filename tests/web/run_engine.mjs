@@ -36,7 +36,7 @@ const acts = {
   brush({ tool: name, dimension, x, s, box, at, move, radius, strength, normal, along }) {
     x = floats(x);
     s = floats(s);
-    if (name === "erase") brushes.eraseState(x, s, dimension, at, radius, box);
+    if (name === "wipe") brushes.wipeState(x, s, dimension, at, radius, box);
     if (name === "push") brushes.push(x, dimension, at, move, radius, strength, box);
     if (name === "clump") brushes.clump(x, dimension, at, radius, strength, box);
     if (name === "cut") brushes.cut(x, dimension, at, normal, radius, along, box);

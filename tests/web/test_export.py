@@ -142,7 +142,7 @@ def test_two_species_step_as_in_python(run: Run, density_counts: tuple[int, int]
 
 
 @pytest.mark.parametrize(("dimension", "box"), [(2, None), (2, (0.6, 0.5)), (3, None)])
-@pytest.mark.parametrize("name", ["erase", "push", "clump", "cut", "cut for ever", "inject"])
+@pytest.mark.parametrize("name", ["wipe", "push", "clump", "cut", "cut for ever", "inject"])
 def test_brushes_are_those_of_python(run: Run, name: str, dimension: int, box: Box) -> None:
     x, s = scattered(200, dimension, 4, box)
     at, move = x.new_full((1, dimension), 0.2), x.new_tensor([[0.05, -0.1, 0.2][:dimension]])
@@ -150,8 +150,8 @@ def test_brushes_are_those_of_python(run: Run, name: str, dimension: int, box: B
     told = {"centre": at, "radius": 0.15, "box": box}
     want_x, want_s = x, s
     match name.split()[0]:
-        case "erase":
-            want_s = brushes.erase_state(x, s, **told)
+        case "wipe":
+            want_s = brushes.wipe_state(x, s, **told)
         case "push":
             want_x = brushes.push(x, move=move, strength=0.7, **told)
         case "clump":
@@ -210,7 +210,7 @@ def test_a_live_world_moves_and_the_same_seed_gives_the_same_world(
 def test_the_rubber_takes_particles_away_and_the_others_go_on(
     run: Run, settings: dict[str, Any]
 ) -> None:
-    rubber = {"type": "brush", "tool": "erase", "at": [0.1, 0], "radius": 0.08, "strength": 1}
+    rubber = {"type": "brush", "tool": "remove", "at": [0.1, 0], "radius": 0.08, "strength": 1}
     before = live(run, settings)
     after = live(run, settings, {"type": "play", "on": False}, rubber)
     x = unpacked(before["x"], (300, 2))
@@ -285,7 +285,7 @@ def test_settings_reach_the_world_and_wrong_messages_are_told(
         "eps must lie in [0.04, 0.25], got 9", "no rule is called nobody",
         "nothing to show is called nothing", "no damage is called luck", "no message is called fly",
     ]  # fmt: skip
-    for name in ("erase", "cut", "clump", "noise"):
+    for name in ("wipe", "cut", "clump", "noise"):
         hurt = live(run, settings, *[ADVANCE] * 3, {"type": "damage", "name": name})
         whole = live(run, settings, *[ADVANCE] * 3)
         assert (hurt["x"], hurt["s"]) != (whole["x"], whole["s"])

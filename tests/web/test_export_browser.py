@@ -85,7 +85,7 @@ def test_an_exported_page_heals(
     page.wait(f"{STEP} >= 100", 120)
     page.run("document.page.play(false)")
     assert page.run(BLANK) < 10
-    page.run("document.page.send({ type: 'damage', name: 'erase' })")
+    page.run("document.page.send({ type: 'damage', name: 'wipe' })")
     assert page.wait(f"{BLANK} > 40 && {BLANK}") > 40
     page.run("document.page.play(true)")
     page.wait(f"{BLANK} < 10", 120)

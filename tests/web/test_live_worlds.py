@@ -15,7 +15,7 @@ import torch
 from npa_envs import NPAError, load_rule, rollout, rollout_species, save_rule
 from npa_envs.agents.policies import ZeroPolicy
 from npa_envs.files import open_regular
-from npa_envs.rule.files import first_rules, rule_metadata, shipped_rules
+from npa_envs.rule.files import preset_rules, rule_metadata, shipped_rules
 from npa_envs.rule.rule import NPARule, dividing
 from npa_envs.tasks.damage import DAMAGE_SIZES
 from npa_envs.training import config_to_dict, preset
@@ -111,16 +111,16 @@ def test_the_same_seed_gives_the_same_world_and_the_next_one_another(world):
     assert world.frame().step == 0
 
 
-def test_erase_takes_particles_and_the_others_feel_it_nearby_only(world, gecko):
+def test_remove_takes_particles_and_the_others_feel_it_nearby_only(world, gecko):
     other = gecko()
     for live in (world, other):
         live.x = 4.0 * live.x
     far = world.x[0, :, 0] > 0.25
-    assert not world.handle(brush("erase", at=[-0.2, 0.0], radius=0.15))
+    assert not world.handle(brush("remove", at=[-0.2, 0.0], radius=0.15))
     frame = world.frame()
     assert 0 < len(frame.positions) < COUNT
     assert world.news() == [{"type": "reordered"}]
-    world.handle(brush("erase", at=[5.0, 5.0]))
+    world.handle(brush("remove", at=[5.0, 5.0]))
     assert world.news() == []
     assert np.linalg.norm(frame.positions - [-0.2, 0.0], axis=1).min() > 0.15
     assert far.sum() > 3
@@ -134,7 +134,7 @@ def test_erase_takes_particles_and_the_others_feel_it_nearby_only(world, gecko):
 
 
 def test_a_world_without_particles_goes_on(world):
-    world.handle(brush("erase", radius=9.0))
+    world.handle(brush("remove", radius=9.0))
     world.advance()
     assert world.frame().positions.shape == (0, 2)
     assert world.frame().colours.shape == (0, 3)
@@ -196,7 +196,7 @@ def test_a_world_that_divides_shows_its_living_particles(tmp_path, device):
         np.testing.assert_array_equal(frame.positions, world.x[0, alive].cpu().numpy())
         assert frame.colours.shape == (int(alive.sum()), 3)
     assert int(alive.sum()) == 64
-    world.handle(brush("erase", radius=9.0))
+    world.handle(brush("remove", radius=9.0))
     world.advance()
     assert world.x.shape == (1, 64, 2)
     assert len(world.frame().positions) == 0
@@ -360,11 +360,11 @@ def test_the_loss_is_computed_only_where_it_is_wanted(world):
         ({"type": "damage", "name": "burn"}, "unknown damage 'burn'"),
         ({"type": "damage", "name": []}, "unknown damage"),
         (brush("paint"), "unknown tool 'paint'"),
-        (brush(["erase"]), "unknown tool"),
-        (brush("erase", at=[0.0]), "at must be 2 finite numbers, got"),
-        (brush("erase", at=[0.0, float("inf")]), "at must be 2 finite numbers"),
-        (brush("erase", at="00"), "at must be 2 finite numbers"),
-        (brush("erase", radius=-1), "radius must be a number in"),
+        (brush(["remove"]), "unknown tool"),
+        (brush("remove", at=[0.0]), "at must be 2 finite numbers, got"),
+        (brush("remove", at=[0.0, float("inf")]), "at must be 2 finite numbers"),
+        (brush("remove", at="00"), "at must be 2 finite numbers"),
+        (brush("remove", radius=-1), "radius must be a number in"),
         (brush("push", move=[1e9, 0.0]), "move must be 2 finite numbers"),
         (brush("inject", source=[0.0]), "source must be 2 finite numbers"),
         (brush("push", strength=2), "strength must be a number in"),
@@ -416,7 +416,7 @@ def test_brushes_work_in_3d(device):
     told = {"at": [0.0, 0.0, 0.0], "radius": 0.5}
     world.handle(brush("push", move=[0.0, 0.0, 0.1], strength=1.0, **told))
     world.handle(brush("cut", move=[1.0, 0.0, 0.0], view=[0.0, 0.0, 1.0], **told))
-    world.handle(brush("erase", **told))
+    world.handle(brush("remove", **told))
     assert float(world.x.norm(dim=-1).min()) > 0.5
     world.advance()
     assert world.frame().positions.shape[1] == 3
@@ -500,7 +500,7 @@ def test_species_have_colours_of_their_own():
 
 def write_run(folder: Path, name: str = "gecko", rule: NPARule | None = None) -> None:
     folder.mkdir(exist_ok=True)
-    metadata = rule_metadata((shipped_rules() | first_rules())[name])
+    metadata = rule_metadata((shipped_rules() | preset_rules())[name])
     told = {key: metadata[key] for key in ("task", "config") if key in metadata}
     save_rule(rule or load_rule(name), folder / "rule.safetensors", metadata=told)
     (folder / "config.json").write_text("{}")
@@ -781,8 +781,8 @@ def test_hands_reach_into_environments(episodes):
     episodes._place(x[None], states[None])
     episodes.handle(brush("inject", source=[0.1, 0.0], radius=0.2, strength=1.0))
     assert not torch.equal(episodes._inner.particles()[1], states)
-    with pytest.raises(NPAError, match="keeps its particles, so that the brush 'erase'"):
-        episodes.handle(brush("erase"))
+    with pytest.raises(NPAError, match="keeps its particles, so that the brush 'remove'"):
+        episodes.handle(brush("remove"))
     episodes.handle({"type": "set", "name": "loss", "value": True})
     assert episodes.frame().loss == pytest.approx(episodes._info["loss"])
 

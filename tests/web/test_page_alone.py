@@ -15,7 +15,7 @@ from npa_envs.web.export import PAGE
 
 SETUP = """
 const world = {
-  type: "world", title: "t", dimension: 2, tools: ["erase"],
+  type: "world", title: "t", dimension: 2, tools: ["remove"],
   capabilities: ["film", "step", "reset"],
 };
 const frame = (step, places = [0, 0, 1, 1]) => ({

@@ -28,7 +28,7 @@ def make(what, **options):
     return world
 
 
-def test_a_rule_a_run_and_an_environment_are_told_apart(tmp_path):
+def test_a_rule_a_run_and_an_environment_are_by_species(tmp_path):
     save_rule(load_rule("gecko"), tmp_path / "rule.safetensors")
     assert type(make("heart")) is RuleWorld
     # A folder with nothing but a rule is that rule.

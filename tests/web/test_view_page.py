@@ -87,7 +87,7 @@ def nearest(page, x: float, y: float) -> float:
     return float(np.linalg.norm(positions(page) - [x, y], axis=1).min())
 
 
-def test_the_world_moves_the_brush_erases_and_a_slider_changes_eps(shown, tmp_path):
+def test_the_world_moves_the_brush_wipes_and_a_slider_changes_eps(shown, tmp_path):
     page, world = shown()
     assert page.run("document.title") == "gecko · npa-envs"
     page.wait(f"{FRAME}.step > 5")
@@ -144,7 +144,7 @@ def test_a_state_is_carried_from_where_one_pressed_to_where_one_drags(shown):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("painter", ["canvas", "webgl2"])
-def test_what_is_erased_heals(shown, painter):
+def test_what_is_wiped_heals(shown, painter):
     page, _ = shown(count=4096, query=f"?painter={painter}")
     page.wait(f"{FRAME}.step > 150", 240)
     kind = page.run("document.page.painter.kind")
@@ -176,7 +176,7 @@ def test_every_tool_and_every_show_works(shown):
     for show in page.run("document.page.world.shows"):
         choose(page, "show", show)
         page.wait(f"document.page.world.show === {json.dumps(show)}")
-    for name in ("erase", "cut", "clump", "noise"):
+    for name in ("wipe", "cut", "clump", "noise"):
         page.run(f"document.querySelector('#damages [title$={name}]').click()")
     page.run("document.getElementById('plots').open = true")
     page.run("document.getElementById('tracers').click()")
@@ -264,7 +264,7 @@ def test_a_3d_world_turns_under_the_pointer(shown, painter, tmp_path):
     assert page.run("document.page.tool") == "look"
     page.drag([(400, 400), (450, 400), (500, 400)])
     assert page.run("document.page.camera.azimuth") == pytest.approx(-40.0)
-    page.run("document.querySelector('[data-tool=erase]').click()")
+    page.run("document.querySelector('[data-tool=remove]').click()")
     page.drag([place_of(page, 0.0, 0.0)] * 3)
     page.wait(f"{FRAME}.positions.length < 3072")
     page.picture(tmp_path / "page.png")

@@ -15,7 +15,7 @@ import pytest
 from PIL import Image
 
 from npa_envs.errors import MissingDependencyError, NPAError
-from npa_envs.web.live import Frame
+from npa_envs.web.live import WorldView
 
 pytest.importorskip("uvicorn")
 testclient = pytest.importorskip("starlette.testclient")
@@ -59,7 +59,7 @@ class Counter:
     def frame(self):
         positions = np.array([[self.step, 0.5], [-1.0, 0.25]], dtype=np.float32)
         colours = np.array([[255, 0, 1], [2, 3, 4]], dtype=np.uint8)
-        return Frame(self.step, positions, colours, 1.5, 0.125 if self.step == 2 else None)
+        return WorldView(self.step, positions, colours, 1.5, 0.125 if self.step == 2 else None)
 
     def news(self):
         return []
@@ -506,7 +506,7 @@ def test_links_open_the_page(tmp_path):
 
 def test_more_messages_than_there_is_room_for_are_refused(site):
     # Without a thread that takes them out.
-    session = server.Session.__new__(server.Session)
+    session = server.ViewerSession.__new__(server.ViewerSession)
     session._inbox = queue.Queue(2)
     told = []
     session._tell = told.append

@@ -9,7 +9,6 @@ from npa_envs import NPAError
 from npa_envs.world.brushes import (
     clump,
     cut,
-    erase_state,
     inject,
     inside_ball,
     offsets_from,
@@ -17,6 +16,7 @@ from npa_envs.world.brushes import (
     removed,
     softness,
     state_around,
+    wipe_state,
 )
 
 BOX = (2.0, 3.0)
@@ -41,7 +41,7 @@ def test_offsets_are_to_the_nearest_image():
 
 
 @pytest.mark.parametrize("space_dim", [2, 3])
-def test_erased_particles_are_gone_and_the_others_are_as_they_were(space_dim):
+def test_wiped_particles_are_gone_and_the_others_are_as_they_were(space_dim):
     x, s = worlds(1, 200, space_dim)
     centre, radius = places(x), 0.6
     gone = inside_ball(x, centre=centre, radius=radius)
@@ -135,7 +135,7 @@ def test_a_cut_with_ends_opens_only_between_them():
     assert torch.equal(nothing, x)
 
 
-def test_clump_and_erase_reach_across_the_edges_of_a_box():
+def test_clump_and_wipe_reach_across_the_edges_of_a_box():
     x = torch.tensor([[[-0.98, 0.0], [0.0, 0.0]]], dtype=torch.float64)
     s = torch.ones(1, 2, 3, dtype=x.dtype)
     centre = torch.tensor([[0.98, 0.0]], dtype=x.dtype)
@@ -143,7 +143,7 @@ def test_clump_and_erase_reach_across_the_edges_of_a_box():
     # To the image of the place on its own side.
     torch.testing.assert_close(pulled[0, 0, 0], torch.tensor(-1.02, dtype=x.dtype))
     assert torch.equal(pulled[0, 1], x[0, 1])
-    blank = erase_state(x, s, centre=centre, radius=0.1, box=BOX)
+    blank = wipe_state(x, s, centre=centre, radius=0.1, box=BOX)
     assert blank[0].tolist() == [[0.0, 0.0, 0.0], [1.0, 1.0, 1.0]]
 
 

@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from npa_envs.world import cuda_graph
-from npa_envs.world.cuda_graph import Replayed, between_graphs, capture, no_garbage_collection
+from npa_envs.world.cuda_graph import GraphedCallable, capture, host_call, no_garbage_collection
 
 CUDA = torch.device("cuda", 0)
 
@@ -136,10 +136,10 @@ def test_a_capture_without_enough_memory_is_tried_again_once_room_is_made(events
     assert events.count("run") == 2
 
 
-def test_what_is_done_between_graphs_is_done_in_every_replay(events):
+def test_what_is_done_host_call_is_done_in_every_replay(events):
     def function():
         events.append("first")
-        between_graphs(lambda: events.append("between"))
+        host_call(lambda: events.append("between"))
         events.append("second")
 
     function()
@@ -159,12 +159,12 @@ def test_what_is_done_between_graphs_is_done_in_every_replay(events):
         captured.replay()
         assert events == ["replay", "between", "replay"]
     events.clear()
-    between_graphs(lambda: events.append("at once"))
+    host_call(lambda: events.append("at once"))
     assert events == ["at once"]
 
 
 def test_a_replayed_function_runs_once_is_captured_once_and_then_replayed(events):
-    replayed = Replayed(lambda: events.append("run"), CUDA, "dice")
+    replayed = GraphedCallable(lambda: events.append("run"), CUDA, "dice")
     counts = []
     for _ in range(4):
         replayed()
@@ -173,7 +173,7 @@ def test_a_replayed_function_runs_once_is_captured_once_and_then_replayed(events
 
 
 def test_on_a_cpu_a_replayed_function_is_simply_called(events):
-    replayed = Replayed(lambda: events.append("run"), torch.device("cpu"))
+    replayed = GraphedCallable(lambda: events.append("run"), torch.device("cpu"))
     for _ in range(3):
         replayed()
     assert events == ["run"] * 3
@@ -184,7 +184,7 @@ class Counter:
 
     def __init__(self, device=CUDA):
         self.count = 0
-        self.run = Replayed(self.add, device)
+        self.run = GraphedCallable(self.add, device)
 
     def add(self):
         self.count += 1
@@ -285,7 +285,7 @@ def test_between_two_graphs_the_second_half_of_a_backward_pass_sees_what_was_don
         cubes = x**3
         count = cubes.detach().sum()
         divisor = torch.empty_like(count)
-        between_graphs(lambda: divisor.copy_(count / 5.0))
+        host_call(lambda: divisor.copy_(count / 5.0))
         (found,) = torch.autograd.grad((cubes / divisor).sum(), x)
         gradient.copy_(found)
         seen.copy_(torch.rand(10, generator=generator, device=CUDA))

@@ -42,8 +42,8 @@ def divide(x, s, dividing=(), dying=(), updated=None):
     odds[1, :, list(dying)] = 1.0
     updated = living(s) if updated is None else updated
     return divided(
-        x, s, torch.ones_like(x[..., 0]), fates=tuple(odds), updated=updated, births=births_of(x),
-        eps=EPS,
+        x, s, torch.ones_like(x[..., 0]), division_probabilities=tuple(odds), updated=updated,
+        births=births_of(x), eps=EPS,
     )  # fmt: skip
 
 
@@ -151,7 +151,7 @@ def test_odds_of_fates_are_a_softmax_of_the_states(device):
     s = torch.randn(1, 4, 6, dtype=torch.float64).to(device)
     logits = (s @ rule.fate.weight.T + rule.fate.bias).detach()
     odds = torch.stack((logits[..., 0], 0 * logits[..., 0], logits[..., 1])).softmax(0)
-    assert_near(rule.fates(s), (odds[0], odds[2]), 1e-15)
+    assert_near(rule.division_probabilities(s), (odds[0], odds[2]), 1e-15)
 
 
 def test_gradients_flow_from_children_to_their_parents_places(device):
@@ -176,7 +176,8 @@ def test_life_has_the_gradient_of_the_expected_number(device):
     for _ in range(2):
         chance = torch.rand(1, count, generator=generator, dtype=x.dtype).to(device)
         _, after, path_length = divided(
-            x, after, path_length, fates=tuple(odds.expand(1, count, 2).unbind(-1)),
+            x, after, path_length,
+            division_probabilities=tuple(odds.expand(1, count, 2).unbind(-1)),
             updated=living(after), births=Births(chance, torch.zeros_like(x)), eps=EPS,
         )  # fmt: skip
     expected = count // 4 * (1.0 + odds[0] - odds[1]) ** 2
@@ -193,7 +194,13 @@ def test_where_there_is_no_slot_nothing_is_learned_of_dividing(device):
     s[:, 4, LIFE] = 0.0
     odds = x.new_tensor([0.6, 0.1])[:, None, None].repeat(1, 2, 9).requires_grad_()
     after = divided(
-        x, s, x[..., 0], fates=tuple(odds), updated=living(s), births=births_of(x), eps=EPS
+        x,
+        s,
+        x[..., 0],
+        division_probabilities=tuple(odds),
+        updated=living(s),
+        births=births_of(x),
+        eps=EPS,
     )
     (found,) = torch.autograd.grad(after[1][..., LIFE].sum(), odds)
     # All would divide; the first does, and both particles that come of it stand for it.
@@ -252,7 +259,7 @@ def test_a_rule_learns_to_divide_with_the_weights_it_has(device):
     made = dividing(plain)
     assert made.divides
     assert_same([made.state_dict()[name] for name in plain.state_dict()], plain.state_dict())
-    odds = made.fates(torch.randn(3, 6, dtype=torch.float64).to(device))
+    odds = made.division_probabilities(torch.randn(3, 6, dtype=torch.float64).to(device))
     assert_near(odds, [part[:1].expand(3) for part in odds], 1e-15)
 
 

@@ -13,8 +13,8 @@ from npa_envs.errors import NPAError
 from npa_envs.tasks.damage import random_particle
 from npa_envs.tasks.morphogenesis2d import Morphogenesis2D, Morphogenesis2DConfig
 from npa_envs.tasks.seeds import uniform_ball
-from npa_envs.world.randomness import Purpose, check_generator, uniform_draws
-from npa_envs.world.steps import StepOptions, draw_step, leave_out_draws
+from npa_envs.world.randomness import StreamId, check_generator, uniform_draws
+from npa_envs.world.steps import StepOptions, draw_step, skip_draws
 
 SIZE = 1001
 """Numbers of a world in a draw."""
@@ -127,10 +127,10 @@ def test_draws_follow_from_key_episode_step_and_number_alone(kind, history, devi
     for letter in history:
         HISTORY[letter](random)
     episode, step, number = place_after(history)
-    beside = random.beside(7)
+    beside = random.substream(7)
     assert_drawn(kind, beside, [(episode, step, 0)] * 3)
     assert_drawn(kind, random, [(episode, step, number)] * 3)
-    assert_drawn(kind, random.beside(7), [(episode, step, 0)] * 3)
+    assert_drawn(kind, random.substream(7), [(episode, step, 0)] * 3)
     beside.advance()
     assert_drawn(kind, beside, [(episode, step + 1, 0)] * 3)
     beside.restart()
@@ -177,13 +177,13 @@ def test_keys_beside_are_splitmixs_published_numbers(device):
         (9817491932198370423, 0x06C45D188009454F),
     )
     for purpose, expected in enumerate(published):
-        keys = random.beside(purpose).keys.tolist()
+        keys = random.substream(purpose).keys.tolist()
         assert tuple(key % 2**64 for key in keys) == expected
 
 
 def test_no_two_purposes_of_the_package_have_one_number():
-    assert len({purpose.value for purpose in Purpose}) == len(Purpose.__members__) >= 4
-    assert all(0 < purpose < 1000 for purpose in Purpose)
+    assert len({purpose.value for purpose in StreamId}) == len(StreamId.__members__) >= 4
+    assert all(0 < purpose < 1000 for purpose in StreamId)
 
 
 def test_draws_have_their_dtypes_and_keep_their_limits(device):
@@ -257,8 +257,8 @@ def test_draws_that_are_left_out_are_as_if_drawn(source, position_noise, update_
         }[source]()
         draw_step(x, options, generator)
         if leave_out:
-            leave_out_draws(x, options, 5, generator)
-            leave_out_draws(x, options, 0, generator)
+            skip_draws(x, options, 5, generator)
+            skip_draws(x, options, 0, generator)
         else:
             for _ in range(5):
                 draw_step(x, options, generator)
@@ -316,8 +316,11 @@ def test_shapes_may_be_empty(device):
         (lambda: WorldRandom.from_keys(torch.zeros(3)), "keys must be an int64 .* got torch.flo"),
         (lambda: WorldRandom.from_keys([1]), "keys must be an int64 tensor .* got list"),
         (lambda: WorldRandom(1).advance(-1), "steps must be an integer of at least 0, got -1"),
-        (lambda: WorldRandom(1).beside(-1), "purpose must be an integer of at least 0, got -1"),
-        (lambda: WorldRandom(1).beside("x"), "purpose must be an integer of at least 0, got 'x'"),
+        (lambda: WorldRandom(1).substream(-1), "purpose must be an integer of at least 0, got -1"),
+        (
+            lambda: WorldRandom(1).substream("x"),
+            "purpose must be an integer of at least 0, got 'x'",
+        ),
         (lambda: WorldRandom(1).uniform(-1), "a size must be an integer of at least 0, got -1"),
         (lambda: WorldRandom(1).normal(2, dtype=torch.float16), "dtype must be .* got torch.f.*16"),
         (lambda: WorldRandom(1).bernoulli(1.5, 2), r"probability must lie in \[0, 1\], got 1.5"),

@@ -80,16 +80,16 @@ def test_rules_that_are_no_plain_networks_run_as_they_are(device):
         assert_near(found, expected, 1e-12)
 
 
-@pytest.mark.parametrize("told_apart", [False, True])
-def test_species_out_of_reach_see_themselves_as_alone(told_apart, device):
-    perception = "per_species" if told_apart else "shared"
-    rules = [make_rule(device, seed=k, species_count=told_apart * 2) for k in range(2)]
+@pytest.mark.parametrize("by_species", [False, True])
+def test_species_out_of_reach_see_themselves_as_alone(by_species, device):
+    perception = "per_species" if by_species else "shared"
+    rules = [make_rule(device, seed=k, species_count=by_species * 2) for k in range(2)]
     x, s = make_world(device)
     x = torch.cat((x[:, :20], x[:, 20:] + 50.0), dim=1)
     options = {"update_prob": 1.0, "counts": [20, 40], "perception": perception}
     shared = npa_envs.rollout_species(rules, x, s, 5, **options)
     own = npa_envs.rollout_species(rules, x, s, 5, density_counts=[20, 40], **options)
-    if told_apart:
+    if by_species:
         # Alone, with a species of nobody's: particles far away of which each sees none.
         z = npa_envs.perceive_species(x[:, :20], s[:, :20], [20], 0.3)
         blank = z.new_zeros(*z.shape[:2], 3)

@@ -32,7 +32,7 @@ def episodes_of_one(seed, events, count=2, **keywords):
 
 
 def test_an_event_is_written_as_it_is_read_and_has_the_usual_size_without_one():
-    for text in ("100:cut", "0:erase:0.25", "7:noise:0.01"):
+    for text in ("100:cut", "0:wipe:0.25", "7:noise:0.01"):
         assert str(parse_damage(text)) == text
     assert (parse_damage("5:clump").extent, parse_damage("5:clump").text) == (0.2, "clump 0.2")
     assert DamageEvent(5, "clump", 0.3).extent == 0.3
@@ -71,7 +71,7 @@ def test_a_mistake_is_named(make, message):
 
 
 def test_damage_comes_after_the_step_of_its_number_and_not_before():
-    plain, hurt = single(), DamageEvents(single(), "3:erase:0.2")
+    plain, hurt = single(), DamageEvents(single(), "3:wipe:0.2")
     observation, _ = plain.reset(seed=5)
     np.testing.assert_array_equal(hurt.reset(seed=5)[0], observation)
     for step in range(1, 4):
@@ -84,11 +84,11 @@ def test_damage_comes_after_the_step_of_its_number_and_not_before():
             np.testing.assert_array_equal(seen[0], observation)
     x, s = plain.unwrapped.particles()
     hurt_x, hurt_s = hurt.unwrapped.particles()
-    erased = (hurt_s != s).any(dim=1)
+    wiped = (hurt_s != s).any(dim=1)
     assert torch.equal(hurt_x, x)
-    assert (hurt_s[erased] == 0).all()
-    assert 1 <= erased.sum() < 64
-    assert torch.pdist(x[erased]).max() <= 0.4
+    assert (hurt_s[wiped] == 0).all()
+    assert 1 <= wiped.sum() < 64
+    assert torch.pdist(x[wiped]).max() <= 0.4
 
 
 def test_damage_gives_no_reward_and_info_says_how_much_was_lost():
@@ -121,7 +121,7 @@ def test_damage_leaves_the_randomness_of_later_steps_as_it_is():
         np.testing.assert_array_equal(hurt.step(action)[0], observation)
 
 
-@pytest.mark.parametrize("kind", ["erase:0.3", "cut", "clump:0.4", "noise"])
+@pytest.mark.parametrize("kind", ["wipe:0.3", "cut", "clump:0.4", "noise"])
 def test_a_stack_of_wrappers_damages_as_one_with_all_events(kind):
     one = DamageEvents(single(), [f"2:{kind}", "5:cut", f"2:{kind}"])
     stack = DamageEvents(single(), [f"2:{kind}", "5:cut"])
@@ -154,7 +154,7 @@ def test_a_stack_of_wrappers_damages_as_one_with_all_events(kind):
 @pytest.mark.parametrize("output", ["numpy", "torch"])
 def test_a_stack_tells_of_worlds_that_only_one_of_its_wrappers_damaged(output):
     envs = VectorDamageEvents(batched(output=output), "2:cut")
-    envs = VectorDamageEvents(envs, "3:erase:1")
+    envs = VectorDamageEvents(envs, "3:wipe:1")
     observations, _ = envs.reset(seed=0)
     envs.step(policy(observations))
     observations, _ = envs.reset(options={"reset_mask": np.array([True, False, False])})
@@ -169,9 +169,9 @@ def test_a_stack_tells_of_worlds_that_only_one_of_its_wrappers_damaged(output):
 @pytest.mark.parametrize(
     ("events", "every"),
     [
-        (["3:cut", "5:erase:0.3", "5:noise"], None),
+        (["3:cut", "5:wipe:0.3", "5:noise"], None),
         ("0:clump:0.3", None),
-        (["2:erase:0.2"], 3),
+        (["2:wipe:0.2"], 3),
     ],
 )
 def test_world_k_is_damaged_as_the_single_environment(events, every):
@@ -223,7 +223,7 @@ def test_worlds_are_damaged_by_their_own_episodes():
 
 @pytest.mark.parametrize("mode", ["same-step", "next-step", "disabled"])
 def test_an_episode_that_is_over_is_left_alone(mode):
-    envs = VectorDamageEvents(batched(autoreset_mode=mode), [f"{STEPS}:erase:3", "0:cut"])
+    envs = VectorDamageEvents(batched(autoreset_mode=mode), [f"{STEPS}:wipe:3", "0:cut"])
     observations, infos = envs.reset(seed=0)
     assert infos["_loss_damage"].all()
     for _ in range(STEPS):
@@ -252,12 +252,12 @@ def test_reused_buffers_show_the_same():
 
 
 def test_the_spec_says_what_is_done():
-    env = DamageEvents(single(), ["3:cut", DamageEvent(5, "erase", 0.3)], every=4)
+    env = DamageEvents(single(), ["3:cut", DamageEvent(5, "wipe", 0.3)], every=4)
     wrapper = env.spec.additional_wrappers[-1]
-    assert wrapper.kwargs == {"events": ["3:cut", "5:erase:0.3"], "every": 4}
+    assert wrapper.kwargs == {"events": ["3:cut", "5:wipe:0.3"], "every": 4}
 
 
-def test_what_is_told_of_a_damaged_world_is_told_of_it_as_it_is():
+def test_what_is_context_info_a_damaged_world_is_context_info_it_as_it_is():
     keywords = {"particle_count": 64, "grow_steps": 32}
     env = DamageEvents(gym.make("npa/Shepherd2DSmall-v0", **keywords), "1:clump:0.6")
     env.reset(seed=0)

@@ -13,7 +13,7 @@ from npa_envs import world_mean
 from npa_envs.envs.multi.task import Population, SpeciesConfig, SpeciesTask, by_species
 from npa_envs.errors import NPAError, shown
 from npa_envs.tasks.morphogenesis2d import Morphogenesis2D, Morphogenesis2DConfig
-from npa_envs.world.randomness import Purpose, WorldRandom
+from npa_envs.world.randomness import StreamId, WorldRandom
 
 USUAL = ("gecko", "heart", "butterfly", "flower", "octopus", "ring")
 """What species grow that are told nothing, in turn."""
@@ -207,7 +207,7 @@ class InvasionTask(PictureLossTask):
         """Return what all particles do: an opponent's, at random."""
         if self.config.opponent is None:
             return action
-        drawn = 2.0 * random.beside(Purpose.OPPONENT).uniform(*action.shape[1:]) - 1.0
+        drawn = 2.0 * random.substream(StreamId.OPPONENT).uniform(*action.shape[1:]) - 1.0
         return torch.where((population.species > 0)[:, None], drawn, action)
 
     def settle(self, rewards: Tensor, live: Tensor, species: Tensor) -> Tensor:

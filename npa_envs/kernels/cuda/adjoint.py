@@ -241,7 +241,7 @@ def listed_adjoint(
     @wp.func
     def lines_around(domain: Domain, d: wp.int32):
         """Lines of cells along which neighbours lie, in one direction across them."""
-        return wp.min(wp.int32(2) * domain.reach + 1, domain.cell_shape[d])
+        return wp.min(wp.int32(2) * domain.cell_reach + 1, domain.cell_shape[d])
 
     @wp.func
     def around(place: wp.int32, count: wp.int32):
@@ -279,17 +279,17 @@ def listed_adjoint(
             lines = lines_around(domain, 1)
             across = wp.int32(wp.uint32(nearby) / wp.uint32(lines))
             nearby -= across * lines
-            z = around(z - domain.reach + across, domain.cell_shape[wp.static(space_dim - 1)])
+            z = around(z - domain.cell_reach + across, domain.cell_shape[wp.static(space_dim - 1)])
             base = z * domain.cell_shape[1]
-        base = (base + around(y - domain.reach + nearby, domain.cell_shape[1])) * nx
+        base = (base + around(y - domain.cell_reach + nearby, domain.cell_shape[1])) * nx
         return base + first, base + last
 
     @wp.func
     def columns_around(domain: Domain, first: wp.int32, last: wp.int32):
         """First column around some columns of cells and one past the last, not wrapped around."""
         nx = domain.cell_shape[0]
-        width = wp.min(last - first + 2 * domain.reach + 1, nx)
-        begin = wp.where(width < nx, around(first - domain.reach, nx), 0)
+        width = wp.min(last - first + 2 * domain.cell_reach + 1, nx)
+        begin = wp.where(width < nx, around(first - domain.cell_reach, nx), 0)
         return begin, begin + width
 
     @wp.func

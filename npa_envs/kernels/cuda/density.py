@@ -184,7 +184,7 @@ def listed_density(
         for segment in range(segments):
             first, last = segment_cells(domain, cell, segment)
             # Five lines of five cells each, none of them wrapped around the grid.
-            if wp.static(flat and not periodic) and segments == 5 and domain.reach == 2:
+            if wp.static(flat and not periodic) and segments == 5 and domain.cell_reach == 2:
                 before, behind = cells_beyond(within_cell, segment)
                 first += before
                 last -= behind

@@ -26,7 +26,7 @@ class Skipped(Exception):
 
 
 @dataclass(frozen=True)
-class Finding:
+class CheckResult:
     """What a check found."""
 
     figures: Mapping[str, float]
@@ -55,7 +55,7 @@ class Finding:
 
 
 @dataclass
-class Session:
+class CheckSession:
     """One run of the command."""
 
     device: torch.device
@@ -92,7 +92,7 @@ class Check:
 
     name: str
     expected: str
-    run: Callable[[Session], Finding]
+    run: Callable[[CheckSession], CheckResult]
     rule: str = ""
     """What `load_rule` takes, of a check of a rule."""
 
@@ -108,7 +108,7 @@ def group_of(name: str) -> str:
 
 
 def in_2d_and_3d(
-    group: str, cases: Mapping[str, tuple[str, Callable[[int, Session], Finding]]]
+    group: str, cases: Mapping[str, tuple[str, Callable[[int, CheckSession], CheckResult]]]
 ) -> list[Check]:
     """Return checks GROUP/CASE/2d and /3d of cases: what is expected, and what measures it."""
     return [

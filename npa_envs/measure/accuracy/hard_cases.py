@@ -12,14 +12,14 @@ from torch import Tensor
 
 from npa_envs import reference
 from npa_envs.errors import NPAError
-from npa_envs.measure.accuracy.checks import Check, Finding, Session, in_2d_and_3d
+from npa_envs.measure.accuracy.checks import Check, CheckResult, CheckSession, in_2d_and_3d
 from npa_envs.measure.accuracy.scenes import (
     EPS,
     LIMITS,
     PRECISIONS,
     SIDE,
     STATE_DIM,
-    Perceived,
+    PerceptionOutcome,
     Scene,
     error_limits,
     perceived,
@@ -82,18 +82,18 @@ def geometry_checks(seed: int = 0) -> list[Check]:
     return [*hard, *in_2d_and_3d("geometry", others)]
 
 
-def _run_scene(scene: Scene, session: Session) -> Finding:
+def _run_scene(scene: Scene, session: CheckSession) -> CheckResult:
     expected = perceived(scene.x, scene.s, scene.box, by_reference=True)
     figures = {}
     for name, dtype in PRECISIONS.items():
         x, s = (tensor.to(session.device, dtype) for tensor in (scene.x, scene.s))
         found = perceived(x, s, scene.box)
-        for what, value, exact in zip(Perceived._fields, found, expected, strict=True):
+        for what, value, exact in zip(PerceptionOutcome._fields, found, expected, strict=True):
             figures[f"{what}_{name}"] = relative_error(value, exact)
-    return Finding(figures, error_limits(scene.x, scene.s, scene.box, expected))
+    return CheckResult(figures, error_limits(scene.x, scene.s, scene.box, expected))
 
 
-def _run_threshold(space_dim: int, session: Session) -> Finding:
+def _run_threshold(space_dim: int, session: CheckSession) -> CheckResult:
     x, offsets = threshold_scenes(space_dim, reference.MOMENT_THRESHOLD)
     s = torch.randn(*x.shape[:2], STATE_DIM, generator=torch.Generator().manual_seed(5)).double()
     fields = reference.fields(x, s, EPS)
@@ -116,10 +116,10 @@ def _run_threshold(space_dim: int, session: Session) -> Finding:
         limits[f"z_{name}"] = LIMITS[f"z_{name}"]
         # Rounding moved some over the threshold by making float32 of the positions.
         figures[f"other_side_{name}"] = float((errors_of_other < errors)[:, 0].sum())
-    return Finding(figures, limits)
+    return CheckResult(figures, limits)
 
 
-def _run_smooth_inverse(space_dim: int, session: Session) -> Finding:
+def _run_smooth_inverse(space_dim: int, session: CheckSession) -> CheckResult:
     x, offsets = threshold_scenes(space_dim, reference.MOMENT_THRESHOLD)
     s = torch.randn(*x.shape[:2], STATE_DIM, generator=torch.Generator().manual_seed(5)).double()
     # All worlds carry the same states: from one to the next only a determinant changes.
@@ -136,7 +136,7 @@ def _run_smooth_inverse(space_dim: int, session: Session) -> Finding:
         figures[f"jump_{name}"] = _largest_jump(smooth[near])
         limits[f"jump_{name}"] = 2.0 * NEAR_THRESHOLD
         figures[f"jump_by_threshold_{name}"] = _largest_jump(perceive(y, t, EPS)[near])
-    return Finding(figures, limits)
+    return CheckResult(figures, limits)
 
 
 def _largest_jump(z: Tensor) -> float:
@@ -145,7 +145,7 @@ def _largest_jump(z: Tensor) -> float:
     return float(corner.diff(dim=0).norm(dim=-1).max() / corner.norm(dim=-1).max())
 
 
-def _run_crowd(space_dim: int, session: Session) -> Finding:
+def _run_crowd(space_dim: int, session: CheckSession) -> CheckResult:
     size = "quick" if session.quick else "cuda" if session.cuda else "cpu"
     count, sampled = CROWD[size], 32
     generator = torch.Generator().manual_seed(session.seed)
@@ -163,7 +163,7 @@ def _run_crowd(space_dim: int, session: Session) -> Finding:
     finite = [tensor.isfinite().all() for tensor in (rho, z, by_states)]
     # Terms of one sign: N roundings at most, √N of them where they are as often up as down.
     limit = 4.0 * count**0.5 * 2.0**-24
-    return Finding(
+    return CheckResult(
         {
             "particles": float(count),
             "not_finite": float(sum(not bool(all_of) for all_of in finite)),
@@ -175,7 +175,7 @@ def _run_crowd(space_dim: int, session: Session) -> Finding:
     )
 
 
-def _run_nearest(space_dim: int, session: Session) -> Finding:
+def _run_nearest(space_dim: int, session: CheckSession) -> CheckResult:
     figures: dict[str, float] = {}
     not_finite = 0
     holds = 0
@@ -197,10 +197,10 @@ def _run_nearest(space_dim: int, session: Session) -> Finding:
             holds = power
     figures |= {"not_finite": float(not_finite), "nearest": 10.0**-holds}
     limits = {"not_finite": 0.0, "nearest": 1e-19 * (1.0 + 1e-9)}
-    return Finding(figures, limits, holds=f"float32: from 1e-{holds} on")
+    return CheckResult(figures, limits, holds=f"float32: from 1e-{holds} on")
 
 
-def _run_outside(space_dim: int, session: Session) -> Finding:
+def _run_outside(space_dim: int, session: CheckSession) -> CheckResult:
     generator = torch.Generator().manual_seed(session.seed)
     inside = (torch.rand(1, 60, space_dim, generator=generator) - 0.5) * SIDE
     s = torch.randn(1, 60, STATE_DIM, generator=generator)
@@ -222,7 +222,9 @@ def _run_outside(space_dim: int, session: Session) -> Finding:
             limits[f"z_{offset:g}"] = allowed["z_float32"]
             farthest = offset if error <= 1e-3 else farthest
     figures["not_finite"] = float(not_finite)
-    return Finding(figures, limits, holds=f"float32: z within 1e-3 up to {farthest:g} sides away")
+    return CheckResult(
+        figures, limits, holds=f"float32: z within 1e-3 up to {farthest:g} sides away"
+    )
 
 
 # The group `values`: what states hold; nothing may reach another world.
@@ -287,7 +289,7 @@ def values_checks() -> list[Check]:
     ]
 
 
-def _worlds(session: Session, space_dim: int, state_dim: int) -> tuple[Tensor, Tensor]:
+def _worlds(session: CheckSession, space_dim: int, state_dim: int) -> tuple[Tensor, Tensor]:
     """Return worlds with about 20 neighbours, half of them out of sight of the other half."""
     generator = torch.Generator().manual_seed(session.seed)
     shape = (WORLD_COUNT, PARTICLE_COUNT)
@@ -304,7 +306,7 @@ def differing(value: Tensor, expected: Tensor) -> float:
     return float((~same).sum())
 
 
-def _run_scale(space_dim: int, session: Session) -> Finding:
+def _run_scale(space_dim: int, session: CheckSession) -> CheckResult:
     x, s = (tensor[:1] for tensor in _worlds(session, space_dim, STATE_DIM))
     figures = {}
     right = []
@@ -322,10 +324,12 @@ def _run_scale(space_dim: int, session: Session) -> Finding:
     largest = max(
         (power for power in right if set(range(low, power, 2)) <= set(right)), default=low
     )
-    return Finding(figures, {"wrong": 0.0}, holds=f"float32: states of 1e{low} to 1e{largest:+d}")
+    return CheckResult(
+        figures, {"wrong": 0.0}, holds=f"float32: states of 1e{low} to 1e{largest:+d}"
+    )
 
 
-def _run_infinite_channel(space_dim: int, session: Session) -> Finding:
+def _run_infinite_channel(space_dim: int, session: CheckSession) -> CheckResult:
     x, s = _worlds(session, space_dim, 16)
     clean = perceive(x, s, EPS)
     broken = s.clone()
@@ -343,11 +347,11 @@ def _run_infinite_channel(space_dim: int, session: Session) -> Finding:
         "out_of_sight": differing(z[WORLD, away], clean[WORLD, away]),
         "touched_numbers": float((~z.isfinite()).sum()),
     }
-    return Finding(figures, dict.fromkeys(list(figures)[:3], 0.0))
+    return CheckResult(figures, dict.fromkeys(list(figures)[:3], 0.0))
 
 
 @torch.no_grad()
-def _run_dead(space_dim: int, session: Session) -> Finding:
+def _run_dead(space_dim: int, session: CheckSession) -> CheckResult:
     torch.manual_seed(session.seed)
     rule = NPARule(space_dim, STATE_DIM, eps0=EPS, divides=True).to(session.device)
     x, s = _worlds(session, space_dim, STATE_DIM)
@@ -368,10 +372,10 @@ def _run_dead(space_dim: int, session: Session) -> Finding:
         "empty_slots": float((~living(clean[1])).sum(dim=1).max()),
     }
     # A few die at any time.
-    return Finding(figures, {"x": 0.0, "s": 0.0, "not_finite": 0.0, "empty_slots": 5.0})
+    return CheckResult(figures, {"x": 0.0, "s": 0.0, "not_finite": 0.0, "empty_slots": 5.0})
 
 
-def _run_gradient(session: Session) -> Finding:
+def _run_gradient(session: CheckSession) -> CheckResult:
     x, s = _worlds(session, 2, 16)
     others = torch.arange(WORLD_COUNT, device=x.device) != WORLD
 
@@ -392,10 +396,10 @@ def _run_gradient(session: Session) -> Finding:
         name: differing(found[others], clean[others])
         for name, (found, clean) in zip(("states", "positions"), pairs, strict=True)
     }
-    return Finding(figures, dict.fromkeys(figures, 0.0))
+    return CheckResult(figures, dict.fromkeys(figures, 0.0))
 
 
-def _broken_rollout(session: Session) -> tuple[tuple[Tensor, Tensor], tuple[Tensor, Tensor]]:
+def _broken_rollout(session: CheckSession) -> tuple[tuple[Tensor, Tensor], tuple[Tensor, Tensor]]:
     """Return worlds after some steps that began with NaN in a state, and without it."""
     rule = load_rule("gecko", device=session.device).float()
     x, s = _worlds(session, 2, rule.state_dim)
@@ -409,7 +413,7 @@ def _broken_rollout(session: Session) -> tuple[tuple[Tensor, Tensor], tuple[Tens
     return run(broken), run(s)
 
 
-def _run_nan_state(session: Session) -> Finding:
+def _run_nan_state(session: CheckSession) -> CheckResult:
     (x, s), (clean_x, clean_s) = _broken_rollout(session)
     others = torch.arange(WORLD_COUNT, device=x.device) != WORLD
     lost = (~s[WORLD].isfinite()).any(-1) | (~x[WORLD].isfinite()).any(-1)
@@ -421,10 +425,10 @@ def _run_nan_state(session: Session) -> Finding:
         "not_found": float(not bool(lost.any())),
         "lost_particles": float(lost.sum()),
     }
-    return Finding(figures, dict.fromkeys(list(figures)[:4], 0.0))
+    return CheckResult(figures, dict.fromkeys(list(figures)[:4], 0.0))
 
 
-def _unreported(calls: dict[str, Callable[[], Any]], named: str) -> Finding:
+def _unreported(calls: dict[str, Callable[[], Any]], named: str) -> CheckResult:
     """Return a finding that counts the calls that are not refused by an error with some words."""
     figures = {}
     for name, call in calls.items():
@@ -433,10 +437,10 @@ def _unreported(calls: dict[str, Callable[[], Any]], named: str) -> Finding:
             figures[name] = 1.0
         except NPAError as error:
             figures[name] = float(named not in str(error))
-    return Finding(figures, dict.fromkeys(figures, 0.0))
+    return CheckResult(figures, dict.fromkeys(figures, 0.0))
 
 
-def _run_nan_position(session: Session) -> Finding:
+def _run_nan_position(session: CheckSession) -> CheckResult:
     rule = load_rule("gecko", device=session.device).float()
     x, s = _worlds(session, 2, rule.state_dim)
     x[WORLD, PARTICLE, 1] = math.nan
@@ -447,9 +451,11 @@ def _run_nan_position(session: Session) -> Finding:
     return _unreported(calls, f"world {WORLD}, particle {PARTICLE}")
 
 
-def _run_blown_up(session: Session) -> Finding:
+def _run_blown_up(session: CheckSession) -> CheckResult:
     rule = load_rule("gecko", device=session.device).float()
     (x, s), _ = _broken_rollout(session)
     if bool(x.isfinite().all()):
-        return Finding({"rollout": 1.0}, {"rollout": 0.0}, note="NaN in a state moved no particle")
+        return CheckResult(
+            {"rollout": 1.0}, {"rollout": 0.0}, note="NaN in a state moved no particle"
+        )
     return _unreported({"rollout": partial(rollout, rule, x, s, 1)}, f"world {WORLD}")

@@ -10,14 +10,14 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from npa_envs.measure.accuracy.checks import Check, Finding, Session, Skipped, in_2d_and_3d
-from npa_envs.measure.accuracy.habitats import WORKS, Habitat, habitat
+from npa_envs.measure.accuracy.checks import Check, CheckResult, CheckSession, Skipped, in_2d_and_3d
+from npa_envs.measure.accuracy.endurance import WORKS, EnduranceCase, habitat
 from npa_envs.measure.accuracy.hard_cases import differing
 from npa_envs.measure.accuracy.scenes import (
     EPS,
     SIDE,
     STATE_DIM,
-    Perceived,
+    PerceptionOutcome,
     Scene,
     error_limits,
     functional_weights,
@@ -60,7 +60,7 @@ DIFFERENCE = 1e-6
 """Relative distance between a directional derivative and a finite difference in float64."""
 
 
-class Outcome(NamedTuple):
+class RolloutOutcome(NamedTuple):
     """A rollout, and gradients of a random linear functional of where it ends."""
 
     x: Tensor
@@ -119,7 +119,9 @@ def powers_of_two(most: int) -> list[int]:
     return [2**k for k in range(int(math.log2(most)) + 1)]
 
 
-def outcome(home: Habitat, session: Session, steps: int, dtype: torch.dtype) -> Outcome:
+def outcome(
+    home: EnduranceCase, session: CheckSession, steps: int, dtype: torch.dtype
+) -> RolloutOutcome:
     """Return a rollout from the seed and its gradients; the same masks in every dtype."""
     rule = NPARule(**home.rule.hyper_parameters()).to(home.x.device)
     rule.load_state_dict(home.rule.state_dict())
@@ -143,14 +145,14 @@ def outcome(home: Habitat, session: Session, steps: int, dtype: torch.dtype) -> 
     network = [*rule.hidden.parameters(), *rule.output.parameters()]
     by_states, *by_weights = torch.autograd.grad(loss, [start, *network])
     flat = [gradient.flatten() for gradient in by_weights]
-    return Outcome(x.detach(), s.detach(), torch.cat(flat)[None], by_states)
+    return RolloutOutcome(x.detach(), s.detach(), torch.cat(flat)[None], by_states)
 
 
-def _home(session: Session, name: str) -> Habitat:
+def _home(session: CheckSession, name: str) -> EnduranceCase:
     return habitat(session, name, particles=QUICK_SHARE if session.quick else 1.0, looks=False)
 
 
-def _run_norm(name: str, session: Session) -> Finding:
+def _run_norm(name: str, session: CheckSession) -> CheckResult:
     home = _home(session, name)
     figures: dict[str, float] = {}
     not_finite = 0.0
@@ -160,39 +162,39 @@ def _run_norm(name: str, session: Session) -> Finding:
         figures[f"states_{steps}"] = float(found.by_states.norm())
         for gradient in (found.by_weights, found.by_states):
             not_finite = max(not_finite, float((~gradient.isfinite()).double().mean()))
-    return Finding(figures | {"not_finite": not_finite}, {"not_finite": 0.0})
+    return CheckResult(figures | {"not_finite": not_finite}, {"not_finite": 0.0})
 
 
-def _run_float32(name: str, session: Session) -> Finding:
+def _run_float32(name: str, session: CheckSession) -> CheckResult:
     home = _home(session, name)
     if home.rule.divides:
         raise Skipped("particles divide by draws that are others in float64")
     counts = powers_of_two(QUICK_STEPS if session.quick else COMPARED_STEPS)
     figures: dict[str, float] = {}
-    usable = dict.fromkeys(Outcome._fields, 0)
+    usable = dict.fromkeys(RolloutOutcome._fields, 0)
     for steps in counts:
         found = outcome(home, session, steps, torch.float32)
         exact = outcome(home, session, steps, torch.float64)
-        for what, value, right in zip(Outcome._fields, found, exact, strict=True):
+        for what, value, right in zip(RolloutOutcome._fields, found, exact, strict=True):
             figures[f"{what}_{steps}"] = error = relative_error(value, right)
             if error <= USABLE_ERROR and usable[what] in (0, steps // 2):
                 usable[what] = steps
-    limits = {f"{what}_1": ONE_STEP_ERROR for what in Outcome._fields}
+    limits = {f"{what}_1": ONE_STEP_ERROR for what in RolloutOutcome._fields}
     told = ", ".join(f"{what} {steps}" for what, steps in usable.items())
-    return Finding(figures, limits, holds=f"steps within 1e-2, of {counts[-1]}: {told}")
+    return CheckResult(figures, limits, holds=f"steps within 1e-2, of {counts[-1]}: {told}")
 
 
-def _run_differences(space_dim: int, periodic: bool, session: Session) -> Finding:
+def _run_differences(space_dim: int, periodic: bool, session: CheckSession) -> CheckResult:
     figures = {}
     for scene in scenes(space_dim, periodic=periodic, seed=session.seed):
         for what in ("states", "positions"):
             # Far away there is no number beside a coordinate that is near enough to it.
             if (scene.name, what) != ("far", "positions"):
                 figures[f"{scene.name}_{what}"] = _difference(scene, session, what)
-    return Finding(figures, dict.fromkeys(figures, DIFFERENCE))
+    return CheckResult(figures, dict.fromkeys(figures, DIFFERENCE))
 
 
-def _difference(scene: Scene, session: Session, what: str) -> float:
+def _difference(scene: Scene, session: CheckSession, what: str) -> float:
     """Return how far a directional derivative is from a finite difference, relatively.
 
     Positions move along a smooth periodic field that is 0 at the origin: particles in one place
@@ -297,7 +299,7 @@ def precision_checks(*, quick: bool, rules: Mapping[str, str] | None = None) -> 
     ]
 
 
-def _every_scene(space_dim: int, session: Session) -> Iterator[Scene]:
+def _every_scene(space_dim: int, session: CheckSession) -> Iterator[Scene]:
     for periodic in (False, True):
         yield from scenes(space_dim, periodic=periodic, seed=session.seed)
 
@@ -307,7 +309,7 @@ def _on(scene: Scene, device: torch.device) -> tuple[Tensor, Tensor]:
     return scene.x.to(device, torch.float32), scene.s.to(device, torch.float32)
 
 
-def _run_short(precision: Precision, name: str, session: Session) -> Finding:
+def _run_short(precision: Precision, name: str, session: CheckSession) -> CheckResult:
     why = precision.obstacle(session.device)
     if why is not None:
         raise Skipped(why)
@@ -315,11 +317,11 @@ def _run_short(precision: Precision, name: str, session: Session) -> Finding:
     found = _metric(home, precision, session)
     base = _metric(home, PRECISIONS["float32"], session)
     figures = {"metric": found, "metric_float32": base, "ratio": found / base}
-    return Finding(figures, {"ratio": WORKS})
+    return CheckResult(figures, {"ratio": WORKS})
 
 
 @torch.no_grad()
-def _metric(home: Habitat, precision: Precision, session: Session) -> float:
+def _metric(home: EnduranceCase, precision: Precision, session: CheckSession) -> float:
     """Return the metric at the horizon; NaN where worlds are not finite."""
     rule = precision.rule(home.rule)
     x, s = home.x, precision.kept(home.s)
@@ -333,19 +335,19 @@ def _metric(home: Habitat, precision: Precision, session: Session) -> float:
     return home.metric(x, s) if finite else float("nan")
 
 
-def _error_share(scene: Scene, found: Perceived, other: Perceived) -> float:
+def _error_share(scene: Scene, found: PerceptionOutcome, other: PerceptionOutcome) -> float:
     """Return how far two perceptions of a scene are apart, over the error that one may have."""
     exact = perceived(scene.x, scene.s, scene.box, by_reference=True)
     allowed = error_limits(scene.x, scene.s, scene.box, exact)
     shares = [
         relative_error(a, b) / allowed[f"{what}_float32"]
-        for what, a, b in zip(Perceived._fields, found, other, strict=True)
+        for what, a, b in zip(PerceptionOutcome._fields, found, other, strict=True)
     ]
     # NaN must not be skipped.
     return float(torch.tensor(shares).max())
 
 
-def _compared(pairs: Iterable[tuple[Scene, Perceived, Perceived]]) -> Finding:
+def _compared(pairs: Iterable[tuple[Scene, PerceptionOutcome, PerceptionOutcome]]) -> CheckResult:
     """Return the largest distance of two perceptions, and the scenes where it is too large."""
     shares = {
         f"{scene.name}/{'open' if scene.box is None else 'periodic'}": _error_share(scene, a, b)
@@ -353,15 +355,15 @@ def _compared(pairs: Iterable[tuple[Scene, Perceived, Perceived]]) -> Finding:
     }
     largest = float(torch.tensor(list(shares.values())).max())
     wrong = [name for name, share in shares.items() if not share <= TWO_ERRORS]
-    return Finding(
+    return CheckResult(
         {"over_allowed_error": largest},
         {"over_allowed_error": TWO_ERRORS},
         note=f"too far apart: {', '.join(wrong)}" if wrong else "",
     )
 
 
-def _run_order(space_dim: int, session: Session) -> Finding:
-    def pairs() -> Iterator[tuple[Scene, Perceived, Perceived]]:
+def _run_order(space_dim: int, session: CheckSession) -> CheckResult:
+    def pairs() -> Iterator[tuple[Scene, PerceptionOutcome, PerceptionOutcome]]:
         for scene in _every_scene(space_dim, session):
             x, s = _on(scene, session.device)
             order = torch.randperm(x.shape[1], generator=torch.Generator().manual_seed(7))
@@ -369,17 +371,17 @@ def _run_order(space_dim: int, session: Session) -> Finding:
             weights = functional_weights(x, s)
             found = perceived(x[:, order], s[:, order], scene.box, weights=weights[:, order])
             back = order.argsort()
-            found = Perceived(*(tensor[:, back] for tensor in found))
+            found = PerceptionOutcome(*(tensor[:, back] for tensor in found))
             yield scene, found, perceived(x, s, scene.box, weights=weights)
 
     return _compared(pairs())
 
 
-def _run_devices(session: Session) -> Finding:
+def _run_devices(session: CheckSession) -> CheckResult:
     if not session.cuda:
         raise Skipped("there is one device only: run it with --device cuda")
 
-    def pairs() -> Iterator[tuple[Scene, Perceived, Perceived]]:
+    def pairs() -> Iterator[tuple[Scene, PerceptionOutcome, PerceptionOutcome]]:
         for space_dim in (2, 3):
             for scene in _every_scene(space_dim, session):
                 found = perceived(*_on(scene, session.device), scene.box)
@@ -388,17 +390,17 @@ def _run_devices(session: Session) -> Finding:
     return _compared(pairs())
 
 
-def _run_repeated(space_dim: int, session: Session) -> Finding:
-    figures = dict.fromkeys(Perceived._fields, 0.0)
+def _run_repeated(space_dim: int, session: CheckSession) -> CheckResult:
+    figures = dict.fromkeys(PerceptionOutcome._fields, 0.0)
     for scene in _every_scene(space_dim, session):
         x, s = _on(scene, session.device)
         first, second = (perceived(x, s, scene.box) for _ in range(2))
-        for what, a, b in zip(Perceived._fields, first, second, strict=True):
+        for what, a, b in zip(PerceptionOutcome._fields, first, second, strict=True):
             figures[what] += differing(a, b)
-    return Finding(figures, dict.fromkeys(figures, 0.0))
+    return CheckResult(figures, dict.fromkeys(figures, 0.0))
 
 
-def _run_batch(space_dim: int, session: Session) -> Finding:
+def _run_batch(space_dim: int, session: CheckSession) -> CheckResult:
     """Worlds of other scenes stand beside each, so that all have the same number of particles."""
     figures = {"open": 0.0, "periodic": 0.0}
     for periodic in (False, True):
@@ -417,11 +419,11 @@ def _run_batch(space_dim: int, session: Session) -> Finding:
         for k in range(len(x)):
             alone = perceive(x[k : k + 1], s[k : k + 1], EPS, box=some[0].box)
             figures["periodic" if periodic else "open"] += differing(together[k], alone[0])
-    return Finding(figures, dict.fromkeys(figures, 0.0))
+    return CheckResult(figures, dict.fromkeys(figures, 0.0))
 
 
 @torch.no_grad()
-def _run_graph(session: Session) -> Finding:
+def _run_graph(session: CheckSession) -> CheckResult:
     if not session.cuda:
         raise Skipped("graphs are CUDA's: run it with --device cuda")
     rule = load_rule("gecko", device=session.device).float()
@@ -445,4 +447,4 @@ def _run_graph(session: Session) -> Finding:
         graph.replay()
         figures["positions"] += differing(x, eager[0])
         figures["states"] += differing(s, eager[1])
-    return Finding(figures, dict.fromkeys(figures, 0.0))
+    return CheckResult(figures, dict.fromkeys(figures, 0.0))

@@ -205,7 +205,7 @@ PRECISIONS = {"float32": torch.float32, "float64": torch.float64}
 """Dtypes by their names."""
 
 
-class Perceived(NamedTuple):
+class PerceptionOutcome(NamedTuple):
     """A perception and its adjoint."""
 
     z: Tensor
@@ -244,7 +244,7 @@ def perceived(
     by_reference: bool = False,
     weights: Tensor | None = None,
     given: Callable[[Tensor], Tensor] = torch.clone,
-) -> Perceived:
+) -> PerceptionOutcome:
     """Return z and the gradients of a random functional of it, by the library or the reference.
 
     `weights` [B, N, P] are by default `functional_weights`; `given` is what to make of positions,
@@ -257,11 +257,11 @@ def perceived(
         z = perceive(x, s, EPS, EPS, box, detach_positions=False)
     weights = given(functional_weights(x, s) if weights is None else weights)
     states, positions = torch.autograd.grad((z * weights).sum(), (s, x))
-    return Perceived(z.detach(), states, positions)
+    return PerceptionOutcome(z.detach(), states, positions)
 
 
 def error_limits(
-    x: Tensor, s: Tensor, box: tuple[float, ...] | None, expected: Perceived
+    x: Tensor, s: Tensor, box: tuple[float, ...] | None, expected: PerceptionOutcome
 ) -> dict[str, float]:
     """Return the relative errors that float64 worlds allow, by the names of `LIMITS`.
 
@@ -283,7 +283,7 @@ def error_limits(
     limits = dict(LIMITS)
     for _ in range(4):
         others = perceived(x, s, box, by_reference=True, given=changed)
-        for what, exact, other in zip(Perceived._fields, expected, others, strict=True):
+        for what, exact, other in zip(PerceptionOutcome._fields, expected, others, strict=True):
             condition = relative_error(other, exact) / change
             for name, dtype in PRECISIONS.items():
                 rounding = 0.5 * torch.finfo(dtype).eps

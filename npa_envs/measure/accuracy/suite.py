@@ -15,13 +15,13 @@ from npa_envs.errors import NPAError, suggest
 from npa_envs.measure.accuracy.checks import (
     GROUPS,
     Check,
-    Finding,
-    Session,
+    CheckResult,
+    CheckSession,
     Skipped,
     Verdict,
     group_of,
 )
-from npa_envs.measure.accuracy.habitats import endurance_checks
+from npa_envs.measure.accuracy.endurance import endurance_checks
 from npa_envs.measure.accuracy.hard_cases import geometry_checks, values_checks
 from npa_envs.measure.accuracy.numerics import gradients_checks, precision_checks
 from npa_envs.measure.plots import draw_matrix, new_figure, png
@@ -72,7 +72,7 @@ def chosen_checks(checks: Sequence[Check], names: Sequence[str]) -> list[Check]:
 
 
 @dataclass(frozen=True)
-class Entry:
+class CheckEntry:
     """A check and what came of it."""
 
     name: str
@@ -92,7 +92,7 @@ class Entry:
     """Of a check of a rule: what `rule_digest` says of it; older records do not tell."""
 
     @classmethod
-    def of(cls, check: Check, finding: Finding, seconds: float) -> Entry:
+    def of(cls, check: Check, finding: CheckResult, seconds: float) -> CheckEntry:
         """Return the entry of a check that ran to its end."""
         return cls(
             check.name,
@@ -131,7 +131,7 @@ class Entry:
 
 
 @dataclass(frozen=True)
-class Row:
+class CheckRow:
     """A line of the printed tables."""
 
     check: str
@@ -146,7 +146,7 @@ class Record:
 
     facts: dict[str, Any]
     """What its figures follow from: device, machine, size, seed, commit, versions."""
-    entries: dict[str, Entry] = field(default_factory=dict)
+    entries: dict[str, CheckEntry] = field(default_factory=dict)
     """What came of each check, by its name."""
 
     @classmethod
@@ -157,7 +157,7 @@ class Record:
             NPAError: As for `read_record`.
         """
 
-        def made(held: dict[str, Any]) -> dict[str, Entry]:
+        def made(held: dict[str, Any]) -> dict[str, CheckEntry]:
             return {fields["name"]: _entry(fields) for fields in held["checks"]}
 
         return cls(dict(facts), read_record(path, facts, made, command="stress") or {})
@@ -191,13 +191,13 @@ class Record:
         found = [entry.verdict for entry in self.entries.values()]
         return {verdict: found.count(verdict) for verdict in ("pass", "range", "fail", "skipped")}
 
-    def failed(self) -> list[Entry]:
+    def failed(self) -> list[CheckEntry]:
         """Return the entries of the checks that failed."""
         return [entry for entry in self.entries.values() if entry.verdict == "fail"]
 
-    def by_group(self) -> dict[str, list[Entry]]:
+    def by_group(self) -> dict[str, list[CheckEntry]]:
         """Return the entries of each group."""
-        groups: dict[str, list[Entry]] = {}
+        groups: dict[str, list[CheckEntry]] = {}
         for entry in self.entries.values():
             groups.setdefault(entry.group, []).append(entry)
         return groups
@@ -220,11 +220,11 @@ class Record:
         return "\n\n".join([*parts, told])
 
 
-def _group_text(entries: Sequence[Entry]) -> str:
+def _group_text(entries: Sequence[CheckEntry]) -> str:
     found = [entry.holds or entry.worst() or entry.note for entry in entries]
     width = max(map(len, found))
     rows = [
-        Row(entry.name, entry.verdict, round(entry.seconds, 2), words.ljust(width))
+        CheckRow(entry.name, entry.verdict, round(entry.seconds, 2), words.ljust(width))
         for entry, words in zip(entries, found, strict=True)
     ]
     return "\n".join(line.rstrip() for line in table_text(rows).splitlines())
@@ -239,15 +239,15 @@ def _with_words(value: Any) -> Any:
     return str(value) if isinstance(value, float) and not math.isfinite(value) else value
 
 
-def _entry(fields: dict[str, Any]) -> Entry:
+def _entry(fields: dict[str, Any]) -> CheckEntry:
     for name in ("figures", "limits"):
         fields[name] = {key: float(value) for key, value in fields[name].items()}
-    return Entry(**fields)
+    return CheckEntry(**fields)
 
 
 def run_checks(
     checks: Sequence[Check],
-    session: Session,
+    session: CheckSession,
     record: Record,
     *,
     max_seconds: float | None = None,
@@ -265,7 +265,9 @@ def run_checks(
     for check in checks:
         if not record.done(check.name):
             if time_is_up():
-                left = Entry(check.name, check.expected, "skipped", note="no time was left for it")
+                left = CheckEntry(
+                    check.name, check.expected, "skipped", note="no time was left for it"
+                )
                 record.entries.setdefault(check.name, left)
             else:
                 found = run_check(check, session)
@@ -286,13 +288,13 @@ def rule_weights(checks: Iterable[Check]) -> dict[str, str]:
     return {check.name: known[check.rule] for check in some}
 
 
-def run_check(check: Check, session: Session) -> Entry:
+def run_check(check: Check, session: CheckSession) -> CheckEntry:
     """Return what comes of a check: raising is a failure, lack of memory a reason to skip."""
     begin = time.perf_counter()
     verdict: Verdict
     try:
         finding = check.run(session)
-        return Entry.of(check, finding, time.perf_counter() - begin)
+        return CheckEntry.of(check, finding, time.perf_counter() - begin)
     except Skipped as reason:
         verdict, note = "skipped", str(reason)
     except torch.OutOfMemoryError:
@@ -301,7 +303,7 @@ def run_check(check: Check, session: Session) -> Entry:
         # Whatever breaks here is what the command is looking for.
         verdict, note = "fail", f"{type(error).__name__}: {' '.join(str(error).split())}"
     seconds = time.perf_counter() - begin
-    return Entry(check.name, check.expected, verdict, note=note, seconds=seconds)
+    return CheckEntry(check.name, check.expected, verdict, note=note, seconds=seconds)
 
 
 def heat_maps(record: Record) -> dict[str, bytes]:
@@ -317,7 +319,7 @@ def heat_maps(record: Record) -> dict[str, bytes]:
     return drawn
 
 
-def _heat_map(group: str, entries: Sequence[Entry]) -> bytes:
+def _heat_map(group: str, entries: Sequence[CheckEntry]) -> bytes:
     from matplotlib.colors import LogNorm
 
     columns = list(dict.fromkeys(name for entry in entries for name in entry.limits))

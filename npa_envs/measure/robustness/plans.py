@@ -96,7 +96,7 @@ def trained_value(condition: str, update_prob: float) -> float | str:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Plan:
+class TrialPlan:
     """What is measured of one rule."""
 
     grow_steps: int
@@ -122,13 +122,13 @@ _VALUES: dict[str, tuple[float | str, ...]] = {
     "shape": ("trained", *SHAPES),
 }
 
-_MOVING = Plan(grow_steps=512, heal_steps=_HEAL_STEPS, chunk=16, values=_VALUES)
+_MOVING = TrialPlan(grow_steps=512, heal_steps=_HEAL_STEPS, chunk=16, values=_VALUES)
 
 PLANS = {
     "morphogenesis2d": _MOVING,
     "morphogenesis3d": replace(_MOVING, grow_steps=128, heal_steps=_HEAL_STEPS[:-2]),
     "texture": replace(_MOVING, grow_steps=1024),
-    "point_classification": Plan(
+    "point_classification": TrialPlan(
         grow_steps=64,
         heal_steps=(0, 8, 16, 24, 32, 48, 64, 96, 128),
         chunk=8,
@@ -141,7 +141,7 @@ PLANS = {
 """What is measured of the rules of each task."""
 
 
-def quick_plan(task_name: str) -> Plan:
+def quick_plan(task_name: str) -> TrialPlan:
     """Return a plan of a task of `PLANS` that takes seconds: few steps, few values."""
     values: dict[str, tuple[float | str, ...]] = {
         "eps": (0.7, 1.0, 1.4),

@@ -13,12 +13,12 @@ from statistics import median
 import torch
 from torch import Tensor
 
-from npa_envs.measure.robustness.grounds import Ground, Home, courses
+from npa_envs.measure.robustness.trials import RuleTrial, TaskTrial, loss_curves
 from npa_envs.ops import world_mean
 from npa_envs.tasks.base import coded_states
-from npa_envs.tasks.damage import DAMAGE_SIZES, clump, cut, erase_state, random_particle
+from npa_envs.tasks.damage import DAMAGE_SIZES, clump, cut, random_particle, wipe_state
 from npa_envs.world.brushes import nearest_image, offsets_from
-from npa_envs.world.randomness import Purpose, WorldRandom
+from npa_envs.world.randomness import StreamId, WorldRandom
 
 STATE_NOISE = 0.3
 """Standard deviation of what is added to every state (dimensionless)."""
@@ -44,11 +44,11 @@ class Damage:
     """Whether it is beyond what rules are asked to heal."""
 
 
-def erase(x: Tensor, s: Tensor, random: WorldRandom, box: Box) -> tuple[Tensor, Tensor]:
+def wipe(x: Tensor, s: Tensor, random: WorldRandom, box: Box) -> tuple[Tensor, Tensor]:
     """Set all states in a disk around a random particle to zero, a ball in 3D."""
     away = offsets_from(x, random_particle(x, random), box)
     centre = torch.zeros_like(x[:, 0])
-    return x, erase_state(away, s, centre=centre, radius=DAMAGE_SIZES["erase"])
+    return x, wipe_state(away, s, centre=centre, radius=DAMAGE_SIZES["wipe"])
 
 
 def slit(x: Tensor, s: Tensor, random: WorldRandom, box: Box) -> tuple[Tensor, Tensor]:
@@ -98,7 +98,7 @@ def _lowest_half(x: Tensor, s: Tensor, key: Tensor) -> tuple[Tensor, Tensor]:
 DAMAGES = {
     damage.name: damage
     for damage in (
-        Damage("erase", erase, static=True),
+        Damage("wipe", wipe, static=True),
         Damage("cut", slit, static=False),
         Damage("clump", pull_together, static=False),
         Damage("noise", add_state_noise, static=True, beyond=True),
@@ -123,7 +123,7 @@ AFTERWARDS, OTHERWISE = 1001, 1002
 
 
 @dataclass(frozen=True)
-class Course:
+class LossCurve:
     """The losses of all seeds at some numbers of steps after one damage."""
 
     damage: str
@@ -176,7 +176,7 @@ def recovery_step(
 
 
 @torch.no_grad()
-def healing(ground: Ground, home: Home) -> list[Course]:
+def healing(ground: RuleTrial, home: TaskTrial) -> list[LossCurve]:
     """Damage grown worlds in every way, and watch them beside their twins.
 
     Returns:
@@ -186,7 +186,7 @@ def healing(ground: Ground, home: Home) -> list[Course]:
     chosen = [d for d in DAMAGES.values() if d.static or not ground.rule.static]
     found = _beside_twins(ground, home, home, [d for d in chosen if not d.halves], control=True)
     smaller = ground.home(share=0.5)
-    grown = ground.run(smaller, ground.random(Purpose.GROWTH))
+    grown = ground.run(smaller, ground.random(StreamId.GROWTH))
     grown.advance(ground.plan.grow_steps)
     twins = smaller.with_worlds(grown.x, grown.s)
     return found + _beside_twins(
@@ -195,15 +195,20 @@ def healing(ground: Ground, home: Home) -> list[Course]:
 
 
 def _beside_twins(
-    ground: Ground, home: Home, twins: Home, damages: Sequence[Damage], *, control: bool
-) -> list[Course]:
+    ground: RuleTrial,
+    home: TaskTrial,
+    twins: TaskTrial,
+    damages: Sequence[Damage],
+    *,
+    control: bool,
+) -> list[LossCurve]:
     """Watch twins and damaged worlds as one batch."""
     steps = ground.plan.heal_steps
     copies = [(twins.x, twins.s)]
     keys = [ground.random(AFTERWARDS).keys]
     names = [damage.name for damage in damages]
     for damage in damages:
-        random = ground.random(Purpose.DAMAGE)
+        random = ground.random(StreamId.DAMAGE)
         x, s = damage.apply(home.x, home.s, random, home.task.box)
         copies.append((x, coded_states(home.task, s)))
         keys.append(keys[0])
@@ -214,11 +219,11 @@ def _beside_twins(
     x, s = (torch.cat(parts) for parts in zip(*copies, strict=True))
     batch = twins.with_worlds(x, s)
     run = ground.run(batch, WorldRandom.from_keys(torch.cat(keys)))
-    losses = courses(batch, run, steps).view(len(steps), len(copies), -1)
+    losses = loss_curves(batch, run, steps).view(len(steps), len(copies), -1)
     # One row for each copy and seed.
     twin, *others = ground.by_seed(losses).permute(1, 2, 0).tolist()
     rows = [
-        Course(name, steps, tuple(map(tuple, other)), tuple(map(tuple, twin)))
+        LossCurve(name, steps, tuple(map(tuple, other)), tuple(map(tuple, twin)))
         for name, other in zip(names, others, strict=True)
     ]
     return rows[-1:] + rows[:-1] if control else rows

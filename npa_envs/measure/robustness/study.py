@@ -12,21 +12,21 @@ from typing import Any
 
 import torch
 
-from npa_envs.measure.accuracy.habitats import WORKS
+from npa_envs.measure.accuracy.endurance import WORKS
 from npa_envs.measure.plots import draw_band, legend_of, mark_decades, new_figure, png
 from npa_envs.measure.record import number, read_record, write_record
-from npa_envs.measure.robustness.grounds import Ground, Home, courses
 from npa_envs.measure.robustness.plans import CONDITIONS, trained_value
 from npa_envs.measure.robustness.recovery import (
     CONTROL,
     DAMAGES,
     RECOVERED,
-    Course,
+    LossCurve,
     healing,
     ratio,
 )
+from npa_envs.measure.robustness.trials import RuleTrial, TaskTrial, loss_curves
 from npa_envs.measure.tables import NONE, markdown_table, short
-from npa_envs.world.randomness import Purpose
+from npa_envs.world.randomness import StreamId
 
 MOST_PARTICLES = {"cpu": 1 << 17, "cuda": 1 << 21}
 """Particles of all worlds together; where there would be more, a value is left out."""
@@ -63,7 +63,7 @@ class RuleRecord:
     facts: Mapping[str, Any]
     """What the figures follow from: the rule's weights, device, machine, size, seeds, commit,
     versions."""
-    courses: tuple[Course, ...]
+    loss_curves: tuple[LossCurve, ...]
     """After each damage, the control first."""
     responses: tuple[Response, ...]
     """Under each condition."""
@@ -85,9 +85,9 @@ class RuleRecord:
         def numbers(values: list[float | None]) -> tuple[float, ...]:
             return tuple(map(number, values))
 
-        def course(row: dict[str, Any]) -> Course:
+        def course(row: dict[str, Any]) -> LossCurve:
             losses, twins = (tuple(map(numbers, row[name])) for name in ("losses", "twins"))
-            return Course(row["damage"], tuple(row["steps"]), losses, twins)
+            return LossCurve(row["damage"], tuple(row["steps"]), losses, twins)
 
         def made(held: dict[str, Any]) -> RuleRecord:
             held["courses"] = tuple(map(course, held["courses"]))
@@ -105,7 +105,7 @@ class RuleRecord:
             NPAError: It cannot be written.
         """
         content = asdict(self)
-        for course, row in zip(self.courses, content["courses"], strict=True):
+        for course, row in zip(self.loss_curves, content["courses"], strict=True):
             row["recovery_steps"] = course.recovery_steps()
         write_record(path, content)
 
@@ -116,7 +116,7 @@ class RuleRecord:
 
 def measure_rule(
     name: str,
-    ground: Ground,
+    ground: RuleTrial,
     most_particles: int,
     *,
     facts: Mapping[str, Any],
@@ -139,7 +139,7 @@ def measure_rule(
         metric=ground.metric_name,
         update_prob=float(ground.task.update_prob),
         facts=facts,
-        courses=tuple(healing(ground, home)),
+        loss_curves=tuple(healing(ground, home)),
         responses=(),
         done=False,
         command=command,
@@ -164,7 +164,9 @@ def measure_rule(
     return record
 
 
-def grow(ground: Ground, condition: str = "", value: float | str = 1.0) -> tuple[Home, Response]:
+def grow(
+    ground: RuleTrial, condition: str = "", value: float | str = 1.0
+) -> tuple[TaskTrial, Response]:
     """Grow worlds from their seeds under a condition, none by default, and take their losses.
 
     Returns:
@@ -186,14 +188,14 @@ def grow(ground: Ground, condition: str = "", value: float | str = 1.0) -> tuple
     # In whole chunks: what is left over would refuse worlds that are not finite any more.
     chunk = ground.plan.chunk
     steps = chunk * max(1, round(ground.plan.grow_steps / pace / chunk))
-    run = ground.run(home, ground.random(Purpose.GROWTH), **changed)
-    losses = ground.by_seed(courses(home, run, (steps,))[0]).tolist()
+    run = ground.run(home, ground.random(StreamId.GROWTH), **changed)
+    losses = ground.by_seed(loss_curves(home, run, (steps,))[0]).tolist()
     return home.with_worlds(run.x, run.s), Response(condition, value, steps, tuple(losses))
 
 
 @torch.no_grad()
 def responses(
-    ground: Ground, trained: Response, most_particles: int, *, done: int = 0
+    ground: RuleTrial, trained: Response, most_particles: int, *, done: int = 0
 ) -> Iterator[Response]:
     """Yield what comes of each value of each condition but for the first `done`.
 
@@ -281,10 +283,10 @@ def recovered_share(
     records: Iterable[RuleRecord], damages: Collection[str]
 ) -> tuple[int, int, int]:
     """Return how many seeds of all rules recovered of damages, are so at the end, and there are."""
-    courses = [c for record in records for c in record.courses if c.damage in damages]
-    recovered = sum(course.recovered() for course in courses)
-    at_end = sum(course.within_at_end() for course in courses)
-    return recovered, at_end, sum(len(course.losses) for course in courses)
+    loss_curves = [c for record in records for c in record.loss_curves if c.damage in damages]
+    recovered = sum(course.recovered() for course in loss_curves)
+    at_end = sum(course.within_at_end() for course in loss_curves)
+    return recovered, at_end, sum(len(course.losses) for course in loss_curves)
 
 
 def tables(records: Sequence[RuleRecord]) -> str:
@@ -312,13 +314,13 @@ def tables(records: Sequence[RuleRecord]) -> str:
     return "\n\n".join(parts) + "\n"
 
 
-def _time(course: Course) -> str:
+def _time(course: LossCurve) -> str:
     step = course.median_step()
     told = f"{course.recovered()}/{len(course.losses)}"
     return told if step is None else f"{told}, {step:g}"
 
 
-def _size(course: Course) -> str:
+def _size(course: LossCurve) -> str:
     first, last = _median(course.ratios(0)), _median(course.ratios(-1))
     return f"{short(first)} → {short(last)} ({course.within_at_end()}/{len(course.losses)})"
 
@@ -336,12 +338,12 @@ def _by_condition(records: Sequence[RuleRecord]) -> str:
     return markdown_table(["rule", *CONDITIONS], rows)
 
 
-def _by_damage(records: Sequence[RuleRecord], cell: Callable[[Course], str]) -> str:
-    done = {course.damage for record in records for course in record.courses}
+def _by_damage(records: Sequence[RuleRecord], cell: Callable[[LossCurve], str]) -> str:
+    done = {course.damage for record in records for course in record.loss_curves}
     names = [name for name in (CONTROL, *DAMAGES) if name in done]
     rows = []
     for record in records:
-        found = {course.damage: course for course in record.courses}
+        found = {course.damage: course for course in record.loss_curves}
         rows.append([record.rule, *(cell(found[n]) if n in found else NONE for n in names)])
     return markdown_table(["rule", *names], rows)
 
@@ -406,12 +408,12 @@ def _draw(records: Sequence[RuleRecord]) -> bytes:
 
 def _draw_courses(panel: Any, record: RuleRecord) -> None:
     """Draw losses over the twins' after each damage."""
-    for place, course in enumerate(record.courses):
+    for place, course in enumerate(record.loss_curves):
         colour = "0.5" if course.damage == CONTROL else f"C{place}"
         columns = [course.ratios(k) for k in range(len(course.steps))]
         _draw_seeds(panel, course.steps, columns, colour, course.damage)
     panel.axhline(RECOVERED, color="black", lw=0.7, ls=":")
-    steps = record.courses[0].steps
+    steps = record.loss_curves[0].steps
     panel.set_xscale("symlog", linthresh=max(1, steps[1]))
     panel.set_xlim(0, steps[-1])
     ticks = [step for step in steps if step & (step - 1) == 0]

@@ -13,7 +13,7 @@ from functools import partial
 import torch
 from torch import Tensor
 
-from npa_envs.measure.speed.timing import Session, relative_error
+from npa_envs.measure.speed.timing import TimingSession, relative_error
 from npa_envs.measure.speed.workloads import Workload
 from npa_envs.world.rollout import rollout
 
@@ -36,7 +36,7 @@ class DriftRow:
     weight_gradient: float
 
 
-def drift_rows(session: Session, workloads: Iterable[Workload]) -> list[DriftRow]:
+def drift_rows(session: TimingSession, workloads: Iterable[Workload]) -> list[DriftRow]:
     """Return a row for each workload."""
     rows: list[DriftRow] = []
     for workload in workloads:
@@ -46,7 +46,7 @@ def drift_rows(session: Session, workloads: Iterable[Workload]) -> list[DriftRow
     return rows
 
 
-def _drift_row(workload: Workload, session: Session, exact: list[Tensor]) -> DriftRow:
+def _drift_row(workload: Workload, session: TimingSession, exact: list[Tensor]) -> DriftRow:
     found = _outcome(workload, session, torch.float32)
     positions, states, by_states, by_weights = (
         relative_error(a, b) for a, b in zip(found, exact, strict=True)
@@ -56,7 +56,7 @@ def _drift_row(workload: Workload, session: Session, exact: list[Tensor]) -> Dri
     return DriftRow(workload.name, positions, states, by_states, median, by_weights)
 
 
-def _outcome(workload: Workload, session: Session, dtype: torch.dtype) -> list[Tensor]:
+def _outcome(workload: Workload, session: TimingSession, dtype: torch.dtype) -> list[Tensor]:
     """Return positions and states at the end, and gradients by states and by weights."""
     device = session.device
     rule = workload.rule(device).to(dtype)

@@ -10,11 +10,11 @@ import torch
 from torch.autograd import DeviceType  # type: ignore[attr-defined]
 from torch.profiler import ProfilerActivity, profile
 
-from npa_envs.measure.speed.timing import Session
+from npa_envs.measure.speed.timing import TimingSession
 from npa_envs.measure.speed.workloads import Workload, rollout_call
-from npa_envs.ops.backend import Request, describe
+from npa_envs.ops.backend import KernelRequest, describe
 from npa_envs.ops.launch import Launch, noted_launches
-from npa_envs.ops.sort import Plan, make_plan
+from npa_envs.ops.sort import KernelPlan, make_plan
 from npa_envs.rule.rule import NPARule
 from npa_envs.world.rollout import step
 from npa_envs.world.steps import row_capacity
@@ -36,7 +36,7 @@ class KernelRow:
     kernel: str
 
 
-def kernel_rows(session: Session, workloads: Sequence[Workload]) -> list[KernelRow]:
+def kernel_rows(session: TimingSession, workloads: Sequence[Workload]) -> list[KernelRow]:
     """Return the kernels of inference and of training; none on a CPU."""
     if not session.cuda:
         session.leave_out("kernels", "CUDA only")
@@ -158,7 +158,7 @@ def _reasons(question: Question) -> list[str]:
         f"One step of {shape[0]} x {shape[1]} particles in {shape[2]}D, C {workload.state_dim}, "
         f"{number} on {question.device}",
         f"  boundary    {_boundary(question)}",
-        f"  cells       {plan.domain.cell_count} a world, eps / {plan.domain.reach} wide: "
+        f"  cells       {plan.domain.cell_count} a world, eps / {plan.domain.cell_reach} wide: "
         "a neighbourhood is a few ranges of sorted particles",
         f"  channels    {plan.group_count} group(s) of {plan.width}, "
         f"{workload.state_dim} used: a kernel is compiled for a group's width",
@@ -177,7 +177,7 @@ def _boundary(question: Question) -> str:
     return f"periodic, side {question.box:g}: nearest images, positions are wrapped"
 
 
-def _request(plan: Plan, rule: NPARule) -> Request:
+def _request(plan: KernelPlan, rule: NPARule) -> KernelRequest:
     """Return what the backend table asks for."""
     hidden, output = rule.folded()[:2]
     return plan.request._replace(
@@ -185,7 +185,7 @@ def _request(plan: Plan, rule: NPARule) -> Request:
     )
 
 
-def _neighbours(plan: Plan) -> str:
+def _neighbours(plan: KernelPlan) -> str:
     if not plan.lists_neighbours:
         return "searched for in each pass"
     listing = plan.listing
@@ -195,7 +195,7 @@ def _neighbours(plan: Plan) -> str:
     )
 
 
-def _rows(plan: Plan, question: Question) -> str:
+def _rows(plan: KernelPlan, question: Question) -> str:
     if not plan.masked:
         return "every particle is perceived and updated"
     prob = question.workload.update_prob

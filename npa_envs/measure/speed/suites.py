@@ -31,11 +31,11 @@ from npa_envs.measure.speed.throughput import (
     slope_rows,
     throughput_rows,
 )
-from npa_envs.measure.speed.timing import LeftOut, Session, Tables
+from npa_envs.measure.speed.timing import LeftOut, Tables, TimingSession
 from npa_envs.measure.tables import UNMEASURED, as_objects, table_text
 
 
-def paper(session: Session) -> Tables:
+def paper(session: TimingSession) -> Tables:
     """Return the paper's table, what the public call costs there, and float32's errors."""
     workloads = SMALL if session.small else PAPER if session.cuda else CPU
     drifting = SMALL if session.small else PROFILED if session.cuda else (ONE_WORLD,)
@@ -49,19 +49,19 @@ def paper(session: Session) -> Tables:
     return tables
 
 
-def scaling(session: Session) -> Tables:
+def scaling(session: TimingSession) -> Tables:
     """Return time and memory against N, neighbours, B and C."""
     rows = scaling_rows(session)
     return {"scaling": rows, "slopes": slope_rows(rows)}
 
 
-def quick(session: Session) -> Tables:
+def quick(session: TimingSession) -> Tables:
     """Return the small tables of the suite `paper`."""
     session.small = True
     return paper(session)
 
 
-SUITES: dict[str, Callable[[Session], Tables]] = {
+SUITES: dict[str, Callable[[TimingSession], Tables]] = {
     "quick": quick,
     "paper": paper,
     "scaling": scaling,
@@ -76,7 +76,7 @@ SUITES: dict[str, Callable[[Session], Tables]] = {
 
 
 @dataclass(frozen=True)
-class Report:
+class BenchReport:
     """One run of one suite."""
 
     suite: str

@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from torch import Tensor
 
-from npa_envs.measure.speed.timing import Session, Timing, compare, timed_calls
+from npa_envs.measure.speed.timing import Timing, TimingSession, compare, timed_calls
 from npa_envs.measure.speed.workloads import Workload, rollout_call
 from npa_envs.rule.rule import NPARule
 from npa_envs.world.recorded import release_recordings
@@ -101,7 +101,7 @@ class AimRow:
     recompute_slower: float
 
 
-def throughput_rows(session: Session, workloads: Sequence[Workload]) -> list[ThroughputRow]:
+def throughput_rows(session: TimingSession, workloads: Sequence[Workload]) -> list[ThroughputRow]:
     """Return two rows for each workload: storing and recomputing."""
     rows: list[ThroughputRow] = []
     for workload in workloads:
@@ -118,7 +118,7 @@ def throughput_rows(session: Session, workloads: Sequence[Workload]) -> list[Thr
 
 
 def throughput_row(
-    session: Session, workload: Workload, memory: Memory = "store", *, train: bool = True
+    session: TimingSession, workload: Workload, memory: Memory = "store", *, train: bool = True
 ) -> ThroughputRow:
     """Return what a step of a workload costs."""
     x, s = workload.worlds(session.device)
@@ -154,7 +154,7 @@ class PublicRow:
     launched_train_us: Timing
 
 
-def public_rows(session: Session, workloads: Sequence[Workload]) -> list[PublicRow]:
+def public_rows(session: TimingSession, workloads: Sequence[Workload]) -> list[PublicRow]:
     """Return a row for each workload: the public call, as it comes."""
     return [
         row
@@ -163,7 +163,7 @@ def public_rows(session: Session, workloads: Sequence[Workload]) -> list[PublicR
     ]
 
 
-def _public_row(session: Session, workload: Workload) -> PublicRow:
+def _public_row(session: TimingSession, workload: Workload) -> PublicRow:
     x, s = workload.worlds(session.device)
     found: dict[tuple[bool, bool], Timing] = {}
     for recorded in (True, False):
@@ -242,7 +242,7 @@ class SlopeRow:
     train_slope: float
 
 
-def scaling_rows(session: Session) -> list[ScalingRow]:
+def scaling_rows(session: TimingSession) -> list[ScalingRow]:
     """Return the rows of all axes, increasing along each."""
     rows: list[ScalingRow] = []
     for axis, values in zip(AXES, _values(session), strict=True):
@@ -251,7 +251,7 @@ def scaling_rows(session: Session) -> list[ScalingRow]:
     return rows
 
 
-def _values(session: Session) -> tuple[Sequence[int], ...]:
+def _values(session: TimingSession) -> tuple[Sequence[int], ...]:
     """Return the values of each axis."""
     if session.small:
         return (256, 1024), (16, 64), (1, 2), (4, 16)
@@ -274,7 +274,7 @@ def varied(axis: str, value: int, *, small: bool = False) -> Workload:
     return replace(usual, eps=usual.eps * math.sqrt(share))
 
 
-def _scaling_row(session: Session, axis: str, value: int) -> ScalingRow:
+def _scaling_row(session: TimingSession, axis: str, value: int) -> ScalingRow:
     workload = varied(axis, value, small=session.small)
     cost = throughput_row(session, workload)
     return ScalingRow(
@@ -392,7 +392,7 @@ def skips(workload: Workload) -> list[Skip]:
     ]
 
 
-def skip_rows(session: Session) -> list[SkipRow]:
+def skip_rows(session: TimingSession) -> list[SkipRow]:
     """Return what each omission saves, measured with and without it in one run."""
     workload = SKIPPED["small" if session.small else session.device.type]
     x, s = workload.worlds(session.device)
@@ -446,7 +446,7 @@ class OneSpeciesRow:
     ratio: float
 
 
-def one_species_rows(session: Session) -> list[OneSpeciesRow]:
+def one_species_rows(session: TimingSession) -> list[OneSpeciesRow]:
     """Return what one species costs beside `rollout`, inference and training."""
     rows: list[OneSpeciesRow] = []
     for workload in SPECIES["small" if session.small else session.device.type]:
@@ -459,7 +459,9 @@ def one_species_rows(session: Session) -> list[OneSpeciesRow]:
     return rows
 
 
-def _species_row(session: Session, workload: Workload, train: bool, graph: bool) -> OneSpeciesRow:
+def _species_row(
+    session: TimingSession, workload: Workload, train: bool, graph: bool
+) -> OneSpeciesRow:
     x, s = workload.worlds(session.device)
     make: Callable[..., Any] = partial(rollout_call, workload, x, s, train=train)
     # Each draws the same masks, as often as the other one is called.

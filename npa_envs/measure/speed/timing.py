@@ -147,7 +147,7 @@ NO_TIME = "no time was left"
 
 
 @dataclass
-class Session:
+class TimingSession:
     """One run of the benchmark."""
 
     device: torch.device

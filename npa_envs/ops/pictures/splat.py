@@ -30,7 +30,7 @@ from npa_envs.kernels.pictures.splat import (
     make_lens,
     splat_kernels,
 )
-from npa_envs.ops.backend import Request
+from npa_envs.ops.backend import KernelRequest
 from npa_envs.ops.launch import aligned, launch, scalar_type
 from npa_envs.ops.mean import world_mean
 from npa_envs.ops.opaque import check_derivatives, once_differentiable, opaque
@@ -103,7 +103,7 @@ def sort_splats(splats: Splats, lens: Any) -> tuple[Tensor, Tensor, Tensor]:
     _check_size(max(cell_total, x.numel()), world_count, lens)
     footprints = x.new_empty(total, FOOTPRINT)
     source = torch.empty(total, dtype=torch.int32, device=x.device)
-    request = Request(x.device, x.dtype, particle_count, lens.cell_count, 2)
+    request = KernelRequest(x.device, x.dtype, particle_count, lens.cell_count, 2)
     capacity = block_capacity(request, x)
     if capacity:
         starts = source.new_empty(cell_total + 1)

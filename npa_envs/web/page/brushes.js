@@ -29,7 +29,7 @@ export function insideBall(x, dimension, centre, radius, box) {
   return found;
 }
 
-export function eraseState(x, s, dimension, centre, radius, box) {
+export function wipeState(x, s, dimension, centre, radius, box) {
   const channels = (s.length / x.length) * dimension;
   for (const i of insideBall(x, dimension, centre, radius, box)) s.fill(0, i * channels, (i + 1) * channels);
 }

@@ -23,7 +23,7 @@ class Gallery {
     title.textContent = document.title;
     const hint = document.createElement("p");
     hint.textContent =
-      "Small neural networks, one in every particle. Choose one, watch it grow, then erase a part of it.";
+      "Small neural networks, one in every particle. Choose one, watch it grow, then remove a part of it.";
     const list = document.createElement("ul");
     for (const { name, preview } of pictured) {
       const item = document.createElement("li"), link = document.createElement("a");

@@ -1,7 +1,7 @@
 // The world behind the exported page: what its messages do, and the frames that it shows. Messages and
 // events are those of page.js, and what they do is what RuleWorld of npa_envs/web/rule_world.py does.
 
-import { clump, cut, eraseState, inject, insideBall, push, stateAround } from "./brushes.js";
+import { clump, cut, wipeState, inject, insideBall, push, stateAround } from "./brushes.js";
 import { Colouring, Look } from "./colours.js";
 import { fastestKernels } from "./kernels_simd.js";
 import { padded, Physics, prepareRule, wrap } from "./physics.js";
@@ -17,7 +17,7 @@ const INJECT_RATE = 0.5;
 const CLUMP_FACTOR = 0.9;
 const SEED_SHARE = 0.5;
 const LEAST_SEED = 16;
-const DAMAGE_SIZES = { erase: 0.2, cut: 0.1, clump: 0.2, noise: 0.05 };
+const DAMAGE_SIZES = { wipe: 0.2, cut: 0.1, clump: 0.2, noise: 0.05 };
 
 // A graphics card is tried for so many steps, whose results may differ so much from the processor's.
 const TRIAL_STEPS = 4;
@@ -229,7 +229,7 @@ export class LiveWorld {
   brush({ tool, at, move, radius, strength, source, rule, view }) {
     const { dimension, box } = this;
     const { x, s, species } = this.world;
-    if (tool === "erase") {
+    if (tool === "remove") {
       const gone = new Set(insideBall(x, dimension, at, radius, box));
       this.keep((i) => !gone.has(i));
     } else if (tool === "push") {
@@ -310,7 +310,7 @@ export class LiveWorld {
     if (count === 0) return;
     const particle = random.below(count);
     const centre = x.slice(particle * dimension, (particle + 1) * dimension);
-    if (name === "erase") eraseState(x, s, dimension, centre, size, null);
+    if (name === "wipe") wipeState(x, s, dimension, centre, size, null);
     if (name === "clump") clump(x, dimension, centre, size, CLUMP_FACTOR, null);
     if (name === "cut") cut(x, dimension, meanOf(x, dimension), random.direction(dimension), size, null, null);
     if (name === "noise") random.normals(x.length, size).forEach((part, k) => (x[k] += part));

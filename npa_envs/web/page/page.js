@@ -14,7 +14,7 @@
 //   {type: "set", name, value}         name: a key of the world's `settings`, or "rule", "show",
 //                                      "loss" (true while its plot is seen: else it is not computed)
 //   {type: "brush", tool, at, move, radius, strength, source?, rule?, view?}
-//                                      tool: erase | push | clump | cut | inject | graft | add
+//                                      tool: remove | push | clump | cut | inject | graft | add
 //                                      at, move: [x, y] or [x, y, z] [length units]; push, clump and
 //                                      inject come again and again while the pointer is down, cut
 //                                      once, at its end: the line from `at` to `at + move`, of
@@ -65,7 +65,7 @@ const BLANK = {
 
 const TOOLS = {
   look: ["Look: drag to move, wheel or pinch to zoom, double click to see all", "M12 5v14M5 12h14M12 5l-2 2M12 5l2 2M12 19l-2-2M12 19l2-2M5 12l2-2M5 12l2 2M19 12l-2-2M19 12l-2 2"],
-  erase: ["Erase", "M4 15l8-9 7 6-7 8H8zM9 20h11"],
+  remove: ["Remove", "M4 15l8-9 7 6-7 8H8zM9 20h11"],
   push: ["Pull with the pointer", "M12 20c-4 0-6-3-7-7 2-1 3 0 4 2V6a1.4 1.4 0 0 1 3 0v5a1.4 1.4 0 0 1 3 0v1a1.4 1.4 0 0 1 3 0v3c0 3-2 5-6 5z"],
   clump: ["Clump", "M4 4l5 5M20 4l-5 5M4 20l5-5M20 20l-5-5M9 6v3H6M15 6v3h3M9 18v-3H6M15 18v-3h3"],
   cut: ["Cut along a line", "M5 19L19 5M6 8a2 2 0 1 0 0-.1M16 18a2 2 0 1 0 0-.1M8 9l8 8"],
@@ -162,7 +162,7 @@ class Page {
       this.frame = null;
       // Frames of the world before that were not drawn yet; the engine waits to hear of them.
       this.tellDrawn();
-      const first = world.tools.includes("erase") && world.dimension === 2 ? "erase" : "look";
+      const first = world.tools.includes("remove") && world.dimension === 2 ? "remove" : "look";
       const keep = before.dimension === world.dimension && world.tools.includes(this.tool);
       this.choose(keep ? this.tool : first);
     }

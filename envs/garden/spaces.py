@@ -10,15 +10,15 @@ from gymnasium.spaces import Box, MultiDiscrete, Space
 from torch import Tensor
 
 from npa_envs.checks import number_tensor
-from npa_envs.envs.core.spaces import Rows, action_tensor
-from npa_envs.envs.garden.brushwork import Columns, grid_places, tool_table
+from npa_envs.envs.core.spaces import ParticleSpaces, action_tensor
+from npa_envs.envs.garden.brush_layout import BrushLayout, grid_places, tool_table
 from npa_envs.envs.garden.config import GardenConfig
 from npa_envs.envs.garden.task import SEEN_AT_A_PLACE, SEEN_LIMIT
 from npa_envs.errors import NPAError, shown
 from npa_envs.world.actions import Physics
 
 
-class Brushes(Rows):
+class BrushSpaces(ParticleSpaces):
     """A coarse picture or moments are seen; actions say what each brush does.
 
     Args:
@@ -35,7 +35,7 @@ class Brushes(Rows):
         """Dimensions of what is seen of one world."""
         on_grid = config.actions == "grid"
         count = config.place_count**2 if on_grid else config.brush_count
-        self.rows_shape = (count, Columns.of(config).width)
+        self.rows_shape = (count, BrushLayout.of(config).width)
         """Of the rows of a world's brushes, (K, W)."""
         self._tools = tool_table(config)
         self._choices = [config.place_count] * 2 + [len(self._tools), config.strength_count]

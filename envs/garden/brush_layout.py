@@ -15,21 +15,21 @@ DIRECTIONS = ((1, 0), (1, 1), (0, 1), (-1, 1), (-1, 0), (-1, -1), (0, -1), (1, -
 """Ways in which a brush of the "discrete" form pushes."""
 
 
-class Columns(NamedTuple):
+class BrushLayout(NamedTuple):
     """Where the numbers of each tool are in a brush's row; empty for what it lacks."""
 
     place: slice
     push: slice
-    erase: slice
+    wipe: slice
     inject: slice
     rate: slice
     width: int
 
     @classmethod
-    def of(cls, config: GardenConfig) -> Columns:
+    def of(cls, config: GardenConfig) -> BrushLayout:
         """Return the columns of a configuration's brushes; those of a grid stay where they are."""
         widths = {"place": 0 if config.actions == "grid" else 2}
-        widths |= {"push": 2, "erase": 1, "inject": len(config.inject_channels), "rate": 1}
+        widths |= {"push": 2, "wipe": 1, "inject": len(config.inject_channels), "rate": 1}
         first, found = 0, {}
         for name, width in widths.items():
             found[name] = slice(first, first + (width * (name in ("place", *config.tools))))
@@ -80,7 +80,7 @@ def brushed(
     Args:
         x: Positions [length units], shape [B, N, 2].
         s: States, dimensionless, shape [B, N, C].
-        action: Rows of brushes, in [-1, 1], shape [B, K, W], as `Columns` says; on a grid K is a
+        action: Rows of brushes, in [-1, 1], shape [B, K, W], see `BrushLayout`; on a grid K is a
             multiple of its places.
         middle: What places are counted from [length units], shape [B, 2].
         config: Says how large and how strong brushes are.
@@ -89,7 +89,7 @@ def brushed(
         Positions, states, and each particle's rate, the share of its rule's steps that it makes,
         dimensionless, shape [B, N, 1]; None where no tool sets it.
     """
-    columns, action = Columns.of(config), action.clamp(-1.0, 1.0)
+    columns, action = BrushLayout.of(config), action.clamp(-1.0, 1.0)
     places = action[..., columns.place]
     if config.actions == "grid":
         places = grid_places(config, x.device).to(x)
@@ -101,8 +101,8 @@ def brushed(
     felt = len(doses[0]) * world_mean(doses.flatten(2)).view(*x.shape[:2], columns.width)
     if "push" in config.tools:
         x = x + config.push_length * felt[..., columns.push]
-    if "erase" in config.tools:
-        s = s * (1.0 - felt[..., columns.erase].clamp(0.0, 1.0))
+    if "wipe" in config.tools:
+        s = s * (1.0 - felt[..., columns.wipe].clamp(0.0, 1.0))
     if "inject" in config.tools:
         channels = [channel % config.state_dim for channel in config.inject_channels]
         index = torch.tensor(channels, device=s.device)
@@ -114,9 +114,9 @@ def brushed(
 def tool_table(config: GardenConfig) -> Tensor:
     """Return what a brush of the "discrete" form can do at full strength, shape [M, W - 2].
 
-    Nothing; pushes in eight directions; erase; inject each channel, up and down; stop, quicken.
+    Nothing; pushes in eight directions; wipe; inject each channel, up and down; stop, quicken.
     """
-    columns = Columns.of(config)
+    columns = BrushLayout.of(config)
     rows = [torch.zeros(columns.width)]
 
     def add(column: slice, values: tuple[float, ...]) -> None:
@@ -128,8 +128,8 @@ def tool_table(config: GardenConfig) -> Tensor:
         for x, y in DIRECTIONS:
             length = (x * x + y * y) ** 0.5
             add(columns.push, (x / length, y / length))
-    if "erase" in config.tools:
-        add(columns.erase, (1.0,))
+    if "wipe" in config.tools:
+        add(columns.wipe, (1.0,))
     if "inject" in config.tools:
         count = len(config.inject_channels)
         for channel in range(count):

@@ -10,8 +10,8 @@ import torch
 from torch import Tensor
 
 from npa_envs.errors import NPAError
-from npa_envs.measure.accuracy.habitats import SMALLEST_VIEWS, Habitat, LongRun, task_name
-from npa_envs.measure.robustness.plans import SHAPES, Plan
+from npa_envs.measure.accuracy.endurance import SMALLEST_VIEWS, EnduranceCase, LongRun, task_name
+from npa_envs.measure.robustness.plans import SHAPES, TrialPlan
 from npa_envs.rule.files import load_rule
 from npa_envs.rule.rule import NPARule
 from npa_envs.tasks.base import Task, seed_worlds, task_for_rule, task_toward
@@ -20,7 +20,7 @@ from npa_envs.tasks.morphogenesis3d import Morphogenesis3D
 from npa_envs.tasks.point_classification import PointClassification, particle_classes
 from npa_envs.tasks.texture import Texture
 from npa_envs.training.trained_tasks import task_of_rule, tasks_of_codes
-from npa_envs.world.randomness import Purpose, WorldRandom
+from npa_envs.world.randomness import StreamId, WorldRandom
 
 SEEN_AT_ONCE = 1 << 17
 """Particles of the worlds whose loss is taken at once: many views of many Gaussians take room."""
@@ -30,13 +30,13 @@ BOX_SHARE = 0.25
 
 
 @dataclass(frozen=True)
-class Home(Habitat):
+class TaskTrial(EnduranceCase):
     """A rule in worlds of its task, and what these worlds are to show."""
 
     goal: Tensor | None = None
     """Goals of the worlds, int64, shape [B], where the task has such."""
 
-    def with_worlds(self, x: Tensor, s: Tensor) -> Home:
+    def with_worlds(self, x: Tensor, s: Tensor) -> TaskTrial:
         """Return the same with particles x [K B, N, D], s [K B, N, C]: K copies of all worlds."""
         goal = None if self.goal is None else self.goal.repeat(len(x) // len(self.goal))
         return replace(self, x=x, s=s, goal=goal)
@@ -126,7 +126,7 @@ class PicturesInTurn:
             yield self._tasks[number], (self._goal == number).nonzero()[:, 0]
 
 
-class Ground:
+class RuleTrial:
     """A rule and the tasks that it is tried in, one for each number of particles.
 
     The seeds are none that a rule was trained with. Of a rule of many pictures, world k of all
@@ -137,7 +137,7 @@ class Ground:
         self,
         name: str,
         device: torch.device,
-        plan: Plan,
+        plan: TrialPlan,
         seeds: range,
         particle_count: int | None = None,
     ) -> None:
@@ -179,7 +179,7 @@ class Ground:
 
     def random(self, purpose: int) -> WorldRandom:
         """Return streams of all worlds for a purpose, at their beginning."""
-        return WorldRandom(self._numbers, device=self._device).beside(purpose)
+        return WorldRandom(self._numbers, device=self._device).substream(purpose)
 
     @property
     def _numbers(self) -> list[int]:
@@ -191,7 +191,7 @@ class Ground:
         """Return how many particles a share of the trained number is."""
         return max(2, round(share * self.particle_count))
 
-    def home(self, share: float = 1.0, shape: str = "trained") -> Home:
+    def home(self, share: float = 1.0, shape: str = "trained") -> TaskTrial:
         """Return fresh worlds: a share of the trained number of particles, a shape of `SHAPES`."""
         count = self.particles(share)
         if count not in self._tasks:
@@ -201,15 +201,15 @@ class Ground:
                 else task_for_rule(_resized(self.task, count, self._device), self.rule)
             )
         task = self._tasks[count]
-        random = self.random(Purpose.GROWTH)
+        random = self.random(StreamId.GROWTH)
         x, s, goal = seed_worlds(task, self.world_count, generator=random, device=self._device)
         if shape != "trained":
             x = SHAPES[shape](count, self.rule.space_dim, self._seed_radius(), random)
-        return Home(
+        return TaskTrial(
             self.rule, task_toward(task, goal), x.float(), s.float(), self.plan.grow_steps, goal
         )
 
-    def run(self, home: Home, random: WorldRandom, **changed: Any) -> LongRun:
+    def run(self, home: TaskTrial, random: WorldRandom, **changed: Any) -> LongRun:
         """Return what runs worlds; `changed` are options of `rollout` that are not as trained."""
         return LongRun(home, random, home.options(**changed), chunk=self.plan.chunk)
 
@@ -242,7 +242,7 @@ def finite_worlds(x: Tensor, s: Tensor) -> Tensor:
     return x.isfinite().flatten(1).all(1) & s.isfinite().flatten(1).all(1)
 
 
-def courses(home: Home, run: LongRun, steps: tuple[int, ...]) -> Tensor:
+def loss_curves(home: TaskTrial, run: LongRun, steps: tuple[int, ...]) -> Tensor:
     """Run worlds and return their losses after numbers of steps, shape [len(steps), B].
 
     A world that is not finite has the loss NaN from then on, and does not disturb the others.

@@ -11,13 +11,13 @@ import torch
 from torch import Tensor
 
 from npa_envs.errors import NPAError
-from npa_envs.measure.accuracy.checks import Check, Finding, Session, Skipped
+from npa_envs.measure.accuracy.checks import Check, CheckResult, CheckSession, Skipped
 from npa_envs.rule.files import load_rule, rule_file, rule_metadata, shipped_rules
 from npa_envs.rule.rule import NPARule
 from npa_envs.tasks.base import Task, seed_worlds, task_toward
 from npa_envs.training.trained_tasks import task_of_rule, trained_config
 from npa_envs.world.brushes import nearest_image
-from npa_envs.world.cuda_graph import Captured, capture
+from npa_envs.world.cuda_graph import GraphSequence, capture
 from npa_envs.world.randomness import Randomness
 from npa_envs.world.rollout import rollout
 
@@ -49,7 +49,7 @@ CHUNK = 50
 
 
 @dataclass(frozen=True)
-class Habitat:
+class EnduranceCase:
     """A float32 rule, its seeds x [B, N, D], s [B, N, C], and its horizon in steps."""
 
     rule: NPARule
@@ -100,13 +100,13 @@ def task_name(rule: str) -> str:
 
 
 def habitat(
-    session: Session,
+    session: CheckSession,
     name: str,
     *,
     world_count: int = 1,
     particles: float = 1.0,
     looks: bool = True,
-) -> Habitat:
+) -> EnduranceCase:
     """Return a rule of the package, or of a file, with seeds of its task.
 
     `particles` is over those it was trained with or, in a quick run, over the most there. Where the
@@ -121,7 +121,7 @@ def habitat(
         task, world_count, generator=session.generator(), device=session.device
     )
     horizon = HORIZONS[task_name(name)]
-    return Habitat(
+    return EnduranceCase(
         rule,
         task_toward(task, goal),
         x.float(),
@@ -130,7 +130,7 @@ def habitat(
     )
 
 
-def _task(session: Session, name: str, particles: float, looks: bool) -> tuple[NPARule, Task]:
+def _task(session: CheckSession, name: str, particles: float, looks: bool) -> tuple[NPARule, Task]:
     """Load a rule and make its task."""
     rule = load_rule(name, device=session.device).float().requires_grad_(False)
     fields = {} if looks or rule.space_dim == 2 else SMALLEST_VIEWS
@@ -143,7 +143,7 @@ def _task(session: Session, name: str, particles: float, looks: bool) -> tuple[N
     return rule, found.task
 
 
-def trained_particles(session: Session, name: str) -> int:
+def trained_particles(session: CheckSession, name: str) -> int:
     """Return how many particles a world of a rule has where their number is not what is varied."""
     path = rule_file(name)
     count = int(trained_config(path, rule_metadata(path)).task.particle_count)
@@ -160,14 +160,19 @@ class LongRun:
     """
 
     def __init__(
-        self, home: Habitat, generator: Randomness, options: dict[str, Any], *, chunk: int = CHUNK
+        self,
+        home: EnduranceCase,
+        generator: Randomness,
+        options: dict[str, Any],
+        *,
+        chunk: int = CHUNK,
     ) -> None:
         self.x, self.s = home.x.clone(), home.s.clone()
         self._rule, self._generator, self._options = home.rule, generator, options
         self.eps: float = options["eps"]
         """Perception radius [length units]."""
         self._steps = chunk
-        self._graph: Captured | None = None
+        self._graph: GraphSequence | None = None
 
     def advance(self, steps: int) -> None:
         """Run some steps more."""
@@ -252,7 +257,9 @@ def endurance_checks(rules: Mapping[str, str] | None = None) -> list[Check]:
     ]
 
 
-def measured(home: Habitat, x: Tensor, s: Tensor, generator: torch.Generator) -> dict[str, float]:
+def measured(
+    home: EnduranceCase, x: Tensor, s: Tensor, generator: torch.Generator
+) -> dict[str, float]:
     """Return the figures of worlds x [B, N, D], s [B, N, C], none of them compared with others.
 
     Some more steps, with masks from the generator, tell the energy.
@@ -278,7 +285,7 @@ def measured(home: Habitat, x: Tensor, s: Tensor, generator: torch.Generator) ->
         }
 
 
-def _run(name: str, session: Session) -> Finding:
+def _run(name: str, session: CheckSession) -> CheckResult:
     home = habitat(session, name, looks=False)
     steps = QUICK_STEPS if session.quick else STEPS
     settled = min(SETTLED, steps // 2)
@@ -310,4 +317,4 @@ def _run(name: str, session: Session) -> Finding:
             note = f"{', '.join(over)} above the bound at step {step}"
         if found["not_finite"]:
             break
-    return Finding(figures, limits, note=note)
+    return CheckResult(figures, limits, note=note)
