@@ -32,6 +32,8 @@ PROGRAMMATIC_STREAM_SERIALIZATION = 6
 
 KERNEL_NODE = 0
 
+NON_BLOCKING_STREAM = 1
+
 
 class _AttributeValue(ctypes.Union):
     _fields_ = [("flag", ctypes.c_int), ("size", ctypes.c_char * 64)]
@@ -67,6 +69,19 @@ def _driver() -> Any:
         needed = ("cuLaunchKernelEx", "cuStreamGetCaptureInfo_v3", "cuGraphNodeGetType")
         return driver if all(hasattr(driver, function) for function in needed) else None
     return None
+
+
+def new_stream(device: torch.device) -> torch.cuda.Stream:
+    """Return a CUDA stream that torch gives to nobody else; it lives as long as the process.
+
+    Torch hands out the same 32 streams in turn: one that is captured could be another thread's.
+    """
+    driver, handle = _driver(), ctypes.c_void_p()
+    with torch.cuda.device(device):
+        torch.cuda.current_stream()
+        if driver is None or driver.cuStreamCreate(ctypes.byref(handle), NON_BLOCKING_STREAM):
+            return torch.cuda.Stream(device)  # type: ignore[no-untyped-call]
+    return torch.cuda.ExternalStream(handle.value, device)  # type: ignore[no-untyped-call]
 
 
 def _follows_kernel(stream: int) -> bool:

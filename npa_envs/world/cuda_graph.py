@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import collections
 import contextlib
 import functools
 import gc
@@ -11,11 +12,13 @@ import threading
 import weakref
 from collections.abc import Callable, Iterator
 from contextvars import ContextVar
-from typing import Any, ParamSpec, TypeVar
+from typing import Any, ClassVar, ParamSpec, TypeVar
 
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
+
+from npa_envs.ops.driver import new_stream
 
 
 def to_device_async(values: NDArray[Any], device: torch.device) -> Tensor:
@@ -129,7 +132,7 @@ def current_stream(device: torch.device) -> torch.cuda.Stream:
 @functools.cache
 def _capture_stream(device_index: int) -> torch.cuda.Stream:
     """The one stream of a device that is captured: graphs can share memory only within a stream."""
-    return torch.cuda.Stream(device_index)  # type: ignore[no-untyped-call]
+    return new_stream(torch.device("cuda", device_index))
 
 
 def prepare_capture(function: Callable[[], object], device: torch.device) -> None:
@@ -441,27 +444,37 @@ class GraphedCallable:
 
 
 class SideStream:
-    """Work on a stream of its own, beside what the current stream does meanwhile.
+    """A CUDA stream that overlaps the current one.
 
     Args:
         device: A CUDA device.
     """
 
+    _free: ClassVar[dict[torch.device, collections.deque[torch.cuda.Stream]]] = {}
+    """Streams whose objects are gone, by device."""
+
     def __init__(self, device: torch.device) -> None:
         self._device = device
-        self._stream = torch.cuda.Stream(device)  # type: ignore[no-untyped-call]
+        try:
+            self._stream = self._free[device].pop()
+        except LookupError:
+            self._stream = new_stream(device)
         self._begin, self._end, self._mark = (torch.cuda.Event() for _ in range(3))  # type: ignore[no-untyped-call]
 
     @staticmethod
     @functools.lru_cache(maxsize=64)
     def of_thread(device: torch.device, thread: int) -> SideStream:
-        """Return the one of a thread, for captures: torch has 32 streams, which it gives in turn.
+        """Return the one of a thread, for captures.
 
         Args:
             device: A CUDA device.
             thread: The thread's identifier.
         """
         return SideStream(device)
+
+    def __del__(self) -> None:
+        if "_stream" in self.__dict__:
+            self._free.setdefault(self._device, collections.deque()).append(self._stream)
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Pickle the device alone: streams and events are a process's own."""
