@@ -49,7 +49,7 @@ def kill():
 class Recording(TorchDispatchMode):
     """A CUDA graph for the CPU: the same operations on the same memory, with numbers as they were.
 
-    The second call of the function is recorded, as by `npa_envs.world.cuda_graph.Replayed`.
+    The second call of the function is recorded, as by `npa_envs.world.cuda_graph.GraphedCallable`.
     """
 
     def __init__(self, function):

@@ -290,7 +290,7 @@ def test_recorded_pieces_of_a_shared_round_are_those_of_kernels_one_by_one(
 
     try:
         recorded = rounds()
-        monkeypatch.setattr(ppo, "Replayed", lambda function, *_, **__: function)
+        monkeypatch.setattr(ppo, "GraphedCallable", lambda function, *_, **__: function)
         for value, wanted in zip(recorded, rounds(), strict=True):
             assert float(wanted.detach().norm()) > 0.0
             torch.testing.assert_close(value, wanted, rtol=1e-3, atol=1e-5)

@@ -108,7 +108,15 @@ def test_a_rule_is_a_policy(world, dtype, device, box):
     rows = Rows(torch.where(mask.view(-1) == 1, own, -1), own, own, 0)
     update = action.reshape(B * N, -1)
     expected = update_particles(
-        update, x, s, x.new_zeros(B, N), rows=rows, reach=REACH, dt=DT, moving=True, box=box
+        update,
+        x,
+        s,
+        x.new_zeros(B, N),
+        rows=rows,
+        max_displacement=REACH,
+        dt=DT,
+        moving=True,
+        box=box,
     )
     delta, change = action[..., :space_dim], action[..., space_dim:]
     scale = float(change.abs().max())

@@ -201,7 +201,7 @@ def test_rows_beyond_the_last_active_one_pull_nothing_back(device):
     update = torch.randn(4, 5, dtype=torch.float64, device=device, requires_grad=True)
     path = x.new_zeros(1, 6)
     moved = update_particles(
-        update, x, s, path, rows=rows, reach=0.1, dt=1.0, moving=True, box=None
+        update, x, s, path, rows=rows, max_displacement=0.1, dt=1.0, moving=True, box=None
     )
     (gradient,) = torch.autograd.grad(sum(value.sum() for value in moved), update)
     assert (gradient[2:] == 0).all()
@@ -228,7 +228,7 @@ def test_columns_that_nothing_reads_change_nothing(space_dim, state_dim, moving,
         sides = None if box is None else (box,) * space_dim
         path = x.new_ones(3, 85)
         moved = update_particles(
-            padded, x, s, path, rows=rows, reach=0.1, dt=0.7, moving=moving, box=sides
+            padded, x, s, path, rows=rows, max_displacement=0.1, dt=0.7, moving=moving, box=sides
         )
         (bar,) = torch.autograd.grad(moved, padded, cotangents(moved))
         assert (bar[:, width:] == 0).all()
