@@ -61,7 +61,7 @@ def stepped(x, s):
         # No product: torch's own may depend on its number of threads.
         update = perception[:, : x.shape[2] + STATE_DIM]
         path = x.new_zeros(x.shape[:2])
-        options = {"reach": 0.1, "dt": 1.0, "moving": True, "box": None}
+        options = {"max_displacement": 0.1, "dt": 1.0, "moving": True, "box": None}
         return perception, *update_particles(update, x, s, path, rows=rows, **options)
 
     return with_gradients(moved, x, s)
