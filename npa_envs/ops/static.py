@@ -19,9 +19,9 @@ from npa_envs.ops.passes import (
     Densities,
     ListedNeighbours,
     NeighbourLists,
-    Terms,
     compute_densities,
 )
+from npa_envs.ops.physics import Physics, Terms
 from npa_envs.ops.sort import (
     KernelPlan,
     SortedWorlds,
@@ -177,27 +177,10 @@ def _(
     ).flat()
 
 
-def prepare_static(
-    x: Tensor,
-    state_dim: int,
-    *,
-    eps: float,
-    box: tuple[float, ...] | None,
-    terms: Terms,
-) -> StaticWorlds:
-    """Sort checked worlds whose particles will not move, and list their neighbours.
-
-    No gradient flows into positions.
-
-    Args:
-        x: Positions [length units], shape [B, N, D].
-        state_dim: State channels C.
-        eps: Perception radius [length units].
-        box: Sides of the periodic box [length units], or None in open space.
-        terms: Groups of the perception vector.
-    """
+def prepare_static(x: Tensor, physics: Physics) -> StaticWorlds:
+    """Sort checked worlds whose particles do not move, and list their neighbours; no gradient."""
     tensors = _prepare_static(
-        x.detach().contiguous(), state_dim, eps, None if box is None else list(box), *terms
+        x.detach().contiguous(), physics.state_dim, physics.eps, physics.sides(), *physics.terms
     )
     return StaticWorlds(StaticTensors.of(tensors))
 

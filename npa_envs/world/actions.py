@@ -7,7 +7,6 @@ bounded output stands. Nothing here waits for the device.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -21,11 +20,12 @@ from npa_envs.ops.episodes import (
     EpisodeRules,
     PreparedJudgement,
 )
-from npa_envs.ops.passes import Terms
 from npa_envs.ops.perceive import NeighbourState, build_neighbours
+from npa_envs.ops.physics import Limits, Physics, Terms
 from npa_envs.ops.species import perceive_by_species
-from npa_envs.ops.update import ActionRules, PreparedActions
+from npa_envs.ops.update import PreparedActions
 from npa_envs.world.randomness import WorldRandom
+from npa_envs.world.steps import draw_step
 
 __all__ = [
     "DIVERGED",
@@ -34,127 +34,29 @@ __all__ = [
     "TIME_LIMIT",
     "Actions",
     "EpisodeRules",
+    "Limits",
     "MomentInverse",
     "NeighbourState",
     "Physics",
     "PreparedJudgement",
-    "find_neighbours",
+    "Terms",
+    "build_neighbours",
     "perceive_each_species",
 ]
 
 
-@dataclass(frozen=True, kw_only=True)
-class Physics:
-    """The constants of a world that is acted upon."""
-
-    space_dim: int
-    """Space dimension D."""
-
-    state_dim: int
-    """State channels C."""
-
-    eps: float
-    """Perception radius ε [length units]."""
-
-    eps0: float
-    """Radius that perception is scaled to, that of the rule's training [length units]."""
-
-    max_displacement: float
-    """Largest displacement of a step, α ε [length units]."""
-
-    state_scale: float
-    """State step of an action of 1, dimensionless."""
-
-    update_prob: float
-    """Probability p of a particle's update in a step, dimensionless."""
-
-    dt: float
-    """Time step, dimensionless."""
-
-    position_noise: float
-    """Standard deviation of the noise on every position in a step [length units]."""
-
-    box: tuple[float, ...] | None
-    """Sides of the periodic box [length units], or None in open space."""
-
-    moving: bool
-    """Whether particles move; otherwise an action has no displacement."""
-
-    moment_inverse: MomentInverse
-    """How perceived state gradients are corrected, as in `npa_envs.perceive`."""
-
-    perception_limit: float
-    """What is perceived is clipped to plus and minus this, dimensionless."""
-
-    position_limit: float
-    """A coordinate beyond this is out of bounds [length units]."""
-
-    state_limit: float
-    """A state beyond this is out of bounds, dimensionless."""
-
-    @property
-    def perception_dim(self) -> int:
-        """Length P of a perception vector."""
-        return Terms().perception_dim(self.space_dim, self.state_dim)
-
-    @property
-    def action_dim(self) -> int:
-        """Length A of an action: D + C, or C where particles are static."""
-        return self.state_dim + (self.space_dim if self.moving else 0)
-
-
-def find_neighbours(
-    x: Tensor, s: Tensor, physics: Physics, places: Tensor | None = None
-) -> NeighbourState:
-    """Return worlds made ready for perception: sorted, their densities known.
-
-    Args:
-        x: Positions [length units], shape [B, N, D], finite.
-        s: States, dimensionless, shape [B, N, C], finite; they may be read again later, where they
-            are.
-        physics: The worlds' constants.
-        places: Which worlds of a larger batch these are, int64, shape [B]; default: their own one.
-    """
-    return build_neighbours(
-        x,
-        s,
-        eps=physics.eps,
-        eps0=physics.eps0,
-        box=physics.box,
-        terms=Terms(moment_inverse=physics.moment_inverse),
-        limit=physics.perception_limit,
-        places=places,
-    )
-
-
 def perceive_each_species(x: Tensor, counts: Sequence[int], physics: Physics) -> Tensor:
-    """Return what particles perceive of each species besides `find_neighbours`, clipped.
-
-    Args:
-        x: Positions [length units], shape [B, N, D], finite, species after species.
-        counts: Particles of each species, which sum to N; zeros for species that are gone.
-        physics: The worlds' constants.
-
-    Returns:
-        c^D ρ_k / N of each species, then L(c^(1+D) ∇ρ_k / N) of each, species by species, zeros for
-        those that are gone, dimensionless, shape [B, N, K (1 + D)].
-    """
-    found = perceive_by_species(
-        x,
-        tuple(counts),
-        eps=physics.eps,
-        eps0=physics.eps0,
-        box=physics.box,
-    )
-    return found.clamp(-physics.perception_limit, physics.perception_limit)
+    """Return `perceive_by_species`, clipped, shape [B, N, K (1 + D)]; zeros for species gone."""
+    limit = physics.limits.perception
+    return perceive_by_species(x, tuple(counts), physics).clamp(-limit, limit)
 
 
 class Actions:
     """What actions do to some worlds, in place, with the masks and the noise of `rollout`.
 
     Args:
-        x: Positions [length units], shape [B, N, D], finite.
-        s: States, dimensionless, shape [B, N, C], finite.
+        x: Positions, finite.
+        s: States, finite.
         physics: The worlds' constants.
         random: Where masks and noise come from; advanced by one step in each `draw`.
         enabled: Whether actions are applied, uint8, shape [1]: set to 0 where one is not finite,
@@ -173,6 +75,7 @@ class Actions:
         enabled: Tensor,
         diverged: Tensor,
     ) -> None:
+        self._x = x
         self._physics = physics
         self._random = random
         self._diverged = diverged
@@ -182,30 +85,18 @@ class Actions:
             self._mask = torch.zeros(x.shape[:2], dtype=torch.uint8, device=x.device)
         if physics.position_noise > 0.0:
             self._noise = torch.zeros_like(x)
-        rules = ActionRules(
-            max_displacement=physics.max_displacement,
-            dt=physics.dt,
-            state_scale=physics.state_scale,
-            moving=physics.moving,
-            box=physics.box,
-            position_limit=physics.position_limit,
-            state_limit=physics.state_limit,
-        )
         self._apply = PreparedActions(
-            x, s, rules, mask=self._mask, noise=self._noise, enabled=enabled, diverged=diverged
+            x, s, physics, mask=self._mask, noise=self._noise, enabled=enabled, diverged=diverged
         )
 
     @torch.no_grad()
     def draw(self) -> None:
         """Draw the next step's masks and noise; may be captured in a CUDA graph."""
-        physics, random = self._physics, self._random
         self._diverged.zero_()
-        random.advance()
-        if self._mask is not None:
-            self._mask.copy_(random.bernoulli(physics.update_prob, self._mask.shape[1]))
-        if self._noise is not None:
-            noise = random.normal(*self._noise.shape[1:], dtype=self._noise.dtype)
-            self._noise.copy_(noise * physics.position_noise)
+        drawn = draw_step(self._x, self._physics, self._random)
+        for own, new in ((self._mask, drawn.mask), (self._noise, drawn.noise)):
+            if own is not None and new is not None:
+                own.copy_(new)
 
     def updated(self) -> Tensor:
         """Return which particles what was drawn last updates, bool, shape [B, N]."""

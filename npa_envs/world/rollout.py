@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import functools
-import math
 from collections.abc import Sequence
-from types import NoneType
 from typing import Literal, NamedTuple, TypedDict, Unpack, overload
 
 import torch
@@ -14,18 +11,14 @@ from torch.utils.checkpoint import checkpoint
 
 from npa_envs.checks import (
     Box,
-    check_scale,
     check_world,
-    checked_box,
     checked_count,
-    checked_eps,
     checked_flag,
-    checked_number,
-    constant,
 )
 from npa_envs.errors import NPAError, shown
 from npa_envs.ops.opaque import check_derivatives
-from npa_envs.ops.static import StaticWorlds, prepare_static
+from npa_envs.ops.physics import Physics, physics
+from npa_envs.ops.static import prepare_static
 from npa_envs.ops.update import wrapped
 from npa_envs.rule.network import Network
 from npa_envs.rule.rule import NPARule, check_rule
@@ -43,7 +36,6 @@ from npa_envs.world.steps import (
     DivisionStep,
     RuleStep,
     Step,
-    StepOptions,
     rule_terms,
     skip_draws,
 )
@@ -86,18 +78,18 @@ def check_memory(memory: Memory) -> None:
         raise NPAError(f"memory must be 'store', 'recompute' or 'minimal', got {shown(memory)}")
 
 
-def checked_options(
+def checked_physics(
     rule: NPARule,
     x: Tensor,
     s: Tensor,
+    *,
     eps: float | None,
     box: Box,
-    update_prob: float,
+    update_prob: float = 1.0,
     dt: float,
-    position_noise: float,
-    detach_positions: bool,
-) -> StepOptions:
-    """Check what `rollout` was given, and return what stays the same over it; its errors."""
+    position_noise: float = 0.0,
+) -> Physics:
+    """Check that worlds and a rule fit, and return the constants of its rollouts."""
     check_world(x, s)
     check_derivatives(x=x, s=s, rule=rule)
     if (x.shape[2], s.shape[2]) != (rule.space_dim, rule.state_dim):
@@ -111,46 +103,20 @@ def checked_options(
             f"the rule must share dtype and device with x, got {weight.dtype} on {weight.device} "
             f"and {x.dtype} on {x.device}: move it with rule.to(x)"
         )
-    given = (eps, box, update_prob, dt, position_noise, detach_positions)
-    # Numbers of other types may change, and tensors are no keys.
-    own = (rule.eps0, rule.alpha)
-    plain = all(type(value) in (float, int, bool, NoneType) for value in (*own, *given))
-    known = plain and not torch.compiler.is_compiling()
-    check = _known_numbers if known else _checked_numbers
-    return check(rule.space_dim, constant(own[0]), constant(own[1]), x.dtype, *given)
-
-
-def _checked_numbers(
-    space_dim: int,
-    eps0: float,
-    alpha: float,
-    dtype: torch.dtype,
-    eps: float | None,
-    box: Box,
-    update_prob: float,
-    dt: float,
-    position_noise: float,
-    detach_positions: bool,
-) -> StepOptions:
-    radius = checked_eps("eps", eps0 if eps is None else eps, space_dim, dtype)
-    check_scale(radius, eps0, space_dim, dtype)
-    update_prob = checked_number("update_prob", update_prob)
-    dt = checked_number("dt", dt)
-    position_noise = checked_number("position_noise", position_noise)
-    if not 0.0 < update_prob <= 1.0:
-        raise NPAError(f"update_prob must lie in (0, 1], got {update_prob}")
-    if not (math.isfinite(dt) and dt > 0.0):
-        raise NPAError(f"dt must be positive and finite, got {dt}")
-    if not (math.isfinite(position_noise) and position_noise >= 0.0):
-        raise NPAError(f"position_noise must be finite and not negative, got {position_noise}")
-    detach_positions = checked_flag("detach_positions", detach_positions)
-    sides = checked_box(box, space_dim, radius, dtype)
-    return StepOptions(
-        radius, sides, update_prob, dt, position_noise, detach_positions, eps0, alpha * radius
+    return physics(
+        rule.space_dim,
+        rule.state_dim,
+        x.dtype,
+        eps=eps,
+        eps0=rule.eps0,
+        box=box,
+        terms=rule_terms(rule),
+        moving=not rule.static,
+        alpha=rule.alpha,
+        update_prob=update_prob,
+        dt=dt,
+        position_noise=position_noise,
     )
-
-
-_known_numbers = functools.lru_cache(maxsize=256, typed=True)(_checked_numbers)
 
 
 def run_steps(
@@ -231,7 +197,8 @@ class RolloutCall(NamedTuple):
     """What a checked call of `rollout` asks for besides its tensors."""
 
     steps: int
-    options: StepOptions
+    physics: Physics
+    detach_positions: bool
     memory: Memory
     keep_every: int | None
 
@@ -244,13 +211,13 @@ class RolloutCall(NamedTuple):
     ) -> Particles:
         """Launch the rollout of one rule."""
         (rule,) = rules
-        options = self.options.constants()
+        physics = self.physics.constants()
         # Any other rule runs as the module that it is.
         network = rule.network()
-        if _stays(rule, self.steps, options):
+        if self._stays():
             # Before all else: a rollout in parts prepares the later ones from wrapped positions.
-            worlds = worlds._replace(x=wrapped(worlds.x, options.box))
-            static = _prepare_static(rule, worlds.x, options)
+            worlds = worlds._replace(x=wrapped(worlds.x, physics.box))
+            static = prepare_static(worlds.x, physics)
         else:
             static = None
         preparable = network is not None and static is None and not rule.divides
@@ -264,7 +231,7 @@ class RolloutCall(NamedTuple):
             # What lies in dead slots must not reach gradients either: 0 times NaN is NaN.
             blank = torch.where(living(worlds.s)[..., None], worlds.s, 0.0)
             worlds = worlds._replace(s=blank)
-        own = RuleStep(rule, network, options, static)
+        own = RuleStep(rule, network, physics, self.detach_positions, static)
         return run_steps(
             DivisionStep(own) if rule.divides else own,
             rules,
@@ -281,27 +248,27 @@ class RolloutCall(NamedTuple):
         self, rule: NPARule, network: Network, worlds: Particles, generator: Randomness | None
     ) -> Particles | None:
         """Run the rollout by prepared steps; None where it is to be launched."""
-        options, steps, every = self.options, self.steps, self.keep_every or self.steps
-        if options.position_noise > 0.0 or steps == 0:
+        physics, steps, every = self.physics, self.steps, self.keep_every or self.steps
+        if physics.position_noise > 0.0 or steps == 0:
             return None
         x, s, _ = worlds
 
         def advance(network: Network, worlds: Particles, mask: Tensor | None) -> Particles:
-            step = RuleStep(rule, network, options)
+            step = RuleStep(rule, network, physics)
             return step.advance(*worlds, mask, None, None, None)
 
         def make() -> PreparedSteps:
             widths = network.row_width, network.update_width
-            return PreparedSteps(advance, worlds, *widths, options.update_prob < 1.0)
+            return PreparedSteps(advance, worlds, *widths, physics.update_prob < 1.0)
 
         def run(prepared: PreparedSteps) -> list[Particles]:
-            draws = RuleStep(rule, network, options).draws(x, steps, generator)
+            draws = RuleStep(rule, network, physics).draws(x, steps, generator)
             with torch.autocast("cpu", enabled=False):
                 return prepared.run(
                     network, worlds, (draw.mask for draw in draws), lambda done: done % every == 0
                 )
 
-        key = (options, rule_form(rule), x.shape, s.shape[2], x.dtype)
+        key = (physics, rule_form(rule), x.shape, s.shape[2], x.dtype)
         kept = run_prepared(key, make, run)
         if kept is None:
             return None
@@ -309,18 +276,11 @@ class RolloutCall(NamedTuple):
             return kept[0]
         return Particles(*map(torch.stack, zip(*kept, strict=True)))
 
-
-def _stays(rule: NPARule, steps: int, options: StepOptions) -> bool:
-    """Return whether positions stay where they are, and it pays to compute what follows of them."""
-    moving = not rule.static or options.position_noise > 0.0 or not options.detach_positions
-    return not moving and steps >= FEWEST_STATIC
-
-
-def _prepare_static(rule: NPARule, x: Tensor, options: StepOptions) -> StaticWorlds:
-    """Compute what follows from positions that stay."""
-    return prepare_static(
-        x, rule.state_dim, eps=options.eps, box=options.box, terms=rule_terms(rule)
-    )
+    def _stays(self) -> bool:
+        """Return whether positions stay where they are, and it pays to prepare them."""
+        physics = self.physics
+        moving = physics.moving or physics.position_noise > 0.0 or not self.detach_positions
+        return not moving and self.steps >= FEWEST_STATIC
 
 
 def _check_one_species(rule: NPARule) -> None:
@@ -331,11 +291,9 @@ def _check_one_species(rule: NPARule) -> None:
         )
 
 
-def _resting(
-    rule: NPARule, worlds: Particles, options: StepOptions, cuda_graph: CudaGraph
-) -> Tensor:
+def _resting(rule: NPARule, worlds: Particles, physics: Physics, cuda_graph: CudaGraph) -> Tensor:
     """Return which worlds stay as they are if all particles are updated, bool, shape [B]."""
-    call = RolloutCall(1, options._replace(update_prob=1.0), "store", None)
+    call = RolloutCall(1, physics._replace(update_prob=1.0), True, "store", None)
     x, s, _ = worlds
     with torch.no_grad():
         after = run_call(call, (rule,), x, s, None, cuda_graph=cuda_graph, watch=None)
@@ -350,7 +308,7 @@ def _may_rest(call: RolloutCall, rule: NPARule, x: Tensor) -> bool:
         and not rule.divides
         and call.steps >= FEWEST_RESTING
         and call.keep_every is None
-        and call.options.position_noise == 0.0
+        and call.physics.position_noise == 0.0
         and not torch.is_grad_enabled()
         and not torch.compiler.is_compiling()
         and not (x.is_cuda and torch.cuda.is_current_stream_capturing())
@@ -366,7 +324,7 @@ def _run_until_rest(
 ) -> Particles:
     """Run a rollout in parts, and leave out what comes when all worlds are at rest."""
     left, part = call.steps, FIRST_PART[worlds.x.device.type]
-    while left and not _resting(rule, worlds, call.options, cuda_graph).all():
+    while left and not _resting(rule, worlds, call.physics, cuda_graph).all():
         own = call._replace(steps=min(part, left))
         x, s, _ = worlds
         worlds = run_call(own, (rule,), x, s, generator, cuda_graph=cuda_graph, watch=None)
@@ -375,7 +333,7 @@ def _run_until_rest(
             # A world has diverged, which the next call refuses, and not this one.
             return call._replace(steps=left).run((rule,), worlds, generator)
     # Whoever draws next gets what comes after all steps.
-    skip_draws(worlds.x, call.options, left, generator)
+    skip_draws(worlds.x, call.physics, left, generator)
     # What is returned is the caller's to write to.
     return Particles(*(value.clone() for value in worlds)) if left == call.steps else worlds
 
@@ -471,8 +429,8 @@ def at_rest(
             "worlds change by chance"
         )
     _check_one_species(rule)
-    options = checked_options(rule, x, s, eps, box, 1.0, dt, 0.0, True)
-    return _resting(rule, Particles(x, s, x.new_zeros(x.shape[:2])), options, "auto")
+    made = checked_physics(rule, x, s, eps=eps, box=box, dt=dt)
+    return _resting(rule, Particles(x, s, x.new_zeros(x.shape[:2])), made, "auto")
 
 
 @overload
@@ -582,16 +540,17 @@ def rollout(
     check_cuda_graph(cuda_graph)
     check_rule(rule)
     _check_one_species(rule)
-    options = checked_options(
-        rule, x, s, eps, box, update_prob, dt, position_noise, detach_positions
+    made = checked_physics(
+        rule, x, s, eps=eps, box=box, update_prob=update_prob, dt=dt, position_noise=position_noise
     )
+    detach_positions = checked_flag("detach_positions", detach_positions)
     check_generator(generator, x.device, x.shape[0])
-    if rule.divides and options.box is not None:
+    if rule.divides and made.box is not None:
         raise NPAError(
             f"box must be None where particles divide, got {shown(box)}: the dead need a place far "
             "from all others"
         )
-    call = RolloutCall(steps, options, memory, kept)
+    call = RolloutCall(steps, made, detach_positions, memory, kept)
     watch = make_watch(on_divergence, x, s)
     if watch is None and not return_path_length and _may_rest(call, rule, x):
         worlds = Particles(x, s, x.new_zeros(x.shape[:2]))

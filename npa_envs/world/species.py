@@ -9,9 +9,18 @@ from typing import Any, Literal, NamedTuple, Unpack, overload
 import torch
 from torch import Tensor
 
-from npa_envs.checks import Box, check_world, checked_count, checked_number, entries
+from npa_envs.checks import (
+    Box,
+    check_world,
+    checked_count,
+    checked_flag,
+    checked_number,
+    constant,
+    entries,
+)
 from npa_envs.errors import NPAError, shown
 from npa_envs.ops.perceive import perceive_rows
+from npa_envs.ops.physics import Physics
 from npa_envs.ops.species import checked_counts, perceive_by_species
 from npa_envs.ops.static import StaticRows
 from npa_envs.ops.update import update_particles
@@ -26,11 +35,11 @@ from npa_envs.world.rollout import (
     RolloutOptions,
     check_memory,
     checked_keep_every,
-    checked_options,
+    checked_physics,
     rollout,
     run_steps,
 )
-from npa_envs.world.steps import Draws, StepOptions, draw_step, row_capacity, rule_terms
+from npa_envs.world.steps import Draws, draw_step, row_capacity
 
 SpeciesPerception = Literal["shared", "per_species"]
 
@@ -183,13 +192,31 @@ def rollout_species(
         return (after[0], after[1], travelled) if return_path_length else (after[0], after[1])
     kept = checked_keep_every(keep_every, steps)
     check_cuda_graph(cuda_graph)
-    options = tuple(
-        checked_options(rule, x, s, eps, box, chance, dt, position_noise, detach_positions)
+    own = [
+        checked_physics(
+            rule, x, s, eps=eps, box=box, update_prob=chance, dt=dt, position_noise=position_noise
+        )
         for rule, chance in zip(species_rules, probabilities, strict=True)
+    ]
+    common = own[0]._replace(
+        update_prob=max(each.update_prob for each in own),
+        max_displacement=max(each.max_displacement for each in own),
+    )
+    species = tuple(
+        SpeciesSpec(size, each.update_prob, divisor)
+        for size, each, divisor in zip(sizes, own, divisors, strict=True)
     )
     check_generator(generator, x.device, x.shape[0])
     worlds = run_call(
-        SpeciesCall(steps, options, memory, kept, sizes, divisors, perception == "per_species"),
+        SpeciesCall(
+            steps,
+            common,
+            checked_flag("detach_positions", detach_positions),
+            memory,
+            kept,
+            species,
+            perception == "per_species",
+        ),
         species_rules,
         x,
         s,
@@ -202,16 +229,26 @@ def rollout_species(
     return worlds.x, worlds.s
 
 
+class SpeciesSpec(NamedTuple):
+    """What may differ between species, besides their rules."""
+
+    count: int
+    """Its particles in a world."""
+    update_prob: float
+    """Probability of each of its particles' updates."""
+    density_count: float
+    """Particles by which it divides densities."""
+
+
 class SpeciesCall(NamedTuple):
     """What a checked call of `rollout_species` asks for besides its tensors."""
 
     steps: int
-    options: tuple[StepOptions, ...]
-    """What each species' particles are told."""
+    physics: Physics
+    detach_positions: bool
     memory: Memory
     keep_every: int | None
-    counts: tuple[int, ...]
-    density_counts: tuple[float, ...]
+    species: tuple[SpeciesSpec, ...]
     by_species: bool
 
     def run(
@@ -222,16 +259,8 @@ class SpeciesCall(NamedTuple):
         watch: DivergenceWatch | None = None,
     ) -> Particles:
         """Launch the rollout."""
-        community = make_species_step(
-            rules,
-            self.counts,
-            [own.constants() for own in self.options],
-            self.density_counts,
-            worlds.x,
-            by_species=self.by_species,
-        )
         return run_steps(
-            community,
+            make_species_step(self, rules, worlds.x),
             rules,
             worlds,
             self.steps,
@@ -340,9 +369,8 @@ class SpeciesStep(NamedTuple):
     """The step of several rules in one world: a common perception pass, then rule by rule."""
 
     species: list[Species]
-    counts: tuple[int, ...]
-    options: StepOptions
-    """With the largest update probability, and the largest reach."""
+    physics: Physics
+    detach_positions: bool
     update_share: Tensor | None
     """Share of the updates so drawn that each particle keeps, shape [N]; None: all keep all."""
     by_species: bool
@@ -354,7 +382,7 @@ class SpeciesStep(NamedTuple):
             yield self._draw(x, generator)
 
     def _draw(self, x: Tensor, generator: Randomness | None) -> Draws:
-        mask, noise, *_ = draw_step(x, self.options, generator)
+        mask, noise, *_ = draw_step(x, self.physics, generator)
         if self.update_share is None:
             return Draws(mask, noise)
         if isinstance(generator, WorldRandom):
@@ -375,31 +403,25 @@ class SpeciesStep(NamedTuple):
         births: Births | None,
     ) -> Particles:
         """Advance checked worlds by one step whose random draws are given."""
-        species, options = self.species, self.options
-        first = species[0].rule
-        shared_dim = rule_terms(first).perception_dim(first.space_dim, first.state_dim)
-        shared_width = shared_dim
+        species, physics = self.species, self.physics
+        shared_width = shared_dim = physics.perception_dim
         if not self.by_species:
             # A folded rule's own row: a one follows the perception vector, then zeros.
             shared_width = max(
                 own.network.row_width if own.network else shared_dim for own in species
             )
         perception, active = perceive_rows(
-            x.detach() if options.detach_positions else x,
+            x.detach() if self.detach_positions else x,
             s,
+            physics,
             mask=mask,
             row_capacity=_row_total(self, x, mask),
             row_width=shared_width,
-            eps=options.eps,
-            eps0=options.eps0,
-            box=options.box,
-            terms=rule_terms(first),
         )
         appended = None
         if self.by_species:
-            appended = perceive_by_species(
-                x, self.counts, eps=options.eps, eps0=options.eps0, box=options.box
-            )
+            counts = tuple(own.end - own.first for own in species)
+            appended = perceive_by_species(x, counts, physics)
         row_count = len(perception)
         outputs, places = [], []
         for own in species:
@@ -407,8 +429,8 @@ class SpeciesStep(NamedTuple):
                 active.row_of.view(x.shape[:2]), own, row_count, mask
             )
             z = perception.index_select(0, place.clamp(max=row_count - 1))
-            if own.count_ratio != 1.0 and first.density_gradient:
-                begin, end = shared_dim - first.space_dim, shared_dim
+            if own.count_ratio != 1.0 and physics.terms.density_gradient:
+                begin, end = shared_dim - physics.space_dim, shared_dim
                 gradient = _recounted(z[:, begin:end], own.count_ratio)
                 z = torch.cat((z[:, :begin], gradient, z[:, end:]), dim=1)
             if appended is not None:
@@ -428,11 +450,8 @@ class SpeciesStep(NamedTuple):
                 x if noise is None else x + noise,
                 s,
                 path_length,
-                rows=active,
-                max_displacement=options.max_displacement,
-                dt=options.dt,
-                moving=not first.static,
-                box=options.box,
+                active,
+                physics,
             )
         )
 
@@ -441,55 +460,36 @@ class SpeciesStep(NamedTuple):
         return worlds
 
 
-def make_species_step(
-    rules: Sequence[NPARule],
-    counts: tuple[int, ...],
-    options: Sequence[StepOptions],
-    density_counts: tuple[float, ...],
-    x: Tensor,
-    *,
-    by_species: bool,
-) -> SpeciesStep:
-    """Return what stays the same over a rollout of checked worlds.
-
-    Args:
-        rules: One rule for each species; they agree.
-        counts: Particles of each species.
-        options: What each species' particles are told.
-        density_counts: Particles by which each species divides densities.
-        x: Positions [length units], shape [B, N, D].
-        by_species: Rules perceive each species' density and density gradient.
-    """
+def make_species_step(call: SpeciesCall, rules: Sequence[NPARule], x: Tensor) -> SpeciesStep:
+    """Return the step of a rollout from positions [B, N, D]; one rule for each species."""
     species = []
     first = 0
     longest = max(rule.alpha for rule in rules)
-    for rule, count, own, divisor in zip(rules, counts, options, density_counts, strict=True):
+    for rule, own in zip(rules, call.species, strict=True):
         species.append(
             Species(
                 rule=rule,
                 network=rule.network(),
                 first=first,
-                end=first + count,
-                update_prob=own.update_prob,
+                end=first + own.count,
+                update_prob=constant(own.update_prob),
                 reach_share=rule.alpha / longest,
-                count_ratio=x.shape[1] / divisor,
+                count_ratio=x.shape[1] / own.density_count,
             )
         )
-        first += count
-    probabilities = [own.update_prob for own in options]
-    highest = max(probabilities)
+        first += own.count
+    physics = call.physics.constants()
     update_share = None
-    if min(probabilities) < highest:
+    if min(own.update_prob for own in species) < physics.update_prob:
         update_share = torch.cat(
             [
-                torch.full((count,), chance / highest, device=x.device)
-                for count, chance in zip(counts, probabilities, strict=True)
+                torch.full(
+                    (own.end - own.first,), own.update_prob / physics.update_prob, device=x.device
+                )
+                for own in species
             ]
         )
-    shared = options[0]._replace(
-        update_prob=highest, max_displacement=max(own.max_displacement for own in options)
-    )
-    return SpeciesStep(species, counts, shared, update_share, by_species)
+    return SpeciesStep(species, physics, call.detach_positions, update_share, call.by_species)
 
 
 def _row_total(community: SpeciesStep, x: Tensor, mask: Tensor | None) -> int:

@@ -10,13 +10,8 @@ from typing import NamedTuple, Protocol
 import torch
 from torch import Tensor
 
-from npa_envs.checks import constant
-from npa_envs.ops.perceive import (
-    PerceptionOptions,
-    Terms,
-    perceive_rows,
-    update_some_at_a_time,
-)
+from npa_envs.ops.perceive import perceive_rows, update_some_at_a_time
+from npa_envs.ops.physics import Physics, Terms
 from npa_envs.ops.static import StaticRows, StaticWorlds, static_rows
 from npa_envs.ops.update import update_particles
 from npa_envs.rule.network import Network
@@ -46,36 +41,6 @@ OVERFLOW_LOG_PROBABILITY = 34.5
 """Row capacities hold with probability 1 - exp(-34.5), about 1 - 1e-15, for each step."""
 
 
-class StepOptions(NamedTuple):
-    """Everything about a step that stays the same over a rollout, checked."""
-
-    eps: float
-    box: tuple[float, ...] | None
-    update_prob: float
-    dt: float
-    position_noise: float
-    detach_positions: bool
-    eps0: float
-    """Radius at which the rule was trained [length units]."""
-    max_displacement: float
-    """Largest displacement alpha eps in a unit of time [length units]."""
-
-    def constants(self) -> StepOptions:
-        """Return them with numbers that a compiler takes for constants."""
-        if not torch.compiler.is_compiling():
-            return self
-        return StepOptions(
-            constant(self.eps),
-            None if self.box is None else tuple([constant(side) for side in self.box]),
-            constant(self.update_prob),
-            constant(self.dt),
-            constant(self.position_noise),
-            self.detach_positions,
-            constant(self.eps0),
-            constant(self.max_displacement),
-        )
-
-
 def row_capacity(particle_total: int, update_prob: float) -> int:
     """Return how many rows hold the active particles of a step, without reading their number.
 
@@ -93,13 +58,13 @@ def row_capacity(particle_total: int, update_prob: float) -> int:
     return min(particle_total, math.ceil(mean + margin))
 
 
-def row_count(mask: Tensor | None, x: Tensor, options: StepOptions) -> int:
+def row_count(mask: Tensor | None, x: Tensor, update_prob: float) -> int:
     """Return how many rows hold the active particles of a step of worlds at x; no mask: all."""
     total = x.shape[0] * x.shape[1]
     if mask is None:
         return total
     # Counting is free on the CPU; on CUDA it would stall the stream.
-    return row_capacity(total, options.update_prob) if mask.is_cuda else max(int(mask.sum()), 1)
+    return row_capacity(total, update_prob) if mask.is_cuda else max(int(mask.sum()), 1)
 
 
 class Draws(NamedTuple):
@@ -115,23 +80,23 @@ class Draws(NamedTuple):
     """What fates and children hang on, where particles divide."""
 
 
-def draw_step(x: Tensor, options: StepOptions, generator: Randomness | None) -> Draws:
+def draw_step(x: Tensor, physics: Physics, generator: Randomness | None) -> Draws:
     """Draw a step's update mask and position noise, in this order."""
     mask = noise = None
     if isinstance(generator, WorldRandom):
         generator.advance()
-        if options.update_prob < 1.0:
-            mask = generator.bernoulli(options.update_prob, x.shape[1])
-        if options.position_noise > 0.0:
+        if physics.update_prob < 1.0:
+            mask = generator.bernoulli(physics.update_prob, x.shape[1])
+        if physics.position_noise > 0.0:
             noise = generator.normal(*x.shape[1:], dtype=x.dtype)
-            noise *= options.position_noise
+            noise *= physics.position_noise
         return Draws(mask, noise)
-    if options.update_prob < 1.0:
+    if physics.update_prob < 1.0:
         mask = torch.empty(x.shape[:2], dtype=torch.uint8, device=x.device)
-        mask.bernoulli_(options.update_prob, generator=generator)
-    if options.position_noise > 0.0:
+        mask.bernoulli_(physics.update_prob, generator=generator)
+    if physics.position_noise > 0.0:
         noise = torch.randn(x.shape, dtype=x.dtype, device=x.device, generator=generator)
-        noise *= options.position_noise
+        noise *= physics.position_noise
     return Draws(mask, noise)
 
 
@@ -164,12 +129,12 @@ def iterate_draws(draw: Callable[[], Draws], like: Tensor, steps: int) -> Iterat
     yield from ready
 
 
-def skip_draws(x: Tensor, options: StepOptions, steps: int, generator: Randomness | None) -> None:
+def skip_draws(x: Tensor, physics: Physics, steps: int, generator: Randomness | None) -> None:
     """Bring a source of draws to where it would be after some steps of worlds at x.
 
     Args:
         x: Positions, of which the shape, the dtype and the device count.
-        options: What the steps draw.
+        physics: The worlds' constants.
         steps: Number of steps.
         generator: The source.
     """
@@ -177,15 +142,15 @@ def skip_draws(x: Tensor, options: StepOptions, steps: int, generator: Randomnes
         return
     if isinstance(generator, WorldRandom):
         generator.advance(steps - 1)
-        draw_step(x, options, generator)
+        draw_step(x, physics, generator)
     elif x.is_cuda:
         # On CUDA torch counts what it has drawn, and equal draws count the same.
         counter = torch.Generator(x.device)
-        draw_step(x, options, counter)
+        draw_step(x, physics, counter)
         reserve_draws(torch_generator(generator, x.device), steps * counter.get_offset())
     else:
         for _ in range(steps):
-            draw_step(x, options, generator)
+            draw_step(x, physics, generator)
 
 
 def rule_terms(rule: NPARule) -> Terms:
@@ -222,24 +187,25 @@ class RuleStep(NamedTuple):
     rule: NPARule
     network: Network | None
     """The rule's weights as they are run; None: it runs as the module that it is."""
-    options: StepOptions
+    physics: Physics
+    detach_positions: bool = True
     static: StaticWorlds | None = None
     """Where particles never move: worlds in sorted order, prepared once."""
 
     def draws(self, x: Tensor, steps: int, generator: Randomness | None) -> Iterator[Draws]:
         """Draw each step's update mask and position noise."""
         if self.static is None:
-            yield from iterate_draws(lambda: draw_step(x, self.options, generator), x, steps)
+            yield from iterate_draws(lambda: draw_step(x, self.physics, generator), x, steps)
             return
         # The rows of static worlds are given some steps at a time, in few launches.
         total = x.shape[0] * x.shape[1]
         together = max(min(16, ROWS_TOGETHER // total), 1)
         for first in range(0, steps, together):
             count = min(together, steps - first)
-            drawn = [draw_step(x, self.options, generator) for _ in range(count)]
+            drawn = [draw_step(x, self.physics, generator) for _ in range(count)]
             masks = [draws.mask for draws in drawn if draws.mask is not None]
             if masks:
-                capacity = row_capacity(total, self.options.update_prob)
+                capacity = row_capacity(total, self.physics.update_prob)
                 rows = static_rows(self.static, x.detach(), masks, capacity)
                 drawn = [Draws(None, None, own) for own in rows]
             yield from drawn
@@ -255,28 +221,23 @@ class RuleStep(NamedTuple):
         births: Births | None,
     ) -> Particles:
         """Return the worlds after one step with these draws."""
-        rule, options = self.rule, self.options
+        rule, physics = self.rule, self.physics
         network = rule if self.network is None else self.network
         width = rule.perception_dim if self.network is None else self.network.row_width
-        count = len(rows.row_source) if rows is not None else row_count(mask, x, options)
+        count = (
+            len(rows.row_source) if rows is not None else row_count(mask, x, physics.update_prob)
+        )
         huge = count > ROWS_KEPT and not torch.is_grad_enabled() and self.static is None
         if huge and not torch.compiler.is_compiling():
-            sides = None if options.box is None else list(options.box)
-            asked = PerceptionOptions(
-                count, width, options.eps, options.eps / options.eps0, sides, rule_terms(rule)
-            )
-            update, active = update_some_at_a_time(x, s, mask, network, asked)
+            update, active = update_some_at_a_time(x, s, physics, mask, network, count, width)
         else:
             perception, active = perceive_rows(
-                x.detach() if options.detach_positions else x,
+                x.detach() if self.detach_positions else x,
                 s,
+                physics,
                 mask=mask,
                 row_capacity=count,
                 row_width=width,
-                eps=options.eps,
-                eps0=options.eps0,
-                box=options.box,
-                terms=rule_terms(rule),
                 static=self.static,
                 static_rows=rows,
             )
@@ -287,11 +248,8 @@ class RuleStep(NamedTuple):
                 x if noise is None else x + noise,
                 s,
                 path_length,
-                rows=active,
-                max_displacement=options.max_displacement,
-                dt=options.dt,
-                moving=not rule.static,
-                box=options.box,
+                active,
+                physics,
             )
         )
 
@@ -311,7 +269,7 @@ class DivisionStep(NamedTuple):
         yield from iterate_draws(lambda: self._draw(x, generator), x, steps)
 
     def _draw(self, x: Tensor, generator: Randomness | None) -> Draws:
-        drawn = draw_step(x, self.step.options, generator)
+        drawn = draw_step(x, self.step.physics, generator)
         chance = uniform_draws(generator, x.shape[:2], x)
         return drawn._replace(births=Births(chance, normal_draws(generator, x.shape, x)))
 
@@ -327,7 +285,7 @@ class DivisionStep(NamedTuple):
     ) -> Particles:
         """Return the worlds after one step with these draws."""
         assert births is not None, "drawn above"
-        eps = self.step.options.eps
+        eps = self.step.physics.eps
         alive = living(s)
         updated = alive if mask is None else alive & mask.bool()
         life, rest = s[..., : LIFE + 1], s[..., LIFE + 1 :]
