@@ -313,7 +313,9 @@ def _(
     return x.new_empty(row_capacity, row_width), kernel_sum
 
 
-def _numbers(physics: Physics) -> tuple[Any, ...]:
+def _numbers(
+    physics: Physics,
+) -> tuple[float, float, list[float] | None, bool, str | None, bool]:
     """Return what operators take of the constants, flat."""
     return constant(physics.eps), physics.scale(), physics.sides(), *physics.terms
 

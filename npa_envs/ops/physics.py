@@ -164,7 +164,8 @@ def _checked(
     dt: Any,
     position_noise: Any,
 ) -> Physics:
-    radius = checked_eps("eps", eps0 if eps is None else eps, space_dim, dtype)
+    given: Any = eps0 if eps is None else eps
+    radius = checked_eps("eps", given, space_dim, dtype)
     radius0 = radius if eps0 is None else constant(eps0)
     check_scale(radius, radius0, space_dim, dtype)
     update_prob = checked_number("update_prob", update_prob)

@@ -77,17 +77,6 @@ class StaticWorlds(NamedTuple):
     tensors: StaticTensors
     """What perception needs of positions."""
 
-    def sort(self, values: Tensor) -> Tensor:
-        """Return values of particles, [B, N, ...], in sorted order; differentiable."""
-        return self._gather(values, self.tensors.source)
-
-    def unsort(self, values: Tensor) -> Tensor:
-        """Return values of sorted particles, [B, N, ...], in the caller's order; differentiable."""
-        return self._gather(values, self.tensors.place)
-
-    def _gather(self, values: Tensor, index: Tensor) -> Tensor:
-        return values.flatten(0, 1).index_select(0, index).view_as(values)
-
 
 @opaque("npa::prepare_static")
 def _prepare_static(

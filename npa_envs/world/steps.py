@@ -1,4 +1,4 @@
-"""Steps: what a rollout repeats, of a rule and of one whose particles divide."""
+"""Steps of worlds: of a rule, of particles that stay, and of particles that divide."""
 
 from __future__ import annotations
 
@@ -11,13 +11,14 @@ import torch
 from torch import Tensor
 
 from npa_envs.ops.perceive import perceive_rows, update_some_at_a_time
-from npa_envs.ops.physics import Physics, Terms
-from npa_envs.ops.static import StaticRows, StaticWorlds, static_rows
-from npa_envs.ops.update import update_particles
+from npa_envs.ops.physics import Physics
+from npa_envs.ops.static import StaticRows, StaticWorlds, prepare_static, static_rows
+from npa_envs.ops.update import update_particles, wrapped
 from npa_envs.rule.network import Network
 from npa_envs.rule.rule import LIFE, NPARule
 from npa_envs.world.cuda_graph import SideStream
 from npa_envs.world.division import Births, divided, living, parked
+from npa_envs.world.particles import Particles
 from npa_envs.world.randomness import (
     Randomness,
     WorldRandom,
@@ -26,7 +27,6 @@ from npa_envs.world.randomness import (
     torch_generator,
     uniform_draws,
 )
-from npa_envs.world.recorded import Particles
 
 ROWS_TOGETHER = 2**24
 """Rows of static worlds that are given together, at most, if they are of several steps."""
@@ -153,32 +153,20 @@ def skip_draws(x: Tensor, physics: Physics, steps: int, generator: Randomness | 
             draw_step(x, physics, generator)
 
 
-def rule_terms(rule: NPARule) -> Terms:
-    """Return the groups of the perception vector that a rule reads."""
-    inverse = rule.moment_inverse if rule.moment_correction else None
-    return Terms(rule.state_gradient, inverse, rule.density_gradient)
-
-
 class Step(Protocol):
     """What a rollout repeats: draws, and an advance that follows from them alone."""
 
-    def draws(self, x: Tensor, steps: int, generator: Randomness | None) -> Iterator[Draws]:
-        """Draw what each of some steps of worlds at x draws."""
+    def enter(self, particles: Particles) -> Particles:
+        """Return worlds as the steps take them, such as in sorted order."""
 
-    def advance(
-        self,
-        x: Tensor,
-        s: Tensor,
-        path_length: Tensor,
-        mask: Tensor | None,
-        noise: Tensor | None,
-        rows: StaticRows | None,
-        births: Births | None,
-    ) -> Particles:
+    def draw(self, like: Tensor, steps: int, source: Randomness | None) -> Iterator[Draws]:
+        """Yield each step's draws, for positions like these."""
+
+    def advance(self, particles: Particles, draws: Draws) -> Particles:
         """Return the worlds after one step with these draws."""
 
-    def ordered(self, worlds: Particles) -> Particles:
-        """Return worlds of the rollout in the caller's order of particles."""
+    def leave(self, particles: Particles) -> Particles:
+        """Return worlds of the rollout in the caller's order."""
 
 
 class RuleStep(NamedTuple):
@@ -190,72 +178,90 @@ class RuleStep(NamedTuple):
     physics: Physics
     detach_positions: bool = True
     static: StaticWorlds | None = None
-    """Where particles never move: worlds in sorted order, prepared once."""
+    """Sorted worlds whose particles never move; `StaticStep` prepares them."""
 
-    def draws(self, x: Tensor, steps: int, generator: Randomness | None) -> Iterator[Draws]:
-        """Draw each step's update mask and position noise."""
-        if self.static is None:
-            yield from iterate_draws(lambda: draw_step(x, self.physics, generator), x, steps)
-            return
-        # The rows of static worlds are given some steps at a time, in few launches.
-        total = x.shape[0] * x.shape[1]
-        together = max(min(16, ROWS_TOGETHER // total), 1)
-        for first in range(0, steps, together):
-            count = min(together, steps - first)
-            drawn = [draw_step(x, self.physics, generator) for _ in range(count)]
-            masks = [draws.mask for draws in drawn if draws.mask is not None]
-            if masks:
-                capacity = row_capacity(total, self.physics.update_prob)
-                rows = static_rows(self.static, x.detach(), masks, capacity)
-                drawn = [Draws(None, None, own) for own in rows]
-            yield from drawn
+    def enter(self, particles: Particles) -> Particles:
+        """Return the worlds."""
+        return particles
 
-    def advance(
-        self,
-        x: Tensor,
-        s: Tensor,
-        path_length: Tensor,
-        mask: Tensor | None,
-        noise: Tensor | None,
-        rows: StaticRows | None,
-        births: Births | None,
-    ) -> Particles:
+    def draw(self, like: Tensor, steps: int, source: Randomness | None) -> Iterator[Draws]:
+        """Yield each step's update mask and position noise."""
+        return iterate_draws(lambda: draw_step(like, self.physics, source), like, steps)
+
+    def advance(self, particles: Particles, draws: Draws) -> Particles:
         """Return the worlds after one step with these draws."""
+        x, s, path_length, _ = particles
+        mask, noise, rows, _ = draws
+        assert path_length is not None, "rollouts measure paths"
         rule, physics = self.rule, self.physics
         network = rule if self.network is None else self.network
         width = rule.perception_dim if self.network is None else self.network.row_width
-        count = (
-            len(rows.row_source) if rows is not None else row_count(mask, x, physics.update_prob)
-        )
-        huge = count > ROWS_KEPT and not torch.is_grad_enabled() and self.static is None
+        total = row_count(mask, x, physics.update_prob) if rows is None else len(rows.row_source)
+        huge = total > ROWS_KEPT and not torch.is_grad_enabled() and self.static is None
         if huge and not torch.compiler.is_compiling():
-            update, active = update_some_at_a_time(x, s, physics, mask, network, count, width)
+            update, active = update_some_at_a_time(x, s, physics, mask, network, total, width)
         else:
             perception, active = perceive_rows(
                 x.detach() if self.detach_positions else x,
                 s,
                 physics,
                 mask=mask,
-                row_capacity=count,
+                row_capacity=total,
                 row_width=width,
                 static=self.static,
                 static_rows=rows,
             )
             update = network(perception)
-        return Particles(
-            *update_particles(
-                update,
-                x if noise is None else x + noise,
-                s,
-                path_length,
-                active,
-                physics,
-            )
-        )
+        moved = x if noise is None else x + noise
+        return Particles(*update_particles(update, moved, s, path_length, active, physics))
 
-    def ordered(self, worlds: Particles) -> Particles:
-        """Return worlds of the rollout in the caller's order of particles."""
-        return worlds if self.static is None else Particles(*map(self.static.unsort, worlds))
+    def leave(self, particles: Particles) -> Particles:
+        """Return the worlds."""
+        return particles
+
+
+class StaticStep(NamedTuple):
+    """The step of a rule whose particles never move: sorted and searched once."""
+
+    step: RuleStep
+    static: StaticWorlds
+    x: Tensor
+    """Positions, wrapped."""
+
+    @classmethod
+    def of(cls, step: RuleStep, x: Tensor) -> StaticStep:
+        """Return the step of worlds at these positions."""
+        # Later parts of a rollout begin at wrapped positions, and so does the first.
+        x = wrapped(x, step.physics.box)
+        static = prepare_static(x, step.physics)
+        return cls(step._replace(static=static), static, x)
+
+    def enter(self, particles: Particles) -> Particles:
+        """Return the worlds in sorted order."""
+        return particles._replace(x=self.x).gather(self.static.tensors.source)
+
+    def draw(self, like: Tensor, steps: int, source: Randomness | None) -> Iterator[Draws]:
+        """Yield each step's rows, which are given some steps at a time, in few launches."""
+        total = like.shape[0] * like.shape[1]
+        physics = self.step.physics
+        together = max(min(16, ROWS_TOGETHER // total), 1)
+        for first in range(0, steps, together):
+            count = min(together, steps - first)
+            drawn = [draw_step(like, physics, source) for _ in range(count)]
+            masks = [draws.mask for draws in drawn if draws.mask is not None]
+            if masks:
+                capacity = row_capacity(total, physics.update_prob)
+                rows = static_rows(self.static, like.detach(), masks, capacity)
+                drawn = [Draws(None, None, own) for own in rows]
+            yield from drawn
+
+    def advance(self, particles: Particles, draws: Draws) -> Particles:
+        """Return the worlds after one step with these draws."""
+        return self.step.advance(particles, draws)
+
+    def leave(self, particles: Particles) -> Particles:
+        """Return the worlds in the caller's order."""
+        return particles.gather(self.static.tensors.place)
 
 
 class DivisionStep(NamedTuple):
@@ -264,38 +270,39 @@ class DivisionStep(NamedTuple):
     step: RuleStep
     """The step of the living."""
 
-    def draws(self, x: Tensor, steps: int, generator: Randomness | None) -> Iterator[Draws]:
-        """Draw each step's update mask, position noise, fates and directions of children."""
-        yield from iterate_draws(lambda: self._draw(x, generator), x, steps)
+    def enter(self, particles: Particles) -> Particles:
+        """Return the worlds with states of zero in dead slots."""
+        # What lies in dead slots must not reach gradients either: 0 times NaN is NaN.
+        s = particles.s
+        return particles._replace(s=torch.where(living(s)[..., None], s, 0.0))
 
-    def _draw(self, x: Tensor, generator: Randomness | None) -> Draws:
-        drawn = draw_step(x, self.step.physics, generator)
-        chance = uniform_draws(generator, x.shape[:2], x)
-        return drawn._replace(births=Births(chance, normal_draws(generator, x.shape, x)))
+    def draw(self, like: Tensor, steps: int, source: Randomness | None) -> Iterator[Draws]:
+        """Yield each step's update mask, position noise, fates and directions of children."""
 
-    def advance(
-        self,
-        x: Tensor,
-        s: Tensor,
-        path_length: Tensor,
-        mask: Tensor | None,
-        noise: Tensor | None,
-        rows: StaticRows | None,
-        births: Births | None,
-    ) -> Particles:
+        def draw() -> Draws:
+            drawn = draw_step(like, self.step.physics, source)
+            chance = uniform_draws(source, like.shape[:2], like)
+            return drawn._replace(births=Births(chance, normal_draws(source, like.shape, like)))
+
+        return iterate_draws(draw, like, steps)
+
+    def advance(self, particles: Particles, draws: Draws) -> Particles:
         """Return the worlds after one step with these draws."""
-        assert births is not None, "drawn above"
+        assert draws.births is not None, "drawn above"
+        x, s, path_length, _ = particles
         eps = self.step.physics.eps
         alive = living(s)
-        updated = alive if mask is None else alive & mask.bool()
+        updated = alive if draws.mask is None else alive & draws.mask.bool()
         life, rest = s[..., : LIFE + 1], s[..., LIFE + 1 :]
         # Life is no weight of what is perceived, so perception gives it no gradient.
         perceived = torch.cat((life.detach(), rest), dim=-1)
         after = self.step.advance(
-            parked(x, alive, eps), perceived, path_length, updated.byte(), noise, rows, None
+            Particles(parked(x, alive, eps), perceived, path_length),
+            draws._replace(mask=updated.byte()),
         )
         # A rule does not change life.
         new_s = torch.cat((life, after.s[..., LIFE + 1 :]), dim=-1)
+        assert after.path_length is not None
         return Particles(
             *divided(
                 after.x,
@@ -303,11 +310,11 @@ class DivisionStep(NamedTuple):
                 after.path_length,
                 division_probabilities=self.step.rule.division_probabilities(new_s),
                 updated=updated,
-                births=births,
+                births=draws.births,
                 eps=eps,
             )
         )
 
-    def ordered(self, worlds: Particles) -> Particles:
-        """Return worlds of the rollout in the caller's order of particles."""
-        return worlds
+    def leave(self, particles: Particles) -> Particles:
+        """Return the worlds."""
+        return particles
