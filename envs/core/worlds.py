@@ -38,8 +38,8 @@ from npa_envs.world.actions import (
     NeighbourState,
     PreparedJudgement,
     build_neighbours,
+    with_mean_reward,
 )
-from npa_envs.world.credit import with_mean_reward
 from npa_envs.world.cuda_graph import (
     GraphedCallable,
     SideStream,

@@ -90,7 +90,6 @@ class DriverLaunch:
 
     Args:
         launch: What `wp.launch` returns with `record_cmd=True`, on CUDA.
-        device: Its device.
         addresses: Addresses of the kernel's parameters.
     """
 

@@ -450,9 +450,6 @@ def perceive_rows(
     """Perceive the active particles of checked worlds.
 
     Args:
-        x: Positions; gradients flow into them if they require gradients.
-        s: States.
-        physics: The worlds' constants.
         mask: Which particles are active, uint8, shape [B, N], or None for all.
         row_capacity: Rows K of the result; active particles beyond it are left out.
         row_width: Columns of a row, at least P: a one follows the perception vector, then zeros.
@@ -542,7 +539,6 @@ class NeighbourState:
     Args:
         launch_of: Returns what to give to a launch that writes rows into a tensor, [B N, P].
         shape: Shape of what is perceived, [B, N, P].
-        like: A tensor of its dtype and on its device.
     """
 
     def __init__(

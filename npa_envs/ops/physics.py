@@ -127,13 +127,8 @@ def physics(
     """Return the constants of worlds of a dtype, checked.
 
     Args:
-        space_dim: As in `Physics`, also below.
-        state_dim: State channels.
         dtype: Floating dtype of the worlds.
-        eps: Perception radius; default: eps0.
         eps0: Radius of the training, itself checked; default: eps.
-        box: Sides of the periodic box, a number for equal sides, or None.
-        terms: Groups of the perception vector.
         moving: Whether particles move.
         alpha: Largest displacement in a unit of time, as a fraction of eps.
         update_prob: Probability of an update.

@@ -237,8 +237,6 @@ def static_rows(
     """Give the active particles of each of some steps rows, all steps at once.
 
     Args:
-        worlds: The worlds.
-        x: Positions in sorted order [length units], contiguous, shape [B, N, D].
         masks: Each step's active particles in the caller's order, uint8, shape [B, N].
         row_capacity: Rows K on CUDA; active particles beyond them get none. On a CPU each step has
             as many as it needs, at least one.
@@ -274,11 +272,7 @@ def static_worlds(
     """Return what the perception pass of a step reads.
 
     Args:
-        plan: Plan of the call.
         tensors: What was prepared.
-        rows: The step's rows.
-        x: Positions in sorted order [length units], shape [B, N, D].
-        s: States in sorted order, dimensionless, shape [B, N, C].
     """
     lists = None
     if plan.lists_neighbours:

@@ -192,7 +192,6 @@ def wrapped(x: Tensor, box: tuple[float, ...] | None) -> Tensor:
     """Return a copy of positions, wrapped into the periodic box if there is one.
 
     Args:
-        x: Positions [length units], shape [B, N, D].
         box: Sides of the box, centred on the origin [length units], or None.
     """
     if box is None:

@@ -6,7 +6,7 @@ bounded output stands. Nothing here waits for the device.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 import torch
 from torch import Tensor
@@ -20,10 +20,11 @@ from npa_envs.ops.episodes import (
     EpisodeRules,
     PreparedJudgement,
 )
+from npa_envs.ops.mean import world_mean
 from npa_envs.ops.perceive import NeighbourState, build_neighbours
 from npa_envs.ops.physics import Limits, Physics, Terms
 from npa_envs.ops.species import perceive_by_species
-from npa_envs.ops.update import PreparedActions
+from npa_envs.ops.update import PreparedActions, wrapped
 from npa_envs.world.randomness import WorldRandom
 from npa_envs.world.steps import draw_step
 
@@ -41,7 +42,9 @@ __all__ = [
     "PreparedJudgement",
     "Terms",
     "build_neighbours",
+    "marginal_gains",
     "perceive_each_species",
+    "with_mean_reward",
 ]
 
 
@@ -55,9 +58,6 @@ class Actions:
     """What actions do to some worlds, in place, with the masks and the noise of `rollout`.
 
     Args:
-        x: Positions, finite.
-        s: States, finite.
-        physics: The worlds' constants.
         random: Where masks and noise come from; advanced by one step in each `draw`.
         enabled: Whether actions are applied, uint8, shape [1]: set to 0 where one is not finite,
             and no world changes; the caller sets it to 1 again.
@@ -120,3 +120,48 @@ class Actions:
     def apply_held(self) -> None:
         """Apply the actions held last with what was drawn last; may be captured in a CUDA graph."""
         self._apply.apply_held()
+
+
+def marginal_gains(
+    losses: Callable[[Tensor, Tensor], Mapping[str, Tensor]],
+    before: tuple[Tensor, Tensor],
+    after: tuple[Tensor, Tensor],
+    box: tuple[float, ...] | None,
+) -> Tensor | None:
+    """Return marginal credit: how much each particle's action lowered the loss, times N; [B, N].
+
+    A particle's part of a step is what it changed, times the loss's slope in the middle of the
+    step. For losses that are quadratic in what particles change, that is the mean of its marginal
+    contribution to what all others did and to what they had not yet done (its Shapley value), and
+    the mean over the particles is what the loss fell; for others it is so up to third order. What a
+    task holds constant in its gradients is constant here.
+
+    Args:
+        losses: The named parts of each world's loss, shape [B] each, of positions and states.
+        after: The same after it.
+
+    Returns:
+        The gains, or None where no gradient leads from the losses to positions or states.
+    """
+    moved = wrapped(after[0] - before[0], box)
+    changed = after[1] - before[1]
+    with torch.enable_grad():
+        x = wrapped(after[0] - 0.5 * moved, box).requires_grad_()
+        s = (after[1] - 0.5 * changed).requires_grad_()
+        total = torch.stack(list(losses(x, s).values())).sum()
+        if not total.requires_grad:
+            return None
+        slopes = torch.autograd.grad(total, (x, s), allow_unused=True)
+    gains = torch.zeros_like(moved[..., 0])
+    for slope, change in zip(slopes, (moved, changed), strict=True):
+        if slope is not None:
+            # Added one by one: the order of torch's own sums is not promised.
+            for column in (slope * change).unbind(dim=-1):
+                gains = gains - column
+    return gains * gains.shape[1]
+
+
+def with_mean_reward(gains: Tensor, reward: Tensor) -> Tensor:
+    """Return particles' gains, [B, N], with what they miss of the worlds' rewards, [B], shared."""
+    missed = reward - world_mean(gains[..., None])[:, 0]
+    return gains + missed[:, None]

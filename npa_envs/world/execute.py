@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Literal, NamedTuple
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any, Literal, NamedTuple
 
 import torch
+from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
 from npa_envs.checks import check_finite_positions
+from npa_envs.errors import NPAError
 from npa_envs.ops.physics import Physics
 from npa_envs.rule.rule import NPARule
 from npa_envs.world.cuda_graph import draws_alone
@@ -16,10 +18,16 @@ from npa_envs.world.divergence import DivergenceWatch
 from npa_envs.world.particles import Particles, combined
 from npa_envs.world.prepared import may_prepare, run_prepared
 from npa_envs.world.randomness import Randomness
-from npa_envs.world.recomputed import RecomputedSteps
 from npa_envs.world.recorded import CudaGraph, run_recorded
-from npa_envs.world.species_step import SpeciesSpec, make_species_step
-from npa_envs.world.steps import DivisionStep, RuleStep, StaticStep, Step, skip_draws
+from npa_envs.world.steps import (
+    DivisionStep,
+    RuleStep,
+    SpeciesSpec,
+    StaticStep,
+    Step,
+    make_species_step,
+    skip_draws,
+)
 
 Memory = Literal["store", "recompute", "minimal"]
 
@@ -87,6 +95,88 @@ class RolloutSpec(NamedTuple):
         return run_steps(step, self, rules, particles, source, watch)
 
 
+class RecomputedSteps:
+    """Steps of a rollout that its backward pass runs again.
+
+    These read the rule and the first worlds where they are. Gradients would silently be wrong if
+    they had changed meanwhile, which is refused.
+
+    Args:
+        advance: Returns the worlds after one step.
+        rules: The rules that it runs.
+    """
+
+    def __init__(
+        self, advance: Callable[..., Any], rules: Sequence[NPARule], worlds: dict[str, Tensor]
+    ) -> None:
+        self._advance = advance
+        self._worlds = worlds
+        # Plain rules are run by copies of their weights, except for those of the fates.
+        self._rules = [(rule, rule.divides or not rule.is_plain()) for rule in rules]
+        self._read: dict[str, Any] | None = None
+        """What has been read, by name, from the end of the forward pass on."""
+
+    def __call__(self, *arguments: Any) -> Any:
+        """Run one step, forward or again."""
+        if self._read is None:
+            return self._advance(*arguments)
+        self._check(self._read)
+        try:
+            return self._advance(*arguments)
+        finally:
+            # A module may change its own buffers, as those of normalisation.
+            self.end_forward()
+
+    def end_forward(self) -> None:
+        """Note what has been read."""
+        self._read = dict(self._readings())
+
+    def _check(self, before: dict[str, Any]) -> None:
+        for name, value in self._readings():
+            if name not in before or before[name] != value:
+                raise NPAError(
+                    f"{name} must stay as it is between a rollout that recomputes steps and its "
+                    "backward pass, got another: call backward() before it changes, or take "
+                    "memory='store'"
+                )
+
+    def _readings(self) -> Iterator[tuple[str, Any]]:
+        """Yield what steps read, by name, as something that can be compared."""
+        for name, world in self._worlds.items():
+            yield name, _Reading(world)
+        for number, (rule, with_weights) in enumerate(self._rules):
+            of_rule = "the rule" if len(self._rules) == 1 else f"rule {number}"
+            for name, value in rule.hyper_parameters().items():
+                yield f"{name} of {of_rule}", value
+            for path, module in rule.named_modules() if with_weights else ():
+                place = f"{path}." if path else ""
+                own = {**vars(module), **module._parameters, **module._buffers}
+                for name, value in own.items():
+                    if isinstance(value, Tensor):
+                        yield f"{place}{name} of {of_rule}", _Reading(value)
+                    elif isinstance(value, bool | int | float | str):
+                        yield f"{place}{name} of {of_rule}", value
+
+
+class _Reading:
+    """A tensor as it was read: equal to another reading if nothing was written in between."""
+
+    def __init__(self, tensor: Tensor) -> None:
+        # Held, so that no other tensor gets the same memory.
+        self._held = tensor.detach()
+        self._where = tensor.data_ptr()
+        self._version = None if tensor.is_inference() else tensor._version
+
+    def __eq__(self, other: object) -> bool:
+        return (
+            isinstance(other, _Reading)
+            and self._where == other._where
+            and self._version == other._version
+        )
+
+    __hash__ = None  # type: ignore[assignment]
+
+
 def run_steps(
     step: Step,
     spec: RolloutSpec,
@@ -129,7 +219,7 @@ def run_steps(
             else:
                 particles = step.advance(particles, draws)
             if watch is not None:
-                after = step.leave(particles.map(torch.Tensor.detach))
+                after = step.leave(particles.map(Tensor.detach))
                 watch.look(after.x, after.s)
             if keep_every is not None and (number + 1) % keep_every == 0:
                 kept.append(step.leave(particles))
@@ -157,9 +247,6 @@ def execute(
 
     Args:
         spec: The rollout.
-        rules: The rule, or one of each species.
-        particles: The worlds; without path lengths where nobody asks for these.
-        source: Source of the draws.
         graph: Whether to record on CUDA; True also records rules that are not plain.
         watch: Checks the worlds after each step, which then are launched.
 
@@ -196,7 +283,7 @@ def run_all_steps(
 
 def resting(
     rules: Sequence[NPARule], particles: Particles, physics: Physics, graph: CudaGraph
-) -> torch.Tensor:
+) -> Tensor:
     """Return which worlds stay as they are if all particles are updated, bool, shape [B]."""
     spec = RolloutSpec(1, physics._replace(update_prob=1.0))
     with torch.no_grad():
@@ -216,7 +303,7 @@ def _may_rest(spec: RolloutSpec, rules: Sequence[NPARule], particles: Particles)
         and spec.steps >= FEWEST_RESTING
         and spec.keep_every is None
         and spec.physics.position_noise == 0.0
-        and particles.path_length is None
+        and not particles.measures_paths
         and not torch.is_grad_enabled()
         and not torch.compiler.is_compiling()
         and not (particles.x.is_cuda and torch.cuda.is_current_stream_capturing())

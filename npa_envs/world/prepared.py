@@ -63,7 +63,6 @@ class PreparedSteps:
     """Steps of worlds of one shape, back and forth between two places in memory.
 
     Args:
-        step: The step, of a rule with any weights.
         particles: Worlds of that shape; they are left as they are.
     """
 

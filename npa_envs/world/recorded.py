@@ -103,10 +103,6 @@ def run_recorded(
 
     Args:
         call: The rollout.
-        rules: The rule, or one of each species.
-        x: Positions at the beginning.
-        s: States at the beginning.
-        generator: Source of the draws.
         cuda_graph: Whether to record; True also records rules that are not plain.
 
     Raises:
@@ -331,7 +327,6 @@ class _Recording:
         """Record rollouts of a number of steps.
 
         Args:
-            steps: The number of steps.
             tensors: Worlds and weights that kernels are warmed up with.
 
         Raises:
@@ -402,11 +397,7 @@ class _Recording:
         return settings
 
     def _check_settings(self, begin: dict[tuple[int, str], Hashable]) -> None:
-        """Check that nothing but inputs has changed.
-
-        Raises:
-            NPAError: Something has.
-        """
+        """Check that nothing but inputs has changed."""
         now = self._settings()
         changed = {key[1] for key in begin.keys() | now.keys() if begin.get(key) != now.get(key)}
         # Of tensors their presence alone is noted.
@@ -610,10 +601,6 @@ def _run_recorded(
 
     Args:
         call: What is asked for.
-        rules: The rule, or one of each species.
-        x: Positions at the beginning [length units], shape [B, N, D].
-        s: States at the beginning, dimensionless, shape [B, N, C].
-        generator: Source of the draws.
         asked: The caller asks for a recording.
     """
     plain = [rule.has_network() for rule in rules]
@@ -650,11 +637,7 @@ def _replay_blocks(
     tensors: Sequence[Tensor],
     generator: Randomness | None,
 ) -> Particles:
-    """Replay the graphs of a rollout one after the other; what the network writes is written.
-
-    Raises:
-        NPAError: A position is not finite.
-    """
+    """Replay the graphs of a rollout one after the other; what the network writes is written."""
     x, s, *weights = tensors
     recording = lease.recording
     given = [x, s, recording.no_path, *weights]

@@ -25,7 +25,7 @@ from npa_envs.world.rollout import (
     result,
     rollout,
 )
-from npa_envs.world.species_step import SpeciesSpec
+from npa_envs.world.steps import SpeciesSpec
 
 SpeciesPerception = Literal["shared", "per_species"]
 
