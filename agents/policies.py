@@ -129,7 +129,7 @@ def interface_of(env: Any) -> Interface:
         physics.space_dim,
         physics.state_dim,
         physics.moving,
-        physics.state_scale,
+        physics.limits.state_scale,
         appended // (1 + physics.space_dim),
         getattr(worlds, "target_dim", 0),
     )

@@ -25,7 +25,7 @@ from npa_envs.errors import NPAError, shown
 from npa_envs.tasks.many_pictures import ManyPictures, named_targets
 from npa_envs.tasks.morphogenesis2d import Morphogenesis2DConfig
 from npa_envs.tasks.targets.clouds import Split
-from npa_envs.world.actions import Physics, find_neighbours
+from npa_envs.world.actions import Physics, build_neighbours
 from npa_envs.world.cuda_graph import to_device_async
 from npa_envs.world.randomness import WorldRandom
 
@@ -144,7 +144,7 @@ class PictureSpaces(ParticleSpaces):
         super().__init__(physics, config)
         assert isinstance(config, Pictures2DEnvConfig), "the environments' own configuration"
         columns = physics.perception_dim + config.target_dim
-        limit = physics.perception_limit
+        limit = physics.limits.perception
         self.observation_space = Box(-limit, limit, (config.particle_count, columns), np.float32)
 
 
@@ -186,7 +186,7 @@ class TargetWorlds(BatchedWorlds):
         """Start the next episodes of some worlds, [M], and write what is observed there."""
         index = to_device_async(worlds, self.device)
         start = self.start(index)
-        rows = find_neighbours(start.x, start.s, self.physics).perceive()
+        rows = build_neighbours(start.x, start.s, self.physics).perceive()
         observation[index] = self._with_target(rows, self._goal[index], None)
 
     def _with_target(self, rows: Tensor, goal: Tensor, out: Tensor | None) -> Tensor:

@@ -4,7 +4,8 @@ import torch
 from torch.utils._pytree import tree_leaves
 
 import npa_envs
-from npa_envs.ops.perceive import Terms, perceive_rows
+from npa_envs.ops.perceive import perceive_rows
+from npa_envs.ops.physics import Physics, Terms
 
 
 def tensors(*values):
@@ -106,16 +107,13 @@ def rows_of(
     x, s, mask=None, *, eps=0.3, eps0=None, box=None, terms=None, width=None, capacity=None
 ):
     """Perceive the active particles, by default in as many rows and columns as they need."""
-    terms = terms or Terms()
+    physics = Physics(x.shape[2], s.shape[2], eps, eps0 or eps, box, terms or Terms())
     active = x.shape[0] * x.shape[1] if mask is None else max(int(mask.sum()), 1)
     return perceive_rows(
         x,
         s,
+        physics,
         mask=mask,
         row_capacity=capacity or active,
-        row_width=width or terms.perception_dim(x.shape[2], s.shape[2]),
-        eps=eps,
-        eps0=eps0 or eps,
-        box=box,
-        terms=terms,
+        row_width=width or physics.perception_dim,
     )

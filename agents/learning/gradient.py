@@ -285,7 +285,7 @@ class EnvironmentTask:
         physics, config = self.physics, self.problem.config
         if self._clamped is None or self._clamped[0] is not rules:
             # Kept, as recorded rollouts know rules that are not plain by themselves.
-            limit = physics.state_scale
+            limit = physics.limits.state_scale
             self._clamped = rules, [ClampedRule(rule, limit) for rule in rules]
         clamped = self._clamped[1]
         common: dict[str, Any] = {

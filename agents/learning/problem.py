@@ -209,7 +209,7 @@ class Problem:
             physics.space_dim,
             physics.state_dim,
             physics.moving,
-            physics.state_scale,
+            physics.limits.state_scale,
             config.species_count if isinstance(config, SpeciesConfig) and by_species else 0,
         )
 

@@ -181,7 +181,7 @@ class SHACLearner:
         self._critic_optimizer = torch.optim.Adam(
             self.critic.parameters(), lr=options.critic_learning_rate, fused=True
         )
-        self._limits = problem.physics.position_limit, problem.physics.state_limit
+        self._limits = problem.physics.limits.position, problem.physics.limits.state
         self.window_count = count
         """Windows of an episode."""
         self._places = places.tolist()

@@ -20,7 +20,7 @@ from npa_envs.checks import (
 from npa_envs.devices import check_device
 from npa_envs.errors import NPAError, UnknownKeywordError, shown, suggest
 from npa_envs.render import STYLES
-from npa_envs.world.actions import MomentInverse, Physics
+from npa_envs.world.actions import Limits, MomentInverse, Physics, Terms
 
 Boundary = Literal["open", "periodic"]
 Reward = Literal["dense", "sparse", "particle", "marginal"]
@@ -183,17 +183,19 @@ class WorldConfig:
             state_dim=self.state_dim,
             eps=self.eps,
             eps0=self.eps0,
+            box=None if self.box is None else (self.box,) * space_dim,
+            terms=Terms(moment_inverse=self.moment_inverse),
+            moving=not static,
             max_displacement=self.alpha * self.eps,
-            state_scale=self.state_scale,
             update_prob=self.update_prob,
             dt=self.dt,
             position_noise=self.position_noise,
-            box=None if self.box is None else (self.box,) * space_dim,
-            moving=not static,
-            moment_inverse=self.moment_inverse,
-            perception_limit=self.observation_limit,
-            position_limit=self.position_limit,
-            state_limit=self.observation_limit,
+            limits=Limits(
+                state_scale=self.state_scale,
+                perception=self.observation_limit,
+                position=self.position_limit,
+                state=self.observation_limit,
+            ),
         )
 
     @property

@@ -17,7 +17,7 @@ from npa_envs.world.actions import Physics
 
 def observation_space(physics: Physics, particle_count: int) -> Box:
     """Return the space of a world's observations: float32, shape [N, P], ± the perception limit."""
-    limit = physics.perception_limit
+    limit = physics.limits.perception
     return Box(-limit, limit, (particle_count, physics.perception_dim), np.float32)
 
 

@@ -15,7 +15,7 @@ from npa_envs.envs.core.config import EnvConfig, WorldConfig
 from npa_envs.errors import NPAError
 from npa_envs.render import draw_worlds
 from npa_envs.tasks.base import GoalTask as TrainedWithGoals
-from npa_envs.world.credit import marginal_gains
+from npa_envs.world.actions import marginal_gains
 from npa_envs.world.randomness import StreamId, WorldRandom
 
 AnyConfig = TypeVar("AnyConfig", bound=WorldConfig)

@@ -37,9 +37,9 @@ from npa_envs.world.actions import (
     EpisodeRules,
     NeighbourState,
     PreparedJudgement,
-    find_neighbours,
+    build_neighbours,
+    with_mean_reward,
 )
-from npa_envs.world.credit import with_mean_reward
 from npa_envs.world.cuda_graph import (
     GraphedCallable,
     SideStream,
@@ -137,8 +137,8 @@ class WorldState:
         """
         given, physics = [], self.physics
         for name, value, width, limit, limit_name in (
-            ("x", x, physics.space_dim, physics.position_limit, "position_limit"),
-            ("s", s, physics.state_dim, physics.state_limit, "observation_limit"),
+            ("x", x, physics.space_dim, physics.limits.position, "position_limit"),
+            ("s", s, physics.state_dim, physics.limits.state, "observation_limit"),
         ):
             tensor = number_tensor(name, value).to(self.device, torch.float32)
             wanted = (world_count, particle_count, width)
@@ -317,7 +317,7 @@ class BatchedWorlds(WorldState):
 
     def _start_and_sort(self, worlds: Tensor) -> NeighbourState:
         start = self.start(worlds)
-        return find_neighbours(start.x, start.s, self.physics, places=worlds)
+        return build_neighbours(start.x, start.s, self.physics, places=worlds)
 
     @torch.no_grad()
     @makes_plain_tensors
@@ -354,7 +354,7 @@ class BatchedWorlds(WorldState):
     @makes_plain_tensors
     def perceive(self, out: Tensor | None = None) -> Tensor:
         """Return what is perceived in all worlds as they are, shape [B, N, P], written to `out`."""
-        return find_neighbours(self.x, self.s, self.physics).perceive(out)
+        return build_neighbours(self.x, self.s, self.physics).perceive(out)
 
     @torch.no_grad()
     @makes_plain_tensors
@@ -447,14 +447,14 @@ class BatchedWorlds(WorldState):
                 self._perceived = self.x.new_empty(*self.x.shape[:2], self.physics.perception_dim)
                 if self.world_count == 1 and self.task.config.output == "numpy":
                     self._host_perceived = pinned_like(self._perceived)
-            find_neighbours(self.x, self.s, self.physics).perceive(self._perceived)
+            build_neighbours(self.x, self.s, self.physics).perceive(self._perceived)
             if self._host_perceived is not None:
                 self._host_perceived.copy_(self._perceived, non_blocking=True)
 
     def _judge_and_sort(self) -> None:
         """Judge the worlds and, beside that, sort them."""
         with self._judging_beside():
-            self._surveyed = find_neighbours(self.x, self.s, self.physics)
+            self._surveyed = build_neighbours(self.x, self.s, self.physics)
 
     @contextlib.contextmanager
     def _judging_beside(self) -> Iterator[None]:
@@ -599,8 +599,8 @@ class BatchedWorlds(WorldState):
         physics, told = self.physics, []
         for world in diverged[:LARGEST_REPORT].tolist():
             numbers = torch.cat((self.x[world], self.s[world]), dim=1)
-            outside = self.x[world].abs() >= physics.position_limit
-            held = torch.cat((outside, self.s[world].abs() >= physics.state_limit), dim=1)
+            outside = self.x[world].abs() >= physics.limits.position
+            held = torch.cat((outside, self.s[world].abs() >= physics.limits.state), dim=1)
             line = f"world {world} in step {int(self.elapsed[world])}"
             if bool(held.any()):
                 particle, entry = held.nonzero()[0].tolist()
@@ -613,8 +613,8 @@ class BatchedWorlds(WorldState):
         if len(diverged) > LARGEST_REPORT:
             told.append(f"and {len(diverged) - LARGEST_REPORT} more worlds")
         return (
-            f"numbers must stay within position_limit = {physics.position_limit:g} and "
-            f"observation_limit = {physics.state_limit:g}, but left them in {'; '.join(told)}: "
+            f"numbers must stay within position_limit = {physics.limits.position:g} and "
+            f"observation_limit = {physics.limits.state:g}, but left them in {'; '.join(told)}: "
             "take smaller actions, raise the limits, or choose on_divergence='terminate' or 'reset'"
         )
 

@@ -97,8 +97,8 @@ class BrushedWorlds(BatchedWorlds):
         physics = self.physics
         diverged = torch.zeros_like(self._diverged, dtype=torch.bool)
         for mine, new, limit in (
-            (self.x, x, physics.position_limit),
-            (self.s, s, physics.state_limit),
+            (self.x, x, physics.limits.position),
+            (self.s, s, physics.limits.state),
         ):
             # NaN is not within any limit.
             diverged |= ~(new.abs() < limit).flatten(1).all(dim=1)

@@ -59,7 +59,7 @@ class AgentsEnv:
         word, count = ("particle", sum(played)) if by_particle else ("species", len(played))
         self.possible_agents = [f"{word}_{k}" for k in range(count)]
         """Names of the agents."""
-        limit = worlds.physics.perception_limit
+        limit = worlds.physics.limits.perception
         self._observation_spaces: dict[str, Box] = {}
         self._action_spaces: dict[str, Box] = {}
         for agent, span in zip(self.possible_agents, episodes.spans[:count], strict=True):
@@ -113,8 +113,8 @@ class AgentsEnv:
 
 def state_space(physics: Physics, particle_count: int) -> Box:
     """Return the space of [position ; state ; present] of N particles, [N, D + C + 1], float32."""
-    places = [physics.position_limit] * physics.space_dim
-    high = np.array([*places, *[physics.state_limit] * physics.state_dim, 1.0], np.float32)
+    places = [physics.limits.position] * physics.space_dim
+    high = np.array([*places, *[physics.limits.state] * physics.state_dim, 1.0], np.float32)
     low = np.append(-high[:-1], np.float32(0.0))
     shape = (particle_count, 1)
     return Box(np.tile(low, shape), np.tile(high, shape), dtype=np.float32)

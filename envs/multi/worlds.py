@@ -24,7 +24,7 @@ from npa_envs.world.actions import (
     Actions,
     NeighbourState,
     Physics,
-    find_neighbours,
+    build_neighbours,
     perceive_each_species,
 )
 from npa_envs.world.cuda_graph import (
@@ -202,8 +202,8 @@ class AgentReferee:
         told = [f"{word}_{agent} of world {world}" for world, agent in places[:LARGEST_REPORT]]
         more = f" and {len(places) - len(told)} more" if len(places) > len(told) else ""
         return (
-            f"agents must have a particle within position_limit = {physics.position_limit:g} and "
-            f"observation_limit = {physics.state_limit:g}, but {', '.join(told)}{more} had none "
+            f"agents must have a particle within position_limit = {physics.limits.position:g} and "
+            f"observation_limit = {physics.limits.state:g}, but {', '.join(told)}{more} had none "
             f"after step {int(self.worlds.elapsed[places[0, 0]])}: take smaller actions, raise the "
             "limits, or choose on_divergence='terminate'"
         )
@@ -596,15 +596,15 @@ class Cohort:
 
     def _look_around(self) -> None:
         x, s, physics = self.population.x, self.population.s, self._judge.physics
-        inside = (s.abs() < physics.state_limit).all(dim=-1)
+        inside = (s.abs() < physics.limits.state).all(dim=-1)
         # In a box nobody gets to the bound but by wrapping onto an edge that may lie there.
         if physics.box is None:
-            inside &= (x.abs() < physics.position_limit).all(dim=-1)
+            inside &= (x.abs() < physics.limits.position).all(dim=-1)
         # Sums of ones are exact in any order.
         count = torch.zeros(len(inside), self._judge.agent_count, device=inside.device)
         self.gone = count.index_add_(1, self._owners, inside.float()) == 0.0
         self.parts = self.measured()
-        self._surveyed = find_neighbours(x, s, physics)
+        self._surveyed = build_neighbours(x, s, physics)
 
 
 class AgentLosses:
@@ -647,7 +647,7 @@ class AgentLosses:
         already are not sorted again.
         """
         x, s, physics = population.x, population.s, self.physics
-        seen = (surveyed or find_neighbours(x, s, physics)).perceive()
+        seen = (surveyed or build_neighbours(x, s, physics)).perceive()
         if self.task.config.perception == "per_species":
             apart = perceive_each_species(x, population.counts, physics)
             seen = torch.cat((seen, apart), dim=-1)

@@ -54,7 +54,6 @@ def make_wide_load(value_type: type, scalar: type) -> Any:
 
     Args:
         value_type: A scalar, vector or matrix type.
-        scalar: The scalar type that it is made of, `wp.int32` included.
     """
 
     @native.func_native()
@@ -86,7 +85,6 @@ def make_read_at(value_type: type, scalar: type, alignment: int) -> Any:
 
     Args:
         value_type: A vector type of a multiple of `alignment` bytes.
-        scalar: The scalar type that it is made of.
         alignment: Bytes that the place is a multiple of in memory, and that a load takes: 4, 8
             or 16.
     """
@@ -103,7 +101,6 @@ def make_read_channels(value_type: type, scalar: type) -> Any:
 
     Args:
         value_type: A vector type.
-        scalar: The scalar type that it is made of.
     """
     count = value_type._length_
     alignment = min(wp.types.type_size_in_bytes(value_type), 16)
@@ -136,7 +133,6 @@ def make_write_at(value_type: type, scalar: type) -> Any:
 
     Args:
         value_type: A vector type of a multiple of 16 bytes; the place is one, too, in memory.
-        scalar: The scalar type that it is made of.
     """
 
     @native.func_native()
@@ -162,7 +158,6 @@ def make_lane_sum(
 
     Args:
         value_type: A scalar, vector or matrix type.
-        scalar: The scalar type that it is made of.
         lanes: Lanes of a particle, 1 on the CPU.
         whole_warps: All threads of a warp call it together, which takes fewer instructions.
         stride: Every so-manyth lane is added, a power of two.
@@ -183,7 +178,6 @@ def make_lane_collect(value_type: type, scalar: type, lanes: int) -> Any:
 
     Args:
         value_type: A matrix [D, W] type; W is a multiple of `lanes`.
-        scalar: The scalar type that it is made of.
         lanes: Lanes of a particle, 1 on the CPU.
     """
     rows, width = value_type._shape_

@@ -56,7 +56,6 @@ def make_add_scaled(group: type, scalar: type) -> Any:
 
     Args:
         group: A vector type, of 4, 8 or 16 channels.
-        scalar: The scalar type that it is made of.
     """
 
     @native.func_native()

@@ -229,11 +229,7 @@ def make_domain(
     """Return the `Domain` of worlds of `particle_count` particles.
 
     Args:
-        space_dim: Space dimension D, 2 or 3.
         scalar: `wp.float32` or `wp.float64`.
-        eps: Perception radius [length units].
-        box: Sides of the periodic box [length units], or None in open space.
-        particle_count: Particles in each world N.
         cell_reach: Cells on each side of a cell in which its neighbours lie; a cell is
             eps / cell_reach wide.
     """

@@ -178,7 +178,6 @@ def make_corrected(space_dim: int, scalar: type, width: int, moment_inverse: str
     """Return a Warp function that multiplies state gradients [D, width] by an inverse of M.
 
     Args:
-        space_dim: Space dimension D, 2 or 3.
         scalar: `wp.float32` or `wp.float64`.
         width: Channels.
         moment_inverse: "smooth", or "threshold": gradients stay as they are where M is singular.

@@ -105,7 +105,6 @@ class DriverLaunch:
 
     Args:
         launch: What `wp.launch` returns with `record_cmd=True`, on CUDA.
-        device: Its device.
         addresses: Addresses of the kernel's parameters.
     """
 

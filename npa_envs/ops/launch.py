@@ -146,9 +146,7 @@ class _Arguments:
     Warp's own launch makes all of them anew, which takes the host ten times longer.
 
     Args:
-        kernel: The kernel.
         size: Number of threads along each dimension.
-        device: Device of every tensor among the arguments.
         block_dim: Threads of a CUDA block.
         arguments: Its arguments, with `range_start` where the kernel has it.
     """
@@ -374,10 +372,6 @@ class PreparedLaunch:
     """A launch that is made again and again with one tensor changed.
 
     Args:
-        kernel: As for `launch`.
-        size: As for `launch`.
-        device: As for `launch`.
-        arguments: As for `launch`.
         changing: The tensor among them that changes; all others stay alive, where they are.
     """
 

@@ -20,7 +20,6 @@ def average_sums(partial_sums: Tensor, value_count: int, like: Tensor) -> Tensor
     Args:
         partial_sums: Float64, shape [B, L, K].
         value_count: How many values they sum.
-        like: A tensor of the means' dtype, on their device.
 
     Returns:
         The means, shape [B, K].

@@ -15,28 +15,11 @@ from npa_envs.kernels.portable.density import density_kernels
 from npa_envs.kernels.portable.perceive import perception_kernels
 from npa_envs.ops.backend import Listing
 from npa_envs.ops.launch import launch
+from npa_envs.ops.physics import Terms
 from npa_envs.ops.sort import KernelPlan, SortedWorlds, density_scale
 
 LISTS_TOGETHER = 32
 """Neighbour lists that lie together."""
-
-
-class Terms(NamedTuple):
-    """Which groups of the perception vector a rule reads: the others are not computed."""
-
-    state_gradient: bool = True
-    moment_inverse: str | None = "threshold"
-    density_gradient: bool = True
-
-    @property
-    def correction(self) -> str | None:
-        """How the state gradient is corrected, "threshold" or "smooth"; None: not at all."""
-        return self.moment_inverse if self.state_gradient else None
-
-    def perception_dim(self, space_dim: int, state_dim: int) -> int:
-        """Length P of a perception vector with these groups."""
-        gradients = state_dim * space_dim * self.state_gradient
-        return 2 * state_dim + gradients + space_dim * self.density_gradient
 
 
 class NeighbourLists(NamedTuple):

@@ -16,9 +16,7 @@ from npa_envs.checks import (
     Box,
     MomentInverse,
     check_finite_positions,
-    check_scale,
     check_world,
-    checked_box,
     checked_eps,
     checked_flag,
     checked_moment_inverse,
@@ -29,12 +27,12 @@ from npa_envs.ops.backend import batch_listing
 from npa_envs.ops.launch import PreparedLaunch, launch
 from npa_envs.ops.opaque import check_derivatives, once_differentiable, opaque
 from npa_envs.ops.passes import (
-    Terms,
     compute_densities,
     compute_density_gradients,
     perception_launch,
     portable_kernels,
 )
+from npa_envs.ops.physics import Physics, Terms, physics
 from npa_envs.ops.sort import make_plan, sort_worlds
 from npa_envs.ops.static import StaticRows, StaticTensors, StaticWorlds, all_rows, static_worlds
 
@@ -100,10 +98,10 @@ def perceive(
     """
     check_world(x, s)
     check_derivatives(x=x, s=s)
-    radius = checked_eps("eps", eps, x.shape[2], x.dtype)
-    radius0 = radius if eps0 is None else checked_eps("eps0", eps0, x.shape[2], x.dtype)
-    check_scale(radius, radius0, x.shape[2], x.dtype)
-    sides = checked_box(box, x.shape[2], radius, x.dtype)
+    space_dim, state_dim = x.shape[2], s.shape[2]
+    if eps0 is not None:
+        eps0 = checked_eps("eps0", eps0, space_dim, x.dtype)
+    made = physics(space_dim, state_dim, x.dtype, eps=eps, eps0=eps0, box=box)
     check_finite_positions(x)
     inverse = checked_moment_inverse(moment_inverse)
     terms = Terms(
@@ -114,13 +112,10 @@ def perceive(
     perception, rows = perceive_rows(
         x.detach() if checked_flag("detach_positions", detach_positions) else x,
         s,
+        made._replace(terms=terms),
         mask=None,
         row_capacity=x.shape[0] * x.shape[1],
-        row_width=terms.perception_dim(x.shape[2], s.shape[2]),
-        eps=radius,
-        eps0=radius0,
-        box=sides,
-        terms=terms,
+        row_width=terms.perception_dim(space_dim, state_dim),
     )
     return perception.index_select(0, rows.row_of).view(*x.shape[:2], -1)
 
@@ -149,13 +144,12 @@ def perception_fields(
     terms = Terms(moment_inverse=checked_moment_inverse(moment_inverse))
     check_world(x, s)
     check_derivatives(x=x, s=s)
-    radius = checked_eps("eps", eps, x.shape[2], x.dtype)
-    sides = checked_box(box, x.shape[2], radius, x.dtype)
+    made = physics(x.shape[2], s.shape[2], x.dtype, eps=eps, box=box)
     check_finite_positions(x)
     x, s = x.contiguous(), s.contiguous()
     world_count, particle_count, space_dim = x.shape
     state_dim = s.shape[2]
-    plan = make_plan(x, x.shape, state_dim, x.shape[0] * x.shape[1], False, radius, sides)
+    plan = make_plan(x, x.shape, state_dim, x.shape[0] * x.shape[1], False, made.eps, made.box)
     ordered = sort_worlds(plan, x, s, None)
     densities = compute_density_gradients(plan, ordered, terms)
     fields = PerceptionFields(
@@ -183,9 +177,6 @@ def perception_fields(
     return PerceptionFields(
         *(field.view(world_count, particle_count, *field.shape[1:]) for field in fields)
     )
-
-
-__all__ = ["Rows", "Terms", "perceive_rows"]
 
 
 class Rows(NamedTuple):
@@ -322,21 +313,11 @@ def _(
     return x.new_empty(row_capacity, row_width), kernel_sum
 
 
-class PerceptionOptions(NamedTuple):
-    """Everything about a call of `perceive_rows` but its tensors, checked."""
-
-    row_capacity: int
-    """Rows K of the result; active particles beyond it are left out."""
-    row_width: int
-    """Columns of a row, at least P: a one follows the perception vector, then zeros."""
-    eps: float
-    """Perception radius [length units]."""
-    scale: float
-    """c = eps / eps0, dimensionless."""
-    box: list[float] | None
-    """Sides of the periodic box [length units], or None in open space."""
-    terms: Terms
-    """Groups of the perception vector."""
+def _numbers(
+    physics: Physics,
+) -> tuple[float, float, list[float] | None, bool, str | None, bool]:
+    """Return what operators take of the constants, flat."""
+    return constant(physics.eps), physics.scale(), physics.sides(), *physics.terms
 
 
 class _PerceiveRows(torch.autograd.Function):
@@ -348,26 +329,28 @@ class _PerceiveRows(torch.autograd.Function):
         x: Tensor,
         s: Tensor,
         mask: Tensor | None,
-        options: PerceptionOptions,
+        row_capacity: int,
+        row_width: int,
+        physics: Physics,
     ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         row_source, *tensors = _perceive_rows(
-            x, s, mask, *options[:-1], *options.terms, for_adjoint=True
+            x, s, mask, row_capacity, row_width, *_numbers(physics), for_adjoint=True
         )
         saved = SavedPerception(*tensors)
         ctx.mark_non_differentiable(saved.row_of, row_source, saved.starts)
         ctx.set_materialize_grads(False)
         kept = saved if ctx.needs_input_grad[0] else saved[:-1]
-        _save(ctx, kept, (), s, mask is not None, options)
+        _save(ctx, kept, (), s, mask is not None, physics)
         return saved.perception, saved.row_of, row_source, saved.starts
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, *bars: Tensor | None) -> tuple[Tensor | None, ...]:
         if bars[0] is None:
-            return None, None, None, None
+            return None, None, None, None, None, None
         states_bar, positions_bar = _pull_back(ctx, bars[0])
         x_bar = positions_bar.view(*states_bar.shape[:2], -1) if ctx.needs_input_grad[0] else None
-        return x_bar, states_bar, None, None
+        return x_bar, states_bar, None, None, None, None
 
 
 class _PerceiveStatic(torch.autograd.Function):
@@ -381,7 +364,9 @@ class _PerceiveStatic(torch.autograd.Function):
         masked: bool,
         static: StaticWorlds,
         rows: StaticRows,
-        options: PerceptionOptions,
+        row_capacity: int,
+        row_width: int,
+        physics: Physics,
     ) -> Tensor:
         tensors = static.tensors
         perception: Tensor
@@ -391,8 +376,9 @@ class _PerceiveStatic(torch.autograd.Function):
             list(rows),
             tensors.flat(),
             masked,
-            *options[:-1],
-            *options.terms,
+            row_capacity,
+            row_width,
+            *_numbers(physics),
             for_adjoint=ctx.needs_input_grad[0],
         )
         if ctx.needs_input_grad[0]:
@@ -406,13 +392,13 @@ class _PerceiveStatic(torch.autograd.Function):
                 row_kernel_sum=kernel_sum,
             )
             listed = () if tensors.listed is None else tensors.listed
-            _save(ctx, saved[:-1], listed, s, masked, options)
+            _save(ctx, saved[:-1], listed, s, masked, physics)
         return perception
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, bar: Tensor) -> tuple[Tensor | None, ...]:
-        return _pull_back(ctx, bar)[0], None, None, None, None, None
+        return _pull_back(ctx, bar)[0], *[None] * 7
 
 
 def _save(
@@ -421,17 +407,17 @@ def _save(
     listed: tuple[Tensor, ...],
     s: Tensor,
     masked: bool,
-    options: PerceptionOptions,
+    physics: Physics,
 ) -> None:
     """Save what `_pull_back` reads."""
-    ctx.options, ctx.shape, ctx.masked = options, s.shape, masked
+    ctx.physics, ctx.shape, ctx.masked = physics, s.shape, masked
     ctx.saved_count = len(tensors)
     ctx.save_for_backward(*tensors, *listed)
 
 
 def _pull_back(ctx: Any, bar: Tensor) -> tuple[Tensor, Tensor]:
     """Return the cotangents of states, [B, N, C], and of positions, [B N, D] or empty."""
-    options, shape = ctx.options, ctx.shape
+    physics, shape = ctx.physics, ctx.shape
     # Read once: unpacking recomputes what a checkpoint has left out.
     tensors = list(ctx.saved_tensors)
     states_bar, positions_bar = perceive_rows_backward(
@@ -441,11 +427,11 @@ def _pull_back(ctx: Any, bar: Tensor) -> tuple[Tensor, Tensor]:
         particle_count=shape[1],
         state_dim=shape[2],
         masked=ctx.masked,
-        eps=options.eps,
-        scale=options.scale,
-        box=options.box,
-        state_gradient=options.terms.state_gradient,
-        density_gradient=options.terms.density_gradient,
+        eps=constant(physics.eps),
+        scale=physics.scale(),
+        box=physics.sides(),
+        state_gradient=physics.terms.state_gradient,
+        density_gradient=physics.terms.density_gradient,
     )
     return states_bar.view(shape), positions_bar
 
@@ -453,29 +439,20 @@ def _pull_back(ctx: Any, bar: Tensor) -> tuple[Tensor, Tensor]:
 def perceive_rows(
     x: Tensor,
     s: Tensor,
+    physics: Physics,
     *,
     mask: Tensor | None,
     row_capacity: int,
     row_width: int,
-    eps: float,
-    eps0: float,
-    box: tuple[float, ...] | None,
-    terms: Terms,
     static: StaticWorlds | None = None,
     static_rows: StaticRows | None = None,
 ) -> tuple[Tensor, Rows]:
     """Perceive the active particles of checked worlds.
 
     Args:
-        x: Positions [length units], shape [B, N, D]; gradients flow into it if it requires them.
-        s: States, dimensionless, shape [B, N, C].
         mask: Which particles are active, uint8, shape [B, N], or None for all.
         row_capacity: Rows K of the result; active particles beyond it are left out.
         row_width: Columns of a row, at least P: a one follows the perception vector, then zeros.
-        eps: Perception radius [length units].
-        eps0: Radius at which the rule was trained [length units].
-        box: Sides of the periodic box [length units], or None in open space.
-        terms: Groups of the perception vector.
         static: What `prepare_static` returned of worlds that stay where they are; x and s are then
             in its order, no gradient flows into x, and the mask is not read.
         static_rows: Rows of the active particles of static worlds, or None for all.
@@ -485,24 +462,22 @@ def perceive_rows(
         and which particles they stand for.
     """
     x, s = x.contiguous(), s.contiguous()
-    sides = None if box is None else [constant(side) for side in box]
-    eps, eps0 = constant(eps), constant(eps0)
-    options = PerceptionOptions(row_capacity, row_width, eps, eps / eps0, sides, terms)
+    options = row_capacity, row_width, physics
     if static is not None:
         rows = all_rows(static, x) if static_rows is None else static_rows
         masked = static_rows is not None
-        perception = _PerceiveStatic.apply(s, x.detach(), masked, static, rows, options)  # type: ignore[no-untyped-call]
+        perception = _PerceiveStatic.apply(s, x.detach(), masked, static, rows, *options)  # type: ignore[no-untyped-call]
         row_base = x.shape[0] * x.shape[1] if masked else 0
         return perception, Rows(rows.row_of, rows.row_source, rows.starts, row_base)
     row_base = 0 if mask is None else x.shape[0] * x.shape[1]
     if not (torch.is_grad_enabled() and (x.requires_grad or s.requires_grad)):
         row_source, *tensors = _perceive_rows(
-            x, s, mask, *options[:-1], *options.terms, for_adjoint=False
+            x, s, mask, row_capacity, row_width, *_numbers(physics), for_adjoint=False
         )
         saved = SavedPerception(*tensors)
         return saved.perception, Rows(saved.row_of, row_source, saved.starts, row_base)
     perception, row_of, row_source, starts = _PerceiveRows.apply(  # type: ignore[no-untyped-call]
-        x, s, mask, options
+        x, s, mask, *options
     )
     return perception, Rows(row_of, row_source, starts, row_base)
 
@@ -514,27 +489,20 @@ ROWS_TOGETHER = 2**22
 def update_some_at_a_time(
     x: Tensor,
     s: Tensor,
+    physics: Physics,
     mask: Tensor | None,
     network: Callable[[Tensor], Tensor],
-    options: PerceptionOptions,
+    row_capacity: int,
+    row_width: int,
 ) -> tuple[Tensor, Rows]:
     """Map the perception of huge worlds to updates, `ROWS_TOGETHER` rows at a time.
 
     All rows of perception together would take most of the memory. The numbers are those that
-    `perceive_rows` and the network give. Not differentiable.
-
-    Args:
-        x: Positions [length units], shape [B, N, D].
-        s: States, dimensionless, shape [B, N, C].
-        mask: Which particles are active, uint8, shape [B, N]; None: all.
-        network: Maps rows of perception [K, row_width] to updates [K, A'], row by row.
-        options: What `perceive_rows` is asked for.
-
-    Returns:
-        Updates, dimensionless, shape [row_capacity, A'], and which particles they stand for.
+    `perceive_rows` and the network give, which maps rows [K, row_width] to updates [K, A'] row by
+    row. Not differentiable.
     """
     x, s = x.detach().contiguous(), s.detach().contiguous()
-    row_capacity, row_width, eps, scale, box, terms = options
+    eps, box, terms = physics.eps, physics.box, physics.terms
     plan = make_plan(x, x.shape, s.shape[2], row_capacity, mask is not None, eps, box)
     ordered = sort_worlds(plan, x, s, mask)
     densities = compute_densities(plan, ordered, terms, plan.listing, with_particles=False)
@@ -548,7 +516,7 @@ def update_some_at_a_time(
                 ordered,
                 densities,
                 terms,
-                scale,
+                physics.scale(),
                 some,
                 first_row=first,
                 row_count=len(some),
@@ -571,7 +539,6 @@ class NeighbourState:
     Args:
         launch_of: Returns what to give to a launch that writes rows into a tensor, [B N, P].
         shape: Shape of what is perceived, [B, N, P].
-        like: A tensor of its dtype and on its device.
     """
 
     def __init__(
@@ -601,33 +568,17 @@ class NeighbourState:
 
 
 def build_neighbours(
-    x: Tensor,
-    s: Tensor,
-    *,
-    eps: float,
-    eps0: float,
-    box: tuple[float, ...] | None,
-    terms: Terms,
-    limit: float,
-    places: Tensor | None = None,
+    x: Tensor, s: Tensor, physics: Physics, places: Tensor | None = None
 ) -> NeighbourState:
-    """Sort checked worlds and compute their densities.
+    """Sort checked worlds into cells and compute densities; valid until x or s change.
 
-    The result may read `s` where it is: it serves until the states change.
-
-    Args:
-        x: Positions [length units], shape [B, N, D].
-        s: States, dimensionless, shape [B, N, C].
-        eps: Perception radius [length units].
-        eps0: Radius at which the rule was trained [length units].
-        box: Sides of the periodic box [length units], or None in open space.
-        terms: Groups of the perception vector.
-        limit: Entries are clipped to plus and minus this, positive.
-        places: Which worlds of a larger batch these are, in whose rows their perception is written,
-            int64, shape [B]; default: a batch of their own.
+    `places` are the worlds' places in a larger batch, in whose rows their perception is written,
+    int64, shape [B]; default: a batch of their own.
     """
     x, s = x.contiguous(), s.contiguous()
-    plan = make_plan(x, x.shape, s.shape[2], x.shape[0] * x.shape[1], False, eps, box)
+    plan = make_plan(
+        x, x.shape, s.shape[2], x.shape[0] * x.shape[1], False, physics.eps, physics.box
+    )
     listed = plan.lists_neighbours
     in_place = listed and plan.state_dim % plan.width == 0 and s.data_ptr() % 16 == 0
     ordered = sort_worlds(plan, x, None if in_place else s, None, with_rows=not listed)
@@ -636,7 +587,7 @@ def build_neighbours(
     densities = compute_densities(
         plan,
         ordered,
-        terms,
+        physics.terms,
         batch_listing(plan.request),
         state_place=ordered.source if in_place else None,
         with_particles=False,
@@ -651,13 +602,12 @@ def build_neighbours(
             plan,
             ordered,
             densities,
-            terms,
-            eps / eps0,
+            physics.terms,
+            physics.scale(),
             rows,
             states=s if in_place else None,
             destination=destination,
-            limit=limit,
+            limit=physics.limits.perception,
         )
 
-    perception_dim = terms.perception_dim(plan.space_dim, plan.state_dim)
-    return NeighbourState(launch_of, (*x.shape[:2], perception_dim), x)
+    return NeighbourState(launch_of, (*x.shape[:2], physics.perception_dim), x)

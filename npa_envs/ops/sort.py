@@ -61,8 +61,6 @@ class KernelPlan(NamedTuple):
 
         Args:
             operator: The operator.
-            aligned: As in `KernelRequest`.
-            position_gradient: As in `KernelRequest`.
         """
         request = self.request
         if not aligned or position_gradient:

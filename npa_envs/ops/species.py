@@ -12,9 +12,7 @@ from torch import Tensor
 from npa_envs.checks import (
     Box,
     check_finite_positions,
-    check_scale,
     check_world,
-    checked_box,
     checked_count,
     checked_eps,
     entries,
@@ -24,6 +22,7 @@ from npa_envs.kernels.portable.species import species_kernel
 from npa_envs.ops.launch import launch, scalar_type
 from npa_envs.ops.opaque import check_derivatives, opaque
 from npa_envs.ops.perceive import perceive
+from npa_envs.ops.physics import Physics, physics
 from npa_envs.ops.sort import density_scale, make_plan, sort_worlds
 
 MOST_SPECIES = 64
@@ -116,33 +115,19 @@ def _(x: Tensor, counts: list[int], *rest: Any) -> tuple[Tensor, Tensor]:
     return x.new_empty(shape), x.new_empty(*shape, x.shape[2])
 
 
-def perceive_by_species(
-    x: Tensor,
-    counts: tuple[int, ...],
-    *,
-    eps: float,
-    eps0: float,
-    box: tuple[float, ...] | None,
-) -> Tensor:
+def perceive_by_species(x: Tensor, counts: tuple[int, ...], physics: Physics) -> Tensor:
     """Return what checked worlds perceive of each species, scaled, shape [B, N, K (1 + D)].
 
-    Args:
-        x: Positions [length units], shape [B, N, D]; no gradient flows into them.
-        counts: Particles of each species; one may have none.
-        eps: Perception radius [length units].
-        eps0: Radius at which the rules were trained [length units].
-        box: Sides of the periodic box [length units], or None in open space.
-
-    Returns:
-        c^D ρ_k / N of each species, then L(c^(1+D) ∇ρ_k / N) of each, species by species.
+    That is c^D ρ_k / N of each species, then L(c^(1+D) ∇ρ_k / N) of each, species by species. A
+    species may have no particles. No gradient flows into positions.
     """
-    scale = eps / eps0
+    scale = physics.scale()
     particle_count, space_dim = x.shape[1:]
     density, gradient = _gather_species(
         x.detach().contiguous(),
         list(counts),
-        eps,
-        None if box is None else list(box),
+        physics.eps,
+        physics.sides(),
         scale**space_dim / particle_count,
         density_scale(scale, space_dim, particle_count),
         True,
@@ -172,18 +157,11 @@ def species_fields(
     check_world(x, x)
     check_derivatives(x=x)
     checked = checked_counts(counts, x.shape[1])
-    radius = checked_eps("eps", eps, x.shape[2], x.dtype)
-    sides = checked_box(box, x.shape[2], radius, x.dtype)
+    made = physics(x.shape[2], 1, x.dtype, eps=eps, box=box)
     check_finite_positions(x)
     return SpeciesFields(
         *_gather_species(
-            x.detach().contiguous(),
-            list(checked),
-            radius,
-            None if sides is None else list(sides),
-            1.0,
-            1.0,
-            False,
+            x.detach().contiguous(), list(checked), made.eps, made.sides(), 1.0, 1.0, False
         )
     )
 
@@ -221,10 +199,9 @@ def perceive_species(
     check_world(x, s)
     check_derivatives(x=x, s=s)
     checked = checked_counts(counts, x.shape[1])
-    radius = checked_eps("eps", eps, x.shape[2], x.dtype)
-    radius0 = radius if eps0 is None else checked_eps("eps0", eps0, x.shape[2], x.dtype)
-    check_scale(radius, radius0, x.shape[2], x.dtype)
-    sides = checked_box(box, x.shape[2], radius, x.dtype)
-    shared = perceive(x, s, radius, radius0, sides, detach_positions)
-    appended = perceive_by_species(x, checked, eps=radius, eps0=radius0, box=sides)
+    if eps0 is not None:
+        eps0 = checked_eps("eps0", eps0, x.shape[2], x.dtype)
+    made = physics(x.shape[2], s.shape[2], x.dtype, eps=eps, eps0=eps0, box=box)
+    shared = perceive(x, s, made.eps, made.eps0, made.box, detach_positions)
+    appended = perceive_by_species(x, checked, made)
     return torch.cat((shared, appended), dim=-1)

@@ -19,9 +19,9 @@ from npa_envs.ops.passes import (
     Densities,
     ListedNeighbours,
     NeighbourLists,
-    Terms,
     compute_densities,
 )
+from npa_envs.ops.physics import Physics, Terms
 from npa_envs.ops.sort import (
     KernelPlan,
     SortedWorlds,
@@ -76,17 +76,6 @@ class StaticWorlds(NamedTuple):
 
     tensors: StaticTensors
     """What perception needs of positions."""
-
-    def sort(self, values: Tensor) -> Tensor:
-        """Return values of particles, [B, N, ...], in sorted order; differentiable."""
-        return self._gather(values, self.tensors.source)
-
-    def unsort(self, values: Tensor) -> Tensor:
-        """Return values of sorted particles, [B, N, ...], in the caller's order; differentiable."""
-        return self._gather(values, self.tensors.place)
-
-    def _gather(self, values: Tensor, index: Tensor) -> Tensor:
-        return values.flatten(0, 1).index_select(0, index).view_as(values)
 
 
 @opaque("npa::prepare_static")
@@ -177,27 +166,10 @@ def _(
     ).flat()
 
 
-def prepare_static(
-    x: Tensor,
-    state_dim: int,
-    *,
-    eps: float,
-    box: tuple[float, ...] | None,
-    terms: Terms,
-) -> StaticWorlds:
-    """Sort checked worlds whose particles will not move, and list their neighbours.
-
-    No gradient flows into positions.
-
-    Args:
-        x: Positions [length units], shape [B, N, D].
-        state_dim: State channels C.
-        eps: Perception radius [length units].
-        box: Sides of the periodic box [length units], or None in open space.
-        terms: Groups of the perception vector.
-    """
+def prepare_static(x: Tensor, physics: Physics) -> StaticWorlds:
+    """Sort checked worlds whose particles do not move, and list their neighbours; no gradient."""
     tensors = _prepare_static(
-        x.detach().contiguous(), state_dim, eps, None if box is None else list(box), *terms
+        x.detach().contiguous(), physics.state_dim, physics.eps, physics.sides(), *physics.terms
     )
     return StaticWorlds(StaticTensors.of(tensors))
 
@@ -265,8 +237,6 @@ def static_rows(
     """Give the active particles of each of some steps rows, all steps at once.
 
     Args:
-        worlds: The worlds.
-        x: Positions in sorted order [length units], contiguous, shape [B, N, D].
         masks: Each step's active particles in the caller's order, uint8, shape [B, N].
         row_capacity: Rows K on CUDA; active particles beyond them get none. On a CPU each step has
             as many as it needs, at least one.
@@ -302,11 +272,7 @@ def static_worlds(
     """Return what the perception pass of a step reads.
 
     Args:
-        plan: Plan of the call.
         tensors: What was prepared.
-        rows: The step's rows.
-        x: Positions in sorted order [length units], shape [B, N, D].
-        s: States in sorted order, dimensionless, shape [B, N, C].
     """
     lists = None
     if plan.lists_neighbours:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -21,6 +21,7 @@ from npa_envs.kernels.portable.update import (
 from npa_envs.ops.launch import PreparedLaunch, launch, scalar_type
 from npa_envs.ops.opaque import check_derivatives, once_differentiable, opaque
 from npa_envs.ops.perceive import Rows
+from npa_envs.ops.physics import Limits, Physics
 from npa_envs.ops.sort import LARGEST_INDEX
 
 
@@ -165,30 +166,21 @@ def update_particles(
     x: Tensor,
     s: Tensor,
     path_length: Tensor,
-    *,
     rows: Rows,
-    max_displacement: float,
-    dt: float,
-    moving: bool,
-    box: tuple[float, ...] | None,
+    physics: Physics,
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Apply a rule's outputs to the particles that have rows.
+    """Return positions, states and path lengths after a rule's updates of the rows' particles.
 
-    Args:
-        update: Raw updates [δ (D) ; Δs (C)], dimensionless, shape [K, A] or wider; the columns
-            beyond A are not read.
-        x: Positions [length units], shape [B, N, D].
-        s: States, dimensionless, shape [B, N, C].
-        path_length: Length of each particle's path so far [length units], shape [B, N].
-        rows: Which particles the rows stand for.
-        max_displacement: Largest displacement alpha eps of a unit step [length units].
-        dt: Time step, dimensionless.
-        moving: Updates begin with δ; otherwise there is none and positions stay.
-        box: Sides of the periodic box, into which positions are wrapped, or None.
+    `update` is [δ (D) ; Δs (C)], dimensionless, shape [K, A] or wider; the columns beyond A are
+    not read.
     """
     x, s = x.contiguous(), s.contiguous()
-    sides = None if box is None else [constant(side) for side in box]
-    options = (constant(max_displacement), constant(dt), moving, sides)
+    options = (
+        constant(physics.max_displacement),
+        constant(physics.dt),
+        physics.moving,
+        physics.sides(),
+    )
     tensors = (update, x, s, path_length)
     if not (torch.is_grad_enabled() and any(tensor.requires_grad for tensor in tensors)):
         return _update_particles(*tensors, rows.row_of, *options)
@@ -200,32 +192,12 @@ def wrapped(x: Tensor, box: tuple[float, ...] | None) -> Tensor:
     """Return a copy of positions, wrapped into the periodic box if there is one.
 
     Args:
-        x: Positions [length units], shape [B, N, D].
         box: Sides of the box, centred on the origin [length units], or None.
     """
     if box is None:
         return x.clone()
     images = [torch.floor(x.detach()[..., d] / side + 0.5) for d, side in enumerate(box)]
     return x - torch.stack([side * image for side, image in zip(box, images, strict=True)], dim=-1)
-
-
-class ActionRules(NamedTuple):
-    """What actions do, the same in every step: the keywords of `apply_actions` of these names."""
-
-    max_displacement: float
-    """Largest displacement alpha eps in a unit of time [length units]."""
-    dt: float
-    """Time step, dimensionless."""
-    state_scale: float
-    """Largest change of a state in a unit of time, dimensionless."""
-    moving: bool
-    """Whether actions begin with a displacement."""
-    box: tuple[float, ...] | None
-    """Sides of the periodic box [length units], or None in open space."""
-    position_limit: float
-    """Largest coordinate's size [length units]."""
-    state_limit: float
-    """Largest state's size, dimensionless."""
 
 
 def apply_actions(
@@ -247,7 +219,7 @@ def apply_actions(
 ) -> None:
     """Move and change particles by their actions, in place; no gradient, nothing waits.
 
-    With the mask m: x ← wrap(x + noise + m dt reach a_x / max(1, |a_x|)) and
+    With the mask m: x ← wrap(x + noise + m dt max_displacement a_x / max(1, |a_x|)) and
     s ← s + m dt state_scale clip(a_s, -1, 1), each computed in float64 and rounded once. A value
     that is not a number becomes 0 and one beyond its limit is moved to it; both mark the world as
     diverged.
@@ -274,65 +246,55 @@ def apply_actions(
             contiguous.
     """
     _check_worlds(action, x, s, mask, noise, enabled, diverged, moving)
-    sides = None if box is None else tuple(box)
-    rules = ActionRules(
-        max_displacement, dt, state_scale, moving, sides, position_limit, state_limit
+    physics = Physics(
+        x.shape[2],
+        s.shape[2],
+        # Actions do not read the radius.
+        eps=1.0,
+        eps0=1.0,
+        box=None if box is None else tuple(box),
+        moving=moving,
+        max_displacement=max_displacement,
+        dt=dt,
+        limits=Limits(state_scale, position=position_limit, state=state_limit),
     )
     aligned = s.data_ptr() % 16 == 0 and action.data_ptr() % 16 == 0
-    launch(*_launch_of(action, x, s, rules, mask, noise, enabled, diverged, aligned=aligned))
+    launch(*_launch_of(action, x, s, physics, mask, noise, enabled, diverged, aligned=aligned))
 
 
 class PreparedActions:
-    """`apply_actions` on the same worlds again and again, checked first: less of the host's time.
+    """`apply_actions` on worlds that stay in their tensors, with launches prepared once.
 
-    Args:
-        x: As for `apply_actions`.
-        s: As for `apply_actions`.
-        rules: What actions do.
-        mask: As for `apply_actions`; may get other numbers before each call.
-        noise: Likewise.
-        enabled: Whether anything happens, uint8, shape [1]: set to 0 where an action is not finite,
-            and never to 1.
-        diverged: As for `apply_actions`.
-
-    Raises:
-        NPAError: As `apply_actions`.
+    Arguments are those of `apply_actions`; mask and noise may get other numbers before each call,
+    and `enabled` is set to 0 where an action is not finite, and never to 1.
     """
 
     def __init__(
         self,
         x: Tensor,
         s: Tensor,
-        rules: ActionRules,
+        physics: Physics,
         *,
         mask: Tensor | None,
         noise: Tensor | None,
         enabled: Tensor,
         diverged: Tensor,
     ) -> None:
-        action_dim = s.shape[2] + (x.shape[2] if rules.moving else 0)
-        self._buffer = s.new_zeros(*s.shape[:2], action_dim)
+        self._buffer = s.new_zeros(*s.shape[:2], physics.action_dim)
         self._worlds = (x, s)
-        self._rules = rules
+        self._physics = physics
         self._enabled = enabled
         self._step = (mask, noise, enabled, diverged)
         self._check: PreparedLaunch | None = None
         self._apply: PreparedLaunch | None = None
-        _check_worlds(self._buffer, x, s, mask, noise, enabled, diverged, rules.moving)
+        _check_worlds(self._buffer, x, s, mask, noise, enabled, diverged, physics.moving)
 
     def __getstate__(self) -> dict[str, Any]:
         """Leave out what cannot be pickled."""
         return self.__dict__ | {"_check": None, "_apply": None}
 
     def __call__(self, action: Tensor) -> None:
-        """Apply actions.
-
-        Args:
-            action: Shape [B, N, A], of any dtype, on any device.
-
-        Raises:
-            NPAError: It has another shape.
-        """
+        """Apply actions, shape [B, N, A], of any dtype, on any device."""
         buffer = self._buffer
         fits = action.dtype == buffer.dtype and action.device == buffer.device
         fits = fits and action.shape == buffer.shape and action.is_contiguous()
@@ -378,7 +340,7 @@ class PreparedActions:
             changing=action,
         )
         aligned = s.data_ptr() % 16 == 0
-        launched = _launch_of(action, x, s, self._rules, *self._step, aligned=aligned)
+        launched = _launch_of(action, x, s, self._physics, *self._step, aligned=aligned)
         apply = PreparedLaunch(*launched, changing=action)
         return check, apply
 
@@ -387,7 +349,7 @@ def _launch_of(
     action: Tensor,
     x: Tensor,
     s: Tensor,
-    rules: ActionRules,
+    physics: Physics,
     mask: Tensor | None,
     noise: Tensor | None,
     enabled: Tensor | None,
@@ -400,20 +362,20 @@ def _launch_of(
     state_dim = s.shape[2]
     # Adjacent channels are then read and written at once.
     aligned = (
-        aligned and state_dim % CHANNEL_SHARE == 0 and (space_dim % 2 == 0 or not rules.moving)
+        aligned and state_dim % CHANNEL_SHARE == 0 and (space_dim % 2 == 0 or not physics.moving)
     )
     return (
         update_kernels(space_dim, scalar_type(x.dtype)).apply_actions,
         world_count * particle_count * -(-state_dim // CHANNEL_SHARE),
         x.device,
         particle_count,
-        rules.max_displacement * rules.dt,
-        rules.state_scale * rules.dt,
-        int(rules.box is not None),
-        rules.box or (1.0,) * space_dim,
-        int(rules.moving),
-        rules.position_limit,
-        rules.state_limit,
+        physics.max_displacement * physics.dt,
+        physics.limits.state_scale * physics.dt,
+        int(physics.box is not None),
+        physics.box or (1.0,) * space_dim,
+        int(physics.moving),
+        physics.limits.position,
+        physics.limits.state,
         int(mask is not None),
         mask,
         int(noise is not None),

@@ -16,15 +16,15 @@ from npa_envs.ops.episodes import EpisodeRules, PreparedJudgement
 from npa_envs.ops.equivariance import MIXED_VECTORS, VectorForm, read_rows, steer_rows
 from npa_envs.ops.mean import world_mean
 from npa_envs.ops.network import arrange_weights, run_network
-from npa_envs.ops.passes import Terms
 from npa_envs.ops.perceive import Rows, build_neighbours, perceive, perceive_rows
+from npa_envs.ops.physics import Limits, Physics, Terms
 from npa_envs.ops.pictures.cameras import orbit
 from npa_envs.ops.pictures.gaussians import render_gaussians
 from npa_envs.ops.pictures.losses import picture_losses
 from npa_envs.ops.pictures.splat import splat
 from npa_envs.ops.pictures.triangles import nearest_triangles
 from npa_envs.ops.static import prepare_static, static_rows
-from npa_envs.ops.update import ActionRules, PreparedActions, update_particles
+from npa_envs.ops.update import PreparedActions, update_particles
 
 
 def warmup(
@@ -98,6 +98,12 @@ def _warm_judgement(elapsed: torch.Tensor) -> None:
     judge(number[None])
 
 
+def _physics(x: torch.Tensor, s: torch.Tensor) -> Physics:
+    return Physics(
+        x.shape[2], s.shape[2], 0.1, 0.1, max_displacement=0.1, limits=Limits(1.0, 1.0, 1.0, 1.0)
+    )
+
+
 def _warm_rows(x: torch.Tensor, s: torch.Tensor) -> None:
     """Perception in rollouts: small and large worlds, all particles and some, gradients or none."""
     for particle_count in (x.shape[1], SHARED_WORLD, SHARED_WORLD + 1):
@@ -109,13 +115,10 @@ def _warm_rows(x: torch.Tensor, s: torch.Tensor) -> None:
                 rows, _ = perceive_rows(
                     places,
                     states.requires_grad_(gradients),
+                    _physics(x, s),
                     mask=chosen,
                     row_capacity=particle_count,
-                    row_width=Terms().perception_dim(x.shape[2], s.shape[2]) + 1,
-                    eps=0.1,
-                    eps0=0.1,
-                    box=None,
-                    terms=Terms(),
+                    row_width=_physics(x, s).perception_dim + 1,
                 )
                 if gradients:
                     _pull_back(rows)
@@ -123,22 +126,19 @@ def _warm_rows(x: torch.Tensor, s: torch.Tensor) -> None:
 
 def _warm_static(x: torch.Tensor, s: torch.Tensor) -> None:
     """Perception of particles that never move, with all of them active and with some."""
-    static = prepare_static(x, s.shape[2], eps=0.1, box=None, terms=Terms())
+    static = prepare_static(x, _physics(x, s))
     mask = torch.ones(x.shape[:2], dtype=torch.uint8, device=x.device)
     (active,) = static_rows(static, x.detach(), [mask], x.shape[1])
     for chosen in (None, active):
         rows, _ = perceive_rows(
             x,
             s,
+            _physics(x, s),
             mask=None,
-            static_rows=chosen,
             row_capacity=x.shape[1],
-            row_width=Terms().perception_dim(x.shape[2], s.shape[2]) + 1,
-            eps=0.1,
-            eps0=0.1,
-            box=None,
-            terms=Terms(),
+            row_width=_physics(x, s).perception_dim + 1,
             static=static,
+            static_rows=chosen,
         )
         _pull_back(rows)
 
@@ -214,9 +214,7 @@ def _warm_observation(x: torch.Tensor, s: torch.Tensor) -> None:
     for particle_count in (x.shape[1], 4096, 4097):
         places = x.detach()[:, :1].expand(-1, particle_count, -1)
         states = s.detach()[:, :1].expand(-1, particle_count, -1)
-        build_neighbours(
-            places, states, eps=0.1, eps0=0.1, box=None, terms=Terms(), limit=1.0
-        ).perceive()
+        build_neighbours(places, states, _physics(x, s)).perceive()
 
 
 def _warm_update(x: torch.Tensor, s: torch.Tensor) -> None:
@@ -225,17 +223,7 @@ def _warm_update(x: torch.Tensor, s: torch.Tensor) -> None:
     update = torch.zeros(
         x.shape[1], x.shape[2] + s.shape[2], dtype=x.dtype, device=x.device, requires_grad=True
     )
-    moved = update_particles(
-        update,
-        x,
-        s,
-        x.new_zeros(x.shape[:2]),
-        rows=rows,
-        max_displacement=0.1,
-        dt=1.0,
-        moving=True,
-        box=None,
-    )
+    moved = update_particles(update, x, s, x.new_zeros(x.shape[:2]), rows, _physics(x, s))
     _pull_back(moved[0])
 
 
@@ -243,7 +231,7 @@ def _warm_actions(x: torch.Tensor, s: torch.Tensor) -> None:
     actions = PreparedActions(
         x.detach().clone(),
         s.detach().clone(),
-        ActionRules(0.1, 1.0, 1.0, True, None, 1.0, 1.0),
+        _physics(x, s),
         mask=None,
         noise=None,
         enabled=torch.ones(1, dtype=torch.uint8, device=x.device),

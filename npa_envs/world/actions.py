@@ -6,8 +6,7 @@ bounded output stands. Nothing here waits for the device.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
 
 import torch
 from torch import Tensor
@@ -21,11 +20,13 @@ from npa_envs.ops.episodes import (
     EpisodeRules,
     PreparedJudgement,
 )
-from npa_envs.ops.passes import Terms
+from npa_envs.ops.mean import world_mean
 from npa_envs.ops.perceive import NeighbourState, build_neighbours
+from npa_envs.ops.physics import Limits, Physics, Terms
 from npa_envs.ops.species import perceive_by_species
-from npa_envs.ops.update import ActionRules, PreparedActions
+from npa_envs.ops.update import PreparedActions, wrapped
 from npa_envs.world.randomness import WorldRandom
+from npa_envs.world.steps import draw_step
 
 __all__ = [
     "DIVERGED",
@@ -34,128 +35,29 @@ __all__ = [
     "TIME_LIMIT",
     "Actions",
     "EpisodeRules",
+    "Limits",
     "MomentInverse",
     "NeighbourState",
     "Physics",
     "PreparedJudgement",
-    "find_neighbours",
+    "Terms",
+    "build_neighbours",
+    "marginal_gains",
     "perceive_each_species",
+    "with_mean_reward",
 ]
 
 
-@dataclass(frozen=True, kw_only=True)
-class Physics:
-    """The constants of a world that is acted upon."""
-
-    space_dim: int
-    """Space dimension D."""
-
-    state_dim: int
-    """State channels C."""
-
-    eps: float
-    """Perception radius ε [length units]."""
-
-    eps0: float
-    """Radius that perception is scaled to, that of the rule's training [length units]."""
-
-    max_displacement: float
-    """Largest displacement of a step, α ε [length units]."""
-
-    state_scale: float
-    """State step of an action of 1, dimensionless."""
-
-    update_prob: float
-    """Probability p of a particle's update in a step, dimensionless."""
-
-    dt: float
-    """Time step, dimensionless."""
-
-    position_noise: float
-    """Standard deviation of the noise on every position in a step [length units]."""
-
-    box: tuple[float, ...] | None
-    """Sides of the periodic box [length units], or None in open space."""
-
-    moving: bool
-    """Whether particles move; otherwise an action has no displacement."""
-
-    moment_inverse: MomentInverse
-    """How perceived state gradients are corrected, as in `npa_envs.perceive`."""
-
-    perception_limit: float
-    """What is perceived is clipped to plus and minus this, dimensionless."""
-
-    position_limit: float
-    """A coordinate beyond this is out of bounds [length units]."""
-
-    state_limit: float
-    """A state beyond this is out of bounds, dimensionless."""
-
-    @property
-    def perception_dim(self) -> int:
-        """Length P of a perception vector."""
-        return Terms().perception_dim(self.space_dim, self.state_dim)
-
-    @property
-    def action_dim(self) -> int:
-        """Length A of an action: D + C, or C where particles are static."""
-        return self.state_dim + (self.space_dim if self.moving else 0)
-
-
-def find_neighbours(
-    x: Tensor, s: Tensor, physics: Physics, places: Tensor | None = None
-) -> NeighbourState:
-    """Return worlds made ready for perception: sorted, their densities known.
-
-    Args:
-        x: Positions [length units], shape [B, N, D], finite.
-        s: States, dimensionless, shape [B, N, C], finite; they may be read again later, where they
-            are.
-        physics: The worlds' constants.
-        places: Which worlds of a larger batch these are, int64, shape [B]; default: their own one.
-    """
-    return build_neighbours(
-        x,
-        s,
-        eps=physics.eps,
-        eps0=physics.eps0,
-        box=physics.box,
-        terms=Terms(moment_inverse=physics.moment_inverse),
-        limit=physics.perception_limit,
-        places=places,
-    )
-
-
 def perceive_each_species(x: Tensor, counts: Sequence[int], physics: Physics) -> Tensor:
-    """Return what particles perceive of each species besides `find_neighbours`, clipped.
-
-    Args:
-        x: Positions [length units], shape [B, N, D], finite, species after species.
-        counts: Particles of each species, which sum to N; zeros for species that are gone.
-        physics: The worlds' constants.
-
-    Returns:
-        c^D ρ_k / N of each species, then L(c^(1+D) ∇ρ_k / N) of each, species by species, zeros for
-        those that are gone, dimensionless, shape [B, N, K (1 + D)].
-    """
-    found = perceive_by_species(
-        x,
-        tuple(counts),
-        eps=physics.eps,
-        eps0=physics.eps0,
-        box=physics.box,
-    )
-    return found.clamp(-physics.perception_limit, physics.perception_limit)
+    """Return `perceive_by_species`, clipped, shape [B, N, K (1 + D)]; zeros for species gone."""
+    limit = physics.limits.perception
+    return perceive_by_species(x, tuple(counts), physics).clamp(-limit, limit)
 
 
 class Actions:
     """What actions do to some worlds, in place, with the masks and the noise of `rollout`.
 
     Args:
-        x: Positions [length units], shape [B, N, D], finite.
-        s: States, dimensionless, shape [B, N, C], finite.
-        physics: The worlds' constants.
         random: Where masks and noise come from; advanced by one step in each `draw`.
         enabled: Whether actions are applied, uint8, shape [1]: set to 0 where one is not finite,
             and no world changes; the caller sets it to 1 again.
@@ -173,6 +75,7 @@ class Actions:
         enabled: Tensor,
         diverged: Tensor,
     ) -> None:
+        self._x = x
         self._physics = physics
         self._random = random
         self._diverged = diverged
@@ -182,30 +85,18 @@ class Actions:
             self._mask = torch.zeros(x.shape[:2], dtype=torch.uint8, device=x.device)
         if physics.position_noise > 0.0:
             self._noise = torch.zeros_like(x)
-        rules = ActionRules(
-            max_displacement=physics.max_displacement,
-            dt=physics.dt,
-            state_scale=physics.state_scale,
-            moving=physics.moving,
-            box=physics.box,
-            position_limit=physics.position_limit,
-            state_limit=physics.state_limit,
-        )
         self._apply = PreparedActions(
-            x, s, rules, mask=self._mask, noise=self._noise, enabled=enabled, diverged=diverged
+            x, s, physics, mask=self._mask, noise=self._noise, enabled=enabled, diverged=diverged
         )
 
     @torch.no_grad()
     def draw(self) -> None:
         """Draw the next step's masks and noise; may be captured in a CUDA graph."""
-        physics, random = self._physics, self._random
         self._diverged.zero_()
-        random.advance()
-        if self._mask is not None:
-            self._mask.copy_(random.bernoulli(physics.update_prob, self._mask.shape[1]))
-        if self._noise is not None:
-            noise = random.normal(*self._noise.shape[1:], dtype=self._noise.dtype)
-            self._noise.copy_(noise * physics.position_noise)
+        drawn = draw_step(self._x, self._physics, self._random)
+        for own, new in ((self._mask, drawn.mask), (self._noise, drawn.noise)):
+            if own is not None and new is not None:
+                own.copy_(new)
 
     def updated(self) -> Tensor:
         """Return which particles what was drawn last updates, bool, shape [B, N]."""
@@ -229,3 +120,48 @@ class Actions:
     def apply_held(self) -> None:
         """Apply the actions held last with what was drawn last; may be captured in a CUDA graph."""
         self._apply.apply_held()
+
+
+def marginal_gains(
+    losses: Callable[[Tensor, Tensor], Mapping[str, Tensor]],
+    before: tuple[Tensor, Tensor],
+    after: tuple[Tensor, Tensor],
+    box: tuple[float, ...] | None,
+) -> Tensor | None:
+    """Return marginal credit: how much each particle's action lowered the loss, times N; [B, N].
+
+    A particle's part of a step is what it changed, times the loss's slope in the middle of the
+    step. For losses that are quadratic in what particles change, that is the mean of its marginal
+    contribution to what all others did and to what they had not yet done (its Shapley value), and
+    the mean over the particles is what the loss fell; for others it is so up to third order. What a
+    task holds constant in its gradients is constant here.
+
+    Args:
+        losses: The named parts of each world's loss, shape [B] each, of positions and states.
+        after: The same after it.
+
+    Returns:
+        The gains, or None where no gradient leads from the losses to positions or states.
+    """
+    moved = wrapped(after[0] - before[0], box)
+    changed = after[1] - before[1]
+    with torch.enable_grad():
+        x = wrapped(after[0] - 0.5 * moved, box).requires_grad_()
+        s = (after[1] - 0.5 * changed).requires_grad_()
+        total = torch.stack(list(losses(x, s).values())).sum()
+        if not total.requires_grad:
+            return None
+        slopes = torch.autograd.grad(total, (x, s), allow_unused=True)
+    gains = torch.zeros_like(moved[..., 0])
+    for slope, change in zip(slopes, (moved, changed), strict=True):
+        if slope is not None:
+            # Added one by one: the order of torch's own sums is not promised.
+            for column in (slope * change).unbind(dim=-1):
+                gains = gains - column
+    return gains * gains.shape[1]
+
+
+def with_mean_reward(gains: Tensor, reward: Tensor) -> Tensor:
+    """Return particles' gains, [B, N], with what they miss of the worlds' rewards, [B], shared."""
+    missed = reward - world_mean(gains[..., None])[:, 0]
+    return gains + missed[:, None]

@@ -105,10 +105,6 @@ class DivergenceWatch:
     """Keeps when and where each world first had a number that is infinite or NaN.
 
     It looks after each step, and nothing is read from the device before `raise_diverged`.
-
-    Args:
-        x: Positions at the start [length units], shape [B, N, D].
-        s: States at the start, dimensionless, shape [B, N, C].
     """
 
     def __init__(self, x: Tensor, s: Tensor) -> None:

@@ -37,11 +37,7 @@ class Births(NamedTuple):
 
 
 def living(s: Tensor) -> Tensor:
-    """Return which slots hold a living particle, bool, shape [B, N].
-
-    Args:
-        s: States of a world whose particles divide, dimensionless, shape [B, N, C].
-    """
+    """Return which slots hold a living particle, bool, shape [B, N]."""
     return s[..., LIFE].detach() > 0.5
 
 
@@ -49,9 +45,7 @@ def parked(x: Tensor, alive: Tensor, eps: float) -> Tensor:
     """Return positions with the dead far away, out of reach of all others and of each other.
 
     Args:
-        x: Positions [length units], shape [B, N, D].
         alive: Which slots hold a living particle, bool, shape [B, N].
-        eps: Perception radius [length units].
     """
     count, space_dim = x.shape[1:]
     side = 1
@@ -90,13 +84,10 @@ def divided(
     share: a birth is credited as if the child were like its parent.
 
     Args:
-        x: Positions after the update [length units], shape [B, N, D].
-        s: States after it, dimensionless, shape [B, N, C].
         path_length: How far each particle travelled [length units], shape [B, N]; of children 0.
         division_probabilities: Of each particle to divide and to die, shape [B, N] each.
         updated: Which living particles were updated, bool, shape [B, N].
         births: What was drawn.
-        eps: Perception radius [length units].
 
     Returns:
         Positions, states and path lengths, which do not count how parent and child move apart.

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import collections
 import threading
-from collections.abc import Callable, Hashable, Iterable
+from collections.abc import Hashable, Iterable
 from typing import Any, NamedTuple
 
 import torch
@@ -20,17 +20,16 @@ from torch.utils._python_dispatch import is_in_torch_dispatch_mode
 from npa_envs.ops.launch import LaunchTape
 from npa_envs.ops.sort import sorts_at_once
 from npa_envs.rule.network import Network
-from npa_envs.world.recorded import LAUNCHED_FIRST, CallKind, Particles, counted
+from npa_envs.world.particles import Particles, combined
+from npa_envs.world.randomness import Randomness
+from npa_envs.world.recorded import LAUNCHED_FIRST, CallKind, counted, rule_form
+from npa_envs.world.steps import Draws, RuleStep
 
 LARGEST_TOTAL = 4096
 """Particles of all worlds, at most: larger ones hide what is saved."""
 
 MOST_KINDS = 32
 """Kinds of calls that are remembered."""
-
-
-Advance = Callable[[Network, Particles, Tensor | None], Particles]
-"""Launches one step of worlds with an update mask, [B, N], and a network."""
 
 
 class _Stand:
@@ -61,50 +60,38 @@ class _Step(NamedTuple):
 
 
 class PreparedSteps:
-    """Steps of worlds of one shape.
+    """Steps of worlds of one shape, back and forth between two places in memory.
 
     Args:
-        advance: Launches a step.
-        worlds: Worlds of that shape; they are left as they are.
-        row_width: Columns of a row of perception.
-        update_width: Columns of an update.
-        masked: Whether some particles are updated only.
+        particles: Worlds of that shape; they are left as they are.
     """
 
-    def __init__(
-        self, advance: Advance, worlds: Particles, row_width: int, update_width: int, masked: bool
-    ) -> None:
+    def __init__(self, step: RuleStep, particles: Particles) -> None:
         # With all particles active there is a row for each.
-        self._mask = torch.ones(worlds.x.shape[:2], dtype=torch.uint8) if masked else None
+        masked = step.physics.update_prob < 1.0
+        self._mask = torch.ones(particles.x.shape[:2], dtype=torch.uint8) if masked else None
         # Whatever the strides of the worlds: what is made contiguous in a step is on no tape.
-        dense = torch.contiguous_format
-        here = Particles(*(torch.empty_like(v, memory_format=dense).copy_(v) for v in worlds))
-        there, after = self._record(advance, here, row_width, update_width)
-        back, last = self._record(advance, after, row_width, update_width)
-        for old, new in zip(last, here, strict=True):
+        first = particles.map(lambda value: value.clone(memory_format=torch.contiguous_format))
+        there, after = self._record(step, first)
+        back, last = self._record(step, after)
+        for old, new in zip(last.tensors(), first.tensors(), strict=True):
             back.tape.move(back.tape.places(old), new)
-        self._places = here, after
+        self._places = first, after
         self._steps = there, back
 
-    def _record(
-        self, advance: Advance, worlds: Particles, row_width: int, update_width: int
-    ) -> tuple[_Step, Particles]:
+    def _record(self, step: RuleStep, particles: Particles) -> tuple[_Step, Particles]:
+        assert step.network is not None
         tape = LaunchTape()
-        stand = _Stand(tape, row_width, update_width)
+        stand = _Stand(tape, step.network.row_width, step.network.update_width)
         with tape.recording():
-            after = advance(stand, worlds, self._mask)
+            after = step._replace(network=stand).advance(particles, Draws(self._mask, None))
         return _Step(tape, stand.split, stand.rows, tape.places(stand.updates)), after
 
     def run(
-        self,
-        network: Network,
-        worlds: Particles,
-        masks: Iterable[Tensor | None],
-        keep: Callable[[int], bool],
+        self, network: Network, particles: Particles, masks: Iterable[Tensor | None], every: int
     ) -> list[Particles]:
-        """Step worlds once with each mask; return copies of those to keep, by the steps done."""
-        for place, value in zip(self._places[0], worlds, strict=True):
-            place.copy_(value)
+        """Step worlds once with each mask; return copies of those after every so many steps."""
+        self._places[0].copy_(particles)
         kept: list[Particles] = []
         for number, mask in enumerate(masks):
             step = self._steps[number % 2]
@@ -117,9 +104,8 @@ class PreparedSteps:
             updates = network(step.rows[:count])
             step.tape.move(step.updates, updates)
             step.tape.replay(step.split)
-            if keep(number + 1):
-                after = self._places[(number + 1) % 2]
-                kept.append(Particles(*(value.clone() for value in after)))
+            if (number + 1) % every == 0:
+                kept.append(self._places[(number + 1) % 2].map(torch.clone))
         return kept
 
 
@@ -129,14 +115,16 @@ _kinds: collections.OrderedDict[Hashable, CallKind[PreparedSteps]] = collections
 _lock = threading.Lock()
 
 
-def may_prepare(worlds: Particles) -> bool:
+def may_prepare(step: RuleStep, particles: Particles) -> bool:
     """Return whether steps of worlds may be prepared: small, on a CPU, without gradients."""
-    x, s, _ = worlds
+    x, s, *_ = particles
     return (
         not torch.compiler.is_compiling()
         and not torch.is_grad_enabled()
         and x.device.type == "cpu"
         and x.shape[0] * x.shape[1] <= LARGEST_TOTAL
+        and step.network is not None
+        and step.physics.position_noise == 0.0
         and sorts_at_once(*x.shape[:2])
         and type(x) is Tensor
         and type(s) is Tensor
@@ -145,17 +133,18 @@ def may_prepare(worlds: Particles) -> bool:
 
 
 def run_prepared(
-    key: Hashable,
-    make: Callable[[], PreparedSteps],
-    run: Callable[[PreparedSteps], list[Particles]],
-) -> list[Particles] | None:
-    """Run prepared steps; None where calls of this kind are too few so far.
-
-    Args:
-        key: What the prepared steps depend on.
-        make: Prepares them.
-        run: Runs them.
-    """
+    step: RuleStep,
+    particles: Particles,
+    source: Randomness | None,
+    steps: int,
+    keep_every: int | None,
+) -> Particles | None:
+    """Run a rollout by prepared steps; None where calls of this kind are too few so far."""
+    if steps == 0:
+        return None
+    assert step.network is not None
+    x, s, *_ = particles
+    key = (step.physics, rule_form(step.rule), x.shape, s.shape[2], x.dtype)
     with _lock:
         kind = counted(_kinds, key, CallKind, _kinds.pop, MOST_KINDS)
     if kind.calls <= LAUNCHED_FIRST:
@@ -165,8 +154,11 @@ def run_prepared(
         prepared = kind.free.pop()
     except IndexError:
         with torch.inference_mode(False), torch.no_grad():
-            prepared = make()
+            prepared = PreparedSteps(step, particles)
+    masks = (draws.mask for draws in step.draw(x, steps, source))
     try:
-        return run(prepared)
+        with torch.autocast("cpu", enabled=False):
+            kept = prepared.run(step.network, particles, masks, keep_every or steps)
     finally:
         kind.free.append(prepared)
+    return kept[0] if keep_every is None else combined(torch.stack, kept)

@@ -281,7 +281,6 @@ def reserve_draws(source: torch.Generator, count: int) -> int:
     """Move a CUDA generator on by what is to be drawn, and return where it stood.
 
     Args:
-        source: The generator.
         count: How far, as torch counts it (`get_offset`).
     """
     with _reserving:
@@ -301,7 +300,6 @@ def check_generator(generator: Randomness | None, device: torch.device, world_co
     """Check that a source of randomness is one, for these worlds, on the device where it is used.
 
     Args:
-        generator: The source; None is torch's own.
         device: Where the numbers are needed.
         world_count: Worlds B.
 
@@ -338,7 +336,6 @@ def uniform_draws(generator: Randomness | None, shape: Sequence[int], like: Tens
     Args:
         generator: Where they come from, checked; None is torch's own.
         shape: Worlds, then what each of them draws.
-        like: A tensor of their dtype and on their device.
     """
     if isinstance(generator, WorldRandom):
         return generator.uniform(*shape[1:], dtype=like.dtype)

@@ -21,7 +21,7 @@ import itertools
 import logging
 import weakref
 from collections.abc import Callable, Hashable, Sequence
-from typing import Any, Generic, Literal, NamedTuple, Protocol, Self, TypeVar
+from typing import TYPE_CHECKING, Any, Generic, Literal, NamedTuple, TypeVar
 
 import torch
 from torch import Tensor
@@ -40,8 +40,8 @@ from npa_envs.world.cuda_graph import (
     prepare_capture,
     recording_lock,
 )
-from npa_envs.world.divergence import DivergenceWatch
 from npa_envs.world.own_rules import rule_settings, rule_tensors
+from npa_envs.world.particles import Particles, combined
 from npa_envs.world.randomness import (
     Randomness,
     WorldRandom,
@@ -49,6 +49,9 @@ from npa_envs.world.randomness import (
     reserve_draws,
     torch_generator,
 )
+
+if TYPE_CHECKING:
+    from npa_envs.world.execute import RolloutSpec
 
 CudaGraph = bool | Literal["auto"]
 """Whether rollouts record themselves on CUDA: "auto" records plain rules."""
@@ -77,41 +80,6 @@ WARM_UP_STEPS = 4
 logger = logging.getLogger(__name__)
 
 
-class Particles(NamedTuple):
-    """Worlds between two steps of a rollout."""
-
-    x: Tensor
-    """Positions [length units], shape [B, N, D]."""
-    s: Tensor
-    """States, dimensionless, shape [B, N, C]."""
-    path_length: Tensor
-    """Length of each particle's path so far [length units], shape [B, N]."""
-
-
-class Rollout(Protocol):
-    """What a checked call asks for besides its tensors; hashable, a named tuple."""
-
-    @property
-    def steps(self) -> int:
-        """Number of steps T."""
-
-    @property
-    def keep_every(self) -> int | None:
-        """Worlds are kept after each so many steps; None: at the end alone."""
-
-    def run(
-        self,
-        rules: Sequence[NPARule],
-        worlds: Particles,
-        generator: Randomness | None,
-        watch: DivergenceWatch | None = None,
-    ) -> Particles:
-        """Launch the rollout."""
-
-    def _replace(self, *, steps: int = ..., keep_every: int | None = ...) -> Self:
-        """Return the call with some fields changed."""
-
-
 def check_cuda_graph(cuda_graph: CudaGraph) -> None:
     """Check whether rollouts shall be recorded.
 
@@ -122,40 +90,27 @@ def check_cuda_graph(cuda_graph: CudaGraph) -> None:
         raise NPAError(f"cuda_graph must be 'auto', True or False, got {shown(cuda_graph)}")
 
 
-def run_call(
-    call: Rollout,
+def run_recorded(
+    call: RolloutSpec,
     rules: Sequence[NPARule],
     x: Tensor,
     s: Tensor,
     generator: Randomness | None,
     *,
     cuda_graph: CudaGraph,
-    watch: DivergenceWatch | None,
-) -> Particles:
-    """Run a checked rollout: recorded where that can be, launched otherwise; the same numbers.
+) -> Particles | None:
+    """Run a checked rollout by replaying it; None where it is to be launched.
 
     Args:
-        call: What is asked for.
-        rules: The rule, or one of each species.
-        x: Positions at the beginning [length units], shape [B, N, D].
-        s: States at the beginning, dimensionless, shape [B, N, C].
-        generator: Source of the draws.
+        call: The rollout.
         cuda_graph: Whether to record; True also records rules that are not plain.
-        watch: What looks at the worlds after each step, which then are launched.
 
     Raises:
         NPAError: A position is not finite.
-        DivergedError: The watch has seen a world diverge.
     """
-    if watch is None and cuda_graph is not False and _can_record(call, x):
-        recorded = _run_recorded(call, rules, x, s, generator, asked=cuda_graph is True)
-        if recorded is not None:
-            return recorded
-    check_finite_positions(x)
-    if x.is_cuda and torch.is_grad_enabled():
-        # Gradients are added up as a recording adds them: first those of this rollout.
-        x, s = x.view_as(x), s.view_as(s)
-    return call.run(rules, Particles(x, s, x.new_zeros(x.shape[:2])), generator, watch)
+    if cuda_graph is False or not _can_record(call, x):
+        return None
+    return _run_recorded(call, rules, x, s, generator, asked=cuda_graph is True)
 
 
 def recorded_memory(device: torch.device) -> int:
@@ -173,7 +128,7 @@ def release_recordings() -> None:
     torch.cuda.empty_cache()
 
 
-def _can_record(call: Rollout, x: Tensor) -> bool:
+def _can_record(call: RolloutSpec, x: Tensor) -> bool:
     # Asked in this order: a compiler cannot trace what a stream does.
     if not x.is_cuda or torch.compiler.is_compiling() or call.steps == 0:
         return False
@@ -320,7 +275,7 @@ class _Recording:
 
     def __init__(
         self,
-        call: Rollout,
+        call: RolloutSpec,
         rules: Sequence[NPARule],
         x: Tensor,
         s: Tensor,
@@ -372,7 +327,6 @@ class _Recording:
         """Record rollouts of a number of steps.
 
         Args:
-            steps: The number of steps.
             tensors: Worlds and weights that kernels are warmed up with.
 
         Raises:
@@ -403,7 +357,7 @@ class _Recording:
 
         def forward() -> None:
             kept.clear()
-            results[:] = self._run(call, kept)
+            results[:] = self._run(call, kept).tensors()
 
         def backward() -> None:
             gradients[:] = self._pull_back(results, self._bars_of(steps))
@@ -443,11 +397,7 @@ class _Recording:
         return settings
 
     def _check_settings(self, begin: dict[tuple[int, str], Hashable]) -> None:
-        """Check that nothing but inputs has changed.
-
-        Raises:
-            NPAError: Something has.
-        """
+        """Check that nothing but inputs has changed."""
         now = self._settings()
         changed = {key[1] for key in begin.keys() | now.keys() if begin.get(key) != now.get(key)}
         # Of tensors their presence alone is noted.
@@ -472,12 +422,12 @@ class _Recording:
             self._bars[count] = [tensor.new_zeros(*first, *tensor.shape) for tensor in worlds]
         return self._bars[count]
 
-    def _warm_up(self, call: Rollout) -> None:
-        results = self._run(call, [])
+    def _warm_up(self, call: RolloutSpec) -> None:
+        results = self._run(call, []).tensors()
         if self.differentiable:
             self._pull_back(results, [torch.zeros_like(result) for result in results])
 
-    def _run(self, call: Rollout, kept: list[Tensor]) -> Particles:
+    def _run(self, call: RolloutSpec, kept: list[Tensor]) -> Particles:
         """Launch a rollout; what its backward pass reads is kept."""
 
         def keep(tensor: Tensor) -> Tensor:
@@ -639,7 +589,7 @@ def _forget(key: Hashable) -> None:
 
 
 def _run_recorded(
-    call: Rollout,
+    call: RolloutSpec,
     rules: Sequence[NPARule],
     x: Tensor,
     s: Tensor,
@@ -651,10 +601,6 @@ def _run_recorded(
 
     Args:
         call: What is asked for.
-        rules: The rule, or one of each species.
-        x: Positions at the beginning [length units], shape [B, N, D].
-        s: States at the beginning, dimensionless, shape [B, N, C].
-        generator: Source of the draws.
         asked: The caller asks for a recording.
     """
     plain = [rule.has_network() for rule in rules]
@@ -685,17 +631,13 @@ def _run_recorded(
 
 
 def _replay_blocks(
-    call: Rollout,
+    call: RolloutSpec,
     lease: _Lease,
     blocks: Sequence[int],
     tensors: Sequence[Tensor],
     generator: Randomness | None,
 ) -> Particles:
-    """Replay the graphs of a rollout one after the other; what the network writes is written.
-
-    Raises:
-        NPAError: A position is not finite.
-    """
+    """Replay the graphs of a rollout one after the other; what the network writes is written."""
     x, s, *weights = tensors
     recording = lease.recording
     given = [x, s, recording.no_path, *weights]
@@ -713,15 +655,15 @@ def _replay_blocks(
         recording.end_draws(generator, steps)
         recording.write_back(steps, given)
         found.append(after)
-        last = after if call.keep_every is None else Particles(*(value[-1] for value in after))
-        given[:3] = last
+        last = after if call.keep_every is None else after.map(lambda value: value[-1])
+        given[:3] = last.tensors()
     if len(found) == 1:
         return found[0]
-    return last if call.keep_every is None else Particles(*map(torch.cat, zip(*found, strict=True)))
+    return last if call.keep_every is None else combined(torch.cat, found)
 
 
 def _compared(
-    call: Rollout,
+    call: RolloutSpec,
     rules: Sequence[NPARule],
     kind: _RecordedKind,
     lease: _Lease,
@@ -749,7 +691,7 @@ def _compared(
     launched = call.run(rules, worlds, generator)
     with torch.no_grad():
         replayed = _replay_blocks(call, lease, blocks, [x, s, *own], source)
-        pairs = zip((*launched, *weights), (*replayed, *own), strict=True)
+        pairs = zip((*launched.tensors(), *weights), (*replayed.tensors(), *own), strict=True)
         same = all(bool(_same(*pair)) for pair in pairs)
     if same:
         lease.recording.compared.update(blocks)
@@ -772,7 +714,7 @@ def _refuse(kind: _RecordedKind, reason: object, *, asked: bool) -> None:
         kind.free.clear()
 
 
-def _blocks(call: Rollout) -> list[int]:
+def _blocks(call: RolloutSpec) -> list[int]:
     """Return the steps of the graphs that are replayed one after the other, without gradients."""
     kept = call.keep_every or 1
     block = max(BLOCK_STEPS // kept, 1) * kept

@@ -2,53 +2,22 @@
 
 from __future__ import annotations
 
-import functools
-import math
-from collections.abc import Sequence
-from types import NoneType
-from typing import Literal, NamedTuple, TypedDict, Unpack, overload
+from typing import Literal, TypedDict, Unpack, overload
 
-import torch
 from torch import Tensor
-from torch.utils.checkpoint import checkpoint
 
-from npa_envs.checks import (
-    Box,
-    check_scale,
-    check_world,
-    checked_box,
-    checked_count,
-    checked_eps,
-    checked_flag,
-    checked_number,
-    constant,
-)
+from npa_envs.checks import Box, check_world, checked_count, checked_flag
 from npa_envs.errors import NPAError, shown
 from npa_envs.ops.opaque import check_derivatives
-from npa_envs.ops.static import StaticWorlds, prepare_static
-from npa_envs.ops.update import wrapped
-from npa_envs.rule.network import Network
+from npa_envs.ops.physics import Physics, Terms, physics
 from npa_envs.rule.rule import NPARule, check_rule
-from npa_envs.world.cuda_graph import draws_alone
-from npa_envs.world.divergence import DivergenceWatch, OnDivergence, make_watch
-from npa_envs.world.division import living
-from npa_envs.world.prepared import PreparedSteps, may_prepare, run_prepared
-from npa_envs.world.randomness import (
-    Randomness,
-    check_generator,
-)
-from npa_envs.world.recomputed import RecomputedSteps
-from npa_envs.world.recorded import CudaGraph, Particles, check_cuda_graph, rule_form, run_call
-from npa_envs.world.steps import (
-    DivisionStep,
-    RuleStep,
-    Step,
-    StepOptions,
-    rule_terms,
-    skip_draws,
-)
+from npa_envs.world.divergence import OnDivergence, make_watch
+from npa_envs.world.execute import STORED_INTERVAL, Memory, RolloutSpec, execute, resting
+from npa_envs.world.particles import Particles
+from npa_envs.world.randomness import Randomness, check_generator
+from npa_envs.world.recorded import CudaGraph, check_cuda_graph
 
-Memory = Literal["store", "recompute", "minimal"]
+__all__ = ["Memory", "at_rest", "rollout", "step"]
 
 
 class RolloutOptions(TypedDict, total=False):
@@ -66,38 +35,24 @@ class RolloutOptions(TypedDict, total=False):
     cuda_graph: CudaGraph
 
 
-STORED_INTERVAL: dict[Memory, int] = {"store": 1, "recompute": 3, "minimal": 2**31}
-"""The last step and every so-manyth before it store what the backward pass reads."""
-
-FEWEST_STATIC = 3
-"""Steps from which on it pays to prepare worlds whose particles never move."""
-
-FEWEST_RESTING = 256
-"""Steps from which on it pays to ask whether worlds are at rest."""
-
-FIRST_PART = {"cpu": 64, "cuda": 1024}
-"""Steps after which that is asked again, by device; the next parts are twice as long each. A GPU
-idles while it is asked."""
-
-
 def check_memory(memory: Memory) -> None:
     """Check what the backward pass shall read."""
     if not isinstance(memory, str) or memory not in STORED_INTERVAL:
         raise NPAError(f"memory must be 'store', 'recompute' or 'minimal', got {shown(memory)}")
 
 
-def checked_options(
+def checked_physics(
     rule: NPARule,
     x: Tensor,
     s: Tensor,
+    *,
     eps: float | None,
     box: Box,
-    update_prob: float,
+    update_prob: float = 1.0,
     dt: float,
-    position_noise: float,
-    detach_positions: bool,
-) -> StepOptions:
-    """Check what `rollout` was given, and return what stays the same over it; its errors."""
+    position_noise: float = 0.0,
+) -> Physics:
+    """Check that worlds and a rule fit, and return the constants of its rollouts."""
     check_world(x, s)
     check_derivatives(x=x, s=s, rule=rule)
     if (x.shape[2], s.shape[2]) != (rule.space_dim, rule.state_dim):
@@ -111,215 +66,23 @@ def checked_options(
             f"the rule must share dtype and device with x, got {weight.dtype} on {weight.device} "
             f"and {x.dtype} on {x.device}: move it with rule.to(x)"
         )
-    given = (eps, box, update_prob, dt, position_noise, detach_positions)
-    # Numbers of other types may change, and tensors are no keys.
-    own = (rule.eps0, rule.alpha)
-    plain = all(type(value) in (float, int, bool, NoneType) for value in (*own, *given))
-    known = plain and not torch.compiler.is_compiling()
-    check = _known_numbers if known else _checked_numbers
-    return check(rule.space_dim, constant(own[0]), constant(own[1]), x.dtype, *given)
-
-
-def _checked_numbers(
-    space_dim: int,
-    eps0: float,
-    alpha: float,
-    dtype: torch.dtype,
-    eps: float | None,
-    box: Box,
-    update_prob: float,
-    dt: float,
-    position_noise: float,
-    detach_positions: bool,
-) -> StepOptions:
-    radius = checked_eps("eps", eps0 if eps is None else eps, space_dim, dtype)
-    check_scale(radius, eps0, space_dim, dtype)
-    update_prob = checked_number("update_prob", update_prob)
-    dt = checked_number("dt", dt)
-    position_noise = checked_number("position_noise", position_noise)
-    if not 0.0 < update_prob <= 1.0:
-        raise NPAError(f"update_prob must lie in (0, 1], got {update_prob}")
-    if not (math.isfinite(dt) and dt > 0.0):
-        raise NPAError(f"dt must be positive and finite, got {dt}")
-    if not (math.isfinite(position_noise) and position_noise >= 0.0):
-        raise NPAError(f"position_noise must be finite and not negative, got {position_noise}")
-    detach_positions = checked_flag("detach_positions", detach_positions)
-    sides = checked_box(box, space_dim, radius, dtype)
-    return StepOptions(
-        radius, sides, update_prob, dt, position_noise, detach_positions, eps0, alpha * radius
-    )
-
-
-_known_numbers = functools.lru_cache(maxsize=256, typed=True)(_checked_numbers)
-
-
-def run_steps(
-    step: Step,
-    rules: Sequence[NPARule],
-    worlds: Particles,
-    steps: int,
-    *,
-    generator: Randomness | None,
-    memory: Memory,
-    keep_every: int | None = None,
-    watch: DivergenceWatch | None = None,
-    with_modules: bool = False,
-) -> Particles:
-    """Repeat a step on checked worlds; return them in the caller's order.
-
-    Args:
-        step: What to repeat.
-        rules: The rules that it runs.
-        worlds: The worlds, in the order that the step takes them in.
-        steps: Number of steps T.
-        generator: Source of the draws.
-        memory: What the backward pass reads is stored or recomputed.
-        keep_every: Return the worlds after each so many steps, one after the other in a first
-            dimension; None: the last ones.
-        watch: What looks at the worlds after each step, or None.
-        with_modules: A rule is run as a module, which may draw: recomputed steps draw the same.
-
-    Raises:
-        DivergedError: The watch has seen a world diverge.
-    """
-    interval = STORED_INTERVAL[memory] if torch.is_grad_enabled() else 1
-    kept: list[Particles] = []
-    # While a graph is recorded, torch's state cannot be read, and its draws are the graph's.
-    recorded = worlds.x.is_cuda and torch.cuda.is_current_stream_capturing()
-    redraw = with_modules and not recorded
-    if with_modules and recorded and not draws_alone():
-        # Recomputed, a module that draws would draw otherwise.
-        interval = 1
-    again = None
-    # What a compiler has taken reads copies.
-    if interval > 1 and not torch.compiler.is_compiling():
-        again = RecomputedSteps(step.advance, rules, {"x": worlds.x, "s": worlds.s})
-    # Worlds keep their dtype under autocast: the kernels read what the rules write.
-    with torch.autocast(worlds.x.device.type, enabled=False):
-        for number, draws in enumerate(step.draws(worlds.x, steps, generator)):
-            if (steps - 1 - number) % interval > 0:
-                worlds = checkpoint(
-                    again or step.advance,
-                    *worlds,
-                    *draws,
-                    use_reentrant=False,
-                    preserve_rng_state=redraw,
-                )
-            else:
-                mask, noise, rows, births = draws
-                worlds = step.advance(*worlds, mask, noise, rows, births)
-            if watch is not None:
-                seen = step.ordered(Particles(*(value.detach() for value in worlds)))
-                watch.look(seen.x, seen.s)
-            if keep_every is not None and (number + 1) % keep_every == 0:
-                kept.append(step.ordered(worlds))
-        if again is not None:
-            again.end_forward()
-        if steps == 0:
-            # What is returned is the caller's to write to.
-            worlds = Particles(*(value.clone() for value in worlds))
-        if keep_every is None:
-            worlds = step.ordered(worlds)
-        else:
-            worlds = Particles(*map(torch.stack, zip(*kept, strict=True)))
-    if watch is not None:
-        watch.raise_diverged()
-    return worlds
-
-
-class RolloutCall(NamedTuple):
-    """What a checked call of `rollout` asks for besides its tensors."""
-
-    steps: int
-    options: StepOptions
-    memory: Memory
-    keep_every: int | None
-
-    def run(
-        self,
-        rules: Sequence[NPARule],
-        worlds: Particles,
-        generator: Randomness | None,
-        watch: DivergenceWatch | None = None,
-    ) -> Particles:
-        """Launch the rollout of one rule."""
-        (rule,) = rules
-        options = self.options.constants()
-        # Any other rule runs as the module that it is.
-        network = rule.network()
-        if _stays(rule, self.steps, options):
-            # Before all else: a rollout in parts prepares the later ones from wrapped positions.
-            worlds = worlds._replace(x=wrapped(worlds.x, options.box))
-            static = _prepare_static(rule, worlds.x, options)
-        else:
-            static = None
-        preparable = network is not None and static is None and not rule.divides
-        if network is not None and preparable and watch is None and may_prepare(worlds):
-            prepared = self._run_prepared(rule, network, worlds, generator)
-            if prepared is not None:
-                return prepared
-        if static is not None:
-            worlds = Particles(*map(static.sort, worlds))
-        if rule.divides:
-            # What lies in dead slots must not reach gradients either: 0 times NaN is NaN.
-            blank = torch.where(living(worlds.s)[..., None], worlds.s, 0.0)
-            worlds = worlds._replace(s=blank)
-        own = RuleStep(rule, network, options, static)
-        return run_steps(
-            DivisionStep(own) if rule.divides else own,
-            rules,
-            worlds,
-            self.steps,
-            generator=generator,
-            memory=self.memory,
-            keep_every=self.keep_every,
-            watch=watch,
-            with_modules=network is None,
-        )
-
-    def _run_prepared(
-        self, rule: NPARule, network: Network, worlds: Particles, generator: Randomness | None
-    ) -> Particles | None:
-        """Run the rollout by prepared steps; None where it is to be launched."""
-        options, steps, every = self.options, self.steps, self.keep_every or self.steps
-        if options.position_noise > 0.0 or steps == 0:
-            return None
-        x, s, _ = worlds
-
-        def advance(network: Network, worlds: Particles, mask: Tensor | None) -> Particles:
-            step = RuleStep(rule, network, options)
-            return step.advance(*worlds, mask, None, None, None)
-
-        def make() -> PreparedSteps:
-            widths = network.row_width, network.update_width
-            return PreparedSteps(advance, worlds, *widths, options.update_prob < 1.0)
-
-        def run(prepared: PreparedSteps) -> list[Particles]:
-            draws = RuleStep(rule, network, options).draws(x, steps, generator)
-            with torch.autocast("cpu", enabled=False):
-                return prepared.run(
-                    network, worlds, (draw.mask for draw in draws), lambda done: done % every == 0
-                )
-
-        key = (options, rule_form(rule), x.shape, s.shape[2], x.dtype)
-        kept = run_prepared(key, make, run)
-        if kept is None:
-            return None
-        if self.keep_every is None:
-            return kept[0]
-        return Particles(*map(torch.stack, zip(*kept, strict=True)))
-
-
-def _stays(rule: NPARule, steps: int, options: StepOptions) -> bool:
-    """Return whether positions stay where they are, and it pays to compute what follows of them."""
-    moving = not rule.static or options.position_noise > 0.0 or not options.detach_positions
-    return not moving and steps >= FEWEST_STATIC
-
-
-def _prepare_static(rule: NPARule, x: Tensor, options: StepOptions) -> StaticWorlds:
-    """Compute what follows from positions that stay."""
-    return prepare_static(
-        x, rule.state_dim, eps=options.eps, box=options.box, terms=rule_terms(rule)
+    return physics(
+        rule.space_dim,
+        rule.state_dim,
+        x.dtype,
+        eps=eps,
+        eps0=rule.eps0,
+        box=box,
+        terms=Terms(
+            rule.state_gradient,
+            rule.moment_inverse if rule.moment_correction else None,
+            rule.density_gradient,
+        ),
+        moving=not rule.static,
+        alpha=rule.alpha,
+        update_prob=update_prob,
+        dt=dt,
+        position_noise=position_noise,
     )
 
 
@@ -331,53 +94,14 @@ def _check_one_species(rule: NPARule) -> None:
         )
 
 
-def _resting(
-    rule: NPARule, worlds: Particles, options: StepOptions, cuda_graph: CudaGraph
-) -> Tensor:
-    """Return which worlds stay as they are if all particles are updated, bool, shape [B]."""
-    call = RolloutCall(1, options._replace(update_prob=1.0), "store", None)
-    x, s, _ = worlds
-    with torch.no_grad():
-        after = run_call(call, (rule,), x, s, None, cuda_graph=cuda_graph, watch=None)
-    return (after.x == x).flatten(1).all(dim=1) & (after.s == s).flatten(1).all(dim=1)
-
-
-def _may_rest(call: RolloutCall, rule: NPARule, x: Tensor) -> bool:
-    """Return whether a rollout asks whether its worlds are at rest: their steps are left out."""
-    return (
-        rule.dead_zone > 0.0
-        and rule.has_network()
-        and not rule.divides
-        and call.steps >= FEWEST_RESTING
-        and call.keep_every is None
-        and call.options.position_noise == 0.0
-        and not torch.is_grad_enabled()
-        and not torch.compiler.is_compiling()
-        and not (x.is_cuda and torch.cuda.is_current_stream_capturing())
-    )
-
-
-def _run_until_rest(
-    call: RolloutCall,
-    rule: NPARule,
-    worlds: Particles,
-    generator: Randomness | None,
-    cuda_graph: CudaGraph,
-) -> Particles:
-    """Run a rollout in parts, and leave out what comes when all worlds are at rest."""
-    left, part = call.steps, FIRST_PART[worlds.x.device.type]
-    while left and not _resting(rule, worlds, call.options, cuda_graph).all():
-        own = call._replace(steps=min(part, left))
-        x, s, _ = worlds
-        worlds = run_call(own, (rule,), x, s, generator, cuda_graph=cuda_graph, watch=None)
-        left, part = left - own.steps, 2 * part
-        if left and not worlds.x.isfinite().all():
-            # A world has diverged, which the next call refuses, and not this one.
-            return call._replace(steps=left).run((rule,), worlds, generator)
-    # Whoever draws next gets what comes after all steps.
-    skip_draws(worlds.x, call.options, left, generator)
-    # What is returned is the caller's to write to.
-    return Particles(*(value.clone() for value in worlds)) if left == call.steps else worlds
+def result(
+    after: Particles, return_path_length: bool
+) -> tuple[Tensor, Tensor] | tuple[Tensor, Tensor, Tensor]:
+    """Return what a public call gives of worlds."""
+    if not return_path_length:
+        return after.x, after.s
+    assert after.path_length is not None, "rollouts measure paths"
+    return after.x, after.s, after.path_length
 
 
 def checked_keep_every(keep_every: int | None, steps: int) -> int | None:
@@ -471,8 +195,8 @@ def at_rest(
             "worlds change by chance"
         )
     _check_one_species(rule)
-    options = checked_options(rule, x, s, eps, box, 1.0, dt, 0.0, True)
-    return _resting(rule, Particles(x, s, x.new_zeros(x.shape[:2])), options, "auto")
+    made = checked_physics(rule, x, s, eps=eps, box=box, dt=dt)
+    return resting((rule,), Particles(x, s), made, "auto")
 
 
 @overload
@@ -582,20 +306,22 @@ def rollout(
     check_cuda_graph(cuda_graph)
     check_rule(rule)
     _check_one_species(rule)
-    options = checked_options(
-        rule, x, s, eps, box, update_prob, dt, position_noise, detach_positions
+    made = checked_physics(
+        rule, x, s, eps=eps, box=box, update_prob=update_prob, dt=dt, position_noise=position_noise
     )
+    detach_positions = checked_flag("detach_positions", detach_positions)
     check_generator(generator, x.device, x.shape[0])
-    if rule.divides and options.box is not None:
+    if rule.divides and made.box is not None:
         raise NPAError(
             f"box must be None where particles divide, got {shown(box)}: the dead need a place far "
             "from all others"
         )
-    call = RolloutCall(steps, options, memory, kept)
-    watch = make_watch(on_divergence, x, s)
-    if watch is None and not return_path_length and _may_rest(call, rule, x):
-        worlds = Particles(x, s, x.new_zeros(x.shape[:2]))
-        after = _run_until_rest(call, rule, worlds, generator, cuda_graph)
-    else:
-        after = run_call(call, (rule,), x, s, generator, cuda_graph=cuda_graph, watch=watch)
-    return (after.x, after.s, after.path_length) if return_path_length else (after.x, after.s)
+    after = execute(
+        RolloutSpec(steps, made, detach_positions, memory, kept),
+        (rule,),
+        Particles(x, s, x.new_zeros(x.shape[:2]) if return_path_length else None),
+        generator,
+        graph=cuda_graph,
+        watch=make_watch(on_divergence, x, s),
+    )
+    return result(after, return_path_length)

@@ -3,34 +3,29 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
-from typing import Any, Literal, NamedTuple, Unpack, overload
+from collections.abc import Sequence
+from typing import Any, Literal, Unpack, overload
 
-import torch
 from torch import Tensor
 
-from npa_envs.checks import Box, check_world, checked_count, checked_number, entries
+from npa_envs.checks import Box, check_world, checked_count, checked_flag, checked_number, entries
 from npa_envs.errors import NPAError, shown
-from npa_envs.ops.perceive import perceive_rows
-from npa_envs.ops.species import checked_counts, perceive_by_species
-from npa_envs.ops.static import StaticRows
-from npa_envs.ops.update import update_particles
-from npa_envs.rule.network import Network
+from npa_envs.ops.species import checked_counts
 from npa_envs.rule.rule import NPARule
-from npa_envs.world.divergence import DivergenceWatch, OnDivergence, make_watch
-from npa_envs.world.division import Births
-from npa_envs.world.randomness import Randomness, WorldRandom, check_generator
-from npa_envs.world.recorded import CudaGraph, Particles, check_cuda_graph, run_call
+from npa_envs.world.divergence import OnDivergence, make_watch
+from npa_envs.world.execute import Memory, RolloutSpec, execute
+from npa_envs.world.particles import Particles
+from npa_envs.world.randomness import Randomness, check_generator
+from npa_envs.world.recorded import CudaGraph, check_cuda_graph
 from npa_envs.world.rollout import (
-    Memory,
     RolloutOptions,
     check_memory,
     checked_keep_every,
-    checked_options,
+    checked_physics,
+    result,
     rollout,
-    run_steps,
 )
-from npa_envs.world.steps import Draws, StepOptions, draw_step, row_capacity, rule_terms
+from npa_envs.world.steps import SpeciesSpec
 
 SpeciesPerception = Literal["shared", "per_species"]
 
@@ -162,7 +157,7 @@ def rollout_species(
     divisors = _checked_divisors(density_counts, sizes)
     check_memory(memory)
     if perception == "shared" and divisors == (float(x.shape[1]),):
-        *after, travelled = rollout(
+        x_after, s_after, travelled = rollout(
             species_rules[0],
             x,
             s,
@@ -180,67 +175,42 @@ def rollout_species(
             cuda_graph=cuda_graph,
             return_path_length=True,
         )
-        return (after[0], after[1], travelled) if return_path_length else (after[0], after[1])
+        return (x_after, s_after, travelled) if return_path_length else (x_after, s_after)
     kept = checked_keep_every(keep_every, steps)
     check_cuda_graph(cuda_graph)
-    options = tuple(
-        checked_options(rule, x, s, eps, box, chance, dt, position_noise, detach_positions)
+    own = [
+        checked_physics(
+            rule, x, s, eps=eps, box=box, update_prob=chance, dt=dt, position_noise=position_noise
+        )
         for rule, chance in zip(species_rules, probabilities, strict=True)
+    ]
+    common = own[0]._replace(
+        update_prob=max(each.update_prob for each in own),
+        max_displacement=max(each.max_displacement for each in own),
+    )
+    species = tuple(
+        SpeciesSpec(size, each.update_prob, divisor)
+        for size, each, divisor in zip(sizes, own, divisors, strict=True)
     )
     check_generator(generator, x.device, x.shape[0])
-    worlds = run_call(
-        SpeciesCall(steps, options, memory, kept, sizes, divisors, perception == "per_species"),
+    spec = RolloutSpec(
+        steps,
+        common,
+        checked_flag("detach_positions", detach_positions),
+        memory,
+        kept,
+        species,
+        perception == "per_species",
+    )
+    after = execute(
+        spec,
         species_rules,
-        x,
-        s,
+        Particles(x, s),
         generator,
-        cuda_graph=cuda_graph,
+        graph=cuda_graph,
         watch=make_watch(on_divergence, x, s),
     )
-    if return_path_length:
-        return worlds.x, worlds.s, worlds.path_length
-    return worlds.x, worlds.s
-
-
-class SpeciesCall(NamedTuple):
-    """What a checked call of `rollout_species` asks for besides its tensors."""
-
-    steps: int
-    options: tuple[StepOptions, ...]
-    """What each species' particles are told."""
-    memory: Memory
-    keep_every: int | None
-    counts: tuple[int, ...]
-    density_counts: tuple[float, ...]
-    by_species: bool
-
-    def run(
-        self,
-        rules: Sequence[NPARule],
-        worlds: Particles,
-        generator: Randomness | None,
-        watch: DivergenceWatch | None = None,
-    ) -> Particles:
-        """Launch the rollout."""
-        community = make_species_step(
-            rules,
-            self.counts,
-            [own.constants() for own in self.options],
-            self.density_counts,
-            worlds.x,
-            by_species=self.by_species,
-        )
-        return run_steps(
-            community,
-            rules,
-            worlds,
-            self.steps,
-            generator=generator,
-            memory=self.memory,
-            keep_every=self.keep_every,
-            watch=watch,
-            with_modules=not all(rule.has_network() for rule in rules),
-        )
+    return result(after, return_path_length)
 
 
 def _checked_rules(rules: Any) -> list[NPARule]:
@@ -316,254 +286,3 @@ def _checked_divisors(density_counts: Any, counts: tuple[int, ...]) -> tuple[flo
             f"got {shown(density_counts)}: for example density_counts={counts}"
         )
     return checked
-
-
-class Species(NamedTuple):
-    """One species of checked worlds."""
-
-    rule: NPARule
-    network: Network | None
-    """The rule's weights as they are run; None where it runs as the module that it is."""
-    first: int
-    """Its first particle in a world."""
-    end: int
-    """One past its last particle."""
-    update_prob: float
-    """Probability of each of its particles' updates."""
-    reach_share: float
-    """Its largest displacement as a share of the largest of all species."""
-    count_ratio: float
-    """Particles of a world over those by which this species divides densities."""
-
-
-class SpeciesStep(NamedTuple):
-    """The step of several rules in one world: a common perception pass, then rule by rule."""
-
-    species: list[Species]
-    counts: tuple[int, ...]
-    options: StepOptions
-    """With the largest update probability, and the largest reach."""
-    update_share: Tensor | None
-    """Share of the updates so drawn that each particle keeps, shape [N]; None: all keep all."""
-    by_species: bool
-    """Rules perceive each species' density and density gradient."""
-
-    def draws(self, x: Tensor, steps: int, generator: Randomness | None) -> Iterator[Draws]:
-        """Draw each step's update mask and position noise: as for one rule, thinned by species."""
-        for _ in range(steps):
-            yield self._draw(x, generator)
-
-    def _draw(self, x: Tensor, generator: Randomness | None) -> Draws:
-        mask, noise, *_ = draw_step(x, self.options, generator)
-        if self.update_share is None:
-            return Draws(mask, noise)
-        if isinstance(generator, WorldRandom):
-            drawn = generator.uniform(x.shape[1])
-        else:
-            drawn = torch.rand(x.shape[:2], device=x.device, generator=generator)
-        kept = (drawn < self.update_share).to(torch.uint8)
-        return Draws(kept if mask is None else mask * kept, noise)
-
-    def advance(
-        self,
-        x: Tensor,
-        s: Tensor,
-        path_length: Tensor,
-        mask: Tensor | None,
-        noise: Tensor | None,
-        rows: StaticRows | None,
-        births: Births | None,
-    ) -> Particles:
-        """Advance checked worlds by one step whose random draws are given."""
-        species, options = self.species, self.options
-        first = species[0].rule
-        shared_dim = rule_terms(first).perception_dim(first.space_dim, first.state_dim)
-        shared_width = shared_dim
-        if not self.by_species:
-            # A folded rule's own row: a one follows the perception vector, then zeros.
-            shared_width = max(
-                own.network.row_width if own.network else shared_dim for own in species
-            )
-        perception, active = perceive_rows(
-            x.detach() if options.detach_positions else x,
-            s,
-            mask=mask,
-            row_capacity=_row_total(self, x, mask),
-            row_width=shared_width,
-            eps=options.eps,
-            eps0=options.eps0,
-            box=options.box,
-            terms=rule_terms(first),
-        )
-        appended = None
-        if self.by_species:
-            appended = perceive_by_species(
-                x, self.counts, eps=options.eps, eps0=options.eps0, box=options.box
-            )
-        row_count = len(perception)
-        outputs, places = [], []
-        for own in species:
-            place, particle = _rows_of_species(
-                active.row_of.view(x.shape[:2]), own, row_count, mask
-            )
-            z = perception.index_select(0, place.clamp(max=row_count - 1))
-            if own.count_ratio != 1.0 and first.density_gradient:
-                begin, end = shared_dim - first.space_dim, shared_dim
-                gradient = _recounted(z[:, begin:end], own.count_ratio)
-                z = torch.cat((z[:, :begin], gradient, z[:, end:]), dim=1)
-            if appended is not None:
-                beside = appended[:, own.first : own.end].flatten(0, 1).index_select(0, particle)
-                if own.count_ratio != 1.0:
-                    beside = _recounted_by_species(beside, len(species), own.count_ratio)
-                z = torch.cat((z, beside), dim=1)
-            outputs.append(_update_of(own, z))
-            places.append(place)
-        width = min(output.shape[1] for output in outputs)
-        update = perception.new_zeros(row_count + 1, width).index_copy(
-            0, torch.cat(places), torch.cat([output[:, :width] for output in outputs])
-        )
-        return Particles(
-            *update_particles(
-                update[:row_count],
-                x if noise is None else x + noise,
-                s,
-                path_length,
-                rows=active,
-                max_displacement=options.max_displacement,
-                dt=options.dt,
-                moving=not first.static,
-                box=options.box,
-            )
-        )
-
-    def ordered(self, worlds: Particles) -> Particles:
-        """Return the worlds: they are in the caller's order."""
-        return worlds
-
-
-def make_species_step(
-    rules: Sequence[NPARule],
-    counts: tuple[int, ...],
-    options: Sequence[StepOptions],
-    density_counts: tuple[float, ...],
-    x: Tensor,
-    *,
-    by_species: bool,
-) -> SpeciesStep:
-    """Return what stays the same over a rollout of checked worlds.
-
-    Args:
-        rules: One rule for each species; they agree.
-        counts: Particles of each species.
-        options: What each species' particles are told.
-        density_counts: Particles by which each species divides densities.
-        x: Positions [length units], shape [B, N, D].
-        by_species: Rules perceive each species' density and density gradient.
-    """
-    species = []
-    first = 0
-    longest = max(rule.alpha for rule in rules)
-    for rule, count, own, divisor in zip(rules, counts, options, density_counts, strict=True):
-        species.append(
-            Species(
-                rule=rule,
-                network=rule.network(),
-                first=first,
-                end=first + count,
-                update_prob=own.update_prob,
-                reach_share=rule.alpha / longest,
-                count_ratio=x.shape[1] / divisor,
-            )
-        )
-        first += count
-    probabilities = [own.update_prob for own in options]
-    highest = max(probabilities)
-    update_share = None
-    if min(probabilities) < highest:
-        update_share = torch.cat(
-            [
-                torch.full((count,), chance / highest, device=x.device)
-                for count, chance in zip(counts, probabilities, strict=True)
-            ]
-        )
-    shared = options[0]._replace(
-        update_prob=highest, max_displacement=max(own.max_displacement for own in options)
-    )
-    return SpeciesStep(species, counts, shared, update_share, by_species)
-
-
-def _row_total(community: SpeciesStep, x: Tensor, mask: Tensor | None) -> int:
-    """Return how many rows hold the active particles of all species."""
-    total = x.shape[0] * x.shape[1]
-    if mask is None:
-        return total
-    if not x.is_cuda:
-        return max(int(mask.sum()), 1)
-    return min(total, sum(_capacity(own, x.shape[0]) for own in community.species))
-
-
-def _capacity(own: Species, world_count: int) -> int:
-    return row_capacity(world_count * (own.end - own.first), own.update_prob)
-
-
-def _rows_of_species(
-    row_of: Tensor, own: Species, row_count: int, mask: Tensor | None
-) -> tuple[Tensor, Tensor]:
-    """Return the rows of a species' active particles, and which of its particles they stand for.
-
-    Both are int64, of one shape [R]; entries that stand for nobody have the row `row_count`. On
-    CUDA R does not depend on the draw, so that nothing waits for the device.
-    """
-    row = row_of[:, own.first : own.end].reshape(-1).long()
-    everyone = torch.arange(len(row), device=row.device)
-    if mask is None:
-        return row, everyone
-    active = row >= 0
-    if row.is_cuda:
-        capacity = _capacity(own, row_of.shape[0])
-        place = active.cumsum(0) - 1
-        place = torch.where(active & (place < capacity), place, capacity)
-        particle = everyone.new_zeros(capacity + 1).scatter(0, place, everyone)[:capacity]
-        filled = torch.arange(capacity, device=row.device) < active.sum()
-        return torch.where(filled, row[particle], row_count), particle
-    particle = active.nonzero()[:, 0]
-    if not len(particle):
-        return row.new_full((1,), row_count), row.new_zeros(1)
-    return row[particle], particle
-
-
-def _recounted(scaled: Tensor, ratio: float) -> Tensor:
-    """Return L(ratio v), given L(v) of vectors in the last dimension; differentiable."""
-    length = torch.linalg.vector_norm(scaled, dim=-1, keepdim=True)
-    somewhere = length > 0.0
-    divisor = torch.where(somewhere, length, 1.0)
-    factor = torch.log1p(ratio * torch.expm1(divisor)) / divisor
-    return scaled * torch.where(somewhere, factor, ratio)
-
-
-def _recounted_by_species(appended: Tensor, species_count: int, ratio: float) -> Tensor:
-    """Return what is perceived of each species, [R, K (1 + D)], with densities times `ratio`."""
-    density, gradient = appended[:, :species_count], appended[:, species_count:]
-    gradient = _recounted(gradient.view(len(gradient), species_count, -1), ratio).flatten(1)
-    return torch.cat((ratio * density, gradient), dim=1)
-
-
-def _update_of(own: Species, z: Tensor) -> Tensor:
-    """Return a species' raw updates, [R, A] or wider, for its rows of perception."""
-    rule = own.rule
-    if own.network is None:
-        update: Tensor = rule(z[:, : rule.perception_dim])
-    else:
-        if z.shape[1] < own.network.row_width:
-            one = z.new_ones(len(z), 1)
-            rest = z.new_zeros(len(z), own.network.row_width - rule.perception_dim - 1)
-            z = torch.cat((z[:, : rule.perception_dim], one, rest), dim=1)
-        update = own.network(z)
-    if rule.static or own.reach_share == 1.0:
-        return update
-    # The displacement r q δ / (1 + |δ|), with this share q of the common reach r, is that of
-    # δ' = q δ / (1 + (1 - q) |δ|), which is pulled back by the same operator.
-    delta = update[:, : rule.space_dim]
-    length = torch.linalg.vector_norm(delta, dim=1, keepdim=True)
-    delta = own.reach_share * delta / (1.0 + (1.0 - own.reach_share) * length)
-    return torch.cat((delta, update[:, rule.space_dim :]), dim=1)

@@ -1,28 +1,26 @@
-"""Steps: what a rollout repeats, of a rule and of one whose particles divide."""
+"""Steps of worlds: of a rule, of particles that stay, that divide, and of several species."""
 
 from __future__ import annotations
 
 import math
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from typing import NamedTuple, Protocol
 
 import torch
 from torch import Tensor
 
 from npa_envs.checks import constant
-from npa_envs.ops.perceive import (
-    PerceptionOptions,
-    Terms,
-    perceive_rows,
-    update_some_at_a_time,
-)
-from npa_envs.ops.static import StaticRows, StaticWorlds, static_rows
-from npa_envs.ops.update import update_particles
+from npa_envs.ops.perceive import perceive_rows, update_some_at_a_time
+from npa_envs.ops.physics import Physics
+from npa_envs.ops.species import perceive_by_species
+from npa_envs.ops.static import StaticRows, StaticWorlds, prepare_static, static_rows
+from npa_envs.ops.update import update_particles, wrapped
 from npa_envs.rule.network import Network
 from npa_envs.rule.rule import LIFE, NPARule
 from npa_envs.world.cuda_graph import SideStream
 from npa_envs.world.division import Births, divided, living, parked
+from npa_envs.world.particles import Particles
 from npa_envs.world.randomness import (
     Randomness,
     WorldRandom,
@@ -31,7 +29,6 @@ from npa_envs.world.randomness import (
     torch_generator,
     uniform_draws,
 )
-from npa_envs.world.recorded import Particles
 
 ROWS_TOGETHER = 2**24
 """Rows of static worlds that are given together, at most, if they are of several steps."""
@@ -44,36 +41,6 @@ MOST_AHEAD = 4
 
 OVERFLOW_LOG_PROBABILITY = 34.5
 """Row capacities hold with probability 1 - exp(-34.5), about 1 - 1e-15, for each step."""
-
-
-class StepOptions(NamedTuple):
-    """Everything about a step that stays the same over a rollout, checked."""
-
-    eps: float
-    box: tuple[float, ...] | None
-    update_prob: float
-    dt: float
-    position_noise: float
-    detach_positions: bool
-    eps0: float
-    """Radius at which the rule was trained [length units]."""
-    max_displacement: float
-    """Largest displacement alpha eps in a unit of time [length units]."""
-
-    def constants(self) -> StepOptions:
-        """Return them with numbers that a compiler takes for constants."""
-        if not torch.compiler.is_compiling():
-            return self
-        return StepOptions(
-            constant(self.eps),
-            None if self.box is None else tuple([constant(side) for side in self.box]),
-            constant(self.update_prob),
-            constant(self.dt),
-            constant(self.position_noise),
-            self.detach_positions,
-            constant(self.eps0),
-            constant(self.max_displacement),
-        )
 
 
 def row_capacity(particle_total: int, update_prob: float) -> int:
@@ -93,13 +60,13 @@ def row_capacity(particle_total: int, update_prob: float) -> int:
     return min(particle_total, math.ceil(mean + margin))
 
 
-def row_count(mask: Tensor | None, x: Tensor, options: StepOptions) -> int:
+def row_count(mask: Tensor | None, x: Tensor, update_prob: float) -> int:
     """Return how many rows hold the active particles of a step of worlds at x; no mask: all."""
     total = x.shape[0] * x.shape[1]
     if mask is None:
         return total
     # Counting is free on the CPU; on CUDA it would stall the stream.
-    return row_capacity(total, options.update_prob) if mask.is_cuda else max(int(mask.sum()), 1)
+    return row_capacity(total, update_prob) if mask.is_cuda else max(int(mask.sum()), 1)
 
 
 class Draws(NamedTuple):
@@ -115,23 +82,23 @@ class Draws(NamedTuple):
     """What fates and children hang on, where particles divide."""
 
 
-def draw_step(x: Tensor, options: StepOptions, generator: Randomness | None) -> Draws:
+def draw_step(x: Tensor, physics: Physics, generator: Randomness | None) -> Draws:
     """Draw a step's update mask and position noise, in this order."""
     mask = noise = None
     if isinstance(generator, WorldRandom):
         generator.advance()
-        if options.update_prob < 1.0:
-            mask = generator.bernoulli(options.update_prob, x.shape[1])
-        if options.position_noise > 0.0:
+        if physics.update_prob < 1.0:
+            mask = generator.bernoulli(physics.update_prob, x.shape[1])
+        if physics.position_noise > 0.0:
             noise = generator.normal(*x.shape[1:], dtype=x.dtype)
-            noise *= options.position_noise
+            noise *= physics.position_noise
         return Draws(mask, noise)
-    if options.update_prob < 1.0:
+    if physics.update_prob < 1.0:
         mask = torch.empty(x.shape[:2], dtype=torch.uint8, device=x.device)
-        mask.bernoulli_(options.update_prob, generator=generator)
-    if options.position_noise > 0.0:
+        mask.bernoulli_(physics.update_prob, generator=generator)
+    if physics.position_noise > 0.0:
         noise = torch.randn(x.shape, dtype=x.dtype, device=x.device, generator=generator)
-        noise *= options.position_noise
+        noise *= physics.position_noise
     return Draws(mask, noise)
 
 
@@ -142,8 +109,6 @@ def iterate_draws(draw: Callable[[], Draws], like: Tensor, steps: int) -> Iterat
 
     Args:
         draw: Returns what the next step draws.
-        like: A tensor on the worlds' device.
-        steps: Number of steps.
     """
     # Asked in this order: a compiler cannot trace what a stream does.
     recording = not torch.compiler.is_compiling() and like.is_cuda
@@ -164,56 +129,37 @@ def iterate_draws(draw: Callable[[], Draws], like: Tensor, steps: int) -> Iterat
     yield from ready
 
 
-def skip_draws(x: Tensor, options: StepOptions, steps: int, generator: Randomness | None) -> None:
-    """Bring a source of draws to where it would be after some steps of worlds at x.
-
-    Args:
-        x: Positions, of which the shape, the dtype and the device count.
-        options: What the steps draw.
-        steps: Number of steps.
-        generator: The source.
-    """
+def skip_draws(x: Tensor, physics: Physics, steps: int, generator: Randomness | None) -> None:
+    """Bring a source of draws to where it would be after some steps of worlds at x."""
     if steps == 0:
         return
     if isinstance(generator, WorldRandom):
         generator.advance(steps - 1)
-        draw_step(x, options, generator)
+        draw_step(x, physics, generator)
     elif x.is_cuda:
         # On CUDA torch counts what it has drawn, and equal draws count the same.
         counter = torch.Generator(x.device)
-        draw_step(x, options, counter)
+        draw_step(x, physics, counter)
         reserve_draws(torch_generator(generator, x.device), steps * counter.get_offset())
     else:
         for _ in range(steps):
-            draw_step(x, options, generator)
-
-
-def rule_terms(rule: NPARule) -> Terms:
-    """Return the groups of the perception vector that a rule reads."""
-    inverse = rule.moment_inverse if rule.moment_correction else None
-    return Terms(rule.state_gradient, inverse, rule.density_gradient)
+            draw_step(x, physics, generator)
 
 
 class Step(Protocol):
     """What a rollout repeats: draws, and an advance that follows from them alone."""
 
-    def draws(self, x: Tensor, steps: int, generator: Randomness | None) -> Iterator[Draws]:
-        """Draw what each of some steps of worlds at x draws."""
+    def enter(self, particles: Particles) -> Particles:
+        """Return worlds as the steps take them, such as in sorted order."""
 
-    def advance(
-        self,
-        x: Tensor,
-        s: Tensor,
-        path_length: Tensor,
-        mask: Tensor | None,
-        noise: Tensor | None,
-        rows: StaticRows | None,
-        births: Births | None,
-    ) -> Particles:
+    def draw(self, like: Tensor, steps: int, source: Randomness | None) -> Iterator[Draws]:
+        """Yield each step's draws, for positions like these."""
+
+    def advance(self, particles: Particles, draws: Draws) -> Particles:
         """Return the worlds after one step with these draws."""
 
-    def ordered(self, worlds: Particles) -> Particles:
-        """Return worlds of the rollout in the caller's order of particles."""
+    def leave(self, particles: Particles) -> Particles:
+        """Return worlds of the rollout in the caller's order."""
 
 
 class RuleStep(NamedTuple):
@@ -222,82 +168,93 @@ class RuleStep(NamedTuple):
     rule: NPARule
     network: Network | None
     """The rule's weights as they are run; None: it runs as the module that it is."""
-    options: StepOptions
+    physics: Physics
+    detach_positions: bool = True
     static: StaticWorlds | None = None
-    """Where particles never move: worlds in sorted order, prepared once."""
+    """Sorted worlds whose particles never move; `StaticStep` prepares them."""
 
-    def draws(self, x: Tensor, steps: int, generator: Randomness | None) -> Iterator[Draws]:
-        """Draw each step's update mask and position noise."""
-        if self.static is None:
-            yield from iterate_draws(lambda: draw_step(x, self.options, generator), x, steps)
-            return
-        # The rows of static worlds are given some steps at a time, in few launches.
-        total = x.shape[0] * x.shape[1]
-        together = max(min(16, ROWS_TOGETHER // total), 1)
-        for first in range(0, steps, together):
-            count = min(together, steps - first)
-            drawn = [draw_step(x, self.options, generator) for _ in range(count)]
-            masks = [draws.mask for draws in drawn if draws.mask is not None]
-            if masks:
-                capacity = row_capacity(total, self.options.update_prob)
-                rows = static_rows(self.static, x.detach(), masks, capacity)
-                drawn = [Draws(None, None, own) for own in rows]
-            yield from drawn
+    def enter(self, particles: Particles) -> Particles:
+        """Return the worlds."""
+        return particles
 
-    def advance(
-        self,
-        x: Tensor,
-        s: Tensor,
-        path_length: Tensor,
-        mask: Tensor | None,
-        noise: Tensor | None,
-        rows: StaticRows | None,
-        births: Births | None,
-    ) -> Particles:
+    def draw(self, like: Tensor, steps: int, source: Randomness | None) -> Iterator[Draws]:
+        """Yield each step's update mask and position noise."""
+        return iterate_draws(lambda: draw_step(like, self.physics, source), like, steps)
+
+    def advance(self, particles: Particles, draws: Draws) -> Particles:
         """Return the worlds after one step with these draws."""
-        rule, options = self.rule, self.options
+        x, s, path_length, _ = particles
+        mask, noise, rows, _ = draws
+        assert path_length is not None, "rollouts measure paths"
+        rule, physics = self.rule, self.physics
         network = rule if self.network is None else self.network
         width = rule.perception_dim if self.network is None else self.network.row_width
-        count = len(rows.row_source) if rows is not None else row_count(mask, x, options)
-        huge = count > ROWS_KEPT and not torch.is_grad_enabled() and self.static is None
+        total = row_count(mask, x, physics.update_prob) if rows is None else len(rows.row_source)
+        huge = total > ROWS_KEPT and not torch.is_grad_enabled() and self.static is None
         if huge and not torch.compiler.is_compiling():
-            sides = None if options.box is None else list(options.box)
-            asked = PerceptionOptions(
-                count, width, options.eps, options.eps / options.eps0, sides, rule_terms(rule)
-            )
-            update, active = update_some_at_a_time(x, s, mask, network, asked)
+            update, active = update_some_at_a_time(x, s, physics, mask, network, total, width)
         else:
             perception, active = perceive_rows(
-                x.detach() if options.detach_positions else x,
+                x.detach() if self.detach_positions else x,
                 s,
+                physics,
                 mask=mask,
-                row_capacity=count,
+                row_capacity=total,
                 row_width=width,
-                eps=options.eps,
-                eps0=options.eps0,
-                box=options.box,
-                terms=rule_terms(rule),
                 static=self.static,
                 static_rows=rows,
             )
             update = network(perception)
-        return Particles(
-            *update_particles(
-                update,
-                x if noise is None else x + noise,
-                s,
-                path_length,
-                rows=active,
-                max_displacement=options.max_displacement,
-                dt=options.dt,
-                moving=not rule.static,
-                box=options.box,
-            )
-        )
+        moved = x if noise is None else x + noise
+        return Particles(*update_particles(update, moved, s, path_length, active, physics))
 
-    def ordered(self, worlds: Particles) -> Particles:
-        """Return worlds of the rollout in the caller's order of particles."""
-        return worlds if self.static is None else Particles(*map(self.static.unsort, worlds))
+    def leave(self, particles: Particles) -> Particles:
+        """Return the worlds."""
+        return particles
+
+
+class StaticStep(NamedTuple):
+    """The step of a rule whose particles never move: sorted and searched once."""
+
+    step: RuleStep
+    static: StaticWorlds
+    x: Tensor
+    """Positions, wrapped."""
+
+    @classmethod
+    def of(cls, step: RuleStep, x: Tensor) -> StaticStep:
+        """Return the step of worlds at these positions."""
+        # Later parts of a rollout begin at wrapped positions, and so does the first.
+        x = wrapped(x, step.physics.box)
+        static = prepare_static(x, step.physics)
+        return cls(step._replace(static=static), static, x)
+
+    def enter(self, particles: Particles) -> Particles:
+        """Return the worlds in sorted order."""
+        return particles._replace(x=self.x).gather(self.static.tensors.source)
+
+    def draw(self, like: Tensor, steps: int, source: Randomness | None) -> Iterator[Draws]:
+        """Yield each step's rows, which are given some steps at a time, in few launches."""
+        total = like.shape[0] * like.shape[1]
+        physics = self.step.physics
+        together = max(min(16, ROWS_TOGETHER // total), 1)
+        for first in range(0, steps, together):
+            count = min(together, steps - first)
+            drawn = [draw_step(like, physics, source) for _ in range(count)]
+            masks = [draws.mask for draws in drawn if draws.mask is not None]
+            if masks:
+                capacity = row_capacity(total, physics.update_prob)
+                rows = static_rows(self.static, like.detach(), masks, capacity)
+                drawn = [Draws(None, None, own) for own in rows]
+            yield from drawn
+
+    def advance(self, particles: Particles, draws: Draws) -> Particles:
+        """Return the worlds after one step with these draws."""
+        return self.step.advance(particles, draws)
+
+    def leave(self, particles: Particles) -> Particles:
+        """Return the worlds in the caller's order."""
+        return particles.gather(self.static.tensors.place)
 
 
 class DivisionStep(NamedTuple):
@@ -306,38 +263,39 @@ class DivisionStep(NamedTuple):
     step: RuleStep
     """The step of the living."""
 
-    def draws(self, x: Tensor, steps: int, generator: Randomness | None) -> Iterator[Draws]:
-        """Draw each step's update mask, position noise, fates and directions of children."""
-        yield from iterate_draws(lambda: self._draw(x, generator), x, steps)
+    def enter(self, particles: Particles) -> Particles:
+        """Return the worlds with states of zero in dead slots."""
+        # What lies in dead slots must not reach gradients either: 0 times NaN is NaN.
+        s = particles.s
+        return particles._replace(s=torch.where(living(s)[..., None], s, 0.0))
 
-    def _draw(self, x: Tensor, generator: Randomness | None) -> Draws:
-        drawn = draw_step(x, self.step.options, generator)
-        chance = uniform_draws(generator, x.shape[:2], x)
-        return drawn._replace(births=Births(chance, normal_draws(generator, x.shape, x)))
+    def draw(self, like: Tensor, steps: int, source: Randomness | None) -> Iterator[Draws]:
+        """Yield each step's update mask, position noise, fates and directions of children."""
 
-    def advance(
-        self,
-        x: Tensor,
-        s: Tensor,
-        path_length: Tensor,
-        mask: Tensor | None,
-        noise: Tensor | None,
-        rows: StaticRows | None,
-        births: Births | None,
-    ) -> Particles:
+        def draw() -> Draws:
+            drawn = draw_step(like, self.step.physics, source)
+            chance = uniform_draws(source, like.shape[:2], like)
+            return drawn._replace(births=Births(chance, normal_draws(source, like.shape, like)))
+
+        return iterate_draws(draw, like, steps)
+
+    def advance(self, particles: Particles, draws: Draws) -> Particles:
         """Return the worlds after one step with these draws."""
-        assert births is not None, "drawn above"
-        eps = self.step.options.eps
+        assert draws.births is not None, "drawn above"
+        x, s, path_length, _ = particles
+        eps = self.step.physics.eps
         alive = living(s)
-        updated = alive if mask is None else alive & mask.bool()
+        updated = alive if draws.mask is None else alive & draws.mask.bool()
         life, rest = s[..., : LIFE + 1], s[..., LIFE + 1 :]
         # Life is no weight of what is perceived, so perception gives it no gradient.
         perceived = torch.cat((life.detach(), rest), dim=-1)
         after = self.step.advance(
-            parked(x, alive, eps), perceived, path_length, updated.byte(), noise, rows, None
+            Particles(parked(x, alive, eps), perceived, path_length),
+            draws._replace(mask=updated.byte()),
         )
         # A rule does not change life.
         new_s = torch.cat((life, after.s[..., LIFE + 1 :]), dim=-1)
+        assert after.path_length is not None
         return Particles(
             *divided(
                 after.x,
@@ -345,11 +303,240 @@ class DivisionStep(NamedTuple):
                 after.path_length,
                 division_probabilities=self.step.rule.division_probabilities(new_s),
                 updated=updated,
-                births=births,
+                births=draws.births,
                 eps=eps,
             )
         )
 
-    def ordered(self, worlds: Particles) -> Particles:
-        """Return worlds of the rollout in the caller's order of particles."""
-        return worlds
+    def leave(self, particles: Particles) -> Particles:
+        """Return the worlds."""
+        return particles
+
+
+class SpeciesSpec(NamedTuple):
+    """What may differ between species, besides their rules."""
+
+    size: int
+    """Its particles in a world."""
+    update_prob: float
+    """Probability of each of its particles' updates."""
+    density_count: float
+    """Particles by which it divides densities."""
+
+
+class Species(NamedTuple):
+    """One species of checked worlds."""
+
+    rule: NPARule
+    network: Network | None
+    """The rule's weights as they are run; None where it runs as the module that it is."""
+    first: int
+    """Its first particle in a world."""
+    end: int
+    """One past its last particle."""
+    update_prob: float
+    """Probability of each of its particles' updates."""
+    reach_share: float
+    """Its largest displacement as a share of the largest of all species."""
+    count_ratio: float
+    """Particles of a world over those by which this species divides densities."""
+
+
+class SpeciesStep(NamedTuple):
+    """The step of several rules in one world: a common perception pass, then rule by rule."""
+
+    species: list[Species]
+    physics: Physics
+    detach_positions: bool
+    update_share: Tensor | None
+    """Share of the updates so drawn that each particle keeps, shape [N]; None: all keep all."""
+    by_species: bool
+    """Rules perceive each species' density and density gradient."""
+
+    def enter(self, particles: Particles) -> Particles:
+        """Return the worlds."""
+        return particles
+
+    def draw(self, like: Tensor, steps: int, source: Randomness | None) -> Iterator[Draws]:
+        """Yield each step's update mask and position noise: as for one rule, thinned by species."""
+        for _ in range(steps):
+            drawn = draw_step(like, self.physics, source)
+            if self.update_share is not None:
+                if isinstance(source, WorldRandom):
+                    chance = source.uniform(like.shape[1])
+                else:
+                    chance = torch.rand(like.shape[:2], device=like.device, generator=source)
+                mask, kept = drawn.mask, (chance < self.update_share).to(torch.uint8)
+                drawn = drawn._replace(mask=kept if mask is None else mask * kept)
+            yield drawn
+
+    def advance(self, particles: Particles, draws: Draws) -> Particles:
+        """Return the worlds after one step with these draws."""
+        x, s, path_length, _ = particles
+        mask, noise, *_ = draws
+        assert path_length is not None, "rollouts measure paths"
+        species, physics = self.species, self.physics
+        shared_width = shared_dim = physics.perception_dim
+        if not self.by_species:
+            # A folded rule's own row: a one follows the perception vector, then zeros.
+            shared_width = max(
+                own.network.row_width if own.network else shared_dim for own in species
+            )
+        perception, active = perceive_rows(
+            x.detach() if self.detach_positions else x,
+            s,
+            physics,
+            mask=mask,
+            row_capacity=_row_total(self, x, mask),
+            row_width=shared_width,
+        )
+        appended = None
+        if self.by_species:
+            counts = tuple(own.end - own.first for own in species)
+            appended = perceive_by_species(x, counts, physics)
+        row_count = len(perception)
+        outputs, places = [], []
+        for own in species:
+            place, particle = _rows_of_species(
+                active.row_of.view(x.shape[:2]), own, row_count, mask
+            )
+            z = perception.index_select(0, place.clamp(max=row_count - 1))
+            if own.count_ratio != 1.0 and physics.terms.density_gradient:
+                begin, end = shared_dim - physics.space_dim, shared_dim
+                gradient = _recounted(z[:, begin:end], own.count_ratio)
+                z = torch.cat((z[:, :begin], gradient, z[:, end:]), dim=1)
+            if appended is not None:
+                beside = appended[:, own.first : own.end].flatten(0, 1).index_select(0, particle)
+                if own.count_ratio != 1.0:
+                    beside = _recounted_by_species(beside, len(species), own.count_ratio)
+                z = torch.cat((z, beside), dim=1)
+            outputs.append(_update_of(own, z))
+            places.append(place)
+        width = min(output.shape[1] for output in outputs)
+        update = perception.new_zeros(row_count + 1, width).index_copy(
+            0, torch.cat(places), torch.cat([output[:, :width] for output in outputs])
+        )
+        moved = x if noise is None else x + noise
+        return Particles(
+            *update_particles(update[:row_count], moved, s, path_length, active, physics)
+        )
+
+    def leave(self, particles: Particles) -> Particles:
+        """Return the worlds."""
+        return particles
+
+
+def make_species_step(
+    rules: Sequence[NPARule],
+    specs: Sequence[SpeciesSpec],
+    physics: Physics,
+    x: Tensor,
+    *,
+    by_species: bool,
+    detach_positions: bool,
+) -> SpeciesStep:
+    """Return the step of species that follow one rule each, in worlds of positions x."""
+    species = []
+    first = 0
+    longest = max(rule.alpha for rule in rules)
+    for rule, own in zip(rules, specs, strict=True):
+        species.append(
+            Species(
+                rule=rule,
+                network=rule.network(),
+                first=first,
+                end=first + own.size,
+                update_prob=constant(own.update_prob),
+                reach_share=rule.alpha / longest,
+                count_ratio=x.shape[1] / own.density_count,
+            )
+        )
+        first += own.size
+    update_share = None
+    if min(own.update_prob for own in species) < physics.update_prob:
+        update_share = torch.cat(
+            [
+                torch.full(
+                    (own.end - own.first,), own.update_prob / physics.update_prob, device=x.device
+                )
+                for own in species
+            ]
+        )
+    return SpeciesStep(species, physics, detach_positions, update_share, by_species)
+
+
+def _row_total(community: SpeciesStep, x: Tensor, mask: Tensor | None) -> int:
+    """Return how many rows hold the active particles of all species."""
+    total = x.shape[0] * x.shape[1]
+    if mask is None:
+        return total
+    if not x.is_cuda:
+        return max(int(mask.sum()), 1)
+    return min(total, sum(_capacity(own, x.shape[0]) for own in community.species))
+
+
+def _capacity(own: Species, world_count: int) -> int:
+    return row_capacity(world_count * (own.end - own.first), own.update_prob)
+
+
+def _rows_of_species(
+    row_of: Tensor, own: Species, row_count: int, mask: Tensor | None
+) -> tuple[Tensor, Tensor]:
+    """Return the rows of a species' active particles, and which of its particles they stand for.
+
+    Both are int64, of one shape [R]; entries that stand for nobody have the row `row_count`. On
+    CUDA R does not depend on the draw, so that nothing waits for the device.
+    """
+    row = row_of[:, own.first : own.end].reshape(-1).long()
+    everyone = torch.arange(len(row), device=row.device)
+    if mask is None:
+        return row, everyone
+    active = row >= 0
+    if row.is_cuda:
+        capacity = _capacity(own, row_of.shape[0])
+        place = active.cumsum(0) - 1
+        place = torch.where(active & (place < capacity), place, capacity)
+        particle = everyone.new_zeros(capacity + 1).scatter(0, place, everyone)[:capacity]
+        filled = torch.arange(capacity, device=row.device) < active.sum()
+        return torch.where(filled, row[particle], row_count), particle
+    particle = active.nonzero()[:, 0]
+    if not len(particle):
+        return row.new_full((1,), row_count), row.new_zeros(1)
+    return row[particle], particle
+
+
+def _recounted(scaled: Tensor, ratio: float) -> Tensor:
+    """Return L(ratio v), given L(v) of vectors in the last dimension; differentiable."""
+    length = torch.linalg.vector_norm(scaled, dim=-1, keepdim=True)
+    somewhere = length > 0.0
+    divisor = torch.where(somewhere, length, 1.0)
+    factor = torch.log1p(ratio * torch.expm1(divisor)) / divisor
+    return scaled * torch.where(somewhere, factor, ratio)
+
+
+def _recounted_by_species(appended: Tensor, species_count: int, ratio: float) -> Tensor:
+    """Return what is perceived of each species, [R, K (1 + D)], with densities times `ratio`."""
+    density, gradient = appended[:, :species_count], appended[:, species_count:]
+    gradient = _recounted(gradient.view(len(gradient), species_count, -1), ratio).flatten(1)
+    return torch.cat((ratio * density, gradient), dim=1)
+
+
+def _update_of(own: Species, z: Tensor) -> Tensor:
+    """Return a species' raw updates, [R, A] or wider, for its rows of perception."""
+    rule = own.rule
+    if own.network is None:
+        update: Tensor = rule(z[:, : rule.perception_dim])
+    else:
+        if z.shape[1] < own.network.row_width:
+            one = z.new_ones(len(z), 1)
+            rest = z.new_zeros(len(z), own.network.row_width - rule.perception_dim - 1)
+            z = torch.cat((z[:, : rule.perception_dim], one, rest), dim=1)
+        update = own.network(z)
+    if rule.static or own.reach_share == 1.0:
+        return update
+    # The displacement r q δ / (1 + |δ|), with this share q of the common reach r, is that of
+    # δ' = q δ / (1 + (1 - q) |δ|), which is pulled back by the same operator.
+    delta = update[:, : rule.space_dim]
+    length = torch.linalg.vector_norm(delta, dim=1, keepdim=True)
+    delta = own.reach_share * delta / (1.0 + (1.0 - own.reach_share) * length)
+    return torch.cat((delta, update[:, rule.space_dim :]), dim=1)

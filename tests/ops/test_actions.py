@@ -9,11 +9,18 @@ from worlds import assert_same, random_mask
 from npa_envs.errors import NPAError
 from npa_envs.ops import apply_actions
 from npa_envs.ops.perceive import Rows
-from npa_envs.ops.update import ActionRules, PreparedActions, update_particles
+from npa_envs.ops.physics import Limits, Physics
+from npa_envs.ops.update import PreparedActions, update_particles
 
 B, N, C = 3, 77, 5
 REACH, DT, STATE_SCALE = 0.07, 0.8, 0.6
-RULES = {"max_displacement": REACH, "dt": DT, "state_scale": STATE_SCALE, "moving": True, "box": None}
+RULES = {
+    "max_displacement": REACH,
+    "dt": DT,
+    "state_scale": STATE_SCALE,
+    "moving": True,
+    "box": None,
+}
 LIMITS = {"position_limit": 50.0, "state_limit": 20.0}
 GIVEN = {"mask": None, "noise": None, "enabled": None, **RULES, **LIMITS}
 ERRORS = {torch.float32: 1e-6, torch.float64: 3e-15}
@@ -107,17 +114,8 @@ def test_a_rule_is_a_policy(world, dtype, device, box):
     own = torch.arange(B * N, dtype=torch.int32, device=device)
     rows = Rows(torch.where(mask.view(-1) == 1, own, -1), own, own, 0)
     update = action.reshape(B * N, -1)
-    expected = update_particles(
-        update,
-        x,
-        s,
-        x.new_zeros(B, N),
-        rows=rows,
-        max_displacement=REACH,
-        dt=DT,
-        moving=True,
-        box=box,
-    )
+    physics = Physics(space_dim, C, 1.0, 1.0, box, max_displacement=REACH, dt=DT)
+    expected = update_particles(update, x, s, x.new_zeros(B, N), rows, physics)
     delta, change = action[..., :space_dim], action[..., space_dim:]
     scale = float(change.abs().max())
     policy = torch.cat((delta / (1.0 + delta.norm(dim=-1, keepdim=True)), change / scale), dim=-1)
@@ -230,14 +228,15 @@ def prepared(x, s, **options):
     """Return the actions on copies of a world, with these copies, and what switches them off."""
     x, s = x.clone(), s.clone()
     enabled = torch.ones(1, dtype=torch.uint8, device=x.device)
-    rules = ActionRules(**RULES, **LIMITS)
+    limits = Limits(STATE_SCALE, position=50.0, state=20.0)
+    physics = Physics(x.shape[2], C, 1.0, 1.0, max_displacement=REACH, dt=DT, limits=limits)
     given = {
         "mask": None,
         "noise": None,
         "diverged": torch.zeros(x.shape[0], dtype=torch.uint8, device=x.device),
         **options,
     }
-    return PreparedActions(x, s, rules, enabled=enabled, **given), (x, s), enabled
+    return PreparedActions(x, s, physics, enabled=enabled, **given), (x, s), enabled
 
 
 @pytest.mark.parametrize("how", ["plain", "strided", "misaligned", "other dtype", "on the host"])

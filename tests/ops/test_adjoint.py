@@ -14,7 +14,7 @@ from worlds import (
 import npa_envs
 from npa_envs.errors import NPAError
 from npa_envs.ops import adjoint
-from npa_envs.ops.perceive import Terms
+from npa_envs.ops.physics import Terms
 
 # Worst error measured, in a box of two eps: 2.1e-6 on CUDA, 1.3e-6 on the CPU.
 BOUND = 1e-5

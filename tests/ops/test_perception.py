@@ -19,7 +19,8 @@ from worlds import (
 import npa_envs
 from npa_envs import reference as oracle
 from npa_envs.ops import backend
-from npa_envs.ops.perceive import Terms, build_neighbours
+from npa_envs.ops.perceive import build_neighbours
+from npa_envs.ops.physics import Limits, Physics, Terms
 
 # The bound of the tests, then the worst error measured on CPUs and CUDA: a quarter of it at most.
 FORWARD = {torch.float32: 3e-6, torch.float64: 1e-14}  # 7.1e-7, 2e-15
@@ -156,7 +157,9 @@ def test_a_clump_takes_no_more_memory_than_the_same_particles_apart(space_dim):
 
 
 def observed(x, s, *, eps=0.2, eps0=0.2, box=None, limit=16.0, **terms):
-    return build_neighbours(x, s, eps=eps, eps0=eps0, box=box, terms=Terms(**terms), limit=limit)
+    limits = Limits(perception=limit)
+    physics = Physics(x.shape[2], s.shape[2], eps, eps0, box, Terms(**terms), limits=limits)
+    return build_neighbours(x, s, physics)
 
 
 @both_inverses
@@ -169,12 +172,12 @@ def test_observation_is_perception_in_the_callers_order_and_clipped(
 ):
     x, s = random_world(3, 83, space_dim, state_dim, dtype=dtype, device=device)
     expected = oracle.perceive(*exact(x, s), 0.3, 0.2, box, moment_inverse=moment_inverse)
-    surveyed = observed(x, s, eps=0.3, box=box, limit=1.5, moment_inverse=moment_inverse)
+    neighbours = observed(x, s, eps=0.3, box=box, limit=1.5, moment_inverse=moment_inverse)
     assert (expected.abs() > 1.5).any()
     # The second time, a recorded launch runs.
     for _ in range(2):
         out = torch.full(expected.shape, float("nan"), dtype=dtype, device=device)
-        assert surveyed.perceive(out) is out
+        assert neighbours.perceive(out) is out
         assert relative_error(out, expected.clamp(-1.5, 1.5)) < FORWARD[dtype]
 
 

@@ -19,10 +19,11 @@ from npa_envs.ops import launch as bridge
 from npa_envs.ops import launch as threads
 from npa_envs.ops import orbit, render_gaussians
 from npa_envs.ops.launch import even_ranges, run_together
-from npa_envs.ops.perceive import Terms, build_neighbours
+from npa_envs.ops.perceive import build_neighbours
+from npa_envs.ops.physics import Limits, Physics, Terms
 from npa_envs.ops.pictures.losses import picture_losses
 from npa_envs.ops.pictures.splat import splat
-from npa_envs.ops.update import ActionRules, PreparedActions, update_particles
+from npa_envs.ops.update import PreparedActions, update_particles
 
 STATE_DIM = 5
 SMALL_RANGE = 7
@@ -50,6 +51,11 @@ def cuts(monkeypatch):
     return counts
 
 
+def physics_of(x):
+    limits = Limits(perception=1.0, position=0.6, state=10.0)
+    return Physics(x.shape[2], STATE_DIM, 0.3, 0.3, max_displacement=0.1, limits=limits)
+
+
 def stepped(x, s):
     """Return perception of half of the particles, their update, and the cotangents of both."""
     mask = random_mask(x)
@@ -61,8 +67,7 @@ def stepped(x, s):
         # No product: torch's own may depend on its number of threads.
         update = perception[:, : x.shape[2] + STATE_DIM]
         path = x.new_zeros(x.shape[:2])
-        options = {"max_displacement": 0.1, "dt": 1.0, "moving": True, "box": None}
-        return perception, *update_particles(update, x, s, path, rows=rows, **options)
+        return perception, *update_particles(update, x, s, path, rows, physics_of(x))
 
     return with_gradients(moved, x, s)
 
@@ -77,17 +82,16 @@ def acted(x, s):
     """Return worlds after two actions, and what they observe then."""
     x, s = x.clone(), s.clone()
     diverged = torch.zeros(x.shape[0], dtype=torch.uint8)
-    rules = ActionRules(0.1, 1.0, 1.0, True, None, position_limit=0.6, state_limit=10.0)
     enabled = torch.ones(1, dtype=torch.uint8)
     given = {"mask": None, "noise": None, "enabled": enabled, "diverged": diverged}
-    actions = PreparedActions(x, s, rules, **given)
+    actions = PreparedActions(x, s, physics_of(x), **given)
     generator = torch.Generator().manual_seed(2)
     for _ in range(2):
         shape = (*x.shape[:2], x.shape[2] + STATE_DIM)
         actions(torch.randn(shape, generator=generator, dtype=x.dtype))
-    surveyed = build_neighbours(x, s, eps=0.3, eps0=0.3, box=None, terms=Terms(), limit=1.0)
-    first = surveyed.perceive()
-    return [x, s, diverged, first, surveyed.perceive(torch.empty_like(first))]
+    neighbours = build_neighbours(x, s, physics_of(x))
+    first = neighbours.perceive()
+    return [x, s, diverged, first, neighbours.perceive(torch.empty_like(first))]
 
 
 def drawn(x, s):

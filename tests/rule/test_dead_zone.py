@@ -15,7 +15,7 @@ from npa_envs.rule.authors import save_demo_json
 from npa_envs.rule.files import rule_metadata
 from npa_envs.training import load_config
 from npa_envs.training.trainer import initial_rule
-from npa_envs.world import rollout as rollout_module
+from npa_envs.world import execute
 from npa_envs.world.randomness import uniform_draws
 
 ZONE = 0.05
@@ -208,10 +208,10 @@ class TestRest:
     def test_a_rollout_leaves_them_out_and_ends_and_draws_as_if_it_did_not(
         self, rule, worlds, device, monkeypatch, by_world
     ):
-        monkeypatch.setattr(rollout_module, "FIRST_PART", {"cpu": 64, "cuda": 64})
+        monkeypatch.setattr(execute, "FIRST_PART", {"cpu": 64, "cuda": 64})
         ways = []
         for fewest in (10**9, 256):
-            monkeypatch.setattr(rollout_module, "FEWEST_RESTING", fewest)
+            monkeypatch.setattr(execute, "FEWEST_RESTING", fewest)
             generator = self.generator(device)
             if by_world:
                 generator = npa_envs.WorldRandom([3, 4], device=device)
@@ -228,15 +228,15 @@ class TestRest:
     @pytest.fixture
     def asked(self, monkeypatch):
         """The steps of each part that is run, of which 1 is a question."""
-        monkeypatch.setattr(rollout_module, "FIRST_PART", {"cpu": 64, "cuda": 64})
+        monkeypatch.setattr(execute, "FIRST_PART", {"cpu": 64, "cuda": 64})
         asked = []
-        own = rollout_module.run_call
+        own = execute.run_all_steps
 
         def noted(call, *args, **options):
             asked.append(call.steps)
             return own(call, *args, **options)
 
-        monkeypatch.setattr(rollout_module, "run_call", noted)
+        monkeypatch.setattr(execute, "run_all_steps", noted)
         return asked
 
     def test_it_runs_no_step_of_worlds_that_begin_at_rest(self, rule, worlds, asked):
@@ -301,7 +301,7 @@ class TestRest:
     def test_static_worlds_that_begin_outside_of_a_box_end_as_if_each_step_ran(
         self, steps, device, monkeypatch
     ):
-        monkeypatch.setattr(rollout_module, "FIRST_PART", {"cpu": 64, "cuda": 64})
+        monkeypatch.setattr(execute, "FIRST_PART", {"cpu": 64, "cuda": 64})
         rule = lively_rule(device, torch.float32, 2, 4, static=True, gain=2.0, dead_zone=1e-3)
         x, s = random_world(2, 50, 2, 4, dtype=torch.float32, device=device)
         ways = []

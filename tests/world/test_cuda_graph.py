@@ -67,7 +67,7 @@ def events(monkeypatch):
     monkeypatch.setattr(torch.cuda, "synchronize", note("synchronize"))
     monkeypatch.setattr(torch.cuda, "empty_cache", note("empty"))
     monkeypatch.setattr(torch.cuda, "get_allocator_backend", lambda: "native")
-    monkeypatch.setattr(cuda_graph.Captured, "abandoned", 0)
+    monkeypatch.setattr(cuda_graph.GraphSequence, "abandoned", 0)
     monkeypatch.setattr(cuda_graph, "_capture_stream", lambda index: stream("side"))
     monkeypatch.setattr(cuda_graph, "_stand_in", lambda graph: contextlib.nullcontext())
     return seen

@@ -10,11 +10,12 @@ from worlds import assert_same, lively_rule, random_world
 import npa_envs
 from npa_envs import WorldRandom
 from npa_envs.errors import NPAError
+from npa_envs.ops.physics import Physics
 from npa_envs.tasks.damage import random_particle
 from npa_envs.tasks.morphogenesis2d import Morphogenesis2D, Morphogenesis2DConfig
 from npa_envs.tasks.seeds import uniform_ball
 from npa_envs.world.randomness import StreamId, check_generator, uniform_draws
-from npa_envs.world.steps import StepOptions, draw_step, skip_draws
+from npa_envs.world.steps import draw_step, skip_draws
 
 SIZE = 1001
 """Numbers of a world in a draw."""
@@ -246,7 +247,7 @@ def test_the_mask_of_a_step_is_the_streams_first_draw(device):
 @pytest.mark.parametrize("source", ["worlds", "generator", "torch's own"])
 def test_draws_that_are_left_out_are_as_if_drawn(source, position_noise, update_prob, device):
     x = torch.zeros(2, 70_001, 2, device=device)
-    options = StepOptions(0.1, None, update_prob, 1.0, position_noise, True, 0.1, 0.05)
+    physics = Physics(2, 1, 0.1, 0.1, update_prob=update_prob, position_noise=position_noise)
     ways = []
     for leave_out in (False, True):
         torch.manual_seed(4)
@@ -255,13 +256,13 @@ def test_draws_that_are_left_out_are_as_if_drawn(source, position_noise, update_
             "generator": lambda: torch.Generator(device).manual_seed(4),
             "torch's own": lambda: None,
         }[source]()
-        draw_step(x, options, generator)
+        draw_step(x, physics, generator)
         if leave_out:
-            skip_draws(x, options, 5, generator)
-            skip_draws(x, options, 0, generator)
+            skip_draws(x, physics, 5, generator)
+            skip_draws(x, physics, 0, generator)
         else:
             for _ in range(5):
-                draw_step(x, options, generator)
+                draw_step(x, physics, generator)
         ways.append([uniform_draws(generator, (2, 9), x) for _ in range(2)])
     assert_same(*ways)
 

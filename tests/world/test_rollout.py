@@ -9,6 +9,7 @@ import npa_envs
 from npa_envs import reference as oracle
 from npa_envs.ops import splat
 from npa_envs.ops.perceive import Rows
+from npa_envs.ops.physics import Physics
 from npa_envs.ops.update import update_particles
 from npa_envs.tasks.seeds import uniform_ball
 from npa_envs.world.steps import row_capacity
@@ -201,7 +202,7 @@ def test_rows_beyond_the_last_active_one_pull_nothing_back(device):
     update = torch.randn(4, 5, dtype=torch.float64, device=device, requires_grad=True)
     path = x.new_zeros(1, 6)
     moved = update_particles(
-        update, x, s, path, rows=rows, max_displacement=0.1, dt=1.0, moving=True, box=None
+        update, x, s, path, rows, Physics(2, 3, 1.0, 1.0, max_displacement=0.1)
     )
     (gradient,) = torch.autograd.grad(sum(value.sum() for value in moved), update)
     assert (gradient[2:] == 0).all()
@@ -227,9 +228,10 @@ def test_columns_that_nothing_reads_change_nothing(space_dim, state_dim, moving,
         padded = torch.nn.functional.pad(update, (0, padding), value=7.0).requires_grad_()
         sides = None if box is None else (box,) * space_dim
         path = x.new_ones(3, 85)
-        moved = update_particles(
-            padded, x, s, path, rows=rows, max_displacement=0.1, dt=0.7, moving=moving, box=sides
+        physics = Physics(
+            space_dim, state_dim, 0.1, 0.1, sides, moving=moving, max_displacement=0.1, dt=0.7
         )
+        moved = update_particles(padded, x, s, path, rows, physics)
         (bar,) = torch.autograd.grad(moved, padded, cotangents(moved))
         assert (bar[:, width:] == 0).all()
         return *moved, bar[:, :width]

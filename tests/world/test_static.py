@@ -15,7 +15,7 @@ from worlds import (
 
 import npa_envs
 from npa_envs.ops import launch, warmup
-from npa_envs.world.rollout import FEWEST_STATIC
+from npa_envs.world.execute import FEWEST_STATIC
 
 STEPS = 5
 

@@ -71,10 +71,8 @@ def make_sum_listed(space_dim: int, width: int, kinds: int, periodic: bool) -> w
     """Return a Warp function that adds weighted channels of listed rows for a warp's particles.
 
     Args:
-        space_dim: Space dimension D.
         width: Channels of a group, W, at most 16.
         kinds: Weights of a pair: 1 for the smoothing kernel, 1 + D with the spiky gradient kernel.
-        periodic: Whether space is a periodic box.
     """
     vector = wp.types.vector(space_dim, wp.float32)
 

@@ -59,10 +59,8 @@ def listed_density(
     """Return the density kernel of one variant.
 
     Args:
-        space_dim: Space dimension D.
         lanes: Threads of a particle; launches of several come in whole warps, which leave their
             lists together.
-        periodic: Whether space is a periodic box.
         capacity: Neighbours that a list has room for.
         masked: Whether only some particles have rows, and lists.
     """

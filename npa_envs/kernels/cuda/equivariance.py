@@ -50,7 +50,6 @@ def row_kernels(
     vectors [K, mixed, D] and mixing weights [perceived, mixed] are flat.
 
     Args:
-        space_dim: Space dimension D.
         scalars: Entries of a row before the first vector.
         perceived: Vectors of a row.
         mixed: Mixed vectors.
@@ -139,7 +138,6 @@ def steering_kernels(space_dim: int, mixed: int, chiral: bool) -> SimpleNamespac
     Outputs are [gates | state changes | 0], updates [displacement | state changes | 0].
 
     Args:
-        space_dim: Space dimension D.
         mixed: Mixed vectors.
         chiral: Whether there is a second gate for each mixed vector.
     """

@@ -76,12 +76,10 @@ def listed_perception(
     """Return the perception kernel of one variant.
 
     Args:
-        space_dim: Space dimension D.
         width: Channels of a group.
         lanes: Lanes of a team, which share the channels of a group.
         state_gradient: Whether the state gradient is perceived.
         moment_inverse: How it is corrected by the moment matrix; None: not at all.
-        periodic: Whether space is a periodic box.
         grouped: Whether channels come in several groups.
         capacity: Neighbours that lists have room for.
         for_adjoint: Whether what the adjoint reads is written, too.

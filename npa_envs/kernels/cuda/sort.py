@@ -279,7 +279,6 @@ def order_particles(space_dim: int, width: int) -> wp.Kernel:
     """Return the last kernel of sorting large worlds, which moves states a warp at a time.
 
     Args:
-        space_dim: Space dimension D, 2 or 3.
         width: Channels of a group: 4, 8 or 16.
     """
     scalar = wp.float32

@@ -43,7 +43,6 @@ def tiled_density(periodic: bool, capacity: int, masked: bool) -> wp.Kernel:
     """Return the density kernel of one variant. A block is a warp, and serves a tile.
 
     Args:
-        periodic: Whether space is a periodic box.
         capacity: Neighbours that a list has room for.
         masked: Whether only some particles have rows, and lists.
     """

@@ -91,7 +91,6 @@ def make_frame(
 
     Args:
         scalar: `wp.float32` or `wp.float64`.
-        shape: Particles N of a world, views V of a world, and colour channels K of a picture.
         sizes: Pixels across and down.
         near: Nothing nearer is seen [length units].
         dilation: Added to both variances on the picture [pixels squared].

@@ -42,7 +42,6 @@ def perception_kernels(
     sums nor holds what only that needs.
 
     Args:
-        space_dim: Space dimension D.
         scalar: `wp.float32` or `wp.float64`.
         width: Channels of a group.
         on_cpu: Whether candidates are sifted.

@@ -30,7 +30,6 @@ def make_search(
                 near, count = sift(domain, entries, neighbours, position, first, end)
 
     Args:
-        space_dim: Space dimension D, 2 or 3.
         scalar: `wp.float32` or `wp.float64`.
         entry_type: Vector type of what is searched, which begins with a position.
         on_cpu: Whether a sift takes several candidates.

@@ -29,7 +29,6 @@ def sort_kernels(space_dim: int, scalar: type, width: int) -> SimpleNamespace:
     """Return the kernels of one variant.
 
     Args:
-        space_dim: Space dimension D, 2 or 3.
         scalar: `wp.float32` or `wp.float64`.
         width: Channels of a group: 4, 8 or 16.
     """
@@ -252,7 +251,6 @@ def give_rows(space_dim: int, scalar: type) -> wp.Kernel:
     """Return the kernel that gives active particles of worlds that are sorted already their rows.
 
     Args:
-        space_dim: Space dimension D, 2 or 3.
         scalar: `wp.float32` or `wp.float64`.
     """
     vector = wp.types.vector(space_dim, scalar)

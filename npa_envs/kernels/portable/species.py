@@ -20,7 +20,6 @@ def species_kernel(space_dim: int, scalar: type, species_count: int) -> wp.Kerne
     """Return the kernel of one variant.
 
     Args:
-        space_dim: Space dimension D, 2 or 3.
         scalar: `wp.float32` or `wp.float64`.
         species_count: Species K.
     """

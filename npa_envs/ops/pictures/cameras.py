@@ -59,12 +59,7 @@ class Cameras:
     """Nothing nearer than this along z is seen [length units]."""
 
     def __post_init__(self) -> None:
-        """Check every field.
-
-        Raises:
-            NPAError: A shape does not fit, a matrix is no rigid motion, or a number is out of its
-                range.
-        """
+        """Check every field."""
         self._check_shapes()
         for name in ("width", "height"):
             checked_side(name, getattr(self, name))

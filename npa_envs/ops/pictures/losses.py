@@ -93,14 +93,9 @@ def picture_losses(
 
     Args:
         x: Particle positions [length units], shape [B, N, 2].
-        states: States, dimensionless, shape [B, N, C], C at least 3.
         target: Picture to compare with, dimensionless, shape [R, R, 4].
         goal: Where each world's mean is moved to [length units], shape [2].
         shift: What is added to states to give colours, dimensionless.
-        pixel_size: As for `splat`.
-        sigma: As for `splat`.
-        lo: As for `splat`.
-        hi: As for `splat`.
 
     Returns:
         Means over the pixels of the density error and of the colour error, shape [B] each. World

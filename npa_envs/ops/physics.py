@@ -1,0 +1,190 @@
+"""The constants of worlds, checked once: radius, box, perception groups, time step, limits."""
+
+from __future__ import annotations
+
+import functools
+import math
+from types import NoneType
+from typing import Any, NamedTuple
+
+import torch
+
+from npa_envs.checks import Box, check_scale, checked_box, checked_eps, checked_number, constant
+from npa_envs.errors import NPAError
+
+
+class Terms(NamedTuple):
+    """The groups of a perception vector; the others are not computed."""
+
+    state_gradient: bool = True
+    moment_inverse: str | None = "threshold"
+    density_gradient: bool = True
+
+    @property
+    def correction(self) -> str | None:
+        """How the state gradient is corrected, "threshold" or "smooth"; None: not at all."""
+        return self.moment_inverse if self.state_gradient else None
+
+    def perception_dim(self, space_dim: int, state_dim: int) -> int:
+        """Length P of a perception vector with these groups."""
+        gradients = state_dim * space_dim * self.state_gradient
+        return 2 * state_dim + gradients + space_dim * self.density_gradient
+
+
+ALL_TERMS = Terms()
+
+
+class Limits(NamedTuple):
+    """What bounds the worlds of environments; rollouts have no bounds."""
+
+    state_scale: float = 1.0
+    """State step of an action of 1, dimensionless."""
+    perception: float = math.inf
+    """Entries of perception are clipped to plus and minus this, dimensionless."""
+    position: float = math.inf
+    """A coordinate beyond this is out of bounds [length units]."""
+    state: float = math.inf
+    """A state beyond this is out of bounds, dimensionless."""
+
+
+class Physics(NamedTuple):
+    """The constants of worlds; `physics` makes and checks them."""
+
+    space_dim: int
+    """Space dimension D."""
+    state_dim: int
+    """State channels C."""
+    eps: float
+    """Perception radius ε [length units]."""
+    eps0: float
+    """Radius ε0 at which the rule was trained [length units]."""
+    box: tuple[float, ...] | None = None
+    """Sides of the periodic box [length units], or None in open space."""
+    terms: Terms = ALL_TERMS
+    """Groups of the perception vector."""
+    moving: bool = True
+    """Updates begin with a displacement; otherwise there is none, and positions stay."""
+    max_displacement: float = 0.0
+    """Largest displacement α ε in a unit of time [length units]; of several species the largest."""
+    update_prob: float = 1.0
+    """Probability p of a particle's update in a step; of several species the highest."""
+    dt: float = 1.0
+    """Time step, dimensionless."""
+    position_noise: float = 0.0
+    """Standard deviation of the noise on every position in a step [length units]."""
+    limits: Limits = Limits()
+    """Bounds of environments."""
+
+    @property
+    def perception_dim(self) -> int:
+        """Length P of a perception vector."""
+        return self.terms.perception_dim(self.space_dim, self.state_dim)
+
+    @property
+    def action_dim(self) -> int:
+        """Length A of an action: D + C, or C where particles are static."""
+        return self.state_dim + (self.space_dim if self.moving else 0)
+
+    def scale(self) -> float:
+        """Return c = eps / eps0."""
+        return constant(self.eps) / constant(self.eps0)
+
+    def sides(self) -> list[float] | None:
+        """Return the box as operators take it."""
+        return None if self.box is None else [constant(side) for side in self.box]
+
+    def constants(self) -> Physics:
+        """Return them with numbers that a compiler takes for constants."""
+        if not torch.compiler.is_compiling():
+            return self
+        sides = self.sides()
+        return self._replace(
+            eps=constant(self.eps),
+            eps0=constant(self.eps0),
+            box=None if sides is None else tuple(sides),
+            max_displacement=constant(self.max_displacement),
+            update_prob=constant(self.update_prob),
+            dt=constant(self.dt),
+            position_noise=constant(self.position_noise),
+        )
+
+
+def physics(
+    space_dim: int,
+    state_dim: int,
+    dtype: torch.dtype,
+    *,
+    eps: float | None,
+    eps0: float | None = None,
+    box: Box = None,
+    terms: Terms = ALL_TERMS,
+    moving: bool = True,
+    alpha: float = 0.0,
+    update_prob: float = 1.0,
+    dt: float = 1.0,
+    position_noise: float = 0.0,
+) -> Physics:
+    """Return the constants of worlds of a dtype, checked.
+
+    Args:
+        dtype: Floating dtype of the worlds.
+        eps0: Radius of the training, itself checked; default: eps.
+        moving: Whether particles move.
+        alpha: Largest displacement in a unit of time, as a fraction of eps.
+        update_prob: Probability of an update.
+        dt: Time step.
+        position_noise: Standard deviation of the noise.
+
+    Raises:
+        NPAError: A number is out of its range, or too large or small for the dtype.
+    """
+    numbers = (eps, eps0, box, alpha, update_prob, dt, position_noise)
+    # Numbers of other types may change, and tensors are no keys.
+    plain = all(type(value) in (float, int, bool, NoneType) for value in numbers)
+    check = _known if plain and not torch.compiler.is_compiling() else _checked
+    return check(space_dim, state_dim, dtype, terms, moving, *numbers)
+
+
+def _checked(
+    space_dim: int,
+    state_dim: int,
+    dtype: torch.dtype,
+    terms: Terms,
+    moving: bool,
+    eps: Any,
+    eps0: float | None,
+    box: Box,
+    alpha: float,
+    update_prob: Any,
+    dt: Any,
+    position_noise: Any,
+) -> Physics:
+    given: Any = eps0 if eps is None else eps
+    radius = checked_eps("eps", given, space_dim, dtype)
+    radius0 = radius if eps0 is None else constant(eps0)
+    check_scale(radius, radius0, space_dim, dtype)
+    update_prob = checked_number("update_prob", update_prob)
+    dt = checked_number("dt", dt)
+    position_noise = checked_number("position_noise", position_noise)
+    if not 0.0 < update_prob <= 1.0:
+        raise NPAError(f"update_prob must lie in (0, 1], got {update_prob}")
+    if not (math.isfinite(dt) and dt > 0.0):
+        raise NPAError(f"dt must be positive and finite, got {dt}")
+    if not (math.isfinite(position_noise) and position_noise >= 0.0):
+        raise NPAError(f"position_noise must be finite and not negative, got {position_noise}")
+    return Physics(
+        space_dim,
+        state_dim,
+        radius,
+        radius0,
+        checked_box(box, space_dim, radius, dtype),
+        terms,
+        moving,
+        constant(alpha) * radius,
+        update_prob,
+        dt,
+        position_noise,
+    )
+
+
+_known = functools.lru_cache(maxsize=256, typed=True)(_checked)

@@ -1,0 +1,332 @@
+"""The ways of running a rollout: at rest, CUDA graph, CPU tape, loop. All give the same numbers."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any, Literal, NamedTuple
+
+import torch
+from torch import Tensor
+from torch.utils.checkpoint import checkpoint
+
+from npa_envs.checks import check_finite_positions
+from npa_envs.errors import NPAError
+from npa_envs.ops.physics import Physics
+from npa_envs.rule.rule import NPARule
+from npa_envs.world.cuda_graph import draws_alone
+from npa_envs.world.divergence import DivergenceWatch
+from npa_envs.world.particles import Particles, combined
+from npa_envs.world.prepared import may_prepare, run_prepared
+from npa_envs.world.randomness import Randomness
+from npa_envs.world.recorded import CudaGraph, run_recorded
+from npa_envs.world.steps import (
+    DivisionStep,
+    RuleStep,
+    SpeciesSpec,
+    StaticStep,
+    Step,
+    make_species_step,
+    skip_draws,
+)
+
+Memory = Literal["store", "recompute", "minimal"]
+
+STORED_INTERVAL: dict[Memory, int] = {"store": 1, "recompute": 3, "minimal": 2**31}
+"""The last step and every so-manyth before it store what the backward pass reads."""
+
+FEWEST_STATIC = 3
+"""Steps from which on it pays to prepare worlds whose particles never move."""
+
+FEWEST_RESTING = 256
+"""Steps from which on it pays to ask whether worlds are at rest."""
+
+FIRST_PART = {"cpu": 64, "cuda": 1024}
+"""Steps after which that is asked again, by device; the next parts are twice as long each. A GPU
+idles while it is asked."""
+
+
+class RolloutSpec(NamedTuple):
+    """A checked rollout without its tensors; hashable: recordings have it in their keys."""
+
+    steps: int
+    physics: Physics
+    detach_positions: bool = True
+    memory: Memory = "store"
+    keep_every: int | None = None
+    """Worlds are kept after each so many steps; None: at the end alone."""
+    species: tuple[SpeciesSpec, ...] = ()
+    """Where several rules share a world."""
+    by_species: bool = False
+    """Rules perceive each species' density and density gradient."""
+
+    def make_step(self, rules: Sequence[NPARule], particles: Particles) -> Step:
+        """Return the step of these worlds."""
+        physics = self.physics.constants()
+        if self.species:
+            return make_species_step(
+                rules,
+                self.species,
+                physics,
+                particles.x,
+                by_species=self.by_species,
+                detach_positions=self.detach_positions,
+            )
+        (rule,) = rules
+        # A rule without a network runs as the module that it is.
+        step = RuleStep(rule, rule.network(), physics, self.detach_positions)
+        moving = physics.moving or physics.position_noise > 0.0 or not self.detach_positions
+        if not moving and self.steps >= FEWEST_STATIC:
+            return StaticStep.of(step, particles.x)
+        return DivisionStep(step) if rule.divides else step
+
+    def run(
+        self,
+        rules: Sequence[NPARule],
+        particles: Particles,
+        source: Randomness | None,
+        watch: DivergenceWatch | None = None,
+    ) -> Particles:
+        """Launch the rollout of checked worlds: from a tape on a CPU, in a loop otherwise."""
+        step = self.make_step(rules, particles)
+        if isinstance(step, RuleStep) and watch is None and may_prepare(step, particles):
+            kept = run_prepared(step, particles, source, self.steps, self.keep_every)
+            if kept is not None:
+                return kept
+        return run_steps(step, self, rules, particles, source, watch)
+
+
+class RecomputedSteps:
+    """Steps of a rollout that its backward pass runs again.
+
+    These read the rule and the first worlds where they are. Gradients would silently be wrong if
+    they had changed meanwhile, which is refused.
+
+    Args:
+        advance: Returns the worlds after one step.
+        rules: The rules that it runs.
+    """
+
+    def __init__(
+        self, advance: Callable[..., Any], rules: Sequence[NPARule], worlds: dict[str, Tensor]
+    ) -> None:
+        self._advance = advance
+        self._worlds = worlds
+        # Plain rules are run by copies of their weights, except for those of the fates.
+        self._rules = [(rule, rule.divides or not rule.is_plain()) for rule in rules]
+        self._read: dict[str, Any] | None = None
+        """What has been read, by name, from the end of the forward pass on."""
+
+    def __call__(self, *arguments: Any) -> Any:
+        """Run one step, forward or again."""
+        if self._read is None:
+            return self._advance(*arguments)
+        self._check(self._read)
+        try:
+            return self._advance(*arguments)
+        finally:
+            # A module may change its own buffers, as those of normalisation.
+            self.end_forward()
+
+    def end_forward(self) -> None:
+        """Note what has been read."""
+        self._read = dict(self._readings())
+
+    def _check(self, before: dict[str, Any]) -> None:
+        for name, value in self._readings():
+            if name not in before or before[name] != value:
+                raise NPAError(
+                    f"{name} must stay as it is between a rollout that recomputes steps and its "
+                    "backward pass, got another: call backward() before it changes, or take "
+                    "memory='store'"
+                )
+
+    def _readings(self) -> Iterator[tuple[str, Any]]:
+        """Yield what steps read, by name, as something that can be compared."""
+        for name, world in self._worlds.items():
+            yield name, _Reading(world)
+        for number, (rule, with_weights) in enumerate(self._rules):
+            of_rule = "the rule" if len(self._rules) == 1 else f"rule {number}"
+            for name, value in rule.hyper_parameters().items():
+                yield f"{name} of {of_rule}", value
+            for path, module in rule.named_modules() if with_weights else ():
+                place = f"{path}." if path else ""
+                own = {**vars(module), **module._parameters, **module._buffers}
+                for name, value in own.items():
+                    if isinstance(value, Tensor):
+                        yield f"{place}{name} of {of_rule}", _Reading(value)
+                    elif isinstance(value, bool | int | float | str):
+                        yield f"{place}{name} of {of_rule}", value
+
+
+class _Reading:
+    """A tensor as it was read: equal to another reading if nothing was written in between."""
+
+    def __init__(self, tensor: Tensor) -> None:
+        # Held, so that no other tensor gets the same memory.
+        self._held = tensor.detach()
+        self._where = tensor.data_ptr()
+        self._version = None if tensor.is_inference() else tensor._version
+
+    def __eq__(self, other: object) -> bool:
+        return (
+            isinstance(other, _Reading)
+            and self._where == other._where
+            and self._version == other._version
+        )
+
+    __hash__ = None  # type: ignore[assignment]
+
+
+def run_steps(
+    step: Step,
+    spec: RolloutSpec,
+    rules: Sequence[NPARule],
+    particles: Particles,
+    source: Randomness | None,
+    watch: DivergenceWatch | None,
+) -> Particles:
+    """Repeat a step on checked worlds.
+
+    Raises:
+        DivergedError: The watch has seen a world diverge.
+    """
+    steps, keep_every = spec.steps, spec.keep_every
+    particles = step.enter(particles)
+    interval = STORED_INTERVAL[spec.memory] if torch.is_grad_enabled() else 1
+    kept: list[Particles] = []
+    # While a graph is recorded, torch's state cannot be read, and its draws are the graph's.
+    recorded = particles.x.is_cuda and torch.cuda.is_current_stream_capturing()
+    with_modules = not all(rule.has_network() for rule in rules)
+    redraw = with_modules and not recorded
+    if with_modules and recorded and not draws_alone():
+        # Recomputed, a module that draws would draw otherwise.
+        interval = 1
+    again = None
+    # What a compiler has taken reads copies.
+    if interval > 1 and not torch.compiler.is_compiling():
+        again = RecomputedSteps(step.advance, rules, {"x": particles.x, "s": particles.s})
+    # Worlds keep their dtype under autocast: the kernels read what the rules write.
+    with torch.autocast(particles.x.device.type, enabled=False):
+        for number, draws in enumerate(step.draw(particles.x, steps, source)):
+            if (steps - 1 - number) % interval > 0:
+                particles = checkpoint(
+                    again or step.advance,
+                    particles,
+                    draws,
+                    use_reentrant=False,
+                    preserve_rng_state=redraw,
+                )
+            else:
+                particles = step.advance(particles, draws)
+            if watch is not None:
+                after = step.leave(particles.map(Tensor.detach))
+                watch.look(after.x, after.s)
+            if keep_every is not None and (number + 1) % keep_every == 0:
+                kept.append(step.leave(particles))
+        if again is not None:
+            again.end_forward()
+        if steps == 0:
+            # What is returned is the caller's to write to.
+            particles = particles.map(torch.clone)
+        particles = step.leave(particles) if keep_every is None else combined(torch.stack, kept)
+    if watch is not None:
+        watch.raise_diverged()
+    return particles
+
+
+def execute(
+    spec: RolloutSpec,
+    rules: Sequence[NPARule],
+    particles: Particles,
+    source: Randomness | None,
+    *,
+    graph: CudaGraph = "auto",
+    watch: DivergenceWatch | None = None,
+) -> Particles:
+    """Run a checked rollout, in the first of the ways that can be taken.
+
+    Args:
+        spec: The rollout.
+        graph: Whether to record on CUDA; True also records rules that are not plain.
+        watch: Checks the worlds after each step, which then are launched.
+
+    Raises:
+        NPAError: A position is not finite.
+        DivergedError: The watch has seen a world diverge.
+    """
+    if watch is None and _may_rest(spec, rules, particles):
+        return _run_until_rest(spec, rules, particles, source, graph)
+    return run_all_steps(spec, rules, particles, source, graph=graph, watch=watch)
+
+
+def run_all_steps(
+    spec: RolloutSpec,
+    rules: Sequence[NPARule],
+    particles: Particles,
+    source: Randomness | None,
+    *,
+    graph: CudaGraph = "auto",
+    watch: DivergenceWatch | None = None,
+) -> Particles:
+    """Run a checked rollout, as `execute`, whether or not worlds are at rest."""
+    x, s, *_ = particles
+    if watch is None:
+        recorded = run_recorded(spec, rules, x, s, source, cuda_graph=graph)
+        if recorded is not None:
+            return recorded
+    check_finite_positions(x)
+    if x.is_cuda and torch.is_grad_enabled():
+        # Gradients are added up as a recording adds them: first those of this rollout.
+        x, s = x.view_as(x), s.view_as(s)
+    return spec.run(rules, Particles(x, s, x.new_zeros(x.shape[:2])), source, watch)
+
+
+def resting(
+    rules: Sequence[NPARule], particles: Particles, physics: Physics, graph: CudaGraph
+) -> Tensor:
+    """Return which worlds stay as they are if all particles are updated, bool, shape [B]."""
+    spec = RolloutSpec(1, physics._replace(update_prob=1.0))
+    with torch.no_grad():
+        after = run_all_steps(spec, rules, particles, None, graph=graph)
+    same_x, same_s = after.x == particles.x, after.s == particles.s
+    return same_x.flatten(1).all(dim=1) & same_s.flatten(1).all(dim=1)
+
+
+def _may_rest(spec: RolloutSpec, rules: Sequence[NPARule], particles: Particles) -> bool:
+    """Return whether a rollout asks whether its worlds are at rest: their steps are left out."""
+    return (
+        len(rules) == 1
+        and not spec.species
+        and rules[0].dead_zone > 0.0
+        and rules[0].has_network()
+        and not rules[0].divides
+        and spec.steps >= FEWEST_RESTING
+        and spec.keep_every is None
+        and spec.physics.position_noise == 0.0
+        and not particles.measures_paths
+        and not torch.is_grad_enabled()
+        and not torch.compiler.is_compiling()
+        and not (particles.x.is_cuda and torch.cuda.is_current_stream_capturing())
+    )
+
+
+def _run_until_rest(
+    spec: RolloutSpec,
+    rules: Sequence[NPARule],
+    particles: Particles,
+    source: Randomness | None,
+    graph: CudaGraph,
+) -> Particles:
+    """Run a rollout in parts, and leave out what comes when all worlds are at rest."""
+    left, part = spec.steps, FIRST_PART[particles.x.device.type]
+    while left and not resting(rules, particles, spec.physics, graph).all():
+        own = spec._replace(steps=min(part, left))
+        particles = run_all_steps(own, rules, particles, source, graph=graph)
+        left, part = left - own.steps, 2 * part
+        if left and not particles.x.isfinite().all():
+            # A world has diverged, which the next call refuses, and not this one.
+            return spec._replace(steps=left).run(rules, particles, source)
+    # Whoever draws next gets what comes after all steps.
+    skip_draws(particles.x, spec.physics, left, source)
+    # What is returned is the caller's to write to.
+    return particles.map(torch.clone) if left == spec.steps else particles

@@ -1,0 +1,76 @@
+"""Worlds of particles: their positions and states, and what goes with them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+
+class Particles(NamedTuple):
+    """B worlds of N particles. Shapes and units are defined here."""
+
+    x: Tensor
+    """Positions [length units], shape [B, N, D]."""
+    s: Tensor
+    """States, dimensionless, shape [B, N, C]."""
+    path_length: Tensor | None = None
+    """Length of each particle's path since the rollout began [length units], shape [B, N]."""
+    goal: Tensor | None = None
+    """What a world is to become, int64, shape [B]."""
+
+    @property
+    def measures_paths(self) -> bool:
+        """Whether path lengths are there."""
+        return self.path_length is not None
+
+    def tensors(self) -> list[Tensor]:
+        """Return the fields that are there."""
+        return [value for value in self if value is not None]
+
+    def map(self, function: Callable[[Tensor], Tensor]) -> Particles:
+        """Return worlds with a function applied to every field."""
+        x, s, *rest = (None if value is None else function(value) for value in self)
+        assert x is not None
+        assert s is not None
+        return Particles(x, s, *rest)
+
+    def take(self, worlds: Tensor) -> Particles:
+        """Return some worlds, by their indices."""
+        return self.map(lambda value: value.index_select(0, worlds))
+
+    def put_(self, worlds: Tensor, other: Particles) -> None:
+        """Write other worlds to these indices."""
+        for own, new in zip(self.tensors(), other.tensors(), strict=True):
+            own.index_copy_(0, worlds, new)
+
+    def where(self, worlds: Tensor, other: Particles) -> Particles:
+        """Return worlds, and those of `other` where `worlds`, bool, shape [B], is False."""
+        pairs = iter(zip(self.tensors(), other.tensors(), strict=True))
+
+        def chosen(value: Tensor) -> Tensor:
+            own, new = next(pairs)
+            return torch.where(worlds.view(-1, *[1] * (value.ndim - 1)), own, new)
+
+        return self.map(chosen)
+
+    def gather(self, order: Tensor) -> Particles:
+        """Return particles in another order: indices among all B N, shape [B N]; differentiable."""
+
+        def gathered(value: Tensor) -> Tensor:
+            return value.flatten(0, 1).index_select(0, order).view_as(value)
+
+        return self._replace(goal=None).map(gathered)._replace(goal=self.goal)
+
+    def copy_(self, other: Particles) -> None:
+        """Write other worlds here, by one kernel."""
+        torch._foreach_copy_(self.tensors(), other.tensors())
+
+
+def combined(function: Callable[[list[Tensor]], Tensor], parts: Sequence[Particles]) -> Particles:
+    """Return worlds made of several ones, field by field, by `torch.stack` or `torch.cat`."""
+    fields = zip(*(part.tensors() for part in parts), strict=True)
+    values = iter([function([*field]) for field in fields])
+    return parts[0].map(lambda _: next(values))
