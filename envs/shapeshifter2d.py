@@ -21,7 +21,7 @@ from npa_envs.envs.core.spaces import ParticleSpaces, action_tensor
 from npa_envs.envs.core.task import EnvTask, Start
 from npa_envs.envs.core.vector import NPAVectorEnv
 from npa_envs.envs.garden.config import GardenReward
-from npa_envs.envs.garden.worlds import BrushedWorlds
+from npa_envs.envs.garden.worlds import LIVING
 from npa_envs.envs.grown import run_rule
 from npa_envs.errors import NPAError
 from npa_envs.rule.codes import Codes
@@ -254,6 +254,12 @@ class ShapeshifterTask(EnvTask[Shapeshifter2DEnvConfig]):
         blank = self.blank_losses.index_select(0, context[:, 0].long())
         return (1.0 - loss / blank).clamp_min(-1.0)
 
+    def next_goals(self, elapsed: Tensor, context: Tensor, goal: Tensor) -> None:
+        """Change the worlds' goals every `hold_steps` steps, in place, once these are paid."""
+        turn = (elapsed.long() // self.config.hold_steps) % GOAL_COUNT
+        context[:, :1] = context.gather(1, 1 + turn[:, None])
+        goal.copy_(context[:, 0].long())
+
     def context_info(self, x: Tensor, s: Tensor, context: Tensor) -> dict[str, Tensor]:
         """Return the number of each world's goal, shape [B]."""
         return {"goal": context[:, 0].long()}
@@ -265,21 +271,6 @@ class ShapeshifterTask(EnvTask[Shapeshifter2DEnvConfig]):
         pixels = self.config.resolution // self.config.picture_size
         seen = F.avg_pool2d(both.permute(0, 3, 1, 2), pixels).flatten(1)
         return seen.clamp(-SEEN_LIMIT, SEEN_LIMIT)
-
-
-class ShiftingWorlds(BrushedWorlds):
-    """Living worlds whose goals change every `hold_steps` steps, after these have been paid."""
-
-    task: Any
-
-    def _rewards(self) -> Tensor:
-        """Return what worlds earn in this step, shape [B], and go on to the next goals."""
-        rewards = super()._rewards()
-        turn = (self.elapsed.long() // self.task.config.hold_steps) % GOAL_COUNT
-        goal = self.context.gather(1, 1 + turn[:, None])
-        self.context[:, :1] = goal
-        self._goal.copy_(goal[:, 0].long())
-        return rewards
 
 
 class CodeForm(ParticleSpaces):
@@ -403,7 +394,7 @@ class Shapeshifter2DEnv(NPAEnv):
     """
 
     task_type = ShapeshifterTask
-    worlds_type = ShiftingWorlds
+    parts = LIVING
     form_type: ClassVar[type[CodeForm]] = CodeForm
 
 
@@ -411,5 +402,5 @@ class Shapeshifter2DVectorEnv(NPAVectorEnv):
     """Worlds of `Shapeshifter2DEnv`, batched on one device; its docstring describes both."""
 
     task_type = ShapeshifterTask
-    worlds_type = ShiftingWorlds
+    parts = LIVING
     form_type: ClassVar[type[CodeForm]] = CodeForm

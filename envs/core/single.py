@@ -14,11 +14,12 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from npa_envs.checks import number_tensor
+from npa_envs.envs.core.referee import reason
 from npa_envs.envs.core.screen import Screen
 from npa_envs.envs.core.spaces import ParticleSpaces, to_output
 from npa_envs.envs.core.task import EnvTask
 from npa_envs.envs.core.vector import check_options, plain_seed, rng_keys
-from npa_envs.envs.core.worlds import BatchedWorlds, reason
+from npa_envs.envs.core.worlds import PARTICLES, BatchedWorlds, Parts
 from npa_envs.errors import NPAError
 from npa_envs.world.actions import DIVERGED, SUCCESS, TIME_LIMIT
 
@@ -123,8 +124,8 @@ class NPAEnv(gymnasium.Env[Any, Any]):
     task_type: ClassVar[type[EnvTask[Any]]]
     """What the environment is about."""
 
-    worlds_type: ClassVar[type[BatchedWorlds]] = BatchedWorlds
-    """What moves the particles."""
+    parts: ClassVar[Parts] = PARTICLES
+    """How the worlds are acted on, observed and judged."""
 
     form_type: ClassVar[type[ParticleSpaces]] = ParticleSpaces
     """How the world is seen and acted upon."""
@@ -137,7 +138,7 @@ class NPAEnv(gymnasium.Env[Any, Any]):
     def __init__(self, **keywords: Any) -> None:
         self.config = self.task_type.config_type.from_keywords(keywords)
         self.render_mode = self.config.render_mode
-        self.worlds = self.worlds_type(self.task_type, self.config, 1)
+        self.worlds = BatchedWorlds(self.task_type, self.config, 1, parts=self.parts)
         self.task = self.worlds.task
         self.form = self.form_type(self.worlds.physics, self.config)
         self.observation_space = self.form.observation_space
@@ -209,7 +210,7 @@ class NPAEnv(gymnasium.Env[Any, Any]):
             diverged = bool(endings[0] & DIVERGED)
             ending = int(worlds.guarded(endings, observation)[0])
         ended, late = ending & (SUCCESS | DIVERGED) != 0, ending & TIME_LIMIT != 0
-        names, numbers = worlds.part_names, worlds.extra_info()
+        names, numbers = worlds.part_names, worlds.host_numbers()
         info = self._losses(numbers)
         info |= {f"reward_{name}": numbers[2 + len(names) + k] for k, name in enumerate(names)}
         info |= {"success": bool(ending & SUCCESS), "diverged": diverged}
@@ -218,11 +219,11 @@ class NPAEnv(gymnasium.Env[Any, Any]):
         if worlds.particle_reward is not None:
             info["particle_reward"] = self._out(worlds.particle_reward[0].clone())
         info |= self._extras("reset", "step")
-        if worlds.pays_last_step_alone:
+        if worlds.referee.pays_last_step_alone:
             paid = ended or late or int(worlds.elapsed[0]) == config.episode_steps
             self._unpaid_steps = 0 if paid else self._unpaid_steps + 1
         self._show()
-        seen = self.form.seen(worlds.told_observation(observation)[0])
+        seen = self.form.seen(worlds.host_observation(observation)[0])
         return seen, numbers[0], ended, late, info
 
     def render(self) -> NDArray[np.uint8] | None:

@@ -120,6 +120,8 @@ class EnvTask(WorldTask[Config]):
     def __init__(self, config: Config, device: torch.device) -> None:
         super().__init__(config, device)
         self._pool: Start | None = None
+        self.target_rows: Tensor | None = None
+        """What rows of an observation hold of each goal behind perception, [K, T]; None: nothing."""
 
     @classmethod
     def extra_bytes(cls, config: Any, world_count: int) -> int:

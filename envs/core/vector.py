@@ -16,10 +16,11 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from npa_envs.checks import is_whole, number_tensor
+from npa_envs.envs.core.referee import FLAGS, StepReport, reason
 from npa_envs.envs.core.screen import Screen
 from npa_envs.envs.core.spaces import ParticleSpaces, to_output
 from npa_envs.envs.core.task import EnvTask
-from npa_envs.envs.core.worlds import FLAGS, BatchedWorlds, StepReport, reason
+from npa_envs.envs.core.worlds import PARTICLES, BatchedWorlds, Parts
 from npa_envs.errors import NPAError, shown, suggest
 from npa_envs.world.actions import TIME_LIMIT
 from npa_envs.world.cuda_graph import to_device_async
@@ -57,8 +58,8 @@ class NPAVectorEnv(VectorEnv[Any, Any, Any]):
     task_type: ClassVar[type[EnvTask[Any]]]
     """What the environment is about."""
 
-    worlds_type: ClassVar[type[BatchedWorlds]] = BatchedWorlds
-    """What moves the particles."""
+    parts: ClassVar[Parts] = PARTICLES
+    """How the worlds are acted on, observed and judged."""
 
     form_type: ClassVar[type[ParticleSpaces]] = ParticleSpaces
     """How the worlds are seen and acted upon."""
@@ -89,7 +90,9 @@ class NPAVectorEnv(VectorEnv[Any, Any, Any]):
         self.config = self.task_type.config_type.from_keywords(keywords)
         self.render_mode = self.config.render_mode
         self.num_envs = num_envs
-        self.worlds = self.worlds_type(self.task_type, self.config, num_envs, episode_steps)
+        self.worlds = BatchedWorlds(
+            self.task_type, self.config, num_envs, episode_steps, parts=self.parts
+        )
         self.task = self.worlds.task
         self.form = self.form_type(self.worlds.physics, self.config)
         self.single_observation_space = self.form.observation_space

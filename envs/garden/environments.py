@@ -7,7 +7,7 @@ from typing import ClassVar
 from npa_envs.envs.core.single import NPAEnv
 from npa_envs.envs.core.vector import NPAVectorEnv
 from npa_envs.envs.garden.spaces import BrushSpaces
-from npa_envs.envs.garden.worlds import BrushedWorlds
+from npa_envs.envs.garden.worlds import LIVING
 
 
 class GardenEnv(NPAEnv):
@@ -89,12 +89,12 @@ class GardenEnv(NPAEnv):
     `particles()` and `place_particles(x, s)`.
     """
 
-    worlds_type = BrushedWorlds
+    parts = LIVING
     form_type: ClassVar[type[BrushSpaces]] = BrushSpaces
 
 
 class GardenVectorEnv(NPAVectorEnv):
     """B living worlds, stepped together; subclasses name the task."""
 
-    worlds_type = BrushedWorlds
+    parts = LIVING
     form_type: ClassVar[type[BrushSpaces]] = BrushSpaces

@@ -175,6 +175,9 @@ class GardenTask(GrownTask[Config]):
         """Return what worlds are worth in a step, [B], of loss [B] and marks [B, M]."""
         raise NotImplementedError
 
+    def next_goals(self, elapsed: Tensor, context: Tensor, goal: Tensor) -> None:
+        """Change goals, in place, after a step is paid, by steps since the start, [B]."""
+
     def context_info(self, x: Tensor, s: Tensor, context: Tensor) -> dict[str, Tensor]:
         """Return what infos tell of worlds besides, shape [B, ...] each."""
         return {}

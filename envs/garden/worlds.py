@@ -1,136 +1,133 @@
-"""The batch of living worlds behind every garden: brushes, the rule's steps, what is seen."""
+"""The parts of living worlds: a rule runs the particles, an action touches the whole world."""
 
 from __future__ import annotations
 
 from typing import Any
 
-import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
-from npa_envs.envs.core.config import EnvConfig
-from npa_envs.envs.core.task import EnvTask, Start
-from npa_envs.envs.core.worlds import BatchedWorlds
-from npa_envs.envs.garden.task import GardenTask
-from npa_envs.world.cuda_graph import makes_plain_tensors, to_device_async
-from npa_envs.world.randomness import StreamId
+from npa_envs.envs.core.referee import WorldReferee
+from npa_envs.envs.core.task import Start
+from npa_envs.envs.core.worlds import BatchedWorlds, Parts, not_finite
+from npa_envs.world.randomness import StreamId, WorldRandom
 
 
-class BrushedWorlds(BatchedWorlds):
-    """B worlds of one garden, stepped together.
+class RuleAction:
+    """What the task's `step` makes of brushes or codes, then the rule's steps.
 
     On a CPU worlds are stepped one after the other, as there a rule's products change in the last
     bit with the number of worlds.
 
     Args:
-        task_type: A subclass of `GardenTask`.
-        config: The environment's configuration.
-        world_count: Worlds B.
-        episode_steps: Steps after which an episode is cut off, or None for never.
-
-    Raises:
-        NPAError: The worlds do not fit into memory.
+        worlds: Whose particles.
     """
 
-    task: GardenTask[Any]
+    recorded = False
 
-    @makes_plain_tensors
-    def __init__(
-        self,
-        task_type: type[EnvTask[Any]],
-        config: EnvConfig,
-        world_count: int,
-        episode_steps: int | None = None,
-    ) -> None:
-        super().__init__(task_type, config, world_count, episode_steps)
-        self.context = torch.zeros(world_count, self.task.context_count, device=self.device)
+    def __init__(self, worlds: BatchedWorlds) -> None:
+        self._task, self._physics, self._random = worlds.task, worlds.physics, worlds.random
+        self._x, self._s, self._diverged = worlds.x, worlds.s, worlds.referee.diverged
+
+    def apply(self, action: Tensor) -> None:
+        """Apply actions, shape [B, K, W].
+
+        Raises:
+            DivergedError: A number is not finite; worlds are then as they were.
+        """
+        action = action.to(self._x.device)
+        if not bool(torch.isfinite(action).all()):
+            raise not_finite(action)
+        diverged = torch.zeros_like(self._diverged, dtype=torch.bool)
+        limits = self._physics.position_limit, self._physics.state_limit
+        for own, new, limit in zip((self._x, self._s), self._stepped(action), limits, strict=True):
+            # NaN is not within any limit.
+            diverged |= ~(new.abs() < limit).flatten(1).all(dim=1)
+            own.copy_(torch.nan_to_num(new, nan=0.0).clamp(-limit, limit))
+        self._diverged.copy_(diverged)
+
+    def _stepped(self, action: Tensor) -> tuple[Tensor, Tensor]:
+        x, s = self._x, self._s
+        if x.is_cuda or len(x) == 1:
+            stepped: tuple[Tensor, Tensor] = self._task.step(x, s, action, self._random)
+            return stepped
+        worlds = []
+        for k in range(len(x)):
+            one = slice(k, k + 1)
+            random = self._random.take(one)
+            worlds.append(self._task.step(x[one], s[one], action[one], random))
+        self._random.sync_with(random, self._task.config.rule_steps)
+        x, s = (torch.cat(part) for part in zip(*worlds, strict=True))
+        return x, s
+
+    def updated(self) -> Tensor:
+        """Living worlds refuse `tell_updated`."""
+        raise NotImplementedError
+
+
+class GardenObserver:
+    """What the task observes of a whole world.
+
+    Args:
+        worlds: Whose observations.
+    """
+
+    perceives_alone = False
+
+    def __init__(self, worlds: BatchedWorlds) -> None:
+        self._observe = worlds.task.observe
+
+    def observe(
+        self, worlds: BatchedWorlds, perceived: Tensor | None, out: Tensor | None
+    ) -> Tensor:
+        """Return the observations of all worlds as they are, shape [B, O]."""
+        seen: Tensor = self._observe(worlds.x, worlds.s, worlds.loss, worlds.referee.context)
+        return seen if out is None else out.copy_(seen)
+
+    def begun(self, worlds: BatchedWorlds, index: Tensor, start: Start) -> Tensor:
+        """Return the observations of worlds that began an episode."""
+        return worlds.perceive()[index]
+
+
+class GardenReferee(WorldReferee):
+    """Pays what the task says a world is worth; arguments are those of `WorldReferee`."""
+
+    def __init__(self, task: Any, x: Tensor, s: Tensor, episode_steps: int | None) -> None:
+        super().__init__(task, x, s, episode_steps)
+        self.context = torch.zeros(len(x), task.context_count, device=x.device)
         """What each world keeps of its start, as its task says, shape [B, M]."""
-        self.restart = self._restart  # type: ignore[assignment]
 
     @property
     def pays_last_step_alone(self) -> bool:
         """Whether an episode's last step is the only one that is paid."""
         return super().pays_last_step_alone and not self.task.pays_each_step
 
-    @torch.no_grad()
-    @makes_plain_tensors
-    def perceive(self, out: Tensor | None = None) -> Tensor:
-        """Return what is seen of all worlds as they are, shape [B, ...], written to `out`."""
-        seen = self.task.observe(self.x, self.s, self.loss, self.context)
-        return seen if out is None else out.copy_(seen)
+    def begin(self, worlds: Tensor, start: Start, random: WorldRandom, *, check: bool) -> None:
+        """Begin episodes in some worlds, and keep the task's context of their starts."""
+        super().begin(worlds, start, random, check=check)
+        draws, loss = random.take(worlds).substream(StreamId.GOAL), self.report.numbers[1][worlds]
+        self.context[worlds] = self.task.episode_context(start, loss, draws)
 
-    def _restart(self, worlds: NDArray[np.int64], observation: Tensor) -> None:
-        """Start the next episodes of some worlds, [M], and write what is seen of them."""
-        index = to_device_async(worlds, self.device)
-        self.start(index)
-        observation[index] = self.perceive()[index]
-
-    @torch.no_grad()
-    @makes_plain_tensors
-    def queue(self, action: Tensor, out: Tensor | None = None) -> Tensor:
-        """Use the brushes, let the rule run, and judge; return what is seen, shape [B, ...]."""
-        action = action.to(self.device)
-        if not bool(torch.isfinite(action).all()):
-            raise self._not_finite(action)
-        x, s = self._lived(action)
-        self._write(x, s)
-        self._judge_worlds()
-        if self._side_stream is not None:
-            self._side_stream.mark()
-        return self.perceive(out)
-
-    def _lived(self, action: Tensor) -> tuple[Tensor, Tensor]:
-        if self.device.type != "cpu" or self.world_count == 1:
-            return self.task.step(self.x, self.s, action, self.random)
-        lived = []
-        for k in range(self.world_count):
-            one = slice(k, k + 1)
-            random = self.random.take(one)
-            lived.append(self.task.step(self.x[one], self.s[one], action[one], random))
-        self.random.sync_with(random, self.task.config.rule_steps)
-        x, s = (torch.cat(part) for part in zip(*lived, strict=True))
-        return x, s
-
-    def _write(self, x: Tensor, s: Tensor) -> None:
-        """Take worlds over, with numbers that left their bounds held there and told of."""
-        physics = self.physics
-        diverged = torch.zeros_like(self._diverged, dtype=torch.bool)
-        for mine, new, limit in (
-            (self.x, x, physics.position_limit),
-            (self.s, s, physics.state_limit),
-        ):
-            # NaN is not within any limit.
-            diverged |= ~(new.abs() < limit).flatten(1).all(dim=1)
-            mine.copy_(torch.nan_to_num(new, nan=0.0).clamp(-limit, limit))
-        self._diverged.copy_(diverged)
-
-    def _judge_worlds(self) -> None:
+    def judge(self) -> None:
         """Write rewards, losses and endings of the worlds as they now are."""
-        super()._judge_worlds()
-        self.report.numbers[0].copy_(self._rewards())
-        if self._side_stream is not None and self.world_count == 1:
-            self._host_numbers.copy_(self.report.numbers, non_blocking=True)
+        super().judge()
+        loss, (ended, late) = self.report.numbers[1], self.report.endings[:2]
+        reward = self.task.reward(self.x, self.s, loss, self.context)
+        if self.pays_last_step_alone:
+            last = ended | late
+            if self.episode_steps is None:
+                last = last | (self.elapsed == self.task.config.episode_steps)
+            reward = torch.where(last, reward, 0.0)
+        self.task.next_goals(self.elapsed, self.context, self.goal)
+        self.report.numbers[0].copy_(reward)
+        if self.x.is_cuda and len(self.x) == 1:
+            self.host_numbers.copy_(self.report.numbers, non_blocking=True)
 
-    def _rewards(self) -> Tensor:
-        """Return what worlds earn in this step, shape [B]."""
-        earned = self.task.reward(self.x, self.s, self.loss, self.context)
-        if not self.pays_last_step_alone:
-            return earned
-        last = self.report.endings[0] | self.report.endings[1]
-        if self.episode_steps is None:
-            last = last | (self.elapsed == self.task.config.episode_steps)
-        return torch.where(last, earned, 0.0)
+    def extra_info(self) -> dict[str, Tensor]:
+        """Return what infos hold besides, shape [B, ...] each."""
+        told: dict[str, Tensor] = self.task.context_info(self.x, self.s, self.context)
+        return told
 
-    @torch.no_grad()
-    @makes_plain_tensors
-    def start(self, worlds: Tensor, keys: Tensor | None = None) -> Start:
-        """Start episodes in some worlds, int64, shape [M], and return their particles."""
-        start = super().start(worlds, keys)
-        random = self.random.take(worlds).substream(StreamId.GOAL)
-        self.context[worlds] = self.task.episode_context(start, self.loss[worlds], random)
-        return start
 
-    def extras(self, when: str) -> dict[str, Tensor]:
-        """Return what infos tell besides, shape [B, ...] each: since a "reset", or of a "step"."""
-        return self.task.context_info(self.x, self.s, self.context) if when == "reset" else {}
+LIVING = Parts(RuleAction, GardenObserver, GardenReferee)
+"""Worlds whose particles a rule runs."""
