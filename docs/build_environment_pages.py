@@ -57,8 +57,12 @@ envs = gym.make_vec("{id}", num_envs=8)
 FIRST = ENVIRONMENTS[0]
 ONCE = {
     "Reward": "The values of `reward` mean the same in [every environment]({page}#reward).",
+    "Starting state": "Seeds are those of [every environment]({page}#starting-state).",
+    "Episode end": "Causes and reasons are those of [every environment]({page}#episode-end).",
+    "Rendering": "Modes and styles are those of [every environment]({page}#rendering).",
     "Vectorized environment": "Batches of worlds and the arguments of `gym.make_vec` are those of "
     "[every environment]({page}#vectorized-environment).",
+    "References": "See [the paper]({page}#references).",
 }
 """Sections whose common part is on the first page alone, and what the others have instead."""
 
@@ -83,14 +87,21 @@ def resolved_sections(env_class: type) -> dict[str, str]:
         # They pay and tell otherwise; all else that they do not say is said of all environments.
         del shared["Reward"], shared["Info"]
         first = {}
-        if issubclass(env_class, GardenEnv):
-            shared |= sections(GardenEnv)
     if env_class is not environment_class(FIRST):
         shared |= {
-            heading: told.format(page=f"{FIRST.name}.md")
-            for heading, told in ONCE.items()
+            heading: link.format(page=f"{FIRST.name}.md")
+            for heading, link in ONCE.items()
             if heading in shared
         }
+    if issubclass(env_class, GardenEnv):
+        gardens = {heading: text for heading, text in sections(GardenEnv).items() if heading}
+        if env_class is not environment_class(GARDENS[0]):
+            page = f"{GARDENS[0].name}.md"
+            gardens = {
+                heading: f"As in [every garden]({page}#{heading.lower().replace(' ', '-')})."
+                for heading in gardens
+            }
+        shared |= gardens
     found = {"": own[""]}
     for heading in order:
         parts = own.get(heading) or first.get(heading), shared.get(heading)
@@ -116,7 +127,7 @@ def argument_tables(config_type: type[EnvConfig]) -> str:
     heading = ("Name", "Type", "Default", "Meaning")
     listed, opening = table(heading, shared), "Of every environment:"
     if config_type is not environment_class(FIRST).task_type.config_type:
-        listed = table(heading[:3], [row[:3] for row in shared])
+        listed = ", ".join(f"`{row[0].strip('`')}={row[2].strip('`')}`" for row in shared) + "."
         opening = f"Of every environment, with their [meanings]({FIRST.name}.md#arguments):"
     return "\n\n".join(("Of this task:", table(heading, own), opening, listed))
 

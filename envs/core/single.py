@@ -40,16 +40,16 @@ class NPAEnv(gymnasium.Env[Any, Any]):
     | `"particle"` | as dense; besides, `info["particle_reward"]` has each particle's own |
     | `"marginal"` | likewise, of what the world would have lost without its action |
 
-    Dense rewards telescope: their sum over an episode is L at its start minus L at its end. So the
-    undiscounted return depends only on the first and the last world. The mean of all particles' own
-    rewards is the dense reward, up to rounding. In a step that diverges, L counts as at least its
-    value at the start, so diverging never pays. The parts in `info` are not changed by this.
+    Dense rewards telescope: their sum over an episode is L at its start minus L at its end. The
+    mean of all particles' own rewards is the dense reward, up to rounding. In a step that diverges,
+    L counts as at least its value at the start, so diverging never pays; the parts in `info` are
+    left as they are.
 
-    With `"marginal"` a particle's own reward is N times what it changed in the step, times minus
-    the slope of L in the middle of the step: to second order its marginal contribution, averaged
-    over being the first and the last to act. What these rewards miss of the dense reward is shared
-    by all alike. A particle that was not updated earns nothing else. It pays for actions, where
-    `"particle"` also pays for what happens to a particle's pixels by the actions of others.
+    With `"marginal"` a particle's own reward is N times its change in the step, times minus the
+    slope of L in the middle of the step: to second order its marginal contribution, averaged over
+    being the first and the last to act. What these rewards miss of the dense reward is shared
+    equally. So it pays a particle for its own action alone, `"particle"` also for what the actions
+    of others do to its pixels.
 
     ## Starting state
 
@@ -65,9 +65,8 @@ class NPAEnv(gymnasium.Env[Any, Any]):
     | `max_episode_steps` steps are done | truncated | `"time limit"` |
 
     A particle has left the world if a coordinate is beyond ±`position_limit`. Its state has run
-    away if a number is beyond ±`observation_limit`. If something else than `max_episode_steps`
-    limits the steps, such as another library, tell `reward="sparse"` the number of steps as
-    `episode_steps`.
+    away if a number is beyond ±`observation_limit`. Where another library limits the steps,
+    `reward="sparse"` needs their number as `episode_steps`.
 
     ## Info
 
@@ -82,10 +81,9 @@ class NPAEnv(gymnasium.Env[Any, Any]):
     ## Rendering
 
     `render_mode="rgb_array"` makes uint8 pictures of shape [R, R, 3], R = `render_size`, that show
-    [-1, 1] × [-1, 1] with y up. `render_mode="human"` shows them in a window while the environment
-    is stepped; it needs `pip install 'npa-envs[human]'` and a screen: without one, it warns once
-    and goes on. `render_style` chooses between the particles' colours, their density, and their
-    hidden channels.
+    [-1, 1] × [-1, 1] with y up. `render_mode="human"` shows them in a window; it needs
+    `pip install 'npa-envs[human]'`, and without a screen it warns once. `render_style` chooses
+    between the particles' colours, their density, and their hidden channels.
 
     ## Arguments
 
@@ -99,13 +97,12 @@ class NPAEnv(gymnasium.Env[Any, Any]):
     flags [B]. World k after `reset(seed=s)` is the single environment after `reset(seed=s + k)`,
     bit for bit, for every B.
 
-    - With `output="torch"` all results are tensors on the device, and actions may be tensors as
-      well. Only the ends of episodes are copied to the host.
-    - Infos are arrays of shape [B], each with a mask of the same name behind an underscore, as
-      Gymnasium's vector environments have them.
+    - With `output="torch"` results are tensors on the device, and actions may be. Only the ends of
+      episodes are copied to the host.
+    - Infos are arrays of shape [B] with masks, as Gymnasium's vector environments have them.
     - With `autoreset_mode="same-step"`, the default, a world whose episode is over starts the next
-      one at once: the last observation is in `infos["final_obs"]`, the last infos, with the reason,
-      in `infos["final_info"]`.
+      one at once: the last observation is in `infos["final_obs"]`, the last infos in
+      `infos["final_info"]`.
     - `reset(options={"reset_mask": mask})` resets some worlds and leaves the others alone.
 
     `env.unwrapped.particles()` returns positions and states, and `place_particles(x, s)` replaces
@@ -298,10 +295,10 @@ class NPAEnv(gymnasium.Env[Any, Any]):
 def _step_limit(env: NPAEnv) -> int | None:
     """Return the step limit that Gymnasium put around an environment, None where there is none.
 
-    An environment is told neither the limit nor what is wrapped around it; but whoever counts its
-    steps is reset together with it, and so stands among its callers. Limits around a wrapper that
-    may take several steps at once are left out: they do not count these.
+    Wrappers that count its steps are reset with it, so they are among its callers. Limits around
+    other wrappers, which may take several steps at once, do not count.
     """
+    # A registered wrapper could say it, but Gymnasium refuses those next to a vector entry point.
     limits, frame = [], sys._getframe(1).f_back
     inner: gymnasium.Env[Any, Any] = env
     while frame is not None:

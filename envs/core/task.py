@@ -121,7 +121,7 @@ class EnvTask(WorldTask[Config]):
         super().__init__(config, device)
         self._pool: Start | None = None
         self.target_rows: Tensor | None = None
-        """What rows of an observation hold of each goal behind perception, [K, T]; None: nothing."""
+        """What rows of observations hold of each goal behind perception, [K, T]; None: nothing."""
 
     @classmethod
     def extra_bytes(cls, config: Any, world_count: int) -> int:

@@ -13,8 +13,7 @@ from npa_envs.envs.garden.worlds import LIVING
 class GardenEnv(NPAEnv):
     """One living world as a Gymnasium environment; subclasses name the task.
 
-    The sections below belong to the docstring of every subclass, after what it says there of its
-    own; where there is none, that of `NPAEnv` does.
+    The sections below belong to the docstring of every subclass, after its own of the same name.
 
     ## Observation space
 
@@ -25,25 +24,23 @@ class GardenEnv(NPAEnv):
     | `"moments"` | means over all particles, [5 + 3C] | lengths, dimensionless |
 
     The grid has P × P places, row by row from the bottom up, from −`place_reach` to `place_reach`
-    along x and y. It goes along with the particles: places are counted from where the middle of the
-    picture is. Six numbers belong to each: what a brush there would hold of the target less what it
-    holds now. These are the number of particles; the same with their places along x and y from the
-    brush, in brush radii, so they say towards which side particles lack; and red, green and blue.
-    The first is 2 and the others are 4 where a brush lacks as many particles as one holds at an
-    average place of the target.
+    along x and y of the picture's middle. Each place has six numbers: what a brush there would hold
+    of the target less what it holds now. These are the number of particles, its products with their
+    x and y from the brush in brush radii, and red, green and blue. The first is 2 and the others
+    are 4 where as many particles lack as a brush holds at an average place of the target.
 
-    The picture is red, green, blue, then density, each row by row; it spans [-1, 1] × [-1, 1], rows
-    from the bottom up, and goes along with the particles likewise. Colours are sums over particles,
-    as the density is. `observe_error=True` adds four channels: the target's picture less this one.
+    The picture is red, green, blue, then density, each row by row from the bottom up; it spans
+    [-1, 1] × [-1, 1] around the picture's middle. Colours are sums over particles, as the density
+    is. `observe_error=True` adds four channels: the target's picture less this one.
 
     Moments are the means of x and y; then, about that place, of x², x y, y², of each state, of x
     times each state, and of y times each state. Numbers are clipped to ±8.
 
     ## Action space
 
-    With `actions="grid"`, `Box(-1, 1, (P², W), float32)`: a brush stands at each place of the grid,
-    and its row says what it does. All are used at once, what a particle feels of them adds up, and
-    then the rule runs for `rule_steps` steps. Zeros do nothing.
+    With `actions="grid"`, `Box(-1, 1, (P², W), float32)`: a row for the brush at each place of the
+    grid. All act at once, their effects add up, and then the rule runs for `rule_steps` steps.
+    Zeros do nothing.
 
     | Columns | Action a | An action of 1 is | Effect where the brush holds w of a particle |
     |---|---|---|---|
@@ -52,13 +49,12 @@ class GardenEnv(NPAEnv):
     | 1 a channel, of `"inject"` | what to inject | `state_scale` | s ← s + w `state_scale` a |
     | 1, of `"rate"` | how fast to live | twice as fast | steps of the rule count 1 + w a times |
 
-    Columns of tools that `tools` leaves out are not there; the default has `"push"` alone.
-    `"inject"` has one for each of `inject_channels`. w = (1 − r²)² at r brush radii from the brush,
-    0 outside: `npa_envs.world.brushes.softness`. What is wiped is clipped to [0, 1] of a state,
-    rates to [0, 2]. Entries are clipped to [-1, 1]. A number that is not finite raises `NPAError`
-    and leaves the world as it was. Worlds are differentiable in all numbers of all brushes, but for
-    the correction of moments that [perception](../mathematics.md#perception) holds constant:
-    `env.unwrapped.task.step(x, s, action, random)`.
+    `tools` says which columns there are; the default has `"push"` alone. `"inject"` has one for
+    each of `inject_channels`. w = (1 − r²)² at r brush radii from the brush, 0 outside. What is
+    wiped is clipped to [0, 1] of a state, rates to [0, 2], entries to [-1, 1]. A number that is not
+    finite raises `NPAError` and leaves the world as it was. `env.unwrapped.task.step(x, s, action,
+    random)` is differentiable in all of them, but for the correction of moments that
+    [perception](../mathematics.md#perception) holds constant.
 
     With `actions="free"`, `Box(-1, 1, (K, 2 + W), float32)`: there are K = `brush_count` brushes,
     and two columns more in front say where each is used, along x and y [length units].
@@ -80,13 +76,8 @@ class GardenEnv(NPAEnv):
 
     ## Vectorized environment
 
-    `gym.make_vec(id, num_envs=B)` makes B worlds that one call steps together, on the CPU or, with
-    `device="cuda"`, on a GPU. Observations, actions, rewards and flags have B in front. World k
-    after `reset(seed=s)` is the single environment after `reset(seed=s + k)`, bit for bit, for
-    every B. On a CPU worlds are stepped one after the other: a batch saves no time there.
-
-    All else is as for the other environments: `output="torch"`, `autoreset_mode`, `reset_mask`,
-    `particles()` and `place_particles(x, s)`.
+    As in [every environment](Morphogenesis2D.md#vectorized-environment), but on a CPU worlds are
+    stepped one after the other: a batch saves no time there.
     """
 
     parts = LIVING
