@@ -82,11 +82,7 @@ class GrownTask(PictureEnvTask[Config]):
 
     @cached_property
     def rule(self) -> NPARule:
-        """What grows them.
-
-        Raises:
-            NPAError: There is no such rule, or it is one of other worlds.
-        """
+        """What grows them."""
         return _load_rule(self.config, self.device)
 
     @property
@@ -143,17 +139,7 @@ def run_rule(
     *,
     detach_positions: bool = False,
 ) -> tuple[Tensor, Tensor]:
-    """Return worlds after some steps of a rule, with the constants of an environment's worlds.
-
-    Args:
-        rule: What runs the particles.
-        config: The environment's configuration.
-        x: Positions [length units], shape [B, N, 2].
-        s: States, dimensionless, shape [B, N, C].
-        steps: Steps of the rule.
-        random: One stream a world; advanced by `steps`.
-        detach_positions: Leave out the gradient by what particles perceive of where others are.
-    """
+    """Return worlds after some steps of a rule, with the constants of an environment's worlds."""
     return rollout(
         rule,
         x,

@@ -106,11 +106,7 @@ class Shapeshifter2DEnvConfig(EnvConfig):
 
 
 def rule_of(config: Shapeshifter2DEnvConfig, device: torch.device) -> tuple[NPARule, Codes]:
-    """Return the rule of a configuration, with its codes.
-
-    Raises:
-        NPAError: There is no such rule, it knows fewer than two codes, or lives in other worlds.
-    """
+    """Return the rule of a configuration, with its codes."""
     rule = load_rule(config.rule, device=device).float().requires_grad_(False)
     if rule.codes is None or len(rule.codes) < 2:
         raise NPAError(
@@ -295,11 +291,7 @@ class CodeForm(ParticleSpaces):
         )
 
     def action(self, action: Any, world_count: int | None) -> Tensor:
-        """Return the codes that actions mean, float32, shape [B, 1, K].
-
-        Raises:
-            NPAError: They are no numbers, or have another shape, or there is no such code.
-        """
+        """Return the codes that actions mean, float32, shape [B, 1, K]."""
         count, dim = self._table.shape
         batch = () if world_count is None else (world_count,)
         letters = "" if world_count is None else "B, "

@@ -37,9 +37,6 @@ VectorStep = tuple[Any, Any, Any, Any, dict[str, Any]]
 
 def single_env(env: Any, wrapper: str) -> NPAEnv:
     """Return the environment of this package that lies under wrappers, for a wrapper of that name.
-
-    Raises:
-        NPAError: It is none of this package, or a vector environment.
     """
     base = getattr(env, "unwrapped", None)
     if isinstance(base, NPAEnv):
@@ -65,9 +62,6 @@ def vector_env(env: Any, wrapper: str) -> NPAVectorEnv:
 
 def torch_env(env: Any, adapter: str) -> NPAVectorEnv:
     """Return the vector environment under wrappers, for an adapter that keeps tensors it is given.
-
-    Raises:
-        NPAError: It is none of this package, hands out arrays, or overwrites what it handed out.
     """
     base = vector_env(env, adapter)
     if base.config.output != "torch":
@@ -153,11 +147,7 @@ def own_rewards(infos: dict[str, Any]) -> Any:
 
 
 def row_space(space: Any) -> Box:
-    """Return the space of one particle of a world's, a box of shape [N, ...].
-
-    Raises:
-        NPAError: The space has no rows.
-    """
+    """Return the space of one particle of a world's, a box of shape [N, ...]."""
     if not isinstance(space, Box) or len(space.shape) < 2:
         raise NPAError(
             "rows need an environment that gives and takes one for each particle, got the space "

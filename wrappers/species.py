@@ -68,12 +68,7 @@ class SpeciesPlan:
         """Species of particles 0 to N - 1 where they stand in blocks, int64, shape [N]."""
 
     def draw(self, random: WorldRandom, worlds: Tensor) -> Tensor:
-        """Return the species of all particles of some worlds, int64, shape [M, N].
-
-        Args:
-            random: The worlds' own streams, at the start of their episodes; left as they are.
-            worlds: Which worlds, int64, shape [M].
-        """
+        """Return the species of all particles of some worlds, int64, shape [M, N]."""
         blocks = self.blocks.to(worlds.device)
         if not self.random:
             return blocks.expand(len(worlds), -1)
@@ -82,9 +77,6 @@ class SpeciesPlan:
 
     def space(self, space: Space[Any], wrapper: str) -> Box:
         """Return the space of observations with tags, for a wrapper of that name, by that without.
-
-        Raises:
-            NPAError: It has no row for each particle.
         """
         count = len(self.blocks)
         if not isinstance(space, Box) or len(space.shape) != 2 or space.shape[0] != count:

@@ -80,11 +80,7 @@ class RunningMoments:
         return {"mean": self.mean.cpu().clone(), "var": self.var.cpu().clone(), "count": count}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Take over what `state_dict` returned.
-
-        Raises:
-            NPAError: A name is missing, unknown, or belongs to samples of another shape.
-        """
+        """Take over what `state_dict` returned."""
         wanted = {"mean": self.mean.shape, "var": self.var.shape, "count": torch.Size()}
         for name in state.keys() ^ wanted.keys():
             fault = "unknown" if name in state else "missing"
@@ -152,11 +148,7 @@ class PerceptionStatistics:
         return like(((z - mean) * scale).clamp_(-self.clip, self.clip), observation)
 
     def space(self, space: Any) -> Box:
-        """Return the space of normalised observations, by that of the observations as they are.
-
-        Raises:
-            NPAError: It holds more than perception.
-        """
+        """Return the space of normalised observations, by that of the observations as they are."""
         shape = (*(space.shape or ()),)
         if len(shape) != 2 or shape[1] != self.perception_dim:
             raise NPAError(
@@ -214,11 +206,7 @@ class _NormalizesPerception(Twin):
         return self.statistics.moments.state_dict()
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Take over the statistics that another wrapper's `state_dict` returned.
-
-        Raises:
-            NPAError: It belongs to other observations.
-        """
+        """Take over the statistics that another wrapper's `state_dict` returned."""
         self.statistics.moments.load_state_dict(state)
 
     def observations(self, observations: Any) -> Any:

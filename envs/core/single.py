@@ -15,16 +15,13 @@ from torch import Tensor
 
 from npa_envs.checks import number_tensor
 from npa_envs.envs.core.referee import reason
-from npa_envs.envs.core.screen import Screen
-from npa_envs.envs.core.spaces import ParticleSpaces, to_output
-from npa_envs.envs.core.task import EnvTask
+from npa_envs.envs.core.screen import WorldsEnv
 from npa_envs.envs.core.vector import check_options, plain_seed, rng_keys
-from npa_envs.envs.core.worlds import PARTICLES, BatchedWorlds, Parts
 from npa_envs.errors import NPAError
 from npa_envs.world.actions import DIVERGED, SUCCESS, TIME_LIMIT
 
 
-class NPAEnv(gymnasium.Env[Any, Any]):
+class NPAEnv(WorldsEnv, gymnasium.Env[Any, Any]):
     """One world of a task as a Gymnasium environment; subclasses name the task.
 
     Keywords are the fields of the task's configuration. An unknown or wrong one, or a world that
@@ -118,34 +115,19 @@ class NPAEnv(gymnasium.Env[Any, Any]):
     - v0: first version.
     """
 
-    task_type: ClassVar[type[EnvTask[Any]]]
-    """What the environment is about."""
-
-    parts: ClassVar[Parts] = PARTICLES
-    """How the worlds are acted on, observed and judged."""
-
-    form_type: ClassVar[type[ParticleSpaces]] = ParticleSpaces
-    """How the world is seen and acted upon."""
-
     metadata: ClassVar[dict[str, Any]] = {  # type: ignore[misc]
         "render_modes": ["rgb_array", "human"],
         "render_fps": 25,
     }
 
     def __init__(self, **keywords: Any) -> None:
-        self.config = self.task_type.config_type.from_keywords(keywords)
-        self.render_mode = self.config.render_mode
-        self.worlds = BatchedWorlds(self.task_type, self.config, 1, parts=self.parts)
-        self.task = self.worlds.task
-        self.form = self.form_type(self.worlds.physics, self.config)
+        self._make_worlds(keywords, 1, None)
         self.observation_space = self.form.observation_space
         self.action_space = self.form.action_space
         self._world = torch.zeros(1, dtype=torch.int64, device=self.task.device)
         self._keyed_from: np.random.Generator | None = None
-        self._started = False
         self._unpaid_steps = 0
         self._warned = False
-        self._screen = Screen(self.worlds, self.config, self.metadata["render_fps"])
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -228,12 +210,6 @@ class NPAEnv(gymnasium.Env[Any, Any]):
         pictures = self._screen.render()
         return None if pictures is None else pictures[0]
 
-    def _repr_mimebundle_(self, include: Any = None, exclude: Any = None) -> dict[str, Any]:
-        """Return what Jupyter shows: the world as it is, from the first reset on."""
-        if not self._started:
-            return {"text/plain": str(self)}
-        return self._screen.for_notebook(str(self))
-
     def close(self) -> None:
         """Close the window, if there is one."""
         self._screen.close()
@@ -272,12 +248,6 @@ class NPAEnv(gymnasium.Env[Any, Any]):
     def _losses(self, numbers: list[float]) -> dict[str, Any]:
         parts = {f"loss_{n}": numbers[2 + k] for k, n in enumerate(self.worlds.part_names)}
         return {"loss": numbers[1]} | parts
-
-    def _out(self, tensor: Tensor) -> Any:
-        return to_output(tensor, self.config.output)
-
-    def _show(self) -> None:
-        self._screen.show(self.spec.id if self.spec is not None else type(self).__name__)
 
     def _warn_of_unpaid_rewards(self) -> None:
         """Warn once where an episode ended by a limit that the environment does not know of."""

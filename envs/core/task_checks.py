@@ -31,9 +31,6 @@ def check_start(task: EnvTask[Any], start: Start, world_count: int, shapes: Any)
         start: What it returned.
         world_count: Worlds B.
         shapes: Shapes of positions and of states, of B worlds and more.
-
-    Raises:
-        NPAError: A tensor has another shape, dtype or device.
     """
     name = starter(task)
     if not isinstance(start, Start):
@@ -54,17 +51,7 @@ def check_start(task: EnvTask[Any], start: Start, world_count: int, shapes: Any)
 def checked_losses(
     task: EnvTask[Any], losses: Any, world_count: int, names: tuple[str, ...]
 ) -> list[Tensor]:
-    """Return the parts of worlds' losses, shape [B] each, without waiting for the device.
-
-    Args:
-        task: Whose they are.
-        losses: What it returned.
-        world_count: Worlds B.
-        names: Names of the parts in earlier calls; empty in the first one.
-
-    Raises:
-        NPAError: There is none, the names are others, or a part has another shape, dtype or device.
-    """
+    """Return the parts of worlds' losses, shape [B] each, without waiting for the device."""
     told = f"{type(task).__name__}.losses"
     if not isinstance(losses, Mapping) or not losses or not all(type(n) is str for n in losses):
         came = list(losses) if isinstance(losses, Mapping) else type(losses).__name__
@@ -83,11 +70,7 @@ def checked_losses(
 
 
 def checked_shares(task: EnvTask[Any], shares: Any, shape: tuple[int, int]) -> Tensor:
-    """Return the particles' shares of worlds' losses, shape [B, N].
-
-    Raises:
-        NPAError: They have another shape, dtype or device.
-    """
+    """Return the particles' shares of worlds' losses, shape [B, N]."""
     _check_tensor(task, "particle_losses", "shares", shares, shape, torch.float32)
     checked: Tensor = shares
     return checked
@@ -115,16 +98,7 @@ def _check_tensor(
 
 
 def check_finite(task: EnvTask[Any], method: str, parts: Mapping[str, Tensor]) -> None:
-    """Check that numbers of worlds are finite; waits for the device.
-
-    Args:
-        task: Whose they are.
-        method: What returned them.
-        parts: Them by name, shape [B, ...] each.
-
-    Raises:
-        NPAError: One is not.
-    """
+    """Check that numbers of worlds are finite; waits for the device."""
     for part, value in parts.items():
         bad = ~torch.isfinite(value.flatten(1) if value.ndim > 1 else value[:, None]).all(dim=1)
         if bool(bad.any()):
@@ -148,11 +122,7 @@ class GlobalDraws:
         self._before = self._states()
 
     def check(self, method: str) -> None:
-        """Check that none of them has moved since, by the method of the task.
-
-        Raises:
-            NPAError: One has.
-        """
+        """Check that none of them has moved since, by the method of the task."""
         now = self._states()
         moved = [name for name, state in self._before.items() if state != now[name]]
         if moved:

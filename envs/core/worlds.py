@@ -45,11 +45,7 @@ FEW_PARTICLES = 8192
 
 
 def check_default_dtype() -> None:
-    """Check that what tasks make by default is float32, as the worlds are.
-
-    Raises:
-        NPAError: It is another dtype.
-    """
+    """Check that what tasks make by default is float32, as the worlds are."""
     dtype = torch.get_default_dtype()
     if dtype != torch.float32:
         raise NPAError(
@@ -108,11 +104,7 @@ class WorldState:
         return random
 
     def checked_particles(self, x: Any, s: Any, world_count: int, particle_count: int) -> Start:
-        """Return particles to be put into M worlds of N, float32 on the device.
-
-        Raises:
-            NPAError: A shape is another one, or a number is not finite or beyond its limit.
-        """
+        """Return particles to be put into M worlds of N, float32 on the device."""
         given, physics = [], self.physics
         for name, value, width, limit, limit_name in (
             ("x", x, physics.space_dim, physics.position_limit, "position_limit"),
@@ -529,15 +521,8 @@ class BatchedWorlds(WorldState):
 
         Nothing is read from the device, and nothing run, where none did.
 
-        Args:
-            endings: What `step` returned, of the worlds that were to act, shape [B].
-            observation: What is observed, shape [B, ...]; changed where worlds are reset.
-
         Returns:
             Endings, shape [B], without divergence where that ends no episode.
-
-        Raises:
-            DivergedError: A world diverged, and `on_divergence` is "raise".
         """
         way = self.task.config.on_divergence
         diverged = endings & DIVERGED != 0

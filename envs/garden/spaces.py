@@ -44,11 +44,7 @@ class BrushSpaces(ParticleSpaces):
             self.action_space = MultiDiscrete(self._choices * config.brush_count)
 
     def action(self, action: Any, world_count: int | None) -> Tensor:
-        """Return actions as worlds take them, rows of brushes, float32, shape [B, K, W].
-
-        Raises:
-            NPAError: They are no numbers, or have another shape, or a choice does not exist.
-        """
+        """Return actions as worlds take them, rows of brushes, float32, shape [B, K, W]."""
         batch = () if world_count is None else (world_count,)
         letters = "" if world_count is None else "B, "
         if self._config.actions != "discrete":

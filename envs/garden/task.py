@@ -56,11 +56,6 @@ class TargetDeficit:
         Numbers are dimensionless: of all particles, of their places along x and y from the brush in
         brush radii, and of their red, green and blue. They are `SEEN_SCALES` times what a brush
         holds, as multiples of the particles that one holds at an average place of the target.
-
-        Args:
-            x: Positions [length units], shape [B, N, 2].
-            s: States, dimensionless, shape [B, N, C].
-            middle: What places are counted from [length units], shape [B, 2].
         """
         return self._wanted - self._held(x, s[..., -3:], middle)
 
@@ -131,16 +126,7 @@ class GardenTask(GrownTask[Config]):
         *,
         detach_positions: bool = False,
     ) -> tuple[Tensor, Tensor]:
-        """Return worlds after brushes and the rule's steps, before what befalls them.
-
-        Args:
-            x: Positions [length units], shape [B, N, 2].
-            s: States, dimensionless, shape [B, N, C].
-            action: What the brushes do, shape [B, K, W].
-            random: One stream a world; advanced by `rule_steps`.
-            detach_positions: Leave out the gradient by what particles perceive of where others
-                are, as training does.
-        """
+        """Return worlds after brushes and the rule's steps, before what befalls them."""
         run = partial(
             run_rule, self.rule, self.config, random=random, detach_positions=detach_positions
         )
@@ -228,10 +214,5 @@ def marks_of_whole(task: GardenTask[Config], start: Start, loss: Tensor) -> Tens
 
 
 def lost_share(loss: Tensor, context: Tensor) -> Tensor:
-    """Return what share of pictures is lost: 0 of whole ones, 1 of grey ones, shape [B].
-
-    Args:
-        loss: Their losses, shape [B].
-        context: What `marks_of_whole` gave, and maybe more, shape [B, M].
-    """
+    """Return what share of pictures is lost: 0 of whole ones, 1 of grey ones, shape [B]."""
     return (loss - context[:, 0]) / context[:, 1]

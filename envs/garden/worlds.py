@@ -30,11 +30,7 @@ class RuleAction:
         self._x, self._s, self._diverged = worlds.x, worlds.s, worlds.referee.diverged
 
     def apply(self, action: Tensor) -> None:
-        """Apply actions, shape [B, K, W].
-
-        Raises:
-            DivergedError: A number is not finite; worlds are then as they were.
-        """
+        """Apply actions, shape [B, K, W]."""
         action = action.to(self._x.device)
         if not bool(torch.isfinite(action).all()):
             raise not_finite(action)

@@ -269,11 +269,6 @@ class AgentReturns:
     def pay(self, parts: Parts, live: Tensor, fled: Tensor) -> Tensor:
         """Take down the losses after a step, and return rewards, 0 for those that did not act.
 
-        Args:
-            parts: Of all agents.
-            live: Which agents acted, bool, shape [B, A].
-            fled: Which left their world in this step, bool, shape [B, A].
-
         Returns:
             Rewards, float64, shape [B, A].
         """
@@ -382,12 +377,7 @@ class SpeciesBatch(WorldState):
     @torch.no_grad()
     @makes_plain_tensors
     def act(self, action: Tensor) -> None:
-        """Apply actions to the worlds that go on; nothing waits for the device.
-
-        Args:
-            action: Finite, on the device, shape [B, N, A]; what it says of particles that are gone
-                is not read.
-        """
+        """Apply actions to the worlds that go on; nothing waits for the device."""
         for cohort in self.cohorts:
             cohort.act(action if cohort is self._whole else action[cohort.places])
         self.elapsed[self.open] += 1
@@ -446,15 +436,7 @@ class SpeciesBatch(WorldState):
         self.open &= ~worlds
 
     def place(self, x: Any, s: Any) -> None:
-        """Replace the particles that are in the worlds, which all have the same ones.
-
-        Args:
-            x: Positions [length units], shape [B, N now, 2].
-            s: States, dimensionless, shape [B, N now, C].
-
-        Raises:
-            NPAError: A shape is another one, or a number is not finite or beyond its limit.
-        """
+        """Replace the particles that are in the worlds, which all have the same ones."""
         (cohort,) = self.cohorts
         there = cohort.population
         count = there.x.shape[1]

@@ -61,11 +61,6 @@ def local_entropy(population: Population, *, eps: float, box: float | None) -> T
     The share of species k around particle i is f_k = b_k / Σ b, where b are the SPH-smoothed tags
     (1 for a particle of species k, else 0). The entropy is −Σ f_k ln f_k / ln K: 0 where a particle
     sees its own species alone, 1 where all K are there in equal parts.
-
-    Args:
-        population: The particles; K is the number of species that there were at the start.
-        eps: Perception radius [length units].
-        box: Side of the periodic box [length units], or None in open space.
     """
     species_count = len(population.counts)
     kinds = torch.arange(species_count, device=population.x.device)

@@ -38,12 +38,7 @@ class PictureLossConfig(SpeciesConfig):
     def goal(
         self, target: str = Morphogenesis2DConfig.target, particle_count: int = 1
     ) -> Morphogenesis2DConfig:
-        """Return what the task of growing a target with so many particles is told.
-
-        Args:
-            target: A built-in name, an emoji, or the path of a picture.
-            particle_count: Particles that the target is made for; as many points are in it.
-        """
+        """Return what the task of growing a target with so many particles is told."""
         return self.task_config(
             Morphogenesis2DConfig,
             target=target,
