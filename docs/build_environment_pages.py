@@ -36,8 +36,7 @@ from page_parts import (
 from npa_envs.envs.core.config import EnvConfig
 from npa_envs.envs.core.single import NPAEnv
 from npa_envs.envs.core.vector import NPAVectorEnv
-from npa_envs.envs.garden.environments import GardenEnv
-from npa_envs.envs.garden.worlds import LIVING
+from npa_envs.envs.garden.environments import LIVING, GardenEnv
 from npa_envs.registration import CODED, ENVIRONMENTS, GARDENS, SIZES, SMALL, Registration
 
 DOCS = Path(__file__).resolve().parent

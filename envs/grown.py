@@ -30,7 +30,7 @@ FIRST_TEST_SEED = 1_000_000
 
 @dataclass(frozen=True, kw_only=True)
 class GrownConfig(Morphogenesis2DEnvConfig):
-    """What grown worlds can be told besides."""
+    """Adds what grows the worlds, and which there are."""
 
     without_rule: ClassVar[str] = ""
     """What else than a rule can be given, as the end of an error's message."""
@@ -45,7 +45,7 @@ class GrownConfig(Morphogenesis2DEnvConfig):
 
     split: Split = "train"
     """Which grown worlds the pool holds: "train", or "test" for others that evaluate what was
-    learned. It needs a `seed_pool`: fresh worlds are told apart by the seeds of `reset`."""
+    learned. It needs a `seed_pool`: fresh worlds differ by the seeds of `reset`."""
 
     grow_steps: int = 256
     """Steps of the rule from the seed to the grown world, of time step 1 and without noise."""

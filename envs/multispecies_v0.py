@@ -91,7 +91,7 @@ class MultiSpeciesEnv(CrowdEnv):
     picture's middle onto the target's, so it does not count where the picture lies.
 
     There is one reward for each species. Rewards of single particles (`reward="particle"` and
-    `"marginal"`), and `tell_updated`, are for environments of one species, and are refused here.
+    `"marginal"`), and `tell_updated`, are for environments of one species, and are refused.
 
     With `reward="team"` every live agent gets the mean of all rewards; the parts in `info` stay its
     own. In an invasion rewards sum to zero: species 0 gains as much as the live invaders lose, in

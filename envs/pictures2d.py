@@ -32,7 +32,7 @@ CHANNELS = 4
 
 @dataclass(frozen=True, kw_only=True)
 class Pictures2DEnvConfig(PictureConfig):
-    """Which pictures are asked for, and whether particles are told."""
+    """Adds the pictures, and whether observations show them."""
 
     words = EnvConfig.words | {"split": get_args(Split)}
 
@@ -40,7 +40,7 @@ class Pictures2DEnvConfig(PictureConfig):
     """Pictures of the split "train": built-in names, emoji, picture files, or folders of such."""
 
     test_targets: tuple[str, ...] = ("letter-a", "ring")
-    """Pictures of the split "test", none of which is among `targets`."""
+    """Pictures of the split "test", not among `targets`."""
 
     split: Split = "train"
     """Which pictures episodes ask for: "train", or "test" to evaluate with others."""
@@ -77,7 +77,7 @@ class Pictures2DEnvConfig(PictureConfig):
 
     @property
     def goal(self) -> Morphogenesis2DConfig:
-        """What the task itself is told."""
+        """Configuration of the task itself."""
         return self._goal_of(self.targets if self.split == "train" else self.test_targets)
 
     @property
@@ -120,7 +120,7 @@ class PicturesTask(PictureEnvTask[Pictures2DEnvConfig]):
         x, s, number = self.goal.seed_with_goals(
             random.world_count, generator=random, device=self.device
         )
-        # No rule of codes acts here.
+        # No rule of codes acts on these worlds.
         return Start(x, s[..., -self.config.state_dim :].contiguous(), goal=number)
 
     def toward(self, goal: Tensor) -> Self:
@@ -155,9 +155,9 @@ class Pictures2DEnv(NPAEnv):
     ends with a small picture of the target. Without, nothing in the observation tells the pictures
     apart; `info["target"]` does.
 
-    Learn with the pictures of the split "train", and evaluate with those of `split="test"`, of
-    which none is among the first. A policy that was told pictures can try ones that it has never
-    seen; one that was not can only find what serves all of them.
+    Learn with the pictures of the split "train", and evaluate with those of `split="test"`, which
+    are others. A policy that observes targets can try new ones; another can only find what serves
+    all of them.
 
     Particles of all pictures are drawn equally large, and pictures are scaled so that each one's
     density is about 1. Action space and reward are those of `Morphogenesis2DEnv`.

@@ -37,7 +37,7 @@ PICTURE = "picture"
 
 @dataclass(frozen=True, kw_only=True)
 class Regeneration2DEnvConfig(GrownConfig):
-    """What 2D regeneration can be told besides."""
+    """Adds the damage."""
 
     without_rule = f", or rule={shown(PICTURE)} to start from the target's own points"
 

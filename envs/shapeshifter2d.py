@@ -21,7 +21,7 @@ from npa_envs.envs.core.spaces import ParticleSpaces, action_tensor
 from npa_envs.envs.core.task import EnvTask, Start
 from npa_envs.envs.core.vector import NPAVectorEnv
 from npa_envs.envs.garden.config import GardenReward
-from npa_envs.envs.garden.worlds import LIVING
+from npa_envs.envs.garden.environments import LIVING
 from npa_envs.envs.grown import run_rule
 from npa_envs.errors import NPAError
 from npa_envs.rule.codes import Codes
@@ -44,7 +44,7 @@ Actions = Literal["code", "choice"]
 
 @dataclass(frozen=True, kw_only=True)
 class Shapeshifter2DEnvConfig(EnvConfig):
-    """What worlds of a rule of many pictures can be told."""
+    """Adds the rule of many pictures and how its goals change."""
 
     words = EnvConfig.words | {"reward": get_args(GardenReward), "actions": get_args(Actions)}
     task_config_type = Morphogenesis2DConfig
@@ -270,12 +270,7 @@ class ShapeshifterTask(EnvTask[Shapeshifter2DEnvConfig]):
 
 
 class CodeForm(ParticleSpaces):
-    """Coarse pictures are seen; an action is a code, or the number of one.
-
-    Args:
-        physics: The worlds' constants.
-        config: The environment's configuration.
-    """
+    """Coarse pictures are seen; an action is a code, or the number of one."""
 
     def __init__(self, physics: Physics, config: Shapeshifter2DEnvConfig) -> None:
         _, codes = rule_of(config, torch.device("cpu"))
@@ -296,10 +291,10 @@ class CodeForm(ParticleSpaces):
         batch = () if world_count is None else (world_count,)
         letters = "" if world_count is None else "B, "
         if not self._chosen:
-            told = action_tensor(
+            code = action_tensor(
                 "action", action, (*batch, dim), "env.action_space", f"[{letters}K] = "
             )
-            return self._limit * told.view(-1, 1, dim).clamp(-1.0, 1.0)
+            return self._limit * code.view(-1, 1, dim).clamp(-1.0, 1.0)
         chosen = number_tensor("action", action)
         if tuple(chosen.shape) != batch or chosen.is_floating_point():
             raise NPAError(

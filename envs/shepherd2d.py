@@ -154,7 +154,7 @@ def lie_of(x: Tensor) -> Tensor:
 def direction(angle: Tensor) -> Tensor:
     """Return cosine and sine of twice an angle [radians], [B, 1], by its tangent, [B, 2]."""
     # Without library functions, whose last bit changes with the number of worlds; the tangent of
-    # an angle is near enough to it that goals are spread as they are told to be.
+    # an angle is near enough to it for the spread of goals.
     square = angle * angle
     return torch.cat((1.0 - square, 2.0 * angle), dim=1) / (1.0 + square)
 

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     AnyVectorEnv = VectorEnv[Any, Any, Any]
     AnyVectorWrapper = VectorWrapper[Any, Any, Any, Any, Any]
 else:
-    # Older releases of Gymnasium have no type parameters here.
+    # Older releases of Gymnasium have no type parameters.
     AnyWrapper, AnyVectorEnv, AnyVectorWrapper = gymnasium.Wrapper, VectorEnv, VectorWrapper
 
 
@@ -36,8 +36,7 @@ VectorStep = tuple[Any, Any, Any, Any, dict[str, Any]]
 
 
 def single_env(env: Any, wrapper: str) -> NPAEnv:
-    """Return the environment of this package that lies under wrappers, for a wrapper of that name.
-    """
+    """Return the environment of this package that lies under wrappers, for a wrapper of that name."""
     base = getattr(env, "unwrapped", None)
     if isinstance(base, NPAEnv):
         return base
@@ -61,8 +60,7 @@ def vector_env(env: Any, wrapper: str) -> NPAVectorEnv:
 
 
 def torch_env(env: Any, adapter: str) -> NPAVectorEnv:
-    """Return the vector environment under wrappers, for an adapter that keeps tensors it is given.
-    """
+    """Return the vector environment under wrappers, for an adapter that keeps tensors it is given."""
     base = vector_env(env, adapter)
     if base.config.output != "torch":
         raise NPAError(
@@ -88,10 +86,10 @@ def check_vector_env(env: Any, wrapper: str) -> None:
 def check_untouched(env: Any, wrapper: str) -> None:
     """Check that the wrappers beneath leave observations as the environment gives them."""
     name = "single_observation_space" if isinstance(env, VectorEnv) else "observation_space"
-    here, there = getattr(env, name), getattr(env.unwrapped, name)
-    if here != there:
+    own, given = getattr(env, name), getattr(env.unwrapped, name)
+    if own != given:
         raise NPAError(
-            f"env must give observations as the environment makes them, {there}, got {here}: "
+            f"env must give observations as the environment makes them, {given}, got {own}: "
             f"put {wrapper} under the wrappers that change observations"
         )
 

@@ -191,13 +191,13 @@ class VectorDamageEvents(_DamagesWorlds, EpisodeWrapper):
         now |= {f"loss_{n}": part for n, part in zip(worlds.part_names, parts, strict=True)}
         mask = torch.from_numpy(hurt).to(base.task.device)
         now |= {"_loss_damage": mask}
-        told = {name: to_output(value, output) for name, value in now.items()}
+        changed = {name: to_output(value, output) for name, value in now.items()}
         if "loss_damage" in infos:
-            told["loss_damage"] = told["loss_damage"] + infos["loss_damage"]
-            told["_loss_damage"] = told["_loss_damage"] | infos["_loss_damage"]
+            changed["loss_damage"] = changed["loss_damage"] + infos["loss_damage"]
+            changed["_loss_damage"] = changed["_loss_damage"] | infos["_loss_damage"]
         fresh = base._extras("reset", None)
-        told |= {name: value for name, value in fresh.items() if not name.startswith("_")}
-        return observations, infos | told
+        changed |= {name: value for name, value in fresh.items() if not name.startswith("_")}
+        return observations, infos | changed
 
 
 def _copy(value: Any) -> Any:

@@ -243,9 +243,9 @@ class _EpisodeRows(RowVecEnv):
         if own is None:
             paid = np.repeat(paid, self.row_count)
         done = ended | cut
-        told = self._ends(np.flatnonzero(done), cut & ~ended, infos)
+        row_infos = self._ends(np.flatnonzero(done), cut & ~ended, infos)
         paid = paid.reshape(self.num_envs).astype(np.float32, copy=False)
-        return self._shown(observations), paid, np.repeat(done, self.row_count), told
+        return self._shown(observations), paid, np.repeat(done, self.row_count), row_infos
 
     def _shown(self, observations: Any) -> Any:
         """Return observations of all worlds, or of some, as those of their rows."""
@@ -378,7 +378,7 @@ class RowPolicy:
     Args:
         model: The model; the policy follows when it is trained on.
         deterministic: Whether it acts by its mean instead of a draw.
-        tag: What the model was told of the species behind each row, shape [K]; None: nothing.
+        tag: Columns with the species behind each row, shape [K]; None: nothing.
 
     Raises:
         NPAError: The model is none.
@@ -409,10 +409,10 @@ class RowPolicy:
 class SpeciesVecEnv(RowVecEnv):
     """Particles of several species as the rows of a Stable-Baselines3 `VecEnv`.
 
-    Without `others` all particles of all species are rows and share one policy; each is told its
-    species by a one-hot tag behind what it perceives. With `others` the particles of those species
-    are played by the policies given, and the remaining species' particles are the rows, without
-    tags: for policies of their own, train them in turn, each beside the others as they are.
+    Without `others` all particles of all species are rows and share one policy; a one-hot tag of
+    its species follows what each perceives. With `others` the particles of those species are played
+    by the policies given, and the remaining species' particles are the rows, without tags: for
+    policies of their own, train them in turn.
 
     A world's rows follow each other, species after species. Each row is paid what its species is.
     Where a species ends, its rows end; until the world's next episode they see zeros,
@@ -505,8 +505,8 @@ class SpeciesVecEnv(RowVecEnv):
         if len(rows):
             last = {name: infos[name].get("final_obs", seen[name]) for name in self.rows_of}
             final = on_host(self._rows(last))[0].reshape(self.num_envs, -1)[rows]
-        told = self.infos(rows, truncated=(cut & ~ended).reshape(-1)[rows], last=final)
-        return shown.reshape(self.num_envs, -1), paid.reshape(-1), over.reshape(-1), told
+        row_infos = self.infos(rows, truncated=(cut & ~ended).reshape(-1)[rows], last=final)
+        return shown.reshape(self.num_envs, -1), paid.reshape(-1), over.reshape(-1), row_infos
 
     def policy(self, model: Any, species: str, *, deterministic: bool = False) -> RowPolicy:
         """Return a model that was trained on these rows as the policy of one species.

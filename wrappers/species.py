@@ -1,4 +1,4 @@
-"""Species tags: each particle is told which species it is."""
+"""Species tags: each particle observes which species it is."""
 
 from __future__ import annotations
 
@@ -76,8 +76,7 @@ class SpeciesPlan:
         return blocks[keys.argsort(dim=1, stable=True)]
 
     def space(self, space: Space[Any], wrapper: str) -> Box:
-        """Return the space of observations with tags, for a wrapper of that name, by that without.
-        """
+        """Return the space of observations with tags, for a wrapper of that name, by that without."""
         count = len(self.blocks)
         if not isinstance(space, Box) or len(space.shape) != 2 or space.shape[0] != count:
             raise NPAError(

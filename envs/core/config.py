@@ -70,7 +70,7 @@ class WorldConfig:
     """Perception radius ε [length units]."""
 
     eps0: float = 0.1
-    """Radius ε0 that perception is scaled to: that of the rules run here [length units]."""
+    """Radius ε0 that perception is scaled to: that of the rules [length units]."""
 
     alpha: float = 0.5
     """Largest displacement in one step, as a fraction of ε (dimensionless)."""
@@ -167,7 +167,7 @@ class WorldConfig:
         return self.box_size if self.boundary == "periodic" else None
 
     def physics(self, space_dim: int, *, static: bool) -> Physics:
-        """Return the constants of the worlds: what `npa_envs.world.actions` acts and perceives by."""
+        """Return the constants by which worlds act and perceive."""
         return Physics(
             space_dim=space_dim,
             state_dim=self.state_dim,

@@ -113,6 +113,8 @@ class WorldReferee:
         """Whether a number of each world left its bounds in the last step, shape [B]."""
         self.enabled = torch.ones(1, dtype=torch.uint8, device=device)
         """0 where the last actions were not finite and so not applied, shape [1]."""
+        self.context = x.new_zeros(world_count, 0)
+        """What the task keeps of the start of each world, shape [B, M]; by default nothing."""
         self.part_names: tuple[str, ...] = ()
         """Names of the parts of the loss, known once worlds have been placed."""
         self.report = StepReport.empty(world_count, 0, device)

@@ -31,13 +31,7 @@ class Drawn(Protocol):
 
 
 class Screen:
-    """What `render` of an environment returns or shows.
-
-    Args:
-        worlds: The environment's worlds.
-        config: The environment's configuration.
-        fps: Most frames a second that the window shows.
-    """
+    """What `render` of an environment returns or shows."""
 
     def __init__(self, worlds: Drawn, config: WorldConfig, fps: float) -> None:
         self._worlds = worlds
@@ -58,10 +52,10 @@ class Screen:
         return self._worlds.pictures(self._worlds.world_count)
 
     def for_notebook(self, name: str) -> dict[str, Any]:
-        """Return what Jupyter shows in place of an environment: the worlds as they are, or some."""
+        """Return what Jupyter shows of an environment: the worlds as they are, or some."""
         count = min(self._worlds.world_count, SHOWN_ACROSS**2)
-        told: dict[str, Any] = show(side_by_side(self._worlds.pictures(count)))._repr_mimebundle_()
-        return told | {"text/plain": name}
+        picture = show(side_by_side(self._worlds.pictures(count)))
+        return {**picture._repr_mimebundle_(), "text/plain": name}
 
     def show(self, title: str) -> None:
         """Show the worlds as they are, the first ones where they are many; only if "human"."""

@@ -239,10 +239,10 @@ class NPAEnv(WorldsEnv, gymnasium.Env[Any, Any]):
         return self.form.seen(observation[0])
 
     def _extras(self, *when: str) -> dict[str, Any]:
-        told = {name: value for own in when for name, value in self.worlds.extras(own).items()}
+        values = {name: value for own in when for name, value in self.worlds.extras(own).items()}
         return {
             name: self._out(value[0].clone()) if value.ndim > 1 else value[0].item()
-            for name, value in told.items()
+            for name, value in values.items()
         }
 
     def _losses(self, numbers: list[float]) -> dict[str, Any]:

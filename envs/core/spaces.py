@@ -27,12 +27,7 @@ def action_space(physics: Physics, particle_count: int) -> Box:
 
 
 class ParticleSpaces:
-    """How most worlds are seen and acted upon: one row for each particle.
-
-    Args:
-        physics: The worlds' constants.
-        config: The environment's configuration.
-    """
+    """How most worlds are seen and acted upon: one row for each particle."""
 
     def __init__(self, physics: Physics, config: WorldConfig) -> None:
         count = config.particle_count
@@ -44,7 +39,7 @@ class ParticleSpaces:
         self._output = config.output
 
     def action(self, action: Any, world_count: int | None) -> Tensor:
-        """Return actions as worlds take them, float32, shape [B, N, A]."""
+        """Return actions as worlds take them, float32, [B, N, A]; B is None for a single world."""
         if world_count is None:
             return action_tensor("action", action, self._shape, "env.action_space", "[N, A] = ")[
                 None

@@ -276,11 +276,7 @@ class EnvTask(WorldTask[Config]):
 
 
 class TargetEnvTask(EnvTask[Config]):
-    """A task that rules are trained on, too: `npa_envs.tasks` has its targets and losses.
-
-    Raises:
-        NPAError: Something that the task needs cannot be loaded, or does not fit.
-    """
+    """A task that rules are trained on, too: `npa_envs.tasks` has its targets and losses."""
 
     goal: Any
     """The task as training sees it."""

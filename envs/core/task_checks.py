@@ -52,16 +52,16 @@ def checked_losses(
     task: EnvTask[Any], losses: Any, world_count: int, names: tuple[str, ...]
 ) -> list[Tensor]:
     """Return the parts of worlds' losses, shape [B] each, without waiting for the device."""
-    told = f"{type(task).__name__}.losses"
+    name = f"{type(task).__name__}.losses"
     if not isinstance(losses, Mapping) or not losses or not all(type(n) is str for n in losses):
         came = list(losses) if isinstance(losses, Mapping) else type(losses).__name__
         raise NPAError(
-            f"{told} must return the parts of each world's loss by name, at least one, got {came}: "
+            f"{name} must return the parts of each world's loss by name, at least one, got {came}: "
             "for example {'distance': distance}, of shape [B]"
         )
     if names and tuple(losses) != names:
         raise NPAError(
-            f"{told} must return the same parts in the same order in each call, got "
+            f"{name} must return the same parts in the same order in each call, got "
             f"{list(losses)} after {list(names)}: return zeros for a part that does not count"
         )
     for part, value in losses.items():
@@ -111,11 +111,7 @@ def check_finite(task: EnvTask[Any], method: str, parts: Mapping[str, Tensor]) -
 
 
 class GlobalDraws:
-    """Where the global generators of random numbers stand, to tell whether a task draws from them.
-
-    Args:
-        task: The task.
-    """
+    """The states of the global generators of random numbers: a task must not draw from them."""
 
     def __init__(self, task: EnvTask[Any]) -> None:
         self._task = task

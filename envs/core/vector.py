@@ -335,7 +335,7 @@ def plain_seed(seed: Any) -> Any:
 
 
 def check_options(options: Any, known: tuple[str, ...]) -> None:
-    """Check what `reset` is told, by names of options."""
+    """Check the options of `reset` by their names."""
     if not isinstance(options, Mapping | None):
         raise NPAError(
             f"options must be a dict or None, got {type(options).__name__}: "
@@ -365,7 +365,7 @@ def worlds_to_reset(options: dict[str, Any] | None, world_count: int) -> NDArray
 
 
 def world_numbers(worlds: Any, world_count: int) -> Tensor:
-    """Return which of B worlds a caller means, by indices, each once; on the CPU, int64, shape [M]."""
+    """Return indices of worlds, each once, checked; on the CPU, int64, shape [M]."""
     given = number_tensor("worlds", worlds).cpu()
     # A mask would else be taken for the indices 0 and 1.
     whole = not given.is_floating_point() and given.dtype != torch.bool

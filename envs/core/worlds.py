@@ -55,18 +55,7 @@ def check_default_dtype() -> None:
 
 
 class WorldState:
-    """Particles of B worlds on a device, a stream of randomness for each world.
-
-    Args:
-        config: The environment's configuration.
-        task_type: Says how many dimensions there are, and whether particles move.
-        world_count: Worlds B.
-        particle_count: Particles of each, N.
-        extra_bytes: Memory that the task needs besides.
-
-    Raises:
-        NPAError: The worlds do not fit into memory.
-    """
+    """Particles of B worlds on a device, a stream of randomness for each world."""
 
     def __init__(
         self,
@@ -182,11 +171,7 @@ class ParticleAction(Actions):
 
 
 class Perception:
-    """What each particle perceives, then the task's `target_rows` for the world's goal.
-
-    Args:
-        worlds: Whose observations.
-    """
+    """What each particle perceives, then the task's `target_rows` for the world's goal."""
 
     def __init__(self, worlds: BatchedWorlds) -> None:
         self._target: Tensor | None = worlds.task.target_rows
@@ -255,7 +240,7 @@ class BatchedWorlds(WorldState):
         extra, count = task_type.extra_bytes(config, world_count), config.particle_count
         super().__init__(config, task_type, world_count, count, extra)
         self.task: Any = task_type(config, self.device)
-        self.referee: Any = parts.referee(self.task, self.x, self.s, episode_steps)
+        self.referee = parts.referee(self.task, self.x, self.s, episode_steps)
         """What judges the worlds."""
         self.action: Any = parts.action(self)
         """What an action does."""
@@ -294,32 +279,27 @@ class BatchedWorlds(WorldState):
     @property
     def episode_steps(self) -> int | None:
         """Steps after which an episode is cut off, or None for never."""
-        steps: int | None = self.referee.episode_steps
-        return steps
+        return self.referee.episode_steps
 
     @property
     def elapsed(self) -> Tensor:
         """Steps since the start of each episode, int32, shape [B]."""
-        elapsed: Tensor = self.referee.elapsed
-        return elapsed
+        return self.referee.elapsed
 
     @property
     def report(self) -> StepReport:
         """What a step returns besides the observation."""
-        report: StepReport = self.referee.report
-        return report
+        return self.referee.report
 
     @property
     def part_names(self) -> tuple[str, ...]:
         """Names of the parts of the loss, known once worlds have been placed."""
-        names: tuple[str, ...] = self.referee.part_names
-        return names
+        return self.referee.part_names
 
     @property
     def particle_reward(self) -> Tensor | None:
         """Each particle's own reward of the last step, shape [B, N], where it has one."""
-        own: Tensor | None = self.referee.particle_reward
-        return own
+        return self.referee.particle_reward
 
     @property
     def target_dim(self) -> int:
@@ -496,8 +476,7 @@ class BatchedWorlds(WorldState):
     def extras(self, when: str) -> dict[str, Tensor]:
         """Return what infos hold besides, shape [B, ...] each: since a "reset", or of a "step"."""
         if when == "reset":
-            own: dict[str, Tensor] = self.referee.extra_info()
-            return own
+            return self.referee.extra_info()
         return {"updated": self.action.updated()} if self.task.config.tell_updated else {}
 
     def host_observation(self, observation: Tensor) -> Tensor:
@@ -569,7 +548,7 @@ class BatchedWorlds(WorldState):
 
 
 def not_finite(action: Tensor) -> DivergedError:
-    """Return the error about actions, shape [B, K, W], of which a number is not finite."""
+    """Return the error about actions, shape [B, K, W], with a number that is not finite."""
     bad = ~torch.isfinite(action)
     world, particle, entry = (int(k) for k in bad.nonzero()[0])
     return DivergedError(
@@ -586,15 +565,8 @@ class GraphedResets:
     """Starts of next episodes, on CUDA as one graph and one launch instead of some hundred.
 
     A recorded start serves a fixed number of worlds. Fewer are filled up by repeating the last one:
-    it is then started twice in the same way, which is the same as once.
-
-    Args:
-        start: Starts the next episodes of worlds (indices, int64, shape [M]) and returns them made
-            ready for perception in the rows of the whole batch. A method's object has to be kept
-            by others.
-        world_count: Worlds B.
-        device: Where they live.
-        recorded: Whether `start` may be recorded: it never waits for the device.
+    it is then started twice in the same way, which is the same as once. `start` is a method of an
+    object that others keep.
     """
 
     def __init__(

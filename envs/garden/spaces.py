@@ -19,12 +19,7 @@ from npa_envs.world.actions import Physics
 
 
 class BrushSpaces(ParticleSpaces):
-    """A coarse picture or moments are seen; actions say what each brush does.
-
-    Args:
-        physics: The worlds' constants.
-        config: The environment's configuration.
-    """
+    """A coarse picture or moments are seen; actions say what each brush does."""
 
     def __init__(self, physics: Physics, config: GardenConfig) -> None:
         self._config = config

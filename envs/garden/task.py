@@ -32,13 +32,7 @@ Config = TypeVar("Config", bound=GardenConfig)
 
 
 class TargetDeficit:
-    """What lacks to a target at some places, as soft brushes there would hold it.
-
-    Args:
-        places: Where [length units], shape [P, 2].
-        target: The target, whose places they are.
-        config: Says how large brushes are.
-    """
+    """What lacks to a target at some places, as soft brushes there would hold it."""
 
     def __init__(self, places: Tensor, target: PointTarget, config: GardenConfig) -> None:
         self.places, self._config = places, config
@@ -63,18 +57,14 @@ class TargetDeficit:
         away = offsets(x, middle[:, None] + self.places, self._config)
         sides = away / self._config.brush_radius
         colours = colour[:, None].expand(-1, len(self.places), -1, -1)
-        told = torch.cat((torch.ones_like(sides[..., :1]), sides, colours), dim=-1)
-        told = told * holds(away, self._config)[..., None]
-        mean = world_mean(told.transpose(1, 2).flatten(2))
+        values = torch.cat((torch.ones_like(sides[..., :1]), sides, colours), dim=-1)
+        values = values * holds(away, self._config)[..., None]
+        mean = world_mean(values.transpose(1, 2).flatten(2))
         return self._scale * mean.view(len(x), len(self.places), SEEN_AT_A_PLACE)
 
 
 class GardenTask(GrownTask[Config]):
-    """A grown picture that goes on living; everything here is differentiable in the brushes.
-
-    Raises:
-        NPAError: There is no such rule, or it is one of other worlds.
-    """
+    """A grown picture that goes on living; differentiable in the brushes."""
 
     config_type: ClassVar[type[GardenConfig]] = GardenConfig
 
@@ -98,8 +88,8 @@ class GardenTask(GrownTask[Config]):
     @classmethod
     def extra_bytes(cls, config: Any, world_count: int) -> int:
         """Return about how much memory pool, pictures and brushes need [bytes]."""
-        told = SEEN_AT_A_PLACE * config.place_count**2 * config.particle_count
-        return super().extra_bytes(config, world_count) + int(3 * 4 * told * world_count)
+        values = SEEN_AT_A_PLACE * config.place_count**2 * config.particle_count
+        return super().extra_bytes(config, world_count) + int(3 * 4 * values * world_count)
 
     def step(
         self,
@@ -198,8 +188,8 @@ class GardenTask(GrownTask[Config]):
         away = x - mean[:, None]
         across, up = away[..., :1], away[..., 1:]
         seconds = torch.cat((across * across, across * up, up * up), dim=-1)
-        told = torch.cat((seconds, s, across * s, up * s), dim=-1)
-        return torch.cat((mean, world_mean(told)), dim=-1)
+        values = torch.cat((seconds, s, across * s, up * s), dim=-1)
+        return torch.cat((mean, world_mean(values)), dim=-1)
 
 
 LEAST_RISE = 0.1

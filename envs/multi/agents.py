@@ -21,18 +21,7 @@ from npa_envs.world.actions import Physics
 
 
 class AgentsEnv(ShownEnv):
-    """What environments of agents are made of, be it one world or many.
-
-    Args:
-        task: A name from `npa_envs.envs.multi.TASKS`.
-        keywords: Fields of the task's configuration.
-        world_count: Worlds B.
-        by_particle: Whether every particle is an agent, and not every species.
-
-    Raises:
-        NPAError: There is no such task, a keyword is unknown or wrong, or the worlds do not fit
-            into memory.
-    """
+    """What environments of agents are made of, be it one world or many."""
 
     metadata: ClassVar[dict[str, Any]] = {
         "name": "npa_multispecies_v0",

@@ -213,13 +213,13 @@ class CrowdEnv(AgentsEnv, pettingzoo.ParallelEnv):  # type: ignore[misc]
 
 
 def in_turns(parallel: Any, *, clips: bool = False) -> Any:
-    """Return an environment as one in which agents act in turn, with PettingZoo's checks of order."""
+    """Return an environment in which agents act in turn, in an order that PettingZoo checks."""
     turns = parallel_to_aec(parallel)
     return OrderEnforcingWrapper(ClipOutOfBoundsWrapper(turns)) if clips else turns
 
 
 def register(name: str, module: str, keywords: dict[str, Any]) -> None:
-    """Put both kinds of an environment into PettingZoo's registries; what is there stays as it is."""
+    """Put both kinds of an environment into PettingZoo's registries, unless they are there."""
     # PettingZoo before 1.27 has no registries.
     if not hasattr(pettingzoo, "register"):
         return

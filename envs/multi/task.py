@@ -168,7 +168,7 @@ class SpeciesConfig(WorldConfig):
 class Population(NamedTuple):
     """The particles of worlds that have the same ones, those of each species one after the other.
 
-    Here N counts the particles that are there.
+    N counts the particles that are left.
     """
 
     x: Tensor
@@ -264,7 +264,7 @@ class SpeciesTask(WorldTask[Any]):
         return rewards
 
     def is_over(self, counts: tuple[int, ...]) -> bool:
-        """Return whether the episode ends for all, where species are gone; by default it goes on."""
+        """Return whether the episode ends for all where species are gone; by default never."""
         return False
 
     @property

@@ -77,7 +77,7 @@ def local_entropy(population: Population, *, eps: float, box: float | None) -> T
     )
     blur = seen[..., species_count:]
     shares = blur / blur.sum(dim=2, keepdim=True)
-    # Beside a share of exactly 0 the entropy has no finite derivative, and NaN would come of it.
+    # At a share of exactly 0 the entropy has no finite derivative, and NaN would come of it.
     there = shares > 0.0
     terms = torch.where(there, torch.special.entr(torch.where(there, shares, 1.0)), 0.0)
     entropy: Tensor = terms.sum(dim=2)
