@@ -36,8 +36,7 @@ from page_parts import (
 from npa_envs.envs.core.config import EnvConfig
 from npa_envs.envs.core.single import NPAEnv
 from npa_envs.envs.core.vector import NPAVectorEnv
-from npa_envs.envs.garden.environments import GardenEnv
-from npa_envs.envs.garden.worlds import BrushedWorlds
+from npa_envs.envs.garden.environments import LIVING, GardenEnv
 from npa_envs.registration import CODED, ENVIRONMENTS, GARDENS, SIZES, SMALL, Registration
 
 DOCS = Path(__file__).resolve().parent
@@ -57,8 +56,12 @@ envs = gym.make_vec("{id}", num_envs=8)
 FIRST = ENVIRONMENTS[0]
 ONCE = {
     "Reward": "The values of `reward` mean the same in [every environment]({page}#reward).",
+    "Starting state": "Seeds are those of [every environment]({page}#starting-state).",
+    "Episode end": "Causes and reasons are those of [every environment]({page}#episode-end).",
+    "Rendering": "Modes and styles are those of [every environment]({page}#rendering).",
     "Vectorized environment": "Batches of worlds and the arguments of `gym.make_vec` are those of "
     "[every environment]({page}#vectorized-environment).",
+    "References": "See [the paper]({page}#references).",
 }
 """Sections whose common part is on the first page alone, and what the others have instead."""
 
@@ -79,18 +82,25 @@ def resolved_sections(env_class: type) -> dict[str, str]:
     first = sections(environment_class(FIRST))
     shared = sections(NPAEnv)
     order = [name for name in (first | shared) if name]
-    if issubclass(env_class.worlds_type, BrushedWorlds):
+    if env_class.parts is LIVING:
         # They pay and tell otherwise; all else that they do not say is said of all environments.
         del shared["Reward"], shared["Info"]
         first = {}
-        if issubclass(env_class, GardenEnv):
-            shared |= sections(GardenEnv)
     if env_class is not environment_class(FIRST):
         shared |= {
-            heading: told.format(page=f"{FIRST.name}.md")
-            for heading, told in ONCE.items()
+            heading: link.format(page=f"{FIRST.name}.md")
+            for heading, link in ONCE.items()
             if heading in shared
         }
+    if issubclass(env_class, GardenEnv):
+        gardens = {heading: text for heading, text in sections(GardenEnv).items() if heading}
+        if env_class is not environment_class(GARDENS[0]):
+            page = f"{GARDENS[0].name}.md"
+            gardens = {
+                heading: f"As in [every garden]({page}#{heading.lower().replace(' ', '-')})."
+                for heading in gardens
+            }
+        shared |= gardens
     found = {"": own[""]}
     for heading in order:
         parts = own.get(heading) or first.get(heading), shared.get(heading)
@@ -116,7 +126,7 @@ def argument_tables(config_type: type[EnvConfig]) -> str:
     heading = ("Name", "Type", "Default", "Meaning")
     listed, opening = table(heading, shared), "Of every environment:"
     if config_type is not environment_class(FIRST).task_type.config_type:
-        listed = table(heading[:3], [row[:3] for row in shared])
+        listed = ", ".join(f"`{row[0].strip('`')}={row[2].strip('`')}`" for row in shared) + "."
         opening = f"Of every environment, with their [meanings]({FIRST.name}.md#arguments):"
     return "\n\n".join(("Of this task:", table(heading, own), opening, listed))
 
@@ -191,7 +201,7 @@ def page(registration: Registration) -> str:
     spaces = {"Observation space": form.observation_space, "Action space": form.action_space}
     letters = {"C": config.state_dim, "D": task.space_dim, "N": count}
     text = resolved_sections(env_class)
-    if not issubclass(env_class.worlds_type, BrushedWorlds):
+    if env_class.parts is not LIVING:
         for heading, space in spaces.items():
             text[heading] = numbered_columns(text[heading], letters, space.shape[1])
     text["Arguments"] += "\n\n" + argument_tables(task.config_type)

@@ -17,6 +17,7 @@ from page_parts import (
 )
 
 from npa_envs.envs import multispecies_v0, particles_v0
+from npa_envs.envs.core.config import WorldConfig
 from npa_envs.envs.multi import TASKS, SpeciesConfig
 from npa_envs.envs.multi.parallel import CrowdEnv
 
@@ -24,6 +25,7 @@ MADE = NOTE.format(script="docs/build_environment_pages.py", source="docstrings"
 MODULES = {"MultiSpecies": multispecies_v0, "Particles": particles_v0}
 """Modules by the names of their pages."""
 
+SINGLE = "Of every environment, with their [meanings](Morphogenesis2D.md#arguments)"
 SAME = "The worlds are those of `multispecies_v0`, such as these; here every particle is an agent."
 EXAMPLE = """\
 ```python
@@ -61,19 +63,21 @@ def env_class(name: str) -> type[CrowdEnv]:
 
 def argument_tables() -> str:
     """Return the fields that all tasks have, and of each task those that are its own or differ."""
-    shared = rows(SpeciesConfig, {})
-    tables = [("Of every task", shared)]
+    single = {field.name: field.default for field in fields(WorldConfig)}
+    listed = ", ".join(
+        f"`{row[0].strip('`')}={row[2].strip('`')}`" for row in rows(WorldConfig, {})
+    )
+    tables = [("Of every task, besides or instead", rows(SpeciesConfig, single))]
     usual = {field.name: field.default for field in fields(SpeciesConfig)}
     for task, task_type in TASKS.items():
         if own := rows(task_type.config_type, usual):
             tables.append((f'Of `"{task}"`, besides or instead', own))
     heading = ("Name", "Type", "Default", "Meaning")
-    return "\n\n".join(f"{title}:\n\n{table(heading, own)}" for title, own in tables)
+    listings = (f"{title}:\n\n{table(heading, own)}" for title, own in tables)
+    return "\n\n".join((f"{SINGLE}: {listed}.", *listings))
 
 
-def rows(
-    config_type: type[SpeciesConfig], usual: dict[str, typing.Any]
-) -> list[tuple[str, str, str, str]]:
+def rows(config_type: type[WorldConfig], usual: dict[str, typing.Any]) -> list[tuple[str, ...]]:
     """Return rows for the fields of a configuration that `usual` does not hold as they are."""
     meanings, kinds = field_meanings(config_type), typing.get_type_hints(config_type)
     return [

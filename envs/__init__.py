@@ -1,9 +1,8 @@
 """Environments over the engine, imported as `npa_envs.envs`.
 
-`gym.make` and `gym.make_vec` take the ids of `npa_envs.registration`; the names here are for those
-who write a task of their own (docs/own_environment.md). No kernels and no physics live here: tasks
-say where worlds start and how far they are from the goal, `npa_envs.world.actions` moves the
-particles.
+`gym.make` and `gym.make_vec` take the ids of `npa_envs.registration`; these names are for tasks of
+your own (docs/own_environment.md). Tasks say where worlds start and how far they are from the goal;
+`npa_envs.world.actions` moves the particles.
 """
 
 from npa_envs.envs.core.config import EnvConfig

@@ -62,7 +62,7 @@ class GardenerTask(GardenTask[Gardener2DEnvConfig]):
     context_count = 2
 
     def disturb(self, x: Tensor, s: Tensor, random: WorldRandom) -> tuple[Tensor, Tensor]:
-        """Return worlds after a gust and a blight, drawn beside the rule's own draws."""
+        """Return worlds after a gust and a blight, by draws apart from the rule's."""
         config, draws = self.config, random.substream(StreamId.DAMAGE)
         chance, angle = draws.uniform(2), 2.0 * math.pi * draws.uniform(1)
         centre = random_particle(x, draws)

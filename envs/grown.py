@@ -30,7 +30,7 @@ FIRST_TEST_SEED = 1_000_000
 
 @dataclass(frozen=True, kw_only=True)
 class GrownConfig(Morphogenesis2DEnvConfig):
-    """What grown worlds can be told besides."""
+    """Adds what grows the worlds, and which there are."""
 
     without_rule: ClassVar[str] = ""
     """What else than a rule can be given, as the end of an error's message."""
@@ -45,7 +45,7 @@ class GrownConfig(Morphogenesis2DEnvConfig):
 
     split: Split = "train"
     """Which grown worlds the pool holds: "train", or "test" for others that evaluate what was
-    learned. It needs a `seed_pool`: fresh worlds are told apart by the seeds of `reset`."""
+    learned. It needs a `seed_pool`: fresh worlds differ by the seeds of `reset`."""
 
     grow_steps: int = 256
     """Steps of the rule from the seed to the grown world, of time step 1 and without noise."""
@@ -82,11 +82,7 @@ class GrownTask(PictureEnvTask[Config]):
 
     @cached_property
     def rule(self) -> NPARule:
-        """What grows them.
-
-        Raises:
-            NPAError: There is no such rule, or it is one of other worlds.
-        """
+        """What grows them."""
         return _load_rule(self.config, self.device)
 
     @property
@@ -143,17 +139,7 @@ def run_rule(
     *,
     detach_positions: bool = False,
 ) -> tuple[Tensor, Tensor]:
-    """Return worlds after some steps of a rule, with the constants of an environment's worlds.
-
-    Args:
-        rule: What runs the particles.
-        config: The environment's configuration.
-        x: Positions [length units], shape [B, N, 2].
-        s: States, dimensionless, shape [B, N, C].
-        steps: Steps of the rule.
-        random: One stream a world; advanced by `steps`.
-        detach_positions: Leave out the gradient by what particles perceive of where others are.
-    """
+    """Return worlds after some steps of a rule, with the constants of an environment's worlds."""
     return rollout(
         rule,
         x,

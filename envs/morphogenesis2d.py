@@ -39,7 +39,7 @@ class PictureConfig(EnvConfig):
 
     @property
     def goal(self) -> Morphogenesis2DConfig:
-        """What the task itself is told."""
+        """Configuration of the task itself."""
         return self.task_config(Morphogenesis2DConfig, target_point_count=self.particle_count)
 
 

@@ -68,7 +68,7 @@ class Morphogenesis3DEnvConfig(EnvConfig):
 
     @property
     def goal(self) -> Morphogenesis3DConfig:
-        """What the task itself is told; the views compared are held out, none is trained with."""
+        """Configuration of the task itself; the views compared are held out."""
         return self.task_config(
             Morphogenesis3DConfig,
             training_views=1,

@@ -22,10 +22,8 @@ class MultiSpeciesEnv(CrowdEnv):
     position and a state of C numbers. The last three numbers, plus 0.5, are its colour. In every
     step each agent tells all of its particles where to move and how to change their states.
 
-    As in the paper, particles perceive each other whatever their species: the states and densities
-    around a particle include all species. So species influence each other only by what others
-    perceive of them. A species that wants to be recognised has to mark its particles by their
-    states. All species perceive in one pass over the world.
+    As in the paper, particles perceive each other whatever their species. Species influence each
+    other only by what others perceive of them, and are recognised only by their particles' states.
 
     | `task` | Id | What it is about |
     |---|---|---|
@@ -35,28 +33,25 @@ class MultiSpeciesEnv(CrowdEnv):
     | `"invasion"` | `npa/Invasion-v0` | species 0 grows a picture, the others keep it from it |
     | `"symbiosis"` | `npa/Symbiosis-v0` | all grow one picture that takes all particles |
 
-    `npa/MixingSmall-v0`, `npa/SegregationSmall-v0`, `npa/CoMorphogenesisSmall-v0` and
-    `npa/SymbiosisSmall-v0` are the same tasks in worlds of 64 particles and episodes of 32 steps;
+    `npa/MixingSmall-v0` and the like have 64 particles and episodes of 32 steps;
     `npa/InvasionSmall-v0` has 64 particles of species 0 and 32 invaders that the environment plays.
     `npa/MixingLarge-v0` and the like have 4096 particles and episodes of 256 steps, for a GPU.
-    `npa_envs.registration.SPECIES_SIZES` holds their keywords. `parallel_env`, `env`, `raw_env` and
-    `batched` take ids instead of tasks as well.
+    `npa_envs.registration.SPECIES_SIZES` holds their keywords. All functions take ids for tasks.
 
     With `opponent="random"` the environment plays the invaders, by actions uniform in [-1, 1], and
     `species_0` is the only agent. The invaders are perceived and drawn, and are in `state()`.
 
     In `parallel_env` all agents act at once. In `env` and `raw_env` they act in turn, by
     PettingZoo's own conversion, and the world moves on after the last one. `env` also clips actions
-    into their space. The ids are for `pettingzoo.make`, of PettingZoo 1.27 or newer, once
-    `npa_envs.envs.multispecies_v0` is imported. Both `"parallel"` and `"aec"` are registered.
-    `batched` steps [many worlds at once](../species.md#many-worlds-at-once), to train on.
+    into their space. `pettingzoo.make`, of PettingZoo 1.27 or newer, takes the ids once
+    `npa_envs.envs.multispecies_v0` is imported, as `"parallel"` and `"aec"`. `batched` steps
+    [many worlds at once](../species.md#many-worlds-at-once), to train on.
 
     A trained rule is a policy for one species:
     `npa_envs.agents.RulePolicy(npa_envs.load_rule("gecko"))`. If all species follow the same rule,
-    the episode is a rollout of it. An invasion with the defaults shows that species disturb each
-    other: after 150 steps of this rule the loss of species 0 was 0.66 beside invaders that did
-    nothing, 0.85 beside invaders that followed the same rule, and 0.94 beside invaders that acted
-    at random (means of three seeds).
+    the episode is a rollout of it. Species disturb each other: after 150 steps of this rule in an
+    invasion with the defaults, the loss of species 0 was 0.66 with invaders that did nothing, 0.85
+    with invaders of the same rule, and 0.94 with random ones (means of three seeds).
 
     ## Observation space
 
@@ -96,7 +91,7 @@ class MultiSpeciesEnv(CrowdEnv):
     picture's middle onto the target's, so it does not count where the picture lies.
 
     There is one reward for each species. Rewards of single particles (`reward="particle"` and
-    `"marginal"`), and `tell_updated`, are for environments of one species, and are refused here.
+    `"marginal"`), and `tell_updated`, are for environments of one species, and are refused.
 
     With `reward="team"` every live agent gets the mean of all rewards; the parts in `info` stay its
     own. In an invasion rewards sum to zero: species 0 gains as much as the live invaders lose, in
@@ -110,9 +105,8 @@ class MultiSpeciesEnv(CrowdEnv):
     ## Starting state
 
     Each species is uniform in a disk of radius `seed_radius`, all states are zero. The disks'
-    centres lie in a row along x, `seed_distance` apart, their middle at the origin.
-    `reset(seed=k)` begins the sequence of episodes that belongs to k, and `reset()` goes on with
-    the next one.
+    centres lie in a row along x, `seed_distance` apart, their middle at the origin. Seeds are those
+    of [`npa/Morphogenesis2D-v0`](Morphogenesis2D.md#starting-state).
 
     ## Episode end
 
@@ -150,10 +144,8 @@ class MultiSpeciesEnv(CrowdEnv):
 
     ## Rendering
 
-    `render_mode="rgb_array"` makes uint8 pictures of shape [R, R, 3], R = `render_size`, with y up.
-    `render_mode="human"` shows them in a window; it needs `pip install 'npa-envs[human]'` and a
-    screen: without one, it warns once and goes on. With `render_style="species"` each species has a
-    colour of its own; the other styles are those of the single environments.
+    As in [`npa/Morphogenesis2D-v0`](Morphogenesis2D.md#rendering). With `render_style="species"`
+    each species has a colour of its own.
 
     ## Arguments
 

@@ -9,7 +9,6 @@ import numpy as np
 import torch
 import torch.nn.functional as F
 from gymnasium.spaces import Box
-from numpy.typing import NDArray
 from torch import Tensor
 
 from npa_envs.checks import check_flag, check_positive
@@ -17,16 +16,14 @@ from npa_envs.envs.core.config import EnvConfig, WorldConfig
 from npa_envs.envs.core.memory import OBSERVATION_COPIES
 from npa_envs.envs.core.single import NPAEnv
 from npa_envs.envs.core.spaces import ParticleSpaces
-from npa_envs.envs.core.task import EnvTask, Start
+from npa_envs.envs.core.task import Start
 from npa_envs.envs.core.vector import NPAVectorEnv
-from npa_envs.envs.core.worlds import BatchedWorlds
 from npa_envs.envs.morphogenesis2d import PictureConfig, PictureEnvTask
 from npa_envs.errors import NPAError, shown
 from npa_envs.tasks.many_pictures import ManyPictures, named_targets
 from npa_envs.tasks.morphogenesis2d import Morphogenesis2DConfig
 from npa_envs.tasks.targets.clouds import Split
-from npa_envs.world.actions import Physics, build_neighbours
-from npa_envs.world.cuda_graph import to_device_async
+from npa_envs.world.actions import Physics
 from npa_envs.world.randomness import WorldRandom
 
 CHANNELS = 4
@@ -35,7 +32,7 @@ CHANNELS = 4
 
 @dataclass(frozen=True, kw_only=True)
 class Pictures2DEnvConfig(PictureConfig):
-    """Which pictures are asked for, and whether particles are told."""
+    """Adds the pictures, and whether observations show them."""
 
     words = EnvConfig.words | {"split": get_args(Split)}
 
@@ -43,7 +40,7 @@ class Pictures2DEnvConfig(PictureConfig):
     """Pictures of the split "train": built-in names, emoji, picture files, or folders of such."""
 
     test_targets: tuple[str, ...] = ("letter-a", "ring")
-    """Pictures of the split "test", none of which is among `targets`."""
+    """Pictures of the split "test", not among `targets`."""
 
     split: Split = "train"
     """Which pictures episodes ask for: "train", or "test" to evaluate with others."""
@@ -80,7 +77,7 @@ class Pictures2DEnvConfig(PictureConfig):
 
     @property
     def goal(self) -> Morphogenesis2DConfig:
-        """What the task itself is told."""
+        """Configuration of the task itself."""
         return self._goal_of(self.targets if self.split == "train" else self.test_targets)
 
     @property
@@ -108,8 +105,8 @@ class PicturesTask(PictureEnvTask[Pictures2DEnvConfig]):
         pictures = self.goal.toward(everyone).target_picture.permute(0, 3, 1, 2)
         small = F.avg_pool2d(pictures, config.resolution // config.picture_size)
         limit = config.observation_limit
-        self.target_rows = small.flatten(1).clamp(-limit, limit)
-        """What rows tell of each picture, dimensionless, shape [K, T]."""
+        if config.observe_target:
+            self.target_rows = small.flatten(1).clamp(-limit, limit)
         self._number = everyone[:1]
 
     @classmethod
@@ -123,7 +120,7 @@ class PicturesTask(PictureEnvTask[Pictures2DEnvConfig]):
         x, s, number = self.goal.seed_with_goals(
             random.world_count, generator=random, device=self.device
         )
-        # No rule of codes acts here.
+        # No rule of codes acts on these worlds.
         return Start(x, s[..., -self.config.state_dim :].contiguous(), goal=number)
 
     def toward(self, goal: Tensor) -> Self:
@@ -148,54 +145,6 @@ class PictureSpaces(ParticleSpaces):
         self.observation_space = Box(-limit, limit, (config.particle_count, columns), np.float32)
 
 
-class TargetWorlds(BatchedWorlds):
-    """B worlds, each with a picture that it is to grow; arguments and errors of `BatchedWorlds`."""
-
-    task: PicturesTask
-
-    def __init__(
-        self,
-        task_type: type[EnvTask[Any]],
-        config: EnvConfig,
-        world_count: int,
-        episode_steps: int | None = None,
-    ) -> None:
-        super().__init__(task_type, config, world_count, episode_steps)
-        self.target_dim = self.task.config.target_dim
-        """Numbers that rows tell of the target besides what particles perceive, T."""
-        if self.target_dim:
-            self.restart = self._restart  # type: ignore[assignment]
-
-    def perceive(self, out: Tensor | None = None) -> Tensor:
-        """Return what is observed in all worlds as they are, [B, N, P + T], written to `out`."""
-        if not self.target_dim:
-            return super().perceive(out)
-        return self._with_target(super().perceive(), self._goal, out)
-
-    def queue(self, action: Tensor, out: Tensor | None = None) -> Tensor:
-        """Do what `step` does but wait for the device; return what is observed, [B, N, P + T]."""
-        if not self.target_dim:
-            return super().queue(action, out)
-        return self._with_target(super().queue(action), self._goal, out)
-
-    def told_observation(self, observation: Tensor) -> Tensor:
-        """Return what is observed in a single world after a step, shape [1, N, P + T]."""
-        return observation if self.target_dim else super().told_observation(observation)
-
-    def _restart(self, worlds: NDArray[np.int64], observation: Tensor) -> None:
-        """Start the next episodes of some worlds, [M], and write what is observed there."""
-        index = to_device_async(worlds, self.device)
-        start = self.start(index)
-        rows = build_neighbours(start.x, start.s, self.physics).perceive()
-        observation[index] = self._with_target(rows, self._goal[index], None)
-
-    def _with_target(self, rows: Tensor, goal: Tensor, out: Tensor | None) -> Tensor:
-        """Return rows, [M, N, P], with what they tell of the worlds' pictures, [M], behind."""
-        told = self.task.target_rows[goal][:, None].expand(-1, rows.shape[1], -1)
-        wide = torch.cat((rows, told), dim=-1)
-        return wide if out is None else out.copy_(wide)
-
-
 class Pictures2DEnv(NPAEnv):
     """Grow the picture that is asked for from a disk of blank particles.
 
@@ -206,9 +155,9 @@ class Pictures2DEnv(NPAEnv):
     ends with a small picture of the target. Without, nothing in the observation tells the pictures
     apart; `info["target"]` does.
 
-    Learn with the pictures of the split "train", and evaluate with those of `split="test"`, of
-    which none is among the first. A policy that was told pictures can try ones that it has never
-    seen; one that was not can only find what serves all of them.
+    Learn with the pictures of the split "train", and evaluate with those of `split="test"`, which
+    are others. A policy that observes targets can try new ones; another can only find what serves
+    all of them.
 
     Particles of all pictures are drawn equally large, and pictures are scaled so that each one's
     density is about 1. Action space and reward are those of `Morphogenesis2DEnv`.
@@ -253,7 +202,6 @@ class Pictures2DEnv(NPAEnv):
     """
 
     task_type = PicturesTask
-    worlds_type = TargetWorlds
     form_type = PictureSpaces
 
 
@@ -261,5 +209,4 @@ class Pictures2DVectorEnv(NPAVectorEnv):
     """Worlds of `Pictures2DEnv`, batched on one device; its docstring describes both."""
 
     task_type = PicturesTask
-    worlds_type = TargetWorlds
     form_type = PictureSpaces

@@ -82,7 +82,7 @@ class PointClassificationEnvConfig(EnvConfig):
 
     @property
     def goal(self) -> PointClassificationConfig:
-        """What the task itself is told."""
+        """Configuration of the task itself."""
         return self.task_config(PointClassificationConfig)
 
 

@@ -8,10 +8,10 @@ import torch
 from torch import Tensor
 
 from npa_envs.checks import check_flag, check_fraction, check_positive
+from npa_envs.envs.core.referee import total
 from npa_envs.envs.core.single import NPAEnv
 from npa_envs.envs.core.task import Start
 from npa_envs.envs.core.vector import NPAVectorEnv
-from npa_envs.envs.core.worlds import total
 from npa_envs.envs.grown import GrownConfig, GrownTask
 from npa_envs.envs.morphogenesis2d import PictureEnvTask
 from npa_envs.errors import NPAError, shown, suggest
@@ -37,7 +37,7 @@ PICTURE = "picture"
 
 @dataclass(frozen=True, kw_only=True)
 class Regeneration2DEnvConfig(GrownConfig):
-    """What 2D regeneration can be told besides."""
+    """Adds the damage."""
 
     without_rule = f", or rule={shown(PICTURE)} to start from the target's own points"
 

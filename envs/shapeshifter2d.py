@@ -21,7 +21,7 @@ from npa_envs.envs.core.spaces import ParticleSpaces, action_tensor
 from npa_envs.envs.core.task import EnvTask, Start
 from npa_envs.envs.core.vector import NPAVectorEnv
 from npa_envs.envs.garden.config import GardenReward
-from npa_envs.envs.garden.worlds import BrushedWorlds
+from npa_envs.envs.garden.environments import LIVING
 from npa_envs.envs.grown import run_rule
 from npa_envs.errors import NPAError
 from npa_envs.rule.codes import Codes
@@ -44,7 +44,7 @@ Actions = Literal["code", "choice"]
 
 @dataclass(frozen=True, kw_only=True)
 class Shapeshifter2DEnvConfig(EnvConfig):
-    """What worlds of a rule of many pictures can be told."""
+    """Adds the rule of many pictures and how its goals change."""
 
     words = EnvConfig.words | {"reward": get_args(GardenReward), "actions": get_args(Actions)}
     task_config_type = Morphogenesis2DConfig
@@ -106,11 +106,7 @@ class Shapeshifter2DEnvConfig(EnvConfig):
 
 
 def rule_of(config: Shapeshifter2DEnvConfig, device: torch.device) -> tuple[NPARule, Codes]:
-    """Return the rule of a configuration, with its codes.
-
-    Raises:
-        NPAError: There is no such rule, it knows fewer than two codes, or lives in other worlds.
-    """
+    """Return the rule of a configuration, with its codes."""
     rule = load_rule(config.rule, device=device).float().requires_grad_(False)
     if rule.codes is None or len(rule.codes) < 2:
         raise NPAError(
@@ -254,6 +250,12 @@ class ShapeshifterTask(EnvTask[Shapeshifter2DEnvConfig]):
         blank = self.blank_losses.index_select(0, context[:, 0].long())
         return (1.0 - loss / blank).clamp_min(-1.0)
 
+    def next_goals(self, elapsed: Tensor, context: Tensor, goal: Tensor) -> None:
+        """Change the worlds' goals every `hold_steps` steps, in place, once these are paid."""
+        turn = (elapsed.long() // self.config.hold_steps) % GOAL_COUNT
+        context[:, :1] = context.gather(1, 1 + turn[:, None])
+        goal.copy_(context[:, 0].long())
+
     def context_info(self, x: Tensor, s: Tensor, context: Tensor) -> dict[str, Tensor]:
         """Return the number of each world's goal, shape [B]."""
         return {"goal": context[:, 0].long()}
@@ -267,28 +269,8 @@ class ShapeshifterTask(EnvTask[Shapeshifter2DEnvConfig]):
         return seen.clamp(-SEEN_LIMIT, SEEN_LIMIT)
 
 
-class ShiftingWorlds(BrushedWorlds):
-    """Living worlds whose goals change every `hold_steps` steps, after these have been paid."""
-
-    task: Any
-
-    def _rewards(self) -> Tensor:
-        """Return what worlds earn in this step, shape [B], and go on to the next goals."""
-        rewards = super()._rewards()
-        turn = (self.elapsed.long() // self.task.config.hold_steps) % GOAL_COUNT
-        goal = self.context.gather(1, 1 + turn[:, None])
-        self.context[:, :1] = goal
-        self._goal.copy_(goal[:, 0].long())
-        return rewards
-
-
 class CodeForm(ParticleSpaces):
-    """Coarse pictures are seen; an action is a code, or the number of one.
-
-    Args:
-        physics: The worlds' constants.
-        config: The environment's configuration.
-    """
+    """Coarse pictures are seen; an action is a code, or the number of one."""
 
     def __init__(self, physics: Physics, config: Shapeshifter2DEnvConfig) -> None:
         _, codes = rule_of(config, torch.device("cpu"))
@@ -304,19 +286,15 @@ class CodeForm(ParticleSpaces):
         )
 
     def action(self, action: Any, world_count: int | None) -> Tensor:
-        """Return the codes that actions mean, float32, shape [B, 1, K].
-
-        Raises:
-            NPAError: They are no numbers, or have another shape, or there is no such code.
-        """
+        """Return the codes that actions mean, float32, shape [B, 1, K]."""
         count, dim = self._table.shape
         batch = () if world_count is None else (world_count,)
         letters = "" if world_count is None else "B, "
         if not self._chosen:
-            told = action_tensor(
+            code = action_tensor(
                 "action", action, (*batch, dim), "env.action_space", f"[{letters}K] = "
             )
-            return self._limit * told.view(-1, 1, dim).clamp(-1.0, 1.0)
+            return self._limit * code.view(-1, 1, dim).clamp(-1.0, 1.0)
         chosen = number_tensor("action", action)
         if tuple(chosen.shape) != batch or chosen.is_floating_point():
             raise NPAError(
@@ -403,7 +381,7 @@ class Shapeshifter2DEnv(NPAEnv):
     """
 
     task_type = ShapeshifterTask
-    worlds_type = ShiftingWorlds
+    parts = LIVING
     form_type: ClassVar[type[CodeForm]] = CodeForm
 
 
@@ -411,5 +389,5 @@ class Shapeshifter2DVectorEnv(NPAVectorEnv):
     """Worlds of `Shapeshifter2DEnv`, batched on one device; its docstring describes both."""
 
     task_type = ShapeshifterTask
-    worlds_type = ShiftingWorlds
+    parts = LIVING
     form_type: ClassVar[type[CodeForm]] = CodeForm

@@ -154,7 +154,7 @@ def lie_of(x: Tensor) -> Tensor:
 def direction(angle: Tensor) -> Tensor:
     """Return cosine and sine of twice an angle [radians], [B, 1], by its tangent, [B, 2]."""
     # Without library functions, whose last bit changes with the number of worlds; the tangent of
-    # an angle is near enough to it that goals are spread as they are told to be.
+    # an angle is near enough to it for the spread of goals.
     square = angle * angle
     return torch.cat((1.0 - square, 2.0 * angle), dim=1) / (1.0 + square)
 
@@ -243,14 +243,11 @@ class Shepherd2DEnv(_GoalReward, GardenEnv):
     ## Description
 
     A trained rule has grown a picture, a creature, from N particles and goes on running them. The
-    agent has brushes on a grid that goes along with the creature; they push, and with other `tools`
-    do what a gardener's can. It is to bring the creature to a goal. Whoever pushes too hard tears
-    it; the rule heals what it can.
+    agent brings it to a goal by brushes on a grid that moves with the creature; they push, or do
+    what other `tools` of a gardener do. Too hard a push tears it; the rule heals what it can.
 
-    Observations are those of goal-conditioned environments: a dictionary with a goal that was
-    achieved and one that is desired, and `compute_reward` for goals other than the episode's own.
-    So Hindsight Experience Replay works as it is, for example `HerReplayBuffer` of
-    Stable-Baselines3.
+    Observations are those of goal-conditioned environments, with `compute_reward` for other goals,
+    so Hindsight Experience Replay works, for example Stable-Baselines3's `HerReplayBuffer`.
 
     ## Observation space
 

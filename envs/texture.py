@@ -52,7 +52,7 @@ class TextureEnvConfig(EnvConfig):
 
     @property
     def goal(self) -> TextureConfig:
-        """What the task itself is told."""
+        """Configuration of the task itself."""
         return self.task_config(TextureConfig)
 
 

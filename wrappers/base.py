@@ -9,6 +9,7 @@ import gymnasium
 import numpy as np
 import torch
 from gymnasium.spaces import Box, Space
+from gymnasium.utils import RecordConstructorArgs
 from gymnasium.vector import AutoresetMode, VectorEnv, VectorWrapper
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
@@ -23,7 +24,7 @@ if TYPE_CHECKING:
     AnyVectorEnv = VectorEnv[Any, Any, Any]
     AnyVectorWrapper = VectorWrapper[Any, Any, Any, Any, Any]
 else:
-    # Older releases of Gymnasium have no type parameters here.
+    # Older releases of Gymnasium have no type parameters.
     AnyWrapper, AnyVectorEnv, AnyVectorWrapper = gymnasium.Wrapper, VectorEnv, VectorWrapper
 
 
@@ -35,45 +36,31 @@ VectorStep = tuple[Any, Any, Any, Any, dict[str, Any]]
 
 
 def single_env(env: Any, wrapper: str) -> NPAEnv:
-    """Return the environment of this package that lies under wrappers, for a wrapper of that name.
-
-    Raises:
-        NPAError: It is none of this package, or a vector environment.
-    """
+    """Return the environment of this package that lies under wrappers, for a wrapper of that name."""
     base = getattr(env, "unwrapped", None)
-    if not isinstance(base, NPAEnv):
-        cure = (
-            f"use Vector{wrapper} for vector environments"
-            if isinstance(base, NPAVectorEnv)
-            else "make one with gym.make('npa/...')"
-        )
-        raise NPAError(f"env must be an environment of npa_envs, got {type(base).__name__}: {cure}")
-    return base
+    if isinstance(base, NPAEnv):
+        return base
+    cure = "make one with gym.make('npa/...')"
+    if isinstance(base, NPAVectorEnv):
+        cure = f"use Vector{wrapper} for vector environments"
+    raise NPAError(f"env must be an environment of npa_envs, got {type(base).__name__}: {cure}")
 
 
 def vector_env(env: Any, wrapper: str) -> NPAVectorEnv:
-    """Return the vector environment that lies under wrappers, likewise.
-
-    Raises:
-        NPAError: It is none of this package.
-    """
+    """Return the vector environment that lies under wrappers, likewise."""
     base = getattr(env, "unwrapped", None)
-    if not isinstance(base, NPAVectorEnv):
-        cure = MAKE_VECTOR
-        if isinstance(base, NPAEnv) and wrapper.startswith("Vector"):
-            cure = f"use {wrapper.removeprefix('Vector')} for a single environment"
-        raise NPAError(
-            f"env must be a vector environment of npa_envs, got {type(base).__name__}: {cure}"
-        )
-    return base
+    if isinstance(base, NPAVectorEnv):
+        return base
+    cure = MAKE_VECTOR
+    if isinstance(base, NPAEnv) and wrapper.startswith("Vector"):
+        cure = f"use {wrapper.removeprefix('Vector')} for a single environment"
+    raise NPAError(
+        f"env must be a vector environment of npa_envs, got {type(base).__name__}: {cure}"
+    )
 
 
 def torch_env(env: Any, adapter: str) -> NPAVectorEnv:
-    """Return the vector environment under wrappers, for an adapter that keeps tensors it is given.
-
-    Raises:
-        NPAError: It is none of this package, hands out arrays, or overwrites what it handed out.
-    """
+    """Return the vector environment under wrappers, for an adapter that keeps tensors it is given."""
     base = vector_env(env, adapter)
     if base.config.output != "torch":
         raise NPAError(
@@ -99,10 +86,10 @@ def check_vector_env(env: Any, wrapper: str) -> None:
 def check_untouched(env: Any, wrapper: str) -> None:
     """Check that the wrappers beneath leave observations as the environment gives them."""
     name = "single_observation_space" if isinstance(env, VectorEnv) else "observation_space"
-    here, there = getattr(env, name), getattr(env.unwrapped, name)
-    if here != there:
+    own, given = getattr(env, name), getattr(env.unwrapped, name)
+    if own != given:
         raise NPAError(
-            f"env must give observations as the environment makes them, {there}, got {here}: "
+            f"env must give observations as the environment makes them, {given}, got {own}: "
             f"put {wrapper} under the wrappers that change observations"
         )
 
@@ -158,11 +145,7 @@ def own_rewards(infos: dict[str, Any]) -> Any:
 
 
 def row_space(space: Any) -> Box:
-    """Return the space of one particle of a world's, a box of shape [N, ...].
-
-    Raises:
-        NPAError: The space has no rows.
-    """
+    """Return the space of one particle of a world's, a box of shape [N, ...]."""
     if not isinstance(space, Box) or len(space.shape) < 2:
         raise NPAError(
             "rows need an environment that gives and takes one for each particle, got the space "
@@ -338,3 +321,33 @@ class VectorObservations(EpisodeWrapper):
         if "final_obs" in infos:
             infos = infos | {"final_obs": self.final_observations(infos["final_obs"])}
         return observations, rewards, terminations, truncations, infos
+
+
+class Twin(RecordConstructorArgs):
+    """The common part of a wrapper of one world and its form for many, before their other base.
+
+    Args:
+        env: An environment of this package.
+        recorded: Arguments that the environment's spec holds.
+    """
+
+    def __init__(self, env: Any, **recorded: Any) -> None:
+        self.many = isinstance(self, EpisodeWrapper)
+        """Whether there are many worlds."""
+        self._base = self.base_of(env)
+        RecordConstructorArgs.__init__(self, **recorded)
+        # The base that follows in the order of methods is Gymnasium's wrapper.
+        super(RecordConstructorArgs, self).__init__(env)  # type: ignore[call-arg]
+        self.space_name = "single_observation_space" if self.many else "observation_space"
+        """Name of the space of one world's observations."""
+
+    def base_of(self, env: Any) -> Any:
+        """Return the environment of this package under wrappers, of one world or many."""
+        find = vector_env if isinstance(self, EpisodeWrapper) else single_env
+        return find(env, type(self).__name__)
+
+    @property
+    def restarted_worlds(self) -> NDArray[np.bool_]:
+        """Worlds whose last observation is the first of an episode, shape [B]."""
+        mask: Any = self.clock.restarted if self.many else [self.restarted]  # type: ignore[attr-defined]
+        return np.asarray(mask)

@@ -5,28 +5,22 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from typing import Any
 
-import gymnasium
 import numpy as np
 import torch
-from gymnasium.utils import RecordConstructorArgs
 from numpy.typing import NDArray
 from torch import Tensor
 
 from npa_envs.checks import is_whole
-from npa_envs.envs.core.single import NPAEnv
 from npa_envs.envs.core.spaces import to_output
-from npa_envs.envs.core.vector import NPAVectorEnv
 from npa_envs.errors import NPAError, shown
 from npa_envs.tasks.damage import DamageEvent, damage_worlds, parse_damage
 from npa_envs.world.randomness import StreamId
 from npa_envs.wrappers.base import (
-    AnyVectorEnv,
     AnyWrapper,
     EpisodeWrapper,
+    Twin,
     VectorStep,
     check_untouched,
-    single_env,
-    vector_env,
     world_indices,
 )
 
@@ -71,15 +65,15 @@ class Schedule:
         return np.asarray(due, dtype=bool)
 
 
-class _DamagesWorlds(RecordConstructorArgs):
-    """The part of both wrappers that knows the events and draws the damage."""
+class _DamagesWorlds(Twin):
+    """The events and the damage that they do, for one world or many."""
 
-    schedule: Schedule
-    """When worlds are damaged."""
-
-    _base: NPAEnv | NPAVectorEnv
-
-    def _count_events_beneath(self, env: Any) -> None:
+    def __init__(
+        self, env: Any, events: Event | Sequence[Event], *, every: int | None = None
+    ) -> None:
+        self.schedule = Schedule(events, every)
+        """When worlds are damaged."""
+        super().__init__(env, events=[str(event) for event in self.schedule.events], every=every)
         check_untouched(env, type(self).__name__)
         # Events of a stack of wrappers are numbered through, so that no two draw the same place.
         self._first = 0
@@ -87,11 +81,6 @@ class _DamagesWorlds(RecordConstructorArgs):
             if isinstance(env, _DamagesWorlds):
                 self._first += len(env.schedule.events)
             env = env.env
-
-    def _read_events(self, events: Event | Sequence[Event], every: int | None) -> None:
-        self.schedule = Schedule(events, every)
-        texts = [str(event) for event in self.schedule.events]
-        RecordConstructorArgs.__init__(self, events=texts, every=every)
 
     def _particles(self, due: NDArray[np.bool_]) -> tuple[Tensor, Tensor]:
         """Return positions and states of all worlds, damaged where events are due, shape [E, B]."""
@@ -129,18 +118,7 @@ class DamageEvents(_DamagesWorlds, AnyWrapper):
         NPAError: An event or the environment is wrong.
     """
 
-    def __init__(
-        self,
-        env: gymnasium.Env[Any, Any],
-        events: Event | Sequence[Event],
-        *,
-        every: int | None = None,
-    ) -> None:
-        self._read_events(events, every)
-        self._base: NPAEnv = single_env(env, type(self).__name__)
-        AnyWrapper.__init__(self, env)
-        self._count_events_beneath(env)
-        self._elapsed = 0
+    _elapsed = 0
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -180,14 +158,6 @@ class VectorDamageEvents(_DamagesWorlds, EpisodeWrapper):
     errors are those of `DamageEvents`, but for `env`, a vector environment of this package.
     """
 
-    def __init__(
-        self, env: AnyVectorEnv, events: Event | Sequence[Event], *, every: int | None = None
-    ) -> None:
-        self._read_events(events, every)
-        self._base: NPAVectorEnv = vector_env(env, type(self).__name__)
-        EpisodeWrapper.__init__(self, env)
-        self._count_events_beneath(env)
-
     def after_reset(self, observations: Any, infos: dict[str, Any]) -> tuple[Any, dict[str, Any]]:
         """Damage the worlds whose episodes start from damaged ones."""
         due = self.schedule.due(self.clock.elapsed) & self.clock.restarted
@@ -221,13 +191,13 @@ class VectorDamageEvents(_DamagesWorlds, EpisodeWrapper):
         now |= {f"loss_{n}": part for n, part in zip(worlds.part_names, parts, strict=True)}
         mask = torch.from_numpy(hurt).to(base.task.device)
         now |= {"_loss_damage": mask}
-        told = {name: to_output(value, output) for name, value in now.items()}
+        changed = {name: to_output(value, output) for name, value in now.items()}
         if "loss_damage" in infos:
-            told["loss_damage"] = told["loss_damage"] + infos["loss_damage"]
-            told["_loss_damage"] = told["_loss_damage"] | infos["_loss_damage"]
+            changed["loss_damage"] = changed["loss_damage"] + infos["loss_damage"]
+            changed["_loss_damage"] = changed["_loss_damage"] | infos["_loss_damage"]
         fresh = base._extras("reset", None)
-        told |= {name: value for name, value in fresh.items() if not name.startswith("_")}
-        return observations, infos | told
+        changed |= {name: value for name, value in fresh.items() if not name.startswith("_")}
+        return observations, infos | changed
 
 
 def _copy(value: Any) -> Any:

@@ -100,9 +100,9 @@ def _recorded(env: Any, policy: Callable[[Any], Any], seeds: list[int]) -> list[
     for k, length in enumerate(map(int, lengths)):
         steps = {name: np.stack([step[name][k] for step in done[:length]]) for name in done[0]}
         shown_to = [*(_of_world(one, k) for one in seen[:length]), last[k]]
-        told = {"loss": np.array([loss[k] for loss in losses[: length + 1]], np.float64)}
+        infos_of_world = {"loss": np.array([loss[k] for loss in losses[: length + 1]], np.float64)}
         buffer: Any = EpisodeBuffer(
-            seed=seeds[k], observations=_stacked(shown_to), infos=told, **steps
+            seed=seeds[k], observations=_stacked(shown_to), infos=infos_of_world, **steps
         )
         episodes.append(buffer)
     return episodes

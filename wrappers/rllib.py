@@ -183,11 +183,7 @@ def rllib_rows_config(
 
 
 def _check_id(name: str, known: Collection[str], others: Collection[str], cure: str) -> None:
-    """Check that an id is known to one of the two functions here.
-
-    Raises:
-        NPAError: It is the other one's, or nobody's.
-    """
+    """Check that an id is known to one of the two functions."""
     if name not in known:
-        told = f"take {cure} for it; " if name in others else ""
-        raise NPAError(f"name must be a known id, got {shown(name)}: {told}{suggest(name, known)}")
+        hint = f"take {cure} for it; " if name in others else ""
+        raise NPAError(f"name must be a known id, got {shown(name)}: {hint}{suggest(name, known)}")

@@ -93,20 +93,12 @@ class RowVecEnv(VecEnv):
         return outcome
 
     def step_async(self, actions: NDArray[Any]) -> None:
-        """Keep the actions of all rows, shape [B R, A], for `step_wait`.
-
-        Raises:
-            NPAError: They have another shape, which could be read as that of other rows.
-        """
+        """Keep the actions of all rows, shape [B R, A], for `step_wait`."""
         check_row_actions(actions, self.num_envs, *(self.action_space.shape or ()))
         self._actions = actions.reshape(self.world_count, self.row_count, -1)
 
     def taken_actions(self) -> NDArray[np.float32]:
-        """Return the actions that were kept, shape [B, R, A]; they are taken once.
-
-        Raises:
-            NPAError: There are none.
-        """
+        """Return the actions that were kept, shape [B, R, A]; they are taken once."""
         if self._actions is None:
             raise NPAError("step_wait needs actions: call step_async, or step")
         actions, self._actions = self._actions, None
@@ -165,19 +157,11 @@ class RowVecEnv(VecEnv):
         return list(pictures or ())
 
     def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
-        """Return an attribute of the environment, once for each row; wrappers are asked first.
-
-        Raises:
-            AttributeError: There is none of that name.
-        """
+        """Return an attribute of the environment, once for each row; wrappers are asked first."""
         return [getattr(self._holder(attr_name), attr_name)] * len(self._chosen(indices))
 
     def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
-        """Set an attribute of the environment where it is found, else of the innermost one.
-
-        Raises:
-            NPAError: Only some rows are chosen, which share one environment.
-        """
+        """Set an attribute of the environment where it is found, else of the innermost one."""
         if len(set(self._chosen(indices))) != self.num_envs:
             raise NPAError("indices must be all rows, which share one environment: give None")
         try:
@@ -189,11 +173,7 @@ class RowVecEnv(VecEnv):
     def env_method(
         self, method_name: str, *method_args: Any, indices: Any = None, **method_kwargs: Any
     ) -> list[Any]:
-        """Call a method of the environment once, and return its result for each row.
-
-        Raises:
-            AttributeError: There is none of that name.
-        """
+        """Call a method of the environment once, and return its result for each row."""
         result = getattr(self._holder(method_name), method_name)(*method_args, **method_kwargs)
         return [result] * len(self._chosen(indices))
 
@@ -254,9 +234,6 @@ class _EpisodeRows(RowVecEnv):
         Returns:
             Of each row: observation [B R, ...], reward [B R], whether its episode is over [B R],
             and infos.
-
-        Raises:
-            DivergedError: An action is not finite; the worlds are then as they were.
         """
         shape = self.vector_env.single_action_space.shape
         actions = self.taken_actions().reshape(self.world_count, *shape)
@@ -266,9 +243,9 @@ class _EpisodeRows(RowVecEnv):
         if own is None:
             paid = np.repeat(paid, self.row_count)
         done = ended | cut
-        told = self._ends(np.flatnonzero(done), cut & ~ended, infos)
+        row_infos = self._ends(np.flatnonzero(done), cut & ~ended, infos)
         paid = paid.reshape(self.num_envs).astype(np.float32, copy=False)
-        return self._shown(observations), paid, np.repeat(done, self.row_count), told
+        return self._shown(observations), paid, np.repeat(done, self.row_count), row_infos
 
     def _shown(self, observations: Any) -> Any:
         """Return observations of all worlds, or of some, as those of their rows."""
@@ -401,7 +378,7 @@ class RowPolicy:
     Args:
         model: The model; the policy follows when it is trained on.
         deterministic: Whether it acts by its mean instead of a draw.
-        tag: What the model was told of the species behind each row, shape [K]; None: nothing.
+        tag: Columns with the species behind each row, shape [K]; None: nothing.
 
     Raises:
         NPAError: The model is none.
@@ -420,11 +397,7 @@ class RowPolicy:
         self.tag = tag
 
     def __call__(self, observations: Any) -> NDArray[np.float32]:
-        """Return actions, shape [B, N, A].
-
-        Args:
-            observations: Shape [B, N, P].
-        """
+        """Return actions, shape [B, N, A]."""
         (seen,) = on_host(observations)
         rows = seen.reshape(-1, seen.shape[-1])
         if self.tag is not None:
@@ -436,10 +409,10 @@ class RowPolicy:
 class SpeciesVecEnv(RowVecEnv):
     """Particles of several species as the rows of a Stable-Baselines3 `VecEnv`.
 
-    Without `others` all particles of all species are rows and share one policy; each is told its
-    species by a one-hot tag behind what it perceives. With `others` the particles of those species
-    are played by the policies given, and the remaining species' particles are the rows, without
-    tags: for policies of their own, train them in turn, each beside the others as they are.
+    Without `others` all particles of all species are rows and share one policy; a one-hot tag of
+    its species follows what each perceives. With `others` the particles of those species are played
+    by the policies given, and the remaining species' particles are the rows, without tags: for
+    policies of their own, train them in turn.
 
     A world's rows follow each other, species after species. Each row is paid what its species is.
     Where a species ends, its rows end; until the world's next episode they see zeros,
@@ -508,10 +481,6 @@ class SpeciesVecEnv(RowVecEnv):
         Returns:
             Of each row: observation [B R, P], reward [B R], whether its episode is over [B R], and
             infos.
-
-        Raises:
-            NPAError: There are no worlds yet.
-            DivergedError: An action is not finite; the worlds are then as they were.
         """
         if not self._seen:
             raise NPAError("step needs worlds: call reset first")
@@ -536,8 +505,8 @@ class SpeciesVecEnv(RowVecEnv):
         if len(rows):
             last = {name: infos[name].get("final_obs", seen[name]) for name in self.rows_of}
             final = on_host(self._rows(last))[0].reshape(self.num_envs, -1)[rows]
-        told = self.infos(rows, truncated=(cut & ~ended).reshape(-1)[rows], last=final)
-        return shown.reshape(self.num_envs, -1), paid.reshape(-1), over.reshape(-1), told
+        row_infos = self.infos(rows, truncated=(cut & ~ended).reshape(-1)[rows], last=final)
+        return shown.reshape(self.num_envs, -1), paid.reshape(-1), over.reshape(-1), row_infos
 
     def policy(self, model: Any, species: str, *, deterministic: bool = False) -> RowPolicy:
         """Return a model that was trained on these rows as the policy of one species.
@@ -546,9 +515,6 @@ class SpeciesVecEnv(RowVecEnv):
             model: The model.
             species: Its name, one of `rows_of`.
             deterministic: Whether it acts by its mean instead of a draw.
-
-        Raises:
-            NPAError: The species' particles are not among the rows.
         """
         if species not in self.rows_of:
             raise NPAError(

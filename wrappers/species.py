@@ -1,29 +1,23 @@
-"""Species tags: each particle is told which species it is."""
+"""Species tags: each particle observes which species it is."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from typing import Any
 
-import gymnasium
 import numpy as np
 import torch
 from gymnasium.spaces import Box, Space
-from gymnasium.utils import RecordConstructorArgs
 from torch import Tensor
 
 from npa_envs.checks import is_real, is_whole
-from npa_envs.envs.core.single import NPAEnv
 from npa_envs.envs.core.spaces import to_output
-from npa_envs.envs.core.vector import NPAVectorEnv
 from npa_envs.errors import NPAError, shown, suggest
 from npa_envs.world.randomness import StreamId, WorldRandom
 from npa_envs.wrappers.base import (
-    AnyVectorEnv,
     Observations,
+    Twin,
     VectorObservations,
-    single_env,
-    vector_env,
     world_indices,
 )
 
@@ -74,12 +68,7 @@ class SpeciesPlan:
         """Species of particles 0 to N - 1 where they stand in blocks, int64, shape [N]."""
 
     def draw(self, random: WorldRandom, worlds: Tensor) -> Tensor:
-        """Return the species of all particles of some worlds, int64, shape [M, N].
-
-        Args:
-            random: The worlds' own streams, at the start of their episodes; left as they are.
-            worlds: Which worlds, int64, shape [M].
-        """
+        """Return the species of all particles of some worlds, int64, shape [M, N]."""
         blocks = self.blocks.to(worlds.device)
         if not self.random:
             return blocks.expand(len(worlds), -1)
@@ -87,11 +76,7 @@ class SpeciesPlan:
         return blocks[keys.argsort(dim=1, stable=True)]
 
     def space(self, space: Space[Any], wrapper: str) -> Box:
-        """Return the space of observations with tags, for a wrapper of that name, by that without.
-
-        Raises:
-            NPAError: It has no row for each particle.
-        """
+        """Return the space of observations with tags, for a wrapper of that name, by that without."""
         count = len(self.blocks)
         if not isinstance(space, Box) or len(space.shape) != 2 or space.shape[0] != count:
             raise NPAError(
@@ -111,34 +96,54 @@ def tagged(observation: Any, tags: Any) -> Any:
     return np.concatenate((observation, tags), axis=-1)
 
 
-class _TagsSpecies(RecordConstructorArgs):
-    """The part of both wrappers that knows the species of all particles, and their tags."""
+class _TagsSpecies(Twin):
+    """The species of all particles, and their tags, for one world or many."""
 
-    _base: NPAEnv | NPAVectorEnv
-
-    def _plan_species(
+    def __init__(
         self,
-        env: NPAEnv | NPAVectorEnv,
-        species_count: int,
-        fractions: Sequence[float] | None,
-        assignment: str,
+        env: Any,
+        species_count: int = 2,
+        *,
+        fractions: Sequence[float] | None = None,
+        assignment: str = "blocks",
     ) -> None:
-        RecordConstructorArgs.__init__(
-            self, species_count=species_count, fractions=fractions, assignment=assignment
+        super().__init__(
+            env, species_count=species_count, fractions=fractions, assignment=assignment
         )
-        self._base = env
-        count = env.config.particle_count
+        count, self._worlds = self._base.config.particle_count, self._base.worlds
         self._plan = SpeciesPlan(count, species_count, fractions, assignment)
+        space = self._plan.space(getattr(env, self.space_name), type(self).__name__)
+        setattr(self, self.space_name, space)
+        everyone = torch.arange(self._worlds.world_count, device=self._base.task.device)
+        self._assign(self._plan.draw(self._worlds.random, everyone).clone())
 
     @property
     def species(self) -> Any:
         """Species of each particle from 0 on, int64, shape [N], or [B, N] of several worlds."""
-        return to_output(self._species, self._base.config.output)
+        return to_output(self._species if self.many else self._species[0], self._output)
+
+    @property
+    def _output(self) -> str:
+        return str(self._base.config.output)
 
     def _assign(self, species: Tensor) -> None:
         self._species = species
         tags = torch.nn.functional.one_hot(species, self._plan.species_count).to(torch.float32)
-        self._tags = to_output(tags, self._base.config.output)
+        self._tags = to_output(tags if self.many else tags[0], self._output)
+
+    def observations(self, observations: Any) -> Any:
+        """Return observations with tags; worlds in a new episode get new ones."""
+        restarted = self.restarted_worlds
+        self._last_tags = self._tags
+        if self._plan.random and restarted.any():
+            chosen = world_indices(restarted, self._base.task.device)
+            drawn = self._plan.draw(self._worlds.random, chosen)
+            self._assign(self._species.index_copy(0, chosen, drawn))
+        return tagged(observations, self._tags)
+
+    def final_observations(self, observations: Any) -> Any:
+        """Return observations with the tags that particles had in the step before."""
+        return tagged(observations, self._last_tags)
 
 
 class SpeciesTags(_TagsSpecies, Observations):
@@ -156,30 +161,6 @@ class SpeciesTags(_TagsSpecies, Observations):
         NPAError: An argument is wrong, or a species would have no particle.
     """
 
-    def __init__(
-        self,
-        env: gymnasium.Env[Any, Any],
-        species_count: int = 2,
-        *,
-        fractions: Sequence[float] | None = None,
-        assignment: str = "blocks",
-    ) -> None:
-        base, name = single_env(env, type(self).__name__), type(self).__name__
-        self._plan_species(base, species_count, fractions, assignment)
-        Observations.__init__(self, env)
-        self.observation_space = self._plan.space(env.observation_space, name)
-        self._draw()
-
-    def observations(self, observations: Any) -> Any:
-        """Return an observation with tags; a world in a new episode gets new ones."""
-        if self.restarted:
-            self._draw()
-        return tagged(observations, self._tags)
-
-    def _draw(self) -> None:
-        world = torch.zeros(1, dtype=torch.int64, device=self._base.task.device)
-        self._assign(self._plan.draw(self._base.worlds.random, world)[0].clone())
-
 
 class VectorSpeciesTags(_TagsSpecies, VectorObservations):
     """`SpeciesTags` for vector environments.
@@ -187,32 +168,3 @@ class VectorSpeciesTags(_TagsSpecies, VectorObservations):
     World k has the species of the single environment with the same seed. Arguments and errors are
     those of `SpeciesTags`, but for `env`, a vector environment of this package.
     """
-
-    def __init__(
-        self,
-        env: AnyVectorEnv,
-        species_count: int = 2,
-        *,
-        fractions: Sequence[float] | None = None,
-        assignment: str = "blocks",
-    ) -> None:
-        base, name = vector_env(env, type(self).__name__), type(self).__name__
-        self._plan_species(base, species_count, fractions, assignment)
-        VectorObservations.__init__(self, env)
-        self.single_observation_space = self._plan.space(env.single_observation_space, name)
-        everyone = torch.arange(env.num_envs, device=base.task.device)
-        self._assign(self._plan.draw(base.worlds.random, everyone).clone())
-
-    def observations(self, observations: Any) -> Any:
-        """Return observations with tags; worlds in a new episode get new ones."""
-        restarted = self.clock.restarted
-        self._last_tags = self._tags
-        if self._plan.random and restarted.any():
-            chosen = world_indices(restarted, self._base.task.device)
-            drawn = self._plan.draw(self._base.worlds.random, chosen)
-            self._assign(self._species.index_copy(0, chosen, drawn))
-        return tagged(observations, self._tags)
-
-    def final_observations(self, observations: Any) -> Any:
-        """Return observations with the tags that particles had in the step before."""
-        return tagged(observations, self._last_tags)

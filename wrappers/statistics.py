@@ -13,32 +13,27 @@ from collections import deque
 from collections.abc import Callable, Mapping
 from typing import Any
 
-import gymnasium
 import numpy as np
 import torch
 from gymnasium.spaces import Box
-from gymnasium.utils import RecordConstructorArgs
 from gymnasium.vector import AutoresetMode
 from numpy.typing import NDArray
 from torch import Tensor
 
 from npa_envs.checks import is_real, is_whole
-from npa_envs.envs.core.single import NPAEnv
-from npa_envs.envs.core.vector import NPAVectorEnv
 from npa_envs.errors import NPAError, shown, suggest
 from npa_envs.world.actions import Physics
 from npa_envs.wrappers.base import (
     AnyVectorEnv,
     EpisodeWrapper,
     Observations,
+    Twin,
     VectorObservations,
     VectorStep,
     as_tensor,
     autoreset_mode,
     check_vector_env,
     like,
-    single_env,
-    vector_env,
     world_indices,
 )
 
@@ -85,11 +80,7 @@ class RunningMoments:
         return {"mean": self.mean.cpu().clone(), "var": self.var.cpu().clone(), "count": count}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Take over what `state_dict` returned.
-
-        Raises:
-            NPAError: A name is missing, unknown, or belongs to samples of another shape.
-        """
+        """Take over what `state_dict` returned."""
         wanted = {"mean": self.mean.shape, "var": self.var.shape, "count": torch.Size()}
         for name in state.keys() ^ wanted.keys():
             fault = "unknown" if name in state else "missing"
@@ -157,11 +148,7 @@ class PerceptionStatistics:
         return like(((z - mean) * scale).clamp_(-self.clip, self.clip), observation)
 
     def space(self, space: Any) -> Box:
-        """Return the space of normalised observations, by that of the observations as they are.
-
-        Raises:
-            NPAError: It holds more than perception.
-        """
+        """Return the space of normalised observations, by that of the observations as they are."""
         shape = (*(space.shape or ()),)
         if len(shape) != 2 or shape[1] != self.perception_dim:
             raise NPAError(
@@ -177,27 +164,23 @@ class PerceptionStatistics:
         return torch.cat((statistics[:centred], gradients))
 
 
-class _NormalizesPerception(RecordConstructorArgs):
-    """The part of both wrappers that keeps statistics of perception and normalises by them."""
+class _NormalizesPerception(Twin):
+    """Statistics of perception and normalisation by them, for one world or many."""
 
     statistics: PerceptionStatistics
     training: bool
     new_ones: Callable[[Any], Any]
 
-    def _choose_statistics(
+    def __init__(
         self,
-        base: NPAEnv | NPAVectorEnv,
-        clip: float | None,
-        epsilon: float | None,
-        training: bool,
-        statistics: PerceptionStatistics | None,
+        env: Any,
+        *,
+        clip: float | None = None,
+        epsilon: float | None = None,
+        training: bool = True,
+        statistics: PerceptionStatistics | None = None,
     ) -> None:
-        """Take the given statistics, or make new ones for an environment of this package.
-
-        Raises:
-            NPAError: There are statistics and other numbers beside them, or one is wrong.
-        """
-        named = (("clip", clip), ("epsilon", epsilon))
+        base, named = self.base_of(env), (("clip", clip), ("epsilon", epsilon))
         given = {name: value for name, value in named if value is not None}
         if statistics is None:
             statistics = PerceptionStatistics(base.worlds.physics, **given)
@@ -214,21 +197,16 @@ class _NormalizesPerception(RecordConstructorArgs):
             )
         if not isinstance(training, bool | np.bool_):
             raise NPAError(f"training must be True or False, got {shown(training)}")
+        super().__init__(env, clip=statistics.clip, epsilon=statistics.epsilon, training=training)
         self.statistics, self.training = statistics, bool(training)
-        RecordConstructorArgs.__init__(
-            self, clip=statistics.clip, epsilon=statistics.epsilon, training=training
-        )
+        setattr(self, self.space_name, statistics.space(getattr(env, self.space_name)))
 
     def state_dict(self) -> dict[str, Tensor]:
         """Return the statistics, for `torch.save` or safetensors."""
         return self.statistics.moments.state_dict()
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Take over the statistics that another wrapper's `state_dict` returned.
-
-        Raises:
-            NPAError: It belongs to other observations.
-        """
+        """Take over the statistics that another wrapper's `state_dict` returned."""
         self.statistics.moments.load_state_dict(state)
 
     def observations(self, observations: Any) -> Any:
@@ -264,20 +242,6 @@ class NormalizePerception(_NormalizesPerception, Observations):
         statistics: The running statistics.
     """
 
-    def __init__(
-        self,
-        env: gymnasium.Env[Any, Any],
-        *,
-        clip: float | None = None,
-        epsilon: float | None = None,
-        training: bool = True,
-        statistics: PerceptionStatistics | None = None,
-    ) -> None:
-        base = single_env(env, type(self).__name__)
-        self._choose_statistics(base, clip, epsilon, training, statistics)
-        Observations.__init__(self, env)
-        self.observation_space = self.statistics.space(env.observation_space)
-
 
 class VectorNormalizePerception(_NormalizesPerception, VectorObservations):
     """`NormalizePerception` for vector environments, of NumPy arrays or tensors on a device.
@@ -286,20 +250,6 @@ class VectorNormalizePerception(_NormalizesPerception, VectorObservations):
     alone. Nothing waits for the device. Arguments, errors and attributes are those of
     `NormalizePerception`, but for `env`, a vector environment of this package.
     """
-
-    def __init__(
-        self,
-        env: AnyVectorEnv,
-        *,
-        clip: float | None = None,
-        epsilon: float | None = None,
-        training: bool = True,
-        statistics: PerceptionStatistics | None = None,
-    ) -> None:
-        base = vector_env(env, type(self).__name__)
-        self._choose_statistics(base, clip, epsilon, training, statistics)
-        VectorObservations.__init__(self, env)
-        self.single_observation_space = self.statistics.space(env.single_observation_space)
 
 
 class TorchRecordEpisodeStatistics(EpisodeWrapper):

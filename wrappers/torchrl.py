@@ -73,11 +73,7 @@ class NPATorchRLEnv(EnvBase):  # type: ignore[misc]
         self.done_spec = Composite(flags, shape=batch, device=self.device)
 
     def _reset(self, tensordict: TensorDictBase | None, **_: Any) -> TensorDictBase:
-        """Start episodes where `_reset` says so, or everywhere.
-
-        Raises:
-            NPAError: Only some particles of a world are to start.
-        """
+        """Start episodes where `_reset` says so, or everywhere."""
         mask = None if tensordict is None else tensordict.get("_reset", None)
         chosen = None if mask is None else self._chosen(mask)
         if chosen is None or bool(chosen.all()):

@@ -70,7 +70,7 @@ class WorldConfig:
     """Perception radius ε [length units]."""
 
     eps0: float = 0.1
-    """Radius ε0 that perception is scaled to: that of the rules run here [length units]."""
+    """Radius ε0 that perception is scaled to: that of the rules [length units]."""
 
     alpha: float = 0.5
     """Largest displacement in one step, as a fraction of ε (dimensionless)."""
@@ -120,12 +120,7 @@ class WorldConfig:
     """Pixels on each side of a rendered picture."""
 
     def __post_init__(self) -> None:
-        """Check every field.
-
-        Raises:
-            NPAError: A field has the wrong type or lies outside its range, or this machine does not
-                have the device.
-        """
+        """Check every field."""
         check_positive(self, int, "particle_count", "state_dim")
         check_positive(self, int, "render_size", at_least=8)
         check_positive(self, float, "eps", "eps0", "alpha", "state_scale", "dt", "box_size")
@@ -172,12 +167,7 @@ class WorldConfig:
         return self.box_size if self.boundary == "periodic" else None
 
     def physics(self, space_dim: int, *, static: bool) -> Physics:
-        """Return the constants of the worlds: what `npa_envs.world.actions` acts and perceives by.
-
-        Args:
-            space_dim: Space dimension D.
-            static: Whether particles stay where they are.
-        """
+        """Return the constants by which worlds act and perceive."""
         return Physics(
             space_dim=space_dim,
             state_dim=self.state_dim,
@@ -225,13 +215,6 @@ class WorldConfig:
         """Return a task's own configuration, with all fields that the environment has as well.
 
         It checks them: so each field is explained, and checked, once.
-
-        Args:
-            config_type: A dataclass of `npa_envs.tasks`.
-            changes: Fields that are called, or valued, otherwise.
-
-        Raises:
-            NPAError: A field is wrong.
         """
         names = [field.name for field in fields(config_type)]  # type: ignore[arg-type]
         shared = {name: getattr(self, name) for name in names if hasattr(self, name)}
@@ -321,11 +304,7 @@ class EnvConfig(WorldConfig):
 
 
 def plain(value: Any) -> Any:
-    """Return a value as fields have it: NumPy's numbers as Python's, lists and arrays as tuples.
-
-    Args:
-        value: Of any type; others are left as they are.
-    """
+    """Return a value as fields have it: NumPy's numbers as Python's, lists and arrays as tuples."""
     if isinstance(value, np.generic | np.ndarray | Tensor):
         value = value.tolist()
     if isinstance(value, Sequence) and not isinstance(value, str):

@@ -60,11 +60,7 @@ def check_memory(
     device: torch.device,
     extra_bytes: int = 0,
 ) -> None:
-    """Check that B worlds fit into a device's memory and into the kernels' indices.
-
-    Raises:
-        NPAError: They do not, with what the task needs besides (`extra_bytes`).
-    """
+    """Check that B worlds fit into a device's memory and into the kernels' indices."""
     what = f"{world_count} world(s) of {particle_count} particles"
     cure = "choose a smaller particle_count or fewer worlds"
     if world_count * particle_count * (1 + physics.state_dim) > LARGEST_INDEX:

@@ -14,16 +14,14 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from npa_envs.checks import number_tensor
-from npa_envs.envs.core.screen import Screen
-from npa_envs.envs.core.spaces import ParticleSpaces, to_output
-from npa_envs.envs.core.task import EnvTask
+from npa_envs.envs.core.referee import reason
+from npa_envs.envs.core.screen import WorldsEnv
 from npa_envs.envs.core.vector import check_options, plain_seed, rng_keys
-from npa_envs.envs.core.worlds import BatchedWorlds, reason
 from npa_envs.errors import NPAError
 from npa_envs.world.actions import DIVERGED, SUCCESS, TIME_LIMIT
 
 
-class NPAEnv(gymnasium.Env[Any, Any]):
+class NPAEnv(WorldsEnv, gymnasium.Env[Any, Any]):
     """One world of a task as a Gymnasium environment; subclasses name the task.
 
     Keywords are the fields of the task's configuration. An unknown or wrong one, or a world that
@@ -39,16 +37,16 @@ class NPAEnv(gymnasium.Env[Any, Any]):
     | `"particle"` | as dense; besides, `info["particle_reward"]` has each particle's own |
     | `"marginal"` | likewise, of what the world would have lost without its action |
 
-    Dense rewards telescope: their sum over an episode is L at its start minus L at its end. So the
-    undiscounted return depends only on the first and the last world. The mean of all particles' own
-    rewards is the dense reward, up to rounding. In a step that diverges, L counts as at least its
-    value at the start, so diverging never pays. The parts in `info` are not changed by this.
+    Dense rewards telescope: their sum over an episode is L at its start minus L at its end. The
+    mean of all particles' own rewards is the dense reward, up to rounding. In a step that diverges,
+    L counts as at least its value at the start, so diverging never pays; the parts in `info` are
+    left as they are.
 
-    With `"marginal"` a particle's own reward is N times what it changed in the step, times minus
-    the slope of L in the middle of the step: to second order its marginal contribution, averaged
-    over being the first and the last to act. What these rewards miss of the dense reward is shared
-    by all alike. A particle that was not updated earns nothing else. It pays for actions, where
-    `"particle"` also pays for what happens to a particle's pixels by the actions of others.
+    With `"marginal"` a particle's own reward is N times its change in the step, times minus the
+    slope of L in the middle of the step: to second order its marginal contribution, averaged over
+    being the first and the last to act. What these rewards miss of the dense reward is shared
+    equally. So it pays a particle for its own action alone, `"particle"` also for what the actions
+    of others do to its pixels.
 
     ## Starting state
 
@@ -64,9 +62,8 @@ class NPAEnv(gymnasium.Env[Any, Any]):
     | `max_episode_steps` steps are done | truncated | `"time limit"` |
 
     A particle has left the world if a coordinate is beyond ±`position_limit`. Its state has run
-    away if a number is beyond ±`observation_limit`. If something else than `max_episode_steps`
-    limits the steps, such as another library, tell `reward="sparse"` the number of steps as
-    `episode_steps`.
+    away if a number is beyond ±`observation_limit`. Where another library limits the steps,
+    `reward="sparse"` needs their number as `episode_steps`.
 
     ## Info
 
@@ -81,10 +78,9 @@ class NPAEnv(gymnasium.Env[Any, Any]):
     ## Rendering
 
     `render_mode="rgb_array"` makes uint8 pictures of shape [R, R, 3], R = `render_size`, that show
-    [-1, 1] × [-1, 1] with y up. `render_mode="human"` shows them in a window while the environment
-    is stepped; it needs `pip install 'npa-envs[human]'` and a screen: without one, it warns once
-    and goes on. `render_style` chooses between the particles' colours, their density, and their
-    hidden channels.
+    [-1, 1] × [-1, 1] with y up. `render_mode="human"` shows them in a window; it needs
+    `pip install 'npa-envs[human]'`, and without a screen it warns once. `render_style` chooses
+    between the particles' colours, their density, and their hidden channels.
 
     ## Arguments
 
@@ -98,13 +94,12 @@ class NPAEnv(gymnasium.Env[Any, Any]):
     flags [B]. World k after `reset(seed=s)` is the single environment after `reset(seed=s + k)`,
     bit for bit, for every B.
 
-    - With `output="torch"` all results are tensors on the device, and actions may be tensors as
-      well. Only the ends of episodes are copied to the host.
-    - Infos are arrays of shape [B], each with a mask of the same name behind an underscore, as
-      Gymnasium's vector environments have them.
+    - With `output="torch"` results are tensors on the device, and actions may be. Only the ends of
+      episodes are copied to the host.
+    - Infos are arrays of shape [B] with masks, as Gymnasium's vector environments have them.
     - With `autoreset_mode="same-step"`, the default, a world whose episode is over starts the next
-      one at once: the last observation is in `infos["final_obs"]`, the last infos, with the reason,
-      in `infos["final_info"]`.
+      one at once: the last observation is in `infos["final_obs"]`, the last infos in
+      `infos["final_info"]`.
     - `reset(options={"reset_mask": mask})` resets some worlds and leaves the others alone.
 
     `env.unwrapped.particles()` returns positions and states, and `place_particles(x, s)` replaces
@@ -120,34 +115,19 @@ class NPAEnv(gymnasium.Env[Any, Any]):
     - v0: first version.
     """
 
-    task_type: ClassVar[type[EnvTask[Any]]]
-    """What the environment is about."""
-
-    worlds_type: ClassVar[type[BatchedWorlds]] = BatchedWorlds
-    """What moves the particles."""
-
-    form_type: ClassVar[type[ParticleSpaces]] = ParticleSpaces
-    """How the world is seen and acted upon."""
-
     metadata: ClassVar[dict[str, Any]] = {  # type: ignore[misc]
         "render_modes": ["rgb_array", "human"],
         "render_fps": 25,
     }
 
     def __init__(self, **keywords: Any) -> None:
-        self.config = self.task_type.config_type.from_keywords(keywords)
-        self.render_mode = self.config.render_mode
-        self.worlds = self.worlds_type(self.task_type, self.config, 1)
-        self.task = self.worlds.task
-        self.form = self.form_type(self.worlds.physics, self.config)
+        self._make_worlds(keywords, 1, None)
         self.observation_space = self.form.observation_space
         self.action_space = self.form.action_space
         self._world = torch.zeros(1, dtype=torch.int64, device=self.task.device)
         self._keyed_from: np.random.Generator | None = None
-        self._started = False
         self._unpaid_steps = 0
         self._warned = False
-        self._screen = Screen(self.worlds, self.config, self.metadata["render_fps"])
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -209,7 +189,7 @@ class NPAEnv(gymnasium.Env[Any, Any]):
             diverged = bool(endings[0] & DIVERGED)
             ending = int(worlds.guarded(endings, observation)[0])
         ended, late = ending & (SUCCESS | DIVERGED) != 0, ending & TIME_LIMIT != 0
-        names, numbers = worlds.part_names, worlds.extra_info()
+        names, numbers = worlds.part_names, worlds.host_numbers()
         info = self._losses(numbers)
         info |= {f"reward_{name}": numbers[2 + len(names) + k] for k, name in enumerate(names)}
         info |= {"success": bool(ending & SUCCESS), "diverged": diverged}
@@ -218,23 +198,17 @@ class NPAEnv(gymnasium.Env[Any, Any]):
         if worlds.particle_reward is not None:
             info["particle_reward"] = self._out(worlds.particle_reward[0].clone())
         info |= self._extras("reset", "step")
-        if worlds.pays_last_step_alone:
+        if worlds.referee.pays_last_step_alone:
             paid = ended or late or int(worlds.elapsed[0]) == config.episode_steps
             self._unpaid_steps = 0 if paid else self._unpaid_steps + 1
         self._show()
-        seen = self.form.seen(worlds.told_observation(observation)[0])
+        seen = self.form.seen(worlds.host_observation(observation)[0])
         return seen, numbers[0], ended, late, info
 
     def render(self) -> NDArray[np.uint8] | None:
         """Return the world's picture, shape [R, R, 3], in the mode "rgb_array"."""
         pictures = self._screen.render()
         return None if pictures is None else pictures[0]
-
-    def _repr_mimebundle_(self, include: Any = None, exclude: Any = None) -> dict[str, Any]:
-        """Return what Jupyter shows: the world as it is, from the first reset on."""
-        if not self._started:
-            return {"text/plain": str(self)}
-        return self._screen.for_notebook(str(self))
 
     def close(self) -> None:
         """Close the window, if there is one."""
@@ -265,21 +239,15 @@ class NPAEnv(gymnasium.Env[Any, Any]):
         return self.form.seen(observation[0])
 
     def _extras(self, *when: str) -> dict[str, Any]:
-        told = {name: value for own in when for name, value in self.worlds.extras(own).items()}
+        values = {name: value for own in when for name, value in self.worlds.extras(own).items()}
         return {
             name: self._out(value[0].clone()) if value.ndim > 1 else value[0].item()
-            for name, value in told.items()
+            for name, value in values.items()
         }
 
     def _losses(self, numbers: list[float]) -> dict[str, Any]:
         parts = {f"loss_{n}": numbers[2 + k] for k, n in enumerate(self.worlds.part_names)}
         return {"loss": numbers[1]} | parts
-
-    def _out(self, tensor: Tensor) -> Any:
-        return to_output(tensor, self.config.output)
-
-    def _show(self) -> None:
-        self._screen.show(self.spec.id if self.spec is not None else type(self).__name__)
 
     def _warn_of_unpaid_rewards(self) -> None:
         """Warn once where an episode ended by a limit that the environment does not know of."""
@@ -297,10 +265,10 @@ class NPAEnv(gymnasium.Env[Any, Any]):
 def _step_limit(env: NPAEnv) -> int | None:
     """Return the step limit that Gymnasium put around an environment, None where there is none.
 
-    An environment is told neither the limit nor what is wrapped around it; but whoever counts its
-    steps is reset together with it, and so stands among its callers. Limits around a wrapper that
-    may take several steps at once are left out: they do not count these.
+    Wrappers that count its steps are reset with it, so they are among its callers. Limits around
+    other wrappers, which may take several steps at once, do not count.
     """
+    # A registered wrapper could say it, but Gymnasium refuses those next to a vector entry point.
     limits, frame = [], sys._getframe(1).f_back
     inner: gymnasium.Env[Any, Any] = env
     while frame is not None:

@@ -27,12 +27,7 @@ def action_space(physics: Physics, particle_count: int) -> Box:
 
 
 class ParticleSpaces:
-    """How most worlds are seen and acted upon: one row for each particle.
-
-    Args:
-        physics: The worlds' constants.
-        config: The environment's configuration.
-    """
+    """How most worlds are seen and acted upon: one row for each particle."""
 
     def __init__(self, physics: Physics, config: WorldConfig) -> None:
         count = config.particle_count
@@ -44,15 +39,7 @@ class ParticleSpaces:
         self._output = config.output
 
     def action(self, action: Any, world_count: int | None) -> Tensor:
-        """Return actions as worlds take them, float32, shape [B, N, A].
-
-        Args:
-            action: What the caller gave.
-            world_count: Worlds B; None: the caller has a single one, and gave [N, A].
-
-        Raises:
-            NPAError: It is no array of numbers, or has another shape.
-        """
+        """Return actions as worlds take them, float32, [B, N, A]; B is None for a single world."""
         if world_count is None:
             return action_tensor("action", action, self._shape, "env.action_space", "[N, A] = ")[
                 None
@@ -77,18 +64,7 @@ def to_output(tensor: Tensor, output: str) -> Any:
 def action_tensor(
     name: str, action: Any, wanted: tuple[int, ...], space: str, letters: str = ""
 ) -> Tensor:
-    """Return an action as a float32 tensor, on the device where it came from.
-
-    Args:
-        name: What the caller calls it.
-        action: An array or tensor.
-        wanted: Its shape.
-        space: Where the caller can look up what it has to be.
-        letters: The shape in letters, and " = ".
-
-    Raises:
-        NPAError: It is no array of numbers, or has another shape.
-    """
+    """Return an action as a float32 tensor, on the device where it came from."""
     came = ""
     if not isinstance(action, Tensor):
         try:

@@ -120,6 +120,8 @@ class EnvTask(WorldTask[Config]):
     def __init__(self, config: Config, device: torch.device) -> None:
         super().__init__(config, device)
         self._pool: Start | None = None
+        self.target_rows: Tensor | None = None
+        """What rows of observations hold of each goal behind perception, [K, T]; None: nothing."""
 
     @classmethod
     def extra_bytes(cls, config: Any, world_count: int) -> int:
@@ -274,11 +276,7 @@ class EnvTask(WorldTask[Config]):
 
 
 class TargetEnvTask(EnvTask[Config]):
-    """A task that rules are trained on, too: `npa_envs.tasks` has its targets and losses.
-
-    Raises:
-        NPAError: Something that the task needs cannot be loaded, or does not fit.
-    """
+    """A task that rules are trained on, too: `npa_envs.tasks` has its targets and losses."""
 
     goal: Any
     """The task as training sees it."""

@@ -31,9 +31,6 @@ def check_start(task: EnvTask[Any], start: Start, world_count: int, shapes: Any)
         start: What it returned.
         world_count: Worlds B.
         shapes: Shapes of positions and of states, of B worlds and more.
-
-    Raises:
-        NPAError: A tensor has another shape, dtype or device.
     """
     name = starter(task)
     if not isinstance(start, Start):
@@ -54,27 +51,17 @@ def check_start(task: EnvTask[Any], start: Start, world_count: int, shapes: Any)
 def checked_losses(
     task: EnvTask[Any], losses: Any, world_count: int, names: tuple[str, ...]
 ) -> list[Tensor]:
-    """Return the parts of worlds' losses, shape [B] each, without waiting for the device.
-
-    Args:
-        task: Whose they are.
-        losses: What it returned.
-        world_count: Worlds B.
-        names: Names of the parts in earlier calls; empty in the first one.
-
-    Raises:
-        NPAError: There is none, the names are others, or a part has another shape, dtype or device.
-    """
-    told = f"{type(task).__name__}.losses"
+    """Return the parts of worlds' losses, shape [B] each, without waiting for the device."""
+    name = f"{type(task).__name__}.losses"
     if not isinstance(losses, Mapping) or not losses or not all(type(n) is str for n in losses):
         came = list(losses) if isinstance(losses, Mapping) else type(losses).__name__
         raise NPAError(
-            f"{told} must return the parts of each world's loss by name, at least one, got {came}: "
+            f"{name} must return the parts of each world's loss by name, at least one, got {came}: "
             "for example {'distance': distance}, of shape [B]"
         )
     if names and tuple(losses) != names:
         raise NPAError(
-            f"{told} must return the same parts in the same order in each call, got "
+            f"{name} must return the same parts in the same order in each call, got "
             f"{list(losses)} after {list(names)}: return zeros for a part that does not count"
         )
     for part, value in losses.items():
@@ -83,11 +70,7 @@ def checked_losses(
 
 
 def checked_shares(task: EnvTask[Any], shares: Any, shape: tuple[int, int]) -> Tensor:
-    """Return the particles' shares of worlds' losses, shape [B, N].
-
-    Raises:
-        NPAError: They have another shape, dtype or device.
-    """
+    """Return the particles' shares of worlds' losses, shape [B, N]."""
     _check_tensor(task, "particle_losses", "shares", shares, shape, torch.float32)
     checked: Tensor = shares
     return checked
@@ -115,16 +98,7 @@ def _check_tensor(
 
 
 def check_finite(task: EnvTask[Any], method: str, parts: Mapping[str, Tensor]) -> None:
-    """Check that numbers of worlds are finite; waits for the device.
-
-    Args:
-        task: Whose they are.
-        method: What returned them.
-        parts: Them by name, shape [B, ...] each.
-
-    Raises:
-        NPAError: One is not.
-    """
+    """Check that numbers of worlds are finite; waits for the device."""
     for part, value in parts.items():
         bad = ~torch.isfinite(value.flatten(1) if value.ndim > 1 else value[:, None]).all(dim=1)
         if bool(bad.any()):
@@ -137,22 +111,14 @@ def check_finite(task: EnvTask[Any], method: str, parts: Mapping[str, Tensor]) -
 
 
 class GlobalDraws:
-    """Where the global generators of random numbers stand, to tell whether a task draws from them.
-
-    Args:
-        task: The task.
-    """
+    """The states of the global generators of random numbers: a task must not draw from them."""
 
     def __init__(self, task: EnvTask[Any]) -> None:
         self._task = task
         self._before = self._states()
 
     def check(self, method: str) -> None:
-        """Check that none of them has moved since, by the method of the task.
-
-        Raises:
-            NPAError: One has.
-        """
+        """Check that none of them has moved since, by the method of the task."""
         now = self._states()
         moved = [name for name, state in self._before.items() if state != now[name]]
         if moved:

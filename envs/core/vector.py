@@ -5,7 +5,7 @@ from __future__ import annotations
 import operator
 from collections.abc import Mapping, Sequence
 from functools import cached_property
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 import torch
@@ -16,10 +16,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from npa_envs.checks import is_whole, number_tensor
-from npa_envs.envs.core.screen import Screen
-from npa_envs.envs.core.spaces import ParticleSpaces, to_output
-from npa_envs.envs.core.task import EnvTask
-from npa_envs.envs.core.worlds import FLAGS, BatchedWorlds, StepReport, reason
+from npa_envs.envs.core.referee import FLAGS, StepReport, reason
+from npa_envs.envs.core.screen import WorldsEnv
 from npa_envs.errors import NPAError, shown, suggest
 from npa_envs.world.actions import TIME_LIMIT
 from npa_envs.world.cuda_graph import to_device_async
@@ -36,7 +34,7 @@ REASONS = np.array([reason(ending) for ending in range(2 * TIME_LIMIT)], dtype=o
 """Why an episode ended, in words, for each combination of endings."""
 
 
-class NPAVectorEnv(VectorEnv[Any, Any, Any]):
+class NPAVectorEnv(WorldsEnv, VectorEnv[Any, Any, Any]):
     """B worlds of a task, stepped together; subclasses name the task.
 
     World k, reset with `seed`, is the single environment reset with `seed + k`, bit for bit.
@@ -53,15 +51,6 @@ class NPAVectorEnv(VectorEnv[Any, Any, Any]):
     Raises:
         NPAError: A keyword is unknown or wrong, or the worlds do not fit into memory.
     """
-
-    task_type: ClassVar[type[EnvTask[Any]]]
-    """What the environment is about."""
-
-    worlds_type: ClassVar[type[BatchedWorlds]] = BatchedWorlds
-    """What moves the particles."""
-
-    form_type: ClassVar[type[ParticleSpaces]] = ParticleSpaces
-    """How the worlds are seen and acted upon."""
 
     metadata: dict[str, Any] = {  # noqa: RUF012 (each instance gets a dictionary of its own)
         "render_modes": ["rgb_array", "human"],
@@ -86,21 +75,15 @@ class NPAVectorEnv(VectorEnv[Any, Any, Any]):
             episode_steps = None
         self.autoreset_mode = checked_mode(autoreset_mode)
         self.metadata = {**type(self).metadata, "autoreset_mode": self.autoreset_mode}
-        self.config = self.task_type.config_type.from_keywords(keywords)
-        self.render_mode = self.config.render_mode
         self.num_envs = num_envs
-        self.worlds = self.worlds_type(self.task_type, self.config, num_envs, episode_steps)
-        self.task = self.worlds.task
-        self.form = self.form_type(self.worlds.physics, self.config)
+        self._make_worlds(keywords, num_envs, episode_steps)
         self.single_observation_space = self.form.observation_space
         self.single_action_space = self.form.action_space
         self.copies = copy
         """Whether what is handed out stays as it is after the next step."""
-        self._started = False
         self._buffer: Tensor | None = None
         self._shared: NDArray[np.float64] | None = None
         self._ended = np.zeros(num_envs, dtype=bool)
-        self._screen = Screen(self.worlds, self.config, self.metadata["render_fps"])
 
     @cached_property
     def observation_space(self) -> Space[Any]:  # type: ignore[override]
@@ -220,21 +203,11 @@ class NPAVectorEnv(VectorEnv[Any, Any, Any]):
         return self.form.seen(observation), numbers[0], flags[0], flags[1], infos
 
     def render(self) -> tuple[NDArray[np.uint8], ...] | None:
-        """Return a picture of each world, shape [R, R, 3], in the mode "rgb_array".
-
-        Raises:
-            NPAError: There is no world yet.
-        """
+        """Return a picture of each world, shape [R, R, 3], in the mode "rgb_array"."""
         if not self._started:
             raise NPAError("render needs worlds: call reset first")
         pictures = self._screen.render()
         return None if pictures is None else tuple(pictures)
-
-    def _repr_mimebundle_(self, include: Any = None, exclude: Any = None) -> dict[str, Any]:
-        """Return what Jupyter shows: the first worlds as they are, from the first reset on."""
-        if not self._started:
-            return {"text/plain": str(self)}
-        return self._screen.for_notebook(str(self))
 
     def close_extras(self, **kwargs: Any) -> None:
         """Close the window, if there is one."""
@@ -274,12 +247,7 @@ class NPAVectorEnv(VectorEnv[Any, Any, Any]):
     def _report(
         self, stepped: NDArray[np.bool_] | None, *, copy: bool
     ) -> tuple[list[Any], list[Any], dict[str, Any]]:
-        """Return numbers, flags and infos as they are, as they are handed out.
-
-        Args:
-            stepped: Worlds that have a step behind them; None: all of them.
-            copy: Make new arrays, which later steps and restarts leave alone.
-        """
+        """Return numbers, flags and infos as they are, as they are handed out."""
         worlds = self.worlds
         report = worlds.report.copy() if copy else worlds.report
         # One view for each quantity, made at once.
@@ -328,27 +296,17 @@ class NPAVectorEnv(VectorEnv[Any, Any, Any]):
         self._shared[:] = numbers
         return list(self._shared)
 
-    def _out(self, tensor: Tensor) -> Any:
-        return to_output(tensor, self.config.output)
-
     def _mask(self, mask: NDArray[np.bool_]) -> Any:
         """Return a mask of worlds as a new array to hand out."""
         given = mask.copy()
         return given if self.config.output == "numpy" else to_device_async(given, self.task.device)
-
-    def _show(self) -> None:
-        self._screen.show(self.spec.id if self.spec is not None else type(self).__name__)
 
 
 # Arguments of environments that are no fields of a configuration, checked.
 
 
 def checked_count(name: str, value: Any) -> int:
-    """Return what the caller calls so, a whole number of at least 1.
-
-    Raises:
-        NPAError: It is not.
-    """
+    """Return what the caller calls so, a whole number of at least 1."""
     if isinstance(value, np.integer):
         value = int(value)
     if not is_whole(value) or value < 1:
@@ -359,14 +317,7 @@ def checked_count(name: str, value: Any) -> int:
 
 
 def checked_mode(given: str | AutoresetMode) -> AutoresetMode:
-    """Return Gymnasium's mode for a word or for itself.
-
-    Args:
-        given: One of `AUTORESET_MODES`, the value of one of Gymnasium's modes, or such a mode.
-
-    Raises:
-        NPAError: There is no such mode.
-    """
+    """Return Gymnasium's mode for a word or for itself."""
     if isinstance(given, AutoresetMode):
         return given
     by_name = AUTORESET_MODES | {mode.value: mode for mode in AutoresetMode}
@@ -384,11 +335,7 @@ def plain_seed(seed: Any) -> Any:
 
 
 def check_options(options: Any, known: tuple[str, ...]) -> None:
-    """Check what `reset` is told, by names of options.
-
-    Raises:
-        NPAError: It is no mapping, or holds another name than the known ones.
-    """
+    """Check the options of `reset` by their names."""
     if not isinstance(options, Mapping | None):
         raise NPAError(
             f"options must be a dict or None, got {type(options).__name__}: "
@@ -401,11 +348,7 @@ def check_options(options: Any, known: tuple[str, ...]) -> None:
 
 
 def worlds_to_reset(options: dict[str, Any] | None, world_count: int) -> NDArray[np.int64]:
-    """Return which of B worlds the options of `reset` ask for: those of the mask, or all.
-
-    Raises:
-        NPAError: The mask is no bool array of shape [B], or chooses no world.
-    """
+    """Return which of B worlds the options of `reset` ask for: those of the mask, or all."""
     check_options(options, ("reset_mask",))
     mask = (options or {}).get("reset_mask")
     if mask is None:
@@ -422,11 +365,7 @@ def worlds_to_reset(options: dict[str, Any] | None, world_count: int) -> NDArray
 
 
 def world_numbers(worlds: Any, world_count: int) -> Tensor:
-    """Return which of B worlds a caller means, by indices, each once; on the CPU, int64, shape [M].
-
-    Raises:
-        NPAError: They are no such indices.
-    """
+    """Return indices of worlds, each once, checked; on the CPU, int64, shape [M]."""
     given = number_tensor("worlds", worlds).cpu()
     # A mask would else be taken for the indices 0 and 1.
     whole = not given.is_floating_point() and given.dtype != torch.bool
@@ -448,9 +387,6 @@ def rng_keys(
 
     The seed is that of the first world, each of the others has one more; or there is one for each;
     without any, keys are drawn from the generator.
-
-    Raises:
-        NPAError: Another number of seeds than of worlds, or a seed is negative.
     """
     if seed is None:
         drawn = np_random.integers(2**64, size=world_count, dtype=np.uint64)

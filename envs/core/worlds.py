@@ -1,14 +1,14 @@
-"""The batch of worlds behind every environment: steps, losses, endings, restarts.
+"""The batch of worlds behind every environment: actions, observations, restarts.
 
-Gymnasium is not known here. A single environment is a batch of one; world k of a batch is, bit for
-bit, that world alone.
+Gymnasium is not known in this module. A single environment is a batch of one; world k of a batch
+is, bit for bit, that world alone.
 """
 
 from __future__ import annotations
 
 import contextlib
 from collections.abc import Callable, Iterator
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 import torch
@@ -18,27 +18,16 @@ from torch import Tensor
 from npa_envs.checks import number_tensor
 from npa_envs.envs.core.config import EnvConfig, WorldConfig
 from npa_envs.envs.core.memory import check_memory
+from npa_envs.envs.core.referee import StepReport, WorldReferee
 from npa_envs.envs.core.task import EnvTask, Start, WorldTask
-from npa_envs.envs.core.task_checks import (
-    GlobalDraws,
-    check_finite,
-    check_start,
-    checked_losses,
-    checked_shares,
-    starter,
-)
-from npa_envs.errors import DivergedError, NPAError, shown
+from npa_envs.envs.core.task_checks import GlobalDraws, check_finite, check_start, starter
+from npa_envs.errors import DivergedError, NPAError
 from npa_envs.world.actions import (
     DIVERGED,
     NOT_FINITE,
-    SUCCESS,
-    TIME_LIMIT,
     Actions,
-    EpisodeRules,
     NeighbourState,
-    PreparedJudgement,
     build_neighbours,
-    with_mean_reward,
 )
 from npa_envs.world.cuda_graph import (
     GraphedCallable,
@@ -54,24 +43,9 @@ from npa_envs.world.randomness import WorldRandom
 FEW_PARTICLES = 8192
 """Particles of all worlds up to which a step on CUDA is one graph: larger ones hide launches."""
 
-FLAGS = ("success", "diverged")
-"""Names of the first two endings in `info`."""
-
-
-def total(parts: Tensor) -> Tensor:
-    """Return the sum of the parts of a loss, [K, B], in their order, which torch's is not."""
-    first, *rest = parts.unbind()
-    for part in rest:
-        first = first + part
-    return first
-
 
 def check_default_dtype() -> None:
-    """Check that what tasks make by default is float32, as the worlds are.
-
-    Raises:
-        NPAError: It is another dtype.
-    """
+    """Check that what tasks make by default is float32, as the worlds are."""
     dtype = torch.get_default_dtype()
     if dtype != torch.float32:
         raise NPAError(
@@ -81,18 +55,7 @@ def check_default_dtype() -> None:
 
 
 class WorldState:
-    """Particles of B worlds on a device, a stream of randomness for each world.
-
-    Args:
-        config: The environment's configuration.
-        task_type: Says how many dimensions there are, and whether particles move.
-        world_count: Worlds B.
-        particle_count: Particles of each, N.
-        extra_bytes: Memory that the task needs besides.
-
-    Raises:
-        NPAError: The worlds do not fit into memory.
-    """
+    """Particles of B worlds on a device, a stream of randomness for each world."""
 
     def __init__(
         self,
@@ -130,11 +93,7 @@ class WorldState:
         return random
 
     def checked_particles(self, x: Any, s: Any, world_count: int, particle_count: int) -> Start:
-        """Return particles to be put into M worlds of N, float32 on the device.
-
-        Raises:
-            NPAError: A shape is another one, or a number is not finite or beyond its limit.
-        """
+        """Return particles to be put into M worlds of N, float32 on the device."""
         given, physics = [], self.physics
         for name, value, width, limit, limit_name in (
             ("x", x, physics.space_dim, physics.limits.position, "position_limit"),
@@ -163,6 +122,96 @@ class WorldState:
         return torch.cuda.device(self.device)
 
 
+class Action(Protocol):
+    """What an action does to worlds, in place."""
+
+    recorded: bool
+    """Whether a step may be recorded on CUDA: it is that of an `Actions`."""
+
+    def apply(self, action: Tensor) -> None:
+        """Apply actions to all worlds, float32, shape [B, ...]."""
+
+    def updated(self) -> Tensor:
+        """Return which particles the last step updated, bool, shape [B, N]."""
+
+
+class Observer(Protocol):
+    """What is observed of worlds."""
+
+    perceives_alone: bool
+    """Whether that is what particles perceive, and nothing else."""
+
+    def observe(
+        self, worlds: BatchedWorlds, perceived: Tensor | None, out: Tensor | None
+    ) -> Tensor:
+        """Return the observations of all worlds, written to `out`.
+
+        `perceived` is what particles perceive, [B, N, P], where a step has computed it already.
+        """
+
+    def begun(self, worlds: BatchedWorlds, index: Tensor, start: Start) -> Tensor:
+        """Return the observations of worlds that began an episode, int64, [M]."""
+
+
+class ParticleAction(Actions):
+    """A displacement and a state step for each particle."""
+
+    recorded = True
+
+    def __init__(self, worlds: BatchedWorlds) -> None:
+        referee = worlds.referee
+        super().__init__(
+            worlds.x,
+            worlds.s,
+            worlds.physics,
+            worlds.random,
+            enabled=referee.enabled,
+            diverged=referee.diverged,
+        )
+
+
+class Perception:
+    """What each particle perceives, then the task's `target_rows` for the world's goal."""
+
+    def __init__(self, worlds: BatchedWorlds) -> None:
+        self._target: Tensor | None = worlds.task.target_rows
+        self.perceives_alone = self._target is None
+
+    def observe(
+        self, worlds: BatchedWorlds, perceived: Tensor | None, out: Tensor | None
+    ) -> Tensor:
+        """Return perception, shape [B, N, P], with target columns [B, N, P + T]."""
+        if self._target is None and perceived is None:
+            return build_neighbours(worlds.x, worlds.s, worlds.physics).perceive(out)
+        if perceived is None:
+            perceived = build_neighbours(worlds.x, worlds.s, worlds.physics).perceive()
+        rows = self._with_target(perceived, worlds.referee.goal)
+        return rows if out is None else out.copy_(rows)
+
+    def begun(self, worlds: BatchedWorlds, index: Tensor, start: Start) -> Tensor:
+        """Return the observations of worlds that began an episode."""
+        rows = build_neighbours(start.x, start.s, worlds.physics).perceive()
+        return self._with_target(rows, worlds.referee.goal[index])
+
+    def _with_target(self, rows: Tensor, goal: Tensor) -> Tensor:
+        if self._target is None:
+            return rows
+        columns = self._target[goal][:, None].expand(-1, rows.shape[1], -1)
+        return torch.cat((rows, columns), dim=-1)
+
+
+class Parts(NamedTuple):
+    """What a batch of worlds is made of."""
+
+    action: Callable[[BatchedWorlds], Action]
+    observer: Callable[[BatchedWorlds], Observer]
+    referee: type[WorldReferee]
+
+
+PARTICLES = Parts(ParticleAction, Perception, WorldReferee)
+"""Worlds whose particles act and perceive."""
+
+
 class BatchedWorlds(WorldState):
     """B worlds of one task, stepped together. All tensors stay where they are between steps.
 
@@ -171,6 +220,7 @@ class BatchedWorlds(WorldState):
         config: The environment's configuration.
         world_count: Worlds B.
         episode_steps: Steps after which an episode is cut off, or None for never.
+        parts: How worlds are acted on, observed and judged.
 
     Raises:
         NPAError: The worlds do not fit into memory.
@@ -183,89 +233,79 @@ class BatchedWorlds(WorldState):
         config: EnvConfig,
         world_count: int,
         episode_steps: int | None = None,
+        *,
+        parts: Parts = PARTICLES,
     ) -> None:
-        # Memory is asked for before the task, which may make a target of as many points.
+        # Memory is checked before the task is made, which may make a target of as many points.
         extra, count = task_type.extra_bytes(config, world_count), config.particle_count
         super().__init__(config, task_type, world_count, count, extra)
-        device = self.device
-        self.task = task_type(config, device)
-        self.episode_steps = episode_steps
-
-        def zeros(*shape: int, dtype: torch.dtype = torch.float32) -> Tensor:
-            return torch.zeros(world_count, *shape, dtype=dtype, device=device)
-
-        self.elapsed = zeros(dtype=torch.int32)
-        """Steps since the start of each episode, shape [B]."""
-        self.particle_loss = zeros(count) if config.reward == "particle" else None
-        """Each particle's share of the loss, shape [B, N], where rewards are shared out."""
-        self.particle_reward = zeros(count) if config.per_particle_reward else None
-        """Each particle's own reward of the last step, shape [B, N], where it has one."""
-        paid_by_action = config.reward == "marginal"
-        self._before = (self.x.clone(), self.s.clone()) if paid_by_action else None
-        self._goal = zeros(dtype=torch.int64)
-        self._aimed = self.task.toward(self._goal)
-        self._start_loss = zeros()
-        self._success_loss = zeros()
-        self._diverged = zeros(dtype=torch.uint8)
-        self._enabled = torch.ones(1, dtype=torch.uint8, device=device)
-        self.part_names: tuple[str, ...] = ()
-        """Names of the parts of the loss, known once worlds have been placed."""
-        self.report = StepReport.empty(world_count, 0, device)
-        """What a step hands out besides the observation."""
-        # Each world's ending, then whether the actions were finite.
-        self._endings = torch.zeros(world_count + 1, dtype=torch.uint8, device=device)
-        self._host_endings, self._host_numbers = self._for_host()
+        self.task: Any = task_type(config, self.device)
+        self.referee = parts.referee(self.task, self.x, self.s, episode_steps)
+        """What judges the worlds."""
+        self.action: Any = parts.action(self)
+        """What an action does."""
+        self.observer = parts.observer(self)
+        """What is observed."""
         self._perceived: Tensor | None = None
         """What is perceived, [B, N, P], where a step is one graph."""
         self._host_perceived: Tensor | None = None
-        """The same of a single world that is handed out as arrays, in pinned memory."""
-        self._told_perceived = False
+        """The same of a single world that is returned as arrays, in pinned memory."""
+        self._host_is_current = False
         """Whether that is of the last step, after which no world began anew."""
-        self._actions = Actions(
-            self.x,
-            self.s,
-            self.physics,
-            self.random,
-            enabled=self._enabled,
-            diverged=self._diverged,
+        self._neighbours: NeighbourState | None = None
+        self._make_graphs()
+        self._resets = GraphedResets(
+            self._start_and_sort, world_count, self.device, recorded=self.task.start_is_short
         )
-        self._surveyed: NeighbourState | None = None
-        self._judgement: PreparedJudgement | None = None
-        self._draw = GraphedCallable(self._actions.draw, device)
-        self._look = GraphedCallable(self._judge_and_sort, device)
-        self._act = GraphedCallable(self._act_and_look, device)
-        self.restart = GraphedResets(
-            self._start_and_sort, world_count, device, recorded=self.task.start_is_short
-        )
-        """Starts the next episodes of some worlds: restart(indices, observation)."""
-        self._side_stream = SideStream(device) if device.type == "cuda" else None
+        self._side_stream = SideStream(self.device) if self.device.type == "cuda" else None
+
+    def _make_graphs(self) -> None:
+        if self.action.recorded:
+            self._draw = GraphedCallable(self.action.draw, self.device)
+        self._look = GraphedCallable(self._judge_and_sort, self.device)
+        self._act = GraphedCallable(self._act_and_look, self.device)
 
     def __getstate__(self) -> dict[str, Any]:
         """Leave out what only the next step needs, and which cannot be pickled."""
-        places = ("_host_endings", "_host_numbers", "_perceived", "_host_perceived")
-        none = dict.fromkeys(("_surveyed", "_judgement", *places))
-        return self.__dict__ | none | {"_told_perceived": False}
-
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        """Make again what was left out."""
-        self.__dict__.update(state)
-        self._host_endings, self._host_numbers = self._for_host()
-
-    def _for_host(self) -> tuple[Tensor, Tensor]:
-        """Return where the host reads endings and numbers: on CUDA pinned memory for copies."""
-        told = (self._endings, self.report.numbers)
-        if self.device.type == "cpu":
-            return told
-        endings, numbers = map(pinned_like, told)
-        return endings, numbers
+        none = dict.fromkeys(("_neighbours", "_perceived", "_host_perceived"))
+        return self.__dict__ | none | {"_host_is_current": False}
 
     def limit_steps(self, episode_steps: int | None) -> None:
         """Cut episodes off after so many steps from now on, or never."""
         if episode_steps != self.episode_steps:
-            self.episode_steps = episode_steps
-            self._judgement = None
-            self._look = GraphedCallable(self._judge_and_sort, self.device)
-            self._act = GraphedCallable(self._act_and_look, self.device)
+            self.referee.limit_steps(episode_steps)
+            self._make_graphs()
+
+    @property
+    def episode_steps(self) -> int | None:
+        """Steps after which an episode is cut off, or None for never."""
+        return self.referee.episode_steps
+
+    @property
+    def elapsed(self) -> Tensor:
+        """Steps since the start of each episode, int32, shape [B]."""
+        return self.referee.elapsed
+
+    @property
+    def report(self) -> StepReport:
+        """What a step returns besides the observation."""
+        return self.referee.report
+
+    @property
+    def part_names(self) -> tuple[str, ...]:
+        """Names of the parts of the loss, known once worlds have been placed."""
+        return self.referee.part_names
+
+    @property
+    def particle_reward(self) -> Tensor | None:
+        """Each particle's own reward of the last step, shape [B, N], where it has one."""
+        return self.referee.particle_reward
+
+    @property
+    def target_dim(self) -> int:
+        """Columns of an observation's rows behind perception, T."""
+        rows = self.task.target_rows
+        return 0 if rows is None else int(rows.shape[1])
 
     @property
     def reward(self) -> Tensor:
@@ -276,12 +316,6 @@ class BatchedWorlds(WorldState):
     def loss(self) -> Tensor:
         """Losses as they are, shape [B]."""
         return self.report.numbers[1]
-
-    @property
-    def pays_last_step_alone(self) -> bool:
-        """Whether an episode's last step is the only one that is paid."""
-        sparse: bool = self.task.config.reward == "sparse"
-        return sparse
 
     @torch.no_grad()
     @makes_plain_tensors
@@ -294,102 +328,66 @@ class BatchedWorlds(WorldState):
         check_default_dtype()
         # The first start is not recorded: the host may look.
         task, first = self.task, not self.part_names
-        draws = GlobalDraws(task) if first else None
-        start = task.start(random)
+        draws, check = GlobalDraws(task) if first else None, first or not self.x.is_cuda
+        start: Start = task.start(random)
         check_start(task, start, len(worlds), (self.x.shape, self.s.shape))
         if draws is not None:
             draws.check(starter(task))
-        if first or not self.x.is_cuda:
+        if check:
             check_finite(task, starter(task), {"positions": start.x, "states": start.s})
         self.random.put(worlds, random)
-        self.elapsed.index_fill_(0, worlds, 0)
-        self.place(worlds, start)
+        self.referee.begin(worlds, start, self.random, check=check)
         if draws is not None:
             draws.check("losses")
-        if first or not self.x.is_cuda:
-            self._check_losses(worlds)
-        self._start_loss[worlds] = self.loss[worlds]
-        if start.success_loss is None:
-            self._success_loss.index_fill_(0, worlds, -torch.inf)
-        else:
-            self._success_loss[worlds] = start.success_loss
         return start
 
     def _start_and_sort(self, worlds: Tensor) -> NeighbourState:
         start = self.start(worlds)
         return build_neighbours(start.x, start.s, self.physics, places=worlds)
 
+    def restart(self, worlds: NDArray[np.int64], observation: Tensor) -> None:
+        """Start the next episodes of some worlds, [M], and write what is observed there."""
+        if self.action.recorded and self.observer.perceives_alone:
+            self._resets(worlds, observation)
+            return
+        index = to_device_async(worlds, self.device)
+        start = self.start(index)
+        observation[index] = self.observer.begun(self, index, start)
+
     @torch.no_grad()
     @makes_plain_tensors
     def place(self, worlds: Tensor, start: Start) -> None:
         """Put particles into some worlds, int64, shape [M], at no reward."""
-        x, s = start.x.contiguous(), start.s.contiguous()
-        task = self.task
-        if self._aimed is not task:
-            goal = self._goal[worlds] if start.goal is None else start.goal
-            self._goal.index_copy_(0, worlds, goal)
-            task = task.toward(goal)
-        parts = task.losses(x, s)
-        values = torch.stack(checked_losses(task, parts, len(x), self.part_names))
-        if not self.part_names:
-            self.part_names = tuple(parts)
-            self.report = StepReport.empty(self.world_count, len(parts), x.device)
-            self._host_endings, self._host_numbers = self._for_host()
-        self.x.index_copy_(0, worlds, x)
-        self.s.index_copy_(0, worlds, s)
-        still = torch.zeros_like(values)
-        numbers = torch.cat((still[:1], total(values)[None], values, still))
-        self.report.numbers.index_copy_(1, worlds, numbers)
-        if self.particle_loss is not None:
-            shares = checked_shares(task, task.particle_losses(x, s), (len(x), x.shape[1]))
-            self.particle_loss[worlds] = shares
-        if self._before is not None:
-            for kept, placed in zip(self._before, (x, s), strict=True):
-                kept.index_copy_(0, worlds, placed)
-        if self.particle_reward is not None:
-            self.particle_reward.index_fill_(0, worlds, 0.0)
-        self.report.endings.index_fill_(1, worlds, False)
+        self.referee.place(worlds, start)
 
     @torch.no_grad()
     @makes_plain_tensors
     def perceive(self, out: Tensor | None = None) -> Tensor:
-        """Return what is perceived in all worlds as they are, shape [B, N, P], written to `out`."""
-        return build_neighbours(self.x, self.s, self.physics).perceive(out)
+        """Return what is observed in all worlds as they are, shape [B, ...], written to `out`."""
+        return self.observer.observe(self, None, out)
 
     @torch.no_grad()
     @makes_plain_tensors
     def reseed(self, worlds: NDArray[np.int64], observation: Tensor) -> None:
         """Start some worlds, [M], anew within their episodes; the last step's pay and flags stay.
 
-        What is perceived in them is written into the observation of all, shape [B, N, P].
+        What is observed in them is written into the observation of all, shape [B, ...].
         """
-        index = to_device_async(worlds, self.x.device)
-        self._told_perceived = False
-        paid, elapsed = self.report.copy(), self.elapsed.clone()
-        own = None if self.particle_reward is None else self.particle_reward.clone()
+        self._host_is_current = False
+        restore = self.referee.restore_pay(to_device_async(worlds, self.x.device))
         self.restart(worlds, observation)
-        self.elapsed.copy_(elapsed)
-        numbers, before = self.report.numbers, paid.numbers
-        numbers[0, index] = before[0, index]
-        improvements = slice(2 + len(self.part_names), None)
-        numbers[improvements, index] = before[improvements, index]
-        self.report.endings.copy_(paid.endings)
-        if own is not None and self.particle_reward is not None:
-            self.particle_reward.copy_(own)
-        if self.world_count == 1:
-            # Of several the host reads none, and this waits for the device.
-            self._host_numbers.copy_(numbers)
+        restore()
 
     def step(self, action: Tensor, out: Tensor | None = None) -> tuple[NDArray[np.uint8], Tensor]:
-        """Apply actions to all worlds; return their endings, [B], and what is perceived, [B, N, P].
+        """Apply actions to all worlds; return their endings, [B], and what is observed, [B, ...].
 
         The endings, one byte a world, and of a single world its numbers are all that the host
         reads. On CUDA the worlds are judged and sorted side by side, and the device perceives while
         the host reads.
 
         Args:
-            action: Float32, shape [B, N, A], on any device.
-            out: Where to write what is perceived; a new tensor otherwise.
+            action: Float32, shape [B, ...], on any device.
+            out: Where to write what is observed; a new tensor otherwise.
 
         Raises:
             DivergedError: An action is not finite; the worlds, and what is reported of them, are
@@ -399,14 +397,13 @@ class BatchedWorlds(WorldState):
         observation = self.queue(action, out)
         if self._side_stream is not None:
             self._side_stream.wait()
-        told: NDArray[np.uint8] = self._host_endings.numpy()
-        if not told[-1]:
+        read: NDArray[np.uint8] = self.referee.host_endings.numpy()
+        if not read[-1]:
             self.random.steps -= 1
-            raise self._not_finite(action)
-        endings = told[:-1].copy()
+            raise not_finite(action)
+        endings = read[:-1].copy()
         if (endings & NOT_FINITE).any():
-            everyone = torch.arange(self.world_count, device=self.device)
-            self._check_losses(everyone)
+            self.referee.check_losses(torch.arange(self.world_count, device=self.device))
             raise NPAError(
                 f"losses of {type(self.task).__name__} must be finite before a step as well as "
                 "after it: mend them, then reset"
@@ -416,130 +413,86 @@ class BatchedWorlds(WorldState):
     @torch.no_grad()
     @makes_plain_tensors
     def queue(self, action: Tensor, out: Tensor | None = None) -> Tensor:
-        """Do what `step` does but wait for the device, and return what is perceived there then."""
-        if self.x.is_cuda and self.x.shape[:2].numel() <= FEW_PARTICLES:
+        """Do what `step` does but wait for the device, and return what is observed there then."""
+        alone = self.observer.perceives_alone
+        if not self.action.recorded:
+            self.action.apply(action)
+            self.referee.judge()
+        elif self.x.is_cuda and self.x.shape[:2].numel() <= FEW_PARTICLES:
             # To copy actions takes less than to launch what one graph then does.
-            self._actions.hold(action)
+            self.action.hold(action)
             self._act()
             assert self._side_stream is not None, "it was CUDA just now"
             assert self._perceived is not None, "it was perceived just now"
             self._side_stream.mark()
-            self._told_perceived = self._host_perceived is not None
+            if not alone:
+                return self.observer.observe(self, self._perceived, out)
+            self._host_is_current = self._host_perceived is not None
             if out is not None:
                 return out.copy_(self._perceived)
-            return self._perceived if self._told_perceived else self._perceived.clone()
+            return self._perceived if self._host_is_current else self._perceived.clone()
         else:
             self._draw()
-            self._actions.apply(action)
+            self.action.apply(action)
             self._look()
         if self._side_stream is not None:
             # The host learns the endings while the device perceives.
             self._side_stream.mark()
-        assert self._surveyed is not None, "the worlds were sorted just now"
-        return self._surveyed.perceive(out)
+        if not self.action.recorded:
+            return self.observer.observe(self, None, out)
+        assert self._neighbours is not None, "the worlds were sorted just now"
+        if alone:
+            return self._neighbours.perceive(out)
+        return self.observer.observe(self, self._neighbours.perceive(), out)
 
     def _act_and_look(self) -> None:
-        """Apply the actions that are held; judge the worlds and, beside that, perceive."""
-        self._actions.draw()
-        self._actions.apply_held()
-        with self._judging_beside():
+        """Apply the actions that are held; judge the worlds and, next to that, perceive."""
+        self.action.draw()
+        self.action.apply_held()
+        with self._judging_on_side():
             if self._perceived is None:
                 self._perceived = self.x.new_empty(*self.x.shape[:2], self.physics.perception_dim)
-                if self.world_count == 1 and self.task.config.output == "numpy":
+                returns_arrays = self.world_count == 1 and self.task.config.output == "numpy"
+                if returns_arrays and self.observer.perceives_alone:
                     self._host_perceived = pinned_like(self._perceived)
             build_neighbours(self.x, self.s, self.physics).perceive(self._perceived)
             if self._host_perceived is not None:
                 self._host_perceived.copy_(self._perceived, non_blocking=True)
 
     def _judge_and_sort(self) -> None:
-        """Judge the worlds and, beside that, sort them."""
-        with self._judging_beside():
-            self._surveyed = build_neighbours(self.x, self.s, self.physics)
+        """Judge the worlds and, next to that, sort them."""
+        with self._judging_on_side():
+            self._neighbours = build_neighbours(self.x, self.s, self.physics)
 
     @contextlib.contextmanager
-    def _judging_beside(self) -> Iterator[None]:
-        """Judge the worlds, on CUDA beside what is launched inside."""
+    def _judging_on_side(self) -> Iterator[None]:
+        """Judge the worlds, on CUDA overlapped with what is launched inside."""
         with contextlib.nullcontext() if self._side_stream is None else self._side_stream.overlap():
-            self._judge_worlds()
+            self.referee.judge()
         yield
         if self._side_stream is not None:
             self._side_stream.join()
 
-    def _judge_worlds(self) -> None:
-        """Write rewards, losses and endings of the worlds as they now are."""
-        task = self._aimed
-        losses = task.losses(self.x, self.s)
-        parts = torch.stack(checked_losses(task, losses, self.world_count, self.part_names))
-        if self._judgement is None:
-            self._judgement = self._make_judgement()
-        if self.particle_reward is None:
-            self._judgement(parts)
-        else:
-            own = self._particle_gains(task)
-            self._judgement(parts, (~torch.isfinite(own).all(dim=1)).byte())
-            if self._before is not None:
-                own = with_mean_reward(own, self.reward)
-            # Worlds that left their bounds are paid as a whole.
-            whole = self._diverged.bool() & (self.task.config.on_divergence != "ignore")
-            own = torch.where(whole[:, None], self.reward[:, None], own)
-            happened = self._enabled.bool()
-            self.particle_reward.copy_(torch.where(happened, own, self.particle_reward))
-        if self._side_stream is not None:
-            self._host_endings.copy_(self._endings, non_blocking=True)
-            if self.world_count == 1:
-                self._host_numbers.copy_(self.report.numbers, non_blocking=True)
-        self._enabled.fill_(1)
-
-    def _particle_gains(self, task: EnvTask[Any]) -> Tensor:
-        """Return what each particle has earned in a step, shape [B, N], and keep what it is now."""
-        shape = self.world_count, self.particle_count
-        if self._before is not None:
-            gains = checked_shares(task, task.particle_gains(self._before, (self.x, self.s)), shape)
-            for kept, now in zip(self._before, (self.x, self.s), strict=True):
-                kept.copy_(now)
-            return gains
-        assert self.particle_loss is not None, "particles are paid by shares or by actions"
-        shares = checked_shares(task, task.particle_losses(self.x, self.s), shape)
-        gains = self.particle_loss - shares
-        self.particle_loss.copy_(shares)
-        return gains
-
-    def _make_judgement(self) -> PreparedJudgement:
-        config = self.task.config
-        paid = (self.episode_steps or config.episode_steps) if config.reward == "sparse" else None
-        return PreparedJudgement(
-            EpisodeRules(self.episode_steps, paid, config.on_divergence),
-            enabled=self._enabled,
-            diverged=self._diverged,
-            first_loss=self._start_loss,
-            success_loss=self._success_loss,
-            elapsed=self.elapsed,
-            numbers=self.report.numbers,
-            flags=self.report.endings,
-            endings=self._endings,
-        )
-
     def extras(self, when: str) -> dict[str, Tensor]:
-        """Return what infos tell besides, shape [B, ...] each: since a "reset", or of a "step"."""
+        """Return what infos hold besides, shape [B, ...] each: since a "reset", or of a "step"."""
         if when == "reset":
-            return self._aimed.extra_info(self.s)
-        return {"updated": self._actions.updated()} if self.task.config.tell_updated else {}
+            return self.referee.extra_info()
+        return {"updated": self.action.updated()} if self.task.config.tell_updated else {}
 
-    def told_observation(self, observation: Tensor) -> Tensor:
-        """Return what is perceived in a single world after a step, [1, N, P]: where it is told.
+    def host_observation(self, observation: Tensor) -> Tensor:
+        """Return the observation of a single world after a step, on the host if it is there.
 
-        Of worlds that are handed out as arrays the host knows it by the end of the step.
+        A world that is returned as arrays is there by the end of the step.
         """
-        told = self._host_perceived if self._told_perceived else None
-        if told is None:
+        if not self._host_is_current or self._host_perceived is None:
             return observation
-        # The next step writes over what is told. NumPy copies it in this thread: torch would wait
-        # for others to wake, which can take milliseconds.
-        return torch.from_numpy(told.numpy().copy())
+        # The next step writes over it. NumPy copies it in this thread: torch would wait for others
+        # to wake, which can take milliseconds.
+        return torch.from_numpy(self._host_perceived.numpy().copy())
 
-    def extra_info(self) -> list[float]:
+    def host_numbers(self) -> list[float]:
         """Return the numbers of a single world's report after a step."""
-        numbers: list[float] = self._host_numbers.numpy()[:, 0].tolist()
+        numbers: list[float] = self.referee.host_numbers.numpy()[:, 0].tolist()
         return numbers
 
     def guarded(self, endings: NDArray[np.uint8], observation: Tensor) -> NDArray[np.uint8]:
@@ -547,22 +500,15 @@ class BatchedWorlds(WorldState):
 
         Nothing is read from the device, and nothing run, where none did.
 
-        Args:
-            endings: What `step` returned, of the worlds that were to act, shape [B].
-            observation: What is perceived, shape [B, N, P]; changed where worlds are reset.
-
         Returns:
             Endings, shape [B], without divergence where that ends no episode.
-
-        Raises:
-            DivergedError: A world diverged, and `on_divergence` is "raise".
         """
         way = self.task.config.on_divergence
         diverged = endings & DIVERGED != 0
         if way == "terminate" or not diverged.any():
             return endings
         if way == "raise":
-            raise DivergedError(self._told(np.flatnonzero(diverged)))
+            raise DivergedError(self._divergence_message(np.flatnonzero(diverged)))
         if way == "reset":
             # Where the time is up, the next episode comes anyway.
             going_on = np.flatnonzero(endings == DIVERGED)
@@ -570,33 +516,15 @@ class BatchedWorlds(WorldState):
                 self.reseed(going_on, observation)
         return endings & ~np.uint8(DIVERGED)
 
-    def _check_losses(self, worlds: Tensor) -> None:
-        """Check that the losses of some worlds, int64, shape [M], are finite."""
-        numbers = self.report.numbers[2 : 2 + len(self.part_names), worlds]
-        parts = {
-            f"part {shown(name)}": part for name, part in zip(self.part_names, numbers, strict=True)
-        }
-        check_finite(self.task, "losses", parts)
-        if self.particle_loss is not None:
-            check_finite(self.task, "particle_losses", {"shares": self.particle_loss[worlds]})
-
     def pictures(self, count: int) -> NDArray[np.uint8]:
         """Return pictures of the first worlds, uint8, shape [count, R, R, 3]."""
         steps = self.elapsed[:count].cpu().numpy()
         pictures: NDArray[np.uint8] = self.task.draw(self.x[:count], self.s[:count], steps)
         return pictures
 
-    def _not_finite(self, action: Tensor) -> DivergedError:
-        bad = ~torch.isfinite(action)
-        world, particle, entry = (int(k) for k in bad.nonzero()[0])
-        return DivergedError(
-            f"action must be finite, got {action[world, particle, entry].item()} at world {world}, "
-            f"particle {particle}, entry {entry} ({int(bad.sum())} such numbers): check the policy"
-        )
-
-    def _told(self, diverged: NDArray[np.int64]) -> str:
+    def _divergence_message(self, diverged: NDArray[np.int64]) -> str:
         """Return an error's message about worlds that diverged."""
-        physics, told = self.physics, []
+        physics, lines = self.physics, []
         for world in diverged[:LARGEST_REPORT].tolist():
             numbers = torch.cat((self.x[world], self.s[world]), dim=1)
             outside = self.x[world].abs() >= physics.limits.position
@@ -609,59 +537,24 @@ class BatchedWorlds(WorldState):
                     f"{numbers[particle, entry].item():g} "
                     f"({int(held.any(dim=1).sum())} such particles)"
                 )
-            told.append(line)
+            lines.append(line)
         if len(diverged) > LARGEST_REPORT:
-            told.append(f"and {len(diverged) - LARGEST_REPORT} more worlds")
+            lines.append(f"and {len(diverged) - LARGEST_REPORT} more worlds")
         return (
             f"numbers must stay within position_limit = {physics.limits.position:g} and "
-            f"observation_limit = {physics.limits.state:g}, but left them in {'; '.join(told)}: "
+            f"observation_limit = {physics.limits.state:g}, but left them in {'; '.join(lines)}: "
             "take smaller actions, raise the limits, or choose on_divergence='terminate' or 'reset'"
         )
 
 
-class StepReport(NamedTuple):
-    """What a step says of each world, in one buffer: it is handed out by one copy, not twenty."""
-
-    buffer: Tensor
-    """All that follows, uint8."""
-    numbers: Tensor
-    """Reward; loss; its parts; their improvements in the last step; shape [2 + 2 K, B]."""
-    endings: Tensor
-    """Terminated; truncated; success; diverged; bool, shape [4, B]."""
-    everyone: Tensor
-    """True for every world, bool, shape [B]."""
-
-    @classmethod
-    def empty(cls, world_count: int, part_count: int, device: torch.device) -> StepReport:
-        """Return the report of B worlds whose loss has K parts: zeros."""
-        rows = 4 * (2 + 2 * part_count) + 3 + len(FLAGS)
-        buffer = torch.zeros(rows * world_count, dtype=torch.uint8, device=device)
-        report = cls.over(buffer, world_count)
-        report.everyone.fill_(True)
-        return report
-
-    @classmethod
-    def over(cls, buffer: Tensor, world_count: int) -> StepReport:
-        """Return the report that a buffer holds."""
-        flag_rows = 3 + len(FLAGS)
-        rows = buffer.view(-1, world_count)
-        numbers = buffer[: -flag_rows * world_count].view(torch.float32).view(-1, world_count)
-        flags = rows[-flag_rows:].view(torch.bool)
-        return cls(buffer, numbers, flags[:-1], flags[-1])
-
-    def __reduce__(self) -> tuple[Callable[..., Any], tuple[Any, ...]]:
-        """Pickle the buffer alone: views that are pickled apart no longer share its memory."""
-        return StepReport.over, (self.buffer, len(self.everyone))
-
-    def copy(self) -> StepReport:
-        """Return a copy that later steps leave alone."""
-        return self.over(self.buffer.clone(), len(self.everyone))
-
-
-def reason(ending: int) -> str | None:
-    """Return why an episode ended, in words, or None where it has not."""
-    words = {DIVERGED: "diverged", SUCCESS: "success", TIME_LIMIT: "time limit"}
-    return next((word for bit, word in words.items() if ending & bit), None)
+def not_finite(action: Tensor) -> DivergedError:
+    """Return the error about actions, shape [B, K, W], with a number that is not finite."""
+    bad = ~torch.isfinite(action)
+    world, particle, entry = (int(k) for k in bad.nonzero()[0])
+    return DivergedError(
+        f"action must be finite, got {action[world, particle, entry].item()} at world {world}, "
+        f"particle {particle}, entry {entry} ({int(bad.sum())} such numbers): check the policy"
+    )
 
 
 GROWTH = 4
@@ -672,15 +565,8 @@ class GraphedResets:
     """Starts of next episodes, on CUDA as one graph and one launch instead of some hundred.
 
     A recorded start serves a fixed number of worlds. Fewer are filled up by repeating the last one:
-    it is then started twice in the same way, which is the same as once.
-
-    Args:
-        start: Starts the next episodes of worlds (indices, int64, shape [M]) and returns them made
-            ready for perception in the rows of the whole batch. A method's object has to be kept
-            by others.
-        world_count: Worlds B.
-        device: Where they live.
-        recorded: Whether `start` may be recorded: it never waits for the device.
+    it is then started twice in the same way, which is the same as once. `start` is a method of an
+    object that others keep.
     """
 
     def __init__(

@@ -46,25 +46,14 @@ def grid_places(config: GardenConfig, device: torch.device | None = None) -> Ten
 
 
 def offsets(x: Tensor, places: Tensor, config: GardenConfig) -> Tensor:
-    """Return the way from each place to each particle [length units], shape [B, K, N, 2].
-
-    Args:
-        x: Positions [length units], shape [B, N, 2].
-        places: Where brushes are [length units], shape [B, K, 2].
-        config: Says what box the world has.
-    """
+    """Return the way from each place to each particle [length units], shape [B, K, N, 2]."""
     spread = x[:, None].expand(-1, places.shape[1], -1, -1)
     box = None if config.box is None else (config.box,) * 2
     return offsets_from(spread.flatten(0, 1), places.flatten(0, 1), box).view(spread.shape)
 
 
 def holds(away: Tensor, config: GardenConfig) -> Tensor:
-    """Return how much soft brushes hold of each particle, dimensionless, shape [B, K, N].
-
-    Args:
-        away: What `offsets` returns, shape [B, K, N, 2].
-        config: Says how large brushes are.
-    """
+    """Return how much soft brushes hold of each particle, dimensionless, shape [B, K, N]."""
     origin = away.new_zeros(away.shape[0] * away.shape[1], 2)
     held = softness(away.flatten(0, 1), centre=origin, radius=config.brush_radius)
     return held.view(away.shape[:3])
@@ -76,14 +65,6 @@ def brushed(
     """Return worlds after their brushes have been used; differentiable in all of them.
 
     All brushes are used at once: what a particle feels of them adds up.
-
-    Args:
-        x: Positions [length units], shape [B, N, 2].
-        s: States, dimensionless, shape [B, N, C].
-        action: Rows of brushes, in [-1, 1], shape [B, K, W], see `BrushLayout`; on a grid K is a
-            multiple of its places.
-        middle: What places are counted from [length units], shape [B, 2].
-        config: Says how large and how strong brushes are.
 
     Returns:
         Positions, states, and each particle's rate, the share of its rule's steps that it makes,

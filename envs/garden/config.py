@@ -1,4 +1,4 @@
-"""What living worlds and brushes can be told."""
+"""Configuration of living worlds and brushes."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ TOOLS = ("push", "wipe", "inject", "rate")
 
 @dataclass(frozen=True, kw_only=True)
 class GardenConfig(GrownConfig):
-    """What living worlds can be told besides."""
+    """Adds brushes and what is observed of living worlds."""
 
     words = EnvConfig.words | {
         "reward": get_args(GardenReward),

@@ -1,20 +1,133 @@
-"""What the environments of living worlds are made of."""
+"""Living worlds: a rule runs the particles, an action touches the whole world."""
 
 from __future__ import annotations
 
-from typing import ClassVar
+from typing import Any, ClassVar
 
+import torch
+from torch import Tensor
+
+from npa_envs.envs.core.referee import WorldReferee
 from npa_envs.envs.core.single import NPAEnv
+from npa_envs.envs.core.task import Start
 from npa_envs.envs.core.vector import NPAVectorEnv
+from npa_envs.envs.core.worlds import BatchedWorlds, Parts, not_finite
 from npa_envs.envs.garden.spaces import BrushSpaces
-from npa_envs.envs.garden.worlds import BrushedWorlds
+from npa_envs.world.randomness import StreamId, WorldRandom
+
+
+class RuleAction:
+    """What the task's `step` makes of brushes or codes, then the rule's steps.
+
+    On a CPU worlds are stepped one after the other, as there a rule's products change in the last
+    bit with the number of worlds.
+    """
+
+    recorded = False
+
+    def __init__(self, worlds: BatchedWorlds) -> None:
+        self._task, self._physics, self._random = worlds.task, worlds.physics, worlds.random
+        self._x, self._s, self._diverged = worlds.x, worlds.s, worlds.referee.diverged
+
+    def apply(self, action: Tensor) -> None:
+        """Apply actions, shape [B, K, W]."""
+        action = action.to(self._x.device)
+        if not bool(torch.isfinite(action).all()):
+            raise not_finite(action)
+        diverged = torch.zeros_like(self._diverged, dtype=torch.bool)
+        limits = self._physics.limits.position, self._physics.limits.state
+        for own, new, limit in zip((self._x, self._s), self._stepped(action), limits, strict=True):
+            # NaN is not within any limit.
+            diverged |= ~(new.abs() < limit).flatten(1).all(dim=1)
+            own.copy_(torch.nan_to_num(new, nan=0.0).clamp(-limit, limit))
+        self._diverged.copy_(diverged)
+
+    def _stepped(self, action: Tensor) -> tuple[Tensor, Tensor]:
+        x, s = self._x, self._s
+        if x.is_cuda or len(x) == 1:
+            stepped: tuple[Tensor, Tensor] = self._task.step(x, s, action, self._random)
+            return stepped
+        worlds = []
+        for k in range(len(x)):
+            one = slice(k, k + 1)
+            random = self._random.take(one)
+            worlds.append(self._task.step(x[one], s[one], action[one], random))
+        self._random.sync_with(random, self._task.config.rule_steps)
+        x, s = (torch.cat(part) for part in zip(*worlds, strict=True))
+        return x, s
+
+    def updated(self) -> Tensor:
+        """Living worlds refuse `tell_updated`."""
+        raise NotImplementedError
+
+
+class GardenObserver:
+    """What the task observes of a whole world."""
+
+    perceives_alone = False
+
+    def __init__(self, worlds: BatchedWorlds) -> None:
+        self._observe = worlds.task.observe
+
+    def observe(
+        self, worlds: BatchedWorlds, perceived: Tensor | None, out: Tensor | None
+    ) -> Tensor:
+        """Return the observations of all worlds as they are, shape [B, O]."""
+        seen: Tensor = self._observe(worlds.x, worlds.s, worlds.loss, worlds.referee.context)
+        return seen if out is None else out.copy_(seen)
+
+    def begun(self, worlds: BatchedWorlds, index: Tensor, start: Start) -> Tensor:
+        """Return the observations of worlds that began an episode."""
+        return worlds.perceive()[index]
+
+
+class GardenReferee(WorldReferee):
+    """Pays what the task says a world is worth; arguments are those of `WorldReferee`."""
+
+    def __init__(self, task: Any, x: Tensor, s: Tensor, episode_steps: int | None) -> None:
+        super().__init__(task, x, s, episode_steps)
+        self.context = x.new_zeros(len(x), task.context_count)
+
+    @property
+    def pays_last_step_alone(self) -> bool:
+        """Whether an episode's last step is the only one that is paid."""
+        return super().pays_last_step_alone and not self.task.pays_each_step
+
+    def begin(self, worlds: Tensor, start: Start, random: WorldRandom, *, check: bool) -> None:
+        """Begin episodes in some worlds, and keep the task's context of their starts."""
+        super().begin(worlds, start, random, check=check)
+        draws, loss = random.take(worlds).substream(StreamId.GOAL), self.report.numbers[1][worlds]
+        self.context[worlds] = self.task.episode_context(start, loss, draws)
+
+    def judge(self) -> None:
+        """Write rewards, losses and endings of the worlds as they now are."""
+        super().judge()
+        loss, (ended, late) = self.report.numbers[1], self.report.endings[:2]
+        reward = self.task.reward(self.x, self.s, loss, self.context)
+        if self.pays_last_step_alone:
+            last = ended | late
+            if self.episode_steps is None:
+                last = last | (self.elapsed == self.task.config.episode_steps)
+            reward = torch.where(last, reward, 0.0)
+        self.task.next_goals(self.elapsed, self.context, self.goal)
+        self.report.numbers[0].copy_(reward)
+        if self.x.is_cuda and len(self.x) == 1:
+            self.host_numbers.copy_(self.report.numbers, non_blocking=True)
+
+    def extra_info(self) -> dict[str, Tensor]:
+        """Return what infos hold besides, shape [B, ...] each."""
+        infos: dict[str, Tensor] = self.task.context_info(self.x, self.s, self.context)
+        return infos
+
+
+LIVING = Parts(RuleAction, GardenObserver, GardenReferee)
+"""Worlds whose particles a rule runs."""
 
 
 class GardenEnv(NPAEnv):
     """One living world as a Gymnasium environment; subclasses name the task.
 
-    The sections below belong to the docstring of every subclass, after what it says there of its
-    own; where there is none, that of `NPAEnv` does.
+    The sections below belong to the docstring of every subclass, after its own of the same name.
 
     ## Observation space
 
@@ -25,25 +138,23 @@ class GardenEnv(NPAEnv):
     | `"moments"` | means over all particles, [5 + 3C] | lengths, dimensionless |
 
     The grid has P × P places, row by row from the bottom up, from −`place_reach` to `place_reach`
-    along x and y. It goes along with the particles: places are counted from where the middle of the
-    picture is. Six numbers belong to each: what a brush there would hold of the target less what it
-    holds now. These are the number of particles; the same with their places along x and y from the
-    brush, in brush radii, so they say towards which side particles lack; and red, green and blue.
-    The first is 2 and the others are 4 where a brush lacks as many particles as one holds at an
-    average place of the target.
+    along x and y of the picture's middle. Each place has six numbers: what a brush there would hold
+    of the target less what it holds now. These are the number of particles, its products with their
+    x and y from the brush in brush radii, and red, green and blue. The first is 2 and the others
+    are 4 where as many particles lack as a brush holds at an average place of the target.
 
-    The picture is red, green, blue, then density, each row by row; it spans [-1, 1] × [-1, 1], rows
-    from the bottom up, and goes along with the particles likewise. Colours are sums over particles,
-    as the density is. `observe_error=True` adds four channels: the target's picture less this one.
+    The picture is red, green, blue, then density, each row by row from the bottom up; it spans
+    [-1, 1] × [-1, 1] around the picture's middle. Colours are sums over particles, as the density
+    is. `observe_error=True` adds four channels: the target's picture less this one.
 
     Moments are the means of x and y; then, about that place, of x², x y, y², of each state, of x
     times each state, and of y times each state. Numbers are clipped to ±8.
 
     ## Action space
 
-    With `actions="grid"`, `Box(-1, 1, (P², W), float32)`: a brush stands at each place of the grid,
-    and its row says what it does. All are used at once, what a particle feels of them adds up, and
-    then the rule runs for `rule_steps` steps. Zeros do nothing.
+    With `actions="grid"`, `Box(-1, 1, (P², W), float32)`: a row for the brush at each place of the
+    grid. All act at once, their effects add up, and then the rule runs for `rule_steps` steps.
+    Zeros do nothing.
 
     | Columns | Action a | An action of 1 is | Effect where the brush holds w of a particle |
     |---|---|---|---|
@@ -52,13 +163,12 @@ class GardenEnv(NPAEnv):
     | 1 a channel, of `"inject"` | what to inject | `state_scale` | s ← s + w `state_scale` a |
     | 1, of `"rate"` | how fast to live | twice as fast | steps of the rule count 1 + w a times |
 
-    Columns of tools that `tools` leaves out are not there; the default has `"push"` alone.
-    `"inject"` has one for each of `inject_channels`. w = (1 − r²)² at r brush radii from the brush,
-    0 outside: `npa_envs.world.brushes.softness`. What is wiped is clipped to [0, 1] of a state,
-    rates to [0, 2]. Entries are clipped to [-1, 1]. A number that is not finite raises `NPAError`
-    and leaves the world as it was. Worlds are differentiable in all numbers of all brushes, but for
-    the correction of moments that [perception](../mathematics.md#perception) holds constant:
-    `env.unwrapped.task.step(x, s, action, random)`.
+    `tools` says which columns there are; the default has `"push"` alone. `"inject"` has one for
+    each of `inject_channels`. w = (1 − r²)² at r brush radii from the brush, 0 outside. What is
+    wiped is clipped to [0, 1] of a state, rates to [0, 2], entries to [-1, 1]. A number that is not
+    finite raises `NPAError` and leaves the world as it was. `env.unwrapped.task.step(x, s, action,
+    random)` is differentiable in all of them, but for the correction of moments that
+    [perception](../mathematics.md#perception) holds constant.
 
     With `actions="free"`, `Box(-1, 1, (K, 2 + W), float32)`: there are K = `brush_count` brushes,
     and two columns more in front say where each is used, along x and y [length units].
@@ -80,21 +190,16 @@ class GardenEnv(NPAEnv):
 
     ## Vectorized environment
 
-    `gym.make_vec(id, num_envs=B)` makes B worlds that one call steps together, on the CPU or, with
-    `device="cuda"`, on a GPU. Observations, actions, rewards and flags have B in front. World k
-    after `reset(seed=s)` is the single environment after `reset(seed=s + k)`, bit for bit, for
-    every B. On a CPU worlds are stepped one after the other: a batch saves no time there.
-
-    All else is as for the other environments: `output="torch"`, `autoreset_mode`, `reset_mask`,
-    `particles()` and `place_particles(x, s)`.
+    As in [every environment](Morphogenesis2D.md#vectorized-environment), but on a CPU worlds are
+    stepped one after the other: a batch saves no time there.
     """
 
-    worlds_type = BrushedWorlds
+    parts = LIVING
     form_type: ClassVar[type[BrushSpaces]] = BrushSpaces
 
 
 class GardenVectorEnv(NPAVectorEnv):
     """B living worlds, stepped together; subclasses name the task."""
 
-    worlds_type = BrushedWorlds
+    parts = LIVING
     form_type: ClassVar[type[BrushSpaces]] = BrushSpaces

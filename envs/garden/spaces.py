@@ -19,12 +19,7 @@ from npa_envs.world.actions import Physics
 
 
 class BrushSpaces(ParticleSpaces):
-    """A coarse picture or moments are seen; actions say what each brush does.
-
-    Args:
-        physics: The worlds' constants.
-        config: The environment's configuration.
-    """
+    """A coarse picture or moments are seen; actions say what each brush does."""
 
     def __init__(self, physics: Physics, config: GardenConfig) -> None:
         self._config = config
@@ -44,11 +39,7 @@ class BrushSpaces(ParticleSpaces):
             self.action_space = MultiDiscrete(self._choices * config.brush_count)
 
     def action(self, action: Any, world_count: int | None) -> Tensor:
-        """Return actions as worlds take them, rows of brushes, float32, shape [B, K, W].
-
-        Raises:
-            NPAError: They are no numbers, or have another shape, or a choice does not exist.
-        """
+        """Return actions as worlds take them, rows of brushes, float32, shape [B, K, W]."""
         batch = () if world_count is None else (world_count,)
         letters = "" if world_count is None else "B, "
         if self._config.actions != "discrete":

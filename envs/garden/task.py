@@ -32,13 +32,7 @@ Config = TypeVar("Config", bound=GardenConfig)
 
 
 class TargetDeficit:
-    """What lacks to a target at some places, as soft brushes there would hold it.
-
-    Args:
-        places: Where [length units], shape [P, 2].
-        target: The target, whose places they are.
-        config: Says how large brushes are.
-    """
+    """What lacks to a target at some places, as soft brushes there would hold it."""
 
     def __init__(self, places: Tensor, target: PointTarget, config: GardenConfig) -> None:
         self.places, self._config = places, config
@@ -56,11 +50,6 @@ class TargetDeficit:
         Numbers are dimensionless: of all particles, of their places along x and y from the brush in
         brush radii, and of their red, green and blue. They are `SEEN_SCALES` times what a brush
         holds, as multiples of the particles that one holds at an average place of the target.
-
-        Args:
-            x: Positions [length units], shape [B, N, 2].
-            s: States, dimensionless, shape [B, N, C].
-            middle: What places are counted from [length units], shape [B, 2].
         """
         return self._wanted - self._held(x, s[..., -3:], middle)
 
@@ -68,18 +57,14 @@ class TargetDeficit:
         away = offsets(x, middle[:, None] + self.places, self._config)
         sides = away / self._config.brush_radius
         colours = colour[:, None].expand(-1, len(self.places), -1, -1)
-        told = torch.cat((torch.ones_like(sides[..., :1]), sides, colours), dim=-1)
-        told = told * holds(away, self._config)[..., None]
-        mean = world_mean(told.transpose(1, 2).flatten(2))
+        values = torch.cat((torch.ones_like(sides[..., :1]), sides, colours), dim=-1)
+        values = values * holds(away, self._config)[..., None]
+        mean = world_mean(values.transpose(1, 2).flatten(2))
         return self._scale * mean.view(len(x), len(self.places), SEEN_AT_A_PLACE)
 
 
 class GardenTask(GrownTask[Config]):
-    """A grown picture that goes on living; everything here is differentiable in the brushes.
-
-    Raises:
-        NPAError: There is no such rule, or it is one of other worlds.
-    """
+    """A grown picture that goes on living; differentiable in the brushes."""
 
     config_type: ClassVar[type[GardenConfig]] = GardenConfig
 
@@ -103,8 +88,8 @@ class GardenTask(GrownTask[Config]):
     @classmethod
     def extra_bytes(cls, config: Any, world_count: int) -> int:
         """Return about how much memory pool, pictures and brushes need [bytes]."""
-        told = SEEN_AT_A_PLACE * config.place_count**2 * config.particle_count
-        return super().extra_bytes(config, world_count) + int(3 * 4 * told * world_count)
+        values = SEEN_AT_A_PLACE * config.place_count**2 * config.particle_count
+        return super().extra_bytes(config, world_count) + int(3 * 4 * values * world_count)
 
     def step(
         self,
@@ -131,16 +116,7 @@ class GardenTask(GrownTask[Config]):
         *,
         detach_positions: bool = False,
     ) -> tuple[Tensor, Tensor]:
-        """Return worlds after brushes and the rule's steps, before what befalls them.
-
-        Args:
-            x: Positions [length units], shape [B, N, 2].
-            s: States, dimensionless, shape [B, N, C].
-            action: What the brushes do, shape [B, K, W].
-            random: One stream a world; advanced by `rule_steps`.
-            detach_positions: Leave out the gradient by what particles perceive of where others
-                are, as training does.
-        """
+        """Return worlds after brushes and the rule's steps, before what befalls them."""
         run = partial(
             run_rule, self.rule, self.config, random=random, detach_positions=detach_positions
         )
@@ -174,6 +150,9 @@ class GardenTask(GrownTask[Config]):
     def reward(self, x: Tensor, s: Tensor, loss: Tensor, context: Tensor) -> Tensor:
         """Return what worlds are worth in a step, [B], of loss [B] and marks [B, M]."""
         raise NotImplementedError
+
+    def next_goals(self, elapsed: Tensor, context: Tensor, goal: Tensor) -> None:
+        """Change goals, in place, after a step is paid, by steps since the start, [B]."""
 
     def context_info(self, x: Tensor, s: Tensor, context: Tensor) -> dict[str, Tensor]:
         """Return what infos tell of worlds besides, shape [B, ...] each."""
@@ -209,8 +188,8 @@ class GardenTask(GrownTask[Config]):
         away = x - mean[:, None]
         across, up = away[..., :1], away[..., 1:]
         seconds = torch.cat((across * across, across * up, up * up), dim=-1)
-        told = torch.cat((seconds, s, across * s, up * s), dim=-1)
-        return torch.cat((mean, world_mean(told)), dim=-1)
+        values = torch.cat((seconds, s, across * s, up * s), dim=-1)
+        return torch.cat((mean, world_mean(values)), dim=-1)
 
 
 LEAST_RISE = 0.1
@@ -225,10 +204,5 @@ def marks_of_whole(task: GardenTask[Config], start: Start, loss: Tensor) -> Tens
 
 
 def lost_share(loss: Tensor, context: Tensor) -> Tensor:
-    """Return what share of pictures is lost: 0 of whole ones, 1 of grey ones, shape [B].
-
-    Args:
-        loss: Their losses, shape [B].
-        context: What `marks_of_whole` gave, and maybe more, shape [B, M].
-    """
+    """Return what share of pictures is lost: 0 of whole ones, 1 of grey ones, shape [B]."""
     return (loss - context[:, 0]) / context[:, 1]

@@ -12,27 +12,16 @@ from gymnasium.utils import seeding
 from numpy.typing import NDArray
 from torch import Tensor
 
-from npa_envs.envs.core.screen import Screen
-from npa_envs.envs.core.spaces import action_tensor, to_output
+from npa_envs.envs.core.screen import Screen, ShownEnv
+from npa_envs.envs.core.spaces import action_tensor
 from npa_envs.envs.core.vector import plain_seed, rng_keys
 from npa_envs.envs.multi.worlds import AgentReferee
 from npa_envs.errors import DivergedError, NPAError, shown
 from npa_envs.world.actions import Physics
 
 
-class AgentsEnv:
-    """What environments of agents are made of, be it one world or many.
-
-    Args:
-        task: A name from `npa_envs.envs.multi.TASKS`.
-        keywords: Fields of the task's configuration.
-        world_count: Worlds B.
-        by_particle: Whether every particle is an agent, and not every species.
-
-    Raises:
-        NPAError: There is no such task, a keyword is unknown or wrong, or the worlds do not fit
-            into memory.
-    """
+class AgentsEnv(ShownEnv):
+    """What environments of agents are made of, be it one world or many."""
 
     metadata: ClassVar[dict[str, Any]] = {
         "name": "npa_multispecies_v0",
@@ -69,14 +58,7 @@ class AgentsEnv:
             self._action_spaces[agent] = Box(-1.0, 1.0, done, np.float32)
         self._state_space = state_space(worlds.physics, worlds.particle_count)
         self.np_random: np.random.Generator | None = None
-        self._started = False
         self._screen = Screen(worlds, self.config, self.metadata["render_fps"])
-
-    def _repr_mimebundle_(self, include: Any = None, exclude: Any = None) -> dict[str, Any]:
-        """Return what Jupyter shows: the worlds as they are, from the first reset on."""
-        if not self._started:
-            return {"text/plain": str(self)}
-        return self._screen.for_notebook(str(self))
 
     def close(self) -> None:
         """Close the window, if there is one."""
@@ -104,9 +86,6 @@ class AgentsEnv:
             raise NPAError("render needs a world: call reset first")
         return self._screen.render()
 
-    def _out(self, tensor: Tensor) -> Any:
-        return to_output(tensor, self.config.output)
-
     def _show(self) -> None:
         self._screen.show(f"{self.metadata['name']}: {self._task_name}")
 
@@ -123,19 +102,7 @@ def state_space(physics: Physics, particle_count: int) -> Box:
 def joined_actions(
     actions: Any, agents: Sequence[str], shapes: Sequence[tuple[int, ...]], device: torch.device
 ) -> Tensor:
-    """Return the actions of all live agents as rows, float32, shape [N, A] or [B, N, A].
-
-    Args:
-        actions: An array or tensor for each live agent.
-        agents: Live agents, in the order of their particles.
-        shapes: Shape of each one's action, [B, N_k, A], [N_k, A] or [A].
-        device: Where the world lives.
-
-    Raises:
-        NPAError: There is an action too few or too many, or one has another shape or is no array
-            of numbers.
-        DivergedError: A number is not finite.
-    """
+    """Return the actions of all live agents as rows, float32, shape [N, A] or [B, N, A]."""
     if not isinstance(actions, Mapping):
         raise NPAError(
             f"actions must be a dict with an action for each live agent, got "

@@ -141,9 +141,6 @@ class CrowdEnv(AgentsEnv, pettingzoo.ParallelEnv):  # type: ignore[misc]
         Returns:
             A row [position ; state ; 1] for each particle that an episode starts with, zeros for
             those that are gone, shape [N, 2 + C + 1].
-
-        Raises:
-            NPAError: There is no world yet.
         """
         return self._out(self._state()[0])
 
@@ -216,24 +213,13 @@ class CrowdEnv(AgentsEnv, pettingzoo.ParallelEnv):  # type: ignore[misc]
 
 
 def in_turns(parallel: Any, *, clips: bool = False) -> Any:
-    """Return an environment as one in which agents act in turn, with PettingZoo's checks of order.
-
-    Args:
-        parallel: An environment in which all act at once.
-        clips: Whether actions are clipped into their spaces, which is then said.
-    """
+    """Return an environment in which agents act in turn, in an order that PettingZoo checks."""
     turns = parallel_to_aec(parallel)
     return OrderEnforcingWrapper(ClipOutOfBoundsWrapper(turns)) if clips else turns
 
 
 def register(name: str, module: str, keywords: dict[str, Any]) -> None:
-    """Put both kinds of an environment into PettingZoo's registries; what is there stays as it is.
-
-    Args:
-        name: What `pettingzoo.make` takes.
-        module: Where `parallel_env` and `env` are.
-        keywords: What they are given.
-    """
+    """Put both kinds of an environment into PettingZoo's registries, unless they are there."""
     # PettingZoo before 1.27 has no registries.
     if not hasattr(pettingzoo, "register"):
         return

@@ -168,7 +168,7 @@ class SpeciesConfig(WorldConfig):
 class Population(NamedTuple):
     """The particles of worlds that have the same ones, those of each species one after the other.
 
-    Here N counts the particles that are there.
+    N counts the particles that are left.
     """
 
     x: Tensor
@@ -228,9 +228,6 @@ class SpeciesTask(WorldTask[Any]):
     def start(self, random: WorldRandom) -> tuple[Tensor, Tensor]:
         """Return fresh worlds: each species uniform in a disk of its own, all states zero.
 
-        Args:
-            random: Where positions come from, one stream a world.
-
         Returns:
             Positions [length units], shape [B, N, 2]; states, dimensionless, shape [B, N, C].
         """
@@ -259,32 +256,15 @@ class SpeciesTask(WorldTask[Any]):
         raise NotImplementedError
 
     def played(self, action: Tensor, population: Population, random: WorldRandom) -> Tensor:
-        """Return what all particles do; by default agents play all species.
-
-        Args:
-            action: What agents tell all particles, anything for those of no agent, [B, N, A].
-            population: Who is there.
-            random: One stream a world, as it stands before the step.
-        """
+        """Return what all particles do; by default agents play all species."""
         return action
 
     def settle(self, rewards: Tensor, live: Tensor, species: Tensor) -> Tensor:
-        """Return what agents are paid; by default what each has earned.
-
-        Args:
-            rewards: How much each agent's loss fell in the step, 0 for agents that did not act,
-                float64, shape [B, agents].
-            live: Whether each agent acted, bool, shape [B, agents].
-            species: Species of each agent, int64, shape [agents].
-        """
+        """Return what agents are paid; by default what each has earned."""
         return rewards
 
     def is_over(self, counts: tuple[int, ...]) -> bool:
-        """Return whether the episode ends for all, where species are gone; by default it goes on.
-
-        Args:
-            counts: Particles of each species.
-        """
+        """Return whether the episode ends for all where species are gone; by default never."""
         return False
 
     @property
@@ -312,12 +292,7 @@ class SpeciesTask(WorldTask[Any]):
 
 
 def by_species(losses: list[Tensor], population: Population) -> Tensor:
-    """Return losses of the species that are there as one tensor, shape [B, K], 0 for the others.
-
-    Args:
-        losses: One for each species with particles, shape [B] each, in order.
-        population: Who is there.
-    """
+    """Return losses of the species that are there as one tensor, shape [B, K], 0 for the others."""
     remaining = iter(losses)
     nothing = population.x.new_zeros(len(population.x))
     found = [next(remaining) if count else nothing for count in population.counts]

@@ -180,9 +180,6 @@ class MultiSpeciesVectorEnv(AgentsEnv):
         Returns:
             For each world a row [position ; state ; 1] for each particle that an episode starts
             with, zeros for those that are gone, shape [B, N, 2 + C + 1].
-
-        Raises:
-            NPAError: There are no worlds yet.
         """
         return self._out(self._state())
 

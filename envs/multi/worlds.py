@@ -16,7 +16,8 @@ from torch import Tensor
 
 from npa_envs import world_mean
 from npa_envs.envs.core.memory import OBSERVATION_COPIES
-from npa_envs.envs.core.worlds import WorldState, total
+from npa_envs.envs.core.referee import total
+from npa_envs.envs.core.worlds import WorldState
 from npa_envs.envs.multi.task import Population, SpeciesTask
 from npa_envs.envs.multi.tasks import task_type
 from npa_envs.errors import DivergedError
@@ -199,11 +200,11 @@ class AgentReferee:
         """Return an error's message about agents that are out of bounds, shape [B, A]."""
         physics, word = self.worlds.physics, "particle" if self._by_particle else "species"
         places = np.argwhere(fled)
-        told = [f"{word}_{agent} of world {world}" for world, agent in places[:LARGEST_REPORT]]
-        more = f" and {len(places) - len(told)} more" if len(places) > len(told) else ""
+        names = [f"{word}_{agent} of world {world}" for world, agent in places[:LARGEST_REPORT]]
+        more = f" and {len(places) - len(names)} more" if len(places) > len(names) else ""
         return (
             f"agents must have a particle within position_limit = {physics.limits.position:g} and "
-            f"observation_limit = {physics.limits.state:g}, but {', '.join(told)}{more} had none "
+            f"observation_limit = {physics.limits.state:g}, but {', '.join(names)}{more} had none "
             f"after step {int(self.worlds.elapsed[places[0, 0]])}: take smaller actions, raise the "
             "limits, or choose on_divergence='terminate'"
         )
@@ -215,7 +216,7 @@ class AgentReferee:
         worlds.remove((endings == REMOVED) | (endings == LEFT))
         if not worlds.open.any():
             return observation
-        # What others lose or gain by a death is nobody's merit: the next step counts from here.
+        # What others lose or gain by a death is nobody's merit: the next step counts from now.
         seen = self.carry_over()
         stays = (endings == 0) & worlds.open[:, None]
         where = to_device_async(stays, worlds.device)[:, self._owner, None]
@@ -223,14 +224,7 @@ class AgentReferee:
 
 
 class AgentReturns:
-    """The losses of all agents in B worlds, now and before, and rewards for what fell.
-
-    Args:
-        task: Says how rewards are settled.
-        species: Species of each agent, int64, shape [A].
-        world_count: Worlds B.
-        team: Whether each is paid the mean of all.
-    """
+    """The losses of all agents in B worlds, now and before, and rewards for what fell."""
 
     def __init__(self, task: SpeciesTask, species: Tensor, world_count: int, *, team: bool) -> None:
         self._task = task
@@ -267,11 +261,6 @@ class AgentReturns:
 
     def pay(self, parts: Parts, live: Tensor, fled: Tensor) -> Tensor:
         """Take down the losses after a step, and return rewards, 0 for those that did not act.
-
-        Args:
-            parts: Of all agents.
-            live: Which agents acted, bool, shape [B, A].
-            fled: Which left their world in this step, bool, shape [B, A].
 
         Returns:
             Rewards, float64, shape [B, A].
@@ -313,15 +302,6 @@ class SpeciesBatch(WorldState):
 
     A world that lost particles is computed without them. Worlds that have the same ones are
     computed together, as a cohort: all of the batch as long as nobody is gone.
-
-    Args:
-        task_type: Gives starts and losses.
-        config: The environment's configuration, of the task's kind.
-        world_count: Worlds B.
-        by_particle: Whether every particle is an agent, and not every species.
-
-    Raises:
-        NPAError: The worlds do not fit into memory, or the task cannot be made.
     """
 
     @makes_plain_tensors
@@ -355,7 +335,7 @@ class SpeciesBatch(WorldState):
 
     @property
     def perception_dim(self) -> int:
-        """Numbers that a particle perceives: P, and K (1 + D) more where species are told apart."""
+        """Numbers that a particle perceives: P, and K (1 + D) more with per-species perception."""
         return self.physics.perception_dim + self._appended
 
     @property
@@ -381,12 +361,7 @@ class SpeciesBatch(WorldState):
     @torch.no_grad()
     @makes_plain_tensors
     def act(self, action: Tensor) -> None:
-        """Apply actions to the worlds that go on; nothing waits for the device.
-
-        Args:
-            action: Finite, on the device, shape [B, N, A]; what it says of particles that are gone
-                is not read.
-        """
+        """Apply actions to the worlds that go on; nothing waits for the device."""
         for cohort in self.cohorts:
             cohort.act(action if cohort is self._whole else action[cohort.places])
         self.elapsed[self.open] += 1
@@ -396,7 +371,7 @@ class SpeciesBatch(WorldState):
     def perceived(self, *, stepped: bool = False) -> Tensor:
         """Return what particles perceive, shape [B, N, P]; zeros where they or their world ended.
 
-        `stepped` says, here and below, that nothing has changed since the last `act`.
+        `stepped` says, also below, that nothing has changed since the last `act`.
         """
         if self.cohorts == [self._whole]:
             return self._whole.perceived(stepped=stepped)
@@ -445,15 +420,7 @@ class SpeciesBatch(WorldState):
         self.open &= ~worlds
 
     def place(self, x: Any, s: Any) -> None:
-        """Replace the particles that are in the worlds, which all have the same ones.
-
-        Args:
-            x: Positions [length units], shape [B, N now, 2].
-            s: States, dimensionless, shape [B, N now, C].
-
-        Raises:
-            NPAError: A shape is another one, or a number is not finite or beyond its limit.
-        """
+        """Replace the particles that are in the worlds, which all have the same ones."""
         (cohort,) = self.cohorts
         there = cohort.population
         count = there.x.shape[1]
@@ -528,14 +495,6 @@ class Cohort:
     """Some worlds of a batch with the same particles, stepped together.
 
     On CUDA what a step computes is recorded at the second one, so it pays where many follow.
-
-    Args:
-        judge: Computes losses, perception and bounds.
-        worlds: Which worlds of the batch these are, int64, shape [M].
-        columns: Which of the particles that an episode starts with are there, int64, shape [N now].
-        x: Their positions [length units], shape [M, N now, 2]; changed in place.
-        s: Their states, dimensionless, shape [M, N now, C]; changed in place.
-        random: One stream a world; goes on in place.
     """
 
     def __init__(
@@ -608,14 +567,7 @@ class Cohort:
 
 
 class AgentLosses:
-    """What is computed of worlds that have the same particles, whichever of a batch they are.
-
-    Args:
-        task: Gives losses.
-        physics: The worlds' constants.
-        owner: Number of the agent that owns each particle, int64, shape [N].
-        by_particle: Whether every particle is an agent, and not every species.
-    """
+    """What is computed of worlds that have the same particles, whichever of a batch they are."""
 
     def __init__(
         self, task: SpeciesTask, physics: Physics, owner: NDArray[np.int64], by_particle: bool

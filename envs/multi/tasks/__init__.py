@@ -31,11 +31,7 @@ ENVIRONMENTS = {
 
 
 def task_settings(name: str) -> tuple[str, dict[str, Any]]:
-    """Return the task that an id means, and its keywords; a task's name means itself.
-
-    Args:
-        name: One of `TASKS`, of `ENVIRONMENTS`, or the id of a size.
-    """
+    """Return the task that an id means, and its keywords; a task's name means itself."""
     for size in SPECIES_SIZES:
         if name == size.id:
             return size.task, dict(size.keywords)
@@ -43,14 +39,7 @@ def task_settings(name: str) -> tuple[str, dict[str, Any]]:
 
 
 def task_type(name: str) -> type[SpeciesTask]:
-    """Return a task's class.
-
-    Args:
-        name: One of `TASKS`.
-
-    Raises:
-        NPAError: There is no such task.
-    """
+    """Return a task's class."""
     if not isinstance(name, str) or name not in TASKS:
         known = [*TASKS, *ENVIRONMENTS, *(size.id for size in SPECIES_SIZES)]
         raise NPAError(f"task must be a known word, got {shown(name)}: {suggest(name, known)}")

@@ -16,7 +16,7 @@ from npa_envs.tasks.morphogenesis2d import Morphogenesis2D, Morphogenesis2DConfi
 from npa_envs.world.randomness import StreamId, WorldRandom
 
 USUAL = ("gecko", "heart", "butterfly", "flower", "octopus", "ring")
-"""What species grow that are told nothing, in turn."""
+"""What species grow by default, in turn."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -38,12 +38,7 @@ class PictureLossConfig(SpeciesConfig):
     def goal(
         self, target: str = Morphogenesis2DConfig.target, particle_count: int = 1
     ) -> Morphogenesis2DConfig:
-        """Return what the task of growing a target with so many particles is told.
-
-        Args:
-            target: A built-in name, an emoji, or the path of a picture.
-            particle_count: Particles that the target is made for; as many points are in it.
-        """
+        """Return what the task of growing a target with so many particles is told."""
         return self.task_config(
             Morphogenesis2DConfig,
             target=target,
@@ -65,16 +60,7 @@ class OnePictureConfig(PictureLossConfig):
 
 
 class PictureLossTask(SpeciesTask):
-    """Pictures to grow, each compared by the splat loss of `npa_envs.tasks.morphogenesis2d`.
-
-    Args:
-        config: The environment's configuration.
-        device: Where the world lives.
-        pictures: Names of targets, and the particles that each is made for.
-
-    Raises:
-        NPAError: A target cannot be loaded.
-    """
+    """Pictures to grow, each compared by the splat loss of `npa_envs.tasks.morphogenesis2d`."""
 
     def __init__(self, config: Any, device: torch.device, *pictures: tuple[str, int]) -> None:
         super().__init__(config, device)
@@ -99,7 +85,7 @@ class PictureLossTask(SpeciesTask):
 
 @dataclass(frozen=True, kw_only=True)
 class CoMorphogenesisConfig(PictureLossConfig):
-    """What growing side by side, or through each other, can be told besides."""
+    """Adds a picture for each species, and how far apart they grow."""
 
     targets: tuple[str, ...] = ()
     """What each species grows: built-in names (`npa-envs list`), emoji, or paths of pictures;
@@ -211,7 +197,7 @@ class InvasionTask(PictureLossTask):
         return torch.where((population.species > 0)[:, None], drawn, action)
 
     def settle(self, rewards: Tensor, live: Tensor, species: Tensor) -> Tensor:
-        """Return rewards of which the sum is zero: invaders pay in equal parts for species 0."""
+        """Return rewards that sum to zero: invaders pay in equal parts for species 0."""
         invading = species > 0
         gained = torch.where(invading, 0.0, rewards).sum(dim=1, keepdim=True)
         payers = live & invading
