@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -17,6 +16,7 @@ from npa_envs.errors import NPAError, shown
 from npa_envs.ops import splat, world_mean
 from npa_envs.ops.pictures.losses import picture_losses
 from npa_envs.rule.rule import COLOUR_OFFSET, LIFE, NPARule
+from npa_envs.tasks.base import Worlds
 from npa_envs.tasks.damage import damage_pool
 from npa_envs.tasks.growth import GrowthConfig, GrowthTask
 from npa_envs.tasks.targets.images import LARGEST_POINT_COUNT
@@ -169,7 +169,7 @@ UNOWNED = 0.05
 
 
 class Morphogenesis2D(GrowthTask[Morphogenesis2DConfig]):
-    """The task of arXiv 2601.16096, section 4.1, with its loss; satisfies `PictureTask`.
+    """The task of arXiv 2601.16096, section 4.1, with its loss.
 
     Of a rule of many pictures, `for_rule` gives the task of one of them.
 
@@ -182,11 +182,7 @@ class Morphogenesis2D(GrowthTask[Morphogenesis2DConfig]):
         NPAError: The target cannot be loaded.
     """
 
-    space_dim = 2
-    """Space dimension D."""
-
     metric_name = "splat loss"
-    """What `metric` is."""
 
     def __init__(
         self,
@@ -212,11 +208,6 @@ class Morphogenesis2D(GrowthTask[Morphogenesis2DConfig]):
         points, colours = self.target.points[None], self.target.colours[None]
         self._target_picture = self._splat(points, colours)[0]
 
-    @property
-    def target_picture(self) -> Tensor:
-        """The target's picture: rgb sums and density, dimensionless, shape [R, R, 4]."""
-        return self._target_picture
-
     def for_rule(self, rule: NPARule) -> Self:
         """Return the task whose fresh worlds carry the code that a rule has for the target.
 
@@ -238,26 +229,19 @@ class Morphogenesis2D(GrowthTask[Morphogenesis2DConfig]):
         Args:
             code: Dimensionless, shape [K].
         """
-        bound = copy.copy(self)
-        bound._code = code.detach()
-        return bound
+        return self._with(_code=code.detach())
 
     def seed(
         self, world_count: int, *, generator: Randomness, device: str | torch.device = "cpu"
-    ) -> tuple[Tensor, Tensor]:
+    ) -> Worlds:
         """Return fresh worlds: of an equivariant rule with a head and a tail, of one that divides
         with one living particle, at the origin.
-
-        Args:
-            world_count: Worlds B.
-            generator: Source of the positions and of the axes, on `device`.
-            device: Where the worlds are made.
         """
-        x, s = super().seed(world_count, generator=generator, device=device)
+        x, s, goal = super().seed(world_count, generator=generator, device=device)
         config = self.config
         if config.division:
             s[:, 0, LIFE] = 1.0
-            return torch.zeros_like(x), s
+            return torch.zeros_like(x), s, goal
         if config.equivariant and max(config.seed_axis, config.seed_across) > 0.0:
             share = (
                 generator.uniform(1, dtype=x.dtype)
@@ -273,7 +257,7 @@ class Morphogenesis2D(GrowthTask[Morphogenesis2DConfig]):
                 s[..., 1] = config.seed_across * across / config.seed_radius
         if self._code is not None:
             s = self.coded(torch.cat((s.new_zeros(*s.shape[:2], len(self._code)), s), dim=-1))
-        return x, s
+        return x, s, goal
 
     def coded(self, s: Tensor) -> Tensor:
         """Return states with the task's code, or as they are where it has none."""
@@ -282,15 +266,16 @@ class Morphogenesis2D(GrowthTask[Morphogenesis2DConfig]):
         code = self._code.to(s).expand(*s.shape[:2], -1)
         return torch.cat((code, s[..., len(self._code) :]), dim=-1)
 
-    def damage(self, x: Tensor, s: Tensor, generator: Randomness) -> tuple[Tensor, Tensor]:
+    def damage(self, x: Tensor, s: Tensor, goal: Tensor | None, generator: Randomness) -> Worlds:
         """Return the worlds damaged; of one that divides particles die, but never all."""
         if not (self.config.division and self.config.damage_radius > 0.0):
-            return super().damage(x, s, generator)
+            return super().damage(x, s, goal, generator)
         # Children of a crowd that is thinned learn who they are among its grown particles.
         stay = uniform_draws(generator, x.shape[:2], x) < SURVIVING
         left = torch.where(stay[..., None], s, 0.0)
         left = torch.where(living(left).any(dim=1)[:, None, None], left, s)
-        return damage_pool(x, left, replace(self.config, damage_radius=0.0), generator=generator)
+        rest = replace(self.config, damage_radius=0.0)
+        return *damage_pool(x, left, rest, generator=generator), goal
 
     def picture(self, x: Tensor, s: Tensor, *, centred: bool = True) -> Tensor:
         """Return each world's picture: colour sums and density, dimensionless, shape [B, R, R, 4].

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import copy
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 import torch
@@ -125,7 +124,7 @@ GREY = 0.5
 
 
 class Morphogenesis3D(GrowthTask[Morphogenesis3DConfig]):
-    """The task of arXiv 2601.16096 with its loss; satisfies `PictureTask`, `ReadOutTask`.
+    """The task of arXiv 2601.16096 with its loss.
 
     As it is, the last three channels of a state are its colour and particles are round; `for_rule`
     gives the task that sees what a rule reads out of the states.
@@ -141,10 +140,8 @@ class Morphogenesis3D(GrowthTask[Morphogenesis3DConfig]):
     """
 
     space_dim = 3
-    """Space dimension D."""
-
     metric_name = "view loss"
-    """What `metric` is: the loss of held-out views."""
+    has_views = True
 
     def __init__(
         self,
@@ -175,9 +172,8 @@ class Morphogenesis3D(GrowthTask[Morphogenesis3DConfig]):
         self.target = target.to(device)
         """What worlds are to look like."""
         self._shown = some_views(self.target.held_out, torch.tensor([visible], device=device))
-        self.target_picture = self._shown.pictures[0].flip(0)
-        """The view that pictures show: red, green and blue times alpha, and alpha, dimensionless,
-        shape [R, R, 4]; rows point up."""
+        # The view that pictures show; rows point up.
+        self._target_picture = self._shown.pictures[0].flip(0)
         self._appearance = Appearance(config.sigma, config.anisotropy, config.opacity)
         self.schedule = ViewSchedule(
             len(target.training.pictures),
@@ -190,7 +186,10 @@ class Morphogenesis3D(GrowthTask[Morphogenesis3DConfig]):
         """Which views, how much blur and which backgrounds an iteration has."""
         self._rule: NPARule | None = None
 
-    def for_rule(self, rule: NPARule) -> Morphogenesis3D:
+    def _remade(self, config: Morphogenesis3DConfig) -> Self:
+        return type(self)(config, target=self.target, device=self.target_picture.device)
+
+    def for_rule(self, rule: NPARule) -> Self:
         """Return the task that sees what a rule reads out of the states; all else is shared.
 
         Raises:
@@ -201,9 +200,7 @@ class Morphogenesis3D(GrowthTask[Morphogenesis3DConfig]):
                 f"the rule must read out {OUTPUTS} numbers of a state, or none, got readout_dim="
                 f"{rule.readout_dim}: it was made for another task"
             )
-        seen = copy.copy(self)
-        seen._rule = rule if rule.readout_dim else None
-        return seen
+        return self._with(_rule=rule if rule.readout_dim else None)
 
     @property
     def rule_shape(self) -> dict[str, Any]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -17,7 +16,7 @@ from npa_envs.checks import check_non_negative, check_positive, check_seed, chec
 from npa_envs.errors import NPAError
 from npa_envs.ops import splat, world_mean
 from npa_envs.rule.rule import NPARule
-from npa_envs.tasks.base import ParticleTask, TaskConfig, check_goal
+from npa_envs.tasks.base import Frame, ParticleTask, TaskConfig, Worlds, check_goal
 from npa_envs.tasks.seeds import drawn_indices
 from npa_envs.tasks.targets.clouds import (
     PointClouds,
@@ -93,7 +92,7 @@ SIGMA = 0.7
 
 
 class PointClassification(ParticleTask[PointClassificationConfig]):
-    """The classification task of arXiv 2601.16096; satisfies `PictureTask` and `GoalTask`.
+    """The classification task of arXiv 2601.16096; its worlds have goals.
 
     The goal of a world is its cloud's class. A rule's read-out gives one number for each class;
     without a rule, or where it has no read-out, these are the last channels of the states.
@@ -104,11 +103,9 @@ class PointClassification(ParticleTask[PointClassificationConfig]):
         split: Which clouds worlds are made of; those of "test" are not varied.
     """
 
-    aligned = False
-    """There is no picture to match."""
-
     metric_name = "mean squared error to the class"
-    """What `metric` is."""
+    trial_name = "share of particles that are wrong"
+    classifies = True
 
     def __init__(
         self,
@@ -123,6 +120,9 @@ class PointClassification(ParticleTask[PointClassificationConfig]):
         self._device = torch.device(device)
         self._rule: NPARule | None = None
         self._goal: Tensor | None = None
+        # There is no picture to match.
+        side = config.resolution
+        self._target_picture = torch.zeros(side, side, 4, device=self._device)
 
     @cached_property
     def clouds(self) -> PointClouds:
@@ -149,9 +149,9 @@ class PointClassification(ParticleTask[PointClassificationConfig]):
         return clouds
 
     @property
-    def target_picture(self) -> Tensor:
-        """Nothing: there is no picture to match; shape [R, R, 4]."""
-        return torch.zeros(self.config.resolution, self.config.resolution, 4, device=self._device)
+    def frame(self) -> Frame:
+        """Where viewers look: at [0, 1]²."""
+        return Frame((0.5, 0.5), 0.6)
 
     @property
     def pixel_size(self) -> float:
@@ -178,34 +178,30 @@ class PointClassification(ParticleTask[PointClassificationConfig]):
         vars(other).pop("clouds", None)
         return other
 
-    def toward(self, goal: Tensor) -> Self:
+    def held_out(self) -> Self:
+        """Return the task with the clouds of "test": those of "train" may be known by heart."""
+        return self.on("test")
+
+    def _remade(self, config: PointClassificationConfig) -> Self:
+        return type(self)(config, device=self._device, split=self.split)
+
+    def toward(self, goal: Tensor | None) -> Self:
         """Return the task with loss and metric for worlds of these classes, int64, shape [B].
 
         Raises:
             NPAError: They are no such tensor; or, on a CPU, there is no such class.
         """
+        if goal is None:
+            return self
         check_goal(goal, self.config.class_count)
         return self._with(_goal=goal)
 
     def seed(
         self, world_count: int, *, generator: Randomness, device: str | torch.device = "cpu"
-    ) -> tuple[Tensor, Tensor]:
-        """Return fresh worlds without their classes; as `seed_with_goals`."""
-        return self.seed_with_goals(world_count, generator=generator, device=device)[:2]
+    ) -> Worlds:
+        """Return random clouds, varied as the configuration says, all states zero, and classes.
 
-    def seed_with_goals(
-        self, world_count: int, *, generator: Randomness, device: str | torch.device = "cpu"
-    ) -> tuple[Tensor, Tensor, Tensor]:
-        """Return random clouds, varied as the configuration says, with all states zero.
-
-        Args:
-            world_count: Worlds B.
-            generator: Source of randomness, on `device`.
-            device: Where the worlds are made: that of the task, or they are copied there.
-
-        Returns:
-            Positions [length units], shape [B, N, 2]; states, dimensionless, shape [B, N, C]; and
-            classes, int64, shape [B].
+        They are made on the device of the task and copied to `device`.
         """
         config, clouds = self.config, self.clouds
         chosen = drawn_indices(len(clouds.label), world_count, generator, torch.device(device))
@@ -221,21 +217,16 @@ class PointClassification(ParticleTask[PointClassificationConfig]):
             )
         return x, x.new_zeros(*x.shape[:2], config.state_dim), goal
 
-    def damage(self, x: Tensor, s: Tensor, generator: Randomness) -> tuple[Tensor, Tensor]:
-        """Return the worlds as they are: who forgets its class cannot be told it again."""
-        return x, s
-
-    def damage_with_goals(
-        self, x: Tensor, s: Tensor, goal: Tensor, generator: Randomness
-    ) -> tuple[Tensor, Tensor, Tensor]:
+    def damage(self, x: Tensor, s: Tensor, goal: Tensor | None, generator: Randomness) -> Worlds:
         """Return some worlds as other clouds, with their states as they were, and the classes."""
         share = self.config.mutated_share
-        if share == 0.0:
+        if goal is None or share == 0.0:
             return x, s, goal
-        other, _, other_goal = self.seed_with_goals(len(x), generator=generator, device=x.device)
+        other, _, other_goal = self.seed(len(x), generator=generator, device=x.device)
         single = x.new_empty(0, dtype=torch.float32)
         mutated = uniform_draws(generator, (len(x), 1), single)[:, 0] < share
         x = torch.where(mutated[:, None, None], other.to(x.dtype), x)
+        assert other_goal is not None, "clouds come with their classes"
         return x, s, torch.where(mutated, other_goal, goal)
 
     def outputs(self, s: Tensor) -> Tensor:
@@ -300,6 +291,14 @@ class PointClassification(ParticleTask[PointClassificationConfig]):
         """Return each world's mean squared error, shape [B]."""
         return world_mean(self.errors(s)[..., None])[:, 0]
 
+    def trial_metric(self, x: Tensor, s: Tensor) -> Tensor:
+        """Return the share of each world's particles that are wrong, shape [B]."""
+        return self.mistakes(s).mean(1)
+
+    def colours(self, s: Tensor) -> Tensor:
+        """Return each particle's colour, its class's; [B, N, 3]."""
+        return class_colours(self.outputs(s))
+
     def overflows(self, s: Tensor) -> Tensor:
         """Return each particle's mean |s − clip(s, −1, 1)|, [B, N]."""
         return channel_mean((s - s.clamp(-1.0, 1.0)).abs())
@@ -326,7 +325,7 @@ class PointClassification(ParticleTask[PointClassificationConfig]):
         """Return each world's picture, coloured by class: colour sums, density, [B, R, R, 4]."""
         return splat(
             x,
-            class_colours(self.outputs(s)),
+            self.colours(s),
             resolution=self.config.resolution,
             pixel_size=self.pixel_size,
             sigma=SIGMA,
@@ -339,10 +338,8 @@ class PointClassification(ParticleTask[PointClassificationConfig]):
         return {name: value for name, value in vars(self).items() if name != "clouds"}
 
     def _with(self, **fields: object) -> Self:
-        bound = copy.copy(self)
-        vars(bound).update({"clouds": self.clouds} if "clouds" in vars(self) else {})
-        vars(bound).update(fields)
-        return bound
+        known = {"clouds": self.clouds} if "clouds" in vars(self) else {}
+        return super()._with(**(known | fields))
 
 
 PICTURE_MARGIN = 0.0625

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import torch
 from torch import Tensor
@@ -21,7 +21,7 @@ from npa_envs.checks import (
 from npa_envs.errors import NPAError, shown
 from npa_envs.ops import periodic_splat
 from npa_envs.rule.rule import COLOUR_OFFSET
-from npa_envs.tasks.base import ParticleTask, TaskConfig, shares_of_loss
+from npa_envs.tasks.base import ParticleTask, TaskConfig, Worlds, shares_of_loss
 from npa_envs.tasks.damage import random_particle, wipe_state
 from npa_envs.tasks.losses.texture import (
     DEFAULT_LOSS,
@@ -131,7 +131,7 @@ DRAWINGS = 16
 
 
 class Texture(ParticleTask[TextureConfig]):
-    """The texture task of arXiv 2601.16096, with its loss; satisfies `PictureTask`.
+    """The texture task of arXiv 2601.16096, with its loss.
 
     Args:
         config: Target, world, rule size and loss.
@@ -141,9 +141,6 @@ class Texture(ParticleTask[TextureConfig]):
     Raises:
         NPAError: The target cannot be loaded.
     """
-
-    aligned = False
-    """A texture may lie anywhere: pixels are not compared one by one."""
 
     def __init__(
         self,
@@ -172,8 +169,8 @@ class Texture(ParticleTask[TextureConfig]):
         """What was told; ε is the one that rules are trained at."""
         self.target = target
         """What worlds are to look like."""
-        self.target_picture = target.picture.to(device)
-        """Its picture: colour sums and density, dimensionless, shape [R, R, 4]."""
+        self._target_picture = target.picture.to(device)
+        self.metric_name = config.loss
         self.pixel_size: float = config.box_size * (target.coverage / config.particle_count) ** 0.5
         """Side of the square that a particle fills [length units]: all together have the target's
         mean density."""
@@ -183,10 +180,8 @@ class Texture(ParticleTask[TextureConfig]):
         """Sides of the periodic box [length units]."""
         return (self.config.box_size, self.config.box_size)
 
-    @property
-    def metric_name(self) -> str:
-        """The texture loss that worlds are measured by."""
-        return self.config.loss
+    def _remade(self, config: TextureConfig) -> Self:
+        return type(self)(config, target=self.target, device=self.target_picture.device)
 
     @property
     def rule_shape(self) -> dict[str, Any]:
@@ -198,15 +193,15 @@ class Texture(ParticleTask[TextureConfig]):
         count = self.config.particle_count
         return uniform_box(world_count, count, self.box, generator=generator, device=device)
 
-    def damage(self, x: Tensor, s: Tensor, generator: Randomness) -> tuple[Tensor, Tensor]:
+    def damage(self, x: Tensor, s: Tensor, goal: Tensor | None, generator: Randomness) -> Worlds:
         """Return the worlds with the states in a disk around one random particle set to zero."""
         if self.config.damage_radius == 0.0:
-            return x, s
+            return x, s, goal
         side = self.config.box_size
         away = x - random_particle(x, generator)[:, None]
         away = away - side * (away / side).round()
         centre = torch.zeros_like(away[:, 0])
-        return x, wipe_state(away, s, centre=centre, radius=self.config.damage_radius)
+        return x, wipe_state(away, s, centre=centre, radius=self.config.damage_radius), goal
 
     def picture(self, x: Tensor, s: Tensor) -> Tensor:
         """Return the picture of each world: colour sums and density, shape [B, R, R, 4]."""

@@ -8,7 +8,7 @@ from typing import Any
 
 from npa_envs.devices import check_device
 from npa_envs.errors import DivergedError, NPAError, shown
-from npa_envs.tasks.base import PictureTask, Task
+from npa_envs.tasks.base import ParticleTask, Task
 from npa_envs.tasks.morphogenesis2d import Morphogenesis2DTrainConfig
 from npa_envs.tasks.train_config import JointTrainConfig, TrainConfig
 from npa_envs.training.joint import JointRules, train_together
@@ -24,7 +24,7 @@ __all__ = [
     "JointTrainConfig",
     "JsonlLog",
     "Morphogenesis2DTrainConfig",
-    "PictureTask",
+    "ParticleTask",
     "RunFolder",
     "Task",
     "TaskEntry",

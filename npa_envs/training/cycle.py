@@ -15,13 +15,7 @@ from torch import Tensor
 import npa_envs.world.rollout
 from npa_envs.errors import NPAError
 from npa_envs.rule.rule import NPARule
-from npa_envs.tasks.base import (
-    GoalTask,
-    ScheduledTask,
-    Task,
-    seed_worlds,
-    task_for_rule,
-)
+from npa_envs.tasks.base import Task, Worlds
 from npa_envs.tasks.train_config import TrainConfig
 from npa_envs.training.iteration import EagerIteration, GraphedIteration, Rollout
 from npa_envs.training.meter import LossMeter
@@ -62,7 +56,7 @@ class TrainingCycle:
         ranks: Ranks | None = None,
         by_world: bool = False,
     ) -> None:
-        self.task = task_for_rule(task, rule)
+        self.task = task.for_rule(rule)
         """The task, as it is for worlds of this rule."""
         _check_varied_eps(self.task, rule, config)
         self._config = config
@@ -145,8 +139,7 @@ class TrainingCycle:
         config, batch = self._config, self.batch
         lo, hi = config.steps
         steps = int(torch.randint(lo, hi, (), generator=self.random.schedule))
-        if isinstance(self.task, ScheduledTask):
-            self.task.begin(iteration)
+        self.task.begin(iteration)
         self._draw()
         if not config.ages and iteration % config.seed_interval == 0:
             self._begin_anew(self._fresh[iteration // config.seed_interval % len(self._fresh)])
@@ -240,15 +233,10 @@ class TrainingCycle:
         if goal is not None:
             self.batch.aim(goal)
 
-    def _damaged(
-        self, x: Tensor, s: Tensor, goal: Tensor | None, hit: Tensor
-    ) -> tuple[Tensor, Tensor, Tensor | None]:
+    def _damaged(self, x: Tensor, s: Tensor, goal: Tensor | None, hit: Tensor) -> Worlds:
         """Return worlds of the pool damaged, those that are hit, bool, shape [B]."""
         worlds, whole = self.random.worlds, (x, s, goal)
-        if isinstance(self.task, GoalTask) and goal is not None:
-            x, s, goal = self.task.damage_with_goals(x, s, goal, worlds)
-        else:
-            x, s = self.task.damage(x, s, worlds)
+        x, s, goal = self.task.damage(x, s, goal, worlds)
         if self._config.damage_share < 1.0:
             x, s = (
                 torch.where(hit[:, None, None], hurt, old)
@@ -288,9 +276,9 @@ class TrainingCycle:
         self._lost.zero_()
         self.optimiser.prepare_gradients()
 
-    def _seeds(self, world_count: int, random: Randomness) -> tuple[Tensor, Tensor, Tensor | None]:
+    def _seeds(self, world_count: int, random: Randomness) -> Worlds:
         dtype = self._config.torch_dtype
-        x, s, goal = seed_worlds(self.task, world_count, generator=random, device=random.device)
+        x, s, goal = self.task.seed(world_count, generator=random, device=random.device)
         lo, hi = map(math.log, self._config.vary_eps)
         if (lo, hi) != (0.0, 0.0):
             # Scaling positions and ε alike is a symmetry: a larger ε is a smaller disk.

@@ -12,7 +12,7 @@ from torch import nn
 
 from npa_envs.errors import DivergedError, shown
 from npa_envs.rule.rule import NPARule
-from npa_envs.tasks.base import Task, task_for_rule, task_toward
+from npa_envs.tasks.base import Task
 
 
 def divergence_error(
@@ -51,7 +51,7 @@ def bad_worlds(task: Task, rule: NPARule, snapshot: dict[str, Any]) -> list[int]
     rule = copy.deepcopy(rule).cpu()
     trained = [parameter for parameter in rule.parameters() if parameter.requires_grad]
     nn.utils.vector_to_parameters(snapshot["parameters"], trained)
-    task = task_for_rule(task, rule)
+    task = task.for_rule(rule)
     x, s, goal = snapshot["x"], snapshot["s"], snapshot.get("goal")
     found = []
     for world in range(len(x)):
@@ -59,7 +59,7 @@ def bad_worlds(task: Task, rule: NPARule, snapshot: dict[str, Any]) -> list[int]
         finite = bool(torch.isfinite(x[one]).all() and torch.isfinite(s[one]).all())
         if finite:
             with torch.no_grad():
-                aimed = task_toward(task, None if goal is None else goal[one])
+                aimed = task.toward(None if goal is None else goal[one])
                 total, parts = aimed.loss(x[one], s[one], torch.zeros_like(x[one][..., 0]))
             finite = all(bool(torch.isfinite(v).all()) for v in (total, *parts.values()))
         if not finite:

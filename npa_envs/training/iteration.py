@@ -12,7 +12,7 @@ from torch import Tensor
 
 import npa_envs.world.rollout
 from npa_envs.rule.rule import LIFE, NPARule, fate_parameters
-from npa_envs.tasks.base import Task, coded_states, task_toward
+from npa_envs.tasks.base import Task
 from npa_envs.tasks.damage import counted_together
 from npa_envs.tasks.train_config import TrainConfig
 from npa_envs.training.randomness import registered
@@ -91,7 +91,7 @@ class EagerIteration:
     ) -> None:
         self.goal = None if goal is None else goal.clone()
         """Goals of the worlds, int64, shape [B], or None; filled like `x0`."""
-        task = task_toward(task, self.goal)
+        task = task.toward(self.goal)
         self.x0, self.s0 = x.clone(), s.clone()
         """Worlds before the rollout."""
         self.x, self.s = torch.empty_like(x), torch.empty_like(s)
@@ -131,7 +131,7 @@ class EagerIteration:
 
     def _forward_backward(self, steps: int) -> None:
         # Through these states codes learn; the pool holds them as they were.
-        s0 = coded_states(self._task, self.s0)
+        s0 = self._task.coded(self.s0)
         if s0 is not self.s0:
             self.s0.copy_(s0.detach())
         x, s, path_length = self._rollout(

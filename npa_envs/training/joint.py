@@ -16,7 +16,7 @@ from npa_envs.rule.files import load_rule, save_rule
 from npa_envs.rule.rule import NPARule
 from npa_envs.tasks.base import differing_fields
 from npa_envs.tasks.co_morphogenesis2d import CoMorphogenesis2D, CoMorphogenesis2DConfig
-from npa_envs.tasks.train_config import JointTrainConfig, TrainConfig
+from npa_envs.tasks.train_config import TrainConfig
 from npa_envs.training.iteration import TrainingOptions
 from npa_envs.training.trainer import Trainer, TrainResult, rule_like, take_options
 from npa_envs.world.species import rollout_species
@@ -58,11 +58,10 @@ class _JointTrainer(Trainer):
     ) -> None:
         self._species = task
         self._given = rules
-        self._frozen: tuple[int, ...] = ()
-        if isinstance(config, JointTrainConfig):
-            self._frozen = config.frozen
-            if rules is None and config.initial_rules and not resume:
-                self._given = [load_rule(source) for source in config.initial_rules]
+        self._frozen: tuple[int, ...] = getattr(config, "frozen", ())
+        begin_with: tuple[str, ...] = getattr(config, "initial_rules", ())
+        if rules is None and begin_with and not resume:
+            self._given = [load_rule(source) for source in begin_with]
         super().__init__(
             task,
             config,

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import torch
 
@@ -14,10 +14,9 @@ from npa_envs.files import parse_json
 from npa_envs.rule.codes import Codes
 from npa_envs.rule.files import rule_file, rule_metadata
 from npa_envs.rule.rule import NPARule
-from npa_envs.tasks.base import PictureTask, task_for_rule
+from npa_envs.tasks.base import Task
 from npa_envs.tasks.many_pictures import named_targets
 from npa_envs.tasks.morphogenesis2d import Morphogenesis2D, Morphogenesis2DConfig
-from npa_envs.tasks.point_classification import PointClassification
 from npa_envs.training.overrides import override
 from npa_envs.training.presets import preset, task_entry
 
@@ -26,11 +25,14 @@ from npa_envs.training.presets import preset, task_entry
 class TrainedTask:
     """The task of a rule, and whether its target is the one that the rule was trained on."""
 
-    task: PictureTask
+    task: Task
     """The task."""
 
     doubt: str | None
     """Why figures against the target would mean nothing; None where they do mean something."""
+
+    task_name: str
+    """Its name in the table of tasks."""
 
 
 def task_of_rule(
@@ -89,22 +91,21 @@ def task_of_rule(
         config = override(config, targets=(), target=_one_of(config.task, rule.codes, chosen))
     doubt = None if told or chosen else "its file does not say what it grows"
     try:
-        task = entry.make(config.task, device)
-        if isinstance(task, PointClassification):
-            # What a rule was trained on it may know by heart.
-            task = task.on("test")
-        return TrainedTask(task_for_rule(task, rule), doubt)
+        # What a rule was trained on it may know by heart.
+        task = entry.make(config.task, device).held_out()
+        return TrainedTask(task.for_rule(rule), doubt, task_name)
     except NPAError as error:
         if chosen or not entry.targets():
             raise
         stand_in = override(config, target=entry.targets()[0])
         task = entry.make(stand_in.task, device)
-        if isinstance(task, Morphogenesis2D) and rule.codes is not None:
+        if rule.codes is not None:
+            target = cast(Morphogenesis2D, task).target
             task = Morphogenesis2D(
-                stand_in.task, target=replace(task.target, name=rule.codes.names[0]), device=device
+                stand_in.task, target=replace(target, name=rule.codes.names[0]), device=device
             )
-        task = task_for_rule(task, rule)
-        return TrainedTask(task, f"its target cannot be loaded: {error}")
+        doubt = f"its target cannot be loaded: {error}"
+        return TrainedTask(task.for_rule(rule), doubt, task_name)
 
 
 def tasks_of_codes(
@@ -121,12 +122,9 @@ def tasks_of_codes(
     Raises:
         NPAError: As for `task_of_rule`.
     """
-    found: list[Morphogenesis2D] = []
-    for name in () if rule.codes is None else rule.codes.names:
-        task = task_of_rule(source, rule, device, **(fields | {"target": name})).task
-        assert isinstance(task, Morphogenesis2D), "only these have codes"
-        found.append(task)
-    return found
+    names = () if rule.codes is None else rule.codes.names
+    found = [task_of_rule(source, rule, device, **(fields | {"target": name})) for name in names]
+    return [cast(Morphogenesis2D, trained.task) for trained in found]
 
 
 def _one_of(task: Morphogenesis2DConfig, codes: Codes, chosen: bool) -> str:

@@ -20,8 +20,7 @@ from npa_envs.errors import DivergedError, NPAError, shown
 from npa_envs.files import write_text
 from npa_envs.rule.files import load_rule, preset_rules, save_rule
 from npa_envs.rule.rule import NPARule, dividing, with_codes
-from npa_envs.tasks.base import GoalTask, Task, differing_fields, untrained_rule
-from npa_envs.tasks.many_pictures import ManyPictures
+from npa_envs.tasks.base import Task, differing_fields, untrained_rule
 from npa_envs.tasks.train_config import TrainConfig
 from npa_envs.training.batch_picture import write_batch_picture
 from npa_envs.training.checkpoint import (
@@ -246,7 +245,7 @@ class Trainer:
     def kept_rule(self) -> NPARule:
         """The rule as a run keeps it."""
         rule = self.rule
-        if isinstance(self.task, ManyPictures) and self.config.task.encoder:
+        if rule.codes is not None and rule.codes.encoder is not None:
             # The table has what the encoder said in the last iteration, before its last step.
             rule = copy.deepcopy(rule)
             self.task.for_rule(rule)
@@ -346,9 +345,7 @@ class Trainer:
         with torch.no_grad():
             picture = self._cycle.task.picture(self._cycle.batch.x, self._cycle.batch.s)
         # Worlds that have goals of their own have no picture in common.
-        target = (
-            None if isinstance(self.task, GoalTask) else getattr(self.task, "target_picture", None)
-        )
+        target = getattr(self.task, "target_picture", None) if self.pool.goal is None else None
         if target is not None:
             picture = torch.cat((target[None].to(picture), picture))
         path = self.folder.picture(self.iteration)

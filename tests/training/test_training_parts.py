@@ -165,7 +165,7 @@ def test_rules_that_know_no_direction_have_one_matrix_more():
 def make_iteration(config, kind=EagerIteration, device="cpu"):
     task = CircleTask()
     rule = task.make_rule(torch.Generator().manual_seed(1)).to(device, config.torch_dtype)
-    x, s = task.seed(
+    x, s, _ = task.seed(
         config.world_count,
         generator=torch.Generator(device).manual_seed(2),
         device=torch.device(device),
@@ -258,7 +258,7 @@ def test_a_parameter_outside_the_loss_gets_a_zero_gradient(tmp_path):
     task = CircleTask()
     rule = task.make_rule(torch.Generator().manual_seed(1))
     rule.unused = nn.Parameter(torch.ones(2))
-    x, s = task.seed(2, generator=torch.Generator(), device=torch.device("cpu"))
+    x, s, _ = task.seed(2, generator=torch.Generator(), device=torch.device("cpu"))
     config = circle_config(tmp_path)
     iteration = EagerIteration(task, rule, config, x, s, torch.Generator(), plain_rollout)
     rule.unused.grad.fill_(5.0)
