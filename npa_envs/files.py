@@ -34,12 +34,7 @@ NEARLY_FULL_BYTES = 64 * 1024
 
 
 def checked_path(path: str | Path) -> Path:
-    """Return a path as pathlib's own.
-
-    Raises:
-        NPAError: It is neither text nor a path, or the system cannot write it, as it holds a zero
-            byte.
-    """
+    """Return a path as pathlib's own."""
     if not isinstance(path, str | os.PathLike):
         raise NPAError(f"a path must be text or a pathlib.Path, got {shown(path)}")
     try:
@@ -52,11 +47,7 @@ def checked_path(path: str | Path) -> Path:
 
 
 def home_path(path: str | Path) -> Path:
-    """Return a path in which a `~` at the beginning is the user's home.
-
-    Raises:
-        NPAError: As for `checked_path`.
-    """
+    """Return a path in which a `~` at the beginning is the user's home."""
     return Path(os.path.expanduser(checked_path(path)))
 
 
@@ -67,9 +58,6 @@ def open_regular(path: str | Path, *, limit: int, what: str = "the file") -> IO[
         path: The file.
         limit: Its largest size [bytes].
         what: What errors call it.
-
-    Raises:
-        NPAError: There is no such file, it may not be read, is no regular one or larger than that.
     """
     path = checked_path(path)
     try:
@@ -91,11 +79,7 @@ def open_regular(path: str | Path, *, limit: int, what: str = "the file") -> IO[
 
 
 def check_regular(path: str | Path, *, limit: int, what: str = "the file") -> None:
-    """Check a file that a library reads by its path, as `open_regular` does.
-
-    Raises:
-        NPAError: As there.
-    """
+    """Check a file that a library reads by its path, as `open_regular` does."""
     open_regular(path, limit=limit, what=what).close()
 
 
@@ -106,9 +90,6 @@ def read_bytes(path: str | Path, *, limit: int, what: str = "the file") -> bytes
         path: The file.
         limit: Its largest size [bytes].
         what: What errors call it.
-
-    Raises:
-        NPAError: As for `open_regular`.
     """
     with open_regular(path, limit=limit, what=what) as file:
         try:
@@ -119,11 +100,7 @@ def read_bytes(path: str | Path, *, limit: int, what: str = "the file") -> bytes
 
 
 def parse_json(text: str | bytes) -> Any:
-    """Return the value of a JSON text.
-
-    Raises:
-        NPAError: It is none, is nested too deeply, or has numbers of thousands of digits.
-    """
+    """Return the value of a JSON text."""
     try:
         return json.loads(text)
     except (ValueError, RecursionError) as error:
@@ -136,9 +113,6 @@ def read_json(path: str | Path, *, limit: int = 16 * _MIB) -> Any:
     Args:
         path: The file.
         limit: Its largest size [bytes].
-
-    Raises:
-        NPAError: As for `open_regular` and `parse_json`.
     """
     return parse_json(read_bytes(path, limit=limit))
 
@@ -152,9 +126,6 @@ def check_torch_archive(file: IO[bytes], *, checksums: bool = True) -> None:
     Args:
         file: It, open; where it stands afterwards is not said.
         checksums: Whether to compare those too, which torch does not look at.
-
-    Raises:
-        NPAError: It is no archive, is damaged, or declares more than it holds.
     """
     try:
         held = file.seek(0, os.SEEK_END)
@@ -197,10 +168,6 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
 
     Args:
         path: The file to write; an existing one is replaced, and its mode is kept.
-
-    Raises:
-        NPAError: The folder is missing or cannot be written to, `path` is a folder, a pipe or a
-            device, the disk is full, or the system refuses the file for another reason.
     """
     given = checked_path(path)
     target = Path(os.path.realpath(given))
@@ -236,9 +203,6 @@ def made_folder(path: Path) -> Iterator[None]:
 
     Args:
         path: The folder.
-
-    Raises:
-        OSError: It cannot be created.
     """
     missing = [folder for folder in (path, *path.parents) if not folder.exists()]
     try:
@@ -276,9 +240,6 @@ def write_bytes(path: str | Path, data: bytes) -> None:
     Args:
         path: The file to write; an existing one is replaced.
         data: Its new content.
-
-    Raises:
-        NPAError: As for `atomic_path`.
     """
     with atomic_path(path) as temporary:
         temporary.write_bytes(data)
@@ -290,9 +251,6 @@ def write_text(path: str | Path, text: str) -> None:
     Args:
         path: The file to write; an existing one is replaced.
         text: Its new content.
-
-    Raises:
-        NPAError: As for `atomic_path`.
     """
     write_bytes(path, text.encode("utf-8"))
 

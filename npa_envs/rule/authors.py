@@ -90,9 +90,6 @@ def read_state_dict(data: bytes) -> RuleParts:
     """Read the authors' state dict.
 
     The space dimension and the number of channels follow from the shapes.
-
-    Raises:
-        NPAError: This is not such a file.
     """
     state = _unpickle(data)
     if state.keys() & _EQUIVARIANT_NAMES:
@@ -147,11 +144,7 @@ def _read_equivariant_state(state: Mapping[Any, Any], *, has_checksum: bool) -> 
 def _equivariant_parts(
     tensors: Mapping[str, Tensor], numbers: Mapping[Any, Any], *, has_checksum: bool = False
 ) -> RuleParts:
-    """Return an equivariant rule of 2D worlds from its tensors, by their names in the web demo.
-
-    Raises:
-        NPAError: Their shapes do not agree.
-    """
+    """Return an equivariant rule of 2D worlds from its tensors, by their names in the web demo."""
     mixing, first, second = (tensors[name] for name in ("W_hidden", "w1.weight", "w2.weight"))
     state_dim, mixed = mixing.shape[0] - 1, mixing.shape[1]
     hidden_dim = first.shape[0]
@@ -196,11 +189,6 @@ def read_demo_json(data: bytes, name: str | None) -> RuleParts:
 
     Args:
         data: The content of the JSON file.
-        name: The rule's name in it, or its number in a stack, from 0; None where the file holds one
-            rule only.
-
-    Raises:
-        NPAError: This is not such a file, or it has no rule of that name.
     """
     entry, place = _demo_rule(parse_json(data), name)
     if "W_hidden" in entry:
@@ -236,12 +224,7 @@ def read_demo_json(data: bytes, name: str | None) -> RuleParts:
 
 
 def _demo_rule(content: Any, name: str | None) -> tuple[Mapping[str, Any], int | None]:
-    """Return the entry of one rule, and which rule of a stack it is.
-
-    Args:
-        content: What the JSON file says.
-        name: The rule's name, or its number in a stack; None where there is one only.
-    """
+    """Return the entry of one rule, and which rule of a stack it is."""
     if isinstance(content, dict) and isinstance(content.get("w1.weight"), dict):
         return content, _number_in_stack(content["w1.weight"], name)
     names = sorted(content) if isinstance(content, dict) else []
@@ -309,14 +292,8 @@ def save_demo_json(
     `load_rule("models.json#name")` gives each of them back.
 
     Args:
-        rules: Name -> rule; the demo has 2D rules without read-out that perceive all the paper's
-            fields and nothing else.
         path: The file to write, ending in `.json`; an existing one is replaced.
         particle_counts: With how many particles a rule starts there; 4096 where nothing is said.
-
-    Raises:
-        NPAError: There are no rules, a rule is not of the demo's kind, a weight is not finite in
-            float32, the suffix is another one, or the file cannot be written.
     """
     path = checked_path(path)
     if path.suffix != ".json":

@@ -201,10 +201,7 @@ def _is_utf8(text: str) -> bool:
 
 
 def _with_sorted_metadata(file: bytes) -> bytes:
-    """Return a safetensors file whose metadata is in order, so that equal rules make equal files.
-
-    The library writes it in an order that changes from call to call.
-    """
+    """Return a safetensors file whose metadata is in order, so that equal rules make equal files."""
     size = int.from_bytes(file[:8], "little")
     header = json.loads(file[8 : 8 + size])
     header["__metadata__"] = dict(sorted(header["__metadata__"].items()))
@@ -230,11 +227,7 @@ def rule_metadata(path: str | Path) -> dict[str, str]:
 
 
 def rule_digest(rule: NPARule) -> str:
-    """Return 16 hexadecimal digits by which the weights of a rule are known: SHA-256 of them.
-
-    Args:
-        rule: The rule, on any device.
-    """
+    """Return 16 hexadecimal digits by which the weights of a rule are known: SHA-256 of them."""
     found = hashlib.sha256()
     for weight in rule.state_dict().values():
         found.update(weight.cpu().numpy().tobytes())

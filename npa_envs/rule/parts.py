@@ -29,9 +29,6 @@ def check_precision(weights: Mapping[str, Tensor]) -> None:
 
     Args:
         weights: Weights by name.
-
-    Raises:
-        NPAError: They are of another dtype, or of several.
     """
     dtypes = {tensor.dtype for tensor in weights.values()}
     if len(dtypes) != 1 or not dtypes <= {torch.float32, torch.float64}:
@@ -47,9 +44,6 @@ def check_finite(weights: Mapping[str, Tensor]) -> None:
 
     Args:
         weights: Weights by name.
-
-    Raises:
-        NPAError: A number is NaN or infinite.
     """
     for name, tensor in weights.items():
         bad = int((~torch.isfinite(tensor)).sum())

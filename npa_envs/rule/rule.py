@@ -572,11 +572,7 @@ class NPARule(nn.Module):
 
 
 def _checked_dead_zone(value: Any, equivariant: bool) -> float:
-    """Return a rule's dead zone as a float.
-
-    Raises:
-        NPAError: It is no finite number of at least 0, or an equivariant rule is to have one.
-    """
+    """Return a rule's dead zone as a float."""
     zone = checked_number("dead_zone", value)
     if not (0.0 <= zone < math.inf):
         raise NPAError(
@@ -612,7 +608,6 @@ def with_codes(rule: NPARule, untrained: NPARule) -> NPARule:
     What is new, the columns of the codes, stays as it is, and so do further hidden units.
 
     Args:
-        rule: A rule without codes.
         untrained: A rule with codes, otherwise of the same shape, but for as many hidden units or
             more; it is changed where the shapes fit.
 
@@ -642,11 +637,7 @@ def with_codes(rule: NPARule, untrained: NPARule) -> NPARule:
 
 
 def dividing(rule: NPARule) -> NPARule:
-    """Return a copy of a rule whose particles also divide and die, with untrained odds.
-
-    Raises:
-        NPAError: As `NPARule` of rules that divide.
-    """
+    """Return a copy of a rule whose particles also divide and die, with untrained odds."""
     made = NPARule(**rule.hyper_parameters() | {"divides": True}).to(rule.hidden.weight)
     made.load_state_dict(made.state_dict() | rule.state_dict())
     return made
@@ -659,11 +650,7 @@ def fate_parameters(rules: nn.Module) -> list[nn.Parameter]:
 
 
 def check_rule(rule: Any) -> None:
-    """Check that something is a rule; one that `torch.compile` has wrapped is one too.
-
-    Raises:
-        NPAError: It is none.
-    """
+    """Check that something is a rule; one that `torch.compile` has wrapped is one too."""
     if not isinstance(rule, NPARule) and not isinstance(getattr(rule, "_orig_mod", None), NPARule):
         raise NPAError(
             f"rule must be an NPARule, got {type(rule).__name__}: load it with npa_envs.load_rule"

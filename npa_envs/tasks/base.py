@@ -162,13 +162,7 @@ class ParticleTask(Generic[ConfigT]):
     def seed(
         self, world_count: int, *, generator: Randomness, device: str | torch.device = "cpu"
     ) -> Worlds:
-        """Return fresh worlds: positions of `places`, all states zero, without goals.
-
-        Args:
-            world_count: Worlds B.
-            generator: Source of all that is drawn, on `device`.
-            device: Where the worlds are made.
-        """
+        """Return fresh worlds: positions of `places`, all states zero, without goals."""
         x = self.places(world_count, generator, torch.device(device))
         return x, x.new_zeros(*x.shape[:2], self.config.state_dim), None
 
@@ -294,11 +288,7 @@ def check_goal(goal: Tensor, count: int) -> None:
     """Check the goals of worlds; their range only on a CPU, as no task may wait for a CUDA device.
 
     Args:
-        goal: What is to be the worlds' goals, int64, shape [B].
         count: How many goals there are to choose from.
-
-    Raises:
-        NPAError: It is no such tensor, or there is no such goal.
     """
     if not isinstance(goal, Tensor) or goal.dtype != torch.int64 or goal.ndim != 1:
         came = f"{goal.dtype} {tuple(goal.shape)}" if isinstance(goal, Tensor) else shown(goal)
@@ -331,7 +321,6 @@ def untrained_rule(generator: torch.Generator, **hyper_parameters: Any) -> NPARu
     """Return a rule on the CPU whose weights are drawn from `generator` alone.
 
     Args:
-        generator: On the CPU; torch's own randomness is left as it is.
         hyper_parameters: What `NPARule` takes.
     """
     with torch.random.fork_rng(devices=()):

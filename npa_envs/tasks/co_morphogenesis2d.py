@@ -41,11 +41,7 @@ class CoMorphogenesis2DConfig:
     """Distance between the centres of neighbouring seeds, which lie in a row [length units]."""
 
     def __post_init__(self) -> None:
-        """Check every field.
-
-        Raises:
-            NPAError: There are fewer than two species, they do not agree, or the distance is wrong.
-        """
+        """Check every field."""
         species = self.species if isinstance(self.species, tuple | list) else ()
         if len(species) < 2 or not all(isinstance(s, Morphogenesis2DConfig) for s in species):
             came = ", ".join(type(config).__name__ for config in species) or "nothing"
@@ -76,10 +72,6 @@ class CoMorphogenesis2D(ParticleTask[Any]):
 
     Worlds hold the particles of all species, one species after the other.
 
-    Args:
-        config: What each species grows, and where.
-        device: Where the targets' pictures are kept and worlds are compared with them.
-
     Raises:
         NPAError: A target cannot be loaded.
     """
@@ -109,11 +101,7 @@ class CoMorphogenesis2D(ParticleTask[Any]):
         return [task.make_rule(generator) for task in self.tasks]
 
     def make_rule(self, generator: torch.Generator) -> NPARule:
-        """Refuse: there is a rule for each species.
-
-        Raises:
-            NPAError: Always.
-        """
+        """Refuse: there is a rule for each species."""
         raise NPAError(
             f"{len(self.tasks)} species need as many rules, not one: "
             "train them with npa_envs.training.train_together"

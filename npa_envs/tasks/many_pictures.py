@@ -30,9 +30,6 @@ def named_targets(targets: Sequence[str]) -> dict[str, str]:
     Args:
         targets: Built-in names, emoji, picture files, and folders, which stand for the pictures in
             them, sorted by name. A file's name is its own without suffix.
-
-    Raises:
-        NPAError: A folder holds no pictures, or two targets have the same name.
     """
     named: dict[str, str] = {}
     for target in targets:
@@ -66,10 +63,6 @@ class ManyPictures(Morphogenesis2D):
 
     A world's goal is the place of its target among `targets`. Particles of all targets are drawn
     equally large, and pictures are scaled so that each target's density is about 1.
-
-    Args:
-        config: As for `Morphogenesis2D`; `targets` says what to grow.
-        device: Where the targets' pictures are kept and worlds are compared with them.
 
     Raises:
         NPAError: There are no targets, one cannot be loaded, or the rule is to know no direction.
@@ -137,11 +130,7 @@ class ManyPictures(Morphogenesis2D):
         return self._with(_codes=rule.codes)
 
     def toward(self, goal: Tensor | None) -> Self:
-        """Return the task with loss and metric for worlds of these targets, int64, shape [B].
-
-        Raises:
-            NPAError: They are no such tensor; or, on a CPU, there is no such target.
-        """
+        """Return the task with loss and metric for worlds of these targets, int64, shape [B]."""
         if goal is None:
             return self
         check_goal(goal, len(self.names))
@@ -192,11 +181,7 @@ class ManyPictures(Morphogenesis2D):
 
     @property
     def target_picture(self) -> Tensor:
-        """Pictures of the worlds' targets: rgb sums and density, shape [B, R, R, 4].
-
-        Raises:
-            NPAError: The goals have not been said by `toward`.
-        """
+        """Pictures of the worlds' targets: rgb sums and density, shape [B, R, R, 4]."""
         if self._goal is None:
             raise NPAError("the worlds' targets must be given first: task.toward(goal), int64 [B]")
         return self._target_pictures.index_select(0, self._goal)

@@ -174,9 +174,7 @@ class Morphogenesis2D(GrowthTask[Morphogenesis2DConfig]):
     Of a rule of many pictures, `for_rule` gives the task of one of them.
 
     Args:
-        config: Target, world, rule size and loss weights.
         target: The target, where it is at hand already; by default `config.target` is loaded.
-        device: Where the target's picture is kept and worlds are compared with it.
 
     Raises:
         NPAError: The target cannot be loaded.
@@ -212,9 +210,6 @@ class Morphogenesis2D(GrowthTask[Morphogenesis2DConfig]):
         """Return the task whose fresh worlds carry the code that a rule has for the target.
 
         It is the code of the target's name, or else what the rule's encoder reads from its picture.
-
-        Raises:
-            NPAError: The rule has codes, but none of this name, and no encoder.
         """
         codes = rule.codes
         if codes is None:
@@ -235,8 +230,7 @@ class Morphogenesis2D(GrowthTask[Morphogenesis2DConfig]):
         self, world_count: int, *, generator: Randomness, device: str | torch.device = "cpu"
     ) -> Worlds:
         """Return fresh worlds: of an equivariant rule with a head and a tail, of one that divides
-        with one living particle, at the origin.
-        """
+        with one living particle, at the origin."""
         x, s, goal = super().seed(world_count, generator=generator, device=device)
         config = self.config
         if config.division:
@@ -281,8 +275,6 @@ class Morphogenesis2D(GrowthTask[Morphogenesis2DConfig]):
         """Return each world's picture: colour sums and density, dimensionless, shape [B, R, R, 4].
 
         Args:
-            x: Positions [length units], shape [B, N, 2].
-            s: States, dimensionless, shape [B, N, C].
             centred: Move each world's mean to the target's, and turn worlds of an equivariant rule,
                 as the loss does.
         """
@@ -393,10 +385,6 @@ class Morphogenesis2D(GrowthTask[Morphogenesis2DConfig]):
 
         Angles are tried evenly spread, and then finer near the best. Where the rule is not chiral
         mirrored worlds are tried too.
-
-        Args:
-            x: Positions [length units], shape [B, N, 2].
-            s: States, dimensionless, shape [B, N, C].
 
         Returns:
             Matrices, shape [B, 2, 2]; without gradient. Where no angles are tried, the identity.

@@ -130,9 +130,7 @@ class Morphogenesis3D(GrowthTask[Morphogenesis3DConfig]):
     gives the task that sees what a rule reads out of the states.
 
     Args:
-        config: Target, world, rule size and loss.
         target: The target, where it is at hand already; by default `config.target` is loaded.
-        device: Where views are kept and worlds are compared with them.
 
     Raises:
         NPAError: The target cannot be loaded, or its views have another size.
@@ -190,11 +188,7 @@ class Morphogenesis3D(GrowthTask[Morphogenesis3DConfig]):
         return type(self)(config, target=self.target, device=self.target_picture.device)
 
     def for_rule(self, rule: NPARule) -> Self:
-        """Return the task that sees what a rule reads out of the states; all else is shared.
-
-        Raises:
-            NPAError: The rule reads out something else than Gaussians.
-        """
+        """Return the task that sees what a rule reads out of the states; all else is shared."""
         if rule.readout_dim not in (0, OUTPUTS):
             raise NPAError(
                 f"the rule must read out {OUTPUTS} numbers of a state, or none, got readout_dim="
@@ -221,8 +215,6 @@ class Morphogenesis3D(GrowthTask[Morphogenesis3DConfig]):
         """Return what cameras see: colours times alpha, and alpha, shape [B, V, H, W, 4].
 
         Args:
-            x: Positions [length units], shape [B, N, 3].
-            s: States (dimensionless), shape [B, N, C].
             cameras: V cameras; the first row of what they see is the upper one.
         """
         return self._draw(x, self.gaussians(s), cameras)
@@ -306,10 +298,8 @@ class ViewSchedule:
     Args:
         view_count: Views to choose from.
         chosen_count: Views of an iteration, all different; at most `view_count`.
-        seed: What views and backgrounds are drawn from.
         blur_sigma: Standard deviation of the blur at first [pixels].
         blur_iterations: Iterations after which there is none; it goes evenly.
-        device: Where the tensors are.
     """
 
     def __init__(
@@ -355,7 +345,6 @@ def blurred(pictures: Tensor, sigma: Tensor) -> Tensor:
     knowing it, and one of 0 leaves the pictures as they are, bit for bit.
 
     Args:
-        pictures: Shape [V, H, W, K]; colours times alpha, and alpha.
         sigma: Standard deviation [pixels], shape [].
     """
     rows, columns = (_weights(size, sigma, pictures) for size in pictures.shape[1:3])

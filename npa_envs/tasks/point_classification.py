@@ -98,8 +98,6 @@ class PointClassification(ParticleTask[PointClassificationConfig]):
     without a rule, or where it has no read-out, these are the last channels of the states.
 
     Args:
-        config: Data, variation, world and rule size.
-        device: Where the clouds are kept.
         split: Which clouds worlds are made of; those of "test" are not varied.
     """
 
@@ -126,11 +124,7 @@ class PointClassification(ParticleTask[PointClassificationConfig]):
 
     @cached_property
     def clouds(self) -> PointClouds:
-        """All clouds that worlds are made of, loaded when first asked for.
-
-        Raises:
-            NPAError: They cannot be loaded, or are of more classes than the configuration says.
-        """
+        """All clouds that worlds are made of, loaded when first asked for."""
         config = self.config
         clouds = load_clouds(
             config.data,
@@ -186,11 +180,7 @@ class PointClassification(ParticleTask[PointClassificationConfig]):
         return type(self)(config, device=self._device, split=self.split)
 
     def toward(self, goal: Tensor | None) -> Self:
-        """Return the task with loss and metric for worlds of these classes, int64, shape [B].
-
-        Raises:
-            NPAError: They are no such tensor; or, on a CPU, there is no such class.
-        """
+        """Return the task with loss and metric for worlds of these classes, int64, shape [B]."""
         if goal is None:
             return self
         check_goal(goal, self.config.class_count)
@@ -230,11 +220,7 @@ class PointClassification(ParticleTask[PointClassificationConfig]):
         return x, s, torch.where(mutated, other_goal, goal)
 
     def outputs(self, s: Tensor) -> Tensor:
-        """Return what each particle says of each class, dimensionless, shape [B, N, K].
-
-        Raises:
-            NPAError: There are fewer outputs than classes.
-        """
+        """Return what each particle says of each class, dimensionless, shape [B, N, K]."""
         outputs = s if self._rule is None else self._rule.read_out(s)
         if outputs.shape[-1] < self.config.class_count:
             raise NPAError(
@@ -244,11 +230,7 @@ class PointClassification(ParticleTask[PointClassificationConfig]):
         return outputs[..., -self.config.class_count :]
 
     def errors(self, s: Tensor) -> Tensor:
-        """Return each particle's mean squared error to the one-hot of its world's class, [B, N].
-
-        Raises:
-            NPAError: The classes have not been said by `toward`.
-        """
+        """Return each particle's mean squared error to the one-hot of its world's class, [B, N]."""
         outputs = self.outputs(s)
         classes = torch.arange(self.config.class_count, device=s.device)
         wanted = (self.wanted[:, None] == classes).to(outputs.dtype)
@@ -256,32 +238,20 @@ class PointClassification(ParticleTask[PointClassificationConfig]):
 
     @property
     def wanted(self) -> Tensor:
-        """Classes of the worlds, int64, shape [B].
-
-        Raises:
-            NPAError: The classes have not been said by `toward`.
-        """
+        """Classes of the worlds, int64, shape [B]."""
         if self._goal is None:
             raise NPAError("the worlds' classes must be given first: task.toward(goal), int64 [B]")
         return self._goal
 
     def mistakes(self, s: Tensor) -> Tensor:
-        """Return 1 for particles that say another class than their world's most loudly, [B, N].
-
-        Raises:
-            NPAError: The classes have not been said by `toward`.
-        """
+        """Return 1 for particles that say another class than their world's most loudly, [B, N]."""
         return (self.outputs(s).argmax(dim=-1) != self.wanted[:, None]).to(s.dtype)
 
     def cross_entropies(self, s: Tensor, sharpness: float) -> Tensor:
         """Return each particle's cross-entropy of softmax(sharpness × outputs), [B, N].
 
         Args:
-            s: States, dimensionless, shape [B, N, C].
             sharpness: How surely outputs are taken as probabilities (dimensionless).
-
-        Raises:
-            NPAError: The classes have not been said by `toward`.
         """
         chances = torch.log_softmax(sharpness * self.outputs(s), dim=-1)
         wanted = self.wanted[:, None, None].expand(*s.shape[:2], 1)
@@ -313,11 +283,7 @@ class PointClassification(ParticleTask[PointClassificationConfig]):
         return error, {"error": error}
 
     def loss(self, x: Tensor, s: Tensor, path_length: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
-        """Return the training loss and its named parts, unweighted, and the share that is right.
-
-        Raises:
-            NPAError: The classes have not been said by `toward`.
-        """
+        """Return the training loss and its named parts, unweighted, and the share that is right."""
         total, parts = super().loss(x, s, path_length)
         return total, {**parts, "accuracy": 1.0 - self.mistakes(s.detach()).mean()}
 
@@ -364,11 +330,7 @@ UNDECIDED = (0.6, 0.6, 0.6)
 
 
 def particle_classes(outputs: Tensor) -> Tensor:
-    """Return the class that each particle says, int64, shape [B, N].
-
-    Args:
-        outputs: One number for each class, shape [B, N, K].
-    """
+    """Return the class that each particle says, int64, shape [B, N]."""
     return outputs.argmax(-1)
 
 
@@ -376,9 +338,6 @@ def majority(outputs: Tensor) -> Tensor:
     """Return the class that most particles of each world say, int64, shape [B].
 
     Of several with as many votes it is the one with the larger sum of outputs.
-
-    Args:
-        outputs: One number for each class, shape [B, N, K].
     """
     particle_count, class_count = outputs.shape[1:]
     classes = torch.arange(class_count, device=outputs.device)
@@ -390,11 +349,7 @@ def majority(outputs: Tensor) -> Tensor:
 
 
 def class_colours(outputs: Tensor) -> Tensor:
-    """Return each particle's colour, its class's, greyer the less it is sure of it; [B, N, 3].
-
-    Args:
-        outputs: One number for each class, shape [B, N, K]; 1 is sure.
-    """
+    """Return each particle's colour, its class's, greyer the less it is sure of it; [B, N, 3]."""
     rows = [PALETTE[k % len(PALETTE)] for k in range(outputs.shape[-1])]
     sure, chosen = outputs.max(-1, keepdim=True)
     sure = sure.clamp(0.0, 1.0)

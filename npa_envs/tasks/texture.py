@@ -134,9 +134,7 @@ class Texture(ParticleTask[TextureConfig]):
     """The texture task of arXiv 2601.16096, with its loss.
 
     Args:
-        config: Target, world, rule size and loss.
         target: The target, where it is at hand already; by default `config.target` is loaded.
-        device: Where the target is kept and worlds are compared with it.
 
     Raises:
         NPAError: The target cannot be loaded.
@@ -244,9 +242,6 @@ class Texture(ParticleTask[TextureConfig]):
         A joint loss sees the density with the colours, and has no part of the density alone.
         Losses that look at some places only see each world as its first particle does, in the
         middle: which places these are then differs from world to world and from step to step.
-
-        Raises:
-            NPAError: The loss needs weights that are missing.
         """
         return self.compare_pictures(self.picture(x - x[:, :1].detach(), s))
 
@@ -348,9 +343,6 @@ class Texture(ParticleTask[TextureConfig]):
 
 def colour_image(channels: Tensor) -> Tensor:
     """Return colours as they are compared, and shown: where particles overlap, their mean.
-
-    Args:
-        channels: Colour sums and density, dimensionless, shape [..., 4, R, R].
 
     Returns:
         Red, green and blue, shape [..., 3, R, R]; black where nothing is.

@@ -327,7 +327,6 @@ class TrainConfig(Generic[TaskConfigT]):
         (Loshchilov and Hutter, arXiv 1608.03983).
 
         Args:
-            iteration: Iterations done so far in the run.
             share: How much of a cosine is over, in [0, 1], where the iterations say less: a caller
                 who counts seconds makes it fall with them.
         """

@@ -26,13 +26,7 @@ def write_batch_picture(path: Path, picture: Tensor, board: Any, iteration: int)
 
     Args:
         path: The file to write, at least `PICTURE_HEIGHT` pixels high.
-        picture: rgb sums and density of the target, if there is one, and of each world, shape
-            [B, R, R, 4].
         board: TensorBoard's writer (`open_tensorboard`), or None.
-        iteration: Iterations done so far.
-
-    Raises:
-        NPAError: The file cannot be written.
     """
     repeats = math.ceil(PICTURE_HEIGHT / picture.shape[1])
     frames = to_uint8(picture).repeat(repeats, axis=1).repeat(repeats, axis=2)

@@ -31,13 +31,7 @@ class TrainingCycle:
     """All that changes while a rule is trained.
 
     Args:
-        task: What to learn.
-        rule: The rule, on the device, in the run's dtype.
-        config: How.
-        device: Where the worlds are.
-        schedule: Randomness of the numbers of steps, on the CPU.
         rollout: The rollout to train through; None is the engine's.
-        ranks: The processes that share the run; None: this one alone.
         by_world: Each world draws by itself, as several processes need it.
 
     Raises:
@@ -133,7 +127,6 @@ class TrainingCycle:
         """Train for one iteration, and return the steps of its rollout, T.
 
         Args:
-            iteration: Iterations done so far in the run.
             share: As for `TrainConfig.learning_rate_at`.
         """
         config, batch = self._config, self.batch

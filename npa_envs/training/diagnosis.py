@@ -21,8 +21,6 @@ def divergence_error(
     """Return the error that ends a run whose loss is not finite.
 
     Args:
-        task: The run's task, to find the worlds at fault.
-        rule: The run's rule; its parameters may have changed since.
         snapshot: `LossMeter.snapshot()`.
         diagnosis: Where the snapshot was written.
     """
@@ -43,8 +41,6 @@ def bad_worlds(task: Task, rule: NPARule, snapshot: dict[str, Any]) -> list[int]
     """Return which worlds of the batch alone give a loss that is not finite.
 
     Args:
-        task: The run's task.
-        rule: The run's rule.
         snapshot: `LossMeter.snapshot()`, with `x` [B, N, D] and `s` [B, N, C] after the rollout,
             the `parameters` at that time, and `goal` [B] where the task has goals.
     """

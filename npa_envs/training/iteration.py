@@ -65,14 +65,7 @@ class EagerIteration:
     are the same tensors in every iteration: fill them with `copy_`.
 
     Args:
-        task: Gives the loss and the world's constants.
-        rule: The rule to differentiate.
-        config: Gives the batch size and the rollout's memory mode.
-        x: Positions of any batch [length units], shape [B, N, D]: shape, dtype and device count.
-        s: States of any batch, shape [B, N, C], likewise.
-        generator: Randomness of the update masks, on the worlds' device.
         rollout: The rollout to run; another one only in tests.
-        goal: The worlds' goals, int64, shape [B], where the task has such.
         mean_over_processes: As `counted_together` takes it, where several processes share a run.
     """
 

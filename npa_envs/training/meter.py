@@ -31,9 +31,6 @@ class LossMeter:
 
     `begin`, `observe` and `send` launch kernels and wait for nothing. `observe` can be captured
     in a CUDA graph: the same tensors are read and written in each iteration.
-
-    Args:
-        iteration: The iteration's buffers.
     """
 
     def __init__(self, iteration: EagerIteration) -> None:

@@ -58,8 +58,6 @@ class RuleOptimiser:
 
     Args:
         parameters: What is trained; its `.grad` is set before `prepare_gradients`.
-        config: Optimiser, learning rates, weight decay.
-        rules: The rule that they are of, or a module of several.
     """
 
     def __init__(

@@ -17,9 +17,6 @@ class WorldPool:
     """Worlds that live on between batches, on the device, so that a rule learns to be stable.
 
     Args:
-        x: Positions of every world [length units], shape [W, N, D], W the pool's size.
-        s: States, shape [W, N, C].
-        goal: The goal of every world, shape [W], where the task has such.
         runaway_limit: A world with a larger |x| or |s|, or one that is not finite, is not kept.
         max_age_range: Steps that the world in the first place lives, and that in the last, all
             others between; None: for ever.
@@ -101,9 +98,6 @@ class WorldPool:
         """Put worlds back; those that are not finite or run away are replaced by fresh ones.
 
         Args:
-            index: Where to, shape [B].
-            x: Positions after the rollout [length units], shape [B, N, D].
-            s: States after the rollout, shape [B, N, C].
             fresh_x: Positions of seeds, shape [B, N, D].
             fresh_s: States of seeds, shape [B, N, C].
             goals: Goals of the worlds and of the seeds, shape [B], where the pool has such.

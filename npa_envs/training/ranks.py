@@ -65,11 +65,7 @@ class Ranks:
         return self.rank == 0
 
     def check(self, config: TrainConfig[Any]) -> None:
-        """Check that a run can be shared.
-
-        Raises:
-            NPAError: The batch cannot be dealt out evenly, or the pool not among its worlds.
-        """
+        """Check that a run can be shared."""
         batch, pool = config.world_count, config.pool_size
         self.check_dealt("world_count", batch)
         if pool % batch:
@@ -79,11 +75,7 @@ class Ranks:
             )
 
     def check_dealt(self, name: str, worlds: int) -> None:
-        """Check that the worlds of a batch, which the caller calls so, can be dealt out evenly.
-
-        Raises:
-            NPAError: They cannot.
-        """
+        """Check that the worlds of a batch, which the caller calls so, can be dealt out evenly."""
         if worlds % self.count:
             nearest = max(worlds // self.count, 1) * self.count
             raise NPAError(
@@ -104,7 +96,6 @@ class Ranks:
         """Return this process's share of all worlds.
 
         Args:
-            worlds: One entry for each world of all processes, shape [total, ...].
             section: Worlds of a section.
         """
         dealt = worlds.view(-1, self.count, section, *worlds.shape[1:])
@@ -114,7 +105,6 @@ class Ranks:
         """Return the worlds of all processes, on the CPU where there are several.
 
         Args:
-            worlds: One entry for each world of this process, shape [n, ...].
             section: Worlds of a section.
 
         Returns:
@@ -154,7 +144,6 @@ class Ranks:
 
         Args:
             asked: This process was asked to.
-            iteration: Iterations done.
         """
         if not self.together:
             return asked
@@ -204,11 +193,7 @@ class Ranks:
         return mean
 
     def check_same(self, tensors: Sequence[Tensor]) -> None:
-        """Check that tensors are the same on all processes, bit for bit.
-
-        Raises:
-            NPAError: They are not.
-        """
+        """Check that tensors are the same on all processes, bit for bit."""
         if self.count == 1:
             return
         own = torch.cat([tensor.detach().reshape(-1).double().cpu() for tensor in tensors])
@@ -251,9 +236,6 @@ def joined_ranks() -> Iterator[Ranks]:
     anything uses CUDA. Within the block, a process that gives no sign of life ends the others (see
     `Heartbeat`), so whichever process keeps the store that they meet in is to leave it last.
     Outside of torchrun, this process is alone.
-
-    Raises:
-        NPAError: The others cannot be reached.
     """
     if not dist.is_available() or not dist.is_torchelastic_launched():
         yield Ranks()

@@ -30,11 +30,7 @@ LARGEST_LOG = 2**29
 
 
 def check_choice(*, resume: bool, overwrite: bool) -> None:
-    """Check that a run does not both go on and start anew.
-
-    Raises:
-        NPAError: It does.
-    """
+    """Check that a run does not both go on and start anew."""
     if resume and overwrite:
         raise NPAError(
             "resume and overwrite exclude each other: resume goes on with the run in the folder, "
@@ -77,7 +73,6 @@ class RunFolder:
 
         Args:
             byte_count: About how large a checkpoint is [bytes].
-            pictures: Make the folder of pictures as well.
 
         Raises:
             NPAError: The folder cannot be created or written to, or its disk has too little room.
@@ -233,9 +228,6 @@ class JsonlLog:
     def truncate(self, iteration: int) -> None:
         """Drop the lines after an iteration, and a last line that a kill cut short.
 
-        Args:
-            iteration: The checkpoint's: lines up to it stay.
-
         Raises:
             NPAError: The file cannot be read or written, or a line of it is damaged.
         """
@@ -284,12 +276,7 @@ def _parsed_record(line: str) -> dict[str, Any] | None:
 
 
 def open_tensorboard(folder: RunFolder, iteration: int) -> Any:
-    """Return a TensorBoard writer that hides what an earlier process wrote after `iteration`.
-
-    Raises:
-        MissingDependencyError: TensorBoard is not installed.
-        NPAError: Its folder cannot be written to.
-    """
+    """Return a TensorBoard writer that hides what an earlier process wrote after `iteration`."""
     # TensorBoard would look for TensorFlow, which takes seconds where it is installed.
     os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
     try:

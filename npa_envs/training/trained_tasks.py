@@ -115,12 +115,7 @@ def tasks_of_codes(
 
     Args:
         source: What the rule was loaded from.
-        rule: The rule.
-        device: Where the tasks keep their targets.
         fields: As for `task_of_rule`.
-
-    Raises:
-        NPAError: As for `task_of_rule`.
     """
     names = () if rule.codes is None else rule.codes.names
     found = [task_of_rule(source, rule, device, **(fields | {"target": name})) for name in names]
@@ -128,20 +123,13 @@ def tasks_of_codes(
 
 
 def _one_of(task: Morphogenesis2DConfig, codes: Codes, chosen: bool) -> str:
-    """Return where the target of one of a rule's codes comes from: the chosen or the first one's.
-
-    A target that has no code is a picture for the rule's encoder.
-    """
+    """Return where the target of one of a rule's codes comes from: the chosen or the first one's."""
     name = task.target if chosen else codes.names[0]
     return _named(task.targets).get(name, name)
 
 
 def _world_of(path: Path, metadata: Mapping[str, str]) -> dict[str, Any]:
-    """Return the fields of the world that a rule was found in, where its file says nothing more.
-
-    Raises:
-        NPAError: What it says is damaged.
-    """
+    """Return the fields of the world that a rule was found in, where its file says nothing more."""
     try:
         fields = parse_json(metadata.get("world", "{}"))
     except NPAError:
@@ -179,11 +167,7 @@ def _named(targets: Sequence[str]) -> dict[str, str]:
 
 
 def trained_config(path: Path, metadata: Mapping[str, str]) -> Any:
-    """Return the configuration that a rule's file says it was trained with.
-
-    Raises:
-        NPAError: What it says is damaged or of another version.
-    """
+    """Return the configuration that a rule's file says it was trained with."""
     try:
         fields = parse_json(metadata["config"])
         if not isinstance(fields, dict):

@@ -163,7 +163,6 @@ class Trainer:
         """Train until the end, or until Ctrl-C, SIGTERM or `max_seconds`; then save.
 
         Args:
-            progress: Show a progress bar.
             max_seconds: Stop after this time [s]; the run can be resumed.
 
         Raises:
@@ -313,12 +312,7 @@ class Trainer:
             self._finish_record()
 
     def _finish_record(self) -> None:
-        """Write the record that was begun, if there is one.
-
-        Raises:
-            DivergedError: The loss was not finite in the interval.
-            NPAError: The log cannot be written.
-        """
+        """Write the record that was begun, if there is one."""
         begun, self._record_begun = self._record_begun, None
         if begun is None:
             return
@@ -422,11 +416,7 @@ def check_seconds(max_seconds: object) -> None:
 
 
 def rule_like(held: dict[str, Any]) -> NPARule:
-    """Return a rule of the shape that a checkpoint tells, on the CPU; its weights are to follow.
-
-    Raises:
-        NPAError: There is no such rule.
-    """
+    """Return a rule of the shape that a checkpoint tells, on the CPU; its weights are to follow."""
     try:
         return untrained_rule(torch.Generator(), **held)
     except (TypeError, RuntimeError, OverflowError) as error:
@@ -452,12 +442,7 @@ def initial_rule(config: TrainConfig[Any], untrained: NPARule) -> NPARule:
     without.
 
     Args:
-        config: The run's configuration.
         untrained: The task's own rule, whose shape the rule must have.
-
-    Raises:
-        NPAError: The configuration's rule cannot be loaded, has another shape, or was trained with
-            another `moment_inverse` than the paper's and the configuration's.
     """
     take_options(untrained, config)
     if not config.initial_rule or (untrained.equivariant and config.initial_rule in preset_rules()):

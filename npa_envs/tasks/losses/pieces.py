@@ -29,9 +29,6 @@ def check_images(images: Tensor, shape: tuple[int, ...]) -> None:
     Args:
         images: What is compared.
         shape: The target's shape, (K, R, R).
-
-    Raises:
-        NPAError: They do not.
     """
     if images.ndim != 4 or tuple(images.shape[1:]) != shape:
         raise NPAError(
@@ -41,11 +38,7 @@ def check_images(images: Tensor, shape: tuple[int, ...]) -> None:
 
 
 def check_size(target: Tensor) -> None:
-    """Check that a target, [K, R, R], is large enough to be looked at.
-
-    Raises:
-        NPAError: It is too small.
-    """
+    """Check that a target, [K, R, R], is large enough to be looked at."""
     if target.shape[-1] < SMALLEST:
         raise NPAError(
             f"resolution must be at least {SMALLEST} pixels, got {target.shape[-1]}: for example 64"
@@ -69,9 +62,6 @@ class TextureDistance:
 
         Args:
             images: Pictures that tile (dimensionless), shape [B, K, R, R].
-
-        Raises:
-            NPAError: They have another shape than the target.
         """
         check_images(images, self._shape)
         if len(images) > 1 and not (torch.is_grad_enabled() and images.requires_grad):
@@ -146,7 +136,6 @@ def orthogonal(size: int, count: int, generator: torch.Generator) -> Tensor:
     Args:
         size: Numbers in each, at least `count`.
         count: Directions.
-        generator: What they are drawn from, on the CPU.
     """
     normal = torch.randn(size, count, generator=generator, dtype=torch.float64)
     basis: Tensor = torch.linalg.qr(normal).Q

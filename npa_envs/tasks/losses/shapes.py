@@ -73,12 +73,7 @@ class PatchTransport(TextureDistance):
 
 
 def _matched(found: Tensor, expected: Tensor) -> Tensor:
-    """Return the larger of two mean squares, of patches and of their nearest ones; shape [B].
-
-    Args:
-        found: Patches of worlds, shape [B, M, F].
-        expected: Patches of the target, shape [L, F].
-    """
+    """Return the larger of two mean squares, of patches and of their nearest ones; shape [B]."""
     with torch.no_grad():
         squares = found.square().sum(2)[:, :, None] + expected.square().sum(1)
         costs = squares - 2.0 * (found @ expected.T)
@@ -114,7 +109,6 @@ class RandomFilters:
 
     Args:
         like: An image of the shape that is to be described, [K, R, R], on the device.
-        seed: What the filters are drawn from.
     """
 
     def __init__(self, like: Tensor, *, seed: int) -> None:

@@ -30,10 +30,6 @@ class MultiScaleSimilarity:
     once, and similarities are multiplied as a sum of logarithms: the derivative of a product waits
     for the device, and is not finite where a size's similarity is 0.
 
-    Args:
-        resolution: Pixels along each side of the pictures, at least 16.
-        device: Where they are.
-
     Raises:
         NPAError: The pictures are too small.
     """

@@ -125,11 +125,7 @@ TEXTURE_LOSSES: Mapping[str, LossEntry] = {
 
 
 def check_loss_name(name: str) -> None:
-    """Check that there is a loss of a name, or that there are all of several joined by "+".
-
-    Raises:
-        NPAError: There is none, or a sum has a loss in it that is not joint.
-    """
+    """Check that there is a loss of a name, or that there are all of several joined by "+"."""
     parts = name.split("+") if isinstance(name, str) else []
     for part in parts or [name]:
         if not isinstance(part, str) or part not in TEXTURE_LOSSES:
@@ -254,9 +250,6 @@ class SlicedWasserstein:
 
         Args:
             images: Pictures that tile (dimensionless), shape [B, K, R, R].
-
-        Raises:
-            NPAError: They have another shape than the target.
         """
         check_images(images, self._shape)
         described = self._descriptor(images, wrap=True, thinned=True)
@@ -283,7 +276,6 @@ class PatchDescriptor:
 
     Args:
         like: An image of the shape that is to be described, [K, R, R], on the device.
-        seed: What the directions are drawn from.
     """
 
     def __init__(self, like: Tensor, *, seed: int) -> None:
@@ -311,7 +303,6 @@ class FilterDescriptor:
 
     Args:
         like: An image of the shape that is to be described, [K, R, R], on the device.
-        seed: What the filters are drawn from.
     """
 
     def __init__(self, like: Tensor, *, seed: int) -> None:
@@ -372,7 +363,6 @@ class VGGTransport(TextureDistance):
         target: The texture (dimensionless), shape [3, R, R], or [1, R, R] for a density.
         weights: File of VGG16's weights; empty: torch's folder of downloads.
         tiles: Whether the target's opposite edges meet.
-        seed: What the places are drawn from.
 
     Raises:
         NPAError: There are no such weights, the file is damaged, or the target is too small or has
@@ -493,9 +483,6 @@ def load_vgg_weights(path: str | Path = "") -> dict[str, Any]:
     Args:
         path: The file; empty: `vgg16-397923af.pth` in torch's folder of downloads. Nothing is
             downloaded.
-
-    Raises:
-        NPAError: There is no such file, or it is damaged or holds something else.
     """
     folder = Path(torch.hub.get_dir()) / "checkpoints"
     file = home_path(path) if str(path) else folder / WEIGHTS_FILE

@@ -43,10 +43,6 @@ def render_emoji(text: str) -> Image.Image:
 
     Args:
         text: One emoji: a character or a sequence joined to one picture.
-
-    Raises:
-        MissingDependencyError: No colour-emoji font is installed.
-        NPAError: The installed fonts have no colour picture for it, or the text is several emoji.
     """
     fonts = find_emoji_fonts()
     if not fonts:

@@ -47,10 +47,6 @@ def read_image(path: Path) -> Image.Image:
 
     Args:
         path: A file in one of `FORMATS`; of an animation, the first frame.
-
-    Raises:
-        NPAError: As for `open_image`, or the picture is fully transparent, or has neither
-            transparency nor a plain background.
     """
     image = open_image(path)
     if np.asarray(image.getchannel("A")).min() == 255:
@@ -70,9 +66,6 @@ def open_image(path: Path) -> Image.Image:
 
     Args:
         path: A file in one of `FORMATS`; of an animation, the first frame.
-
-    Raises:
-        NPAError: The file is missing, not readable, empty, truncated, no picture, or too large.
     """
     name = shown(str(path))
     content = read_bytes(path, limit=_LARGEST_FILE, what="target")
@@ -168,9 +161,6 @@ def cut_out_background(image: Image.Image, *, label: str) -> Image.Image:
     Args:
         image: An RGBA picture without transparent pixels.
         label: The name of the picture in error messages.
-
-    Raises:
-        NPAError: The border is not of one colour, or the whole picture is.
     """
     image = image.reduce(math.ceil(max(image.size) / _LARGEST_CUT_OUT))
     rgb = np.asarray(image.convert("RGB")).astype(np.float32)
@@ -209,12 +199,7 @@ def resample(image: Image.Image, point_count: int, *, label: str = "picture") ->
 
     Args:
         image: An RGBA picture with at least one opaque pixel.
-        point_count: The number of opaque pixels aimed at.
         label: The name of the picture in error messages.
-
-    Raises:
-        NPAError: Nothing opaque is left at the scale nearest to `point_count`, or the opaque pixels
-            are so few and far apart that the grid would be larger than `LARGEST_GRID`.
     """
     image = image.crop(image.getchannel("A").getbbox())
     area = _opaque_count(image)

@@ -224,11 +224,6 @@ def load_mesh(source: str | Path) -> Mesh:
 
     Args:
         source: A built-in name, or the path of a mesh file that trimesh reads.
-
-    Raises:
-        NPAError: The name is unknown, or the file is missing, damaged, holds no triangles, or some
-            without an area or of a size that numbers do not hold.
-        MissingDependencyError: It is a file and trimesh is not installed.
     """
     if isinstance(source, str) and source in MESHES:
         return MESHES[source]().fitted()

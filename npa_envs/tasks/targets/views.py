@@ -117,8 +117,6 @@ def views_of_mesh(
 
     Args:
         mesh: What to draw.
-        name: What the target is called.
-        resolution: Pixels along each side of a view.
         training_count: Views to train with.
         held_out_count: Views to measure by.
     """
@@ -136,7 +134,6 @@ def surrounding_cameras(count: int, resolution: int, *, turn: float = 0.0) -> Ca
 
     Args:
         count: Cameras V.
-        resolution: Pixels along each side of their pictures.
         turn: The spiral is turned by so much of a full turn: others than those at 0.
     """
     k = torch.arange(count, dtype=torch.float64)
@@ -169,7 +166,6 @@ def some_views(views: Views, index: Tensor) -> Views:
 
     Args:
         views: All of them.
-        index: Which, on their device, shape [V].
     """
     cameras = views.cameras
     intrinsics = cameras.intrinsics
@@ -224,12 +220,8 @@ def read_nerf(
 
     Args:
         folder: Holds `transforms_train.json` and `transforms_test.json` (or `_val`).
-        resolution: Pixels along each side of a view.
         training_count: Views to train with, at most.
         held_out_count: Views to measure by, at most.
-
-    Raises:
-        NPAError: A file is missing or damaged, a pose is no rigid motion, or nothing is seen.
     """
     held_out = next((folder / name for name in HELD_OUT if (folder / name).is_file()), None)
     if held_out is None:
