@@ -271,14 +271,12 @@ def _check_target(given: Path, target: Path) -> None:
         if not target.parent.exists():
             raise NPAError(
                 f"cannot write {shown(str(given))}: the folder {shown(str(target.parent))} does "
-                "not exist: "
-                f"create it first (mkdir -p {shown(str(target.parent))})"
+                f"not exist: create it first (mkdir -p {shown(str(target.parent))})"
             )
         if not target.parent.is_dir():
             raise NPAError(
                 f"cannot write {shown(str(given))}: {shown(str(target.parent))} is a file, not a "
-                "folder: "
-                "give a path in a folder"
+                "folder: give a path in a folder"
             )
     except OSError as error:
         raise NPAError(_explain(given, error)) from error

@@ -201,7 +201,7 @@ def _is_utf8(text: str) -> bool:
 
 
 def _with_sorted_metadata(file: bytes) -> bytes:
-    """Return a safetensors file whose metadata is in order, so that equal rules make equal files."""
+    """Return a safetensors file with sorted metadata, so that equal rules make equal files."""
     size = int.from_bytes(file[:8], "little")
     header = json.loads(file[8 : 8 + size])
     header["__metadata__"] = dict(sorted(header["__metadata__"].items()))

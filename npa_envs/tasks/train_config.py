@@ -363,8 +363,7 @@ class JointTrainConfig(TrainConfig[TaskConfigT]):
         if self.initial_rule:
             raise NPAError(
                 f"initial_rule is for one rule, got {shown(self.initial_rule)}: give "
-                "initial_rules, one "
-                "for each species"
+                "initial_rules, one for each species"
             )
         rules = self.initial_rules
         if not isinstance(rules, tuple) or not all(isinstance(r, str) and r for r in rules):

@@ -32,8 +32,7 @@ def divergence_error(
         f"the loss must stay finite, but {' and '.join(visible)} was not in iteration "
         f"{snapshot['iteration']} ({snapshot['steps']} steps, {where} of the batch): lower "
         "learning_rate, or use fewer steps; the worlds and the rule are in "
-        f"{shown(str(diagnosis))}, "
-        "the last good checkpoint is untouched"
+        f"{shown(str(diagnosis))}, the last good checkpoint is untouched"
     )
 
 

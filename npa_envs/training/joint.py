@@ -165,8 +165,7 @@ def train_together(
     if config.initial_rule:
         raise NPAError(
             f"initial_rule is for one rule, got {shown(config.initial_rule)}: give one for each "
-            "species "
-            "as rules"
+            "species as rules"
         )
     task = CoMorphogenesis2D(config.task, device=check_device(config.device))
     trainer = _JointTrainer(task, config, rules, resume=resume, overwrite=overwrite)

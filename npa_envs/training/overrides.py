@@ -90,8 +90,7 @@ def load_config(
     if not isinstance(fields, Mapping) or not all(isinstance(key, str) for key in fields):
         raise NPAError(
             f"the configuration file {shown(str(path))} must hold field names and values at its "
-            "top "
-            f"level, got {type(fields).__name__}: for example 'iterations: 500'"
+            f"top level, got {type(fields).__name__}: for example 'iterations: 500'"
         )
     own = dict(fields)
     try:

@@ -128,9 +128,8 @@ class RunFolder:
                     pass  # The file system has no locks.
             if self._known != _identity(self.checkpoint):
                 raise NPAError(
-                    f"out must be a folder that no other run writes to, but another one has "
-                    f"written {str(self.checkpoint)!r} meanwhile: resume it, or choose another "
-                    "folder"
+                    "out must be a folder that no other run writes to, but another one has written "
+                    f"{str(self.checkpoint)!r} meanwhile: resume it, or choose another folder"
                 )
             with contextlib.suppress(OSError):  # A full disk; who reads it can do without.
                 lock.truncate(0)

@@ -123,7 +123,7 @@ def tasks_of_codes(
 
 
 def _one_of(task: Morphogenesis2DConfig, codes: Codes, chosen: bool) -> str:
-    """Return where the target of one of a rule's codes comes from: the chosen or the first one's."""
+    """Return where the target of a rule's code comes from: the chosen or the first one's."""
     name = task.target if chosen else codes.names[0]
     return _named(task.targets).get(name, name)
 

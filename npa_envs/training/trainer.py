@@ -244,7 +244,8 @@ class Trainer:
     def kept_rule(self) -> NPARule:
         """The rule as a run keeps it."""
         rule = self.rule
-        if rule.codes is not None and rule.codes.encoder is not None:
+        codes = getattr(rule, "codes", None)
+        if codes is not None and codes.encoder is not None:
             # The table has what the encoder said in the last iteration, before its last step.
             rule = copy.deepcopy(rule)
             self.task.for_rule(rule)

@@ -488,11 +488,10 @@ def load_vgg_weights(path: str | Path = "") -> dict[str, Any]:
     file = home_path(path) if str(path) else folder / WEIGHTS_FILE
     if not os.path.exists(file):
         raise NPAError(
-            f"vgg_ot needs VGG16's weights, and there is no file {shown(str(file))}: "
-            f"download {WEIGHTS_URL} (528 MiB) to {shown(str(folder / WEIGHTS_FILE))}, for example "
-            "with "
-            f"python -c \"import torch; torch.hub.load_state_dict_from_url('{WEIGHTS_URL}')\", "
-            "or give the path of such a file as vgg_weights, or choose loss='patch_swd' or "
+            f"vgg_ot needs VGG16's weights, and there is no file {shown(str(file))}: download "
+            f"{WEIGHTS_URL} (528 MiB) to {shown(str(folder / WEIGHTS_FILE))}, for example with "
+            f"python -c \"import torch; torch.hub.load_state_dict_from_url('{WEIGHTS_URL}')\", or "
+            "give the path of such a file as vgg_weights, or choose loss='patch_swd' or "
             "'filter_swd', which need no weights"
         )
     try:
@@ -502,14 +501,12 @@ def load_vgg_weights(path: str | Path = "") -> dict[str, Any]:
     except (OSError, RuntimeError, ValueError, EOFError, pickle.UnpicklingError) as error:
         raise NPAError(
             f"VGG16's weights {shown(str(file))} cannot be read, the file is damaged or no torch "
-            "file "
-            f"({shown(error)}): download {WEIGHTS_URL} again"
+            f"file ({shown(error)}): download {WEIGHTS_URL} again"
         ) from error
     if not isinstance(content, dict):
         raise NPAError(
             f"VGG16's weights {shown(str(file))} must be a state dict, got "
-            f"{type(content).__name__}: "
-            f"download {WEIGHTS_URL}"
+            f"{type(content).__name__}: download {WEIGHTS_URL}"
         )
     return content
 

@@ -354,8 +354,7 @@ def _idx_folder(folder: Path, split: Split) -> DigitPictures:
     if images.ndim != 3 or labels.shape != images.shape[:1] or images.size == 0:
         raise NPAError(
             f"the {split} files of {shown(str(folder))} must hold pictures [M, H, W] and classes "
-            "[M], "
-            f"got {list(images.shape)} and {list(labels.shape)}: get them anew"
+            f"[M], got {list(images.shape)} and {list(labels.shape)}: get them anew"
         )
     # By a table: the quotients themselves would take eight bytes a pixel.
     ink = (np.arange(256) / 255.0).astype(np.float32)

@@ -48,9 +48,8 @@ def render_emoji(text: str) -> Image.Image:
     if not fonts:
         raise MissingDependencyError(
             f"target {shown(text)} is an emoji and needs an installed colour-emoji font, found "
-            "none: "
-            "install one, on Debian and Ubuntu with 'apt install fonts-noto-color-emoji', "
-            "or give a picture file or a built-in target"
+            "none: install one, on Debian and Ubuntu with 'apt install fonts-noto-color-emoji', or "
+            "give a picture file or a built-in target"
         )
     several = False
     for path in fonts:
@@ -70,8 +69,7 @@ def render_emoji(text: str) -> Image.Image:
         )
     raise NPAError(
         f"target {shown(text)} must be an emoji that an installed font draws in colour, but none "
-        "of "
-        f"{names} does: give another emoji, a picture file, or install 'fonts-noto-color-emoji'"
+        f"of {names} does: give another emoji, a picture file, or install 'fonts-noto-color-emoji'"
     )
 
 

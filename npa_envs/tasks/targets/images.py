@@ -170,10 +170,8 @@ def cut_out_background(image: Image.Image, *, label: str) -> Image.Image:
     if uniform < _UNIFORM_SHARE:
         raise NPAError(
             f"target {shown(label)} has no transparency, so at least {_UNIFORM_SHARE:.0%} of its "
-            "border "
-            f"must have one colour (the background), but only {uniform:.0%} have: "
-            "give a PNG or WebP with a transparent background, or grow the whole picture "
-            "(keep_background)"
+            f"border must have one colour (the background), but only {uniform:.0%} have: give a "
+            "PNG or WebP with a transparent background, or grow the whole picture (keep_background)"
         )
     similar = np.abs(rgb - background).max(axis=-1) <= _BACKGROUND_TOLERANCE
     outside = _connected_to_border(similar)

@@ -256,8 +256,7 @@ def _read_mesh(path: Path) -> Mesh:
         # Its readers report damaged files by exceptions of many kinds.
         raise NPAError(
             f"target {shown(str(path))} cannot be read as a mesh ({type(error).__name__}: "
-            f"{shown(error)}): "
-            "save it anew, for example as .ply or .glb"
+            f"{shown(error)}): save it anew, for example as .ply or .glb"
         ) from error
     in_space = vertices.shape[1:] == (3,) and faces.shape[1:] == (3,)
     if not in_space or faces.size == 0 or vertices.size == 0 or not np.isfinite(vertices).all():

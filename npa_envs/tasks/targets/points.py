@@ -142,8 +142,7 @@ def _named_image(
         return source, render_emoji(source)
     raise NPAError(
         "target must be a built-in name, the path of a picture file or one emoji, got "
-        f"{shown(source)}: "
-        f"{suggest(source, DRAWINGS)}"
+        f"{shown(source)}: {suggest(source, DRAWINGS)}"
     )
 
 

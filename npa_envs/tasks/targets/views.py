@@ -91,8 +91,7 @@ def load_views(
     if not isinstance(source, str | Path) or not str(source):
         raise NPAError(
             "target must be a built-in mesh, a mesh file or a folder of views, got "
-            f"{shown(source)}: "
-            "for example 'mushroom'"
+            f"{shown(source)}: for example 'mushroom'"
         )
     counts = {"training_count": training_count, "held_out_count": held_out_count}
     for name, value in {"resolution": resolution, **counts}.items():
@@ -235,8 +234,7 @@ def read_nerf(
     if reach == 0.0:
         raise NPAError(
             f"views must show something, but no picture of {shown(str(folder))} has a pixel of "
-            "alpha "
-            f"above {SEEN}: give pictures with a transparent background"
+            f"alpha above {SEEN}: give pictures with a transparent background"
         )
     scale = RADIUS / reach
     return ViewTarget(folder.name, _scaled(training, scale), _scaled(measured, scale))
