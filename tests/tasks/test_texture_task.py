@@ -138,7 +138,7 @@ def test_damage_wipes_a_disk_that_reaches_across_the_seam():
     corners = x.new_tensor([[[-0.95, 0.95], [0.95, 0.95], [0.0, 0.0], [-0.3, -0.95]]])
     x = torch.cat((x, corners), dim=1)
     s = torch.ones(1, 54, 16)
-    places, states = task.damage(x, s, None, torch.Generator().manual_seed(0))
+    places, states, _ = task.damage(x, s, None, torch.Generator().manual_seed(0))
     assert torch.equal(places, x)
     wiped = states[0, :, 0] == 0.0
     # Drawn is one of the fifty in the corner, but for a chance of 4 in 54.
