@@ -52,13 +52,7 @@ def home_path(path: str | Path) -> Path:
 
 
 def open_regular(path: str | Path, *, limit: int, what: str = "the file") -> IO[bytes]:
-    """Open a regular file to read its bytes; pipes, devices and folders are refused.
-
-    Args:
-        path: The file.
-        limit: Its largest size [bytes].
-        what: What errors call it.
-    """
+    """Open a regular file to read its bytes; pipes, devices and folders are refused."""
     path = checked_path(path)
     try:
         # Opening a pipe that nobody writes to would block without this flag.
@@ -84,13 +78,7 @@ def check_regular(path: str | Path, *, limit: int, what: str = "the file") -> No
 
 
 def read_bytes(path: str | Path, *, limit: int, what: str = "the file") -> bytes:
-    """Return the content of a regular file.
-
-    Args:
-        path: The file.
-        limit: Its largest size [bytes].
-        what: What errors call it.
-    """
+    """Return the content of a regular file."""
     with open_regular(path, limit=limit, what=what) as file:
         try:
             # Some files of the system have more in them than they say.
@@ -108,12 +96,7 @@ def parse_json(text: str | bytes) -> Any:
 
 
 def read_json(path: str | Path, *, limit: int = 16 * _MIB) -> Any:
-    """Return the value of a JSON file.
-
-    Args:
-        path: The file.
-        limit: Its largest size [bytes].
-    """
+    """Return the value of a JSON file."""
     return parse_json(read_bytes(path, limit=limit))
 
 
@@ -124,7 +107,6 @@ def check_torch_archive(file: IO[bytes], *, checksums: bool = True) -> None:
     holds would take more memory than it is worth.
 
     Args:
-        file: It, open; where it stands afterwards is not said.
         checksums: Whether to compare those too, which torch does not look at.
     """
     try:
@@ -165,9 +147,6 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
     look at the suffix work. It exists (empty) from the start, so that a folder that cannot be
     written to is noticed before any work is done. If the block raises, it is removed and `path`
     stays as it was. A symbolic link is followed: the file that it points to is replaced.
-
-    Args:
-        path: The file to write; an existing one is replaced, and its mode is kept.
     """
     given = checked_path(path)
     target = Path(os.path.realpath(given))
@@ -216,11 +195,7 @@ def made_folder(path: Path) -> Iterator[None]:
 
 
 def remove_unfinished(path: Path) -> None:
-    """Remove the temporary files that killed writes of a file have left beside it.
-
-    Args:
-        path: The file, which nobody may be writing now; its name may be a pattern of `Path.glob`.
-    """
+    """Remove the temporary files that killed writes of a file have left in its folder."""
     pattern = _temporary_name(path, "[0-9a-f]" * 2 * _TOKEN_BYTES)
     for left in path.parent.glob(pattern):
         # One that cannot be removed takes up space, and nothing else.
@@ -235,23 +210,13 @@ def _temporary_name(path: Path, token: str) -> str:
 
 
 def write_bytes(path: str | Path, data: bytes) -> None:
-    """Write `data` to `path`, whole or not at all.
-
-    Args:
-        path: The file to write; an existing one is replaced.
-        data: Its new content.
-    """
+    """Write `data` to `path`, whole or not at all."""
     with atomic_path(path) as temporary:
         temporary.write_bytes(data)
 
 
 def write_text(path: str | Path, text: str) -> None:
-    """Write `text` as UTF-8 with plain newlines to `path`, whole or not at all.
-
-    Args:
-        path: The file to write; an existing one is replaced.
-        text: Its new content.
-    """
+    """Write `text` as UTF-8 with plain newlines to `path`, whole or not at all."""
     write_bytes(path, text.encode("utf-8"))
 
 
@@ -316,11 +281,7 @@ def _explain(given: Path, error: OSError) -> str:
 
 
 def plain_numbers(value: Any) -> Any:
-    """Return a tree of values as JSON has it; numbers that are not finite are None.
-
-    Args:
-        value: Mappings, lists and tuples of plain values.
-    """
+    """Return a tree of values as JSON has it; numbers that are not finite are None."""
     if isinstance(value, Mapping):
         return {key: plain_numbers(inner) for key, inner in value.items()}
     if isinstance(value, list | tuple):
@@ -329,9 +290,5 @@ def plain_numbers(value: Any) -> Any:
 
 
 def json_text(value: Any) -> str:
-    """Return a tree of values as the text of a JSON file, by `plain_numbers`.
-
-    Args:
-        value: As there.
-    """
+    """Return a tree of values as the text of a JSON file, by `plain_numbers`."""
     return json.dumps(plain_numbers(value), indent=1, allow_nan=False, ensure_ascii=False) + "\n"

@@ -50,7 +50,7 @@ class Places:
 
 
 class Child(ABC):
-    """A process that is told where to run once its turn has come."""
+    """A process that learns its device once its turn has come."""
 
     @abstractmethod
     def go(self, device: str) -> None:

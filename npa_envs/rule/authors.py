@@ -26,6 +26,7 @@ import math
 import pickle
 import struct
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -34,7 +35,6 @@ from torch import Tensor
 
 from npa_envs.errors import NPAError, shown, suggest
 from npa_envs.files import check_torch_archive, checked_path, parse_json, write_text
-from npa_envs.rule.parts import RuleParts, check_finite
 from npa_envs.rule.rule import NPARule, check_rule
 
 _DEMO_SPACE_DIM = 2
@@ -84,6 +84,41 @@ _WEIGHT_NAMES = {
 }
 _DECODER_NAMES = {name for name in _WEIGHT_NAMES if name.startswith("decoder")}
 _IGNORED = {"N0"}
+
+
+@dataclass(frozen=True)
+class RuleParts:
+    """A rule taken apart: what `NPARule` is made with, and its weights by its own names."""
+
+    hyper_parameters: dict[str, Any]
+    weights: dict[str, Tensor]
+    header: dict[str, str] | None = None
+    """Metadata of a file in our format."""
+    has_checksum: bool = False
+    """Whether the file has one, which shows damage."""
+
+
+def check_precision(weights: Mapping[str, Tensor]) -> None:
+    """Check that all weights are float32, or all float64."""
+    dtypes = {tensor.dtype for tensor in weights.values()}
+    if len(dtypes) != 1 or not dtypes <= {torch.float32, torch.float64}:
+        raise NPAError(
+            "the weights must be all float32 or all float64, got "
+            f"{sorted(str(dtype) for dtype in dtypes)}: convert them, as rule.float() does, and "
+            "save the rule again"
+        )
+
+
+def check_finite(weights: Mapping[str, Tensor]) -> None:
+    """Check that every weight is finite."""
+    for name, tensor in weights.items():
+        bad = int((~torch.isfinite(tensor)).sum())
+        if bad:
+            raise NPAError(
+                f"the weights must be finite, got {bad} of {tensor.numel()} numbers in "
+                f"{shown(name)} NaN or infinite: take an earlier checkpoint, or train with a lower "
+                "learning rate"
+            )
 
 
 def read_state_dict(data: bytes) -> RuleParts:
@@ -185,11 +220,7 @@ def _equivariant_parts(
 
 
 def read_demo_json(data: bytes, name: str | None) -> RuleParts:
-    """Read one rule of the authors' web demo.
-
-    Args:
-        data: The content of the JSON file.
-    """
+    """Read one rule of the authors' web demo."""
     entry, place = _demo_rule(parse_json(data), name)
     if "W_hidden" in entry:
         return _read_equivariant_entry(entry, place)
@@ -292,7 +323,6 @@ def save_demo_json(
     `load_rule("models.json#name")` gives each of them back.
 
     Args:
-        path: The file to write, ending in `.json`; an existing one is replaced.
         particle_counts: With how many particles a rule starts there; 4096 where nothing is said.
     """
     path = checked_path(path)

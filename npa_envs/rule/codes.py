@@ -1,4 +1,4 @@
-"""Codes: the numbers by which a rule of many pictures is told which one to grow."""
+"""Codes: the numbers that say which picture a rule of many pictures grows."""
 
 from __future__ import annotations
 
@@ -29,7 +29,6 @@ class Codes(nn.Module):
     particle.
 
     Args:
-        names: What each code stands for, all different.
         dim: Numbers of a code, K.
         encoder: Codes are read from pictures by a network, so that a picture that was never trained
             on has one too. Without, each is learned by itself.

@@ -19,7 +19,7 @@ FLAT = 0.5 * math.sqrt(1.0 / math.pi)
 
 
 class Gaussians(NamedTuple):
-    """What `render_gaussians` takes besides positions and cameras."""
+    """Arguments of `render_gaussians`, without positions and cameras."""
 
     scales: Tensor
     """Standard deviations [length units], shape [B, N, 3]."""
@@ -85,7 +85,6 @@ def draw_gaussians(x: Tensor, gaussians: Gaussians, cameras: Cameras) -> tuple[T
 
     Args:
         gaussians: How particles look.
-        cameras: V cameras, the same for all worlds.
 
     Returns:
         Red, green and blue, shape [B, V, H, W, 3], and alpha, shape [B, V, H, W].

@@ -35,7 +35,7 @@ class Frame(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class TaskConfig:
-    """World and rule of a task; the configurations of tasks add what they are told besides."""
+    """World and rule of a task; the tasks' configurations add their own fields."""
 
     particle_count: int = 4096
     """Particles in a world, N."""
@@ -142,18 +142,14 @@ class ParticleTask(Generic[ConfigT]):
 
     @property
     def rule_shape(self) -> dict[str, Any]:
-        """What `NPARule` takes besides the channels, the hidden width and ε0."""
+        """Further arguments of `NPARule`: all but channels, hidden width and ε0."""
         raise NotImplementedError
 
     def make_rule(self, generator: torch.Generator) -> NPARule:
         """Return an untrained rule on the CPU; its weights are drawn from `generator`."""
-        return untrained_rule(
-            generator,
-            state_dim=self.config.state_dim,
-            hidden_dim=self.config.hidden_dim,
-            eps0=self.config.eps,
-            **self.rule_shape,
-        )
+        config = self.config
+        sizes = {"state_dim": config.state_dim, "hidden_dim": config.hidden_dim}
+        return untrained_rule(generator, **(sizes | {"eps0": config.eps} | self.rule_shape))
 
     def places(self, world_count: int, generator: Randomness, device: torch.device) -> Tensor:
         """Return the positions of fresh worlds."""

@@ -1,4 +1,4 @@
-"""2D morphogenesis of several species in one world, each beside the others."""
+"""2D morphogenesis of several species that share one world."""
 
 from __future__ import annotations
 
@@ -199,7 +199,7 @@ _OWN: Mapping[str, Mapping[str, Any]] = {"best": {"cut_share": 0.25}, "fast": {"
 def _beside(
     name: str, alone: Morphogenesis2DTrainConfig, neighbour: str
 ) -> JointTrainConfig[CoMorphogenesis2DConfig]:
-    """Return a run of one species, with another one of the same kind beside it."""
+    """Return a run of one species, together with another one of the same kind."""
     own = dataclasses.replace(alone.task, **_OWN.get(name, {}))
     species = (own, dataclasses.replace(own, target=neighbour))
     run = {field.name: getattr(alone, field.name) for field in dataclasses.fields(alone)}

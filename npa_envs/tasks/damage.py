@@ -1,6 +1,6 @@
 """Damage that a rule should heal: to worlds of a rollout, and to those of the training pool.
 
-Nothing here reads a value back from the device, so all of it may be captured in a CUDA graph.
+No function reads a value back from the device, so all may be captured in a CUDA graph.
 """
 
 from __future__ import annotations

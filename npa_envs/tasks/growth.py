@@ -58,7 +58,7 @@ class GrowthTask(ParticleTask[GrowthConfigT]):
 
     @property
     def rule_shape(self) -> dict[str, Any]:
-        """What `NPARule` takes besides the channels, the hidden width and ε0."""
+        """Further arguments of `NPARule`: all but channels, hidden width and ε0."""
         return {"space_dim": self.space_dim, "alpha": self.config.alpha}
 
     def places(self, world_count: int, generator: Randomness, device: torch.device) -> Tensor:

@@ -1,4 +1,4 @@
-"""Many pictures by one rule: each world has a target of its own, told by a code."""
+"""Many pictures by one rule: each world has a target of its own, which a code names."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from npa_envs.errors import NPAError, shown
 from npa_envs.files import home_path
 from npa_envs.rule.codes import Codes
 from npa_envs.rule.rule import NPARule
-from npa_envs.tasks.base import Worlds, check_goal, untrained_rule
+from npa_envs.tasks.base import Worlds, check_goal
 from npa_envs.tasks.morphogenesis2d import Morphogenesis2D, Morphogenesis2DConfig
 from npa_envs.tasks.seeds import drawn_indices
 from npa_envs.tasks.targets.images import looks_like_path
@@ -103,7 +103,7 @@ class ManyPictures(Morphogenesis2D):
 
     @property
     def rule_shape(self) -> dict[str, Any]:
-        """What `NPARule` takes besides the hidden width and ε0."""
+        """Further arguments of `NPARule`: all but hidden width and ε0."""
         config = self.config
         return super().rule_shape | {
             "state_dim": config.code_dim + config.state_dim,
@@ -112,17 +112,10 @@ class ManyPictures(Morphogenesis2D):
             "encoder": config.encoder,
         }
 
-    def make_rule(self, generator: torch.Generator) -> NPARule:
-        """Return an untrained rule on the CPU; its weights are drawn from `generator`."""
-        config = self.config
-        return untrained_rule(
-            generator, hidden_dim=config.hidden_dim, eps0=config.eps, **self.rule_shape
-        )
-
     def for_rule(self, rule: NPARule) -> Self:
         """Return the task whose worlds carry the codes of a rule.
 
-        Those of an encoder are read from the pictures here, and each time that states are `coded`.
+        An encoder reads them from the pictures now, and each time that states are `coded`.
         """
         if rule.codes is not None:
             with torch.no_grad():

@@ -173,9 +173,6 @@ class Morphogenesis2D(GrowthTask[Morphogenesis2DConfig]):
 
     Of a rule of many pictures, `for_rule` gives the task of one of them.
 
-    Args:
-        target: The target, where it is at hand already; by default `config.target` is loaded.
-
     Raises:
         NPAError: The target cannot be loaded.
     """
@@ -333,7 +330,7 @@ class Morphogenesis2D(GrowthTask[Morphogenesis2DConfig]):
 
     @property
     def rule_shape(self) -> dict[str, Any]:
-        """What `NPARule` takes besides the channels, the hidden width and ε0."""
+        """Further arguments of `NPARule`: all but channels, hidden width and ε0."""
         config = self.config
         known: dict[str, Any] = {"divides": True} if config.division else {}
         if config.equivariant:

@@ -129,9 +129,6 @@ class Morphogenesis3D(GrowthTask[Morphogenesis3DConfig]):
     As it is, the last three channels of a state are its colour and particles are round; `for_rule`
     gives the task that sees what a rule reads out of the states.
 
-    Args:
-        target: The target, where it is at hand already; by default `config.target` is loaded.
-
     Raises:
         NPAError: The target cannot be loaded, or its views have another size.
         MissingDependencyError: The library that reads a mesh file is not installed.
@@ -198,7 +195,7 @@ class Morphogenesis3D(GrowthTask[Morphogenesis3DConfig]):
 
     @property
     def rule_shape(self) -> dict[str, Any]:
-        """What `NPARule` takes besides the channels, the hidden width and ε0."""
+        """Further arguments of `NPARule`: all but channels, hidden width and ε0."""
         readout = {"readout_dim": OUTPUTS, "readout_hidden_dim": self.config.readout_hidden_dim}
         return super().rule_shape | readout
 
@@ -212,11 +209,7 @@ class Morphogenesis3D(GrowthTask[Morphogenesis3DConfig]):
         return self._appearance.gaussians(outputs)
 
     def views(self, x: Tensor, s: Tensor, cameras: Cameras) -> Tensor:
-        """Return what cameras see: colours times alpha, and alpha, shape [B, V, H, W, 4].
-
-        Args:
-            cameras: V cameras; the first row of what they see is the upper one.
-        """
+        """Return what cameras see: colours times alpha, and alpha, shape [B, V, H, W, 4]."""
         return self._draw(x, self.gaussians(s), cameras)
 
     def picture(self, x: Tensor, s: Tensor) -> Tensor:

@@ -154,7 +154,7 @@ class PointClassification(ParticleTask[PointClassificationConfig]):
 
     @property
     def rule_shape(self) -> dict[str, Any]:
-        """What `NPARule` takes besides the channels, the hidden width and ε0."""
+        """Further arguments of `NPARule`: all but channels, hidden width and ε0."""
         config = self.config
         readout = {
             "readout_dim": config.class_count,

@@ -28,14 +28,9 @@ def uniform_ball(
         radius: Radius of the ball [length units].
     """
     device = check_device(device)
-    world_count, particle_count, space_dim = (
-        checked_count(name, value)
-        for name, value in (
-            ("world_count", world_count),
-            ("particle_count", particle_count),
-            ("space_dim", space_dim),
-        )
-    )
+    world_count = checked_count("world_count", world_count)
+    particle_count = checked_count("particle_count", particle_count)
+    space_dim = checked_count("space_dim", space_dim)
     if space_dim < 1:
         raise NPAError(f"space_dim must be at least 1, got {shown(space_dim)}: give 2 or 3")
     radius = checked_finite("radius", radius, " [length units]")

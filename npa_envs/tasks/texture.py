@@ -133,9 +133,6 @@ DRAWINGS = 16
 class Texture(ParticleTask[TextureConfig]):
     """The texture task of arXiv 2601.16096, with its loss.
 
-    Args:
-        target: The target, where it is at hand already; by default `config.target` is loaded.
-
     Raises:
         NPAError: The target cannot be loaded.
     """
@@ -164,7 +161,7 @@ class Texture(ParticleTask[TextureConfig]):
             seen = min(2.0 * target.gap * config.box_size, LARGEST_EPS, 0.5 * config.box_size)
             config = replace(config, see_across=False, eps=max(config.eps, seen))
         self.config = config
-        """What was told; ε is the one that rules are trained at."""
+        """The configuration; its ε is the one that rules are trained at."""
         self.target = target
         """What worlds are to look like."""
         self._target_picture = target.picture.to(device)
@@ -183,7 +180,7 @@ class Texture(ParticleTask[TextureConfig]):
 
     @property
     def rule_shape(self) -> dict[str, Any]:
-        """What `NPARule` takes besides the channels, the hidden width and ε0."""
+        """Further arguments of `NPARule`: all but channels, hidden width and ε0."""
         return {"alpha": self.config.alpha}
 
     def places(self, world_count: int, generator: Randomness, device: torch.device) -> Tensor:
@@ -209,7 +206,6 @@ class Texture(ParticleTask[TextureConfig]):
         """Return the target as particles draw it: a jittered lattice of them, with its colours.
 
         Args:
-            number: What jitter and shift are drawn from.
             shifted: Whether the target is moved round the box, so that another part is cut out.
 
         Returns:

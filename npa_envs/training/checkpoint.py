@@ -58,12 +58,7 @@ NOT_NEGATIVE = {
 
 
 def save_checkpoint(path: Path, content: dict[str, Any]) -> None:
-    """Write a checkpoint, whole or not at all.
-
-    Args:
-        path: The file; an existing one stays as it is until the new one is complete.
-        content: Tensors, numbers, strings, and lists and dicts of them.
-    """
+    """Write a checkpoint, whole or not at all."""
     with atomic_path(path) as temporary, _PatientFile(temporary, "wb") as file:
         torch.save(
             {"format": CHECKPOINT_FORMAT, "format_version": CHECKPOINT_VERSION, **content}, file
@@ -122,11 +117,7 @@ def load_checkpoint(path: Path) -> dict[str, Any]:
 
 
 def drawn_by_world(content: Mapping[str, Any]) -> bool:
-    """Return whether each world of a run draws by itself, as several processes need it.
-
-    Args:
-        content: What `load_checkpoint` returned.
-    """
+    """Return whether each world of a run draws by itself, as several processes need it."""
     states = content.get("random_states")
     return isinstance(states, dict) and states.keys() == {"schedule"}
 
@@ -169,14 +160,7 @@ def check_same_run(
 
 
 def check_content(content: dict[str, Any], expected: Mapping[str, Any], path: Path) -> None:
-    """Check that what a run goes on from is of the kind that the run itself has.
-
-    Args:
-        content: The checkpoint.
-        expected: The same of the run as it is, by the same names: dicts have the same keys, tensors
-            the same shapes and dtypes, others the same types.
-        path: The checkpoint's, for the error.
-    """
+    """Check that what a run goes on from is of the kind that the run itself has."""
     wrong = [
         what for name, like in expected.items() for what in _wrong(name, content.get(name), like)
     ]

@@ -26,7 +26,7 @@ WARM_UP_STEPS = 2
 
 
 class TrainingOptions(TypedDict):
-    """What the trainer tells a rollout by name."""
+    """Keyword arguments that the trainer gives a rollout."""
 
     eps: float
     box: tuple[float, ...] | None
@@ -63,10 +63,6 @@ class EagerIteration:
 
     Reads `x0`, `s0`; writes `x`, `s`, `terms` and the `.grad` of every parameter. All of these
     are the same tensors in every iteration: fill them with `copy_`.
-
-    Args:
-        rollout: The rollout to run; another one only in tests.
-        mean_over_processes: As `counted_together` takes it, where several processes share a run.
     """
 
     def __init__(

@@ -54,7 +54,7 @@ class TaskEntry:
     def expected_seconds(self, config: TrainConfig[Any]) -> float | None:
         """Return about how long a run takes on a CPU [s]: as its particle-steps to those of `fast`.
 
-        None on other devices, where particle-steps do not tell.
+        None on other devices, where particle-steps say little.
         """
         if config.device != "cpu":
             return None

@@ -90,7 +90,6 @@ def world_streams(
     """Return streams of this process's worlds, which do not depend on who else has which.
 
     Args:
-        total: Worlds of all processes.
         places: Which of them are this process's, on the CPU, int64, shape [B].
     """
     keys = np.random.default_rng(seed).integers(2**64, size=total, dtype=np.uint64)

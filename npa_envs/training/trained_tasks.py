@@ -1,4 +1,4 @@
-"""Tasks that rules were trained on, as their files tell."""
+"""Tasks that rules were trained on, read from their files."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def task_of_rule(
     particle_count: int | None = None,
     **fields: Any,
 ) -> TrainedTask:
-    """Return the task that a rule was trained on, as its file tells.
+    """Return the task that a rule was trained on, read from its file.
 
     A rule whose file says nothing of a task, as the authors' do, is run in the paper's world of
     2D morphogenesis with the rule's own sizes, or in the one that it was found in where
@@ -78,8 +78,8 @@ def task_of_rule(
         "hidden_dim": rule.hidden_dim,
     }
     own |= {"eps": rule.eps0} | ({} if rule.static else {"alpha": rule.alpha})
-    told = "config" in metadata
-    if not told:
+    known = "config" in metadata
+    if not known:
         config = override(preset("paper", task_name, **own), **_world_of(path, metadata))
     else:
         config = trained_config(path, metadata)
@@ -89,7 +89,7 @@ def task_of_rule(
     chosen = fields.get("target") is not None
     if rule.codes is not None:
         config = override(config, targets=(), target=_one_of(config.task, rule.codes, chosen))
-    doubt = None if told or chosen else "its file does not say what it grows"
+    doubt = None if known or chosen else "its file does not say what it grows"
     try:
         # What a rule was trained on it may know by heart.
         task = entry.make(config.task, device).held_out()
@@ -114,7 +114,6 @@ def tasks_of_codes(
     """Return the task of each picture that a rule has a code for, in their order; none without.
 
     Args:
-        source: What the rule was loaded from.
         fields: As for `task_of_rule`.
     """
     names = () if rule.codes is None else rule.codes.names

@@ -69,7 +69,7 @@ def test_worlds_age_and_are_new_when_they_run_away():
     pool = WorldPool(x, x.clone(), runaway_limit=1.0, max_age_range=(5, 40))
     index = torch.tensor([0, 2, 3])
     after = torch.tensor([0.0, 0.0, 3.0])[:, None, None].expand(3, 2, 2)
-    pool.write(index, after, after, x[:3], x[:3], age=torch.tensor([7, 8, 9]))
+    pool.write(index, (after, after, None), (x[:3], x[:3], None), age=torch.tensor([7, 8, 9]))
     assert pool.age.tolist() == [7, 0, 8, 0]
     age, over = pool.ages_of(index)
     assert age.tolist() == [7, 8, 0]
@@ -83,7 +83,9 @@ def test_pool_replaces_worlds_that_run_away_and_only_those(bad, where, device):
     x, s = (torch.full((3, 4, c), v, device=device) for c, v in ((2, 7.0), (3, 8.0)))
     (x if where == "x" else s)[1, 2, 1] = bad
     fresh_x, fresh_s = torch.full_like(x, 0.5), torch.full_like(s, 0.25)
-    replaced = pool.write(torch.tensor([5, 0, 3], device=device), x, s, fresh_x, fresh_s)
+    replaced = pool.write(
+        torch.tensor([5, 0, 3], device=device), (x, s, None), (fresh_x, fresh_s, None)
+    )
     assert replaced.tolist() == [False, True, False]
     assert pool.x[:, 0, 0].tolist() == [0.5, 1, 2, 7, 4, 7]
     assert pool.s[:, 0, 0].tolist() == [0.25, 1, 2, 8, 4, 8]

@@ -255,10 +255,7 @@ def load_pictures(data: str, split: Split = "train", *, folder: str = "data") ->
     """Return the pictures of a data set.
 
     Args:
-        data: "digits" (scikit-learn's 1797 pictures of 8 x 8 pixels), "mnist" (by torchvision), or
-            the path of a folder with files in MNIST's IDX format.
         split: "train" or "test"; no picture is in both.
-        folder: Where torchvision keeps "mnist".
     """
     if split not in get_args(Split):
         raise NPAError(f"split must be 'train' or 'test', got {shown(split)}")

@@ -39,11 +39,7 @@ def find_emoji_fonts() -> list[Path]:
 
 
 def render_emoji(text: str) -> Image.Image:
-    """Return the RGBA picture of one emoji.
-
-    Args:
-        text: One emoji: a character or a sequence joined to one picture.
-    """
+    """Return the RGBA picture of one emoji."""
     fonts = find_emoji_fonts()
     if not fonts:
         raise MissingDependencyError(

@@ -43,11 +43,7 @@ Mask = NDArray[np.bool_]
 
 
 def read_image(path: Path) -> Image.Image:
-    """Read a picture as RGBA; one without transparency is cut out of its plain background.
-
-    Args:
-        path: A file in one of `FORMATS`; of an animation, the first frame.
-    """
+    """Read a picture as RGBA; one without transparency is cut out of its plain background."""
     image = open_image(path)
     if np.asarray(image.getchannel("A")).min() == 255:
         return cut_out_background(image, label=str(path))
@@ -62,11 +58,7 @@ def with_background(image: Image.Image) -> Image.Image:
 
 
 def open_image(path: Path) -> Image.Image:
-    """Read a picture as RGBA, as it is.
-
-    Args:
-        path: A file in one of `FORMATS`; of an animation, the first frame.
-    """
+    """Read a picture as RGBA, as it is."""
     name = shown(str(path))
     content = read_bytes(path, limit=_LARGEST_FILE, what="target")
     if not content:
@@ -157,10 +149,6 @@ def cut_out_background(image: Image.Image, *, label: str) -> Image.Image:
     The background is what has the colour of the border and is connected with it; a hole that the
     object encloses stays opaque. Pixels at the object's edge, which mix both colours, are unmixed.
     A side above 2048 pixels is reduced to that first.
-
-    Args:
-        image: An RGBA picture without transparent pixels.
-        label: The name of the picture in error messages.
     """
     image = image.reduce(math.ceil(max(image.size) / _LARGEST_CUT_OUT))
     rgb = np.asarray(image.convert("RGB")).astype(np.float32)
@@ -194,10 +182,6 @@ def resample(image: Image.Image, point_count: int, *, label: str = "picture") ->
     The scale is continuous: the picture is sampled with a pitch found by bisection, on a square
     grid that holds the whole picture, so that other shapes than squares are padded. Colours are
     averaged with alpha as weight, so that those of transparent pixels never leak in.
-
-    Args:
-        image: An RGBA picture with at least one opaque pixel.
-        label: The name of the picture in error messages.
     """
     image = image.crop(image.getchannel("A").getbbox())
     area = _opaque_count(image)

@@ -220,11 +220,7 @@ def builtin_meshes() -> tuple[str, ...]:
 
 
 def load_mesh(source: str | Path) -> Mesh:
-    """Return a mesh, fitted into the ball of radius 0.85 around the origin.
-
-    Args:
-        source: A built-in name, or the path of a mesh file that trimesh reads.
-    """
+    """Return a mesh, fitted into the ball of radius 0.85 around the origin."""
     if isinstance(source, str) and source in MESHES:
         return MESHES[source]().fitted()
     path = home_path(source)

@@ -117,7 +117,6 @@ def load_target_image(
     """Return the name and the full-size RGBA picture of what `load_target` accepts as source.
 
     Args:
-        source: A built-in name, the path of a picture file, or one emoji.
         keep_background: As for `load_target`.
     """
     if not isinstance(source, str | Path):
@@ -163,7 +162,6 @@ def target_from_image(
     """Make a target from the opaque pixels of a picture in memory.
 
     Args:
-        image: A Pillow picture, used as it is: what it has no transparency for is all target.
         extent: Side of the square around the origin that the target just fits in [length units].
     """
     rgba = image.convert("RGBA")

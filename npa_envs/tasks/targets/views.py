@@ -115,7 +115,6 @@ def views_of_mesh(
     """Draw a mesh that fits into the ball of radius 0.85 from cameras all around.
 
     Args:
-        mesh: What to draw.
         training_count: Views to train with.
         held_out_count: Views to measure by.
     """
@@ -154,18 +153,13 @@ def over(views: Tensor, background: Tensor) -> Tensor:
     """Return colours before a background, shape [..., 3].
 
     Args:
-        views: Colours times alpha, and alpha, shape [..., 4].
         background: Red, green and blue; broadcasts to [..., 3].
     """
     return views[..., :3] + (1.0 - views[..., 3:]) * background
 
 
 def some_views(views: Views, index: Tensor) -> Views:
-    """Return some of the views.
-
-    Args:
-        views: All of them.
-    """
+    """Return some of the views."""
     cameras = views.cameras
     intrinsics = cameras.intrinsics
     chosen = replace(
@@ -180,7 +174,6 @@ def nearest_camera(cameras: Cameras, elevation: float) -> int:
     """Return which camera looks at the origin from nearest to the front, at an elevation.
 
     Args:
-        cameras: V cameras.
         elevation: Above the horizon [degrees]; the front is where z points to.
     """
     motions = cameras.world_to_camera.double().cpu()
@@ -218,7 +211,6 @@ def read_nerf(
     """Read a scene; `load_views` says what becomes of it.
 
     Args:
-        folder: Holds `transforms_train.json` and `transforms_test.json` (or `_val`).
         training_count: Views to train with, at most.
         held_out_count: Views to measure by, at most.
     """
