@@ -107,7 +107,7 @@ def measured(rule: npa_envs.NPARule, config: Morphogenesis2DConfig, device: str)
     """Return losses over the steps, and those of creatures turned by 90 degrees."""
     task, blind = tasks_of(config, device)
     random = WorldRandom(SEEDS, device=device)
-    x, s = task.seed(len(SEEDS), generator=random, device=device)
+    x, s, _ = task.seed(len(SEEDS), generator=random, device=device)
     found: dict[str, Any] = {"upright": {}, "best_angle": {}}
     done, grown = 0, (x, s)
     for steps in STEPS:

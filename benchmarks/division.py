@@ -26,7 +26,7 @@ from torch import Tensor
 import npa_envs
 from npa_envs.measure.record import machine, write_record
 from npa_envs.rule.files import rule_metadata
-from npa_envs.tasks.base import PictureTask
+from npa_envs.tasks.base import Task
 from npa_envs.training import preset
 from npa_envs.training.trained_tasks import task_of_rule
 from npa_envs.world.division import living
@@ -81,7 +81,7 @@ def train(arguments: argparse.Namespace) -> None:
     print(f"{[*wanted]}, {trainers[0].iteration} iterations, {seconds:.1f} s together")
 
 
-def row(task: PictureTask, x: Tensor, s: Tensor, divides: bool) -> dict[str, list[float]]:
+def row(task: Task, x: Tensor, s: Tensor, divides: bool) -> dict[str, list[float]]:
     """Return the loss of each world and how many particles live in it."""
     alive = living(s).sum(dim=1) if divides else torch.full((len(x),), x.shape[1])
     return {"loss": task.metric(x, s).tolist(), "living": alive.tolist()}
@@ -99,7 +99,7 @@ def measured(path: Path, device: torch.device) -> dict[str, Any]:
             rule, x, s, steps, eps=task.eps, update_prob=task.update_prob, generator=random
         )
 
-    x, s = task.seed(len(SEEDS), generator=random, device=device)
+    x, s, _ = task.seed(len(SEEDS), generator=random, device=device)
     found: dict[str, Any] = {"iteration": int(rule_metadata(path)["iteration"]), "grown": {}}
     done = 0
     for steps in STEPS:

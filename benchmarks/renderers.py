@@ -124,7 +124,7 @@ def main() -> None:
     rule = npa_envs.load_rule("duck-v0", device=DEVICE).requires_grad_(False)
     task = task_of_rule("duck-v0", rule, DEVICE).task
     generator = torch.Generator(DEVICE).manual_seed(1)
-    x, s = task.seed(4, generator=generator, device=DEVICE)
+    x, s, _ = task.seed(4, generator=generator, device=DEVICE)
     with torch.no_grad():
         grown = npa_envs.rollout(rule, x, s, 128, generator=generator)
     cameras = some_views(task.target.training, torch.arange(4, device=DEVICE)).cameras

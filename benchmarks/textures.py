@@ -138,7 +138,7 @@ def particles(arguments: argparse.Namespace) -> None:
             config = preset("paper", "texture", target=target, loss=loss, **changes).task
             task = Texture(config, device=device)
             generator = torch.Generator(device).manual_seed(0)
-            x, s = task.seed(1, generator=generator, device=device)
+            x, s, _ = task.seed(1, generator=generator, device=device)
             colour = s[..., -3:].clone().requires_grad_()
             x.requires_grad_()
             half = 0.5 * config.box_size

@@ -95,7 +95,7 @@ def directions(paths: list[str]) -> Shots:
         task = task_of(path, rule)
         for seed in SEEDS:
             generator = torch.Generator().manual_seed(seed)
-            x, s = run(rule, task, *task.seed(1, generator=generator), GROWN, seed=seed)
+            x, s = run(rule, task, *task.seed(1, generator=generator)[:2], GROWN, seed=seed)
             shots.append((f"{kind}, step {GROWN}", as_it_lies(task, x, s)))
         quarter = turns(torch.tensor([0.5 * math.pi]), torch.ones(1))
         x = turned(x, quarter)
@@ -118,7 +118,7 @@ def directions_upright(paths: list[str]) -> Shots:
         task = task_of(path, rule)
         shots.append(("target", enlarged(task.target_picture)[::2, ::2]))
         generator = torch.Generator().manual_seed(SEEDS[0])
-        x, s = run(rule, task, *task.seed(1, generator=generator), GROWN, seed=SEEDS[0])
+        x, s = run(rule, task, *task.seed(1, generator=generator)[:2], GROWN, seed=SEEDS[0])
         shots.append((f"step {GROWN}", as_it_lies(task, x, s)[::2, ::2]))
         y, u = run(rule, task, turned(x, quarter), s, AFTER, seed=SEEDS[1])
         shots.append((f"turned, {AFTER} later", as_it_lies(task, y, u)[::2, ::2]))
@@ -138,12 +138,12 @@ def sizes(paths: list[str]) -> Shots:
             count = round(share * trained.config.particle_count)
             task = task_of(path, rule, count)
             generator = torch.Generator().manual_seed(SEEDS[0])
-            x, s = run(rule, task, *task.seed(1, generator=generator), GROWN, seed=SEEDS[0])
+            x, s = run(rule, task, *task.seed(1, generator=generator)[:2], GROWN, seed=SEEDS[0])
             shots.append((f"N = {count}", as_it_lies(task, x, s)))
         for share in RADII:
             # A larger radius is a smaller disk: scaling both is a symmetry.
             generator = torch.Generator().manual_seed(SEEDS[0])
-            x, s = trained.seed(1, generator=generator)
+            x, s, _ = trained.seed(1, generator=generator)
             x, s = run(rule, trained, x / share, s, GROWN, seed=SEEDS[0])
             shots.append((f"{share:g} x radius", as_it_lies(trained, x, s)))
     return shots
@@ -153,7 +153,7 @@ def division(paths: list[str]) -> Shots:
     """Return a world that grows from one particle, loses a half, and grows it again."""
     rule = npa_envs.load_rule(paths[0])
     task = task_of(paths[0], rule)
-    x, s = task.seed(1, generator=torch.Generator())
+    x, s, _ = task.seed(1, generator=torch.Generator())
     shots: Shots = [("step 0: 1 lives", as_it_lies(task, x, s))]
     step = 0
     for steps in GROWTH:
@@ -205,7 +205,7 @@ def sixty(path: str) -> Image.Image:
     rule = npa_envs.load_rule(path)
     tiles = []
     for task in tasks_of_codes(path, rule, CPU):
-        x, s = task.seed(1, generator=torch.Generator().manual_seed(SEEDS[0]))
+        x, s, _ = task.seed(1, generator=torch.Generator().manual_seed(SEEDS[0]))
         tile = [to_uint8(task.target_picture)]
         for before, after in pairwise((0, *LATER)):
             x, s = run(rule, task, x, s, after - before, seed=SEEDS[0] + after)

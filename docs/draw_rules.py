@@ -35,7 +35,7 @@ def grown(name: str, steps: tuple[int, ...]) -> tuple[Any, list[tuple[Tensor, Te
     rule = npa_envs.load_rule(name)
     task = task_of_rule(name, rule, CPU).task
     generator = torch.Generator().manual_seed(SEED)
-    x, s = task.seed(1, generator=generator)
+    x, s, _ = task.seed(1, generator=generator)
     worlds, before = [], 0
     for mark in steps:
         x, s = npa_envs.rollout(

@@ -184,9 +184,8 @@ class ShapeshifterTask(EnvTask[Shapeshifter2DEnvConfig]):
 
     def fresh(self, random: WorldRandom) -> Start:
         """Return grown worlds of random pictures, with another picture as their goal."""
-        x, s, grown = self.pictures.seed_with_goals(
-            random.world_count, generator=random, device=self.device
-        )
+        x, s, grown = self.pictures.seed(random.world_count, generator=random, device=self.device)
+        assert grown is not None, "worlds of many pictures have goals"
         s = self.rule.with_code(s, self.codes.table[grown][:, None])
         count = self.config.grow_steps
         # One by one: a rule's products change in the last bit with the number of worlds.

@@ -34,12 +34,7 @@ NEARLY_FULL_BYTES = 64 * 1024
 
 
 def checked_path(path: str | Path) -> Path:
-    """Return a path as pathlib's own.
-
-    Raises:
-        NPAError: It is neither text nor a path, or the system cannot write it, as it holds a zero
-            byte.
-    """
+    """Return a path as pathlib's own."""
     if not isinstance(path, str | os.PathLike):
         raise NPAError(f"a path must be text or a pathlib.Path, got {shown(path)}")
     try:
@@ -52,25 +47,12 @@ def checked_path(path: str | Path) -> Path:
 
 
 def home_path(path: str | Path) -> Path:
-    """Return a path in which a `~` at the beginning is the user's home.
-
-    Raises:
-        NPAError: As for `checked_path`.
-    """
+    """Return a path in which a `~` at the beginning is the user's home."""
     return Path(os.path.expanduser(checked_path(path)))
 
 
 def open_regular(path: str | Path, *, limit: int, what: str = "the file") -> IO[bytes]:
-    """Open a regular file to read its bytes; pipes, devices and folders are refused.
-
-    Args:
-        path: The file.
-        limit: Its largest size [bytes].
-        what: What errors call it.
-
-    Raises:
-        NPAError: There is no such file, it may not be read, is no regular one or larger than that.
-    """
+    """Open a regular file to read its bytes; pipes, devices and folders are refused."""
     path = checked_path(path)
     try:
         # Opening a pipe that nobody writes to would block without this flag.
@@ -91,25 +73,12 @@ def open_regular(path: str | Path, *, limit: int, what: str = "the file") -> IO[
 
 
 def check_regular(path: str | Path, *, limit: int, what: str = "the file") -> None:
-    """Check a file that a library reads by its path, as `open_regular` does.
-
-    Raises:
-        NPAError: As there.
-    """
+    """Check a file that a library reads by its path, as `open_regular` does."""
     open_regular(path, limit=limit, what=what).close()
 
 
 def read_bytes(path: str | Path, *, limit: int, what: str = "the file") -> bytes:
-    """Return the content of a regular file.
-
-    Args:
-        path: The file.
-        limit: Its largest size [bytes].
-        what: What errors call it.
-
-    Raises:
-        NPAError: As for `open_regular`.
-    """
+    """Return the content of a regular file."""
     with open_regular(path, limit=limit, what=what) as file:
         try:
             # Some files of the system have more in them than they say.
@@ -119,11 +88,7 @@ def read_bytes(path: str | Path, *, limit: int, what: str = "the file") -> bytes
 
 
 def parse_json(text: str | bytes) -> Any:
-    """Return the value of a JSON text.
-
-    Raises:
-        NPAError: It is none, is nested too deeply, or has numbers of thousands of digits.
-    """
+    """Return the value of a JSON text."""
     try:
         return json.loads(text)
     except (ValueError, RecursionError) as error:
@@ -131,15 +96,7 @@ def parse_json(text: str | bytes) -> Any:
 
 
 def read_json(path: str | Path, *, limit: int = 16 * _MIB) -> Any:
-    """Return the value of a JSON file.
-
-    Args:
-        path: The file.
-        limit: Its largest size [bytes].
-
-    Raises:
-        NPAError: As for `open_regular` and `parse_json`.
-    """
+    """Return the value of a JSON file."""
     return parse_json(read_bytes(path, limit=limit))
 
 
@@ -150,11 +107,7 @@ def check_torch_archive(file: IO[bytes], *, checksums: bool = True) -> None:
     holds would take more memory than it is worth.
 
     Args:
-        file: It, open; where it stands afterwards is not said.
         checksums: Whether to compare those too, which torch does not look at.
-
-    Raises:
-        NPAError: It is no archive, is damaged, or declares more than it holds.
     """
     try:
         held = file.seek(0, os.SEEK_END)
@@ -194,13 +147,6 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
     look at the suffix work. It exists (empty) from the start, so that a folder that cannot be
     written to is noticed before any work is done. If the block raises, it is removed and `path`
     stays as it was. A symbolic link is followed: the file that it points to is replaced.
-
-    Args:
-        path: The file to write; an existing one is replaced, and its mode is kept.
-
-    Raises:
-        NPAError: The folder is missing or cannot be written to, `path` is a folder, a pipe or a
-            device, the disk is full, or the system refuses the file for another reason.
     """
     given = checked_path(path)
     target = Path(os.path.realpath(given))
@@ -236,9 +182,6 @@ def made_folder(path: Path) -> Iterator[None]:
 
     Args:
         path: The folder.
-
-    Raises:
-        OSError: It cannot be created.
     """
     missing = [folder for folder in (path, *path.parents) if not folder.exists()]
     try:
@@ -252,11 +195,7 @@ def made_folder(path: Path) -> Iterator[None]:
 
 
 def remove_unfinished(path: Path) -> None:
-    """Remove the temporary files that killed writes of a file have left beside it.
-
-    Args:
-        path: The file, which nobody may be writing now; its name may be a pattern of `Path.glob`.
-    """
+    """Remove the temporary files that killed writes of a file have left in its folder."""
     pattern = _temporary_name(path, "[0-9a-f]" * 2 * _TOKEN_BYTES)
     for left in path.parent.glob(pattern):
         # One that cannot be removed takes up space, and nothing else.
@@ -271,29 +210,13 @@ def _temporary_name(path: Path, token: str) -> str:
 
 
 def write_bytes(path: str | Path, data: bytes) -> None:
-    """Write `data` to `path`, whole or not at all.
-
-    Args:
-        path: The file to write; an existing one is replaced.
-        data: Its new content.
-
-    Raises:
-        NPAError: As for `atomic_path`.
-    """
+    """Write `data` to `path`, whole or not at all."""
     with atomic_path(path) as temporary:
         temporary.write_bytes(data)
 
 
 def write_text(path: str | Path, text: str) -> None:
-    """Write `text` as UTF-8 with plain newlines to `path`, whole or not at all.
-
-    Args:
-        path: The file to write; an existing one is replaced.
-        text: Its new content.
-
-    Raises:
-        NPAError: As for `atomic_path`.
-    """
+    """Write `text` as UTF-8 with plain newlines to `path`, whole or not at all."""
     write_bytes(path, text.encode("utf-8"))
 
 
@@ -313,14 +236,12 @@ def _check_target(given: Path, target: Path) -> None:
         if not target.parent.exists():
             raise NPAError(
                 f"cannot write {shown(str(given))}: the folder {shown(str(target.parent))} does "
-                "not exist: "
-                f"create it first (mkdir -p {shown(str(target.parent))})"
+                f"not exist: create it first (mkdir -p {shown(str(target.parent))})"
             )
         if not target.parent.is_dir():
             raise NPAError(
                 f"cannot write {shown(str(given))}: {shown(str(target.parent))} is a file, not a "
-                "folder: "
-                "give a path in a folder"
+                "folder: give a path in a folder"
             )
     except OSError as error:
         raise NPAError(_explain(given, error)) from error
@@ -360,11 +281,7 @@ def _explain(given: Path, error: OSError) -> str:
 
 
 def plain_numbers(value: Any) -> Any:
-    """Return a tree of values as JSON has it; numbers that are not finite are None.
-
-    Args:
-        value: Mappings, lists and tuples of plain values.
-    """
+    """Return a tree of values as JSON has it; numbers that are not finite are None."""
     if isinstance(value, Mapping):
         return {key: plain_numbers(inner) for key, inner in value.items()}
     if isinstance(value, list | tuple):
@@ -373,9 +290,5 @@ def plain_numbers(value: Any) -> Any:
 
 
 def json_text(value: Any) -> str:
-    """Return a tree of values as the text of a JSON file, by `plain_numbers`.
-
-    Args:
-        value: As there.
-    """
+    """Return a tree of values as the text of a JSON file, by `plain_numbers`."""
     return json.dumps(plain_numbers(value), indent=1, allow_nan=False, ensure_ascii=False) + "\n"

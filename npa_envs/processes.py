@@ -50,7 +50,7 @@ class Places:
 
 
 class Child(ABC):
-    """A process that is told where to run once its turn has come."""
+    """A process that learns its device once its turn has come."""
 
     @abstractmethod
     def go(self, device: str) -> None:
@@ -95,9 +95,6 @@ def run_children(
         places: Where.
         ahead: Start as many children early, which get ready and wait.
         max_seconds: None begins after so long [s].
-
-    Raises:
-        KeyboardInterrupt: A signal of `STOPPING` has come.
     """
     ready, running = deque[SomeChild](), dict[int, SomeChild]()
     until = time.monotonic() + max_seconds
@@ -206,9 +203,6 @@ def part_of(
         items: All of them, in the same order on all machines.
         words: Which part of how many, counted from 1.
         together: Items for which this is equal belong to the same part.
-
-    Raises:
-        NPAError: The words say no part.
     """
     if words is None:
         return list(items)

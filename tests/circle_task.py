@@ -6,6 +6,7 @@ import torch
 from torch import Tensor
 
 from npa_envs.rule.rule import NPARule
+from npa_envs.tasks.base import ParticleTask, Worlds
 from npa_envs.tasks.morphogenesis2d import Morphogenesis2DConfig
 from npa_envs.training import TrainConfig
 from npa_envs.world.rollout import Memory
@@ -15,7 +16,7 @@ STATE_DIM = 3
 RESOLUTION = 8
 
 
-class CircleTask:
+class CircleTask(ParticleTask):
     """Mean squared distance from the circle of radius 0.5, and a small pull on the states."""
 
     eps = 0.2
@@ -34,16 +35,16 @@ class CircleTask:
                 parameter.uniform_(-0.1, 0.1, generator=generator)
         return rule
 
-    def seed(
-        self, world_count: int, *, generator: torch.Generator, device: torch.device
-    ) -> tuple[Tensor, Tensor]:
+    def seed(self, world_count: int, *, generator: torch.Generator, device: torch.device) -> Worlds:
         x = torch.rand(world_count, PARTICLE_COUNT, 2, generator=generator, device=device)
         s = torch.zeros(world_count, PARTICLE_COUNT, STATE_DIM, device=device)
-        return 0.4 * x - 0.2, s
+        return 0.4 * x - 0.2, s, None
 
-    def damage(self, x: Tensor, s: Tensor, generator: torch.Generator) -> tuple[Tensor, Tensor]:
+    def damage(
+        self, x: Tensor, s: Tensor, goal: Tensor | None, generator: torch.Generator
+    ) -> Worlds:
         blank = torch.rand(s.shape[:2], generator=generator, device=s.device) < 0.2
-        return x, s.masked_fill(blank[..., None], 0.0)
+        return x, s.masked_fill(blank[..., None], 0.0), goal
 
     def loss(self, x: Tensor, s: Tensor, path_length: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
         self.loss_calls += 1

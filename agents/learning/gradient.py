@@ -20,7 +20,7 @@ from npa_envs.envs.multi.task import Population, SpeciesConfig, SpeciesTask
 from npa_envs.errors import NPAError, shown
 from npa_envs.rule.network import FoldedRule
 from npa_envs.rule.rule import NPARule
-from npa_envs.tasks.base import Task
+from npa_envs.tasks.base import ParticleTask, Worlds
 from npa_envs.tasks.train_config import TrainConfig
 from npa_envs.training.cycle import TrainingCycle
 from npa_envs.world.randomness import Randomness, WorldRandom
@@ -106,7 +106,7 @@ def train(
     config = _trainer_config(problem, progress, seed, device, options, task.can_be_recorded)
     # The cycle asks of the rule what any module has, and of the task what it needs of one.
     cycle = TrainingCycle(
-        cast(Task, task),
+        task,
         cast(NPARule, rules),
         config,
         device,
@@ -183,10 +183,7 @@ def episode_task(problem: Problem, device: torch.device) -> EnvironmentTask:
     Raises:
         NPAError: The problem is a game or its species die, so that no gradient descends its loss.
     """
-    made = EnvironmentTask(problem, device)
-    generator = torch.Generator(device).manual_seed(0)
-    has_goals = not problem.is_species and made._start(1, generator, device)[3] is not None
-    return GoalEpisodeTask(problem, device) if has_goals else made
+    return EnvironmentTask(problem, device)
 
 
 def _check_rules_of_play(problem: Problem, task: EnvTask[Any] | SpeciesTask) -> None:
@@ -207,20 +204,16 @@ def _check_rules_of_play(problem: Problem, task: EnvTask[Any] | SpeciesTask) -> 
         )
 
 
-class EnvironmentTask:
+class EnvironmentTask(ParticleTask[Any]):
     """Worlds as a problem's episodes start, and their loss; worlds move by the problem's physics.
 
-    It is a `npa_envs.tasks.base.Task` as far as the training cycle asks for one.
+    Episodes are damaged where they start, or not at all. Rules are made by the learner.
     """
 
     def __init__(self, problem: Problem, device: torch.device) -> None:
         self.problem = problem
         self.physics = problem.physics
         """The worlds' constants."""
-        self.eps, self.box = self.physics.eps, self.physics.box
-        """Perception radius ε and sides of the periodic box, None in open space [length units]."""
-        self.update_prob = self.physics.update_prob
-        """Probability of a particle's update in a step, dimensionless."""
         self._task = problem.make_task(device)
         counts = torch.tensor(problem.counts)
         self._species = torch.arange(len(counts)).repeat_interleave(counts).to(device)
@@ -232,12 +225,31 @@ class EnvironmentTask:
         """Whether starts take few operations, so that they are recorded on CUDA."""
         return isinstance(self._task, SpeciesTask) or self._task.start_is_short
 
+    @property
+    def eps(self) -> float:
+        """Perception radius ε [length units]."""
+        return self.physics.eps
+
+    @property
+    def box(self) -> tuple[float, ...] | None:
+        """Sides of the periodic box, None in open space [length units]."""
+        return self.physics.box
+
+    @property
+    def update_prob(self) -> float:
+        """Probability of a particle's update in a step (dimensionless)."""
+        return self.physics.update_prob
+
     def seed(
-        self, world_count: int, *, generator: Randomness, device: torch.device
-    ) -> tuple[Tensor, Tensor]:
-        """Return worlds as episodes begin: positions [B, N, D] and states [B, N, C]."""
-        x, s, *_ = self._start(world_count, generator, device)
-        return x, s
+        self, world_count: int, *, generator: Randomness, device: str | torch.device = "cpu"
+    ) -> Worlds:
+        """Return worlds as episodes begin, and their goals where they have such."""
+        x, s, *rest = self._start(world_count, generator, torch.device(device))
+        return x, s, None if self.problem.is_species else rest[1]
+
+    def toward(self, goal: Tensor | None) -> Self:
+        """Return the task with the loss of worlds that have these goals, shape [B]."""
+        return self if goal is None else self._with(_task=cast(Any, self._task).toward(goal))
 
     def loss(self, x: Tensor, s: Tensor, path_length: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
         """Return the environment's loss, the mean over worlds and species, and its named parts.
@@ -329,31 +341,6 @@ class EnvironmentTask:
                 "a method that follows gradients, but no gradient leads from them to positions or "
                 "states: compute them by torch's operations, or learn by 'ppo' or 'evolution'"
             )
-
-
-class GoalEpisodeTask(EnvironmentTask):
-    """The same for a task whose worlds have goals of their own, such as the class of a cloud."""
-
-    def seed_with_goals(
-        self, world_count: int, *, generator: Randomness, device: torch.device
-    ) -> tuple[Tensor, Tensor, Tensor]:
-        """Return worlds at the beginning of their episodes, and their goals, int64, shape [B]."""
-        x, s, _, goal = self._start(world_count, generator, device)
-        return x, s, goal
-
-    def damage_with_goals(
-        self, x: Tensor, s: Tensor, goal: Tensor, generator: torch.Generator
-    ) -> tuple[Tensor, Tensor, Tensor]:
-        """Return worlds as they are: episodes are damaged where they start, or not at all."""
-        return x, s, goal
-
-    def toward(self, goal: Tensor) -> Self:
-        """Return the task with the loss of worlds that have these goals, shape [B]."""
-        aimed = type(self).__new__(type(self))
-        vars(aimed).update(vars(self))
-        assert isinstance(self._task, EnvTask), "species have no goals"
-        aimed._task = self._task.toward(goal)
-        return aimed
 
 
 class _ClampInward(torch.autograd.Function):

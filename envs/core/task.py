@@ -14,7 +14,6 @@ from torch import Tensor
 from npa_envs.envs.core.config import EnvConfig, WorldConfig
 from npa_envs.errors import NPAError
 from npa_envs.render import draw_worlds
-from npa_envs.tasks.base import GoalTask as TrainedWithGoals
 from npa_envs.world.actions import marginal_gains
 from npa_envs.world.randomness import StreamId, WorldRandom
 
@@ -283,15 +282,11 @@ class TargetEnvTask(EnvTask[Config]):
 
     def seed(self, random: WorldRandom) -> tuple[Tensor, Tensor]:
         """Return worlds as training begins with them, all states zero."""
-        seeds: tuple[Tensor, Tensor] = self.goal.seed(
-            random.world_count, generator=random, device=self.device
-        )
-        return seeds
+        x, s, _ = self.goal.seed(random.world_count, generator=random, device=self.device)
+        return x, s
 
     def toward(self, goal: Tensor) -> Self:
         """Return the task with losses for worlds of these goals, where training has such too."""
-        if not isinstance(self.goal, TrainedWithGoals):
-            return self
         aimed = copy.copy(self)
         aimed.goal = self.goal.toward(goal)
         return aimed

@@ -117,7 +117,6 @@ def grow_and_heal(options: DemoOptions, report: DemoReport) -> None:
     from npa_envs.cli.film import WorldFilm, film_world, write_film
     from npa_envs.measure.quality import measure
     from npa_envs.rule.files import load_rule
-    from npa_envs.tasks.base import coded_states, seed_worlds, task_toward
     from npa_envs.tasks.damage import DamageEvent, damage_worlds
     from npa_envs.training import check_device
     from npa_envs.training.trained_tasks import task_of_rule
@@ -126,8 +125,8 @@ def grow_and_heal(options: DemoOptions, report: DemoReport) -> None:
     rule = load_rule(options.rule, device=device).float()
     trained = task_of_rule(options.rule, rule, device)
     generator = torch.Generator(device).manual_seed(options.seed)
-    x, s, goal = seed_worlds(trained.task, 1, generator=generator, device=device)
-    task = task_toward(trained.task, goal)
+    x, s, goal = trained.task.seed(1, generator=generator, device=device)
+    task = trained.task.toward(goal)
     report.line(f"{options.rule}: {x.shape[1]} particles, {rule.weight_count} weights")
 
     def figures(step: int) -> str:
@@ -141,7 +140,7 @@ def grow_and_heal(options: DemoOptions, report: DemoReport) -> None:
             if kind is not None:
                 damage = DamageEvent(step, kind)
                 x, s = damage_worlds(x, s, kind=kind, generator=generator)
-                s = coded_states(task, s)
+                s = task.coded(s)
                 film.shoot(task, x, s, f"step {step}: {damage.text}", mark=True)
                 lines.append(f"  {damage.text}: {figures(step)}")
             start = time.perf_counter()
@@ -206,7 +205,7 @@ def train_small(options: DemoOptions, report: DemoReport) -> None:
     device = check_device(options.device)
     task = task_entry(task_name).make(override(config, resolution=SCREEN).task, device)
     generator = torch.Generator(device).manual_seed(options.seed + 1)
-    x, s = task.seed(1, generator=generator, device=device)
+    x, s, _ = task.seed(1, generator=generator, device=device)
     steps = 4 * config.steps[1]
     with StepBar(steps, show=options.progress) as bar:
         x, s, film = film_world(

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, cast
 
 from npa_envs.cli.output import RuleOptions, StepBar, check_numbers, parse_options
 from npa_envs.errors import NPAError, shown
@@ -78,7 +78,7 @@ def main(arguments: Sequence[str]) -> int:
         )
     judge = TextureJudge(trained.task) if options.judge else None
     judged: list[JudgeRow] = []
-    clouds = isinstance(trained.task, PointClassification)
+    clouds = trained.task.classifies
     known = not (clouds or options.healing)
     with StepBar(max(checkpoints) if known else None, show=options.progress) as bar:
         tables = tables_of(
@@ -94,8 +94,9 @@ def main(arguments: Sequence[str]) -> int:
     if judged:
         tables["judge"] = judged
     what = f"{options.seed_count} worlds"
-    if isinstance(trained.task, PointClassification):
-        what = f"{len(trained.task.clouds.label)} {trained.task.split} clouds"
+    if clouds:
+        task = cast(PointClassification, trained.task)
+        what = f"{len(task.clouds.label)} {task.split} clouds"
     print(f"{options.rule}: {what}, loss: {trained.task.metric_name}")
     for name, rows in tables.items():
         print(table_text(rows, missing=UNMEASURED if name == "growth" else "never"))

@@ -26,13 +26,12 @@ from npa_envs.render import (
     write_splat,
 )
 from npa_envs.rule.rule import NPARule
-from npa_envs.tasks.base import coded_states
 from npa_envs.tasks.damage import DamageEvent, damage_worlds
 from npa_envs.training.trained_tasks import task_of_rule
 from npa_envs.world.rollout import rollout
 
 if TYPE_CHECKING:
-    from npa_envs.tasks.base import PictureTask, ViewTask
+    from npa_envs.tasks.base import Task
 
 SCREEN = 256
 """Least pixels on each side of a film whose resolution is not asked for."""
@@ -71,7 +70,7 @@ class WorldFilm:
 
     def shoot(
         self,
-        task: PictureTask,
+        task: Task,
         x: Tensor,
         s: Tensor,
         caption: str,
@@ -111,7 +110,7 @@ class WorldFilm:
 
 def film_world(
     rule: NPARule,
-    task: PictureTask,
+    task: Task,
     x: Tensor,
     s: Tensor,
     steps: int,
@@ -160,7 +159,7 @@ def film_world(
                 film.shoot(task, x, s, f"step {step}", step=step)
             for damage in hurts.get(step, ()) if step < last else ():
                 x, s = damage_worlds(x, s, kind=damage.kind, size=damage.size, generator=generator)
-                s = coded_states(task, s)
+                s = task.coded(s)
                 film.shoot(task, x, s, f"step {step}: {damage.text}", mark=True)
             if stop():
                 break
@@ -173,7 +172,7 @@ def frame_steps(steps: int) -> int:
 
 
 def large_task(
-    task: PictureTask,
+    task: Task,
     source: str,
     rule: NPARule,
     device: torch.device,
@@ -181,7 +180,7 @@ def large_task(
     resolution: int | None = None,
     style: Style = "splats",
     **world: Any,
-) -> PictureTask:
+) -> Task:
     """Return a rule's task with pictures that are large enough to be seen.
 
     Args:
@@ -225,12 +224,12 @@ def write_film(film: WorldFilm, folder: Path, name: str, *, fps: float = 25.0) -
 
 
 def write_solid(
-    task: ViewTask,
+    task: Task,
     x: Tensor,
     s: Tensor,
     folder: Path,
     *,
-    shown: ViewTask | None = None,
+    shown: Task | None = None,
     resolution: int = SCREEN,
     background: str = "white",
 ) -> list[Path]:

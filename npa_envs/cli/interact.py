@@ -156,7 +156,6 @@ def _organisms(
     """Load the rules, with what each grows, and settle how they meet."""
     from npa_envs.measure.interaction import InteractionSettings, RuleUnderTest
     from npa_envs.rule.files import load_rule, shipped_rules
-    from npa_envs.tasks.morphogenesis2d import Morphogenesis2D
     from npa_envs.training.trained_tasks import task_of_rule
 
     sources = list(dict.fromkeys(options.rules))
@@ -166,7 +165,7 @@ def _organisms(
     for source in sources:
         rule = load_rule(source, device=device).float().requires_grad_(False)
         trained = task_of_rule(source, rule, device)
-        if not isinstance(trained.task, Morphogenesis2D):
+        if trained.task_name != TASK:
             raise NPAError(f"rules must be of the task {TASK}, got {source!r}: leave it out")
         if trained.doubt is not None:
             raise NPAError(f"cannot measure {source!r}: {trained.doubt}: leave it out")

@@ -23,9 +23,8 @@ from npa_envs.measure.quality import CHECKPOINTS, CLOUD_CHECKPOINTS, score_line,
 from npa_envs.measure.record import current_commit, machine, versions
 from npa_envs.measure.tables import UNMEASURED, markdown_table, table_markdown, tables_json
 from npa_envs.rule.files import load_rule
-from npa_envs.tasks.base import PictureTask, ViewTask, seed_worlds
+from npa_envs.tasks.base import Task
 from npa_envs.tasks.damage import DamageEvent
-from npa_envs.tasks.point_classification import PointClassification
 from npa_envs.tasks.texture import Texture
 from npa_envs.training.trained_tasks import task_of_rule, tasks_of_codes
 
@@ -93,7 +92,7 @@ def write_report(
     rule = load_rule(path, device=device).float()
     task = task_of_rule(str(path), rule, device).task
     thorough = device.type == "cuda"
-    clouds = isinstance(task, PointClassification)
+    clouds = task.classifies
     checkpoints = (CLOUD_CHECKPOINTS if clouds else CHECKPOINTS)[: None if thorough else 5]
     count = 8 if thorough else 2
     judge = TextureJudge(task) if isinstance(task, Texture) else None
@@ -152,14 +151,14 @@ def _decay(rows: Sequence[Any]) -> str:
 def _film(
     path: Path,
     rule: NPARule,
-    task: PictureTask,
+    task: Task,
     folder: Path,
     device: torch.device,
     bar: StepBar,
 ) -> None:
     """Film a world of the rule from its seed."""
     generator = torch.Generator(device).manual_seed(FIRST_SEED)
-    x, s, _ = seed_worlds(task, 1, generator=generator, device=device)
+    x, s, _ = task.seed(1, generator=generator, device=device)
     x, s, film = film_world(
         rule,
         large_task(task, str(path), rule, device),
@@ -171,7 +170,7 @@ def _film(
         every=frame_steps(FILM_STEPS),
         progress=bar.advance,
     )
-    if isinstance(task, ViewTask):
+    if task.has_views:
         write_solid(task, x, s, folder)
     write_film(film, folder, path.stem)
 

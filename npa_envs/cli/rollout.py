@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Literal, cast
 
 import tyro
 
@@ -86,7 +86,6 @@ def main(arguments: Sequence[str]) -> int:
     )
     from npa_envs.measure.quality import measure
     from npa_envs.rule.files import load_rule
-    from npa_envs.tasks.base import ViewTask, seed_worlds, task_toward
     from npa_envs.tasks.damage import parse_damage
     from npa_envs.tasks.point_classification import PointClassification, majority
     from npa_envs.training import check_device
@@ -117,8 +116,8 @@ def main(arguments: Sequence[str]) -> int:
     )
     folder = writable_folder(options.out)
     generator = torch.Generator(device).manual_seed(options.seed)
-    x, s, goal = seed_worlds(task, 1, generator=generator, device=device)
-    task = task_toward(task, goal)
+    x, s, goal = task.seed(1, generator=generator, device=device)
+    task = task.toward(goal)
     with stop_flag() as stop, StepBar(options.steps, show=options.progress) as bar:
         x, s, film = film_world(
             rule,
@@ -141,11 +140,11 @@ def main(arguments: Sequence[str]) -> int:
     else:
         row = measure(task, x, s, done)
         print(f"step {done}: {row.figures}, extent {row.extent:.3f}")
-    if isinstance(task, PointClassification) and goal is not None:
-        vote = int(majority(task.outputs(s)))
+    if task.classifies and goal is not None:
+        vote = int(majority(cast(PointClassification, task).outputs(s)))
         print(f"most particles say {vote}; the cloud is a {int(goal)}")
     paths = write_film(film, folder, "growth", fps=options.fps)
-    if isinstance(task, ViewTask) and isinstance(shown, ViewTask):
+    if task.has_views:
         paths += write_solid(
             task,
             x,

@@ -26,7 +26,6 @@ from npa_envs.cli.train_options import (
 from npa_envs.errors import NPAError
 from npa_envs.training import (
     TASKS,
-    JointTrainConfig,
     RunFolder,
     TrainConfig,
     TrainResult,
@@ -135,7 +134,7 @@ def run(
         return INTERRUPTED if result.interrupted else 0
     rules = [folder.rule]
     meet = ""
-    if isinstance(config, JointTrainConfig):
+    if task_entry(task_name).joint:
         rules = [folder.rule_of(number) for number in range(len(config.task.species))]
         meet = f"npa-envs interact {shlex.join(map(str, rules))}"
         meet += f" --distances {config.task.distance:g}"

@@ -25,7 +25,7 @@ from npa_envs.measure.tables import as_objects
 from npa_envs.ops import species_fields
 from npa_envs.render import draw_worlds
 from npa_envs.rule.rule import NPARule
-from npa_envs.tasks.base import PictureTask
+from npa_envs.tasks.base import Task
 from npa_envs.world.randomness import StreamId, WorldRandom
 from npa_envs.world.species import rollout_species
 
@@ -195,7 +195,7 @@ class RuleUnderTest:
     """What tables call it."""
     rule: NPARule
     """The rule, on the device to run on."""
-    task_of: Callable[[int], PictureTask]
+    task_of: Callable[[int], Task]
     """Returns its task with a number of particles, of which seeds are made and losses taken."""
     update_prob: float
     """Probability of a particle's update in a step, as trained (dimensionless)."""
@@ -346,7 +346,9 @@ class Encounters:
         random = WorldRandom(settings.seeds, device=self._device)
         streams = (random, random.substream(StreamId.SPECIES))
         parts = [
-            organism.task_of(count).seed(len(settings.seeds), generator=stream, device=self._device)
+            organism.task_of(count).seed(
+                len(settings.seeds), generator=stream, device=self._device
+            )[:2]
             for organism, count, stream in zip(organisms, counts, streams, strict=False)
         ]
         for number, (place, _) in enumerate(parts):

@@ -9,7 +9,7 @@ import itertools
 import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, cast
 
 import torch
 from torch import Tensor
@@ -19,7 +19,7 @@ from npa_envs.errors import NPAError, shown, suggest
 from npa_envs.measure.tables import table_text, tables_json
 from npa_envs.rule.files import shipped_rules
 from npa_envs.rule.rule import NPARule
-from npa_envs.tasks.base import PictureTask, ViewTask, coded_states, task_for_rule
+from npa_envs.tasks.base import Task
 from npa_envs.tasks.damage import cut, random_particle, wipe_state
 from npa_envs.tasks.point_classification import PointClassification, majority, particle_classes
 from npa_envs.world.rollout import rollout
@@ -109,7 +109,7 @@ class HealingRow:
 @torch.no_grad()
 def evaluate(
     rule: NPARule,
-    task: PictureTask,
+    task: Task,
     *,
     checkpoints: Sequence[int] = CHECKPOINTS,
     seeds: Sequence[int] = tuple(range(8)),
@@ -145,7 +145,7 @@ def evaluate(
     return rows
 
 
-def measure(task: PictureTask, x: Tensor, s: Tensor, step: int) -> EvaluationRow:
+def measure(task: Task, x: Tensor, s: Tensor, step: int) -> EvaluationRow:
     """Measure worlds as they are.
 
     Args:
@@ -156,7 +156,7 @@ def measure(task: PictureTask, x: Tensor, s: Tensor, step: int) -> EvaluationRow
     """
     loss = task.metric(x, s)
     ratio = None
-    if isinstance(task, ViewTask):
+    if task.has_views:
         ratio = task.view_psnr(x, s)
     elif task.aligned:
         ratio = psnr(task.picture(x, s), task.target_picture.to(x.device))
@@ -187,7 +187,7 @@ def psnr(picture: Tensor, target: Tensor) -> Tensor:
 @torch.no_grad()
 def healing(
     rule: NPARule,
-    task: PictureTask,
+    task: Task,
     *,
     grow_steps: int = 1024,
     heal_steps: int = 1000,
@@ -236,7 +236,7 @@ def healing(
         ),
         f"wiped disk, radius {wipe_radius:g}": (
             x,
-            coded_states(task, wipe_state(x, s, centre=centre, radius=wipe_radius, box=task.box)),
+            task.coded(wipe_state(x, s, centre=centre, radius=wipe_radius, box=task.box)),
         ),
     }
     rows = []
@@ -454,7 +454,7 @@ def _partners(label: Tensor) -> Tensor:
 
 def tables_of(
     rule: NPARule,
-    task: PictureTask,
+    task: Task,
     *,
     checkpoints: Sequence[int] | None = None,
     seeds: Sequence[int] = tuple(range(8)),
@@ -481,7 +481,8 @@ def tables_of(
     Raises:
         NPAError: As for the functions that measure them.
     """
-    if isinstance(task, PointClassification):
+    if task.classifies:
+        task = cast(PointClassification, task)
         told: dict[str, Any] = {"seed": seeds[0], "progress": progress}
         clouds: dict[str, Sequence[Any]] = {
             "accuracy": accuracies(rule, task, checkpoints=checkpoints or CLOUD_CHECKPOINTS, **told)
@@ -512,7 +513,7 @@ class RuleRunner:
         # The caller's own rule stays on its device.
         self._rule = copy.deepcopy(rule).to(device)
         self.dtype = next(rule.parameters()).dtype
-        self.task = task_for_rule(task, self._rule)
+        self.task = task.for_rule(self._rule)
         self.generator = torch.Generator(device).manual_seed(seed)
         self._progress = progress
 
@@ -538,7 +539,7 @@ class RuleRunner:
 
 def _from_seeds(
     rule: NPARule,
-    task: PictureTask,
+    task: Task,
     seeds: Sequence[int],
     device: torch.device,
     progress: Callable[[int], None] | None,
@@ -548,7 +549,7 @@ def _from_seeds(
         raise NPAError("seeds must hold at least one number, got none: for example seeds=(0, 1)")
     runner = RuleRunner(rule, task, device, seeds[0] + len(seeds), progress)
     worlds = [
-        task.seed(1, generator=torch.Generator(device).manual_seed(seed), device=device)
+        task.seed(1, generator=torch.Generator(device).manual_seed(seed), device=device)[:2]
         for seed in seeds
     ]
     x, s = (torch.cat(parts).to(runner.dtype) for parts in zip(*worlds, strict=True))

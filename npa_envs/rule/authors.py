@@ -26,6 +26,7 @@ import math
 import pickle
 import struct
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -34,7 +35,6 @@ from torch import Tensor
 
 from npa_envs.errors import NPAError, shown, suggest
 from npa_envs.files import check_torch_archive, checked_path, parse_json, write_text
-from npa_envs.rule.parts import RuleParts, check_finite
 from npa_envs.rule.rule import NPARule, check_rule
 
 _DEMO_SPACE_DIM = 2
@@ -86,13 +86,45 @@ _DECODER_NAMES = {name for name in _WEIGHT_NAMES if name.startswith("decoder")}
 _IGNORED = {"N0"}
 
 
+@dataclass(frozen=True)
+class RuleParts:
+    """A rule taken apart: what `NPARule` is made with, and its weights by its own names."""
+
+    hyper_parameters: dict[str, Any]
+    weights: dict[str, Tensor]
+    header: dict[str, str] | None = None
+    """Metadata of a file in our format."""
+    has_checksum: bool = False
+    """Whether the file has one, which shows damage."""
+
+
+def check_precision(weights: Mapping[str, Tensor]) -> None:
+    """Check that all weights are float32, or all float64."""
+    dtypes = {tensor.dtype for tensor in weights.values()}
+    if len(dtypes) != 1 or not dtypes <= {torch.float32, torch.float64}:
+        raise NPAError(
+            "the weights must be all float32 or all float64, got "
+            f"{sorted(str(dtype) for dtype in dtypes)}: convert them, as rule.float() does, and "
+            "save the rule again"
+        )
+
+
+def check_finite(weights: Mapping[str, Tensor]) -> None:
+    """Check that every weight is finite."""
+    for name, tensor in weights.items():
+        bad = int((~torch.isfinite(tensor)).sum())
+        if bad:
+            raise NPAError(
+                f"the weights must be finite, got {bad} of {tensor.numel()} numbers in "
+                f"{shown(name)} NaN or infinite: take an earlier checkpoint, or train with a lower "
+                "learning rate"
+            )
+
+
 def read_state_dict(data: bytes) -> RuleParts:
     """Read the authors' state dict.
 
     The space dimension and the number of channels follow from the shapes.
-
-    Raises:
-        NPAError: This is not such a file.
     """
     state = _unpickle(data)
     if state.keys() & _EQUIVARIANT_NAMES:
@@ -147,11 +179,7 @@ def _read_equivariant_state(state: Mapping[Any, Any], *, has_checksum: bool) -> 
 def _equivariant_parts(
     tensors: Mapping[str, Tensor], numbers: Mapping[Any, Any], *, has_checksum: bool = False
 ) -> RuleParts:
-    """Return an equivariant rule of 2D worlds from its tensors, by their names in the web demo.
-
-    Raises:
-        NPAError: Their shapes do not agree.
-    """
+    """Return an equivariant rule of 2D worlds from its tensors, by their names in the web demo."""
     mixing, first, second = (tensors[name] for name in ("W_hidden", "w1.weight", "w2.weight"))
     state_dim, mixed = mixing.shape[0] - 1, mixing.shape[1]
     hidden_dim = first.shape[0]
@@ -192,16 +220,7 @@ def _equivariant_parts(
 
 
 def read_demo_json(data: bytes, name: str | None) -> RuleParts:
-    """Read one rule of the authors' web demo.
-
-    Args:
-        data: The content of the JSON file.
-        name: The rule's name in it, or its number in a stack, from 0; None where the file holds one
-            rule only.
-
-    Raises:
-        NPAError: This is not such a file, or it has no rule of that name.
-    """
+    """Read one rule of the authors' web demo."""
     entry, place = _demo_rule(parse_json(data), name)
     if "W_hidden" in entry:
         return _read_equivariant_entry(entry, place)
@@ -236,12 +255,7 @@ def read_demo_json(data: bytes, name: str | None) -> RuleParts:
 
 
 def _demo_rule(content: Any, name: str | None) -> tuple[Mapping[str, Any], int | None]:
-    """Return the entry of one rule, and which rule of a stack it is.
-
-    Args:
-        content: What the JSON file says.
-        name: The rule's name, or its number in a stack; None where there is one only.
-    """
+    """Return the entry of one rule, and which rule of a stack it is."""
     if isinstance(content, dict) and isinstance(content.get("w1.weight"), dict):
         return content, _number_in_stack(content["w1.weight"], name)
     names = sorted(content) if isinstance(content, dict) else []
@@ -309,14 +323,7 @@ def save_demo_json(
     `load_rule("models.json#name")` gives each of them back.
 
     Args:
-        rules: Name -> rule; the demo has 2D rules without read-out that perceive all the paper's
-            fields and nothing else.
-        path: The file to write, ending in `.json`; an existing one is replaced.
         particle_counts: With how many particles a rule starts there; 4096 where nothing is said.
-
-    Raises:
-        NPAError: There are no rules, a rule is not of the demo's kind, a weight is not finite in
-            float32, the suffix is another one, or the file cannot be written.
     """
     path = checked_path(path)
     if path.suffix != ".json":

@@ -1,4 +1,4 @@
-"""Codes: the numbers by which a rule of many pictures is told which one to grow."""
+"""Codes: the numbers that say which picture a rule of many pictures grows."""
 
 from __future__ import annotations
 
@@ -29,7 +29,6 @@ class Codes(nn.Module):
     particle.
 
     Args:
-        names: What each code stands for, all different.
         dim: Numbers of a code, K.
         encoder: Codes are read from pictures by a network, so that a picture that was never trained
             on has one too. Without, each is learned by itself.
@@ -71,21 +70,13 @@ class Codes(nn.Module):
         return iter(self.names)
 
     def number(self, name: str) -> int:
-        """Return the place of a name.
-
-        Raises:
-            NPAError: No code has this name.
-        """
+        """Return the place of a name."""
         if name not in self.names:
             raise NPAError(f"unknown code {shown(name)}: {suggest(name, self.names)}")
         return self.names.index(name)
 
     def __getitem__(self, name: str) -> Tensor:
-        """Return the code of a name, shape [K].
-
-        Raises:
-            NPAError: No code has this name.
-        """
+        """Return the code of a name, shape [K]."""
         return self.table[self.number(name)]
 
     def blend(self, shares: Mapping[str, float]) -> Tensor:
@@ -93,9 +84,6 @@ class Codes(nn.Module):
 
         Args:
             shares: Weight of each name, for example {"gecko": 0.5, "butterfly": 0.5}.
-
-        Raises:
-            NPAError: A name is unknown, or the weights are not finite or add up to 0 or less.
         """
         total = sum(shares.values())
         if not (math.isfinite(total) and total > 0.0):
@@ -107,14 +95,7 @@ class Codes(nn.Module):
         return torch.stack(parts).sum(dim=0)
 
     def encode(self, pictures: Tensor) -> Tensor:
-        """Return the codes of pictures, shape [B, K], differentiable.
-
-        Args:
-            pictures: rgb sums and density, as a task's `target_picture`, shape [B, R, R, 4].
-
-        Raises:
-            NPAError: The rule has no encoder, or the shape is another one.
-        """
+        """Return the codes of pictures, shape [B, K], differentiable."""
         if self.encoder is None:
             raise NPAError("this rule has no encoder: train one with encoder=True (--encoder)")
         if pictures.ndim != 4 or pictures.shape[3] != 4 or pictures.shape[1] != pictures.shape[2]:
@@ -127,11 +108,7 @@ class Codes(nn.Module):
 
 
 def check_names(names: object) -> None:
-    """Check that what codes are to be called is several texts.
-
-    Raises:
-        NPAError: It is not.
-    """
+    """Check that what codes are to be called is several texts."""
     if (
         not isinstance(names, Collection)
         or isinstance(names, str)

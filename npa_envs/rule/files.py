@@ -29,8 +29,13 @@ from npa_envs.files import (
     read_bytes,
     write_bytes,
 )
-from npa_envs.rule.authors import read_demo_json, read_state_dict
-from npa_envs.rule.parts import RuleParts, check_finite, check_precision
+from npa_envs.rule.authors import (
+    RuleParts,
+    check_finite,
+    check_precision,
+    read_demo_json,
+    read_state_dict,
+)
 from npa_envs.rule.rule import NPARule, RuleHyperParameters, check_rule, is_altered
 
 FORMAT_NAME = "npa-envs rule"
@@ -201,10 +206,7 @@ def _is_utf8(text: str) -> bool:
 
 
 def _with_sorted_metadata(file: bytes) -> bytes:
-    """Return a safetensors file whose metadata is in order, so that equal rules make equal files.
-
-    The library writes it in an order that changes from call to call.
-    """
+    """Return a safetensors file with sorted metadata, so that equal rules make equal files."""
     size = int.from_bytes(file[:8], "little")
     header = json.loads(file[8 : 8 + size])
     header["__metadata__"] = dict(sorted(header["__metadata__"].items()))
@@ -217,9 +219,6 @@ def _with_sorted_metadata(file: bytes) -> bytes:
 def rule_metadata(path: str | Path) -> dict[str, str]:
     """Return the text in the header of a file that `save_rule` wrote, all of it.
 
-    Args:
-        path: The `.safetensors` file.
-
     Raises:
         NPAError: The file is missing, garbage, truncated, or not a rule.
     """
@@ -230,11 +229,7 @@ def rule_metadata(path: str | Path) -> dict[str, str]:
 
 
 def rule_digest(rule: NPARule) -> str:
-    """Return 16 hexadecimal digits by which the weights of a rule are known: SHA-256 of them.
-
-    Args:
-        rule: The rule, on any device.
-    """
+    """Return 16 hexadecimal digits by which the weights of a rule are known: SHA-256 of them."""
     found = hashlib.sha256()
     for weight in rule.state_dict().values():
         found.update(weight.cpu().numpy().tobytes())
@@ -243,9 +238,6 @@ def rule_digest(rule: NPARule) -> str:
 
 def rule_file(source: str | Path) -> Path:
     """Return the file of a rule.
-
-    Args:
-        source: As for `load_rule`.
 
     Raises:
         NPAError: The name is unknown, it is no such path, or a folder without one rule.
@@ -330,9 +322,9 @@ def _read_ours(path: Path) -> RuleParts:
 
 def _checksum(header: Mapping[str, str], weights: Mapping[str, Tensor]) -> str:
     """Return SHA-256 over the metadata, but for the checksum itself, and over all weights."""
-    told: list[Any] = sorted(item for item in header.items() if item[0] != "checksum")
-    told += [(name, str(tensor.dtype), *tensor.shape) for name, tensor in sorted(weights.items())]
-    found = hashlib.sha256(json.dumps(told).encode())
+    content: list[Any] = sorted(item for item in header.items() if item[0] != "checksum")
+    content += [(name, str(held.dtype), *held.shape) for name, held in sorted(weights.items())]
+    found = hashlib.sha256(json.dumps(content).encode())
     for _, tensor in sorted(weights.items()):
         found.update(tensor.numpy().tobytes())
     return found.hexdigest()

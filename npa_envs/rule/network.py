@@ -140,13 +140,7 @@ class FoldedInvariants(NamedTuple):
 def fold_weights(
     hidden_weight: Tensor, output_weight: Tensor, dead_zone: float = 0.0
 ) -> FoldedRule:
-    """Return folded weights as they are run on their device, differentiable in both.
-
-    Args:
-        hidden_weight: [W1 | b1 | 0], shape [H, row_width].
-        output_weight: W2 and rows of zeros up to a multiple of `FOLD`, shape [A', H].
-        dead_zone: Outputs of this size or smaller are 0.
-    """
+    """Return folded weights as they are run on their device, differentiable in both."""
     arranged = arrange_weights(hidden_weight, output_weight)
     if arranged is None:
         return FoldedRule(hidden_weight, output_weight, dead_zone=dead_zone)

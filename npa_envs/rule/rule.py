@@ -5,7 +5,7 @@ from __future__ import annotations
 import difflib
 import math
 from collections.abc import Sequence
-from typing import Any, TypedDict
+from typing import Any, TypedDict, cast
 
 import torch
 from torch import Tensor, nn
@@ -37,7 +37,6 @@ COLOUR_OFFSET = 0.5
 INIT_GAIN = 0.1
 """Gain of the Xavier-uniform initialisation: a fresh rule hardly moves its particles."""
 
-
 LARGEST_DIM = 65536
 """No dimension of a rule is larger."""
 
@@ -49,7 +48,7 @@ FIRST_FATES = (5.0, -8.0)
 
 
 STEP_PARTS = frozenset(
-    (
+    [
         "__call__",
         "__getattr__",
         "__getattribute__",
@@ -68,13 +67,13 @@ STEP_PARTS = frozenset(
         "update_dim",
         "update_weight",
         "vector_form",
-    )
+    ]
 )
 """What a step of a rule is made of: where a subclass changes any of it, the rule is not plain."""
 
 
 class RuleHyperParameters(TypedDict):
-    """Everything besides its weights that makes an `NPARule`."""
+    """Everything that makes an `NPARule`, but its weights."""
 
     space_dim: int
     state_dim: int
@@ -202,14 +201,11 @@ class NPARule(nn.Module):
             )
         if species_count < 0:
             raise NPAError(f"species_count must be at least 0, got {shown(species_count)}")
-        self.space_dim = space_dim
-        self.state_dim = state_dim
-        self.hidden_dim = hidden_dim
+        self.space_dim, self.state_dim, self.hidden_dim = space_dim, state_dim, hidden_dim
         self.eps0 = checked_positive("eps0", eps0, " [length units]")
         self.alpha = checked_positive("alpha", alpha)
         self.static = checked_flag("static", static)
-        self.readout_dim = readout_dim
-        self.readout_hidden_dim = readout_hidden_dim
+        self.readout_dim, self.readout_hidden_dim = readout_dim, readout_hidden_dim
         self.moment_correction = checked_flag("moment_correction", moment_correction)
         self.moment_inverse = checked_moment_inverse(moment_inverse)
         self.state_gradient = checked_flag("state_gradient", state_gradient)
@@ -546,37 +542,19 @@ class NPARule(nn.Module):
     def hyper_parameters(self) -> RuleHyperParameters:
         """Return all that `NPARule` takes: `NPARule(**rule.hyper_parameters())` has this shape."""
         codes = self.codes
-        return RuleHyperParameters(
-            space_dim=self.space_dim,
-            state_dim=self.state_dim,
-            hidden_dim=self.hidden_dim,
-            eps0=self.eps0,
-            alpha=self.alpha,
-            static=self.static,
-            readout_dim=self.readout_dim,
-            readout_hidden_dim=self.readout_hidden_dim,
-            moment_correction=self.moment_correction,
-            state_gradient=self.state_gradient,
-            density_gradient=self.density_gradient,
-            species_count=self.species_count,
-            moment_inverse=self.moment_inverse,
-            equivariant=self.equivariant,
-            chiral=self.chiral,
-            mixed_vectors=self.mixed_vectors,
-            code_dim=self.code_dim,
-            code_names=() if codes is None else codes.names,
-            encoder=codes is not None and codes.encoder is not None,
-            divides=self.divides,
-            dead_zone=self.dead_zone,
-        )
+        own = {
+            "code_names": () if codes is None else codes.names,
+            "encoder": codes is not None and codes.encoder is not None,
+        }
+        found = {
+            name: own[name] if name in own else getattr(self, name)
+            for name in RuleHyperParameters.__annotations__
+        }
+        return cast(RuleHyperParameters, found)
 
 
 def _checked_dead_zone(value: Any, equivariant: bool) -> float:
-    """Return a rule's dead zone as a float.
-
-    Raises:
-        NPAError: It is no finite number of at least 0, or an equivariant rule is to have one.
-    """
+    """Return a rule's dead zone as a float."""
     zone = checked_number("dead_zone", value)
     if not (0.0 <= zone < math.inf):
         raise NPAError(
@@ -612,7 +590,6 @@ def with_codes(rule: NPARule, untrained: NPARule) -> NPARule:
     What is new, the columns of the codes, stays as it is, and so do further hidden units.
 
     Args:
-        rule: A rule without codes.
         untrained: A rule with codes, otherwise of the same shape, but for as many hidden units or
             more; it is changed where the shapes fit.
 
@@ -642,11 +619,7 @@ def with_codes(rule: NPARule, untrained: NPARule) -> NPARule:
 
 
 def dividing(rule: NPARule) -> NPARule:
-    """Return a copy of a rule whose particles also divide and die, with untrained odds.
-
-    Raises:
-        NPAError: As `NPARule` of rules that divide.
-    """
+    """Return a copy of a rule whose particles also divide and die, with untrained odds."""
     made = NPARule(**rule.hyper_parameters() | {"divides": True}).to(rule.hidden.weight)
     made.load_state_dict(made.state_dict() | rule.state_dict())
     return made
@@ -659,11 +632,7 @@ def fate_parameters(rules: nn.Module) -> list[nn.Parameter]:
 
 
 def check_rule(rule: Any) -> None:
-    """Check that something is a rule; one that `torch.compile` has wrapped is one too.
-
-    Raises:
-        NPAError: It is none.
-    """
+    """Check that something is a rule; one that `torch.compile` has wrapped is one too."""
     if not isinstance(rule, NPARule) and not isinstance(getattr(rule, "_orig_mod", None), NPARule):
         raise NPAError(
             f"rule must be an NPARule, got {type(rule).__name__}: load it with npa_envs.load_rule"

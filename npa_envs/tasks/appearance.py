@@ -19,7 +19,7 @@ FLAT = 0.5 * math.sqrt(1.0 / math.pi)
 
 
 class Gaussians(NamedTuple):
-    """What `render_gaussians` takes besides positions and cameras."""
+    """Arguments of `render_gaussians`, without positions and cameras."""
 
     scales: Tensor
     """Standard deviations [length units], shape [B, N, 3]."""
@@ -57,11 +57,7 @@ class Appearance:
     """Opacity of a particle whose output is 0, in (0, 1)."""
 
     def gaussians(self, outputs: Tensor) -> Gaussians:
-        """Return the Gaussians of particles.
-
-        Args:
-            outputs: A rule's outputs (`NPARule.read_out`), dimensionless, shape [B, N, K], K >= 3.
-        """
+        """Return the Gaussians of particles."""
         lead = outputs.shape[:-1]
         # The renderer adds one half, as `NPARule.colour` does.
         flat = outputs[..., None, -3:]
@@ -88,9 +84,7 @@ def draw_gaussians(x: Tensor, gaussians: Gaussians, cameras: Cameras) -> tuple[T
     """Return what cameras see before a black background; differentiable but by the cameras.
 
     Args:
-        x: Positions [length units], shape [B, N, 3].
         gaussians: How particles look.
-        cameras: V cameras, the same for all worlds.
 
     Returns:
         Red, green and blue, shape [B, V, H, W, 3], and alpha, shape [B, V, H, W].

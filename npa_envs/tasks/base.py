@@ -5,8 +5,9 @@ Any object with the methods of `Task` can be trained on; `ParticleTask` has thos
 
 from __future__ import annotations
 
+import copy
 from dataclasses import dataclass, replace
-from typing import Any, Generic, Protocol, Self, TypeVar, cast, runtime_checkable
+from typing import Any, Generic, NamedTuple, Self, TypeVar
 
 import torch
 from torch import Tensor
@@ -14,163 +15,27 @@ from torch import Tensor
 from npa_envs.checks import check_fraction, check_non_negative, check_positive
 from npa_envs.errors import NPAError, shown
 from npa_envs.ops import Cameras, world_mean
-from npa_envs.rule.rule import NPARule
+from npa_envs.rule.rule import COLOUR_OFFSET, NPARule
 from npa_envs.tasks.appearance import Gaussians
 from npa_envs.world.randomness import Randomness
 
-
-class Task(Protocol):
-    """A thing to learn. Shapes: B worlds, N particles, D space, C channels, R pixels.
-
-    No method may wait for the device (no `.item()`, no branch on a tensor's value): the trainer
-    captures `seed`, `damage` and `loss` in CUDA graphs and never reads a number back between two
-    log lines. So these must do the same in every iteration, and draw from their generator alone.
-    """
-
-    @property
-    def eps(self) -> float:
-        """Perception radius ε [length units]."""
-
-    @property
-    def box(self) -> tuple[float, ...] | None:
-        """Sides of the periodic box [length units], or None where the domain is open."""
-
-    @property
-    def update_prob(self) -> float:
-        """Probability p that a particle is updated in a step (dimensionless)."""
-
-    def make_rule(self, generator: torch.Generator) -> NPARule:
-        """Return an untrained rule on the CPU; its weights are drawn from `generator`."""
-
-    def seed(
-        self, world_count: int, *, generator: Randomness, device: torch.device
-    ) -> tuple[Tensor, Tensor]:
-        """Return fresh worlds: positions x [B, N, D] [length units] and states s [B, N, C]."""
-
-    def damage(self, x: Tensor, s: Tensor, generator: Randomness) -> tuple[Tensor, Tensor]:
-        """Return the worlds damaged, as the pool's are before a rollout, so that they heal."""
-
-    def loss(self, x: Tensor, s: Tensor, path_length: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
-        """Return the scalar to minimise and its named parts, scalars too.
-
-        Args:
-            x: Positions [length units], shape [B, N, D].
-            s: States, shape [B, N, C].
-            path_length: Σ|Δx| of every particle over the rollout [length units], shape [B, N].
-        """
-
-    def picture(self, x: Tensor, s: Tensor) -> Tensor:
-        """Return the picture of each world: rgb sums and density, shape [B, R, R, 4]."""
-
-    def metric(self, x: Tensor, s: Tensor) -> Tensor:
-        """Return how far each world is from the goal, shape [B]; lower is better."""
+Worlds = tuple[Tensor, Tensor, Tensor | None]
+"""Positions x [B, N, D], states s [B, N, C], and goals, int64 [B], of worlds that have such."""
 
 
-class PictureTask(Task, Protocol):
-    """A task that is learned from a picture: what films and the evaluation need besides."""
+class Frame(NamedTuple):
+    """Where viewers look."""
 
-    @property
-    def target_picture(self) -> Tensor:
-        """The picture to match: rgb sums and density, shape [R, R, 4]."""
+    centre: tuple[float, ...]
+    """Middle of what is shown [length units]."""
 
-    @property
-    def aligned(self) -> bool:
-        """Whether worlds are to match it pixel by pixel, so that a PSNR means something."""
-
-    @property
-    def metric_name(self) -> str:
-        """What `metric` is, in a word or two."""
-
-
-@runtime_checkable
-class ReadOutTask(Protocol):
-    """A task that needs its rule: it compares what the rule reads out of the states, or its fresh
-    worlds carry a code of the rule.
-
-    It has all that `Task` has besides.
-    """
-
-    def for_rule(self, rule: NPARule) -> Task:
-        """Return the task with worlds, losses, metric and pictures as they are for `rule`.
-
-        Its parameters are read anew at each call, so that losses are differentiable in them and
-        change with them. The task itself stays as it is.
-        """
-
-
-@runtime_checkable
-class GoalTask(Protocol):
-    """A task in which every world has a goal of its own, such as the class of what it shows.
-
-    It has all that `Task` has besides; goals are int64, shape [B], and stay with their worlds.
-    """
-
-    def seed_with_goals(
-        self, world_count: int, *, generator: Randomness, device: torch.device
-    ) -> tuple[Tensor, Tensor, Tensor]:
-        """Return fresh worlds as `seed` does, and their goals."""
-
-    def damage_with_goals(
-        self, x: Tensor, s: Tensor, goal: Tensor, generator: Randomness
-    ) -> tuple[Tensor, Tensor, Tensor]:
-        """Return the worlds damaged as `damage` does, and what their goals are then."""
-
-    def toward(self, goal: Tensor) -> Task:
-        """Return the task with loss and metric for worlds of these goals.
-
-        The tensor is read anew at each call. The task itself stays as it is.
-        """
-
-
-@runtime_checkable
-class CodedTask(Protocol):
-    """A task whose worlds may carry a code of their rule, which says what to grow.
-
-    It has all that `Task` has besides.
-    """
-
-    def coded(self, s: Tensor) -> Tensor:
-        """Return states [B, N, C] with the code of each world as it is now, or as they are.
-
-        Where it is learned, they are differentiable in it.
-        """
-
-
-@runtime_checkable
-class ScheduledTask(Protocol):
-    """A task whose loss changes from iteration to iteration: by a curriculum, or by draws.
-
-    It has all that `Task` has besides.
-    """
-
-    def begin(self, iteration: int) -> None:
-        """Prepare the loss of an iteration, without waiting for the device.
-
-        Recorded graphs read what is written here: always into the same tensors. What is written
-        must follow from the iteration alone, so that a resumed run goes on as it would have.
-        """
-
-
-@runtime_checkable
-class ViewTask(Protocol):
-    """A task of 3D worlds that cameras see as Gaussians, from several sides.
-
-    It has all that `PictureTask` has besides.
-    """
-
-    def view_psnr(self, x: Tensor, s: Tensor) -> Tensor:
-        """Return each world's mean PSNR over the views that it is measured by [dB], shape [B]."""
-
-    def views(self, x: Tensor, s: Tensor, cameras: Cameras) -> Tensor:
-        """Return what cameras see: colours times alpha, and alpha, shape [B, V, H, W, 4]."""
-
-    def gaussians(self, s: Tensor) -> Gaussians:
-        """Return how particles of states s [B, N, C] look."""
+    half_width: float
+    """Half of its side [length units]."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class TaskConfig:
-    """World and rule of a task; the configurations of tasks add what they are told besides."""
+    """World and rule of a task; the tasks' configurations add their own fields."""
 
     particle_count: int = 4096
     """Particles in a world, N."""
@@ -210,16 +75,37 @@ ConfigT = TypeVar("ConfigT", bound=TaskConfig)
 
 
 class ParticleTask(Generic[ConfigT]):
-    """A task of one rule: world, untrained rule, fresh worlds, and the penalties of the loss.
+    """A thing to learn: world, untrained rule, fresh worlds, loss, metric and pictures.
 
     A task says where particles begin (`places`) and what is compared (`compare`), and has a
-    picture and a metric besides. In all methods x are positions [length units], shape [B, N, D],
-    s states (dimensionless), shape [B, N, C], and path_length is how far each particle travelled
-    in the rollout [length units], shape [B, N].
+    metric and a picture; all else has defaults. In all methods x are positions [length units],
+    shape [B, N, D], s states (dimensionless), shape [B, N, C], and path_length is how far each
+    particle travelled in the rollout [length units], shape [B, N].
+
+    No method may wait for the device (no `.item()`, no branch on a tensor's value): the trainer
+    captures `seed`, `damage` and `loss` in CUDA graphs and never reads a number back between two
+    log lines. So these must do the same in every iteration, and draw from their generator alone.
     """
 
     config: ConfigT
-    """What the task was told."""
+    """World, rule and loss."""
+
+    space_dim: int = 2
+    """Space dimension D."""
+
+    metric_name: str = "loss"
+    """What `metric` is, in a word or two."""
+
+    aligned: bool = False
+    """Whether worlds are to match `target_picture` pixel by pixel: a PSNR means something."""
+
+    has_views: bool = False
+    """Whether worlds are seen from several sides, by `views`, `view_psnr` and `gaussians`."""
+
+    classifies: bool = False
+    """Whether particles that stay where they are say what their cloud shows."""
+
+    _target_picture: Tensor | None = None
 
     @property
     def eps(self) -> float:
@@ -237,19 +123,33 @@ class ParticleTask(Generic[ConfigT]):
         return self.config.update_prob
 
     @property
+    def frame(self) -> Frame:
+        """Where viewers look: at the box, or around the origin."""
+        open_space = 1.1 if self.space_dim == 2 else 0.95
+        half_width = open_space if self.box is None else 0.5 * min(self.box)
+        return Frame((0.0,) * self.space_dim, half_width)
+
+    @property
+    def target_picture(self) -> Tensor:
+        """The picture to match: rgb sums and density, dimensionless, shape [R, R, 4].
+
+        Raises:
+            AttributeError: The task has none.
+        """
+        if self._target_picture is None:
+            raise AttributeError(f"{type(self).__name__} has no picture to match")
+        return self._target_picture
+
+    @property
     def rule_shape(self) -> dict[str, Any]:
-        """What `NPARule` takes besides the channels, the hidden width and ε0."""
+        """Further arguments of `NPARule`: all but channels, hidden width and ε0."""
         raise NotImplementedError
 
     def make_rule(self, generator: torch.Generator) -> NPARule:
         """Return an untrained rule on the CPU; its weights are drawn from `generator`."""
-        return untrained_rule(
-            generator,
-            state_dim=self.config.state_dim,
-            hidden_dim=self.config.hidden_dim,
-            eps0=self.config.eps,
-            **self.rule_shape,
-        )
+        config = self.config
+        sizes = {"state_dim": config.state_dim, "hidden_dim": config.hidden_dim}
+        return untrained_rule(generator, **(sizes | {"eps0": config.eps} | self.rule_shape))
 
     def places(self, world_count: int, generator: Randomness, device: torch.device) -> Tensor:
         """Return the positions of fresh worlds."""
@@ -257,16 +157,57 @@ class ParticleTask(Generic[ConfigT]):
 
     def seed(
         self, world_count: int, *, generator: Randomness, device: str | torch.device = "cpu"
-    ) -> tuple[Tensor, Tensor]:
-        """Return fresh worlds: positions of `places`, all states zero.
-
-        Args:
-            world_count: Worlds B.
-            generator: Source of the positions, on `device`.
-            device: Where the worlds are made.
-        """
+    ) -> Worlds:
+        """Return fresh worlds: positions of `places`, all states zero, without goals."""
         x = self.places(world_count, generator, torch.device(device))
-        return x, x.new_zeros(*x.shape[:2], self.config.state_dim)
+        return x, x.new_zeros(*x.shape[:2], self.config.state_dim), None
+
+    def damage(self, x: Tensor, s: Tensor, goal: Tensor | None, generator: Randomness) -> Worlds:
+        """Return worlds of the pool damaged, so that they heal, and their goals from then on."""
+        return x, s, goal
+
+    def begin(self, iteration: int) -> None:
+        """Prepare the loss of an iteration, without waiting for the device.
+
+        Recorded graphs read what is written: always into the same tensors. It must follow from the
+        iteration alone, so that a resumed run goes on as it would have.
+        """
+
+    def for_rule(self, rule: NPARule) -> Self:
+        """Return the task as it is for the worlds of a rule; most are the same for all rules.
+
+        The rule's parameters are read anew at each call: losses are differentiable in them and
+        change with them. The task itself stays as it is.
+        """
+        return self
+
+    def toward(self, goal: Tensor | None) -> Self:
+        """Return the task with loss and metric for worlds of these goals; most have none.
+
+        The tensor is read anew at each call. The task itself stays as it is.
+        """
+        return self
+
+    def coded(self, s: Tensor) -> Tensor:
+        """Return states with the code of each world, which damage takes away, where it has one.
+
+        Where it is learned, they are differentiable in it.
+        """
+        return s
+
+    def held_out(self) -> Self:
+        """Return the task with worlds that no rule was trained on, where data are split."""
+        return self
+
+    def resized(self, particle_count: int) -> Self:
+        """Return the task with another number of particles; for a rule call `for_rule` again."""
+        return self._remade(self.config.with_particle_count(particle_count))
+
+    def _remade(self, config: ConfigT) -> Self:
+        """Return the task of another configuration, on the same device."""
+        make: Any = type(self)
+        found: Self = make(config, device=self.target_picture.device)
+        return found
 
     def compare(self, x: Tensor, s: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
         """Return how far worlds are from the goal, weighted, and its named parts, unweighted."""
@@ -295,36 +236,55 @@ class ParticleTask(Generic[ConfigT]):
             total = total + weight * term
         return total, parts
 
+    def picture(self, x: Tensor, s: Tensor) -> Tensor:
+        """Return the picture of each world: rgb sums and density, shape [B, R, R, 4]."""
+        raise NotImplementedError
 
-TaskT = TypeVar("TaskT", bound=Task)
+    def metric(self, x: Tensor, s: Tensor) -> Tensor:
+        """Return how far each world is from the goal, shape [B]; lower is better."""
+        raise NotImplementedError
+
+    @property
+    def trial_name(self) -> str:
+        """What `trial_metric` is."""
+        return self.metric_name
+
+    def trial_metric(self, x: Tensor, s: Tensor) -> Tensor:
+        """Return what trials of robustness count, shape [B]: as a default `metric`."""
+        return self.metric(x, s)
+
+    def colours(self, s: Tensor) -> Tensor:
+        """Return each particle's colour as pictures show it, shape [B, N, 3]."""
+        return s[..., -3:] + COLOUR_OFFSET
+
+    def views(self, x: Tensor, s: Tensor, cameras: Cameras) -> Tensor:
+        """Return what V cameras see: colours times alpha, and alpha, shape [B, V, H, W, 4]."""
+        raise NotImplementedError
+
+    def view_psnr(self, x: Tensor, s: Tensor) -> Tensor:
+        """Return each world's mean PSNR over the views that it is measured by [dB], shape [B]."""
+        raise NotImplementedError
+
+    def gaussians(self, s: Tensor) -> Gaussians:
+        """Return how particles of states s look."""
+        raise NotImplementedError
+
+    def _with(self, **fields: object) -> Self:
+        """Return a copy with other attributes."""
+        bound = copy.copy(self)
+        vars(bound).update(fields)
+        return bound
 
 
-def task_for_rule(task: TaskT, rule: NPARule) -> TaskT:
-    """Return a task as it is for the worlds of one rule; most are the same for all rules."""
-    return cast(TaskT, task.for_rule(rule)) if isinstance(task, ReadOutTask) else task
-
-
-def task_toward(task: TaskT, goal: Tensor | None) -> TaskT:
-    """Return a task as it is for worlds of some goals; most tasks have none.
-
-    Args:
-        task: Any task.
-        goal: The worlds' goals, int64, shape [B], or None.
-    """
-    return (
-        task if goal is None or not isinstance(task, GoalTask) else cast(TaskT, task.toward(goal))
-    )
+Task = ParticleTask[Any]
+"""Any task."""
 
 
 def check_goal(goal: Tensor, count: int) -> None:
     """Check the goals of worlds; their range only on a CPU, as no task may wait for a CUDA device.
 
     Args:
-        goal: What is to be the worlds' goals, int64, shape [B].
         count: How many goals there are to choose from.
-
-    Raises:
-        NPAError: It is no such tensor, or there is no such goal.
     """
     if not isinstance(goal, Tensor) or goal.dtype != torch.int64 or goal.ndim != 1:
         came = f"{goal.dtype} {tuple(goal.shape)}" if isinstance(goal, Tensor) else shown(goal)
@@ -336,27 +296,6 @@ def check_goal(goal: Tensor, count: int) -> None:
             f"goal must hold numbers of at least 0 and below {count}, got {shown(goal.tolist())}: "
             "for example torch.tensor([0])"
         )
-
-
-def coded_states(task: Task, s: Tensor) -> Tensor:
-    """Return states that carry the code of their task again, where it has one.
-
-    Damage to states takes it away, and no rule writes it.
-
-    Args:
-        task: Any task, toward the worlds' goals.
-        s: States (dimensionless), shape [B, N, C].
-    """
-    return task.coded(s) if isinstance(task, CodedTask) else s
-
-
-def seed_worlds(
-    task: Task, world_count: int, *, generator: Randomness, device: torch.device
-) -> tuple[Tensor, Tensor, Tensor | None]:
-    """Return fresh worlds of any task: positions, states, and goals where it has such."""
-    if isinstance(task, GoalTask):
-        return task.seed_with_goals(world_count, generator=generator, device=device)
-    return *task.seed(world_count, generator=generator, device=device), None
 
 
 def shares_of_loss(loss: Tensor, amounts: Tensor) -> Tensor:
@@ -378,7 +317,6 @@ def untrained_rule(generator: torch.Generator, **hyper_parameters: Any) -> NPARu
     """Return a rule on the CPU whose weights are drawn from `generator` alone.
 
     Args:
-        generator: On the CPU; torch's own randomness is left as it is.
         hyper_parameters: What `NPARule` takes.
     """
     with torch.random.fork_rng(devices=()):

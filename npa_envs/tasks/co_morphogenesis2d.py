@@ -1,4 +1,4 @@
-"""2D morphogenesis of several species in one world, each beside the others."""
+"""2D morphogenesis of several species that share one world."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ from torch import Tensor
 from npa_envs.checks import check_non_negative
 from npa_envs.errors import NPAError
 from npa_envs.rule.rule import COLOUR_OFFSET, NPARule
+from npa_envs.tasks.base import ParticleTask, Worlds
 from npa_envs.tasks.morphogenesis2d import (
     HALF_SEEDS,
     MORPHOGENESIS2D_PRESETS,
@@ -40,11 +41,7 @@ class CoMorphogenesis2DConfig:
     """Distance between the centres of neighbouring seeds, which lie in a row [length units]."""
 
     def __post_init__(self) -> None:
-        """Check every field.
-
-        Raises:
-            NPAError: There are fewer than two species, they do not agree, or the distance is wrong.
-        """
+        """Check every field."""
         species = self.species if isinstance(self.species, tuple | list) else ()
         if len(species) < 2 or not all(isinstance(s, Morphogenesis2DConfig) for s in species):
             came = ", ".join(type(config).__name__ for config in species) or "nothing"
@@ -70,14 +67,10 @@ class CoMorphogenesis2DConfig:
         return tuple(self.distance * (k - middle) for k in range(len(self.species)))
 
 
-class CoMorphogenesis2D:
-    """`Morphogenesis2D` of every species, each on its own particles; satisfies `Task`.
+class CoMorphogenesis2D(ParticleTask[Any]):
+    """`Morphogenesis2D` of every species, each on its own particles.
 
     Worlds hold the particles of all species, one species after the other.
-
-    Args:
-        config: What each species grows, and where.
-        device: Where the targets' pictures are kept and worlds are compared with them.
 
     Raises:
         NPAError: A target cannot be loaded.
@@ -99,11 +92,6 @@ class CoMorphogenesis2D:
         return self.tasks[0].eps
 
     @property
-    def box(self) -> None:
-        """Open space."""
-        return None
-
-    @property
     def update_prob(self) -> float:
         """Probability of a particle's update in a step, dimensionless."""
         return self.tasks[0].update_prob
@@ -113,11 +101,7 @@ class CoMorphogenesis2D:
         return [task.make_rule(generator) for task in self.tasks]
 
     def make_rule(self, generator: torch.Generator) -> NPARule:
-        """Refuse: there is a rule for each species.
-
-        Raises:
-            NPAError: Always.
-        """
+        """Refuse: there is a rule for each species."""
         raise NPAError(
             f"{len(self.tasks)} species need as many rules, not one: "
             "train them with npa_envs.training.train_together"
@@ -125,22 +109,23 @@ class CoMorphogenesis2D:
 
     def seed(
         self, world_count: int, *, generator: Randomness, device: str | torch.device = "cpu"
-    ) -> tuple[Tensor, Tensor]:
+    ) -> Worlds:
         """Return fresh worlds: each species uniform in a disk of its own, all states zero."""
         seeds = [task.seed(world_count, generator=generator, device=device) for task in self.tasks]
         positions = [
             torch.stack((x[..., 0] + centre, x[..., 1]), dim=-1)
-            for (x, _), centre in zip(seeds, self.config.centres, strict=True)
+            for (x, *_), centre in zip(seeds, self.config.centres, strict=True)
         ]
-        return torch.cat(positions, dim=1), torch.cat([s for _, s in seeds], dim=1)
+        return torch.cat(positions, dim=1), torch.cat([s for _, s, _ in seeds], dim=1), None
 
-    def damage(self, x: Tensor, s: Tensor, generator: Randomness) -> tuple[Tensor, Tensor]:
+    def damage(self, x: Tensor, s: Tensor, goal: Tensor | None, generator: Randomness) -> Worlds:
         """Return the worlds with each species damaged as it is alone."""
         hurt = [
-            task.damage(own_x, own_s, generator)
+            task.damage(own_x, own_s, None, generator)
             for task, own_x, own_s in zip(self.tasks, *self._split(x, s), strict=True)
         ]
-        return torch.cat([x for x, _ in hurt], dim=1), torch.cat([s for _, s in hurt], dim=1)
+        x, s = torch.cat([x for x, *_ in hurt], dim=1), torch.cat([s for _, s, _ in hurt], dim=1)
+        return x, s, goal
 
     def loss(self, x: Tensor, s: Tensor, path_length: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
         """Return the sum of the species' training losses and its parts, named "k.part"."""
@@ -214,7 +199,7 @@ _OWN: Mapping[str, Mapping[str, Any]] = {"best": {"cut_share": 0.25}, "fast": {"
 def _beside(
     name: str, alone: Morphogenesis2DTrainConfig, neighbour: str
 ) -> JointTrainConfig[CoMorphogenesis2DConfig]:
-    """Return a run of one species, with another one of the same kind beside it."""
+    """Return a run of one species, together with another one of the same kind."""
     own = dataclasses.replace(alone.task, **_OWN.get(name, {}))
     species = (own, dataclasses.replace(own, target=neighbour))
     run = {field.name: getattr(alone, field.name) for field in dataclasses.fields(alone)}

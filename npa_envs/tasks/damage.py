@@ -1,6 +1,6 @@
 """Damage that a rule should heal: to worlds of a rollout, and to those of the training pool.
 
-Nothing here reads a value back from the device, so all of it may be captured in a CUDA graph.
+No function reads a value back from the device, so all may be captured in a CUDA graph.
 """
 
 from __future__ import annotations
@@ -65,11 +65,7 @@ class DamageEvent:
     """Radius, gap or standard deviation [length units]; None is the usual one."""
 
     def __post_init__(self) -> None:
-        """Check every field.
-
-        Raises:
-            NPAError: The kind is unknown, the step negative, or the size not positive and finite.
-        """
+        """Check every field."""
         if not isinstance(self.kind, str) or self.kind not in DAMAGE_SIZES:
             raise NPAError(f"unknown damage {shown(self.kind)}: {suggest(self.kind, DAMAGE_SIZES)}")
         if not is_whole(self.step) or self.step < 0:
@@ -163,17 +159,8 @@ def damage_worlds(
 def random_particle(x: Tensor, generator: Randomness | None = None) -> Tensor:
     """Return the position of one particle of each world, each as likely as the others.
 
-    Args:
-        x: Particle positions [length units], shape [B, N, D].
-        generator: Where the choice comes from, on the device of `x`; None is torch's own.
-            A `WorldRandom` of B worlds chooses in each world what it would choose alone.
-
     Returns:
         The chosen positions [length units], shape [B, D].
-
-    Raises:
-        NPAError: A wrong shape or dtype, no particles, or a generator on another device or for
-            another number of worlds.
     """
     check_world(x, x)
     check_generator(generator, x.device, x.shape[0])
@@ -195,13 +182,7 @@ def displace(x: Tensor, *, share: float, generator: Randomness | None = None) ->
     Nothing waits for the device.
 
     Args:
-        x: Particle positions [length units], shape [B, N, D].
         share: Probability of each particle to be thrown out (dimensionless).
-        generator: Source of randomness, on the device of `x`; a `WorldRandom` of B worlds throws in
-            each world what it would throw alone.
-
-    Raises:
-        NPAError: The generator is on another device or for another number of worlds.
     """
     world_count, particle_count, space_dim = x.shape
     check_generator(generator, x.device, world_count)
@@ -222,14 +203,9 @@ def tear_off(
     rest. Nothing waits for the device.
 
     Args:
-        x: Particle positions [length units], shape [B, N, D].
         radius: Flakes are disks (balls in 3D) around random particles, of any radius up to this
             [length units].
         chance: Probability of a world to lose one (dimensionless).
-        generator: Source of randomness, as for `displace`.
-
-    Raises:
-        NPAError: The generator is on another device or for another number of worlds.
     """
     world_count, _, space_dim = x.shape
     centre = random_particle(x, generator)
@@ -271,10 +247,6 @@ def escape_motion(x: Tensor, path_length: Tensor) -> Tensor:
 
     It is 0 where there are none. Within `counted_together` the mean of what all processes return
     is the mean over the particles of all of them.
-
-    Args:
-        x: Particle positions [length units], shape [B, N, D].
-        path_length: How far each particle travelled [length units], shape [B, N].
     """
     outside = (x.detach().abs().amax(dim=-1) > 1.0).to(x.dtype)
     count, mean = outside.sum(), _counting.get()
@@ -314,11 +286,7 @@ class PoolDamage:
     """Probability of each particle to be thrown out of worlds from the pool (dimensionless)."""
 
     def __post_init__(self) -> None:
-        """Check every field.
-
-        Raises:
-            NPAError: A field is no finite number of at least 0, or `cut_share` above 1.
-        """
+        """Check every field."""
         check_fraction(self, "cut_share")
         check_non_negative(
             self, "damage_radius", "clump_radius", "cut_gap", "flake_radius", "escape_share"
@@ -331,11 +299,7 @@ def damage_pool(
     """Return worlds that are damaged at random places; nothing waits for the device.
 
     Args:
-        x: Particle positions [length units], shape [B, N, D].
-        s: Particle states (dimensionless), shape [B, N, C].
         damage: What is done.
-        generator: Source of randomness, on the device of `x`; a `WorldRandom` of B worlds does to
-            each world what it would do to it alone.
     """
     if damage.damage_radius > 0.0:
         centre = random_particle(x, generator)

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from npa_envs.checks import check_non_negative, check_positive
-from npa_envs.tasks.base import ParticleTask, TaskConfig
+from npa_envs.tasks.base import ParticleTask, TaskConfig, Worlds
 from npa_envs.tasks.damage import PoolDamage, damage_pool, escape_motion
 from npa_envs.tasks.seeds import uniform_ball
 from npa_envs.world.randomness import Randomness
@@ -56,12 +56,9 @@ class GrowthTask(ParticleTask[GrowthConfigT]):
     aligned = True
     """What is grown is compared with the target pixel by pixel."""
 
-    space_dim: int
-    """Space dimension D."""
-
     @property
     def rule_shape(self) -> dict[str, Any]:
-        """What `NPARule` takes besides the channels, the hidden width and ε0."""
+        """Further arguments of `NPARule`: all but channels, hidden width and ε0."""
         return {"space_dim": self.space_dim, "alpha": self.config.alpha}
 
     def places(self, world_count: int, generator: Randomness, device: torch.device) -> Tensor:
@@ -71,9 +68,9 @@ class GrowthTask(ParticleTask[GrowthConfigT]):
             world_count, count, self.space_dim, radius, generator=generator, device=device
         )
 
-    def damage(self, x: Tensor, s: Tensor, generator: Randomness) -> tuple[Tensor, Tensor]:
+    def damage(self, x: Tensor, s: Tensor, goal: Tensor | None, generator: Randomness) -> Worlds:
         """Return the worlds damaged as the configuration says, each at a place of its own."""
-        return damage_pool(x, s, self.config, generator=generator)
+        return *damage_pool(x, s, self.config, generator=generator), goal
 
     def penalties(
         self, x: Tensor, s: Tensor, path_length: Tensor

@@ -1,8 +1,7 @@
-"""Many pictures by one rule: each world has a target of its own, told by a code."""
+"""Many pictures by one rule: each world has a target of its own, which a code names."""
 
 from __future__ import annotations
 
-import copy
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any, Self
@@ -14,7 +13,7 @@ from npa_envs.errors import NPAError, shown
 from npa_envs.files import home_path
 from npa_envs.rule.codes import Codes
 from npa_envs.rule.rule import NPARule
-from npa_envs.tasks.base import check_goal, untrained_rule
+from npa_envs.tasks.base import Worlds, check_goal
 from npa_envs.tasks.morphogenesis2d import Morphogenesis2D, Morphogenesis2DConfig
 from npa_envs.tasks.seeds import drawn_indices
 from npa_envs.tasks.targets.images import looks_like_path
@@ -31,9 +30,6 @@ def named_targets(targets: Sequence[str]) -> dict[str, str]:
     Args:
         targets: Built-in names, emoji, picture files, and folders, which stand for the pictures in
             them, sorted by name. A file's name is its own without suffix.
-
-    Raises:
-        NPAError: A folder holds no pictures, or two targets have the same name.
     """
     named: dict[str, str] = {}
     for target in targets:
@@ -63,14 +59,10 @@ def _pictures_of(target: str) -> list[str]:
 
 
 class ManyPictures(Morphogenesis2D):
-    """Morphogenesis of several targets by one rule; satisfies `GoalTask` and `CodedTask`.
+    """Morphogenesis of several targets by one rule; each world has a goal and a code.
 
     A world's goal is the place of its target among `targets`. Particles of all targets are drawn
     equally large, and pictures are scaled so that each target's density is about 1.
-
-    Args:
-        config: As for `Morphogenesis2D`; `targets` says what to grow.
-        device: Where the targets' pictures are kept and worlds are compared with them.
 
     Raises:
         NPAError: There are no targets, one cannot be loaded, or the rule is to know no direction.
@@ -111,7 +103,7 @@ class ManyPictures(Morphogenesis2D):
 
     @property
     def rule_shape(self) -> dict[str, Any]:
-        """What `NPARule` takes besides the hidden width and ε0."""
+        """Further arguments of `NPARule`: all but hidden width and ε0."""
         config = self.config
         return super().rule_shape | {
             "state_dim": config.code_dim + config.state_dim,
@@ -120,49 +112,28 @@ class ManyPictures(Morphogenesis2D):
             "encoder": config.encoder,
         }
 
-    def make_rule(self, generator: torch.Generator) -> NPARule:
-        """Return an untrained rule on the CPU; its weights are drawn from `generator`."""
-        config = self.config
-        return untrained_rule(
-            generator, hidden_dim=config.hidden_dim, eps0=config.eps, **self.rule_shape
-        )
-
     def for_rule(self, rule: NPARule) -> Self:
         """Return the task whose worlds carry the codes of a rule.
 
-        Those of an encoder are read from the pictures here, and each time that states are `coded`.
+        An encoder reads them from the pictures now, and each time that states are `coded`.
         """
         if rule.codes is not None:
             with torch.no_grad():
                 self._read_codes(rule.codes)
         return self._with(_codes=rule.codes)
 
-    def toward(self, goal: Tensor) -> Self:
-        """Return the task with loss and metric for worlds of these targets, int64, shape [B].
-
-        Raises:
-            NPAError: They are no such tensor; or, on a CPU, there is no such target.
-        """
+    def toward(self, goal: Tensor | None) -> Self:
+        """Return the task with loss and metric for worlds of these targets, int64, shape [B]."""
+        if goal is None:
+            return self
         check_goal(goal, len(self.names))
         return self._with(_goal=goal)
 
     def seed(
         self, world_count: int, *, generator: Randomness, device: str | torch.device = "cpu"
-    ) -> tuple[Tensor, Tensor]:
-        """Return fresh worlds without their goals; as `seed_with_goals`."""
-        return self.seed_with_goals(world_count, generator=generator, device=device)[:2]
-
-    def seed_with_goals(
-        self, world_count: int, *, generator: Randomness, device: str | torch.device = "cpu"
-    ) -> tuple[Tensor, Tensor, Tensor]:
-        """Return fresh worlds of random targets, with their goals, int64, shape [B].
-
-        Args:
-            world_count: Worlds B.
-            generator: Source of positions and targets, on `device`.
-            device: Where the worlds are made.
-        """
-        x, s = super().seed(world_count, generator=generator, device=device)
+    ) -> Worlds:
+        """Return fresh worlds of random targets, and which ones these are."""
+        x, s, _ = super().seed(world_count, generator=generator, device=device)
         goal = drawn_indices(len(self.names), world_count, generator, torch.device(device))
         blank = s.new_zeros(*s.shape[:2], self.config.code_dim)
         s = torch.cat((blank, s), dim=-1)
@@ -170,12 +141,10 @@ class ManyPictures(Morphogenesis2D):
             s = self._carrying(s, self._codes.table.detach(), goal)
         return x, s, goal
 
-    def damage_with_goals(
-        self, x: Tensor, s: Tensor, goal: Tensor, generator: Randomness
-    ) -> tuple[Tensor, Tensor, Tensor]:
+    def damage(self, x: Tensor, s: Tensor, goal: Tensor | None, generator: Randomness) -> Worlds:
         """Return the worlds damaged, some with another target, and their goals."""
-        x, s = self.damage(x, s, generator)
-        if self.config.switch_share == 0.0:
+        x, s, goal = super().damage(x, s, goal, generator)
+        if goal is None or self.config.switch_share == 0.0:
             return x, s, goal
         other = drawn_indices(len(self.names), len(x), generator, x.device)
         single = x.new_empty(0, dtype=torch.float32)
@@ -205,11 +174,7 @@ class ManyPictures(Morphogenesis2D):
 
     @property
     def target_picture(self) -> Tensor:
-        """Pictures of the worlds' targets: rgb sums and density, shape [B, R, R, 4].
-
-        Raises:
-            NPAError: The goals have not been said by `toward`.
-        """
+        """Pictures of the worlds' targets: rgb sums and density, shape [B, R, R, 4]."""
         if self._goal is None:
             raise NPAError("the worlds' targets must be given first: task.toward(goal), int64 [B]")
         return self._target_pictures.index_select(0, self._goal)
@@ -227,8 +192,3 @@ class ManyPictures(Morphogenesis2D):
         if self._goal is None:
             return picture
         return picture * self._scales.index_select(0, self._goal).to(picture)[:, None, None, None]
-
-    def _with(self, **fields: object) -> Self:
-        bound = copy.copy(self)
-        vars(bound).update(fields)
-        return bound

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -17,6 +16,7 @@ from npa_envs.errors import NPAError, shown
 from npa_envs.ops import splat, world_mean
 from npa_envs.ops.pictures.losses import picture_losses
 from npa_envs.rule.rule import COLOUR_OFFSET, LIFE, NPARule
+from npa_envs.tasks.base import Worlds
 from npa_envs.tasks.damage import damage_pool
 from npa_envs.tasks.growth import GrowthConfig, GrowthTask
 from npa_envs.tasks.targets.images import LARGEST_POINT_COUNT
@@ -169,24 +169,15 @@ UNOWNED = 0.05
 
 
 class Morphogenesis2D(GrowthTask[Morphogenesis2DConfig]):
-    """The task of arXiv 2601.16096, section 4.1, with its loss; satisfies `PictureTask`.
+    """The task of arXiv 2601.16096, section 4.1, with its loss.
 
     Of a rule of many pictures, `for_rule` gives the task of one of them.
-
-    Args:
-        config: Target, world, rule size and loss weights.
-        target: The target, where it is at hand already; by default `config.target` is loaded.
-        device: Where the target's picture is kept and worlds are compared with it.
 
     Raises:
         NPAError: The target cannot be loaded.
     """
 
-    space_dim = 2
-    """Space dimension D."""
-
     metric_name = "splat loss"
-    """What `metric` is."""
 
     def __init__(
         self,
@@ -212,18 +203,10 @@ class Morphogenesis2D(GrowthTask[Morphogenesis2DConfig]):
         points, colours = self.target.points[None], self.target.colours[None]
         self._target_picture = self._splat(points, colours)[0]
 
-    @property
-    def target_picture(self) -> Tensor:
-        """The target's picture: rgb sums and density, dimensionless, shape [R, R, 4]."""
-        return self._target_picture
-
     def for_rule(self, rule: NPARule) -> Self:
         """Return the task whose fresh worlds carry the code that a rule has for the target.
 
         It is the code of the target's name, or else what the rule's encoder reads from its picture.
-
-        Raises:
-            NPAError: The rule has codes, but none of this name, and no encoder.
         """
         codes = rule.codes
         if codes is None:
@@ -238,26 +221,18 @@ class Morphogenesis2D(GrowthTask[Morphogenesis2DConfig]):
         Args:
             code: Dimensionless, shape [K].
         """
-        bound = copy.copy(self)
-        bound._code = code.detach()
-        return bound
+        return self._with(_code=code.detach())
 
     def seed(
         self, world_count: int, *, generator: Randomness, device: str | torch.device = "cpu"
-    ) -> tuple[Tensor, Tensor]:
+    ) -> Worlds:
         """Return fresh worlds: of an equivariant rule with a head and a tail, of one that divides
-        with one living particle, at the origin.
-
-        Args:
-            world_count: Worlds B.
-            generator: Source of the positions and of the axes, on `device`.
-            device: Where the worlds are made.
-        """
-        x, s = super().seed(world_count, generator=generator, device=device)
+        with one living particle, at the origin."""
+        x, s, goal = super().seed(world_count, generator=generator, device=device)
         config = self.config
         if config.division:
             s[:, 0, LIFE] = 1.0
-            return torch.zeros_like(x), s
+            return torch.zeros_like(x), s, goal
         if config.equivariant and max(config.seed_axis, config.seed_across) > 0.0:
             share = (
                 generator.uniform(1, dtype=x.dtype)
@@ -273,7 +248,7 @@ class Morphogenesis2D(GrowthTask[Morphogenesis2DConfig]):
                 s[..., 1] = config.seed_across * across / config.seed_radius
         if self._code is not None:
             s = self.coded(torch.cat((s.new_zeros(*s.shape[:2], len(self._code)), s), dim=-1))
-        return x, s
+        return x, s, goal
 
     def coded(self, s: Tensor) -> Tensor:
         """Return states with the task's code, or as they are where it has none."""
@@ -282,22 +257,21 @@ class Morphogenesis2D(GrowthTask[Morphogenesis2DConfig]):
         code = self._code.to(s).expand(*s.shape[:2], -1)
         return torch.cat((code, s[..., len(self._code) :]), dim=-1)
 
-    def damage(self, x: Tensor, s: Tensor, generator: Randomness) -> tuple[Tensor, Tensor]:
+    def damage(self, x: Tensor, s: Tensor, goal: Tensor | None, generator: Randomness) -> Worlds:
         """Return the worlds damaged; of one that divides particles die, but never all."""
         if not (self.config.division and self.config.damage_radius > 0.0):
-            return super().damage(x, s, generator)
+            return super().damage(x, s, goal, generator)
         # Children of a crowd that is thinned learn who they are among its grown particles.
         stay = uniform_draws(generator, x.shape[:2], x) < SURVIVING
         left = torch.where(stay[..., None], s, 0.0)
         left = torch.where(living(left).any(dim=1)[:, None, None], left, s)
-        return damage_pool(x, left, replace(self.config, damage_radius=0.0), generator=generator)
+        rest = replace(self.config, damage_radius=0.0)
+        return *damage_pool(x, left, rest, generator=generator), goal
 
     def picture(self, x: Tensor, s: Tensor, *, centred: bool = True) -> Tensor:
         """Return each world's picture: colour sums and density, dimensionless, shape [B, R, R, 4].
 
         Args:
-            x: Positions [length units], shape [B, N, 2].
-            s: States, dimensionless, shape [B, N, C].
             centred: Move each world's mean to the target's, and turn worlds of an equivariant rule,
                 as the loss does.
         """
@@ -356,7 +330,7 @@ class Morphogenesis2D(GrowthTask[Morphogenesis2DConfig]):
 
     @property
     def rule_shape(self) -> dict[str, Any]:
-        """What `NPARule` takes besides the channels, the hidden width and ε0."""
+        """Further arguments of `NPARule`: all but channels, hidden width and ε0."""
         config = self.config
         known: dict[str, Any] = {"divides": True} if config.division else {}
         if config.equivariant:
@@ -408,10 +382,6 @@ class Morphogenesis2D(GrowthTask[Morphogenesis2DConfig]):
 
         Angles are tried evenly spread, and then finer near the best. Where the rule is not chiral
         mirrored worlds are tried too.
-
-        Args:
-            x: Positions [length units], shape [B, N, 2].
-            s: States, dimensionless, shape [B, N, C].
 
         Returns:
             Matrices, shape [B, 2, 2]; without gradient. Where no angles are tried, the identity.

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import copy
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 import torch
@@ -125,15 +124,10 @@ GREY = 0.5
 
 
 class Morphogenesis3D(GrowthTask[Morphogenesis3DConfig]):
-    """The task of arXiv 2601.16096 with its loss; satisfies `PictureTask`, `ReadOutTask`.
+    """The task of arXiv 2601.16096 with its loss.
 
     As it is, the last three channels of a state are its colour and particles are round; `for_rule`
     gives the task that sees what a rule reads out of the states.
-
-    Args:
-        config: Target, world, rule size and loss.
-        target: The target, where it is at hand already; by default `config.target` is loaded.
-        device: Where views are kept and worlds are compared with them.
 
     Raises:
         NPAError: The target cannot be loaded, or its views have another size.
@@ -141,10 +135,8 @@ class Morphogenesis3D(GrowthTask[Morphogenesis3DConfig]):
     """
 
     space_dim = 3
-    """Space dimension D."""
-
     metric_name = "view loss"
-    """What `metric` is: the loss of held-out views."""
+    has_views = True
 
     def __init__(
         self,
@@ -175,9 +167,8 @@ class Morphogenesis3D(GrowthTask[Morphogenesis3DConfig]):
         self.target = target.to(device)
         """What worlds are to look like."""
         self._shown = some_views(self.target.held_out, torch.tensor([visible], device=device))
-        self.target_picture = self._shown.pictures[0].flip(0)
-        """The view that pictures show: red, green and blue times alpha, and alpha, dimensionless,
-        shape [R, R, 4]; rows point up."""
+        # The view that pictures show; rows point up.
+        self._target_picture = self._shown.pictures[0].flip(0)
         self._appearance = Appearance(config.sigma, config.anisotropy, config.opacity)
         self.schedule = ViewSchedule(
             len(target.training.pictures),
@@ -190,24 +181,21 @@ class Morphogenesis3D(GrowthTask[Morphogenesis3DConfig]):
         """Which views, how much blur and which backgrounds an iteration has."""
         self._rule: NPARule | None = None
 
-    def for_rule(self, rule: NPARule) -> Morphogenesis3D:
-        """Return the task that sees what a rule reads out of the states; all else is shared.
+    def _remade(self, config: Morphogenesis3DConfig) -> Self:
+        return type(self)(config, target=self.target, device=self.target_picture.device)
 
-        Raises:
-            NPAError: The rule reads out something else than Gaussians.
-        """
+    def for_rule(self, rule: NPARule) -> Self:
+        """Return the task that sees what a rule reads out of the states; all else is shared."""
         if rule.readout_dim not in (0, OUTPUTS):
             raise NPAError(
                 f"the rule must read out {OUTPUTS} numbers of a state, or none, got readout_dim="
                 f"{rule.readout_dim}: it was made for another task"
             )
-        seen = copy.copy(self)
-        seen._rule = rule if rule.readout_dim else None
-        return seen
+        return self._with(_rule=rule if rule.readout_dim else None)
 
     @property
     def rule_shape(self) -> dict[str, Any]:
-        """What `NPARule` takes besides the channels, the hidden width and ε0."""
+        """Further arguments of `NPARule`: all but channels, hidden width and ε0."""
         readout = {"readout_dim": OUTPUTS, "readout_hidden_dim": self.config.readout_hidden_dim}
         return super().rule_shape | readout
 
@@ -221,13 +209,7 @@ class Morphogenesis3D(GrowthTask[Morphogenesis3DConfig]):
         return self._appearance.gaussians(outputs)
 
     def views(self, x: Tensor, s: Tensor, cameras: Cameras) -> Tensor:
-        """Return what cameras see: colours times alpha, and alpha, shape [B, V, H, W, 4].
-
-        Args:
-            x: Positions [length units], shape [B, N, 3].
-            s: States (dimensionless), shape [B, N, C].
-            cameras: V cameras; the first row of what they see is the upper one.
-        """
+        """Return what cameras see: colours times alpha, and alpha, shape [B, V, H, W, 4]."""
         return self._draw(x, self.gaussians(s), cameras)
 
     def picture(self, x: Tensor, s: Tensor) -> Tensor:
@@ -309,10 +291,8 @@ class ViewSchedule:
     Args:
         view_count: Views to choose from.
         chosen_count: Views of an iteration, all different; at most `view_count`.
-        seed: What views and backgrounds are drawn from.
         blur_sigma: Standard deviation of the blur at first [pixels].
         blur_iterations: Iterations after which there is none; it goes evenly.
-        device: Where the tensors are.
     """
 
     def __init__(
@@ -358,7 +338,6 @@ def blurred(pictures: Tensor, sigma: Tensor) -> Tensor:
     knowing it, and one of 0 leaves the pictures as they are, bit for bit.
 
     Args:
-        pictures: Shape [V, H, W, K]; colours times alpha, and alpha.
         sigma: Standard deviation [pixels], shape [].
     """
     rows, columns = (_weights(size, sigma, pictures) for size in pictures.shape[1:3])

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -17,7 +16,7 @@ from npa_envs.checks import check_non_negative, check_positive, check_seed, chec
 from npa_envs.errors import NPAError
 from npa_envs.ops import splat, world_mean
 from npa_envs.rule.rule import NPARule
-from npa_envs.tasks.base import ParticleTask, TaskConfig, check_goal
+from npa_envs.tasks.base import Frame, ParticleTask, TaskConfig, Worlds, check_goal
 from npa_envs.tasks.seeds import drawn_indices
 from npa_envs.tasks.targets.clouds import (
     PointClouds,
@@ -93,22 +92,18 @@ SIGMA = 0.7
 
 
 class PointClassification(ParticleTask[PointClassificationConfig]):
-    """The classification task of arXiv 2601.16096; satisfies `PictureTask` and `GoalTask`.
+    """The classification task of arXiv 2601.16096; its worlds have goals.
 
     The goal of a world is its cloud's class. A rule's read-out gives one number for each class;
     without a rule, or where it has no read-out, these are the last channels of the states.
 
     Args:
-        config: Data, variation, world and rule size.
-        device: Where the clouds are kept.
         split: Which clouds worlds are made of; those of "test" are not varied.
     """
 
-    aligned = False
-    """There is no picture to match."""
-
     metric_name = "mean squared error to the class"
-    """What `metric` is."""
+    trial_name = "share of particles that are wrong"
+    classifies = True
 
     def __init__(
         self,
@@ -123,14 +118,13 @@ class PointClassification(ParticleTask[PointClassificationConfig]):
         self._device = torch.device(device)
         self._rule: NPARule | None = None
         self._goal: Tensor | None = None
+        # There is no picture to match.
+        side = config.resolution
+        self._target_picture = torch.zeros(side, side, 4, device=self._device)
 
     @cached_property
     def clouds(self) -> PointClouds:
-        """All clouds that worlds are made of, loaded when first asked for.
-
-        Raises:
-            NPAError: They cannot be loaded, or are of more classes than the configuration says.
-        """
+        """All clouds that worlds are made of, loaded when first asked for."""
         config = self.config
         clouds = load_clouds(
             config.data,
@@ -149,9 +143,9 @@ class PointClassification(ParticleTask[PointClassificationConfig]):
         return clouds
 
     @property
-    def target_picture(self) -> Tensor:
-        """Nothing: there is no picture to match; shape [R, R, 4]."""
-        return torch.zeros(self.config.resolution, self.config.resolution, 4, device=self._device)
+    def frame(self) -> Frame:
+        """Where viewers look: at [0, 1]²."""
+        return Frame((0.5, 0.5), 0.6)
 
     @property
     def pixel_size(self) -> float:
@@ -160,7 +154,7 @@ class PointClassification(ParticleTask[PointClassificationConfig]):
 
     @property
     def rule_shape(self) -> dict[str, Any]:
-        """What `NPARule` takes besides the channels, the hidden width and ε0."""
+        """Further arguments of `NPARule`: all but channels, hidden width and ε0."""
         config = self.config
         readout = {
             "readout_dim": config.class_count,
@@ -178,34 +172,26 @@ class PointClassification(ParticleTask[PointClassificationConfig]):
         vars(other).pop("clouds", None)
         return other
 
-    def toward(self, goal: Tensor) -> Self:
-        """Return the task with loss and metric for worlds of these classes, int64, shape [B].
+    def held_out(self) -> Self:
+        """Return the task with the clouds of "test": those of "train" may be known by heart."""
+        return self.on("test")
 
-        Raises:
-            NPAError: They are no such tensor; or, on a CPU, there is no such class.
-        """
+    def _remade(self, config: PointClassificationConfig) -> Self:
+        return type(self)(config, device=self._device, split=self.split)
+
+    def toward(self, goal: Tensor | None) -> Self:
+        """Return the task with loss and metric for worlds of these classes, int64, shape [B]."""
+        if goal is None:
+            return self
         check_goal(goal, self.config.class_count)
         return self._with(_goal=goal)
 
     def seed(
         self, world_count: int, *, generator: Randomness, device: str | torch.device = "cpu"
-    ) -> tuple[Tensor, Tensor]:
-        """Return fresh worlds without their classes; as `seed_with_goals`."""
-        return self.seed_with_goals(world_count, generator=generator, device=device)[:2]
+    ) -> Worlds:
+        """Return random clouds, varied as the configuration says, all states zero, and classes.
 
-    def seed_with_goals(
-        self, world_count: int, *, generator: Randomness, device: str | torch.device = "cpu"
-    ) -> tuple[Tensor, Tensor, Tensor]:
-        """Return random clouds, varied as the configuration says, with all states zero.
-
-        Args:
-            world_count: Worlds B.
-            generator: Source of randomness, on `device`.
-            device: Where the worlds are made: that of the task, or they are copied there.
-
-        Returns:
-            Positions [length units], shape [B, N, 2]; states, dimensionless, shape [B, N, C]; and
-            classes, int64, shape [B].
+        They are made on the device of the task and copied to `device`.
         """
         config, clouds = self.config, self.clouds
         chosen = drawn_indices(len(clouds.label), world_count, generator, torch.device(device))
@@ -221,29 +207,20 @@ class PointClassification(ParticleTask[PointClassificationConfig]):
             )
         return x, x.new_zeros(*x.shape[:2], config.state_dim), goal
 
-    def damage(self, x: Tensor, s: Tensor, generator: Randomness) -> tuple[Tensor, Tensor]:
-        """Return the worlds as they are: who forgets its class cannot be told it again."""
-        return x, s
-
-    def damage_with_goals(
-        self, x: Tensor, s: Tensor, goal: Tensor, generator: Randomness
-    ) -> tuple[Tensor, Tensor, Tensor]:
+    def damage(self, x: Tensor, s: Tensor, goal: Tensor | None, generator: Randomness) -> Worlds:
         """Return some worlds as other clouds, with their states as they were, and the classes."""
         share = self.config.mutated_share
-        if share == 0.0:
+        if goal is None or share == 0.0:
             return x, s, goal
-        other, _, other_goal = self.seed_with_goals(len(x), generator=generator, device=x.device)
+        other, _, other_goal = self.seed(len(x), generator=generator, device=x.device)
         single = x.new_empty(0, dtype=torch.float32)
         mutated = uniform_draws(generator, (len(x), 1), single)[:, 0] < share
         x = torch.where(mutated[:, None, None], other.to(x.dtype), x)
+        assert other_goal is not None, "clouds come with their classes"
         return x, s, torch.where(mutated, other_goal, goal)
 
     def outputs(self, s: Tensor) -> Tensor:
-        """Return what each particle says of each class, dimensionless, shape [B, N, K].
-
-        Raises:
-            NPAError: There are fewer outputs than classes.
-        """
+        """Return what each particle says of each class, dimensionless, shape [B, N, K]."""
         outputs = s if self._rule is None else self._rule.read_out(s)
         if outputs.shape[-1] < self.config.class_count:
             raise NPAError(
@@ -253,11 +230,7 @@ class PointClassification(ParticleTask[PointClassificationConfig]):
         return outputs[..., -self.config.class_count :]
 
     def errors(self, s: Tensor) -> Tensor:
-        """Return each particle's mean squared error to the one-hot of its world's class, [B, N].
-
-        Raises:
-            NPAError: The classes have not been said by `toward`.
-        """
+        """Return each particle's mean squared error to the one-hot of its world's class, [B, N]."""
         outputs = self.outputs(s)
         classes = torch.arange(self.config.class_count, device=s.device)
         wanted = (self.wanted[:, None] == classes).to(outputs.dtype)
@@ -265,32 +238,20 @@ class PointClassification(ParticleTask[PointClassificationConfig]):
 
     @property
     def wanted(self) -> Tensor:
-        """Classes of the worlds, int64, shape [B].
-
-        Raises:
-            NPAError: The classes have not been said by `toward`.
-        """
+        """Classes of the worlds, int64, shape [B]."""
         if self._goal is None:
             raise NPAError("the worlds' classes must be given first: task.toward(goal), int64 [B]")
         return self._goal
 
     def mistakes(self, s: Tensor) -> Tensor:
-        """Return 1 for particles that say another class than their world's most loudly, [B, N].
-
-        Raises:
-            NPAError: The classes have not been said by `toward`.
-        """
+        """Return 1 for particles that say another class than their world's most loudly, [B, N]."""
         return (self.outputs(s).argmax(dim=-1) != self.wanted[:, None]).to(s.dtype)
 
     def cross_entropies(self, s: Tensor, sharpness: float) -> Tensor:
         """Return each particle's cross-entropy of softmax(sharpness × outputs), [B, N].
 
         Args:
-            s: States, dimensionless, shape [B, N, C].
             sharpness: How surely outputs are taken as probabilities (dimensionless).
-
-        Raises:
-            NPAError: The classes have not been said by `toward`.
         """
         chances = torch.log_softmax(sharpness * self.outputs(s), dim=-1)
         wanted = self.wanted[:, None, None].expand(*s.shape[:2], 1)
@@ -299,6 +260,14 @@ class PointClassification(ParticleTask[PointClassificationConfig]):
     def metric(self, x: Tensor, s: Tensor) -> Tensor:
         """Return each world's mean squared error, shape [B]."""
         return world_mean(self.errors(s)[..., None])[:, 0]
+
+    def trial_metric(self, x: Tensor, s: Tensor) -> Tensor:
+        """Return the share of each world's particles that are wrong, shape [B]."""
+        return self.mistakes(s).mean(1)
+
+    def colours(self, s: Tensor) -> Tensor:
+        """Return each particle's colour, its class's; [B, N, 3]."""
+        return class_colours(self.outputs(s))
 
     def overflows(self, s: Tensor) -> Tensor:
         """Return each particle's mean |s − clip(s, −1, 1)|, [B, N]."""
@@ -314,11 +283,7 @@ class PointClassification(ParticleTask[PointClassificationConfig]):
         return error, {"error": error}
 
     def loss(self, x: Tensor, s: Tensor, path_length: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
-        """Return the training loss and its named parts, unweighted, and the share that is right.
-
-        Raises:
-            NPAError: The classes have not been said by `toward`.
-        """
+        """Return the training loss and its named parts, unweighted, and the share that is right."""
         total, parts = super().loss(x, s, path_length)
         return total, {**parts, "accuracy": 1.0 - self.mistakes(s.detach()).mean()}
 
@@ -326,7 +291,7 @@ class PointClassification(ParticleTask[PointClassificationConfig]):
         """Return each world's picture, coloured by class: colour sums, density, [B, R, R, 4]."""
         return splat(
             x,
-            class_colours(self.outputs(s)),
+            self.colours(s),
             resolution=self.config.resolution,
             pixel_size=self.pixel_size,
             sigma=SIGMA,
@@ -339,10 +304,8 @@ class PointClassification(ParticleTask[PointClassificationConfig]):
         return {name: value for name, value in vars(self).items() if name != "clouds"}
 
     def _with(self, **fields: object) -> Self:
-        bound = copy.copy(self)
-        vars(bound).update({"clouds": self.clouds} if "clouds" in vars(self) else {})
-        vars(bound).update(fields)
-        return bound
+        known = {"clouds": self.clouds} if "clouds" in vars(self) else {}
+        return super()._with(**(known | fields))
 
 
 PICTURE_MARGIN = 0.0625
@@ -367,11 +330,7 @@ UNDECIDED = (0.6, 0.6, 0.6)
 
 
 def particle_classes(outputs: Tensor) -> Tensor:
-    """Return the class that each particle says, int64, shape [B, N].
-
-    Args:
-        outputs: One number for each class, shape [B, N, K].
-    """
+    """Return the class that each particle says, int64, shape [B, N]."""
     return outputs.argmax(-1)
 
 
@@ -379,9 +338,6 @@ def majority(outputs: Tensor) -> Tensor:
     """Return the class that most particles of each world say, int64, shape [B].
 
     Of several with as many votes it is the one with the larger sum of outputs.
-
-    Args:
-        outputs: One number for each class, shape [B, N, K].
     """
     particle_count, class_count = outputs.shape[1:]
     classes = torch.arange(class_count, device=outputs.device)
@@ -393,11 +349,7 @@ def majority(outputs: Tensor) -> Tensor:
 
 
 def class_colours(outputs: Tensor) -> Tensor:
-    """Return each particle's colour, its class's, greyer the less it is sure of it; [B, N, 3].
-
-    Args:
-        outputs: One number for each class, shape [B, N, K]; 1 is sure.
-    """
+    """Return each particle's colour, its class's, greyer the less it is sure of it; [B, N, 3]."""
     rows = [PALETTE[k % len(PALETTE)] for k in range(outputs.shape[-1])]
     sure, chosen = outputs.max(-1, keepdim=True)
     sure = sure.clamp(0.0, 1.0)

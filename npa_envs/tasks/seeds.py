@@ -25,29 +25,12 @@ def uniform_ball(
     """Return points uniform in a ball around the origin [length units], shape [B, N, D].
 
     Args:
-        world_count: Worlds B.
-        particle_count: Particles in each world N.
-        space_dim: Space dimension D.
         radius: Radius of the ball [length units].
-        generator: Source of randomness, on `device`; a `WorldRandom` of B worlds makes each world
-            what it would be alone.
-        device: Where the points are made.
-        dtype: Their floating dtype.
-
-    Raises:
-        NPAError: A count is no integer of at least 0, the radius not finite or negative, the dtype
-            no float32 or float64, there is no such device, or the generator is on another one or
-            for another number of worlds.
     """
     device = check_device(device)
-    world_count, particle_count, space_dim = (
-        checked_count(name, value)
-        for name, value in (
-            ("world_count", world_count),
-            ("particle_count", particle_count),
-            ("space_dim", space_dim),
-        )
-    )
+    world_count = checked_count("world_count", world_count)
+    particle_count = checked_count("particle_count", particle_count)
+    space_dim = checked_count("space_dim", space_dim)
     if space_dim < 1:
         raise NPAError(f"space_dim must be at least 1, got {shown(space_dim)}: give 2 or 3")
     radius = checked_finite("radius", radius, " [length units]")
@@ -77,15 +60,7 @@ def uniform_box(
     """Return points uniform in a box around the origin [length units], shape [B, N, D].
 
     Args:
-        world_count: Worlds B.
-        particle_count: Particles in each world N.
         box: Sides of the box [length units], one for each of D dimensions.
-        generator: As for `uniform_ball`.
-        device: Where the points are made.
-        dtype: Their floating dtype.
-
-    Raises:
-        NPAError: As for `uniform_ball`, or a side is no finite number.
     """
     device = check_device(device)
     world_count = checked_count("world_count", world_count)
@@ -128,11 +103,7 @@ def _check_points(number_count: int, dtype: torch.dtype) -> None:
 def _unit_ball_by_world(
     generator: WorldRandom, particle_count: int, space_dim: int, dtype: torch.dtype
 ) -> Tensor:
-    """Return points uniform in the unit ball, by operations that round alike wherever they run.
-
-    Torch's powers round differently at the end of a tensor, which lies elsewhere in other batches.
-    The largest of D uniform numbers is distributed as a D-th root of one.
-    """
+    """Return points uniform in the unit ball, by operations that round alike wherever they run."""
     direction = generator.normal(particle_count, space_dim, dtype=dtype)
     squares = direction * direction
     length = sum(squares.unbind(dim=-1), torch.zeros_like(squares[..., 0])).sqrt()

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import torch
 from torch import Tensor
@@ -21,7 +21,7 @@ from npa_envs.checks import (
 from npa_envs.errors import NPAError, shown
 from npa_envs.ops import periodic_splat
 from npa_envs.rule.rule import COLOUR_OFFSET
-from npa_envs.tasks.base import ParticleTask, TaskConfig, shares_of_loss
+from npa_envs.tasks.base import ParticleTask, TaskConfig, Worlds, shares_of_loss
 from npa_envs.tasks.damage import random_particle, wipe_state
 from npa_envs.tasks.losses.texture import (
     DEFAULT_LOSS,
@@ -131,19 +131,11 @@ DRAWINGS = 16
 
 
 class Texture(ParticleTask[TextureConfig]):
-    """The texture task of arXiv 2601.16096, with its loss; satisfies `PictureTask`.
-
-    Args:
-        config: Target, world, rule size and loss.
-        target: The target, where it is at hand already; by default `config.target` is loaded.
-        device: Where the target is kept and worlds are compared with it.
+    """The texture task of arXiv 2601.16096, with its loss.
 
     Raises:
         NPAError: The target cannot be loaded.
     """
-
-    aligned = False
-    """A texture may lie anywhere: pixels are not compared one by one."""
 
     def __init__(
         self,
@@ -169,11 +161,11 @@ class Texture(ParticleTask[TextureConfig]):
             seen = min(2.0 * target.gap * config.box_size, LARGEST_EPS, 0.5 * config.box_size)
             config = replace(config, see_across=False, eps=max(config.eps, seen))
         self.config = config
-        """What was told; ε is the one that rules are trained at."""
+        """The configuration; its ε is the one that rules are trained at."""
         self.target = target
         """What worlds are to look like."""
-        self.target_picture = target.picture.to(device)
-        """Its picture: colour sums and density, dimensionless, shape [R, R, 4]."""
+        self._target_picture = target.picture.to(device)
+        self.metric_name = config.loss
         self.pixel_size: float = config.box_size * (target.coverage / config.particle_count) ** 0.5
         """Side of the square that a particle fills [length units]: all together have the target's
         mean density."""
@@ -183,14 +175,12 @@ class Texture(ParticleTask[TextureConfig]):
         """Sides of the periodic box [length units]."""
         return (self.config.box_size, self.config.box_size)
 
-    @property
-    def metric_name(self) -> str:
-        """The texture loss that worlds are measured by."""
-        return self.config.loss
+    def _remade(self, config: TextureConfig) -> Self:
+        return type(self)(config, target=self.target, device=self.target_picture.device)
 
     @property
     def rule_shape(self) -> dict[str, Any]:
-        """What `NPARule` takes besides the channels, the hidden width and ε0."""
+        """Further arguments of `NPARule`: all but channels, hidden width and ε0."""
         return {"alpha": self.config.alpha}
 
     def places(self, world_count: int, generator: Randomness, device: torch.device) -> Tensor:
@@ -198,15 +188,15 @@ class Texture(ParticleTask[TextureConfig]):
         count = self.config.particle_count
         return uniform_box(world_count, count, self.box, generator=generator, device=device)
 
-    def damage(self, x: Tensor, s: Tensor, generator: Randomness) -> tuple[Tensor, Tensor]:
+    def damage(self, x: Tensor, s: Tensor, goal: Tensor | None, generator: Randomness) -> Worlds:
         """Return the worlds with the states in a disk around one random particle set to zero."""
         if self.config.damage_radius == 0.0:
-            return x, s
+            return x, s, goal
         side = self.config.box_size
         away = x - random_particle(x, generator)[:, None]
         away = away - side * (away / side).round()
         centre = torch.zeros_like(away[:, 0])
-        return x, wipe_state(away, s, centre=centre, radius=self.config.damage_radius)
+        return x, wipe_state(away, s, centre=centre, radius=self.config.damage_radius), goal
 
     def picture(self, x: Tensor, s: Tensor) -> Tensor:
         """Return the picture of each world: colour sums and density, shape [B, R, R, 4]."""
@@ -216,7 +206,6 @@ class Texture(ParticleTask[TextureConfig]):
         """Return the target as particles draw it: a jittered lattice of them, with its colours.
 
         Args:
-            number: What jitter and shift are drawn from.
             shifted: Whether the target is moved round the box, so that another part is cut out.
 
         Returns:
@@ -249,9 +238,6 @@ class Texture(ParticleTask[TextureConfig]):
         A joint loss sees the density with the colours, and has no part of the density alone.
         Losses that look at some places only see each world as its first particle does, in the
         middle: which places these are then differs from world to world and from step to step.
-
-        Raises:
-            NPAError: The loss needs weights that are missing.
         """
         return self.compare_pictures(self.picture(x - x[:, :1].detach(), s))
 
@@ -353,9 +339,6 @@ class Texture(ParticleTask[TextureConfig]):
 
 def colour_image(channels: Tensor) -> Tensor:
     """Return colours as they are compared, and shown: where particles overlap, their mean.
-
-    Args:
-        channels: Colour sums and density, dimensionless, shape [..., 4, R, R].
 
     Returns:
         Red, green and blue, shape [..., 3, R, R]; black where nothing is.

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Generic, Literal, TypeVar, get_args
@@ -208,6 +208,13 @@ class TrainConfig(Generic[TaskConfigT]):
                 f"initial_rule must be the name of a rule or of a file, or '' for none, got "
                 f"{shown(self.initial_rule)}"
             )
+        self._check_pair(
+            "steps",
+            is_whole,
+            lambda lo, hi: 1 <= lo < hi,
+            "whole numbers (lo, hi) with 1 <= lo < hi",
+            "hi is exclusive, so exactly 32 steps are steps=(32, 33)",
+        )
         self._check_schedule()
         if self.world_count > self.pool_size:
             raise NPAError(
@@ -216,30 +223,39 @@ class TrainConfig(Generic[TaskConfigT]):
                 f"set pool_size={self.world_count} or more"
             )
         self._check_max_age_range()
-        self._check_eps()
-        self._check_choice("optimiser", get_args(OptimiserName))
-        self._check_choice("schedule", get_args(Schedule))
-        self._check_choice("dtype", ("float32", "float64"))
-        self._check_choice("memory", get_args(Memory))
-        self._check_choice("moment_inverse", get_args(MomentInverse))
+        self._check_pair(
+            "vary_eps",
+            is_real,
+            lambda lo, hi: 0.0 < lo <= hi,
+            "factors (lo, hi) with 0 < lo <= hi",
+            "for example vary_eps=(0.5, 2.0)",
+        )
+        choices = {"optimiser": OptimiserName, "schedule": Schedule, "memory": Memory}
+        choices |= {"moment_inverse": MomentInverse, "dtype": Literal["float32", "float64"]}
+        for name, kind in choices.items():
+            value, allowed = getattr(self, name), get_args(kind)
+            if not isinstance(value, str) or value not in allowed:
+                raise NPAError(f"{name} must be one of {', '.join(allowed)}, got {shown(value)}")
         parse_device(self.device)
         if not isinstance(self.out, Path):
             raise NPAError(
                 f"out must be a pathlib.Path, got {shown(self.out)}: Path({shown(self.out)})"
             )
 
+    def _check_pair(
+        self,
+        name: str,
+        kind: Callable[[object], bool],
+        fits: Callable[[Any, Any], bool],
+        rule: str,
+        cure: str,
+    ) -> None:
+        pair = getattr(self, name)
+        right = isinstance(pair, tuple) and len(pair) == 2 and all(map(kind, pair))
+        if not right or not fits(*pair):
+            raise NPAError(f"{name} must be two {rule}, got {shown(pair)}: {cure}")
+
     def _check_schedule(self) -> None:
-        steps = self.steps
-        if (
-            not isinstance(steps, tuple)
-            or len(steps) != 2
-            or not all(is_whole(bound) for bound in steps)
-            or not 1 <= steps[0] < steps[1]
-        ):
-            raise NPAError(
-                f"steps must be two whole numbers (lo, hi) with 1 <= lo < hi, got {shown(steps)}: "
-                "hi is exclusive, so exactly 32 steps are steps=(32, 33)"
-            )
         milestones = self.milestones
         if not isinstance(milestones, tuple) or not all(is_whole(m) for m in milestones):
             raise NPAError(f"milestones must be a tuple of whole numbers, got {shown(milestones)}")
@@ -250,17 +266,13 @@ class TrainConfig(Generic[TaskConfigT]):
             )
 
     def _check_max_age_range(self) -> None:
-        times = self.max_age_range
-        if (
-            not isinstance(times, tuple)
-            or len(times) != 2
-            or not all(is_whole(steps) for steps in times)
-            or not (1 <= times[0] <= times[1] or times == (0, 0))
-        ):
-            raise NPAError(
-                "max_age_range must be two whole numbers (lo, hi) with 1 <= lo <= hi, or (0, 0), "
-                f"got {shown(times)}: for example max_age_range=(64, 16384)"
-            )
+        self._check_pair(
+            "max_age_range",
+            is_whole,
+            lambda lo, hi: 1 <= lo <= hi or lo == hi == 0,
+            "whole numbers (lo, hi) with 1 <= lo <= hi, or (0, 0)",
+            "for example max_age_range=(64, 16384)",
+        )
         if self.ages and self.pool_size % self.world_count:
             raise NPAError(
                 f"pool_size must be a multiple of world_count where max_age_range are set, got "
@@ -273,26 +285,6 @@ class TrainConfig(Generic[TaskConfigT]):
                     f"{name} needs max_age_range, got {getattr(self, name)} without: "
                     "set max_age_range, for example to (256, 32768)"
                 )
-
-    def _check_eps(self) -> None:
-        factors = self.vary_eps
-        if (
-            not isinstance(factors, tuple)
-            or len(factors) != 2
-            or not all(is_real(factor) for factor in factors)
-            or not 0.0 < factors[0] <= factors[1]
-        ):
-            raise NPAError(
-                f"vary_eps must be two factors (lo, hi) with 0 < lo <= hi, got {shown(factors)}: "
-                "for example vary_eps=(0.5, 2.0)"
-            )
-
-    def _check_choice(self, name: str, choices: tuple[str, ...]) -> None:
-        value = getattr(self, name)
-        if not isinstance(value, str) or value not in choices:
-            raise NPAError(
-                f"{name} must be one of {', '.join(choices)}, got {shown(getattr(self, name))}"
-            )
 
     @property
     def ages(self) -> bool:
@@ -327,7 +319,6 @@ class TrainConfig(Generic[TaskConfigT]):
         (Loshchilov and Hutter, arXiv 1608.03983).
 
         Args:
-            iteration: Iterations done so far in the run.
             share: How much of a cosine is over, in [0, 1], where the iterations say less: a caller
                 who counts seconds makes it fall with them.
         """
@@ -355,17 +346,12 @@ class JointTrainConfig(TrainConfig[TaskConfigT]):
     """Numbers of the species, from 0, whose initial rules stay as they are."""
 
     def __post_init__(self) -> None:
-        """Check every field; how many species there are is the task's to know.
-
-        Raises:
-            NPAError: A field has the wrong type or lies outside its range.
-        """
+        """Check every field; how many species there are is the task's to know."""
         super().__post_init__()
         if self.initial_rule:
             raise NPAError(
                 f"initial_rule is for one rule, got {shown(self.initial_rule)}: give "
-                "initial_rules, one "
-                "for each species"
+                "initial_rules, one for each species"
             )
         rules = self.initial_rules
         if not isinstance(rules, tuple) or not all(isinstance(r, str) and r for r in rules):

@@ -8,14 +8,19 @@ from typing import Any
 
 from npa_envs.devices import check_device
 from npa_envs.errors import DivergedError, NPAError, shown
-from npa_envs.tasks.base import PictureTask, Task
+from npa_envs.tasks.base import ParticleTask, Task
 from npa_envs.tasks.morphogenesis2d import Morphogenesis2DTrainConfig
 from npa_envs.tasks.train_config import JointTrainConfig, TrainConfig
-from npa_envs.training.joint import JointRules, train_together
 from npa_envs.training.overrides import config_to_dict, load_config, override
 from npa_envs.training.presets import TASKS, TaskEntry, preset, task_entry
 from npa_envs.training.run_folder import JsonlLog, RunFolder
-from npa_envs.training.trainer import Trainer, TrainResult, check_seconds
+from npa_envs.training.trainer import (
+    JointRules,
+    Trainer,
+    TrainResult,
+    check_seconds,
+    train_together,
+)
 
 __all__ = [
     "TASKS",
@@ -24,7 +29,7 @@ __all__ = [
     "JointTrainConfig",
     "JsonlLog",
     "Morphogenesis2DTrainConfig",
-    "PictureTask",
+    "ParticleTask",
     "RunFolder",
     "Task",
     "TaskEntry",
@@ -89,7 +94,7 @@ def train(
             begun=begun,
         )
     task = entry.make(config.task, check_device(config.device))
-    # A task may settle what follows from its target; rule and checkpoint tell what was settled.
+    # A task may settle what follows from its target; rule and checkpoint hold the result.
     config = replace(config, task=getattr(task, "config", config.task))
     trainer = Trainer(task, config, task_name=task_name, resume=resume, overwrite=overwrite)
     begun()

@@ -58,15 +58,7 @@ NOT_NEGATIVE = {
 
 
 def save_checkpoint(path: Path, content: dict[str, Any]) -> None:
-    """Write a checkpoint, whole or not at all.
-
-    Args:
-        path: The file; an existing one stays as it is until the new one is complete.
-        content: Tensors, numbers, strings, and lists and dicts of them.
-
-    Raises:
-        NPAError: The file cannot be written.
-    """
+    """Write a checkpoint, whole or not at all."""
     with atomic_path(path) as temporary, _PatientFile(temporary, "wb") as file:
         torch.save(
             {"format": CHECKPOINT_FORMAT, "format_version": CHECKPOINT_VERSION, **content}, file
@@ -96,11 +88,7 @@ class _PatientFile(FileIO):
 
 
 def load_checkpoint(path: Path) -> dict[str, Any]:
-    """Read a checkpoint on to the CPU; nothing in it is executed.
-
-    Raises:
-        NPAError: There is no such file, it cannot be read, or it is no checkpoint of this version.
-    """
+    """Read a checkpoint on to the CPU; nothing in it is executed."""
     if not os.path.exists(path):
         raise NPAError(
             f"there is no checkpoint to resume from at {str(path)!r}: give the folder of an "
@@ -129,21 +117,13 @@ def load_checkpoint(path: Path) -> dict[str, Any]:
 
 
 def drawn_by_world(content: Mapping[str, Any]) -> bool:
-    """Return whether each world of a run draws by itself, as several processes need it.
-
-    Args:
-        content: What `load_checkpoint` returned.
-    """
+    """Return whether each world of a run draws by itself, as several processes need it."""
     states = content.get("random_states")
     return isinstance(states, dict) and states.keys() == {"schedule"}
 
 
 def check_task(content: Mapping[str, Any], task_name: str, path: Path) -> None:
-    """Check that a checkpoint is of a task.
-
-    Raises:
-        NPAError: It is of another one.
-    """
+    """Check that a checkpoint is of a task."""
     if content.get("task_name") != task_name:
         raise NPAError(
             f"the checkpoint {str(path)!r} is of task {shown(content.get('task_name'))}, "
@@ -154,12 +134,7 @@ def check_task(content: Mapping[str, Any], task_name: str, path: Path) -> None:
 def check_same_run(
     content: dict[str, Any], task_name: str, config: TrainConfig[Any], path: Path
 ) -> None:
-    """Check that a checkpoint belongs to the run that is to be resumed.
-
-    Raises:
-        NPAError: It lacks something, is of another task, of another configuration, or further
-            than the run goes.
-    """
+    """Check that a checkpoint belongs to the run that is to be resumed."""
     _check_complete(content, path)
     check_task(content, task_name, path)
     theirs = _flat(content["config"])
@@ -185,18 +160,7 @@ def check_same_run(
 
 
 def check_content(content: dict[str, Any], expected: Mapping[str, Any], path: Path) -> None:
-    """Check that what a run goes on from is of the kind that the run itself has.
-
-    Args:
-        content: The checkpoint.
-        expected: The same of the run as it is, by the same names: dicts have the same keys, tensors
-            the same shapes and dtypes, others the same types.
-        path: The checkpoint's, for the error.
-
-    Raises:
-        NPAError: Something is of another type, shape or dtype, not finite, or negative where that
-            makes no sense.
-    """
+    """Check that what a run goes on from is of the kind that the run itself has."""
     wrong = [
         what for name, like in expected.items() for what in _wrong(name, content.get(name), like)
     ]

@@ -1,6 +1,6 @@
 """The cycle of training: worlds from a pool, rollout, gradients, worlds back, optimiser's step.
 
-Nothing here waits for the device. An iteration runs eagerly, or as CUDA graphs; what happened is
+No method waits for the device. An iteration runs eagerly, or as CUDA graphs; what happened is
 kept on the device until a line of the log asks for it.
 """
 
@@ -15,13 +15,7 @@ from torch import Tensor
 import npa_envs.world.rollout
 from npa_envs.errors import NPAError
 from npa_envs.rule.rule import NPARule
-from npa_envs.tasks.base import (
-    GoalTask,
-    ScheduledTask,
-    Task,
-    seed_worlds,
-    task_for_rule,
-)
+from npa_envs.tasks.base import Task, Worlds
 from npa_envs.tasks.train_config import TrainConfig
 from npa_envs.training.iteration import EagerIteration, GraphedIteration, Rollout
 from npa_envs.training.meter import LossMeter
@@ -37,13 +31,6 @@ class TrainingCycle:
     """All that changes while a rule is trained.
 
     Args:
-        task: What to learn.
-        rule: The rule, on the device, in the run's dtype.
-        config: How.
-        device: Where the worlds are.
-        schedule: Randomness of the numbers of steps, on the CPU.
-        rollout: The rollout to train through; None is the engine's.
-        ranks: The processes that share the run; None: this one alone.
         by_world: Each world draws by itself, as several processes need it.
 
     Raises:
@@ -62,7 +49,7 @@ class TrainingCycle:
         ranks: Ranks | None = None,
         by_world: bool = False,
     ) -> None:
-        self.task = task_for_rule(task, rule)
+        self.task = task.for_rule(rule)
         """The task, as it is for worlds of this rule."""
         _check_varied_eps(self.task, rule, config)
         self._config = config
@@ -124,8 +111,12 @@ class TrainingCycle:
         self._age = torch.zeros_like(self._index)
         self._steps = torch.zeros_like(self._index[0])
         self._lost = torch.zeros_like(self._index[0])
-        self._fresh_x, self._fresh_s = (torch.empty_like(t) for t in batch)
-        self._fresh_goal = None if goals is None else torch.empty_like(goals)
+        fresh_goal = None if goals is None else torch.empty_like(goals)
+        self._fresh_worlds: Worlds = (
+            torch.empty_like(batch[0]),
+            torch.empty_like(batch[1]),
+            fresh_goal,
+        )
         worlds = registered(self.random.worlds)
         self._draw = (
             GraphedCallable(self._draw_worlds, device, worlds) if graphed else self._draw_worlds
@@ -139,14 +130,12 @@ class TrainingCycle:
         """Train for one iteration, and return the steps of its rollout, T.
 
         Args:
-            iteration: Iterations done so far in the run.
             share: As for `TrainConfig.learning_rate_at`.
         """
         config, batch = self._config, self.batch
         lo, hi = config.steps
         steps = int(torch.randint(lo, hi, (), generator=self.random.schedule))
-        if isinstance(self.task, ScheduledTask):
-            self.task.begin(iteration)
+        self.task.begin(iteration)
         self._draw()
         if not config.ages and iteration % config.seed_interval == 0:
             self._begin_anew(self._fresh[iteration // config.seed_interval % len(self._fresh)])
@@ -223,40 +212,21 @@ class TrainingCycle:
         if config.damages:
             x0, s0, goal = self._damaged(x0, s0, goal, hit)
         # Drawn in every iteration, needed or not: nobody on the host knows which worlds run away.
-        fresh_x, fresh_s, fresh_goal = self._seeds(len(self._index), worlds)
-        self._fresh_x.copy_(fresh_x)
-        self._fresh_s.copy_(fresh_s)
-        if self._fresh_goal is not None and fresh_goal is not None:
-            self._fresh_goal.copy_(fresh_goal)
+        fresh = self._seeds(len(self._index), worlds)
+        for kept, made in zip(self._fresh_worlds, fresh, strict=True):
+            if kept is not None and made is not None:
+                kept.copy_(made)
         if config.ages:
-            x0, s0 = (
-                torch.where(over[:, None, None], fresh, old)
-                for fresh, old in ((fresh_x, x0), (fresh_s, s0))
-            )
-            if goal is not None and fresh_goal is not None:
-                goal = torch.where(over, fresh_goal, goal)
+            x0, s0, goal = chosen(over, fresh, (x0, s0, goal))
         self.batch.x0.copy_(x0)
         self.batch.s0.copy_(s0)
         if goal is not None:
             self.batch.aim(goal)
 
-    def _damaged(
-        self, x: Tensor, s: Tensor, goal: Tensor | None, hit: Tensor
-    ) -> tuple[Tensor, Tensor, Tensor | None]:
+    def _damaged(self, x: Tensor, s: Tensor, goal: Tensor | None, hit: Tensor) -> Worlds:
         """Return worlds of the pool damaged, those that are hit, bool, shape [B]."""
-        worlds, whole = self.random.worlds, (x, s, goal)
-        if isinstance(self.task, GoalTask) and goal is not None:
-            x, s, goal = self.task.damage_with_goals(x, s, goal, worlds)
-        else:
-            x, s = self.task.damage(x, s, worlds)
-        if self._config.damage_share < 1.0:
-            x, s = (
-                torch.where(hit[:, None, None], hurt, old)
-                for hurt, old in ((x, whole[0]), (s, whole[1]))
-            )
-            if goal is not None and whole[2] is not None:
-                goal = torch.where(hit, goal, whole[2])
-        return x, s, goal
+        damaged = self.task.damage(x, s, goal, self.random.worlds)
+        return damaged if self._config.damage_share == 1.0 else chosen(hit, damaged, (x, s, goal))
 
     def _places_hurt(self) -> Tensor:
         """Return whether the batch's worlds come from places damaged each time, shape [B]."""
@@ -264,22 +234,17 @@ class TrainingCycle:
 
     def _begin_anew(self, index: Tensor) -> None:
         """Let some worlds of the batch, int64, shape [M], be fresh seeds."""
-        batch = self.batch
-        batch.x0.index_copy_(0, index, self._fresh_x.index_select(0, index))
-        batch.s0.index_copy_(0, index, self._fresh_s.index_select(0, index))
-        if batch.goal is not None and self._fresh_goal is not None:
-            batch.goal.index_copy_(0, index, self._fresh_goal.index_select(0, index))
+        begun = self.batch.x0, self.batch.s0, self.batch.goal
+        for own, fresh in zip(begun, self._fresh_worlds, strict=True):
+            if own is not None and fresh is not None:
+                own.index_copy_(0, index, fresh.index_select(0, index))
 
     @torch.no_grad()
     def _keep_worlds(self) -> None:
         """Put the batch back into the pool."""
-        batch = self.batch
-        goals = None
-        if batch.goal is not None and self._fresh_goal is not None:
-            goals = batch.goal, self._fresh_goal
-        fresh = self._fresh_x, self._fresh_s
+        worlds = self.batch.x, self.batch.s, self.batch.goal
         age = self._age + self._steps if self._config.ages else None
-        self._lost += self.pool.write(self._index, batch.x, batch.s, *fresh, goals, age).sum()
+        self._lost += self.pool.write(self._index, worlds, self._fresh_worlds, age).sum()
 
     @torch.no_grad()
     def _note_iteration(self) -> None:
@@ -288,9 +253,9 @@ class TrainingCycle:
         self._lost.zero_()
         self.optimiser.prepare_gradients()
 
-    def _seeds(self, world_count: int, random: Randomness) -> tuple[Tensor, Tensor, Tensor | None]:
+    def _seeds(self, world_count: int, random: Randomness) -> Worlds:
         dtype = self._config.torch_dtype
-        x, s, goal = seed_worlds(self.task, world_count, generator=random, device=random.device)
+        x, s, goal = self.task.seed(world_count, generator=random, device=random.device)
         lo, hi = map(math.log, self._config.vary_eps)
         if (lo, hi) != (0.0, 0.0):
             # Scaling positions and ε alike is a symmetry: a larger ε is a smaller disk.
@@ -305,6 +270,15 @@ class TrainingCycle:
     def _pooled(self) -> list[tuple[str, Tensor | None]]:
         pool = self.pool
         return [("x", pool.x), ("s", pool.s), ("goal", pool.goal), ("age", pool.age)]
+
+
+def chosen(which: Tensor, worlds: Worlds, others: Worlds) -> Worlds:
+    """Return `worlds` where `which`, bool, shape [B], and the others elsewhere."""
+    (x, s, goal), (other_x, other_s, other_goal) = worlds, others
+    mask = which[:, None, None]
+    if goal is not None and other_goal is not None:
+        goal = torch.where(which, goal, other_goal)
+    return torch.where(mask, x, other_x), torch.where(mask, s, other_s), goal
 
 
 def _check_varied_eps(task: Task, rule: NPARule, config: TrainConfig[Any]) -> None:

@@ -12,7 +12,7 @@ from torch import Tensor
 
 import npa_envs.world.rollout
 from npa_envs.rule.rule import LIFE, NPARule, fate_parameters
-from npa_envs.tasks.base import Task, coded_states, task_toward
+from npa_envs.tasks.base import Task
 from npa_envs.tasks.damage import counted_together
 from npa_envs.tasks.train_config import TrainConfig
 from npa_envs.training.randomness import registered
@@ -26,7 +26,7 @@ WARM_UP_STEPS = 2
 
 
 class TrainingOptions(TypedDict):
-    """What the trainer tells a rollout by name."""
+    """Keyword arguments that the trainer gives a rollout."""
 
     eps: float
     box: tuple[float, ...] | None
@@ -63,17 +63,6 @@ class EagerIteration:
 
     Reads `x0`, `s0`; writes `x`, `s`, `terms` and the `.grad` of every parameter. All of these
     are the same tensors in every iteration: fill them with `copy_`.
-
-    Args:
-        task: Gives the loss and the world's constants.
-        rule: The rule to differentiate.
-        config: Gives the batch size and the rollout's memory mode.
-        x: Positions of any batch [length units], shape [B, N, D]: shape, dtype and device count.
-        s: States of any batch, shape [B, N, C], likewise.
-        generator: Randomness of the update masks, on the worlds' device.
-        rollout: The rollout to run; another one only in tests.
-        goal: The worlds' goals, int64, shape [B], where the task has such.
-        mean_over_processes: As `counted_together` takes it, where several processes share a run.
     """
 
     def __init__(
@@ -91,7 +80,7 @@ class EagerIteration:
     ) -> None:
         self.goal = None if goal is None else goal.clone()
         """Goals of the worlds, int64, shape [B], or None; filled like `x0`."""
-        task = task_toward(task, self.goal)
+        task = task.toward(self.goal)
         self.x0, self.s0 = x.clone(), s.clone()
         """Worlds before the rollout."""
         self.x, self.s = torch.empty_like(x), torch.empty_like(s)
@@ -131,7 +120,7 @@ class EagerIteration:
 
     def _forward_backward(self, steps: int) -> None:
         # Through these states codes learn; the pool holds them as they were.
-        s0 = coded_states(self._task, self.s0)
+        s0 = self._task.coded(self.s0)
         if s0 is not self.s0:
             self.s0.copy_(s0.detach())
         x, s, path_length = self._rollout(

@@ -1,14 +1,19 @@
-"""What happened in training, summed on the device until a line of the log asks for it."""
+"""What happened in training: sums on the device until the log asks, and what diverged."""
 
 from __future__ import annotations
 
+import copy
 import math
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
+from npa_envs.errors import DivergedError, shown
+from npa_envs.rule.rule import NPARule
+from npa_envs.tasks.base import Task
 from npa_envs.training.iteration import EagerIteration
 
 NONE_YET = -1
@@ -31,9 +36,6 @@ class LossMeter:
 
     `begin`, `observe` and `send` launch kernels and wait for nothing. `observe` can be captured
     in a CUDA graph: the same tensors are read and written in each iteration.
-
-    Args:
-        iteration: The iteration's buffers.
     """
 
     def __init__(self, iteration: EagerIteration) -> None:
@@ -64,11 +66,7 @@ class LossMeter:
         self._step_sum += steps
 
     def observe(self, replaced: Tensor) -> None:
-        """Take note of an iteration, before the optimiser changes the parameters.
-
-        Args:
-            replaced: Which of its worlds left the pool, shape [B], bool, or how many, shape [].
-        """
+        """Take note of an iteration, before the optimiser changes the parameters."""
         terms = self._iteration.terms
         self._sums += terms
         self._replaced += replaced.sum()
@@ -155,3 +153,40 @@ class LossMeter:
             "s": iteration.s,
             "parameters": torch.nn.utils.parameters_to_vector(iteration.parameters).detach(),
         }
+
+
+def divergence_error(
+    task: Task, rule: NPARule, snapshot: dict[str, Any], diagnosis: Path
+) -> DivergedError:
+    """Return the error that ends a run whose loss is not finite."""
+    terms = [name for name, value in snapshot["terms"].items() if not math.isfinite(value)]
+    visible = [name for name in terms if name != "loss"] or terms
+    worlds = bad_worlds(task, rule, snapshot)
+    where = f"world{'s' * (len(worlds) > 1)} {', '.join(map(str, worlds))}" if worlds else "no one"
+    return DivergedError(
+        f"the loss must stay finite, but {' and '.join(visible)} was not in iteration "
+        f"{snapshot['iteration']} ({snapshot['steps']} steps, {where} of the batch): lower "
+        "learning_rate, or use fewer steps; the worlds and the rule are in "
+        f"{shown(str(diagnosis))}, the last good checkpoint is untouched"
+    )
+
+
+def bad_worlds(task: Task, rule: NPARule, snapshot: dict[str, Any]) -> list[int]:
+    """Return which worlds of the batch alone give a loss that is not finite."""
+    rule = copy.deepcopy(rule).cpu()
+    trained = [parameter for parameter in rule.parameters() if parameter.requires_grad]
+    nn.utils.vector_to_parameters(snapshot["parameters"], trained)
+    task = task.for_rule(rule)
+    x, s, goal = snapshot["x"], snapshot["s"], snapshot.get("goal")
+    found = []
+    for world in range(len(x)):
+        one = slice(world, world + 1)
+        finite = bool(torch.isfinite(x[one]).all() and torch.isfinite(s[one]).all())
+        if finite:
+            with torch.no_grad():
+                aimed = task.toward(None if goal is None else goal[one])
+                total, parts = aimed.loss(x[one], s[one], torch.zeros_like(x[one][..., 0]))
+            finite = all(bool(torch.isfinite(v).all()) for v in (total, *parts.values()))
+        if not finite:
+            found.append(world)
+    return found

@@ -55,11 +55,6 @@ class RuleOptimiser:
     With the optimiser "muon" the matrices of layers take Muon's steps: the mean of the gradients
     made orthogonal, in bfloat16 whatever their precision, as long as AdamW's steps are (Jordan et
     al. 2024; Liu et al., arXiv 2502.16982). All else takes AdamW's.
-
-    Args:
-        parameters: What is trained; its `.grad` is set before `prepare_gradients`.
-        config: Optimiser, learning rates, weight decay.
-        rules: The rule that they are of, or a module of several.
     """
 
     def __init__(

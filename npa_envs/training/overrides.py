@@ -90,8 +90,7 @@ def load_config(
     if not isinstance(fields, Mapping) or not all(isinstance(key, str) for key in fields):
         raise NPAError(
             f"the configuration file {shown(str(path))} must hold field names and values at its "
-            "top "
-            f"level, got {type(fields).__name__}: for example 'iterations: 500'"
+            f"top level, got {type(fields).__name__}: for example 'iterations: 500'"
         )
     own = dict(fields)
     try:
@@ -182,14 +181,7 @@ def _laid_over(name: str, present: Any, fields: Mapping[str, Any]) -> Any:
 
 
 def _convert(name: str, value: Any, kind: Any, present: Any) -> Any:
-    """Return a plain value as the field's type; ranges are the dataclass's own business.
-
-    Args:
-        name: The field, for errors.
-        value: The plain value.
-        kind: The field's type.
-        present: What the field holds: mappings are laid over it.
-    """
+    """Return a plain value as the field's type; ranges are the dataclass's own business."""
     origin = typing.get_origin(kind)
     if origin is typing.Literal:
         return value

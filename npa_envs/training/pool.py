@@ -7,6 +7,7 @@ import math
 import torch
 from torch import Tensor
 
+from npa_envs.tasks.base import Worlds
 from npa_envs.world.randomness import Randomness, WorldRandom
 
 RUNAWAY_LIMIT = 10.0
@@ -17,15 +18,11 @@ class WorldPool:
     """Worlds that live on between batches, on the device, so that a rule learns to be stable.
 
     Args:
-        x: Positions of every world [length units], shape [W, N, D], W the pool's size.
-        s: States, shape [W, N, C].
-        goal: The goal of every world, shape [W], where the task has such.
         runaway_limit: A world with a larger |x| or |s|, or one that is not finite, is not kept.
         max_age_range: Steps that the world in the first place lives, and that in the last, all
             others between; None: for ever.
         places: Places of these worlds among those of all processes, int64, shape [W]; None: they
             are all.
-        total: Worlds of all processes; None: W.
     """
 
     def __init__(
@@ -83,27 +80,17 @@ class WorldPool:
         age = self.age.index_select(0, index)
         return age, age >= self.lifetime.index_select(0, index)
 
-    def read(self, index: Tensor) -> tuple[Tensor, Tensor, Tensor | None]:
+    def read(self, index: Tensor) -> Worlds:
         """Return copies of the worlds at `index` [B]: x [B, N, D], s [B, N, C] and goals [B]."""
         goal = None if self.goal is None else self.goal.index_select(0, index)
         return self.x.index_select(0, index), self.s.index_select(0, index), goal
 
     def write(
-        self,
-        index: Tensor,
-        x: Tensor,
-        s: Tensor,
-        fresh_x: Tensor,
-        fresh_s: Tensor,
-        goals: tuple[Tensor, Tensor] | None = None,
-        age: Tensor | None = None,
+        self, index: Tensor, worlds: Worlds, fresh: Worlds, age: Tensor | None = None
     ) -> Tensor:
         """Put worlds back; those that are not finite or run away are replaced by fresh ones.
 
         Args:
-            index: Where to, shape [B].
-            x: Positions after the rollout [length units], shape [B, N, D].
-            s: States after the rollout, shape [B, N, C].
             fresh_x: Positions of seeds, shape [B, N, D].
             fresh_s: States of seeds, shape [B, N, C].
             goals: Goals of the worlds and of the seeds, shape [B], where the pool has such.
@@ -112,14 +99,15 @@ class WorldPool:
         Returns:
             Which worlds were replaced, shape [B], bool.
         """
+        (x, s, goal), (fresh_x, fresh_s, fresh_goal) = worlds, fresh
         farthest = torch.maximum(_largest(x), _largest(s))
         # A comparison with NaN is false, so what is not finite is not kept either.
         keep = farthest <= self._runaway_limit
         mask = keep[:, None, None]
         self.x.index_copy_(0, index, torch.where(mask, x, fresh_x))
         self.s.index_copy_(0, index, torch.where(mask, s, fresh_s))
-        if self.goal is not None and goals is not None:
-            self.goal.index_copy_(0, index, torch.where(keep, *goals))
+        if self.goal is not None and goal is not None and fresh_goal is not None:
+            self.goal.index_copy_(0, index, torch.where(keep, goal, fresh_goal))
         if self.age is not None and age is not None:
             self.age.index_copy_(0, index, age.masked_fill(~keep, 0))
         return ~keep

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any, cast
+from typing import Any
 
 import torch
 
 from npa_envs.errors import NPAError, shown, suggest
-from npa_envs.tasks.base import PictureTask
+from npa_envs.tasks.base import Task
 from npa_envs.tasks.co_morphogenesis2d import CO_MORPHOGENESIS2D_PRESETS, CoMorphogenesis2D
 from npa_envs.tasks.many_pictures import ManyPictures
 from npa_envs.tasks.morphogenesis2d import MORPHOGENESIS2D_PRESETS, Morphogenesis2D
@@ -33,7 +33,7 @@ class TaskEntry:
     presets: Mapping[str, TrainConfig[Any]]
     """Configurations by name: `paper`, `fast`, `tiny`, and `best` where a recipe was searched."""
 
-    make: Callable[[Any, torch.device], PictureTask]
+    make: Callable[[Any, torch.device], Task]
     """Builds the task from its own configuration, on a device."""
 
     targets: Callable[[], tuple[str, ...]]
@@ -54,7 +54,7 @@ class TaskEntry:
     def expected_seconds(self, config: TrainConfig[Any]) -> float | None:
         """Return about how long a run takes on a CPU [s]: as its particle-steps to those of `fast`.
 
-        None on other devices, where particle-steps do not tell.
+        None on other devices, where particle-steps say little.
         """
         if config.device != "cpu":
             return None
@@ -81,7 +81,7 @@ TASKS: Mapping[str, TaskEntry] = {
         summary="grow pictures in one world, each by a rule of its own",
         presets=CO_MORPHOGENESIS2D_PRESETS,
         # Films and the evaluation take its rules one by one, as rules of their own task.
-        make=lambda config, device: cast(PictureTask, CoMorphogenesis2D(config, device=device)),
+        make=lambda config, device: CoMorphogenesis2D(config, device=device),
         targets=tuple,
         fast_seconds=340.0,
         joint=True,

@@ -51,14 +51,7 @@ class RunRandomness:
         schedule: torch.Generator,
         ranks: Ranks,
     ) -> RunRandomness:
-        """Return the randomness of worlds that several processes share.
-
-        Args:
-            config: The run's configuration.
-            device: Where the worlds are.
-            schedule: Randomness of the numbers of steps.
-            ranks: The processes.
-        """
+        """Return the randomness of worlds that several processes share."""
         batch, pool = config.world_count, config.pool_size
 
         def streams(purpose: int, total: int, places: Tensor) -> WorldRandom:
@@ -97,10 +90,7 @@ def world_streams(
     """Return streams of this process's worlds, which do not depend on who else has which.
 
     Args:
-        seed: Whole numbers of at least 0: the run's seed and what is drawn, for example.
-        total: Worlds of all processes.
         places: Which of them are this process's, on the CPU, int64, shape [B].
-        device: Where the worlds are.
     """
     keys = np.random.default_rng(seed).integers(2**64, size=total, dtype=np.uint64)
     return WorldRandom.from_keys(torch.from_numpy(keys.view(np.int64))[places].to(device))

@@ -6,10 +6,12 @@ import contextlib
 import gc
 import math
 import os
+import sys
+import threading
 import time
 import uuid
 from collections.abc import Iterator, Sequence
-from typing import Any, TypeVar
+from typing import Any, Protocol, TypeVar
 
 import torch
 import torch.distributed as dist
@@ -17,7 +19,6 @@ from torch import Tensor
 
 from npa_envs.errors import LostProcessError, NPAError, shown
 from npa_envs.tasks.train_config import TrainConfig
-from npa_envs.training.heartbeat import Heartbeat
 
 ValueT = TypeVar("ValueT")
 
@@ -65,11 +66,7 @@ class Ranks:
         return self.rank == 0
 
     def check(self, config: TrainConfig[Any]) -> None:
-        """Check that a run can be shared.
-
-        Raises:
-            NPAError: The batch cannot be dealt out evenly, or the pool not among its worlds.
-        """
+        """Check that a run can be shared."""
         batch, pool = config.world_count, config.pool_size
         self.check_dealt("world_count", batch)
         if pool % batch:
@@ -79,11 +76,7 @@ class Ranks:
             )
 
     def check_dealt(self, name: str, worlds: int) -> None:
-        """Check that the worlds of a batch, which the caller calls so, can be dealt out evenly.
-
-        Raises:
-            NPAError: They cannot.
-        """
+        """Check that the worlds of a batch, which the caller calls so, can be dealt out evenly."""
         if worlds % self.count:
             nearest = max(worlds // self.count, 1) * self.count
             raise NPAError(
@@ -95,7 +88,6 @@ class Ranks:
         """Return which of all worlds are this process's, on the CPU, int64, shape [total / R].
 
         Args:
-            total: Worlds of all processes.
             section: Worlds of a section.
         """
         return self.own(torch.arange(total), section)
@@ -104,7 +96,6 @@ class Ranks:
         """Return this process's share of all worlds.
 
         Args:
-            worlds: One entry for each world of all processes, shape [total, ...].
             section: Worlds of a section.
         """
         dealt = worlds.view(-1, self.count, section, *worlds.shape[1:])
@@ -114,7 +105,6 @@ class Ranks:
         """Return the worlds of all processes, on the CPU where there are several.
 
         Args:
-            worlds: One entry for each world of this process, shape [n, ...].
             section: Worlds of a section.
 
         Returns:
@@ -154,7 +144,6 @@ class Ranks:
 
         Args:
             asked: This process was asked to.
-            iteration: Iterations done.
         """
         if not self.together:
             return asked
@@ -179,7 +168,6 @@ class Ranks:
 
         Args:
             means: Tensors of one dtype.
-            total: A count that their dtype holds exactly.
         """
         if not self.together:
             return
@@ -204,11 +192,7 @@ class Ranks:
         return mean
 
     def check_same(self, tensors: Sequence[Tensor]) -> None:
-        """Check that tensors are the same on all processes, bit for bit.
-
-        Raises:
-            NPAError: They are not.
-        """
+        """Check that tensors are the same on all processes, bit for bit."""
         if self.count == 1:
             return
         own = torch.cat([tensor.detach().reshape(-1).double().cpu() for tensor in tensors])
@@ -245,15 +229,12 @@ ALONE = Ranks()
 
 @contextlib.contextmanager
 def joined_ranks() -> Iterator[Ranks]:
-    """Join the processes that torchrun has started beside this one, within the block.
+    """Join the other processes that torchrun has started, within the block.
 
     Each of them sees one CUDA device, that of its number on its machine. To be called before
     anything uses CUDA. Within the block, a process that gives no sign of life ends the others (see
     `Heartbeat`), so whichever process keeps the store that they meet in is to leave it last.
     Outside of torchrun, this process is alone.
-
-    Raises:
-        NPAError: The others cannot be reached.
     """
     if not dist.is_available() or not dist.is_torchelastic_launched():
         yield Ranks()
@@ -302,3 +283,97 @@ def _choose_device(number: int) -> None:
     seen = os.environ.get("CUDA_VISIBLE_DEVICES")
     devices = [str(number)] if seen is None else seen.split(",")[number : number + 1]
     os.environ["CUDA_VISIBLE_DEVICES"] = ",".join(devices)
+
+
+BEAT_SECONDS = 5.0
+"""Pause between two signs of life [s]."""
+
+SILENT_BEATS = 8
+"""A process that gave no sign in so many pauses of another one is lost."""
+
+LOST_CODE = 2
+"""Exit code of a process that has lost another one: the command line's for errors."""
+
+_LEFT = -(2**62)
+
+
+class Counters(Protocol):
+    """What Heartbeat needs of a store of torch.distributed's."""
+
+    def add(self, key: str, amount: int, /) -> int:
+        """Add to a counter, which begins at 0, and return it."""
+        ...
+
+
+class Heartbeat:
+    """Ends this process, with a message, where another one gives no sign of life.
+
+    Collectives alone may wait for a process that was stopped, or whose machine is gone, for NCCL's
+    10 minutes. Time counts in this process's own pauses: one that was stopped itself blames nobody
+    for that. A process that waits or computes gives signs all the same.
+
+    Args:
+        rank: Number of this process, from 0.
+        count: Number of processes, R.
+    """
+
+    def __init__(self, store: Counters, rank: int, count: int) -> None:
+        self._store, self._rank = store, rank
+        self._signs = [0] * count
+        self._ended = threading.Event()
+        self._left = self._store_gone = False
+        # Two, as a store that does not answer holds up whoever asks it.
+        self._threads = [
+            threading.Thread(target=task, daemon=True) for task in (self._beat, self._watch)
+        ]
+        for thread in self._threads:
+            thread.start()
+
+    def end(self, *, left: bool) -> None:
+        """Watch no longer.
+
+        Args:
+            left: This process has done its part, and the others need not miss it.
+        """
+        self._left = left
+        self._ended.set()
+        for thread in self._threads:
+            thread.join(BEAT_SECONDS)
+
+    def _beat(self) -> None:
+        try:
+            while not self._ended.is_set():
+                for other in range(len(self._signs)):
+                    self._signs[other] = self._store.add(str(other), int(other == self._rank))
+                self._ended.wait(BEAT_SECONDS)
+            if self._left:
+                self._store.add(str(self._rank), _LEFT)
+        except RuntimeError:
+            # From now on all seem silent that have not left.
+            self._store_gone = True
+
+    def _watch(self) -> None:
+        count = len(self._signs)
+        seen, silent = self._signs.copy(), [0] * count
+        while not self._ended.wait(BEAT_SECONDS):
+            signs = self._signs.copy()
+            for other in range(count):
+                alive = other == self._rank or signs[other] != seen[other] or signs[other] < 0
+                silent[other] = 0 if alive else silent[other] + 1
+            seen = signs
+            lost = [str(other) for other in range(count) if silent[other] >= SILENT_BEATS]
+            if lost:
+                why = (
+                    "as the store that processes meet in is gone"
+                    if self._store_gone
+                    else "which was killed or stopped, or cannot be reached"
+                )
+                print(
+                    f"npa-envs: error: process {self._rank} of {count} has heard nothing from "
+                    f"process {', '.join(lost)} for {SILENT_BEATS * BEAT_SECONDS:.0f} s, {why}: "
+                    "the last checkpoint is intact; resume it",
+                    file=sys.stderr,
+                    flush=True,
+                )
+                # The main thread may wait in a collective for ever.
+                os._exit(LOST_CODE)

@@ -1,9 +1,10 @@
-"""Files of a training run: its folder, the log, TensorBoard's events."""
+"""Files of a training run: its folder, the log, pictures of a batch, TensorBoard's events."""
 
 from __future__ import annotations
 
 import contextlib
 import json
+import math
 import os
 import shutil
 import socket
@@ -11,14 +12,21 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+from torch import Tensor
+
 from npa_envs.checks import is_real, is_whole
 from npa_envs.errors import MissingDependencyError, NPAError
 from npa_envs.files import (
     made_folder,
     read_bytes,
     remove_unfinished,
+    write_bytes,
     write_text,
 )
+from npa_envs.render.colours import to_uint8
+from npa_envs.render.film import encode_frame
 
 try:
     import fcntl
@@ -30,11 +38,7 @@ LARGEST_LOG = 2**29
 
 
 def check_choice(*, resume: bool, overwrite: bool) -> None:
-    """Check that a run does not both go on and start anew.
-
-    Raises:
-        NPAError: It does.
-    """
+    """Check that a run does not both go on and start anew."""
     if resume and overwrite:
         raise NPAError(
             "resume and overwrite exclude each other: resume goes on with the run in the folder, "
@@ -77,12 +81,11 @@ class RunFolder:
 
         Args:
             byte_count: About how large a checkpoint is [bytes].
-            pictures: Make the folder of pictures as well.
 
         Raises:
             NPAError: The folder cannot be created or written to, or its disk has too little room.
         """
-        # A new checkpoint is written beside the old one.
+        # A new checkpoint is written while the old one is there.
         needed = 2 * byte_count
         try:
             with made_folder(self.pictures if pictures else self.path):
@@ -133,9 +136,8 @@ class RunFolder:
                     pass  # The file system has no locks.
             if self._known != _identity(self.checkpoint):
                 raise NPAError(
-                    f"out must be a folder that no other run writes to, but another one has "
-                    f"written {str(self.checkpoint)!r} meanwhile: resume it, or choose another "
-                    "folder"
+                    "out must be a folder that no other run writes to, but another one has written "
+                    f"{str(self.checkpoint)!r} meanwhile: resume it, or choose another folder"
                 )
             with contextlib.suppress(OSError):  # A full disk; who reads it can do without.
                 lock.truncate(0)
@@ -144,7 +146,7 @@ class RunFolder:
             yield
 
     def note_checkpoint(self) -> None:
-        """Take down which checkpoint lies here now: that which was just read or written, or none.
+        """Remember the checkpoint that was just read or written, or that there is none.
 
         The next `locked` refuses where it is another one.
         """
@@ -183,7 +185,7 @@ class RunFolder:
 
 
 def _identity(path: Path) -> tuple[int, int] | None:
-    """Return what tells a file from the one that replaces it, or None where there is none."""
+    """Return inode and time of a file, which change when it is replaced, or None without one."""
     try:
         status = path.stat()
     except OSError:
@@ -233,9 +235,6 @@ class JsonlLog:
     def truncate(self, iteration: int) -> None:
         """Drop the lines after an iteration, and a last line that a kill cut short.
 
-        Args:
-            iteration: The checkpoint's: lines up to it stay.
-
         Raises:
             NPAError: The file cannot be read or written, or a line of it is damaged.
         """
@@ -284,12 +283,7 @@ def _parsed_record(line: str) -> dict[str, Any] | None:
 
 
 def open_tensorboard(folder: RunFolder, iteration: int) -> Any:
-    """Return a TensorBoard writer that hides what an earlier process wrote after `iteration`.
-
-    Raises:
-        MissingDependencyError: TensorBoard is not installed.
-        NPAError: Its folder cannot be written to.
-    """
+    """Return a TensorBoard writer that hides what an earlier process wrote after `iteration`."""
     # TensorBoard would look for TensorFlow, which takes seconds where it is installed.
     os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
     try:
@@ -308,3 +302,38 @@ def open_tensorboard(folder: RunFolder, iteration: int) -> Any:
             f"cannot write to {str(folder.tensorboard)!r} ({error}): mend its permissions or "
             "train with tensorboard=False"
         ) from error
+
+
+PICTURE_HEIGHT = 256
+"""Least height of the pictures [pixels]; the pixels of smaller worlds are repeated."""
+
+PICTURE_GAP = 8
+"""Pixels between the worlds of a picture."""
+
+
+def write_batch_picture(path: Path, picture: Tensor, board: Any, iteration: int) -> None:
+    """Write target and worlds of a batch side by side as a PNG, and as a JPEG to TensorBoard."""
+    repeats = math.ceil(PICTURE_HEIGHT / picture.shape[1])
+    frames = to_uint8(picture).repeat(repeats, axis=1).repeat(repeats, axis=2)
+    frames = np.pad(frames, ((0, 0), (0, 0), (0, PICTURE_GAP), (0, 0)), constant_values=255)
+    frame = np.concatenate(list(frames), axis=1)[:, :-PICTURE_GAP]
+    write_bytes(path, encode_frame(frame, "PNG"))
+    if board is not None:
+        _add_picture(board, frame, iteration)
+
+
+def _add_picture(board: Any, frame: NDArray[np.uint8], iteration: int) -> None:
+    # Imported late: only runs with TensorBoard need it.
+    from tensorboard.compat.proto.summary_pb2 import Summary
+
+    # The writer's own add_image makes a PNG, and TensorBoard takes a checksum of it in Python, byte
+    # by byte, which holds up the interpreter for longer than all the rest takes.
+    height, width, channels = frame.shape
+    image = Summary.Image(
+        height=height,
+        width=width,
+        colorspace=channels,
+        encoded_image_string=encode_frame(frame, "JPEG"),
+    )
+    summary = Summary(value=[Summary.Value(tag="batch", image=image)])
+    board.file_writer.add_summary(summary, iteration)

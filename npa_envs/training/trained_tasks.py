@@ -1,11 +1,11 @@
-"""Tasks that rules were trained on, as their files tell."""
+"""Tasks that rules were trained on, read from their files."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import torch
 
@@ -14,10 +14,9 @@ from npa_envs.files import parse_json
 from npa_envs.rule.codes import Codes
 from npa_envs.rule.files import rule_file, rule_metadata
 from npa_envs.rule.rule import NPARule
-from npa_envs.tasks.base import PictureTask, task_for_rule
+from npa_envs.tasks.base import Task
 from npa_envs.tasks.many_pictures import named_targets
 from npa_envs.tasks.morphogenesis2d import Morphogenesis2D, Morphogenesis2DConfig
-from npa_envs.tasks.point_classification import PointClassification
 from npa_envs.training.overrides import override
 from npa_envs.training.presets import preset, task_entry
 
@@ -26,11 +25,14 @@ from npa_envs.training.presets import preset, task_entry
 class TrainedTask:
     """The task of a rule, and whether its target is the one that the rule was trained on."""
 
-    task: PictureTask
+    task: Task
     """The task."""
 
     doubt: str | None
     """Why figures against the target would mean nothing; None where they do mean something."""
+
+    task_name: str
+    """Its name in the table of tasks."""
 
 
 def task_of_rule(
@@ -41,7 +43,7 @@ def task_of_rule(
     particle_count: int | None = None,
     **fields: Any,
 ) -> TrainedTask:
-    """Return the task that a rule was trained on, as its file tells.
+    """Return the task that a rule was trained on, read from its file.
 
     A rule whose file says nothing of a task, as the authors' do, is run in the paper's world of
     2D morphogenesis with the rule's own sizes, or in the one that it was found in where
@@ -76,8 +78,8 @@ def task_of_rule(
         "hidden_dim": rule.hidden_dim,
     }
     own |= {"eps": rule.eps0} | ({} if rule.static else {"alpha": rule.alpha})
-    told = "config" in metadata
-    if not told:
+    known = "config" in metadata
+    if not known:
         config = override(preset("paper", task_name, **own), **_world_of(path, metadata))
     else:
         config = trained_config(path, metadata)
@@ -87,24 +89,23 @@ def task_of_rule(
     chosen = fields.get("target") is not None
     if rule.codes is not None:
         config = override(config, targets=(), target=_one_of(config.task, rule.codes, chosen))
-    doubt = None if told or chosen else "its file does not say what it grows"
+    doubt = None if known or chosen else "its file does not say what it grows"
     try:
-        task = entry.make(config.task, device)
-        if isinstance(task, PointClassification):
-            # What a rule was trained on it may know by heart.
-            task = task.on("test")
-        return TrainedTask(task_for_rule(task, rule), doubt)
+        # What a rule was trained on it may know by heart.
+        task = entry.make(config.task, device).held_out()
+        return TrainedTask(task.for_rule(rule), doubt, task_name)
     except NPAError as error:
         if chosen or not entry.targets():
             raise
         stand_in = override(config, target=entry.targets()[0])
         task = entry.make(stand_in.task, device)
-        if isinstance(task, Morphogenesis2D) and rule.codes is not None:
+        if rule.codes is not None:
+            target = cast(Morphogenesis2D, task).target
             task = Morphogenesis2D(
-                stand_in.task, target=replace(task.target, name=rule.codes.names[0]), device=device
+                stand_in.task, target=replace(target, name=rule.codes.names[0]), device=device
             )
-        task = task_for_rule(task, rule)
-        return TrainedTask(task, f"its target cannot be loaded: {error}")
+        doubt = f"its target cannot be loaded: {error}"
+        return TrainedTask(task.for_rule(rule), doubt, task_name)
 
 
 def tasks_of_codes(
@@ -113,37 +114,21 @@ def tasks_of_codes(
     """Return the task of each picture that a rule has a code for, in their order; none without.
 
     Args:
-        source: What the rule was loaded from.
-        rule: The rule.
-        device: Where the tasks keep their targets.
         fields: As for `task_of_rule`.
-
-    Raises:
-        NPAError: As for `task_of_rule`.
     """
-    found: list[Morphogenesis2D] = []
-    for name in () if rule.codes is None else rule.codes.names:
-        task = task_of_rule(source, rule, device, **(fields | {"target": name})).task
-        assert isinstance(task, Morphogenesis2D), "only these have codes"
-        found.append(task)
-    return found
+    names = () if rule.codes is None else rule.codes.names
+    found = [task_of_rule(source, rule, device, **(fields | {"target": name})) for name in names]
+    return [cast(Morphogenesis2D, trained.task) for trained in found]
 
 
 def _one_of(task: Morphogenesis2DConfig, codes: Codes, chosen: bool) -> str:
-    """Return where the target of one of a rule's codes comes from: the chosen or the first one's.
-
-    A target that has no code is a picture for the rule's encoder.
-    """
+    """Return where the target of a rule's code comes from: the chosen or the first one's."""
     name = task.target if chosen else codes.names[0]
     return _named(task.targets).get(name, name)
 
 
 def _world_of(path: Path, metadata: Mapping[str, str]) -> dict[str, Any]:
-    """Return the fields of the world that a rule was found in, where its file says nothing more.
-
-    Raises:
-        NPAError: What it says is damaged.
-    """
+    """Return the fields of the world that a rule was found in, where its file says nothing more."""
     try:
         fields = parse_json(metadata.get("world", "{}"))
     except NPAError:
@@ -181,11 +166,7 @@ def _named(targets: Sequence[str]) -> dict[str, str]:
 
 
 def trained_config(path: Path, metadata: Mapping[str, str]) -> Any:
-    """Return the configuration that a rule's file says it was trained with.
-
-    Raises:
-        NPAError: What it says is damaged or of another version.
-    """
+    """Return the configuration that a rule's file says it was trained with."""
     try:
         fields = parse_json(metadata["config"])
         if not isinstance(fields, dict):

@@ -1,4 +1,4 @@
-"""The trainer: one iteration after another, and everything that a run leaves behind."""
+"""The trainer, of one rule or of several in one world, and all that a run leaves behind."""
 
 from __future__ import annotations
 
@@ -6,12 +6,13 @@ import copy
 import json
 import math
 import time
-from contextlib import AbstractContextManager, nullcontext
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Unpack, cast
 
 import torch
+from torch import Tensor, nn
 from tqdm import tqdm
 
 from npa_envs.checks import is_real
@@ -20,25 +21,29 @@ from npa_envs.errors import DivergedError, NPAError, shown
 from npa_envs.files import write_text
 from npa_envs.rule.files import load_rule, preset_rules, save_rule
 from npa_envs.rule.rule import NPARule, dividing, with_codes
-from npa_envs.tasks.base import GoalTask, Task, differing_fields, untrained_rule
-from npa_envs.tasks.many_pictures import ManyPictures
+from npa_envs.tasks.base import Task, differing_fields, untrained_rule
+from npa_envs.tasks.co_morphogenesis2d import CoMorphogenesis2D, CoMorphogenesis2DConfig
 from npa_envs.tasks.train_config import TrainConfig
-from npa_envs.training.batch_picture import write_batch_picture
 from npa_envs.training.checkpoint import (
     check_content,
     check_same_run,
     drawn_by_world,
-    load_checkpoint,
     save_checkpoint,
     unusable_checkpoint,
 )
 from npa_envs.training.cycle import TrainingCycle
-from npa_envs.training.diagnosis import divergence_error
-from npa_envs.training.iteration import Rollout
+from npa_envs.training.iteration import Rollout, TrainingOptions
+from npa_envs.training.meter import divergence_error
 from npa_envs.training.overrides import config_to_dict
 from npa_envs.training.ranks import Ranks
-from npa_envs.training.run_folder import JsonlLog, RunFolder, check_choice, open_tensorboard
-from npa_envs.training.stopping import stop_flag
+from npa_envs.training.run import Run
+from npa_envs.training.run_folder import (
+    JsonlLog,
+    RunFolder,
+    open_tensorboard,
+    write_batch_picture,
+)
+from npa_envs.world.species import rollout_species
 
 FIRST_PICTURE = 10
 """Iteration after which the first picture is written, where the interval is longer."""
@@ -103,8 +108,6 @@ class Trainer:
         self.task = task
         self.config = config
         self.task_name = task_name
-        self.iteration = 0
-        """Iterations done."""
         self._share = 0.0
         self.folder = RunFolder(config.out)
         self._log = JsonlLog(self.folder.log)
@@ -114,11 +117,10 @@ class Trainer:
         self._seconds_before = 0.0
         self._started: float | None = None
         self._ranks = ranks = Ranks.current() if ranks is None else ranks
-        content = None
-        if ranks.first:
-            content = self._open_folder(resume=resume, overwrite=overwrite)
-        content = ranks.broadcast(content)
-
+        self._kept = Run(
+            self.folder, ranks, self._check_same_run, resume=resume, overwrite=overwrite
+        )
+        content = self._kept.take_content()
         device = check_device(config.device)
         # While the host waits for the numbers, a GPU would have nothing to do; a CPU has done all.
         self._log_late = device.type == "cuda"
@@ -134,15 +136,11 @@ class Trainer:
         if ranks.first:
             rule_bytes = sum(p.nbytes for p in self.rule.parameters())
             self.folder.prepare(ranks.count * self._cycle.pool_bytes + 16 * rule_bytes)
-        with self._folder_locked():
-            if ranks.first:
-                self.folder.tidy()
+        with self._kept.held(begin=True):
             if content is not None:
                 self._restore(content)
             if ranks.first:
-                if content is None and overwrite:
-                    self.folder.clear()
-                elif content is None and self._log.records():
+                if content is None and self._log.records():
                     raise NPAError(
                         f"out must be a folder without a run, but {shown(str(self.folder.path))} "
                         "holds a log without its checkpoint: choose another folder (--out), or "
@@ -156,15 +154,15 @@ class Trainer:
                 # full is noticed now.
                 self.save()
 
-    def _folder_locked(self) -> AbstractContextManager[None]:
-        """Return what keeps other runs out of the folder while the first process writes to it."""
-        return self.folder.locked() if self._ranks.first else nullcontext()
+    @property
+    def iteration(self) -> int:
+        """Iterations done."""
+        return self._kept.iteration
 
     def run(self, *, progress: bool = True, max_seconds: float | None = None) -> TrainResult:
         """Train until the end, or until Ctrl-C, SIGTERM or `max_seconds`; then save.
 
         Args:
-            progress: Show a progress bar.
             max_seconds: Stop after this time [s]; the run can be resumed.
 
         Raises:
@@ -174,10 +172,10 @@ class Trainer:
                 was made.
         """
         check_seconds(max_seconds)
-        with self._folder_locked():
-            return self._run(progress, max_seconds)
+        with self._kept.held():
+            return self._train(progress, max_seconds)
 
-    def _run(self, progress: bool, max_seconds: float | None) -> TrainResult:
+    def _train(self, progress: bool, max_seconds: float | None) -> TrainResult:
         config, total, ranks = self.config, self.config.total_iterations, self._ranks
         start = self._started = time.perf_counter()
         seconds = math.inf if max_seconds is None else max_seconds
@@ -187,26 +185,28 @@ class Trainer:
                 self._board = open_tensorboard(self.folder, self.iteration)
         visible = progress and ranks.first
         bar = tqdm(total=total, initial=self.iteration, disable=not visible, unit="it")
-        try:
-            with stop_flag(patient=ranks.together) as stop:
-                while self.iteration < total:
-                    asked = stop.is_set() or time.perf_counter() - start >= seconds
-                    if ranks.agree_to_stop(asked, self.iteration):
-                        break
-                    self.iterate()
-                    # Of the iteration before: meanwhile the device has this one to do.
-                    self._finish_record()
-                    if self._due(config.log_interval) or self.iteration == total:
-                        self._begin_record()
-                    if self._picture_due():
-                        self._write_picture()
-                    if self._due(config.checkpoint_interval) and self.iteration < total:
-                        self.save()
-                    bar.update()
-                    if "loss" in self._record:
-                        bar.set_postfix(loss=f"{self._record['loss']:.4g}", refresh=False)
+
+        def step() -> None:
+            self.iterate()
+            # Of the iteration before: meanwhile the device has this one to do.
+            self._finish_record()
+            if self._due(config.log_interval) or self.iteration == total:
+                self._begin_record()
+            if self._picture_due():
+                self._write_picture()
+            if self._due(config.checkpoint_interval) and self.iteration < total:
                 self.save()
-                interrupted = ranks.any(stop.is_set())
+            bar.update()
+            if "loss" in self._record:
+                bar.set_postfix(loss=f"{self._record['loss']:.4g}", refresh=False)
+
+        try:
+            interrupted = self._kept.go(
+                step,
+                over=lambda: self.iteration >= total,
+                late=lambda: time.perf_counter() - start >= seconds,
+                end=lambda _: self.save(),
+            )
         finally:
             # What happens until the next `run` is no time of training.
             self._seconds_before, self._started = self._seconds(), None
@@ -240,13 +240,14 @@ class Trainer:
             )
         self._cycle.run(self.iteration, share)
         self._share = share
-        self.iteration += 1
+        self._kept.iteration += 1
 
     @property
     def kept_rule(self) -> NPARule:
         """The rule as a run keeps it."""
         rule = self.rule
-        if isinstance(self.task, ManyPictures) and self.config.task.encoder:
+        codes = getattr(rule, "codes", None)
+        if codes is not None and codes.encoder is not None:
             # The table has what the encoder said in the last iteration, before its last step.
             rule = copy.deepcopy(rule)
             self.task.for_rule(rule)
@@ -267,15 +268,15 @@ class Trainer:
         content |= {"rule": self.rule.state_dict(), **self._cycle.state_dict()}
         if not self._ranks.first:
             return
-        save_checkpoint(self.folder.checkpoint, self._origin() | content)
-        self.folder.note_checkpoint()
+        self._kept.keep(self._origin() | content)
         # A rule is passed on: where and on what it was trained is nobody's business.
-        told = config_to_dict(self.config)
-        told = {name: told[name] for name in told if name not in ("out", "device", "initial_rule")}
-        self._save_rule(self.kept_rule, told)
+        config = config_to_dict(self.config)
+        for private in ("out", "device", "initial_rule"):
+            del config[private]
+        self._save_rule(self.kept_rule, config)
 
-    def _save_rule(self, rule: NPARule, told: dict[str, Any]) -> None:
-        metadata = {"task": self.task_name, "config": json.dumps(told)}
+    def _save_rule(self, rule: NPARule, config: dict[str, Any]) -> None:
+        metadata = {"task": self.task_name, "config": json.dumps(config)}
         metadata["iteration"] = str(self.iteration)
         save_rule(rule, self.folder.rule, metadata=metadata)
 
@@ -314,12 +315,7 @@ class Trainer:
             self._finish_record()
 
     def _finish_record(self) -> None:
-        """Write the record that was begun, if there is one.
-
-        Raises:
-            DivergedError: The loss was not finite in the interval.
-            NPAError: The log cannot be written.
-        """
+        """Write the record that was begun, if there is one."""
         begun, self._record_begun = self._record_begun, None
         if begun is None:
             return
@@ -346,9 +342,7 @@ class Trainer:
         with torch.no_grad():
             picture = self._cycle.task.picture(self._cycle.batch.x, self._cycle.batch.s)
         # Worlds that have goals of their own have no picture in common.
-        target = (
-            None if isinstance(self.task, GoalTask) else getattr(self.task, "target_picture", None)
-        )
+        target = getattr(self.task, "target_picture", None) if self.pool.goal is None else None
         if target is not None:
             picture = torch.cat((target[None].to(picture), picture))
         path = self.folder.picture(self.iteration)
@@ -372,29 +366,12 @@ class Trainer:
         assert error is not None, "made by the first process"
         raise error
 
-    def _open_folder(self, *, resume: bool, overwrite: bool) -> dict[str, Any] | None:
-        check_choice(resume=resume, overwrite=overwrite)
-        path = self.folder.checkpoint
-        self.folder.note_checkpoint()
-        if path.exists():
-            # A run that goes on is told of before anything is made.
-            with self.folder.locked():
-                pass
-        if resume:
-            content = load_checkpoint(path)
-            check_same_run(content, self.task_name, self.config, path)
-            return content
-        if path.exists() and not overwrite:
-            raise NPAError(
-                f"out must be a folder without a run, but {shown(str(self.folder.path))} holds "
-                "one: resume it (--resume), choose another folder (--out), or overwrite it "
-                "(--overwrite)"
-            )
-        return None
+    def _check_same_run(self, content: dict[str, Any], path: Path) -> None:
+        check_same_run(content, self.task_name, self.config, path)
 
     def _restore(self, content: dict[str, Any]) -> None:
         path = self.folder.checkpoint
-        self.iteration = content["iteration"]
+        self._kept.iteration = content["iteration"]
         expected = {"rule": self.rule.state_dict(), **self._cycle.state_like(self.iteration)}
         read = dict(content)
         if self._ranks.together:
@@ -425,11 +402,7 @@ def check_seconds(max_seconds: object) -> None:
 
 
 def rule_like(held: dict[str, Any]) -> NPARule:
-    """Return a rule of the shape that a checkpoint tells, on the CPU; its weights are to follow.
-
-    Raises:
-        NPAError: There is no such rule.
-    """
+    """Return a rule of the shape in a checkpoint, on the CPU, with random weights."""
     try:
         return untrained_rule(torch.Generator(), **held)
     except (TypeError, RuntimeError, OverflowError) as error:
@@ -455,12 +428,7 @@ def initial_rule(config: TrainConfig[Any], untrained: NPARule) -> NPARule:
     without.
 
     Args:
-        config: The run's configuration.
         untrained: The task's own rule, whose shape the rule must have.
-
-    Raises:
-        NPAError: The configuration's rule cannot be loaded, has another shape, or was trained with
-            another `moment_inverse` than the paper's and the configuration's.
     """
     take_options(untrained, config)
     if not config.initial_rule or (untrained.equivariant and config.initial_rule in preset_rules()):
@@ -485,10 +453,10 @@ def initial_rule(config: TrainConfig[Any], untrained: NPARule) -> NPARule:
                 "codes, or from random weights (initial_rule='')"
             )
     if wrong:
-        told, asked = rule.hyper_parameters(), untrained.hyper_parameters()
+        given, asked = rule.hyper_parameters(), untrained.hyper_parameters()
         differences = [
             f"{'eps0, the eps it learned at' if name == 'eps0' else name} "
-            f"({shown(told.get(name))}, here {shown(asked.get(name))})"
+            f"({shown(given.get(name))}, here {shown(asked.get(name))})"
             for name in wrong
         ]
         raise NPAError(
@@ -497,3 +465,155 @@ def initial_rule(config: TrainConfig[Any], untrained: NPARule) -> NPARule:
             "random weights (initial_rule='')"
         )
     return rule
+
+
+JOINT_TASK_NAME = "co_morphogenesis2d"
+"""What checkpoints call the task of several rules in one world."""
+
+
+class JointRules(nn.Module):
+    """The rules of one world, one for each species: what the trainer takes for its rule.
+
+    Args:
+        rules: The rules, species by species.
+    """
+
+    def __init__(self, rules: Sequence[NPARule]) -> None:
+        super().__init__()
+        self.rules = nn.ModuleList(rules)
+
+    def __iter__(self) -> Any:
+        return iter(self.rules)
+
+    def hyper_parameters(self) -> dict[str, Any]:
+        """Return all that the rules are made with, for checkpoints."""
+        return {"rules": [dict(rule.hyper_parameters()) for rule in self]}
+
+
+class _JointTrainer(Trainer):
+    """`Trainer` of several rules, each of which leaves a file as if it had been trained alone."""
+
+    def __init__(
+        self,
+        task: CoMorphogenesis2D,
+        config: TrainConfig[CoMorphogenesis2DConfig],
+        rules: Sequence[NPARule] | None,
+        *,
+        resume: bool,
+        overwrite: bool,
+    ) -> None:
+        self._species = task
+        self._given = rules
+        self._frozen: tuple[int, ...] = getattr(config, "frozen", ())
+        begin_with: tuple[str, ...] = getattr(config, "initial_rules", ())
+        if rules is None and begin_with and not resume:
+            self._given = [load_rule(source) for source in begin_with]
+        super().__init__(
+            task,
+            config,
+            task_name=JOINT_TASK_NAME,
+            resume=resume,
+            overwrite=overwrite,
+            rollout=self._rollout_together,
+        )
+
+    def _rollout_together(
+        self, rule: NPARule, x: Tensor, s: Tensor, steps: int, /, **options: Unpack[TrainingOptions]
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        counts = self._species.config.counts
+        rules = list(cast(JointRules, rule))
+        return rollout_species(rules, x, s, steps, counts=counts, density_counts=counts, **options)
+
+    def _make_rule(self, generator: torch.Generator, held: dict[str, Any] | None) -> NPARule:
+        # The trainer asks of its rule what any module has, and for its hyper-parameters.
+        made = self._species.make_rules(generator)
+        for rule in made:
+            take_options(rule, self.config)
+        if held is not None:
+            self._given = [rule_like(own) for own in held["rules"]]
+        if self._given is None:
+            if self._frozen:
+                raise NPAError(
+                    f"frozen must name rules that were trained before, got {self._frozen} without "
+                    "initial_rules: give one for each species"
+                )
+            return cast(NPARule, JointRules(made))
+        if len(self._given) != len(made):
+            raise NPAError(
+                f"rules must be one for each of {len(made)} species, got {len(self._given)}"
+            )
+        for number, (rule, own) in enumerate(zip(self._given, made, strict=True)):
+            if rule.moment_inverse == "threshold":
+                own.moment_inverse = "threshold"
+            own.dead_zone = rule.dead_zone
+            wrong = differing_fields(rule, own)
+            if wrong:
+                raise NPAError(
+                    f"rules must have the shape of their species, but rule {number} differs in "
+                    f"{', '.join(wrong)}: change those fields of species {number}"
+                )
+        rules = copy.deepcopy(list(self._given))
+        for rule in rules:
+            rule.moment_inverse = self.config.moment_inverse
+        for number in self._frozen:
+            if number >= len(rules):
+                raise NPAError(
+                    f"frozen must name species from 0 to {len(rules) - 1}, got {shown(number)}"
+                )
+            rules[number].requires_grad_(False)
+        if not any(p.requires_grad for rule in rules for p in rule.parameters()):
+            raise NPAError("frozen must leave a rule that learns, got all of them: leave one out")
+        return cast(NPARule, JointRules(rules))
+
+    def _save_rule(self, rule: NPARule, config: dict[str, Any]) -> None:
+        for number, one in enumerate(cast(JointRules, rule)):
+            own = {name: config[name] for name in config if name not in ("initial_rules", "frozen")}
+            own["task"] = config["task"]["species"][number]
+            metadata = {"task": "morphogenesis2d", "config": json.dumps(own)}
+            metadata |= {"iteration": str(self.iteration), "trained_in": JOINT_TASK_NAME}
+            save_rule(one, self.folder.rule_of(number), metadata=metadata)
+
+
+def train_together(
+    config: TrainConfig[CoMorphogenesis2DConfig],
+    rules: Sequence[NPARule] | None = None,
+    *,
+    resume: bool = False,
+    overwrite: bool = False,
+    progress: bool = True,
+    max_seconds: float | None = None,
+    begun: Callable[[], None] = lambda: None,
+) -> TrainResult:
+    """Train one rule for each species of a world that all of them share.
+
+    Each rule sees densities divided by its own particles, as it would alone. A rule whose
+    parameters do not require gradients stays as it is: the others learn to live with it.
+
+    Args:
+        config: The run's configuration, for example `preset("fast", "co_morphogenesis2d")` or
+            `TrainConfig(task=CoMorphogenesis2DConfig())`.
+        rules: What to start from, one rule for each species; copied. None: the configuration's
+            `initial_rules`, or untrained ones.
+        resume: Go on from the checkpoint in `config.out`; give the same `rules` again.
+        overwrite: Start anew although `config.out` holds a run; its files are removed.
+        progress: Show a progress bar.
+        max_seconds: Stop after this time [s]; the run can be resumed.
+        begun: Called once when nothing is left to be refused, before the first iteration.
+
+    Returns:
+        What the run came to; its `rule` holds the rules, in the order of the species. Their files
+        are `rule-0.safetensors`, `rule-1.safetensors`, ... in `config.out`.
+
+    Raises:
+        NPAError: Rules do not fit the species, a target cannot be loaded, or as for `Trainer`.
+        DivergedError: The loss is not finite.
+    """
+    if config.initial_rule:
+        raise NPAError(
+            f"initial_rule is for one rule, got {shown(config.initial_rule)}: give one for each "
+            "species as rules"
+        )
+    task = CoMorphogenesis2D(config.task, device=check_device(config.device))
+    trainer = _JointTrainer(task, config, rules, resume=resume, overwrite=overwrite)
+    begun()
+    return trainer.run(progress=progress, max_seconds=max_seconds)

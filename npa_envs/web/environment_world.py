@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from typing import Any
+from typing import Any, cast
 
 import gymnasium
 from torch import Tensor
@@ -14,8 +14,8 @@ from npa_envs.errors import NPAError, shown, suggest
 from npa_envs.registration import ALL, CODED, GARDEN_IDS
 from npa_envs.rule.files import load_rule
 from npa_envs.rule.rule import COLOUR_OFFSET
+from npa_envs.tasks.base import Task
 from npa_envs.tasks.damage import DAMAGE_SIZES, damage_worlds
-from npa_envs.tasks.point_classification import PointClassification, class_colours
 from npa_envs.web.colouring import Colouring, Seen, shows_of
 from npa_envs.web.live import Live, Touch, WorldView, brushed, checked_seed
 from npa_envs.world.brushes import nearest_image
@@ -180,8 +180,8 @@ class EnvironmentWorld(Live):
 
     def _own_colours(self, s: Tensor) -> Tensor:
         goal = getattr(self._inner.task, "goal", None)
-        if isinstance(goal, PointClassification):
-            return class_colours(goal.outputs(s))
+        if getattr(goal, "classifies", False):
+            return cast(Task, goal).colours(s)
         return s[..., -3:] + COLOUR_OFFSET
 
     def _damage(self, name: str) -> None:

@@ -10,7 +10,7 @@ import json
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import torch
 from PIL import Image
@@ -20,7 +20,6 @@ from npa_envs.errors import NPAError, shown
 from npa_envs.files import atomic_path, checked_path
 from npa_envs.rule.files import load_rule
 from npa_envs.rule.rule import NPARule, check_rule
-from npa_envs.tasks.growth import GrowthTask
 from npa_envs.tasks.point_classification import PALETTE, UNDECIDED, PointClassification
 from npa_envs.web.colouring import colour_ramp
 from npa_envs.web.live import checked_seed
@@ -193,11 +192,12 @@ def page_rule(source: str, *, particle_count: int | None = None) -> dict[str, An
     live = RuleWorld(source, device=torch.device("cpu"), particle_count=particle_count, choices={})
     rule, task = live.main.rule, live.task
     seed: dict[str, Any]
-    if isinstance(task, PointClassification):
-        seed = {"kind": "clouds", "clouds": [_packed(cloud) for cloud in one_of_each(task)]}
+    if task.classifies:
+        clouds = one_of_each(cast(PointClassification, task))
+        seed = {"kind": "clouds", "clouds": [_packed(cloud) for cloud in clouds]}
     elif task.box is not None:
         seed = {"kind": "box"}
-    elif isinstance(task, GrowthTask):
+    elif hasattr(task.config, "seed_radius"):
         seed = {"kind": "ball", "radius": task.config.seed_radius}
     else:
         raise NPAError(
@@ -211,7 +211,7 @@ def page_rule(source: str, *, particle_count: int | None = None) -> dict[str, An
     return {
         **rule.hyper_parameters(),
         "name": live.main.name,
-        "classes": classes if isinstance(task, PointClassification) else None,
+        "classes": classes if task.classifies else None,
         "weights": {name: _packed(tensor) for name, tensor in rule.state_dict().items()},
         "world": world | {"count": live.full, "seed": seed},
     }

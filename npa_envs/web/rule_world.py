@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import time
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -19,15 +20,10 @@ from npa_envs.files import open_regular, parse_json
 from npa_envs.rule.files import load_rule, rule_file, rule_metadata, shipped_rules
 from npa_envs.rule.rule import NPARule
 from npa_envs.tasks.base import (
-    PictureTask,
-    coded_states,
-    seed_worlds,
-    task_for_rule,
-    task_toward,
+    Task,
 )
 from npa_envs.tasks.co_morphogenesis2d import CoMorphogenesis2DConfig
 from npa_envs.tasks.damage import DAMAGE_SIZES, damage_worlds
-from npa_envs.tasks.point_classification import PointClassification, class_colours
 from npa_envs.tasks.seeds import uniform_ball
 from npa_envs.tasks.train_config import TrainConfig
 from npa_envs.training.overrides import load_config
@@ -142,8 +138,8 @@ class RuleWorld(Live):
         """Begin a fresh world of the chosen rule alone."""
         self.seed = self.seed + 1 if seed is None else seed
         self._generator = torch.Generator(self._device).manual_seed(self.seed)
-        self.x, self.s, self._goal = seed_worlds(
-            self.task, 1, generator=self._generator, device=self._device
+        self.x, self.s, self._goal = self.task.seed(
+            1, generator=self._generator, device=self._device
         )
         self.full = self.x.shape[1]
         self.organisms, self.counts = [self.main], [self.full]
@@ -158,7 +154,7 @@ class RuleWorld(Live):
         """When that was asked last [steps]."""
 
     @property
-    def task(self) -> PictureTask:
+    def task(self) -> Task:
         """The task of the chosen rule."""
         return self.trained.task
 
@@ -170,11 +166,7 @@ class RuleWorld(Live):
     def describe(self) -> dict[str, Any]:
         """Return the event "world"."""
         task, box = self.task, self.task.box
-        half_width, centre = 1.1 if self.dimension == 2 else 0.95, [0.0] * self.dimension
-        if box is not None:
-            half_width = 0.5 * min(box)
-        elif isinstance(task, PointClassification):
-            half_width, centre = 0.6, [0.5] * self.dimension
+        centre, half_width = list(task.frame.centre), task.frame.half_width
         alike = [name for name in self._choices if self._may_join(name)]
         tools = ["remove", "push", "clump", "cut", "inject", "graft", "add"]
         if self.main.rule.static:
@@ -251,7 +243,7 @@ class RuleWorld(Live):
             "eps": self.eps, "update_prob": self.update_prob, "noise": self.noise,
             "count": self.full,
         }  # fmt: skip
-        if isinstance(self.task, PointClassification):
+        if self.task.classifies:
             del values["count"]
         told = {name: ranges[name].to_dict(value) for name, value in values.items()}
         return super()._settings() | told
@@ -356,8 +348,8 @@ class RuleWorld(Live):
         return WorldView(self.step, positions, colours, self._milliseconds, loss)
 
     def _own_colours(self, s: Tensor) -> Tensor:
-        if isinstance(self.task, PointClassification):
-            return class_colours(self.task.outputs(s))
+        if self.task.classifies:
+            return self.task.colours(s)
         if self.main.rule.divides:
             return self.main.rule.colour(s)
         parts = zip(self.organisms, s.split_with_sizes(self.counts, dim=1), strict=True)
@@ -365,7 +357,7 @@ class RuleWorld(Live):
 
     @torch.no_grad()
     def _metric(self) -> float:
-        return float(task_toward(self.task, self._goal).metric(self.x, self.s))
+        return float(self.task.toward(self._goal).metric(self.x, self.s))
 
     # Hands.
 
@@ -426,7 +418,7 @@ class RuleWorld(Live):
         if organism.rule.codes is None:
             return s
         own = organism.name == self.main.name
-        return coded_states(self.task if own else self._task_of(organism, None).task, s)
+        return (self.task if own else self._task_of(organism, None).task).coded(s)
 
     def _joining(self, name: Any) -> LiveRule:
         organism = self._organism(name)
@@ -580,7 +572,7 @@ class RunWorld(RuleWorld):
         worlds = []
         for organism, centre in zip(self.organisms, self._centres, strict=True):
             task = self._task_of(organism, self._each).task
-            x, s = task.seed(1, generator=self._generator, device=self._device)
+            x, s, _ = task.seed(1, generator=self._generator, device=self._device)
             x[..., 0] += centre
             worlds.append((x, s))
         self.x, self.s = (torch.cat(parts, dim=1) for parts in zip(*worlds, strict=True))
@@ -659,8 +651,8 @@ class RunWorld(RuleWorld):
         ):
             for name, rule in own.items():
                 rule.load_state_dict(fresh[name].state_dict())
-            task = task_for_rule(self.task, self.main.rule)
-            self.trained = TrainedTask(task, self.trained.doubt)
+            task = self.task.for_rule(self.main.rule)
+            self.trained = replace(self.trained, task=task)
             with torch.no_grad():
                 self.s = self._all_coded(self.s)
         else:

@@ -389,7 +389,7 @@ def test_regeneration_starts_grown_and_damaged():
     assert float((x.amax(0) - x.amin(0)).max()) > 1.0
     task = env.unwrapped.task
     random = npa_envs.WorldRandom([0]).substream(StreamId.GROWTH)
-    start_x, start_s = task.goal.seed(1, generator=random)
+    start_x, start_s, _ = task.goal.seed(1, generator=random)
     growth = random.substream(StreamId.GROWTH)
     with torch.no_grad():
         expected = npa_envs.rollout(grown, start_x, start_s, 48, generator=growth)

@@ -43,7 +43,7 @@ def grow(name: str) -> dict[str, np.ndarray]:
     used = {"eps": task.eps, "box": task.box}
     assert used == scenes.RULES[name], f"{name} is run with {used}"
     generator = torch.Generator().manual_seed(SEEDS[name])
-    x, s = task.seed(2, generator=generator, device=torch.device("cpu"))
+    x, s, _ = task.seed(2, generator=generator, device=torch.device("cpu"))
     with torch.no_grad():
         x, s = npa_envs.rollout(rule, x, s, STEPS[name], generator=generator, **used)
     return {f"world/{name}/x": x.numpy(), f"world/{name}/s": s.numpy()}

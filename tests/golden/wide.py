@@ -44,7 +44,6 @@ class Names:
     from npa_envs.agents.learning import Budget, Problem, train
     from npa_envs.cli import main
     from npa_envs.envs import gardeners_v0, multispecies_v0, particles_v0
-    from npa_envs.tasks.base import seed_worlds, task_toward
     from npa_envs.tasks.damage import damage_worlds
     from npa_envs.training.trained_tasks import task_of_rule
     from npa_envs.world import brushes
@@ -89,10 +88,8 @@ def of_rule(name: str) -> Any:
     rule = load_rule(name)
     task = Names.task_of_rule(name, rule, torch.device("cpu"), particle_count=160).task
     options = {"eps": task.eps, "box": task.box}
-    x, s, goal = Names.seed_worlds(
-        task, 2, generator=WorldRandom([3, 4]), device=torch.device("cpu")
-    )
-    task = Names.task_toward(task, goal)
+    x, s, goal = task.seed(2, generator=WorldRandom([3, 4]), device=torch.device("cpu"))
+    task = task.toward(goal)
     with torch.no_grad():
         x, s = rollout(rule, x, s, 16, generator=WorldRandom([5, 6]), **options)
     results = {"x": x, "s": s, "colour": rule.colour(s), "picture": task.picture(x, s)}

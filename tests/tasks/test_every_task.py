@@ -11,7 +11,6 @@ from npa_envs.cli import main
 from npa_envs.errors import NPAError
 from npa_envs.measure.quality import evaluate
 from npa_envs.rule.files import load_rule
-from npa_envs.tasks.base import seed_worlds, task_for_rule, task_toward
 from npa_envs.training import TASKS, Trainer, preset, task_entry, train
 from npa_envs.world.randomness import WorldRandom
 
@@ -50,23 +49,23 @@ def task_of(name, config, device="cpu"):
 def test_a_world_is_seeded_and_measured_alone_as_in_a_batch(tiny, name):
     task = task_of(name, tiny(name))
     cpu = torch.device("cpu")
-    x, s, goal = seed_worlds(task, 3, generator=WorldRandom([5, 6, 7]), device=cpu)
-    alone, _, _ = seed_worlds(task, 1, generator=WorldRandom([6]), device=cpu)
+    x, s, goal = task.seed(3, generator=WorldRandom([5, 6, 7]), device=cpu)
+    alone, _, _ = task.seed(1, generator=WorldRandom([6]), device=cpu)
     assert torch.equal(x[1:2], alone)
     assert not s.any()
     s = 0.3 * torch.randn(s.shape, generator=torch.Generator().manual_seed(0))
-    together = task_toward(task, goal).metric(x, s)
+    together = task.toward(goal).metric(x, s)
     for k in range(3):
-        aimed = task_toward(task, None if goal is None else goal[k : k + 1])
+        aimed = task.toward(None if goal is None else goal[k : k + 1])
         assert torch.equal(aimed.metric(x[k : k + 1], s[k : k + 1]), together[k : k + 1])
     with pytest.raises(NPAError, match="path_length must have shape"):
-        task_toward(task, goal).loss(x, s, torch.zeros(1, 7))
+        task.toward(goal).loss(x, s, torch.zeros(1, 7))
 
 
 def worlds(task, world_count, dtype=torch.float64):
     """Fresh worlds with states about 0.3."""
     generator = torch.Generator().manual_seed(0)
-    x, s = task.seed(world_count, generator=generator)
+    x, s, _ = task.seed(world_count, generator=generator)
     return x.to(dtype), 0.3 * torch.randn(s.shape, generator=generator, dtype=dtype)
 
 
@@ -76,7 +75,7 @@ def test_gradients_equal_finite_differences(tiny, name, fields):
     """By positions, by states, and by the read-out's own weights."""
     task = task_of(name, tiny(name, **fields))
     rule = lively_rule(task, torch.float64)
-    task = task_for_rule(task, rule)
+    task = task.for_rule(rule)
     x, s = worlds(task, 1)
     path_length = torch.rand(1, len(x[0]), dtype=torch.float64)
     weights = [] if rule.readout is None else [rule.readout[2].weight.requires_grad_(False)]
@@ -123,7 +122,7 @@ WEIGHED = {
 def test_loss_is_the_weighted_sum_of_its_parts(tiny, name):
     fields, weights = WEIGHED[name]
     task = task_of(name, tiny(name, **fields))
-    task = task_for_rule(task, lively_rule(task))
+    task = task.for_rule(lively_rule(task))
     x, s = worlds(task, 2, torch.float32)
     x, s = x if task.box else 6.0 * x, 4.0 * s
     total, parts = task.loss(x, s, torch.full(x.shape[:2], 0.4))

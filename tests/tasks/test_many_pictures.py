@@ -92,7 +92,7 @@ def test_gradients_of_the_loss_reach_the_worlds_codes_alone(device):
     task = task_of(device)
     rule = task.make_rule(generator()).to(device)
     task = task.for_rule(rule)
-    x, s, goal = task.seed_with_goals(2, generator=generator(1, device), device=device)
+    x, s, goal = task.seed(2, generator=generator(1, device), device=device)
     goal.fill_(1)
     aimed = task.toward(goal)
     s = aimed.coded(s)
@@ -108,14 +108,14 @@ def test_gradients_of_the_loss_reach_the_worlds_codes_alone(device):
 def test_switched_worlds_get_another_goal_and_its_code(device):
     task = task_of(device, switch_share=1.0, targets=("heart", "ring"))
     task = task.for_rule(task.make_rule(generator()).to(device))
-    x, s, goal = task.seed_with_goals(16, generator=generator(1, device), device=device)
-    _, hurt, switched = task.damage_with_goals(x, s, goal, generator(2, device))
+    x, s, goal = task.seed(16, generator=generator(1, device), device=device)
+    _, hurt, switched = task.damage(x, s, goal, generator(2, device))
     assert 0 < int((switched != goal).sum()) < 16
     after = task.toward(switched).coded(hurt)
     codes = after[..., :3].unique(dim=1)[:, 0]
     assert len(codes.unique(dim=0)) == 2
     kept = task_of(device, switch_share=0.0)
-    assert torch.equal(kept.damage_with_goals(x, s, goal, generator(2, device))[2], goal)
+    assert torch.equal(kept.damage(x, s, goal, generator(2, device))[2], goal)
 
 
 @pytest.mark.parametrize("encoder", [False, True])
@@ -154,7 +154,7 @@ def test_an_encoder_reads_the_pictures_once_in_an_iteration(monkeypatch):
     bound = task.for_rule(rule)
     # Fresh worlds carry what the encoder says, also of a rule that nobody has trained.
     assert torch.equal(rule.codes.table, encode(rule.codes, task._target_pictures))
-    _, s, goal = bound.seed_with_goals(2, generator=generator(1))
+    _, s, goal = bound.seed(2, generator=generator(1))
     assert torch.equal(s[:, 0, :3], rule.codes.table[goal])
     config = preset("tiny", **SMALL, targets=TARGETS, encoder=True, steps=(2, 4), pool_size=6)
     cycle, _ = make_cycle(config, task)
@@ -196,7 +196,7 @@ def test_the_command_trains_and_evaluates_by_name(tmp_path, capsys):
     assert rule.state_dim == 8
     task = task_of_rule(f"{out}/rule.safetensors", rule, torch.device("cpu"), target="ring").task
     assert task.target.name == "ring"
-    _, s = task.seed(1, generator=generator())
+    _, s, _ = task.seed(1, generator=generator())
     assert torch.equal(s[0, :, :3], rule.codes["ring"].expand(48, 3))
     first = task_of_rule(f"{out}/rule.safetensors", rule, torch.device("cpu")).task
     assert first.target.name == "heart"
@@ -222,7 +222,7 @@ def test_rows_tell_the_right_code_from_another():
     ]
     assert rows[3].loss == sorted(row.loss for row in rows[:3])[1]
     # A rule that has learned nothing does not care: all worlds stay disks.
-    x, s = tasks[0].seed(2, generator=npa_envs.WorldRandom((1, 2)))
+    x, s, _ = tasks[0].seed(2, generator=npa_envs.WorldRandom((1, 2)))
     assert rows[0].loss == pytest.approx(float(tasks[0].metric(x, s).mean()), rel=0.2)
     with pytest.raises(NPAError, match="two or more"):
         picture_rows(rule, tasks[:1], seeds=(1,))

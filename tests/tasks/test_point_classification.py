@@ -18,7 +18,6 @@ from npa_envs.measure.quality import (
     changes_of_mind,
 )
 from npa_envs.rule.files import load_rule, save_rule
-from npa_envs.tasks.base import task_for_rule
 from npa_envs.tasks.point_classification import (
     PALETTE,
     UNDECIDED,
@@ -62,7 +61,7 @@ def random(seed=0, device="cpu"):
 def test_pictures_have_room_around_the_ink():
     config = PointClassificationConfig(particle_count=64, resolution=32)
     task = PointClassification(config)
-    x, s, _ = task.seed_with_goals(32, generator=random())
+    x, s, _ = task.seed(32, generator=random())
     assert float(x.amax()) > 0.99
     density = task.picture(x, s)[..., 3]
     edges = torch.cat((density[:, 0], density[:, -1], density[:, :, 0], density[:, :, -1]), dim=1)
@@ -70,7 +69,7 @@ def test_pictures_have_room_around_the_ink():
 
 
 def test_worlds_are_clouds_of_their_class_with_blank_states(task, device):
-    x, s, goal = task.seed_with_goals(50, generator=random(1, device), device=device)
+    x, s, goal = task.seed(50, generator=random(1, device), device=device)
     assert s.shape == (50, 24, 6)
     assert not s.any()
     assert_goals_fit(x, goal, task.clouds)
@@ -83,16 +82,16 @@ def test_test_clouds_are_others_and_never_varied(folder):
     test_task = train_task.on("test")
     assert len(train_task.clouds.label) == 36
     assert len(test_task.clouds.label) == 18
-    x, _, _ = test_task.seed_with_goals(5, generator=random())
+    x, _, _ = test_task.seed(5, generator=random())
     assert all((test_task.clouds.x == cloud).flatten(1).all(1).any() for cloud in x)
-    x, _, _ = train_task.seed_with_goals(5, generator=random())
+    x, _, _ = train_task.seed(5, generator=random())
     assert not any((train_task.clouds.x == cloud).flatten(1).all(1).any() for cloud in x)
 
 
 def test_loss_is_the_error_to_the_class_and_the_overflow(task, device):
     rule = task.make_rule(random()).to(device).double()
     goal = torch.tensor([2, 0], device=device)
-    aimed = task_for_rule(task, rule).toward(goal)
+    aimed = task.for_rule(rule).toward(goal)
     s = 2.0 * torch.randn(2, 24, 6, dtype=torch.float64, device=device)
     x = torch.rand(2, 24, 2, dtype=torch.float64, device=device)
     total, parts = aimed.loss(x, s, x[..., 0])
@@ -197,9 +196,9 @@ def test_so_many_worlds_of_a_batch_are_fresh_clouds(folder, tmp_path, share, cou
 def test_mutated_worlds_keep_their_states(folder):
     config = PointClassificationConfig(data=folder, mutated_share=0.5, **SMALL)
     task = PointClassification(config)
-    x, s, goal = task.seed_with_goals(200, generator=random(1))
+    x, s, goal = task.seed(200, generator=random(1))
     s = s + torch.arange(200.0)[:, None, None]
-    new_x, new_s, new_goal = task.damage_with_goals(x, s, goal, random(2))
+    new_x, new_s, new_goal = task.damage(x, s, goal, random(2))
     assert torch.equal(new_s, s)
     moved = (new_x != x).flatten(1).any(1)
     # Half of 200, less one in 36 that becomes what it was: 97 ± 7.

@@ -46,8 +46,8 @@ def test_only_the_paths_of_those_outside_count():
 def test_a_share_throws_particles_of_the_pool_out_and_a_weight_counts_their_paths():
     task = Morphogenesis2D(SMALL)
     generator = torch.Generator().manual_seed(1)
-    x, s = task.seed(2, generator=generator)
-    hurt_x, _ = task.damage(x, s, generator)
+    x, s, _ = task.seed(2, generator=generator)
+    hurt_x, *_ = task.damage(x, s, None, generator)
     out = hurt_x.norm(dim=-1) > 1.0
     assert 0 < int(out.sum()) < 60
     path = torch.ones(2, 96)
@@ -60,7 +60,7 @@ def test_a_share_throws_particles_of_the_pool_out_and_a_weight_counts_their_path
 
 def test_the_distance_of_the_centroid_from_where_worlds_begin_is_paid_for():
     task = Morphogenesis2D(replace(SMALL, drift_weight=2.0), device="cpu")
-    x, s = task.seed(1, generator=torch.Generator().manual_seed(0), device=torch.device("cpu"))
+    x, s, _ = task.seed(1, generator=torch.Generator().manual_seed(0), device=torch.device("cpu"))
     moved = (x + torch.tensor([0.3, -0.4])).requires_grad_()
     still = x.new_zeros(x.shape[:2])
     near, there = task.loss(x - x.mean(1, keepdim=True), s, still), task.loss(moved, s, still)

@@ -107,7 +107,7 @@ def test_gradients_are_those_of_differences(name):
 @pytest.mark.parametrize("name", JOINT)
 def test_grey_starts_and_empty_places_have_finite_slopes(name):
     task = Texture(dataclasses.replace(SMALL, loss=name))
-    x, s = task.seed(2, generator=torch.Generator().manual_seed(0))
+    x, s, _ = task.seed(2, generator=torch.Generator().manual_seed(0))
     for places in (x, torch.zeros_like(x)):
         x, s = places.clone().requires_grad_(), s.detach().clone().requires_grad_()
         loss, _ = task.loss(x, s, torch.zeros(x.shape[:2]))
@@ -131,7 +131,7 @@ def test_worlds_may_be_of_another_precision_than_the_target(name):
     torch.testing.assert_close(loss(images.float()).double(), values, rtol=1e-5, atol=0.0)
     assert torch.isfinite(slopes).all()
     task = Texture(dataclasses.replace(SMALL, loss=name))
-    x, s = task.seed(1, generator=torch.Generator().manual_seed(0))
+    x, s, _ = task.seed(1, generator=torch.Generator().manual_seed(0))
     found = task.metric(x.double(), s.double())
     torch.testing.assert_close(found, task.metric(x, s).double(), rtol=1e-5, atol=0.0)
 

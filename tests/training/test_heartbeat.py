@@ -6,16 +6,16 @@ import time
 import pytest
 import torch.distributed as dist
 
-from npa_envs.training import heartbeat
-from npa_envs.training.heartbeat import LOST_CODE, Heartbeat
+from npa_envs.training import ranks
+from npa_envs.training.ranks import LOST_CODE, Heartbeat
 
 
 @pytest.fixture
 def codes(monkeypatch):
     """Exit codes with which a process would have ended; its pauses are short."""
     ended = []
-    monkeypatch.setattr(heartbeat, "BEAT_SECONDS", 0.05)
-    monkeypatch.setattr(heartbeat.os, "_exit", ended.append)
+    monkeypatch.setattr(ranks, "BEAT_SECONDS", 0.05)
+    monkeypatch.setattr(ranks.os, "_exit", ended.append)
     return ended
 
 
@@ -28,8 +28,8 @@ def waited(codes, seconds=60.0):
 
 def test_nobody_is_missed_who_lives_or_has_left(codes, monkeypatch):
     # No load gives a thread sixty pauses and another one none.
-    monkeypatch.setattr(heartbeat, "BEAT_SECONDS", 0.02)
-    monkeypatch.setattr(heartbeat, "SILENT_BEATS", 60)
+    monkeypatch.setattr(ranks, "BEAT_SECONDS", 0.02)
+    monkeypatch.setattr(ranks, "SILENT_BEATS", 60)
     store = dist.HashStore()
     first, second = (Heartbeat(store, rank, 2) for rank in (0, 1))
     time.sleep(2.0)

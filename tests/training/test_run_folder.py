@@ -26,7 +26,7 @@ def test_a_run_killed_at_its_first_checkpoint_is_resumed_with_its_configuration(
         save_checkpoint(path, content)
         kill()
 
-    monkeypatch.setattr("npa_envs.training.trainer.save_checkpoint", killed_after)
+    monkeypatch.setattr("npa_envs.training.run.save_checkpoint", killed_after)
     with pytest.raises(Killed):
         trainer_of(config)
     monkeypatch.undo()
@@ -179,7 +179,7 @@ def test_a_checkpoint_with_something_wrong_in_it_is_refused_by_name(finished, pl
         there[last] = (
             made(value, there[last]) if value in ("negative", "nan", "sparse", "meta") else value
         )
-        monkeypatch.setattr("npa_envs.training.trainer.load_checkpoint", lambda _, c=content: c)
+        monkeypatch.setattr("npa_envs.training.run.load_checkpoint", lambda _, c=content: c)
         before = {file: file.read_bytes() for file in finished.iterdir() if file.is_file()}
         with pytest.raises(NPAError, match=rf"checkpoint\.pt' .*{place.split('/')[0]}.*: start a"):
             trainer_of(override(config, log_interval=2), resume=True)

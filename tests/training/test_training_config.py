@@ -98,7 +98,7 @@ def test_no_field_of_the_run_hides_one_of_the_task():
         (
             "damage_and_keep_share",
             0.5,
-            "damage_and_keep_share needs worlds that have max_age_range, got 0.5 without",
+            "damage_and_keep_share needs max_age_range, got 0.5 without",
         ),
         ("damage_share", 1.5, "damage_share must be at most 1, got 1.5"),
         ("damage_share", -0.5, "damage_share must be a finite number of at least 0, got -0.5"),
@@ -136,9 +136,7 @@ def test_flags_are_true_or_false(field):
 
 
 def test_what_needs_ages_needs_max_age_range():
-    with pytest.raises(
-        NPAError, match="stillness_weight needs worlds that have max_age_range, got 64"
-    ):
+    with pytest.raises(NPAError, match="stillness_weight needs max_age_range, got 64"):
         override(PAPER, stillness_weight=64)
 
 

@@ -69,7 +69,7 @@ def test_worlds_age_and_are_new_when_they_run_away():
     pool = WorldPool(x, x.clone(), runaway_limit=1.0, max_age_range=(5, 40))
     index = torch.tensor([0, 2, 3])
     after = torch.tensor([0.0, 0.0, 3.0])[:, None, None].expand(3, 2, 2)
-    pool.write(index, after, after, x[:3], x[:3], age=torch.tensor([7, 8, 9]))
+    pool.write(index, (after, after, None), (x[:3], x[:3], None), age=torch.tensor([7, 8, 9]))
     assert pool.age.tolist() == [7, 0, 8, 0]
     age, over = pool.ages_of(index)
     assert age.tolist() == [7, 8, 0]
@@ -83,7 +83,9 @@ def test_pool_replaces_worlds_that_run_away_and_only_those(bad, where, device):
     x, s = (torch.full((3, 4, c), v, device=device) for c, v in ((2, 7.0), (3, 8.0)))
     (x if where == "x" else s)[1, 2, 1] = bad
     fresh_x, fresh_s = torch.full_like(x, 0.5), torch.full_like(s, 0.25)
-    replaced = pool.write(torch.tensor([5, 0, 3], device=device), x, s, fresh_x, fresh_s)
+    replaced = pool.write(
+        torch.tensor([5, 0, 3], device=device), (x, s, None), (fresh_x, fresh_s, None)
+    )
     assert replaced.tolist() == [False, True, False]
     assert pool.x[:, 0, 0].tolist() == [0.5, 1, 2, 7, 4, 7]
     assert pool.s[:, 0, 0].tolist() == [0.25, 1, 2, 8, 4, 8]
@@ -165,7 +167,7 @@ def test_rules_that_know_no_direction_have_one_matrix_more():
 def make_iteration(config, kind=EagerIteration, device="cpu"):
     task = CircleTask()
     rule = task.make_rule(torch.Generator().manual_seed(1)).to(device, config.torch_dtype)
-    x, s = task.seed(
+    x, s, _ = task.seed(
         config.world_count,
         generator=torch.Generator(device).manual_seed(2),
         device=torch.device(device),
@@ -258,7 +260,7 @@ def test_a_parameter_outside_the_loss_gets_a_zero_gradient(tmp_path):
     task = CircleTask()
     rule = task.make_rule(torch.Generator().manual_seed(1))
     rule.unused = nn.Parameter(torch.ones(2))
-    x, s = task.seed(2, generator=torch.Generator(), device=torch.device("cpu"))
+    x, s, _ = task.seed(2, generator=torch.Generator(), device=torch.device("cpu"))
     config = circle_config(tmp_path)
     iteration = EagerIteration(task, rule, config, x, s, torch.Generator(), plain_rollout)
     rule.unused.grad.fill_(5.0)

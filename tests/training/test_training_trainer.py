@@ -158,8 +158,8 @@ class WatchedTask(CircleTask):
         self.fresh = []
 
     def seed(self, world_count, *, generator, device):
-        x, s = super().seed(world_count, generator=generator, device=device)
-        return x, s + 0.125
+        x, s, goal = super().seed(world_count, generator=generator, device=device)
+        return x, s + 0.125, goal
 
     def make_rollout(self):
         def rollout(rule, x, s, steps, **options):

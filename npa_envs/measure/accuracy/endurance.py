@@ -14,7 +14,7 @@ from npa_envs.errors import NPAError
 from npa_envs.measure.accuracy.checks import Check, CheckResult, CheckSession, Skipped
 from npa_envs.rule.files import load_rule, rule_file, rule_metadata, shipped_rules
 from npa_envs.rule.rule import NPARule
-from npa_envs.tasks.base import Task, seed_worlds, task_toward
+from npa_envs.tasks.base import Task
 from npa_envs.training.trained_tasks import task_of_rule, trained_config
 from npa_envs.world.brushes import nearest_image
 from npa_envs.world.cuda_graph import GraphSequence, capture
@@ -117,13 +117,11 @@ def habitat(
     """
     key = ("task", name, particles, looks)
     rule, task = session.once(key, lambda: _task(session, name, particles, looks))
-    x, s, goal = seed_worlds(
-        task, world_count, generator=session.generator(), device=session.device
-    )
+    x, s, goal = task.seed(world_count, generator=session.generator(), device=session.device)
     horizon = HORIZONS[task_name(name)]
     return EnduranceCase(
         rule,
-        task_toward(task, goal),
+        task.toward(goal),
         x.float(),
         s.float(),
         min(horizon, QUICK_HORIZON) if session.quick else horizon,

@@ -15,7 +15,6 @@ from torch import Tensor
 
 from npa_envs.measure.robustness.trials import RuleTrial, TaskTrial, loss_curves
 from npa_envs.ops import world_mean
-from npa_envs.tasks.base import coded_states
 from npa_envs.tasks.damage import DAMAGE_SIZES, clump, cut, random_particle, wipe_state
 from npa_envs.world.brushes import nearest_image, offsets_from
 from npa_envs.world.randomness import StreamId, WorldRandom
@@ -210,7 +209,7 @@ def _beside_twins(
     for damage in damages:
         random = ground.random(StreamId.DAMAGE)
         x, s = damage.apply(home.x, home.s, random, home.task.box)
-        copies.append((x, coded_states(home.task, s)))
+        copies.append((x, home.task.coded(s)))
         keys.append(keys[0])
     if control:
         copies.append(copies[0])

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, Self
 
 import torch
 from torch import Tensor
@@ -14,13 +14,10 @@ from npa_envs.measure.accuracy.endurance import SMALLEST_VIEWS, EnduranceCase, L
 from npa_envs.measure.robustness.plans import SHAPES, TrialPlan
 from npa_envs.rule.files import load_rule
 from npa_envs.rule.rule import NPARule
-from npa_envs.tasks.base import Task, seed_worlds, task_for_rule, task_toward
-from npa_envs.tasks.morphogenesis2d import Morphogenesis2D
-from npa_envs.tasks.morphogenesis3d import Morphogenesis3D
-from npa_envs.tasks.point_classification import PointClassification, particle_classes
-from npa_envs.tasks.texture import Texture
+from npa_envs.tasks.base import ParticleTask, Worlds
+from npa_envs.tasks.morphogenesis2d import Morphogenesis2D, Morphogenesis2DConfig
 from npa_envs.training.trained_tasks import task_of_rule, tasks_of_codes
-from npa_envs.world.randomness import StreamId, WorldRandom
+from npa_envs.world.randomness import Randomness, StreamId, WorldRandom
 
 SEEN_AT_ONCE = 1 << 17
 """Particles of the worlds whose loss is taken at once: many views of many Gaussians take room."""
@@ -55,17 +52,14 @@ class TaskTrial(EnduranceCase):
         return torch.cat(found)
 
     def _losses(self, x: Tensor, s: Tensor, worlds: slice) -> Tensor:
-        if isinstance(self.task, PointClassification):
-            assert self.goal is not None, "clouds are made with their classes"
-            says = particle_classes(self.task.outputs(s))
-            return (says != self.goal[worlds, None]).to(s.dtype).mean(1)
-        return task_toward(self.task, None if self.goal is None else self.goal[worlds]).metric(x, s)
+        goal = None if self.goal is None else self.goal[worlds]
+        return self.task.toward(goal).trial_metric(x, s)
 
 
-class PicturesInTurn:
+class PicturesInTurn(ParticleTask[Morphogenesis2DConfig]):
     """Worlds of several pictures of one rule, each compared as in a world of its own.
 
-    Satisfies `GoalTask` and `CodedTask`: a world's goal is the place of its picture.
+    A world's goal is the place of its picture.
 
     Args:
         tasks: The task of each picture, for the rule.
@@ -76,36 +70,29 @@ class PicturesInTurn:
         first = tasks[0]
         self._tasks, self._goal = tuple(tasks), goal
         self.config, self.metric_name = first.config, first.metric_name
-        self.eps, self.box, self.update_prob = first.eps, first.box, first.update_prob
 
-    def resized(self, particle_count: int, rule: NPARule, device: torch.device) -> PicturesInTurn:
+    def resized(self, particle_count: int) -> Self:
         """Return the same pictures for another number of particles."""
-        return PicturesInTurn(
-            [
-                Morphogenesis2D(
-                    task.config.with_particle_count(particle_count), device=device
-                ).for_rule(rule)
-                for task in self._tasks
-            ],
-            self._goal,
-        )
+        return type(self)([task.resized(particle_count) for task in self._tasks], self._goal)
 
-    def seed_with_goals(
-        self, world_count: int, *, generator: WorldRandom, device: torch.device
-    ) -> tuple[Tensor, Tensor, Tensor]:
+    def for_rule(self, rule: NPARule) -> Self:
+        """Return the task for the worlds of a rule."""
+        return type(self)([task.for_rule(rule) for task in self._tasks], self._goal)
+
+    def seed(
+        self, world_count: int, *, generator: Randomness, device: str | torch.device = "cpu"
+    ) -> Worlds:
         """Return fresh worlds with the codes of their pictures, and which ones these are."""
-        x, s = self._tasks[0].seed(world_count, generator=generator, device=device)
+        x, s, _ = self._tasks[0].seed(world_count, generator=generator, device=device)
         return x, self.coded(s), self._goal
 
-    def damage_with_goals(
-        self, x: Tensor, s: Tensor, goal: Tensor, generator: WorldRandom
-    ) -> tuple[Tensor, Tensor, Tensor]:
+    def damage(self, x: Tensor, s: Tensor, goal: Tensor | None, generator: Randomness) -> Worlds:
         """Return the worlds damaged as each picture's task does it."""
-        return *self._tasks[0].damage(x, s, generator), goal
+        return self._tasks[0].damage(x, s, goal, generator)
 
-    def toward(self, goal: Tensor) -> PicturesInTurn:
+    def toward(self, goal: Tensor | None) -> Self:
         """Return the task for worlds of other pictures, int64, shape [B]."""
-        return PicturesInTurn(self._tasks, goal)
+        return self if goal is None else type(self)(self._tasks, goal)
 
     def coded(self, s: Tensor) -> Tensor:
         """Return states with the codes of their worlds' pictures."""
@@ -157,10 +144,8 @@ class RuleTrial:
             raise NPAError(f"cannot measure {name!r}: {found.doubt}: choose another rule")
         self.task: Any = found.task
         """The task as trained."""
-        self.metric_name = found.task.metric_name
+        self.metric_name = found.task.trial_name
         """What losses are."""
-        if isinstance(found.task, PointClassification):
-            self.metric_name = "share of particles that are wrong"
         if self.rule.codes is not None:
             pictures = tasks_of_codes(name, self.rule, device, particle_count=particle_count)
             numbers = torch.tensor(self._numbers, device=device)
@@ -195,18 +180,14 @@ class RuleTrial:
         """Return fresh worlds: a share of the trained number of particles, a shape of `SHAPES`."""
         count = self.particles(share)
         if count not in self._tasks:
-            self._tasks[count] = (
-                self.task.resized(count, self.rule, self._device)
-                if isinstance(self.task, PicturesInTurn)
-                else task_for_rule(_resized(self.task, count, self._device), self.rule)
-            )
+            self._tasks[count] = self.task.resized(count).for_rule(self.rule)
         task = self._tasks[count]
         random = self.random(StreamId.GROWTH)
-        x, s, goal = seed_worlds(task, self.world_count, generator=random, device=self._device)
+        x, s, goal = task.seed(self.world_count, generator=random, device=self._device)
         if shape != "trained":
             x = SHAPES[shape](count, self.rule.space_dim, self._seed_radius(), random)
         return TaskTrial(
-            self.rule, task_toward(task, goal), x.float(), s.float(), self.plan.grow_steps, goal
+            self.rule, task.toward(goal), x.float(), s.float(), self.plan.grow_steps, goal
         )
 
     def run(self, home: TaskTrial, random: WorldRandom, **changed: Any) -> LongRun:
@@ -218,23 +199,8 @@ class RuleTrial:
         return losses.double().reshape(*losses.shape[:-1], len(self.seeds), -1).mean(-1)
 
     def _seed_radius(self) -> float:
-        config = self.task.config
-        if isinstance(self.task, Texture):
-            return BOX_SHARE * float(config.box_size)
-        return float(config.seed_radius)
-
-
-def _resized(task: Any, particle_count: int, device: torch.device) -> Task:
-    """Return a task for another number of particles; views and textures are made once."""
-    config = task.config.with_particle_count(particle_count)
-    if isinstance(task, Morphogenesis2D):
-        return Morphogenesis2D(config, device=device)
-    if isinstance(task, PointClassification):
-        return PointClassification(config, device=device, split=task.split)
-    if isinstance(task, Texture):
-        return Texture(config, target=task.target, device=device)
-    assert isinstance(task, Morphogenesis3D), "tasks of shipped rules are these four"
-    return Morphogenesis3D(config, target=task.target, device=device)
+        box = self.task.box
+        return float(self.task.config.seed_radius) if box is None else BOX_SHARE * min(box)
 
 
 def finite_worlds(x: Tensor, s: Tensor) -> Tensor:

@@ -27,11 +27,7 @@ def check_images(images: Tensor, shape: tuple[int, ...]) -> None:
     """Check that images have the target's shape.
 
     Args:
-        images: What is compared.
         shape: The target's shape, (K, R, R).
-
-    Raises:
-        NPAError: They do not.
     """
     if images.ndim != 4 or tuple(images.shape[1:]) != shape:
         raise NPAError(
@@ -41,11 +37,7 @@ def check_images(images: Tensor, shape: tuple[int, ...]) -> None:
 
 
 def check_size(target: Tensor) -> None:
-    """Check that a target, [K, R, R], is large enough to be looked at.
-
-    Raises:
-        NPAError: It is too small.
-    """
+    """Check that a target, [K, R, R], is large enough to be looked at."""
     if target.shape[-1] < SMALLEST:
         raise NPAError(
             f"resolution must be at least {SMALLEST} pixels, got {target.shape[-1]}: for example 64"
@@ -53,11 +45,7 @@ def check_size(target: Tensor) -> None:
 
 
 class TextureDistance:
-    """The distance of images from a target; satisfies `TextureLoss`.
-
-    Args:
-        target: The texture (dimensionless), shape [K, R, R].
-    """
+    """The distance of images from a target; satisfies `TextureLoss`."""
 
     def __init__(self, target: Tensor) -> None:
         self._shape = tuple(target.shape)
@@ -66,12 +54,6 @@ class TextureDistance:
         """Return the distance of each image (dimensionless), shape [B]; differentiable.
 
         Without gradient images are compared one by one, so that no image depends on the others.
-
-        Args:
-            images: Pictures that tile (dimensionless), shape [B, K, R, R].
-
-        Raises:
-            NPAError: They have another shape than the target.
         """
         check_images(images, self._shape)
         if len(images) > 1 and not (torch.is_grad_enabled() and images.requires_grad):
@@ -112,7 +94,6 @@ def patches(images: Tensor, size: int, *, stride: int, wrap: bool) -> Tensor:
     """Return the square patches of images as rows, shape [B, M, K size²].
 
     Args:
-        images: The images, shape [B, K, R, R].
         size: Pixels along each side, odd.
         stride: Pixels from one patch to the next.
         wrap: Whether patches reach across the edges; otherwise M is smaller.
@@ -133,7 +114,6 @@ def products(rows: Tensor, weights: Tensor) -> Tensor:
 
     Args:
         rows: Contiguous rows, shape [B, M, E].
-        weights: Shape [E, F].
     """
     weights = weights.to(rows)
     tables = [one if one.data_ptr() % ALIGNMENT == 0 else one.clone() for one in rows]
@@ -146,7 +126,6 @@ def orthogonal(size: int, count: int, generator: torch.Generator) -> Tensor:
     Args:
         size: Numbers in each, at least `count`.
         count: Directions.
-        generator: What they are drawn from, on the CPU.
     """
     normal = torch.randn(size, count, generator=generator, dtype=torch.float64)
     basis: Tensor = torch.linalg.qr(normal).Q
@@ -176,10 +155,6 @@ def relaxed_transport(first: Tensor, second: Tensor) -> Tensor:
 
     Either side may send all to the nearest of the other; the larger of both costs is taken, each
     a lower bound of the cost of transport.
-
-    Args:
-        first: Rows, shape [B, M, F].
-        second: Rows, shape [1, L, F] or [B, L, F].
     """
     costs = 1.0 - _directions(first) @ _directions(second).transpose(1, 2)
     there, back = costs.amin(dim=2).mean(dim=1), costs.amin(dim=1).mean(dim=1)
@@ -187,12 +162,7 @@ def relaxed_transport(first: Tensor, second: Tensor) -> Tensor:
 
 
 def moment_distance(first: Tensor, second: Tensor) -> Tensor:
-    """Return the mean absolute differences of means and of covariances, added, shape [B].
-
-    Args:
-        first: Rows, shape [B, M, F].
-        second: Rows, shape [1, L, F] or [B, L, F].
-    """
+    """Return the mean absolute differences of means and of covariances, added, shape [B]."""
     (mean, covariance), (other_mean, other_covariance) = _moments(first), _moments(second)
     difference = (mean - other_mean).abs().mean(dim=(1, 2))
     return difference + (covariance - other_covariance).abs().mean(dim=(1, 2))

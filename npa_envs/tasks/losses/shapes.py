@@ -40,13 +40,6 @@ class PatchTransport(TextureDistance):
     the target's variance; the sizes' are averaged. So nothing may be there that the target does not
     have, and nothing may be missing. After the relaxed transport of Kolkin, Salavon and
     Shakhnarovich (2019), with patches in place of a network's features.
-
-    Args:
-        target: The texture (dimensionless), shape [K, R, R].
-        tiles: Whether the target's opposite edges meet.
-
-    Raises:
-        NPAError: The target is too small.
     """
 
     def __init__(self, target: Tensor, *, tiles: bool) -> None:
@@ -73,12 +66,7 @@ class PatchTransport(TextureDistance):
 
 
 def _matched(found: Tensor, expected: Tensor) -> Tensor:
-    """Return the larger of two mean squares, of patches and of their nearest ones; shape [B].
-
-    Args:
-        found: Patches of worlds, shape [B, M, F].
-        expected: Patches of the target, shape [L, F].
-    """
+    """Return the larger of two mean squares, of patches and of their nearest ones; shape [B]."""
     with torch.no_grad():
         squares = found.square().sum(2)[:, :, None] + expected.square().sum(1)
         costs = squares - 2.0 * (found @ expected.T)
@@ -104,17 +92,13 @@ FILTERS = 32
 """Random filters of each size."""
 
 REFERENCE = 128
-"""Pixels along each side that filters' sizes are told for."""
+"""Pixels along each side of the images that `FILTER_SIZES` refers to."""
 
 
 class RandomFilters:
     """The image and one layer of random filters of many sizes, rectified.
 
     After Ustyuzhaninov, Brendel, Gatys and Bethge, arXiv 1606.00021.
-
-    Args:
-        like: An image of the shape that is to be described, [K, R, R], on the device.
-        seed: What the filters are drawn from.
     """
 
     def __init__(self, like: Tensor, *, seed: int) -> None:
@@ -136,7 +120,6 @@ class RandomFilters:
         """Return the image's channels and the rectified answers at every second place.
 
         Args:
-            images: The images, shape [B, K, R, R].
             wrap: Whether their opposite edges meet; otherwise places near them are left out.
         """
         waves = torch.fft.rfft2(images)
@@ -151,14 +134,6 @@ class FeatureTransport(TextureDistance):
     """Relaxed optimal transport of features and their moments; satisfies `TextureLoss`.
 
     As `vgg_ot` (Kolkin, Salavon and Shakhnarovich 2019), of features that need no weights.
-
-    Args:
-        target: The texture (dimensionless), shape [K, R, R].
-        features: What is compared.
-        tiles: Whether the target's opposite edges meet.
-
-    Raises:
-        NPAError: The target is too small.
     """
 
     def __init__(self, target: Tensor, features: RandomFilters, *, tiles: bool) -> None:

@@ -29,13 +29,6 @@ class MultiScaleSimilarity:
     Windows and halving are products with a matrix from both sides, which tens of pictures want at
     once, and similarities are multiplied as a sum of logarithms: the derivative of a product waits
     for the device, and is not finite where a size's similarity is 0.
-
-    Args:
-        resolution: Pixels along each side of the pictures, at least 16.
-        device: Where they are.
-
-    Raises:
-        NPAError: The pictures are too small.
     """
 
     def __init__(self, resolution: int, *, device: str | torch.device = "cpu") -> None:

@@ -37,7 +37,7 @@ from npa_envs.tasks.losses.shapes import (
 )
 
 DEFAULT_LOSS = "patch_swd"
-"""The loss that needs nothing but what is here."""
+"""The loss that needs no weights and no options."""
 
 
 class TextureLoss(Protocol):
@@ -48,17 +48,12 @@ class TextureLoss(Protocol):
     """
 
     def __call__(self, images: Tensor) -> Tensor:
-        """Return how unlike the target each image is (dimensionless), shape [B]; differentiable.
-
-        Args:
-            images: Pictures that tile without a seam (dimensionless), shape [B, K, R, R] with the
-                target's K channels.
-        """
+        """Return how unlike the target each image is (dimensionless), shape [B]; differentiable."""
 
 
 @dataclass(frozen=True)
 class LossOptions:
-    """What a loss is told besides its target."""
+    """Options of a loss."""
 
     tiles: bool = True
     """Whether the target's opposite edges fit together; where not, nothing is read across them."""
@@ -125,11 +120,7 @@ TEXTURE_LOSSES: Mapping[str, LossEntry] = {
 
 
 def check_loss_name(name: str) -> None:
-    """Check that there is a loss of a name, or that there are all of several joined by "+".
-
-    Raises:
-        NPAError: There is none, or a sum has a loss in it that is not joint.
-    """
+    """Check that there is a loss of a name, or that there are all of several joined by "+"."""
     parts = name.split("+") if isinstance(name, str) else []
     for part in parts or [name]:
         if not isinstance(part, str) or part not in TEXTURE_LOSSES:
@@ -152,11 +143,7 @@ class LossSum:
         self._losses = losses
 
     def __call__(self, images: Tensor) -> Tensor:
-        """Return the sum of each image's losses (dimensionless), shape [B]; differentiable.
-
-        Args:
-            images: Pictures that tile (dimensionless), shape [B, K, R, R].
-        """
+        """Return the sum of each image's losses (dimensionless), shape [B]; differentiable."""
         return torch.stack([loss(images) for loss in self._losses]).sum(0)
 
 
@@ -169,7 +156,7 @@ def make_texture_loss(
         name: One of `TEXTURE_LOSSES`, or several joint ones joined by "+", which are summed.
         target: The texture (dimensionless), shape [K, R, R]; K is 3 for colours, 1 for a density,
             4 for both.
-        options: What else the loss is told.
+        options: Options of the loss.
 
     Raises:
         NPAError: There is no such loss, the target's shape does not fit, or weights that the loss
@@ -214,7 +201,6 @@ class Descriptor(Protocol):
         """Return the numbers at each place of images, a table for each size, [B, M, F] each.
 
         Args:
-            images: The images, shape [B, K, R, R].
             wrap: Whether their opposite edges meet; otherwise places near them are left out.
             thinned: Whether at most `PLACES` along each side are enough.
         """
@@ -225,14 +211,6 @@ class SlicedWasserstein:
 
     For each size it is the mean over the numbers of the squared 2-Wasserstein distance between
     their distributions, relative to the target's own variance; the sizes' are added.
-
-    Args:
-        target: The texture (dimensionless), shape [K, R, R].
-        descriptor: What is compared.
-        tiles: Whether the target's opposite edges meet.
-
-    Raises:
-        NPAError: The target is too small.
     """
 
     def __init__(self, target: Tensor, descriptor: Descriptor, *, tiles: bool) -> None:
@@ -250,14 +228,7 @@ class SlicedWasserstein:
             self._scales = [1.0 / (numbers[0].var(0).mean() + FLOOR) for numbers in described]
 
     def __call__(self, images: Tensor) -> Tensor:
-        """Return the distance of each image (dimensionless), shape [B]; differentiable.
-
-        Args:
-            images: Pictures that tile (dimensionless), shape [B, K, R, R].
-
-        Raises:
-            NPAError: They have another shape than the target.
-        """
+        """Return the distance of each image (dimensionless), shape [B]; differentiable."""
         check_images(images, self._shape)
         described = self._descriptor(images, wrap=True, thinned=True)
         total = images.new_zeros(len(images))
@@ -280,10 +251,6 @@ class PatchDescriptor:
     """Square patches of all channels, seen from random directions.
 
     There are as many directions as a patch has numbers, at right angles to each other.
-
-    Args:
-        like: An image of the shape that is to be described, [K, R, R], on the device.
-        seed: What the directions are drawn from.
     """
 
     def __init__(self, like: Tensor, *, seed: int) -> None:
@@ -308,10 +275,6 @@ class FilterDescriptor:
 
     The filters of the first layer sum to zero, but for one for each channel that averages; those of
     the second see its features from random directions.
-
-    Args:
-        like: An image of the shape that is to be described, [K, R, R], on the device.
-        seed: What the filters are drawn from.
     """
 
     def __init__(self, like: Tensor, *, seed: int) -> None:
@@ -367,16 +330,6 @@ class VGGTransport(TextureDistance):
     For each layer it is the relaxed earth mover's distance under the cosine distance of features,
     plus the mean absolute differences of their means and of their covariances; the layers' are
     added. A layer with more than 1024 places is compared at 1024 of them, drawn once.
-
-    Args:
-        target: The texture (dimensionless), shape [3, R, R], or [1, R, R] for a density.
-        weights: File of VGG16's weights; empty: torch's folder of downloads.
-        tiles: Whether the target's opposite edges meet.
-        seed: What the places are drawn from.
-
-    Raises:
-        NPAError: There are no such weights, the file is damaged, or the target is too small or has
-            another number of channels.
     """
 
     def __init__(self, target: Tensor, *, weights: str = "", tiles: bool, seed: int) -> None:
@@ -432,17 +385,7 @@ VGG_MEAN, VGG_DEVIATION = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
 
 
 class VGGFeatures:
-    """Features of images at some layers.
-
-    Args:
-        weights: Weight and bias by name, as in torchvision's state dict: `features.0.weight`, ...
-        layers: Numbers of the layers whose outputs are wanted, in torchvision's counting: each
-            convolution, rectifier and pooling counts as one, from 0.
-        like: A tensor of the dtype and on the device that the features are wanted in.
-
-    Raises:
-        NPAError: A weight is missing or has another shape.
-    """
+    """Features of images at some layers."""
 
     def __init__(self, weights: Mapping[str, Any], layers: Sequence[int], like: Tensor) -> None:
         self._layers = frozenset(layers)
@@ -463,8 +406,6 @@ class VGGFeatures:
         """Return the features at each layer, shape [B, F, R', R'] each, ever coarser.
 
         Args:
-            images: Red, green and blue, or one channel that stands for all three (dimensionless),
-                shape [B, 3, R, R] or [B, 1, R, R].
             wrap: Whether opposite edges meet; otherwise images are mirrored at their edges.
         """
         mode = "circular" if wrap else "reflect"
@@ -488,24 +429,15 @@ class VGGFeatures:
 
 
 def load_vgg_weights(path: str | Path = "") -> dict[str, Any]:
-    """Return the weights of VGG16 by name, on the CPU.
-
-    Args:
-        path: The file; empty: `vgg16-397923af.pth` in torch's folder of downloads. Nothing is
-            downloaded.
-
-    Raises:
-        NPAError: There is no such file, or it is damaged or holds something else.
-    """
+    """Return the weights of VGG16 by name, on the CPU."""
     folder = Path(torch.hub.get_dir()) / "checkpoints"
     file = home_path(path) if str(path) else folder / WEIGHTS_FILE
     if not os.path.exists(file):
         raise NPAError(
-            f"vgg_ot needs VGG16's weights, and there is no file {shown(str(file))}: "
-            f"download {WEIGHTS_URL} (528 MiB) to {shown(str(folder / WEIGHTS_FILE))}, for example "
-            "with "
-            f"python -c \"import torch; torch.hub.load_state_dict_from_url('{WEIGHTS_URL}')\", "
-            "or give the path of such a file as vgg_weights, or choose loss='patch_swd' or "
+            f"vgg_ot needs VGG16's weights, and there is no file {shown(str(file))}: download "
+            f"{WEIGHTS_URL} (528 MiB) to {shown(str(folder / WEIGHTS_FILE))}, for example with "
+            f"python -c \"import torch; torch.hub.load_state_dict_from_url('{WEIGHTS_URL}')\", or "
+            "give the path of such a file as vgg_weights, or choose loss='patch_swd' or "
             "'filter_swd', which need no weights"
         )
     try:
@@ -515,14 +447,12 @@ def load_vgg_weights(path: str | Path = "") -> dict[str, Any]:
     except (OSError, RuntimeError, ValueError, EOFError, pickle.UnpicklingError) as error:
         raise NPAError(
             f"VGG16's weights {shown(str(file))} cannot be read, the file is damaged or no torch "
-            "file "
-            f"({shown(error)}): download {WEIGHTS_URL} again"
+            f"file ({shown(error)}): download {WEIGHTS_URL} again"
         ) from error
     if not isinstance(content, dict):
         raise NPAError(
             f"VGG16's weights {shown(str(file))} must be a state dict, got "
-            f"{type(content).__name__}: "
-            f"download {WEIGHTS_URL}"
+            f"{type(content).__name__}: download {WEIGHTS_URL}"
         )
     return content
 

@@ -106,16 +106,11 @@ def sample_ink(
 
     Args:
         ink: Pictures, shape [M, H, W]; the longer side becomes 1 length unit.
-        particle_count: Points N of each cloud.
         sample_seed: What the places are drawn from.
-        device: Where points are chosen.
 
     Returns:
         Positions in [0, 1]² [length units], shape [M, N, 2], and the mean share of each picture
         that has ink.
-
-    Raises:
-        NPAError: A picture has no ink.
     """
     darkest = ink.max((1, 2))
     if (darkest <= 0).any():
@@ -151,11 +146,7 @@ def sample_ink(
 
 
 def _places(side: int, shape: tuple[int, ...], random: torch.Generator) -> tuple[Tensor, Tensor]:
-    """Return one random place in each cell of a grid, in random order.
-
-    Returns:
-        The cells' numbers, shape [K], and the places as whole numbers below `LEVELS`, [K, 2].
-    """
+    """Return one random place in each cell of a grid, in random order."""
     height, width = shape
     longer = max(height, width)
     order = torch.randperm(side * side, generator=random)
@@ -183,16 +174,7 @@ def _first(has_ink: Tensor, most: int) -> Tensor:
 
 
 def _farthest_points(candidates: Tensor, counts: Tensor, particle_count: int) -> Tensor:
-    """Choose points one by one, each as far from those before as can be.
-
-    Args:
-        candidates: Points as whole numbers, shape [M, K, 2].
-        counts: How many of each row are to be chosen from, shape [M], at least 1.
-        particle_count: Points N; where a row has fewer, they are repeated.
-
-    Returns:
-        Shape [M, N, 2]; the first is the first of the candidates.
-    """
+    """Choose points one by one, each as far from those before as can be."""
     across, up = candidates.unbind(-1)
     valid = torch.arange(across.shape[1], device=across.device) < counts[:, None]
     # Never the farthest, even where all that may be chosen has been.
@@ -215,12 +197,10 @@ def varied(
     """Return clouds turned, stretched and shaken around the middle of the unit square.
 
     Args:
-        x: Clouds [length units], shape [B, N, 2].
         rotation: Largest angle [degrees], either way.
         stretch: Largest share by which a cloud grows or shrinks, along each axis by itself, and by
             which it is sheared (dimensionless).
         jitter: Standard deviation of what is added to every coordinate [length units].
-        generator: Randomness, on the device of the clouds.
     """
     world_count, particle_count = x.shape[:2]
     if rotation > 0.0 or stretch > 0.0:
@@ -275,14 +255,7 @@ def load_pictures(data: str, split: Split = "train", *, folder: str = "data") ->
     """Return the pictures of a data set.
 
     Args:
-        data: "digits" (scikit-learn's 1797 pictures of 8 x 8 pixels), "mnist" (by torchvision), or
-            the path of a folder with files in MNIST's IDX format.
         split: "train" or "test"; no picture is in both.
-        folder: Where torchvision keeps "mnist".
-
-    Raises:
-        MissingDependencyError: scikit-learn or torchvision is needed and not installed.
-        NPAError: There is no such data set or split, or a file is missing or damaged.
     """
     if split not in get_args(Split):
         raise NPAError(f"split must be 'train' or 'test', got {shown(split)}")
@@ -300,11 +273,7 @@ def load_pictures(data: str, split: Split = "train", *, folder: str = "data") ->
 
 
 def read_idx(path: Path) -> NDArray[np.uint8]:
-    """Return the bytes of a file in MNIST's IDX format, gzipped or not, in their shape.
-
-    Raises:
-        NPAError: It cannot be read, or does not hold what its head says.
-    """
+    """Return the bytes of a file in MNIST's IDX format, gzipped or not, in their shape."""
     name = f"the IDX file {shown(str(path))}"
     with open_regular(path, limit=LARGEST_IDX, what="the IDX file") as file:
         try:
@@ -382,8 +351,7 @@ def _idx_folder(folder: Path, split: Split) -> DigitPictures:
     if images.ndim != 3 or labels.shape != images.shape[:1] or images.size == 0:
         raise NPAError(
             f"the {split} files of {shown(str(folder))} must hold pictures [M, H, W] and classes "
-            "[M], "
-            f"got {list(images.shape)} and {list(labels.shape)}: get them anew"
+            f"[M], got {list(images.shape)} and {list(labels.shape)}: get them anew"
         )
     # By a table: the quotients themselves would take eight bytes a pixel.
     ink = (np.arange(256) / 255.0).astype(np.float32)

@@ -39,22 +39,13 @@ def find_emoji_fonts() -> list[Path]:
 
 
 def render_emoji(text: str) -> Image.Image:
-    """Return the RGBA picture of one emoji.
-
-    Args:
-        text: One emoji: a character or a sequence joined to one picture.
-
-    Raises:
-        MissingDependencyError: No colour-emoji font is installed.
-        NPAError: The installed fonts have no colour picture for it, or the text is several emoji.
-    """
+    """Return the RGBA picture of one emoji."""
     fonts = find_emoji_fonts()
     if not fonts:
         raise MissingDependencyError(
             f"target {shown(text)} is an emoji and needs an installed colour-emoji font, found "
-            "none: "
-            "install one, on Debian and Ubuntu with 'apt install fonts-noto-color-emoji', "
-            "or give a picture file or a built-in target"
+            "none: install one, on Debian and Ubuntu with 'apt install fonts-noto-color-emoji', or "
+            "give a picture file or a built-in target"
         )
     several = False
     for path in fonts:
@@ -74,8 +65,7 @@ def render_emoji(text: str) -> Image.Image:
         )
     raise NPAError(
         f"target {shown(text)} must be an emoji that an installed font draws in colour, but none "
-        "of "
-        f"{names} does: give another emoji, a picture file, or install 'fonts-noto-color-emoji'"
+        f"of {names} does: give another emoji, a picture file, or install 'fonts-noto-color-emoji'"
     )
 
 

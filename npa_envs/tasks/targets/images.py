@@ -43,15 +43,7 @@ Mask = NDArray[np.bool_]
 
 
 def read_image(path: Path) -> Image.Image:
-    """Read a picture as RGBA; one without transparency is cut out of its plain background.
-
-    Args:
-        path: A file in one of `FORMATS`; of an animation, the first frame.
-
-    Raises:
-        NPAError: As for `open_image`, or the picture is fully transparent, or has neither
-            transparency nor a plain background.
-    """
+    """Read a picture as RGBA; one without transparency is cut out of its plain background."""
     image = open_image(path)
     if np.asarray(image.getchannel("A")).min() == 255:
         return cut_out_background(image, label=str(path))
@@ -66,14 +58,7 @@ def with_background(image: Image.Image) -> Image.Image:
 
 
 def open_image(path: Path) -> Image.Image:
-    """Read a picture as RGBA, as it is.
-
-    Args:
-        path: A file in one of `FORMATS`; of an animation, the first frame.
-
-    Raises:
-        NPAError: The file is missing, not readable, empty, truncated, no picture, or too large.
-    """
+    """Read a picture as RGBA, as it is."""
     name = shown(str(path))
     content = read_bytes(path, limit=_LARGEST_FILE, what="target")
     if not content:
@@ -164,13 +149,6 @@ def cut_out_background(image: Image.Image, *, label: str) -> Image.Image:
     The background is what has the colour of the border and is connected with it; a hole that the
     object encloses stays opaque. Pixels at the object's edge, which mix both colours, are unmixed.
     A side above 2048 pixels is reduced to that first.
-
-    Args:
-        image: An RGBA picture without transparent pixels.
-        label: The name of the picture in error messages.
-
-    Raises:
-        NPAError: The border is not of one colour, or the whole picture is.
     """
     image = image.reduce(math.ceil(max(image.size) / _LARGEST_CUT_OUT))
     rgb = np.asarray(image.convert("RGB")).astype(np.float32)
@@ -180,10 +158,8 @@ def cut_out_background(image: Image.Image, *, label: str) -> Image.Image:
     if uniform < _UNIFORM_SHARE:
         raise NPAError(
             f"target {shown(label)} has no transparency, so at least {_UNIFORM_SHARE:.0%} of its "
-            "border "
-            f"must have one colour (the background), but only {uniform:.0%} have: "
-            "give a PNG or WebP with a transparent background, or grow the whole picture "
-            "(keep_background)"
+            f"border must have one colour (the background), but only {uniform:.0%} have: give a "
+            "PNG or WebP with a transparent background, or grow the whole picture (keep_background)"
         )
     similar = np.abs(rgb - background).max(axis=-1) <= _BACKGROUND_TOLERANCE
     outside = _connected_to_border(similar)
@@ -206,15 +182,6 @@ def resample(image: Image.Image, point_count: int, *, label: str = "picture") ->
     The scale is continuous: the picture is sampled with a pitch found by bisection, on a square
     grid that holds the whole picture, so that other shapes than squares are padded. Colours are
     averaged with alpha as weight, so that those of transparent pixels never leak in.
-
-    Args:
-        image: An RGBA picture with at least one opaque pixel.
-        point_count: The number of opaque pixels aimed at.
-        label: The name of the picture in error messages.
-
-    Raises:
-        NPAError: Nothing opaque is left at the scale nearest to `point_count`, or the opaque pixels
-            are so few and far apart that the grid would be larger than `LARGEST_GRID`.
     """
     image = image.crop(image.getchannel("A").getbbox())
     area = _opaque_count(image)

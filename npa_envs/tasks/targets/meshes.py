@@ -220,16 +220,7 @@ def builtin_meshes() -> tuple[str, ...]:
 
 
 def load_mesh(source: str | Path) -> Mesh:
-    """Return a mesh, fitted into the ball of radius 0.85 around the origin.
-
-    Args:
-        source: A built-in name, or the path of a mesh file that trimesh reads.
-
-    Raises:
-        NPAError: The name is unknown, or the file is missing, damaged, holds no triangles, or some
-            without an area or of a size that numbers do not hold.
-        MissingDependencyError: It is a file and trimesh is not installed.
-    """
+    """Return a mesh, fitted into the ball of radius 0.85 around the origin."""
     if isinstance(source, str) and source in MESHES:
         return MESHES[source]().fitted()
     path = home_path(source)
@@ -261,8 +252,7 @@ def _read_mesh(path: Path) -> Mesh:
         # Its readers report damaged files by exceptions of many kinds.
         raise NPAError(
             f"target {shown(str(path))} cannot be read as a mesh ({type(error).__name__}: "
-            f"{shown(error)}): "
-            "save it anew, for example as .ply or .glb"
+            f"{shown(error)}): save it anew, for example as .ply or .glb"
         ) from error
     in_space = vertices.shape[1:] == (3,) and faces.shape[1:] == (3,)
     if not in_space or faces.size == 0 or vertices.size == 0 or not np.isfinite(vertices).all():

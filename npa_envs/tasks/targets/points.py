@@ -117,12 +117,7 @@ def load_target_image(
     """Return the name and the full-size RGBA picture of what `load_target` accepts as source.
 
     Args:
-        source: A built-in name, the path of a picture file, or one emoji.
         keep_background: As for `load_target`.
-
-    Raises:
-        NPAError: As for `load_target`.
-        MissingDependencyError: As for `load_target`.
     """
     if not isinstance(source, str | Path):
         raise NPAError(
@@ -146,8 +141,7 @@ def _named_image(
         return source, render_emoji(source)
     raise NPAError(
         "target must be a built-in name, the path of a picture file or one emoji, got "
-        f"{shown(source)}: "
-        f"{suggest(source, DRAWINGS)}"
+        f"{shown(source)}: {suggest(source, DRAWINGS)}"
     )
 
 
@@ -168,14 +162,7 @@ def target_from_image(
     """Make a target from the opaque pixels of a picture in memory.
 
     Args:
-        image: A Pillow picture, used as it is: what it has no transparency for is all target.
-        name: The target's name.
-        point_count: The number of points aimed at.
         extent: Side of the square around the origin that the target just fits in [length units].
-        device: Where the tensors are made.
-
-    Raises:
-        NPAError: No pixel is opaque, or the opaque part is too thin for so few points.
     """
     rgba = image.convert("RGBA")
     require_opaque_pixels(rgba, label=name)
@@ -210,7 +197,6 @@ def smooth_curve(points: Points, *, closed: bool = False, steps: int = 16) -> Po
     """Return a Catmull-Rom curve through the points.
 
     Args:
-        points: Corner points, in drawing coordinates.
         closed: Whether the last point joins the first.
         steps: Samples between two corner points.
     """
@@ -275,7 +261,6 @@ def stroke(points: Points, widths: Sequence[float], *, grow: float = 0) -> Image
     """Return the mask of a brush stroke along a smooth curve, with round ends.
 
     Args:
-        points: Points on the curve.
         widths: Widths of the stroke, spread evenly along the curve and interpolated in between.
         grow: How far the stroke is widened on each side.
     """

@@ -177,17 +177,9 @@ OVERSAMPLING = 4
 def draw_pattern(name: str, resolution: int, *, seed: int = 0) -> Array:
     """Draw a built-in texture.
 
-    Args:
-        name: One of `PATTERNS`.
-        resolution: Pixels R along each side.
-        seed: Where those that scatter things have their places from.
-
     Returns:
         Red, green and blue, each times alpha, and alpha, float64, shape [R, R, 4]; pixel r is
         centred at (r + 1/2) / R, and rows point up.
-
-    Raises:
-        NPAError: There is no such texture, or the resolution is not positive.
     """
     if name not in PATTERNS:
         raise NPAError(f"unknown texture {shown(name)}: {suggest(name, PATTERNS)}")

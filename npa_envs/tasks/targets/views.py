@@ -91,8 +91,7 @@ def load_views(
     if not isinstance(source, str | Path) or not str(source):
         raise NPAError(
             "target must be a built-in mesh, a mesh file or a folder of views, got "
-            f"{shown(source)}: "
-            "for example 'mushroom'"
+            f"{shown(source)}: for example 'mushroom'"
         )
     counts = {"training_count": training_count, "held_out_count": held_out_count}
     for name, value in {"resolution": resolution, **counts}.items():
@@ -116,9 +115,6 @@ def views_of_mesh(
     """Draw a mesh that fits into the ball of radius 0.85 from cameras all around.
 
     Args:
-        mesh: What to draw.
-        name: What the target is called.
-        resolution: Pixels along each side of a view.
         training_count: Views to train with.
         held_out_count: Views to measure by.
     """
@@ -136,7 +132,6 @@ def surrounding_cameras(count: int, resolution: int, *, turn: float = 0.0) -> Ca
 
     Args:
         count: Cameras V.
-        resolution: Pixels along each side of their pictures.
         turn: The spiral is turned by so much of a full turn: others than those at 0.
     """
     k = torch.arange(count, dtype=torch.float64)
@@ -158,19 +153,13 @@ def over(views: Tensor, background: Tensor) -> Tensor:
     """Return colours before a background, shape [..., 3].
 
     Args:
-        views: Colours times alpha, and alpha, shape [..., 4].
         background: Red, green and blue; broadcasts to [..., 3].
     """
     return views[..., :3] + (1.0 - views[..., 3:]) * background
 
 
 def some_views(views: Views, index: Tensor) -> Views:
-    """Return some of the views.
-
-    Args:
-        views: All of them.
-        index: Which, on their device, shape [V].
-    """
+    """Return some of the views."""
     cameras = views.cameras
     intrinsics = cameras.intrinsics
     chosen = replace(
@@ -185,7 +174,6 @@ def nearest_camera(cameras: Cameras, elevation: float) -> int:
     """Return which camera looks at the origin from nearest to the front, at an elevation.
 
     Args:
-        cameras: V cameras.
         elevation: Above the horizon [degrees]; the front is where z points to.
     """
     motions = cameras.world_to_camera.double().cpu()
@@ -223,13 +211,8 @@ def read_nerf(
     """Read a scene; `load_views` says what becomes of it.
 
     Args:
-        folder: Holds `transforms_train.json` and `transforms_test.json` (or `_val`).
-        resolution: Pixels along each side of a view.
         training_count: Views to train with, at most.
         held_out_count: Views to measure by, at most.
-
-    Raises:
-        NPAError: A file is missing or damaged, a pose is no rigid motion, or nothing is seen.
     """
     held_out = next((folder / name for name in HELD_OUT if (folder / name).is_file()), None)
     if held_out is None:
@@ -243,8 +226,7 @@ def read_nerf(
     if reach == 0.0:
         raise NPAError(
             f"views must show something, but no picture of {shown(str(folder))} has a pixel of "
-            "alpha "
-            f"above {SEEN}: give pictures with a transparent background"
+            f"alpha above {SEEN}: give pictures with a transparent background"
         )
     scale = RADIUS / reach
     return ViewTarget(folder.name, _scaled(training, scale), _scaled(measured, scale))
