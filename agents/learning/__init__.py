@@ -8,6 +8,7 @@ method's libraries are imported when it is asked for.
 from __future__ import annotations
 
 import inspect
+import json
 import pkgutil
 from collections.abc import Callable, Iterable
 from dataclasses import fields, is_dataclass, replace
@@ -16,9 +17,14 @@ from typing import Any, NamedTuple
 
 import torch
 
-from npa_envs.agents.learning.kept import KeptProgress
 from npa_envs.agents.learning.problem import EVALUATION_SEEDS, Problem, check_run_seed
-from npa_envs.agents.learning.progress import Budget, CurvePoint, Progress, check_finite
+from npa_envs.agents.learning.progress import (
+    Budget,
+    CurvePoint,
+    Keeping,
+    Progress,
+    check_finite,
+)
 from npa_envs.agents.learning.rules import RuleSet, RuleSetPolicy, starting_rules
 from npa_envs.devices import check_device
 from npa_envs.errors import MissingDependencyError, NPAError, shown, suggest
@@ -138,7 +144,7 @@ def train(
 
     Raises:
         NPAError: There is no such method or option, the method cannot learn this problem, cannot be
-            shared or kept, or the rules to begin with do not fit it. Or as for `KeptProgress`.
+            shared or kept, or the rules to begin with do not fit it. Or as for `Progress`.
         DivergedError: The rules' weights have become infinite or NaN.
         MissingDependencyError: The method needs a library that is not installed.
     """
@@ -155,6 +161,7 @@ def train(
             "give a function of your own, 'package.module:function', or take another library"
         )
     function = _function(method, methods_for(problem))
+    declared = _declared(function)
     known = _options_of(function)
     for name in options:
         if name not in known:
@@ -166,38 +173,33 @@ def train(
     if start is not None:
         start = starting_rules(problem, seed, place, start)
     _check_kept(method, out, resume or overwrite)
-    declared = _declared(function)
-    account: dict[str, Any] = {
-        "problem": problem,
-        "budget": budget,
-        "device": place,
-        "evaluation_seeds": evaluation_seeds,
-        "entries": entries,
-        "on_entry": on_entry,
-    }
-    if out is None:
-        progress = Progress(**account)
-    else:
-        told = {"method": method, "problem": problem.to_json(), "seed": seed, "options": options}
-        told["started"] = start is not None
-        progress = KeptProgress(
-            RunFolder(Path(out)),
-            told,
-            resume=resume,
-            overwrite=overwrite,
-            on_stop=on_stop,
-            **account,
+    keeping = None
+    if out is not None:
+        run = {"method": method, "problem": problem.to_json(), "seed": seed, "options": options}
+        run = json.loads(json.dumps(run | {"started": start is not None}))
+        folder = RunFolder(Path(out))
+        keeping = Keeping(
+            folder=folder, run=run, resume=resume, overwrite=overwrite, on_stop=on_stop
         )
+    progress = Progress(
+        problem,
+        budget,
+        device=place,
+        evaluation_seeds=evaluation_seeds,
+        entries=entries,
+        on_entry=on_entry,
+        keeping=keeping,
+    )
     given = {"options": replace(declared, **options)} if declared is not None else options
     result = function(problem, progress, seed, device=place, start=start, **given)
     if isinstance(result, RuleSet):
-        # Of no use any more, they may keep the memory of recorded work.
+        # Unused gradients may keep the memory of recorded work.
         result.zero_grad()
         return Trained(result, progress.log, result.policy())
     return Trained(None, progress.log, result)
 
 
-def _check_kept(method: str, out: str | Path | None, told: bool) -> None:
+def _check_kept(method: str, out: str | Path | None, begins: bool) -> None:
     """Check that a run can be kept and shared, where that is asked for."""
     several = Ranks.current().count > 1
     if method not in KEPT_METHODS and (several or out is not None):
@@ -205,7 +207,7 @@ def _check_kept(method: str, out: str | Path | None, told: bool) -> None:
         raise NPAError(
             f"method {shown(method)} cannot {asked}: take one of {', '.join(KEPT_METHODS)}"
         )
-    if told and out is None:
+    if begins and out is None:
         raise NPAError("resume and overwrite need a folder: give out='runs/heart'")
 
 

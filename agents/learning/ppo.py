@@ -189,6 +189,13 @@ class PPOLearner:
             )
             for net in (self.actor, self.critic)
         )
+        self.modules: dict[str, nn.Module] = {"actor": self.actor, "critic": self.critic}
+        """What learns, by name."""
+        self.optimisers: dict[str, torch.optim.Optimizer] = {
+            "actor": self.optimizer,
+            "critic": self.critic_optimizer,
+        }
+        """Their optimisers."""
         self._seed, self._places, self._total = seed, places.tolist(), total
         observation = self._worlds_of_part(0)
         self.memory = Memory(
@@ -230,14 +237,6 @@ class PPOLearner:
         self._part = 0
         self._weights = self._near.new_zeros(self._minibatches.count, 2)
         self._moved = self._near.new_zeros(2)
-
-    def modules(self) -> dict[str, nn.Module]:
-        """Return what learns, by the names that checkpoints have for it."""
-        return {"actor": self.actor, "critic": self.critic}
-
-    def optimisers(self) -> dict[str, torch.optim.Optimizer]:
-        """Return what makes it learn."""
-        return {"actor": self.optimizer, "critic": self.critic_optimizer}
 
     def go_on(self, iteration: int, part: int) -> None:
         """Go on after so many rounds, for the part-th time, from 1 on, with other worlds."""

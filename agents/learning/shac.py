@@ -181,6 +181,13 @@ class SHACLearner:
         self._critic_optimizer = torch.optim.Adam(
             self.critic.parameters(), lr=options.critic_learning_rate, fused=True
         )
+        self.modules = {"rules": self.rules, "critic": self.critic, "target": self.target}
+        """What learns, by name."""
+        self.optimisers: dict[str, torch.optim.Optimizer] = {
+            "rules": self._optimizer,
+            "critic": self._critic_optimizer,
+        }
+        """Their optimisers."""
         self._limits = problem.physics.position_limit, problem.physics.state_limit
         self.window_count = count
         """Windows of an episode."""
@@ -197,14 +204,6 @@ class SHACLearner:
         self.windows_left = [1 + place % self.window_count for place in self._places]
         """Windows left of each world's episode: at first all numbers, so that every part of an
         episode is in a batch."""
-
-    def modules(self) -> dict[str, torch.nn.Module]:
-        """Return what learns, by the names that checkpoints have for it."""
-        return {"rules": self.rules, "critic": self.critic, "target": self.target}
-
-    def optimisers(self) -> dict[str, torch.optim.Optimizer]:
-        """Return what makes it learn."""
-        return {"rules": self._optimizer, "critic": self._critic_optimizer}
 
     def go_on(self, iteration: int, part: int) -> None:
         """Go on after so many windows, for the part-th time, from 1 on, with fresh worlds."""

@@ -356,7 +356,7 @@ def test_recorded_rounds_are_those_of_kernels_one_by_one(
         return [*batch, *given.actor.parameters(), *given.critic.parameters()]
 
     recorded = learned()
-    monkeypatch.setattr(ppo, "Replayed", lambda function, *_, **__: function)
+    monkeypatch.setattr(ppo, "GraphedCallable", lambda function, *_, **__: function)
     for value, wanted in zip(recorded, learned(), strict=True):
         assert float(wanted.detach().norm()) > 0.0
         torch.testing.assert_close(value, wanted, rtol=1e-3, atol=1e-5)

@@ -33,8 +33,9 @@ def learner_of(form):
     """The learner of this process, whose numbers are float64; worlds themselves are float32."""
     problem, method, options = FORMS[form]
     kind = ppo.PPOOptions if method is ppo else shac.SHACOptions
-    made = method.Learner(problem, kind(**options), 0, CPU, None, Ranks.current())
-    for module in made.modules().values():
+    learner = ppo.PPOLearner if method is ppo else shac.SHACLearner
+    made = learner(problem, kind(**options), 0, CPU, None, Ranks.current())
+    for module in made.modules.values():
         module.double()
     if method is ppo:
         for holder in (made.memory, made):
@@ -67,7 +68,7 @@ def learned(form):
             made.learn(0.01 * share_left)
         said.append([float(part.detach()) for part in told])
     weights = [
-        weight for module in made.modules().values() for weight in module.state_dict().values()
+        weight for module in made.modules.values() for weight in module.state_dict().values()
     ]
     return said, [
         weight.flatten().tolist() for weight in weights if isinstance(weight, torch.Tensor)
@@ -290,7 +291,7 @@ def test_recorded_pieces_of_a_shared_round_are_those_of_kernels_one_by_one(
 
     try:
         recorded = rounds()
-        monkeypatch.setattr(ppo, "Replayed", lambda function, *_, **__: function)
+        monkeypatch.setattr(ppo, "GraphedCallable", lambda function, *_, **__: function)
         for value, wanted in zip(recorded, rounds(), strict=True):
             assert float(wanted.detach().norm()) > 0.0
             torch.testing.assert_close(value, wanted, rtol=1e-3, atol=1e-5)
