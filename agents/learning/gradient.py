@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import copy
 import itertools
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Literal, Self, cast
+from typing import Any, Self, cast
 
 import torch
 from torch import Tensor
@@ -24,7 +25,6 @@ from npa_envs.tasks.base import Task
 from npa_envs.tasks.train_config import TrainConfig
 from npa_envs.training.cycle import TrainingCycle
 from npa_envs.world.randomness import Randomness, WorldRandom
-from npa_envs.world.recorded import CudaGraph
 from npa_envs.world.rollout import Memory
 
 LONGEST = 96
@@ -95,32 +95,50 @@ def train(
 
     Rollouts begin where episodes do, or go on from where earlier ones ended, in a pool as in the
     paper (arXiv 2601.16096). State steps are clamped to the action space, as environments clip
-    them; that environments clip observations is not seen.
+    them. Observations are not clipped.
 
     Raises:
         NPAError: An option is out of its range, or the environment's loss has no gradient.
         DivergedError: The rules' weights are not finite.
     """
-    task = episode_task(problem, device)
+    task = environment_task(problem, device)
     rules = starting_rules(problem, seed, device, start)
-    config = _trainer_config(problem, progress, seed, device, options, task.can_be_recorded)
-    # The cycle asks of the rule what any module has, and of the task what it needs of one.
-    cycle = TrainingCycle(
-        cast(Task, task),
-        cast(NPARule, rules),
-        config,
-        device,
-        torch.Generator().manual_seed(seed),
-        task.rollout,
+    length, steps, pool_size = problem.episode_steps, options.steps, options.pool_size
+    if steps is None:
+        steps = (length, length + 1) if length <= LONGEST else (LONGEST // 3, LONGEST + 1)
+    if pool_size is None:
+        pool_size = 0 if steps[0] >= length else max(POOL_SIZE, options.world_count)
+    config = _Schedule(
+        task=problem.config,
+        progress=progress,
+        # The budget ends the run.
+        iterations=2**40,
+        repeats=1,
+        world_count=options.world_count,
+        pool_size=pool_size or options.world_count,
+        steps=steps,
+        learning_rate=options.learning_rate,
+        last_rate=options.last_rate,
+        milestones=(),
+        seed_interval=1,
+        fresh_share=options.fresh_share if pool_size else 1.0,
+        damage_share=0.0,
+        seed=seed,
+        device=str(device),
+        memory=options.memory,
+        cuda_graph=task.can_be_recorded,
     )
+    schedule = torch.Generator().manual_seed(seed)
+    # The cycle calls of both what these have.
+    learned, rule = cast(Task, task), cast(NPARule, rules)
+    cycle = TrainingCycle(learned, rule, config, device, schedule, task.rollout)
     # On CUDA every number of steps is a recording of its own.
-    for length in range(*config.steps) if device.type == "cuda" else (config.steps[0],):
-        cycle.batch.run(length)
+    for number in range(*config.steps) if device.type == "cuda" else (config.steps[0],):
+        cycle.batch.run(number)
     numbers = itertools.count()
 
     def iteration() -> int:
-        steps = cycle.run(next(numbers))
-        return steps * config.world_count * problem.particle_count
+        return cycle.run(next(numbers)) * config.world_count * problem.particle_count
 
     return progress.run(rules, iteration)
 
@@ -140,57 +158,19 @@ class _Schedule(TrainConfig[Any]):
         return annealed(self.learning_rate, self.last_rate, self.progress.share)
 
 
-def _trainer_config(
-    problem: Problem,
-    progress: Progress,
-    seed: int,
-    device: torch.device,
-    options: GradientOptions,
-    cuda_graph: bool,
-) -> _Schedule:
-    """Return the trainer's configuration of a run, whose end is the budget's and not its own."""
-    length = problem.episode_steps
-    steps = options.steps
-    if steps is None:
-        steps = (length, length + 1) if length <= LONGEST else (LONGEST // 3, LONGEST + 1)
-    pool_size = options.pool_size
-    if pool_size is None:
-        pool_size = 0 if steps[0] >= length else max(POOL_SIZE, options.world_count)
-    return _Schedule(
-        task=problem.config,
-        progress=progress,
-        iterations=2**40,
-        repeats=1,
-        world_count=options.world_count,
-        pool_size=pool_size or options.world_count,
-        steps=steps,
-        learning_rate=options.learning_rate,
-        last_rate=options.last_rate,
-        milestones=(),
-        seed_interval=1,
-        fresh_share=options.fresh_share if pool_size else 1.0,
-        damage_share=0.0,
-        seed=seed,
-        device=str(device),
-        memory=options.memory,
-        cuda_graph=cuda_graph,
-    )
-
-
-def episode_task(problem: Problem, device: torch.device) -> EnvironmentTask:
+def environment_task(problem: Problem, device: torch.device) -> EnvironmentTask:
     """Return a problem's task for the gradient's trainer.
 
     Raises:
         NPAError: The problem is a game or its species die, so that no gradient descends its loss.
     """
     made = EnvironmentTask(problem, device)
-    generator = torch.Generator(device).manual_seed(0)
-    has_goals = not problem.is_species and made._start(1, generator, device)[3] is not None
-    return GoalEpisodeTask(problem, device) if has_goals else made
+    goal = made.start(1, torch.Generator(device).manual_seed(0))[2]
+    return made if goal is None else EnvironmentGoalTask(problem, device)
 
 
-def _check_rules_of_play(problem: Problem, task: EnvTask[Any] | SpeciesTask) -> None:
-    """Check that all rules want the same, and that nobody leaves a world."""
+def _check_one_loss(problem: Problem, task: EnvTask[Any] | SpeciesTask) -> None:
+    """Check that all rules descend one loss, and that no particle leaves a world."""
     if not isinstance(task, SpeciesTask):
         return
     if type(task).settle is not SpeciesTask.settle:
@@ -210,21 +190,19 @@ def _check_rules_of_play(problem: Problem, task: EnvTask[Any] | SpeciesTask) -> 
 class EnvironmentTask:
     """Worlds as a problem's episodes start, and their loss; worlds move by the problem's physics.
 
-    It is a `npa_envs.tasks.base.Task` as far as the training cycle asks for one.
+    It is a `npa_envs.tasks.base.Task` as far as the training cycle needs one.
     """
 
     def __init__(self, problem: Problem, device: torch.device) -> None:
-        self.problem = problem
+        self.problem, self.device = problem, device
         self.physics = problem.physics
         """The worlds' constants."""
         self.eps, self.box = self.physics.eps, self.physics.box
-        """Perception radius ε and sides of the periodic box, None in open space [length units]."""
         self.update_prob = self.physics.update_prob
-        """Probability of a particle's update in a step, dimensionless."""
         self._task = problem.make_task(device)
         counts = torch.tensor(problem.counts)
         self._species = torch.arange(len(counts)).repeat_interleave(counts).to(device)
-        _check_rules_of_play(problem, self._task)
+        _check_one_loss(problem, self._task)
         self._clamped: tuple[RuleSet, list[ClampedRule]] | None = None
 
     @property
@@ -232,20 +210,39 @@ class EnvironmentTask:
         """Whether starts take few operations, so that they are recorded on CUDA."""
         return isinstance(self._task, SpeciesTask) or self._task.start_is_short
 
+    def start(
+        self, world_count: int, generator: Randomness
+    ) -> tuple[Tensor, Tensor, Tensor | None]:
+        """Return worlds as episodes begin: positions, states, and goals where it has such."""
+        if isinstance(generator, WorldRandom):
+            keys = generator.integers(KEY_RANGE[1])
+        else:
+            keys = torch.randint(
+                *KEY_RANGE, (world_count,), generator=generator, device=self.device
+            )
+        x, s, *rest = self._task.start(WorldRandom.from_keys(keys))
+        return x, s, rest[1] if rest else None
+
     def seed(
         self, world_count: int, *, generator: Randomness, device: torch.device
     ) -> tuple[Tensor, Tensor]:
-        """Return worlds as episodes begin: positions [B, N, D] and states [B, N, C]."""
-        x, s, *_ = self._start(world_count, generator, device)
-        return x, s
+        """Return worlds as episodes begin."""
+        return self.start(world_count, generator)[:2]
+
+    def toward(self, goal: Tensor | None) -> Self:
+        """Return the task with the loss of worlds that have these goals, shape [B]."""
+        if goal is None:
+            return self
+        assert isinstance(self._task, EnvTask), "species have no goals"
+        aimed = copy.copy(self)
+        aimed._task = self._task.toward(goal)
+        return aimed
 
     def loss(self, x: Tensor, s: Tensor, path_length: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
         """Return the environment's loss, the mean over worlds and species, and its named parts.
 
-        Nothing is paid for the path length.
-
         Raises:
-            NPAError: No gradient leads from it to what requires one.
+            NPAError: It has no gradient.
         """
         parts = {name: part.mean() for name, part in self._losses(x, s).items()}
         total = torch.stack(list(parts.values())).sum()
@@ -256,7 +253,7 @@ class EnvironmentTask:
         """Return the environment's loss of each world, the mean over its species, shape [B].
 
         Raises:
-            NPAError: As for `loss`.
+            NPAError: It has no gradient.
         """
         total = torch.stack(list(self._losses(x, s).values())).sum(dim=0)
         total = total.flatten(1).mean(dim=1) if total.dim() > 1 else total
@@ -264,56 +261,34 @@ class EnvironmentTask:
         return total
 
     def rollout(
-        self,
-        rules: Any,
-        x: Tensor,
-        s: Tensor,
-        steps: int,
-        /,
-        *,
-        eps: float,
-        box: tuple[float, ...] | None,
-        update_prob: float,
-        memory: Memory,
-        generator: Randomness,
-        return_path_length: Literal[True],
-        keep_every: int | None = None,
-        cuda_graph: CudaGraph = "auto",
+        self, rules: Any, x: Tensor, s: Tensor, steps: int, /, **options: Any
     ) -> tuple[Tensor, Tensor, Tensor]:
-        """Run a set of rules as the environment would, differentiably; as `npa_envs.rollout`."""
-        assert isinstance(rules, RuleSet), "the learner trains sets of rules"
+        """Run a `RuleSet` as the environment would, differentiably.
+
+        Options are those of `npa_envs.rollout`; the physics is the environment's.
+        """
         physics, config = self.physics, self.problem.config
         if self._clamped is None or self._clamped[0] is not rules:
-            # Kept, as recorded rollouts know rules that are not plain by themselves.
+            # Made once: recorded rollouts know clamped rules by their identity.
             limit = physics.state_scale
             self._clamped = rules, [ClampedRule(rule, limit) for rule in rules]
         clamped = self._clamped[1]
-        common: dict[str, Any] = {
-            "eps": eps,
-            "box": box,
-            "update_prob": update_prob,
+        options = {
+            "eps": self.eps,
+            "box": self.box,
+            "update_prob": self.update_prob,
             "dt": physics.dt,
             "position_noise": physics.position_noise,
-            "memory": memory,
-            "generator": generator,
-            "return_path_length": return_path_length,
-            "keep_every": keep_every,
-            "cuda_graph": cuda_graph,
+            "return_path_length": True,
+            **options,
         }
-        if not isinstance(config, SpeciesConfig):
-            return npa_envs.rollout(clamped[0], x, s, steps, **common)
-        common |= {"counts": config.counts, "perception": config.perception}
-        return npa_envs.rollout_species(clamped, x, s, steps, **common)
-
-    def _start(
-        self, world_count: int, generator: Randomness, device: torch.device
-    ) -> tuple[Any, ...]:
-        if isinstance(generator, WorldRandom):
-            keys = generator.integers(KEY_RANGE[1])
-        else:
-            keys = torch.randint(*KEY_RANGE, (world_count,), generator=generator, device=device)
-        start: tuple[Any, ...] = self._task.start(WorldRandom.from_keys(keys))
-        return start
+        rollout: Any = npa_envs.rollout
+        rule: Any = clamped[0]
+        if isinstance(config, SpeciesConfig):
+            rollout, rule = npa_envs.rollout_species, clamped
+            options |= {"counts": config.counts, "perception": config.perception}
+        last: tuple[Tensor, Tensor, Tensor] = rollout(rule, x, s, steps, **options)
+        return last
 
     def _losses(self, x: Tensor, s: Tensor) -> Mapping[str, Tensor]:
         """Return the parts of each world's loss, shape [B] or [B, K]."""
@@ -331,29 +306,20 @@ class EnvironmentTask:
             )
 
 
-class GoalEpisodeTask(EnvironmentTask):
+class EnvironmentGoalTask(EnvironmentTask):
     """The same for a task whose worlds have goals of their own, such as the class of a cloud."""
 
     def seed_with_goals(
         self, world_count: int, *, generator: Randomness, device: torch.device
-    ) -> tuple[Tensor, Tensor, Tensor]:
-        """Return worlds at the beginning of their episodes, and their goals, int64, shape [B]."""
-        x, s, _, goal = self._start(world_count, generator, device)
-        return x, s, goal
+    ) -> tuple[Tensor, Tensor, Tensor | None]:
+        """Return worlds as episodes begin, and their goals, int64, shape [B]."""
+        return self.start(world_count, generator)
 
     def damage_with_goals(
         self, x: Tensor, s: Tensor, goal: Tensor, generator: torch.Generator
     ) -> tuple[Tensor, Tensor, Tensor]:
         """Return worlds as they are: episodes are damaged where they start, or not at all."""
         return x, s, goal
-
-    def toward(self, goal: Tensor) -> Self:
-        """Return the task with the loss of worlds that have these goals, shape [B]."""
-        aimed = type(self).__new__(type(self))
-        vars(aimed).update(vars(self))
-        assert isinstance(self._task, EnvTask), "species have no goals"
-        aimed._task = self._task.toward(goal)
-        return aimed
 
 
 class _ClampInward(torch.autograd.Function):
@@ -386,7 +352,7 @@ class ClampedWeights(FoldedRule):
     limit: float
 
     def __call__(self, rows: Tensor) -> Tensor:
-        """Map rows [z | 1 | 0], shape [K, row_width], to updates [δ | clamped Δs | 0], [K, A']."""
+        """Map rows [z | 1 | 0] to updates [δ | clamped Δs | 0]."""
         update = super().__call__(rows)
         first = self.displacement_dim
         return torch.cat((update[:, :first], clamp_inward(update[:, first:], self.limit)), dim=1)
@@ -405,7 +371,7 @@ class ClampedRule(NPARule):
         self.rule_is_plain = rule.is_plain()
 
     def forward(self, perception: Tensor) -> Tensor:
-        """Map perception vectors [..., P] to updates with clamped state steps; as `NPARule`."""
+        """Map perception vectors [..., P] to updates with clamped state steps."""
         update = super().forward(perception)
         first = self.update_dim - self.state_dim
         return torch.cat(

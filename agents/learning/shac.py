@@ -9,12 +9,12 @@ from __future__ import annotations
 
 import copy
 from dataclasses import dataclass
-from typing import NamedTuple, cast, get_args
+from typing import NamedTuple, get_args
 
 import torch
 from torch import Tensor
 
-from npa_envs.agents.learning.gradient import EnvironmentTask, episode_task
+from npa_envs.agents.learning.gradient import environment_task
 from npa_envs.agents.learning.ppo_common import (
     Critic,
     CriticKind,
@@ -27,7 +27,6 @@ from npa_envs.agents.learning.problem import Problem
 from npa_envs.agents.learning.progress import Progress, annealed
 from npa_envs.agents.learning.rules import RuleSet
 from npa_envs.checks import check_fraction, check_non_negative, check_positive
-from npa_envs.tasks.base import Task, seed_worlds, task_toward
 from npa_envs.training.optimiser import normalise_gradients
 from npa_envs.training.randomness import restart
 from npa_envs.training.ranks import ALONE, Ranks
@@ -166,7 +165,7 @@ class SHACLearner:
         count = -(-problem.episode_steps // options.steps)
         self.window = -(-problem.episode_steps // count)
         """Steps of a window, h."""
-        self.task = episode_task(problem, device)
+        self.task = environment_task(problem, device)
         self.random = learner_random(seed, options.world_count, places, device, ranks)
         """What worlds, update masks and shuffles draw from."""
         width = problem.physics.space_dim + problem.physics.state_dim + 1
@@ -233,22 +232,17 @@ class SHACLearner:
             x0,
             s0,
             steps,
-            eps=task.eps,
-            box=task.box,
-            update_prob=task.update_prob,
             memory=self.options.memory,
             generator=self.random,
-            return_path_length=True,
             keep_every=1,
             cuda_graph=True,
         )
         x, s = torch.cat((x0[None], x)), torch.cat((s0[None], s))
         goals = None if self.goal is None else self.goal.repeat(steps + 1)
-        aimed = cast(EnvironmentTask, task_toward(cast(Task, task), goals))
-        losses = aimed.world_losses(x.flatten(0, 1), s.flatten(0, 1))
+        losses = task.toward(goals).world_losses(x.flatten(0, 1), s.flatten(0, 1))
         losses = losses.view(steps + 1, -1)
-        told = losses[..., None, None].expand(*s.shape[:-1], 1)
-        features = torch.cat((x - x.mean(dim=-2, keepdim=True), s, told), dim=-1)
+        level = losses[..., None, None].expand(*s.shape[:-1], 1)
+        features = torch.cat((x - x.mean(dim=-2, keepdim=True), s, level), dim=-1)
         # Worlds that run away are held at the limits of the environment until they begin anew.
         self.x, self.s = (
             torch.nan_to_num(last.detach()).clamp(-limit, limit)
@@ -277,9 +271,7 @@ class SHACLearner:
         random = self.random
         if isinstance(random, WorldRandom):
             random = random.take(torch.tensor(worlds, device=self.device))
-        # The task has what is asked of one here.
-        task = cast(Task, self.task)
-        return seed_worlds(task, len(worlds), generator=random, device=self.device)
+        return self.task.start(len(worlds), random)
 
     def gain(self, window: StepWindow) -> Tensor:
         """Return the mean discounted reward of a window, and of what is foreseen after it."""
