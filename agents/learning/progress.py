@@ -65,7 +65,7 @@ class Budget:
         return max(by_time, by_steps)
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class CurvePoint:
     """One evaluation: a point of a learning curve."""
 

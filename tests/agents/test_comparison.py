@@ -31,13 +31,12 @@ from npa_envs.agents.comparison.report import (
 from npa_envs.agents.comparison.run import (
     PICTURE,
     SIZE,
-    ComparisonPoint,
     RunRecord,
     final_picture,
     held_records,
     run_jobs,
 )
-from npa_envs.agents.learning import METHODS, Problem, RuleSet
+from npa_envs.agents.learning import METHODS, CurvePoint, Problem, RuleSet
 from npa_envs.cli import main
 from npa_envs.cli.compare import CompareOptions, make_plan
 from npa_envs.cli.compare import _jobs as jobs_of
@@ -87,9 +86,9 @@ def record(method: str, seed: int, returns=(), *, axis="seconds", status="done",
     return RunRecord(job=Job(axis, "growth", method, seed), status=status, **given | fields)
 
 
-def points(*pairs: tuple[float, float]) -> tuple[ComparisonPoint, ...]:
+def points(*pairs: tuple[float, float]) -> tuple[CurvePoint, ...]:
     """A curve of returns against seconds; a second is 100 particle-steps."""
-    return tuple(ComparisonPoint(at, 100.0 * at, value, 0.0, 1.0 - value) for at, value in pairs)
+    return tuple(CurvePoint(at, 100.0 * at, value, 0.0, 1.0 - value) for at, value in pairs)
 
 
 @pytest.fixture

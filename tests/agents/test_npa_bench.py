@@ -21,8 +21,8 @@ from npa_envs.agents.comparison.npa_bench import (
     write_rows,
 )
 from npa_envs.agents.comparison.plan import Job
-from npa_envs.agents.comparison.run import ComparisonPoint, RunRecord
-from npa_envs.agents.learning import methods_for
+from npa_envs.agents.comparison.run import RunRecord
+from npa_envs.agents.learning import CurvePoint, methods_for
 from npa_envs.cli import main
 from npa_envs.cli.compare import CompareOptions, make_plan
 from npa_envs.errors import NPAError
@@ -54,8 +54,8 @@ def records(plan, status="done"):
             status=status,
             returns=(float(job.seed),) * plan.episodes,
             curve=(
-                ComparisonPoint(0.0, 0.0, -1.0, 0.1, 1.0),
-                ComparisonPoint(2.0, 1000.0, 0.5, 0.1, 1.0),
+                CurvePoint(0.0, 0.0, -1.0, 0.1, 1.0),
+                CurvePoint(2.0, 1000.0, 0.5, 0.1, 1.0),
             ),
             date="2026-01-02",
         )
