@@ -25,8 +25,7 @@ from npa_envs.agents.learning.progress import (
     Progress,
     check_finite,
 )
-from npa_envs.agents.learning.rules import RuleSet, RuleSetPolicy, starting_rules
-from npa_envs.devices import check_device
+from npa_envs.agents.learning.rules import RuleSet, RuleSetPolicy
 from npa_envs.errors import MissingDependencyError, NPAError, shown, suggest
 from npa_envs.training.ranks import Ranks
 from npa_envs.training.run_folder import RunFolder
@@ -59,10 +58,8 @@ METHODS: dict[str, str] = {
     "zero": "npa_envs.agents.learning.baselines:train_zero",
     "scripted": "npa_envs.agents.learning.baselines:train_scripted",
 }
-"""Where methods are: functions `f(problem, progress, seed, *, device, start, ...)` that return a
-`RuleSet` or a policy. `progress` keeps the budget and the learning curve, `seed` is that of new
-rules and of all draws, `start` are rules to begin with, which are copied, or None. A method's
-options are further keyword arguments, or the fields of a dataclass which is the default of an
+"""Methods: functions `f(progress, ...)` of a `Progress` that return a `RuleSet` or a policy. A
+method's options are keyword-only arguments, or the fields of a dataclass which is the default of an
 argument `options`. Others may be added."""
 
 KEPT_METHODS = ("ppo", "shac")
@@ -169,9 +166,6 @@ def train(
                 f"method {shown(method)} has no option {shown(name)}: {suggest(name, known)}"
             )
     check_run_seed(seed)
-    place = check_device(device)
-    if start is not None:
-        start = starting_rules(problem, seed, place, start)
     _check_kept(method, out, resume or overwrite)
     keeping = None
     if out is not None:
@@ -184,14 +178,16 @@ def train(
     progress = Progress(
         problem,
         budget,
-        device=place,
+        seed,
+        device=device,
         evaluation_seeds=evaluation_seeds,
         entries=entries,
         on_entry=on_entry,
+        initial=start,
         keeping=keeping,
     )
     given = {"options": replace(declared, **options)} if declared is not None else options
-    result = function(problem, progress, seed, device=place, start=start, **given)
+    result = function(progress, **given)
     if isinstance(result, RuleSet):
         # Unused gradients may keep the memory of recorded work.
         result.zero_grad()
@@ -237,8 +233,7 @@ def _options_of(function: Callable[..., Any]) -> dict[str, Any]:
     if declared is not None:
         return {field.name: getattr(declared, field.name) for field in fields(declared)}
     parameters = inspect.signature(function).parameters.values()
-    own = [p for p in parameters if p.kind is p.KEYWORD_ONLY and p.name not in ("device", "start")]
-    return {parameter.name: parameter.default for parameter in own}
+    return {p.name: p.default for p in parameters if p.kind is p.KEYWORD_ONLY}
 
 
 def _declared(function: Callable[..., Any]) -> Any:

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from npa_envs.agents.learning.problem import Problem, world_seeds
 from npa_envs.agents.learning.progress import Progress, annealed
-from npa_envs.agents.learning.rules import RuleSet, Source, starting_rules
+from npa_envs.agents.learning.rules import RuleSet, Source
 from npa_envs.checks import check_fraction, check_positive, is_real
 from npa_envs.errors import NPAError, shown
 
@@ -70,15 +70,7 @@ class CloneOptions:
 DEFAULTS = CloneOptions()
 
 
-def train(
-    problem: Problem,
-    progress: Progress,
-    seed: int,
-    *,
-    device: torch.device,
-    start: RuleSet | None = None,
-    options: CloneOptions = DEFAULTS,
-) -> RuleSet:
+def train(progress: Progress, options: CloneOptions = DEFAULTS) -> RuleSet:
     """Learn a teacher's actions in the worlds that it comes to, and in those of the student.
 
     The loss is the squared error of actions over the variance of the teacher's, column by column:
@@ -91,7 +83,8 @@ def train(
         DivergedError: The rules' weights are not finite.
         MissingDependencyError: Datasets need Minari, which is not installed.
     """
-    rules = starting_rules(problem, seed, device, start)
+    problem, device, seed = progress.problem, progress.device, progress.seed
+    rules = progress.first_rules()
     generator = torch.Generator(device).manual_seed(seed)
     optimiser = torch.optim.Adam(
         rules.parameters(), lr=options.learning_rate, fused=device.type == "cuda"

@@ -18,9 +18,9 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from npa_envs.agents.learning.problem import FIRST_EVALUATION_SEED, Problem
+from npa_envs.agents.learning.problem import FIRST_EVALUATION_SEED
 from npa_envs.agents.learning.progress import Progress
-from npa_envs.agents.learning.rules import RuleSet, starting_rules
+from npa_envs.agents.learning.rules import RuleSet
 from npa_envs.agents.learning.weights import RuleWeights, layers_of, updates_of
 from npa_envs.agents.policies import bounded, perceived
 from npa_envs.checks import check_positive
@@ -51,15 +51,7 @@ class EvolutionOptions:
 DEFAULTS = EvolutionOptions()
 
 
-def train(
-    problem: Problem,
-    progress: Progress,
-    seed: int,
-    *,
-    device: torch.device,
-    start: RuleSet | None = None,
-    options: EvolutionOptions = DEFAULTS,
-) -> RuleSet:
+def train(progress: Progress, options: EvolutionOptions = DEFAULTS) -> RuleSet:
     """Evolve rules until the budget is spent, and return the mean of the last generation.
 
     Candidates are drawn on the host and tried on the device.
@@ -67,11 +59,12 @@ def train(
     Raises:
         MissingDependencyError: cma is not installed.
     """
-    rules = starting_rules(problem, seed, device, start)
+    problem, device = progress.problem, progress.device
+    rules = progress.first_rules()
     candidates = RulePopulation(rules)
     world_count = options.population * options.worlds_per_candidate
     envs = problem.make_envs(world_count, device=device, copy=False)
-    draws = np.random.default_rng(seed)
+    draws = np.random.default_rng(progress.seed)
     strategy = _strategy(candidates, options, draws)
 
     def generation() -> int:

@@ -8,14 +8,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 from gymnasium.spaces import Dict
 from numpy.typing import NDArray
 
-from npa_envs.agents.learning.baselines import check_no_garden_start
-from npa_envs.agents.learning.problem import Problem, world_seeds
+from npa_envs.agents.learning.baselines import check_no_start
+from npa_envs.agents.learning.problem import world_seeds
 from npa_envs.agents.learning.progress import Progress
-from npa_envs.agents.learning.rules import RuleSet
 from npa_envs.checks import check_fraction, check_positive
 from npa_envs.errors import MissingDependencyError, NPAError, shown
 from npa_envs.wrappers.sb3 import WorldVecEnv, on_host
@@ -34,7 +32,7 @@ ALGORITHMS: dict[str, type[SAC] | type[PPO]] = {"sac": SAC, "ppo": PPO}
 
 @dataclass(frozen=True, kw_only=True)
 class GardenOptions:
-    """What both algorithms are told; all that is not said is as Stable-Baselines3 has it."""
+    """What both algorithms are settings; all that is not said is as Stable-Baselines3 has it."""
 
     gamma: float = 0.9
     """Discount of a reward one step later (dimensionless)."""
@@ -84,58 +82,36 @@ class GardenPPOOptions(GardenOptions):
 SAC_DEFAULTS, PPO_DEFAULTS = SACOptions(), GardenPPOOptions()
 
 
-def train_sac(
-    problem: Problem,
-    progress: Progress,
-    seed: int,
-    *,
-    device: torch.device,
-    start: RuleSet | None = None,
-    options: SACOptions = SAC_DEFAULTS,
-) -> GardenPolicy:
+def train_sac(progress: Progress, options: SACOptions = SAC_DEFAULTS) -> GardenPolicy:
     """Return what SAC (Haarnoja et al., arXiv 1801.01290) finds within a budget.
 
     Raises:
         NPAError: There are rules to start from.
     """
-    told = {
+    settings = {
         "learning_starts": options.learning_starts,
-        "gradient_steps": max(1, problem.num_envs // options.world_steps),
+        "gradient_steps": max(1, progress.problem.num_envs // options.world_steps),
     }
-    return _learned(SAC, told, problem, progress, seed, device, start, options)
+    return _learned(SAC, settings, progress, options)
 
 
-def train_ppo(
-    problem: Problem,
-    progress: Progress,
-    seed: int,
-    *,
-    device: torch.device,
-    start: RuleSet | None = None,
-    options: GardenPPOOptions = PPO_DEFAULTS,
-) -> GardenPolicy:
+def train_ppo(progress: Progress, options: GardenPPOOptions = PPO_DEFAULTS) -> GardenPolicy:
     """Return what PPO (Schulman et al., arXiv 1707.06347) finds within a budget.
 
     Raises:
         NPAError: There are rules to start from, or a round would be a single step of a world.
     """
-    if options.steps * problem.num_envs < 2:
+    if options.steps * progress.problem.num_envs < 2:
         raise NPAError("steps must be at least 2 in a single world, got 1: give steps=32")
-    told = {"n_steps": options.steps, "batch_size": options.batch_size}
-    return _learned(PPO, told, problem, progress, seed, device, start, options)
+    settings = {"n_steps": options.steps, "batch_size": options.batch_size}
+    return _learned(PPO, settings, progress, options)
 
 
 def _learned(
-    algorithm: Any,
-    told: dict[str, int],
-    problem: Problem,
-    progress: Progress,
-    seed: int,
-    device: torch.device,
-    start: RuleSet | None,
-    options: GardenOptions,
+    algorithm: Any, settings: dict[str, int], progress: Progress, options: GardenOptions
 ) -> GardenPolicy:
-    check_no_garden_start(start)
+    check_no_start(progress)
+    problem, seed, device = progress.problem, progress.seed, progress.device
     env = WorldVecEnv(problem.make_envs(device=device))
     has_goals = isinstance(env.observation_space, Dict)
     model = algorithm(
@@ -145,7 +121,7 @@ def _learned(
         learning_rate=options.learning_rate,
         seed=seed,
         device=device,
-        **told,
+        **settings,
     )
     # Stable-Baselines3 would begin with worlds seed, seed + 1, and so on.
     env.seed(world_seeds(seed, problem.num_envs)[0])

@@ -14,7 +14,7 @@ from torch import Tensor
 import npa_envs
 from npa_envs.agents.learning.problem import Problem
 from npa_envs.agents.learning.progress import Progress, annealed
-from npa_envs.agents.learning.rules import RuleSet, starting_rules
+from npa_envs.agents.learning.rules import RuleSet
 from npa_envs.checks import check_fraction
 from npa_envs.envs.core.task import EnvTask
 from npa_envs.envs.multi.task import Population, SpeciesConfig, SpeciesTask
@@ -82,15 +82,7 @@ class GradientOptions:
 DEFAULTS = GradientOptions()
 
 
-def train(
-    problem: Problem,
-    progress: Progress,
-    seed: int,
-    *,
-    device: torch.device,
-    start: RuleSet | None = None,
-    options: GradientOptions = DEFAULTS,
-) -> RuleSet:
+def train(progress: Progress, options: GradientOptions = DEFAULTS) -> RuleSet:
     """Descend the loss at the end of rollouts, differentiated through all of their steps.
 
     Rollouts begin where episodes do, or go on from where earlier ones ended, in a pool as in the
@@ -101,8 +93,8 @@ def train(
         NPAError: An option is out of its range, or the environment's loss has no gradient.
         DivergedError: The rules' weights are not finite.
     """
-    task = environment_task(problem, device)
-    rules = starting_rules(problem, seed, device, start)
+    problem, device, seed = progress.problem, progress.device, progress.seed
+    task, rules = environment_task(problem, device), progress.first_rules()
     length, steps, pool_size = problem.episode_steps, options.steps, options.pool_size
     if steps is None:
         steps = (length, length + 1) if length <= LONGEST else (LONGEST // 3, LONGEST + 1)

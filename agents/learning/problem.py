@@ -470,7 +470,8 @@ class ConcatenatedSpeciesEnv:
         if "final_obs" in first:
             last = {agent: infos[agent]["final_obs"] for agent in self.spans}
             which = over.cpu().numpy()
-            reasons = np.where(which, self._reasons, None)
+            reasons = self._reasons.copy()
+            reasons[~which] = None
             self._reasons[which] = None
             final = {"loss": found["loss"], "_loss": over, "reason": reasons}
             found |= {"final_obs": self._concatenated(last), "_final_obs": over}

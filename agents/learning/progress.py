@@ -14,7 +14,7 @@ from torch import Tensor, nn
 
 from npa_envs.agents.evaluation import evaluate_policy
 from npa_envs.agents.learning.problem import Problem
-from npa_envs.agents.learning.rules import RuleSet
+from npa_envs.agents.learning.rules import RuleSet, starting_rules
 from npa_envs.checks import check_count, check_positive, is_real
 from npa_envs.devices import check_device
 from npa_envs.errors import DivergedError, NPAError, shown
@@ -90,9 +90,9 @@ class Learner(Protocol):
 
     random: Randomness
     """What it draws from."""
-    modules: Mapping[str, nn.Module]
+    modules: dict[str, nn.Module]
     """What learns, by name."""
-    optimisers: Mapping[str, torch.optim.Optimizer]
+    optimisers: dict[str, torch.optim.Optimizer]
     """Their optimisers of Adam's kind, by name."""
 
     def go_on(self, iteration: int, part: int) -> None:
@@ -142,10 +142,12 @@ class Progress:
     Args:
         problem: What is learned.
         budget: What may be spent.
-        device: Where evaluations run: the learner's device.
+        seed: Of new rules and of all that the learner draws.
+        device: Where worlds, rules and evaluations are.
         evaluation_seeds: Of the episodes, which no learner sees: one each.
         entries: Evaluations besides the first, at equal shares of the budget.
         on_entry: Called with each entry.
+        initial: Rules to begin with, which are copied; None: new ones.
         keeping: Where and how the run is kept; None: it is not.
 
     Raises:
@@ -158,17 +160,27 @@ class Progress:
         self,
         problem: Problem,
         budget: Budget,
+        seed: int = 0,
         *,
         device: str | torch.device,
         evaluation_seeds: Iterable[int],
         entries: int = 20,
         on_entry: Callable[[CurvePoint], None] | None = None,
+        initial: RuleSet | None = None,
         keeping: Keeping | None = None,
     ) -> None:
         self.problem = problem
         """What is learned."""
         self.budget = budget
         """What may be spent."""
+        self.seed = seed
+        """Seed of new rules and of all that the learner draws."""
+        self.device = check_device(device)
+        """Where worlds, rules and evaluations are."""
+        self.initial = None
+        """Copies of the rules to begin with, on the device; None: new ones."""
+        if initial is not None:
+            self.initial = starting_rules(problem, self.device, initial)
         self.particle_steps = 0
         """Particle-steps spent so far."""
         self.log: list[CurvePoint] = []
@@ -190,7 +202,6 @@ class Progress:
         check_count("entries", entries, ": try 20")
         self._entries = entries
         self._on_entry = on_entry
-        self._device = check_device(device)
         self._envs: Any = None
         self._started = False
         self._since: float | None = None
@@ -203,6 +214,12 @@ class Progress:
         if keeping is not None and self.ranks.first:
             content = _prepare(keeping)
         self._content: dict[str, Any] | None = self.ranks.broadcast(content)
+
+    def first_rules(self) -> RuleSet:
+        """Return the rules that a learner begins with and may change, on the device."""
+        if self.initial is not None:
+            return self.initial
+        return RuleSet.new(self.problem, self.seed).to(self.device)
 
     def run(
         self, rules: RuleSet, iteration: Callable[[], int], learner: Learner | None = None
@@ -275,9 +292,9 @@ class Progress:
         """
         self._check_started("advance")
         self.particle_steps += particle_steps
-        if self._device.type == "cuda":
+        if self.device.type == "cuda":
             event = torch.cuda.Event()  # type: ignore[no-untyped-call]
-            event.record(torch.cuda.current_stream(self._device))
+            event.record(torch.cuda.current_stream(self.device))
             if self._previous is not None:
                 self._previous.synchronize()
             self._previous = event
@@ -323,7 +340,7 @@ class Progress:
     def _evaluate(self, actor: RuleSet | Callable[[Any], Any]) -> None:
         if self._envs is None:
             count = min(len(self._seeds), self.problem.num_envs)
-            self._envs = self.problem.make_envs(count, device=self._device)
+            self._envs = self.problem.make_envs(count, device=self.device)
         policy = actor
         if isinstance(actor, RuleSet):
             policy = actor.policy()
@@ -343,8 +360,8 @@ class Progress:
             self._on_entry(entry)
 
     def _wait(self) -> None:
-        if self._device.type == "cuda":
-            torch.cuda.synchronize(self._device)
+        if self.device.type == "cuda":
+            torch.cuda.synchronize(self.device)
 
     @contextlib.contextmanager
     def _kept(self, learner: Learner | None) -> Iterator[Callable[[], bool]]:

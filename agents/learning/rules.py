@@ -229,16 +229,12 @@ class RuleSetPolicy(Policy):
         return {agent: known[agent] for agent in counts}
 
 
-def starting_rules(
-    problem: Problem, seed: int, device: torch.device, start: RuleSet | None
-) -> RuleSet:
-    """Return rules for a learner to change: copies of those given, or new ones, on a device.
+def starting_rules(problem: Problem, device: torch.device, start: RuleSet) -> RuleSet:
+    """Return copies of rules for a learner to change, on a device.
 
     Raises:
-        NPAError: What was given is no set of rules, or does not fit the problem.
+        NPAError: They are no set of rules, or do not fit the problem.
     """
-    if start is None:
-        return RuleSet.new(problem, seed).to(device)
     if not isinstance(start, RuleSet):
         raise NPAError(
             f"start must be a RuleSet, got {type(start).__name__}: RuleSet.of(problem, 'heart')"

@@ -10,7 +10,6 @@ import sys
 from dataclasses import dataclass
 from typing import Any
 
-import torch
 from gymnasium.spaces import Space
 from torch import Tensor
 
@@ -23,7 +22,7 @@ from npa_envs.agents.learning.ppo_common import (
     noise_left,
     zero_output_rules,
 )
-from npa_envs.agents.learning.problem import Problem, world_seeds
+from npa_envs.agents.learning.problem import world_seeds
 from npa_envs.agents.learning.progress import Progress
 from npa_envs.agents.learning.rules import RuleSet
 from npa_envs.checks import check_positive
@@ -63,15 +62,7 @@ class WorldOptions(CommonOptions):
 DEFAULTS = WorldOptions()
 
 
-def train(
-    problem: Problem,
-    progress: Progress,
-    seed: int,
-    *,
-    device: torch.device,
-    start: RuleSet | None = None,
-    options: WorldOptions = DEFAULTS,
-) -> RuleSet:
+def train(progress: Progress, options: WorldOptions = DEFAULTS) -> RuleSet:
     """Return the rules that Stable-Baselines3's PPO finds within a budget.
 
     Stable-Baselines3 seeds torch and NumPy as a whole; what is seen goes through the host.
@@ -80,7 +71,8 @@ def train(
         NPAError: A minibatch would be a single step of a world.
         DivergedError: The policy has diverged.
     """
-    pace = options.pace(start)
+    problem, seed, device = progress.problem, progress.seed, progress.device
+    pace = options.pace(progress.initial)
     seen = options.steps * problem.num_envs
     batch_size = -(-seen // options.minibatches)
     if batch_size < 2:
@@ -105,7 +97,7 @@ def train(
         target_kl=world_kl(pace.target_kl),
         tensorboard_log=options.tensorboard_log,
         policy_kwargs={
-            "rules": zero_output_rules(problem, seed, start),
+            "rules": zero_output_rules(problem, seed, progress.initial),
             "initial_std": pace.initial_std,
             "critic": options.critic,
         },

@@ -245,7 +245,7 @@ def test_a_method_of_ones_own_is_a_row_of_the_table(monkeypatch):
     )
 
 
-def train_wildly(problem, progress, seed, *, device, start=None, factor=1.0):
-    rules = wild_rules(problem, seed, factor).to(device)
+def train_wildly(progress, *, factor=1.0):
+    rules = wild_rules(progress.problem, progress.seed, factor)
     progress.start(rules)
     return rules

@@ -117,8 +117,8 @@ def _still(tmp_path, monkeypatch):
     """A method of one's own, in a module of the current folder."""
     monkeypatch.chdir(tmp_path)
     (tmp_path / "still.py").write_text(
-        "def train(problem, progress, seed, *, device, start=None, patience=1):\n"
-        "    rules = problem.new_rules(seed).to(device)\n"
+        "def train(progress, *, patience=1):\n"
+        "    rules = progress.first_rules()\n"
         "    progress.start(rules)\n"
         "    return rules\n"
     )
