@@ -18,13 +18,7 @@ from typing import Any, NamedTuple
 import torch
 
 from npa_envs.agents.learning.problem import EVALUATION_SEEDS, Problem, check_run_seed
-from npa_envs.agents.learning.progress import (
-    Budget,
-    CurvePoint,
-    Keeping,
-    Progress,
-    check_finite,
-)
+from npa_envs.agents.learning.progress import Budget, CurvePoint, Keeping, Progress, check_finite
 from npa_envs.agents.learning.rules import RuleSet, RuleSetPolicy
 from npa_envs.errors import MissingDependencyError, NPAError, shown, suggest
 from npa_envs.training.ranks import Ranks

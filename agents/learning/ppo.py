@@ -28,12 +28,7 @@ from npa_envs.agents.learning.ppo_common import (
     seeded_critic,
     zero_output_rules,
 )
-from npa_envs.agents.learning.problem import (
-    ROW_REWARDS,
-    WORLDS_PER_SEED,
-    Problem,
-    world_seeds,
-)
+from npa_envs.agents.learning.problem import ROW_REWARDS, WORLDS_PER_SEED, Problem, world_seeds
 from npa_envs.agents.learning.progress import Budget, Progress
 from npa_envs.agents.learning.rules import RuleSet
 from npa_envs.checks import check_flag, check_non_negative, check_positive

@@ -391,12 +391,7 @@ class ConcatenatedSpeciesEnv:
     """
 
     def __init__(
-        self,
-        task: str,
-        num_envs: int,
-        episode_steps: int,
-        device: str,
-        keywords: Mapping[str, Any],
+        self, task: str, num_envs: int, episode_steps: int, device: str, keywords: Mapping[str, Any]
     ) -> None:
         self.species_env = env = MultiSpeciesVectorEnv(
             task,

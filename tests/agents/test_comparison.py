@@ -555,11 +555,7 @@ def test_curves_have_a_line_for_each_point_of_each_run():
 
 @pytest.mark.parametrize(
     ("budgets", "at_once", "said"),
-    [
-        ({"seconds": {}}, 3, True),
-        ({"seconds": {}}, 1, False),
-        ({"particle-steps": {}}, 3, False),
-    ],
+    [({"seconds": {}}, 3, True), ({"seconds": {}}, 1, False), ({"particle-steps": {}}, 3, False)],
 )
 def test_a_table_says_where_equal_wall_time_was_shared(budgets, at_once, said, tmp_path):
     made = plan(budgets=budgets, settings={"runs_at_once": at_once})

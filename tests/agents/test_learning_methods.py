@@ -331,11 +331,7 @@ def test_methods_that_learn_nothing_evaluate_once():
     [
         (heart(episode_steps=16), (0.03, -0.03), PaintPolicy),
         (species(episode_steps=16), (0.03, -0.03), SpreadPolicy),
-        (
-            species("npa/Symbiosis-v0", episode_steps=16, resolution=16),
-            (0.03, -0.03),
-            PaintPolicy,
-        ),
+        (species("npa/Symbiosis-v0", episode_steps=16, resolution=16), (0.03, -0.03), PaintPolicy),
         (damaged(particle_count=200, eps=0.15), (0.001, -0.001), MendPolicy),
     ],
     ids=lambda p: getattr(p, "env_id", ""),

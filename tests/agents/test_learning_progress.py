@@ -6,13 +6,7 @@ from clock import Clock
 from learning_problems import heart, wild_rules
 
 from npa_envs.agents import evaluate_policy
-from npa_envs.agents.learning import (
-    METHODS,
-    Budget,
-    Progress,
-    method_options,
-    train,
-)
+from npa_envs.agents.learning import METHODS, Budget, Progress, method_options, train
 from npa_envs.agents.learning.progress import annealed
 from npa_envs.errors import DivergedError, NPAError
 

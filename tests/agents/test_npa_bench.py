@@ -53,10 +53,7 @@ def records(plan, status="done"):
             facts=plan.facts(job),
             status=status,
             returns=(float(job.seed),) * plan.episodes,
-            curve=(
-                CurvePoint(0.0, 0.0, -1.0, 0.1, 1.0),
-                CurvePoint(2.0, 1000.0, 0.5, 0.1, 1.0),
-            ),
+            curve=(CurvePoint(0.0, 0.0, -1.0, 0.1, 1.0), CurvePoint(2.0, 1000.0, 0.5, 0.1, 1.0)),
             date="2026-01-02",
         )
         for job in plan.jobs()
