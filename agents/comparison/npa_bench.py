@@ -96,11 +96,7 @@ class Suite:
         return [name for name in METHODS if any(name in table for table in suited)]
 
     def problem_of(self, task: str) -> Problem:
-        """Return the problem of a name of `tasks`.
-
-        Raises:
-            NPAError: There is no such task.
-        """
+        """Return the problem of a name of `tasks`."""
         if task not in self.tasks:
             raise NPAError(
                 f"unknown task {shown(task)} of {self.name}: {suggest(task, self.tasks)}"
@@ -209,9 +205,6 @@ def write_rows(
 
     A file keeps its runs of other problems and seeds. It then names the commands, commits, machines
     and versions of all of its runs, separated by semicolons.
-
-    Raises:
-        NPAError: A file cannot be written, or as for `check_rows`.
     """
     paths = []
     for method in dict.fromkeys(record.job.method for record in records):
@@ -234,12 +227,7 @@ def write_rows(
 
 
 def check_rows(suite: Suite, plan: ComparisonPlan, folder: Path) -> None:
-    """Check that runs of a plan can be added to the rows in a folder, before any of them is run.
-
-    Raises:
-        NPAError: A row is of another suite, or of another method or other options under its name,
-            has other episodes, as quick runs do, or cannot be read.
-    """
+    """Check that runs of a plan can be added to the rows in a folder, before any of them is run."""
     for method in plan.methods:
         _held_row(suite, plan, method, folder)
 
@@ -329,12 +317,7 @@ def _run_object(suite: Suite, record: RunRecord) -> dict[str, Any]:
 
 
 def read_row(path: Path) -> BenchRow:
-    """Return a row from its file.
-
-    Raises:
-        NPAError: It does not follow the schema or the rules of the benchmark.
-        MissingDependencyError: jsonschema is not installed.
-    """
+    """Return a row from its file."""
     try:
         import jsonschema
     except ImportError as error:
@@ -394,11 +377,7 @@ def _check_row(row: BenchRow, name: str) -> None:
 
 
 def read_rows(suite: Suite, folder: Path) -> dict[str, BenchRow]:
-    """Return all rows of a suite's folder by their methods.
-
-    Raises:
-        NPAError: As for `read_row`; or a file is of another suite, or two are of one method.
-    """
+    """Return all rows of a suite's folder by their methods."""
     rows: dict[str, BenchRow] = {}
     for path in sorted(folder.glob("*.json")):
         row = read_row(path)
@@ -431,9 +410,6 @@ def normalised(rows: Mapping[str, BenchRow], method: str, env_id: str) -> NDArra
     """Return the score of each run: (R − R_zero) / (R_gradient − R_zero) of mean returns R.
 
     R_zero and R_gradient are means over their runs. A run that diverged has the score 0.
-
-    Raises:
-        NPAError: There are no runs of `zero` or `gradient`, or the gradient is no better.
     """
     ends = []
     for name in (NOTHING, YARDSTICK):
@@ -464,9 +440,6 @@ def score(samples: Sequence[NDArray[np.float64]], seed: int = 0) -> Score:
     Args:
         samples: Scores of the runs on each problem.
         seed: Of the draws.
-
-    Raises:
-        MissingDependencyError: SciPy is not installed.
     """
     try:
         from scipy.stats import bootstrap

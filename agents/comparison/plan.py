@@ -84,11 +84,7 @@ QUICK_STEPS = 16
 
 
 def make_problem(name: str, *, quick: bool = False) -> Problem:
-    """Return one of `PROBLEMS`; a quick one is tiny, for a test that everything runs.
-
-    Raises:
-        NPAError: There is no such task.
-    """
+    """Return one of `PROBLEMS`; a quick one is tiny, for a test that everything runs."""
     if name not in PROBLEMS:
         raise NPAError(f"unknown task {name!r}: {suggest(name, PROBLEMS)}")
     sizes = PROBLEMS[name]

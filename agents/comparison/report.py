@@ -36,11 +36,7 @@ TABLE, FIGURES, CURVES = "comparison.md", "comparison.json", "comparison.csv"
 def write_table(
     plan: ComparisonPlan, records: Sequence[RunRecord], folder: Path, command: str
 ) -> str:
-    """Write the table, in Markdown and as JSON, and all curves; return the table in Markdown.
-
-    Raises:
-        NPAError: A file cannot be written.
-    """
+    """Write the table, in Markdown and as JSON, and all curves; return the table in Markdown."""
     table = rows(records)
     shown = text(table)
     at_once = plan.settings.get("runs_at_once", 1)
@@ -57,11 +53,7 @@ def write_table(
 
 
 def write_pictures(records: Sequence[RunRecord], folder: Path) -> list[str]:
-    """Write filmstrips and, where matplotlib is installed, curves; return a line for each file.
-
-    Raises:
-        NPAError: A file cannot be written.
-    """
+    """Write filmstrips and, where matplotlib is installed, curves; return a line for each file."""
     strips = [f"wrote {path}" for path in write_strips(records, folder)]
     return [*strips, *write_plots(lambda: pictures(records), folder / "curves_*.png", "curves")]
 

@@ -95,11 +95,7 @@ class RunRecord:
 
     @classmethod
     def read(cls, folder: Path, facts: Mapping[str, Any]) -> RunRecord | None:
-        """Return the record that a run left in its folder, None where there is none.
-
-        Raises:
-            NPAError: As for `read_record`.
-        """
+        """Return the record that a run left in its folder, None where there is none."""
 
         def made(held: dict[str, Any]) -> RunRecord:
             points: list[dict[str, Any]]
@@ -330,11 +326,7 @@ def lasts(plan: ComparisonPlan, job: Job) -> bool:
 
 
 def held_records(plan: ComparisonPlan, folder: Path) -> dict[Job, RunRecord]:
-    """Return the records of an earlier comparison in a folder without runs that failed.
-
-    Raises:
-        NPAError: A record cannot be read, or follows from other settings.
-    """
+    """Return the records of an earlier comparison in a folder without runs that failed."""
     found = {job: RunRecord.read(folder / job.folder, plan.facts(job)) for job in plan.jobs()}
     return {
         job: record
@@ -368,10 +360,6 @@ def run_jobs(
         command: The command line, for the records.
         max_seconds: No run begins after so long [s].
         written: Called with each record once it is in its place.
-
-    Raises:
-        NPAError: A run would clone one that is neither among the jobs nor in the folder, or is
-            there with other settings, or the folder cannot be written to.
     """
     _check_teachers(plan, jobs, folder)
     waiting = list(jobs)

@@ -40,11 +40,7 @@ GAINS = (0.001, 0.003, 0.01, 0.03, 0.1, 0.3, -0.01, -0.03, -0.1, -0.3)
 
 
 def train_random(progress: Progress) -> Policy:
-    """Return the policy that acts at random; nothing is spent.
-
-    Raises:
-        NPAError: There are rules to start from.
-    """
+    """Return the policy that acts at random; nothing is spent."""
     return _evaluated(progress, RandomPolicy(_one_world(progress), progress.seed))
 
 
@@ -71,9 +67,6 @@ def train_scripted(progress: Progress, *, gains: Sequence[float] = GAINS) -> Pol
     α ε; negative ones gather), play one episode in each of the problem's worlds, from seeds that
     evaluations do not use, until all have done so or the budget is spent. The best one is taken,
     which may be doing nothing.
-
-    Raises:
-        NPAError: There are rules to start from, or gains are no finite numbers.
     """
     check_no_start(progress)
     if not isinstance(gains, list | tuple) or not all(map(is_real, gains)):
@@ -113,11 +106,7 @@ def _candidates(envs: Any, gains: Sequence[float]) -> Iterator[Policy]:
 
 
 def check_no_start(progress: Progress) -> None:
-    """Check that there are no rules to begin with.
-
-    Raises:
-        NPAError: There are some.
-    """
+    """Check that there are no rules to begin with."""
     if progress.initial is not None:
         if progress.problem.is_garden:
             raise NPAError("start must be None in a garden, where the world's rule is not learned")

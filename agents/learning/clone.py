@@ -77,11 +77,6 @@ def train(progress: Progress, options: CloneOptions = DEFAULTS) -> RuleSet:
     the share of what it does that is not explained. The student acts in some of the worlds, and is
     told what the teacher would have done there (dataset aggregation, Ross et al. 2011), as its
     errors lead it to where the teacher never comes.
-
-    Raises:
-        NPAError: There is no teacher and no dataset, or both, or one does not fit the problem.
-        DivergedError: The rules' weights are not finite.
-        MissingDependencyError: Datasets need Minari, which is not installed.
     """
     problem, device, seed = progress.problem, progress.device, progress.seed
     rules = progress.first_rules()

@@ -55,9 +55,6 @@ def train(progress: Progress, options: EvolutionOptions = DEFAULTS) -> RuleSet:
     """Evolve rules until the budget is spent, and return the mean of the last generation.
 
     Candidates are drawn on the host and tried on the device.
-
-    Raises:
-        MissingDependencyError: cma is not installed.
     """
     problem, device = progress.problem, progress.device
     rules = progress.first_rules()
@@ -80,11 +77,7 @@ def train(progress: Progress, options: EvolutionOptions = DEFAULTS) -> RuleSet:
 
 
 class RulePopulation(RuleWeights):
-    """Rules of one architecture whose weights are the rows of a matrix, as `RuleWeights` has them.
-
-    Raises:
-        NPAError: A rule is more than its two layers.
-    """
+    """Rules of one architecture whose weights are the rows of a matrix, as `RuleWeights` has them."""
 
     def __init__(self, rules: RuleSet) -> None:
         super().__init__(rules)

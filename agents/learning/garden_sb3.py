@@ -83,11 +83,7 @@ SAC_DEFAULTS, PPO_DEFAULTS = SACOptions(), GardenPPOOptions()
 
 
 def train_sac(progress: Progress, options: SACOptions = SAC_DEFAULTS) -> GardenPolicy:
-    """Return what SAC (Haarnoja et al., arXiv 1801.01290) finds within a budget.
-
-    Raises:
-        NPAError: There are rules to start from.
-    """
+    """Return what SAC (Haarnoja et al., arXiv 1801.01290) finds within a budget."""
     settings = {
         "learning_starts": options.learning_starts,
         "gradient_steps": max(1, progress.problem.num_envs // options.world_steps),
@@ -96,11 +92,7 @@ def train_sac(progress: Progress, options: SACOptions = SAC_DEFAULTS) -> GardenP
 
 
 def train_ppo(progress: Progress, options: GardenPPOOptions = PPO_DEFAULTS) -> GardenPolicy:
-    """Return what PPO (Schulman et al., arXiv 1707.06347) finds within a budget.
-
-    Raises:
-        NPAError: There are rules to start from, or a round would be a single step of a world.
-    """
+    """Return what PPO (Schulman et al., arXiv 1707.06347) finds within a budget."""
     if options.steps * progress.problem.num_envs < 2:
         raise NPAError("steps must be at least 2 in a single world, got 1: give steps=32")
     settings = {"n_steps": options.steps, "batch_size": options.batch_size}
@@ -167,11 +159,7 @@ class GardenPolicy:
         self._shapes = _shapes(space.spaces if isinstance(space, Dict) else space)
 
     def __call__(self, observation: Any) -> NDArray[np.float32]:
-        """Return actions of worlds, shape [B, K, W], for what is seen of them, [B, ...].
-
-        Raises:
-            NPAError: Something else is seen than where the policy has learned.
-        """
+        """Return actions of worlds, shape [B, K, W], for what is seen of them, [B, ...]."""
         wanted = self._shapes
         found = {name: shape[1:] for name, shape in _shapes(observation).items()}
         if wanted != found:
@@ -195,11 +183,7 @@ class GardenPolicy:
 
     @classmethod
     def load(cls, path: str | Path) -> GardenPolicy:
-        """Return what `save` wrote; Stable-Baselines3 unpickles it, so trust who made the file.
-
-        Raises:
-            NPAError: The file is not called as `save` calls it, is missing, or cannot be read.
-        """
+        """Return what `save` wrote; Stable-Baselines3 unpickles it, so trust who made the file."""
         name = Path(path).stem
         if name not in ALGORITHMS:
             raise NPAError(

@@ -88,10 +88,6 @@ def train(progress: Progress, options: GradientOptions = DEFAULTS) -> RuleSet:
     Rollouts begin where episodes do, or go on from where earlier ones ended, in a pool as in the
     paper (arXiv 2601.16096). State steps are clamped to the action space, as environments clip
     them. Observations are not clipped.
-
-    Raises:
-        NPAError: An option is out of its range, or the environment's loss has no gradient.
-        DivergedError: The rules' weights are not finite.
     """
     problem, device, seed = progress.problem, progress.device, progress.seed
     task, rules = environment_task(problem, device), progress.first_rules()
@@ -151,11 +147,7 @@ class _Schedule(TrainConfig[Any]):
 
 
 def environment_task(problem: Problem, device: torch.device) -> EnvironmentTask:
-    """Return a problem's task for the gradient's trainer.
-
-    Raises:
-        NPAError: The problem is a game or its species die, so that no gradient descends its loss.
-    """
+    """Return a problem's task for the gradient's trainer."""
     made = EnvironmentTask(problem, device)
     goal = made.start(1, torch.Generator(device).manual_seed(0))[2]
     return made if goal is None else EnvironmentGoalTask(problem, device)
@@ -231,22 +223,14 @@ class EnvironmentTask:
         return aimed
 
     def loss(self, x: Tensor, s: Tensor, path_length: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
-        """Return the environment's loss, the mean over worlds and species, and its named parts.
-
-        Raises:
-            NPAError: It has no gradient.
-        """
+        """Return the environment's loss, the mean over worlds and species, and its named parts."""
         parts = {name: part.mean() for name, part in self._losses(x, s).items()}
         total = torch.stack(list(parts.values())).sum()
         self._check_gradient(total, x, s)
         return total, parts
 
     def world_losses(self, x: Tensor, s: Tensor) -> Tensor:
-        """Return the environment's loss of each world, the mean over its species, shape [B].
-
-        Raises:
-            NPAError: It has no gradient.
-        """
+        """Return the environment's loss of each world, the mean over its species, shape [B]."""
         total = torch.stack(list(self._losses(x, s).values())).sum(dim=0)
         total = total.flatten(1).mean(dim=1) if total.dim() > 1 else total
         self._check_gradient(total, x, s)

@@ -109,11 +109,7 @@ DEFAULTS = PPOOptions()
 
 
 def train(progress: Progress, options: PPOOptions = DEFAULTS) -> RuleSet:
-    """Return the rules that proximal policy optimisation finds within a budget.
-
-    Raises:
-        DivergedError: The policy has diverged.
-    """
+    """Return the rules that proximal policy optimisation finds within a budget."""
     problem, device, ranks = progress.problem, progress.device, progress.ranks
     count = ranks.broadcast(world_count(problem, options, device, progress.budget, ranks))
     options = replace(options, worlds=count)

@@ -128,11 +128,7 @@ def noise_left(share_left: float, last_noise: float, decay_share: float) -> floa
 
 
 def check_word(name: str, word: object, words: Sequence[str]) -> None:
-    """Check that an option is one of a few words.
-
-    Raises:
-        NPAError: It is none of them.
-    """
+    """Check that an option is one of a few words."""
     if word not in words:
         raise NPAError(f"{name} must be a known word, got {shown(word)}: {suggest(word, words)}")
 

@@ -66,10 +66,6 @@ def train(progress: Progress, options: WorldOptions = DEFAULTS) -> RuleSet:
     """Return the rules that Stable-Baselines3's PPO finds within a budget.
 
     Stable-Baselines3 seeds torch and NumPy as a whole; what is seen goes through the host.
-
-    Raises:
-        NPAError: A minibatch would be a single step of a world.
-        DivergedError: The policy has diverged.
     """
     problem, seed, device = progress.problem, progress.seed, progress.device
     pace = options.pace(progress.initial)

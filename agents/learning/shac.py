@@ -105,10 +105,6 @@ def train(progress: Progress, options: SHACOptions = DEFAULTS) -> RuleSet:
 
     Rewards are the falls of the environment's loss, as with `reward="dense"`. To the critic worlds
     go on after an episode's end. State steps are clamped as by the gradient's learner.
-
-    Raises:
-        NPAError: The environment's loss has no gradient.
-        DivergedError: The rules' weights are not finite.
     """
     problem, ranks = progress.problem, progress.ranks
     learner = SHACLearner(problem, options, progress.seed, progress.device, progress.initial, ranks)

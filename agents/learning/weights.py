@@ -25,9 +25,6 @@ class RuleWeights:
 
     Args:
         rules: The rules, which are changed in place.
-
-    Raises:
-        NPAError: A rule is more than its two layers.
     """
 
     def __init__(self, rules: Iterable[NPARule]) -> None:

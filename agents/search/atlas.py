@@ -34,11 +34,7 @@ Pictures = Mapping[tuple[int, ...], NDArray[np.uint8]]
 
 
 def write_elites(search: Search, folder: Path) -> Pictures:
-    """Write each elite's rule as `elites/CELL.safetensors`, and return its first world's picture.
-
-    Raises:
-        NPAError: A file cannot be written.
-    """
+    """Write each elite's rule as `elites/CELL.safetensors`, and return its first world's picture."""
     pictures = {}
     for elite in search.elites():
         trials = search.candidates.try_all(elite.solution[None])

@@ -35,11 +35,7 @@ class Proposals(Protocol):
 
 
 def import_ribs() -> Any:
-    """Return the library with its parts imported.
-
-    Raises:
-        MissingDependencyError: It is not installed, or cma, by which it runs CMA-ES, is not.
-    """
+    """Return the library with its parts imported."""
     try:
         import cma  # noqa: F401
         import ribs.archives
@@ -62,9 +58,6 @@ def make_archive(weight_count: int, axes: tuple[Axis, ...], seed: int = 0) -> An
         weight_count: Numbers that a candidate is made of, W.
         axes: The descriptors.
         seed: Of the elites that are drawn from it.
-
-    Raises:
-        MissingDependencyError: pyribs is not installed.
     """
     return import_ribs().archives.GridArchive(
         solution_dim=weight_count,
