@@ -15,7 +15,7 @@ from npa_envs.checks import check_fraction, check_positive, is_real
 from npa_envs.errors import NPAError, shown
 
 VARIANCE_FLOOR = 1e-8
-"""Added to the variance of the teacher's actions: what it never does is still to be learned."""
+"""Added to the variance of the teacher's actions, which may be 0."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -27,8 +27,8 @@ class CloneOptions:
     it must be given, or a dataset."""
 
     dataset: str | None = None
-    """A dataset of Minari, by its id, to learn from instead: nobody acts, and the particle-steps
-    that count are those learned from."""
+    """A dataset of Minari, by its id, to learn from instead; the particle-steps that count are
+    those learned from."""
 
     student_share: float = 0.5
     """Share of the worlds in which the student acts, in [0, 1]; 0: plain cloning."""
@@ -73,10 +73,9 @@ DEFAULTS = CloneOptions()
 def train(progress: Progress, options: CloneOptions = DEFAULTS) -> RuleSet:
     """Learn a teacher's actions in the worlds that it comes to, and in those of the student.
 
-    The loss is the squared error of actions over the variance of the teacher's, column by column:
-    the share of what it does that is not explained. The student acts in some of the worlds, and is
-    told what the teacher would have done there (dataset aggregation, Ross et al. 2011), as its
-    errors lead it to where the teacher never comes.
+    The loss is the squared error of actions over the variance of the teacher's, column by column.
+    In some of the worlds the student acts, as its errors lead to worlds that the teacher's actions
+    do not, and the teacher's actions there are learned (dataset aggregation, Ross et al. 2011).
     """
     problem, device, seed = progress.problem, progress.device, progress.seed
     rules = progress.first_rules()
@@ -107,7 +106,7 @@ def train(progress: Progress, options: CloneOptions = DEFAULTS) -> RuleSet:
 def _taught(
     problem: Problem, rules: RuleSet, seed: int, device: torch.device, options: CloneOptions
 ) -> tuple[Callable[[], int], Demonstrations]:
-    """Return what goes on in worlds and counts their steps, and what was seen there."""
+    """Return a function that steps worlds and counts their steps, and its demonstrations."""
     teacher = _teacher(problem, options.teacher).to(device).policy()
     student, envs = rules.policy(), problem.make_envs(device=device)
     observation, _ = envs.reset(seed=world_seeds(seed, problem.num_envs))
@@ -128,12 +127,12 @@ def _taught(
 
 
 def _recorded(problem: Problem, device: torch.device, options: CloneOptions) -> Demonstrations:
-    """Return what a dataset holds, on a device."""
+    """Return the demonstrations of a dataset, on a device."""
     from npa_envs.wrappers.minari import read_pairs
 
     if options.teacher is not None:
         raise NPAError("teacher must be None where a dataset is given: it holds what was done")
-    assert options.dataset is not None, "asked for by the caller"
+    assert options.dataset is not None, "checked by the caller"
     seen, done = read_pairs(options.dataset)
     interface, count = problem.interface, problem.particle_count
     wanted = (count, interface.perception_dim), (count, interface.action_dim)
@@ -167,16 +166,14 @@ def unexplained(rules: RuleSet, observation: Tensor, action: Tensor) -> Tensor:
 
 
 class Demonstrations:
-    """The last worlds that were seen, and what the teacher does in them, on the device.
+    """The last W observations of worlds, and the teacher's actions, on the device.
 
-    At most `capacity` worlds W are kept, of the shape and device of an observation and an action.
+    At most `capacity` worlds are kept, of the shape and device of an observation and an action.
     """
 
     def __init__(self, capacity: int, observation: Tensor, action: Tensor) -> None:
         self.observations = observation.new_zeros(capacity, *observation.shape[1:])
-        """Shape [W, N, P]."""
         self.actions = action.new_zeros(capacity, *action.shape[1:])
-        """Shape [W, N, A]."""
         self.count = 0
         """Worlds that were added so far; the oldest are overwritten."""
 

@@ -77,7 +77,7 @@ def train(progress: Progress, options: EvolutionOptions = DEFAULTS) -> RuleSet:
 
 
 class RulePopulation(RuleWeights):
-    """Rules of one architecture whose weights are the rows of a matrix, as `RuleWeights` has them."""
+    """Rules of one architecture; their weights are rows of a matrix, as `RuleWeights` has them."""
 
     def __init__(self, rules: RuleSet) -> None:
         super().__init__(rules)
@@ -85,7 +85,7 @@ class RulePopulation(RuleWeights):
 
     @torch.no_grad()
     def actions(self, weights: Tensor, observation: Tensor) -> Tensor:
-        """Return what each of K candidates does in its own M worlds, shape [K * M, N, A].
+        """Return actions, [K * M, N, A], of K candidates in M worlds each.
 
         Weights have shape [K, W]; observations, candidate by candidate, [K * M, N, P].
         """
@@ -117,7 +117,7 @@ def fitness(
     for _ in range(episode_steps):
         action = candidates.actions(weights, observation)
         observation, reward, terminated, truncated, _ = envs.step(action)
-        # A world that is over has begun another episode, which is not asked for.
+        # A world that is over has begun another episode, which does not count.
         returns += torch.where(running, reward, 0.0)
         running &= ~(terminated | truncated)
     return returns.view(len(weights), -1).mean(dim=1)
@@ -138,20 +138,14 @@ def _strategy(
     def normal(*shape: int) -> NDArray[np.float64]:
         return draws.standard_normal(shape)
 
-    words = {
-        "popsize": options.population,
-        "CMA_diagonal": True,
-        "CMA_stds": candidates.scales(),
-        "randn": normal,
-        # With draws of one's own the library wants none.
-        "seed": math.nan,
-        "verbose": -9,
-    }
+    # The library takes no seed where `randn` is given.
+    words = {"popsize": options.population, "randn": normal, "seed": math.nan, "verbose": -9}
+    words |= {"CMA_diagonal": True, "CMA_stds": candidates.scales()}
     return cma.CMAEvolutionStrategy(candidates.vector(), options.sigma, words)
 
 
 def costs(found: NDArray[np.float64]) -> list[float]:
-    """Return what is to be minimised of mean returns [K]; what is not finite is the worst."""
+    """Return costs to minimise for mean returns [K]; those that are not finite are the worst."""
     finite = np.isfinite(found)
     worst = found[finite].min() - 1.0 if finite.any() else 0.0
     minimised: list[float] = (-np.where(finite, found, worst)).tolist()

@@ -1,4 +1,4 @@
-"""Weights of rules as one vector: what searches without gradients change."""
+"""Weights of rules as one vector, for searches without gradients."""
 
 from __future__ import annotations
 
@@ -19,12 +19,9 @@ MOST_HIDDEN = 2**27
 
 
 class RuleWeights:
-    """Rules whose weights are one vector: W1, b1, W2 of the update networks, rule after rule.
+    """Plain rules, changed in place, whose weights are one vector: W1, b1, W2, rule after rule.
 
-    What else a rule has (its read-out) is not changed.
-
-    Args:
-        rules: The rules, which are changed in place.
+    Read-outs are not changed.
     """
 
     def __init__(self, rules: Iterable[NPARule]) -> None:
@@ -51,10 +48,7 @@ class RuleWeights:
             )
 
     def scales(self) -> NDArray[np.float64]:
-        """Return the size that each weight would be drawn with, by Xavier and at a gain of 1.
-
-        Layers of different width take steps of different size; biases that of their layer.
-        """
+        """Return the standard deviation of each weight by Xavier at a gain of 1; biases as W1."""
         sizes = []
         for rule in self._each:
             hidden, bias, output = layers_of(rule)
