@@ -61,8 +61,8 @@ KEPT_METHODS = ("ppo", "shac")
 
 GARDEN_METHODS: dict[str, str] = {
     "gradient": "npa_envs.agents.learning.baselines:tend_gradient",
-    "ppo_world": "npa_envs.agents.learning.garden_sb3:train_ppo",
-    "sac": "npa_envs.agents.learning.garden_sb3:train_sac",
+    "ppo_world": "npa_envs.agents.learning.sb3:train_garden_ppo",
+    "sac": "npa_envs.agents.learning.sb3:train_garden_sac",
     "random": "npa_envs.agents.learning.baselines:tend_random",
     "zero": "npa_envs.agents.learning.baselines:tend_zero",
     "scripted": "npa_envs.agents.learning.baselines:tend_scripted",

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from npa_envs import NPARule, WorldRandom, perception_fields, rollout
-from npa_envs.agents.learning.weights import RuleWeights, updates_of
+from npa_envs.agents.learning.evolution import RuleWeights, updates_of
 from npa_envs.checks import check_positive
 from npa_envs.errors import NPAError
 from npa_envs.tasks.seeds import uniform_ball
