@@ -75,10 +75,8 @@ class Trained(NamedTuple):
 
     rules: RuleSet | None
     """The rules, on the run's device; None where a method has none."""
-
     log: list[CurvePoint]
     """The learning curve."""
-
     policy: Callable[[Any], Any]
     """Maps observations, [B, N, P], to actions, [B, N, A], and a dict of agents' observations, of
     PettingZoo's parallel environments, to one of their actions: the rules' where there are some."""

@@ -25,29 +25,21 @@ class CloneOptions:
     teacher: Source | Sequence[Source] | RuleSet | None = None
     """A rule, a shipped rule's name or a file, for all species or one for each, or a set of rules;
     it must be given, or a dataset."""
-
     dataset: str | None = None
     """A dataset of Minari, by its id, to learn from instead; the particle-steps that count are
     those learned from."""
-
     student_share: float = 0.5
     """Share of the worlds in which the student acts, in [0, 1]; 0: plain cloning."""
-
     collect_steps: int = 8
     """Steps of the worlds in an iteration."""
-
     kept_steps: int = 64
     """Steps of all worlds that are learned from, at least `collect_steps`."""
-
     updates: int = 16
     """Optimiser's steps in an iteration."""
-
     batch_worlds: int = 4
     """Worlds, with all of their particles, in each of them."""
-
     learning_rate: float = 3e-3
     """Adam's, at the beginning."""
-
     last_rate: float = 0.02
     """Learning rate at the end, as a share of the first."""
 

@@ -38,10 +38,8 @@ class EvolutionOptions:
 
     population: int = 32
     """Candidates of a generation, at least 4."""
-
     worlds_per_candidate: int = 1
     """Worlds that each is tried in."""
-
     sigma: float = 0.1
     """Step size to begin with, as a fraction of the size that a layer's weights are drawn with
     (Xavier, gain 1; dimensionless)."""

@@ -44,24 +44,18 @@ class GradientOptions:
     steps: tuple[int, int] | None = None
     """Range [lo, hi) that the number of steps of each rollout is drawn from; None: whole episodes
     of up to 96 steps, or 32 to 96 steps of longer ones."""
-
     world_count: int = 8
     """Worlds in a batch."""
-
     pool_size: int | None = None
     """Worlds that live on between rollouts; 0: none, all rollouts begin where episodes do. None: 64
     where rollouts are shorter than episodes, else 0."""
-
     fresh_share: float = 0.25
     """Share of each batch from the pool that begins where episodes do, at least one world
     (dimensionless)."""
-
     learning_rate: float = 4e-3
     """AdamW's, at the beginning."""
-
     last_rate: float = 0.05
     """Learning rate at the end, as a share of the first."""
-
     memory: Memory = "store"
     """What the backward pass reads: "store", "recompute" or "minimal", as in `rollout`."""
 
@@ -137,7 +131,6 @@ class _Schedule(TrainConfig[Any]):
 
     progress: Progress
     """The run's account."""
-
     last_rate: float
     """Learning rate at the end, as a share of the first (dimensionless)."""
 

@@ -57,25 +57,19 @@ class PPOOptions(CommonOptions):
     """Worlds B to act in; None: the problem's `num_envs`, and on CUDA, where that is more, as many
     as have 131 072 particles together on each GPU, if memory has room for them and particle-steps
     are enough for 128 rounds. Several processes share them out."""
-
     critic_learning_rate: float = 1e-3
     """The critic's step at the start, as `learning_rate` is the rules'."""
-
     clip: float | None = None
     """Ratios of likelihoods count up to 1 plus or minus this (dimensionless). None: 0.2, or 0.02
     for a world's, whose logarithms are means over many particles."""
-
     ratio: Literal["particle", "world"] = "particle"
     """Each particle has a ratio of its own, or a world has one, of mean log-probabilities."""
-
     credit: Literal["world", "particle", "marginal"] = "world"
     """Each particle is paid what its world is; its own share; or what its world would have lost
     without its action."""
-
     masked: bool = False
     """Leave out of a round the actions of particles in steps that did not update them; not with
     several species."""
-
     critic_width: int = 64
     """Units in a hidden layer of the critic."""
 

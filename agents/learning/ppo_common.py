@@ -51,48 +51,35 @@ class CommonOptions:
 
     steps: int = 16
     """Steps of all worlds in a round, T."""
-
     epochs: int = 4
     """Passes over a round; fewer where `target_kl` is passed."""
-
     learning_rate: float | None = None
     """Adam's step at the start, from which it falls to zero over the budget; None: 0.001, or 0.0001
     with a `start`."""
-
     minibatches: int = 4
     """Parts that a round is shuffled into in each pass."""
-
     gamma: float = 0.5
     """Discount of a reward one step later (dimensionless)."""
-
     gae_lambda: float = 0.9
     """Discount of what the critic did not foresee, besides `gamma` (dimensionless)."""
-
     entropy_weight: float = 0.0
     """Weight of the entropy of an action in what is maximised."""
-
     max_gradient_norm: float = 0.5
     """Gradients are shortened to this norm: those of rules and of the critic by themselves on the
     device, taken together in Stable-Baselines3."""
-
     target_kl: float | None = None
     """The rules stay as they are for the rest of a round once particles' actions are farther than
     this from those that were played [nats]; None: 0.2, or 0.05 with a `start`."""
-
     initial_std: float | None = None
     """Standard deviation of every action column at first; None: 0.2, or 0.05 with a `start`."""
-
     last_noise: float | None = None
     """What is left of the standard deviations at the end of the budget (dimensionless); None: 0.25,
     or 1 with a `start`."""
-
     noise_decay_share: float = 0.5
     """Share of the budget, its last, in which standard deviations fall to that; 1: from the
     start."""
-
     critic_rounds: int | None = None
     """Rounds in which the critic learns alone; None: 0, or 4 with a `start`."""
-
     critic: CriticKind = "particle"
     """A value follows from a particle's own perception, or from its whole world ("central")."""
 

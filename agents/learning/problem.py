@@ -94,16 +94,12 @@ class Problem:
     env_id: str
     """Of `npa_envs.registration`, or of a species task: "npa/Mixing-v0"; or of an environment of
     one's own that is registered with Gymnasium."""
-
     keywords: Mapping[str, Any] = field(default_factory=dict)
     """Further keywords of `gym.make` or `multispecies_v0.batched`, of JSON's types."""
-
     episode_steps: int
     """Steps after which an episode is cut off."""
-
     num_envs: int = 16
     """Worlds B in which learners act at the same time."""
-
     hidden_dim: int = 128
     """Width of the hidden layer of new rules."""
 

@@ -43,7 +43,6 @@ class Budget:
     """Wall-clock time of learning [s]. Set-up and evaluations come on top, and may take longer:
     there are at most `entries` + 2 evaluations, of an episode for each of `evaluation_seeds`. By
     default these are 22 of 16 episodes; `entries=1` makes at most 3."""
-
     particle_steps: int | None = None
     """Steps of an environment or a rollout, times the particles that took them."""
 
@@ -71,16 +70,12 @@ class CurvePoint:
 
     seconds: float
     """Time spent by then [s]."""
-
     particle_steps: int
     """Particle-steps spent by then."""
-
     mean_return: float
     """Mean return of the evaluation's episodes."""
-
     standard_error: float
     """Its standard error; infinite for a single episode."""
-
     final_loss: float
     """Mean loss at the episodes' ends, before the next ones start."""
 

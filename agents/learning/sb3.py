@@ -54,7 +54,6 @@ class WorldOptions(CommonOptions):
     clip: float = 0.02
     """Ratios of likelihoods count up to 1 plus or minus this (dimensionless); little, as their
     logarithms are means over many particles."""
-
     tensorboard_log: str | None = None
     """Folder for Stable-Baselines3's own log; None: nowhere."""
 
@@ -257,7 +256,6 @@ class GardenOptions:
 
     gamma: float = 0.9
     """Discount of a reward one step later (dimensionless)."""
-
     learning_rate: float = 3e-4
     """Adam's."""
 
@@ -273,7 +271,6 @@ class SACOptions(GardenOptions):
 
     learning_starts: int = 1000
     """Steps of worlds before the first gradient step."""
-
     world_steps: int = 8
     """Steps of worlds for each gradient step, as nearly as the number of worlds allows."""
 
@@ -289,7 +286,6 @@ class GardenPPOOptions(GardenOptions):
 
     steps: int = 32
     """Steps of each world in a round."""
-
     batch_size: int = 64
     """Steps of worlds in a minibatch, at least 2."""
 

@@ -44,46 +44,33 @@ class SHACOptions:
     steps: int = 16
     """Steps that a gradient leads through, h, at most: an episode is cut into windows of equal
     length."""
-
     world_count: int = 8
     """Worlds B; several processes share them out."""
-
     gamma: float = 0.97
     """Discount of a reward one step later (dimensionless)."""
-
     value_weight: float = 0.25
     """Weight of the critic's value in what rules ascend; 1 as in the source; 0: rules look no
     farther than their window (dimensionless)."""
-
     td_lambda: float = 0.95
     """Weight of later rewards against the critic's values, in its targets (dimensionless)."""
-
     learning_rate: float = 4e-3
     """AdamW's for the rules, at the beginning; gradients are normalised parameter by parameter."""
-
     last_rate: float = 0.05
     """Learning rate at the end, as a share of the first (dimensionless)."""
-
     critic_learning_rate: float = 1e-3
     """Adam's for the critic."""
-
     critic_epochs: int = 4
     """Passes of the critic over a window."""
-
     minibatches: int = 4
     """Parts that a window is shuffled into in each pass."""
-
     critic: CriticKind = "central"
     """A world's value is the mean over particles of a function of each, or of the whole world
     ("central")."""
-
     critic_width: int = 64
     """Units in a hidden layer of the critic."""
-
     target_rate: float = 0.2
     """Share of the critic that its copy takes over after each window. Targets and gradients are
     made with the copy (dimensionless)."""
-
     memory: Memory = "store"
     """What the backward pass reads: "store", "recompute" or "minimal", as in `rollout`."""
 
@@ -121,7 +108,6 @@ class StepWindow(NamedTuple):
 
     features: Tensor
     """The critic's inputs before and after each step, shape [h + 1, B, N, F]."""
-
     losses: Tensor
     """The worlds' losses then, shape [h + 1, B]."""
 

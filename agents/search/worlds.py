@@ -48,19 +48,14 @@ class SearchWorld:
 
     particle_count: int = 128
     """Particles N."""
-
     steps: int = 128
     """Steps from the seed, a multiple of 16."""
-
     world_count: int = 1
     """Worlds that each candidate is tried in, B; figures are their means."""
-
     state_dim: int = 4
     """State channels C, at least 3; the last three are the colour (less 0.5)."""
-
     hidden_dim: int = 8
     """Hidden units of a rule."""
-
     eps: float = 0.1
     """Perception radius ε [length units]."""
 
