@@ -352,7 +352,13 @@ def write_strips(records: Sequence[RunRecord], folder: Path) -> list[Path]:
             seeds = sorted({seed for _, seed in found})
             places = [(method, seed) for seed in seeds for method in methods]
             frames = [_frame(found.get(place), folder) for place in places]
-            captions = [_caption(*place, found.get(place)) for place in places]
+            captions = []
+            for method, seed in places:
+                record = found.get((method, seed))
+                result = "not run" if record is None else str(record.status)
+                if record is not None and result == "done":
+                    result = f"loss {record.mean_loss:.3f}"
+                captions.append(f"{method}, seed {seed}: {result}")
             written.append(folder / f"grown_{task}_{axis}.png")
             write_filmstrip(written[-1], frames, captions, columns=len(methods))
     return written
@@ -365,10 +371,3 @@ def _frame(record: RunRecord | None, folder: Path) -> NDArray[np.uint8]:
         return np.full((SIZE, SIZE, 3), 255, np.uint8)
     with Image.open(path) as picture:
         return np.asarray(picture.convert("RGB"))
-
-
-def _caption(method: str, seed: int, record: RunRecord | None) -> str:
-    result: str = "not run" if record is None else record.status
-    if record is not None and result == "done":
-        result = f"loss {record.mean_loss:.3f}"
-    return f"{method}, seed {seed}: {result}"

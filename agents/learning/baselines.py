@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, TypeVar
 
@@ -87,7 +87,10 @@ def train_scripted(progress: Progress, *, gains: Sequence[float] = GAINS) -> Pol
         return episodes.mean_return
 
     most = tried(best)
-    for policy in _candidates(envs, gains):
+    makers = [
+        make for make in SCRIPTED if make is not PaintPolicy or target_colour(envs) is not None
+    ]
+    for policy in (make(envs, gain=gain) for make in makers for gain in gains):
         if progress.over:
             break
         mean_return = tried(policy)
@@ -95,14 +98,6 @@ def train_scripted(progress: Progress, *, gains: Sequence[float] = GAINS) -> Pol
             best, most = policy, mean_return
     progress.look(best, force=True)
     return best
-
-
-def _candidates(envs: Any, gains: Sequence[float]) -> Iterator[Policy]:
-    for make in SCRIPTED:
-        if make is PaintPolicy and target_colour(envs) is None:
-            continue
-        for gain in gains:
-            yield make(envs, gain=gain)
 
 
 def check_no_start(progress: Progress) -> None:

@@ -99,7 +99,11 @@ def _taught(
     problem: Problem, rules: RuleSet, seed: int, device: torch.device, options: CloneOptions
 ) -> tuple[Callable[[], int], Demonstrations]:
     """Return a function that steps worlds and counts their steps, and its demonstrations."""
-    teacher = _teacher(problem, options.teacher).to(device).policy()
+    source = options.teacher
+    if source is None:
+        raise NPAError("teacher must be given to clone, or a dataset: for example teacher='heart'")
+    given = list(source) if isinstance(source, RuleSet) else source
+    teacher = RuleSet.of(problem, given).to(device).policy()
     student, envs = rules.policy(), problem.make_envs(device=device)
     observation, _ = envs.reset(seed=world_seeds(seed, problem.num_envs))
     some = Demonstrations(options.kept_steps * problem.num_envs, observation, teacher(observation))
@@ -136,12 +140,6 @@ def _recorded(problem: Problem, device: torch.device, options: CloneOptions) -> 
     some = Demonstrations(len(seen), seen.to(device), done.to(device))
     some.add(seen.to(device), done.to(device))
     return some
-
-
-def _teacher(problem: Problem, source: Source | Sequence[Source] | RuleSet | None) -> RuleSet:
-    if source is None:
-        raise NPAError("teacher must be given to clone, or a dataset: for example teacher='heart'")
-    return RuleSet.of(problem, list(source) if isinstance(source, RuleSet) else source)
 
 
 def unexplained(rules: RuleSet, observation: Tensor, action: Tensor) -> Tensor:

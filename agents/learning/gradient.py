@@ -108,7 +108,8 @@ def train(progress: Progress, options: GradientOptions = DEFAULTS) -> RuleSet:
         seed=seed,
         device=str(device),
         memory=options.memory,
-        cuda_graph=task.can_be_recorded,
+        # Long starts are not recorded.
+        cuda_graph=not isinstance(task.inner, EnvTask) or task.inner.start_is_short,
     )
     schedule = torch.Generator().manual_seed(seed)
     # The cycle calls of both what these have.
@@ -176,16 +177,12 @@ class EnvironmentTask:
         """The worlds' constants."""
         self.eps, self.box = self.physics.eps, self.physics.box
         self.update_prob = self.physics.update_prob
-        self._task = problem.make_task(device)
+        self.inner = problem.make_task(device)
+        """The environment's task."""
         counts = torch.tensor(problem.counts)
         self._species = torch.arange(len(counts)).repeat_interleave(counts).to(device)
-        _check_one_loss(problem, self._task)
+        _check_one_loss(problem, self.inner)
         self._clamped: tuple[RuleSet, list[ClampedRule]] | None = None
-
-    @property
-    def can_be_recorded(self) -> bool:
-        """Whether starts take few operations, so that they are recorded on CUDA."""
-        return isinstance(self._task, SpeciesTask) or self._task.start_is_short
 
     def start(
         self, world_count: int, generator: Randomness
@@ -197,7 +194,7 @@ class EnvironmentTask:
             keys = torch.randint(
                 *KEY_RANGE, (world_count,), generator=generator, device=self.device
             )
-        x, s, *rest = self._task.start(WorldRandom.from_keys(keys))
+        x, s, *rest = self.inner.start(WorldRandom.from_keys(keys))
         return x, s, rest[1] if rest else None
 
     def seed(
@@ -210,9 +207,9 @@ class EnvironmentTask:
         """Return the task with the loss of worlds that have these goals, shape [B]."""
         if goal is None:
             return self
-        assert isinstance(self._task, EnvTask), "species have no goals"
+        assert isinstance(self.inner, EnvTask), "species have no goals"
         aimed = copy.copy(self)
-        aimed._task = self._task.toward(goal)
+        aimed.inner = self.inner.toward(goal)
         return aimed
 
     def loss(self, x: Tensor, s: Tensor, path_length: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
@@ -261,15 +258,15 @@ class EnvironmentTask:
 
     def _losses(self, x: Tensor, s: Tensor) -> Mapping[str, Tensor]:
         """Return the parts of each world's loss, shape [B] or [B, K]."""
-        if isinstance(self._task, SpeciesTask):
-            return self._task.losses(Population(x, s, self.problem.counts, self._species))
-        return self._task.losses(x, s)
+        if isinstance(self.inner, SpeciesTask):
+            return self.inner.losses(Population(x, s, self.problem.counts, self._species))
+        return self.inner.losses(x, s)
 
     def _check_gradient(self, total: Tensor, x: Tensor, s: Tensor) -> None:
         asked = torch.is_grad_enabled() and (x.requires_grad or s.requires_grad)
         if asked and not total.requires_grad:
             raise NPAError(
-                f"the losses of {type(self._task).__name__} must be differentiable for "
+                f"the losses of {type(self.inner).__name__} must be differentiable for "
                 "a method that follows gradients, but no gradient leads from them to positions or "
                 "states: compute them by torch's operations, or learn by 'ppo' or 'evolution'"
             )

@@ -364,26 +364,9 @@ class ConcatenatedSpeciesEnv:
     It has the interface of `NPAVectorEnv` as far as learners need it. Reward and loss of a world
     are the means over its species; a species that ended keeps the loss that it had then. A world
     terminates where all of its species have ended by themselves. The reason is that of the first
-    species that ended by itself, or "left the world" where one did.
-
-    Every step's infos have, besides `final_obs` and `final_info` as elsewhere:
-
-    | Key | Value |
-    |---|---|
-    | `loss` | before a restart, shape [B] |
-    | `particle_reward` | reward of each particle's species, shape [B, N] |
-    | `acted` | whether that species was alive: rows to leave out where not, bool, shape [B, N] |
-    | `particle_terminated` | whether that species ended by itself now, bool, shape [B, N] |
-
-    Args:
-        task: A name from `npa_envs.envs.multi.TASKS`.
-        num_envs: Worlds B.
-        episode_steps: Steps after which an episode is cut off.
-        device: Where the worlds live.
-        keywords: Fields of the task's configuration.
-
-    Raises:
-        NPAError: As for `multispecies_v0.batched`.
+    species that ended by itself, or "left the world" where one did. Every step's infos also have
+    of each particle's species, in [B, N], its reward in `particle_reward`, whether it was alive in
+    `acted`, and whether it ended by itself now in `particle_terminated`.
     """
 
     def __init__(

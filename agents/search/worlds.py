@@ -188,7 +188,9 @@ class Candidates:
     def _try(self, weights: Tensor) -> Trials:
         world, count = self.world, len(weights)
         random = WorldRandom(self._seeds * count, device=self.device)
-        x, s = self._seed(random)
+        shape = random.world_count, world.particle_count, 2
+        x = uniform_ball(*shape, SEED_RADIUS, generator=random, device=self.device)
+        s = x.new_zeros(*x.shape[:2], world.state_dim)
         every = world.steps // SNAPSHOTS
         options: dict[str, Any] = {"generator": random, "keep_every": every}
         options |= {"update_prob": UPDATE_PROB, "return_path_length": True}
@@ -209,13 +211,6 @@ class Candidates:
             return None
         measures = self.crowding_and_mixing(xs.flatten(0, 1), ss.flatten(0, 1))
         return Found(quality, (speed, *measures))
-
-    def _seed(self, random: WorldRandom) -> tuple[Tensor, Tensor]:
-        """Return disks of blank particles."""
-        world = self.world
-        shape = random.world_count, world.particle_count, 2
-        x = uniform_ball(*shape, SEED_RADIUS, generator=random, device=self.device)
-        return x, x.new_zeros(*x.shape[:2], world.state_dim)
 
     def crowding_and_mixing(self, x: Tensor, s: Tensor) -> tuple[float, float]:
         """Return two descriptors of worlds x [B, N, D], s [B, N, C]."""
