@@ -19,24 +19,20 @@ from npa_envs.world.randomness import WorldRandom
 TIME_LIMIT = "time limit"
 """Why an episode ended that Gymnasium cut off."""
 
-_TOLD = {"reason", "diverged", "success"}
+_REASONS = {"reason", "diverged", "success"}
 
 
 class Episodes(NamedTuple):
-    """Episodes of a policy, one entry a seed."""
+    """Episodes of a policy, one entry a seed, shape [E]."""
 
     returns: NDArray[np.float64]
-    """Sums of the rewards, shape [E]."""
-
+    """Sums of the rewards."""
     start_losses: NDArray[np.float64]
-    """Losses before the first step, shape [E]."""
-
+    """Losses before the first step."""
     final_losses: NDArray[np.float64]
-    """Losses after the last step, shape [E]."""
-
+    """Losses after the last step."""
     steps: NDArray[np.int64]
-    """Lengths, shape [E]."""
-
+    """Lengths."""
     endings: tuple[str, ...]
     """Why each was over: "success", "diverged" or "time limit"; of several species why the first
     one ended by itself, and "left the world" where one diverged."""
@@ -71,7 +67,7 @@ def evaluate_policy(env: Any, policy: Callable[[Any], Any], seeds: Iterable[int]
     Raises:
         NPAError: There are no seeds or wrong ones, or the environment is another one.
     """
-    # What lives in other processes shows what it is by what it returns.
+    # Environments in other processes are recognised by their infos.
     elsewhere = isinstance(getattr(env, "unwrapped", None), AsyncVectorEnv)
     worlds = None if elsewhere else unwrapped(env).worlds
     if not (hasattr(env, "num_envs") or isinstance(env, gymnasium.Env)):
@@ -88,7 +84,7 @@ def evaluate_policy(env: Any, policy: Callable[[Any], Any], seeds: Iterable[int]
     given = list(seeds)
     if not given:
         raise NPAError("seeds must hold at least one seed, got none: give seeds=range(8)")
-    # Before the first episode, not in the midst of them.
+    # Wrong seeds are errors now, not in the first episode.
     WorldRandom(given)
     policy = policy_in(env, policy)
     single = isinstance(env, gymnasium.Env)
@@ -131,7 +127,7 @@ def _run(env: Any, policy: Callable[[Any], Any], seeds: list[int]) -> tuple[NDAr
             final = infos.get("final_info", infos)
             final_losses[over] = _host(final["loss"])[over]
             for k in np.flatnonzero(over):
-                endings[k] = _ending({name: final[name][k] for name in _TOLD & final.keys()})
+                endings[k] = _ending({name: final[name][k] for name in _REASONS & final.keys()})
             running &= ~over
         if not resets_itself and ended.any() and running.any():
             observation, _ = env.reset(options={"reset_mask": ended})
@@ -153,20 +149,20 @@ def _run_single(
 
 
 def _as_batch(observation: Any) -> Any:
-    """Return what is seen of one world, an array or a dict of such, as what is seen of a batch."""
+    """Return an observation of one world, an array or a dict of such, as one of a batch."""
     if isinstance(observation, Mapping):
         return {name: part[None] for name, part in observation.items()}
     return observation[None]
 
 
 def _ending(info: Mapping[str, Any]) -> str:
-    """Return why an episode ended, from what its last step told of that world."""
+    """Return why an episode ended, from the infos of its last step."""
     flags = [name for name in ("diverged", "success") if info.get(name)]
     return str(info.get("reason") or next(iter(flags), TIME_LIMIT))
 
 
 def _step_limit(env: Any) -> int | None:
-    """Return the steps after which Gymnasium cuts off episodes of single environments, or None."""
+    """Return Gymnasium's limit on episodes of single environments, or None."""
     inner, spec = env.unwrapped, None
     if isinstance(inner, SyncVectorEnv | AsyncVectorEnv):
         spec = inner.get_attr("spec")[0]

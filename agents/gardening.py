@@ -8,7 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from npa_envs.agents.policies import unwrapped
+from npa_envs.agents.policies import PolicyDraws, unwrapped
 from npa_envs.checks import is_real
 from npa_envs.envs.garden.brush_layout import BrushLayout, grid_places
 from npa_envs.envs.garden.task import GardenTask, TargetDeficit
@@ -21,7 +21,7 @@ FREE_PLACES = 8
 
 
 class BrushPolicy:
-    """A policy of a garden, for arrays and tensors alike; subclasses say what brushes do.
+    """A policy of a garden, for arrays and tensors alike; subclasses define `act`.
 
     Args:
         env: A garden, single or vector, whose actions are numbers: "grid" or "free".
@@ -43,10 +43,10 @@ class BrushPolicy:
         self.config = self.task.config
         self.columns = BrushLayout.of(self.config)
         self.shape = inner.form.rows_shape
-        """Of what the brushes of a world do, (K, W)."""
+        """Shape of a world's actions, (K, W)."""
 
     def __call__(self, observation: Any) -> Any:
-        """Return what brushes do, shape [K, W], or [B, K, W] where B worlds are seen.
+        """Return the brushes' actions, [K, W], or [B, K, W] for observations of B worlds.
 
         Policies look at the worlds of their environment, not at the observation.
         """
@@ -56,7 +56,7 @@ class BrushPolicy:
         return action if isinstance(seen, Tensor) else action.cpu().numpy()
 
     def act(self, world_count: int) -> Tensor:
-        """Return what brushes do in the environment's worlds, float32, shape [B, K, W]."""
+        """Return the brushes' actions in the environment's worlds, float32, shape [B, K, W]."""
         raise NotImplementedError
 
     def still(self, world_count: int) -> Tensor:
@@ -72,22 +72,6 @@ class StillGardener(BrushPolicy):
         return self.still(world_count)
 
 
-class _Draws:
-    """Random numbers of a policy, one sequence a world."""
-
-    def __init__(self, device: torch.device, seed: int) -> None:
-        self._device, self._seed = device, seed
-        self._random: WorldRandom | None = None
-
-    def next(self, world_count: int) -> WorldRandom:
-        """Return the source of the next step's numbers, from the start where worlds are others."""
-        if self._random is None or self._random.world_count != world_count:
-            seeds = range(self._seed, self._seed + world_count)
-            self._random = WorldRandom(seeds, device=self._device).substream(StreamId.POLICY)
-        self._random.advance()
-        return self._random
-
-
 class RandomGardener(BrushPolicy):
     """Act at random, uniformly over the action space.
 
@@ -98,24 +82,24 @@ class RandomGardener(BrushPolicy):
 
     def __init__(self, env: Any, seed: int = 0) -> None:
         super().__init__(env)
-        self._draws = _Draws(self.task.device, seed)
+        self._draws = PolicyDraws(seed)
 
     def act(self, world_count: int) -> Tensor:
         """Return numbers from [-1, 1)."""
-        return 2.0 * self._draws.next(world_count).uniform(*self.shape) - 1.0
+        return 2.0 * self._draws.next(world_count, self.task.device).uniform(*self.shape) - 1.0
 
 
 class ScriptedGardener(BrushPolicy):
-    """Push particles to the side on which they lack, and from places with too many to others.
+    """Push particles towards places with too few of them.
 
-    What it does on a grid is linear in what is seen there. Brushes that can go anywhere go where
-    most is to be pushed furthest and no brush before them is.
+    On a grid actions are linear in observations. Free brushes go where the longest push is due and
+    no brush before them is.
 
     Args:
         env: A garden whose brushes push.
-        gain: How far to push for what lacks at a place (dimensionless).
-        share: How far to push towards neighbouring places for what lacks there (dimensionless).
-        width: How far away neighbours are, as a standard deviation [length units].
+        gain: Push for the deficit at a place (dimensionless).
+        share: Push towards neighbouring places for the deficit there (dimensionless).
+        width: Standard deviation of the distance of neighbours [length units].
 
     Raises:
         NPAError: `env` is no garden, its brushes do not push, or a number is not positive.
@@ -134,11 +118,11 @@ class ScriptedGardener(BrushPolicy):
         places = self._lacking.places
         away = places[None] - places[:, None]
         near = (-0.5 * away.square().sum(dim=-1) / checked_positive("width", width) ** 2).exp()
-        # In double precision: libraries add up one world in another order than many.
+        # In double precision: libraries add up one world in another order than several.
         self._ways = (checked_positive("share", share) * near[..., None] * away).double()
 
     def act(self, world_count: int) -> Tensor:
-        """Return what the brushes do about the worlds as they are."""
+        """Return the pushes for the deficits of the worlds."""
         worlds, action = self.worlds, self.still(world_count)
         lack = self._lacking(worlds.x, worlds.s, self.task.middle(worlds.x))
         ways = torch.einsum("bq,pqd->bpd", lack[..., 0].double(), self._ways).to(lack.dtype)
@@ -158,11 +142,11 @@ class ScriptedGardener(BrushPolicy):
 
 
 class ScriptedShepherd(BrushPolicy):
-    """Push everywhere: all the way to the goal, around, or outwards, as it asks for.
+    """Push everywhere in the direction of the goal: to a place, around, or outwards.
 
     Args:
         env: `npa/Shepherd2D-v0`, whose brushes push.
-        gain: Share of what is missing to the goal that is done in a step (dimensionless).
+        gain: Share of the way to the goal in a step (dimensionless).
         ring: Distance from the middle of the picture at which brushes stand that can go anywhere
             [length units].
 
@@ -186,7 +170,7 @@ class ScriptedShepherd(BrushPolicy):
             self._places = ring * torch.stack((angle.cos(), angle.sin()), dim=1)
 
     def act(self, world_count: int) -> Tensor:
-        """Return pushes towards the goals of the worlds as they are."""
+        """Return pushes towards the goals of the worlds."""
         worlds, action = self.worlds, self.still(world_count)
         achieved = self.task.achieved(worlds.x, worlds.s, worlds.referee.context)
         missing = (self.task.desired(worlds.referee.context) - achieved)[:, None, :2]
@@ -205,23 +189,19 @@ class ScriptedShepherd(BrushPolicy):
 
 
 def checked_positive(name: str, value: Any) -> float:
-    """Return what the caller calls so, a positive number.
-
-    Raises:
-        NPAError: It is none.
-    """
+    """Return a number that must be positive and finite."""
     if not is_real(value) or value <= 0.0:
         raise NPAError(f"{name} must be positive and finite, got {shown(value)}: try 0.2")
     return float(value)
 
 
 class GradientGardener(BrushPolicy):
-    """Plan by the gradient of what worlds are worth, through brushes, rule and picture.
+    """Plan by the gradient of rewards through brushes, rule and picture.
 
     In each step it copies the worlds and improves a plan for the next `horizon` steps by Adam,
     with draws of its own: it knows the state of the world, the rule and the target, and nothing of
-    the damage to come. It begins with what `ScriptedGardener` or `ScriptedShepherd` would do, and
-    does the first step of the best plan that it has seen.
+    the damage to come. It begins with the action of `ScriptedGardener` or `ScriptedShepherd`, and
+    takes the first step of the best plan found.
 
     Args:
         env: A garden whose brushes push, with dense rewards.
@@ -247,11 +227,11 @@ class GradientGardener(BrushPolicy):
         self._scripted = ScriptedShepherd(env) if shepherd else ScriptedGardener(env)
         self._horizon, self._iterations = horizon, iterations
         self._learning_rate = learning_rate
-        self._draws = _Draws(self.task.device, seed)
+        self._draws = PolicyDraws(seed)
 
     def act(self, world_count: int) -> Tensor:
-        """Return the first step of the plan, for the worlds as they are."""
-        draws = self._draws.next(world_count)
+        """Return the first step of the best plan."""
+        draws = self._draws.next(world_count, self.task.device)
         first = self._scripted.act(world_count)
         plan = torch.stack([first] + [self.still(world_count)] * (self._horizon - 1))
         plan[1:, ..., self.columns.place] = first[..., self.columns.place]
@@ -273,7 +253,7 @@ class GradientGardener(BrushPolicy):
 
     @torch.enable_grad()
     def worth(self, plan: Tensor, draws: WorldRandom) -> Tensor:
-        """Return what the worlds earn in the steps of a plan, [T, B, K, W], summed, [B]."""
+        """Return the worlds' rewards in the steps of a plan, [T, B, K, W], summed, [B]."""
         worlds, task = self.worlds, self.task
         x, s = worlds.x.detach(), worlds.s.detach()
         random = draws.substream(StreamId.POLICY)

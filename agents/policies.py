@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
 from collections.abc import Mapping, Sequence
 from itertools import accumulate
@@ -26,26 +27,20 @@ class Interface(NamedTuple):
 
     space_dim: int
     """Space dimension D."""
-
     state_dim: int
     """State channels C."""
-
     moving: bool
     """Whether actions begin with a displacement."""
-
     state_scale: float
     """State step of an action of 1, dimensionless."""
-
     species_count: int = 0
     """Species whose densities and density gradients follow in an observation; 0: none."""
-
     target_dim: int = 0
-    """Columns at the end of an observation that tell of the world's target; policies leave them
-    out."""
+    """Columns of the world's target at the end of an observation; policies leave them out."""
 
     @property
     def shared_dim(self) -> int:
-        """Columns of an observation that tell of all species together."""
+        """Columns of an observation about all species together."""
         return self.state_dim * (2 + self.space_dim) + self.space_dim
 
     @property
@@ -76,8 +71,8 @@ class Interface(NamedTuple):
         """Return the action of a displacement and a state step, within the action space.
 
         Args:
-            displacement: As a fraction of α ε, shape [..., D]; longer ones are shortened to 1, and
-                where particles do not move it counts for nothing.
+            displacement: As a fraction of α ε, shape [..., D]; longer ones are shortened to 1.
+                Where particles do not move it is left out.
             state_step: Change of the states, dimensionless, shape [..., C]; clipped to plus and
                 minus `state_scale`.
         """
@@ -89,12 +84,10 @@ class Interface(NamedTuple):
 
 
 def unwrapped(env: Any) -> Any:
-    """Return the NPA environment, single or vector, within wrappers.
-
-    Of Gymnasium's `SyncVectorEnv` it is the first of the environments that it holds.
+    """Return the NPA environment, single or vector, within wrappers; of `SyncVectorEnv` the first.
 
     Raises:
-        NPAError: It is none.
+        NPAError: There is none.
     """
     inner = getattr(env, "unwrapped", None)
     if isinstance(inner, SyncVectorEnv):
@@ -123,7 +116,7 @@ def interface_of(env: Any) -> Interface:
     """
     worlds = unwrapped(env).worlds
     physics = worlds.physics
-    # Worlds of species that are told apart perceive more than their physics says.
+    # Worlds with perception by species perceive more than their physics says.
     appended = getattr(worlds, "perception_dim", physics.perception_dim) - physics.perception_dim
     return Interface(
         physics.space_dim,
@@ -136,10 +129,10 @@ def interface_of(env: Any) -> Interface:
 
 
 def acting_interface(env: Any) -> Interface:
-    """Return what `interface_of` does of an environment whose actions are rows of its particles.
+    """Return `interface_of` an environment whose actions are rows of its particles.
 
     Raises:
-        NPAError: Actions are something else there, such as codes or brushes.
+        NPAError: Actions are something else, such as codes or brushes.
     """
     interface = interface_of(env)
     space = getattr(env, "single_action_space", None) or getattr(env, "action_space", None)
@@ -173,11 +166,7 @@ class Policy:
         self.interface = interface
 
     def act(self, observation: Tensor) -> Tensor:
-        """Return actions, float32, shape [B, N, A], on any device.
-
-        Args:
-            observation: What is perceived, float32, shape [B, N, P], on any device.
-        """
+        """Return actions [B, N, A] for observations [B, N, P], float32, on any device."""
         raise NotImplementedError
 
     @overload
@@ -188,11 +177,7 @@ class Policy:
 
     @torch.no_grad()
     def __call__(self, observation: Any) -> Any:
-        """Return the actions for observations, shape [N, P] or [B, N, P], or for agents' own.
-
-        Raises:
-            NPAError: The shape is another one.
-        """
+        """Return the actions for observations, or for each agent's."""
         if isinstance(observation, Mapping):
             return self._act_by_agent(observation)
         if isinstance(observation, Tensor):
@@ -202,7 +187,7 @@ class Policy:
         return self._act_on(torch.from_numpy(writable)).cpu().numpy()
 
     def _act_by_agent(self, observations: Mapping[str, Any]) -> dict[str, Any]:
-        """Return the actions of agents, by [P] or [N_k, P] or [B, N_k, P] that each perceives."""
+        """Return the actions of agents that observe [P] or [N_k, P] or [B, N_k, P]."""
         if not observations:
             return {}
         rows = {agent: torch.as_tensor(seen) for agent, seen in observations.items()}
@@ -228,7 +213,7 @@ class Policy:
         return result
 
     def _places(self, counts: Mapping[str, int]) -> dict[str, slice]:
-        """Return where the particles of agents stand, of whom each has so many."""
+        """Return the places of the particles of agents with such numbers of them."""
         ends = accumulate(counts.values())
         return {
             agent: slice(end - count, end)
@@ -299,14 +284,7 @@ class RulePolicy(Policy):
 
 
 class ZeroPolicy(Policy):
-    """Do nothing.
-
-    Args:
-        env: The environment that it is to act in.
-
-    Raises:
-        NPAError: Actions there are no rows of particles.
-    """
+    """Do nothing, in an environment whose actions are rows of particles."""
 
     def __init__(self, env: Any) -> None:
         super().__init__(acting_interface(env))
@@ -314,6 +292,29 @@ class ZeroPolicy(Policy):
     def act(self, observation: Tensor) -> Tensor:
         """Return zeros."""
         return observation.new_zeros(*observation.shape[:2], self.interface.action_dim)
+
+
+class PolicyDraws:
+    """Random numbers of a policy: a stream for each world, from the seeds `seed`, `seed + 1`, ...
+
+    Raises:
+        NPAError: The seed is no integer of at least 0.
+    """
+
+    def __init__(self, seed: Any) -> None:
+        if not (is_whole(seed) or isinstance(seed, np.integer)) or seed < 0:
+            raise NPAError(f"a seed must be an integer of at least 0, got {shown(seed)}")
+        self._seed = int(seed)
+        self._random: WorldRandom | None = None
+
+    def next(self, world_count: int, device: torch.device) -> WorldRandom:
+        """Return the source of the next step; other numbers of worlds begin from the start."""
+        if self._random is None or self._random.world_count != world_count:
+            seeds = range(self._seed, self._seed + world_count)
+            # A substream, as an environment with the same seed draws its masks from these streams.
+            self._random = WorldRandom(seeds, device=device).substream(StreamId.POLICY)
+        self._random.advance()
+        return self._random
 
 
 class RandomPolicy(Policy):
@@ -326,27 +327,18 @@ class RandomPolicy(Policy):
         seed: Of the sequence of actions, at least 0.
 
     Raises:
-        NPAError: The seed is no such integer, or actions there are no rows of particles.
+        NPAError: The seed is no such integer, or the environment's actions are no rows of
+            particles.
     """
 
     def __init__(self, env: Any, seed: int = 0) -> None:
         super().__init__(acting_interface(env))
-        given: Any = seed
-        if not (is_whole(given) or isinstance(given, np.integer)) or given < 0:
-            raise NPAError(f"a seed must be an integer of at least 0, got {shown(given)}")
-        self._seed = int(given)
-        self._random: WorldRandom | None = None
+        self._draws = PolicyDraws(seed)
 
     def act(self, observation: Tensor) -> Tensor:
         """Return numbers from [-1, 1)."""
         world_count, particle_count, _ = observation.shape
-        random = self._random
-        if random is None or random.world_count != world_count:
-            seeds = range(self._seed, self._seed + world_count)
-            # Beside, as an environment with the same seed draws its masks from the very streams.
-            random = WorldRandom(seeds, device=observation.device).substream(StreamId.POLICY)
-        self._random = random
-        random.advance()
+        random = self._draws.next(world_count, observation.device)
         return 2.0 * random.uniform(particle_count, self.interface.action_dim) - 1.0
 
 
@@ -363,9 +355,7 @@ class SpreadPolicy(Policy):
 
     def __init__(self, env: Any, gain: float = 0.03) -> None:
         super().__init__(interface_of(env))
-        if not is_real(gain):
-            raise NPAError(f"gain must be a finite number, got {shown(gain)}: try 0.03")
-        self._gain = gain
+        self._gain = _finite("gain", gain, 0.03)
 
     def act(self, observation: Tensor) -> Tensor:
         """Return displacements down the gradient and the subclass's state steps."""
@@ -403,21 +393,16 @@ class PaintPolicy(SpreadPolicy):
             colour = target_colour(env)
             if colour is None:
                 raise NPAError("colour must be given where env has no target: colour=(0, 0.5, 0)")
-        try:
+        with contextlib.suppress(TypeError, ValueError, RuntimeError, OverflowError):
             self._colour = torch.as_tensor(colour, dtype=torch.float32)
-        except (TypeError, ValueError, RuntimeError, OverflowError) as error:
+        if getattr(self, "_colour", torch.zeros(0)).shape != (3,):
             raise NPAError(
-                f"colour must have three numbers, got {shown(colour)}: for example colour=(0, 0.5, "
-                "0)"
-            ) from error
-        if self._colour.shape != (3,):
-            raise NPAError(
-                f"colour must have three numbers, got {tuple(self._colour.shape)}: "
-                "for example colour=(0, 0.5, 0)"
+                f"colour must have three numbers, got {shown(colour)}: for example "
+                "colour=(0, 0.5, 0)"
             )
 
     def state_step(self, observation: Tensor) -> Tensor:
-        """Return the way to the colour, which the last three channels hold."""
+        """Return the way to the colour in the last three channels."""
         step = torch.zeros_like(self.interface.states(observation))
         wanted = self._colour.to(step.device) - COLOUR_OFFSET
         step[..., -3:] = wanted - self.interface.states(observation)[..., -3:]
@@ -425,7 +410,7 @@ class PaintPolicy(SpreadPolicy):
 
 
 class MendPolicy(SpreadPolicy):
-    """Heal without a memory: blank particles take on their neighbours' mean state, all spread out.
+    """Heal without a memory: blank particles take their neighbours' mean state, all spread out.
 
     Args:
         env: The environment that it is to act in.
@@ -438,9 +423,7 @@ class MendPolicy(SpreadPolicy):
 
     def __init__(self, env: Any, blank: float = 0.1, gain: float = 0.003) -> None:
         super().__init__(env, gain)
-        if not is_real(blank):
-            raise NPAError(f"blank must be a finite number, got {shown(blank)}: try 0.1")
-        self._blank = blank
+        self._blank = _finite("blank", blank, 0.1)
 
     def state_step(self, observation: Tensor) -> Tensor:
         """Return the way to the neighbours' mean state where a particle is blank."""
@@ -449,18 +432,22 @@ class MendPolicy(SpreadPolicy):
         return torch.where(blank, self.interface.mean_states(observation) - states, 0.0)
 
 
+def _finite(name: str, value: float, example: float) -> float:
+    if not is_real(value):
+        raise NPAError(f"{name} must be a finite number, got {shown(value)}: try {example}")
+    return value
+
+
 def rule_interface(rule: NPARule, state_scale: float) -> Interface:
-    """Return what observations and actions mean to a rule."""
+    """Return the meaning of observations and actions to a rule."""
     moving = not rule.static
     return Interface(rule.space_dim, rule.state_dim, moving, state_scale, rule.species_count)
 
 
 def bounded_update(rule: NPARule, observation: Tensor) -> tuple[Tensor, Tensor]:
-    """Return what a rule does about what particles observe; differentiable.
+    """Return a rule's bounded updates for observations [K, P]; differentiable.
 
-    Args:
-        rule: The rule; the update is computed on its device, in its precision.
-        observation: What environments offer, shape [K, P].
+    They are computed on the rule's device, in its precision.
 
     Returns:
         Displacements δ / (1 + |δ|) as fractions of α ε, shape [K, D], or [K, 0] where particles are
@@ -470,7 +457,7 @@ def bounded_update(rule: NPARule, observation: Tensor) -> tuple[Tensor, Tensor]:
     rows = perceived(rule, observation.to(weight.device, weight.dtype))
     network = rule.network()
     if network is not None:
-        # The very products of a rollout: a rule amplifies rounding from step to step.
+        # The same products as in a rollout: a rule amplifies rounding from step to step.
         padded = rows.new_zeros(len(rows), network.row_width)
         padded[:, : rule.perception_dim] = rows
         padded[:, rule.perception_dim] = 1.0
@@ -488,7 +475,7 @@ def bounded(rule: NPARule, update: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def perceived(rule: NPARule, rows: Tensor) -> Tensor:
-    """Return what a rule reads of observations [K, P], in its order."""
+    """Return the columns of observations [K, P] that a rule reads, in its order."""
     if rule.state_gradient and rule.density_gradient:
         return rows
     first, end = 2 * rule.state_dim, rule_interface(rule, 1.0).shared_dim
@@ -498,7 +485,7 @@ def perceived(rule: NPARule, rows: Tensor) -> Tensor:
         groups.append(rows[:, first:density])
     if rule.density_gradient:
         groups.append(rows[:, density:end])
-    # What is offered of each species is read by all rules that tell them apart.
+    # All rules that perceive by species read all columns of the species.
     return torch.cat((*groups, rows[:, end:]), dim=1)
 
 
@@ -519,7 +506,7 @@ def check_rule_fits(rule: NPARule, wanted: Interface, config: Any) -> None:
     """Check that a rule can act in an environment as it does in a rollout.
 
     Raises:
-        NPAError: It cannot; the message says in what they differ.
+        NPAError: They differ.
     """
     _check_correction(rule)
     if rule.static == wanted.moving:

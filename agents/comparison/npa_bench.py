@@ -1,9 +1,9 @@
 """NPA-Bench v0: frozen problems and budgets, rows of results as JSON files, and their scores.
 
-There are two suites by one protocol, one for a GPU and a small one for a laptop. A row is what one
-method reached in a suite: for each problem the returns of at least `LEAST_SEEDS` runs. It is a
-file, which anybody can write; `npa_bench_v0.schema.json` beside this module is its schema. Scores
-follow from the files alone: those of the methods `zero` and `gradient` are 0 and 1.
+There are two suites by one protocol, one for a GPU and a small one for a laptop. A row holds the
+results of one method in a suite: for each problem the returns of at least `LEAST_SEEDS` runs. It is
+a file that follows `npa_bench_v0.schema.json`, whoever wrote it. Scores follow from the files
+alone: those of the methods `zero` and `gradient` are 0 and 1.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from npa_envs.agents.learning import methods_for
 from npa_envs.agents.learning.problem import Problem
 from npa_envs.errors import MissingDependencyError, NPAError, shown, suggest
 from npa_envs.files import read_json
-from npa_envs.measure.record import write_record
+from npa_envs.measure.record import number, write_record
 
 AXIS: Axis = "particle-steps"
 """What is equal for all methods."""
@@ -41,10 +41,10 @@ METHODS = {
     "random": "acts at random",
     "zero": "does nothing",
 }
-"""What is run, in a sentence; a method that has nothing for a problem is left out there."""
+"""Methods in a sentence each; one that cannot learn a problem is left out there."""
 
 EPISODES = 32
-"""Held-out episodes that tell what a run has reached."""
+"""Held-out episodes of a run at its end."""
 
 LEAST_SEEDS = 5
 """Runs of a method on a problem, at least, from different seeds."""
@@ -65,7 +65,7 @@ class BenchProblem(NamedTuple):
 
 
 QUICK_SHARE = 1e-3
-"""Share of the budgets that quick runs have: they say nothing but that it runs."""
+"""Share of the budgets that quick runs have, which only show that all runs."""
 
 LEFT_OUT = frozenset({("npa/PointClassificationSmall-v0", "scripted")})
 """Pairs of a problem and a method that are not run: no scripted policy classifies."""
@@ -73,13 +73,11 @@ LEFT_OUT = frozenset({("npa/PointClassificationSmall-v0", "scripted")})
 
 @dataclass(frozen=True)
 class Suite:
-    """Problems by their ids with their budgets. Nothing of them ever changes; others make another
-    version.
-    """
+    """Problems by their ids with their budgets: frozen, as changed ones make another version."""
 
     name: str
     groups: Mapping[str, Mapping[str, BenchProblem]]
-    """Problems that are told together."""
+    """Problems that are reported together."""
 
     @property
     def entries(self) -> dict[str, BenchProblem]:
@@ -98,25 +96,18 @@ class Suite:
         return [name for name in METHODS if any(name in table for table in suited)]
 
     def problem_of(self, task: str) -> Problem:
-        """Return the problem of a name of `tasks`.
-
-        Raises:
-            NPAError: There is no such task.
-        """
+        """Return the problem of a name of `tasks`."""
         if task not in self.tasks:
             raise NPAError(
                 f"unknown task {shown(task)} of {self.name}: {suggest(task, self.tasks)}"
             )
-        entry = self.entries[self.tasks[task]]
-        return Problem(
-            env_id=self.tasks[task],
-            episode_steps=entry.episode_steps,
-            num_envs=entry.num_envs,
-            hidden_dim=entry.hidden_dim,
-        )
+        env_id = self.tasks[task]
+        fields = self.entries[env_id]._asdict()
+        del fields["particle_steps"]
+        return Problem(env_id=env_id, **fields)
 
     def leaves_out(self, task: str, method: str) -> bool:
-        """Return whether a method has nothing for a task; "module:function" is taken to have."""
+        """Return whether a method cannot learn a task; "module:function" is taken to learn all."""
         if ":" in method:
             return False
         known = methods_for(self.problem_of(task))
@@ -128,7 +119,7 @@ class Suite:
 
 
 def task_name(env_id: str) -> str:
-    """Return what runs of a problem are called: its id without "npa/"."""
+    """Return the name of a problem's task: its id without "npa/"."""
     return env_id.removeprefix("npa/")
 
 
@@ -170,36 +161,36 @@ SUITES: Mapping[str, Suite] = {
 particles, and its steps count."""
 
 
-# Rows: what methods reached
+# Rows: results of methods
 
 
 @dataclass(frozen=True)
 class BenchRun:
-    """What one run reached."""
+    """The result of one run."""
 
     env_id: str
     seed: int
     particle_steps: float
-    """What it learned from."""
+    """Particle-steps that it learned from."""
     mean_return: float
     """Mean return of the held-out episodes; NaN where it diverged."""
     curve: tuple[tuple[float, float], ...] = ()
     """Particle-steps, and the mean return of other held-out episodes after them."""
     machine: str = ""
-    """Where it ran, in a row of several machines; empty: not told."""
+    """Its machine, in a row of several machines."""
 
 
 @dataclass(frozen=True)
 class BenchRow:
-    """What a method reached in a suite."""
+    """The results of a method in a suite."""
 
     suite: Suite
     method: str
     runs: tuple[BenchRun, ...]
     about: str = ""
-    """What the method is, in a sentence."""
+    """The method in a sentence."""
     machine: str = ""
-    """Where it ran; several machines are set apart by semicolons."""
+    """Its machine, or several separated by semicolons."""
 
     def returns(self, env_id: str) -> NDArray[np.float64]:
         """Return the mean returns of its runs on a problem, in the order of their seeds."""
@@ -212,18 +203,14 @@ def write_rows(
 ) -> list[Path]:
     """Write a file for each method of a suite's plan, METHOD.json, and return the paths.
 
-    What a file holds of other problems and seeds is kept. It then names the commands, commits,
-    machines and versions of all of its runs, set apart by semicolons.
-
-    Raises:
-        NPAError: A file cannot be written, or as for `check_rows`.
+    A file keeps its runs of other problems and seeds. It then names the commands, commits, machines
+    and versions of all of its runs, separated by semicolons.
     """
     paths = []
     for method in dict.fromkeys(record.job.method for record in records):
         some = [r for r in records if r.job.method == method and r.status != "failed"]
         if some:
             paths.append(folder / f"{method}.json")
-            facts = {name: plan.settings[name] for name in ("machine", "commit", "versions")}
             row = {
                 "benchmark": suite.name,
                 "method": method,
@@ -231,7 +218,7 @@ def write_rows(
                 "options": dict(plan.options.get(method, {})),
                 "command": command,
                 "date": max(record.date for record in some),
-                **facts,
+                **{name: plan.settings[name] for name in ("machine", "commit", "versions")},
                 "runs": [_run_object(suite, record) for record in some],
             }
             held = _held_row(suite, plan, method, folder)
@@ -240,12 +227,7 @@ def write_rows(
 
 
 def check_rows(suite: Suite, plan: ComparisonPlan, folder: Path) -> None:
-    """Check that runs of a plan can be added to the rows in a folder, before any of them is run.
-
-    Raises:
-        NPAError: A row is of another suite, or of another method or other options under its name,
-            has other episodes, as quick runs do, or cannot be read.
-    """
+    """Check that runs of a plan can be added to the rows in a folder, before any of them is run."""
     for method in plan.methods:
         _held_row(suite, plan, method, folder)
 
@@ -253,7 +235,7 @@ def check_rows(suite: Suite, plan: ComparisonPlan, folder: Path) -> None:
 def _held_row(
     suite: Suite, plan: ComparisonPlan, method: str, folder: Path
 ) -> dict[str, Any] | None:
-    """Return a method's row in a folder, None where there is none; errors of `check_rows`."""
+    """Return a method's row in a folder, None where there is none."""
     path = folder / f"{method}.json"
     if not path.exists():
         return None
@@ -268,8 +250,8 @@ def _held_row(
         lengths = {len(run["returns"]) for run in held["runs"]}
         for run in held["runs"]:
             run["id"], run["seed"]
-        told = [held[name] for name in ("machine", "commit", "command", "date")]
-        if not all(isinstance(text, str) for text in told):
+        texts = [held[name] for name in ("machine", "commit", "command", "date")]
+        if not all(isinstance(text, str) for text in texts):
             raise TypeError("machine, commit, command and date must be text")
     except (TypeError, KeyError, AttributeError, NPAError) as error:
         raise NPAError(
@@ -290,36 +272,32 @@ def _held_row(
     return held
 
 
-def _joined(suite: Suite, held: Mapping[str, Any], row: Mapping[str, Any]) -> dict[str, Any]:
+def _joined(suite: Suite, held: Mapping[str, Any], row: dict[str, Any]) -> dict[str, Any]:
     """Return a row with those runs of an earlier one that it does not have."""
     new = {(run["id"], run["seed"]) for run in row["runs"]}
     kept = [dict(run) for run in held["runs"] if (run["id"], run["seed"]) not in new]
     if not kept:
-        return dict(row)
+        return row
     added = [dict(run) for run in row["runs"]]
     for some, where in ((kept, held["machine"]), (added, row["machine"])):
-        # A row of several machines says already where each run was.
+        # In a row of several machines each run has its own already.
         if held["machine"] != row["machine"] and ";" not in where:
             for run in some:
                 run.setdefault("machine", where)
     order, runs = list(suite.entries), [*kept, *added]
     runs.sort(key=lambda run: (run["seed"], order.index(run["id"]) if run["id"] in order else -1))
-    versions = {**held.get("versions", {}), **row["versions"]}
-    told = {name: _both(held[name], row[name]) for name in ("command", "commit", "machine")}
-    return {
-        **row,
-        **told,
-        "date": max(held["date"], row["date"]),
-        "versions": {
-            name: _both(held.get("versions", {}).get(name, version), version)
-            for name, version in versions.items()
-        },
-        "runs": runs,
+    before, now = held.get("versions", {}), row["versions"]
+    versions = {
+        name: _both(before.get(name, version), now.get(name, version))
+        for name, version in {**before, **now}.items()
     }
+    both = {name: _both(held[name], row[name]) for name in ("command", "commit", "machine")}
+    date = max(held["date"], row["date"])
+    return {**row, **both, "date": date, "versions": versions, "runs": runs}
 
 
 def _both(first: str | None, second: str | None) -> str | None:
-    """Return what both say, each part once, set apart by semicolons."""
+    """Return two texts in one, each part once, separated by semicolons."""
     if first == second:
         return first
     parts = [part for text in (first, second) for part in str(text).split("; ")]
@@ -339,12 +317,7 @@ def _run_object(suite: Suite, record: RunRecord) -> dict[str, Any]:
 
 
 def read_row(path: Path) -> BenchRow:
-    """Return a row from its file.
-
-    Raises:
-        NPAError: It does not follow the schema or the rules of the benchmark.
-        MissingDependencyError: jsonschema is not installed.
-    """
+    """Return a row from its file."""
     try:
         import jsonschema
     except ImportError as error:
@@ -358,15 +331,15 @@ def read_row(path: Path) -> BenchRow:
         raise NPAError(
             f"{path.name} must follow {SCHEMA.name}, but at {error.json_path} {error.message}"
         ) from error
-    runs = tuple(_read_run(run) for run in held["runs"])
-    suite, told = SUITES[held["benchmark"]], held.get("about", "")
-    row = BenchRow(suite, held["method"], runs, told, held["machine"])
+    runs = tuple(map(_read_run, held["runs"]))
+    suite, about = SUITES[held["benchmark"]], held.get("about", "")
+    row = BenchRow(suite, held["method"], runs, about, held["machine"])
     _check_row(row, path.name)
     return row
 
 
 def _read_run(held: Mapping[str, Any]) -> BenchRun:
-    returns = [math.nan if value is None else float(value) for value in held["returns"]]
+    returns = [number(value) for value in held["returns"]]
     mean = sum(returns) / len(returns) if returns else math.nan
     curve = tuple((at, value) for at, value in held["curve"] if value is not None)
     where = held.get("machine", "")
@@ -374,11 +347,10 @@ def _read_run(held: Mapping[str, Any]) -> BenchRun:
 
 
 def _check_row(row: BenchRow, name: str) -> None:
-    """Check what a schema cannot say; raises NPAError."""
+    """Check the rules that are not in the schema; raises NPAError."""
     entries = row.suite.entries
-    machines = row.machine.split("; ")
     for run in row.runs:
-        if run.machine and run.machine not in machines:
+        if run.machine and run.machine not in row.machine.split("; "):
             raise NPAError(
                 f"{name} has a run on {shown(run.machine)} that its machine does not name, got "
                 f"{shown(row.machine)}: name it there, behind a semicolon"
@@ -405,11 +377,7 @@ def _check_row(row: BenchRow, name: str) -> None:
 
 
 def read_rows(suite: Suite, folder: Path) -> dict[str, BenchRow]:
-    """Return all rows of a suite's folder by their methods.
-
-    Raises:
-        NPAError: As for `read_row`; or a file is of another suite, or two are of one method.
-    """
+    """Return all rows of a suite's folder by their methods."""
     rows: dict[str, BenchRow] = {}
     for path in sorted(folder.glob("*.json")):
         row = read_row(path)
@@ -442,9 +410,6 @@ def normalised(rows: Mapping[str, BenchRow], method: str, env_id: str) -> NDArra
     """Return the score of each run: (R − R_zero) / (R_gradient − R_zero) of mean returns R.
 
     R_zero and R_gradient are means over their runs. A run that diverged has the score 0.
-
-    Raises:
-        NPAError: There are no runs of `zero` or `gradient`, or the gradient is no better.
     """
     ends = []
     for name in (NOTHING, YARDSTICK):
@@ -475,9 +440,6 @@ def score(samples: Sequence[NDArray[np.float64]], seed: int = 0) -> Score:
     Args:
         samples: Scores of the runs on each problem.
         seed: Of the draws.
-
-    Raises:
-        MissingDependencyError: SciPy is not installed.
     """
     try:
         from scipy.stats import bootstrap

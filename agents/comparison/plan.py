@@ -19,7 +19,7 @@ from npa_envs.processes import part_of
 
 
 class Sizes(NamedTuple):
-    """A problem: its environment and keywords, episode, hidden layer, and what makes it quick."""
+    """A problem: environment, keywords, episode, hidden layer, and keywords of its quick form."""
 
     env_id: str
     keywords: Mapping[str, Any]
@@ -37,18 +37,14 @@ GROWTH = {
     "state_scale": 0.1,
     "colour_weight": 20.0,
 }
-"""What both tasks of growth have in common: a heart, wide enough neighbourhoods, small steps."""
+"""Keywords of both tasks of growth: a heart, wide enough neighbourhoods, small steps."""
 
 SMALL = {"particle_count": 64, "eps": 0.2, "eps0": 0.2, "resolution": 32}
-"""What makes both of them quick."""
+"""Keywords of their quick forms."""
 
 PROBLEMS: Mapping[str, Sizes] = {
     "morphogenesis2d": Sizes(
-        "npa/Morphogenesis2D-v0",
-        {**GROWTH, "seed_radius": 0.4},
-        48,
-        64,
-        SMALL,
+        "npa/Morphogenesis2D-v0", {**GROWTH, "seed_radius": 0.4}, 48, 64, SMALL
     ),
     "regeneration2d": Sizes(
         "npa/Regeneration2D-v0",
@@ -88,11 +84,7 @@ QUICK_STEPS = 16
 
 
 def make_problem(name: str, *, quick: bool = False) -> Problem:
-    """Return one of `PROBLEMS`; a quick one is tiny, for a test that everything runs.
-
-    Raises:
-        NPAError: There is no such task.
-    """
+    """Return one of `PROBLEMS`; a quick one is tiny, for a test that everything runs."""
     if name not in PROBLEMS:
         raise NPAError(f"unknown task {name!r}: {suggest(name, PROBLEMS)}")
     sizes = PROBLEMS[name]
@@ -112,7 +104,7 @@ NOTHING, YARDSTICK = "zero", "gradient"
 """Methods whose mean returns count as 0 and as 1."""
 
 Axis = Literal["seconds", "particle-steps"]
-"""What a comparison holds equal for all methods: wall time, or particle-steps."""
+"""Budget that is equal for all methods: wall time, or particle-steps."""
 
 AXES: tuple[Axis, ...] = get_args(Axis)
 
@@ -122,15 +114,15 @@ class Job:
     """One run: a method of `npa_envs.agents.learning` on a task of `PROBLEMS`, from a seed."""
 
     axis: Axis
-    """What its budget is counted in."""
+    """Unit of its budget."""
     task: str
     method: str
     seed: int
-    """Of the rule's first weights, of training's worlds and of everything that is drawn."""
+    """Seed of the rule's first weights, of training's worlds and of all draws."""
 
     @property
     def folder(self) -> PurePosixPath:
-        """Where its results lie, below the comparison's folder."""
+        """Folder of its results, below the comparison's."""
         return PurePosixPath(self.axis, self.task, self.method, f"seed-{self.seed}")
 
     def __str__(self) -> str:
@@ -150,16 +142,16 @@ class ComparisonPlan:
     options: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
     """Keyword options by method; others run with their defaults."""
     own: Mapping[str, str] = field(default_factory=dict)
-    """What is run as methods with names of their own: a known method, or "module:function"."""
+    """Methods with names of one's own: a known method, or "module:function"."""
     left_out: Collection[tuple[str, str]] = ()
-    """Pairs (task, method) that are not run, as the method has nothing for the task."""
+    """Pairs (task, method) that are not run."""
     episodes: int = 32
-    """Held-out episodes that tell what a run has reached."""
+    """Held-out episodes of each run at its end."""
     settings: Mapping[str, Any] = field(default_factory=dict)
-    """What else figures follow from: device, machine, runs at once, commit, versions."""
+    """Other facts that figures depend on: device, machine, runs at once, commit, versions."""
 
     def jobs(self) -> list[Job]:
-        """Return all runs, one seed after the other: what is whole first is whole for all."""
+        """Return all runs, one seed after the other, so that a seed is whole for all methods."""
         return [
             Job(axis, task, method, seed)
             for axis in self.budgets
@@ -177,7 +169,7 @@ class ComparisonPlan:
         return part_of(self.jobs(), words, lambda job: (job.axis, job.seed, job.task))
 
     def teacher(self, job: Job) -> Job | None:
-        """Return the run whose rules a run clones; None where it does not, or options name one."""
+        """Return the run whose rules a run clones, if it does and its options name no teacher."""
         if self.own.get(job.method, job.method) != "clone":
             return None
         if "teacher" in self.options.get(job.method, {}):
@@ -185,7 +177,7 @@ class ComparisonPlan:
         return replace(job, method="gradient")
 
     def facts(self, job: Job) -> dict[str, Any]:
-        """Return what the figures of one of `jobs()` follow from, as JSON has it."""
+        """Return the facts that figures of one of `jobs()` depend on, of JSON's types."""
         return {
             "problem": dict(self.tasks[job.task]),
             "budget": self.budgets[job.axis][job.task],

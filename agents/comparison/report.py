@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from npa_envs.agents.comparison.plan import AXES, NOTHING, YARDSTICK, Axis, ComparisonPlan
-from npa_envs.agents.comparison.run import PICTURE, SIZE, ComparisonPoint, RunRecord
+from npa_envs.agents.comparison.run import PICTURE, SIZE, RunRecord
+from npa_envs.agents.learning import CurvePoint
 from npa_envs.files import write_text
 from npa_envs.measure.plots import draw_band, legend_of, new_figure, png, write_plots
 from npa_envs.measure.record import write_record
@@ -35,49 +36,36 @@ TABLE, FIGURES, CURVES = "comparison.md", "comparison.json", "comparison.csv"
 def write_table(
     plan: ComparisonPlan, records: Sequence[RunRecord], folder: Path, command: str
 ) -> str:
-    """Write the table, in Markdown and as JSON, and all curves; return the table in Markdown.
-
-    Raises:
-        NPAError: A file cannot be written.
-    """
+    """Write the table, in Markdown and as JSON, and all curves; return the table in Markdown."""
     table = rows(records)
-    told = text(table) + _sharing(plan)
+    shown = text(table)
+    at_once = plan.settings.get("runs_at_once", 1)
+    if "seconds" in plan.budgets and at_once > 1:
+        shown += (
+            f"\nUp to {at_once} runs at once shared a device: the share of each in its wall time "
+            "is not controlled.\n"
+        )
     facts = {"command": command, **asdict(plan), "left_out": sorted(map(list, plan.left_out))}
-    write_text(folder / TABLE, f"`{command}`\n\n{told}")
+    write_text(folder / TABLE, f"`{command}`\n\n{shown}")
     write_record(folder / FIGURES, {"facts": facts, "rows": [row.as_object() for row in table]})
     write_text(folder / CURVES, curves(records))
-    return told
-
-
-def _sharing(plan: ComparisonPlan) -> str:
-    """Return what is to be said where runs of equal wall time were not alone; else nothing."""
-    at_once = plan.settings.get("runs_at_once", 1)
-    if "seconds" not in plan.budgets or at_once == 1:
-        return ""
-    return (
-        f"\nUp to {at_once} runs at once shared a device: what each had of it in its wall time is "
-        "not controlled.\n"
-    )
+    return shown
 
 
 def write_pictures(records: Sequence[RunRecord], folder: Path) -> list[str]:
-    """Write what was grown and, where matplotlib is installed, the curves; return what was done.
-
-    Raises:
-        NPAError: A file cannot be written.
-    """
+    """Write filmstrips and, where matplotlib is installed, curves; return a line for each file."""
     strips = [f"wrote {path}" for path in write_strips(records, folder)]
     return [*strips, *write_plots(lambda: pictures(records), folder / "curves_*.png", "curves")]
 
 
-# Rows: what a method reached on a task
+# Rows: the results of a method on a task
 
 
 class Estimate(NamedTuple):
     """A mean over seeds."""
 
     mean: float
-    """The mean; NaN where there is nothing to take it of."""
+    """The mean; NaN where there are no values."""
     error: float
     """Its standard error; NaN where there are fewer than two seeds."""
 
@@ -102,36 +90,36 @@ def estimate(values: Iterable[float]) -> Estimate:
 
 @dataclass(frozen=True)
 class ReportRow:
-    """What a method reached on a task, over its seeds."""
+    """The results of a method on a task, over its seeds."""
 
     axis: Axis
-    """What was equal for all methods."""
+    """The budget that is equal for all methods."""
     task: str
     method: str
     done: int
-    """Runs that came to their end."""
+    """Runs that finished."""
     diverged: int
     """Runs whose numbers became infinite or NaN."""
     failed: int
     """Runs that ended in another error."""
     counted: int
-    """Runs whose return is finite: those that means are taken of."""
+    """Runs whose return is finite: means are over these."""
     episodes_diverged: float
     """Share of the held-out episodes in which a world diverged; NaN without episodes."""
     final_return: Estimate
-    """Of held-out episodes."""
+    """Return of held-out episodes."""
     final_loss: Estimate
-    """At the ends of the same episodes."""
+    """Loss at the ends of the same episodes."""
     fraction: Estimate
-    """Of the gradient's improvement over doing nothing."""
+    """Fraction of the gradient's improvement over doing nothing."""
     seconds: float
-    """Mean wall time that training took [s]."""
+    """Mean wall time of training [s]."""
     particle_steps: float
-    """Mean particle-steps that training took."""
+    """Mean particle-steps of training."""
 
     @property
     def runs(self) -> int:
-        """All runs, whatever became of them."""
+        """All runs."""
         return self.done + self.diverged + self.failed
 
     def as_object(self) -> dict[str, Any]:
@@ -152,42 +140,25 @@ def rows(records: Iterable[RunRecord]) -> list[ReportRow]:
         job = record.job
         groups.setdefault((job.axis, job.task, job.method), []).append(record)
     returns = {key: estimate(r.mean_return for r in some) for key, some in groups.items()}
-    return [
-        _row(
-            some,
-            returns[key],
-            nothing=returns.get((*key[:2], NOTHING), UNKNOWN),
-            yardstick=returns.get((*key[:2], YARDSTICK), UNKNOWN),
+
+    def share(key: tuple[Axis, str, str]) -> Estimate:
+        nothing, yardstick = (
+            returns.get((*key[:2], method), UNKNOWN) for method in (NOTHING, YARDSTICK)
         )
-        for key, some in groups.items()
-    ]
+        found = fraction(returns[key], nothing, yardstick)
+        known = key[2] == YARDSTICK and not math.isnan(found.mean)
+        return Estimate(1.0, math.nan) if known else found
+
+    return [_row(some, returns[key], share(key)) for key, some in groups.items()]
 
 
-def fraction(reached: Estimate, nothing: Estimate, yardstick: Estimate) -> Estimate:
-    """Return (R - R_nothing) / (R_yardstick - R_nothing) of mean returns R, with both R's error.
-
-    It is not defined where the yardstick is no better than nothing. Errors are propagated to first
-    order; that of R_nothing, which is the same in both differences, is left out.
-    """
-    gain = yardstick.mean - nothing.mean
-    if not gain > 0.0 or math.isnan(reached.mean):
-        return UNKNOWN
-    share = (reached.mean - nothing.mean) / gain
-    return Estimate(share, math.hypot(reached.error, share * yardstick.error) / gain)
-
-
-def _row(
-    records: Sequence[RunRecord], reached: Estimate, *, nothing: Estimate, yardstick: Estimate
-) -> ReportRow:
+def _row(records: Sequence[RunRecord], reached: Estimate, share: Estimate) -> ReportRow:
     job = records[0].job
     states = [record.status for record in records]
     lasts = [record.curve[-1] for record in records if record.curve]
     endings = [record.endings for record in records if record.endings]
     episodes = sum(sum(ending.values()) for ending in endings)
     lost = sum(ending.get(word, 0) for ending in endings for word in LOST)
-    share = fraction(reached, nothing, yardstick)
-    if job.method == YARDSTICK and not math.isnan(share.mean):
-        share = Estimate(1.0, math.nan)
     return ReportRow(
         axis=job.axis,
         task=job.task,
@@ -203,6 +174,19 @@ def _row(
         seconds=estimate(last.seconds for last in lasts).mean,
         particle_steps=estimate(last.particle_steps for last in lasts).mean,
     )
+
+
+def fraction(reached: Estimate, nothing: Estimate, yardstick: Estimate) -> Estimate:
+    """Return (R - R_nothing) / (R_yardstick - R_nothing) of mean returns R, with both R's error.
+
+    It is not defined where the yardstick is no better than nothing. Errors are propagated to first
+    order; that of R_nothing, which is the same in both differences, is left out.
+    """
+    gain = yardstick.mean - nothing.mean
+    if not gain > 0.0 or math.isnan(reached.mean):
+        return UNKNOWN
+    share = (reached.mean - nothing.mean) / gain
+    return Estimate(share, math.hypot(reached.error, share * yardstick.error) / gain)
 
 
 # Rows in words
@@ -236,30 +220,19 @@ def _table(table: Sequence[ReportRow]) -> str:
         return math.inf if math.isnan(mean) else -mean
 
     def cells(row: ReportRow) -> list[str]:
+        runs = [f"{row.done}"]
+        runs += [f"{row.diverged} diverged"] if row.diverged else []
+        runs += [f"{row.failed} failed"] if row.failed else []
+        if row.episodes_diverged > 0.0:
+            runs.append(f"{row.episodes_diverged:.0%} of episodes diverged")
         partial = f" (of {row.counted} of {row.runs})" if row.counted < row.runs else ""
         numbers = (row.final_return, row.final_loss, row.fraction)
         shown = [str(n) if math.isnan(n.mean) else f"{n}{partial}" for n in numbers]
         spent = (row.seconds, row.particle_steps)
-        return [
-            row.method,
-            _runs(row),
-            *shown,
-            *(NONE if math.isnan(value) else short(value) for value in spent),
-        ]
+        amounts = [NONE if math.isnan(value) else short(value) for value in spent]
+        return [row.method, ", ".join(runs), *shown, *amounts]
 
     return markdown_table(heads, map(cells, sorted(table, key=rank)))
-
-
-def _runs(row: ReportRow) -> str:
-    """Return how many runs there are, and what went wrong."""
-    parts = [f"{row.done}"]
-    if row.diverged:
-        parts.append(f"{row.diverged} diverged")
-    if row.failed:
-        parts.append(f"{row.failed} failed")
-    if row.episodes_diverged > 0.0:
-        parts.append(f"{row.episodes_diverged:.0%} of episodes diverged")
-    return ", ".join(parts)
 
 
 # Learning curves
@@ -268,25 +241,18 @@ def _runs(row: ReportRow) -> str:
 def curves(records: Iterable[RunRecord]) -> str:
     """Return all learning curves as comma-separated values, a line for each point.
 
-    Of runs that failed these are the curves up to there.
+    The curve of a run that failed ends there.
     """
-    heads = [
-        "axis",
-        "task",
-        "method",
-        "seed",
-        "status",
-        *(field.name for field in fields(ComparisonPoint)),
-    ]
+    names = [field.name for field in fields(CurvePoint)]
     lines = [
-        [*(r.job.axis, r.job.task, r.job.method, r.job.seed, r.status), *astuple(point)]
+        [r.job.axis, r.job.task, r.job.method, r.job.seed, r.status, *astuple(point)]
         for r in records
         for point in r.curve
     ]
-    return csv_text(heads, lines)
+    return csv_text(["axis", "task", "method", "seed", "status", *names], lines)
 
 
-ACROSS: dict[str, Callable[[ComparisonPoint], float]] = {
+ACROSS: dict[str, Callable[[CurvePoint], float]] = {
     "wall time [s]": lambda point: point.seconds,
     "particle-steps": lambda point: point.particle_steps,
 }
@@ -297,21 +263,19 @@ PLACES = 64
 
 
 class Curve(NamedTuple):
-    """A mean over seeds."""
+    """A mean over seeds at K places: where, the mean, and its standard error, shape [K] each."""
 
     across: NDArray[np.float64]
-    """Where, shape [K]."""
     mean: NDArray[np.float64]
-    """Mean of the seeds, shape [K]."""
     error: NDArray[np.float64]
-    """Its standard error, 0 for a single seed, shape [K]."""
+    """0 for a single seed."""
 
 
-def curve(records: Sequence[RunRecord], across: Callable[[ComparisonPoint], float]) -> Curve | None:
-    """Return the mean of learning curves where all of them are; None where they nowhere are.
+def curve(records: Sequence[RunRecord], across: Callable[[CurvePoint], float]) -> Curve | None:
+    """Return the mean of learning curves where they overlap; None where they do not.
 
-    Between its points a curve is straight. What does not learn has a single point: its curve is
-    that. Runs that broke off are left out, so that they do not cut off the others, unless all did.
+    Between its points a curve is straight. A method that does not learn has a single point. Runs
+    that broke off are left out, so that they do not cut off the others, unless all did.
     """
     lines = []
     for record in [record for record in records if record.status == "done"] or records:
@@ -339,13 +303,17 @@ def pictures(records: Sequence[RunRecord]) -> dict[str, bytes]:
 
 def _draw(records: Sequence[RunRecord]) -> bytes:
     axes = [axis for axis in AXES if any(record.job.axis == axis for record in records)]
-    methods = list(dict.fromkeys(record.job.method for record in records))
+    names = {}
+    for method in dict.fromkeys(record.job.method for record in records):
+        states = [record.status for record in records if record.job.method == method]
+        done, count = states.count("done"), len(states)
+        names[method] = method if done == count else f"{method} ({done} of {count})"
     figure, grid = new_figure(len(axes), len(ACROSS), (10.0, 3.4 * len(axes)))
     for axis, panels in zip(axes, grid, strict=True):
         for (label, across), panel in zip(ACROSS.items(), panels, strict=True):
-            for number, method in enumerate(methods):
+            for number, (method, name) in enumerate(names.items()):
                 some = [r for r in records if (r.job.axis, r.job.method) == (axis, method)]
-                _draw_method(panel, curve(some, across), f"C{number}", _name(method, records))
+                _draw_method(panel, curve(some, across), f"C{number}", name)
             panel.set(xlabel=label, ylabel="return of held-out episodes")
             panel.set_title(HEADINGS[axis], fontsize=9, loc="left")
             panel.grid(alpha=0.3)
@@ -354,18 +322,11 @@ def _draw(records: Sequence[RunRecord]) -> bytes:
     return png(figure)
 
 
-def _name(method: str, records: Sequence[RunRecord]) -> str:
-    """Return what a method is called in a picture: with the number of whole runs where not all."""
-    states = [record.status for record in records if record.job.method == method]
-    done = states.count("done")
-    return method if done == len(states) else f"{method} ({done} of {len(states)})"
-
-
 def _draw_method(panel: Any, found: Curve | None, colour: str, name: str) -> None:
     if found is None:
         panel.plot([], [], color=colour, label=name)
     elif len(found.across) == 1:
-        # It does not learn: what it gets, it gets for nothing.
+        # It does not learn.
         (mean,), (error,) = found.mean, found.error
         panel.axhline(mean, color=colour, lw=1.0, ls="--", label=name)
         panel.axhspan(mean - error, mean + error, color=colour, alpha=0.2, lw=0)
@@ -374,7 +335,7 @@ def _draw_method(panel: Any, found: Curve | None, colour: str, name: str) -> Non
         draw_band(panel, found.across, lines, colour, name, lw=1.5)
 
 
-# What each method grew: the last picture of a held-out episode
+# Filmstrips: the last picture of a held-out episode of each run
 
 
 def write_strips(records: Sequence[RunRecord], folder: Path) -> list[Path]:
@@ -391,7 +352,13 @@ def write_strips(records: Sequence[RunRecord], folder: Path) -> list[Path]:
             seeds = sorted({seed for _, seed in found})
             places = [(method, seed) for seed in seeds for method in methods]
             frames = [_frame(found.get(place), folder) for place in places]
-            captions = [_caption(*place, found.get(place)) for place in places]
+            captions = []
+            for method, seed in places:
+                record = found.get((method, seed))
+                result = "not run" if record is None else str(record.status)
+                if record is not None and result == "done":
+                    result = f"loss {record.mean_loss:.3f}"
+                captions.append(f"{method}, seed {seed}: {result}")
             written.append(folder / f"grown_{task}_{axis}.png")
             write_filmstrip(written[-1], frames, captions, columns=len(methods))
     return written
@@ -404,10 +371,3 @@ def _frame(record: RunRecord | None, folder: Path) -> NDArray[np.uint8]:
         return np.full((SIZE, SIZE, 3), 255, np.uint8)
     with Image.open(path) as picture:
         return np.asarray(picture.convert("RGB"))
-
-
-def _caption(method: str, seed: int, record: RunRecord | None) -> str:
-    told: str = "not run" if record is None else record.status
-    if record is not None and told == "done":
-        told = f"loss {record.mean_loss:.3f}"
-    return f"{method}, seed {seed}: {told}"

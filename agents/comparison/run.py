@@ -2,8 +2,8 @@
 
 They are spread over cores or GPUs, and each may fail by itself: a run has a process,
 `python -m npa_envs.agents.comparison.run FOLDER`, which gets ready, waits for a line on its input
-that names a device, and does there what `request.json` in the folder asks for. Then it may be told
-another folder and another device; it ends when its input does.
+that names a device, and does there what `request.json` in the folder asks for. Another folder, as
+JSON on a line, and another device are one more run. The process ends when its input does.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ from npa_envs.render import write_png
 Status = Literal["done", "diverged", "failed"]
 
 RECORD, REQUEST, OUTPUT, PICTURE = "run.json", "request.json", "output.txt", "picture.png"
-"""Files in the folder of a run: its record, what its process was asked for, what that said, the
+"""Files in the folder of a run: its record, the request to its process, the output of that, the
 last picture of a held-out episode."""
 
 SIZE = 192
@@ -54,32 +54,19 @@ FIRST_TEST_SEED = 2_000_000
 """Seeds of the held-out episodes begin here; learning curves are measured on others."""
 
 
-@dataclass(frozen=True)
-class ComparisonPoint:
-    """A place on a learning curve: training's wall time [s] and particles times steps so far, and
-    the mean return of held-out episodes, its standard error, and their mean loss at the end.
-    """
-
-    seconds: float
-    particle_steps: float
-    mean_return: float
-    standard_error: float
-    final_loss: float
-
-
 @dataclass(frozen=True, kw_only=True)
 class RunRecord:
-    """What came of one run."""
+    """The result of one run."""
 
     job: Job
     facts: Mapping[str, Any]
-    """What its figures follow from."""
+    """What its figures depend on."""
     status: Status
     """"done"; "diverged": numbers became infinite or NaN; "failed": an error of another kind."""
     error: str = ""
-    """What was raised, where it is not done."""
-    curve: Sequence[ComparisonPoint] = ()
-    """What held-out episodes gave while it learned."""
+    """The error, where it is not done."""
+    curve: Sequence[CurvePoint] = ()
+    """Held-out episodes while it learned."""
     returns: Sequence[float] = ()
     """Returns of the held-out episodes at the end."""
     final_losses: Sequence[float] = ()
@@ -103,26 +90,19 @@ class RunRecord:
         return _mean(self.final_losses)
 
     def write(self, folder: Path) -> None:
-        """Write everything into the run's folder; what is not finite becomes null.
-
-        Raises:
-            NPAError: It cannot be written.
-        """
+        """Write everything into the run's folder; numbers that are not finite become null."""
         write_record(folder / RECORD, asdict(self))
 
     @classmethod
     def read(cls, folder: Path, facts: Mapping[str, Any]) -> RunRecord | None:
-        """Return the record that a run left in its folder, None where there is none.
-
-        Raises:
-            NPAError: As for `read_record`.
-        """
+        """Return the record that a run left in its folder, None where there is none."""
 
         def made(held: dict[str, Any]) -> RunRecord:
+            points: list[dict[str, Any]]
             points = [{name: number(v) for name, v in row.items()} for row in held["curve"]]
             own = {
                 "job": Job(**held["job"]),
-                "curve": tuple(ComparisonPoint(**point) for point in points),
+                "curve": tuple(CurvePoint(**point) for point in points),
                 "returns": tuple(map(number, held["returns"])),
                 "final_losses": tuple(map(number, held["final_losses"])),
             }
@@ -137,11 +117,11 @@ def _mean(values: Sequence[float]) -> float:
 
 @dataclass(frozen=True)
 class RunRequest:
-    """What a process is asked for."""
+    """What a process is to do."""
 
     job: Job
     facts: dict[str, Any]
-    """What its figures follow from: problem, budget, method, options, episodes, and more."""
+    """What its figures depend on: problem, budget, method, options, episodes, and more."""
     threads: int = 1
     command: str = ""
     teacher: str = ""
@@ -155,26 +135,8 @@ class RunRequest:
         held = json.loads((folder / REQUEST).read_text("utf-8"))
         return cls(**held | {"job": Job(**held["job"])})
 
-    @property
-    def problem(self) -> Problem:
-        """What is to be learned."""
-        return Problem.from_json(json.dumps(self.facts["problem"]))
-
-    @property
-    def method(self) -> str:
-        """What learns: a known method, or "module:function"."""
-        return str(self.facts["method"])
-
-    @property
-    def budget(self) -> Budget:
-        """What may be spent on it."""
-        amount = self.facts["budget"]
-        if self.job.axis == "seconds":
-            return Budget(seconds=float(amount))
-        return Budget(particle_steps=int(amount))
-
     def record(self, status: Status, begin: float, **fields: Any) -> RunRecord:
-        """Return a record of what came of it since `begin`, of `time.perf_counter` [s]."""
+        """Return the record of a run that began at `begin` of `time.perf_counter` [s]."""
         return RunRecord(
             job=self.job,
             facts=self.facts,
@@ -189,20 +151,20 @@ class RunRequest:
 def run(folder: Path, device: str) -> None:
     """Do what `request.json` in a folder asks for; leave the record, the rules and a picture there.
 
-    Whatever is raised is recorded, so that other runs can go on.
+    Errors are recorded, so that other runs can go on.
     """
     request = RunRequest.read(folder)
     torch.set_num_threads(request.threads)
     begin = time.perf_counter()
-    curve: list[ComparisonPoint] = []
+    curve: list[CurvePoint] = []
     try:
-        episodes = _learn(request, folder, device, lambda entry: curve.append(_point(entry)))
+        episodes = _learn(request, folder, device, curve.append)
     except Exception as error:
-        # Whatever breaks here is what the table has to say of the method.
+        # The table reports what breaks in a method.
         traceback.print_exc()
         status: Status = "diverged" if isinstance(error, DivergedError) else "failed"
-        told = f"{type(error).__name__}: {' '.join(str(error).split())}"
-        record = request.record(status, begin, error=told, curve=tuple(curve))
+        said = f"{type(error).__name__}: {' '.join(str(error).split())}"
+        record = request.record(status, begin, error=said, curve=tuple(curve))
     else:
         finite = math.isfinite(episodes.mean_return)
         record = request.record(
@@ -221,37 +183,22 @@ def _learn(
     request: RunRequest, folder: Path, device: str, on_entry: Callable[[CurvePoint], None]
 ) -> Episodes:
     """Learn, write what was learned, and return the held-out episodes."""
-    problem, job, facts = request.problem, request.job, request.facts
-    options = dict(facts["options"])
-    if request.teacher:
-        options["teacher"] = request.teacher
+    job, facts = request.job, request.facts
+    problem, amount = Problem(**facts["problem"]), facts["budget"]
+    in_seconds = job.axis == "seconds"
+    budget = Budget(seconds=amount) if in_seconds else Budget(particle_steps=int(amount))
+    options = dict(facts["options"]) | ({"teacher": request.teacher} if request.teacher else {})
     trained = train(
-        request.method,
-        problem,
-        request.budget,
-        job.seed,
-        device=device,
-        on_entry=on_entry,
-        **options,
+        facts["method"], problem, budget, job.seed, device=device, on_entry=on_entry, **options
     )
     trained.save(folder)
     seeds = range(FIRST_TEST_SEED, FIRST_TEST_SEED + facts["episodes"])
-    # Worlds of their own: what a method changed in its environment does not reach them.
+    # New worlds: the method may have changed its own.
     envs = problem.make_envs(min(len(seeds), problem.num_envs), device=device)
     episodes = evaluate_policy(envs, trained.policy, seeds)
     picture = final_picture(problem, trained.policy, FIRST_TEST_SEED, device=device)
     write_png(folder / PICTURE, picture)
     return episodes
-
-
-def _point(entry: CurvePoint) -> ComparisonPoint:
-    return ComparisonPoint(
-        entry.seconds,
-        entry.particle_steps,
-        entry.mean_return,
-        entry.standard_error,
-        entry.final_loss,
-    )
 
 
 def final_picture(
@@ -261,13 +208,9 @@ def final_picture(
 
     The policy maps observations, [1, N, P], to actions, [1, N, A].
     """
-    seen = {"render_mode": "rgb_array", "render_size": SIZE}
+    keywords = {**problem.keywords, "render_mode": "rgb_array", "render_size": SIZE}
     # One step more, as a world that is over shows the next episode's start.
-    longer = replace(
-        problem,
-        keywords={**problem.keywords, **seen},
-        episode_steps=problem.episode_steps + 1,
-    )
+    longer = replace(problem, keywords=keywords, episode_steps=problem.episode_steps + 1)
     envs = longer.make_envs(1, device=device)
     policy = policy_in(envs, policy)
     observation, _ = envs.reset(seed=[seed])
@@ -299,22 +242,23 @@ def main(folder: Path) -> None:
         os._exit(1)
 
     threading.Thread(target=listen, daemon=True).start()
-    # Loads what the method needs. Whatever breaks here breaks in `run` as well, which records it.
+    request = RunRequest.read(folder)
+    # Loads the method's libraries. What breaks now breaks in `run` as well, which records it.
     with contextlib.suppress(Exception):
-        method_options(RunRequest.read(folder).method)
-    lasts = RunRequest.read(folder).lasts
+        method_options(request.facts["method"])
+    lasts = request.lasts
     run(folder, lines.get())
     while lasts:
         folder = Path(json.loads(lines.get()))
         _redirect_output(folder)
         run(folder, lines.get())
-        # Nothing of a run is to be in the way of the next.
+        # Free the memory of a run for the next one.
         gc.collect()
         torch.cuda.empty_cache()
 
 
 def _redirect_output(folder: Path) -> None:
-    """Send what this process says from now on into a folder's file."""
+    """Send the output of this process into a folder's file from now on."""
     for stream in (sys.stdout, sys.stderr):
         stream.flush()
     with (folder / OUTPUT).open("wb") as output:
@@ -326,15 +270,13 @@ def _redirect_output(folder: Path) -> None:
 # libraries, a GPU's context and kernels, takes longer than many runs learn.
 
 PROGRAM = (sys.executable, "-m", "npa_envs.agents.comparison.run")
-"""What a run's process is, before the folder of the run: it gets ready, begins when a line of its
-input names a device, and ends when its input does. Another folder, as JSON on a line, and another
-device are one more run."""
+"""Command of a run's process, before the folder of the run."""
 
 MEASURED = ("done", "diverged")
 """Runs that a resumed comparison does not repeat."""
 
-TOLD = 2000
-"""Characters at most that are told of what a dead process said last."""
+LAST_OUTPUT = 2000
+"""Characters of a dead process' last output that are shown, at most."""
 
 
 @dataclass
@@ -357,7 +299,7 @@ class _Process(Child):
         _tell(self.process, device)
 
     def end(self) -> None:
-        """End it, and leave nothing of it."""
+        """End it, and remove its folder."""
         self.process.terminate()
         self.process.communicate()
         shutil.rmtree(self.folder, ignore_errors=True)
@@ -365,8 +307,8 @@ class _Process(Child):
 
 def _tell(process: subprocess.Popen[bytes], line: str) -> None:
     """Write a line to the input of a process."""
-    assert process.stdin is not None, "asked for at its start"
-    # One that has died is found dead, and recorded, by whoever looks next.
+    assert process.stdin is not None, "opened at its start"
+    # The next look finds that a process has died, and records it.
     with contextlib.suppress(BrokenPipeError):
         process.stdin.write(f"{line}\n".encode())
         process.stdin.flush()
@@ -375,20 +317,16 @@ def _tell(process: subprocess.Popen[bytes], line: str) -> None:
 def lasts(plan: ComparisonPlan, job: Job) -> bool:
     """Return whether the process of a run does others before and afterwards.
 
-    One that is measured by time has a process of its own, so that all start alike, and so has a
-    function from outside this library, as it may keep what it likes.
+    A run that is measured by time has a process of its own, so that all start alike, and so has a
+    function from outside this library, which may leave things in memory.
     """
     own = ":" in plan.own.get(job.method, job.method)
-    # Elsewhere no folder can be moved while a process writes into it.
+    # Other systems move no folder while a process writes into it.
     return os.name == "posix" and job.axis == "particle-steps" and not own
 
 
 def held_records(plan: ComparisonPlan, folder: Path) -> dict[Job, RunRecord]:
-    """Return what an earlier comparison left in a folder, but for runs that failed.
-
-    Raises:
-        NPAError: A record cannot be read, or follows from other settings.
-    """
+    """Return the records of an earlier comparison in a folder without runs that failed."""
     found = {job: RunRecord.read(folder / job.folder, plan.facts(job)) for job in plan.jobs()}
     return {
         job: record
@@ -422,10 +360,6 @@ def run_jobs(
         command: The command line, for the records.
         max_seconds: No run begins after so long [s].
         written: Called with each record once it is in its place.
-
-    Raises:
-        NPAError: A run would clone one that is neither among the jobs nor in the folder, or is
-            there with other settings, or the folder cannot be written to.
     """
     _check_teachers(plan, jobs, folder)
     waiting = list(jobs)
@@ -447,7 +381,7 @@ def run_jobs(
             one.process.communicate()
         written(record)
 
-    # What a killed comparison left of runs half-way.
+    # Unfinished runs of a killed comparison.
     for job in jobs:
         target = folder / job.folder
         for left in target.parent.glob(f".{target.name}.*"):
@@ -466,10 +400,7 @@ def run_jobs(
 
 
 def _check_teachers(plan: ComparisonPlan, jobs: Collection[Job], folder: Path) -> None:
-    """Refuse runs whose teacher is not there and will not come, before anything is run.
-
-    One that is there must follow from the same settings.
-    """
+    """Refuse runs whose teacher is neither in the folder, with the same settings, nor to be run."""
     for job in jobs:
         teacher = plan.teacher(job)
         if teacher is None or teacher in jobs:
@@ -502,7 +433,7 @@ def _start(
     request = RunRequest(job, plan.facts(job), places.threads, command, taught, lasting)
     write_record(part / REQUEST, asdict(request))
     if lasting and idle:
-        # The process turns to this file itself, unless it dies before.
+        # The process opens this file itself, unless it dies before.
         (part / OUTPUT).touch()
         process = idle.pop()
         _tell(process, json.dumps(str(part)))
@@ -527,14 +458,14 @@ def _finish(plan: ComparisonPlan, one: _Process, folder: Path, command: str) -> 
     record = RunRecord.read(one.folder, request.facts)
     if record is None:
         code = one.process.returncode
-        told = (one.folder / OUTPUT).read_text("utf-8", errors="replace").strip()[-TOLD:]
-        error = f"its process ended with code {code}: {' '.join(told.split())}"
+        said = (one.folder / OUTPUT).read_text("utf-8", errors="replace").strip()[-LAST_OUTPUT:]
+        error = f"its process ended with code {code}: {' '.join(said.split())}"
         record = request.record("failed", one.begin, error=error)
         record.write(one.folder)
     (one.folder / REQUEST).unlink(missing_ok=True)
     target = folder / one.job.folder
     if target.exists():
-        # It holds a run that failed, or no record: else this one would not have been run.
+        # It holds a run that failed, or no record: others are not repeated.
         shutil.rmtree(target)
     os.replace(one.folder, target)
     return record

@@ -8,6 +8,7 @@ method's libraries are imported when it is asked for.
 from __future__ import annotations
 
 import inspect
+import json
 import pkgutil
 from collections.abc import Callable, Iterable
 from dataclasses import fields, is_dataclass, replace
@@ -16,11 +17,9 @@ from typing import Any, NamedTuple
 
 import torch
 
-from npa_envs.agents.learning.kept import KeptProgress
 from npa_envs.agents.learning.problem import EVALUATION_SEEDS, Problem, check_run_seed
-from npa_envs.agents.learning.progress import Budget, CurvePoint, Progress, check_finite
-from npa_envs.agents.learning.rules import RuleSet, RuleSetPolicy, starting_rules
-from npa_envs.devices import check_device
+from npa_envs.agents.learning.progress import Budget, CurvePoint, Keeping, Progress, check_finite
+from npa_envs.agents.learning.rules import RuleSet, RuleSetPolicy
 from npa_envs.errors import MissingDependencyError, NPAError, shown, suggest
 from npa_envs.training.ranks import Ranks
 from npa_envs.training.run_folder import RunFolder
@@ -53,10 +52,8 @@ METHODS: dict[str, str] = {
     "zero": "npa_envs.agents.learning.baselines:train_zero",
     "scripted": "npa_envs.agents.learning.baselines:train_scripted",
 }
-"""Where methods are: functions `f(problem, progress, seed, *, device, start, ...)` that return a
-`RuleSet` or a policy. `progress` keeps the budget and the learning curve, `seed` is that of new
-rules and of all draws, `start` are rules to begin with, which are copied, or None. A method's
-options are further keyword arguments, or the fields of a dataclass which is the default of an
+"""Methods: functions `f(progress, ...)` of a `Progress` that return a `RuleSet` or a policy. A
+method's options are keyword-only arguments, or the fields of a dataclass which is the default of an
 argument `options`. Others may be added."""
 
 KEPT_METHODS = ("ppo", "shac")
@@ -64,8 +61,8 @@ KEPT_METHODS = ("ppo", "shac")
 
 GARDEN_METHODS: dict[str, str] = {
     "gradient": "npa_envs.agents.learning.baselines:tend_gradient",
-    "ppo_world": "npa_envs.agents.learning.garden_sb3:train_ppo",
-    "sac": "npa_envs.agents.learning.garden_sb3:train_sac",
+    "ppo_world": "npa_envs.agents.learning.sb3:train_garden_ppo",
+    "sac": "npa_envs.agents.learning.sb3:train_garden_sac",
     "random": "npa_envs.agents.learning.baselines:tend_random",
     "zero": "npa_envs.agents.learning.baselines:tend_zero",
     "scripted": "npa_envs.agents.learning.baselines:tend_scripted",
@@ -78,10 +75,8 @@ class Trained(NamedTuple):
 
     rules: RuleSet | None
     """The rules, on the run's device; None where a method has none."""
-
     log: list[CurvePoint]
     """The learning curve."""
-
     policy: Callable[[Any], Any]
     """Maps observations, [B, N, P], to actions, [B, N, A], and a dict of agents' observations, of
     PettingZoo's parallel environments, to one of their actions: the rules' where there are some."""
@@ -138,7 +133,7 @@ def train(
 
     Raises:
         NPAError: There is no such method or option, the method cannot learn this problem, cannot be
-            shared or kept, or the rules to begin with do not fit it. Or as for `KeptProgress`.
+            shared or kept, or the rules to begin with do not fit it. Or as for `Progress`.
         DivergedError: The rules' weights have become infinite or NaN.
         MissingDependencyError: The method needs a library that is not installed.
     """
@@ -155,6 +150,7 @@ def train(
             "give a function of your own, 'package.module:function', or take another library"
         )
     function = _function(method, methods_for(problem))
+    declared = _declared(function)
     known = _options_of(function)
     for name in options:
         if name not in known:
@@ -162,42 +158,36 @@ def train(
                 f"method {shown(method)} has no option {shown(name)}: {suggest(name, known)}"
             )
     check_run_seed(seed)
-    place = check_device(device)
-    if start is not None:
-        start = starting_rules(problem, seed, place, start)
     _check_kept(method, out, resume or overwrite)
-    declared = _declared(function)
-    account: dict[str, Any] = {
-        "problem": problem,
-        "budget": budget,
-        "device": place,
-        "evaluation_seeds": evaluation_seeds,
-        "entries": entries,
-        "on_entry": on_entry,
-    }
-    if out is None:
-        progress = Progress(**account)
-    else:
-        told = {"method": method, "problem": problem.to_json(), "seed": seed, "options": options}
-        told["started"] = start is not None
-        progress = KeptProgress(
-            RunFolder(Path(out)),
-            told,
-            resume=resume,
-            overwrite=overwrite,
-            on_stop=on_stop,
-            **account,
+    keeping = None
+    if out is not None:
+        run = {"method": method, "problem": problem.to_json(), "seed": seed, "options": options}
+        run = json.loads(json.dumps(run | {"started": start is not None}))
+        folder = RunFolder(Path(out))
+        keeping = Keeping(
+            folder=folder, run=run, resume=resume, overwrite=overwrite, on_stop=on_stop
         )
+    progress = Progress(
+        problem,
+        budget,
+        seed,
+        device=device,
+        evaluation_seeds=evaluation_seeds,
+        entries=entries,
+        on_entry=on_entry,
+        initial=start,
+        keeping=keeping,
+    )
     given = {"options": replace(declared, **options)} if declared is not None else options
-    result = function(problem, progress, seed, device=place, start=start, **given)
+    result = function(progress, **given)
     if isinstance(result, RuleSet):
-        # Of no use any more, they may keep the memory of recorded work.
+        # Unused gradients may keep the memory of recorded work.
         result.zero_grad()
         return Trained(result, progress.log, result.policy())
     return Trained(None, progress.log, result)
 
 
-def _check_kept(method: str, out: str | Path | None, told: bool) -> None:
+def _check_kept(method: str, out: str | Path | None, begins: bool) -> None:
     """Check that a run can be kept and shared, where that is asked for."""
     several = Ranks.current().count > 1
     if method not in KEPT_METHODS and (several or out is not None):
@@ -205,7 +195,7 @@ def _check_kept(method: str, out: str | Path | None, told: bool) -> None:
         raise NPAError(
             f"method {shown(method)} cannot {asked}: take one of {', '.join(KEPT_METHODS)}"
         )
-    if told and out is None:
+    if begins and out is None:
         raise NPAError("resume and overwrite need a folder: give out='runs/heart'")
 
 
@@ -235,8 +225,7 @@ def _options_of(function: Callable[..., Any]) -> dict[str, Any]:
     if declared is not None:
         return {field.name: getattr(declared, field.name) for field in fields(declared)}
     parameters = inspect.signature(function).parameters.values()
-    own = [p for p in parameters if p.kind is p.KEYWORD_ONLY and p.name not in ("device", "start")]
-    return {parameter.name: parameter.default for parameter in own}
+    return {p.name: p.default for p in parameters if p.kind is p.KEYWORD_ONLY}
 
 
 def _declared(function: Callable[..., Any]) -> Any:

@@ -10,12 +10,12 @@ from torch import Tensor
 
 from npa_envs.agents.learning.problem import Problem, world_seeds
 from npa_envs.agents.learning.progress import Progress, annealed
-from npa_envs.agents.learning.rules import RuleSet, Source, starting_rules
+from npa_envs.agents.learning.rules import RuleSet, Source
 from npa_envs.checks import check_fraction, check_positive, is_real
 from npa_envs.errors import NPAError, shown
 
 VARIANCE_FLOOR = 1e-8
-"""Added to the variance of the teacher's actions: what it never does is still to be learned."""
+"""Added to the variance of the teacher's actions, which may be 0."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -25,29 +25,21 @@ class CloneOptions:
     teacher: Source | Sequence[Source] | RuleSet | None = None
     """A rule, a shipped rule's name or a file, for all species or one for each, or a set of rules;
     it must be given, or a dataset."""
-
     dataset: str | None = None
-    """A dataset of Minari, by its id, to learn from instead: nobody acts, and the particle-steps
-    that count are those learned from."""
-
+    """A dataset of Minari, by its id, to learn from instead; the particle-steps that count are
+    those learned from."""
     student_share: float = 0.5
     """Share of the worlds in which the student acts, in [0, 1]; 0: plain cloning."""
-
     collect_steps: int = 8
     """Steps of the worlds in an iteration."""
-
     kept_steps: int = 64
     """Steps of all worlds that are learned from, at least `collect_steps`."""
-
     updates: int = 16
     """Optimiser's steps in an iteration."""
-
     batch_worlds: int = 4
     """Worlds, with all of their particles, in each of them."""
-
     learning_rate: float = 3e-3
     """Adam's, at the beginning."""
-
     last_rate: float = 0.02
     """Learning rate at the end, as a share of the first."""
 
@@ -70,28 +62,15 @@ class CloneOptions:
 DEFAULTS = CloneOptions()
 
 
-def train(
-    problem: Problem,
-    progress: Progress,
-    seed: int,
-    *,
-    device: torch.device,
-    start: RuleSet | None = None,
-    options: CloneOptions = DEFAULTS,
-) -> RuleSet:
+def train(progress: Progress, options: CloneOptions = DEFAULTS) -> RuleSet:
     """Learn a teacher's actions in the worlds that it comes to, and in those of the student.
 
-    The loss is the squared error of actions over the variance of the teacher's, column by column:
-    the share of what it does that is not explained. The student acts in some of the worlds, and is
-    told what the teacher would have done there (dataset aggregation, Ross et al. 2011), as its
-    errors lead it to where the teacher never comes.
-
-    Raises:
-        NPAError: There is no teacher and no dataset, or both, or one does not fit the problem.
-        DivergedError: The rules' weights are not finite.
-        MissingDependencyError: Datasets need Minari, which is not installed.
+    The loss is the squared error of actions over the variance of the teacher's, column by column.
+    In some of the worlds the student acts, as its errors lead to worlds that the teacher's actions
+    do not, and the teacher's actions there are learned (dataset aggregation, Ross et al. 2011).
     """
-    rules = starting_rules(problem, seed, device, start)
+    problem, device, seed = progress.problem, progress.device, progress.seed
+    rules = progress.first_rules()
     generator = torch.Generator(device).manual_seed(seed)
     optimiser = torch.optim.Adam(
         rules.parameters(), lr=options.learning_rate, fused=device.type == "cuda"
@@ -119,8 +98,12 @@ def train(
 def _taught(
     problem: Problem, rules: RuleSet, seed: int, device: torch.device, options: CloneOptions
 ) -> tuple[Callable[[], int], Demonstrations]:
-    """Return what goes on in worlds and counts their steps, and what was seen there."""
-    teacher = _teacher(problem, options.teacher).to(device).policy()
+    """Return a function that steps worlds and counts their steps, and its demonstrations."""
+    source = options.teacher
+    if source is None:
+        raise NPAError("teacher must be given to clone, or a dataset: for example teacher='heart'")
+    given = list(source) if isinstance(source, RuleSet) else source
+    teacher = RuleSet.of(problem, given).to(device).policy()
     student, envs = rules.policy(), problem.make_envs(device=device)
     observation, _ = envs.reset(seed=world_seeds(seed, problem.num_envs))
     some = Demonstrations(options.kept_steps * problem.num_envs, observation, teacher(observation))
@@ -140,12 +123,12 @@ def _taught(
 
 
 def _recorded(problem: Problem, device: torch.device, options: CloneOptions) -> Demonstrations:
-    """Return what a dataset holds, on a device."""
+    """Return the demonstrations of a dataset, on a device."""
     from npa_envs.wrappers.minari import read_pairs
 
     if options.teacher is not None:
         raise NPAError("teacher must be None where a dataset is given: it holds what was done")
-    assert options.dataset is not None, "asked for by the caller"
+    assert options.dataset is not None, "checked by the caller"
     seen, done = read_pairs(options.dataset)
     interface, count = problem.interface, problem.particle_count
     wanted = (count, interface.perception_dim), (count, interface.action_dim)
@@ -157,12 +140,6 @@ def _recorded(problem: Problem, device: torch.device, options: CloneOptions) -> 
     some = Demonstrations(len(seen), seen.to(device), done.to(device))
     some.add(seen.to(device), done.to(device))
     return some
-
-
-def _teacher(problem: Problem, source: Source | Sequence[Source] | RuleSet | None) -> RuleSet:
-    if source is None:
-        raise NPAError("teacher must be given to clone, or a dataset: for example teacher='heart'")
-    return RuleSet.of(problem, list(source) if isinstance(source, RuleSet) else source)
 
 
 def unexplained(rules: RuleSet, observation: Tensor, action: Tensor) -> Tensor:
@@ -179,16 +156,14 @@ def unexplained(rules: RuleSet, observation: Tensor, action: Tensor) -> Tensor:
 
 
 class Demonstrations:
-    """The last worlds that were seen, and what the teacher does in them, on the device.
+    """The last W observations of worlds, and the teacher's actions, on the device.
 
-    At most `capacity` worlds W are kept, of the shape and device of an observation and an action.
+    At most `capacity` worlds are kept, of the shape and device of an observation and an action.
     """
 
     def __init__(self, capacity: int, observation: Tensor, action: Tensor) -> None:
         self.observations = observation.new_zeros(capacity, *observation.shape[1:])
-        """Shape [W, N, P]."""
         self.actions = action.new_zeros(capacity, *action.shape[1:])
-        """Shape [W, N, A]."""
         self.count = 0
         """Worlds that were added so far; the oldest are overwritten."""
 

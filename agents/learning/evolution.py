@@ -10,21 +10,26 @@ in the next: differences between candidates are theirs and not their luck's.
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import Tensor
+from torch import Tensor, nn
 
-from npa_envs.agents.learning.problem import FIRST_EVALUATION_SEED, Problem
+from npa_envs.agents.learning.problem import FIRST_EVALUATION_SEED
 from npa_envs.agents.learning.progress import Progress
-from npa_envs.agents.learning.rules import RuleSet, starting_rules
-from npa_envs.agents.learning.weights import RuleWeights, layers_of, updates_of
+from npa_envs.agents.learning.rules import RuleSet
 from npa_envs.agents.policies import bounded, perceived
 from npa_envs.checks import check_positive
-from npa_envs.errors import MissingDependencyError
+from npa_envs.errors import MissingDependencyError, NPAError
+from npa_envs.rule.network import without_small
+from npa_envs.rule.rule import NPARule
+
+MOST_HIDDEN = 2**27
+"""Numbers of hidden layers that are held at once, at most: 512 MiB of float32."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -33,10 +38,8 @@ class EvolutionOptions:
 
     population: int = 32
     """Candidates of a generation, at least 4."""
-
     worlds_per_candidate: int = 1
     """Worlds that each is tried in."""
-
     sigma: float = 0.1
     """Step size to begin with, as a fraction of the size that a layer's weights are drawn with
     (Xavier, gain 1; dimensionless)."""
@@ -51,27 +54,17 @@ class EvolutionOptions:
 DEFAULTS = EvolutionOptions()
 
 
-def train(
-    problem: Problem,
-    progress: Progress,
-    seed: int,
-    *,
-    device: torch.device,
-    start: RuleSet | None = None,
-    options: EvolutionOptions = DEFAULTS,
-) -> RuleSet:
+def train(progress: Progress, options: EvolutionOptions = DEFAULTS) -> RuleSet:
     """Evolve rules until the budget is spent, and return the mean of the last generation.
 
     Candidates are drawn on the host and tried on the device.
-
-    Raises:
-        MissingDependencyError: cma is not installed.
     """
-    rules = starting_rules(problem, seed, device, start)
+    problem, device = progress.problem, progress.device
+    rules = progress.first_rules()
     candidates = RulePopulation(rules)
     world_count = options.population * options.worlds_per_candidate
     envs = problem.make_envs(world_count, device=device, copy=False)
-    draws = np.random.default_rng(seed)
+    draws = np.random.default_rng(progress.seed)
     strategy = _strategy(candidates, options, draws)
 
     def generation() -> int:
@@ -86,12 +79,70 @@ def train(
     return progress.run(rules, generation)
 
 
-class RulePopulation(RuleWeights):
-    """Rules of one architecture whose weights are the rows of a matrix, as `RuleWeights` has them.
+class RuleWeights:
+    """Plain rules, changed in place, whose weights are one vector: W1, b1, W2, rule after rule.
 
-    Raises:
-        NPAError: A rule is more than its two layers.
+    Read-outs are not changed.
     """
+
+    def __init__(self, rules: Iterable[NPARule]) -> None:
+        self._each = list(rules)
+        self._parts = [part for rule in self._each for part in layers_of(rule)]
+        for rule in self._each:
+            if not rule.is_plain():
+                raise NPAError(
+                    "rules must be plain NPARules, whose networks are their two layers, got one "
+                    "that overrides its network: evolve it by its own code"
+                )
+
+    def vector(self) -> NDArray[np.float64]:
+        """Return the weights of the rules as they are, shape [W]."""
+        with torch.no_grad():
+            return nn.utils.parameters_to_vector(self._parts).double().cpu().numpy()
+
+    def put(self, vector: NDArray[np.float64]) -> None:
+        """Give the rules these weights, shape [W]."""
+        first = self._parts[0]
+        with torch.no_grad():
+            nn.utils.vector_to_parameters(
+                torch.as_tensor(vector, dtype=first.dtype, device=first.device), self._parts
+            )
+
+    def scales(self) -> NDArray[np.float64]:
+        """Return the standard deviation of each weight by Xavier at a gain of 1; biases as W1."""
+        sizes = []
+        for rule in self._each:
+            hidden, bias, output = layers_of(rule)
+            first = math.sqrt(2.0 / sum(hidden.shape))
+            sizes += [np.full(hidden.numel() + bias.numel(), first)]
+            sizes += [np.full(output.numel(), math.sqrt(2.0 / sum(output.shape)))]
+        return np.concatenate(sizes)
+
+
+def layers_of(rule: NPARule) -> tuple[Tensor, Tensor, Tensor]:
+    """Return W1 [H, P], b1 [H] and W2 [A, H]."""
+    return rule.hidden.weight, rule.hidden.bias, rule.output.weight
+
+
+def updates_of(rule: NPARule, weights: Tensor, rows: Tensor) -> Tensor:
+    """Return raw updates, [K, R, A], of K candidates' weights for their own rows, [K, R, P]."""
+    shapes = [tuple(part.shape) for part in layers_of(rule)]
+    sizes = [math.prod(shape) for shape in shapes]
+    first, bias, second = (
+        part.reshape(-1, *shape)
+        for part, shape in zip(torch.split(weights, sizes, dim=1), shapes, strict=True)
+    )
+    at_once = max(1, MOST_HIDDEN // (rows.shape[1] * rule.hidden_dim))
+    updates = []
+    for k in range(0, len(weights), at_once):
+        some = slice(k, k + at_once)
+        hidden = torch.baddbmm(bias[some, None], rows[some], first[some].mT).relu_()
+        updates.append(torch.bmm(hidden, second[some].mT))
+    return without_small(torch.cat(updates), rule.dead_zone)
+
+
+class RulePopulation(RuleWeights):
+    """Rules of one architecture; their weights are rows of a matrix, as `RuleWeights` has them."""
 
     def __init__(self, rules: RuleSet) -> None:
         super().__init__(rules)
@@ -99,7 +150,7 @@ class RulePopulation(RuleWeights):
 
     @torch.no_grad()
     def actions(self, weights: Tensor, observation: Tensor) -> Tensor:
-        """Return what each of K candidates does in its own M worlds, shape [K * M, N, A].
+        """Return actions, [K * M, N, A], of K candidates in M worlds each.
 
         Weights have shape [K, W]; observations, candidate by candidate, [K * M, N, P].
         """
@@ -131,7 +182,7 @@ def fitness(
     for _ in range(episode_steps):
         action = candidates.actions(weights, observation)
         observation, reward, terminated, truncated, _ = envs.step(action)
-        # A world that is over has begun another episode, which is not asked for.
+        # A world that is over has begun another episode, which does not count.
         returns += torch.where(running, reward, 0.0)
         running &= ~(terminated | truncated)
     return returns.view(len(weights), -1).mean(dim=1)
@@ -152,20 +203,14 @@ def _strategy(
     def normal(*shape: int) -> NDArray[np.float64]:
         return draws.standard_normal(shape)
 
-    words = {
-        "popsize": options.population,
-        "CMA_diagonal": True,
-        "CMA_stds": candidates.scales(),
-        "randn": normal,
-        # With draws of one's own the library wants none.
-        "seed": math.nan,
-        "verbose": -9,
-    }
+    # The library takes no seed where `randn` is given.
+    words = {"popsize": options.population, "randn": normal, "seed": math.nan, "verbose": -9}
+    words |= {"CMA_diagonal": True, "CMA_stds": candidates.scales()}
     return cma.CMAEvolutionStrategy(candidates.vector(), options.sigma, words)
 
 
 def costs(found: NDArray[np.float64]) -> list[float]:
-    """Return what is to be minimised of mean returns [K]; what is not finite is the worst."""
+    """Return costs to minimise for mean returns [K]; those that are not finite are the worst."""
     finite = np.isfinite(found)
     worst = found[finite].min() - 1.0 if finite.any() else 0.0
     minimised: list[float] = (-np.where(finite, found, worst)).tolist()

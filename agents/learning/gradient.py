@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import copy
 import itertools
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Literal, Self, cast
+from typing import Any, Self, cast
 
 import torch
 from torch import Tensor
@@ -13,7 +14,7 @@ from torch import Tensor
 import npa_envs
 from npa_envs.agents.learning.problem import Problem
 from npa_envs.agents.learning.progress import Progress, annealed
-from npa_envs.agents.learning.rules import RuleSet, starting_rules
+from npa_envs.agents.learning.rules import RuleSet
 from npa_envs.checks import check_fraction
 from npa_envs.envs.core.task import EnvTask
 from npa_envs.envs.multi.task import Population, SpeciesConfig, SpeciesTask
@@ -24,7 +25,6 @@ from npa_envs.tasks.base import ParticleTask, Worlds
 from npa_envs.tasks.train_config import TrainConfig
 from npa_envs.training.cycle import TrainingCycle
 from npa_envs.world.randomness import Randomness, WorldRandom
-from npa_envs.world.recorded import CudaGraph
 from npa_envs.world.rollout import Memory
 
 LONGEST = 96
@@ -44,24 +44,18 @@ class GradientOptions:
     steps: tuple[int, int] | None = None
     """Range [lo, hi) that the number of steps of each rollout is drawn from; None: whole episodes
     of up to 96 steps, or 32 to 96 steps of longer ones."""
-
     world_count: int = 8
     """Worlds in a batch."""
-
     pool_size: int | None = None
     """Worlds that live on between rollouts; 0: none, all rollouts begin where episodes do. None: 64
     where rollouts are shorter than episodes, else 0."""
-
     fresh_share: float = 0.25
     """Share of each batch from the pool that begins where episodes do, at least one world
     (dimensionless)."""
-
     learning_rate: float = 4e-3
     """AdamW's, at the beginning."""
-
     last_rate: float = 0.05
     """Learning rate at the end, as a share of the first."""
-
     memory: Memory = "store"
     """What the backward pass reads: "store", "recompute" or "minimal", as in `rollout`."""
 
@@ -82,83 +76,24 @@ class GradientOptions:
 DEFAULTS = GradientOptions()
 
 
-def train(
-    problem: Problem,
-    progress: Progress,
-    seed: int,
-    *,
-    device: torch.device,
-    start: RuleSet | None = None,
-    options: GradientOptions = DEFAULTS,
-) -> RuleSet:
+def train(progress: Progress, options: GradientOptions = DEFAULTS) -> RuleSet:
     """Descend the loss at the end of rollouts, differentiated through all of their steps.
 
     Rollouts begin where episodes do, or go on from where earlier ones ended, in a pool as in the
     paper (arXiv 2601.16096). State steps are clamped to the action space, as environments clip
-    them; that environments clip observations is not seen.
-
-    Raises:
-        NPAError: An option is out of its range, or the environment's loss has no gradient.
-        DivergedError: The rules' weights are not finite.
+    them. Observations are not clipped.
     """
-    task = episode_task(problem, device)
-    rules = starting_rules(problem, seed, device, start)
-    config = _trainer_config(problem, progress, seed, device, options, task.can_be_recorded)
-    # The cycle asks of the rule what any module has, and of the task what it needs of one.
-    cycle = TrainingCycle(
-        task,
-        cast(NPARule, rules),
-        config,
-        device,
-        torch.Generator().manual_seed(seed),
-        task.rollout,
-    )
-    # On CUDA every number of steps is a recording of its own.
-    for length in range(*config.steps) if device.type == "cuda" else (config.steps[0],):
-        cycle.batch.run(length)
-    numbers = itertools.count()
-
-    def iteration() -> int:
-        steps = cycle.run(next(numbers))
-        return steps * config.world_count * problem.particle_count
-
-    return progress.run(rules, iteration)
-
-
-@dataclass(frozen=True, kw_only=True)
-class _Schedule(TrainConfig[Any]):
-    """A trainer's configuration whose learning rate follows the budget."""
-
-    progress: Progress
-    """The run's account."""
-
-    last_rate: float
-    """Learning rate at the end, as a share of the first (dimensionless)."""
-
-    def learning_rate_at(self, iteration: int, share: float = 0.0) -> float:
-        """Return the learning rate now: half a cosine over the budget, whatever the arguments."""
-        return annealed(self.learning_rate, self.last_rate, self.progress.share)
-
-
-def _trainer_config(
-    problem: Problem,
-    progress: Progress,
-    seed: int,
-    device: torch.device,
-    options: GradientOptions,
-    cuda_graph: bool,
-) -> _Schedule:
-    """Return the trainer's configuration of a run, whose end is the budget's and not its own."""
-    length = problem.episode_steps
-    steps = options.steps
+    problem, device, seed = progress.problem, progress.device, progress.seed
+    task, rules = environment_task(problem, device), progress.first_rules()
+    length, steps, pool_size = problem.episode_steps, options.steps, options.pool_size
     if steps is None:
         steps = (length, length + 1) if length <= LONGEST else (LONGEST // 3, LONGEST + 1)
-    pool_size = options.pool_size
     if pool_size is None:
         pool_size = 0 if steps[0] >= length else max(POOL_SIZE, options.world_count)
-    return _Schedule(
+    config = _Schedule(
         task=problem.config,
         progress=progress,
+        # The budget ends the run.
         iterations=2**40,
         repeats=1,
         world_count=options.world_count,
@@ -173,21 +108,45 @@ def _trainer_config(
         seed=seed,
         device=str(device),
         memory=options.memory,
-        cuda_graph=cuda_graph,
+        # Long starts are not recorded.
+        cuda_graph=not isinstance(task.inner, EnvTask) or task.inner.start_is_short,
     )
+    schedule = torch.Generator().manual_seed(seed)
+    # The cycle calls of the rules what one rule has.
+    rule = cast(NPARule, rules)
+    cycle = TrainingCycle(task, rule, config, device, schedule, task.rollout)
+    # On CUDA every number of steps is a recording of its own.
+    for number in range(*config.steps) if device.type == "cuda" else (config.steps[0],):
+        cycle.batch.run(number)
+    numbers = itertools.count()
+
+    def iteration() -> int:
+        return cycle.run(next(numbers)) * config.world_count * problem.particle_count
+
+    return progress.run(rules, iteration)
 
 
-def episode_task(problem: Problem, device: torch.device) -> EnvironmentTask:
-    """Return a problem's task for the gradient's trainer.
+@dataclass(frozen=True, kw_only=True)
+class _Schedule(TrainConfig[Any]):
+    """A trainer's configuration whose learning rate follows the budget."""
 
-    Raises:
-        NPAError: The problem is a game or its species die, so that no gradient descends its loss.
-    """
+    progress: Progress
+    """The run's account."""
+    last_rate: float
+    """Learning rate at the end, as a share of the first (dimensionless)."""
+
+    def learning_rate_at(self, iteration: int, share: float = 0.0) -> float:
+        """Return the learning rate now: half a cosine over the budget, whatever the arguments."""
+        return annealed(self.learning_rate, self.last_rate, self.progress.share)
+
+
+def environment_task(problem: Problem, device: torch.device) -> EnvironmentTask:
+    """Return a problem's task for the gradient's trainer."""
     return EnvironmentTask(problem, device)
 
 
-def _check_rules_of_play(problem: Problem, task: EnvTask[Any] | SpeciesTask) -> None:
-    """Check that all rules want the same, and that nobody leaves a world."""
+def _check_one_loss(problem: Problem, task: EnvTask[Any] | SpeciesTask) -> None:
+    """Check that all rules descend one loss, and that no particle leaves a world."""
     if not isinstance(task, SpeciesTask):
         return
     if type(task).settle is not SpeciesTask.settle:
@@ -211,19 +170,15 @@ class EnvironmentTask(ParticleTask[Any]):
     """
 
     def __init__(self, problem: Problem, device: torch.device) -> None:
-        self.problem = problem
+        self.problem, self.device = problem, device
         self.physics = problem.physics
         """The worlds' constants."""
-        self._task = problem.make_task(device)
+        self.inner = problem.make_task(device)
+        """The environment's task."""
         counts = torch.tensor(problem.counts)
         self._species = torch.arange(len(counts)).repeat_interleave(counts).to(device)
-        _check_rules_of_play(problem, self._task)
+        _check_one_loss(problem, self.inner)
         self._clamped: tuple[RuleSet, list[ClampedRule]] | None = None
-
-    @property
-    def can_be_recorded(self) -> bool:
-        """Whether starts take few operations, so that they are recorded on CUDA."""
-        return isinstance(self._task, SpeciesTask) or self._task.start_is_short
 
     @property
     def eps(self) -> float:
@@ -244,100 +199,77 @@ class EnvironmentTask(ParticleTask[Any]):
         self, world_count: int, *, generator: Randomness, device: str | torch.device = "cpu"
     ) -> Worlds:
         """Return worlds as episodes begin, and their goals where they have such."""
-        x, s, *rest = self._start(world_count, generator, torch.device(device))
-        return x, s, None if self.problem.is_species else rest[1]
+        if isinstance(generator, WorldRandom):
+            keys = generator.integers(KEY_RANGE[1])
+        else:
+            keys = torch.randint(*KEY_RANGE, (world_count,), generator=generator, device=device)
+        x, s, *rest = self.inner.start(WorldRandom.from_keys(keys))
+        return x, s, rest[1] if rest else None
 
     def toward(self, goal: Tensor | None) -> Self:
         """Return the task with the loss of worlds that have these goals, shape [B]."""
-        return self if goal is None else self._with(_task=cast(Any, self._task).toward(goal))
+        if goal is None:
+            return self
+        assert isinstance(self.inner, EnvTask), "species have no goals"
+        aimed = copy.copy(self)
+        aimed.inner = self.inner.toward(goal)
+        return aimed
 
     def loss(self, x: Tensor, s: Tensor, path_length: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
-        """Return the environment's loss, the mean over worlds and species, and its named parts.
-
-        Nothing is paid for the path length.
-
-        Raises:
-            NPAError: No gradient leads from it to what requires one.
-        """
+        """Return the environment's loss, the mean over worlds and species, and its named parts."""
         parts = {name: part.mean() for name, part in self._losses(x, s).items()}
         total = torch.stack(list(parts.values())).sum()
         self._check_gradient(total, x, s)
         return total, parts
 
     def world_losses(self, x: Tensor, s: Tensor) -> Tensor:
-        """Return the environment's loss of each world, the mean over its species, shape [B].
-
-        Raises:
-            NPAError: As for `loss`.
-        """
+        """Return the environment's loss of each world, the mean over its species, shape [B]."""
         total = torch.stack(list(self._losses(x, s).values())).sum(dim=0)
         total = total.flatten(1).mean(dim=1) if total.dim() > 1 else total
         self._check_gradient(total, x, s)
         return total
 
     def rollout(
-        self,
-        rules: Any,
-        x: Tensor,
-        s: Tensor,
-        steps: int,
-        /,
-        *,
-        eps: float,
-        box: tuple[float, ...] | None,
-        update_prob: float,
-        memory: Memory,
-        generator: Randomness,
-        return_path_length: Literal[True],
-        keep_every: int | None = None,
-        cuda_graph: CudaGraph = "auto",
+        self, rules: Any, x: Tensor, s: Tensor, steps: int, /, **options: Any
     ) -> tuple[Tensor, Tensor, Tensor]:
-        """Run a set of rules as the environment would, differentiably; as `npa_envs.rollout`."""
-        assert isinstance(rules, RuleSet), "the learner trains sets of rules"
+        """Run a `RuleSet` as the environment would, differentiably.
+
+        Options are those of `npa_envs.rollout`; the physics is the environment's.
+        """
         physics, config = self.physics, self.problem.config
         if self._clamped is None or self._clamped[0] is not rules:
-            # Kept, as recorded rollouts know rules that are not plain by themselves.
+            # Made once: recorded rollouts know clamped rules by their identity.
             limit = physics.limits.state_scale
             self._clamped = rules, [ClampedRule(rule, limit) for rule in rules]
         clamped = self._clamped[1]
-        common: dict[str, Any] = {
-            "eps": eps,
-            "box": box,
-            "update_prob": update_prob,
+        options = {
+            "eps": self.eps,
+            "box": self.box,
+            "update_prob": self.update_prob,
             "dt": physics.dt,
             "position_noise": physics.position_noise,
-            "memory": memory,
-            "generator": generator,
-            "return_path_length": return_path_length,
-            "keep_every": keep_every,
-            "cuda_graph": cuda_graph,
+            "return_path_length": True,
+            **options,
         }
-        if not isinstance(config, SpeciesConfig):
-            return npa_envs.rollout(clamped[0], x, s, steps, **common)
-        common |= {"counts": config.counts, "perception": config.perception}
-        return npa_envs.rollout_species(clamped, x, s, steps, **common)
-
-    def _start(
-        self, world_count: int, generator: Randomness, device: torch.device
-    ) -> tuple[Any, ...]:
-        if isinstance(generator, WorldRandom):
-            keys = generator.integers(KEY_RANGE[1])
-        else:
-            keys = torch.randint(*KEY_RANGE, (world_count,), generator=generator, device=device)
-        start: tuple[Any, ...] = self._task.start(WorldRandom.from_keys(keys))
-        return start
+        rollout: Any = npa_envs.rollout
+        rule: Any = clamped[0]
+        if isinstance(config, SpeciesConfig):
+            rollout, rule = npa_envs.rollout_species, clamped
+            options |= {"counts": config.counts, "perception": config.perception}
+        last: tuple[Tensor, Tensor, Tensor] = rollout(rule, x, s, steps, **options)
+        return last
 
     def _losses(self, x: Tensor, s: Tensor) -> Mapping[str, Tensor]:
         """Return the parts of each world's loss, shape [B] or [B, K]."""
-        if isinstance(self._task, SpeciesTask):
-            return self._task.losses(Population(x, s, self.problem.counts, self._species))
-        return self._task.losses(x, s)
+        if isinstance(self.inner, SpeciesTask):
+            return self.inner.losses(Population(x, s, self.problem.counts, self._species))
+        return self.inner.losses(x, s)
 
     def _check_gradient(self, total: Tensor, x: Tensor, s: Tensor) -> None:
         asked = torch.is_grad_enabled() and (x.requires_grad or s.requires_grad)
         if asked and not total.requires_grad:
             raise NPAError(
-                f"the losses of {type(self._task).__name__} must be differentiable for "
+                f"the losses of {type(self.inner).__name__} must be differentiable for "
                 "a method that follows gradients, but no gradient leads from them to positions or "
                 "states: compute them by torch's operations, or learn by 'ppo' or 'evolution'"
             )
@@ -373,7 +305,7 @@ class ClampedWeights(FoldedRule):
     limit: float
 
     def __call__(self, rows: Tensor) -> Tensor:
-        """Map rows [z | 1 | 0], shape [K, row_width], to updates [δ | clamped Δs | 0], [K, A']."""
+        """Map rows [z | 1 | 0] to updates [δ | clamped Δs | 0]."""
         update = super().__call__(rows)
         first = self.displacement_dim
         return torch.cat((update[:, :first], clamp_inward(update[:, first:], self.limit)), dim=1)
@@ -392,7 +324,7 @@ class ClampedRule(NPARule):
         self.rule_is_plain = rule.is_plain()
 
     def forward(self, perception: Tensor) -> Tensor:
-        """Map perception vectors [..., P] to updates with clamped state steps; as `NPARule`."""
+        """Map perception vectors [..., P] to updates with clamped state steps."""
         update = super().forward(perception)
         first = self.update_dim - self.state_dim
         return torch.cat(

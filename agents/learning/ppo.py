@@ -3,8 +3,8 @@
 Source: Schulman et al., arXiv 1707.06347, in the manner of CleanRL: one file, read from the top.
 A round is `steps` steps of all worlds, then `epochs` passes over them in minibatches of particles.
 The host reads one byte a world in each step (has its episode ended?), and one number a pass. On
-CUDA what is drawn, judged and learned is recorded once as CUDA graphs: a round is thousands of
-short kernels, which a host takes longer to launch than a GPU to run.
+CUDA draws, advantages and updates are recorded once as CUDA graphs: a round is thousands of short
+kernels, which a host takes longer to launch than a GPU to run.
 """
 
 from __future__ import annotations
@@ -18,20 +18,17 @@ from torch import Tensor, nn
 
 from npa_envs.agents.learning.ppo_common import (
     CommonOptions,
-    Critic,
     GaussianRules,
     Minibatches,
     check_word,
+    find_gradients,
+    gradients_of,
     learner_random,
     noise_left,
+    seeded_critic,
     zero_output_rules,
 )
-from npa_envs.agents.learning.problem import (
-    ROW_REWARDS,
-    WORLDS_PER_SEED,
-    Problem,
-    world_seeds,
-)
+from npa_envs.agents.learning.problem import ROW_REWARDS, WORLDS_PER_SEED, Problem, world_seeds
 from npa_envs.agents.learning.progress import Budget, Progress
 from npa_envs.agents.learning.rules import RuleSet
 from npa_envs.checks import check_flag, check_non_negative, check_positive
@@ -43,7 +40,7 @@ from npa_envs.world.cuda_graph import GraphedCallable
 from npa_envs.wrappers.base import own_rewards
 
 MANY_PARTICLES = 2**17
-"""Particles of all worlds together on a GPU: a round of fewer takes hardly less time."""
+"""Particles of all worlds on a GPU: a round of fewer takes hardly less time."""
 
 FEWEST_ROUNDS = 128
 """Rounds that a budget of particle-steps is to be enough for."""
@@ -60,25 +57,19 @@ class PPOOptions(CommonOptions):
     """Worlds B to act in; None: the problem's `num_envs`, and on CUDA, where that is more, as many
     as have 131 072 particles together on each GPU, if memory has room for them and particle-steps
     are enough for 128 rounds. Several processes share them out."""
-
     critic_learning_rate: float = 1e-3
     """The critic's step at the start, as `learning_rate` is the rules'."""
-
     clip: float | None = None
     """Ratios of likelihoods count up to 1 plus or minus this (dimensionless). None: 0.2, or 0.02
     for a world's, whose logarithms are means over many particles."""
-
     ratio: Literal["particle", "world"] = "particle"
     """Each particle has a ratio of its own, or a world has one, of mean log-probabilities."""
-
     credit: Literal["world", "particle", "marginal"] = "world"
     """Each particle is paid what its world is; its own share; or what its world would have lost
     without its action."""
-
     masked: bool = False
-    """Leave out of a round what particles did in steps that did not update them; several species
-    do not tell."""
-
+    """Leave out of a round the actions of particles in steps that did not update them; not with
+    several species."""
     critic_width: int = 64
     """Units in a hidden layer of the critic."""
 
@@ -111,23 +102,12 @@ class PPOOptions(CommonOptions):
 DEFAULTS = PPOOptions()
 
 
-def train(
-    problem: Problem,
-    progress: Progress,
-    seed: int,
-    *,
-    device: torch.device,
-    start: RuleSet | None = None,
-    options: PPOOptions = DEFAULTS,
-) -> RuleSet:
-    """Return the rules that proximal policy optimisation finds within a budget.
-
-    Raises:
-        DivergedError: The policy has diverged.
-    """
-    ranks = progress.ranks
+def train(progress: Progress, options: PPOOptions = DEFAULTS) -> RuleSet:
+    """Return the rules that proximal policy optimisation finds within a budget."""
+    problem, device, ranks = progress.problem, progress.device, progress.ranks
     count = ranks.broadcast(world_count(problem, options, device, progress.budget, ranks))
-    learner = PPOLearner(problem, replace(options, worlds=count), seed, device, start, ranks)
+    options = replace(options, worlds=count)
+    learner = PPOLearner(problem, options, progress.seed, device, progress.initial, ranks)
 
     def round_of_ppo() -> int:
         share_left = 1.0 - progress.share
@@ -139,7 +119,7 @@ def train(
 
 
 class PPOLearner:
-    """Rules, critic, worlds and what was seen of them; the seed is that of all that is drawn.
+    """Rules, critic, worlds and their rounds; the seed is that of all draws.
 
     Several processes each have a share of the worlds, draw for each of these by itself, and take
     the means of gradients, moments and weights.
@@ -166,18 +146,11 @@ class PPOLearner:
             copy=False,
         )
         self.random = learner_random(seed, total, places, device, ranks)
-        """What exploration and shuffles draw from."""
+        """Source of exploration and shuffles."""
         rules = zero_output_rules(problem, seed, start)
         self.actor = GaussianRules(rules, self.pace.initial_std).to(device)
-        with torch.random.fork_rng(devices=[]):
-            torch.manual_seed(seed)
-            critic = Critic(
-                problem.interface.perception_dim,
-                problem.counts,
-                options.critic,
-                options.critic_width,
-            )
-        self.critic = critic.to(device)
+        perception_dim = problem.interface.perception_dim
+        self.critic = seeded_critic(problem, perception_dim, options, seed).to(device)
         # Recorded steps read their length where it can be changed.
         self.optimizer, self.critic_optimizer = (
             torch.optim.Adam(
@@ -189,6 +162,13 @@ class PPOLearner:
             )
             for net in (self.actor, self.critic)
         )
+        self.modules: dict[str, nn.Module] = {"actor": self.actor, "critic": self.critic}
+        """What learns, by name."""
+        self.optimisers: dict[str, torch.optim.Optimizer] = {
+            "actor": self.optimizer,
+            "critic": self.critic_optimizer,
+        }
+        """Their optimisers."""
         self._seed, self._places, self._total = seed, places.tolist(), total
         observation = self._worlds_of_part(0)
         self.memory = Memory(
@@ -200,13 +180,13 @@ class PPOLearner:
         self.critic.observe(observation, ranks)
         self.rounds = 0
         """Rounds done."""
-        # What recorded work reads and writes besides.
+        # Recorded work reads and writes these in place.
         self._now = observation.clone()
         self._action, self._log_prob = (
             part[0].clone() for part in (self.memory.actions, self.memory.log_probs)
         )
         self._near, self._rate, self._all_act = torch.ones(3, device=device)
-        # Of what is shuffled for the rules, and of worlds for the critic.
+        # Groups for the rules, and worlds for the critic.
         rows = (1,) if options.ratio == "world" else problem.counts
         self._minibatches = Minibatches(
             options.steps, len(places), (*rows, 1), options.minibatches, self.random
@@ -231,21 +211,13 @@ class PPOLearner:
         self._weights = self._near.new_zeros(self._minibatches.count, 2)
         self._moved = self._near.new_zeros(2)
 
-    def modules(self) -> dict[str, nn.Module]:
-        """Return what learns, by the names that checkpoints have for it."""
-        return {"actor": self.actor, "critic": self.critic}
-
-    def optimisers(self) -> dict[str, torch.optim.Optimizer]:
-        """Return what makes it learn."""
-        return {"actor": self.optimizer, "critic": self.critic_optimizer}
-
     def go_on(self, iteration: int, part: int) -> None:
         """Go on after so many rounds, for the part-th time, from 1 on, with other worlds."""
         self.rounds = iteration
         self.memory.seen[-1].copy_(self._worlds_of_part(part))
 
     def _worlds_of_part(self, part: int) -> Tensor:
-        """Begin the episodes of a part of the run, and return what is seen."""
+        """Begin the episodes of a part of the run, and return observations."""
         seeds = world_seeds(self._seed, self._total, part)
         observation: Tensor
         observation, _ = self.envs.reset(seed=[seeds[place] for place in self._places])
@@ -258,7 +230,7 @@ class PPOLearner:
 
     @torch.no_grad()
     def play(self) -> Round:
-        """Act for T steps in all worlds, and judge what was done; the next round replaces it."""
+        """Act for T steps in all worlds, and find advantages; the next round overwrites them."""
         memory = self.memory
         memory.seen[0].copy_(memory.seen[-1])
         last_seen = {}
@@ -275,7 +247,7 @@ class PPOLearner:
             memory.rewards[step].copy_(reward[:, None] if shared else own_rewards(infos))
             memory.acted[step].copy_(infos.get("acted", self._all_act))
             if self.options.masked and "updated" in infos:
-                # Of worlds that began anew as well: it stands until the next step.
+                # True of worlds that began anew as well: it is of the step before.
                 memory.acted[step].mul_(infos["updated"])
             # A species may end before its world does.
             gone = infos.get("particle_terminated", terminated[:, None])
@@ -289,7 +261,7 @@ class PPOLearner:
 
     @torch.no_grad()
     def _draw_actions(self) -> None:
-        """Draw what particles do about what they perceive now."""
+        """Draw actions for the present observations."""
         restart(self.random)
         action, log_prob = self.actor.sample(self._now, self.random)
         self._action.copy_(action)
@@ -297,7 +269,7 @@ class PPOLearner:
 
     @torch.no_grad()
     def _find_values(self) -> None:
-        """Ask the critic about all that was seen, part by part to save memory."""
+        """Find the critic's values of all observations, part by part to save memory."""
         memory, seen = self.memory, self.memory.seen.flatten(0, 1)
         size = -(-len(seen) // self.options.minibatches)
         values = torch.cat([self.critic(part) for part in torch.split(seen, size)])
@@ -306,7 +278,7 @@ class PPOLearner:
 
     @torch.no_grad()
     def _find_advantages(self) -> None:
-        """Judge what was done by what was paid, and by what the critic had foreseen."""
+        """Find advantages and targets from rewards and values."""
         memory, values = self.memory, self.memory.values[:-1]
         advantages = generalised_advantages(
             memory.rewards,
@@ -325,8 +297,8 @@ class PPOLearner:
     def improve(self, share_left: float) -> None:
         """Let rules and critic learn from the last round.
 
-        Learning rates are the share of the budget that is left of what they were at the start, and
-        by it the noise of the next round is made less.
+        Learning rates, and the noise of the next round, fall with the share of the budget that is
+        left.
         """
         options = self.options
         rules_learn = self.rounds >= self.pace.critic_rounds
@@ -343,7 +315,7 @@ class PPOLearner:
                 self._learn_values()
                 continue
             self._learn()
-            # All that the host waits for.
+            # The host waits for nothing else.
             if not bool(self._near):
                 break
         self.actor.leave_noise(
@@ -382,7 +354,7 @@ class PPOLearner:
     def _step_both(self) -> None:
         """Let critic and rules follow their gradients."""
         self._descend(self.critic_optimizer)
-        # Rules that have gone too far stay, without a question to the host.
+        # Rules that have gone too far stay; the host need not know.
         moved, count = self._moved
         self._near *= moved / count.clamp(min=1.0) <= self.pace.target_kl
         self.optimizer.param_groups[0]["lr"].copy_(self._near * self._rate)
@@ -394,13 +366,13 @@ class PPOLearner:
         optimizer.step()
 
     def _weigh(self) -> None:
-        """Find what the parts of a pass weigh, where processes weigh them together."""
+        """Find the weights of the parts of a pass, where several processes share them."""
         if self.ranks.together:
             self._weigh_own()
             self.ranks.reduce([self._weights])
 
     def _weigh_parts(self) -> None:
-        """Add up what rows of worlds and of rules count for, in each part of a pass."""
+        """Add up the weights of worlds and of rules' rows in each part of a pass."""
         acted = [self.memory.round.acted]
         for part in range(self._minibatches.count):
             (worlds,) = self._worlds(part, acted)
@@ -413,12 +385,12 @@ class PPOLearner:
         return self._weights[self._part, column] if self.ranks.together else weights.sum()
 
     def _worlds(self, part: int, values: Sequence[Tensor]) -> list[Tensor]:
-        """Return of values, [M, N, ...] each, the worlds that the critic learns from in a part."""
+        """Return the worlds of a part that the critic learns from, of values [M, N, ...] each."""
         order = self._minibatches.parts[-1][part]
         return [value[order] for value in values]
 
     def _rows(self, part: int, values: Sequence[Tensor]) -> list[list[Tensor]]:
-        """Return what the rules learn from: worlds as well, or particles of each species."""
+        """Return the rows that rules learn from: worlds as well, or particles of each species."""
         orders = [parts[part] for parts in self._minibatches.parts[:-1]]
         if self.options.ratio == "world":
             return [[value[order] for value in values] for order in orders]
@@ -431,11 +403,11 @@ class PPOLearner:
         return rows
 
     def _gain_weights(self, acted: Tensor) -> Tensor:
-        """Return what the ratios of rows count for, from what their particles do."""
+        """Return the weights of the ratios of rows."""
         return acted.amax(dim=1, keepdim=True) if self.options.ratio == "world" else acted
 
     def _gain(self, part: list[Round]) -> Tensor:
-        """Return the clipped gain of the rules, and take down how far actions have moved [nats]."""
+        """Return the clipped gain of the rules, and note how far actions have moved [nats]."""
         options, actor = self.options, self.actor
         if options.ratio == "world":
             (worlds,) = part
@@ -466,48 +438,29 @@ class PPOLearner:
         return 0.5 * squares / self._weight(worlds.acted, 0).clamp(min=1.0)
 
 
-def find_gradients(optimizer: torch.optim.Optimizer, loss: Tensor) -> None:
-    """Write the gradients of a loss to where those of an optimiser's parameters are."""
-    # A read-out does not act, and layers may be frozen.
-    parameters = [p for p in optimizer.param_groups[0]["params"] if p.requires_grad]
-    # Not backward(): its accumulation nodes remember the stream they were first used on, which a
-    # capture on another stream must not touch.
-    gradients = torch.autograd.grad(loss, parameters, allow_unused=True)
-    for parameter, gradient in zip(parameters, gradients, strict=True):
-        if gradient is not None:
-            if parameter.grad is None:
-                # Laid out like the parameter, as the fused optimizer takes for granted.
-                parameter.grad = torch.empty_like(parameter)
-            parameter.grad.copy_(gradient)
-
-
-def gradients_of(optimizer: torch.optim.Optimizer) -> list[Tensor]:
-    """Return the gradients of an optimiser's parameters, of those that have one."""
-    return [p.grad for p in optimizer.param_groups[0]["params"] if p.grad is not None]
-
-
 class Round(NamedTuple):
-    """What T steps of B worlds of N particles gave, flat: M = T B worlds, one after the other."""
+    """T steps of B worlds of N particles, flat: M = T B worlds, one after the other."""
 
     observations: Tensor
-    """What particles perceived, shape [M, N, P]."""
+    """Perceptions, shape [M, N, P]."""
     actions: Tensor
-    """What they did, not clipped, shape [M, N, A]."""
+    """Actions, not clipped, shape [M, N, A]."""
     log_probs: Tensor
-    """Its log-probability then, shape [M, N]."""
+    """Their log-probabilities when they were drawn, shape [M, N]."""
     advantages: Tensor
-    """How much better it was than foreseen, and than other worlds fared in the same step,
-    standardised, shape [M, N], or [M, 1] where a world has one."""
+    """Advantages over the critic's values and over other worlds in the same step, standardised,
+    shape [M, N], or [M, 1] where a world has one."""
     targets: Tensor
-    """What the critic should have said, shape [M, N]."""
+    """Targets of the critic, shape [M, N]."""
     acted: Tensor
     """1 where a particle's species was alive, else 0, shape [M, N]."""
 
 
 class Memory:
-    """Where rounds are written, each over the one before, as what is recorded stays at its place.
+    """Tensors of a round, which the next round overwrites: recorded work reads them in place.
 
-    A particle has an advantage of its own where `own_advantages`; else a world has one.
+    A particle has an advantage of its own where `own_advantages`; else a world has one. Shapes are
+    [T, B, N], where nothing else is said; the fields of `Round` are as there.
     """
 
     def __init__(
@@ -520,32 +473,23 @@ class Memory:
 
         single = (steps, worlds, particles)
         self.seen = zeros(steps + 1, *observation.shape)
-        """What is perceived before each step, and after the last one, shape [T + 1, B, N, P]."""
+        """Observations before each step, and after the last one, shape [T + 1, B, N, P]."""
         self.seen[-1].copy_(observation)
         self.actions = zeros(*single, action_dim)
-        """What is done, not clipped, shape [T, B, N, A]."""
-        self.log_probs = zeros(*single)
-        """Log-probabilities of that, shape [T, B, N]."""
-        self.acted = zeros(*single)
-        """1 where a particle's species is alive, else 0, likewise."""
+        self.log_probs, self.acted, self.targets = (zeros(*single) for _ in range(3))
         self.rewards = zeros(*single)
-        """What each particle is paid, likewise."""
-        self.terminated = zeros(*single, dtype=torch.bool)
-        """Whether a particle's episode has ended by itself in a step, likewise."""
-        self.ended = zeros(*single, dtype=torch.bool)
-        """Whether it has ended or was cut off, likewise."""
+        """Reward of each particle."""
+        self.terminated, self.ended = (zeros(*single, dtype=torch.bool) for _ in range(2))
+        """Whether a particle's episode ended by itself in a step; and whether it ended at all."""
         self.values = zeros(steps + 1, worlds, particles)
-        """What the critic says of what is seen, shape [T + 1, B, N]."""
+        """The critic's values of `seen`, shape [T + 1, B, N]."""
         self.following = zeros(*single)
-        """What it says of the states after each step, before any restart, shape [T, B, N]."""
+        """Its values of the states after each step, before any restart."""
         self.advantages = zeros(steps, worlds, particles if own_advantages else 1)
-        """As those of a `Round`, shape [T, B, N] or [T, B, 1]."""
-        self.targets = zeros(*single)
-        """What the critic should have said, shape [T, B, N]."""
 
     @property
     def round(self) -> Round:
-        """What is learned from, as views."""
+        """The round, as views."""
         kept = (self.actions, self.log_probs, self.advantages, self.targets, self.acted)
         return Round(*(part.flatten(0, 1) for part in (self.seen[:-1], *kept)))
 
@@ -560,13 +504,12 @@ def generalised_advantages(
     gamma: float,
     gae_lambda: float,
 ) -> Tensor:
-    """Return advantages, shape [T, ...]: discounted sums of what the critic did not foresee.
+    """Return advantages: discounted sums of rewards and of changes of value, within episodes.
 
-    An episode that terminated is worth nothing more; one that was cut off would have gone on, and
-    is worth what the critic says of where it was cut. No sum goes on into the next episode.
-    All arguments have shape [T, ...]: `values` are what the critic says of the states before each
-    step, `following` of those after it, before any restart; `ended` says where an episode
-    terminated or was cut off. Source: Schulman et al., arXiv 1506.02438, equation 16.
+    An episode that terminated has no value afterwards; one that was cut off has the critic's. All
+    have shape [T, ...]: `values` are of the states before each step, `following` of those after it,
+    before any restart; `ended` is where an episode terminated or was cut off. Source: Schulman et
+    al., arXiv 1506.02438, equation 16.
     """
     surprises = rewards + gamma * following.masked_fill(terminated, 0.0) - values
     discounts = (gamma * gae_lambda) * (~ended).to(rewards.dtype)
@@ -587,10 +530,10 @@ def over_particles(values: Tensor, weights: Tensor) -> Tensor:
 def standardised(values: Tensor, weights: Tensor, ranks: Ranks = ALONE) -> Tensor:
     """Return numbers less each step's weighted mean, in units of the standard deviation of all.
 
-    A step's mean over all worlds is what it is worth whatever is done: how far an episode has come,
-    which a critic learns only with time. A single world is compared with its own other steps.
-    Values have shape [T, B, N], or [T, B, 1] for one number a world, weights [T, B, N]; means and
-    deviation are over the worlds of all processes.
+    A step's mean over all worlds depends on how far an episode has come, which a critic learns only
+    with time. A single world is compared with its own other steps. Values have shape [T, B, N], or
+    [T, B, 1] for one number a world, weights [T, B, N]; means and deviation are over the worlds of
+    all processes.
     """
     shares = weights if values.shape == weights.shape else weights.amax(-1, True)
     alike = (1, 2) if values.shape[1] * ranks.count > 1 else (0, 1, 2)
@@ -624,11 +567,10 @@ def world_count(
     budget: Budget,
     ranks: Ranks = ALONE,
 ) -> int:
-    """Return the worlds B to act in, of all processes.
+    """Return the worlds B of all processes: those of the options, or by default the problem's.
 
-    They are what the options say; where those say nothing, the problem's on the CPU, and on a GPU
-    about `MANY_PARTICLES` particles' worth for each process, if memory and budget allow, never
-    fewer than the problem's.
+    On a GPU the default is about `MANY_PARTICLES` particles for each process, if memory and budget
+    allow, and never fewer worlds than the problem's.
     """
     if options.worlds is not None:
         return options.worlds
@@ -645,10 +587,10 @@ def world_count(
 
 
 def world_bytes(problem: Problem, options: PPOOptions, device: torch.device) -> int:
-    """Return about what memory a world takes: itself, its rounds and what is learned [bytes]."""
+    """Return about the memory of a world, its rounds and its part in learning [bytes]."""
     interface, count = problem.interface, problem.particle_count
     columns = interface.perception_dim + interface.action_dim
-    # Of each step what was seen, done and paid; of a minibatch's besides what gradients need.
+    # Each step keeps observations, actions and rewards; those of a minibatch also gradients.
     kept = (options.steps + 1) * (columns + interface.action_dim + 16)
     hidden = 4 * problem.hidden_dim + 8 * options.critic_width
     learned = -(-options.steps // options.minibatches) * (2 * columns + hidden)

@@ -6,7 +6,7 @@ import copy
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal, NamedTuple, get_args
+from typing import Any, Literal, NamedTuple, get_args
 
 import torch
 from torch import Tensor, nn
@@ -42,7 +42,7 @@ WARM = Pace(1e-4, 0.05, 1.0, 4, 0.05)
 """For rules to begin with: noise, haste and a raw critic would undo what they can do."""
 
 CriticKind = Literal["particle", "central"]
-"""What a value is told of: a "particle" alone, or its whole world besides ("central")."""
+"""Input of a value: a "particle" alone, or its whole world besides ("central")."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -51,48 +51,35 @@ class CommonOptions:
 
     steps: int = 16
     """Steps of all worlds in a round, T."""
-
     epochs: int = 4
     """Passes over a round; fewer where `target_kl` is passed."""
-
     learning_rate: float | None = None
     """Adam's step at the start, from which it falls to zero over the budget; None: 0.001, or 0.0001
     with a `start`."""
-
     minibatches: int = 4
     """Parts that a round is shuffled into in each pass."""
-
     gamma: float = 0.5
     """Discount of a reward one step later (dimensionless)."""
-
     gae_lambda: float = 0.9
     """Discount of what the critic did not foresee, besides `gamma` (dimensionless)."""
-
     entropy_weight: float = 0.0
     """Weight of the entropy of an action in what is maximised."""
-
     max_gradient_norm: float = 0.5
     """Gradients are shortened to this norm: those of rules and of the critic by themselves on the
     device, taken together in Stable-Baselines3."""
-
     target_kl: float | None = None
     """The rules stay as they are for the rest of a round once particles' actions are farther than
     this from those that were played [nats]; None: 0.2, or 0.05 with a `start`."""
-
     initial_std: float | None = None
     """Standard deviation of every action column at first; None: 0.2, or 0.05 with a `start`."""
-
     last_noise: float | None = None
     """What is left of the standard deviations at the end of the budget (dimensionless); None: 0.25,
     or 1 with a `start`."""
-
     noise_decay_share: float = 0.5
     """Share of the budget, its last, in which standard deviations fall to that; 1: from the
     start."""
-
     critic_rounds: int | None = None
     """Rounds in which the critic learns alone; None: 0, or 4 with a `start`."""
-
     critic: CriticKind = "particle"
     """A value follows from a particle's own perception, or from its whole world ("central")."""
 
@@ -119,30 +106,45 @@ class CommonOptions:
 
 
 def noise_left(share_left: float, last_noise: float, decay_share: float) -> float:
-    """Return what is left of the first noise: all of it at first, then it falls by equal factors.
+    """Return the share of the first noise that is left: 1 at first, then it falls exponentially.
 
-    What is learned is what is best with noise, and what counts is what it does without: towards the
-    end, in the last `decay_share` of the budget, the two are to become the same.
+    Rules learn what is best with noise, and are evaluated without. In the last `decay_share` of the
+    budget the two become the same.
     """
     return math.pow(last_noise, max(0.0, 1.0 - share_left / decay_share))
 
 
 def check_word(name: str, word: object, words: Sequence[str]) -> None:
-    """Check that an option is one of a few words.
-
-    Raises:
-        NPAError: It is none of them.
-    """
+    """Check that an option is one of a few words."""
     if word not in words:
         raise NPAError(f"{name} must be a known word, got {shown(word)}: {suggest(word, words)}")
 
 
-def zero_output_rules(problem: Problem, seed: int, start: RuleSet | None) -> RuleSet:
-    """Return the rules that PPO begins with: those given, or fresh ones that do nothing.
+def find_gradients(optimizer: torch.optim.Optimizer, loss: Tensor) -> None:
+    """Write the gradients of a loss into those of an optimiser's parameters."""
+    # A read-out does not act, and layers may be frozen.
+    parameters = [p for p in optimizer.param_groups[0]["params"] if p.requires_grad]
+    # Not backward(): its accumulation nodes remember the stream they were first used on, which a
+    # capture on another stream must not touch.
+    gradients = torch.autograd.grad(loss, parameters, allow_unused=True)
+    for parameter, gradient in zip(parameters, gradients, strict=True):
+        if gradient is not None:
+            if parameter.grad is None:
+                # Laid out like the parameter, as fused optimisers expect.
+                parameter.grad = torch.empty_like(parameter)
+            parameter.grad.copy_(gradient)
 
-    Fresh rules have random output layers, and what they do in each step adds up: in
-    `npa/Regeneration2D-v0` they take apart what is whole. Layers of zeros leave it alone, and learn
-    just as well, as what is hidden is random still.
+
+def gradients_of(optimizer: torch.optim.Optimizer) -> list[Tensor]:
+    """Return the gradients of those of an optimiser's parameters that have one."""
+    return [p.grad for p in optimizer.param_groups[0]["params"] if p.grad is not None]
+
+
+def zero_output_rules(problem: Problem, seed: int, start: RuleSet | None) -> RuleSet:
+    """Return the rules that actor-critics begin with: those given, or fresh ones that do nothing.
+
+    The steps of random output layers add up: in `npa/Regeneration2D-v0` they take apart whole
+    pictures. Output layers of zeros leave these alone, and learn just as well.
     """
     if start is not None:
         return start
@@ -175,7 +177,7 @@ class GaussianRules(nn.Module):
     def __init__(self, rules: RuleSet, initial_std: float) -> None:
         super().__init__()
         self.rules = copy.deepcopy(rules)
-        """What acts without exploration."""
+        """The means."""
         widths = [rule.update_dim for rule in self.rules]
         start = torch.full((len(widths), widths[0]), math.log(initial_std))
         self.noise_left = 1.0
@@ -185,15 +187,15 @@ class GaussianRules(nn.Module):
         counts = [span.stop - span.start for span in self.rules.spans]
         kinds = torch.arange(len(widths)).repeat_interleave(torch.tensor(counts))
         self.register_buffer("row_species", kinds, persistent=False)
-        # The same rules one by one, not registered a second time.
+        # A tuple, so that modules are registered once.
         self._each = tuple(RuleSet([rule], [1], self.rules.interface) for rule in self.rules)
 
     def get_extra_state(self) -> float:
-        """Return what a state has besides parameters: what is left of the noise."""
+        """Return the share of the noise that is left, for `state_dict`."""
         return self.noise_left
 
     def set_extra_state(self, state: float) -> None:
-        """Go on with the noise that a state had."""
+        """Set the share of the noise that is left."""
         self.noise_left = state
 
     def row_log_std(self) -> Tensor:
@@ -202,7 +204,7 @@ class GaussianRules(nn.Module):
 
     @torch.no_grad()
     def leave_noise(self, left: float) -> None:
-        """Scale standard deviations to a share of the first; what was learned of them stays."""
+        """Scale standard deviations to a share of the first, on top of what was learned."""
         self.log_std.add_(math.log(left / self.noise_left))
         self.noise_left = left
 
@@ -237,11 +239,10 @@ FARTHEST = 8.0
 
 
 class Critic(nn.Module):
-    """Values of particles, which standardises what it sees and predicts by running moments.
+    """Values of particles, whose inputs and outputs are standardised by running moments.
 
-    A critic is not exported, so that it may see more, and otherwise, than a rule does. A value of
-    the kind "particle" follows from the particle's own perception, "central" from that and from
-    features of all particles of its world, averaged.
+    A value of the kind "particle" is a function of the particle's own perception, "central" of that
+    and of features of all particles of its world, averaged.
     """
 
     mean: Tensor
@@ -286,10 +287,7 @@ class Critic(nn.Module):
 
     @torch.no_grad()
     def observe(self, observation: Tensor, ranks: Ranks = ALONE) -> None:
-        """Take observations [..., P] into the moments that inputs are standardised by.
-
-        Where several processes share a run, these are the moments of what all of them observe.
-        """
+        """Take observations [..., P] of all processes into the moments of inputs."""
         rate = self._rate(0)
         rows = observation.flatten(0, -2)
         mean, square = rows.mean(dim=0), rows.square().mean(dim=0)
@@ -299,7 +297,7 @@ class Critic(nn.Module):
 
     @torch.no_grad()
     def rescale(self, targets: Tensor, ranks: Ranks = ALONE) -> None:
-        """Take targets into the scale of values; what the critic says now keeps its meaning."""
+        """Take targets into the scale of values; values stay the same."""
         before = self.scale.clone()
         square = targets.square().mean()
         ranks.reduce([square])
@@ -314,10 +312,17 @@ class Critic(nn.Module):
         return (1.0 / self.updates[moment]).clamp(min=SLOWEST)
 
 
+def seeded_critic(problem: Problem, input_dim: int, options: Any, seed: int) -> Critic:
+    """Return the critic of a problem's particles; torch's own randomness is left as it is."""
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(seed)
+        return Critic(input_dim, problem.counts, options.critic, options.critic_width)
+
+
 def learner_random(
     seed: int, total: int, places: Tensor, device: torch.device, ranks: Ranks
 ) -> Randomness:
-    """Return what a learner draws from: of each world by itself where processes share them."""
+    """Return the source of a learner's draws: a stream a world where processes share them."""
     if ranks.together:
         return world_streams((seed,), total, places, device)
     return torch.Generator(device).manual_seed(seed)
@@ -348,7 +353,7 @@ class Minibatches:
         shared = worlds if isinstance(random, WorldRandom) else 1
         self.count = min(count, steps * worlds * min(rows) // shared)
         """Parts of a pass."""
-        # What is recorded reads them where they are.
+        # Recorded work reads them in place.
         self._orders = [
             torch.zeros(steps * worlds * n, dtype=torch.int64, device=random.device) for n in rows
         ]

@@ -10,7 +10,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
 from itertools import accumulate
-from typing import Any, Literal, NamedTuple, get_args
+from types import SimpleNamespace
+from typing import Any, Literal, get_args
 
 import gymnasium
 import numpy as np
@@ -52,9 +53,9 @@ EVALUATION_SEEDS = range(FIRST_EVALUATION_SEED, FIRST_EVALUATION_SEED + 16)
 """Seeds of evaluations, far from those that learners begin their worlds with."""
 
 LEFT = "left the world"
-"""Why species end where they diverge."""
+"""Reason for the end of a species that diverged."""
 
-UNSAID_STEPS = 256
+DEFAULT_STEPS = 256
 """Steps of an episode where an id is registered without a limit."""
 
 SPECIES = (*SPECIES_TASKS, *(size.id for size in SPECIES_SIZES))
@@ -78,7 +79,7 @@ ELSEWHERE = {
     "task": "the id says it",
     "perceive": "the id says it",
 }
-"""Keywords of environments that problems do not take, and where they are said instead."""
+"""Keywords of environments that problems do not take, and why."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -93,16 +94,12 @@ class Problem:
     env_id: str
     """Of `npa_envs.registration`, or of a species task: "npa/Mixing-v0"; or of an environment of
     one's own that is registered with Gymnasium."""
-
     keywords: Mapping[str, Any] = field(default_factory=dict)
-    """What `gym.make` or `multispecies_v0.batched` is given besides, of JSON's types."""
-
+    """Further keywords of `gym.make` or `multispecies_v0.batched`, of JSON's types."""
     episode_steps: int
     """Steps after which an episode is cut off."""
-
     num_envs: int = 16
     """Worlds B in which learners act at the same time."""
-
     hidden_dim: int = 128
     """Width of the hidden layer of new rules."""
 
@@ -127,11 +124,10 @@ class Problem:
         except (TypeError, ValueError) as error:
             raise NPAError(
                 f"keywords must have values of JSON's types, got {shown(dict(self.keywords))}: "
-                "give "
-                f"numbers, text and lists ({error})"
+                f"give numbers, text and lists ({error})"
             ) from error
         object.__setattr__(self, "keywords", plain)
-        # Unknown ids and wrong keywords are errors now, not in the midst of a comparison.
+        # Unknown ids and wrong keywords are errors now, not in the middle of a comparison.
         _ = self.config
 
     def __hash__(self) -> int:
@@ -145,7 +141,7 @@ class Problem:
 
     @property
     def is_garden(self) -> bool:
-        """Whether a rule runs the particles, and an action says what few brushes do."""
+        """Whether a rule runs the particles, and actions are those of brushes."""
         return not self.is_species and issubclass(self.env_type.task_type, GardenTask)
 
     @property
@@ -203,14 +199,15 @@ class Problem:
     @property
     def interface(self) -> Interface:
         """What observations and actions mean, column by column."""
-        physics, config = self.physics, self.config
-        by_species = isinstance(config, SpeciesConfig) and config.perception == "per_species"
+        physics, config, species = self.physics, self.config, 0
+        if isinstance(config, SpeciesConfig) and config.perception == "per_species":
+            species = config.species_count
         return Interface(
             physics.space_dim,
             physics.state_dim,
             physics.moving,
             physics.limits.state_scale,
-            config.species_count if isinstance(config, SpeciesConfig) and by_species else 0,
+            species,
         )
 
     @property
@@ -233,9 +230,7 @@ class Problem:
             NPAError: Something that the task needs cannot be loaded.
         """
         place = check_device(device)
-        config = replace(self.config, device=str(place))
-        made: EnvTask[Any] | SpeciesTask = self.task_type(config, place)
-        return made
+        return self.task_type(replace(self.config, device=str(place)), place)
 
     def make_envs(
         self,
@@ -251,23 +246,23 @@ class Problem:
         `reset(seed=0)` returns observations, [B, N, P], and infos; `step(actions)`, of [B, N, A],
         returns observations, rewards, terminations and truncations, [B] each, and infos. Worlds
         restart in the step that ends their episodes: then `infos["final_obs"]`, [B, N, P], has the
-        last observations where `infos["_final_obs"]`, [B], says so.
+        last observations where `infos["_final_obs"]`, [B], is true.
 
         Args:
             num_envs: Worlds B; None: the problem's.
             device: Where they live.
-            row_rewards: Let `infos["particle_reward"]`, [B, N], of each step have what each
-                particle is paid: "particle", its own share of the improvement, or "marginal", what
-                its world would have lost without its action. Of several species each particle is
-                paid what its species is, in any case.
-            tell_updated: Let `infos["updated"]`, [B, N], of each step tell whose actions took
-                effect. Several species do not tell.
+            row_rewards: Give `infos["particle_reward"]`, [B, N], the reward of each particle:
+                "particle", its own share of the improvement, or "marginal", the loss of its world
+                without its action. Of several species each particle always has the reward of its
+                species.
+            tell_updated: Give `infos["updated"]`, [B, N], whose actions took effect in each step;
+                not for several species.
             copy: Hand out new tensors; False: where possible the same ones in each step,
                 overwritten by the next.
 
         Raises:
-            NPAError: The worlds do not fit into memory, there is no such device, or particles are
-                to be paid where the problem's keywords pay otherwise.
+            NPAError: The worlds do not fit into memory, there is no such device, or `row_rewards`
+                contradicts the problem's keywords.
         """
         count = self.num_envs if num_envs is None else num_envs
         place = str(check_device(device))
@@ -304,14 +299,7 @@ class Problem:
         return made
 
     def new_rules(self, seed: int) -> RuleSet:
-        """Return untrained rules of the right architecture, one for each species, on the CPU.
-
-        Args:
-            seed: Of their weights, at least 0; torch's own randomness is left as it is.
-
-        Raises:
-            NPAError: The seed is none.
-        """
+        """Return untrained rules, one for each species; as `RuleSet.new`."""
         return RuleSet.new(self, seed)
 
     def to_json(self) -> str:
@@ -322,41 +310,32 @@ class Problem:
     def from_json(cls, text: str) -> Problem:
         """Return the problem that `to_json` wrote.
 
-        Args:
-            text: JSON.
-
         Raises:
-            NPAError: It is no problem.
+            NPAError: The text is no problem in JSON.
         """
         try:
-            fields = json.loads(text)
-            return cls(**fields)
-        except TypeError as error:
+            return cls(**json.loads(text))
+        except (TypeError, json.JSONDecodeError) as error:
             raise NPAError(
-                f"text must be a problem in JSON, got {shown(text)} ({error})"
+                f"text must be a problem in JSON, got {shown(text)} ({error}): give what "
+                "Problem.to_json returned"
             ) from error
-        except json.JSONDecodeError as error:
-            raise NPAError(f"text must be JSON, got {shown(text)} ({error})") from error
 
 
 def registered_steps(env_id: str) -> int:
-    """Return the steps after which episodes of an id are cut off as it is registered.
-
-    256 where it says nothing, or is not known.
-    """
+    """Return the steps after which episodes of an id are cut off; 256 where it has no limit."""
     if env_id in SPECIES:
         steps = task_settings(env_id)[1].get("max_cycles")
     else:
         steps = getattr(gymnasium.registry.get(env_id), "max_episode_steps", None)
-    return UNSAID_STEPS if steps is None else int(steps)
+    return DEFAULT_STEPS if steps is None else int(steps)
 
 
 def check_run_seed(seed: Any) -> None:
-    """Check the seed of a run: `RUNS` runs have worlds of their own.
+    """Check the seed of a run, which has worlds of its own.
 
     Raises:
-        NPAError: It is no whole number from 0 on, or so large that its worlds would be those of
-            evaluations.
+        NPAError: It is no whole number from 0 to `RUNS` - 1.
     """
     if not is_whole(seed) or not 0 <= seed < RUNS:
         raise NPAError(
@@ -383,57 +362,21 @@ def world_seeds(seed: int, count: int, part: int = 0) -> list[int]:
     return [first + (part * count + world) % WORLDS_PER_SEED for world in range(count)]
 
 
-class WorldFacts(NamedTuple):
-    """What policies and their evaluation ask of worlds."""
-
-    physics: Physics
-    """The worlds' constants."""
-
-    perception_dim: int
-    """Length P of an observation of a particle."""
-
-    episode_steps: int
-    """Steps after which an episode is cut off."""
-
-
 class ConcatenatedSpeciesEnv:
     """Worlds of several species whose particles stand one after the other: [B, N, P], [B, N, A].
 
-    It has the interface of `NPAVectorEnv` as far as learners need it. A world is paid the mean of
-    what its species are paid, and its loss is the mean of theirs; a species that ended keeps the
-    loss that it had then. A world terminates where all of its species have ended by themselves. The
-    reason is that of the first species that ended by itself, unless one left the world: then it is
-    that.
-
-    Every step's infos have, besides `final_obs` and `final_info` as elsewhere:
-
-    | Key | Value |
-    |---|---|
-    | `loss` | before a restart, shape [B] |
-    | `particle_reward` | what the species of each particle is paid, shape [B, N] |
-    | `acted` | whether that species was alive: rows to leave out where not, bool, shape [B, N] |
-    | `particle_terminated` | whether that species ended by itself now, bool, shape [B, N] |
-
-    Args:
-        task: A name from `npa_envs.envs.multi.TASKS`.
-        num_envs: Worlds B.
-        episode_steps: Steps after which an episode is cut off.
-        device: Where the worlds live.
-        keywords: Fields of the task's configuration.
-
-    Raises:
-        NPAError: As for `multispecies_v0.batched`.
+    It has the interface of `NPAVectorEnv` as far as learners need it. Reward and loss of a world
+    are the means over its species; a species that ended keeps the loss that it had then. A world
+    terminates where all of its species have ended by themselves. The reason is that of the first
+    species that ended by itself, or "left the world" where one did. Every step's infos also have
+    of each particle's species, in [B, N], its reward in `particle_reward`, whether it was alive in
+    `acted`, and whether it ended by itself now in `particle_terminated`.
     """
 
     def __init__(
-        self,
-        task: str,
-        num_envs: int,
-        episode_steps: int,
-        device: str,
-        keywords: Mapping[str, Any],
+        self, task: str, num_envs: int, episode_steps: int, device: str, keywords: Mapping[str, Any]
     ) -> None:
-        self.species_env = MultiSpeciesVectorEnv(
+        self.species_env = env = MultiSpeciesVectorEnv(
             task,
             world_count=num_envs,
             max_cycles=episode_steps,
@@ -442,28 +385,25 @@ class ConcatenatedSpeciesEnv:
             **keywords,
         )
         """The environment with an array for each species."""
-        env = self.species_env
-        self.num_envs = env.world_count
-        """Worlds B."""
-        self.config = env.config
-        """Its configuration."""
-        self.render_mode = env.render_mode
-        """What `species_env.render()` returns."""
+        self.num_envs, self.config, self.render_mode = num_envs, env.config, env.render_mode
         self.task = env.worlds.task
         """Starts and losses."""
         self.metadata = {"autoreset_mode": AutoresetMode.SAME_STEP}
-        self.worlds = WorldFacts(env.worlds.physics, env.worlds.perception_dim, episode_steps)
-        """The worlds' constants."""
+        self.worlds = SimpleNamespace(
+            physics=env.worlds.physics,
+            perception_dim=env.worlds.perception_dim,
+            episode_steps=episode_steps,
+        )
+        """What policies and their evaluation read."""
         counts = env.config.played_counts
         spans = [slice(end - n, end) for end, n in zip(accumulate(counts), counts, strict=True)]
         self.spans = dict(zip(env.agents, spans, strict=True))
-        """Where each species' particles stand."""
+        """Places of each species' particles."""
         self.single_observation_space = _concatenated_space(env.single_observation_spaces)
-        """Space of one world's observations, shape [N, P]."""
         self.single_action_space = _concatenated_space(env.single_action_spaces)
-        """Space of one world's actions, shape [N, A]."""
-        self._loss = torch.zeros(self.num_envs, len(spans), device=device)
-        self._reasons = np.full(self.num_envs, None, dtype=object)
+        self._counts = torch.tensor(counts, device=device)
+        self._loss = torch.zeros(num_envs, len(spans), device=device)
+        self._reasons = np.full(num_envs, None, dtype=object)
 
     @property
     def unwrapped(self) -> ConcatenatedSpeciesEnv:
@@ -473,27 +413,17 @@ class ConcatenatedSpeciesEnv:
     def reset(
         self, *, seed: int | Sequence[int] | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Tensor, dict[str, Any]]:
-        """Start episodes; arguments and errors of `MultiSpeciesVectorEnv.reset`.
-
-        Returns:
-            Observations, shape [B, N, P], and infos with `loss`.
-        """
+        """Start episodes as `MultiSpeciesVectorEnv.reset`; infos have `loss`."""
         rows, infos = self.species_env.reset(seed, options)
         chosen = worlds_to_reset(options, self.num_envs)
         self._reasons[chosen] = None
-        # Nothing is said any more of species that have ended in worlds that go on.
+        # Infos are silent about species that have ended in worlds that go on.
         losses, index = self._stacked(infos, "loss"), to_device_async(chosen, self._loss.device)
         self._loss = self._loss.index_copy(0, index, losses[index])
         return self._concatenated(rows), {"loss": self._loss.mean(dim=1)}
 
     def step(self, actions: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, dict[str, Any]]:
-        """Apply an action to each particle, and perceive.
-
-        Args:
-            actions: Shape [B, N, A], in [-1, 1].
-
-        Returns:
-            Observations [B, N, P], rewards [B], terminations [B], truncations [B], and infos.
+        """Apply actions, [B, N, A], in [-1, 1], and perceive.
 
         Raises:
             NPAError: The actions have another shape; the worlds are then as they were.
@@ -501,29 +431,30 @@ class ConcatenatedSpeciesEnv:
         """
         by_species = {agent: actions[:, span] for agent, span in self.spans.items()}
         rows, rewards, terminations, truncations, infos = self.species_env.step(by_species)
-        acted = self._stacked(infos, "acted")
+        paid, ended, cut = (
+            torch.stack(list(part.values()), dim=1) for part in (rewards, terminations, truncations)
+        )
+        acted, late = self._stacked(infos, "acted"), cut.any(dim=1)
         self._loss = torch.where(acted, self._stacked(infos, "loss"), self._loss)
-        paid = torch.stack(list(rewards.values()), dim=1)
-        told: dict[str, Any] = {
+        found: dict[str, Any] = {
             "loss": self._loss.mean(dim=1),
             "particle_reward": self._by_particle(paid),
             "acted": self._by_particle(acted),
-            "particle_terminated": self._by_particle(torch.stack(list(terminations.values()), 1)),
+            "particle_terminated": self._by_particle(ended),
         }
-        late = torch.stack(list(truncations.values()), dim=1).any(dim=1)
         self._remember_reasons(infos)
         first = infos[self.species_env.agents[0]]
         over = first.get("_final_obs", torch.zeros_like(late))
         if "final_obs" in first:
             last = {agent: infos[agent]["final_obs"] for agent in self.spans}
-            told |= {"final_obs": self._concatenated(last), "_final_obs": over}
             which = over.cpu().numpy()
             reasons = self._reasons.copy()
             reasons[~which] = None
             self._reasons[which] = None
-            told["final_info"] = {"loss": told["loss"], "_loss": over, "reason": reasons}
-            told["_final_info"] = over
-        return self._concatenated(rows), paid.mean(dim=1), over & ~late, over & late, told
+            final = {"loss": found["loss"], "_loss": over, "reason": reasons}
+            found |= {"final_obs": self._concatenated(last), "_final_obs": over}
+            found |= {"final_info": final, "_final_info": over}
+        return self._concatenated(rows), paid.mean(dim=1), over & ~late, over & late, found
 
     def close(self) -> None:
         """Close the window, if there is one."""
@@ -533,25 +464,22 @@ class ConcatenatedSpeciesEnv:
         return torch.cat([rows[agent] for agent in self.spans], dim=1)
 
     def _stacked(self, infos: Mapping[str, Mapping[str, Any]], name: str) -> Tensor:
-        """Return what infos say of each species, shape [B, K]."""
+        """Return an info of each species, shape [B, K]."""
         return torch.stack([infos[agent][name] for agent in self.spans], dim=1)
 
     def _by_particle(self, values: Tensor) -> Tensor:
-        """Return what holds for species, [B, K], for each of their particles, shape [B, N]."""
-        parts = [
-            values[:, k : k + 1].expand(-1, span.stop - span.start)
-            for k, span in enumerate(self.spans.values())
-        ]
-        return torch.cat(parts, dim=1)
+        """Return values of species, [B, K], for each of their particles, shape [B, N]."""
+        count = self.single_action_space.shape[0]
+        return values.repeat_interleave(self._counts, dim=1, output_size=count)
 
     def _remember_reasons(self, infos: Mapping[str, Mapping[str, Any]]) -> None:
-        """Keep why the first species of each world ended; that one left is told before all else."""
+        """Keep why the first species of each world ended, or that one left the world."""
         for agent in self.spans:
             own = infos[agent].get("reason")
             if own is not None:
-                told = own != None  # noqa: E711
+                given = own != None  # noqa: E711
                 held = (self._reasons != None) & (self._reasons != TIME_LIMIT)  # noqa: E711
-                self._reasons = np.where((told & ~held) | (own == LEFT), own, self._reasons)
+                self._reasons = np.where((given & ~held) | (own == LEFT), own, self._reasons)
 
 
 def _concatenated_space(spaces: Mapping[str, Any]) -> Box:

@@ -1,4 +1,4 @@
-"""The account of a learner: its budget, what it has spent, and its learning curve."""
+"""The account of a run: its budget, its learning curve, and its checkpoints."""
 
 from __future__ import annotations
 
@@ -6,19 +6,28 @@ import contextlib
 import math
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any, Protocol
 
 import torch
-from torch import nn
+from torch import Tensor, nn
 
 from npa_envs.agents.evaluation import evaluate_policy
 from npa_envs.agents.learning.problem import Problem
-from npa_envs.agents.learning.rules import RuleSet
-from npa_envs.checks import is_real, is_whole
+from npa_envs.agents.learning.rules import RuleSet, starting_rules
+from npa_envs.checks import check_count, check_positive, is_real
 from npa_envs.devices import check_device
 from npa_envs.errors import DivergedError, NPAError, shown
+from npa_envs.files import json_text, write_text
+from npa_envs.training.checkpoint import (
+    check_content,
+    load_checkpoint,
+    save_checkpoint,
+    unusable_checkpoint,
+)
 from npa_envs.training.ranks import Ranks
+from npa_envs.training.run_folder import RunFolder, check_choice
+from npa_envs.training.stopping import stop_flag
 from npa_envs.world.randomness import Randomness, WorldRandom
 
 
@@ -34,7 +43,6 @@ class Budget:
     """Wall-clock time of learning [s]. Set-up and evaluations come on top, and may take longer:
     there are at most `entries` + 2 evaluations, of an episode for each of `evaluation_seeds`. By
     default these are 22 of 16 episodes; `entries=1` makes at most 3."""
-
     particle_steps: int | None = None
     """Steps of an environment or a rollout, times the particles that took them."""
 
@@ -44,59 +52,62 @@ class Budget:
             raise NPAError(
                 "a budget must say something: Budget(seconds=60) or particle_steps=10**7"
             )
-        if self.seconds is not None and not (is_real(self.seconds) and self.seconds > 0.0):
-            raise NPAError(
-                f"seconds must be positive and finite, got {shown(self.seconds)}: try 60"
-            )
-        steps = self.particle_steps
-        if steps is not None and not (is_whole(steps) and steps > 0):
-            raise NPAError(
-                f"particle_steps must be a positive integer, got {shown(steps)}: try 10**7"
-            )
+        if self.seconds is not None:
+            check_positive(self, float, "seconds")
+        if self.particle_steps is not None:
+            check_positive(self, int, "particle_steps")
 
     def share(self, seconds: float, particle_steps: int) -> float:
         """Return the share of the budget that time [s] and particle-steps are; 1: it is spent."""
         by_time = 0.0 if self.seconds is None else seconds / self.seconds
-        by_steps = 0.0
-        if self.particle_steps is not None:
-            by_steps = particle_steps / self.particle_steps
+        by_steps = 0.0 if self.particle_steps is None else particle_steps / self.particle_steps
         return max(by_time, by_steps)
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class CurvePoint:
     """One evaluation: a point of a learning curve."""
 
     seconds: float
     """Time spent by then [s]."""
-
     particle_steps: int
     """Particle-steps spent by then."""
-
     mean_return: float
     """Mean return of the evaluation's episodes."""
-
     standard_error: float
     """Its standard error; infinite for a single episode."""
-
     final_loss: float
     """Mean loss at the episodes' ends, before the next ones start."""
 
 
 class Learner(Protocol):
-    """A learner whose run can be stopped and go on: what is to be kept of it."""
+    """A learner whose run can be stopped and resumed: what its checkpoints hold."""
 
     random: Randomness
     """What it draws from."""
-
-    def modules(self) -> Mapping[str, nn.Module]:
-        """Return what learns, by name."""
-
-    def optimisers(self) -> Mapping[str, torch.optim.Optimizer]:
-        """Return what makes it learn, by name: of Adam's kind."""
+    modules: dict[str, nn.Module]
+    """What learns, by name."""
+    optimisers: dict[str, torch.optim.Optimizer]
+    """Their optimisers of Adam's kind, by name."""
 
     def go_on(self, iteration: int, part: int) -> None:
         """Go on after so many iterations, for the part-th time, from 1 on, with other worlds."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Keeping:
+    """Where and how a run is kept."""
+
+    folder: RunFolder
+    """For checkpoint, rules and curve."""
+    run: Mapping[str, Any]
+    """What the run is of, of JSON's types: a resumed run must be of the same."""
+    resume: bool = False
+    """Go on from the checkpoint in the folder."""
+    overwrite: bool = False
+    """Begin anew although the folder holds a run; its files are removed."""
+    on_stop: Callable[[], None] = lambda: None
+    """Called where the run is asked to stop before its budget is spent."""
 
 
 class Progress:
@@ -112,49 +123,68 @@ class Progress:
     progress.look(rules, force=True)
     ```
 
-    Neither what happens before `start` nor evaluations count, nor what is written meanwhile. On
-    CUDA the host waits for the device only there; besides, `advance` keeps it at most one iteration
-    ahead, so that time is what the device took.
+    Set-up before `start`, evaluations and checkpoints count as no time. On CUDA the host waits for
+    the device only there, and `advance` keeps it at most one iteration ahead, so that time is what
+    the device took.
+
+    A run that is kept writes a checkpoint, the rules and the curve as `log.jsonl` with each entry
+    of the curve, and where SIGTERM or Ctrl-C stops it. A resumed run has the weights, the
+    optimisers and the account of the checkpoint, on any number of processes, and new episodes.
 
     Where torch has a default group of processes, each has an account, and all go by the clock of
-    the first one. Each evaluates the same episodes, and the first one tells of them.
+    the first one. Each evaluates the same episodes. The first one reports and writes.
 
     Args:
         problem: What is learned.
         budget: What may be spent.
-        device: Where evaluations run: the learner's device.
+        seed: Of new rules and of all that the learner draws.
+        device: Where worlds, rules and evaluations are.
         evaluation_seeds: Of the episodes, which no learner sees: one each.
         entries: Evaluations besides the first, at equal shares of the budget.
         on_entry: Called with each entry.
+        initial: Rules to begin with, which are copied; None: new ones.
+        keeping: Where and how the run is kept; None: it is not.
 
     Raises:
-        NPAError: There are no seeds or wrong ones, or the number of entries is not positive.
+        NPAError: There are no seeds or wrong ones, or the number of entries is not positive. Or the
+            folder holds a run, without `resume` or `overwrite`; or none or another one, with
+            `resume`.
     """
 
     def __init__(
         self,
         problem: Problem,
         budget: Budget,
+        seed: int = 0,
         *,
         device: str | torch.device,
         evaluation_seeds: Iterable[int],
         entries: int = 20,
         on_entry: Callable[[CurvePoint], None] | None = None,
+        initial: RuleSet | None = None,
+        keeping: Keeping | None = None,
     ) -> None:
         self.problem = problem
         """What is learned."""
         self.budget = budget
         """What may be spent."""
+        self.seed = seed
+        """Seed of new rules and of all that the learner draws."""
+        self.device = check_device(device)
+        """Where worlds, rules and evaluations are."""
+        self.initial = None
+        """Copies of the rules to begin with, on the device; None: new ones."""
+        if initial is not None:
+            self.initial = starting_rules(problem, self.device, initial)
         self.particle_steps = 0
         """Particle-steps spent so far."""
         self.log: list[CurvePoint] = []
         """Evaluations so far."""
         self.ranks = Ranks.current()
         """The processes that share the run."""
-        given: Any = evaluation_seeds
-        if not isinstance(given, Iterable):
+        if not isinstance(evaluation_seeds, Iterable):
             raise NPAError(
-                f"evaluation_seeds must be one for each episode, got {shown(given)}: "
+                f"evaluation_seeds must be one for each episode, got {shown(evaluation_seeds)}: "
                 "range(1_000_000, 1_000_016)"
             )
         self._seeds = list(evaluation_seeds)
@@ -162,22 +192,29 @@ class Progress:
             raise NPAError(
                 "evaluation_seeds must hold at least one seed, got none: range(100, 132)"
             )
-        # Now, not in the first evaluation.
+        # Wrong seeds are errors now, not in the first evaluation.
         WorldRandom(self._seeds)
-        if not is_whole(entries) or entries < 1:
-            raise NPAError(
-                f"entries must be a whole number of at least 1, got {shown(entries)}: try 20"
-            )
+        check_count("entries", entries, ": try 20")
         self._entries = entries
         self._on_entry = on_entry
-        self._device = check_device(device)
         self._envs: Any = None
         self._started = False
         self._since: float | None = None
-        self._seconds = 0.0
-        self._elapsed = 0.0
+        self._seconds = self._elapsed = 0.0
         self._looks = 0
         self._previous: torch.cuda.Event | None = None
+        self._iteration = self._part = 0
+        self._keeping = keeping
+        content = None
+        if keeping is not None and self.ranks.first:
+            content = _prepare(keeping)
+        self._content: dict[str, Any] | None = self.ranks.broadcast(content)
+
+    def first_rules(self) -> RuleSet:
+        """Return the rules that a learner begins with and may change, on the device."""
+        if self.initial is not None:
+            return self.initial
+        return RuleSet.new(self.problem, self.seed).to(self.device)
 
     def run(
         self, rules: RuleSet, iteration: Callable[[], int], learner: Learner | None = None
@@ -190,20 +227,30 @@ class Progress:
             learner: What checkpoints are made of, where the run is kept.
 
         Raises:
-            NPAError: It has started before.
+            NPAError: It has started before. Or a file of a run that is kept cannot be written or
+                used, or another run writes there.
             DivergedError: A weight of the rules is not finite, or an action.
         """
-        self.start(rules)
-        while not self.over:
-            self.advance(iteration())
-            self.look(rules)
-        self.look(rules, force=True)
+        with self._kept(learner) as asked_to_stop:
+            self.start(rules)
+            self._save(rules, learner)
+            while not self.over and not asked_to_stop():
+                self.advance(iteration())
+                self._iteration += 1
+                entries = len(self.log)
+                self.look(rules)
+                if len(self.log) > entries:
+                    self._save(rules, learner)
+            # An evaluation takes its time, and who asked to stop may not wait.
+            self._save(rules, learner)
+            self.look(rules, force=True)
+            self._save(rules, learner)
         return rules
 
     def start(self, actor: RuleSet | Callable[[Any], Any]) -> None:
         """Evaluate the rules or the policy that the learner begins with, and begin to count.
 
-        Of a run that goes on, this is known.
+        A resumed run has this evaluation already.
 
         Raises:
             NPAError: It has started before.
@@ -233,16 +280,16 @@ class Progress:
         return self.share >= 1.0
 
     def advance(self, particle_steps: int) -> None:
-        """Take down the particle-steps that an iteration took.
+        """Count the particle-steps that an iteration took.
 
         Raises:
             NPAError: Nothing has started yet.
         """
         self._check_started("advance")
         self.particle_steps += particle_steps
-        if self._device.type == "cuda":
+        if self.device.type == "cuda":
             event = torch.cuda.Event()  # type: ignore[no-untyped-call]
-            event.record(torch.cuda.current_stream(self._device))
+            event.record(torch.cuda.current_stream(self.device))
             if self._previous is not None:
                 self._previous.synchronize()
             self._previous = event
@@ -263,11 +310,10 @@ class Progress:
         self._check_started("look")
         fresh = self.particle_steps > self.log[-1].particle_steps
         due = self.share >= (self._looks + 1) / self._entries
-        if not fresh or not (force or due):
-            return
-        with self._stopped_clock():
-            self._looks = int(self.share * self._entries)
-            self._evaluate(actor)
+        if fresh and (force or due):
+            with self._stopped_clock():
+                self._looks = int(self.share * self._entries)
+                self._evaluate(actor)
 
     @contextlib.contextmanager
     def _stopped_clock(self) -> Iterator[None]:
@@ -279,7 +325,7 @@ class Progress:
         self._since = time.perf_counter()
 
     def _agree_on_time(self) -> None:
-        """Take down the time as the first process has it."""
+        """Take the time of the first process."""
         self._elapsed = self.ranks.broadcast(self.seconds)
 
     def _check_started(self, caller: str) -> None:
@@ -289,7 +335,7 @@ class Progress:
     def _evaluate(self, actor: RuleSet | Callable[[Any], Any]) -> None:
         if self._envs is None:
             count = min(len(self._seeds), self.problem.num_envs)
-            self._envs = self.problem.make_envs(count, device=self._device)
+            self._envs = self.problem.make_envs(count, device=self.device)
         policy = actor
         if isinstance(actor, RuleSet):
             policy = actor.policy()
@@ -309,8 +355,85 @@ class Progress:
             self._on_entry(entry)
 
     def _wait(self) -> None:
-        if self._device.type == "cuda":
-            torch.cuda.synchronize(self._device)
+        if self.device.type == "cuda":
+            torch.cuda.synchronize(self.device)
+
+    @contextlib.contextmanager
+    def _kept(self, learner: Learner | None) -> Iterator[Callable[[], bool]]:
+        """Hold the run's folder, if any, within the block; yields whether to stop."""
+        keeping, first = self._keeping, self.ranks.first
+        if keeping is None:
+            yield lambda: False
+            return
+        assert learner is not None, "methods whose runs are kept are learners"
+        with keeping.folder.locked() if first else contextlib.nullcontext():
+            if first:
+                keeping.folder.tidy()
+            if self._content is not None:
+                self._go_on(keeping, learner, self._content)
+            elif first and keeping.overwrite:
+                keeping.folder.clear()
+            with stop_flag(patient=self.ranks.together) as flag:
+
+                def asked_to_stop() -> bool:
+                    stops = self.ranks.agree_to_stop(flag.is_set(), self._iteration)
+                    if stops:
+                        keeping.on_stop()
+                    return stops
+
+                yield asked_to_stop
+
+    def _save(self, rules: RuleSet, learner: Learner | None) -> None:
+        """Write a run that is kept, once all processes agree on what was learned."""
+        if self._keeping is not None and learner is not None:
+            with self._stopped_clock():
+                self._write(self._keeping, rules, learner)
+
+    def _write(self, keeping: Keeping, rules: RuleSet, learner: Learner) -> None:
+        state, folder = learner_state(learner), keeping.folder
+        learned = [value for held in state["modules"].values() for value in held.values()]
+        self.ranks.check_same([value for value in learned if isinstance(value, Tensor)])
+        if not self.ranks.first:
+            return
+        curve = [asdict(entry) for entry in self.log]
+        content = {
+            "learner": dict(keeping.run),
+            "iteration": self._iteration,
+            "part": self._part,
+            "particle_steps": self.particle_steps,
+            "seconds": self._elapsed,
+            "curve": curve,
+        }
+        save_checkpoint(folder.checkpoint, content | state)
+        folder.note_checkpoint()
+        rules.save(folder.path)
+        lines = [" ".join(json_text(line).split()) for line in curve]
+        write_text(folder.log, "\n".join(lines) + "\n")
+
+    def _go_on(self, keeping: Keeping, learner: Learner, content: dict[str, Any]) -> None:
+        """Go on from what a checkpoint holds."""
+        path, like = keeping.folder.checkpoint, learner_state(learner)
+        like |= {"iteration": 0, "part": 0, "particle_steps": 0, "seconds": 0.0}
+        like["optimisers"] = _moments_like(learner, content.get("optimisers"))
+        random = content.get("random")
+        if not isinstance(random, Tensor) or random.shape != like["random"].shape:
+            # Processes that share a run draw by world, and one alone does not: draws begin anew.
+            content["random"] = like["random"]
+        check_content(content, like, path)
+        try:
+            self.log = [CurvePoint(**entry) for entry in content.get("curve") or ()]
+            numbers = [value for entry in self.log for value in asdict(entry).values()]
+            load_learner_state(learner, content)
+        except (TypeError, RuntimeError) as error:
+            raise unusable_checkpoint(path, f"it cannot be used ({shown(error)})") from error
+        # The error of a single episode is infinite.
+        if not self.log or not all(is_real(value) or value == math.inf for value in numbers):
+            raise unusable_checkpoint(path, "curve must hold the numbers of its entries")
+        self._iteration, self._part = content["iteration"], content["part"] + 1
+        self.particle_steps = content["particle_steps"]
+        self._seconds = self._elapsed = content["seconds"]
+        self._looks = int(self.share * self._entries)
+        learner.go_on(self._iteration, self._part)
 
 
 def annealed(rate: float, last_rate: float, share: float) -> float:
@@ -331,6 +454,72 @@ def check_finite(rules: RuleSet, particle_steps: int) -> None:
             if bad:
                 raise DivergedError(
                     f"weights must stay finite, but {bad} of {weight.numel()} in {shown(name)} of "
-                    "rule "
-                    f"{number} were not after {particle_steps} particle-steps: learn more slowly"
+                    f"rule {number} were not after {particle_steps} particle-steps: learn more "
+                    "slowly"
                 )
+
+
+def _prepare(keeping: Keeping) -> dict[str, Any] | None:
+    """Prepare the folder of a run, and return the checkpoint that it goes on from, if any."""
+    check_choice(resume=keeping.resume, overwrite=keeping.overwrite)
+    folder, content = keeping.folder, None
+    folder.note_checkpoint()
+    if keeping.resume:
+        content = load_checkpoint(folder.checkpoint)
+        held = content.get("learner")
+        if held != keeping.run:
+            held = held if isinstance(held, dict) else {}
+            names = [name for name, value in keeping.run.items() if held.get(name) != value]
+            raise NPAError(
+                f"the checkpoint {str(folder.checkpoint)!r} must be of the same run, but "
+                f"differs in {', '.join(names)}: learn what it is of, or choose another folder"
+            )
+    elif folder.checkpoint.exists() and not keeping.overwrite:
+        raise NPAError(
+            f"out must be a folder without a run, but {shown(str(folder.path))} holds one: "
+            "resume it, choose another folder, or overwrite it"
+        )
+    folder.prepare(0, pictures=False)
+    return content
+
+
+def learner_state(learner: Learner) -> dict[str, Any]:
+    """Return the state of a learner without its worlds."""
+    random = learner.random
+    # All worlds have drawn equally often.
+    drawn = random.episodes[:1] if isinstance(random, WorldRandom) else random.get_state()
+    optimisers = learner.optimisers.items()
+    return {
+        "modules": {name: module.state_dict() for name, module in learner.modules.items()},
+        "optimisers": {name: optimiser.state_dict()["state"] for name, optimiser in optimisers},
+        "random": drawn.cpu(),
+    }
+
+
+def load_learner_state(learner: Learner, state: Mapping[str, Any]) -> None:
+    """Load what `learner_state` returned."""
+    for name, module in learner.modules.items():
+        module.load_state_dict(state["modules"][name])
+    for name, optimiser in learner.optimisers.items():
+        # The groups are those of the options.
+        groups = optimiser.state_dict()["param_groups"]
+        optimiser.load_state_dict({"state": state["optimisers"][name], "param_groups": groups})
+    random = learner.random
+    if isinstance(random, WorldRandom):
+        random.episodes.fill_(int(state["random"]))
+    else:
+        random.set_state(state["random"])
+
+
+def _moments_like(learner: Learner, held: Any) -> dict[str, Any]:
+    """Return Adam's state of those parameters that a checkpoint has some of."""
+    like: dict[str, Any] = {}
+    for name, optimiser in learner.optimisers.items():
+        own = held.get(name) if isinstance(held, dict) else None
+        keys = own.keys() if isinstance(own, dict) else ()
+        like[name] = {
+            number: {"step": torch.zeros(()), "exp_avg": value, "exp_avg_sq": value}
+            for number, value in enumerate(optimiser.param_groups[0]["params"])
+            if number in keys
+        }
+    return like

@@ -1,4 +1,4 @@
-"""Sets of rules, one for each species of a problem: what all learners change."""
+"""Sets of rules, one for each species of a problem."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class RuleSet(nn.Module):
     Args:
         rules: One for each species, which are not copied.
         counts: Particles of each species.
-        interface: What observations and actions mean: `problem.interface`.
+        interface: `problem.interface`.
 
     Raises:
         NPAError: There is not one rule for each species.
@@ -52,20 +52,15 @@ class RuleSet(nn.Module):
         """The rules, in the order of the species."""
         ends = list(accumulate(counts))
         self.spans = [slice(end - count, end) for end, count in zip(ends, counts, strict=True)]
-        """Where each species' particles stand."""
+        """Places of each species' particles."""
         self.interface = interface
-        """What observations and actions mean."""
 
     @classmethod
     def new(cls, problem: Problem, seed: int) -> RuleSet:
-        """Return untrained rules of the architecture that a problem asks for, on the CPU.
-
-        Args:
-            problem: What they are to learn.
-            seed: Of their weights, at least 0; torch's own randomness is left as it is.
+        """Return untrained rules for a problem, on the CPU; torch's own randomness stays as it is.
 
         Raises:
-            NPAError: The seed is no such integer.
+            NPAError: The seed is no integer of at least 0.
         """
         if not is_whole(seed) or seed < 0:
             raise NPAError(
@@ -74,11 +69,10 @@ class RuleSet(nn.Module):
         interface, config = problem.interface, problem.config
         with torch.random.fork_rng(devices=()):
             torch.manual_seed(seed)
+            sizes = interface.space_dim, interface.state_dim, problem.hidden_dim
             rules = [
                 NPARule(
-                    interface.space_dim,
-                    interface.state_dim,
-                    problem.hidden_dim,
+                    *sizes,
                     eps0=config.eps0,
                     alpha=config.alpha,
                     static=not interface.moving,
@@ -91,10 +85,10 @@ class RuleSet(nn.Module):
 
     @classmethod
     def of(cls, problem: Problem, source: Source | Sequence[Source]) -> RuleSet:
-        """Return copies of rules that there are already, for a problem, on the CPU.
+        """Return copies of existing rules for a problem that they fit, on the CPU.
 
         Args:
-            problem: Where they are to act: they need not come from there, but have to fit.
+            problem: Where they are to act.
             source: A rule, or what `npa_envs.load_rule` takes, for all species or one for each; or
                 a folder that `save` wrote.
 
@@ -115,11 +109,7 @@ class RuleSet(nn.Module):
 
     @classmethod
     def load(cls, folder: str | Path, problem: Problem) -> RuleSet:
-        """Return the rules that `save` wrote, on the CPU.
-
-        Args:
-            folder: Where they are.
-            problem: Where they are to act.
+        """Return the rules that `save` wrote, on the CPU, for a problem.
 
         Raises:
             NPAError: A file is missing or holds no rule, or one that does not fit.
@@ -127,10 +117,7 @@ class RuleSet(nn.Module):
         return cls.of(problem, [Path(folder) / _file_name(k) for k in range(len(problem.counts))])
 
     def save(self, folder: str | Path) -> list[Path]:
-        """Write each rule as an ordinary rule's file, and return their paths.
-
-        Args:
-            folder: Made where it is missing; `rule-0.safetensors` and so on are replaced in it.
+        """Write `rule-0.safetensors` and so on into a folder, and return their paths.
 
         Raises:
             NPAError: A weight is not finite, or a file cannot be written.
@@ -143,8 +130,7 @@ class RuleSet(nn.Module):
         except OSError as error:
             raise NPAError(
                 f"folder must be one that can be made, got {shown(str(folder))} "
-                f"({error.strerror}): "
-                "choose another place"
+                f"({error.strerror}): choose another place"
             ) from error
         return paths
 
@@ -157,17 +143,10 @@ class RuleSet(nn.Module):
         return self.mean(observation)
 
     def mean(self, observation: Tensor) -> Tensor:
-        """Return every particle's action: a_x = δ / (1 + |δ|) and a_s = Δs / state_scale.
+        """Return actions [B, N, A] for observations: a_x = δ / (1 + |δ|), a_s = Δs / state_scale.
 
-        It is what `policy` does, and `RulePolicy` with each rule, but for state steps beyond the
-        action space: they are clipped there and in environments, and not here, so that gradients do
-        not vanish.
-
-        Args:
-            observation: What is perceived, on the rules' device, shape [B, N, P].
-
-        Returns:
-            Differentiable in the weights and in the observation, shape [B, N, A].
+        They are those of `policy`, but state steps beyond the action space are not clipped, so that
+        gradients do not vanish. They are differentiable in the weights and in the observation.
         """
         scale = self.interface.state_scale
         parts = [
@@ -177,11 +156,7 @@ class RuleSet(nn.Module):
         return parts[0] if len(parts) == 1 else torch.cat(parts, dim=1)
 
     def updates(self, observation: Tensor) -> list[tuple[Tensor, Tensor]]:
-        """Return the displacements, [B, N_k, D], and state steps, [B, N_k, C], of each species.
-
-        Args:
-            observation: What is perceived, on the rules' device, shape [B, N, P].
-        """
+        """Return displacements, [B, N_k, D], and state steps, [B, N_k, C], of each species."""
         found = []
         for rule, span in zip(self, self.spans, strict=True):
             rows = observation[:, span]
@@ -198,11 +173,7 @@ class RuleSet(nn.Module):
 
 
 class RuleSetPolicy(Policy):
-    """A set of rules as a policy for all particles of its problem.
-
-    Args:
-        rules: The rules; actions are computed on their device.
-    """
+    """A set of rules as a policy for all particles of its problem, on the rules' device."""
 
     def __init__(self, rules: RuleSet) -> None:
         super().__init__(rules.interface)
@@ -229,16 +200,12 @@ class RuleSetPolicy(Policy):
         return {agent: known[agent] for agent in counts}
 
 
-def starting_rules(
-    problem: Problem, seed: int, device: torch.device, start: RuleSet | None
-) -> RuleSet:
-    """Return rules for a learner to change: copies of those given, or new ones, on a device.
+def starting_rules(problem: Problem, device: torch.device, start: RuleSet) -> RuleSet:
+    """Return copies of rules for a learner to change, on a device.
 
     Raises:
-        NPAError: What was given is no set of rules, or does not fit the problem.
+        NPAError: They are no set of rules, or do not fit the problem.
     """
-    if start is None:
-        return RuleSet.new(problem, seed).to(device)
     if not isinstance(start, RuleSet):
         raise NPAError(
             f"start must be a RuleSet, got {type(start).__name__}: RuleSet.of(problem, 'heart')"

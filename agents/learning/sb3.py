@@ -1,19 +1,23 @@
-"""Stable-Baselines3's PPO over whole worlds: a likelihood a world, the mean over its particles.
+"""Learners of Stable-Baselines3: PPO over whole worlds; PPO and SAC in gardens.
 
-It is the independent baseline of the device's own PPO: rollouts, advantages and updates are
-Stable-Baselines3's; only the policy, whose actor is rules, is ours.
+PPO over worlds has a likelihood a world, the mean over its particles. It is the independent
+baseline of the device's own PPO: rollouts, advantages and updates are Stable-Baselines3's; only the
+policy, whose actor is rules, is ours.
 """
 
 from __future__ import annotations
 
 import sys
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
-import torch
-from gymnasium.spaces import Space
+import numpy as np
+from gymnasium.spaces import Dict, Space
+from numpy.typing import NDArray
 from torch import Tensor
 
+from npa_envs.agents.learning.baselines import check_no_start
 from npa_envs.agents.learning.ppo_common import (
     CommonOptions,
     Critic,
@@ -23,20 +27,20 @@ from npa_envs.agents.learning.ppo_common import (
     noise_left,
     zero_output_rules,
 )
-from npa_envs.agents.learning.problem import Problem, world_seeds
+from npa_envs.agents.learning.problem import world_seeds
 from npa_envs.agents.learning.progress import Progress
 from npa_envs.agents.learning.rules import RuleSet
-from npa_envs.checks import check_positive
-from npa_envs.errors import MissingDependencyError, NPAError
-from npa_envs.wrappers.sb3 import WorldVecEnv
+from npa_envs.checks import check_fraction, check_positive
+from npa_envs.errors import MissingDependencyError, NPAError, shown
+from npa_envs.wrappers.sb3 import WorldVecEnv, on_host
 
 try:
-    from stable_baselines3 import PPO
+    from stable_baselines3 import PPO, SAC
     from stable_baselines3.common.callbacks import BaseCallback
     from stable_baselines3.common.policies import ActorCriticPolicy
 except ImportError as error:
     raise MissingDependencyError(
-        "this form of PPO needs Stable-Baselines3: pip install 'npa-envs[sb3]'"
+        "this method needs Stable-Baselines3: pip install 'npa-envs[sb3]'"
     ) from error
 
 EXCESS = 1.5
@@ -50,7 +54,6 @@ class WorldOptions(CommonOptions):
     clip: float = 0.02
     """Ratios of likelihoods count up to 1 plus or minus this (dimensionless); little, as their
     logarithms are means over many particles."""
-
     tensorboard_log: str | None = None
     """Folder for Stable-Baselines3's own log; None: nowhere."""
 
@@ -63,24 +66,13 @@ class WorldOptions(CommonOptions):
 DEFAULTS = WorldOptions()
 
 
-def train(
-    problem: Problem,
-    progress: Progress,
-    seed: int,
-    *,
-    device: torch.device,
-    start: RuleSet | None = None,
-    options: WorldOptions = DEFAULTS,
-) -> RuleSet:
+def train(progress: Progress, options: WorldOptions = DEFAULTS) -> RuleSet:
     """Return the rules that Stable-Baselines3's PPO finds within a budget.
 
     Stable-Baselines3 seeds torch and NumPy as a whole; what is seen goes through the host.
-
-    Raises:
-        NPAError: A minibatch would be a single step of a world.
-        DivergedError: The policy has diverged.
     """
-    pace = options.pace(start)
+    problem, seed, device = progress.problem, progress.seed, progress.device
+    pace = options.pace(progress.initial)
     seen = options.steps * problem.num_envs
     batch_size = -(-seen // options.minibatches)
     if batch_size < 2:
@@ -105,17 +97,21 @@ def train(
         target_kl=world_kl(pace.target_kl),
         tensorboard_log=options.tensorboard_log,
         policy_kwargs={
-            "rules": zero_output_rules(problem, seed, start),
+            "rules": zero_output_rules(problem, seed, progress.initial),
             "initial_std": pace.initial_std,
             "critic": options.critic,
         },
         seed=seed,
         device=device,
     )
-    # Stable-Baselines3 would begin with worlds seed, seed + 1, and so on.
-    env.seed(world_seeds(seed, problem.num_envs)[0])
-    model.learn(sys.maxsize, callback)
+    _learn(model, env, progress, callback)
     return callback.rules
+
+
+def _learn(model: Any, env: WorldVecEnv, progress: Progress, callback: BaseCallback) -> None:
+    # Stable-Baselines3 would begin with worlds seed, seed + 1, and so on.
+    env.seed(world_seeds(progress.seed, progress.problem.num_envs)[0])
+    model.learn(sys.maxsize, callback)
 
 
 def world_kl(particle_kl: float) -> float:
@@ -246,3 +242,182 @@ class WorldRulePolicy(ActorCriticPolicy):
         given = super()._get_constructor_parameters()
         del given["net_arch"]
         return given | self._made_of
+
+
+# Gardens: SAC and PPO as they come, a row for each world.
+
+ALGORITHMS: dict[str, type[SAC] | type[PPO]] = {"sac": SAC, "ppo": PPO}
+"""By the names of the files that `GardenPolicy.save` writes, without ".zip"."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class GardenOptions:
+    """What both algorithms are settings; all that is not said is as Stable-Baselines3 has it."""
+
+    gamma: float = 0.9
+    """Discount of a reward one step later (dimensionless)."""
+    learning_rate: float = 3e-4
+    """Adam's."""
+
+    def __post_init__(self) -> None:
+        """Check every field; raises NPAError."""
+        check_fraction(self, "gamma")
+        check_positive(self, float, "learning_rate")
+
+
+@dataclass(frozen=True, kw_only=True)
+class SACOptions(GardenOptions):
+    """Options of `train_garden_sac`."""
+
+    learning_starts: int = 1000
+    """Steps of worlds before the first gradient step."""
+    world_steps: int = 8
+    """Steps of worlds for each gradient step, as nearly as the number of worlds allows."""
+
+    def __post_init__(self) -> None:
+        """Check every field; raises NPAError."""
+        super().__post_init__()
+        check_positive(self, int, "learning_starts", "world_steps")
+
+
+@dataclass(frozen=True, kw_only=True)
+class GardenPPOOptions(GardenOptions):
+    """Options of `train_garden_ppo`."""
+
+    steps: int = 32
+    """Steps of each world in a round."""
+    batch_size: int = 64
+    """Steps of worlds in a minibatch, at least 2."""
+
+    def __post_init__(self) -> None:
+        """Check every field; raises NPAError."""
+        super().__post_init__()
+        check_positive(self, int, "steps")
+        check_positive(self, int, "batch_size", at_least=2)
+
+
+SAC_DEFAULTS, GARDEN_PPO_DEFAULTS = SACOptions(), GardenPPOOptions()
+
+
+def train_garden_sac(progress: Progress, options: SACOptions = SAC_DEFAULTS) -> GardenPolicy:
+    """Return the policy that SAC (Haarnoja et al., arXiv 1801.01290) finds within a budget."""
+    gradient_steps = max(1, progress.problem.num_envs // options.world_steps)
+    settings = {"learning_starts": options.learning_starts, "gradient_steps": gradient_steps}
+    return _garden_policy(SAC, progress, options, **settings)
+
+
+def train_garden_ppo(
+    progress: Progress, options: GardenPPOOptions = GARDEN_PPO_DEFAULTS
+) -> GardenPolicy:
+    """Return the policy that PPO (Schulman et al., arXiv 1707.06347) finds within a budget."""
+    if options.steps * progress.problem.num_envs < 2:
+        raise NPAError("steps must be at least 2 in a single world, got 1: give steps=32")
+    settings = {"n_steps": options.steps, "batch_size": options.batch_size}
+    return _garden_policy(PPO, progress, options, **settings)
+
+
+def _garden_policy(
+    algorithm: Any, progress: Progress, options: GardenOptions, **settings: int
+) -> GardenPolicy:
+    check_no_start(progress)
+    env = WorldVecEnv(progress.problem.make_envs(device=progress.device))
+    model = algorithm(
+        "MultiInputPolicy" if isinstance(env.observation_space, Dict) else "MlpPolicy",
+        env,
+        gamma=options.gamma,
+        learning_rate=options.learning_rate,
+        seed=progress.seed,
+        device=progress.device,
+        **settings,
+    )
+    policy = GardenPolicy(model)
+    _learn(model, env, progress, GardenCallback(progress, policy))
+    env.close()
+    return policy
+
+
+class GardenCallback(BaseCallback):
+    """Keeps a learner's account while Stable-Baselines3 learns to garden, and stops it in time."""
+
+    def __init__(self, progress: Progress, policy: GardenPolicy) -> None:
+        super().__init__()
+        self._progress, self._policy = progress, policy
+        rule_steps: int = getattr(progress.problem.config, "rule_steps", 1)
+        self._step = progress.problem.num_envs * progress.problem.particle_count * rule_steps
+
+    def _on_training_start(self) -> None:
+        self._progress.start(self._policy)
+
+    def _on_step(self) -> bool:
+        """Count a step of all worlds, and return whether to go on."""
+        self._progress.advance(self._step)
+        self._progress.look(self._policy)
+        return not self._progress.over
+
+    def _on_training_end(self) -> None:
+        self._progress.look(self._policy, force=True)
+
+
+class GardenPolicy:
+    """A model of Stable-Baselines3, without noise, as the policy of a garden.
+
+    Args:
+        model: The model; the policy follows while it learns.
+    """
+
+    def __init__(self, model: Any) -> None:
+        self.model = model
+        space = model.observation_space
+        self._shapes = _shapes(space.spaces if isinstance(space, Dict) else space)
+
+    def __call__(self, observation: Any) -> NDArray[np.float32]:
+        """Return actions of worlds, shape [B, K, W], for what is seen of them, [B, ...]."""
+        wanted = self._shapes
+        found = {name: shape[1:] for name, shape in _shapes(observation).items()}
+        if wanted != found:
+            raise NPAError(
+                "observation must be of a garden like that which the policy has learned in, of "
+                f"shapes {wanted} by world, got {found}: take one that has learned in this garden"
+            )
+        seen: Any = observation
+        if isinstance(observation, dict):
+            seen = dict(zip(observation, on_host(*observation.values()), strict=True))
+        else:
+            (seen,) = on_host(observation)
+        action, _ = self.model.predict(seen, deterministic=True)
+        return np.asarray(action)
+
+    def save(self, folder: str | Path) -> list[Path]:
+        """Write the model as Stable-Baselines3 does, `sac.zip` or `ppo.zip`; return the path."""
+        path = Path(folder) / f"{type(self.model).__name__.lower()}.zip"
+        self.model.save(path)
+        return [path]
+
+    @classmethod
+    def load(cls, path: str | Path) -> GardenPolicy:
+        """Return what `save` wrote; Stable-Baselines3 unpickles it, so trust who made the file."""
+        name = Path(path).stem
+        if name not in ALGORITHMS:
+            raise NPAError(
+                f"path must be of a file sac.zip or ppo.zip, got {shown(str(path))}: name the file "
+                "as the learner that wrote it, because its name says how to read it"
+            )
+        if not Path(path).is_file():
+            raise NPAError(
+                f"path must be of a file that exists, got {shown(str(path))}: name one that "
+                "`save` or `npa-envs learn` wrote"
+            )
+        try:
+            return cls(ALGORITHMS[name].load(path, device="cpu"))
+        except Exception as error:
+            # What unpickling raises depends on what is in the file.
+            raise NPAError(
+                f"path must be of a file that {name}'s `save` wrote, got {shown(str(path))} "
+                f"({shown(error)}): save the policy again, or name another file"
+            ) from error
+
+
+def _shapes(parts: Any) -> dict[str, tuple[int, ...]]:
+    """Return the shapes of the parts of an observation or a space, or of what has none."""
+    named = parts if isinstance(parts, dict) else {"observation": parts}
+    return {name: tuple(part.shape) for name, part in named.items()}

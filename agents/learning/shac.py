@@ -1,7 +1,7 @@
 """Short-horizon actor-critic: gradients through a few steps, a critic for the rest.
 
 Source: Xu et al., arXiv 2204.07137. Worlds live on from window to window. Rules ascend the rewards
-of a window, differentiated through its steps, and what a critic says of the worlds at its end. The
+of a window, differentiated through its steps, and the critic's value of the worlds at its end. The
 gradient never leads through a whole episode.
 """
 
@@ -14,13 +14,16 @@ from typing import NamedTuple, get_args
 import torch
 from torch import Tensor
 
-from npa_envs.agents.learning.gradient import episode_task
+from npa_envs.agents.learning.gradient import environment_task
 from npa_envs.agents.learning.ppo_common import (
     Critic,
     CriticKind,
     Minibatches,
     check_word,
+    find_gradients,
+    gradients_of,
     learner_random,
+    seeded_critic,
     zero_output_rules,
 )
 from npa_envs.agents.learning.problem import Problem
@@ -41,47 +44,33 @@ class SHACOptions:
     steps: int = 16
     """Steps that a gradient leads through, h, at most: an episode is cut into windows of equal
     length."""
-
     world_count: int = 8
     """Worlds B; several processes share them out."""
-
     gamma: float = 0.97
     """Discount of a reward one step later (dimensionless)."""
-
     value_weight: float = 0.25
-    """Weight of what the critic foresees in what rules ascend; 1: all of it, as in the source; 0:
-    rules look no farther than their window (dimensionless)."""
-
+    """Weight of the critic's value in what rules ascend; 1 as in the source; 0: rules look no
+    farther than their window (dimensionless)."""
     td_lambda: float = 0.95
-    """Weight of what is paid later against what the critic foresees, in its targets
-    (dimensionless)."""
-
+    """Weight of later rewards against the critic's values, in its targets (dimensionless)."""
     learning_rate: float = 4e-3
     """AdamW's for the rules, at the beginning; gradients are normalised parameter by parameter."""
-
     last_rate: float = 0.05
     """Learning rate at the end, as a share of the first (dimensionless)."""
-
     critic_learning_rate: float = 1e-3
     """Adam's for the critic."""
-
     critic_epochs: int = 4
     """Passes of the critic over a window."""
-
     minibatches: int = 4
     """Parts that a window is shuffled into in each pass."""
-
     critic: CriticKind = "central"
-    """A value is the mean of what follows from each particle, or from the whole world
+    """A world's value is the mean over particles of a function of each, or of the whole world
     ("central")."""
-
     critic_width: int = 64
     """Units in a hidden layer of the critic."""
-
     target_rate: float = 0.2
-    """Share of the critic that its slowly following copy takes over after each window: the copy
-    says what targets and gradients are made of (dimensionless)."""
-
+    """Share of the critic that its copy takes over after each window. Targets and gradients are
+    made with the copy (dimensionless)."""
     memory: Memory = "store"
     """What the backward pass reads: "store", "recompute" or "minimal", as in `rollout`."""
 
@@ -98,26 +87,14 @@ class SHACOptions:
 DEFAULTS = SHACOptions()
 
 
-def train(
-    problem: Problem,
-    progress: Progress,
-    seed: int,
-    *,
-    device: torch.device,
-    start: RuleSet | None = None,
-    options: SHACOptions = DEFAULTS,
-) -> RuleSet:
+def train(progress: Progress, options: SHACOptions = DEFAULTS) -> RuleSet:
     """Return the rules that a short-horizon actor-critic finds within a budget.
 
-    Rewards are what each step takes off the environment's loss, as with `reward="dense"`. An
-    episode's end is no end to the critic: worlds would go on. State
-    steps are clamped as by the gradient's learner.
-
-    Raises:
-        NPAError: The environment's loss has no gradient.
-        DivergedError: The rules' weights are not finite.
+    Rewards are the falls of the environment's loss, as with `reward="dense"`. To the critic worlds
+    go on after an episode's end. State steps are clamped as by the gradient's learner.
     """
-    learner = SHACLearner(problem, options, seed, device, start, progress.ranks)
+    problem, ranks = progress.problem, progress.ranks
+    learner = SHACLearner(problem, options, progress.seed, progress.device, progress.initial, ranks)
 
     def iteration() -> int:
         learner.learn(annealed(options.learning_rate, options.last_rate, progress.share))
@@ -127,22 +104,21 @@ def train(
 
 
 class StepWindow(NamedTuple):
-    """What h steps of B worlds were."""
+    """h steps of B worlds."""
 
     features: Tensor
-    """What the critic sees of the worlds before and after each step, shape [h + 1, B, N, F]."""
-
+    """The critic's inputs before and after each step, shape [h + 1, B, N, F]."""
     losses: Tensor
     """The worlds' losses then, shape [h + 1, B]."""
 
     @property
     def rewards(self) -> Tensor:
-        """What each step took off the loss, shape [h, B]."""
+        """Falls of the loss in each step, shape [h, B]."""
         return self.losses[:-1] - self.losses[1:]
 
 
 class SHACLearner:
-    """Rules, critic and worlds; the seed is that of all that is drawn.
+    """Rules, critic and worlds; the seed is that of all draws.
 
     Several processes each have a share of the worlds, draw for each of these by itself, and take
     the means of gradients and moments.
@@ -165,21 +141,29 @@ class SHACLearner:
         count = -(-problem.episode_steps // options.steps)
         self.window = -(-problem.episode_steps // count)
         """Steps of a window, h."""
-        self.task = episode_task(problem, device)
+        self.task = environment_task(problem, device)
         self.random = learner_random(seed, options.world_count, places, device, ranks)
-        """What worlds, update masks and shuffles draw from."""
+        """Source of worlds, update masks and shuffles."""
         width = problem.physics.space_dim + problem.physics.state_dim + 1
-        with torch.random.fork_rng(devices=[]):
-            torch.manual_seed(seed)
-            critic = Critic(width, problem.counts, options.critic, options.critic_width)
-        self.critic = critic.to(device)
+        self.critic = seeded_critic(problem, width, options, seed).to(device)
         self.target = copy.deepcopy(self.critic).requires_grad_(False)
         """The critic's copy, which follows it slowly."""
-        self._weights = [p for p in self.rules.parameters() if p.requires_grad]
-        self._optimizer = torch.optim.AdamW(self._weights, fused=True)
+        weights = [p for p in self.rules.parameters() if p.requires_grad]
+        self._optimizer = torch.optim.AdamW(weights, fused=True)
         self._critic_optimizer = torch.optim.Adam(
             self.critic.parameters(), lr=options.critic_learning_rate, fused=True
         )
+        self.modules: dict[str, torch.nn.Module] = {
+            "rules": self.rules,
+            "critic": self.critic,
+            "target": self.target,
+        }
+        """What learns, by name."""
+        self.optimisers: dict[str, torch.optim.Optimizer] = {
+            "rules": self._optimizer,
+            "critic": self._critic_optimizer,
+        }
+        """Their optimisers."""
         self._limits = problem.physics.limits.position, problem.physics.limits.state
         self.window_count = count
         """Windows of an episode."""
@@ -197,14 +181,6 @@ class SHACLearner:
         """Windows left of each world's episode: at first all numbers, so that every part of an
         episode is in a batch."""
 
-    def modules(self) -> dict[str, torch.nn.Module]:
-        """Return what learns, by the names that checkpoints have for it."""
-        return {"rules": self.rules, "critic": self.critic, "target": self.target}
-
-    def optimisers(self) -> dict[str, torch.optim.Optimizer]:
-        """Return what makes it learn."""
-        return {"rules": self._optimizer, "critic": self._critic_optimizer}
-
     def go_on(self, iteration: int, part: int) -> None:
         """Go on after so many windows, for the part-th time, from 1 on, with fresh worlds."""
         self._begin()
@@ -212,11 +188,8 @@ class SHACLearner:
     def learn(self, rate: float) -> None:
         """Let worlds live for a window, and rules and critic learn from it once."""
         window = self.play()
-        gradients = torch.autograd.grad(-self.gain(window), self._weights, allow_unused=True)
-        followed = [(w, g) for w, g in zip(self._weights, gradients, strict=True) if g is not None]
-        for weight, gradient in followed:
-            weight.grad = gradient.clone(memory_format=torch.contiguous_format)
-        means = [weight.grad for weight, _ in followed if weight.grad is not None]
+        find_gradients(self._optimizer, -self.gain(window))
+        means = gradients_of(self._optimizer)
         self.ranks.reduce(means)
         normalise_gradients(means)
         self._optimizer.param_groups[0]["lr"] = rate
@@ -233,22 +206,17 @@ class SHACLearner:
             x0,
             s0,
             steps,
-            eps=task.eps,
-            box=task.box,
-            update_prob=task.update_prob,
             memory=self.options.memory,
             generator=self.random,
-            return_path_length=True,
             keep_every=1,
             cuda_graph=True,
         )
         x, s = torch.cat((x0[None], x)), torch.cat((s0[None], s))
         goals = None if self.goal is None else self.goal.repeat(steps + 1)
-        aimed = task.toward(goals)
-        losses = aimed.world_losses(x.flatten(0, 1), s.flatten(0, 1))
+        losses = task.toward(goals).world_losses(x.flatten(0, 1), s.flatten(0, 1))
         losses = losses.view(steps + 1, -1)
-        told = losses[..., None, None].expand(*s.shape[:-1], 1)
-        features = torch.cat((x - x.mean(dim=-2, keepdim=True), s, told), dim=-1)
+        level = losses[..., None, None].expand(*s.shape[:-1], 1)
+        features = torch.cat((x - x.mean(dim=-2, keepdim=True), s, level), dim=-1)
         # Worlds that run away are held at the limits of the environment until they begin anew.
         self.x, self.s = (
             torch.nan_to_num(last.detach()).clamp(-limit, limit)
@@ -280,7 +248,7 @@ class SHACLearner:
         return self.task.seed(len(worlds), generator=random, device=self.device)
 
     def gain(self, window: StepWindow) -> Tensor:
-        """Return the mean discounted reward of a window, and of what is foreseen after it."""
+        """Return the mean discounted reward of a window and value after it."""
         gamma, steps = self.options.gamma, self.window
         discounts = gamma ** torch.arange(steps, device=self.device, dtype=torch.float32)
         paid = (discounts[:, None] * window.rewards).sum(dim=0)
@@ -288,7 +256,7 @@ class SHACLearner:
         return (paid + self.options.value_weight * gamma**steps * foreseen).mean()
 
     def learn_values(self, window: StepWindow) -> None:
-        """Let the critic learn what the window was worth, and its copy follow."""
+        """Let the critic learn the window's targets, and its copy follow."""
         options = self.options
         seen = window.features[:-1].flatten(0, 1)
         with torch.no_grad():
@@ -303,14 +271,12 @@ class SHACLearner:
             ).flatten()
             for critic in (self.critic, self.target):
                 critic.rescale(targets, self.ranks)
-        weights = list(self.critic.parameters())
         for _ in range(options.critic_epochs):
             self._minibatches.shuffle()
             for part in self._minibatches.parts[0]:
                 error = (values(self.critic, seen[part]) - targets[part]) / self.critic.scale
-                self._critic_optimizer.zero_grad()
-                torch.autograd.backward(0.5 * error.square().mean())
-                self.ranks.reduce([p.grad for p in weights if p.grad is not None])
+                find_gradients(self._critic_optimizer, 0.5 * error.square().mean())
+                self.ranks.reduce(gradients_of(self._critic_optimizer))
                 self._critic_optimizer.step()
         with torch.no_grad():
             pairs = zip(self.target.parameters(), self.critic.parameters(), strict=True)
@@ -319,24 +285,19 @@ class SHACLearner:
 
 
 def values(critic: Critic, features: Tensor) -> Tensor:
-    """Return the values of worlds of which a critic sees [M, N, F], shape [M]."""
-    said: Tensor = critic(features)
-    return said.mean(dim=-1)
+    """Return the values of worlds with features [M, N, F], shape [M]."""
+    each: Tensor = critic(features)
+    return each.mean(dim=-1)
 
 
 def td_lambda_targets(
     rewards: Tensor, following: Tensor, *, gamma: float, td_lambda: float
 ) -> Tensor:
-    """Return what a critic should have said before each step of a window, shape [h, ...].
+    """Return a critic's targets before each step of a window, shape [h, ...].
 
-    Sums of rewards to come, discounted; after each step the critic's own word counts with weight
-    1 - `td_lambda`, after the last one alone. Source: arXiv 2204.07137, equation 7.
-
-    Args:
-        rewards: Of each step, shape [h, ...].
-        following: What the critic says of the worlds after each step, shape [h, ...].
-        gamma: Discount of a reward one step later.
-        td_lambda: Weight of what is paid later.
+    They are discounted sums of later rewards, in which the critic's values after each step,
+    `following`, have weight 1 - `td_lambda`, and weight 1 after the last step. Source: arXiv
+    2204.07137, equation 7.
     """
     targets = torch.empty_like(rewards)
     later = following[-1]

@@ -34,11 +34,7 @@ Pictures = Mapping[tuple[int, ...], NDArray[np.uint8]]
 
 
 def write_elites(search: Search, folder: Path) -> Pictures:
-    """Write each elite's rule as `elites/CELL.safetensors`, and return its first world's picture.
-
-    Raises:
-        NPAError: A file cannot be written.
-    """
+    """Write each elite's rule as `elites/CELL.safetensors`; return its first world's picture."""
     pictures = {}
     for elite in search.elites():
         trials = search.candidates.try_all(elite.solution[None])
@@ -51,12 +47,13 @@ def write_elites(search: Search, folder: Path) -> Pictures:
 
 
 def _metadata(search: Search, elite: Elite) -> dict[str, str]:
-    """Return what a rule's file says: in which world it was found, and what it was there."""
+    """Return the metadata of a rule's file: its world, quality and descriptors."""
     names = [axis.name for axis in search.axes]
-    told = {"quality": elite.found.quality, **dict(zip(names, elite.found.measures, strict=True))}
+    measures = dict(zip(names, elite.found.measures, strict=True))
+    found = {"quality": elite.found.quality, **measures}
     world: dict[str, float] = {"particle_count": search.world.particle_count}
     world |= {"update_prob": UPDATE_PROB, "seed_radius": SEED_RADIUS}
-    return {"found": json.dumps(told), "world": json.dumps(world)}
+    return {"found": json.dumps(found), "world": json.dumps(world)}
 
 
 def _picture(search: Search, trials: Trials) -> NDArray[np.uint8]:
@@ -119,8 +116,8 @@ img {{ display: block; width: {SIDE}px; height: {SIDE}px; }}
 def _cell(search: Search, elite: Elite | None, pictures: Pictures) -> str:
     if elite is None:
         return "<td></td>"
-    told = zip(search.axes, elite.found.measures, strict=True)
-    text = ", ".join(f"{axis.name} {value:.3f}" for axis, value in told)
+    measures = zip(search.axes, elite.found.measures, strict=True)
+    text = ", ".join(f"{axis.name} {value:.3f}" for axis, value in measures)
     file = f"{ELITES}/{elite.name}.safetensors"
     data = base64.b64encode(encode_frame(pictures[elite.cell], "JPEG")).decode()
     return (
@@ -130,7 +127,7 @@ def _cell(search: Search, elite: Elite | None, pictures: Pictures) -> str:
 
 
 def _span(axis: Axis, cell: int) -> str:
-    """Return where a cell of an axis begins and ends."""
+    """Return the beginning and the end of a cell of an axis."""
     width = (axis.highest - axis.lowest) / axis.cells
     begin = axis.lowest + cell * width
     return f"{begin:.3g} to {begin + width:.3g}"

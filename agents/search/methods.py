@@ -25,7 +25,7 @@ FIRST_STEP = 0.2
 
 
 class Proposals(Protocol):
-    """What proposes candidates and learns from what they came to; pyribs' schedulers are such."""
+    """Proposes candidates and learns from their results, as pyribs' schedulers do."""
 
     def ask(self) -> Numbers:
         """Return candidates, shape [K, W]."""
@@ -35,11 +35,7 @@ class Proposals(Protocol):
 
 
 def import_ribs() -> Any:
-    """Return the library with its parts imported.
-
-    Raises:
-        MissingDependencyError: It is not installed, or cma, by which it runs CMA-ES, is not.
-    """
+    """Return the library with its parts imported."""
     try:
         import cma  # noqa: F401
         import ribs.archives
@@ -54,17 +50,10 @@ def import_ribs() -> Any:
 
 
 def make_archive(weight_count: int, axes: tuple[Axis, ...], seed: int = 0) -> Any:
-    """Return an empty archive, a `ribs.archives.GridArchive`.
+    """Return an empty `ribs.archives.GridArchive` of candidates with so many weights.
 
-    Only qualities above 0 are kept: all others are dead, or blew up.
-
-    Args:
-        weight_count: Numbers that a candidate is made of, W.
-        axes: The descriptors.
-        seed: Of the elites that are drawn from it.
-
-    Raises:
-        MissingDependencyError: pyribs is not installed.
+    Only qualities above 0 are kept: all others are dead, or blew up. The seed is that of the elites
+    that are drawn from it.
     """
     return import_ribs().archives.GridArchive(
         solution_dim=weight_count,
@@ -78,15 +67,7 @@ def make_archive(weight_count: int, axes: tuple[Axis, ...], seed: int = 0) -> An
 
 
 class RandomProposals:
-    """Candidates drawn at random, each with weights of a size of its own.
-
-    Sizes are spread evenly in the logarithm. Nothing is learned.
-
-    Args:
-        archive: Where candidates go.
-        batch_size: Candidates K of a batch.
-        seed: Of the draws.
-    """
+    """Random candidates, each with weights of a size of its own, spread evenly in the logarithm."""
 
     def __init__(self, archive: Any, batch_size: int, seed: int) -> None:
         self._archive = archive
@@ -163,8 +144,10 @@ a diagonal covariance. `random` draws anew.
 """
 
 
-def as_told(found: list[Found | None], axes: tuple[Axis, ...]) -> tuple[Numbers, Numbers]:
+def qualities_and_measures(
+    found: list[Found | None], axes: tuple[Axis, ...]
+) -> tuple[Numbers, Numbers]:
     """Return qualities, shape [K], and descriptors, [K, M]; all are 0 where nothing was found."""
     nothing = Found(0.0, (0.0,) * len(axes))
-    told = [nothing if one is None else one for one in found]
-    return np.array([one.quality for one in told]), np.array([one.measures for one in told])
+    whole = [nothing if one is None else one for one in found]
+    return np.array([one.quality for one in whole]), np.array([one.measures for one in whole])

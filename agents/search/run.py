@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import zlib
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from npa_envs.agents.search.methods import METHODS, as_told, make_archive
+from npa_envs.agents.search.methods import METHODS, make_archive, qualities_and_measures
 from npa_envs.agents.search.worlds import Axis, Candidates, Found, SearchWorld
 from npa_envs.checks import is_whole
 from npa_envs.errors import NPAError, shown, suggest
@@ -22,11 +22,11 @@ RESULTS = "search.json"
 """The file that a stopped search goes on from."""
 
 LIBRARIES = ("numpy", "ribs", "cma")
-"""What proposals follow from besides the settings; other versions may propose others."""
+"""Libraries whose other versions may propose other candidates."""
 
 
 class Growth(NamedTuple):
-    """What an archive holds after some candidates."""
+    """An archive after some candidates."""
 
     evaluations: int
     """Candidates tried so far."""
@@ -42,7 +42,7 @@ class Elite(NamedTuple):
     """The best candidate of a cell."""
 
     cell: tuple[int, ...]
-    """Which cell of each axis, from 0."""
+    """Place on each axis, from 0."""
     found: Found
     """Its quality and descriptors."""
     solution: NDArray[np.float64]
@@ -50,36 +50,20 @@ class Elite(NamedTuple):
 
     @property
     def name(self) -> str:
-        """What its files are called, such as "3-4-1"."""
+        """Name of its files, such as "3-4-1"."""
         return "-".join(map(str, self.cell))
 
 
-@dataclass
-class CandidateBatch:
-    """Candidates that were tried together."""
-
-    fingerprint: int
-    """CRC-32 of their weights."""
-    found: list[Found | None]
-    """What each came to; None: nothing alive."""
-
-    @classmethod
-    def of(cls, told: Mapping[str, Any]) -> CandidateBatch:
-        """Return the batch that a record tells of."""
-        found = [None if one is None else Found(one[0], tuple(one[1:])) for one in told["found"]]
-        return cls(int(told["fingerprint"]), found)
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return the batch as a record tells it: quality and descriptors of each candidate."""
-        found = [None if one is None else [one.quality, *one.measures] for one in self.found]
-        return {"fingerprint": self.fingerprint, "found": found}
+Batch = dict[str, Any]
+"""Candidates that were tried together, as in the record: "fingerprint", the CRC-32 of their
+weights, and "found", quality and descriptors of each, or None where nothing is alive."""
 
 
 class Search:
     """A search for rules that differ, in worlds of one kind.
 
-    The same settings give the same elites. A record holds what all candidates came to, but not
-    their weights: to go on, the same candidates are proposed once more and not tried again.
+    The same settings give the same elites. A record holds the results of all candidates, but not
+    their weights: a resumed search proposes the same candidates once more and does not try them.
 
     Args:
         world: Where candidates live.
@@ -116,9 +100,8 @@ class Search:
         self.axes: tuple[Axis, ...] = world.axes()
         """The descriptors."""
         self.candidates = Candidates(world, device=device)
-        """What tries candidates."""
         self.growth: list[Growth] = []
-        """What the archive held after each batch."""
+        """The archive after each batch."""
         self.facts: dict[str, Any] = {
             **asdict(world),
             "method": method,
@@ -128,8 +111,8 @@ class Search:
             "axes": [list(axis) for axis in self.axes],
             "versions": {name: installed_version(name) for name in LIBRARIES},
         }
-        """What the elites follow from."""
-        self._batches: list[CandidateBatch] = []
+        """Facts that the elites depend on."""
+        self._batches: list[Batch] = []
         self._path = path
         self.archive = make_archive(self.candidates.weight_count, self.axes, seed)
         """The elites, a `ribs.archives.GridArchive`."""
@@ -140,11 +123,11 @@ class Search:
     @property
     def evaluations(self) -> int:
         """Candidates that have been tried."""
-        return sum(len(batch.found) for batch in self._batches)
+        return sum(len(batch["found"]) for batch in self._batches)
 
     @property
     def particle_steps(self) -> int:
-        """What they have cost: B N T each."""
+        """Their cost: B N T each."""
         return self.evaluations * self.world.particle_steps
 
     def run(
@@ -165,10 +148,13 @@ class Search:
         while self.particle_steps + batch_cost <= budget and not enough():
             solutions = self._proposals.ask()
             found = self.candidates.try_all(solutions).found
-            self._tell(CandidateBatch(_fingerprint(solutions), found))
+            results = [None if one is None else [one.quality, *one.measures] for one in found]
+            self._tell({"fingerprint": _fingerprint(solutions), "found": results})
             progress(len(found) * self.world.particle_steps)
             if self._path is not None:
-                self._write(self._path)
+                growth = [list(step) for step in self.growth]
+                content = {"facts": self.facts, "growth": growth, "batches": self._batches}
+                write_record(self._path, content)
 
     def elites(self) -> list[Elite]:
         """Return the best candidate of each cell that has one, cell by cell."""
@@ -186,30 +172,27 @@ class Search:
         ]
         return sorted(elites, key=lambda elite: elite.cell)
 
-    def _tell(self, batch: CandidateBatch) -> None:
-        self._proposals.tell(*as_told(batch.found, self.axes))
+    def _tell(self, batch: Batch) -> None:
+        found = [None if one is None else Found(one[0], tuple(one[1:])) for one in batch["found"]]
+        self._proposals.tell(*qualities_and_measures(found, self.axes))
         self._batches.append(batch)
         self.growth.append(growth_of(self.archive, self.evaluations))
 
-    def _write(self, path: Path) -> None:
-        write_record(
-            path,
-            {
-                "facts": self.facts,
-                "growth": [list(step) for step in self.growth],
-                "batches": [batch.to_dict() for batch in self._batches],
-            },
-        )
-
     def _replay(self, path: Path) -> None:
-        """Propose again what was tried before, and tell what it came to."""
+        """Propose again the candidates of a record, and tell their results."""
 
-        def read(held: dict[str, Any]) -> list[CandidateBatch]:
-            return [CandidateBatch.of(told) for told in held["batches"]]
+        def read(held: dict[str, Any]) -> list[Batch]:
+            return [
+                {
+                    "fingerprint": int(batch["fingerprint"]),
+                    "found": [one and list(map(float, one)) for one in batch["found"]],
+                }
+                for batch in held["batches"]
+            ]
 
         for batch in read_record(path, self.facts, read, command="search") or []:
-            solutions = self._proposals.ask()
-            if _fingerprint(solutions) != batch.fingerprint or len(solutions) != len(batch.found):
+            asked = self._proposals.ask()
+            if _fingerprint(asked) != batch["fingerprint"] or len(asked) != len(batch["found"]):
                 raise NPAError(
                     f"{str(path)!r} must tell of the candidates that are proposed here, but batch "
                     f"{len(self._batches)} is of others (another machine?): remove it, or choose "
@@ -219,20 +202,18 @@ class Search:
 
 
 def growth_of(archive: Any, evaluations: int) -> Growth:
-    """Return what an archive holds."""
+    """Return the growth of an archive."""
     stats = archive.stats
     best = 0.0 if stats.obj_max is None else float(stats.obj_max)
     return Growth(evaluations, float(stats.qd_score), float(stats.coverage), best)
 
 
 def tried_again(search: Search, seeds: Sequence[int], *, steps: int | None = None) -> Growth:
-    """Return what the archive would hold if its elites had met other worlds instead.
-
-    Each elite is tried once more, in worlds of other seeds, and put where it then belongs.
+    """Return the growth of an archive of the same elites, tried once more in other worlds.
 
     Args:
-        search: Whose elites.
-        seeds: The worlds' numbers, of which each elite meets all.
+        search: Of the elites.
+        seeds: The worlds' numbers; each elite meets all.
         steps: Steps from the seed, of which the later half is judged; default: as searched.
 
     Raises:
@@ -244,7 +225,9 @@ def tried_again(search: Search, seeds: Sequence[int], *, steps: int | None = Non
     elites = search.elites()
     if elites:
         solutions = np.stack([elite.solution for elite in elites])
-        archive.add(solutions, *as_told(candidates.try_all(solutions).found, search.axes))
+        archive.add(
+            solutions, *qualities_and_measures(candidates.try_all(solutions).found, search.axes)
+        )
     return growth_of(archive, len(elites))
 
 

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from npa_envs import NPARule, WorldRandom, perception_fields, rollout
-from npa_envs.agents.learning.weights import RuleWeights, updates_of
+from npa_envs.agents.learning.evolution import RuleWeights, updates_of
 from npa_envs.checks import check_positive
 from npa_envs.errors import NPAError
 from npa_envs.tasks.seeds import uniform_ball
@@ -34,16 +34,12 @@ Numbers = NDArray[np.float64]
 
 
 class Axis(NamedTuple):
-    """A descriptor: one way in which worlds differ."""
+    """A descriptor: a name, where its first cell begins, where its last one ends, and how many."""
 
     name: str
-    """What it is called."""
     lowest: float
-    """Where its first cell begins."""
     highest: float
-    """Where its last cell ends."""
     cells: int
-    """Cells of equal width."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -52,19 +48,14 @@ class SearchWorld:
 
     particle_count: int = 128
     """Particles N."""
-
     steps: int = 128
     """Steps from the seed, a multiple of 16."""
-
     world_count: int = 1
     """Worlds that each candidate is tried in, B; figures are their means."""
-
     state_dim: int = 4
     """State channels C, at least 3; the last three are the colour (less 0.5)."""
-
     hidden_dim: int = 8
     """Hidden units of a rule."""
-
     eps: float = 0.1
     """Perception radius ε [length units]."""
 
@@ -82,11 +73,11 @@ class SearchWorld:
 
     @property
     def particle_steps(self) -> int:
-        """What one candidate costs: B N T."""
+        """Cost of one candidate: B N T."""
         return self.world_count * self.particle_count * self.steps
 
     def make_rule(self) -> NPARule:
-        """Return a rule whose weights are to be put in, on the CPU."""
+        """Return a rule of any weights, on the CPU."""
         with torch.random.fork_rng(devices=()):
             return NPARule(2, self.state_dim, self.hidden_dim, eps0=self.eps).requires_grad_(False)
 
@@ -109,7 +100,7 @@ class SearchWorld:
 
 
 class Found(NamedTuple):
-    """What a candidate's worlds come to."""
+    """Result of a candidate."""
 
     quality: float
     """`bounded` times `alive`, in (0, 1]."""
@@ -118,14 +109,13 @@ class Found(NamedTuple):
 
 
 class Trials(NamedTuple):
-    """The worlds of K candidates at the end, and what was found."""
+    """Results of K candidates, None where numbers blew up or nothing changes any more; and their
+    worlds at the end, [K, B, N, D] and [K, B, N, C].
+    """
 
     found: list[Found | None]
-    """Of each; None where numbers blew up, or where nothing changes any more."""
     x: Tensor
-    """Positions [length units], shape [K, B, N, D]."""
     s: Tensor
-    """States, dimensionless, shape [K, B, N, C]."""
 
 
 class RuleStack(NPARule):
@@ -150,7 +140,7 @@ class RuleStack(NPARule):
         """Map rows of perception [K R, P] to raw updates [K R, A]."""
         count = len(self.weights)
         if len(perception) % count:
-            # Where nobody is updated there is one row, which nobody reads.
+            # Where no particle is updated there is one row, which is not read.
             return perception.new_zeros(len(perception), self.update_dim)
         rows = perception.reshape(count, len(perception) // count, self.perception_dim)
         return updates_of(self, self.weights, rows).flatten(0, 1)
@@ -160,12 +150,7 @@ class Candidates:
     """Tries rules whose weights are given, all from the same seeds and with the same masks.
 
     On a CPU candidates share a batch of worlds. On CUDA, where rows of perception are not counted,
-    they are tried one after the other.
-
-    Args:
-        world: Where they live.
-        device: Where that is computed.
-        seeds: The worlds' numbers, one for each of B; default: 0 to B - 1.
+    they are tried one after the other. The seeds of the B worlds are 0 to B - 1 by default.
     """
 
     def __init__(
@@ -173,7 +158,6 @@ class Candidates:
     ) -> None:
         self.world = world
         self.device = device
-        """Where worlds are computed."""
         self._seeds = tuple(range(world.world_count) if seeds is None else seeds)
         self._rule = world.make_rule()
         self.scales = RuleWeights([self._rule]).scales()
@@ -183,26 +167,18 @@ class Candidates:
 
     @property
     def weight_count(self) -> int:
-        """Numbers that a candidate is made of, W."""
+        """Weights of a candidate, W."""
         return len(self.scales)
 
     def rule_of(self, solution: Numbers) -> NPARule:
-        """Return a candidate's rule, on the CPU.
-
-        Args:
-            solution: Its weights in units of `scales`, shape [W].
-        """
+        """Return the rule of a candidate's weights in units of `scales`, [W], on the CPU."""
         rule = self.world.make_rule()
         RuleWeights([rule]).put(solution * self.scales)
         return rule
 
     @torch.no_grad()
     def try_all(self, solutions: Numbers) -> Trials:
-        """Grow candidates' worlds and judge them.
-
-        Args:
-            solutions: Their weights in units of `scales`, shape [K, W].
-        """
+        """Grow the worlds of candidates, whose weights are in units of `scales`, [K, W]."""
         weights = torch.as_tensor(solutions * self.scales, dtype=torch.float32).to(self.device)
         together = len(weights) if self.device.type == "cpu" else 1
         parts = [self._try(some) for some in torch.split(weights, together)]
@@ -212,13 +188,13 @@ class Candidates:
     def _try(self, weights: Tensor) -> Trials:
         world, count = self.world, len(weights)
         random = WorldRandom(self._seeds * count, device=self.device)
-        x, s = self._seed(random)
+        shape = random.world_count, world.particle_count, 2
+        x = uniform_ball(*shape, SEED_RADIUS, generator=random, device=self.device)
+        s = x.new_zeros(*x.shape[:2], world.state_dim)
         every = world.steps // SNAPSHOTS
-        told: dict[str, Any] = {
-            "generator": random, "keep_every": every, "update_prob": UPDATE_PROB,
-            "return_path_length": True,
-        }  # fmt: skip
-        xs, ss, path = rollout(RuleStack(self._rule, weights), x, s, world.steps, **told)
+        options: dict[str, Any] = {"generator": random, "keep_every": every}
+        options |= {"update_prob": UPDATE_PROB, "return_path_length": True}
+        xs, ss, path = rollout(RuleStack(self._rule, weights), x, s, world.steps, **options)
         late = SNAPSHOTS // 2
         travelled = (path[-1] - path[late - 1]).mean(dim=1) / ((SNAPSHOTS - late) * every)
         late_x, late_s = (values[late:].unflatten(1, (count, -1)) for values in (xs, ss))
@@ -227,28 +203,14 @@ class Candidates:
         return Trials(found, late_x[-1], late_s[-1])
 
     def _judge(self, xs: Tensor, ss: Tensor, speed: float) -> Found | None:
-        """Return what a candidate came to, from late moments [T, B, N, ·] of its worlds."""
+        """Return a candidate's result from late moments [T, B, N, ·] of its worlds."""
         if not (xs.isfinite().all() and ss.isfinite().all()):
             return None
         quality = float(quality_of(xs, ss))
         if quality <= 0.0:
             return None
-        return Found(
-            quality, (speed, *self.crowding_and_mixing(xs.flatten(0, 1), ss.flatten(0, 1)))
-        )
-
-    def _seed(self, random: WorldRandom) -> tuple[Tensor, Tensor]:
-        """Return disks of blank particles."""
-        world = self.world
-        x = uniform_ball(
-            random.world_count,
-            world.particle_count,
-            2,
-            SEED_RADIUS,
-            generator=random,
-            device=self.device,
-        )
-        return x, x.new_zeros(*x.shape[:2], world.state_dim)
+        measures = self.crowding_and_mixing(xs.flatten(0, 1), ss.flatten(0, 1))
+        return Found(quality, (speed, *measures))
 
     def crowding_and_mixing(self, x: Tensor, s: Tensor) -> tuple[float, float]:
         """Return two descriptors of worlds x [B, N, D], s [B, N, C]."""
@@ -266,15 +228,11 @@ def _colours(s: Tensor) -> Tensor:
 
 
 def quality_of(xs: Tensor, ss: Tensor) -> Tensor:
-    """Return how alive worlds are within their bounds, in [0, 1], shape [].
+    """Return how alive worlds [T, B, N, ·] are within their bounds, in [0, 1], shape [].
 
     bounded = 1 / (1 + mean |s − clip(s, −1, 1)| + mean |x − clip(x, −1, 1)|), with the terms that
-    training penalises. alive = twice the standard deviation over time of a particle's colour
+    training penalises. alive = twice the standard deviation over T moments of a particle's colour
     channels, averaged: 1 where each flickers between 0 and 1. The quality is bounded times alive.
-
-    Args:
-        xs: Positions at T moments [length units], shape [T, B, N, D].
-        ss: States, dimensionless, shape [T, B, N, C].
     """
     excess = [(values - values.clamp(-1.0, 1.0)).abs().mean() for values in (xs, ss)]
     alive = 2.0 * _colours(ss).std(dim=0, correction=0).mean()

@@ -144,7 +144,7 @@ def policy_of(options: RecordOptions, problem: Problem) -> Callable[[Any], Any]:
         ).policy
     source = options.policy
     if source.endswith(".zip") and problem.is_garden:
-        from npa_envs.agents.learning.garden_sb3 import GardenPolicy
+        from npa_envs.agents.learning.sb3 import GardenPolicy
 
         return GardenPolicy.load(source)
     if problem.is_garden:

@@ -31,13 +31,12 @@ from npa_envs.agents.comparison.report import (
 from npa_envs.agents.comparison.run import (
     PICTURE,
     SIZE,
-    ComparisonPoint,
     RunRecord,
     final_picture,
     held_records,
     run_jobs,
 )
-from npa_envs.agents.learning import METHODS, Problem, RuleSet
+from npa_envs.agents.learning import METHODS, CurvePoint, Problem, RuleSet
 from npa_envs.cli import main
 from npa_envs.cli.compare import CompareOptions, make_plan
 from npa_envs.cli.compare import _jobs as jobs_of
@@ -87,9 +86,9 @@ def record(method: str, seed: int, returns=(), *, axis="seconds", status="done",
     return RunRecord(job=Job(axis, "growth", method, seed), status=status, **given | fields)
 
 
-def points(*pairs: tuple[float, float]) -> tuple[ComparisonPoint, ...]:
+def points(*pairs: tuple[float, float]) -> tuple[CurvePoint, ...]:
     """A curve of returns against seconds; a second is 100 particle-steps."""
-    return tuple(ComparisonPoint(at, 100.0 * at, value, 0.0, 1.0 - value) for at, value in pairs)
+    return tuple(CurvePoint(at, 100.0 * at, value, 0.0, 1.0 - value) for at, value in pairs)
 
 
 @pytest.fixture
@@ -162,9 +161,8 @@ def test_a_task_of_the_comparison_survives_json(name, quick):
 
 
 def test_the_command_line_becomes_a_plan():
-    made = make_plan(
-        CompareOptions(seconds=2.0, particle_steps=1e6, options=("evolution.population=8",))
-    )
+    options = ("evolution.population=8",)
+    made = make_plan(CompareOptions(seconds=2.0, particle_steps=1e6, options=options))
     assert list(made.tasks) == list(PROBLEMS)
     assert list(made.methods) == [name for name in METHODS if name != "clone"]
     assert made.budgets["seconds"] == dict.fromkeys(PROBLEMS, 2.0)
@@ -456,9 +454,7 @@ def test_the_process_of_a_run_ends_with_the_comparison(tmp_path, told):
     made = make_plan(
         CompareOptions(quick=True, seconds=600.0, tasks=("mixing",), methods=("random", "gradient"))
     )
-    job = next(job for job in made.jobs() if job.method == "gradient")
-    request = {"job": dataclasses.asdict(job), "facts": made.facts(job)}
-    (tmp_path / "request.json").write_text(json.dumps(request))
+    request_of(next(job for job in made.jobs() if job.method == "gradient"), made, tmp_path)
     process = subprocess.Popen(
         [*one_run.PROGRAM, str(tmp_path)], stdin=subprocess.PIPE, stderr=subprocess.PIPE
     )
@@ -556,11 +552,7 @@ def test_curves_have_a_line_for_each_point_of_each_run():
 
 @pytest.mark.parametrize(
     ("budgets", "at_once", "said"),
-    [
-        ({"seconds": {}}, 3, True),
-        ({"seconds": {}}, 1, False),
-        ({"particle-steps": {}}, 3, False),
-    ],
+    [({"seconds": {}}, 3, True), ({"seconds": {}}, 1, False), ({"particle-steps": {}}, 3, False)],
 )
 def test_a_table_says_where_equal_wall_time_was_shared(budgets, at_once, said, tmp_path):
     made = plan(budgets=budgets, settings={"runs_at_once": at_once})
@@ -612,9 +604,8 @@ def test_a_picture_shows_the_end_of_the_episode_and_not_the_next_start(name, dev
     assert not np.array_equal(shown, final_picture(problem, still, 4, device=place))
     first, again = (RandomPolicy(problem.make_envs(1, device=device)) for _ in range(2))
     keywords = {**problem.keywords, "render_mode": "rgb_array", "render_size": SIZE}
-    envs = dataclasses.replace(problem, keywords=keywords, episode_steps=99).make_envs(
-        1, device=device
-    )
+    longer = dataclasses.replace(problem, keywords=keywords, episode_steps=99)
+    envs = longer.make_envs(1, device=device)
     observation, _ = envs.reset(seed=[3])
     for _ in range(problem.episode_steps):
         observation, *_ = envs.step(first(observation))
@@ -642,6 +633,14 @@ def test_a_strip_has_a_column_for_each_method_and_room_for_what_failed(tmp_path)
 # The whole command
 
 
+def quick_words(methods: str, particle_steps: int, options: str) -> list[str]:
+    """Words of a quick comparison; the options begin with one of evolution."""
+    return (
+        f"compare --quick --tasks morphogenesis2d --seeds 1 --no-progress --methods {methods} "
+        f"--particle-steps {particle_steps} --options evolution.{options}"
+    ).split()
+
+
 def test_a_quick_comparison_is_of_one_task_and_seed_unless_told_otherwise():
     plan = make_plan(CompareOptions(quick=True))
     assert (list(plan.tasks), plan.seeds) == (["morphogenesis2d"], (0,))
@@ -652,11 +651,7 @@ def test_a_quick_comparison_is_of_one_task_and_seed_unless_told_otherwise():
 
 def test_a_quick_comparison_stops_goes_on_and_refuses_other_settings(tmp_path, capsys):
     pytest.importorskip("cma")
-    words = (
-        "compare --quick --tasks morphogenesis2d --methods zero evolution --seeds 1 "
-        "--particle-steps 20000 --no-progress --commit test "
-        f"--options evolution.population=4 --out {tmp_path}"
-    ).split()
+    words = quick_words("zero evolution", 20_000, f"population=4 --commit test --out {tmp_path}")
     assert main([*words, "--max-seconds", "1e-3"]) == 0
     assert "1 runs are left: call again" in capsys.readouterr().out
     folder = tmp_path / "particle-steps" / "morphogenesis2d"
@@ -690,12 +685,7 @@ def test_a_quick_comparison_stops_goes_on_and_refuses_other_settings(tmp_path, c
 
 
 def test_a_method_that_raises_is_in_the_table_and_the_command_says_so(tmp_path, capsys):
-    words = (
-        "compare --quick --tasks morphogenesis2d --methods evolution --seeds 1 "
-        "--particle-steps 1000 --no-progress "
-        f"--options evolution.population=1 --out {tmp_path}"
-    ).split()
-    assert main(words) == 1
+    assert main(quick_words("evolution", 1000, f"population=1 --out {tmp_path}")) == 1
     told = capsys.readouterr().out
     assert "| evolution | 0, 1 failed | – |" in told
     assert "evolution/seed-0 failed: NPAError: population must be a whole number" in told
@@ -703,8 +693,14 @@ def test_a_method_that_raises_is_in_the_table_and_the_command_says_so(tmp_path, 
     assert "Traceback" in output.read_text()
 
 
-def train_wildly(problem, progress, seed, *, device, start=None):
-    still = ZeroPolicy(problem.make_envs(1, device=device))
+def request_of(job, made, folder) -> None:
+    """Write the request of a job into a folder."""
+    request = {"job": dataclasses.asdict(job), "facts": made.facts(job)}
+    (folder / "request.json").write_text(json.dumps(request))
+
+
+def train_wildly(progress):
+    still = ZeroPolicy(progress.problem.make_envs(1))
     return lambda observation: math.nan + still(observation)
 
 
@@ -713,8 +709,7 @@ def test_a_policy_whose_actions_are_not_finite_has_diverged(name, tmp_path, monk
     monkeypatch.setitem(METHODS, "wild", f"{__name__}:train_wildly")
     made = make_plan(CompareOptions(quick=True, tasks=(name,), methods=("wild",)))
     (job, *_) = made.jobs()
-    request = {"job": dataclasses.asdict(job), "facts": made.facts(job)}
-    (tmp_path / "request.json").write_text(json.dumps(request))
+    request_of(job, made, tmp_path)
     one_run.run(tmp_path, "cpu")
     found = RunRecord.read(tmp_path, made.facts(job))
     assert (found.status, "must be finite" in found.error) == ("diverged", True)

@@ -72,7 +72,7 @@ def test_algorithms_as_they_come_learn_within_their_budget_and_can_be_loaded(
 
 def test_a_policy_of_another_garden_or_a_file_of_something_else_is_refused(tmp_path):
     pytest.importorskip("stable_baselines3")
-    from npa_envs.agents.learning.garden_sb3 import GardenPolicy
+    from npa_envs.agents.learning.sb3 import GardenPolicy
 
     problem = garden()
     (path,) = learned("sac", problem, 1, learning_starts=2).save(tmp_path)

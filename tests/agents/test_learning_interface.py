@@ -8,10 +8,7 @@ import torch
 from learning_problems import digits, heart, species, wild_rules
 
 import npa_envs
-from npa_envs.agents import (
-    RandomPolicy,
-    SpreadPolicy,
-)
+from npa_envs.agents import RandomPolicy, SpreadPolicy
 from npa_envs.agents.learning import Budget, Problem, RuleSet, train
 from npa_envs.envs import multispecies_v0, particles_v0
 from npa_envs.errors import NPAError

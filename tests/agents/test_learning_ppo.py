@@ -27,16 +27,9 @@ from npa_envs.rule.rule import NPARule
 from npa_envs.world.cuda_graph import no_garbage_collection
 
 HEART = heart(
-    episode_steps=16,
-    num_envs=8,
-    particle_count=64,
-    eps=0.2,
-    eps0=0.1,
-    seed_radius=0.45,
-    colour_weight=20.0,
-    state_scale=0.1,
-    resolution=32,
-)
+    episode_steps=16, num_envs=8, particle_count=64, eps=0.2, eps0=0.1, seed_radius=0.45,
+    colour_weight=20.0, state_scale=0.1, resolution=32,
+)  # fmt: skip
 ROUND = 16 * 8 * 64
 FEW = replace(HEART, num_envs=2)
 """As HEART, in a quarter of its worlds."""
@@ -66,16 +59,8 @@ def run(form, problem, budget, seed=0, **keywords):
     method, options = FORMS[form]
     if method == "ppo_world":
         pytest.importorskip("stable_baselines3")
-    return train(
-        method,
-        problem,
-        Budget(particle_steps=budget),
-        seed,
-        evaluation_seeds=SEEDS,
-        entries=1,
-        **options,
-        **keywords,
-    )
+    given = {"evaluation_seeds": SEEDS, "entries": 1} | options | keywords
+    return train(method, problem, Budget(particle_steps=budget), seed, **given)
 
 
 @EVERY_FORM
@@ -132,15 +117,8 @@ def test_advantages_are_the_sums_of_the_definition_within_episodes():
     )
     terminated = torch.rand(steps, worlds, generator=generator) < 0.15
     truncated = torch.rand(steps, worlds, generator=generator) < 0.15
-    found = generalised_advantages(
-        rewards,
-        values,
-        following,
-        terminated,
-        terminated | truncated,
-        gamma=gamma,
-        gae_lambda=gae_lambda,
-    )
+    given = rewards, values, following, terminated, terminated | truncated
+    found = generalised_advantages(*given, gamma=gamma, gae_lambda=gae_lambda)
     assert (terminated & truncated).any()
     for world in range(worlds):
         for step in range(steps):
@@ -332,13 +310,12 @@ def test_rules_that_have_gone_far_enough_stay_for_the_rest_of_a_round():
 @pytest.mark.parametrize(
     ("form", "problem", "options"),
     [
-        ("device", HEART, {}),
-        ("device, by worlds", HEART, {}),
-        ("device", HEART, {"target_kl": 1e-6}),
-        ("device", DYING, {}),
-        ("device, by worlds", DYING, {}),
+        pytest.param("device", HEART, {}, id="particles"),
+        pytest.param("device, by worlds", HEART, {}, id="worlds"),
+        pytest.param("device", HEART, {"target_kl": 1e-6}, id="rules that stay"),
+        pytest.param("device", DYING, {}, id="species"),
+        pytest.param("device, by worlds", DYING, {}, id="species, by worlds"),
     ],
-    ids=["particles", "worlds", "rules that stay", "species", "species, by worlds"],
 )
 def test_recorded_rounds_are_those_of_kernels_one_by_one(
     form, problem, options, device, monkeypatch

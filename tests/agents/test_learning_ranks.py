@@ -33,8 +33,9 @@ def learner_of(form):
     """The learner of this process, whose numbers are float64; worlds themselves are float32."""
     problem, method, options = FORMS[form]
     kind = ppo.PPOOptions if method is ppo else shac.SHACOptions
-    made = method.Learner(problem, kind(**options), 0, CPU, None, Ranks.current())
-    for module in made.modules().values():
+    learner = ppo.PPOLearner if method is ppo else shac.SHACLearner
+    made = learner(problem, kind(**options), 0, CPU, None, Ranks.current())
+    for module in made.modules.values():
         module.double()
     if method is ppo:
         for holder in (made.memory, made):
@@ -67,7 +68,7 @@ def learned(form):
             made.learn(0.01 * share_left)
         said.append([float(part.detach()) for part in told])
     weights = [
-        weight for module in made.modules().values() for weight in module.state_dict().values()
+        weight for module in made.modules.values() for weight in module.state_dict().values()
     ]
     return said, [
         weight.flatten().tolist() for weight in weights if isinstance(weight, torch.Tensor)
@@ -111,17 +112,9 @@ ROUND = {"ppo": 3 * 4 * 48, "shac": 2 * 4 * 48}
 
 def kept(method, out, rounds, **given):
     """Learn for some rounds; what is learned, and the particle-steps of the curve's entries."""
-    trained = train(
-        method,
-        HEART,
-        Budget(particle_steps=rounds * ROUND[method]),
-        0,
-        evaluation_seeds=range(500, 502),
-        entries=2,
-        out=out,
-        **METHODS[method],
-        **given,
-    )
+    budget, given = Budget(particle_steps=rounds * ROUND[method]), METHODS[method] | given
+    given |= {"evaluation_seeds": range(500, 502), "entries": 2, "out": out}
+    trained = train(method, HEART, budget, 0, **given)
     weights = [weight.flatten().tolist() for weight in trained.rules.parameters()]
     return weights, [entry.particle_steps // ROUND[method] for entry in trained.log]
 
@@ -228,11 +221,8 @@ def test_a_run_goes_on_with_rules_to_begin_with_if_it_began_with_some(tmp_path):
 
 
 def test_seeds_of_evaluations_are_asked_for_once(tmp_path):
-    budget = Budget(particle_steps=ROUND["ppo"])
-    seeds = iter(range(500, 502))
-    train(
-        "ppo", HEART, budget, 0, evaluation_seeds=seeds, entries=2, out=tmp_path, **METHODS["ppo"]
-    )
+    given = METHODS["ppo"] | {"evaluation_seeds": iter(range(500, 502)), "entries": 2}
+    train("ppo", HEART, Budget(particle_steps=ROUND["ppo"]), 0, out=tmp_path, **given)
 
 
 def test_a_checkpoint_that_was_changed_is_refused(finished):

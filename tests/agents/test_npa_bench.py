@@ -21,8 +21,8 @@ from npa_envs.agents.comparison.npa_bench import (
     write_rows,
 )
 from npa_envs.agents.comparison.plan import Job
-from npa_envs.agents.comparison.run import ComparisonPoint, RunRecord
-from npa_envs.agents.learning import methods_for
+from npa_envs.agents.comparison.run import RunRecord
+from npa_envs.agents.learning import CurvePoint, methods_for
 from npa_envs.cli import main
 from npa_envs.cli.compare import CompareOptions, make_plan
 from npa_envs.errors import NPAError
@@ -53,14 +53,26 @@ def records(plan, status="done"):
             facts=plan.facts(job),
             status=status,
             returns=(float(job.seed),) * plan.episodes,
-            curve=(
-                ComparisonPoint(0.0, 0.0, -1.0, 0.1, 1.0),
-                ComparisonPoint(2.0, 1000.0, 0.5, 0.1, 1.0),
-            ),
+            curve=(CurvePoint(0.0, 0.0, -1.0, 0.1, 1.0), CurvePoint(2.0, 1000.0, 0.5, 0.1, 1.0)),
             date="2026-01-02",
         )
         for job in plan.jobs()
     ]
+
+
+@pytest.fixture
+def zero_row(tmp_path):
+    """A plan of one method, and the file of its row."""
+    made = plan_of(methods=("zero",))
+    (path,) = write_rows(SUITE, made, records(made), tmp_path, "first")
+    return made, path
+
+
+def changed(path, change) -> None:
+    """Change what a file of JSON holds."""
+    held = json.loads(path.read_text())
+    change(held)
+    path.write_text(json.dumps(held))
 
 
 @pytest.mark.parametrize("suite", SUITES.values(), ids=SUITES)
@@ -117,8 +129,8 @@ def _still(tmp_path, monkeypatch):
     """A method of one's own, in a module of the current folder."""
     monkeypatch.chdir(tmp_path)
     (tmp_path / "still.py").write_text(
-        "def train(problem, progress, seed, *, device, start=None, patience=1):\n"
-        "    rules = problem.new_rules(seed).to(device)\n"
+        "def train(progress, *, patience=1):\n"
+        "    rules = progress.first_rules()\n"
         "    progress.start(rules)\n"
         "    return rules\n"
     )
@@ -179,34 +191,26 @@ def test_a_run_that_failed_is_in_no_row_and_one_that_diverged_has_no_returns(tmp
         (lambda held: held["runs"][0].update(machine=""), r"\$.runs\[0\].machine"),
     ],
 )
-def test_a_row_that_breaks_a_rule_is_refused(tmp_path, change, words):
-    made = plan_of(methods=("zero",))
-    (path,) = write_rows(SUITE, made, records(made), tmp_path, "it")
-    held = json.loads(path.read_text())
-    change(held)
-    path.write_text(json.dumps(held))
+def test_a_row_that_breaks_a_rule_is_refused(zero_row, change, words):
+    _, path = zero_row
+    changed(path, change)
     with pytest.raises(NPAError, match=words):
         read_row(path)
 
 
-def test_runs_of_a_row_from_several_machines_say_where_they_ran(tmp_path):
-    made = plan_of(methods=("zero",))
-    (path,) = write_rows(SUITE, made, records(made), tmp_path, "it")
-    held = json.loads(path.read_text())
-    held["machine"] = "abacus; slide rule"
-    held["runs"][0]["machine"] = "slide rule"
-    path.write_text(json.dumps(held))
+def test_runs_of_a_row_from_several_machines_say_where_they_ran(zero_row):
+    _, path = zero_row
+    changed(path, lambda held: held.update(machine="abacus; slide rule"))
+    changed(path, lambda held: held["runs"][0].update(machine="slide rule"))
     assert [run.machine for run in read_row(path).runs[:2]] == ["slide rule", ""]
 
 
-def test_a_narrower_call_keeps_the_rest_of_a_row(tmp_path):
-    made = plan_of(methods=("zero",))
-    (path,) = write_rows(SUITE, made, records(made), tmp_path, "first")
+def test_a_narrower_call_keeps_the_rest_of_a_row(zero_row, tmp_path):
+    made, path = zero_row
     whole = json.loads(path.read_text())
     fewer = plan_of(methods=("zero",), tasks=("MixingSmall-v0",))
-    fewer = dataclasses.replace(
-        fewer, settings=fewer.settings | {"commit": "decade", "machine": "abacus"}
-    )
+    settings = fewer.settings | {"commit": "decade", "machine": "abacus"}
+    fewer = dataclasses.replace(fewer, settings=settings)
     write_rows(SUITE, fewer, records(fewer), tmp_path, "second")
     held = json.loads(path.read_text())
     assert (held["command"], held["commit"]) == ("first; second", "c0ffee; decade")
@@ -241,9 +245,7 @@ def test_runs_are_not_added_to_a_row_of_something_else(tmp_path, change, words):
     check_rows(SUITE, made, tmp_path)
     (path,) = write_rows(SUITE, made, records(made), tmp_path, "it")
     check_rows(SUITE, made, tmp_path)
-    held = json.loads(path.read_text())
-    change(held)
-    path.write_text(json.dumps(held))
+    changed(path, change)
     with pytest.raises(NPAError, match=words):
         check_rows(SUITE, made, tmp_path)
 
@@ -264,9 +266,8 @@ def test_the_small_suite_is_all_small_worlds_that_rules_act_in():
     assert set(SUITES["npa-bench-small-v0"].entries) == small
 
 
-def test_a_method_has_one_row(tmp_path):
-    made = plan_of(methods=("zero",))
-    (path,) = write_rows(SUITE, made, records(made), tmp_path, "it")
+def test_a_method_has_one_row(zero_row, tmp_path):
+    _, path = zero_row
     (tmp_path / "again.json").write_bytes(path.read_bytes())
     with pytest.raises(NPAError, match="second row of 'zero'"):
         read_rows(SUITE, tmp_path)

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 from clock import Clock
 
-from npa_envs.agents.learning.kept import KeptProgress
+from npa_envs.agents.learning import Progress
 from npa_envs.cli import main
 from npa_envs.cli.learn import parse, problem_of
 from npa_envs.training.checkpoint import load_checkpoint
@@ -129,14 +129,14 @@ def test_worlds_are_those_of_shac_where_they_are_told(tmp_path):
 
 
 def test_what_is_written_takes_no_time_and_what_is_over_has_finished(tmp_path, monkeypatch):
-    clock, write = Clock(tick=1 / 64), KeptProgress._write
+    clock, write = Clock(tick=1 / 64), Progress._write
     monkeypatch.setattr("npa_envs.agents.learning.progress.time", clock)
 
     def slow(progress, *given):
         clock.sleep(1.0)
         write(progress, *given)
 
-    monkeypatch.setattr(KeptProgress, "_write", slow)
+    monkeypatch.setattr(Progress, "_write", slow)
     words = [*WORDS, "--seconds", "0.5", "--no-progress", "--out", str(tmp_path)]
     assert main(words) == 0
     seconds = [json.loads(line)["seconds"] for line in (tmp_path / "log.jsonl").open()]
