@@ -57,7 +57,7 @@ STEP_PARTS = frozenset(
         "_folded",
         "_folded_invariants",
         "_update_by_invariants",
-        "fates",
+        "division_probabilities",
         "folded",
         "forward",
         "input_dim",

@@ -33,7 +33,7 @@ from npa_envs.errors import NPAError
 from npa_envs.rule.files import load_rule, save_rule
 from npa_envs.rule.rule import NPARule
 from npa_envs.tasks.point_classification import class_colours
-from npa_envs.web.colouring import Colouring, Seen
+from npa_envs.web.colouring import ColouredWorld, Colouring
 from npa_envs.web.export import (
     PAGE,
     check_browser_rule,
@@ -304,7 +304,7 @@ def test_particles_have_the_colours_of_the_viewer(
     frame = last(told, "frame")
     x, s = unpacked(told["x"], (1, 300, 2)), unpacked(told["s"], (1, 300, 16))
     rule = load_rule("gecko")
-    seen = Seen(
+    seen = ColouredWorld(
         x, s, rule.colour, 0.1, None, [300], 300, unpacked(told["travelled"], (1, 300)),
         torch.tensor([told["updated"]]).bool(),
     )  # fmt: skip

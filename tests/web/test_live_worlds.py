@@ -21,7 +21,7 @@ from npa_envs.tasks.damage import DAMAGE_SIZES
 from npa_envs.training import config_to_dict, preset
 from npa_envs.training.run_folder import JsonlLog
 from npa_envs.web import rule_world
-from npa_envs.web.colouring import Colouring, Seen, signed_colours, species_colours
+from npa_envs.web.colouring import ColouredWorld, Colouring, signed_colours, species_colours
 from npa_envs.web.environment_world import EnvironmentWorld, make_environment
 from npa_envs.web.rule_world import RuleWorld, RunWorld
 from npa_envs.web.server import frame_bytes
@@ -442,7 +442,7 @@ def test_a_gpu_makes_sixty_frames_a_second(name):
 # Colours.
 
 
-def seen(**told) -> Seen:
+def seen(**told) -> ColouredWorld:
     generator = torch.Generator().manual_seed(3)
     x = torch.rand(1, 50, 2, generator=generator)
     s = torch.randn(1, 50, 6, generator=generator)
@@ -450,7 +450,7 @@ def seen(**told) -> Seen:
         "x": x, "s": s, "colours": lambda s: s[..., -3:], "eps": 0.2, "box": None,
         "counts": [50], "full": 50, "travelled": None, "updated": None,
     }  # fmt: skip
-    return Seen(**(usual | told))
+    return ColouredWorld(**(usual | told))
 
 
 def test_zero_is_grey_and_signs_are_opposite():

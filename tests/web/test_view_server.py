@@ -415,8 +415,8 @@ def test_a_film_that_is_long_enough_ends_by_itself(client, site, monkeypatch):
         assert frames.info["duration"] * getattr(frames, "n_frames", 1) <= 120
 
 
-def film_of(colour) -> server.Film:
-    film = server.Film()
+def film_of(colour) -> server.PageFilm:
+    film = server.PageFilm()
     film.add(jpeg(colour=colour))
     return film
 
