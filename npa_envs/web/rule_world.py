@@ -100,7 +100,7 @@ class RuleWorld(LiveWorld):
         self._choices = others | {name: source}
         self._plant(name, particle_count)
 
-    def _organism(self, name: Any) -> LiveRule:
+    def _live_rule(self, name: Any) -> LiveRule:
         if not isinstance(name, str) or name not in self._choices:
             raise NPAError(f"unknown rule {shown(name)}: {suggest(name, self._choices)}")
         if name not in self._rules:
@@ -108,25 +108,25 @@ class RuleWorld(LiveWorld):
             self._rules[name] = rule.requires_grad_(False)
         return LiveRule(name, self._rules[name])
 
-    def _task_of(self, organism: LiveRule, particle_count: int | None) -> TrainedTask:
-        key = (organism.name, particle_count)
+    def _task_of(self, live_rule: LiveRule, particle_count: int | None) -> TrainedTask:
+        key = (live_rule.name, particle_count)
         if key not in self._trained:
             if len(self._trained) >= MOST_TASKS:
                 self._trained.clear()
             self._trained[key] = task_of_rule(
-                self._choices[organism.name],
-                organism.rule,
+                self._choices[live_rule.name],
+                live_rule.rule,
                 self._device,
                 particle_count=particle_count,
-                **(SMALL_VIEWS if organism.rule.space_dim == 3 else {}),
+                **(SMALL_VIEWS if live_rule.rule.space_dim == 3 else {}),
             )
         return self._trained[key]
 
     def _plant(self, name: Any, particle_count: int | None = None) -> None:
         """Begin a fresh world of a rule with the task that it was trained on."""
-        organism = self._organism(name)
-        self.trained = self._task_of(organism, particle_count)
-        self.main = organism
+        live_rule = self._live_rule(name)
+        self.trained = self._task_of(live_rule, particle_count)
+        self.main = live_rule
         self.eps, self.update_prob, self.noise = self.task.eps, self.task.update_prob, 0.0
         self.speed = 1
         if self.show not in self._shows():
@@ -142,7 +142,7 @@ class RuleWorld(LiveWorld):
             self.task, 1, generator=self._generator, device=self._device
         )
         self.full = self.x.shape[1]
-        self.organisms, self.counts = [self.main], [self.full]
+        self.live_rules, self.counts = [self.main], [self.full]
         self._divisors = [float(self.full)]
         self._colouring = Colouring()
         self._travelled: Tensor | None = None
@@ -187,7 +187,7 @@ class RuleWorld(LiveWorld):
             "rules": sorted(self._choices),
             "rule": self.main.name,
             "others": [name for name in self._choices if self._may_join(name)],
-            "species": [organism.name for organism in self.organisms],
+            "species": [live_rule.name for live_rule in self.live_rules],
             "tools": tools,
             "damages": list(DAMAGE_SIZES),
             "capabilities": [*capabilities, "loss"] if self._has_loss() else capabilities,
@@ -200,7 +200,7 @@ class RuleWorld(LiveWorld):
         """Return whether particles of another rule can live in this world."""
         own = self.main.rule
         try:
-            other = self._organism(name).rule
+            other = self._live_rule(name).rule
         except NPAError:
             return False
         alike = all(getattr(other, field) == getattr(own, field) for field in AGREEMENTS)
@@ -271,7 +271,7 @@ class RuleWorld(LiveWorld):
         before = self.s
         path_length = self._go(1 if watched else steps, options)
         if watched:
-            longest = max(organism.rule.alpha for organism in self.organisms) * self.eps
+            longest = max(live_rule.rule.alpha for live_rule in self.live_rules) * self.eps
             self._travelled = path_length / longest
             self._updated = (self.s != before).any(dim=-1)
         if self._device.type == "cuda":
@@ -301,7 +301,7 @@ class RuleWorld(LiveWorld):
 
     def _go(self, steps: int, options: Mapping[str, Any]) -> Tensor:
         """Run steps and return the path length of each particle."""
-        rules = [organism.rule for organism in self.organisms]
+        rules = [live_rule.rule for live_rule in self.live_rules]
         if self._is_as_planted():
             self.x, self.s, path_length = rollout(
                 rules[0], self.x, self.s, steps, return_path_length=True, **options
@@ -330,7 +330,7 @@ class RuleWorld(LiveWorld):
         with torch.no_grad():
             colours = self._colouring(self.show, coloured)
         positions: NDArray[np.float32] = x[0].cpu().numpy()
-        alone = len(self.organisms) == 1 and positions.size and self._has_loss()
+        alone = len(self.live_rules) == 1 and positions.size and self._has_loss()
         loss = self._loss(self._metric) if alone else None
         return WorldView(self.step, positions, colours, self._milliseconds, loss)
 
@@ -339,8 +339,8 @@ class RuleWorld(LiveWorld):
             return class_colours(self.task.outputs(s))
         if self.main.rule.divides:
             return self.main.rule.colour(s)
-        parts = zip(self.organisms, s.split_with_sizes(self.counts, dim=1), strict=True)
-        return torch.cat([organism.rule.colour(part) for organism, part in parts], dim=1)
+        parts = zip(self.live_rules, s.split_with_sizes(self.counts, dim=1), strict=True)
+        return torch.cat([live_rule.rule.colour(part) for live_rule, part in parts], dim=1)
 
     @torch.no_grad()
     def _metric(self) -> float:
@@ -355,7 +355,7 @@ class RuleWorld(LiveWorld):
     @torch.no_grad()
     def _brush(self, message: Mapping[str, Any]) -> bool:
         touch = Touch.read(message, self.x)
-        before = [organism.name for organism in self.organisms]
+        before = [live_rule.name for live_rule in self.live_rules]
         match touch.tool:
             case "remove" if self.main.rule.divides:
                 self.s = wipe_state(self.x, self.s, centre=touch.at, radius=touch.radius)
@@ -368,16 +368,16 @@ class RuleWorld(LiveWorld):
                 self._add(touch, self._joining(message.get("rule")))
             case _:
                 self.x, self.s = brushed(self.x, self.s, touch, self.task.box)
-        return before != [organism.name for organism in self.organisms]
+        return before != [live_rule.name for live_rule in self.live_rules]
 
-    def _graft(self, touch: Touch, organism: LiveRule) -> None:
+    def _graft(self, touch: Touch, live_rule: LiveRule) -> None:
         inside = inside_ball(self.x, centre=touch.at, radius=touch.radius, box=self.task.box)
         # Grafted particles divide densities by the same number as those around them.
-        number = self._number(organism, float(self.full))
-        s = torch.where(inside[..., None], self._coded(organism, self.s), self.s)
+        number = self._number(live_rule, float(self.full))
+        s = torch.where(inside[..., None], self._coded(live_rule, self.s), self.s)
         self._arrange(self.x, s, torch.where(inside[0], number, self._species()))
 
-    def _add(self, touch: Touch, organism: LiveRule) -> None:
+    def _add(self, touch: Touch, live_rule: LiveRule) -> None:
         count = max(16, round(touch.strength * SEED_SHARE * self.full))
         room = MOST_PARTICLES[self._device.type] - self.x.shape[1]
         if count > room:
@@ -387,42 +387,42 @@ class RuleWorld(LiveWorld):
             device=self._device, dtype=self.x.dtype,
         )  # fmt: skip
         # A new species divides densities by its own number of particles, as if it grew alone.
-        number = self._number(organism, float(count))
+        number = self._number(live_rule, float(count))
         x = torch.cat((self.x, ball + touch.at[:, None]), dim=1)
-        fresh = self._coded(organism, self.s.new_zeros(1, count, self.s.shape[2]))
+        fresh = self._coded(live_rule, self.s.new_zeros(1, count, self.s.shape[2]))
         s = torch.cat((self.s, fresh), dim=1)
         self._arrange(x, s, torch.nn.functional.pad(self._species(), (0, count), value=number))
 
     def _all_coded(self, s: Tensor) -> Tensor:
         """Return states of all particles, each with the code of its species."""
-        parts = zip(self.organisms, s.split_with_sizes(self.counts, dim=1), strict=True)
-        return torch.cat([self._coded(organism, part) for organism, part in parts], dim=1)
+        parts = zip(self.live_rules, s.split_with_sizes(self.counts, dim=1), strict=True)
+        return torch.cat([self._coded(live_rule, part) for live_rule, part in parts], dim=1)
 
-    def _coded(self, organism: LiveRule, s: Tensor) -> Tensor:
+    def _coded(self, live_rule: LiveRule, s: Tensor) -> Tensor:
         """Return states of a species with its rule's code, if the rule has codes."""
-        if organism.rule.codes is None:
+        if live_rule.rule.codes is None:
             return s
-        own = organism.name == self.main.name
-        return coded_states(self.task if own else self._task_of(organism, None).task, s)
+        own = live_rule.name == self.main.name
+        return coded_states(self.task if own else self._task_of(live_rule, None).task, s)
 
     def _joining(self, name: Any) -> LiveRule:
-        organism = self._organism(name)
-        if not self._may_join(organism.name):
+        live_rule = self._live_rule(name)
+        if not self._may_join(live_rule.name):
             raise NPAError(
-                f"{organism.name} cannot live in a world of {self.main.name}: rules of one world "
+                f"{live_rule.name} cannot live in a world of {self.main.name}: rules of one world "
                 f"must agree in {', '.join(AGREEMENTS)}, and not divide"
             )
-        return organism
+        return live_rule
 
-    def _number(self, organism: LiveRule, divisor: float) -> int:
+    def _number(self, live_rule: LiveRule, divisor: float) -> int:
         """Return the number of a rule's species; a rule new to the world gets the next number."""
-        names = [own.name for own in self.organisms]
-        if organism.name not in names:
-            names.append(organism.name)
-            self.organisms.append(organism)
+        names = [own.name for own in self.live_rules]
+        if live_rule.name not in names:
+            names.append(live_rule.name)
+            self.live_rules.append(live_rule)
             self.counts.append(0)
             self._divisors.append(divisor)
-        return names.index(organism.name)
+        return names.index(live_rule.name)
 
     def _species(self) -> Tensor:
         """Return the species of each particle, int64, shape [N]."""
@@ -435,10 +435,10 @@ class RuleWorld(LiveWorld):
         if not torch.equal(order, torch.arange(self.x.shape[1], device=order.device)):
             # The page's tracers follow particles by their index.
             self._news.append({"type": "reordered"})
-        counts = torch.bincount(species, minlength=len(self.organisms)).tolist()
+        counts = torch.bincount(species, minlength=len(self.live_rules)).tolist()
         living = [k for k, count in enumerate(counts) if count] or [0]
         self.x, self.s = x[:, order], s[:, order]
-        self.organisms = [self.organisms[k] for k in living]
+        self.live_rules = [self.live_rules[k] for k in living]
         self._divisors = [self._divisors[k] for k in living]
         self.counts = [counts[k] for k in living]
 
@@ -539,10 +539,10 @@ class RunWorld(RuleWorld):
         super().reset(seed)
         if len(self._files) == 1:
             return
-        self.organisms = [self._organism(name) for name in self._files]
+        self.live_rules = [self._live_rule(name) for name in self._files]
         worlds = []
-        for organism, centre in zip(self.organisms, self._centres, strict=True):
-            task = self._task_of(organism, self._each).task
+        for live_rule, centre in zip(self.live_rules, self._centres, strict=True):
+            task = self._task_of(live_rule, self._each).task
             x, s = task.seed(1, generator=self._generator, device=self._device)
             x[..., 0] += centre
             worlds.append((x, s))
@@ -604,7 +604,7 @@ class RunWorld(RuleWorld):
         fresh = {
             name: load_rule(path, device=self._device).float() for name, path in self._files.items()
         }
-        own = {name: self._organism(name).rule for name in fresh}
+        own = {name: self._live_rule(name).rule for name in fresh}
         goals = self._goal_choices()
         # Tasks hold the old rules' codes.
         self._trained.clear()

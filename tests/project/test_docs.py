@@ -1,11 +1,13 @@
 """The documentation is true: pages are current, tables name what is there, code runs."""
 
 import contextlib
+import importlib
 import importlib.util
 import re
 import sys
 from dataclasses import fields
 from pathlib import Path
+from types import ModuleType
 
 import gymnasium as gym
 import numpy as np
@@ -52,6 +54,26 @@ def code_blocks(path: Path) -> list[str]:
     return re.findall(r"^```python\n(.*?)^```", text, re.MULTILINE | re.DOTALL)
 
 
+def script(name: str) -> ModuleType:
+    """Import a script of docs/."""
+    sys.path.insert(0, str(DOCS))
+    try:
+        return importlib.import_module(name)
+    finally:
+        sys.path.remove(str(DOCS))
+
+
+def run_code(page: str, *changes: tuple[str, str], names=None, blocks=slice(None)) -> dict:
+    """Run blocks of a page, with changes of texts that it has, and return its names."""
+    code = "\n".join(code_blocks(DOCS / f"{page}.md")[blocks])
+    for old, new in changes:
+        assert old in code
+        code = code.replace(old, new)
+    names = {} if names is None else names
+    exec(compile(code, f"{page}.md", "exec"), names)
+    return names
+
+
 def section(path: Path, heading: str) -> str:
     return path.read_text(encoding="utf-8").split(f"\n## {heading}\n")[1].split("\n## ")[0]
 
@@ -70,12 +92,7 @@ def anchors(path: Path) -> set[str]:
 @pytest.fixture(scope="module")
 def builder():
     """The script that makes the pages."""
-    sys.path.insert(0, str(DOCS))
-    try:
-        import build_environment_pages
-    finally:
-        sys.path.remove(str(DOCS))
-    return build_environment_pages
+    return script("build_environment_pages")
 
 
 @pytest.fixture(scope="module")
@@ -83,12 +100,7 @@ def bench():
     """The script that makes the tables of NPA-Bench."""
     pytest.importorskip("jsonschema")
     pytest.importorskip("scipy")
-    sys.path.insert(0, str(DOCS))
-    try:
-        import build_npa_bench_page
-    finally:
-        sys.path.remove(str(DOCS))
-    return build_npa_bench_page
+    return script("build_npa_bench_page")
 
 
 def test_the_tables_of_the_benchmark_are_what_its_files_say(bench, tmp_path, capsys):
@@ -128,12 +140,7 @@ def test_tables_and_curves_of_the_benchmark_show_all_rows(bench):
 @pytest.fixture(scope="module")
 def gallery():
     """The script that makes the page of the rules."""
-    sys.path.insert(0, str(DOCS))
-    try:
-        import build_gallery_page
-    finally:
-        sys.path.remove(str(DOCS))
-    return build_gallery_page
+    return script("build_gallery_page")
 
 
 @pytest.fixture(scope="module")
@@ -416,9 +423,7 @@ def test_the_code_about_datasets_runs(tmp_path, monkeypatch):
 )
 def test_the_code_of_a_page_runs(page, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
-    (block,) = code_blocks(DOCS / f"{page}.md")
-    names = {}
-    exec(compile(block, f"{page}.md", "exec"), names)
+    names = run_code(page)
     told = capsys.readouterr().out
     if page == "training":
         assert told.startswith("random: ")
@@ -435,18 +440,14 @@ def test_the_code_of_a_page_runs(page, tmp_path, monkeypatch, capsys):
 @pytest.mark.slow
 def test_the_code_about_the_search_runs():
     pytest.importorskip("ribs", reason="the extra search is not installed")
-    (block,) = code_blocks(DOCS / "search.md")
-    names = {}
-    exec(block, names)
+    names = run_code("search")
     assert names["search"].evaluations == 40
     assert 0.0 < names["best"].found.quality <= 1.0
     assert names["rule"].weight_count == len(names["best"].solution)
 
 
 def test_the_code_about_codes_runs():
-    block = code_blocks(DOCS / "beyond.md")[0]
-    names = {}
-    exec(compile(block, "beyond.md", "exec"), names)
+    names = run_code("beyond", blocks=slice(1))
     codes, s, x = names["rule"].codes, names["s"], names["x"]
     right = x[0, :, 0] > 0
     assert 0 < int(right.sum()) < len(right)
@@ -456,11 +457,8 @@ def test_the_code_about_codes_runs():
 
 def test_the_code_about_own_losses_runs(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
-    (block,) = code_blocks(DOCS / "own_loss.md")
-    assert block.count("range(150)") == 1
-    names = {}
-    # Less of it: what is tested is that it runs and goes down.
-    exec(compile(block.replace("range(150)", "range(12)"), "own_loss.md", "exec"), names)
+    # Fewer iterations: tested is that it runs and goes down.
+    names = run_code("own_loss", ("range(150)", "range(12)"))
     (first,) = re.findall(r"^0: (.+)$", capsys.readouterr().out, re.MULTILINE)
     told = re.search(r"fell from (0\.\d+) at the start", (DOCS / "own_loss.md").read_text())
     assert float(first) == pytest.approx(float(told[1]), abs=1e-3)
@@ -470,37 +468,28 @@ def test_the_code_about_own_losses_runs(tmp_path, monkeypatch, capsys):
 
 def test_the_code_about_own_tasks_runs(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    (block,) = code_blocks(DOCS / "own_task.md")
-    assert block.count("iterations=60") == 1
-    names = {}
-    exec(compile(block.replace("iterations=60", "iterations=6"), "own_task.md", "exec"), names)
+    names = run_code("own_task", ("iterations=60", "iterations=6"))
     assert names["result"].finished
     assert (tmp_path / "runs" / "ring" / "rule.safetensors").exists()
 
 
 def test_the_code_about_own_kernels_prints_what_the_page_says(capsys):
-    (block,) = code_blocks(DOCS / "own_kernel.md")
-    exec(compile(block, "own_kernel.md", "exec"), {})
+    run_code("own_kernel")
     printed = re.search(r"It prints `(.+)`", (DOCS / "own_kernel.md").read_text())
     assert capsys.readouterr().out.strip() == printed[1]
 
 
 def test_the_code_of_the_first_minutes_and_about_graphics_cards_runs():
-    names = {}
-    (block,) = code_blocks(DOCS / "first_minutes.md")
-    exec(compile(block, "first_minutes.md", "exec"), names)
+    names = run_code("first_minutes")
     assert names["x"].shape == (1, 1024, 2)
-    worlds, environments, _ = code_blocks(DOCS / "gpu.md")
-    small_worlds = worlds.replace("8, 4096", "2, 256").replace("steps=64", "steps=2")
-    exec(compile(small_worlds, "gpu.md", "exec"), names)
+    changes = ("8, 4096", "2, 256"), ("steps=64", "steps=2"), ("num_envs=64", "num_envs=2")
+    run_code("gpu", *changes, names=names, blocks=slice(2))
     assert names["x"].shape == (2, 256, 2)
-    exec(compile(environments.replace("num_envs=64", "num_envs=2"), "gpu.md", "exec"), names)
     assert isinstance(names["observations"], torch.Tensor)
 
 
 def test_the_code_about_several_species_runs():
-    names = {}
-    exec(compile("\n".join(code_blocks(DOCS / "species.md")), "species.md", "exec"), names)
+    names = run_code("species")
     assert names["x"].shape == (1, 256, 2)
     assert [own.target for own in names["config"].task.species] == ["ring", "heart"]
     assert names["observations"]["species_0"].shape == (8, 32, 66)
@@ -511,11 +500,9 @@ def test_the_code_about_several_species_runs():
 
 def test_the_code_about_learning_runs(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
-    example, _, method = code_blocks(DOCS / "learning.md")
-    names = {}
-    # Less of it: what is tested is that it runs, and what needs no learning.
-    assert example.count("00_000") == 2
-    exec(compile(example.replace("00_000", "0_000"), "learning.md", "exec"), names)
+    # Less learning: tested is that it runs, and what needs no learning.
+    names = run_code("learning", ("00_000", "0_000"), blocks=slice(1))
+    method = code_blocks(DOCS / "learning.md")[2]
     told = capsys.readouterr().out.splitlines()
     assert [line.split(":")[0] for line in told] == [
         "zero", "random", "scripted", "gradient", "cold", "warm",
@@ -582,9 +569,7 @@ def test_the_tutorial_of_gardeners_runs(capsys, tmp_path, monkeypatch):
 
 def test_the_code_about_ppo_runs(capsys):
     pytest.importorskip("stable_baselines3")
-    (block,) = [code for code in code_blocks(DOCS / "learning.md") if '"ppo_world"' in code]
-    assert block.count("500_000") == 1
-    exec(compile(block.replace("500_000", "1_000"), "learning.md", "exec"), {})
+    run_code("learning", ("500_000", "1_000"), blocks=slice(1, 2))
     told = capsys.readouterr().out.splitlines()
     forms = ("ppo", "ppo_world")
     assert [line.split(":")[0] for line in told] == [form for form in forms for _ in range(3)]
@@ -592,26 +577,22 @@ def test_the_code_about_ppo_runs(capsys):
 
 def test_the_code_about_exported_pages_runs(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    (block,) = code_blocks(DOCS / "export_web.md")
-    exec(compile(block, "export_web.md", "exec"), {})
+    run_code("export_web")
     assert "<title>Two rules</title>" in (tmp_path / "page.html").read_text()
 
 
 def test_the_code_about_stability_runs(capsys):
-    guards, inverse = code_blocks(DOCS / "stability.md")
     x = torch.rand(3, 64, 2, generator=torch.Generator().manual_seed(0))
     x[1, 5, 0] = torch.nan
     names = {"npa_envs": npa_envs, "gym": gym, "rule": npa_envs.load_rule("heart")}
     names |= {"x": x, "s": torch.zeros(3, 64, 16)}
-    exec(compile(guards.replace("512", "2"), "stability.md", "exec"), names)
+    run_code("stability", ("512", "2"), names=names)
     assert names["x"].shape == (2, 64, 2)
-    exec(compile(inverse, "stability.md", "exec"), names)
     assert names["z"].shape == (2, 64, 66)
 
 
 def test_the_code_about_the_viewer_runs(capsys):
-    (block,) = code_blocks(DOCS / "view.md")
-    exec(compile(block, "view.md", "exec"), {})
+    run_code("view")
     assert capsys.readouterr().out == "(256, 2)\n"
 
 
