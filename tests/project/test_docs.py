@@ -105,8 +105,8 @@ def bench():
 
 def test_the_tables_of_the_benchmark_are_what_its_files_say(bench, tmp_path, capsys):
     assert bench.main(["--check"]) == 0
-    text = (DOCS / bench.PAGE).read_text()
-    (tmp_path / bench.PAGE).write_text(text.replace("| 1e8 |", "| 2e8 |"))
+    text = (DOCS / bench.PAGE).read_text(encoding="utf-8")
+    (tmp_path / bench.PAGE).write_text(text.replace("| 1e8 |", "| 2e8 |"), encoding="utf-8")
     assert bench.main(["--check"], tmp_path) == 1
     assert "run python docs/build_npa_bench_page.py" in capsys.readouterr().err
 
@@ -130,7 +130,9 @@ def test_tables_and_curves_of_the_benchmark_show_all_rows(bench):
     assert text.index("| `sac` | it is sac | 2 |") < text.index("| `other` | it is other | 2 |")
     assert second not in text
     assert "](images/npa_bench_v0.png)" in text
-    assert text in bench.page((DOCS / bench.PAGE).read_text(), dict.fromkeys(SUITES, rows))
+    assert text in bench.page(
+        (DOCS / bench.PAGE).read_text(encoding="utf-8"), dict.fromkeys(SUITES, rows)
+    )
     assert bench.curves(suite, rows).startswith(b"\x89PNG")
     del rows["gradient"]
     assert "Scores need the rows" in bench.results(suite, rows)
@@ -147,7 +149,7 @@ def gallery():
 def ring(tmp_path_factory):
     """The module that the page about own environments shows."""
     path = tmp_path_factory.mktemp("own") / "ring.py"
-    path.write_text(code_blocks(OWN)[0])
+    path.write_text(code_blocks(OWN)[0], encoding="utf-8")
     spec = importlib.util.spec_from_file_location("ring", path)
     module = importlib.util.module_from_spec(spec)
     sys.modules["ring"] = module
@@ -165,7 +167,7 @@ def test_pages_of_environments_are_current(builder, capsys):
 def test_the_gallery_is_current_and_shows_every_rule(gallery, capsys):
     status = gallery.main(["--check"])
     assert status == 0, capsys.readouterr().err
-    text = (DOCS / "gallery.md").read_text()
+    text = (DOCS / "gallery.md").read_text(encoding="utf-8")
     assert sorted(re.findall(r"^### (.+)$", text, re.MULTILINE)) == sorted(shipped_rules())
     films = re.findall(r"\(images/(gallery/[\w-]+\.webp)\)", text)
     assert len(films) == len(shipped_rules())
@@ -173,7 +175,7 @@ def test_the_gallery_is_current_and_shows_every_rule(gallery, capsys):
 
 
 def test_the_reference_of_commands_has_every_command_and_task():
-    text = (DOCS / "commands.md").read_text()
+    text = (DOCS / "commands.md").read_text(encoding="utf-8")
     asked = re.findall(r"^```\{command-help\} (.+)$", text, re.MULTILINE)
     assert asked == re.findall(r"^##+ (.+)$", text, re.MULTILINE)
     assert sorted(asked) == sorted([*COMMANDS, *(f"train {name}" for name in TRAINED)])
@@ -183,7 +185,9 @@ def commands_of_pages() -> dict[tuple[str, ...], set[str]]:
     """Return the options that blocks of shell give to each command, by command and task."""
     asked: dict[tuple[str, ...], set[str]] = {}
     for path in TEXTS:
-        for block in re.findall(r"^ *```(?:sh|bash)\n(.*?)^ *```", path.read_text(), re.M | re.S):
+        for block in re.findall(
+            r"^ *```(?:sh|bash)\n(.*?)^ *```", path.read_text(encoding="utf-8"), re.M | re.S
+        ):
             for line in re.sub(r"\\\n", " ", block).splitlines():
                 # What follows `--` is told to the runs of a sweep.
                 words = re.sub(r"#.*| > .*| -- .*", "", line).replace(".venv/bin/", "").split()
@@ -253,7 +257,7 @@ def test_the_tables_of_options_are_what_the_presets_choose(preset):
 def test_the_reference_of_the_interface_has_every_public_name(package, page):
     module = importlib.import_module(package)
     public = {*module.__all__, *getattr(module, "ON_REQUEST", {})}
-    text = (DOCS / "api" / f"{page}.md").read_text()
+    text = (DOCS / "api" / f"{page}.md").read_text(encoding="utf-8")
     told = re.findall(rf"^\.\. auto\w+:: {re.escape(package)}\.(\w+)$", text, re.MULTILINE)
     assert sorted(told) == sorted(public)
 
@@ -261,12 +265,14 @@ def test_the_reference_of_the_interface_has_every_public_name(package, page):
 def test_check_finds_pages_that_are_changed_missing_or_nobodys(builder, tmp_path, capsys):
     made = builder.pages()
     for name, text in made.items():
-        (tmp_path / name).write_text(text)
+        (tmp_path / name).write_text(text, encoding="utf-8")
     assert builder.main(["--check"], tmp_path) == 0
     changed = tmp_path / "Morphogenesis2D.md"
-    changed.write_text(changed.read_text().replace("1024", "1023", 1))
+    changed.write_text(
+        changed.read_text(encoding="utf-8").replace("1024", "1023", 1), encoding="utf-8"
+    )
     (tmp_path / "README.md").unlink()
-    (tmp_path / "Forgotten.md").write_text("# An environment of the past\n")
+    (tmp_path / "Forgotten.md").write_text("# An environment of the past\n", encoding="utf-8")
     assert builder.main(["--check"], tmp_path) == 1
     told = capsys.readouterr().err
     assert "not current: Forgotten.md, Morphogenesis2D.md, README.md: run python docs/" in told
@@ -286,7 +292,7 @@ def test_a_table_of_columns_must_name_each_column_once(builder):
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda path: path.stem)
 def test_a_page_has_every_section(page):
-    headings = re.findall(r"^## (.+)$", page.read_text(), re.MULTILINE)
+    headings = re.findall(r"^## (.+)$", page.read_text(encoding="utf-8"), re.MULTILINE)
     assert headings == [
         "Description",
         "Observation space",
@@ -301,13 +307,13 @@ def test_a_page_has_every_section(page):
         "References",
         "Version history",
     ]
-    assert not re.search(r"As in `\w+Env`", page.read_text())
+    assert not re.search(r"As in `\w+Env`", page.read_text(encoding="utf-8"))
 
 
 def test_the_first_page_alone_explains_what_all_environments_share():
     meaning = "Standard deviation of the noise added to every position in a step"
     shared = ("Dense rewards telescope", "| `num_envs` |", meaning)
-    first, *others = (page.read_text() for page in PAGES)
+    first, *others = (page.read_text(encoding="utf-8") for page in PAGES)
     assert all(text in first for text in shared)
     for page in others:
         assert not any(text in page for text in shared)
@@ -392,7 +398,7 @@ def test_the_other_code_about_own_environments_runs_as_it_says(ring, monkeypatch
     for block in code_blocks(OWN)[1:]:
         exec(block, names)
     first, last = map(float, capsys.readouterr().out.split(" -> "))
-    told = re.search(r"from (0\.\d+)\s+to (0\.\d+)", OWN.read_text())
+    told = re.search(r"from (0\.\d+)\s+to (0\.\d+)", OWN.read_text(encoding="utf-8"))
     assert first == pytest.approx(float(told[1]), abs=1e-3)
     assert last == pytest.approx(float(told[2]), abs=2e-3)
 
@@ -460,7 +466,9 @@ def test_the_code_about_own_losses_runs(tmp_path, monkeypatch, capsys):
     # Fewer iterations: tested is that it runs and goes down.
     names = run_code("own_loss", ("range(150)", "range(12)"))
     (first,) = re.findall(r"^0: (.+)$", capsys.readouterr().out, re.MULTILINE)
-    told = re.search(r"fell from (0\.\d+) at the start", (DOCS / "own_loss.md").read_text())
+    told = re.search(
+        r"fell from (0\.\d+) at the start", (DOCS / "own_loss.md").read_text(encoding="utf-8")
+    )
     assert float(first) == pytest.approx(float(told[1]), abs=1e-3)
     assert names["loss"].item() < 0.8 * float(first)
     assert npa_envs.load_rule("ring.safetensors").state_dim == 16
@@ -475,7 +483,7 @@ def test_the_code_about_own_tasks_runs(tmp_path, monkeypatch):
 
 def test_the_code_about_own_kernels_prints_what_the_page_says(capsys):
     run_code("own_kernel")
-    printed = re.search(r"It prints `(.+)`", (DOCS / "own_kernel.md").read_text())
+    printed = re.search(r"It prints `(.+)`", (DOCS / "own_kernel.md").read_text(encoding="utf-8"))
     assert capsys.readouterr().out.strip() == printed[1]
 
 
@@ -507,14 +515,14 @@ def test_the_code_about_learning_runs(tmp_path, monkeypatch, capsys):
     assert [line.split(":")[0] for line in told] == [
         "zero", "random", "scripted", "gradient", "cold", "warm",
     ]  # fmt: skip
-    page = (DOCS / "learning.md").read_text()
+    page = (DOCS / "learning.md").read_text(encoding="utf-8")
     random, scripted = (float(line.split()[1]) for line in told[1:3])
     (printed,) = re.findall(r"^random: (\d\.\d+) ±", page, re.MULTILINE)
     assert random == pytest.approx(float(printed), abs=0.02)
     # Its search pays for episodes too, and ends early here.
     assert scripted > random
     assert (tmp_path / "grown" / "rule-0.safetensors").exists()
-    (tmp_path / "mine.py").write_text(method)
+    (tmp_path / "mine.py").write_text(method, encoding="utf-8")
     monkeypatch.syspath_prepend(tmp_path)
     budget = Budget(particle_steps=2000)
     trained = train("mine:train", names["problem"], budget, 0, noise=0.2, entries=1)
@@ -578,7 +586,7 @@ def test_the_code_about_ppo_runs(capsys):
 def test_the_code_about_exported_pages_runs(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     run_code("export_web")
-    assert "<title>Two rules</title>" in (tmp_path / "page.html").read_text()
+    assert "<title>Two rules</title>" in (tmp_path / "page.html").read_text(encoding="utf-8")
 
 
 def test_the_code_about_stability_runs(capsys):
@@ -611,7 +619,9 @@ def test_the_code_of_the_readme_runs():
 
 def test_every_page_with_code_is_run_by_a_test():
     """The names of pages in this folder's tests are the list of what is run."""
-    tests = "".join(path.read_text() for path in sorted(Path(__file__).parent.glob("test_*.py")))
+    tests = "".join(
+        path.read_text(encoding="utf-8") for path in sorted(Path(__file__).parent.glob("test_*.py"))
+    )
     pages = [path for path in sorted(DOCS.glob("*.md")) if code_blocks(path)]
     assert len(pages) > 10
     assert [path.stem for path in pages if path.stem not in tests] == []
@@ -619,7 +629,7 @@ def test_every_page_with_code_is_run_by_a_test():
 
 @pytest.mark.parametrize("path", TEXTS, ids=lambda path: path.relative_to(ROOT).as_posix())
 def test_links_lead_somewhere(path):
-    for target in re.findall(r"\]\(([^)\s]+)\)", path.read_text()):
+    for target in re.findall(r"\]\(([^)\s]+)\)", path.read_text(encoding="utf-8")):
         if target.startswith("http"):
             continue
         name, _, anchor = target.partition("#")
@@ -636,7 +646,7 @@ def in_package(name: str) -> Path:
 
 @pytest.mark.parametrize("path", TEXTS, ids=lambda path: path.relative_to(ROOT).as_posix())
 def test_paths_in_code_exist(path):
-    text = path.read_text()
+    text = path.read_text(encoding="utf-8")
     named = re.findall(rf"`((?:{FOLDERS})/[\w./]*|\w+/[\w/]*\.(?:py|cuh))`", text)
     gone = [name for name in named if "NAME" not in name and not in_package(name).exists()]
     assert gone == []
@@ -644,7 +654,7 @@ def test_paths_in_code_exist(path):
 
 def test_the_map_names_what_is_there():
     """Of the drawings' lines, of the way of `eps`, and of "`name` in `file`"."""
-    text = MAP.read_text()
+    text = MAP.read_text(encoding="utf-8")
     trail = re.findall(r"((?:npa_envs|envs)/[\w/]+\.py): ([\w.]+)", text)
     assert len(trail) == 9
     drawn = re.findall(r"((?:world|ops|rule|envs/core)/\w+\.py) +([A-Za-z_]\w*(?:\.\w+)?) ", text)
@@ -656,17 +666,19 @@ def test_the_map_names_what_is_there():
     for file, name in [*trail, *drawn, *told]:
         for part in name.split("."):
             defined = rf"^ *(?:def|class) {part}\b|^ *{part}\b(?:: .*)? = |^    {part}:"
-            there = re.search(defined, in_package(file).read_text(), re.MULTILINE)
+            there = re.search(defined, in_package(file).read_text(encoding="utf-8"), re.MULTILINE)
             assert there, f"{file} has no {name}"
 
 
 def test_the_page_on_what_is_measured_shows_the_backend_table():
     chosen = describe(KernelRequest(torch.device("cpu"), torch.float32))
-    assert "\n".join(f"  {line}" for line in chosen) in (DOCS / "measured.md").read_text()
+    assert "\n".join(f"  {line}" for line in chosen) in (DOCS / "measured.md").read_text(
+        encoding="utf-8"
+    )
 
 
 def test_the_index_leads_to_every_page():
-    links = re.findall(r"\]\(([^)#]+)", (DOCS / "index.md").read_text())
+    links = re.findall(r"\]\(([^)#]+)", (DOCS / "index.md").read_text(encoding="utf-8"))
     linked = {(DOCS / name).resolve() for name in links}
     pages = {*DOCS.glob("*.md"), DOCS / "environments" / "README.md"}
     assert pages - {DOCS / "index.md"} <= linked
@@ -737,7 +749,7 @@ def test_a_page_names_the_keys_of_info_and_the_parts_of_the_loss(name, task):
 @every_page
 def test_a_page_tells_spaces_and_agents_as_they_are(name):
     env = MODULES[name].parallel_env()
-    head = page_of(name).read_text().split("```")[0]
+    head = page_of(name).read_text(encoding="utf-8").split("```")[0]
     for shown in (
         f"`{env.possible_agents[0]}` to `{env.possible_agents[-1]}`",
         f"`{env.observation_space(env.possible_agents[0])}`",
@@ -750,7 +762,9 @@ def test_a_page_tells_spaces_and_agents_as_they_are(name):
 
 @every_page
 def test_the_page_lists_tasks_with_their_ids(name):
-    rows = re.findall(r'^\| `"(\w+)"` \| `([^`]+)` \|', page_of(name).read_text(), re.MULTILINE)
+    rows = re.findall(
+        r'^\| `"(\w+)"` \| `([^`]+)` \|', page_of(name).read_text(encoding="utf-8"), re.MULTILINE
+    )
     assert {id_: task for task, id_ in rows} == MODULES[name].ENVIRONMENTS
 
 

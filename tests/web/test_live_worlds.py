@@ -507,7 +507,7 @@ def write_run(folder: Path, name: str = "gecko", rule: NPARule | None = None) ->
     metadata = rule_metadata((shipped_rules() | preset_rules())[name])
     told = {key: metadata[key] for key in ("task", "config") if key in metadata}
     save_rule(rule or load_rule(name), folder / "rule.safetensors", metadata=told)
-    (folder / "config.json").write_text("{}")
+    (folder / "config.json").write_text("{}", encoding="utf-8")
     if not (folder / "log.jsonl").exists():
         log(folder, 0, 10)
 
@@ -522,7 +522,7 @@ def trained_on(name: str) -> NPARule:
 
 
 def log(folder: Path, first: int, end: int) -> None:
-    with (folder / "log.jsonl").open("a") as file:
+    with (folder / "log.jsonl").open("a", encoding="utf-8") as file:
         for k in range(first, end):
             file.write(json.dumps({"iteration": k, "loss": 1.0 / (k + 1)}) + "\n")
 
@@ -654,7 +654,7 @@ def test_of_a_log_only_what_is_new_is_read(tmp_path, followed, monkeypatch):
     assert points(world) == []
     assert opened == []
     # What was read before is not looked at again.
-    with path.open("r+") as file:
+    with path.open("r+", encoding="utf-8") as file:
         file.write("X")
     log(tmp_path, 10, 11)
     assert points(world) == [(True, [[10, 1.0 / 11]])]
@@ -670,10 +670,10 @@ def test_a_log_that_begins_anew_or_goes_back_is_told_from_its_start(tmp_path, fo
     JsonlLog(path).truncate(4)
     assert points(world) == [(False, [[k, 1.0 / (k + 1)] for k in range(5)])]
     # Another run, which may be written over the same place of the disk, and be longer already.
-    with path.open("r+") as file:
+    with path.open("r+", encoding="utf-8") as file:
         file.write("".join(f'{{"iteration": {k}, "loss": 2.0}}\n' for k in range(20)))
     assert points(world) == [(False, [[k, 2.0] for k in range(20)])]
-    path.write_text("")
+    path.write_text("", encoding="utf-8")
     assert points(world) == []
     log(tmp_path, 0, 2)
     assert points(world) == [(False, [[0, 1.0], [1, 0.5]])]
@@ -685,12 +685,12 @@ def test_a_log_that_begins_anew_or_goes_back_is_told_from_its_start(tmp_path, fo
 
 def test_a_line_that_is_being_written_waits(tmp_path):
     write_run(tmp_path)
-    with (tmp_path / "log.jsonl").open("a") as file:
+    with (tmp_path / "log.jsonl").open("a", encoding="utf-8") as file:
         file.write('{"iteration": 10, "lo')
     world = RunWorld(tmp_path, device=CPU, particle_count=COUNT)
     curve = world.news()[0]
     assert curve["points"][-1] == [9, 0.1]
-    with (tmp_path / "log.jsonl").open("a") as file:
+    with (tmp_path / "log.jsonl").open("a", encoding="utf-8") as file:
         file.write('ss": 0.25}\n')
     assert news(world)[0]["points"] == [[10, 0.25]]
 
@@ -710,7 +710,7 @@ def test_a_rule_that_is_damaged_meanwhile_is_told_and_the_world_lives_on(tmp_pat
 def test_an_unfinished_run_is_refused_in_words(tmp_path):
     with pytest.raises(NPAError, match=r"must hold the rule\.safetensors of a run"):
         RunWorld(tmp_path, device=CPU)
-    (tmp_path / "config.json").write_text("{}")
+    (tmp_path / "config.json").write_text("{}", encoding="utf-8")
     with pytest.raises(NPAError, match="has not written its rules yet: wait for its first"):
         RunWorld(tmp_path, device=CPU)
     with pytest.raises(NPAError, match="a run must be a folder"):

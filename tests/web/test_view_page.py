@@ -278,7 +278,7 @@ def test_the_command_prints_its_link_and_ends_by_ctrl_c(pages, tmp_path):
     command = [sys.executable, "-m", "npa_envs.cli", "view", "heart", "--particle-count", "128"]
     command += ["--no-browser", "--port", "0", "--out", str(tmp_path)]
     with subprocess.Popen(
-        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, encoding="utf-8"
     ) as run:
         line = run.stdout.readline()
         address = line.split()[1]
