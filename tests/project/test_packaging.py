@@ -176,6 +176,6 @@ def test_the_extras_are_told_as_they_are() -> None:
 def test_the_entries_for_lists_name_the_tested_versions() -> None:
     lines = (ROOT / "constraints.txt").read_text(encoding="utf-8")
     pinned = dict(re.findall(r"^(\S+)==(\S+)$", lines, re.MULTILINE))
-    page = (ROOT / "docs/integrations.md").read_text(encoding="utf-8")
-    badges = dict(re.findall(r"badge/(\w+)-v([\d.]+)-blue", page))
+    text = (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8")
+    badges = dict(re.findall(r"badge/(\w+)-v([\d.]+)-blue", text))
     assert badges == {"Gymnasium": pinned["gymnasium"], "PettingZoo": pinned["pettingzoo"]}
