@@ -53,36 +53,36 @@ class Colouring:
         self._covariance: Tensor | None = None
         self._basis: Tensor | None = None
 
-    def __call__(self, show: str, seen: ColouredWorld) -> NDArray[np.uint8]:
+    def __call__(self, show: str, world: ColouredWorld) -> NDArray[np.uint8]:
         """Return red, green and blue of each particle, uint8, [N, 3], by one of `shows_of`."""
-        if seen.x.shape[1] == 0:
+        if world.x.shape[1] == 0:
             return np.zeros((0, 3), dtype=np.uint8)
         match show.split():
             case ["colours"]:
-                return _bytes(seen.colours(seen.s)[0])
+                return _bytes(world.colours(world.s)[0])
             case ["density"]:
                 # 1 is a world whose particles fill [-1, 1]^D, or its box, evenly.
-                rho = species_fields(seen.x, [seen.x.shape[1]], eps=seen.eps, box=seen.box).rho
-                volume = float(np.prod(seen.box or (2.0,) * seen.x.shape[2]))
-                crowding = rho[0].sum(dim=-1) * (volume / seen.full)
+                rho = species_fields(world.x, [world.x.shape[1]], eps=world.eps, box=world.box).rho
+                volume = float(np.prod(world.box or (2.0,) * world.x.shape[2]))
+                crowding = rho[0].sum(dim=-1) * (volume / world.full)
                 # Worlds in open space fill a part of it, and are denser.
-                return _ramp(1.0 - torch.exp2(-crowding / (1.0 if seen.box else 4.0)))
+                return _ramp(1.0 - torch.exp2(-crowding / (1.0 if world.box else 4.0)))
             case ["components"]:
-                return _bytes(self._components(seen.s[0]))
+                return _bytes(self._components(world.s[0]))
             case ["species"]:
-                return species_colours(len(seen.counts)).repeat(seen.counts, axis=0)
+                return species_colours(len(world.counts)).repeat(world.counts, axis=0)
             case ["speed"]:
-                share = _known(seen.travelled, seen)
+                share = _known(world.travelled, world)
                 return _ramp(share.clamp(0.0, 1.0).sqrt())
             case ["mask"]:
-                updated = _known(seen.updated, seen).bool()[:, None]
+                updated = _known(world.updated, world).bool()[:, None]
                 on, off = (updated.new_tensor(tint, dtype=torch.float32) for tint in MASK_COLOURS)
                 return _bytes(torch.where(updated, on, off))
-            case ["state", number] if number.isdecimal() and int(number) < seen.s.shape[2]:
-                return _bytes(signed_colours(seen.s[0, :, int(number)]))
+            case ["state", number] if number.isdecimal() and int(number) < world.s.shape[2]:
+                return _bytes(signed_colours(world.s[0, :, int(number)]))
         raise NPAError(
             f"show must be one of the world's, got {shown(show)}: "
-            f"{suggest(show, shows_of(seen.s.shape[2]))}"
+            f"{suggest(show, shows_of(world.s.shape[2]))}"
         )
 
     def _components(self, s: Tensor) -> Tensor:
@@ -127,10 +127,10 @@ def species_colours(count: int) -> NDArray[np.uint8]:
     return _bytes(srgb(torch.stack(lab, dim=-1)))
 
 
-def _known(values: Tensor | None, seen: ColouredWorld) -> Tensor:
+def _known(values: Tensor | None, world: ColouredWorld) -> Tensor:
     """Return values of the last step [N], or zeros before the first one."""
-    if values is None or values.shape[1] != seen.x.shape[1]:
-        return torch.zeros(seen.x.shape[1], device=seen.x.device)
+    if values is None or values.shape[1] != world.x.shape[1]:
+        return torch.zeros(world.x.shape[1], device=world.x.device)
     return values[0]
 
 

@@ -449,11 +449,11 @@ class Page {
     const { frame, camera, canvas } = this;
     if (!frame || this.world.dimension !== 3) return 0;
     const width = canvas.clientWidth, height = canvas.clientHeight;
-    const reach = Math.max(8, (0.3 * $("radius").value) / camera.unit(width, height));
+    const within = Math.max(8, (0.3 * $("radius").value) / camera.unit(width, height));
     let nearest = -Infinity;
     for (let k = 0; k < frame.positions.length; k += 3) {
       const [x, y, near] = camera.project(frame.positions.subarray(k, k + 3), width, height);
-      if (near > nearest && Math.hypot(x - column, y - row) < reach) nearest = near;
+      if (near > nearest && Math.hypot(x - column, y - row) < within) nearest = near;
     }
     return Number.isFinite(nearest) ? nearest : 0;
   }
