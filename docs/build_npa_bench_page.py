@@ -87,23 +87,6 @@ def scored(suite: Suite, rows: dict[str, BenchRow], group: str) -> str:
     return table(heads, lines) if lines else NO_ROWS
 
 
-def returned(suite: Suite, rows: dict[str, BenchRow]) -> str:
-    """Return the mean returns with their standard errors over seeds, Markdown."""
-    ids = measured(suite, rows)
-    lines = []
-    for method in ranked(rows):
-        cells = []
-        for env_id in ids:
-            values = rows[method].returns(env_id)
-            values = values[np.isfinite(values)]
-            told = NONE
-            if len(values):
-                told = f"{values.mean():.3f} ± {values.std(ddof=1) / len(values) ** 0.5:.3f}"
-            cells.append(told)
-        lines.append((f"`{method}`", *cells))
-    return table(("Method", *(f"`{task_name(env_id)}`" for env_id in ids)), lines)
-
-
 def described(rows: dict[str, BenchRow]) -> str:
     """Return what the files say of their methods, Markdown."""
     lines = []
@@ -117,11 +100,10 @@ def results(suite: Suite, rows: dict[str, BenchRow]) -> str:
     """Return all tables of a suite's rows, and its picture, Markdown."""
     if not rows:
         return NO_ROWS
-    told = [described(rows)]
-    told += [f"Scores, {name}:\n\n{scored(suite, rows, name)}" for name in suite.groups]
-    told += [f"Returns, mean and standard error over seeds:\n\n{returned(suite, rows)}"]
-    told += [f"![{CAPTION}](images/{plain_name(suite)}.png)"]
-    return "\n\n".join(told)
+    parts = [described(rows)]
+    parts += [f"Scores, {name}:\n\n{scored(suite, rows, name)}" for name in suite.groups]
+    parts += [f"![{CAPTION}](images/{plain_name(suite)}.png)"]
+    return "\n\n".join(parts)
 
 
 def page(text: str, rows: dict[str, dict[str, BenchRow]]) -> str:

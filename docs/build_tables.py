@@ -1,20 +1,23 @@
-"""Write the measured tables and numbers of the pages from the records in `benchmarks/results/`.
+"""Write the measured tables of the pages from the records in `benchmarks/results/`.
 
     python docs/build_tables.py          write all pages
     python docs/build_tables.py --check  fail where a page is not current
 
-A table stands between two marks of a page. The first mark says what the table is made of: a record,
-its rows, and a line `heading | cell` for each column.
+A page has the table, and a line with its record, machine, commit, date and command, between two
+marks:
 
-    <!-- table: rollouts
+    <!-- table: rollouts -->
+    <!-- /table -->
+
+`docs/tables.txt` says how it is made: its name, a record, its rows, and a line `heading | cell` for
+each column.
+
+    [rollouts]
     record: paper_h200
     rows: r.tables.public
     Workload (B, N, T) | {workload}
     Inference [µs a step] | {infer_us.median:.0f}
     Training [µs a step] | {train_us.median:.0f}
-    -->
-    (made: the table, and a line with the record, its machine, commit, date and command)
-    <!-- /table -->
 
 `record` is the name of a file in `benchmarks/results/` without `.json`, or with `.jsonl`; a path
 from the repository's root is one with a slash and its ending; a pattern (`shipped/*.json`) or
@@ -24,13 +27,6 @@ A cell is the text of a Python f-string over the fields of a row (`it` is the ro
 records are attributes as well, and `mean`, `error` (standard error), `option(x, ".0f")` (a dash for
 None) and Python's own functions are there. `caption: no` leaves out the line about the record.
 Digits are those that the cell's format gives.
-
-A number in prose is the cell of such a table, of any page, by its row's first cell and its column:
-
-    <!-- n: rollouts | 2D (8, 4096, 64) | Training [µs a step] -->128<!-- /n -->
-
-No line may begin with that mark, because Markdown would take the line for HTML. A table between
-`<!-- table: NAME` and `-->` that only numbers need is hidden by `show: no`.
 """
 
 from __future__ import annotations
@@ -40,17 +36,18 @@ import os
 import re
 import sys
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from statistics import mean, stdev
-from typing import Any, NamedTuple
+from typing import Any
 
 from page_parts import table, write_or_check
 
 ROOT = Path(__file__).resolve().parent.parent
 RESULTS = ROOT / "benchmarks" / "results"
-TABLE = re.compile(r"<!-- table: (?P<name>[\w-]+)\n(?P<spec>.*?)\n-->\n.*?<!-- /table -->", re.S)
-NUMBER = re.compile(r"<!-- n: (?P<cell>[^>]+?) -->[^<]*<!-- /n -->")
-KEYS = {"record", "rows", "caption", "show"}
+SPECS = ROOT / "docs" / "tables.txt"
+TABLE = re.compile(r"(<!-- table: (?P<name>[\w-]+) -->\n).*?(<!-- /table -->)", re.S)
+KEYS = {"record", "rows", "caption"}
 """First words of lines that are no columns."""
 
 MEASURED = re.compile(r"\d\s?(?:µs|ms|dB|%|times)(?![\w-])|±")
@@ -60,10 +57,9 @@ MADE = (
     re.compile(r"<!-- table: .*?<!-- /table -->", re.S),
     re.compile(r"<!-- made: .*?<!-- end -->", re.S),
     re.compile(r"^ *```.*?^ *```", re.S | re.M),
-    NUMBER,
     re.compile(r"`[^`\n]*`"),
 )
-"""Parts of a page that may hold it: tables, tables of NPA-Bench, code, numbers."""
+"""Parts of a page that may hold it: tables, tables of NPA-Bench, code."""
 
 
 class Fields(dict[str, Any]):
@@ -74,27 +70,6 @@ class Fields(dict[str, Any]):
             return self[name]
         except KeyError:
             raise AttributeError(f"no field {name!r} among {', '.join(self)}") from None
-
-
-class Made(NamedTuple):
-    """A table that was made: its headings, its cells, and the line below it."""
-
-    headings: tuple[str, ...]
-    rows: list[tuple[str, ...]]
-    caption: str
-    show: bool
-
-    def markdown(self) -> str:
-        """Return the table and the line below it."""
-        parts = [table(self.headings, self.rows)] if self.show else []
-        return "\n\n".join(parts + ([self.caption] if self.caption else []))
-
-    def cell(self, row: str, column: str) -> str:
-        """Return a cell by the first cell of its row and the heading of its column."""
-        found = [cells for cells in self.rows if cells[0] == row]
-        if len(found) != 1 or column not in self.headings:
-            raise SystemExit(f"no single cell {row!r} | {column!r} in {self.headings}")
-        return found[0][self.headings.index(column)]
 
 
 def error(values: Sequence[float]) -> float:
@@ -147,8 +122,8 @@ def caption_of(paths: Sequence[Path], records: Sequence[Any], folder: Path) -> s
     ):
         facts = own.get("facts", {})
         found.append({**facts.get("settings", {}), **facts, **own})
-    told = []
-    for key, shown in (
+    parts = []
+    for key, form in (
         ("machine", "{}"),
         ("date", "{}"),
         ("commit", "commit {}"),
@@ -157,8 +132,8 @@ def caption_of(paths: Sequence[Path], records: Sequence[Any], folder: Path) -> s
         values = {
             str(facts.get(key)) for facts in found if not isinstance(facts.get(key), (list, dict))
         }
-        told += [shown.format(*values)] if len(values) == 1 and values != {"None"} else []
-    return f"Measured: {', '.join(links + told)}."
+        parts += [form.format(*values)] if len(values) == 1 and values != {"None"} else []
+    return f"Measured: {', '.join(links + parts)}."
 
 
 def short(text: str) -> str:
@@ -167,8 +142,8 @@ def short(text: str) -> str:
     return re.sub(r"\b0(\.0+)?e0\b", "0", text)
 
 
-def made_of(name: str, text: str, folder: Path) -> Made:
-    """Return the table that lines of a mark describe, for a page of a folder."""
+def made_of(name: str, text: str, folder: Path) -> str:
+    """Return the table that a text of `SPECS` describes, for a page of a folder, Markdown."""
     lines = [line for line in text.splitlines() if line.strip()]
     spec = {k: v.strip() for k, _, v in (line.partition(":") for line in lines) if k in KEYS}
     columns = [line.split(" | ", 1) for line in lines if line.partition(":")[0] not in KEYS]
@@ -186,13 +161,10 @@ def made_of(name: str, text: str, folder: Path) -> Made:
             cells.append(tuple(short(eval(f"f'''{cell}'''", names)) for _, cell in columns))
     except Exception as problem:
         raise SystemExit(f"table {name}: {type(problem).__name__}: {problem}") from problem
-    caption = (
-        ""
-        if "no" in (spec.get("caption"), spec.get("show"))
-        else caption_of(paths, records, folder)
-    )
-    heads = tuple(head.strip() for head, _ in columns)
-    return Made(heads, cells, caption, spec.get("show") != "no")
+    made = table(tuple(head.strip() for head, _ in columns), cells)
+    if spec.get("caption") == "no":
+        return made
+    return f"{made}\n\n{caption_of(paths, records, folder)}"
 
 
 def pages() -> dict[str, str]:
@@ -201,42 +173,41 @@ def pages() -> dict[str, str]:
     return {p.relative_to(ROOT).as_posix(): p.read_text(encoding="utf-8") for p in paths}
 
 
-def rebuilt(texts: Mapping[str, str]) -> dict[str, str]:
-    """Return pages with all tables and numbers made anew; raise for names that come twice."""
-    tables: dict[str, Made] = {}
-    for page, text in texts.items():
-        for found in TABLE.finditer(text):
-            if found["name"] in tables:
-                raise SystemExit(f"{page}: a table {found['name']} is there already")
-            tables[found["name"]] = made_of(found["name"], found["spec"], (ROOT / page).parent)
+def specs(text: str) -> dict[str, str]:
+    """Return the descriptions of tables by their names; raise for names that come twice."""
+    parts = re.split(r"^\[([\w-]+)\]\n", text, flags=re.M)[1:]
+    names = parts[::2]
+    if len(set(names)) < len(names):
+        raise SystemExit(f"a table is described twice among {', '.join(names)}")
+    return dict(zip(names, parts[1::2], strict=True))
 
-    def in_place(found: re.Match[str]) -> str:
-        head = f"<!-- table: {found['name']}\n{found['spec']}\n-->\n"
-        body = tables[found["name"]].markdown()
-        return f"{head}{body}\n<!-- /table -->" if body else f"{head}<!-- /table -->"
 
-    def number(found: re.Match[str]) -> str:
-        name, _, rest = found["cell"].partition(" | ")
-        row, _, column = rest.rpartition(" | ")
-        if name not in tables:
-            raise SystemExit(f"n: no table {name}")
-        return f"<!-- n: {found['cell']} -->{tables[name].cell(row, column)}<!-- /n -->"
+def rebuilt(texts: Mapping[str, str], described: Mapping[str, str]) -> dict[str, str]:
+    """Return pages with all tables made anew; raise for tables without a page or a description."""
+    shown = [found["name"] for text in texts.values() for found in TABLE.finditer(text)]
+    if sorted(shown) != sorted(described):
+        odd = set(shown) ^ set(described) or {name for name in shown if shown.count(name) > 1}
+        raise SystemExit(f"each table is described once and shown once, not {', '.join(odd)}")
 
-    return {page: NUMBER.sub(number, TABLE.sub(in_place, text)) for page, text in texts.items()}
+    def made(page: str, found: re.Match[str]) -> str:
+        name = found["name"]
+        return f"{found[1]}{made_of(name, described[name], (ROOT / page).parent)}\n{found[3]}"
+
+    return {page: TABLE.sub(partial(made, page), text) for page, text in texts.items()}
 
 
 def loose_figures(text: str) -> list[str]:
     """Return the lines of a page that hold a measurement outside of made text and code."""
-    marks = re.findall(r"^<!-- n: .*$", text, re.M)
     for made in MADE:
         text = made.sub("", text)
-    return marks + [line for line in text.splitlines() if MEASURED.search(line)]
+    return [line for line in text.splitlines() if MEASURED.search(line)]
 
 
 def main(arguments: list[str] | None = None) -> int:
     """Write or check the pages; return the exit status."""
     texts = pages()
-    return write_or_check(ROOT, rebuilt(texts), list(texts), __doc__, arguments)
+    made = rebuilt(texts, specs(SPECS.read_text(encoding="utf-8")))
+    return write_or_check(ROOT, made, list(texts), __doc__, arguments)
 
 
 if __name__ == "__main__":

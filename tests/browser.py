@@ -153,11 +153,11 @@ def browser(folder: Path, *flags: str) -> Iterator[Callable[[], Page]]:
         try:
             told = folder / "DevToolsActivePort"
             end = time.monotonic() + 60
-            while not (told.is_file() and told.read_text().count("\n")):
+            while not (told.is_file() and told.read_text(encoding="utf-8").count("\n")):
                 assert process.poll() is None, "Chromium did not start"
                 assert time.monotonic() < end, "Chromium does not answer"
                 time.sleep(0.05)
-            base = f"http://127.0.0.1:{told.read_text().split()[0]}"
+            base = f"http://127.0.0.1:{told.read_text('utf-8').split()[0]}"
             pages = []
 
             def new_page() -> Page:

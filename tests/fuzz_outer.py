@@ -54,7 +54,7 @@ def reconfigure(name: Any, task: Any, field: str, value: Any) -> None:
 def read_config(text: Any, suffix: Any) -> None:
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / f"config{suffix}"
-        path.write_text(str(text))
+        path.write_text(str(text), encoding="utf-8")
         load_config(path, preset("tiny"))
 
 

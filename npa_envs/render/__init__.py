@@ -1,4 +1,7 @@
-"""Pictures and films of particle worlds, and a window that shows them."""
+"""Pictures and films of particle worlds, and a window that shows them.
+
+Wrong arguments and files that cannot be written raise an `NPAError`.
+"""
 
 from npa_envs.render.colours import to_uint8
 from npa_envs.render.display import Shown, show, show_worlds

@@ -1,4 +1,4 @@
-"""Colours of pictures: of splatted fields, of densities, of states."""
+"""Colours of pictures, densities and states."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ Background = str | tuple[float, float, float]
 
 
 def to_uint8(picture: Tensor, background: Background = "white") -> NDArray[np.uint8]:
-    """Show splatted colours over a background, with y upwards.
+    """Return splatted colours over a background as pixels, with y upwards.
 
-    Where particles overlap, so that the density is above 1, their colours are averaged; where it is
-    below 1, the background shines through. What is not finite is shown as background.
+    Colours are averaged where the density is above 1, and mixed with the background where it is
+    below 1. Pixels that are not finite are background.
 
     Args:
         picture: Sums of red, green and blue and the density (dimensionless), shape [..., R, R, 4],
@@ -30,9 +30,6 @@ def to_uint8(picture: Tensor, background: Background = "white") -> NDArray[np.ui
 
     Returns:
         Pixels of shape [..., R, R, 3]; the first row is the highest y.
-
-    Raises:
-        NPAError: A wrong shape or dtype, or an unknown colour.
     """
     if not isinstance(picture, Tensor):
         raise NPAError(
@@ -49,7 +46,7 @@ def to_uint8(picture: Tensor, background: Background = "white") -> NDArray[np.ui
     valid = fields.isfinite().all(dim=-1, keepdim=True)
     fields = torch.where(valid, fields, torch.zeros_like(fields))
     sums, density = fields[..., :3], fields[..., 3:]
-    # Added channel by channel: a tensor of the colour would be a copy to the device for each frame.
+    # By channel: a tensor of the background would be copied to the device for each frame.
     visible = sums / density.clamp(min=1)
     uncovered = 1 - density.clamp(0, 1)
     visible = torch.stack(
@@ -60,11 +57,7 @@ def to_uint8(picture: Tensor, background: Background = "white") -> NDArray[np.ui
 
 
 def background_colour(background: Background) -> tuple[float, float, float]:
-    """Return red, green and blue in [0, 1] of a colour name, "#rrggbb" or a triple.
-
-    Raises:
-        NPAError: The name is unknown, or the triple is not three numbers in [0, 1].
-    """
+    """Return red, green and blue in [0, 1] of a colour name, "#rrggbb" or a triple."""
     if isinstance(background, str):
         try:
             red, green, blue = ImageColor.getrgb(background)[:3]
@@ -84,31 +77,29 @@ def background_colour(background: Background) -> tuple[float, float, float]:
     return channels[0], channels[1], channels[2]
 
 
-# Colours that say something: an even ramp for densities, a fixed map for states.
-#
-# Both are mixed in OKLab (B. Ottosson, 2020), whose distances are about those that the eye sees.
-
+# Densities have an even ramp, states a fixed map, both in OKLab (B. Ottosson, 2020), whose
+# distances are about those that the eye perceives.
 
 RAMP_STOPS = ("#2a1858", "#792a86", "#cc4a70", "#f2985f", "#fbe6bd")
-"""The ramp's colours from dark to light; over a light background it runs the other way."""
+"""The ramp's colours from dark to light; reversed over a light background."""
 
 RAMP_LENGTH = 1024
-"""Entries of a ramp's table: several for each step of an 8-bit channel."""
+"""Entries of a ramp's table."""
 
 LIGHT_BACKGROUND = 0.6
-"""OKLab lightness from which on a ramp gets darker with density, not lighter."""
+"""OKLab lightness of backgrounds above which a ramp gets darker with density."""
 
 GOLDEN_ANGLE = math.pi * (3.0 - math.sqrt(5.0))
-"""Angle between the hues of neighbouring channels: any first few spread over the circle."""
+"""Angle between the hues of successive channels, which spreads any number over the circle."""
 
 STATE_LIGHTNESS = (0.67, 0.2)
-"""OKLab lightness of a blank particle, and how far a state may move it."""
+"""OKLab lightness of a blank particle, and the most that a state changes it."""
 
 STATE_CHROMA = 0.16
 """Largest OKLab chroma of a state along each of the two axes."""
 
 STATE_GAIN = 2.8
-"""States of this inverse size, the usual one, take the tanh to its bend (dimensionless)."""
+"""Inverse of a usual state's size, for the argument of tanh (dimensionless)."""
 
 _LMS_FROM_RGB = (
     (0.4122214708, 0.5363325363, 0.0514459929),
@@ -155,23 +146,21 @@ def ramp(background: tuple[float, float, float]) -> NDArray[np.uint8]:
     places = np.linspace(0.0, walked[-1], RAMP_LENGTH)
     lab = np.stack([np.interp(places, walked, knots[:, k]) for k in range(3)], axis=1)
     colours = (srgb(torch.from_numpy(lab)) * 255).round().to(torch.uint8).numpy()
-    # Kept for every later picture, so nobody may write into it.
+    # The cached array must not change.
     colours.setflags(write=False)
     return colours
 
 
 def state_colours(hidden: Tensor) -> Tensor:
-    """Return a colour for each hidden state; the same state has the same colour everywhere.
+    """Return a colour in [0, 1], [..., 3], for each hidden state [..., H], H 0 or more.
 
-    Each channel pulls towards a hue of its own, in its negative towards the opposite one, and
-    lighter or darker. A state of zeros, as every seed has, is grey. States without their colour
-    channels, [..., H] with H 0 or more, become colours in [0, 1], [..., 3].
+    Each channel has a hue and a lightness, negative values the opposite ones. Zeros are grey.
     """
     count = hidden.shape[-1]
     pull = []
     for part in range(3):
         total = hidden.new_zeros(hidden.shape[:-1])
-        # A fixed order of additions: a matrix product's would depend on the device and on B.
+        # A matrix product's order of additions would depend on the device and on B.
         for channel in range(count):
             angle = channel * GOLDEN_ANGLE
             weight = (math.cos(1.5 * angle + 1.0), math.cos(angle), math.sin(angle))[part]

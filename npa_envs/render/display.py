@@ -1,4 +1,4 @@
-"""Pictures and films that a notebook shows."""
+"""Pictures and films in notebooks."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ from npa_envs.render.film import Frame, check_rate, checked_frames, encode_frame
 from npa_envs.render.worlds import draw_worlds
 
 MOST_SHOWN = 16
-"""At most so many worlds are shown side by side."""
+"""Most worlds side by side."""
 
 _CELL_PARTICLES = 4
 _GAP = 4
 
 
 class Shown:
-    """Pictures that a notebook shows where they end a cell: one, or a film that repeats.
+    """A picture or a repeating film, which a notebook displays as the value of a cell.
 
     Args:
         frames: Pictures of one size, uint8, shape [H, W, 3] each.
@@ -42,10 +42,7 @@ class Shown:
         return f"a film of {len(self.frames)} pictures of {width} × {height} pixels"
 
     def _repr_mimebundle_(self, include: Any = None, exclude: Any = None) -> dict[str, Any]:
-        """Return what Jupyter shows: a picture, or a film within HTML, which more programs show.
-
-        A JPEG takes a tenth of a PNG, so that notebooks stay small.
-        """
+        """Return a JPEG, a tenth of a PNG, or a film within HTML, which more programs show."""
         shown: dict[str, Any] = {"text/plain": repr(self)}
         if len(self.frames) == 1:
             return shown | {"image/jpeg": _base64(encode_frame(self.frames[0], "JPEG"))}
@@ -54,16 +51,7 @@ class Shown:
 
 
 def show(frames: Frame | Iterable[Frame], *, fps: float = 25.0) -> Shown:
-    """Return what a notebook shows as a picture, or as a film that repeats.
-
-    Args:
-        frames: One picture, uint8, shape [H, W, 3], such as `env.render()` returns, or several of
-            one size.
-        fps: Frames a second of a film.
-
-    Raises:
-        NPAError: No frames, a wrong shape, dtype or rate.
-    """
+    """Return one picture [H, W, 3], as of `env.render()`, or several as a film for a notebook."""
     check_rate(fps)
     if isinstance(frames, np.ndarray) and frames.ndim == 3:
         return Shown(checked_frames([frames]), fps)
@@ -73,20 +61,16 @@ def show(frames: Frame | Iterable[Frame], *, fps: float = 25.0) -> Shown:
 def show_worlds(
     x: Tensor, s: Tensor, *, fps: float = 12.5, pixel_size: float | None = None, **drawing: Any
 ) -> Shown:
-    """Return worlds as a notebook shows them: side by side, as a film where they are a trajectory.
+    """Return worlds side by side for a notebook; a trajectory becomes a film.
 
     Args:
         x: Particle positions [length units], shape [B, N, D], or [K, B, N, D] of a trajectory, as
             `rollout(..., keep_every=...)` returns it.
         s: Particle states (dimensionless), shape [B, N, C] or [K, B, N, C]; of a rule with a
-            read-out what `rule.read_out(s)` returns, for its colours.
+            read-out the value of `rule.read_out(s)`.
         fps: Frames a second of a film.
-        pixel_size: How far particles stand apart [length units]; None: as far as in the last of
-            these worlds.
-        drawing: What `draw_worlds` takes besides.
-
-    Raises:
-        NPAError: As `draw_worlds`; or there is nothing to show.
+        pixel_size: Distance between particles [length units]; None: that of the last step.
+        drawing: Other arguments of `draw_worlds`.
     """
     check_rate(fps)
     if not (isinstance(x, Tensor) and isinstance(s, Tensor) and x.ndim == s.ndim):
@@ -128,10 +112,7 @@ def _base64(content: bytes) -> str:
 
 
 def _spacing(x: Tensor) -> float:
-    """Return how far particles of the first world [1 of B, N, D] stand apart, at least 1e-6.
-
-    The space that they fill is counted in cells that hold some of them.
-    """
+    """Return the distance between particles of the first world, by the cells that they fill."""
     places = x[0].detach().double()
     places = places[places.isfinite().all(dim=-1)]
     if not len(places):

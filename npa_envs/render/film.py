@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 from torch import Tensor
 
-from npa_envs.checks import checked_count, checked_finite, is_real
+from npa_envs.checks import checked_count, checked_finite, is_real, is_whole
 from npa_envs.errors import MissingDependencyError, NPAError, shown
 from npa_envs.files import atomic_path
 from npa_envs.ops import Cameras, orbit
@@ -24,6 +24,7 @@ from npa_envs.render.colours import Background, background_colour, to_uint8
 from npa_envs.tasks.targets.views import ANGLE, DISTANCE
 
 Frame = NDArray[np.uint8]
+"""Pixels of a picture, uint8, shape [H, W, 3]; the first row is the upper one."""
 
 GIF_HIGHEST_RATE = 50
 """Most frames a second that players show of a GIF."""
@@ -36,26 +37,14 @@ _MARGIN = 8
 
 
 def write_png(path: str | Path, frame: Frame) -> None:
-    """Write one picture, as small as a PNG can be.
-
-    Args:
-        path: The PNG file.
-        frame: Pixels, uint8, shape [H, W, 3].
-
-    Raises:
-        NPAError: A wrong shape or dtype, or the file cannot be written.
-    """
+    """Write one picture, uint8, shape [H, W, 3], as small as a PNG can be."""
     (checked,) = checked_frames([frame])
     with atomic_path(path) as temporary:
         Image.fromarray(checked).save(temporary, format="PNG", optimize=True)
 
 
 def encode_frame(frame: Frame, kind: Literal["PNG", "JPEG"]) -> bytes:
-    """Return the content of a picture's file, soon rather than small: PNG is exact, JPEG nearly so.
-
-    Raises:
-        NPAError: A wrong shape or dtype.
-    """
+    """Return the content of a picture's file, fast rather than small."""
     (checked,) = checked_frames([frame])
     options = {"compress_level": 1} if kind == "PNG" else {"quality": 90}
     buffer = io.BytesIO()
@@ -69,12 +58,12 @@ def write_gif(path: str | Path, frames: Iterable[Frame], fps: float = 25) -> Non
     Args:
         path: The GIF file.
         frames: Pictures of one size, uint8, shape [H, W, 3] each.
-        fps: Frames a second, at most 50; what players show. A GIF counts in hundredths of a second:
-            single frames are rounded to them, the length of the film is not.
+        fps: Frames a second, at most 50. Times of single frames are rounded to hundredths of a
+            second, the length of the film is not.
 
     Raises:
-        NPAError: No frames, a wrong shape, dtype or rate, frames that are alike for longer than a
-            GIF can show one, or the file cannot be written.
+        NPAError: Wrong frames or rate, more than 655 s of equal frames, or the file cannot be
+            written.
     """
     pictures = checked_frames(frames)
     check_rate(fps, highest=GIF_HIGHEST_RATE)
@@ -82,7 +71,7 @@ def write_gif(path: str | Path, frames: Iterable[Frame], fps: float = 25) -> Non
     indexed = []
     for picture in pictures:
         quantised = Image.fromarray(picture).quantize(palette=palette, dither=Image.Dither.NONE)
-        # Pillow finds palette entries only roughly; a background off by one level would flicker.
+        # Pillow's choice of entries is approximate; a background off by one level would flicker.
         index = np.array(quantised)
         index[(picture == background).all(axis=-1)] = entry
         exact = Image.fromarray(index, "P")
@@ -97,7 +86,7 @@ def write_gif(path: str | Path, frames: Iterable[Frame], fps: float = 25) -> Non
                 duration=durations, loop=0, optimize=False, disposal=1,
             )  # fmt: skip
         except (OverflowError, struct.error) as error:
-            # Pillow writes frames that are alike as one; its time has 16 bits.
+            # Pillow merges equal frames into one, whose time has 16 bits.
             raise NPAError(
                 f"frames may be alike for at most {GIF_LONGEST:.0f} s in a GIF, got more at "
                 f"fps={fps:g}: raise fps, or leave some of them out"
@@ -107,16 +96,13 @@ def write_gif(path: str | Path, frames: Iterable[Frame], fps: float = 25) -> Non
 def write_webp(
     path: str | Path, frames: Iterable[Frame], fps: float = 25, *, quality: int = 50
 ) -> None:
-    """Write a WebP that repeats for ever; a GIF of the same film takes about five times as much.
+    """Write a WebP that repeats for ever, a fifth the size of a GIF.
 
     Args:
         path: The WebP file.
         frames: Pictures of one size, uint8, shape [H, W, 3] each.
         fps: Frames a second.
         quality: 0 to 100.
-
-    Raises:
-        NPAError: No frames, a wrong shape, dtype, rate or quality, or the file cannot be written.
     """
     content = encode_webp(frames, fps, quality=quality)
     with atomic_path(path) as temporary:
@@ -124,11 +110,7 @@ def write_webp(
 
 
 def encode_webp(frames: Iterable[Frame], fps: float = 25, *, quality: int = 50) -> bytes:
-    """Return the content of the file that `write_webp` writes.
-
-    Raises:
-        NPAError: No frames, a wrong shape, dtype, rate or quality.
-    """
+    """Return the content of the file that `write_webp` writes."""
     first, *others = map(Image.fromarray, checked_frames(frames))
     check_rate(fps)
     if not (is_real(quality) and 0 <= quality <= 100):
@@ -147,11 +129,10 @@ def write_mp4(path: str | Path, frames: Iterable[Frame], fps: float = 25) -> Non
     Args:
         path: The MP4 file.
         frames: Pictures of one size, uint8, shape [H, W, 3] each. An odd width or height is made
-            even by repeating the last column or row, as the format demands.
+            even by repeating the last column or row.
         fps: Frames a second.
 
     Raises:
-        NPAError: No frames, a wrong shape, dtype or rate, or the file cannot be written.
         MissingDependencyError: imageio or its ffmpeg is not installed.
     """
     pictures = checked_frames(frames)
@@ -179,25 +160,19 @@ def write_filmstrip(
 ) -> None:
     """Write frames side by side into one picture, each with a caption below.
 
-    Where a caption is wider than the frames, background on either side of each makes room for it.
-
     Args:
-        path: A PNG file, or a WebP file where the name ends in `.webp`.
+        path: A WebP file where the name ends in `.webp`, else a PNG file.
         frames: Pictures of one size, uint8, shape [H, W, 3] each.
-        captions: One text for each frame, or None for none.
+        captions: One text for each frame, or None.
         columns: Frames in a row; None is all of them, at most 8.
-        background: A colour name, "#rrggbb", or red, green and blue in [0, 1].
-
-    Raises:
-        NPAError: No frames, a wrong shape or dtype, another number of captions than of frames,
-            fewer than one column, an unknown colour, or the file cannot be written.
+        background: As of `to_uint8`.
     """
     pictures = checked_frames(frames)
     count = len(pictures)
     if captions is not None:
         captions = _checked_captions(captions, count)
     across = min(count, 8) if columns is None else columns
-    if isinstance(across, bool) or not isinstance(across, int) or across < 1:
+    if not is_whole(across) or across < 1:
         raise NPAError(f"columns must be an integer of at least 1, got {shown(columns)}: try 4")
     across = min(across, count)
     height, width, _ = pictures[0].shape
@@ -242,21 +217,13 @@ def _checked_captions(captions: Any, count: int) -> list[str]:
 
 
 def check_rate(fps: float, *, highest: float = 1000) -> None:
-    """Check a film's rate [frames a second]; `GIF_HIGHEST_RATE` is the highest for a GIF.
-
-    Raises:
-        NPAError: It is not in [0.1, highest].
-    """
+    """Check a film's rate [frames a second], at least 0.1."""
     if not (is_real(fps) and 0.1 <= fps <= highest):
         raise NPAError(f"fps must be in [0.1, {highest}], got {shown(fps)}: try 25")
 
 
 def checked_frames(frames: Iterable[Frame]) -> list[Frame]:
-    """Return pictures of one size, uint8, shape [H, W, 3] each.
-
-    Raises:
-        NPAError: There are none, or of another shape or dtype.
-    """
+    """Return pictures as a list, after checking their number, shapes and dtype."""
     given: Any = frames
     if not isinstance(given, Iterable) or getattr(given, "ndim", 1) == 0:
         raise NPAError(
@@ -296,7 +263,7 @@ def _shared_palette(pictures: list[Frame]) -> tuple[Image.Image, Frame, int]:
     means = [np.bincount(which, weights=sample[:, k]) / counts for k in range(3)]
     shades, shade_counts = np.unique(sample[which == counts.argmax()], axis=0, return_counts=True)
     background = shades[shade_counts.argmax()]
-    # Each colour by the root of its count: else a wide background would drown small spots.
+    # Each colour by the root of its count: a wide background would take the palette of small spots.
     repeats = np.ceil(np.sqrt(counts)).astype(np.int64)
     swatch = np.repeat(np.stack(means, axis=1).round().astype(np.uint8), repeats, axis=0)[None]
     palette = Image.fromarray(swatch).quantize(
@@ -319,7 +286,7 @@ def _import_imageio() -> tuple[Any, Any]:
 
 
 def _check_film(path: Path, frame_count: int, ffmpeg: Any) -> None:
-    # The writer does not report an encoder that died, for example on a full disk.
+    # The writer does not report an encoder that failed, for example on a full disk.
     try:
         found, _ = ffmpeg.count_frames_and_secs(str(path))
     except RuntimeError as error:
@@ -355,31 +322,22 @@ def turntable_frames(
         views: Draws the world: colours times alpha, and alpha, shape [1, V, H, W, 4].
         frame_count: Pictures of one turn.
         resolution: Pixels along each side.
-        elevation: How far above the horizon the cameras are [degrees].
-        azimuth: How far the first camera has gone round [degrees].
-        background: A colour name, "#rrggbb", or red, green and blue in [0, 1].
-        device: Where the world is.
+        elevation: Angle of the cameras above the horizon [degrees].
+        azimuth: Angle of the first camera around the vertical axis [degrees].
+        background: As of `to_uint8`.
+        device: The world's device.
 
     Returns:
         Pixels, uint8, shape [R, R, 3] each; the first row is the upper one.
-
-    Raises:
-        NPAError: A number is out of its range, or the colour is unknown.
     """
     frame_count = checked_count("frame_count", frame_count)
     azimuth = checked_finite("azimuth", azimuth, " [degrees]")
     frames = []
     with torch.no_grad():
         for k in range(frame_count):
-            cameras = orbit(
-                1,
-                elevation,
-                DISTANCE,
-                ANGLE,
-                width=resolution,
-                height=resolution,
-                azimuth=azimuth + 360.0 * k / frame_count,
-            )
+            angle = azimuth + 360.0 * k / frame_count
+            size = {"width": resolution, "height": resolution}
+            cameras = orbit(1, elevation, DISTANCE, ANGLE, azimuth=angle, **size)
             picture = views(cameras.to(torch.device(device)))[0, 0]
             frames.append(to_uint8(picture.flip(0), background))
     return frames

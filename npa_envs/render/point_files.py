@@ -15,20 +15,11 @@ from npa_envs.tasks.appearance import FLAT, Gaussians
 Columns = dict[str, NDArray[np.generic]]
 
 LEAST_OPACITY = 1e-6
-"""Opacities are kept so far from 0 and 1 where they are written as logits."""
+"""Least distance of an opacity from 0 and 1 in a file of logits."""
 
 
 def write_points(path: str | Path, x: Tensor, gaussians: Gaussians) -> None:
-    """Write a point cloud as a binary PLY file: x, y, z and red, green, blue.
-
-    Args:
-        path: The file.
-        x: Positions [length units], shape [1, N, 3].
-        gaussians: How the particles look, of one world.
-
-    Raises:
-        NPAError: There is more than one world, or the file cannot be written.
-    """
+    """Write one world, x [1, N, 3], as a binary PLY file: x, y, z and red, green, blue."""
     places = _checked(x)
     columns: Columns = {name: places[:, k] for k, name in enumerate("xyz")}
     colours = (255.0 * _colours(gaussians)).round().astype(np.uint8)
@@ -37,17 +28,9 @@ def write_points(path: str | Path, x: Tensor, gaussians: Gaussians) -> None:
 
 
 def write_gaussians(path: str | Path, x: Tensor, gaussians: Gaussians) -> None:
-    """Write Gaussians as a PLY file with the fields of 3D Gaussian splatting (Kerbl et al. 2023).
+    """Write one world, x [1, N, 3], as a PLY file of 3D Gaussian splatting (Kerbl et al. 2023).
 
     Scales are logarithms, opacities logits; `f_rest` holds degree 1, channel by channel.
-
-    Args:
-        path: The file.
-        x: Positions [length units], shape [1, N, 3].
-        gaussians: How the particles look, of one world.
-
-    Raises:
-        NPAError: There is more than one world, or the file cannot be written.
     """
     places = _checked(x)
     harmonics = _numpy(gaussians.colours)
@@ -65,19 +48,11 @@ def write_gaussians(path: str | Path, x: Tensor, gaussians: Gaussians) -> None:
 
 
 def write_splat(path: str | Path, x: Tensor, gaussians: Gaussians) -> None:
-    """Write Gaussians as a `.splat` file, which viewers in browsers read: 32 bytes a particle.
+    """Write one world, x [1, N, 3], as a `.splat` file for viewers in browsers.
 
-    Position and scale as float32, red, green, blue and opacity as bytes, and the rotation (w, x, y,
-    z) as bytes around 128; the largest and most opaque first. What depends on the direction of
-    sight has no place in it.
-
-    Args:
-        path: The file.
-        x: Positions [length units], shape [1, N, 3].
-        gaussians: How the particles look, of one world.
-
-    Raises:
-        NPAError: There is more than one world, or the file cannot be written.
+    A particle takes 32 bytes: position and scale as float32; red, green, blue and opacity as bytes;
+    the rotation (w, x, y, z) as bytes around 128. The largest and most opaque come first. Colours
+    are means over all directions of sight.
     """
     places = _checked(x)
     scales, opacities = _numpy(gaussians.scales), _numpy(gaussians.opacities)

@@ -1,4 +1,4 @@
-"""A window that shows frames as they are made; the only place that knows pygame."""
+"""A window for frames; the only module that uses pygame."""
 
 from __future__ import annotations
 
@@ -23,26 +23,24 @@ _SETTINGS = {
 }
 
 _NO_SCREEN = ("offscreen", "dummy")
-"""Drivers that SDL turns to where there is no screen; `SDL_VIDEODRIVER` may ask for one by name."""
+"""SDL's drivers without a screen; `SDL_VIDEODRIVER` may ask for one by name."""
 
 _shown: Window | None = None
-"""The window on the screen: pygame has one for each process."""
+"""The open window: pygame has one for each process."""
 
 
 class Window:
     """A window on the screen; without a screen it warns once and then does nothing.
 
-    A process has one window. Making another takes its place: the older one is then `closed`.
+    A process has one window: a new one closes the older one.
 
     Args:
-        title: What its title bar says.
+        title: Text of the title bar.
         size: Width and height [screen pixels], or one number for both. Frames of another size are
             scaled to it.
-        fps: Most frames shown a second: `show` waits for the rest of a frame's time; None shows
-            them as fast as they come.
+        fps: Most frames a second, for which `show` waits; None: no limit.
 
     Raises:
-        NPAError: A size or rate out of range.
         MissingDependencyError: pygame is not installed.
     """
 
@@ -57,7 +55,7 @@ class Window:
         self.fps = fps
         """Most frames shown a second; None: no limit."""
         self.closed = False
-        """Whether it was closed, by the user or by `close`, or another window took its place."""
+        """Whether the user, `close` or another window has closed it."""
         self._pygame = _import_pygame()
         self._clock = self._pygame.time.Clock()
         self._surface: Any = None
@@ -75,18 +73,11 @@ class Window:
 
     @property
     def visible(self) -> bool:
-        """Whether it is on the screen: there is a screen, and it was not closed."""
+        """Whether it is on the screen."""
         return self._surface is not None
 
     def show(self, frame: Frame) -> None:
-        """Show a frame, answer the window's events, and wait where frames come too fast.
-
-        Args:
-            frame: Pixels, uint8, shape [H, W, 3].
-
-        Raises:
-            NPAError: A wrong shape or dtype.
-        """
+        """Show a frame, uint8, shape [H, W, 3]; handle events and keep to `fps`."""
         pixels = np.asarray(frame)
         if pixels.dtype != np.uint8 or pixels.ndim != 3 or pixels.shape[-1] != 3 or not pixels.size:
             raise NPAError(
@@ -106,10 +97,10 @@ class Window:
             self._clock.tick(self.fps)
 
     def answer_events(self) -> None:
-        """Answer the window's events, so that it stays alive between frames that come slowly."""
+        """Handle the window's events, also between frames that come slowly."""
         if self._surface is None:
             return
-        # Another library of this process may have shut the display down.
+        # Another library of the process may have shut the display down.
         lost = not self._pygame.display.get_init()
         if lost or any(event.type == self._pygame.QUIT for event in self._pygame.event.get()):
             self.close()
@@ -171,7 +162,7 @@ def _checked_size(size: Any) -> tuple[int, int]:
 def _import_pygame() -> Any:
     try:
         with _settings(), warnings.catch_warnings():
-            # Its use of setuptools is deprecated, which its users cannot mend.
+            # pygame's use of setuptools is deprecated.
             warnings.simplefilter("ignore")
             return importlib.import_module("pygame")
     except ImportError as error:
@@ -183,7 +174,7 @@ def _import_pygame() -> Any:
 
 @contextlib.contextmanager
 def _settings() -> Iterator[None]:
-    """Set what pygame reads from the environment, where the user did not, for a while."""
+    """Set pygame's environment variables for a while, unless the user has set them."""
     missing = {name: value for name, value in _SETTINGS.items() if name not in os.environ}
     os.environ.update(missing)
     try:

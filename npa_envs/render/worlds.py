@@ -1,4 +1,4 @@
-"""Pictures of worlds as they are, without legend or axes: what environments show."""
+"""Pictures of worlds, without legend or axes."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from torch import Tensor
 
 from npa_envs.checks import (
     check_world,
+    checked_finite,
     checked_flag,
-    checked_number,
     checked_positive,
     number_tensor,
-)
+)  # fmt: skip
 from npa_envs.errors import NPAError, shown, suggest
 from npa_envs.ops import periodic_splat, splat
 from npa_envs.ops.pictures.splat import checked_window
@@ -31,22 +31,22 @@ from npa_envs.render.colours import (
 from npa_envs.rule.rule import COLOUR_OFFSET
 
 STYLES = ("particles", "density", "states")
-"""What a picture can show: the particles' own colours, how dense they are, their hidden states."""
+"""Styles of pictures: the particles' own colours, their density, their hidden states."""
 
 COLOUR_CHANNELS = 3
-"""The last channels of a state are its colour, less `COLOUR_OFFSET`."""
+"""The last channels of a state, which are its colour less `COLOUR_OFFSET`."""
 
 LAYERS = 24
-"""Layers that a 3D world is cut into, from near to far, as many particles in each."""
+"""Layers of a 3D world from near to far, with equal numbers of particles."""
 
 OPACITY = 5.0
 """Optical depth of a layer of density 1 in 3D (dimensionless)."""
 
 BEAD = 0.7
-"""Size of a particle in 3D as a share of its size in 2D: there, nothing has to close the gaps."""
+"""Size of a particle in 3D over its size in 2D, where spots must close the gaps."""
 
 SHADE = 0.45
-"""Share of its light that a particle loses at the far end of the view."""
+"""Share of light that a particle at the far end of the view loses."""
 
 
 def draw_worlds(
@@ -66,39 +66,31 @@ def draw_worlds(
 ) -> NDArray[np.uint8]:
     """Draw worlds: every particle is a soft spot, y is up.
 
-    Colours mean the same in every picture: nothing is fitted to a frame, so films do not flicker.
-    A picture depends on its own world only, not on the others of the batch. Particles whose
-    position (or state, where the style shows it) is not finite are left out.
-
-    3D worlds are seen from afar, without perspective, by a camera that turns around the vertical
-    axis through `centre`. Near particles cover far ones, and far ones are darker.
+    Nothing is fitted to a frame or a batch, so colours mean the same in every picture. Particles
+    whose position (or state, where the style shows it) is not finite are left out. 3D worlds are
+    drawn without perspective: near particles cover far ones, and far ones are darker.
 
     Args:
         x: Particle positions [length units], shape [B, N, D], D = 2 or 3, on any device.
         s: Particle states (dimensionless), shape [B, N, C].
         style: "particles" shows the last three channels plus 0.5 as red, green and blue, clipped;
-            "density" how dense the particles stand, with 1, as dense as the target's pixels, in the
-            middle of the colour ramp (in 3D: along the line of sight, with 1 where half the depth
-            of the view is full); "states" all other channels, each pulling towards a hue of its own
-            (grey: a blank particle).
+            "density" the density, with that of the target's pixels in the middle of the colour ramp
+            (in 3D along the line of sight, with half the depth of the view full); "states" all
+            other channels, each by a hue (grey: a blank particle).
         resolution: Pixels R along each side, 2 or more.
-        pixel_size: Side of a pixel of the target, or how far particles usually stand apart [length
+        pixel_size: Side of a pixel of the target, or usual distance between particles [length
             units].
         sigma: Standard deviation of a particle's spot in `pixel_size`, dimensionless.
-        centre: What lies in the middle of the picture [length units], shape [D] or [B, D]; None is
-            the origin.
+        centre: Middle of the picture [length units], shape [D] or [B, D]; None is the origin.
         half_width: From the middle of the picture to its edge [length units].
-        periodic: 2D only: the picture shows a periodic box, and particles reach across its edges.
-        azimuth: 3D only: how far the camera has gone round [degrees], seen from above against the
-            clock; 0 has x to the right and z towards the viewer.
-        elevation: 3D only: how far above the horizon the camera is [degrees].
-        background: A colour name such as "black", "#rrggbb", or red, green and blue in [0, 1].
+        periodic: 2D only: the picture is a periodic box, whose edges are joined.
+        azimuth: 3D only: angle of the camera around the vertical axis [degrees], counterclockwise
+            from above; at 0 x points right and z towards the viewer.
+        elevation: 3D only: angle of the camera above the horizon [degrees].
+        background: As of `to_uint8`.
 
     Returns:
         Pixels of shape [B, R, R, 3]; the first row is the highest y.
-
-    Raises:
-        NPAError: An unknown style or colour, a shape that does not fit, or a number out of range.
     """
     check_world(x, s)
     if not isinstance(style, str) or style not in STYLES:
@@ -107,10 +99,8 @@ def draw_worlds(
         )
     half_width = checked_positive("half_width", half_width)
     periodic = checked_flag("periodic", periodic)
-    azimuth, elevation = checked_number("azimuth", azimuth), checked_number("elevation", elevation)
-    for name, value in (("azimuth", azimuth), ("elevation", elevation)):
-        if not math.isfinite(value):
-            raise NPAError(f"{name} must be a finite angle in degrees, got {shown(value)}")
+    azimuth = checked_finite("azimuth", azimuth, " [degrees]")
+    elevation = checked_finite("elevation", elevation, " [degrees]")
     resolution, pixel_size, sigma, *_ = checked_window(
         resolution, pixel_size, sigma, -half_width, half_width
     )
@@ -127,16 +117,13 @@ def draw_worlds(
         visible = (places.abs() <= limit).all(-1, keepdim=True)
         if style != "density":
             visible = visible & s.isfinite().all(-1, keepdim=True)
-        # Nobody sees a place that is no number, but the images of all others in a periodic box.
+        # A periodic box draws every finite position; NaN draws nothing.
         nowhere = math.nan if periodic else limit
         places, colour = places.where(visible, nowhere), colour.where(visible, 0.0)
         draw = partial(
             periodic_splat if periodic else splat,
-            resolution=resolution,
-            pixel_size=pixel_size,
-            lo=-half_width,
-            hi=half_width,
-        )
+            resolution=resolution, pixel_size=pixel_size, lo=-half_width, hi=half_width,
+        )  # fmt: skip
         if style == "density":
             density = draw(places, colour, sigma=sigma)[..., 3]
             if depth is not None:
@@ -177,7 +164,7 @@ def _colours(s: Tensor, style: str) -> Tensor:
 
 
 def _seen_from(x: Tensor, azimuth: float, elevation: float) -> tuple[Tensor, Tensor]:
-    """Return places on the picture, [B, N, 2], and how near they are, [B, N, 1]."""
+    """Return places on the picture, [B, N, 2], and distances towards the viewer, [B, N, 1]."""
     turn, tilt = (math.radians(angle % 360.0) for angle in (azimuth, elevation))
     right, height, outward = x.unbind(-1)
     across = math.cos(turn) * right - math.sin(turn) * outward

@@ -1,4 +1,4 @@
-"""Colours of single particles: what each tells of its state, its surroundings, its movement."""
+"""Colours of particles by state, density, species, speed or update mask."""
 
 from __future__ import annotations
 
@@ -15,34 +15,33 @@ from npa_envs.ops import species_fields
 from npa_envs.render.colours import GOLDEN_ANGLE, STATE_CHROMA, STATE_GAIN, ramp, srgb
 
 SHOWS = ("colours", "density", "components", "species", "speed", "mask")
-"""What can be shown besides single state channels: "state 0", "state 1", ..."""
+"""Choices of the page, followed by the state channels: "state 0", "state 1", ..."""
 
 DARK = (0.05, 0.06, 0.09)
-"""What the ramp of densities and speeds begins at; it is seen on light backgrounds as well."""
+"""First colour of the ramp of densities and speeds."""
+
+MASK_COLOURS = (0.98, 0.78, 0.36), (0.29, 0.33, 0.42)
+"""Red, green and blue of updated particles, and of the others."""
 
 BALANCE = 0.9
-"""How much of its memory of covariances the basis of components keeps from frame to frame."""
+"""Weight of earlier frames in the moving average of the covariance behind "components"."""
 
 
-class Seen(NamedTuple):
-    """A world of which particles are coloured."""
+class ColouredWorld(NamedTuple):
+    """A world whose particles are coloured."""
 
     x: Tensor
-    """Positions [length units], shape [1, N, D]."""
     s: Tensor
-    """States (dimensionless), shape [1, N, C]."""
     colours: Callable[[Tensor], Tensor]
-    """Own colours of particles of states [1, N, C], in [0, 1] if clipped, shape [1, N, 3]."""
+    """Own colours [1, N, 3] of particles with states [1, N, C]; they may exceed [0, 1]."""
     eps: float
-    """Perception radius [length units]."""
     box: tuple[float, ...] | None
-    """Sides of the periodic box [length units], or None."""
     counts: Sequence[int]
     """Particles of each species, species after species."""
     full: int
-    """Particles that the world had when it was fresh."""
+    """Particles of the fresh world."""
     travelled: Tensor | None
-    """How far each particle went in the last step, as a share of the farthest way, [1, N]."""
+    """Path of each particle in the last step over the longest possible one, [1, N]."""
     updated: Tensor | None
     """Which particles the last step updated, bool, shape [1, N]."""
 
@@ -54,47 +53,41 @@ class Colouring:
         self._covariance: Tensor | None = None
         self._basis: Tensor | None = None
 
-    def __call__(self, show: str, seen: Seen) -> NDArray[np.uint8]:
-        """Return red, green and blue of each particle, uint8, shape [N, 3].
-
-        Args:
-            show: One of `shows_of`.
-            seen: The world.
-
-        Raises:
-            NPAError: `show` is another word.
-        """
-        if seen.x.shape[1] == 0:
+    def __call__(self, show: str, world: ColouredWorld) -> NDArray[np.uint8]:
+        """Return red, green and blue of each particle, uint8, [N, 3], by one of `shows_of`."""
+        if world.x.shape[1] == 0:
             return np.zeros((0, 3), dtype=np.uint8)
         match show.split():
             case ["colours"]:
-                return _bytes(seen.colours(seen.s)[0])
+                return _bytes(world.colours(world.s)[0])
             case ["density"]:
                 # 1 is a world whose particles fill [-1, 1]^D, or its box, evenly.
-                rho = species_fields(seen.x, [seen.x.shape[1]], eps=seen.eps, box=seen.box).rho
-                volume = float(np.prod(seen.box or (2.0,) * seen.x.shape[2]))
-                crowding = rho[0].sum(dim=-1) * (volume / seen.full)
-                # In open space worlds fill a part only, and so are denser.
-                return _ramp(1.0 - torch.exp2(-crowding / (1.0 if seen.box else 4.0)))
+                rho = species_fields(world.x, [world.x.shape[1]], eps=world.eps, box=world.box).rho
+                volume = float(np.prod(world.box or (2.0,) * world.x.shape[2]))
+                crowding = rho[0].sum(dim=-1) * (volume / world.full)
+                # Worlds in open space fill a part of it, and are denser.
+                return _ramp(1.0 - torch.exp2(-crowding / (1.0 if world.box else 4.0)))
             case ["components"]:
-                return _bytes(self._components(seen.s[0]))
+                return _bytes(self._components(world.s[0]))
             case ["species"]:
-                return species_colours(len(seen.counts)).repeat(seen.counts, axis=0)
+                return species_colours(len(world.counts)).repeat(world.counts, axis=0)
             case ["speed"]:
-                share = _known(seen.travelled, seen)
+                share = _known(world.travelled, world)
                 return _ramp(share.clamp(0.0, 1.0).sqrt())
             case ["mask"]:
-                return _bytes(_mask_colours(_known(seen.updated, seen)))
-            case ["state", number] if number.isdecimal() and int(number) < seen.s.shape[2]:
-                return _bytes(signed_colours(seen.s[0, :, int(number)]))
+                updated = _known(world.updated, world).bool()[:, None]
+                on, off = (updated.new_tensor(tint, dtype=torch.float32) for tint in MASK_COLOURS)
+                return _bytes(torch.where(updated, on, off))
+            case ["state", number] if number.isdecimal() and int(number) < world.s.shape[2]:
+                return _bytes(signed_colours(world.s[0, :, int(number)]))
         raise NPAError(
-            f"show must be what the world has, got {shown(show)}: "
-            f"{suggest(show, shows_of(seen.s.shape[2]))}"
+            f"show must be one of the world's, got {shown(show)}: "
+            f"{suggest(show, shows_of(world.s.shape[2]))}"
         )
 
     def _components(self, s: Tensor) -> Tensor:
         """Return the first three principal components as colours; the basis moves slowly."""
-        # One particle that is no number would end the basis of all, for good.
+        # One NaN in the moving average would stay there.
         known = s[s.isfinite().all(dim=-1)].double()
         mean = known.mean(dim=0)
         covariance = (known - mean).T @ (known - mean) / max(len(known), 1)
@@ -105,7 +98,7 @@ class Colouring:
         count = min(3, len(values))
         basis = vectors[:, -count:].flip(-1).to(s.device)
         if self._basis is not None:
-            # An eigenvector may come with either sign: colours must not flip between frames.
+            # An eigenvector's sign is arbitrary: colours must not flip between frames.
             sign = (basis * self._basis).sum(dim=0, keepdim=True).sign()
             basis = basis * torch.where(sign == 0, 1.0, sign)
         self._basis = basis
@@ -115,7 +108,7 @@ class Colouring:
 
 
 def shows_of(state_dim: int, *, species: bool = True) -> list[str]:
-    """Return what can be shown of particles with so many state channels, of rules or not."""
+    """Return what `Colouring` can show of particles with so many state channels."""
     own = SHOWS if species else ("colours", "density", "components", "speed")
     return [*own, *(f"state {k}" for k in range(state_dim))]
 
@@ -123,43 +116,28 @@ def shows_of(state_dim: int, *, species: bool = True) -> list[str]:
 def signed_colours(values: Tensor) -> Tensor:
     """Return colours of numbers [...]: blue below 0, grey at 0, orange above; [..., 3]."""
     pull = torch.tanh(0.5 * STATE_GAIN * values)
-    return srgb(
-        torch.stack(
-            (
-                0.62 + 0.18 * pull.abs(),
-                0.5 * STATE_CHROMA * pull,
-                STATE_CHROMA * pull,
-            ),
-            dim=-1,
-        )
-    )
+    lab = (0.62 + 0.18 * pull.abs(), 0.5 * STATE_CHROMA * pull, STATE_CHROMA * pull)
+    return srgb(torch.stack(lab, dim=-1))
 
 
 def species_colours(count: int) -> NDArray[np.uint8]:
-    """Return colours that tell species apart, whatever their number, uint8, shape [count, 3]."""
+    """Return distinct colours of any number of species, uint8, shape [count, 3]."""
     hue = 0.9 + GOLDEN_ANGLE * torch.arange(count, dtype=torch.float64)
     lab = (torch.full_like(hue, 0.72), 0.13 * hue.cos(), 0.13 * hue.sin())
     return _bytes(srgb(torch.stack(lab, dim=-1)))
 
 
-def _mask_colours(updated: Tensor) -> Tensor:
-    on, off = (0.98, 0.78, 0.36), (0.29, 0.33, 0.42)
-    return torch.stack(
-        [torch.where(updated, bright, dim) for bright, dim in zip(on, off, strict=True)], dim=-1
-    )
-
-
-def _known(values: Tensor | None, seen: Seen) -> Tensor:
-    """Return numbers of a last step [N], or zeros where there was none."""
-    if values is None or values.shape[1] != seen.x.shape[1]:
-        return torch.zeros(seen.x.shape[1], device=seen.x.device)
+def _known(values: Tensor | None, world: ColouredWorld) -> Tensor:
+    """Return values of the last step [N], or zeros before the first one."""
+    if values is None or values.shape[1] != world.x.shape[1]:
+        return torch.zeros(world.x.shape[1], device=world.x.device)
     return values[0]
 
 
 def colour_ramp() -> NDArray[np.uint8]:
     """Return the colours of densities and speeds from low to high, uint8, shape [entries, 3]."""
     table = ramp(DARK)
-    # The darkest colours would not be seen on a dark background.
+    # The darkest colours would vanish on a dark background.
     return table[len(table) // 6 :]
 
 

@@ -1,4 +1,4 @@
-"""Live worlds of environments: what a policy does in one, episode after episode."""
+"""Live worlds of environments in which a policy acts, episode after episode."""
 
 from __future__ import annotations
 
@@ -16,25 +16,24 @@ from npa_envs.rule.files import load_rule
 from npa_envs.rule.rule import COLOUR_OFFSET
 from npa_envs.tasks.base import Task
 from npa_envs.tasks.damage import DAMAGE_SIZES, damage_worlds
-from npa_envs.web.colouring import Colouring, Seen, shows_of
-from npa_envs.web.live import Live, Touch, WorldView, brushed, checked_seed
+from npa_envs.web.colouring import ColouredWorld, Colouring, shows_of
+from npa_envs.web.live import LiveWorld, Touch, WorldView, brushed, checked_seed
 from npa_envs.world.brushes import nearest_image
 
 
 def make_environment(
     id: str, policy: str = "zero", *, device: str = "cpu", **keywords: Any
 ) -> tuple[Any, Callable[[Any], Any]]:
-    """Return an environment of this package, and what acts in it.
+    """Return an environment of this package, and a policy for it.
 
     Args:
         id: Its id, such as "npa/Texture-v0".
         policy: "zero", "random", or the source of a rule that fits it.
-        device: Where its world lives.
-        keywords: More of its keywords; None leaves one as it is.
+        device: The world's device.
+        keywords: More of its keywords; those that are None keep their defaults.
 
     Raises:
-        NPAError: There is no such environment or rule, the rule does not fit, or a keyword is
-            wrong.
+        NPAError: There is no such environment or rule, or a keyword is wrong.
     """
     others = {*GARDEN_IDS, *(environment.id for environment in CODED)}
     if id in others:
@@ -47,37 +46,32 @@ def make_environment(
         raise NPAError(f"unknown environment {shown(id)}: {suggest(id, known)}")
     simple = {"zero": ZeroPolicy, "random": RandomPolicy}
     rule = None if policy in simple else load_rule(policy, device=device).float()
-    told = {name: value for name, value in keywords.items() if value is not None}
-    limit = told.get("max_episode_steps", 1)
+    given = {name: value for name, value in keywords.items() if value is not None}
+    limit = given.get("max_episode_steps", 1)
     if not is_whole(limit) or limit < 1:
-        # Gymnasium checks this one itself, in its own words.
+        # Gymnasium's own message does not say how to mend it.
         raise NPAError(
             f"max_episode_steps must be a whole number of at least 1, got {shown(limit)}: try 512"
         )
-    env = gymnasium.make(id, disable_env_checker=True, device=device, output="torch", **told)
+    env = gymnasium.make(id, disable_env_checker=True, device=device, output="torch", **given)
     return env, simple[policy](env) if rule is None else RulePolicy(rule, env)
 
 
-class EnvironmentWorld(Live):
-    """An environment of this package with a policy in it.
+class EnvironmentWorld(LiveWorld):
+    """An environment of this package in which a policy acts.
 
     Args:
         env: The environment, single, wrapped or not; it is closed with the world.
-        policy: What acts: maps an observation [N, P] to an action [N, A].
+        policy: Maps an observation [N, P] to an action [N, A].
         seed: The seed of the first episode.
-        title: What the page calls it.
+        title: The page's title; None: the environment's id.
 
     Raises:
         NPAError: The environment is none of this package.
     """
 
     def __init__(
-        self,
-        env: Any,
-        policy: Callable[[Any], Any],
-        *,
-        seed: int = 0,
-        title: str | None = None,
+        self, env: Any, policy: Callable[[Any], Any], *, seed: int = 0, title: str | None = None
     ) -> None:
         super().__init__()
         self._env, self._inner, self._policy = env, env.unwrapped, policy
@@ -107,28 +101,17 @@ class EnvironmentWorld(Live):
     def describe(self) -> dict[str, Any]:
         """Return the event "world"."""
         physics, task = self._inner.worlds.physics, self._inner.task
-        box, dimension = physics.box, physics.space_dim
-        return {
-            "type": "world",
+        box = physics.box
+        return super().describe() | {
             "title": self._title,
             "note": f"episode {self._episode}{self._ended}",
-            "dimension": dimension,
+            "dimension": physics.space_dim,
             "box": None if box is None else list(box),
             "half_width": task.half_width if box is None else 0.5 * min(box),
-            "centre": [0.0] * dimension,
             "spot": 0.7 * float(task.pixel_size),
-            "rules": [],
-            "rule": None,
-            "others": [],
-            "species": [],
-            "shows": self._shows(),
-            "show": self.show,
             "tools": [*(("push", "clump", "cut") if physics.moving else ()), "inject"],
             "damages": list(DAMAGE_SIZES) if physics.moving else ["wipe"],
-            "settings": self._settings(),
             "capabilities": ["step", "reset", "film", "loss"],
-            "playing": self.playing,
-            "seed": self.seed,
         }
 
     def _shows(self) -> list[str]:
@@ -143,7 +126,6 @@ class EnvironmentWorld(Live):
             self._return += float(reward)
             if before is not None:
                 physics = self._inner.worlds.physics
-                # Over the edge of a box, not all across it.
                 way = nearest_image(self._inner.particles()[0] - before, physics.box)
                 self._travelled = way.norm(dim=-1)[None] / max(physics.max_displacement, 1e-12)
             if ended or late:
@@ -151,32 +133,25 @@ class EnvironmentWorld(Live):
                     f"; the last one ended after {self.step} steps: "
                     f"{self._info.get('reason')}, return {self._return:.3g}"
                 )
-                self._news.append(
-                    {
-                        "type": "curve", "name": "Return", "append": self._episode > 1,
-                        "points": [[self._episode, self._return]],
-                    }
-                )  # fmt: skip
+                point = [self._episode, self._return]
+                curve = {"type": "curve", "name": "Return", "points": [point]}
+                self._news.append(curve | {"append": self._episode > 1})
                 self._begin(None)
                 self._news.append(self.describe())
                 return
 
     def frame(self) -> WorldView:
-        """Return what is seen now."""
+        """Return the present frame."""
         x, s = (part[None] for part in self._inner.particles())
         physics = self._inner.worlds.physics
         count = x.shape[1]
-        seen = Seen(
+        coloured = ColouredWorld(
             x, s, self._own_colours, physics.eps, physics.box, [count], count, self._travelled, None
         )
+        colours = self._colouring(self.show, coloured)
         loss = self._info.get("loss") if self._loss_wanted else None
-        return WorldView(
-            self.step,
-            x[0].cpu().numpy(),
-            self._colouring(self.show, seen),
-            self._milliseconds,
-            None if loss is None else float(loss),
-        )
+        loss = None if loss is None else float(loss)
+        return WorldView(self.step, x[0].cpu().numpy(), colours, self._milliseconds, loss)
 
     def _own_colours(self, s: Tensor) -> Tensor:
         goal = getattr(self._inner.task, "goal", None)

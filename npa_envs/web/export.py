@@ -1,4 +1,4 @@
-"""Pages that run rules by themselves: one HTML file with weights, engine and brushes, no server."""
+"""HTML files that run rules in a browser without a server."""
 
 from __future__ import annotations
 
@@ -28,29 +28,23 @@ from npa_envs.web.rule_world import RuleWorld, name_of
 PAGE = Path(__file__).resolve().parent / "page"
 """The folder of the page's own files."""
 
-PAGE_MODULES = ("exported.js",)
-"""Modules that the exported page begins with; they import the others."""
-
 STYLES = ("page.css", "exported.css")
 """Style sheets of the exported page."""
 
-WORKER_MODULE = "live_world.js"
-"""The module that the page's worker begins with."""
-
 PREVIEW_STEPS = 256
-"""Steps that a world has grown for its preview; half as many where no shape has to form."""
+"""Steps of a world before its preview; half as many for textures and clouds."""
 
 PREVIEW_PIXELS = 192
 """Pixels on each side of a preview."""
 
 MOST_WEIGHTS = 2**20
-"""Weights of a rule that a page takes: 5.6 MB of text, and far too slow for a browser already."""
+"""Most weights of a rule in a page: 5.6 MB of text, and very slow in a browser."""
 
 POLICY = (
     "default-src 'none'; script-src {scripts} 'wasm-unsafe-eval'; style-src {styles}; "
     "worker-src blob:; img-src data: blob:; media-src blob:; base-uri 'none'; form-action 'none'"
 )
-"""What the page may load: nothing but itself."""
+"""The page's content security policy: nothing is loaded."""
 
 _IMPORT = re.compile(r'^import \{ ([\w, ]+) \} from "\./(\w+\.js)";$', re.MULTILINE)
 _EXPORT = re.compile(r"^export (?=(?:async function|function|class|const) (\w+))", re.MULTILINE)
@@ -60,15 +54,11 @@ _MODULE_LINE = re.compile(r"^(?:import|export)\b.*$", re.MULTILINE)
 def joined_modules(names: Sequence[str], folder: Path = PAGE) -> str:
     """Return modules and all that they import as one script, each in a scope of its own.
 
-    Afterwards the exports of `page.js` are members of the constant `page`, and so on.
-
-    Args:
-        names: Files in the folder.
-        folder: Where they are.
+    The exports of `page.js` become members of the constant `page`, and so on.
 
     Raises:
-        ValueError: An import or an export is written in a way that is not read here, or modules
-            import each other in a circle.
+        ValueError: An import or an export has an unknown form, or modules import each other in a
+            circle.
     """
     order: list[str] = []
     texts: dict[str, str] = {}
@@ -112,8 +102,7 @@ def export_web(
 ) -> None:
     """Write one HTML file that runs rules in a browser, whole or not at all.
 
-    Nothing is loaded from anywhere: weights, engine and page are in the file, and its policy
-    forbids the browser any connection.
+    Weights, engine and page are in the file, and its policy forbids the browser any connection.
 
     Args:
         sources: Rules, each as `load_rule` takes it; the first one is shown first.
@@ -149,7 +138,7 @@ def export_web(
     words = [str(source) for source in sources]
     names = distinct_names(words, "a page")
     seed = checked_seed(seed)
-    # Where it cannot be written is told before previews are grown.
+    # The file is opened before previews are grown, which takes long.
     with atomic_path(path) as temporary:
         rules = [page_rule(source, particle_count=particle_count) for source in words]
         if previews:
@@ -160,11 +149,7 @@ def export_web(
 
 
 def distinct_names(sources: Sequence[str], what: str) -> list[str]:
-    """Return what rules are called by their sources, in one file.
-
-    Args:
-        sources: Each as `load_rule` takes it.
-        what: What errors call that file.
+    """Return the names of rules in one file, which errors call `what`.
 
     Raises:
         NPAError: There are none, or two have one name.
@@ -179,11 +164,7 @@ def distinct_names(sources: Sequence[str], what: str) -> list[str]:
 
 
 def page_rule(source: str, *, particle_count: int | None = None) -> dict[str, Any]:
-    """Return a rule as the page's engine reads it: numbers as float32 in base64, and its world.
-
-    Args:
-        source: As `load_rule` takes it.
-        particle_count: Particles N; None: as trained.
+    """Return a rule and its world as the page's engine reads them: numbers as float32 in base64.
 
     Raises:
         NPAError: It cannot be loaded, or a browser cannot run it.
@@ -204,7 +185,7 @@ def page_rule(source: str, *, particle_count: int | None = None) -> dict[str, An
             f"a page grows rules from a ball, a box or a point cloud, {shown(source)} begins with "
             f"a {type(task).__name__}: watch it with npa-envs view"
         )
-    # What the engine in the page says itself.
+    # Fields that the engine in the page adds itself.
     own = {"type", "rules", "rule", "others", "species", "show", "capabilities", "playing", "seed"}
     world = {name: value for name, value in live.describe().items() if name not in own}
     classes = {"palette": PALETTE, "undecided": UNDECIDED}
@@ -218,62 +199,36 @@ def page_rule(source: str, *, particle_count: int | None = None) -> dict[str, An
 
 
 def check_browser_rule(rule: NPARule, name: str) -> None:
-    """Check that the page's engine can run a rule.
-
-    Raises:
-        NPAError: It is equivariant, has codes or a network of its own, perceives species by
-            themselves, or is too large.
-    """
+    """Raise an `NPAError` if the page's engine cannot run a rule."""
     check_rule(rule)
-    if rule.equivariant:
-        raise NPAError(
-            f"a page runs rules that know directions only, {shown(name)} is equivariant: watch it "
-            "with npa-envs view"
-        )
-    if rule.code_dim:
-        raise NPAError(
-            f"a page runs rules without codes only, {shown(name)} has code_dim={rule.code_dim}: "
-            "watch it with npa-envs view"
-        )
-    if rule.divides:
-        raise NPAError(
-            f"a page runs rules whose particles stay as many as they are only, {shown(name)} "
-            "divides: watch it with npa-envs view"
-        )
-    if not rule.is_plain():
-        raise NPAError(
-            f"a page runs rules of two plain layers only, {shown(name)} is a "
-            f"{type(rule).__name__} with a network of its own: run it in Python"
-        )
-    if rule.species_count:
-        raise NPAError(
-            f"a page runs rules that perceive all species alike, {shown(name)} has species_count="
-            f"{rule.species_count}: run it with npa_envs.rollout_species"
-        )
-    if rule.weight_count > MOST_WEIGHTS:
-        raise NPAError(
-            f"a page takes rules of at most {MOST_WEIGHTS} weights, {shown(name)} has "
-            f"{rule.weight_count}: watch it with npa-envs view"
-        )
+    view = "watch it with npa-envs view"
+    kind, species, size = type(rule).__name__, rule.species_count, rule.weight_count
+    for fails, rule_of_page, given, cure in (
+        (rule.equivariant, "that know directions only", "is equivariant", view),
+        (rule.code_dim, "without codes only", f"has code_dim={rule.code_dim}", view),
+        (rule.divides, "with a fixed number of particles only", "divides", view),
+        (
+            not rule.is_plain(), "of two plain layers only",
+            f"is a {kind} with a network of its own", "run it in Python",
+        ),
+        (
+            species, "that perceive all species alike", f"has species_count={species}",
+            "run it with npa_envs.rollout_species",
+        ),
+        (size > MOST_WEIGHTS, f"of at most {MOST_WEIGHTS} weights", f"has {size}", view),
+    ):  # fmt: skip
+        if fails:
+            raise NPAError(f"a page runs rules {rule_of_page}, {shown(name)} {given}: {cure}")
 
 
 def one_of_each(task: PointClassification) -> list[Tensor]:
-    """Return a cloud of each class, the first one of the data, shape [N, 2]."""
+    """Return the first cloud of each class, shape [N, 2]."""
     label = task.clouds.label.tolist()
     return [task.clouds.x[label.index(kind)] for kind in sorted(set(label))]
 
 
 def preview(source: str, *, particle_count: int | None = None, seed: int = 0) -> str:
-    """Return a picture of a rule's grown world as a data address: WebP with transparency.
-
-    Args:
-        source: As `load_rule` takes it.
-        particle_count: Particles N; None: as trained.
-        seed: Randomness of the world.
-
-    Raises:
-        NPAError: The rule cannot be loaded.
-    """
+    """Return a picture of a rule's grown world as a data address: WebP with transparency."""
     live = RuleWorld(
         source, device=torch.device("cpu"), seed=seed, particle_count=particle_count, choices={}
     )
@@ -291,23 +246,17 @@ def preview(source: str, *, particle_count: int | None = None, seed: int = 0) ->
 
 
 def page_text(rules: Sequence[Mapping[str, Any]], *, title: str, seed: int = 0) -> str:
-    """Return the HTML of a page.
-
-    Args:
-        rules: As `page_rule` gives them; the first one is shown first.
-        title: Of the page.
-        seed: Randomness of the first world.
-    """
+    """Return the HTML of a page of rules, each as `page_rule` returns it."""
     settings = {
         "worker": "worker",
         "seed": seed,
         "ramp": base64.b64encode(colour_ramp().tobytes()).decode(),
         "rules": rules,
     }
-    # What could end the element that holds it is written otherwise.
+    # "<" would allow a rule's text to end the element that holds it.
     data = json.dumps(settings, separators=(",", ":")).replace("<", "\\u003c")
-    worker = f"{joined_modules([WORKER_MODULE])}\nlive_world.serve(self);\n"
-    code = f"{joined_modules(PAGE_MODULES)}\nexported.begin();\n"
+    worker = f"{joined_modules(['live_world.js'])}\nlive_world.serve(self);\n"
+    code = f"{joined_modules(['exported.js'])}\nexported.begin();\n"
     style = "\n".join((PAGE / name).read_text(encoding="utf-8") for name in STYLES)
     policy = POLICY.format(scripts=_digest(code), styles=_digest(style))
     page = (PAGE / "index.html").read_text(encoding="utf-8")

@@ -1,15 +1,14 @@
-"""What live worlds have in common: messages, frames, hands.
+"""Worlds that a page shows and changes while they run: messages, frames, brushes.
 
-A live world goes on while one watches and touches it: it takes messages, moves on and shows frames,
-and knows nothing of how these travel. The messages and what `describe` returns are listed at the
-head of `npa_envs/web/page/page.js`.
+The messages and what `describe` returns are listed at the head of `npa_envs/web/page/page.js`.
 """
 
 from __future__ import annotations
 
 import time
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -22,16 +21,16 @@ from npa_envs.tasks.damage import DAMAGE_SIZES
 from npa_envs.world.brushes import clump, cut, inject, push, state_around
 
 MOST_STEPS = 64
-"""Steps from frame to frame, at most."""
+"""Most steps from frame to frame."""
 
 LOSS_SHARE = 0.1
-"""Share of the time that losses take at most, while they are looked at."""
+"""Largest share of the time that losses take while their plot is open."""
 
 CLUMP_RATE = 0.25
-"""Share of its distance that a particle loses to the brush `clump` of strength 1 in one message."""
+"""Share of its distance by which the brush `clump` of strength 1 pulls a particle per message."""
 
 INJECT_RATE = 0.5
-"""Share of the way to a state that the brush `inject` of strength 1 goes in one message."""
+"""Share of the way to the new state that the brush `inject` of strength 1 goes per message."""
 
 FARTHEST = 1e4
 """Largest coordinate that a message may name [length units]."""
@@ -41,7 +40,7 @@ LARGEST_RADIUS = 10.0
 
 
 class WorldView(NamedTuple):
-    """What is seen of a world at a time."""
+    """A frame of a world."""
 
     step: int
     """Steps from the seed."""
@@ -50,42 +49,13 @@ class WorldView(NamedTuple):
     colours: NDArray[np.uint8]
     """Red, green and blue, shape [N, 3]."""
     milliseconds: float
-    """Time of one step, lately [ms]."""
+    """Mean time of the last steps [ms]."""
     loss: float | None
-    """How far the world is from its target, where that was computed."""
-
-
-class LiveWorld(Protocol):
-    """A world that goes on while one watches and touches it."""
-
-    playing: bool
-    """Whether it goes on by itself."""
-
-    def describe(self) -> dict[str, Any]:
-        """Return the event "world"."""
-
-    def handle(self, message: Mapping[str, Any]) -> bool:
-        """Do what a message says; return whether `describe` has changed.
-
-        Raises:
-            NPAError: The message says nothing that can be done; the world is as it was.
-        """
-
-    def advance(self) -> None:
-        """Go on to the next frame."""
-
-    def frame(self) -> WorldView:
-        """Return what is seen now."""
-
-    def news(self) -> list[dict[str, Any]]:
-        """Return other events since the last call: curves, errors, descriptions that changed."""
-
-    def close(self) -> None:
-        """Give back what the world holds."""
+    """The metric of the world's task, where it was computed."""
 
 
 class Range(NamedTuple):
-    """What a number may be."""
+    """The range of a number."""
 
     low: float
     high: float
@@ -93,15 +63,9 @@ class Range(NamedTuple):
     whole: bool = False
 
     def checked(self, name: str, value: Any) -> float:
-        """Return a number that lies in the range.
-
-        Raises:
-            NPAError: It does not, or is none.
-        """
-        if (
-            not (is_whole(value) if self.whole else is_real(value))
-            or not self.low <= value <= self.high
-        ):
+        """Return a number that lies in the range."""
+        valid = is_whole(value) if self.whole else is_real(value)
+        if not valid or not self.low <= value <= self.high:
             kind = "a whole number" if self.whole else "a number"
             raise NPAError(
                 f"{name} must be {kind} in [{self.low:g}, {self.high:g}], got {shown(value)}"
@@ -110,21 +74,22 @@ class Range(NamedTuple):
 
     def to_dict(self, value: float) -> dict[str, Any]:
         """Return the range and the present value as the page reads them."""
-        told: dict[str, Any] = {"value": value, "low": self.low, "high": self.high}
-        if self.scale is not None:
-            told["scale"] = self.scale
-        return told | ({"whole": True} if self.whole else {})
+        optional = {"scale": self.scale, "whole": self.whole}
+        given = {name: part for name, part in optional.items() if part}
+        return {"value": value, "low": self.low, "high": self.high} | given
 
 
 SPEED = Range(1, MOST_STEPS, "log", whole=True)
-"""Steps from frame to frame."""
 
 
-class Live:
-    """What live worlds have in common: playing, time, colours, and the way of a message."""
+class LiveWorld(ABC):
+    """A world that a page shows and changes while it runs."""
+
+    seed: int
 
     def __init__(self) -> None:
         self.playing = True
+        """Whether it runs by itself."""
         self.speed = 1
         self.show = "colours"
         self.step = 0
@@ -133,8 +98,23 @@ class Live:
         self._loss_due = 0.0
         self._news: list[dict[str, Any]] = []
 
+    def describe(self) -> dict[str, Any]:
+        """Return the event "world"."""
+        return {
+            "type": "world",
+            "shows": self._shows(),
+            "show": self.show,
+            "settings": self._settings(),
+            "playing": self.playing,
+            "seed": self.seed,
+        }
+
     def handle(self, message: Mapping[str, Any]) -> bool:
-        """Do what a message says; return whether `describe` has changed."""
+        """Apply a message; return whether `describe` has changed.
+
+        Raises:
+            NPAError: The message is not valid. The world is unchanged.
+        """
         kind = message.get("type") if isinstance(message, Mapping) else None
         match kind:
             case "play":
@@ -161,29 +141,36 @@ class Live:
         return False
 
     def advance(self) -> None:
-        """Go on to the next frame."""
+        """Run to the next frame."""
         self._timed(self.speed)
 
+    @abstractmethod
+    def frame(self) -> WorldView:
+        """Return the present frame."""
+
     def news(self) -> list[dict[str, Any]]:
-        """Return other events since the last call."""
-        told, self._news = self._news, []
-        return told
+        """Return other events since the last call: curves, errors, changed descriptions."""
+        events, self._news = self._news, []
+        return events
 
-    def close(self) -> None:
-        """Give back what the world holds: nothing."""
+    def close(self) -> None:  # noqa: B027
+        """Release what the world holds."""
 
+    @abstractmethod
     def reset(self, seed: int | None) -> None:
-        """Begin a fresh world, of the next seed where none is given."""
-        raise NotImplementedError
+        """Begin a fresh world; without a seed, of the next one."""
 
-    def _run(self, steps: int) -> None:
-        raise NotImplementedError
+    @abstractmethod
+    def _run(self, steps: int) -> None: ...
 
-    def _damage(self, name: str) -> None:
-        raise NotImplementedError
+    @abstractmethod
+    def _damage(self, name: str) -> None: ...
 
-    def _brush(self, message: Mapping[str, Any]) -> bool:
-        raise NotImplementedError
+    @abstractmethod
+    def _brush(self, message: Mapping[str, Any]) -> bool: ...
+
+    @abstractmethod
+    def _shows(self) -> list[str]: ...
 
     def _set(self, name: str, value: Any) -> bool:
         match name:
@@ -202,9 +189,6 @@ class Live:
     def _settings(self) -> dict[str, Any]:
         return {"speed": SPEED.to_dict(self.speed)}
 
-    def _shows(self) -> list[str]:
-        raise NotImplementedError
-
     def _timed(self, steps: int) -> None:
         start = time.perf_counter()
         self._run(steps)
@@ -213,62 +197,55 @@ class Live:
         self._milliseconds += (0.2 if self._milliseconds else 1.0) * (each - self._milliseconds)
 
     def _loss(self, compute: Callable[[], float]) -> float | None:
-        """Return a loss where it is wanted and may take the time again."""
+        """Return the loss while its plot is open, at most as often as `LOSS_SHARE` allows."""
         start = time.perf_counter()
         if not self._loss_wanted or start < self._loss_due:
             return None
         loss = compute()
-        taken = time.perf_counter() - start
-        self._loss_due = start + taken / LOSS_SHARE
+        self._loss_due = start + (time.perf_counter() - start) / LOSS_SHARE
         return loss
 
 
 class Touch(NamedTuple):
-    """What a hand does at a place."""
+    """A brush at a place."""
 
     tool: str
     at: Tensor
     """Where [length units], shape [1, D]."""
     move: Tensor
-    """How it moves [length units], shape [1, D]."""
+    """Its movement [length units], shape [1, D]."""
     radius: float
     """Radius of the brush [length units]."""
     strength: float
     """From 0 to 1, dimensionless."""
     source: Tensor
-    """Where the brush `inject` takes the state from [length units], shape [1, D]."""
+    """Place whose state the brush `inject` spreads [length units], shape [1, D]."""
     view: Tensor | None
-    """In 3D the unit vector towards the viewer, shape [1, D], where it is known."""
+    """In 3D the unit vector towards the viewer, shape [1, D], or None."""
 
     @classmethod
     def read(cls, message: Mapping[str, Any], x: Tensor) -> Touch:
-        """Return what a message says, for a world at x [1, N, D].
-
-        Raises:
-            NPAError: A tool or a number is missing or wrong.
-        """
+        """Return the brush of a message, for a world at x [1, N, D]."""
         tool = message.get("tool")
         tools = ("remove", "push", "clump", "cut", "inject", "graft", "add")
         if tool not in tools:
             raise NPAError(f"unknown tool {shown(tool)}: {suggest(tool, tools)}")
-        at = _checked_vector("at", message.get("at"), x)
-        move = _checked_vector("move", message.get("move", [0.0] * x.shape[2]), x)
-        radius = Range(1e-4, LARGEST_RADIUS).checked("radius", message.get("radius"))
-        strength = Range(0.0, 1.0).checked("strength", message.get("strength", 1.0))
-        source = _checked_vector("source", message.get("source", message.get("at")), x)
-        view = message.get("view")
-        toward = None if view is None else _checked_vector("view", view, x)
-        return cls(str(tool), at, move, radius, strength, source, toward)
+        at, view = message.get("at"), message.get("view")
+        return cls(
+            str(tool),
+            _checked_vector("at", at, x),
+            _checked_vector("move", message.get("move", [0.0] * x.shape[2]), x),
+            Range(1e-4, LARGEST_RADIUS).checked("radius", message.get("radius")),
+            Range(0.0, 1.0).checked("strength", message.get("strength", 1.0)),
+            _checked_vector("source", message.get("source", at), x),
+            None if view is None else _checked_vector("view", view, x),
+        )
 
 
 def brushed(
     x: Tensor, s: Tensor, touch: Touch, box: tuple[float, ...] | None
 ) -> tuple[Tensor, Tensor]:
-    """Return worlds after a brush that keeps all particles: push, clump, cut or inject.
-
-    Raises:
-        NPAError: It is another brush.
-    """
+    """Return worlds after a brush that keeps all particles: push, clump, cut or inject."""
     match touch.tool:
         case "push":
             moved = push(
@@ -286,10 +263,10 @@ def brushed(
                 gap=touch.radius, box=box,
             )  # fmt: skip
         case "inject":
-            told: dict[str, Any] = {"radius": touch.radius, "box": box}
-            state, holds = state_around(x, s, centre=touch.source, **told)
+            disk: dict[str, Any] = {"radius": touch.radius, "box": box}
+            state, holds = state_around(x, s, centre=touch.source, **disk)
             strength = INJECT_RATE * touch.strength * holds.to(x.dtype)
-            return x, inject(x, s, centre=touch.at, state=state, strength=strength, **told)
+            return x, inject(x, s, centre=touch.at, state=state, strength=strength, **disk)
     raise NPAError(
         f"this world keeps its particles, so that the brush {shown(touch.tool)} does nothing: take "
         "push, clump, cut or inject"
@@ -297,7 +274,7 @@ def brushed(
 
 
 def across(move: Tensor, view: Tensor | None) -> Tensor:
-    """Return the direction across a cut along `move` [1, D], seen from `view` in 3D, [1, D]."""
+    """Return the normal of a cut along `move` [1, D]; in 3D the cut contains `view`."""
     if move.shape[1] == 2:
         return torch.stack((-move[:, 1], move[:, 0]), dim=1)
     toward = move.new_tensor([[0.0, 0.0, 1.0]]) if view is None else view
@@ -306,22 +283,14 @@ def across(move: Tensor, view: Tensor | None) -> Tensor:
 
 
 def checked_flag(name: str, value: Any) -> bool:
-    """Return a flag of a message.
-
-    Raises:
-        NPAError: It is none.
-    """
+    """Return a flag of a message."""
     if not isinstance(value, bool):
         raise NPAError(f"{name} must be true or false, got {shown(value)}")
     return value
 
 
 def checked_seed(value: Any) -> int:
-    """Return a world's number.
-
-    Raises:
-        NPAError: It is none.
-    """
+    """Return a valid seed."""
     return int(Range(0, 2**53, whole=True).checked("seed", value))
 
 

@@ -1,4 +1,4 @@
-"""Live worlds of rules: a rule with whatever grafts and seeds bring in, and the rule of a run."""
+"""Live worlds of rules, and of the newest rules of a training run."""
 
 from __future__ import annotations
 
@@ -30,48 +30,46 @@ from npa_envs.training.overrides import load_config
 from npa_envs.training.presets import preset
 from npa_envs.training.run_folder import LARGEST_LOG, RunFolder
 from npa_envs.training.trained_tasks import TrainedTask, task_of_rule, trained_config
-from npa_envs.web.colouring import Colouring, Seen, shows_of
-from npa_envs.web.live import Live, Range, Touch, WorldView, brushed, checked_seed
+from npa_envs.web.colouring import ColouredWorld, Colouring, shows_of
+from npa_envs.web.live import LiveWorld, Range, Touch, WorldView, brushed, checked_seed
 from npa_envs.world.brushes import inside_ball, removed, wipe_state
 from npa_envs.world.division import living
 from npa_envs.world.rollout import at_rest, rollout
 from npa_envs.world.species import AGREEMENTS, rollout_species
 
 MOST_PARTICLES = {"cpu": 16384, "cuda": 131072}
-"""Largest number of particles that the slider offers, on each kind of device."""
+"""Most particles of a world, by the kind of device."""
 
 SEED_SHARE = 0.5
-"""Particles that the brush `add` of strength 1 adds, as a share of those of a fresh world."""
+"""Particles that the brush `add` of strength 1 adds, over those of a fresh world."""
 
 SMALL_VIEWS = {"resolution": 64, "training_views": 1, "held_out_views": 6}
-"""What the loss of a 3D world looks at: as trained, drawing the target alone takes many seconds."""
+"""Smaller views for the loss of 3D worlds, whose targets take many seconds to draw."""
 
 MOST_TASKS = 8
-"""Tasks that are kept, with their targets: a slider of N asks for many."""
+"""Tasks that are cached, with their targets: the slider of N makes many."""
 
 REST_LOOK = 64
-"""Steps from one question whether the world is at rest to the next."""
+"""Steps between two checks whether the world is at rest."""
 
 POLL_SECONDS = 1.0
-"""Time between two looks into the folder of a run [s]."""
+"""Time between two looks at the files of a run [s]."""
 
 
 class LiveRule(NamedTuple):
-    """A rule by its name."""
+    """A float32 rule with its name."""
 
     name: str
-    """What the page calls it."""
     rule: NPARule
-    """The rule, float32, on the world's device."""
 
 
-class RuleWorld(Live):
-    """A world of one rule, or of several that grafts and seeds have brought into it.
+class RuleWorld(LiveWorld):
+    """A world of one rule, and of others that the brushes graft and add bring in.
 
     Args:
         source: The rule: a shipped one or a file.
-        device: Where the world lives.
-        seed: The first world's number.
+        device: The world's device.
+        seed: The seed of the first world.
         particle_count: Particles N; None: as trained.
         choices: Other rules that may be chosen, by their names; None: the shipped ones.
 
@@ -98,9 +96,7 @@ class RuleWorld(Live):
         self._choices = others | {name: source}
         self._plant(name, particle_count)
 
-    # Which rule, and a fresh world of it.
-
-    def _organism(self, name: Any) -> LiveRule:
+    def _live_rule(self, name: Any) -> LiveRule:
         if not isinstance(name, str) or name not in self._choices:
             raise NPAError(f"unknown rule {shown(name)}: {suggest(name, self._choices)}")
         if name not in self._rules:
@@ -108,25 +104,25 @@ class RuleWorld(Live):
             self._rules[name] = rule.requires_grad_(False)
         return LiveRule(name, self._rules[name])
 
-    def _task_of(self, organism: LiveRule, particle_count: int | None) -> TrainedTask:
-        key = (organism.name, particle_count)
+    def _task_of(self, live_rule: LiveRule, particle_count: int | None) -> TrainedTask:
+        key = (live_rule.name, particle_count)
         if key not in self._trained:
             if len(self._trained) >= MOST_TASKS:
                 self._trained.clear()
             self._trained[key] = task_of_rule(
-                self._choices[organism.name],
-                organism.rule,
+                self._choices[live_rule.name],
+                live_rule.rule,
                 self._device,
                 particle_count=particle_count,
-                **(SMALL_VIEWS if organism.rule.space_dim == 3 else {}),
+                **(SMALL_VIEWS if live_rule.rule.space_dim == 3 else {}),
             )
         return self._trained[key]
 
     def _plant(self, name: Any, particle_count: int | None = None) -> None:
-        """Begin a fresh world of a rule, in the world that it was trained in."""
-        organism = self._organism(name)
-        self.trained = self._task_of(organism, particle_count)
-        self.main = organism
+        """Begin a fresh world of a rule with the task that it was trained on."""
+        live_rule = self._live_rule(name)
+        self.trained = self._task_of(live_rule, particle_count)
+        self.main = live_rule
         self.eps, self.update_prob, self.noise = self.task.eps, self.task.update_prob, 0.0
         self.speed = 1
         if self.show not in self._shows():
@@ -142,16 +138,16 @@ class RuleWorld(Live):
             1, generator=self._generator, device=self._device
         )
         self.full = self.x.shape[1]
-        self.organisms, self.counts = [self.main], [self.full]
+        self.live_rules, self.counts = [self.main], [self.full]
         self._divisors = [float(self.full)]
         self._colouring = Colouring()
         self._travelled: Tensor | None = None
         self._updated: Tensor | None = None
         self.step, self._milliseconds, self._loss_due = 0, 0.0, 0.0
         self._still: tuple[Any, ...] = ()
-        """What was at rest, and under what."""
+        """The tensors, their versions, the rule and ε that were found to be at rest."""
         self._looked = 0
-        """When that was asked last [steps]."""
+        """Step of the last check for rest."""
 
     @property
     def task(self) -> Task:
@@ -167,18 +163,14 @@ class RuleWorld(Live):
         """Return the event "world"."""
         task, box = self.task, self.task.box
         centre, half_width = list(task.frame.centre), task.frame.half_width
-        alike = [name for name in self._choices if self._may_join(name)]
-        tools = ["remove", "push", "clump", "cut", "inject", "graft", "add"]
-        if self.main.rule.static:
-            tools.remove("add")
-        if self.main.rule.divides:
-            # A rule that divides lives alone, and fills its world by itself. What the dead have in
-            # their slots is no state to be carried anywhere.
-            tools = [tool for tool in tools if tool not in ("inject", "graft", "add")]
-        return {
-            "type": "world",
-            "title": self._title(),
-            "note": self._note(),
+        tools = ["remove", "push", "clump", "cut"]
+        # A rule that divides lives alone and fills its world; its dead particles have no state.
+        if not self.main.rule.divides:
+            tools += ["inject", "graft"] if self.main.rule.static else ["inject", "graft", "add"]
+        capabilities = ["step", "reset", "film"]
+        return super().describe() | {
+            "title": self.main.name,
+            "note": "",
             "dimension": self.dimension,
             "box": None if box is None else list(box),
             "half_width": half_width,
@@ -186,36 +178,25 @@ class RuleWorld(Live):
             "spot": self._spot(),
             "rules": sorted(self._choices),
             "rule": self.main.name,
-            "others": alike,
-            "species": [organism.name for organism in self.organisms],
-            "shows": self._shows(),
-            "show": self.show,
+            "others": [name for name in self._choices if self._may_join(name)],
+            "species": [live_rule.name for live_rule in self.live_rules],
             "tools": tools,
             "damages": list(DAMAGE_SIZES),
-            "settings": self._settings(),
-            "capabilities": ["step", "reset", "film", *self._loss_offered()],
-            "playing": self.playing,
-            "seed": self.seed,
+            "capabilities": [*capabilities, "loss"] if self._has_loss() else capabilities,
         }
 
-    def _title(self) -> str:
-        return self.main.name
-
-    def _note(self) -> str:
-        return ""
-
-    def _loss_offered(self) -> list[str]:
-        return ["loss"] if self.trained.doubt is None else []
+    def _has_loss(self) -> bool:
+        return self.trained.doubt is None
 
     def _may_join(self, name: str) -> bool:
         """Return whether particles of another rule can live in this world."""
+        own = self.main.rule
         try:
-            other = self._organism(name).rule
+            other = self._live_rule(name).rule
         except NPAError:
             return False
-        if other.divides or self.main.rule.divides:
-            return False
-        return all(getattr(other, what) == getattr(self.main.rule, what) for what in AGREEMENTS)
+        alike = all(getattr(other, field) == getattr(own, field) for field in AGREEMENTS)
+        return alike and not (other.divides or own.divides)
 
     def _spot(self) -> float:
         """Return the standard deviation of a particle's spot [length units]."""
@@ -224,11 +205,9 @@ class RuleWorld(Live):
         spacing = (0.1 / self.full) ** (1.0 / 3.0) if size is None else float(size)
         return 0.7 * spacing
 
-    # Settings.
-
     def _ranges(self) -> dict[str, Range]:
         eps0, box = self.main.rule.eps0, self.task.box
-        # Cells of a periodic box are as wide as the radius, and two of them must fit.
+        # A periodic box holds at least two cells of width ε.
         most = 2.5 * eps0 if box is None else min(2.5 * eps0, 0.499 * min(box))
         return {
             "eps": Range(0.4 * eps0, most, "log"),
@@ -245,8 +224,8 @@ class RuleWorld(Live):
         }  # fmt: skip
         if self.task.classifies:
             del values["count"]
-        told = {name: ranges[name].to_dict(value) for name, value in values.items()}
-        return super()._settings() | told
+        own = {name: ranges[name].to_dict(value) for name, value in values.items()}
+        return super()._settings() | own
 
     def _shows(self) -> list[str]:
         return shows_of(self.main.rule.state_dim)
@@ -266,8 +245,6 @@ class RuleWorld(Live):
             setattr(self, name, number)
         return True
 
-    # Time.
-
     @torch.no_grad()
     def _run(self, steps: int) -> None:
         self.step += steps
@@ -276,23 +253,24 @@ class RuleWorld(Live):
         watched = self.show in ("mask", "speed")
         if not watched and self._rests():
             return
-        told: dict[str, Any] = {
+        options: dict[str, Any] = {
             "eps": self.eps, "box": self.task.box, "update_prob": self.update_prob,
             "position_noise": self.noise, "generator": self._generator,
         }  # fmt: skip
         if watched and steps > 1:
-            # Shown is the last step alone.
-            self._go(steps - 1, told)
+            # Masks and speeds are those of the last step alone.
+            self._go(steps - 1, options)
         before = self.s
-        travelled = self._go(1 if watched else steps, told, path=watched)
-        if travelled is not None:
-            reach = max(organism.rule.alpha for organism in self.organisms) * self.eps
-            self._travelled, self._updated = travelled / reach, (self.s != before).any(dim=-1)
+        path_length = self._go(1 if watched else steps, options)
+        if watched:
+            longest = max(live_rule.rule.alpha for live_rule in self.live_rules) * self.eps
+            self._travelled = path_length / longest
+            self._updated = (self.s != before).any(dim=-1)
         if self._device.type == "cuda":
             torch.cuda.synchronize(self._device)
 
     def _rests(self) -> bool:
-        """Return whether the rule's own world is at rest, which is asked now and then."""
+        """Return whether a world of one rule is at rest, checked every `REST_LOOK` steps."""
         rule = self.main.rule
         if not rule.dead_zone or rule.divides or self.noise > 0.0 or not self._is_as_planted():
             return False
@@ -305,7 +283,7 @@ class RuleWorld(Live):
         self._looked = self.step
         rests = bool(at_rest(rule, *worlds, eps=self.eps, box=self.task.box))
         if rests:
-            # The worlds are kept, so that nothing else gets their ids.
+            # The tensors are kept, so that no others get their ids.
             self._still = (*worlds, *now)
         return rests
 
@@ -313,23 +291,24 @@ class RuleWorld(Live):
         """Return whether the particles are those of a fresh world of one rule."""
         return self.counts == [self.full] and self._divisors == [float(self.full)]
 
-    def _go(self, steps: int, told: Mapping[str, Any], *, path: bool = False) -> Tensor | None:
-        rules = [organism.rule for organism in self.organisms]
+    def _go(self, steps: int, options: Mapping[str, Any]) -> Tensor:
+        """Run steps and return the path length of each particle."""
+        rules = [live_rule.rule for live_rule in self.live_rules]
         if self._is_as_planted():
-            self.x, self.s, travelled = rollout(
-                rules[0], self.x, self.s, steps, return_path_length=True, **told
+            self.x, self.s, path_length = rollout(
+                rules[0], self.x, self.s, steps, return_path_length=True, **options
             )
         else:
-            # Densities are divided by the particles of a fresh world: what a hand takes away or
-            # adds is then felt nearby, and nowhere else.
-            self.x, self.s, travelled = rollout_species(
+            # Densities are divided by the particles of a fresh world, so that particles that a
+            # brush adds or removes change densities in their neighbourhood only.
+            self.x, self.s, path_length = rollout_species(
                 rules, self.x, self.s, steps, counts=self.counts, return_path_length=True,
-                density_counts=self._divisors, **told,
+                density_counts=self._divisors, **options,
             )  # fmt: skip
-        return travelled if path else None
+        return path_length
 
     def frame(self) -> WorldView:
-        """Return what is seen now."""
+        """Return the present frame."""
         x, s, travelled, updated = self.x, self.s, self._travelled, self._updated
         counts = self.counts
         if self.main.rule.divides:
@@ -337,13 +316,13 @@ class RuleWorld(Live):
             x, s, counts = x[:, alive], s[:, alive], [int(alive.sum())]
             travelled = None if travelled is None else travelled[:, alive]
             updated = None if updated is None else updated[:, alive]
-        seen = Seen(
+        coloured = ColouredWorld(
             x, s, self._own_colours, self.eps, self.task.box, counts, self.full, travelled, updated
         )
         with torch.no_grad():
-            colours = self._colouring(self.show, seen)
+            colours = self._colouring(self.show, coloured)
         positions: NDArray[np.float32] = x[0].cpu().numpy()
-        alone = len(self.organisms) == 1 and positions.size and self._loss_offered()
+        alone = len(self.live_rules) == 1 and positions.size and self._has_loss()
         loss = self._loss(self._metric) if alone else None
         return WorldView(self.step, positions, colours, self._milliseconds, loss)
 
@@ -352,14 +331,12 @@ class RuleWorld(Live):
             return self.task.colours(s)
         if self.main.rule.divides:
             return self.main.rule.colour(s)
-        parts = zip(self.organisms, s.split_with_sizes(self.counts, dim=1), strict=True)
-        return torch.cat([organism.rule.colour(part) for organism, part in parts], dim=1)
+        parts = zip(self.live_rules, s.split_with_sizes(self.counts, dim=1), strict=True)
+        return torch.cat([live_rule.rule.colour(part) for live_rule, part in parts], dim=1)
 
     @torch.no_grad()
     def _metric(self) -> float:
         return float(self.task.toward(self._goal).metric(self.x, self.s))
-
-    # Hands.
 
     @torch.no_grad()
     def _damage(self, name: str) -> None:
@@ -370,7 +347,7 @@ class RuleWorld(Live):
     @torch.no_grad()
     def _brush(self, message: Mapping[str, Any]) -> bool:
         touch = Touch.read(message, self.x)
-        before = [organism.name for organism in self.organisms]
+        before = [live_rule.name for live_rule in self.live_rules]
         match touch.tool:
             case "remove" if self.main.rule.divides:
                 self.s = wipe_state(self.x, self.s, centre=touch.at, radius=touch.radius)
@@ -383,16 +360,16 @@ class RuleWorld(Live):
                 self._add(touch, self._joining(message.get("rule")))
             case _:
                 self.x, self.s = brushed(self.x, self.s, touch, self.task.box)
-        return before != [organism.name for organism in self.organisms]
+        return before != [live_rule.name for live_rule in self.live_rules]
 
-    def _graft(self, touch: Touch, organism: LiveRule) -> None:
+    def _graft(self, touch: Touch, live_rule: LiveRule) -> None:
         inside = inside_ball(self.x, centre=touch.at, radius=touch.radius, box=self.task.box)
-        # Among its hosts it sees densities as they do.
-        number = self._number(organism, float(self.full))
-        s = torch.where(inside[..., None], self._coded(organism, self.s), self.s)
+        # Grafted particles divide densities by the same number as those around them.
+        number = self._number(live_rule, float(self.full))
+        s = torch.where(inside[..., None], self._coded(live_rule, self.s), self.s)
         self._arrange(self.x, s, torch.where(inside[0], number, self._species()))
 
-    def _add(self, touch: Touch, organism: LiveRule) -> None:
+    def _add(self, touch: Touch, live_rule: LiveRule) -> None:
         count = max(16, round(touch.strength * SEED_SHARE * self.full))
         room = MOST_PARTICLES[self._device.type] - self.x.shape[1]
         if count > room:
@@ -401,43 +378,43 @@ class RuleWorld(Live):
             1, count, self.dimension, touch.radius, generator=self._generator,
             device=self._device, dtype=self.x.dtype,
         )  # fmt: skip
-        # As if it grew alone: what is new divides densities by its own number.
-        number = self._number(organism, float(count))
+        # A new species divides densities by its own number of particles, as if it grew alone.
+        number = self._number(live_rule, float(count))
         x = torch.cat((self.x, ball + touch.at[:, None]), dim=1)
-        fresh = self._coded(organism, self.s.new_zeros(1, count, self.s.shape[2]))
+        fresh = self._coded(live_rule, self.s.new_zeros(1, count, self.s.shape[2]))
         s = torch.cat((self.s, fresh), dim=1)
         self._arrange(x, s, torch.nn.functional.pad(self._species(), (0, count), value=number))
 
     def _all_coded(self, s: Tensor) -> Tensor:
         """Return states of all particles, each with the code of its species."""
-        parts = zip(self.organisms, s.split_with_sizes(self.counts, dim=1), strict=True)
-        return torch.cat([self._coded(organism, part) for organism, part in parts], dim=1)
+        parts = zip(self.live_rules, s.split_with_sizes(self.counts, dim=1), strict=True)
+        return torch.cat([self._coded(live_rule, part) for live_rule, part in parts], dim=1)
 
-    def _coded(self, organism: LiveRule, s: Tensor) -> Tensor:
-        """Return states of a species with the code that its rule gives them, where it has such."""
-        if organism.rule.codes is None:
+    def _coded(self, live_rule: LiveRule, s: Tensor) -> Tensor:
+        """Return states of a species with its rule's code, if the rule has codes."""
+        if live_rule.rule.codes is None:
             return s
-        own = organism.name == self.main.name
-        return (self.task if own else self._task_of(organism, None).task).coded(s)
+        own = live_rule.name == self.main.name
+        return (self.task if own else self._task_of(live_rule, None).task).coded(s)
 
     def _joining(self, name: Any) -> LiveRule:
-        organism = self._organism(name)
-        if not self._may_join(organism.name):
+        live_rule = self._live_rule(name)
+        if not self._may_join(live_rule.name):
             raise NPAError(
-                f"{organism.name} cannot live in a world of {self.main.name}: rules of one world "
+                f"{live_rule.name} cannot live in a world of {self.main.name}: rules of one world "
                 f"must agree in {', '.join(AGREEMENTS)}, and not divide"
             )
-        return organism
+        return live_rule
 
-    def _number(self, organism: LiveRule, divisor: float) -> int:
-        """Return the number of a species, after giving a rule that is new here the next one."""
-        names = [own.name for own in self.organisms]
-        if organism.name not in names:
-            names.append(organism.name)
-            self.organisms.append(organism)
+    def _number(self, live_rule: LiveRule, divisor: float) -> int:
+        """Return the number of a rule's species; a rule new to the world gets the next number."""
+        names = [own.name for own in self.live_rules]
+        if live_rule.name not in names:
+            names.append(live_rule.name)
+            self.live_rules.append(live_rule)
             self.counts.append(0)
             self._divisors.append(divisor)
-        return names.index(organism.name)
+        return names.index(live_rule.name)
 
     def _species(self) -> Tensor:
         """Return the species of each particle, int64, shape [N]."""
@@ -445,21 +422,21 @@ class RuleWorld(Live):
         return numbers.repeat_interleave(torch.tensor(self.counts)).to(self._device)
 
     def _arrange(self, x: Tensor, s: Tensor, species: Tensor) -> None:
-        """Take particles in any order, and put them species after species."""
+        """Store particles, sorted by species."""
         order = species.argsort(stable=True)
         if not torch.equal(order, torch.arange(self.x.shape[1], device=order.device)):
-            # The page's tracers follow particles by their place.
+            # The page's tracers follow particles by their index.
             self._news.append({"type": "reordered"})
-        counts = torch.bincount(species, minlength=len(self.organisms)).tolist()
+        counts = torch.bincount(species, minlength=len(self.live_rules)).tolist()
         living = [k for k, count in enumerate(counts) if count] or [0]
         self.x, self.s = x[:, order], s[:, order]
-        self.organisms = [self.organisms[k] for k in living]
+        self.live_rules = [self.live_rules[k] for k in living]
         self._divisors = [self._divisors[k] for k in living]
         self.counts = [counts[k] for k in living]
 
 
 def name_of(source: str) -> str:
-    """Return what the page calls a rule: its file's name, or that of the run it belongs to."""
+    """Return the name of a rule's file, or of the run that the file belongs to."""
     if "#" in source:
         return source.rpartition("#")[2]
     path = rule_file(source)
@@ -467,11 +444,7 @@ def name_of(source: str) -> str:
 
 
 class FollowedLog:
-    """The log of a run that goes on: each call reads what has been added since the last one.
-
-    Args:
-        path: The file that the run's `JsonlLog` writes.
-    """
+    """The log of a run in progress, `path`, read record by record as it grows."""
 
     def __init__(self, path: Path) -> None:
         self._path = path
@@ -479,16 +452,10 @@ class FollowedLog:
         self._end = 0
         self._last_line = b""
         self.iteration = -1
-        """That of the last record; -1: there is none yet."""
+        """Iteration of the last record, or -1."""
 
     def news(self) -> tuple[list[dict[str, Any]], bool]:
-        """Return the records that are new, and whether the log begins anew with them.
-
-        Lines that are no records are left out: the run itself complains of them.
-
-        Raises:
-            NPAError: The file cannot be read.
-        """
+        """Return new records, and whether the log has begun anew. Broken lines are skipped."""
         try:
             now = self._path.stat()
         except FileNotFoundError:
@@ -500,11 +467,11 @@ class FollowedLog:
         with open_regular(self._path, limit=LARGEST_LOG, what="the log") as file:
             file.seek(self._end - len(self._last_line))
             if file.read(len(self._last_line)) != self._last_line:
-                # A resumed run has gone back to its checkpoint, or another one has begun here.
+                # The run was resumed from a checkpoint, or another one has begun in its folder.
                 self._forget()
                 file.seek(0)
             text = file.read(LARGEST_LOG)
-        # What stands behind the last end of a line is being written.
+        # The last line is complete once it ends with a newline.
         text = text[: text.rfind(b"\n") + 1]
         anew = self.iteration < 0
         records = []
@@ -523,13 +490,9 @@ class FollowedLog:
 
 
 class RunWorld(RuleWorld):
-    """The rules of a training run, as of its last checkpoint, in a world that lives on.
+    """A world of the rules of a training run, replaced by those of each new checkpoint.
 
-    Args:
-        folder: The run's folder.
-        device: Where the world lives.
-        seed: The first world's number.
-        particle_count: Particles N; None: as trained.
+    Args are those of `RuleWorld`, with the run's folder in place of a rule.
 
     Raises:
         NPAError: The folder holds no run, or one that has not written a rule yet.
@@ -568,43 +531,42 @@ class RunWorld(RuleWorld):
         super().reset(seed)
         if len(self._files) == 1:
             return
-        self.organisms = [self._organism(name) for name in self._files]
+        self.live_rules = [self._live_rule(name) for name in self._files]
         worlds = []
-        for organism, centre in zip(self.organisms, self._centres, strict=True):
-            task = self._task_of(organism, self._each).task
+        for live_rule, centre in zip(self.live_rules, self._centres, strict=True):
+            task = self._task_of(live_rule, self._each).task
             x, s, _ = task.seed(1, generator=self._generator, device=self._device)
             x[..., 0] += centre
             worlds.append((x, s))
         self.x, self.s = (torch.cat(parts, dim=1) for parts in zip(*worlds, strict=True))
         self.counts = [x.shape[1] for x, _ in worlds]
         self.full = sum(self.counts)
-        # As in training, each sees densities as it would alone.
+        # As in training, each species divides densities by its own number of particles.
         self._divisors = [float(count) for count in self.counts]
 
     def describe(self) -> dict[str, Any]:
-        """Return the event "world"; which rules there are is the run's matter."""
-        return super().describe() | {"rules": [], "rule": None}
+        """Return the event "world", without a choice of rules."""
+        return super().describe() | {
+            "title": self._run_folder.path.resolve().name,
+            "note": f"a training run, iteration {self._iteration}",
+            "rules": [],
+            "rule": None,
+        }
 
     def _settings(self) -> dict[str, Any]:
-        told = super()._settings()
+        settings = super()._settings()
         if len(self._files) > 1:
-            del told["count"]
-        return told
-
-    def _title(self) -> str:
-        return self._run_folder.path.resolve().name
-
-    def _note(self) -> str:
-        return f"a training run, iteration {self._iteration}"
+            del settings["count"]
+        return settings
 
     def news(self) -> list[dict[str, Any]]:
-        """Return the run's new losses, and the world where its rule has changed."""
+        """Return other events since the last call, with the run's new losses and rules."""
         if time.monotonic() >= self._due:
             self._due = time.monotonic() + POLL_SECONDS
             try:
                 self._poll()
             except NPAError as error:
-                # A file that is just being written is whole a moment later.
+                # A file that is being written can be read a moment later.
                 self._news.append({"type": "error", "message": str(error)})
         return super().news()
 
@@ -616,35 +578,27 @@ class RunWorld(RuleWorld):
         fresh, anew = self._log.news()
         if fresh:
             self._iteration = self._log.iteration
-            points = [
-                [record["iteration"], record["loss"]]
-                for record in fresh
-                if is_real(record.get("loss"))
-            ]
-            self._news.append(
-                {
-                    "type": "curve", "name": "Training loss", "points": points,
-                    "append": not anew,
-                }
-            )  # fmt: skip
+            points = [[r["iteration"], r["loss"]] for r in fresh if is_real(r.get("loss"))]
+            curve = {"type": "curve", "name": "Training loss", "points": points}
+            self._news.append(curve | {"append": not anew})
         written = self._stamp()
         fresher = written != self._written
         if fresher:
-            # Also where it cannot be read: that is told once.
+            # Set even if it cannot be read: the error is reported once.
             self._written = written
             self._take_rules()
         if fresh or fresher:
             self._news.append(self.describe())
 
     def _take_rules(self) -> None:
-        """Take the rules as they are now: the world goes on under them, if they fit."""
+        """Load the newest rules; the world continues with them if they have the same form."""
         self._still = ()
         fresh = {
             name: load_rule(path, device=self._device).float() for name, path in self._files.items()
         }
-        own = {name: self._organism(name).rule for name in fresh}
+        own = {name: self._live_rule(name).rule for name in fresh}
         goals = self._goal_choices()
-        # What follows from the rules as they were, such as the codes of their targets.
+        # Tasks hold the old rules' codes.
         self._trained.clear()
         if goals == self._goals and all(
             fresh[k].hyper_parameters() == own[k].hyper_parameters() for k in own
@@ -656,33 +610,33 @@ class RunWorld(RuleWorld):
             with torch.no_grad():
                 self.s = self._all_coded(self.s)
         else:
-            # Another run has begun in this folder.
+            # Another run has begun in the folder.
             self._rules.clear()
             self._plant(self.main.name, self._each)
             self._news.append({"type": "reordered"})
         self._goals = goals
 
     def _goal_choices(self) -> list[Any]:
-        """Return what the rules' files say that they are trained on."""
+        """Return the tasks of the rules' files, with their options."""
         found: list[Any] = []
         for path in self._files.values():
             metadata = rule_metadata(path)
-            held = trained_config(path, metadata).task if "config" in metadata else None
-            found.append((metadata.get("task"), held))
+            config = trained_config(path, metadata).task if "config" in metadata else None
+            found.append((metadata.get("task"), config))
         return found
 
 
 def joint_preset() -> TrainConfig[CoMorphogenesis2DConfig]:
-    """Return what the configuration of a run of several rules begins with."""
+    """Return the preset that the configuration of a run of several rules overrides."""
     config: TrainConfig[CoMorphogenesis2DConfig] = preset("fast", "co_morphogenesis2d")
     return config
 
 
 def rules_of_run(folder: RunFolder) -> list[Path]:
-    """Return the files of a run's rules: one, or those of the species that it trains together.
+    """Return the file of a run's rule, or those of the species that it trains together.
 
     Raises:
-        NPAError: There are none; the message says what is missing.
+        NPAError: There are none.
     """
     path = str(folder.path)
     if not folder.path.is_dir():

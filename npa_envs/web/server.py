@@ -1,8 +1,7 @@
 """A server for one page: files, a socket to a live world for each reader, films.
 
-It binds the loopback address unless told otherwise; bound elsewhere it asks for a token. Requests
-whose `Host` is another name than the server's are refused, so that no foreign page reaches it under
-a name of its own (DNS rebinding), and sockets that a page of another origin opens.
+It binds the loopback address by default; bound elsewhere it asks for a token. It refuses requests
+whose `Host` is another name than its own (DNS rebinding) and sockets of pages of another origin.
 """
 
 from __future__ import annotations
@@ -48,38 +47,38 @@ PAGE = Path(__file__).resolve().parent / "page"
 """The folder of the page's files."""
 
 PORT = 8765
-"""The first port that is tried."""
+"""First port that is tried."""
 
 PORTS_TRIED = 20
-"""How many ports are tried from there on, where none was asked for."""
+"""Number of ports from `PORT` on that are tried if the user names none."""
 
 MOST_SESSIONS = 4
-"""Readers at a time; each has a world of their own."""
+"""Most readers at a time; each has a world of their own."""
 
 FRAMES_AHEAD = 2
-"""Frames on the way to a page that has not drawn them yet, at most."""
+"""Most frames that a page has not drawn yet."""
 
 FRAME_SECONDS = 1.0 / 60.0
-"""Time from frame to frame, at least [s]."""
+"""Least time from frame to frame [s]."""
 
 LARGEST_MESSAGE = 2**20
-"""Bytes of what a page sends at once, at most."""
+"""Most bytes of a message."""
 
 MESSAGES_KEPT = 256
-"""Messages that wait for a world, or for a page, at most: more are refused until it reads them."""
+"""Most messages in a queue; more are refused."""
 
 MOST_PICTURES = 500
-"""Pictures of a film, 20 seconds, at most: each takes a megabyte while it is written."""
+"""Most pictures of a film, 20 seconds: each takes a megabyte while it is written."""
 
 FILM_RATE = 25.0
-"""Pictures a second of a film."""
+"""Pictures of a film per second."""
 
 LARGEST_PICTURE = 1024
-"""Pixels on each side of a film's pictures, at most."""
+"""Most pixels on each side of a film's pictures."""
 
 KIND = 1
 HEADER = struct.Struct("<IIIIff")
-"""Of a frame: kind, step, particles, dimension, milliseconds, loss (NaN: not computed)."""
+"""A frame's kind, step, particles, dimension, milliseconds, loss (NaN: not computed)."""
 
 SECURITY = {
     "Content-Security-Policy": "default-src 'self'; "
@@ -94,40 +93,37 @@ SECURITY = {
 
 @dataclass(frozen=True)
 class Site:
-    """What a server shows, where, and to whom."""
+    """The worlds, the address and the token of a server."""
 
     make_world: Callable[[], LiveWorld]
-    """Makes a world for each reader, in the thread that it then lives in."""
+    """Makes a reader's world, in the thread that runs it."""
     films: Path
-    """Folder that films are written to; created when one is."""
+    """Folder of films; created with the first one."""
     host: str = "127.0.0.1"
-    """The address that is bound."""
+    """The bound address."""
     token: str | None = None
-    """What readers must name; None: nothing."""
+    """The token that readers must give, or None."""
     one_at_a_time: bool = False
-    """Worlds take turns: on CUDA, work that one thread records must not meet another's."""
+    """Worlds take turns: on CUDA, one thread's work must not be recorded by another."""
     turn: threading.Lock = field(default_factory=threading.Lock)
-    """Held by the world whose turn it is."""
     open_sessions: list[ViewerSession] = field(default_factory=list)
-    """Readers that are here."""
 
     def alone(self) -> contextlib.AbstractContextManager[Any]:
-        """Return what a world works within."""
+        """Return the context in which a world takes its turn."""
         return self.turn if self.one_at_a_time else contextlib.nullcontext()
 
     def knows(self, host: str) -> bool:
         """Return whether a request's `Host` may name this server."""
         name = _host_name(host)
         if self.token is not None:
-            # Whoever knows the token has come from the link, by whatever name.
+            # The token is proof enough, under any name of this computer.
             return bool(name)
         return name == self.host or name in ("localhost", "127.0.0.1", "::1")
 
     def admits(self, token: str | None) -> bool:
         """Return whether a token is right, or none is asked for."""
-        if self.token is None:
-            return True
-        return token is not None and secrets.compare_digest(token.encode(), self.token.encode())
+        own = self.token
+        return own is None or secrets.compare_digest((token or "").encode(), own.encode())
 
 
 def make_site(
@@ -137,13 +133,13 @@ def make_site(
     host: str = "127.0.0.1",
     one_at_a_time: bool = False,
 ) -> Site:
-    """Return a site that asks for a token of its own unless it is bound to a loopback address."""
+    """Return a site; unless its address is a loopback address, it asks for a fresh token."""
     token = None if is_loopback(host) else secrets.token_urlsafe(24)
     return Site(make_world, films, host, token, one_at_a_time)
 
 
 def is_loopback(host: str) -> bool:
-    """Return whether an address is reached from this computer alone."""
+    """Return whether only this computer can reach an address."""
     if host == "localhost":
         return True
     try:
@@ -161,20 +157,14 @@ def make_app(site: Site) -> Starlette:
         return FileResponse(PAGE / "index.html", headers=SECURITY)
 
     async def part(request: Request) -> Response:
-        path = PAGE / request.path_params["name"]
-        # Of the folder itself: a name holds no slash, and may not lead out by dots.
-        if path.parent != PAGE or path.suffix not in (".js", ".css") or not _is_file(path):
-            return PlainTextResponse("no such file", 404, SECURITY)
-        kind = "text/javascript" if path.suffix == ".js" else "text/css"
-        return FileResponse(path, media_type=kind, headers=SECURITY)
+        name = request.path_params["name"]
+        return _file(PAGE, name, {".js": "text/javascript", ".css": "text/css"})
 
     async def film(request: Request) -> Response:
         if not site.admits(request.query_params.get("token")):
             return _refused("films need the token of the page")
-        path = site.films / request.path_params["name"]
-        if path.parent != site.films or path.suffix not in (".gif", ".mp4") or not _is_file(path):
-            return PlainTextResponse("no such film", 404, SECURITY)
-        return FileResponse(path, headers=SECURITY)
+        name = request.path_params["name"]
+        return _file(site.films, name, {".gif": "image/gif", ".mp4": "video/mp4"})
 
     async def meet(reader: WebSocket) -> None:
         host, origin = reader.headers.get("host", ""), reader.headers.get("origin")
@@ -206,7 +196,7 @@ def make_app(site: Site) -> Starlette:
 
 
 class HostCheck:
-    """Refuses requests that come under another name than the server's."""
+    """Refuses requests whose `Host` is not the server's."""
 
     def __init__(self, app: Any, site: Site) -> None:
         self._app, self._site = app, site
@@ -221,12 +211,13 @@ class HostCheck:
         await self._app(scope, receive, send)
 
 
-def _is_file(path: Path) -> bool:
-    """Return whether there is a file; a name that no file can have is that of none."""
-    try:
-        return path.is_file()
-    except (OSError, ValueError):
-        return False
+def _file(folder: Path, name: str, kinds: Mapping[str, str]) -> Response:
+    """Return a file of a folder, not of one above or below it, with the type of its suffix."""
+    path = folder / name
+    with contextlib.suppress(OSError, ValueError):  # A name that no file can have.
+        if path.parent == folder and path.suffix in kinds and path.is_file():
+            return FileResponse(path, media_type=kinds[path.suffix], headers=SECURITY)
+    return PlainTextResponse("no such file", 404, SECURITY)
 
 
 def _refused(reason: str) -> Response:
@@ -241,7 +232,7 @@ def _host_name(host: str) -> str:
 
 
 def frame_bytes(frame: WorldView) -> bytes:
-    """Return a frame as it is sent: header, positions, colours."""
+    """Return the bytes of a frame: header, positions, colours."""
     count, dimension = frame.positions.shape
     loss = float("nan") if frame.loss is None else frame.loss
     header = HEADER.pack(KIND, frame.step, count, dimension, frame.milliseconds, loss)
@@ -250,15 +241,9 @@ def frame_bytes(frame: WorldView) -> bytes:
 
 
 class ViewerSession:
-    """One reader and their world, which lives in a thread of its own.
+    """One reader's socket, and a thread with their world.
 
-    The world waits for the page: at most `FRAMES_AHEAD` frames are on the way, so that a page that
-    is slow, or hidden, is never behind what it does to the world.
-
-    Args:
-        site: What is shown.
-        reader: The reader's socket, accepted.
-        loop: The loop that sends.
+    The world waits for a page that is slow or hidden: at most `FRAMES_AHEAD` frames are on the way.
     """
 
     def __init__(self, site: Site, reader: WebSocket, loop: asyncio.AbstractEventLoop) -> None:
@@ -280,7 +265,7 @@ class ViewerSession:
             writing.cancel()
 
     def stop(self) -> None:
-        """Let the world end after what it is doing."""
+        """Let the world end after its present frame."""
         self._stopped.set()
         self._give_room()
         self._post(None)
@@ -316,7 +301,7 @@ class ViewerSession:
                 return
 
     def _give_room(self) -> None:
-        with contextlib.suppress(ValueError):  # A page that says more than it has drawn.
+        with contextlib.suppress(ValueError):  # A page reported more frames than it got.
             self._room.release()
 
     def _tell(self, event: Mapping[str, Any]) -> None:
@@ -327,11 +312,9 @@ class ViewerSession:
             self._loop.call_soon_threadsafe(self._put, data)
 
     def _put(self, data: bytes | str | None) -> None:
-        # A page that does not read is told no more; the end always.
+        # A page that does not read gets no more events; None ends the loop of `_write`.
         if data is None or self._outbox.qsize() < MESSAGES_KEPT:
             self._outbox.put_nowait(data)
-
-    # In the world's own thread.
 
     def _live(self) -> None:
         try:
@@ -343,7 +326,7 @@ class ViewerSession:
         try:
             self._go_on(world)
         except Exception as error:
-            # A mistake of ours, or a device that has failed: told here, and raised for the log.
+            # A bug or a failed device: shown in the page, and raised for the log.
             self._tell({"type": "error", "message": f"the world has ended: {shown(error)}"})
             raise
         finally:
@@ -362,7 +345,7 @@ class ViewerSession:
                 changed = True
             if not (world.playing or changed):
                 continue
-            # A page that is hidden draws nothing: its messages are answered meanwhile.
+            # A hidden page draws nothing; its messages are answered meanwhile.
             if not self._room.acquire(timeout=0.25):
                 continue
             pause = due - self._clock()
@@ -386,7 +369,7 @@ class ViewerSession:
         return self._loop.time()
 
     def _take(self, world: LiveWorld, *, wait: bool) -> bool:
-        """Do what messages say; return whether there were any."""
+        """Apply messages; return whether there were any."""
         taken = False
         while not self._stopped.is_set():
             try:
@@ -418,7 +401,7 @@ class ViewerSession:
 
     def _end_film(self) -> None:
         film, self._film = self._film, None
-        # The world goes on meanwhile.
+        # The world runs meanwhile.
         threading.Thread(target=self._write_film, args=(film,), daemon=True).start()
 
     def _write_film(self, film: PageFilm) -> None:
@@ -430,7 +413,7 @@ class ViewerSession:
             self._tell({"type": "error", "message": str(error)})
 
     def _add_picture(self, data: bytes) -> None:
-        # Pictures that were on the way when the film ended are left out.
+        # Pictures that come after the film's end are ignored.
         if self._film is not None:
             self._film.add(data)
             if self._film.is_full:
@@ -439,22 +422,18 @@ class ViewerSession:
 
 
 class PageFilm:
-    """Pictures that a page has drawn, as a film."""
+    """A film of pictures that a page has drawn."""
 
     def __init__(self) -> None:
         self._pictures: list[bytes] = []
 
     @property
     def is_full(self) -> bool:
-        """Whether it has as many pictures as it may have."""
+        """Whether it has `MOST_PICTURES`."""
         return len(self._pictures) >= MOST_PICTURES
 
     def add(self, data: bytes) -> None:
-        """Add a picture, a JPEG file.
-
-        Raises:
-            NPAError: It is no picture, or too large.
-        """
+        """Add a picture, a JPEG file."""
         try:
             with Image.open(io.BytesIO(data), formats=["JPEG"]) as picture:
                 size = picture.size
@@ -468,11 +447,7 @@ class PageFilm:
         self._pictures.append(data)
 
     def write(self, folder: Path) -> Iterator[Path]:
-        """Write the film as GIF and as MP4; each file is given as soon as it is there.
-
-        Raises:
-            NPAError: It has no pictures, one is damaged, or a file cannot be written.
-        """
+        """Write the film as GIF and as MP4; yield each file once it is written."""
         if not self._pictures:
             raise NPAError("the film has no pictures: let the world move while it records")
         try:
@@ -480,7 +455,7 @@ class PageFilm:
                 np.asarray(Image.open(io.BytesIO(data), formats=["JPEG"]).convert("RGB"))
                 for data in self._pictures
             ]
-            # Readers may stop their films in one second.
+            # Several readers may end their films within a second.
             name = f"{time.strftime('film-%Y%m%d-%H%M%S')}-{secrets.token_hex(3)}"
             with made_folder(folder):
                 # A GIF needs no ffmpeg.
@@ -495,28 +470,17 @@ class PageFilm:
 
 
 def _parsed(text: str) -> dict[str, Any] | str:
-    """Return a message's object, or what is wrong with it."""
-    try:
+    """Return a message's object, or an error."""
+    message = None
+    with contextlib.suppress(ValueError, RecursionError):
         message = json.loads(text)
-    except (ValueError, RecursionError):
-        return f"a message must be a JSON object, got {shown(text)}"
-    return (
-        message
-        if isinstance(message, dict)
-        else f"a message must be a JSON object, got {shown(text)}"
-    )
+    if isinstance(message, dict):
+        return message
+    return f"a message must be a JSON object, got {shown(text)}"
 
 
 def open_port(host: str, port: int | None) -> socket.socket:
-    """Return a socket that listens, on the port asked for, or on the first one that is free.
-
-    Args:
-        host: The address to bind.
-        port: The port; None: `PORT` or one of those after it.
-
-    Raises:
-        NPAError: The address is none of this computer, or the port is in use.
-    """
+    """Return a listening socket on a port, or for None on the first free one from `PORT` on."""
     if port is not None and not 0 <= port <= 65535:
         raise NPAError(f"port must be in [0, 65535], got {port}: leave it out for a free one")
     tried = [port] if port is not None else [*range(PORT, PORT + PORTS_TRIED), 0]
@@ -532,7 +496,7 @@ def open_port(host: str, port: int | None) -> socket.socket:
                 "127.0.0.1"
             ) from error
         try:
-            # The port of a server that has just ended may be taken at once, one that serves not.
+            # Allows the port of a server that has just ended, not of one that runs.
             listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
             listener.bind(address)
             listener.listen(128)
@@ -550,22 +514,20 @@ def open_port(host: str, port: int | None) -> socket.socket:
 def address_of(site: Site, listener: socket.socket) -> str:
     """Return the link that opens a site."""
     port = listener.getsockname()[1]
-    # Whoever binds all addresses opens the page on this computer first.
-    name = (
-        "127.0.0.1" if site.host in ("0.0.0.0", "") else "::1" if site.host == "::" else site.host
-    )
+    # The link of a server on all addresses opens the page on this computer.
+    name = {"0.0.0.0": "127.0.0.1", "": "127.0.0.1", "::": "::1"}.get(site.host, site.host)
     name = f"[{name}]" if ":" in name else name
     token = "" if site.token is None else f"?token={site.token}"
     return f"http://{name}:{port}/{token}"
 
 
 def make_server(site: Site) -> uvicorn.Server:
-    """Return what serves a site until its `should_exit` is set."""
+    """Return a server that runs until its `should_exit` is set."""
     config = uvicorn.Config(
         make_app(site),
         log_level="warning",
         ws_max_size=LARGEST_MESSAGE,
-        # Frames of random numbers hardly shrink, and packing them takes longer than sending.
+        # Frames hardly compress, and compressing takes longer than sending.
         ws_per_message_deflate=False,
         server_header=False,
         timeout_graceful_shutdown=2,
@@ -575,6 +537,6 @@ def make_server(site: Site) -> uvicorn.Server:
 
 def serve(site: Site, listener: socket.socket) -> None:
     """Serve a site until Ctrl-C."""
-    # The server ends its work in order and then raises it.
+    # The server stops in order and then raises it.
     with contextlib.suppress(KeyboardInterrupt):
         make_server(site).run(sockets=[listener])

@@ -207,7 +207,7 @@ def write_film(folder: Path) -> None:
     server = pytest.importorskip("npa_envs.web.server")
     picture = io.BytesIO()
     Image.new("RGB", (64, 64)).save(picture, "JPEG")
-    film = server.Film()
+    film = server.PageFilm()
     film.add(picture.getvalue())
     list(film.write(folder))
 

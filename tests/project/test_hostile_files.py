@@ -128,7 +128,7 @@ def test_postscript_that_is_called_a_picture_starts_nothing(tmp_path, monkeypatc
     ran = []
     monkeypatch.setattr(EpsImagePlugin, "Ghostscript", lambda *a, **k: ran.append(a))
     text = "%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 9 9\n%%EndComments\nshowpage\n%%EOF\n"
-    (tmp_path / "drawing.png").write_text(text)
+    (tmp_path / "drawing.png").write_text(text, encoding="utf-8")
     with pytest.raises(NPAError, match="its content is none of these"):
         open_image(tmp_path / "drawing.png")
     assert not ran
@@ -222,7 +222,7 @@ BAD_CONFIGS = {
 def test_configurations_that_are_bombs_are_refused_briefly(tmp_path, case):
     suffix, text = BAD_CONFIGS[case]
     path = tmp_path / f"config{suffix}"
-    path.write_text(text)
+    path.write_text(text, encoding="utf-8")
     with pytest.raises(NPAError) as caught:
         configure(path)
     assert len(str(caught.value)) < 2500
@@ -243,7 +243,7 @@ def write_scene(folder: Path, **changes: Any) -> None:
     frame = {"file_path": "./a", "transform_matrix": torch.eye(4).tolist()}
     scene = {"camera_angle_x": 0.7, "frames": [frame | changes.pop("frame", {})]} | changes
     for name in ("transforms_train.json", "transforms_test.json"):
-        (folder / name).write_text(json.dumps(scene))
+        (folder / name).write_text(json.dumps(scene), encoding="utf-8")
     Image.new("RGBA", (8, 8), (255, 0, 0, 255)).save(folder / "a.png")
 
 
@@ -291,7 +291,7 @@ def test_a_mesh_that_covers_no_pixel_gives_empty_views(tmp_path):
     pytest.importorskip("trimesh")
     far = [*TRIANGLE, [0.0, 1e-2, 0.0], [1e-2, 0.0, 0.0], [10.0, 10.0, 10.0]]
     (tmp_path / "mesh.obj").write_text(
-        "".join(f"v {x} {y} {z}\n" for x, y, z in far) + "f 1 4 5\nf 6 6 6\n"
+        "".join(f"v {x} {y} {z}\n" for x, y, z in far) + "f 1 4 5\nf 6 6 6\n", encoding="utf-8"
     )
     views = load_views(tmp_path / "mesh.obj", resolution=2, training_count=1, held_out_count=1)
     assert (views.training.pictures == 0.0).all()
@@ -308,7 +308,7 @@ def test_meshes_that_cannot_be_drawn_are_refused(tmp_path, case):
 
 def test_a_rule_of_deep_or_long_json_is_refused(tmp_path):
     for text in (100_000 * "[", '{"a": ' + 5000 * "9" + "}"):
-        (tmp_path / "models.json").write_text(text)
+        (tmp_path / "models.json").write_text(text, encoding="utf-8")
         with pytest.raises(NPAError, match="this is no JSON text"):
             load_rule(tmp_path / "models.json")
 
@@ -336,7 +336,11 @@ def test_a_kernel_cache_that_cannot_be_made_names_the_folder_and_the_cure(tmp_pa
     (tmp_path / "file").touch()
     environment = os.environ | {"WARP_CACHE_PATH": str(tmp_path / "file")}
     done = subprocess.run(
-        [sys.executable, "-c", USE_KERNELS], env=environment, capture_output=True, text=True
+        [sys.executable, "-c", USE_KERNELS],
+        env=environment,
+        capture_output=True,
+        text=True,
+        encoding="utf-8",
     )
     assert str(tmp_path / "file") in done.stdout, done.stderr
     assert "remove it" in done.stdout

@@ -68,7 +68,9 @@ PROGRAMS = {
 
 
 def run(program: str) -> str:
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
+    done = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, encoding="utf-8"
+    )
     assert done.returncode == 0, done.stderr
     assert done.stderr == ""
     return done.stdout
@@ -99,7 +101,7 @@ def test_wrappers_and_help_come_without_torch_whose_threads_wait_as_told(
         "print('stable_baselines3' in sys.modules)"
     )
     words = [sys.executable, "-c", program, *(["load"] if policy is None else [])]
-    done = subprocess.run(words, capture_output=True, text=True, env=os.environ)
+    done = subprocess.run(words, capture_output=True, text=True, env=os.environ, encoding="utf-8")
     assert done.stdout.endswith(f"\n[] {policy or 'passive'}\nFalse\n"), done.stdout + done.stderr
 
 
@@ -111,7 +113,9 @@ def test_folders_that_kernels_are_compiled_in_are_removed_without_a_warning() ->
         "folder = runtime.get_clang_pch_dir()\n"
         "print(folder)"
     )
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
+    done = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, encoding="utf-8"
+    )
     assert "ResourceWarning" not in done.stderr
     assert not Path(done.stdout.splitlines()[-1]).exists()
 
@@ -121,7 +125,9 @@ def test_warp_starts_without_a_word_about_a_missing_driver_and_keeps_all_others(
         "import os\nfrom npa_envs.runtime import start_warp, without_line\n"
         "with without_line(b'one'):\n    os.write(2, b'one\\ntwo\\n')\nstart_warp()"
     )
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
+    done = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, encoding="utf-8"
+    )
     assert done.stderr.splitlines()[0] == "two"
     assert "CUDA driver" not in done.stderr
 

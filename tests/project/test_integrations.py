@@ -29,7 +29,9 @@ def in_a_folder_of_its_own(tmp_path, monkeypatch):
 
 def program(mark: str) -> str:
     """Return the page's one program that holds a piece of text."""
-    blocks = re.findall(r"^```python\n(.*?)^```", PAGE.read_text(), re.MULTILINE | re.DOTALL)
+    blocks = re.findall(
+        r"^```python\n(.*?)^```", PAGE.read_text(encoding="utf-8"), re.MULTILINE | re.DOTALL
+    )
     (block,) = (block for block in blocks if mark in block)
     return block
 
@@ -48,7 +50,7 @@ def run(code: str, *, rounds: int = 60) -> dict:
 
 def told(library: str) -> float:
     """Return the return that the page prints of a library."""
-    (mean,) = re.findall(rf"^{library}: ([\d.]+) ± [\d.]+$", PAGE.read_text(), re.M)
+    (mean,) = re.findall(rf"^{library}: ([\d.]+) ± [\d.]+$", PAGE.read_text(encoding="utf-8"), re.M)
     return float(mean)
 
 

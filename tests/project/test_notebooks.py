@@ -24,7 +24,7 @@ LARGEST = 300_000
 
 def cells(name: str, kind: str) -> list[dict]:
     """The cells of a notebook that are of a kind."""
-    notebook = json.loads((FOLDER / f"{name}.ipynb").read_text())
+    notebook = json.loads((FOLDER / f"{name}.ipynb").read_text(encoding="utf-8"))
     return [cell for cell in notebook["cells"] if cell["cell_type"] == kind]
 
 
@@ -87,7 +87,7 @@ def test_a_notebook_is_stored_as_it_ran(name):
 @pytest.mark.parametrize("name", SMALL)
 def test_a_section_is_about_a_screen_long(name):
     sections = []
-    for cell in json.loads((FOLDER / f"{name}.ipynb").read_text())["cells"]:
+    for cell in json.loads((FOLDER / f"{name}.ipynb").read_text(encoding="utf-8"))["cells"]:
         if cell["source"][0].startswith("#") and cell["cell_type"] == "markdown":
             sections.append(0)
         sections[-1] += len(cell["source"])

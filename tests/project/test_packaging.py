@@ -17,7 +17,7 @@ from npa_envs.cli.doctor import EXTRAS
 
 ROOT = Path(__file__).resolve().parents[2]
 SHIPPED = ("pyproject.toml", "MANIFEST.in", "README.md", "LICENSE", "npa_envs", *MAPPED_PACKAGES)
-PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
 IGNORE = shutil.ignore_patterns("__pycache__", "*.egg-info")
 PRINT_FILES = (
     "import npa_envs, npa_envs.envs, npa_envs.wrappers, npa_envs.agents\n"
@@ -45,7 +45,11 @@ def run_python(cwd: Path, program: str, *, search: Path | None = None) -> list[s
     )
     prelude += f"sys.path.insert(1, {str(search)!r})\n" if search else ""
     done = subprocess.run(
-        [sys.executable, "-c", prelude + program], cwd=cwd, capture_output=True, text=True
+        [sys.executable, "-c", prelude + program],
+        cwd=cwd,
+        capture_output=True,
+        text=True,
+        encoding="utf-8",
     )
     assert done.returncode == 0, done.stderr
     return done.stdout.split("\n")[:-1]
@@ -126,7 +130,7 @@ def test_folders_called_envs_in_site_packages_are_not_taken_for_ours(tmp_path: P
 
 
 def test_every_package_is_listed_in_pyproject() -> None:
-    project = tomllib.loads((ROOT / "pyproject.toml").read_text())
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
     found = {
         ".".join(p.parent.relative_to(ROOT).parts) for p in (ROOT / "npa_envs").rglob("__init__.py")
     }
@@ -143,7 +147,7 @@ def test_constraints_pin_every_direct_dependency() -> None:
     for extra in PROJECT["optional-dependencies"].values():
         requirements += extra
     wanted = {r.split(">=")[0].split("[")[0].lower() for r in requirements} - {"npa-envs"}
-    lines = (ROOT / "constraints.txt").read_text().splitlines()
+    lines = (ROOT / "constraints.txt").read_text(encoding="utf-8").splitlines()
     pinned = {line.split("==")[0].lower() for line in lines if "==" in line}
     assert wanted <= pinned
     assert not [line for line in lines if "+" in line]
@@ -151,14 +155,16 @@ def test_constraints_pin_every_direct_dependency() -> None:
 
 def test_the_version_is_the_same_everywhere() -> None:
     assert npa_envs.__version__ == PROJECT["version"]
-    assert f"\nversion: {PROJECT['version']}\n" in (ROOT / "CITATION.cff").read_text()
+    assert f"\nversion: {PROJECT['version']}\n" in (ROOT / "CITATION.cff").read_text(
+        encoding="utf-8"
+    )
 
 
 def test_the_extras_are_told_as_they_are() -> None:
     extras = PROJECT["optional-dependencies"]
     (together,) = extras["all"]
     assert list(EXTRAS) == re.findall(r"\w+", together.removeprefix("npa-envs"))
-    page = (ROOT / "docs/install.md").read_text()
+    page = (ROOT / "docs/install.md").read_text(encoding="utf-8")
     rows = re.findall(r"^\| `(\w+)` \| .+ \| (.*?) ?\|$", page, re.MULTILINE)
     assert [name for name, _ in rows[: len(EXTRAS) + 1]] == [*EXTRAS, "all"]
     assert sorted(name for name, _ in rows) == sorted(extras)
@@ -168,8 +174,8 @@ def test_the_extras_are_told_as_they_are() -> None:
 
 
 def test_the_entries_for_lists_name_the_tested_versions() -> None:
-    lines = (ROOT / "constraints.txt").read_text()
+    lines = (ROOT / "constraints.txt").read_text(encoding="utf-8")
     pinned = dict(re.findall(r"^(\S+)==(\S+)$", lines, re.MULTILINE))
-    page = (ROOT / "docs/integrations.md").read_text()
-    badges = dict(re.findall(r"badge/(\w+)-v([\d.]+)-blue", page))
+    text = (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8")
+    badges = dict(re.findall(r"badge/(\w+)-v([\d.]+)-blue", text))
     assert badges == {"Gymnasium": pinned["gymnasium"], "PettingZoo": pinned["pettingzoo"]}

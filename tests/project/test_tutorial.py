@@ -33,7 +33,7 @@ def printed(text: str) -> dict[str, tuple[float, float]]:
 
 def told() -> dict[str, float]:
     """Return the mean returns that the page says the program prints, by policy."""
-    return {name: mean for name, (mean, _) in printed(TUTORIAL.read_text()).items()}
+    return {name: mean for name, (mean, _) in printed(TUTORIAL.read_text(encoding="utf-8")).items()}
 
 
 def test_the_program_runs_and_gives_the_returns_that_need_no_training(

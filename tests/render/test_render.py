@@ -287,7 +287,9 @@ def test_disk_that_fills_up_is_a_clear_error_and_keeps_the_old_file(tmp_path):
     for path in words[1::2]:
         Path(path).write_bytes(b"old")
     program = [sys.executable, "-c", FILE_SIZE_LIMIT, *words]
-    done = subprocess.run(program, capture_output=True, text=True, timeout=300, check=False)
+    done = subprocess.run(
+        program, capture_output=True, text=True, timeout=300, check=False, encoding="utf-8"
+    )
     _, *told = done.stdout.split("refused: ")
     assert len(told) == len(WRITERS), done.stderr
     for text, path in zip(told, words[1::2], strict=True):

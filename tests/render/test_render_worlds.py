@@ -220,7 +220,7 @@ def test_far_particles_are_darker():
         ({"half_width": 0.0}, "half_width must be positive"),
         ({"pixel_size": math.nan}, "pixel_size must be positive"),
         ({"sigma": -1.0}, "sigma must be positive"),
-        ({"azimuth": math.inf}, "azimuth must be a finite angle"),
+        ({"azimuth": math.inf}, "azimuth must be finite"),
         ({"centre": (0.0, 0.0, 0.0)}, r"centre must have shape \[2\] or \[3, 2\]"),
         ({"background": "no colour"}, "background must be a colour"),
         ({"resolution": 1}, "resolution must be at least 2"),

@@ -140,6 +140,7 @@ def test_pygame_starts_with_the_first_window_and_without_a_banner():
         capture_output=True,
         text=True,
         check=True,
+        encoding="utf-8",
     )
     assert done.stdout == ""
 

@@ -33,7 +33,7 @@ from npa_envs.errors import NPAError
 from npa_envs.rule.files import load_rule, save_rule
 from npa_envs.rule.rule import NPARule
 from npa_envs.tasks.point_classification import class_colours
-from npa_envs.web.colouring import Colouring, Seen
+from npa_envs.web.colouring import ColouredWorld, Colouring
 from npa_envs.web.export import (
     PAGE,
     check_browser_rule,
@@ -60,10 +60,10 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Run]:
     folder = tmp_path_factory.mktemp("page")
     for module in PAGE.glob("*.js"):
         shutil.copy(module, folder)
-    (folder / "package.json").write_text('{"type": "module"}')
+    (folder / "package.json").write_text('{"type": "module"}', encoding="utf-8")
     command = [node, str(Path(__file__).with_name("run_engine.mjs")), str(folder)]
     pipe = subprocess.PIPE
-    with subprocess.Popen(command, stdin=pipe, stdout=pipe, text=True) as process:
+    with subprocess.Popen(command, stdin=pipe, stdout=pipe, text=True, encoding="utf-8") as process:
         assert process.stdin is not None
         assert process.stdout is not None
 
@@ -304,7 +304,7 @@ def test_particles_have_the_colours_of_the_viewer(
     frame = last(told, "frame")
     x, s = unpacked(told["x"], (1, 300, 2)), unpacked(told["s"], (1, 300, 16))
     rule = load_rule("gecko")
-    seen = Seen(
+    seen = ColouredWorld(
         x, s, rule.colour, 0.1, None, [300], 300, unpacked(told["travelled"], (1, 300)),
         torch.tensor([told["updated"]]).bool(),
     )  # fmt: skip
@@ -361,7 +361,7 @@ def test_each_class_of_digits_begins_as_a_cloud_of_its_own(run: Run) -> None:
 
 def test_a_page_is_one_small_file_that_asks_for_nothing(tmp_path: Path) -> None:
     export_web(["gecko"], tmp_path / "page.html")
-    text = (tmp_path / "page.html").read_text()
+    text = (tmp_path / "page.html").read_text(encoding="utf-8")
     assert len(text) < 300_000
     assert "default-src 'none'" in text
     # What a page could load: no element of it names anything but data.
@@ -373,22 +373,26 @@ def test_a_page_is_one_small_file_that_asks_for_nothing(tmp_path: Path) -> None:
 
 def test_a_title_cannot_leave_its_element(tmp_path: Path) -> None:
     export_web(["gecko"], tmp_path / "page.html", title="</title><script>alert(1)</script>")
-    text = (tmp_path / "page.html").read_text()
+    text = (tmp_path / "page.html").read_text(encoding="utf-8")
     assert "<script>alert(1)" not in text
 
 
 def test_modules_are_joined_in_the_order_of_their_imports(tmp_path: Path) -> None:
     (tmp_path / "a.js").write_text(
-        'import { two } from "./b.js";\nexport const four = two + two;\n'
+        'import { two } from "./b.js";\nexport const four = two + two;\n', encoding="utf-8"
     )
-    (tmp_path / "b.js").write_text("const one = 1;\nexport const two = one + one;\n")
+    (tmp_path / "b.js").write_text(
+        "const one = 1;\nexport const two = one + one;\n", encoding="utf-8"
+    )
     text = joined_modules(["a.js"], tmp_path)
     assert text.index("const b =") < text.index("const a =")
     assert "const { two } = b;" in text
-    (tmp_path / "b.js").write_text('import { four } from "./a.js";\nexport const two = four;\n')
+    (tmp_path / "b.js").write_text(
+        'import { four } from "./a.js";\nexport const two = four;\n', encoding="utf-8"
+    )
     with pytest.raises(ValueError, match=r"a\.js -> b\.js -> a\.js"):
         joined_modules(["a.js"], tmp_path)
-    (tmp_path / "b.js").write_text("export default 2;\n")
+    (tmp_path / "b.js").write_text("export default 2;\n", encoding="utf-8")
     with pytest.raises(ValueError, match="export default 2;"):
         joined_modules(["a.js"], tmp_path)
 
@@ -417,7 +421,7 @@ def test_rules_are_named_by_paths_as_well(tmp_path: Path) -> None:
     export_web(
         [tmp_path / "mine.safetensors"], tmp_path / "page.html", particle_count=64, previews=True
     )
-    assert '"name":"mine"' in (tmp_path / "page.html").read_text()
+    assert '"name":"mine"' in (tmp_path / "page.html").read_text(encoding="utf-8")
 
 
 def test_bad_pages_are_refused(tmp_path: Path) -> None:
@@ -441,10 +445,10 @@ def test_the_command_writes_pages_and_collections(
     run_folder = str(tmp_path / "run")
     assert main(["export-web", "gecko", run_folder, "-o", str(page)]) == 0
     assert f"wrote {page}" in capsys.readouterr().out
-    names = re.findall(r'"name":"(\w+)"', page.read_text())
+    names = re.findall(r'"name":"(\w+)"', page.read_text(encoding="utf-8"))
     assert names == ["gecko", "run"]
     assert main(["export-web", "gecko", "--out", str(collection), "--particle-count", "77"]) == 0
-    assert '"N0": 77' in collection.read_text()
+    assert '"N0": 77' in collection.read_text(encoding="utf-8")
     assert torch.equal(
         load_rule(f"{collection}#gecko").output.weight, load_rule("gecko").output.weight
     )

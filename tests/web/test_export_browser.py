@@ -208,7 +208,7 @@ def test_a_step_on_a_graphics_card_is_that_of_python(
     script = joined_modules(["physics_gpu.js"])
     shown = "Object.assign(window, { physics, physics_gpu });"
     text = f"<!doctype html><script>{script}\n{shown}</script>"
-    (tmp_path / "card.html").write_text(text)
+    (tmp_path / "card.html").write_text(text, encoding="utf-8")
     page = card_page()
     page.open((tmp_path / "card.html").as_uri())
     page.wait("window.physics_gpu")

@@ -21,7 +21,7 @@ from npa_envs.tasks.damage import DAMAGE_SIZES
 from npa_envs.training import config_to_dict, preset
 from npa_envs.training.run_folder import JsonlLog
 from npa_envs.web import rule_world
-from npa_envs.web.colouring import Colouring, Seen, signed_colours, species_colours
+from npa_envs.web.colouring import ColouredWorld, Colouring, signed_colours, species_colours
 from npa_envs.web.environment_world import EnvironmentWorld, make_environment
 from npa_envs.web.rule_world import RuleWorld, RunWorld
 from npa_envs.web.server import frame_bytes
@@ -40,6 +40,15 @@ def gecko(device):
 
 def brush(tool, **told):
     return {"type": "brush", "tool": tool, "at": [0.0, 0.0], "radius": 0.1} | told
+
+
+def world_of(rule: NPARule, path: Path, device: torch.device, **options) -> RuleWorld:
+    """A world of a rule that was trained by the preset `paper` with some options."""
+    config = config_to_dict(preset("paper", **options))
+    kept = {name: config[name] for name in config if name not in ("out", "device")}
+    metadata = {"task": "morphogenesis2d", "config": json.dumps(kept)}
+    save_rule(rule, path, metadata=metadata)
+    return RuleWorld(str(path), device=device)
 
 
 @pytest.fixture
@@ -89,6 +98,12 @@ def test_the_mask_shows_about_as_many_as_are_updated(device):
     bright = (world.frame().colours[:, 0] > 200).mean()
     # Four standard deviations of a share of 1024 draws.
     assert abs(bright - 0.25) < 0.06
+
+
+@pytest.mark.parametrize("show", ["mask", "speed"])
+def test_before_the_first_step_nothing_was_updated_or_has_moved(world, show):
+    world.handle({"type": "set", "name": "show", "value": show})
+    assert len(np.unique(world.frame().colours, axis=0)) == 1
 
 
 def test_play_and_step(world):
@@ -148,13 +163,7 @@ def test_a_world_at_rest_is_not_stepped_until_something_changes_it(tmp_path, dev
     rule = load_rule("gecko")
     # Nothing but a state that is large leaves the zone.
     rule.dead_zone = 40.0
-    config = config_to_dict(preset("paper", particle_count=COUNT))
-    told = {name: config[name] for name in config if name not in ("out", "device")}
-    save_rule(
-        rule, path := tmp_path / "resting.safetensors",
-        metadata={"task": "morphogenesis2d", "config": json.dumps(told)},
-    )  # fmt: skip
-    world = RuleWorld(str(path), device=device)
+    world = world_of(rule, tmp_path / "resting.safetensors", device, particle_count=COUNT)
     asked = []
 
     def noted(*args, **options):
@@ -178,13 +187,8 @@ def test_a_world_at_rest_is_not_stepped_until_something_changes_it(tmp_path, dev
 
 
 def test_a_world_that_divides_shows_its_living_particles(tmp_path, device):
-    config = config_to_dict(preset("paper", division=True, particle_count=64))
-    told = {name: config[name] for name in config if name not in ("out", "device")}
-    save_rule(
-        dividing(load_rule("gecko")), path := tmp_path / "dividing.safetensors",
-        metadata={"task": "morphogenesis2d", "config": json.dumps(told)},
-    )  # fmt: skip
-    world = RuleWorld(str(path), device=device)
+    rule, path = dividing(load_rule("gecko")), tmp_path / "dividing.safetensors"
+    world = world_of(rule, path, device, division=True, particle_count=64)
     assert len(world.frame().positions) == 1
     assert not {"inject", "graft", "add"} & set(world.describe()["tools"])
     world.handle({"type": "set", "name": "speed", "value": 8})
@@ -442,7 +446,7 @@ def test_a_gpu_makes_sixty_frames_a_second(name):
 # Colours.
 
 
-def seen(**told) -> Seen:
+def seen(**told) -> ColouredWorld:
     generator = torch.Generator().manual_seed(3)
     x = torch.rand(1, 50, 2, generator=generator)
     s = torch.randn(1, 50, 6, generator=generator)
@@ -450,7 +454,7 @@ def seen(**told) -> Seen:
         "x": x, "s": s, "colours": lambda s: s[..., -3:], "eps": 0.2, "box": None,
         "counts": [50], "full": 50, "travelled": None, "updated": None,
     }  # fmt: skip
-    return Seen(**(usual | told))
+    return ColouredWorld(**(usual | told))
 
 
 def test_zero_is_grey_and_signs_are_opposite():
@@ -503,7 +507,7 @@ def write_run(folder: Path, name: str = "gecko", rule: NPARule | None = None) ->
     metadata = rule_metadata((shipped_rules() | preset_rules())[name])
     told = {key: metadata[key] for key in ("task", "config") if key in metadata}
     save_rule(rule or load_rule(name), folder / "rule.safetensors", metadata=told)
-    (folder / "config.json").write_text("{}")
+    (folder / "config.json").write_text("{}", encoding="utf-8")
     if not (folder / "log.jsonl").exists():
         log(folder, 0, 10)
 
@@ -518,9 +522,26 @@ def trained_on(name: str) -> NPARule:
 
 
 def log(folder: Path, first: int, end: int) -> None:
-    with (folder / "log.jsonl").open("a") as file:
+    with (folder / "log.jsonl").open("a", encoding="utf-8") as file:
         for k in range(first, end):
             file.write(json.dumps({"iteration": k, "loss": 1.0 / (k + 1)}) + "\n")
+
+
+def news(world: RunWorld) -> list[dict]:
+    """What a world tells after it has looked at its run."""
+    world._due = 0.0
+    return world.news()
+
+
+def points(world: RunWorld) -> list[tuple]:
+    return [(event["append"], event["points"]) for event in news(world) if "points" in event]
+
+
+@pytest.fixture
+def followed(tmp_path) -> RunWorld:
+    """A world of a run of the gecko in the test's folder."""
+    write_run(tmp_path)
+    return RunWorld(tmp_path, device=CPU, particle_count=COUNT)
 
 
 def test_a_run_is_followed(tmp_path):
@@ -538,8 +559,7 @@ def test_a_run_is_followed(tmp_path):
     newer = trained_on("gecko")
     write_run(folder, rule=newer)
     log(folder, 10, 12)
-    world._due = 0.0
-    curve, told = (event for event in world.news() if event["type"] != "error")
+    curve, told = (event for event in news(world) if event["type"] != "error")
     assert (curve["points"], curve["append"]) == ([[10, 1.0 / 11], [11, 1.0 / 12]], True)
     assert told["note"] == "a training run, iteration 11"
     assert torch.equal(world.main.rule.hidden.weight, newer.hidden.weight)
@@ -547,8 +567,7 @@ def test_a_run_is_followed(tmp_path):
     assert world.x is x
     assert world.step == 1
     # Nothing is told again.
-    world._due = 0.0
-    assert world.news() == []
+    assert news(world) == []
 
 
 @pytest.mark.filterwarnings("ignore:.*has no checksum")
@@ -576,40 +595,34 @@ def test_a_run_of_several_rules_is_one_world_of_them(tmp_path):
     path = folder / "rule-1.safetensors"
     told = {name: rule_metadata(path)[name] for name in ("task", "config")}
     save_rule(rules[0], path, metadata=told)
-    world._due = 0.0
-    world.news()
-    assert torch.equal(world.organisms[1].rule.hidden.weight, rules[0].hidden.weight)
+    news(world)
+    assert torch.equal(world.live_rules[1].rule.hidden.weight, rules[0].hidden.weight)
     world.handle({"type": "reset"})
     assert world.counts == [128, 128]
 
 
-def test_another_run_in_the_folder_is_another_world(tmp_path):
-    write_run(tmp_path)
-    world = RunWorld(tmp_path, device=CPU, particle_count=COUNT)
+def test_another_run_in_the_folder_is_another_world(tmp_path, followed):
+    world = followed
     world.news()
     write_run(tmp_path, "dots")
-    world._due = 0.0
-    reordered, told = world.news()
+    reordered, told = news(world)
     assert reordered == {"type": "reordered"}
     assert told["box"] == [2.0, 2.0]
     world.advance()
     assert world.frame().step == 1
 
 
-def test_another_run_with_another_picture_is_another_world(tmp_path):
-    write_run(tmp_path)
-    world = RunWorld(tmp_path, device=CPU, particle_count=COUNT)
+def test_another_run_with_another_picture_is_another_world(tmp_path, followed):
+    world = followed
     world.advance()
     # Of the same sizes.
     write_run(tmp_path, "heart")
-    world._due = 0.0
-    assert world.news()[-1]["type"] == "world"
+    assert news(world)[-1]["type"] == "world"
     assert world.task.config.target == "heart"
     assert world.step == 0
     world.advance()
     write_run(tmp_path, "heart", trained_on("heart"))
-    world._due = 0.0
-    world.news()
+    news(world)
     assert world.step == 1
 
 
@@ -622,89 +635,74 @@ def test_particles_carry_the_codes_of_the_newest_rule(tmp_path):
     assert not torch.equal(world.s[0, 0, :8], code)
     rest = world.s[..., 8:].clone()
     write_run(tmp_path, "seven-pictures", newer)
-    world._due = 0.0
-    world.news()
+    news(world)
     assert torch.equal(world.s[0, :, :8], code.expand(64, 8))
     assert torch.equal(world.s[..., 8:], rest)
     world.handle({"type": "reset"})
     assert torch.equal(world.s[0, :, :8], code.expand(64, 8))
 
 
-def test_of_a_log_only_what_is_new_is_read(tmp_path, monkeypatch):
-    write_run(tmp_path)
-    world = RunWorld(tmp_path, device=CPU, particle_count=COUNT)
+def test_of_a_log_only_what_is_new_is_read(tmp_path, followed, monkeypatch):
+    world = followed
     path = tmp_path / "log.jsonl"
 
-    def points():
-        world._due = 0.0
-        return [(event["append"], event["points"]) for event in world.news() if "points" in event]
-
-    assert len(points()[0][1]) == 10
+    assert len(points(world)[0][1]) == 10
     opened = []
     monkeypatch.setattr(
         rule_world, "open_regular", lambda *a, **k: opened.append(a) or open_regular(*a, **k)
     )
-    assert points() == []
+    assert points(world) == []
     assert opened == []
     # What was read before is not looked at again.
-    with path.open("r+") as file:
+    with path.open("r+", encoding="utf-8") as file:
         file.write("X")
     log(tmp_path, 10, 11)
-    assert points() == [(True, [[10, 1.0 / 11]])]
+    assert points(world) == [(True, [[10, 1.0 / 11]])]
     assert len(opened) == 1
 
 
-def test_a_log_that_begins_anew_or_goes_back_is_told_from_its_start(tmp_path):
-    write_run(tmp_path)
-    world = RunWorld(tmp_path, device=CPU, particle_count=COUNT)
+def test_a_log_that_begins_anew_or_goes_back_is_told_from_its_start(tmp_path, followed):
+    world = followed
     path = tmp_path / "log.jsonl"
 
-    def points():
-        world._due = 0.0
-        return [(event["append"], event["points"]) for event in world.news() if "points" in event]
-
-    points()
+    points(world)
     # A resumed run drops the lines after its checkpoint.
     JsonlLog(path).truncate(4)
-    assert points() == [(False, [[k, 1.0 / (k + 1)] for k in range(5)])]
+    assert points(world) == [(False, [[k, 1.0 / (k + 1)] for k in range(5)])]
     # Another run, which may be written over the same place of the disk, and be longer already.
-    with path.open("r+") as file:
+    with path.open("r+", encoding="utf-8") as file:
         file.write("".join(f'{{"iteration": {k}, "loss": 2.0}}\n' for k in range(20)))
-    assert points() == [(False, [[k, 2.0] for k in range(20)])]
-    path.write_text("")
-    assert points() == []
+    assert points(world) == [(False, [[k, 2.0] for k in range(20)])]
+    path.write_text("", encoding="utf-8")
+    assert points(world) == []
     log(tmp_path, 0, 2)
-    assert points() == [(False, [[0, 1.0], [1, 0.5]])]
+    assert points(world) == [(False, [[0, 1.0], [1, 0.5]])]
     path.unlink()
-    assert points() == []
+    assert points(world) == []
     log(tmp_path, 0, 1)
-    assert points() == [(False, [[0, 1.0]])]
+    assert points(world) == [(False, [[0, 1.0]])]
 
 
 def test_a_line_that_is_being_written_waits(tmp_path):
     write_run(tmp_path)
-    with (tmp_path / "log.jsonl").open("a") as file:
+    with (tmp_path / "log.jsonl").open("a", encoding="utf-8") as file:
         file.write('{"iteration": 10, "lo')
     world = RunWorld(tmp_path, device=CPU, particle_count=COUNT)
     curve = world.news()[0]
     assert curve["points"][-1] == [9, 0.1]
-    with (tmp_path / "log.jsonl").open("a") as file:
+    with (tmp_path / "log.jsonl").open("a", encoding="utf-8") as file:
         file.write('ss": 0.25}\n')
-    world._due = 0.0
-    assert world.news()[0]["points"] == [[10, 0.25]]
+    assert news(world)[0]["points"] == [[10, 0.25]]
 
 
-def test_a_rule_that_is_damaged_meanwhile_is_told_and_the_world_lives_on(tmp_path):
-    write_run(tmp_path)
-    world = RunWorld(tmp_path, device=CPU, particle_count=COUNT)
+def test_a_rule_that_is_damaged_meanwhile_is_told_and_the_world_lives_on(tmp_path, followed):
+    world = followed
     world.news()
     (tmp_path / "rule.safetensors").write_bytes(b"half")
-    world._due = 0.0
-    (error,) = world.news()
+    (error,) = news(world)
     assert error["type"] == "error"
     assert "cannot load a rule" in error["message"]
-    world._due = 0.0
-    assert world.news() == []
+    assert news(world) == []
     world.advance()
     assert world.step == 1
 
@@ -712,7 +710,7 @@ def test_a_rule_that_is_damaged_meanwhile_is_told_and_the_world_lives_on(tmp_pat
 def test_an_unfinished_run_is_refused_in_words(tmp_path):
     with pytest.raises(NPAError, match=r"must hold the rule\.safetensors of a run"):
         RunWorld(tmp_path, device=CPU)
-    (tmp_path / "config.json").write_text("{}")
+    (tmp_path / "config.json").write_text("{}", encoding="utf-8")
     with pytest.raises(NPAError, match="has not written its rules yet: wait for its first"):
         RunWorld(tmp_path, device=CPU)
     with pytest.raises(NPAError, match="a run must be a folder"):

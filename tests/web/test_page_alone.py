@@ -36,7 +36,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     copy = tmp_path_factory.mktemp("page")
     for module in PAGE.glob("*.js"):
         shutil.copy(module, copy)
-    (copy / "package.json").write_text('{"type": "module"}')
+    (copy / "package.json").write_text('{"type": "module"}', encoding="utf-8")
     return copy
 
 
@@ -44,7 +44,9 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def run(folder: Path) -> Any:
     def script(text: str) -> Any:
         command = ["node", str(Path(__file__).with_name("run_page.mjs")), str(folder), SETUP + text]
-        done = subprocess.run(command, capture_output=True, text=True, timeout=300, check=False)
+        done = subprocess.run(
+            command, capture_output=True, text=True, timeout=300, check=False, encoding="utf-8"
+        )
         assert done.returncode == 0, done.stderr
         return json.loads(done.stdout)
 

@@ -33,7 +33,7 @@ def test_a_rule_a_run_and_an_environment_are_by_species(tmp_path):
     assert type(make("heart")) is RuleWorld
     # A folder with nothing but a rule is that rule.
     assert type(make(tmp_path)) is RuleWorld
-    (tmp_path / "config.json").write_text("{}")
+    (tmp_path / "config.json").write_text("{}", encoding="utf-8")
     assert type(make(tmp_path)) is RunWorld
     assert type(make("npa/Morphogenesis2D-v0", policy="heart")) is EnvironmentWorld
 
@@ -87,7 +87,7 @@ def test_what_is_wrong_is_said_before_anything_is_served(words, error, capsys, t
 
 
 def test_an_unfinished_run_is_refused(tmp_path):
-    (tmp_path / "log.jsonl").write_text("")
+    (tmp_path / "log.jsonl").write_text("", encoding="utf-8")
     with pytest.raises(NPAError, match="has not written its rules"):
         make(tmp_path)
 
@@ -97,7 +97,7 @@ def test_half_written_rules_and_ports_in_use_are_told(capsys, tmp_path):
     run.mkdir()
     save_rule(load_rule("gecko"), run / "rule.safetensors")
     whole = (run / "rule.safetensors").read_bytes()
-    (run / "config.json").write_text('{"particle_cou')
+    (run / "config.json").write_text('{"particle_cou', encoding="utf-8")
     assert type(make(run)) is RunWorld
     (run / "rule.safetensors").write_bytes(whole[: len(whole) // 2])
     words = ["--no-browser", "--out", str(tmp_path)]

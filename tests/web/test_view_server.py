@@ -87,6 +87,11 @@ def client(site):
     return testclient.TestClient(server.make_app(site), base_url=HERE)
 
 
+def client_of(world, films, **options):
+    site = server.make_site(world, films=films, **options)
+    return testclient.TestClient(server.make_app(site), base_url=HERE)
+
+
 def meet(client, **options):
     """Open the socket, and take the first event."""
     return client.websocket_connect(SOCKET, **options)
@@ -113,7 +118,7 @@ def test_the_page_and_its_files_are_served(client):
     assert page.status_code == 200
     assert "frame-ancestors 'none'" in page.headers["content-security-policy"]
     assert "unsafe" not in page.headers["content-security-policy"]
-    for name in ("page.js", "drawing.js", "plots.js", "engine_socket.js", "viewer.js", "page.css"):
+    for name in ("page.js", "drawing.js", "plots.js", "viewer.js", "page.css"):
         part = client.get(f"/{name}")
         assert part.status_code == 200
         assert name.split(".")[1] in part.headers["content-type"].replace("javascript", "js")
@@ -277,8 +282,7 @@ def test_a_world_that_cannot_be_made_says_why(tmp_path):
     def make_world():
         raise NPAError("no such rule")
 
-    site = server.make_site(make_world, films=tmp_path)
-    client = testclient.TestClient(server.make_app(site), base_url=HERE)
+    client = client_of(make_world, tmp_path)
     with meet(client) as reader:
         assert next_error(reader) == "no such rule"
 
@@ -289,8 +293,7 @@ def test_a_world_that_breaks_says_so(tmp_path):
         def advance(self):
             raise RuntimeError("out of memory")
 
-    site = server.make_site(Broken, films=tmp_path)
-    client = testclient.TestClient(server.make_app(site), base_url=HERE)
+    client = client_of(Broken, tmp_path)
     with meet(client) as reader:
         reader.receive_json()
         assert next_error(reader) == "the world has ended: out of memory"
@@ -306,8 +309,7 @@ def test_a_page_that_says_it_has_drawn_more_gets_no_more_ahead(tmp_path):
                 assert told.wait(60)
             super().advance()
 
-    site = server.make_site(Held, films=tmp_path)
-    client = testclient.TestClient(server.make_app(site), base_url=HERE)
+    client = client_of(Held, tmp_path)
     with meet(client) as reader:
         reader.receive_json()
         reader.send_json({"type": "drawn"})
@@ -356,8 +358,7 @@ def test_worlds_that_take_turns_are_never_at_work_together(tmp_path):
             self.step += self.step != 12
             busy.release()
 
-    site = server.make_site(Jealous, films=tmp_path, one_at_a_time=True)
-    client = testclient.TestClient(server.make_app(site), base_url=HERE)
+    client = client_of(Jealous, tmp_path, one_at_a_time=True)
     with meet(client) as first, meet(client) as second:
         for _ in range(30):
             for reader in (first, second):
@@ -415,8 +416,8 @@ def test_a_film_that_is_long_enough_ends_by_itself(client, site, monkeypatch):
         assert frames.info["duration"] * getattr(frames, "n_frames", 1) <= 120
 
 
-def film_of(colour) -> server.Film:
-    film = server.Film()
+def film_of(colour) -> server.PageFilm:
+    film = server.PageFilm()
     film.add(jpeg(colour=colour))
     return film
 

@@ -1,10 +1,10 @@
-// What a hand does to a world at a place: the formulas of npa_envs/world/brushes.py, in place.
+// Brushes, by the formulas of npa_envs/world/brushes.py, in place.
 //
 // x: positions [length units], s: states, one particle after the other; box: sides [length units] of
 // the periodic box, across whose edges a brush reaches, or null.
 
-// Calls visit(i, offset, square) for each particle: the way to it from a place, to its nearest image
-// in a box, which the call may change but not keep, and the square of its length.
+// Calls visit(i, offset, square) for each particle: its offset from a place, to its nearest image in a
+// box, which `visit` may change but not keep, and the square of its length.
 function forEach(x, dimension, centre, box, visit) {
   const offset = new Float64Array(dimension);
   const count = x.length / dimension;
@@ -42,7 +42,7 @@ export function push(x, dimension, centre, move, radius, strength, box) {
   });
 }
 
-// The mean state that a soft brush holds, or null where it holds nobody.
+// The mean state under a soft brush, or null where it holds no particle.
 export function stateAround(x, s, dimension, centre, radius, box) {
   const channels = (s.length / x.length) * dimension, mean = new Float64Array(channels);
   let total = 0;
@@ -63,7 +63,7 @@ export function inject(x, s, dimension, centre, radius, state, strength, box) {
   });
 }
 
-// How much a soft brush holds of a particle at a distance of which the square is given.
+// The weight of a soft brush at a distance whose square is given.
 function softness(square, radius) {
   return radius > 0 ? Math.max(0, 1 - square / (radius * radius)) ** 2 : 0;
 }
@@ -81,11 +81,11 @@ export function clump(x, dimension, centre, radius, factor, box) {
 export function cut(x, dimension, centre, normal, gap, along, box) {
   const length = Math.hypot(...normal) || 1;
   const direction = normal.map((part) => part / length);
-  const reach = along === null ? Infinity : inner(along, along);
+  const half = along === null ? Infinity : inner(along, along);
   forEach(x, dimension, centre, box, (i, offset) => {
     const height = inner(offset, direction);
     const shift = (height >= 0 ? 0.5 : -0.5) * Math.max(0, gap - Math.abs(height));
-    if (along !== null && Math.abs(inner(offset, along)) > reach) return;
+    if (along !== null && Math.abs(inner(offset, along)) > half) return;
     for (let d = 0; d < dimension; d++) x[i * dimension + d] += shift * direction[d];
   });
 }

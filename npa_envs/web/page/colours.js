@@ -1,5 +1,4 @@
-// Colours of single particles, as npa_envs/web/colouring.py gives them: what each tells of its state,
-// its surroundings, its movement.
+// Colours of particles by state, density, species, speed or update mask, as npa_envs/web/colouring.py.
 
 // Of npa_envs/render/colours.py and npa_envs/web/colouring.py.
 const COLOUR_OFFSET = 0.5;
@@ -46,8 +45,7 @@ export class Colouring {
     return new Uint8Array(bytes.buffer);
   }
 
-  // 1 is a world whose particles fill [-1, 1]^D, or its box, evenly. In open space worlds fill a part
-  // only, and so are denser.
+  // 1 is a world whose particles fill [-1, 1]^D, or its box, evenly. Worlds in open space are denser.
   densities({ physics, world, eps, box, dimension, full }, bytes) {
     physics.sort(world, eps, box);
     physics.computeDensities(world.count, eps);
@@ -61,7 +59,7 @@ export class Colouring {
   // The first three principal components as colours; their basis moves slowly.
   components(s, channels, bytes) {
     const count = s.length / channels;
-    // One particle that is no number would end the basis of all, for good.
+    // One NaN in the moving average would stay there.
     const known = [];
     for (let i = 0; i < count; i++) {
       if (s.subarray(i * channels, (i + 1) * channels).every(Number.isFinite)) known.push(i);
@@ -82,7 +80,7 @@ export class Colouring {
     this.covariance = this.covariance.map((kept, k) => BALANCE * kept + (1 - BALANCE) * fresh[k]);
     const found = eigenvectors(this.covariance, channels).slice(0, 3);
     found.forEach(({ vector }, k) => {
-      // An eigenvector may come with either sign: colours must not flip between frames.
+      // An eigenvector's sign is arbitrary: colours must not flip between frames.
       if (this.basis?.[k] && product(vector, this.basis[k]) < 0) vector.forEach((part, c) => (vector[c] = -part));
     });
     this.basis = found.map(({ vector }) => vector);
@@ -104,8 +102,8 @@ export class Colouring {
   }
 }
 
-// How particles of one rule look: their last three outputs as colours, or the colour of the class that
-// they say, greyer the less they are sure of it.
+// Colours of one rule's particles: their last three outputs, or the colour of their class, greyer the
+// smaller its output.
 export class Look {
   // rule: of LiveWorld; its `classes` are {palette, undecided}, or null.
   constructor(rule, kernels) {
@@ -115,7 +113,7 @@ export class Look {
     this.kernels = kernels;
     this.outputs = outputs === 0 ? this.channels : rule.classes === null ? 3 : outputs;
     if (outputs === 0) return;
-    // Of the read-out only what is seen.
+    // Only those outputs of the read-out that have colours.
     const kept = this.outputs;
     this.first = kernels.layer(weights["readout.0.weight"], weights["readout.0.bias"], this.channels, hidden);
     this.second = kernels.layer(

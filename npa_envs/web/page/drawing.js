@@ -1,7 +1,7 @@
 // Particles on a canvas: cameras, and painters with WebGL2 or, where there is none, without it.
 
-// Where one looks from. 2D worlds are seen from straight above, and the camera moves and zooms; 3D
-// worlds are seen in perspective, and the camera goes round: y is up, angles are in degrees.
+// The camera moves and zooms over 2D worlds, and goes round 3D worlds in perspective: y is up, angles are
+// in degrees.
 export class Camera {
   constructor(dimension, halfWidth, centre = [0, 0, 0]) {
     this.dimension = dimension;
@@ -35,7 +35,7 @@ export class Camera {
     return (2 * this.halfWidth) / (this.zoom * Math.min(width, this.open(height)));
   }
 
-  // Rows of the canvas that no controls cover; the centre is seen in their middle.
+  // Rows of the canvas that no controls cover; the centre lies in their middle.
   open(height) {
     return height * (1 - this.covered);
   }
@@ -99,8 +99,9 @@ function dot(a, b) {
 
 // What a painter draws:
 //   {positions, colours, dimension, box, spot, camera, background: [r, g, b] in [0, 1],
-//    look: "soft" | "points", still: nothing moves, so that there is time, trails: {positions: Float32Array of pairs of points [x, y, z],
-//    fades: Float32Array} or null, ink: [r, g, b] of trails}
+//    look: "soft" | "points", still: nothing moves, which allows slow drawing,
+//    trails: {positions: Float32Array of pairs of points [x, y, z], fades: Float32Array} or null,
+//    ink: [r, g, b] of trails}
 // `kind`: "webgl2", "canvas", or "auto": WebGL2 unless it would be a processor that draws, which is
 // faster without it.
 export function makePainter(canvas, kind = "auto") {
@@ -110,10 +111,10 @@ export function makePainter(canvas, kind = "auto") {
 }
 
 function quickest() {
-  // Asked of a canvas of its own: one that has given a context gives no other.
+  // On a canvas of its own, because a canvas has one kind of context.
   const gl = document.createElement("canvas").getContext("webgl2", { failIfMajorPerformanceCaveat: true });
-  const told = gl?.getExtension("WEBGL_debug_renderer_info");
-  const name = told ? gl.getParameter(told.UNMASKED_RENDERER_WEBGL) : "";
+  const names = gl?.getExtension("WEBGL_debug_renderer_info");
+  const name = names ? gl.getParameter(names.UNMASKED_RENDERER_WEBGL) : "";
   gl?.getExtension("WEBGL_lose_context")?.loseContext();
   return gl && !/swiftshader|llvmpipe|software|basic render/i.test(name) ? "webgl2" : "canvas";
 }
@@ -464,12 +465,12 @@ function projected({ positions, dimension, camera }, offset, width, height) {
 
 // Adds soft spots: sums of colours and of weights. They end round, where they are faint.
 function addSpots(sums, width, height, places, colours, spot) {
-  const reach = 2.4 * spot, fall = -0.5 / (spot * spot), faint = Math.exp(-0.5 * 2.4 ** 2);
-  const weights = new Float32Array(2 * Math.ceil(reach) + 2);
+  const extent = 2.4 * spot, fall = -0.5 / (spot * spot), faint = Math.exp(-0.5 * 2.4 ** 2);
+  const weights = new Float32Array(2 * Math.ceil(extent) + 2);
   for (let k = 0; k < places.length / 4; k++) {
     const column = places[4 * k], row = places[4 * k + 1];
-    const left = Math.max(0, Math.ceil(column - reach)), last = Math.min(width - 1, Math.floor(column + reach));
-    const top = Math.max(0, Math.ceil(row - reach)), end = Math.min(height - 1, Math.floor(row + reach));
+    const left = Math.max(0, Math.ceil(column - extent)), last = Math.min(width - 1, Math.floor(column + extent));
+    const top = Math.max(0, Math.ceil(row - extent)), end = Math.min(height - 1, Math.floor(row + extent));
     for (let x = left; x <= last; x++) weights[x - left] = Math.exp(fall * (x - column) ** 2);
     const red = colours[3 * k], green = colours[3 * k + 1], blue = colours[3 * k + 2];
     for (let y = top; y <= end; y++) {

@@ -1,7 +1,47 @@
-// The page by itself: over the engine in the browser, behind pictures to choose from where it has some.
+// The page without a server: a worker computes worlds, and pictures offer a choice of rules. See page.js.
 
-import { connect } from "./engine_browser.js";
 import { start } from "./page.js";
+
+// Starts the worker whose text stands in the element that `settings.worker` names; the rest of the
+// settings is what LiveWorld takes.
+async function connect({ worker: element, ...settings }, listener) {
+  const text = document.getElementById(element).textContent;
+  const worker = new Worker(URL.createObjectURL(new Blob([text], { type: "text/javascript" })));
+  // The worker is a frame ahead; the page gets the next one when it has drawn the one before.
+  const ready = [];
+  let drawing = false;
+  const pump = () => {
+    if (drawing || ready.length === 0) return;
+    drawing = true;
+    listener(ready.shift());
+  };
+  const drop = () => worker.postMessage({ type: "drawn" });
+  worker.onmessage = ({ data }) => {
+    if (data.type === "frame") ready.push(data);
+    else {
+      // Frames of a world that is no more.
+      if (data.type === "world") ready.splice(0).forEach(drop);
+      listener(data);
+    }
+    pump();
+  };
+  worker.onerror = (event) => {
+    event.preventDefault();
+    listener({ type: "error", message: event.message || "this browser does not let the page start a worker" });
+  };
+  // "?engine=processor" behind the address keeps off the graphics card, "?engine=gpu" insists on it.
+  const engine = new URLSearchParams(location.search).get("engine") ?? "auto";
+  worker.postMessage({ type: "begin", settings: { ...settings, engine } });
+  return {
+    send(message) {
+      worker.postMessage(message);
+      if (message.type !== "drawn") return;
+      drawing = false;
+      // Never from within a call of the page's own.
+      queueMicrotask(pump);
+    },
+  };
+}
 
 // Begins with what the page holds in its element `rules`.
 export function begin() {
@@ -11,7 +51,7 @@ export function begin() {
   else new Gallery(settings, pictured);
 }
 
-// The address says what is seen: "#gecko" that rule's world, no name all pictures.
+// The address chooses: "#gecko" shows that rule's world, no name shows all pictures.
 class Gallery {
   constructor(settings, pictured) {
     this.settings = settings;
@@ -54,7 +94,7 @@ class Gallery {
       const others = this.settings.rules.filter((rule) => rule !== chosen);
       this.page = await start(connect, { ...this.settings, rules: [chosen, ...others] });
     } else {
-      // The world tells whether it runs when its rule is set.
+      // Setting the rule announces whether the world runs.
       this.page.play(true);
       this.page.send({ type: "set", name: "rule", value: chosen.name });
     }

@@ -132,20 +132,20 @@ function pairsCode(dimension) {
   const local = (name) => names.indexOf(name);
   const value = (name) => get(local(name));
   const put = (name, code) => set(local(name), code);
-  const told = (name) => value(`probe ${name}`);
+  const probed = (name) => value(`probe ${name}`);
   const axes = ["x", "y", "z"].slice(0, dimension);
   const large = { x: "X", y: "Y", z: "Z" };
   const offset = (axis) => [
-    ...put(`d${axis}`, minus(load(add(value(axis), value("byte"))), told(axis))),
-    ...put(`d${axis}`, minus(value(`d${axis}`), times(told(`side${large[axis]}`), nearest(times(value(`d${axis}`), told(`per${large[axis]}`)))))),
+    ...put(`d${axis}`, minus(load(add(value(axis), value("byte"))), probed(axis))),
+    ...put(`d${axis}`, minus(value(`d${axis}`), times(probed(`side${large[axis]}`), nearest(times(value(`d${axis}`), probed(`per${large[axis]}`)))))),
   ];
   const sum = (terms) => terms.reduce((left, right) => plus(left, right));
   const append = (list, code) => store(add(value(list), value("at")), shuffled(code, value("front")));
   const hit = [
     ...put("distance", root(value("squared"))),
-    ...put("left", minus(told("square"), value("squared"))),
-    ...put("share", minus(told("eps"), value("distance"))),
-    ...put("share", over(times(told("slope"), times(value("share"), value("share"))), value("distance"))),
+    ...put("left", minus(probed("square"), value("squared"))),
+    ...put("share", minus(probed("eps"), value("distance"))),
+    ...put("share", over(times(probed("slope"), times(value("share"), value("share"))), value("distance"))),
     ...put("share", times(value("share"), load(add(value("volume"), value("byte"))))),
     // What is no number where a particle meets itself, or behind the last one, is masked.
     ...put("share", and(value("share"), and(value("inside"), less(zeros, value("squared"))))),
@@ -156,7 +156,7 @@ function pairsCode(dimension) {
     ...put("at", multiply(value("count"), number(4))),
     ...append("place", timesIntegers(value("lanes"), spreadInteger(value("width")))),
     ...append("a", times(
-      times(told("weight"), times(value("left"), times(value("left"), value("left")))),
+      times(probed("weight"), times(value("left"), times(value("left"), value("left")))),
       load(add(value("volume"), value("byte"))),
     )),
     ...axes.flatMap((axis) => append(`k${axis}`, value(`s${axis}`))),
@@ -165,7 +165,7 @@ function pairsCode(dimension) {
   const four = [
     ...axes.flatMap(offset),
     ...put("squared", sum(axes.map((axis) => times(value(`d${axis}`), value(`d${axis}`))))),
-    ...put("inside", and(less(value("squared"), told("square")), lessIntegers(value("lanes"), spreadInteger(value("end"))))),
+    ...put("inside", and(less(value("squared"), probed("square")), lessIntegers(value("lanes"), spreadInteger(value("end"))))),
     ...put("found", bits(value("inside"))),
     ...when(value("found"), hit),
     ...put("byte", add(value("byte"), number(16))),
@@ -313,13 +313,13 @@ export function simdKernels(width, dimension) {
 
   function pairs(points, i, ranges, used, { eps, weight, slope, sides, width: stride }, list, moment) {
     const { x, y, z, volume } = points;
-    const told = [x[i], y[i], z[i], eps, eps * eps, weight, slope];
+    const scalars = [x[i], y[i], z[i], eps, eps * eps, weight, slope];
     // In open space no image is nearer.
-    probe.set(told);
+    probe.set(scalars);
     for (let d = 0; d < 3; d++) {
       const periodic = sides[d] < Infinity;
-      probe[told.length + d] = periodic ? sides[d] : 0;
-      probe[told.length + 3 + d] = periodic ? 1 / sides[d] : 0;
+      probe[scalars.length + d] = periodic ? sides[d] : 0;
+      probe[scalars.length + 3 + d] = periodic ? 1 / sides[d] : 0;
     }
     const at = ranges.byteOffset;
     const { place, a, slopes } = list;

@@ -1,5 +1,5 @@
-// The world behind the exported page: what its messages do, and the frames that it shows. Messages and
-// events are those of page.js, and what they do is what RuleWorld of npa_envs/web/rule_world.py does.
+// The world of the exported page. Messages and events are those of page.js, and their effects those of
+// RuleWorld in npa_envs/web/rule_world.py.
 
 import { clump, cut, wipeState, inject, insideBall, push, stateAround } from "./brushes.js";
 import { Colouring, Look } from "./colours.js";
@@ -70,8 +70,8 @@ export class LiveWorld {
     this.random = new Random(seed);
     this.steps = this.milliseconds = 0;
     this.species = [this.rule];
-    // What each species divides densities by: what a hand takes away or adds is felt nearby, and
-    // nowhere else.
+    // Each species divides densities by the particles of a fresh world, so that particles that a brush
+    // adds or removes change densities in their neighbourhood only.
     this.full = this.values.count;
     this.divisors = [this.full];
     this.colouring = new Colouring(this.ramp);
@@ -108,7 +108,7 @@ export class LiveWorld {
   take(x, s, species) {
     const count = species.length;
     this.world = { count, x, s, species };
-    // How far each went in the last step, as a share of the farthest way, and whether it was updated.
+    // Each particle's path in the last step over the longest possible one, and whether it was updated.
     this.travelled = new Float32Array(count);
     this.updated = new Uint8Array(count);
     if (this.physics !== undefined && count > this.physics.capacity) this.prepare();
@@ -159,7 +159,7 @@ export class LiveWorld {
       for (let i = 0; i < world.count; i++) updated[i] = random.uniform() < values.update_prob ? 1 : 0;
       const noise = values.noise > 0 ? random.normals(world.x.length, values.noise) : null;
       await this.compute({ eps: this.eps, box, mask: updated, noise, densityCounts: this.divisors });
-      const reach = this.eps * Math.max(...this.species.map((rule) => rule.alpha));
+      const longest = this.eps * Math.max(...this.species.map((rule) => rule.alpha));
       for (let i = 0; i < world.count; i++) {
         let square = 0;
         for (let d = 0; d < dimension; d++) {
@@ -167,7 +167,7 @@ export class LiveWorld {
           if (box !== null) part -= box[d] * Math.round(part / box[d]);
           square += part * part;
         }
-        this.travelled[i] = Math.sqrt(square) / reach;
+        this.travelled[i] = Math.sqrt(square) / longest;
       }
     }
     this.steps++;
@@ -225,7 +225,7 @@ export class LiveWorld {
     else this.announce();
   }
 
-  // What a hand does at a place: page.js says what the parts of a message are.
+  // Applies a brush; page.js describes the message.
   brush({ tool, at, move, radius, strength, source, rule, view }) {
     const { dimension, box } = this;
     const { x, s, species } = this.world;
@@ -271,7 +271,7 @@ export class LiveWorld {
     const { x, s, species } = this.world;
     const room = (this.rule.world.settings.count?.high ?? this.full) - this.world.count;
     if (count > room) throw Error(`the world has room for ${Math.max(0, room)} particles more, got ${count}`);
-    // As if it grew alone: what is new divides densities by its own number.
+    // A new species divides densities by its own number of particles, as if it grew alone.
     const number = this.speciesOf(name, count);
     const ball = this.random.ball(count, this.dimension, radius);
     for (let k = 0; k < ball.length; k++) ball[k] += at[k % this.dimension];
@@ -282,7 +282,7 @@ export class LiveWorld {
     );
   }
 
-  // The number of a rule among the species; a rule that is new here gets the next one.
+  // The number of a rule's species; a rule new to the world gets the next number.
   speciesOf(name, divisor) {
     const rule = this.known(name);
     const number = this.species.indexOf(rule);
@@ -341,27 +341,16 @@ export class LiveWorld {
     const settings = {};
     for (const [name, range] of Object.entries(ranges)) settings[name] = { ...range, value: values[name] };
     this.changed = true;
+    const names = (rules) => rules.map((own) => own.name);
     this.send({
       type: "world",
-      title: world.title,
-      note: world.note,
-      dimension: world.dimension,
-      box: world.box,
-      centre: world.centre,
-      half_width: world.half_width,
-      spot: world.spot,
-      rules: this.rules.map((own) => own.name),
+      ...world,
+      rules: names(this.rules),
       rule: rule.name,
-      others: this.rules.filter((own) => this.mayJoin(own)).map((own) => own.name),
-      species: this.species.map((own) => own.name),
-      shows: world.shows,
-      show,
-      tools: world.tools,
-      damages: world.damages,
-      settings,
+      others: names(this.rules.filter((own) => this.mayJoin(own))),
+      species: names(this.species),
       capabilities: ["step", "reset"],
-      playing,
-      seed,
+      show, settings, playing, seed,
     });
   }
 }

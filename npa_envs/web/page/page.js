@@ -1,9 +1,9 @@
 // The page: one canvas, brushes, controls and plots over an engine that moves the particles.
 //
-// An engine is a module with one function, `connect`. `engine_socket.js` speaks to a server that runs
-// the Python engine, `engine_browser.js` computes in the page. Nothing else knows which one runs.
+// An engine is a function `connect`: that of `viewer.js` speaks to a server that runs the Python engine,
+// that of `exported.js` computes in the page. Nothing else knows which one runs.
 //
-//   const engine = await connect(settings, listener);   // settings: what index.html hands to `start`
+//   const engine = await connect(settings, listener);   // settings: those of `start`
 //   engine.send(message);                               // page -> engine, a JSON object
 //   listener(event);                                    // engine -> page, an object
 //
@@ -12,7 +12,7 @@
 //   {type: "step"}                     one step, while paused
 //   {type: "reset", seed}              a fresh world; without seed the next one
 //   {type: "set", name, value}         name: a key of the world's `settings`, or "rule", "show",
-//                                      "loss" (true while its plot is seen: else it is not computed)
+//                                      "loss" (true while its plot is open: else it is not computed)
 //   {type: "brush", tool, at, move, radius, strength, source?, rule?, view?}
 //                                      tool: remove | push | clump | cut | inject | graft | add
 //                                      at, move: [x, y] or [x, y, z] [length units]; push, clump and
@@ -34,8 +34,8 @@
 //       once, and after changes. note: a sentence for the reader, or ""; box: sides [length units] or
 //       null; centre, half_width: what the canvas shows at first; spot: standard deviation of a
 //       particle's spot [length units]; rules: names that `rule` may take; others: names that graft
-//       and add may take; species: names of the rules that live in the world now; settings: {name: {value, low, high, scale?: "log", whole?: true}}
-//       with names among eps, update_prob, noise, count, speed (steps a frame);
+//       and add may take; species: names of the rules of the world's particles; settings: {name:
+//       {value, low, high, scale?: "log", whole?: true}} with names among eps, update_prob, noise, count, speed (steps a frame);
 //       capabilities: some of "step", "reset", "film", "loss".
 //       A key that an engine leaves out is as in `BLANK` below.
 //   {type: "frame", step, positions, colours, milliseconds, loss?}
@@ -47,8 +47,8 @@
 //   {type: "file", name, url}                                      a file of a film is ready
 //   {type: "error", message}
 //
-// index.html loads viewer.js, which starts the page over the socket. For the exported page modules are
-// joined into one file instead, in this order: drawing.js, plots.js, page.js, then the engine. For that, imports are single lines of names in braces, exports stand before
+// index.html loads viewer.js. For the exported page, exported.js and the modules that it imports are
+// joined into one file. For that, imports are single lines of names in braces, exports stand before
 // `function`, `class` or `const`, and top-level names differ between modules.
 //
 // `show`: "colours", "density", "species", "speed", "mask", "components" (the first three principal
@@ -147,9 +147,7 @@ class Page {
     } else if (event.type === "world") this.meet(event);
     else if (event.type === "curve") this.curve(event);
     else if (event.type === "reordered") this.tracers.clear();
-    else if (event.type === "film") {
-      if (this.recording?.picture) this.showRecording((this.recording = null));
-    }
+    else if (event.type === "film" && this.recording?.picture) this.showRecording((this.recording = null));
     else if (event.type === "file") this.offer(event.name, event.url);
     else if (event.type === "error") this.complain(event.message);
   }
@@ -160,7 +158,7 @@ class Page {
     if (!this.met || before.dimension !== world.dimension || before.half_width !== world.half_width) {
       this.camera = new Camera(world.dimension, world.half_width, world.centre);
       this.frame = null;
-      // Frames of the world before that were not drawn yet; the engine waits to hear of them.
+      // Also the undrawn frames of the former world: the engine waits for each.
       this.tellDrawn();
       const first = world.tools.includes("remove") && world.dimension === 2 ? "remove" : "look";
       const keep = before.dimension === world.dimension && world.tools.includes(this.tool);
@@ -238,8 +236,8 @@ class Page {
     matchMedia("(prefers-color-scheme: dark)").onchange = () => this.showTheme();
     this.showTheme();
     for (const name of ["radius", "strength", "size"]) {
-      const input = $(name), told = input.parentElement.querySelector("output");
-      input.oninput = () => { told.textContent = short(+input.value); this.dirty = true; };
+      const input = $(name), output = input.parentElement.querySelector("output");
+      input.oninput = () => { output.textContent = short(+input.value); this.dirty = true; };
       input.oninput();
     }
     this.fold(innerWidth <= 760);
@@ -333,19 +331,19 @@ class Page {
 
   slider(input, name, { value, low, high, scale, whole }) {
     const bend = scale === "log" ? Math.log : (v) => v, unbend = scale === "log" ? Math.exp : (v) => v;
-    const told = input.parentElement.querySelector("output");
-    // Three digits may lie beside the end of the range.
+    const output = input.parentElement.querySelector("output");
+    // Rounded to three digits, a value may exceed the range.
     const read = () => Math.min(high, Math.max(low,
       (whole ? Math.round : (v) => +v.toPrecision(3))(unbend(+input.value))));
     input.min = bend(low);
     input.max = bend(high);
     input.step = whole && scale !== "log" ? 1 : (bend(high) - bend(low)) / 200;
     if (document.activeElement !== input || !this.pressing) input.value = bend(value);
-    told.textContent = short(value);
+    output.textContent = short(value);
     input.onpointerdown = () => (this.pressing = true);
     input.onpointerup = () => (this.pressing = false);
     input.oninput = () => {
-      told.textContent = short(read());
+      output.textContent = short(read());
       clearTimeout(this.settling);
       // A world is made anew for another number of particles: only once the slider rests.
       const send = () => this.send({ type: "set", name, value: read() });
@@ -385,7 +383,7 @@ class Page {
     new ResizeObserver(() => (this.dirty = true)).observe(canvas);
   }
 
-  // All of the world, wherever it has gone.
+  // Shows all of the world.
   fit() {
     if (this.frame) this.camera.fit(this.frame.positions);
     this.dirty = true;
@@ -451,11 +449,11 @@ class Page {
     const { frame, camera, canvas } = this;
     if (!frame || this.world.dimension !== 3) return 0;
     const width = canvas.clientWidth, height = canvas.clientHeight;
-    const reach = Math.max(8, (0.3 * $("radius").value) / camera.unit(width, height));
+    const within = Math.max(8, (0.3 * $("radius").value) / camera.unit(width, height));
     let nearest = -Infinity;
     for (let k = 0; k < frame.positions.length; k += 3) {
       const [x, y, near] = camera.project(frame.positions.subarray(k, k + 3), width, height);
-      if (near > nearest && Math.hypot(x - column, y - row) < reach) nearest = near;
+      if (near > nearest && Math.hypot(x - column, y - row) < within) nearest = near;
     }
     return Number.isFinite(nearest) ? nearest : 0;
   }
@@ -501,7 +499,7 @@ class Page {
     }
   }
 
-  // Each frame of the screen: what the brush does, and what is new to see.
+  // Each frame of the screen: the brush, and new frames of the world.
 
   tick() {
     requestAnimationFrame(() => this.tick());
@@ -533,8 +531,8 @@ class Page {
     while (this.frameTimes[0] < now - 2000) this.frameTimes.shift();
     this.plots.milliseconds.add(frame.step, frame.milliseconds);
     if (frame.loss !== undefined) this.plots.loss.add(frame.step, frame.loss);
-    if (now - (this.told ?? 0) > 250) {
-      this.told = now;
+    if (now - (this.reported ?? 0) > 250) {
+      this.reported = now;
       const { length } = this.frameTimes;
       const rate = length > 1 ? (1000 * (length - 1)) / (now - this.frameTimes[0]) : 0;
       const count = frame.positions.length / world.dimension;
@@ -546,7 +544,7 @@ class Page {
 
   draw({ still = false } = {}) {
     const { canvas, frame, world, camera } = this;
-    // More pixels than this are not seen, and cost where the processor draws.
+    // More pixels are invisible, and slow where the processor draws.
     const ratio = Math.min(devicePixelRatio || 1, 1600 / Math.max(canvas.clientWidth, canvas.clientHeight, 1), 2);
     const width = Math.round(canvas.clientWidth * ratio), height = Math.round(canvas.clientHeight * ratio);
     if (!width || !height) return;
@@ -626,7 +624,7 @@ function numbers(hex) {
   return [1, 3, 5].map((k) => parseInt(hex.trim().slice(k, k + 2), 16) / 255);
 }
 
-// What the reader chose is kept where the browser allows it.
+// Choices are stored where the browser allows it.
 function keep(name, value) {
   try { localStorage.setItem(`npa-envs ${name}`, value); } catch { /* private windows */ }
 }

@@ -1,5 +1,5 @@
 // The step of Neural Particle Automata in plain JavaScript: the same formulas, in the same order, as
-// npa_envs/reference.py and docs/mathematics.md. Nothing here knows of pages, brushes or drawing.
+// npa_envs/reference.py and docs/mathematics.md.
 //
 // Particles are sorted by cell, densities are summed over pairs in double precision, and only active
 // particles perceive. The two sums that take most of the time, states over neighbours and the
@@ -15,8 +15,8 @@ const BLOCK_ROWS = 64;
 const LANES = 4;
 export const TILE_OUTPUTS = 8;
 
-// Cells on each side of the grid at most: farther particles share cells with others, and are told
-// apart by their distance.
+// Most cells on each side of the grid: farther particles share cells with others, and distances are
+// checked.
 export const MOST_CELLS = { 2: 256, 3: 64 };
 
 // Cells in which eps is divided.
@@ -167,7 +167,7 @@ export function plainKernels() {
 }
 
 // A matrix [outputs, inputs], row by row, and a bias or null, as products read them: eight outputs at a
-// time lie beside each other, [tiles, inputs, 8].
+// time are contiguous, [tiles, inputs, 8].
 export function tiledLayer(floats, weight, bias, inputs, outputs) {
   const width = tiled(outputs);
   const weights = floats(width * inputs), offset = floats(width);
@@ -304,14 +304,14 @@ export class Physics {
   rangesAround(cell) {
     const [nx, ny, nz] = this.cells;
     const { starts, ranges, dimension } = this;
-    const reach = CELLS_PER_RADIUS[dimension];
+    const span = CELLS_PER_RADIUS[dimension];
     const cx = cell % nx, cy = Math.floor(cell / nx) % ny, cz = Math.floor(cell / (nx * ny));
     // In a small box each cell is looked at once, however often it lies around.
-    const around = 2 * reach + 1;
+    const around = 2 * span + 1;
     const countX = Math.min(nx, around), countY = Math.min(ny, around), countZ = Math.min(nz, around);
-    const firstX = countX < around ? 0 : (cx - reach + nx) % nx;
-    const firstY = countY < around ? 0 : cy - reach + ny;
-    const firstZ = countZ < around ? 0 : cz - reach + nz;
+    const firstX = countX < around ? 0 : (cx - span + nx) % nx;
+    const firstY = countY < around ? 0 : cy - span + ny;
+    const firstZ = countZ < around ? 0 : cz - span + nz;
     let used = 0;
     const add = (from, to) => {
       if (from < to) {

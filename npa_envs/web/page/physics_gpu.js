@@ -15,7 +15,7 @@ export async function openDevice() {
 // Shaders for one rule: sizes are constants in them.
 function shaders(rule) {
   const { space_dim: dimension, state_dim: channels, inputs, hidden_dim: hidden, outputs } = rule;
-  const reach = CELLS_PER_RADIUS[dimension];
+  const span = CELLS_PER_RADIUS[dimension];
   const axes = ["x", "y", "z"].slice(0, dimension);
   const smooth = rule.moment_inverse === "smooth";
   // Visits all j in the cells around sorted particle i: d is the way to it, square its length's square.
@@ -23,9 +23,9 @@ function shaders(rule) {
     let own = points[i].xyz;
     let cell = home[i];
     let at = vec3u(cell % world.cells.x, (cell / world.cells.x) % world.cells.y, cell / (world.cells.x * world.cells.y));
-    let counts = min(world.cells.xyz, vec3u(${2 * reach + 1}));
-    // In a small box each cell is looked at once, however often it lies around.
-    let first = select(at + world.cells.xyz - vec3u(${reach}), vec3u(0), counts < vec3u(${2 * reach + 1}));
+    let counts = min(world.cells.xyz, vec3u(${2 * span + 1}));
+    // In a small box each cell is visited once.
+    let first = select(at + world.cells.xyz - vec3u(${span}), vec3u(0), counts < vec3u(${2 * span + 1}));
     for (var cz = 0u; cz < counts.z; cz++) {
       for (var cy = 0u; cy < counts.y; cy++) {
         for (var cx = 0u; cx < counts.x; cx++) {

@@ -1,6 +1,46 @@
-// The page over the engine behind a server.
+// The page over the engine behind a server: frames and events come over a WebSocket. See page.js.
 
-import { connect } from "./engine_socket.js";
 import { start } from "./page.js";
+
+const WORDS = 6; // 32-bit numbers before a frame's positions
+const KIND = 1;
+
+// Connects to the server that the page came from; it has no settings.
+async function connect(settings, listener) {
+  const address = new URL("socket", location.href);
+  address.protocol = address.protocol === "https:" ? "wss:" : "ws:";
+  const token = new URLSearchParams(location.search).get("token");
+  if (token) address.searchParams.set("token", token);
+  const socket = new WebSocket(address);
+  socket.binaryType = "arraybuffer";
+  socket.onmessage = ({ data }) => {
+    listener(typeof data === "string" ? JSON.parse(data) : frameOf(data));
+  };
+  await new Promise((opened, failed) => {
+    socket.onopen = opened;
+    socket.onclose = () => failed(Error("the server does not answer: is it still running?"));
+  });
+  socket.onclose = ({ reason }) => listener({
+    type: "error", message: reason || "the connection is closed: start npa-envs view again",
+  });
+  return {
+    send(message) {
+      if (socket.readyState !== WebSocket.OPEN) return;
+      socket.send(message instanceof Blob ? message : JSON.stringify(message));
+    },
+  };
+}
+
+// Frames: kind, step, count, dimension (uint32), milliseconds, loss (float32; NaN: not computed),
+// positions (float32), colours (uint8); all little-endian, as browsers' arrays are.
+function frameOf(data) {
+  const [kind, step, count, dimension] = new Uint32Array(data, 0, 4);
+  if (kind !== KIND) throw Error(`frames must be of kind ${KIND}, got ${kind}`);
+  const [milliseconds, loss] = new Float32Array(data, 16, 2);
+  const positions = new Float32Array(data, 4 * WORDS, count * dimension);
+  const colours = new Uint8Array(data, 4 * (WORDS + count * dimension), 3 * count);
+  const frame = { type: "frame", step, positions, colours, milliseconds };
+  return Number.isFinite(loss) ? { ...frame, loss } : frame;
+}
 
 start(connect, {});
