@@ -1,7 +1,7 @@
-"""The record of a measurement: JSON written whole, with the facts that its figures follow from.
+"""Records of measurements: JSON written whole, with the facts that the figures follow from.
 
-A record is written after every entry, so that a run that was stopped goes on from it; figures that
-follow from other facts (device, machine, commit, versions, settings) are refused.
+A record is written after every entry, so that a run that was stopped goes on from it. Figures of
+other facts (device, machine, commit, versions, settings) are refused.
 """
 
 from __future__ import annotations
@@ -15,49 +15,92 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 from datetime import date
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, Generic, TypeVar
 
 import torch
 
 from npa_envs.errors import NPAError, shown
 from npa_envs.files import json_text, plain_numbers, read_json, write_text
+from npa_envs.measure.tables import as_objects, table_text
 
 LIBRARIES = ("npa-envs", "torch", "warp-lang", "numpy", "scipy", "warpSPHCore")
 """Distributions whose versions are recorded."""
 
-Kept = TypeVar("Kept")
+Content = TypeVar("Content")
+Row = TypeVar("Row")
 
 LARGEST_RECORD = 64 * 2**20
 """Bytes of a record, at most."""
 
 
-def write_record(path: Path, content: Any) -> None:
-    """Write JSON, whole or not at all; numbers that are not finite become null.
+@dataclass
+class Record(Generic[Row]):
+    """Rows of a measurement, and what they follow from, in a JSON file."""
 
-    Raises:
-        NPAError: It cannot be written.
-    """
+    facts: Mapping[str, Any]
+    """What the rows follow from: device, machine, settings, commit, versions."""
+    rows: list[Row] = field(default_factory=list)
+    path: Path | None = None
+    """The file that is written after each entry; None: none."""
+    content: Callable[[list[Row]], Mapping[str, Any]] = lambda rows: {"rows": as_objects(rows)}
+    """Returns what the file holds besides the facts."""
+    key: str = "facts"
+    """What the file calls the facts."""
+
+    def resume(self, read: Callable[[dict[str, Any]], list[Row]], *, command: str) -> Record[Row]:
+        """Take over the rows of the file, if there is one, and return this record.
+
+        Args:
+            read: Makes rows of the file's JSON object.
+            command: Name of the command that writes such records, for the errors.
+
+        Raises:
+            NPAError: As for `read_record`.
+        """
+        if self.path is not None:
+            found = read_record(self.path, self.facts, read, command=command, key=self.key)
+            self.rows += found or []
+        return self
+
+    def add(self, *rows: Row) -> None:
+        """Add rows and write the file."""
+        self.rows += rows
+        self.write()
+
+    def write(self) -> None:
+        """Write the file, where there is to be one."""
+        if self.path is not None:
+            write_record(self.path, {self.key: self.facts, **self.content(self.rows)})
+
+    def table(self) -> str:
+        """Return the rows as a plain text table."""
+        return table_text(self.rows)
+
+
+def write_record(path: Path, content: Any) -> None:
+    """Write JSON, whole or not at all; numbers that are not finite become null."""
     write_text(path, json_text(content))
 
 
 def read_record(
     path: Path,
     facts: Mapping[str, Any],
-    make: Callable[[dict[str, Any]], Kept],
+    make: Callable[[dict[str, Any]], Content],
     *,
     command: str,
     key: str = "facts",
-) -> Kept | None:
-    """Return the record that a stopped run left; None where there is none.
+) -> Content | None:
+    """Return what `make` makes of the record that a stopped run left; None where there is none.
 
     Args:
         path: The file that it wrote.
         facts: What figures follow from now.
         make: Makes the record of the JSON object.
         command: Name of the command that writes such records, for the errors.
-        key: Where the object says what its figures follow from.
+        key: What the object calls its facts.
 
     Raises:
         NPAError: The file is no such record, or its figures follow from something else.
@@ -78,8 +121,7 @@ def read_record(
         if before.get(name) != value:
             raise NPAError(
                 f"{str(path)!r} holds figures of other settings: {name} was "
-                f"{shown(before.get(name))}, "
-                f"now {shown(value)}: {cure}"
+                f"{shown(before.get(name))}, now {shown(value)}: {cure}"
             )
     return record
 
@@ -99,13 +141,7 @@ def time_limit(max_seconds: float | None) -> Callable[[], bool]:
 
 
 def measured_facts(device: torch.device, commit: str | None, **settings: Any) -> dict[str, Any]:
-    """Return what figures follow from: device, machine, settings, commit and versions.
-
-    Args:
-        device: Where they are measured.
-        commit: Commit that is measured; None: that of the checkout.
-        settings: What else they follow from.
-    """
+    """Return what figures follow from; without a commit, that of the checkout is measured."""
     return {
         "device": device.type,
         "machine": machine(device),
@@ -116,15 +152,11 @@ def measured_facts(device: torch.device, commit: str | None, **settings: Any) ->
 
 
 def without_folders(words: Sequence[str], *options: str) -> list[str]:
-    """Return a command's words with the values of some options replaced by the options' names.
+    """Return a command's words without the paths of options: "--out", "OUT" or "--out=OUT".
 
-    Records are not to tell where on which machine they were written.
-
-    Args:
-        words: "--out", "PATH" or "--out=PATH" becomes "--out", "OUT" or "--out=OUT".
-        options: Names with their dashes.
+    Records do not name folders of the machine that they were written on.
     """
-    told: list[str] = []
+    plain: list[str] = []
     before = ""
     for word in words:
         name, mark, _ = word.partition("=")
@@ -132,9 +164,9 @@ def without_folders(words: Sequence[str], *options: str) -> list[str]:
             word = before.lstrip("-").upper()
         elif mark and name in options:
             word = f"{name}={name.lstrip('-').upper()}"
-        told.append(word)
+        plain.append(word)
         before = word
-    return told
+    return plain
 
 
 def script_parser(description: str | None) -> argparse.ArgumentParser:
@@ -148,8 +180,7 @@ def script_parser(description: str | None) -> argparse.ArgumentParser:
 
 
 def script_facts(arguments: argparse.Namespace) -> dict[str, str]:
-    """Return what the record of a script begins with, for arguments of `script_parser`."""
-    # Records are not to tell where on which machine they were written.
+    """Return what the record of a script of `script_parser` begins with, without its path."""
     words = ["OUT" if word == str(arguments.output) else word for word in sys.argv]
     return {
         "command": " ".join(["python", *words]),

@@ -199,8 +199,8 @@ def record(*found: LossCurve, **changed) -> RuleRecord:
     lost = Response("eps", 4.0, 8, (0.5, math.nan))
     left_out = Response("particles", 2.0, 0, (), note="256 particles in all")
     fields = {"rule": "heart", "task": "morphogenesis2d", "metric": "loss", "update_prob": 0.5}
-    fields["facts"] = {"a": 1}
-    return RuleRecord(**fields | {"courses": found, "responses": (*told, lost, left_out)} | changed)
+    fields |= {"curves": found, "responses": (*told, lost, left_out)}
+    return RuleRecord({"a": 1}, **fields | changed)
 
 
 # Where rules work
@@ -363,7 +363,7 @@ def test_stored_records_give_the_stored_tables():
     folder = Path(__file__).resolve().parents[2] / "benchmarks" / "results" / "robustness_h200"
     places = [folder / f"robustness_{name}.json" for name in rule_names()]
     held = {path: json.loads(path.read_text("utf-8")) for path in places if path.exists()}
-    records = [RuleRecord.read(path, content["facts"]) for path, content in held.items()]
+    records = [RuleRecord(content["facts"], path).read() for path, content in held.items()]
     assert len(records) == len(list(folder.glob("*.json"))) == 15
     assert all(record.done for record in records)
     assert tables(records) == (folder / "robustness.md").read_text("utf-8")
@@ -383,9 +383,12 @@ def test_records_come_back_as_they_were_written_and_curves_are_drawn_by_task(tmp
     course = LossCurve("wipe", (0, 16), ((2.0, 1.0), (2.0, math.nan)), ((1.0, 1.0), (1.0, 1.0)))
     records = [record(course), record(course, task="texture", rule="dots")]
     path = tmp_path / "robustness_heart.json"
-    records[0].write(path)
+    records[0].path = path
+    records[0].write()
     assert json.loads(path.read_text())["courses"][0]["recovery_steps"] == [16, None]
-    assert repr(RuleRecord.read(path, {"a": 1})) == repr(records[0])
+    found = RuleRecord({"a": 1}, path).read()
+    assert repr((found.rows, found.curves)) == repr((records[0].rows, records[0].curves))
+    assert found.about == records[0].about
     pytest.importorskip("matplotlib")
     drawn = pictures(records)
     assert set(drawn) == {"morphogenesis2d", "texture"}

@@ -59,7 +59,7 @@ LADDER = {
     "npa_envs.render": rung(8, "torch numpy PIL imageio imageio_ffmpeg pygame", never=ORACLES),
     "npa_envs.training": rung(9, "torch numpy tqdm yaml tensorboard", never=ORACLES),
     "npa_envs": Rung(10, frozenset({COMPUTED_NAME}), never=ORACLES),
-    "npa_envs.measure.record": rung(2, "torch", never=INSIDES),
+    "npa_envs.measure.record": rung(3, "torch", never=INSIDES),
     "npa_envs.measure.tables": rung(2),
     "npa_envs.measure.plots": rung(2, "matplotlib"),
     "npa_envs.measure.judge": rung(10, "torch", never=INSIDES),

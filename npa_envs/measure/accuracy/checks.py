@@ -1,4 +1,4 @@
-"""Checks of hard cases: what each is given and finds."""
+"""Checks of hard cases: their sessions, figures, limits and verdicts."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ GROUPS = {
 
 
 class Skipped(Exception):
-    """A check has nothing to measure here; the message is the reason."""
+    """A check has nothing to measure; the message is the reason."""
 
 
 @dataclass(frozen=True)
@@ -32,7 +32,7 @@ class CheckResult:
     figures: Mapping[str, float]
     """What was measured, by name."""
     limits: Mapping[str, float] = field(default_factory=dict)
-    """The largest value that the figure of a name may have; others are only told."""
+    """The largest value that the figure of a name may have; others have none."""
     holds: str = ""
     """For a range: where it holds, in words."""
     note: str = ""
@@ -95,11 +95,6 @@ class Check:
     run: Callable[[CheckSession], CheckResult]
     rule: str = ""
     """What `load_rule` takes, of a check of a rule."""
-
-    @property
-    def group(self) -> str:
-        """The group that it belongs to."""
-        return group_of(self.name)
 
 
 def group_of(name: str) -> str:
