@@ -12,7 +12,6 @@ import torch
 from npa_envs.files import json_text
 from npa_envs.measure.plots import new_figure, number_plainly, png
 from npa_envs.measure.record import machine, versions
-from npa_envs.measure.speed.drift import drift_rows
 from npa_envs.measure.speed.explain import kernel_rows
 from npa_envs.measure.speed.throughput import (
     AXES,
@@ -23,7 +22,7 @@ from npa_envs.measure.speed.throughput import (
     PUBLIC,
     SMALL,
     ScalingRow,
-    aim_rows,
+    drift_rows,
     one_species_rows,
     public_rows,
     scaling_rows,
@@ -31,21 +30,21 @@ from npa_envs.measure.speed.throughput import (
     slope_rows,
     throughput_rows,
 )
-from npa_envs.measure.speed.timing import LeftOut, Tables, TimingSession
+from npa_envs.measure.speed.timing import LeftOut, Tables, Timing, TimingSession
 from npa_envs.measure.tables import UNMEASURED, as_objects, table_text
 
 
 def paper(session: TimingSession) -> Tables:
-    """Return the paper's table, what the public call costs there, and float32's errors."""
+    """Return the paper's table, times of the public call, and errors of float32."""
     workloads = SMALL if session.small else PAPER if session.cuda else CPU
     drifting = SMALL if session.small else PROFILED if session.cuda else (ONE_WORLD,)
-    rows = throughput_rows(session, workloads)
-    tables: Tables = {"throughput": rows, "drift": drift_rows(session, drifting)}
+    tables: Tables = {
+        "throughput": throughput_rows(session, workloads),
+        "drift": drift_rows(session, drifting),
+    }
     if session.cuda:
         # On a CPU the throughput is that of the public call.
         tables["public"] = public_rows(session, SMALL if session.small else PUBLIC)
-    if session.cuda and not session.small:
-        tables["aims"] = aim_rows(rows)
     return tables
 
 
@@ -72,9 +71,6 @@ SUITES: dict[str, Callable[[TimingSession], Tables]] = {
 """What makes the tables of each suite."""
 
 
-# The report
-
-
 @dataclass(frozen=True)
 class BenchReport:
     """One run of one suite."""
@@ -88,7 +84,6 @@ class BenchReport:
     tables: Tables
     """Rows by the table's name."""
     left_out: Sequence[LeftOut]
-    """What was not measured."""
 
     def text(self) -> str:
         """Return the tables as plain text."""
@@ -145,9 +140,13 @@ def pictures(tables: Tables) -> dict[str, bytes]:
 def _draw_scaling(table: Sequence[ScalingRow], what: str) -> Any:
     figure, grid = new_figure(2, 2, (9.2, 7.6))
     panels = grid.ravel()
+    unit = "us" if what == "time" else "mib"
     for name, panel in zip(AXES, panels, strict=True):
         rows = [row for row in table if row.axis == name]
-        for label, values in _curves(rows, what).items():
+        for field, label in (("infer", "inference"), ("train", "training")):
+            found = [getattr(row, f"{field}_{unit}") for row in rows]
+            # A cell that was not measured is a gap.
+            values = [cell.median if isinstance(cell, Timing) else cell for cell in found]
             panel.plot([row.value for row in rows], values, marker="o", ms=4, label=label)
         panel.set(xscale="log", yscale="log", xlabel=AXIS_LABELS[name])
         panel.set_ylabel("time of a step [µs]" if what == "time" else "peak memory [MiB]")
@@ -157,16 +156,3 @@ def _draw_scaling(table: Sequence[ScalingRow], what: str) -> Any:
         panel.grid(alpha=0.3)
     panels[0].legend(fontsize=8)
     return figure
-
-
-def _curves(rows: Sequence[ScalingRow], what: str) -> dict[str, list[float | None]]:
-    """Return the values of each curve; what was not measured is a gap."""
-    if what == "memory":
-        return {
-            "inference": [row.infer_mib for row in rows],
-            "training": [row.train_mib for row in rows],
-        }
-    return {
-        "inference": [row.infer_us.median for row in rows],
-        "training": [row.train_us.median if row.train_us else None for row in rows],
-    }

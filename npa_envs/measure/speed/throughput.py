@@ -1,37 +1,31 @@
-"""Throughput: what a step costs in the paper's workloads, against N, neighbours, B and C.
-
-Also what it saves to leave out what a scene does not need, and what one species pays for others.
-"""
+"""Time, memory and drift of rollouts: the paper's workloads, scaling, skips, one species."""
 
 from __future__ import annotations
 
-import itertools
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
+import torch
 from torch import Tensor
 
-from npa_envs.measure.speed.timing import Timing, TimingSession, compare, timed_calls
+from npa_envs.measure.speed.timing import (
+    Timing,
+    TimingSession,
+    compare,
+    relative_error,
+    timed_calls,
+)
 from npa_envs.measure.speed.workloads import Workload, rollout_call
 from npa_envs.rule.rule import NPARule
 from npa_envs.world.recorded import release_recordings
-from npa_envs.world.rollout import Memory
+from npa_envs.world.rollout import Memory, rollout
 from npa_envs.world.species import rollout_species
 
-# Suite `paper`: inference and training, storing and recomputing.
-
-
-class Aim(NamedTuple):
-    """What a workload should cost on an H200: a step [µs], and memory with recomputing [MiB]."""
-
-    infer_us: float
-    train_us: float
-    train_mib: float | None
-
+# Suite `paper`: inference and training, storing and recomputing; float32 against float64.
 
 EIGHT_WORLDS = Workload(2, 8, 4096, 64)
 ONE_WORLD = Workload(2, 1, 4096, 64)
@@ -58,15 +52,6 @@ SMALL = (Workload(2, 1, 1024, 8),)
 INFERENCE_ONLY = (SIXTEEN_MILLION,)
 """Workloads that are not trained."""
 
-AIMS = {
-    EIGHT_WORLDS: Aim(72, 163, 395),
-    ONE_WORLD: Aim(50, 120, 64),
-    LARGE_WORLDS: Aim(700, 1450, 810),
-    CUBES: Aim(150, 310, 450),
-    MILLION: Aim(1500, 3500, None),
-}
-"""What is aimed at on an H200."""
-
 
 @dataclass(frozen=True)
 class ThroughputRow:
@@ -82,23 +67,6 @@ class ThroughputRow:
     worlds_mib: float
     infer_mib: float | None
     train_mib: float | None
-
-
-@dataclass(frozen=True)
-class AimRow:
-    """A workload against what is aimed at on an H200; training by the faster way.
-
-    `recompute_slower`: training's time with recomputing over the faster one's.
-    """
-
-    workload: str
-    infer_us: float
-    infer_aim: float
-    train_us: float
-    train_aim: float
-    recompute_mib: float
-    mib_aim: float | None
-    recompute_slower: float
 
 
 def throughput_rows(session: TimingSession, workloads: Sequence[Workload]) -> list[ThroughputRow]:
@@ -140,11 +108,10 @@ def throughput_row(
 
 @dataclass(frozen=True)
 class PublicRow:
-    """What a step of a call of `rollout` costs a person who calls it in a plain loop [µs].
+    """Time of a step of `rollout` in a plain loop [µs]; each call is waited for.
 
-    Each reading is one call, with loss and gradients for training, and ends with a
-    synchronisation. On CUDA the first numbers are of calls that replay what they have recorded,
-    the others of calls with `cuda_graph=False`.
+    On CUDA the first numbers are of calls that replay a recording, the `launched` ones of calls
+    with `cuda_graph=False`.
     """
 
     workload: str
@@ -155,7 +122,7 @@ class PublicRow:
 
 
 def public_rows(session: TimingSession, workloads: Sequence[Workload]) -> list[PublicRow]:
-    """Return a row for each workload: the public call, as it comes."""
+    """Return a row for each workload."""
     return [
         row
         for workload in workloads
@@ -173,40 +140,71 @@ def _public_row(session: TimingSession, workload: Workload) -> PublicRow:
             timing = timed_calls(run, session.device, warm=3, repeats=session.repeats)
             found[recorded, train] = timing.divided(workload.steps)
     release_recordings()
-    return PublicRow(
-        workload=workload.name,
-        infer_us=found[True, False],
-        train_us=found[True, True],
-        launched_infer_us=found[False, False],
-        launched_train_us=found[False, True],
+    return PublicRow(workload.name, *found.values())
+
+
+@dataclass(frozen=True)
+class DriftRow:
+    """Relative errors of float32 after all steps of a workload, with float64's update masks.
+
+    Worlds are chaotic: after enough steps errors show how long worlds ran. Gradients are those of a
+    random linear functional by the states at the start and the weights; their errors come from few
+    particles, whose hidden units are on in one precision alone. `state_gradient_median` is the
+    median over the particles, each relative to its own.
+    """
+
+    workload: str
+    positions: float
+    states: float
+    state_gradient: float
+    state_gradient_median: float
+    weight_gradient: float
+
+
+def drift_rows(session: TimingSession, workloads: Iterable[Workload]) -> list[DriftRow]:
+    """Return a row for each workload."""
+    rows: list[DriftRow] = []
+    for workload in workloads:
+        what = f"drift of {workload.name}"
+        for exact in session.attempt(what, partial(_outcome, workload, session, torch.float64)):
+            rows += session.attempt(what, partial(_drift_row, workload, session, exact))
+    return rows
+
+
+def _drift_row(workload: Workload, session: TimingSession, exact: list[Tensor]) -> DriftRow:
+    found = _outcome(workload, session, torch.float32)
+    positions, states, by_states, by_weights = map(relative_error, found, exact)
+    distance = (found[2].double() - exact[2]).norm(dim=-1)
+    median = float((distance / exact[2].norm(dim=-1)).median())
+    return DriftRow(workload.name, positions, states, by_states, median, by_weights)
+
+
+def _outcome(workload: Workload, session: TimingSession, dtype: torch.dtype) -> list[Tensor]:
+    """Return positions and states at the end, and gradients by states and by weights."""
+    device = session.device
+    rule = workload.rule(device).to(dtype)
+    start, states = (tensor.to(dtype) for tensor in workload.worlds(device))
+    states.requires_grad_()
+    x, s = rollout(
+        rule,
+        start,
+        states,
+        workload.steps,
+        eps=workload.eps,
+        update_prob=workload.update_prob,
+        generator=torch.Generator(device).manual_seed(1),
+        memory="recompute",
     )
+    loss = (x * drawn_like(x)).sum() + (s * drawn_like(s)).sum()
+    by_states, *by_weights = torch.autograd.grad(loss, [states, *rule.parameters()])
+    weights = torch.cat([gradient.flatten() for gradient in by_weights])
+    return [tensor.detach() for tensor in (x, s, by_states, weights)]
 
 
-def aim_rows(rows: Sequence[ThroughputRow]) -> list[AimRow]:
-    """Return the workloads that have an aim against it; none where memory was not measured."""
-    aims = {workload.name: aim for workload, aim in AIMS.items()}
-    return [
-        _aim_row(store, recompute, aims[store.workload])
-        for store, recompute in itertools.pairwise(rows)
-        if store.workload == recompute.workload in aims
-    ]
-
-
-def _aim_row(store: ThroughputRow, recompute: ThroughputRow, aim: Aim) -> AimRow:
-    assert store.train_us is not None
-    assert recompute.train_us is not None
-    assert recompute.train_mib is not None
-    train_us = min(store.train_us.median, recompute.train_us.median)
-    return AimRow(
-        workload=store.workload,
-        infer_us=min(store.infer_us.median, recompute.infer_us.median),
-        infer_aim=aim.infer_us,
-        train_us=train_us,
-        train_aim=aim.train_us,
-        recompute_mib=recompute.train_mib,
-        mib_aim=aim.train_mib,
-        recompute_slower=recompute.train_us.median / train_us,
-    )
+def drawn_like(like: Tensor) -> Tensor:
+    """Return the weights of a random linear functional, the same numbers in every dtype."""
+    generator = torch.Generator(like.device).manual_seed(2)
+    return torch.randn(like.shape, generator=generator, device=like.device).to(like.dtype)
 
 
 # Suite `scaling`: N, neighbours, B and C, one of them at a time.
@@ -217,10 +215,7 @@ AXES = ("particles", "neighbours", "worlds", "channels")
 
 @dataclass(frozen=True)
 class ScalingRow:
-    """One step of a 2D workload that differs from its neighbours in the table in one number.
-
-    `neighbours`: mean number of particles within eps of one, itself included, far from the edges.
-    """
+    """One step of a 2D workload; the `neighbours` of a particle include itself."""
 
     axis: str
     value: float
@@ -277,34 +272,27 @@ def varied(axis: str, value: int, *, small: bool = False) -> Workload:
 def _scaling_row(session: TimingSession, axis: str, value: int) -> ScalingRow:
     workload = varied(axis, value, small=session.small)
     cost = throughput_row(session, workload)
-    return ScalingRow(
-        axis=axis,
-        value=value,
-        workload=workload.name,
-        neighbours=workload.neighbour_count,
-        channels=workload.state_dim,
-        infer_us=cost.infer_us,
-        train_us=cost.train_us,
-        infer_mib=cost.infer_mib,
-        train_mib=cost.train_mib,
-    )
+    own = {"neighbours": workload.neighbour_count, "channels": workload.state_dim}
+    costs = ("workload", "infer_us", "train_us", "infer_mib", "train_mib")
+    return ScalingRow(axis, value, **own, **{name: getattr(cost, name) for name in costs})
 
 
 def slope_rows(rows: Sequence[ScalingRow]) -> list[SlopeRow]:
     """Return how the times of each axis grow."""
-    of_axis = {axis: [row for row in rows if row.axis == axis] for axis in AXES}
-    return [_slope_row(axis, found) for axis, found in of_axis.items() if len(found) > 1]
+    slopes = []
+    for axis in AXES:
+        found = [row for row in rows if row.axis == axis]
+        if len(found) > 1:
+            larger = found[-max(2, math.ceil(len(found) / 2)) :]
+            values = np.log([row.value for row in larger])
+            infer = np.log([row.infer_us.median for row in larger])
+            train = np.log([row.train_us.median for row in larger if row.train_us])
+            fits = (float(np.polyfit(values, times, 1)[0]) for times in (infer, train))
+            slopes.append(SlopeRow(axis, *fits))
+    return slopes
 
 
-def _slope_row(axis: str, rows: Sequence[ScalingRow]) -> SlopeRow:
-    larger = rows[-max(2, math.ceil(len(rows) / 2)) :]
-    values = np.log([row.value for row in larger])
-    infer = np.log([row.infer_us.median for row in larger])
-    train = np.log([row.train_us.median for row in larger if row.train_us])
-    return SlopeRow(axis, *(float(np.polyfit(values, times, 1)[0]) for times in (infer, train)))
-
-
-# Suite `skips`: what it saves to leave out what a scene does not need.
+# Suite `skips`: time saved by computations that a scene does not need.
 
 SKIPPED = {
     "cuda": Workload(2, 8, 4096, 16),
@@ -314,12 +302,12 @@ SKIPPED = {
 """Worlds to measure on, by kinds of sessions."""
 
 STATIC_STEPS = 32
-"""Steps of a rollout that does once what never changes."""
+"""Steps of a rollout of a static world."""
 
 
 @dataclass(frozen=True)
 class SkipRow:
-    """Something that is left out; times of one step of a rollout with and without it [µs]."""
+    """A computation that rollouts leave out; times of one step with and without it [µs]."""
 
     left_out: str
     condition: str
@@ -341,10 +329,10 @@ class Skip:
 
 
 def skips(workload: Workload) -> list[Skip]:
-    """Return all that rollouts leave out."""
+    """Return all computations that rollouts leave out."""
     side = 2.0 * workload.half_width
     training = {"train": True}
-    # What follows from positions is computed anew in each step if they may get a gradient.
+    # Cells and densities are computed anew in each step if positions may get a gradient.
     rebuilt = {"detach_positions": False}
     static = {"rule": {"static": True}}
     return [
@@ -402,28 +390,25 @@ def skip_rows(session: TimingSession) -> list[SkipRow]:
         run, generator = rollout_call(rolled, x, s, **options)
         return session.cost(run, generator=generator).time.divided(rolled.steps)
 
+    def row(skip: Skip) -> SkipRow:
+        done, skipped = cost(skip.done, skip.steps), cost(skip.skipped, skip.steps)
+        saved = 1.0 - skipped.median / done.median
+        return SkipRow(skip.left_out, skip.condition, done, skipped, f"{saved:.0%}")
+
     rows: list[SkipRow] = []
     for skip in skips(workload):
-        rows += session.attempt(skip.left_out, partial(_skip_row, skip, cost))
+        rows += session.attempt(skip.left_out, partial(row, skip))
     return rows
 
 
-def _skip_row(skip: Skip, cost: Callable[[dict[str, Any], int | None], Timing]) -> SkipRow:
-    done, skipped = cost(skip.done, skip.steps), cost(skip.skipped, skip.steps)
-    saved = 1.0 - skipped.median / done.median
-    return SkipRow(skip.left_out, skip.condition, done, skipped, f"{saved:.0%}")
-
-
-# Suite `species`: what a world of one species pays for the others that could be there: nothing.
-
+# Suite `species`: overhead of `rollout_species` with one species.
 
 SPECIES = {
     "cuda": (Workload(2, 8, 4096, 16), Workload(2, 1, 256, 16)),
     "cpu": (Workload(2, 1, 4096, 4), Workload(2, 1, 256, 4)),
     "small": (Workload(2, 1, 256, 2),),
 }
-"""Worlds to measure on, by kinds of sessions: what is paid once shows in few steps of few
-particles."""
+"""Worlds to measure on, by kinds of sessions; small ones show the cost of a call."""
 
 PAIRS_PER_REPEAT = 3
 """Pairs of readings for each reading of other tables: a ratio of nearly 1 needs more of them."""
@@ -433,9 +418,8 @@ PAIRS_PER_REPEAT = 3
 class OneSpeciesRow:
     """The same rule and worlds by `rollout` and by `rollout_species` with one species.
 
-    Times are those of one step [µs] of inference, or of training with a functional's gradient by
-    the rule's weights; `calls` are "graph" where CUDA replays what was captured. `ratio` is the
-    median over pairs of readings in turn; aimed at: at most 1.03.
+    Times are those of one step [µs]; `calls` are "graph" where CUDA replays a captured graph.
+    `ratio` is the median over pairs of readings in turn.
     """
 
     workload: str
@@ -447,7 +431,7 @@ class OneSpeciesRow:
 
 
 def one_species_rows(session: TimingSession) -> list[OneSpeciesRow]:
-    """Return what one species costs beside `rollout`, inference and training."""
+    """Return rows of inference and training."""
     rows: list[OneSpeciesRow] = []
     for workload in SPECIES["small" if session.small else session.device.type]:
         for train in (False, True):
@@ -482,7 +466,7 @@ def _species_row(
 def roll_one_species(
     rule: NPARule, x: Tensor, s: Tensor, steps: int, **options: Any
 ) -> tuple[Tensor, Tensor]:
-    """Roll worlds out as those of one species that sees densities as it does alone."""
+    """Roll worlds out as those of one species, with the densities of `rollout`."""
     count = [x.shape[1]]
     worlds: tuple[Tensor, Tensor] = rollout_species(
         [rule], x, s, steps, counts=count, density_counts=count, **options
