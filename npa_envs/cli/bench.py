@@ -34,46 +34,32 @@ class BenchOptions(MeasureOptions):
 
     suite: str | None = None
     """quick (the default), paper, scaling, skips, species or kernels."""
-
     quick: bool = False
     """Small worlds only: about a minute on a CPU."""
-
     repeats: int = 7
     """Readings of every time; tables show their median and range."""
-
     out: Path | None = None
     """Folder for SUITE_DEVICE.json and plots; default: nothing is written."""
-
     max_seconds: float | None = None
     """Leave out what has not begun after this time [s]; the rest is written. Default: never."""
-
     plots: bool = False
     """Also draw plots into the output folder; needs the extra `bench`."""
-
     explain: bool = False
     """Measure nothing: say which kernels a step launches, and why. The options below tell which."""
-
     space_dim: Literal[2, 3] = 2
     """Space dimension of the step explained."""
-
     world_count: int = 1
     """Its worlds B."""
-
     particle_count: int = 4096
     """Its particles in each world N."""
-
     state_dim: int = 16
     """Its state channels C."""
-
     update_prob: float = 0.5
     """Its probability of each particle's update."""
-
     periodic: bool = False
     """Its box is periodic."""
-
     dtype: Literal["float32", "float64"] = "float32"
     """Its precision."""
-
     gradients: Literal["none", "weights", "positions"] = "weights"
     """What it is differentiated by: nothing, weights and states, or positions as well."""
 

@@ -61,52 +61,39 @@ class CompareOptions(MeasureOptions):
     out: Path = Path("comparison")
     """Folder for AXIS/TASK/METHOD/seed-K/, and for comparison.md, .json, .csv and pictures of what
     the command names (curves need the extra `bench`)."""
-
     suite: Literal["npa-bench-v0", "npa-bench-small-v0"] | None = None
     """Run a frozen benchmark, the small one on a laptop, with its own tasks, budgets and episodes;
     write a row for each method, OUT/rows/METHOD.json, and keep what it has of other tasks and
     seeds."""
-
     tasks: tuple[str, ...] = ()
     """morphogenesis2d, regeneration2d, point_classification, mixing, or those of the suite, its ids
     without npa/; default: all, or the first when quick."""
-
     methods: tuple[str, ...] = ()
     """Methods of npa_envs.agents.learning; default: all but `clone`, which needs a teacher: the run
     of `gradient` from the same seed, or options; of a suite: all of them. NAME=METHOD gives one a
     name of its own, for other options (bold=ppo), or runs your function (mine=module:function)."""
-
     seeds: int | None = None
     """Seeds for each method and task: 0, 1, ...; default: 3, 5 of a suite, or 1 when quick."""
-
     seconds: float | None = None
     """Compare for equal wall time: seconds that each run may learn. Its start and evaluations come
     on top."""
-
     particle_steps: float | None = None
     """Compare for equal particle-steps: as many as each run may learn from, for example 1e8."""
-
     episodes: int | None = None
     """Held-out episodes that tell what a run has reached; default: 32, or 4 when quick."""
-
     options: Annotated[tuple[str, ...], tyro.conf.arg(metavar="METHOD.NAME=VALUE")] = ()
     """Options of methods, values as JSON or plain text: evolution.population=64."""
-
     quick: bool = False
     """Tiny worlds and, unless said otherwise, few steps, methods, tasks and one seed, a minute at
     most on two CPU cores: figures that say nothing but that it runs."""
-
     devices: tuple[str, ...] = ()
     """Several devices that runs are dealt out to, for example cuda:0 cuda:1; default: --device."""
-
     jobs: int | None = None
     """Runs at once; default: one for each device. Those on one device share its time, which counts
     where wall time is equal: with --seconds, as many on each device."""
-
     part: Annotated[str | None, tyro.conf.arg(metavar="K/N")] = None
     """Run the K-th of N parts alone: a machine, or a task of a scheduler's array, takes one each,
     all with the same --out on a shared disk."""
-
     max_seconds: float = math.inf
     """No run begins after so long; the next call goes on."""
 
@@ -166,11 +153,7 @@ def main(arguments: Sequence[str]) -> int:
 
 
 def make_plan(options: CompareOptions) -> ComparisonPlan:
-    """Return what the command line asks for.
-
-    Raises:
-        NPAError: As for `main`.
-    """
+    """Return the plan that the command line asks for."""
     from npa_envs.agents.comparison.plan import LEFT_OUT, PROBLEMS, ComparisonPlan, make_problem
     from npa_envs.agents.learning import METHODS
     from npa_envs.agents.learning.problem import RUNS

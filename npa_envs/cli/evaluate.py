@@ -27,25 +27,19 @@ class EvaluateOptions(RuleOptions):
 
     data_folder: str | None = None
     """Point clouds only: where torchvision keeps "mnist"; default: as trained."""
-
     checkpoints: tuple[int, ...] | None = None
     """Steps from the seed to measure at, increasing; default: 64, 128, ... 4096, or 8, 16, 24, 32,
     64, 128 of point clouds."""
-
     seed_count: int = 8
     """Worlds to measure, each from a seed of its own; of point clouds all test clouds are taken."""
-
     first_seed: int = 1_000_000
     """The first world's number; training uses others."""
-
     healing: bool = False
     """Also cut the grown worlds and wipe a part, and measure how they heal. Point clouds are
     always cut and changed."""
-
     judge: bool = False
     """Textures only: also judge worlds by three distances from the target that no loss compares, as
     ratios: at 1 they differ from it as drawings of it by particles do."""
-
     json: Path | None = None
     """Also write the table to this JSON file."""
 
@@ -55,7 +49,7 @@ def main(arguments: Sequence[str]) -> int:
     options = parse_options(EvaluateOptions, "evaluate", arguments)
     from npa_envs.devices import check_device
     from npa_envs.files import write_text
-    from npa_envs.measure.judge import JudgeRow, TextureJudge
+    from npa_envs.measure.judge import TextureJudge
     from npa_envs.measure.quality import CHECKPOINTS, check_steps, tables_of
     from npa_envs.measure.tables import UNMEASURED, table_text, tables_json
     from npa_envs.rule.files import load_rule
@@ -77,7 +71,6 @@ def main(arguments: Sequence[str]) -> int:
             "give --target, a built-in name or a picture"
         )
     judge = TextureJudge(trained.task) if options.judge else None
-    judged: list[JudgeRow] = []
     clouds = isinstance(trained.task, PointClassification)
     known = not (clouds or options.healing)
     with StepBar(max(checkpoints) if known else None, show=options.progress) as bar:
@@ -89,10 +82,8 @@ def main(arguments: Sequence[str]) -> int:
             changed=clouds or options.healing,
             device=device,
             progress=bar.advance,
-            watch=None if judge is None else lambda *world: judged.append(judge.row(*world)),
+            judge=judge,
         )
-    if judged:
-        tables["judge"] = judged
     what = f"{options.seed_count} worlds"
     if isinstance(trained.task, PointClassification):
         what = f"{len(trained.task.clouds.label)} {trained.task.split} clouds"
@@ -106,12 +97,7 @@ def main(arguments: Sequence[str]) -> int:
 
 
 def evaluate_pictures(options: EvaluateOptions, rule: NPARule, device: torch.device) -> int:
-    """Measure and print what each code of a rule of many pictures grows.
-
-    Raises:
-        NPAError: A picture cannot be loaded any more, or something is asked for that is measured of
-            one picture.
-    """
+    """Measure and print the pictures of a rule of many, each by its code."""
     from npa_envs.files import write_text
     from npa_envs.measure.codes import PICTURE_CHECKPOINTS, picture_rows
     from npa_envs.measure.tables import table_text, tables_json

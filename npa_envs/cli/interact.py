@@ -56,41 +56,29 @@ class InteractOptions(RunOptions):
 
     rules: Annotated[tuple[str, ...], tyro.conf.Positional, tyro.conf.arg(metavar="RULE")] = ()
     """Rules of 2D morphogenesis: shipped ones (`npa-envs list`) or files; default: all shipped."""
-
     seed_count: int = 8
     """Worlds of each encounter, each from seeds of its own."""
-
     first_seed: int = 1_000_000
     """The first world's number; training uses others."""
-
     distances: tuple[float, ...] = (0.0, 0.5, 1.0)
     """Distances between the centres of the two seeds [length units]."""
-
     ratios: tuple[float, ...] = (0.5,)
     """Shares of the particles that are the measured rule's."""
-
     eps_factors: tuple[float, ...] = (1.0,)
     """Perception radii, over that of the rules."""
-
     itself: bool = True
     """Also bring each rule together with itself."""
-
     steps: int = 512
     """Steps from the seeds."""
-
     particle_count: int | None = None
     """Particles of both together; default: the most that one of the rules was trained with."""
-
     update_prob: float | None = None
     """Probability of each particle's update in a step; default: of each rule as trained."""
-
     margin: float = 0.2
     """Share by which a loss must change to count as changed."""
-
     quick: bool = False
     """Two rules, worlds and distances, few particles and steps, unless said otherwise: figures that
     say nothing but that it runs."""
-
     out: Path = Path("runs/interact")
     """Folder to write to; created where missing."""
 

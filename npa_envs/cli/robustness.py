@@ -36,25 +36,19 @@ class RobustnessOptions(MeasureOptions):
     rules: Annotated[tuple[str, ...], tyro.conf.Positional, tyro.conf.arg(metavar="RULES")] = ()
     """Shipped rules (`npa-envs list`), rules that runs begin with (`seven-pictures`), files of
     rules, or folders of runs; default: all shipped ones, or one of each task when quick."""
-
     seed_count: int | None = None
     """Seeds for each figure; default: 8, or 2 when quick."""
-
     first_seed: int = 1_000_000
     """The first seed's number; training uses others."""
-
     most_particles: int | None = None
     """Particles of all seeds' worlds together, above which a condition is left out; default:
     131072 on a CPU, 2097152 on CUDA."""
-
     quick: bool = False
     """Small worlds, few steps and values, a minute at most on two CPU cores: figures that say
     nothing but that it runs."""
-
     out: Path | None = None
     """Folder for robustness_RULE.json, robustness.md, and curves (extra `bench`); default: nothing
     is written."""
-
     max_seconds: float | None = None
     """Stop after this time; the same command goes on. Default: never."""
 

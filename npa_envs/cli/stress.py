@@ -37,23 +37,17 @@ class StressOptions(MeasureOptions):
     rules: Annotated[tuple[str, ...], tyro.conf.Positional, tyro.conf.arg(metavar="RULES")] = ()
     """Check these rules alone, in all checks that are of a rule: shipped ones (`npa-envs list`),
     files of rules, or folders of runs; default: the library and the shipped rules."""
-
     quick: bool = False
     """Small worlds, few steps, some rules: about a minute on two CPU cores."""
-
     only: tuple[str, ...] = ()
     """Groups (geometry, values, time, gradients, precision), checks (time/gecko), or the first
     words of checks (geometry/clump); default: all."""
-
     max_seconds: float | None = None
     """Begin no check after so long [s]; what is left is skipped, and run by the next call."""
-
     seed: int = 0
     """What random worlds are drawn from."""
-
     out: Path | None = None
     """Folder for stress_DEVICE.json and heat maps (extra `bench`); default: nothing is written."""
-
     list: bool = False
     """Run nothing: say which checks there are and what each expects."""
 

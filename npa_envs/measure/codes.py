@@ -1,4 +1,4 @@
-"""Rules of many pictures: what each code grows, and what the code of another picture grows."""
+"""Rules of many pictures: loss and PSNR of each picture by its code, and by another code."""
 
 from __future__ import annotations
 
@@ -10,11 +10,10 @@ import torch
 from torch import Tensor
 
 from npa_envs.errors import NPAError
-from npa_envs.measure.quality import check_steps, psnr
+from npa_envs.measure.quality import check_steps, psnr, run_worlds
 from npa_envs.rule.rule import NPARule
 from npa_envs.tasks.morphogenesis2d import Morphogenesis2D
 from npa_envs.world.randomness import WorldRandom
-from npa_envs.world.rollout import rollout
 
 WORLDS = 64
 """Worlds that are run at once."""
@@ -28,18 +27,16 @@ MEDIAN = "(median)"
 
 @dataclass(frozen=True)
 class PictureRow:
-    """Worlds of one picture, grown from its code."""
+    """Worlds of one picture, or medians of all pictures: means of splat loss and PSNR [dB].
+
+    `shuffled` is the loss with the code of the next picture of the list.
+    """
 
     step: int
-    """Steps from the seed."""
     target: str
-    """The picture's name, or `MEDIAN`."""
     loss: float
-    """Splat loss with its own code, mean of the worlds."""
     shuffled: float
-    """Splat loss with the code of the next picture of the list, mean of the worlds."""
     psnr: float
-    """PSNR with its own code, mean of the worlds [dB]."""
 
 
 @torch.no_grad()
@@ -52,22 +49,10 @@ def grown(
     device: str | torch.device = "cpu",
     progress: Callable[[int], None] | None = None,
 ) -> list[tuple[Tensor, Tensor]]:
-    """Return worlds of each task after some steps, all from the same seeds.
+    """Return x [T, B, N, 2] and s [T, B, N, C] of T tasks at each of `checkpoints`.
 
-    Args:
-        rule: The rule.
-        tasks: Tasks of equal worlds, each with its own code.
-        checkpoints: Steps from the seed, positive and increasing.
-        seeds: One number for each world of a task.
-        device: Where to run.
-        progress: Called with the number of steps done since its last call.
-
-    Returns:
-        For each of `checkpoints` positions [length units], shape [T, B, N, 2], and states, shape
-        [T, B, N, C].
-
-    Raises:
-        NPAError: `checkpoints` are empty or out of order.
+    All tasks have equal worlds, each its own code, and start from the same seeds; `progress` is
+    called with the number of steps done since its last call.
     """
     check_steps("checkpoints", checkpoints)
     together = max(1, WORLDS // len(seeds))
@@ -82,15 +67,7 @@ def grown(
         random = WorldRandom([*seeds] * len(some), device=device)
         done = 0
         for number, step in enumerate(checkpoints):
-            x, s = rollout(
-                rule,
-                x,
-                s,
-                step - done,
-                eps=some[0].eps,
-                update_prob=some[0].update_prob,
-                generator=random,
-            )
+            x, s = run_worlds(rule, some[0], x, s, step - done, random)
             found[number].append((x, s))
             if progress is not None:
                 progress(step - done)
@@ -116,26 +93,18 @@ def picture_rows(
     device: str | torch.device = "cpu",
     progress: Callable[[int], None] | None = None,
 ) -> list[PictureRow]:
-    """Measure what each code grows, and what the code of the next picture in the list grows.
+    """Return for each of `checkpoints` a row for each picture, and one of the medians.
 
-    Args:
-        rule: The rule.
-        tasks: The tasks of its pictures, each with its code, two or more.
-        checkpoints: As for `grown`.
-        seeds: As for `grown`.
-        device: Where to run.
-        progress: As for `grown`.
-
-    Returns:
-        For each of `checkpoints` a row for each picture, and one of the medians.
+    Arguments are those of `grown`.
 
     Raises:
-        NPAError: There are fewer than two pictures, or as for `grown`.
+        NPAError: There are fewer than two pictures, or `checkpoints` are empty or out of order.
     """
     if len(tasks) < 2:
         raise NPAError(f"pictures must be two or more, got {len(tasks)}: nothing to tell apart")
-    told = {"seeds": seeds, "device": device, "progress": progress}
-    worlds = grown(rule, tasks, checkpoints=checkpoints, **told)  # type: ignore[arg-type]
+    worlds = grown(
+        rule, tasks, checkpoints=checkpoints, seeds=seeds, device=device, progress=progress
+    )
     rows = []
     for step, (x, s) in zip(checkpoints, worlds, strict=True):
         own = [_row(step, tasks, number, x, s) for number in range(len(tasks))]
@@ -150,7 +119,7 @@ def picture_rows(
 def _row(
     step: int, tasks: Sequence[Morphogenesis2D], number: int, x: Tensor, s: Tensor
 ) -> PictureRow:
-    """Return the row of one task, of worlds x [T, B, N, 2], s [T, B, N, C] of all."""
+    """Return the row of one task from the worlds of all."""
     task, other = tasks[number], (number + 1) % len(tasks)
     ratio = psnr(task.picture(x[number], s[number]), task.target_picture)
     return PictureRow(

@@ -9,7 +9,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -173,24 +173,20 @@ FRAME_RESOLUTION = 160
 
 @dataclass(frozen=True)
 class RuleUnderTest:
-    """A trained rule that grows in 2D, and what it grows."""
+    """A trained rule that grows in 2D, and its task with a number of particles."""
 
     name: str
-    """What tables call it."""
     rule: NPARule
-    """The rule, on the device to run on."""
     task_of: Callable[[int], PictureTask]
-    """Returns its task with a number of particles, of which seeds are made and losses taken."""
     update_prob: float
     """Probability of a particle's update in a step, as trained (dimensionless)."""
 
 
-@dataclass
-class Scenes:
+class Scenes(NamedTuple):
     """Pictures of the first worlds, uint8, [R, R, 3]: `len(FRAME_SHARES)` of each encounter."""
 
-    frames: list[NDArray[np.uint8]] = field(default_factory=list)
-    captions: list[str] = field(default_factory=list)
+    frames: list[NDArray[np.uint8]]
+    captions: list[str]
 
 
 class _Solo(NamedTuple):
@@ -235,7 +231,7 @@ class Encounters:
         self, first: RuleUnderTest, second: RuleUnderTest
     ) -> tuple[list[InteractionRow], Scenes]:
         """Grow one rule, which is measured, with another or itself: a row for each setting."""
-        rows, scenes, given = [], Scenes(), self.settings
+        rows, scenes, given = [], Scenes([], []), self.settings
         spacing = math.sqrt(4.0 / given.particle_count)
         for factor, ratio, distance in itertools.product(
             given.eps_factors, given.ratios, given.distances
@@ -366,10 +362,10 @@ def interaction_record(path: Path, settings: Mapping[str, Any]) -> Record[Intera
 
     def read(held: dict[str, Any]) -> list[InteractionRow]:
         # JSON has no infinite numbers.
-        return [
-            InteractionRow(**{k: math.inf if v is None else v for k, v in row.items()})
-            for row in held["rows"]
+        rows: list[dict[str, Any]] = [
+            {k: math.inf if v is None else v for k, v in row.items()} for row in held["rows"]
         ]
+        return [InteractionRow(**row) for row in rows]
 
     record = Record[InteractionRow](settings, path=path, content=content, key="settings")
     return record.resume(read, command="interact")
@@ -422,20 +418,13 @@ def phase_diagram(rows: Sequence[InteractionRow]) -> bytes:
     found = {(row.eps_factor, row.ratio, row.distance): row for row in rows}
     size = 1.6 + 0.62 * len(distances), 1.4 + 0.4 * len(ratios)
     figure, grid = new_figure(2, len(factors), (size[0] * len(factors) + 1.0, 2 * size[1]))
+    names = [[f"{value:g}" for value in values] for values in (ratios, distances)]
     for panels, (what, title, colours, norm, bar) in zip(grid, _shades(), strict=True):
         for panel, factor in zip(panels, factors, strict=True):
             held = [[found.get((factor, r, d)) for d in distances] for r in ratios]
-            scale = draw_matrix(
-                panel,
-                [f"{ratio:g}" for ratio in ratios],
-                [f"{distance:g}" for distance in distances],
-                [[None if row is None else getattr(row, what) for row in line] for line in held],
-                colours=colours,
-                norm=norm,
-                notes=[
-                    ["" if row is None else _interval(row, what) for row in line] for line in held
-                ],
-            )
+            values = [[row and getattr(row, what) for row in line] for line in held]
+            notes = [["" if row is None else _interval(row, what) for row in line] for line in held]
+            scale = draw_matrix(panel, *names, values, colours=colours, norm=norm, notes=notes)
             panel.set(xlabel="distance")
             panel.set_title(title + _radius(factor), fontsize=9)
         panels[0].set_ylabel(f"ratio of {rows[0].rule}")
@@ -455,16 +444,12 @@ def _radius(factor: float) -> str:
 
 
 def _shades() -> tuple[tuple[str, str, str, Any, dict[str, Any]], ...]:
-    """Return what is drawn of rows: field, title, colours, their norm, and marks of their bar."""
+    """Return for each drawn field its name, title, colours, their norm, and marks of their bar."""
     from matplotlib.colors import LogNorm, Normalize
 
+    ticks = {"ticks": [0.25, 0.5, 1.0, 2.0, 4.0], "format": "%g"}
+    changes = LogNorm(1.0 / LARGEST_CHANGE, LARGEST_CHANGE)
     return (
-        (
-            "change",
-            "loss together / alone",
-            "RdBu_r",
-            LogNorm(1.0 / LARGEST_CHANGE, LARGEST_CHANGE),
-            {"ticks": [0.25, 0.5, 1.0, 2.0, 4.0], "format": "%g"},
-        ),
+        ("change", "loss together / alone", "RdBu_r", changes, ticks),
         ("mixing", "mixing index", "viridis", Normalize(0.0, 1.0), {}),
     )

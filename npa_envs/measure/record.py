@@ -6,17 +6,14 @@ other facts (device, machine, commit, versions, settings) are refused.
 
 from __future__ import annotations
 
-import argparse
 import importlib.metadata
 import math
 import os
 import platform
 import subprocess
-import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from datetime import date
 from pathlib import Path
 from typing import Any, Generic, TypeVar
 
@@ -169,28 +166,6 @@ def without_folders(words: Sequence[str], *options: str) -> list[str]:
     return plain
 
 
-def script_parser(description: str | None) -> argparse.ArgumentParser:
-    """Return a parser of the options that all scripts in `benchmarks/` have."""
-    parser = argparse.ArgumentParser(description=description)
-    parser.add_argument("--device", default="cuda" if torch.cuda.is_available() else "cpu")
-    parser.add_argument("--threads", type=int, default=1, help="CPU threads of torch")
-    parser.add_argument("--commit", help="commit that is measured; default: that of the checkout")
-    parser.add_argument("--output", type=Path, help="JSON file to write")
-    return parser
-
-
-def script_facts(arguments: argparse.Namespace) -> dict[str, str]:
-    """Return what the record of a script of `script_parser` begins with, without its path."""
-    words = ["OUT" if word == str(arguments.output) else word for word in sys.argv]
-    return {
-        "command": " ".join(["python", *words]),
-        "commit": arguments.commit or current_commit(),
-        "date": date.today().isoformat(),
-        "machine": machine(torch.device(arguments.device)),
-        "torch": torch.__version__,
-    }
-
-
 def machine(device: torch.device) -> str:
     """Return the name of a device's hardware."""
     if device.type == "cuda":
@@ -213,10 +188,8 @@ def installed_version(name: str) -> str | None:
 
 def versions() -> dict[str, str | None]:
     """Return versions of Python and of `LIBRARIES`; None: not installed."""
-    return {
-        "python": platform.python_version(),
-        **{name: installed_version(name) for name in LIBRARIES},
-    }
+    found = {name: installed_version(name) for name in LIBRARIES}
+    return {"python": platform.python_version(), **found}
 
 
 def current_commit() -> str:

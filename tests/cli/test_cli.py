@@ -539,7 +539,7 @@ def test_rollout_notices_before_the_first_step_that_it_cannot_write(
 ):
     refuse = raising(PermissionError(13, "Permission denied"))
     monkeypatch.setattr("npa_envs.cli.output.tempfile.TemporaryFile", refuse)
-    monkeypatch.setattr("npa_envs.cli.film.rollout", lambda *_, **__: pytest.fail("a step ran"))
+    monkeypatch.setattr("npa_envs.cli.film.run_worlds", lambda *_, **__: pytest.fail("a step ran"))
     words = ["rollout", rule, "--steps", "9", "--out", str(tmp_path)]
     assert "out must be a folder that can be written to" in error_of(capsys, words)
 

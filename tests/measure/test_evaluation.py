@@ -16,9 +16,8 @@ from npa_envs.measure.quality import (
     evaluate,
     healing,
     psnr,
-    table_text,
-    tables_json,
 )
+from npa_envs.measure.tables import table_text, tables_json
 from npa_envs.rule.rule import NPARule
 
 

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from scripts import script_facts, script_parser
 
 from npa_envs.errors import NPAError
 from npa_envs.measure.plots import mark_decades, write_plots
@@ -15,8 +16,6 @@ from npa_envs.measure.record import (
     measured_facts,
     number,
     read_record,
-    script_facts,
-    script_parser,
     time_limit,
     without_folders,
     write_record,

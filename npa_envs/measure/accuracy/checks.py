@@ -27,16 +27,13 @@ class Skipped(Exception):
 
 @dataclass(frozen=True)
 class CheckResult:
-    """What a check found."""
+    """Figures of a check by name, and limits of some of them."""
 
     figures: Mapping[str, float]
-    """What was measured, by name."""
     limits: Mapping[str, float] = field(default_factory=dict)
-    """The largest value that the figure of a name may have; others have none."""
     holds: str = ""
     """For a range: where it holds, in words."""
     note: str = ""
-    """What else there is to know."""
 
     def exceeded(self) -> list[str]:
         """Return the names whose figure is above its limit, not a number, or missing."""
@@ -56,16 +53,13 @@ class CheckResult:
 
 @dataclass
 class CheckSession:
-    """One run of the command."""
+    """One run of the command; when quick, with small worlds and few steps."""
 
     device: torch.device
-    """Where everything is run."""
     quick: bool = False
-    """Small worlds and few steps: about a minute on two CPU cores."""
     seed: int = 0
-    """What random worlds are drawn from."""
     kept: dict[Any, Any] = field(default_factory=dict)
-    """What several checks need and only one has to make."""
+    """Results that several checks share."""
 
     @property
     def cuda(self) -> bool:
@@ -85,10 +79,7 @@ class CheckSession:
 
 @dataclass(frozen=True)
 class Check:
-    """A hard case GROUP/CASE, what is expected in a sentence, and what measures it.
-
-    `run` raises `Skipped` where there is nothing to measure.
-    """
+    """A hard case GROUP/CASE, its expectation in a sentence, and the function that measures it."""
 
     name: str
     expected: str

@@ -1,4 +1,4 @@
-"""Plans of what is measured of a rule: conditions and their values, steps, shapes of seeds."""
+"""Plans of robustness: conditions and their values, steps, shapes of seeds."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ from npa_envs.world.randomness import WorldRandom
 # Seeds of other shapes than the trained one, as dense where their size allows it.
 
 SIZE_FACTOR = 1.5
-"""By how much a larger disk's radius is larger, and a smaller one's smaller."""
+"""Ratio of a larger disk's radius, and its inverse that of a smaller one's."""
 
 BLOB_DISTANCE = 1.25
 """From the origin to the centre of each of two blobs, in their radii (dimensionless)."""
 
 Shape = Callable[[int, int, float, WorldRandom], Tensor]
-"""Makes positions [length units], shape [B, N, D], of N, D, the disk's radius and randomness."""
+"""Makes positions [B, N, D] of N, D, the disk's radius and randomness."""
 
 
 def disk(particle_count: int, space_dim: int, radius: float, random: WorldRandom) -> Tensor:
@@ -47,10 +47,7 @@ def square(particle_count: int, space_dim: int, radius: float, random: WorldRand
 
 
 def two_blobs(particle_count: int, space_dim: int, radius: float, random: WorldRandom) -> Tensor:
-    """Return two disks beside each other with the area of one, balls in 3D.
-
-    Every other particle is in the left one.
-    """
+    """Return two disks side by side with the area of one, balls in 3D."""
     small = radius * 0.5 ** (1.0 / space_dim)
     x = disk(particle_count, space_dim, small, random)
     side = torch.arange(particle_count, device=x.device) % 2 * 2 - 1
@@ -78,7 +75,7 @@ CONDITIONS = {
     "noise": "noise of every position in each step, over the perception radius",
     "shape": "shape of the seed",
 }
-"""What is varied, one at a time, with a summary."""
+"""Conditions, varied one at a time, with a summary."""
 
 TRAINED: Mapping[str, float | str] = {
     "eps": 1.0,
@@ -97,18 +94,18 @@ def trained_value(condition: str, update_prob: float) -> float | str:
 
 @dataclass(frozen=True, kw_only=True)
 class TrialPlan:
-    """What is measured of one rule."""
+    """Measurements of one rule: all steps are whole chunks, which CUDA records as a graph.
+
+    `grow_steps` lead from the seed to the damage, and to the loss under each condition;
+    `heal_steps` after the damage, from 0 on, losses are taken; `values` of each condition increase,
+    the trained one among them.
+    """
 
     grow_steps: int
-    """Steps from the seed to the damage, and to the loss under each condition: whole chunks."""
     heal_steps: tuple[int, ...]
-    """Steps after the damage at which the loss is taken, increasing from 0, in whole chunks."""
     chunk: int
-    """Steps that are recorded in one CUDA graph."""
     worlds_per_seed: int = 1
-    """Worlds whose mean loss is that of a seed."""
     values: Mapping[str, tuple[float | str, ...]]
-    """Values of each condition, numbers increasing, the trained one among them."""
 
 
 _HEAL_STEPS = (0, 16, 32, 48, 64, 96, 128, 192, 256, 384, 512, 768, 1024)
@@ -132,9 +129,9 @@ PLANS = {
         grow_steps=64,
         heal_steps=(0, 8, 16, 24, 32, 48, 64, 96, 128),
         chunk=8,
-        # Few clouds are wrong, and of one that is nearly all particles are.
+        # Few clouds are wrong, and nearly all of their particles are.
         worlds_per_seed=128,
-        # Clouds are what they are: their shape is what is to be told.
+        # The shape of a cloud is its class.
         values={name: values for name, values in _VALUES.items() if name != "shape"},
     ),
 }

@@ -1,4 +1,4 @@
-"""Grounds that a rule is tried on: worlds of its task, from unseen seeds, each with own streams."""
+"""Test worlds of a rule: its task, unseen seeds, a stream each."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from npa_envs.training.trained_tasks import task_of_rule, tasks_of_codes
 from npa_envs.world.randomness import StreamId, WorldRandom
 
 SEEN_AT_ONCE = 1 << 17
-"""Particles of the worlds whose loss is taken at once: many views of many Gaussians take room."""
+"""Particles of the worlds whose loss is taken at once; views of Gaussians take much memory."""
 
 BOX_SHARE = 0.25
 """Radius of seeds of another shape, over the side of a box that is full when trained."""
@@ -31,21 +31,17 @@ BOX_SHARE = 0.25
 
 @dataclass(frozen=True)
 class TaskTrial(EnduranceCase):
-    """A rule in worlds of its task, and what these worlds are to show."""
+    """A rule in worlds of its task, with their goals, where the task has such."""
 
     goal: Tensor | None = None
-    """Goals of the worlds, int64, shape [B], where the task has such."""
 
     def with_worlds(self, x: Tensor, s: Tensor) -> TaskTrial:
-        """Return the same with particles x [K B, N, D], s [K B, N, C]: K copies of all worlds."""
+        """Return the same with other particles of K copies of all worlds, [K B, N, ...]."""
         goal = None if self.goal is None else self.goal.repeat(len(x) // len(self.goal))
         return replace(self, x=x, s=s, goal=goal)
 
     def losses(self, x: Tensor, s: Tensor) -> Tensor:
-        """Return how far each world is from the goal, shape [B]; lower is better.
-
-        That is the task's metric; of clouds, the share of particles that say the wrong class.
-        """
+        """Return the task's metric, [B]; of clouds, the share of particles that are wrong."""
         some = max(1, SEEN_AT_ONCE // x.shape[1])
         found = []
         with torch.no_grad():
@@ -63,13 +59,9 @@ class TaskTrial(EnduranceCase):
 
 
 class PicturesInTurn:
-    """Worlds of several pictures of one rule, each compared as in a world of its own.
+    """Worlds of several pictures of one rule: a world's goal is the place of its task.
 
-    Satisfies `GoalTask` and `CodedTask`: a world's goal is the place of its picture.
-
-    Args:
-        tasks: The task of each picture, for the rule.
-        goal: Which of them the worlds grow, int64, shape [B].
+    Satisfies `GoalTask` and `CodedTask`.
     """
 
     def __init__(self, tasks: Sequence[Morphogenesis2D], goal: Tensor) -> None:
@@ -93,7 +85,7 @@ class PicturesInTurn:
     def seed_with_goals(
         self, world_count: int, *, generator: WorldRandom, device: torch.device
     ) -> tuple[Tensor, Tensor, Tensor]:
-        """Return fresh worlds with the codes of their pictures, and which ones these are."""
+        """Return fresh worlds with the codes of their pictures, and their goals."""
         x, s = self._tasks[0].seed(world_count, generator=generator, device=device)
         return x, self.coded(s), self._goal
 
@@ -104,7 +96,7 @@ class PicturesInTurn:
         return *self._tasks[0].damage(x, s, generator), goal
 
     def toward(self, goal: Tensor) -> PicturesInTurn:
-        """Return the task for worlds of other pictures, int64, shape [B]."""
+        """Return the task for worlds of other pictures."""
         return PicturesInTurn(self._tasks, goal)
 
     def coded(self, s: Tensor) -> Tensor:
@@ -115,7 +107,7 @@ class PicturesInTurn:
         return s
 
     def metric(self, x: Tensor, s: Tensor) -> Tensor:
-        """Return how far each world is from its picture, shape [B]."""
+        """Return the metric of each world, [B]."""
         losses = x.new_empty(len(x))
         for task, worlds in self._worlds():
             losses[worlds] = task.metric(x[worlds], s[worlds])
@@ -127,10 +119,9 @@ class PicturesInTurn:
 
 
 class RuleTrial:
-    """A rule and the tasks that it is tried in, one for each number of particles.
+    """A rule and its tasks, one for each number of particles, with seeds unseen in training.
 
-    The seeds are none that a rule was trained with. Of a rule of many pictures, world k of all
-    numbers grows picture k, modulo their number.
+    Of a rule of many pictures, world k grows picture k, modulo their number.
     """
 
     def __init__(
@@ -156,9 +147,7 @@ class RuleTrial:
         if found.doubt is not None:
             raise NPAError(f"cannot measure {name!r}: {found.doubt}: choose another rule")
         self.task: Any = found.task
-        """The task as trained."""
         self.metric_name = found.task.metric_name
-        """What losses are."""
         if isinstance(found.task, PointClassification):
             self.metric_name = "share of particles that are wrong"
         if self.rule.codes is not None:
@@ -204,24 +193,20 @@ class RuleTrial:
         random = self.random(StreamId.GROWTH)
         x, s, goal = seed_worlds(task, self.world_count, generator=random, device=self._device)
         if shape != "trained":
-            x = SHAPES[shape](count, self.rule.space_dim, self._seed_radius(), random)
+            config, box = self.task.config, isinstance(self.task, Texture)
+            radius = BOX_SHARE * config.box_size if box else config.seed_radius
+            x = SHAPES[shape](count, self.rule.space_dim, float(radius), random)
         return TaskTrial(
             self.rule, task_toward(task, goal), x.float(), s.float(), self.plan.grow_steps, goal
         )
 
     def run(self, home: TaskTrial, random: WorldRandom, **changed: Any) -> LongRun:
-        """Return what runs worlds; `changed` are options of `rollout` that are not as trained."""
+        """Return a run of worlds; `changed` are options of `rollout` that differ from training."""
         return LongRun(home, random, home.options(**changed), chunk=self.plan.chunk)
 
     def by_seed(self, losses: Tensor) -> Tensor:
-        """Return the mean loss of each seed's worlds, shape [..., seeds], from [..., B]."""
+        """Return the mean loss of each seed's worlds, [..., seeds], from [..., B]."""
         return losses.double().reshape(*losses.shape[:-1], len(self.seeds), -1).mean(-1)
-
-    def _seed_radius(self) -> float:
-        config = self.task.config
-        if isinstance(self.task, Texture):
-            return BOX_SHARE * float(config.box_size)
-        return float(config.seed_radius)
 
 
 def _resized(task: Any, particle_count: int, device: torch.device) -> Task:
@@ -238,14 +223,14 @@ def _resized(task: Any, particle_count: int, device: torch.device) -> Task:
 
 
 def finite_worlds(x: Tensor, s: Tensor) -> Tensor:
-    """Return in which worlds x [B, N, D], s [B, N, C] all is finite, shape [B]."""
+    """Return which worlds are finite, [B]."""
     return x.isfinite().flatten(1).all(1) & s.isfinite().flatten(1).all(1)
 
 
 def loss_curves(home: TaskTrial, run: LongRun, steps: tuple[int, ...]) -> Tensor:
-    """Run worlds and return their losses after numbers of steps, shape [len(steps), B].
+    """Run worlds and return their losses after numbers of steps, [len(steps), B].
 
-    A world that is not finite has the loss NaN from then on, and does not disturb the others.
+    A world that is not finite has the loss NaN from then on; the others are not disturbed.
     """
     lost = torch.zeros(len(home.x), dtype=torch.bool, device=home.x.device)
     found = []

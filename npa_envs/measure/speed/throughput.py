@@ -272,9 +272,8 @@ def varied(axis: str, value: int, *, small: bool = False) -> Workload:
 def _scaling_row(session: TimingSession, axis: str, value: int) -> ScalingRow:
     workload = varied(axis, value, small=session.small)
     cost = throughput_row(session, workload)
-    own = {"neighbours": workload.neighbour_count, "channels": workload.state_dim}
-    costs = ("workload", "infer_us", "train_us", "infer_mib", "train_mib")
-    return ScalingRow(axis, value, **own, **{name: getattr(cost, name) for name in costs})
+    own = (axis, value, cost.workload, workload.neighbour_count, workload.state_dim)
+    return ScalingRow(*own, cost.infer_us, cost.train_us, cost.infer_mib, cost.train_mib)
 
 
 def slope_rows(rows: Sequence[ScalingRow]) -> list[SlopeRow]:
