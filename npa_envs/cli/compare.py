@@ -21,6 +21,7 @@ from npa_envs.cli.output import (
     StepBar,
     check_numbers,
     chosen_names,
+    named_values,
     parse_options,
     writable_folder,
 )
@@ -46,7 +47,7 @@ QUICK: dict[str, Any] = {
     "methods": ("gradient", "evolution", "zero"),
     "seeds": 1,
 }
-"""What a quick comparison compares unless it is told."""
+"""Defaults of a quick comparison."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -127,7 +128,7 @@ def main(arguments: Sequence[str]) -> int:
         write_table(plan, whole(), folder, command)
         bar.advance(1)
 
-    places = Places(_devices(options), _jobs(options), options.threads)
+    places = Places((options.devices or (options.device,)), _jobs(options), options.threads)
     with StepBar(len(missing), show=options.progress, unit="run") as bar:
         run_jobs(
             plan,
@@ -138,17 +139,17 @@ def main(arguments: Sequence[str]) -> int:
             max_seconds=options.max_seconds,
             written=written,
         )
-    told = [write_table(plan, whole(), folder, command), *write_pictures(whole(), folder)]
+    lines = [write_table(plan, whole(), folder, command), *write_pictures(whole(), folder)]
     if options.suite is not None:
         rows = write_rows(
             SUITES[options.suite], plan, whole(), writable_folder(folder / ROWS), command
         )
-        told += [f"wrote {path}" for path in rows]
+        lines += [f"wrote {path}" for path in rows]
     failed = [record for record in whole() if record.status == "failed"]
-    told += [f"{record.job} failed: {record.error}" for record in failed]
+    lines += [f"{record.job} failed: {record.error}" for record in failed]
     left = sum(job not in records for job in mine)
-    told += [f"{left} runs are left: call again with the same options"] if left else []
-    print("\n".join(told))
+    lines += [f"{left} runs are left: call again with the same options"] if left else []
+    print("\n".join(lines))
     return RUN_FAILED if failed else 0
 
 
@@ -167,8 +168,8 @@ def make_plan(options: CompareOptions) -> ComparisonPlan:
     if options.suite is not None:
         return _suite_plan(options)
     if options.quick:
-        told = {name: getattr(options, name) or few for name, few in QUICK.items()}
-        options = replace(options, **told)
+        few = {name: getattr(options, name) or value for name, value in QUICK.items()}
+        options = replace(options, **few)
     tasks = chosen_names("task", options.tasks, PROBLEMS)
     methods, own = _chosen_methods(options.methods, METHODS)
     if not options.methods:
@@ -205,8 +206,8 @@ def _suite_plan(options: CompareOptions) -> ComparisonPlan:
     if quick and not options.tasks:
         tasks = tasks[:1]
     methods, own = _chosen_methods(options.methods, suite.methods)
-    told = _method_options(options.options, methods, own)
-    for name in told.keys() - own.keys():
+    chosen = _method_options(options.options, methods, own)
+    for name in chosen.keys() - own.keys():
         raise NPAError(
             f"options of {name!r} are frozen in {suite.name}: give it a name of its own, "
             f"--methods my_{name}={name} --options my_{name}.NAME=VALUE"
@@ -223,7 +224,7 @@ def _suite_plan(options: CompareOptions) -> ComparisonPlan:
             for method in methods
             if suite.leaves_out(task, own.get(method, method))
         ],
-        options=told,
+        options=chosen,
         own=own,
         episodes=QUICK_EPISODES if quick else npa_bench.EPISODES,
         settings=_settings(options),
@@ -259,8 +260,8 @@ def _chosen_methods(words: Sequence[str], known: Iterable[str]) -> tuple[list[st
     own = dict(named)
     for name, count in Counter(name for name, _ in named).items():
         if count > 1:
-            told = " and ".join(word for word in words if word.startswith(f"{name}="))
-            raise NPAError(f"methods must have names of their own, got {told}: rename one")
+            same = " and ".join(word for word in words if word.startswith(f"{name}="))
+            raise NPAError(f"methods must have names of their own, got {same}: rename one")
     for name, method in own.items():
         if not re.fullmatch("[a-z0-9_]+", name) or name in known:
             raise NPAError(
@@ -303,21 +304,13 @@ def _method_options(
             known = method_options(own.get(method, method))
         if option not in known:
             raise NPAError(f"unknown option {option!r} in {word!r}: {suggest(option, known)}")
-        try:
-            plain = json.loads(value)
-        except ValueError:
-            plain = value
-        found.setdefault(method, {})[option] = plain
+        found.setdefault(method, {}).update(named_values("options", [f"{option}={value}"]))
     return found
-
-
-def _devices(options: CompareOptions) -> tuple[str, ...]:
-    return options.devices or (options.device,)
 
 
 def _jobs(options: CompareOptions) -> int:
     """Return how many runs there are at once, as fairly as times are compared."""
-    count = len(_devices(options))
+    count = len(options.devices or (options.device,))
     jobs = count if options.jobs is None else options.jobs
     if options.seconds is not None and jobs % count:
         raise NPAError(
@@ -332,7 +325,7 @@ def _settings(options: CompareOptions) -> dict[str, Any]:
     from npa_envs.devices import check_device
     from npa_envs.measure.record import installed_version, machine, measured_facts
 
-    places = [check_device(name) for name in _devices(options)]
+    places = [check_device(name) for name in (options.devices or (options.device,))]
     kinds = {(place.type, machine(place)) for place in places}
     if len(kinds) > 1:
         raise NPAError(

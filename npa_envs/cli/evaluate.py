@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from npa_envs.cli.output import RuleOptions, StepBar, check_numbers, parse_options
 from npa_envs.errors import NPAError, shown
@@ -48,10 +48,8 @@ def main(arguments: Sequence[str]) -> int:
     """Measure and print."""
     options = parse_options(EvaluateOptions, "evaluate", arguments)
     from npa_envs.devices import check_device
-    from npa_envs.files import write_text
     from npa_envs.measure.judge import TextureJudge
     from npa_envs.measure.quality import CHECKPOINTS, check_steps, tables_of
-    from npa_envs.measure.tables import UNMEASURED, table_text, tables_json
     from npa_envs.rule.files import load_rule
     from npa_envs.tasks.point_classification import PointClassification
     from npa_envs.training.trained_tasks import task_of_rule
@@ -63,7 +61,7 @@ def main(arguments: Sequence[str]) -> int:
     rule = load_rule(options.rule, device=device).float()
     world = options.world() | {"data_folder": options.data_folder}
     if rule.codes is not None and options.target is None:
-        return evaluate_pictures(options, rule, device)
+        return _pictures(options, rule, device)
     trained = task_of_rule(options.rule, rule, device, **world)
     if trained.doubt is not None:
         raise NPAError(
@@ -88,19 +86,12 @@ def main(arguments: Sequence[str]) -> int:
     if isinstance(trained.task, PointClassification):
         what = f"{len(trained.task.clouds.label)} {trained.task.split} clouds"
     print(f"{options.rule}: {what}, loss: {trained.task.metric_name}")
-    for name, rows in tables.items():
-        print(table_text(rows, missing=UNMEASURED if name == "growth" else "never"))
-    if options.json is not None:
-        write_text(options.json, tables_json(tables, metric=trained.task.metric_name))
-        print(f"wrote {options.json}")
-    return 0
+    return _finish(options, tables, trained.task.metric_name)
 
 
-def evaluate_pictures(options: EvaluateOptions, rule: NPARule, device: torch.device) -> int:
+def _pictures(options: EvaluateOptions, rule: NPARule, device: torch.device) -> int:
     """Measure and print the pictures of a rule of many, each by its code."""
-    from npa_envs.files import write_text
     from npa_envs.measure.codes import PICTURE_CHECKPOINTS, picture_rows
-    from npa_envs.measure.tables import table_text, tables_json
     from npa_envs.training.trained_tasks import tasks_of_codes
 
     assert rule.codes is not None, "asked before"
@@ -109,13 +100,12 @@ def evaluate_pictures(options: EvaluateOptions, rule: NPARule, device: torch.dev
             "healing and judge are measured of one picture at a time, of the rule's "
             f"{len(rule.codes)}: give --target {shown(rule.codes.names[0])}"
         )
-    checkpoints = options.checkpoints or PICTURE_CHECKPOINTS
     tasks = tasks_of_codes(options.rule, rule, device, **options.world())
     with StepBar(None, show=options.progress) as bar:
         rows = picture_rows(
             rule,
             tasks,
-            checkpoints=checkpoints,
+            checkpoints=options.checkpoints or PICTURE_CHECKPOINTS,
             seeds=range(options.first_seed, options.first_seed + options.seed_count),
             device=device,
             progress=bar.advance,
@@ -125,8 +115,17 @@ def evaluate_pictures(options: EvaluateOptions, rule: NPARule, device: torch.dev
         f"{options.rule}: {len(tasks)} pictures, {options.seed_count} worlds each, loss: {metric}, "
         "shuffled: with the code of the next picture"
     )
-    print(table_text(rows))
+    return _finish(options, {"pictures": rows}, metric)
+
+
+def _finish(options: EvaluateOptions, tables: Mapping[str, Sequence[Any]], metric: str) -> int:
+    """Print tables and, if asked for, write them."""
+    from npa_envs.files import write_text
+    from npa_envs.measure.tables import UNMEASURED, table_text, tables_json
+
+    for name, rows in tables.items():
+        print(table_text(rows, missing=UNMEASURED if name == "growth" else "never"))
     if options.json is not None:
-        write_text(options.json, tables_json({"pictures": rows}, metric=metric))
+        write_text(options.json, tables_json(tables, metric=metric))
         print(f"wrote {options.json}")
     return 0

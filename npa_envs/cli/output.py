@@ -6,6 +6,7 @@ import argparse
 import contextlib
 import inspect
 import json
+import re
 import tempfile
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
@@ -20,68 +21,61 @@ from npa_envs.files import NEARLY_FULL_BYTES, made_folder
 
 OptionsT = TypeVar("OptionsT")
 
-EXAMPLES: dict[str, tuple[str, ...]] = {
-    "bench": ("bench --quick", "bench --suite scaling --out results --plots"),
-    "compare": (
-        "compare --quick --out quick",
-        "compare --seconds 60 --methods gradient ppo --tasks morphogenesis2d",
-        "compare --suite npa-bench-small-v0 --out bench --jobs 2",
-    ),
-    "demo": ("demo", "demo --target star --train-seconds 60 --out star"),
-    "doctor": ("doctor",),
-    "evaluate": ("evaluate gecko --healing", "evaluate runs/heart --seed-count 2"),
-    "export-web": ("export-web gecko heart -o page.html", "export-web --gallery -o gallery.html"),
-    "interact": ("interact gecko heart", "interact --quick"),
-    "learn": (
-        "learn ppo npa/Morphogenesis2D-v0 --keywords target=heart --particle-steps 1e9 "
-        "--device cuda",
-        "learn shac npa/Mixing-v0 --seconds 600 --gpus 2 --out runs/mixing",
-    ),
-    "list": ("list",),
-    "record": (
-        "record npa/Morphogenesis2D-v0 --policy gecko --options target=gecko "
-        "--dataset npa/gecko-v0",
-        "record npa/Gardener2DSmall-v0 --policy scripted --dataset npa/gardener/scripted-v0",
-    ),
-    "robustness": ("robustness heart --quick", "robustness --device cuda --out results"),
-    "rollout": (
-        "rollout gecko --damage 300:cut 500:wipe --steps 700",
-        "rollout runs/heart",
-        "rollout gecko --resolution 512 --style points --background black",
-    ),
-    "search": (
-        "search",
-        "search --method cma-me --budget 5e7 --out runs/alive",
-    ),
-    "stress": ("stress --quick", "stress --only geometry --out results"),
-    "sweep": (
-        "sweep --over target=heart,ring seed=0,1,2 --devices cuda:0 cuda:1 -- morphogenesis2d",
-    ),
-    "view": ("view gecko", "view runs/heart", "view npa/Morphogenesis2D-v0 --policy gecko"),
-    "warmup": ("warmup", "warmup --device cuda --space-dims 2 3"),
-    "train morphogenesis2d": (
-        "train morphogenesis2d --target heart --out runs/heart",
-        "train morphogenesis2d --preset paper --target lizard.png --device cuda",
-        "train morphogenesis2d --preset paper --target lizard.png --gpus 4",
-    ),
-    "train co_morphogenesis2d": (
-        "train co_morphogenesis2d --targets ring heart",
-        "train co_morphogenesis2d --preset paper --targets gecko heart --device cuda",
-    ),
-    "train morphogenesis3d": (
-        "train morphogenesis3d --target duck --out runs/duck",
-        "train morphogenesis3d --preset paper --target statue.obj --device cuda",
-    ),
-    "train texture": (
-        "train texture --target dots --out runs/dots",
-        "train texture --target wall.png --loss filter_swd",
-    ),
-    "train point_classification": (
-        "train point_classification --out runs/digits",
-        "train point_classification --preset paper --data mnist --device cuda",
-    ),
-}
-"""What the help of each command shows."""
+_EXAMPLES = """
+bench --quick
+bench --suite scaling --out results --plots
+compare --quick --out quick
+compare --seconds 60 --methods gradient ppo --tasks morphogenesis2d
+compare --suite npa-bench-small-v0 --out bench --jobs 2
+demo
+demo --target star --train-seconds 60 --out star
+doctor
+evaluate gecko --healing
+evaluate runs/heart --seed-count 2
+export-web gecko heart -o page.html
+export-web --gallery -o gallery.html
+interact gecko heart
+interact --quick
+learn ppo npa/Morphogenesis2D-v0 --keywords target=heart --particle-steps 1e9 --device cuda
+learn shac npa/Mixing-v0 --seconds 600 --gpus 2 --out runs/mixing
+list
+record npa/Morphogenesis2D-v0 --policy gecko --options target=gecko --dataset npa/gecko-v0
+record npa/Gardener2DSmall-v0 --policy scripted --dataset npa/gardener/scripted-v0
+robustness heart --quick
+robustness --device cuda --out results
+rollout gecko --damage 300:cut 500:wipe --steps 700
+rollout runs/heart
+rollout gecko --resolution 512 --style points --background black
+search
+search --method cma-me --budget 5e7 --out runs/alive
+stress --quick
+stress --only geometry --out results
+sweep --over target=heart,ring seed=0,1,2 --devices cuda:0 cuda:1 -- morphogenesis2d
+view gecko
+view runs/heart
+view npa/Morphogenesis2D-v0 --policy gecko
+warmup
+warmup --device cuda --space-dims 2 3
+train morphogenesis2d --target heart --out runs/heart
+train morphogenesis2d --preset paper --target lizard.png --device cuda
+train morphogenesis2d --preset paper --target lizard.png --gpus 4
+train co_morphogenesis2d --targets ring heart
+train co_morphogenesis2d --preset paper --targets gecko heart --device cuda
+train morphogenesis3d --target duck --out runs/duck
+train morphogenesis3d --preset paper --target statue.obj --device cuda
+train texture --target dots --out runs/dots
+train texture --target wall.png --loss filter_swd
+train point_classification --out runs/digits
+train point_classification --preset paper --data mnist --device cuda
+"""
+
+EXAMPLES: dict[str, list[str]] = {}
+"""Examples that the help of each command shows."""
+
+for _line in _EXAMPLES.split("\n")[1:-1]:
+    _command = re.match(r"train \w+|[\w-]+", _line)
+    assert _command is not None, "every example begins with a command"
+    EXAMPLES.setdefault(_command[0], []).append(_line)
 
 
 def parse_options(
