@@ -418,13 +418,15 @@ def phase_diagram(rows: Sequence[InteractionRow]) -> bytes:
     found = {(row.eps_factor, row.ratio, row.distance): row for row in rows}
     size = 1.6 + 0.62 * len(distances), 1.4 + 0.4 * len(ratios)
     figure, grid = new_figure(2, len(factors), (size[0] * len(factors) + 1.0, 2 * size[1]))
-    names = [[f"{value:g}" for value in values] for values in (ratios, distances)]
+    down, across = ([f"{value:g}" for value in values] for values in (ratios, distances))
     for panels, (what, title, colours, norm, bar) in zip(grid, _shades(), strict=True):
         for panel, factor in zip(panels, factors, strict=True):
             held = [[found.get((factor, r, d)) for d in distances] for r in ratios]
             values = [[row and getattr(row, what) for row in line] for line in held]
             notes = [["" if row is None else _interval(row, what) for row in line] for line in held]
-            scale = draw_matrix(panel, *names, values, colours=colours, norm=norm, notes=notes)
+            scale = draw_matrix(
+                panel, down, across, values, colours=colours, norm=norm, notes=notes
+            )
             panel.set(xlabel="distance")
             panel.set_title(title + _radius(factor), fontsize=9)
         panels[0].set_ylabel(f"ratio of {rows[0].rule}")

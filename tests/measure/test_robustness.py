@@ -345,6 +345,7 @@ def test_a_world_that_is_lost_stays_lost_and_leaves_the_others_as_they_are(devic
 
 
 def test_plans_are_whole_chunks_and_hold_what_was_trained():
+    assert task_name("seven-pictures") == "morphogenesis2d"
     for name, path in shipped_rules().items():
         update_prob = trained_config(path, rule_metadata(path)).task.update_prob
         for plan in (PLANS[task_name(name)], quick_plan(task_name(name))):
@@ -451,7 +452,3 @@ def test_a_record_of_a_rule_that_was_trained_anew_is_refused(tmp_path, capsys, m
     save_rule(rule, path, metadata=metadata)
     assert main(words) == 2
     assert "holds figures of other settings: weights was" in capsys.readouterr().err
-
-
-def test_rules_that_runs_begin_with_are_known_by_name():
-    assert task_name("seven-pictures") == "morphogenesis2d"
