@@ -422,7 +422,9 @@ def phase_diagram(rows: Sequence[InteractionRow]) -> bytes:
     for panels, (what, title, colours, norm, bar) in zip(grid, _shades(), strict=True):
         for panel, factor in zip(panels, factors, strict=True):
             held = [[found.get((factor, r, d)) for d in distances] for r in ratios]
-            values = [[row and getattr(row, what) for row in line] for line in held]
+            values = [
+                [None if row is None else getattr(row, what) for row in line] for line in held
+            ]
             notes = [["" if row is None else _interval(row, what) for row in line] for line in held]
             scale = draw_matrix(
                 panel, down, across, values, colours=colours, norm=norm, notes=notes
