@@ -35,8 +35,7 @@ from npa_envs.files import read_json, write_bytes, write_text
 from npa_envs.measure.plots import new_figure, number_plainly, png
 from npa_envs.measure.quality import psnr
 from npa_envs.measure.speed.precisions import PRECISIONS, Precision
-from npa_envs.measure.speed.suites import BenchReport
-from npa_envs.measure.speed.throughput import drawn_like
+from npa_envs.measure.speed.suites import BenchReport, drawn_like
 from npa_envs.measure.speed.timing import (
     NO_TIME,
     Cost,

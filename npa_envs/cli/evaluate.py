@@ -91,7 +91,7 @@ def main(arguments: Sequence[str]) -> int:
 
 def _pictures(options: EvaluateOptions, rule: NPARule, device: torch.device) -> int:
     """Measure and print the pictures of a rule of many, each by its code."""
-    from npa_envs.measure.codes import PICTURE_CHECKPOINTS, picture_rows
+    from npa_envs.measure.quality import PICTURE_CHECKPOINTS, picture_rows
     from npa_envs.training.trained_tasks import tasks_of_codes
 
     assert rule.codes is not None, "asked before"

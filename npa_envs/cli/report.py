@@ -16,9 +16,14 @@ from npa_envs.cli.film import film_world, frame_steps, large_task, write_film, w
 from npa_envs.cli.output import StepBar, writable_folder
 from npa_envs.errors import MissingDependencyError
 from npa_envs.files import write_text
-from npa_envs.measure.codes import picture_rows
 from npa_envs.measure.judge import TextureJudge
-from npa_envs.measure.quality import CHECKPOINTS, CLOUD_CHECKPOINTS, score_line, tables_of
+from npa_envs.measure.quality import (
+    CHECKPOINTS,
+    CLOUD_CHECKPOINTS,
+    picture_rows,
+    score_line,
+    tables_of,
+)
 from npa_envs.measure.record import current_commit, machine, versions
 from npa_envs.measure.tables import UNMEASURED, markdown_table, table_markdown, tables_json
 from npa_envs.rule.files import load_rule

@@ -62,8 +62,7 @@ def main(arguments: Sequence[str]) -> int:
     from npa_envs.measure.plots import write_plots
     from npa_envs.measure.record import measured_facts, time_limit, without_folders
     from npa_envs.measure.robustness import study
-    from npa_envs.measure.robustness.plans import PLANS, quick_plan
-    from npa_envs.measure.robustness.trials import RuleTrial
+    from npa_envs.measure.robustness.trials import PLANS, RuleTrial, quick_plan
     from npa_envs.rule.files import load_rule, rule_digest
 
     check_numbers(options, seed_count=1, first_seed=0, most_particles=1, threads=1)

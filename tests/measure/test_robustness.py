@@ -11,17 +11,6 @@ import torch
 from npa_envs.cli import main
 from npa_envs.measure.accuracy.endurance import rule_names, task_name
 from npa_envs.measure.robustness import study
-from npa_envs.measure.robustness.plans import (
-    BLOB_DISTANCE,
-    CONDITIONS,
-    PLANS,
-    SHAPES,
-    SIZE_FACTOR,
-    TrialPlan,
-    disk,
-    quick_plan,
-    trained_value,
-)
 from npa_envs.measure.robustness.recovery import (
     CONTROL,
     DAMAGES,
@@ -41,7 +30,19 @@ from npa_envs.measure.robustness.study import (
     where_it_works,
     working_range,
 )
-from npa_envs.measure.robustness.trials import RuleTrial, loss_curves
+from npa_envs.measure.robustness.trials import (
+    BLOB_DISTANCE,
+    CONDITIONS,
+    PLANS,
+    SHAPES,
+    SIZE_FACTOR,
+    RuleTrial,
+    TrialPlan,
+    disk,
+    loss_curves,
+    quick_plan,
+    trained_value,
+)
 from npa_envs.rule.files import (
     load_rule,
     rule_digest,

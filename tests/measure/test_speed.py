@@ -11,11 +11,11 @@ import torch
 from clock import Clock
 
 from npa_envs.cli import main
-from npa_envs.measure.speed import suites, throughput
+from npa_envs.measure.speed import suites
 from npa_envs.measure.speed.explain import Question, explain
-from npa_envs.measure.speed.suites import BenchReport
-from npa_envs.measure.speed.throughput import (
+from npa_envs.measure.speed.suites import (
     PAPER,
+    BenchReport,
     DriftRow,
     drift_rows,
     roll_one_species,
@@ -108,7 +108,7 @@ def test_scaling_varies_one_number_at_a_time_and_slopes_are_those_of_logarithms(
         for n in (16, 64, 256, 1024)
     ]
     slopes = slope_rows(grown)
-    assert [slope.axis for slope in slopes] == list(throughput.AXES)
+    assert [slope.axis for slope in slopes] == list(suites.AXES)
     for slope in slopes:
         assert (slope.infer_slope, slope.train_slope) == pytest.approx((1.0, 2.0))
 

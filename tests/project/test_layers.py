@@ -64,7 +64,6 @@ LADDER = {
     "npa_envs.measure.plots": rung(2, "matplotlib"),
     "npa_envs.measure.judge": rung(10, "torch", never=INSIDES),
     "npa_envs.measure.quality": rung(11, "torch numpy tqdm", never=INSIDES),
-    "npa_envs.measure.codes": rung(12, "torch", never=INSIDES),
     "npa_envs.measure.interaction": rung(11, "torch numpy matplotlib", never=ORACLES),
     "npa_envs.measure.speed": rung(13, "torch numpy matplotlib", never=("npa_envs.kernels",)),
     "npa_envs.measure.accuracy": rung(14, "torch matplotlib", never=("npa_envs.kernels",)),

@@ -15,7 +15,6 @@ import torch
 from npa_envs.measure.accuracy.endurance import WORKS
 from npa_envs.measure.plots import draw_band, legend_of, mark_decades, new_figure, png
 from npa_envs.measure.record import Record, number
-from npa_envs.measure.robustness.plans import CONDITIONS, trained_value
 from npa_envs.measure.robustness.recovery import (
     CONTROL,
     DAMAGES,
@@ -24,7 +23,13 @@ from npa_envs.measure.robustness.recovery import (
     healing,
     ratio,
 )
-from npa_envs.measure.robustness.trials import RuleTrial, TaskTrial, loss_curves
+from npa_envs.measure.robustness.trials import (
+    CONDITIONS,
+    RuleTrial,
+    TaskTrial,
+    loss_curves,
+    trained_value,
+)
 from npa_envs.measure.tables import NONE, as_objects, markdown_table, short
 from npa_envs.world.randomness import StreamId
 
