@@ -81,7 +81,7 @@ class CompareOptions(MeasureOptions):
     particle_steps: float | None = None
     """Compare for equal particle-steps: as many as each run may learn from, for example 1e8."""
     episodes: int | None = None
-    """Held-out episodes that tell what a run has reached; default: 32, or 4 when quick."""
+    """Held-out episodes that measure a run; default: 32, or 4 when quick."""
     options: Annotated[tuple[str, ...], tyro.conf.arg(metavar="METHOD.NAME=VALUE")] = ()
     """Options of methods, values as JSON or plain text: evolution.population=64."""
     quick: bool = False
@@ -321,7 +321,7 @@ def _jobs(options: CompareOptions) -> int:
 
 
 def _settings(options: CompareOptions) -> dict[str, Any]:
-    """Return what figures follow from besides problems, budgets and options."""
+    """Return the facts of figures other than problems, budgets and options."""
     from npa_envs.devices import check_device
     from npa_envs.measure.record import installed_version, machine, measured_facts
 

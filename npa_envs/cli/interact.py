@@ -43,7 +43,7 @@ QUICK: dict[str, Any] = {
 
 @dataclass(frozen=True, kw_only=True)
 class InteractOptions(RunOptions):
-    """Grow every rule beside every other one, and measure what that does to it.
+    """Grow every rule next to every other one, and measure how that changes it.
 
     Every ordered pair of rules, also of a rule with itself, at every distance, ratio and radius:
     the first one's task loss on its own particles together and alone, how much both mix, and how

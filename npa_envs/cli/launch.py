@@ -31,11 +31,11 @@ def launch(count: int, words: Sequence[str], out: Path, device: str) -> int:
     If one ends early, the others are asked to end, and are killed after half a minute. On CUDA each
     process has a device of its own. `out` is the folder of the run, for errors.
     """
-    seen = torch.cuda.device_count()
-    if device != "cpu" and count > seen:
+    found = torch.cuda.device_count()
+    if device != "cpu" and count > found:
         raise NPAError(
-            f"processes must be at most the {seen} CUDA devices that torch sees, got {count}: take "
-            "fewer, or --device cpu"
+            f"processes must be at most the {found} CUDA devices that torch sees, got {count}: "
+            "take fewer, or --device cpu"
         )
     if not dist.is_available():
         raise NPAError(

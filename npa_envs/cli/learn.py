@@ -59,7 +59,7 @@ class LearnOptions(RunOptions):
     episodes: int = 16
     """Episodes by which a point of the curve is measured."""
     entries: int = 20
-    """Points of the curve besides the first, and checkpoints."""
+    """Points of the curve after the first, and checkpoints."""
     out: Path = Path("runs/learn")
     """Folder for checkpoint, rules and curve."""
     processes: int | None = None

@@ -112,8 +112,8 @@ def write_report(
     write_text(folder / f"{path.stem}.json", text)
     card = folder / f"{path.stem}.md"
     strip = folder / f"{path.stem}-filmstrip.png"
-    seen = f"\n![A world from the seed on.]({strip.name})\n" if strip.exists() else ""
-    write_text(card, _card(rule, task, training, facts, tables) + seen)
+    picture = f"\n![A world from the seed on.]({strip.name})\n" if strip.exists() else ""
+    write_text(card, _card(rule, task, training, facts, tables) + picture)
     return card, score_line(json.loads(text)) + _decay(tables.get("growth", ())) + not_filmed
 
 

@@ -41,7 +41,7 @@ SHOWN = {
 
 @dataclass(frozen=True, kw_only=True)
 class TrainOptions:
-    """What most runs are told; the paper's schedule, pool and world follow below."""
+    """The most common options; the paper's schedule, pool and world follow below."""
 
     preset: str = ""
     """Configuration to start from: `paper`, `fast` (minutes on a CPU), `tiny` (seconds), or for
@@ -144,7 +144,7 @@ def starting_configuration(task_name: str, arguments: Sequence[str]) -> TrainCon
         try:
             base = load_config(folder.config, base)
         except NPAError:
-            # Fields of another task are unknown here; that it is another task says more.
+            # Fields of another task are unknown: its name is the better error.
             check_task(load_checkpoint(folder.checkpoint), task_name, folder.checkpoint)
             raise
         if first.preset and first.config is None:
@@ -177,16 +177,16 @@ def parse(
 
     def read(defaults: Any) -> tuple[TrainOptions, Any]:
         # These stand first, as options of their own, and not once more below.
-        told = {
+        shared = {
             name: getattr(holder, name)
             for name in COMMON
             for holder in (defaults, defaults.task)
             if hasattr(holder, name)
             and not (name == "target" and isinstance(holder, SpeciesOptions))
         }
-        common = _without(TrainOptions(**told), set(COMMON) - told.keys())
-        task = _without(defaults.task, told, whole=whole)
-        training = _without(replace(defaults, task=task), told, whole=whole)
+        common = _without(TrainOptions(**shared), set(COMMON) - shared.keys())
+        task = _without(defaults.task, shared, whole=whole)
+        training = _without(replace(defaults, task=task), shared, whole=whole)
         kinds = [("common", type(common)), ("training", type(training))]
         command = make_dataclass("Command", kinds, frozen=True)
         parsed: Any = parse_options(
@@ -200,7 +200,7 @@ def parse(
         task = _of_type(type(defaults.task), parsed.training.task)
         config = _of_type(type(defaults), parsed.training, task=task)
         return _of_type(TrainOptions, parsed.common), override(
-            config, **{name: getattr(parsed.common, name) for name in told}
+            config, **{name: getattr(parsed.common, name) for name in shared}
         )
 
     return parse_joint(base, read) if isinstance(base, JointTrainConfig) else read(base)

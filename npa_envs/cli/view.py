@@ -75,7 +75,7 @@ def main(arguments: Sequence[str]) -> int:
     device = check_device(options.device)
     make_world = world_maker(options, device)
     with torch_threads(options.threads):
-        # Made once before the server starts: what is wrong with it is said here.
+        # Made once before the server starts, so that errors come at once.
         make_world().close()
     from npa_envs.web.server import address_of, make_site, open_port, serve
 

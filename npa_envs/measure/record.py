@@ -43,7 +43,7 @@ class Record(Generic[Row]):
     path: Path | None = None
     """The file that is written after each entry; None: none."""
     content: Callable[[list[Row]], Mapping[str, Any]] = lambda rows: {"rows": as_objects(rows)}
-    """Returns what the file holds besides the facts."""
+    """Returns the file's fields other than the facts."""
     key: str = "facts"
     """What the file calls the facts."""
 
@@ -129,7 +129,7 @@ def number(value: float | None) -> float:
 
 
 def time_limit(max_seconds: float | None) -> Callable[[], bool]:
-    """Return what says whether so long [s] has passed since now; never for None."""
+    """Return a function that says whether so long [s] has passed; never for None."""
     end = math.inf if max_seconds is None else time.monotonic() + max_seconds
     return lambda: time.monotonic() >= end
 

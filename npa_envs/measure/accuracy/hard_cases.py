@@ -219,7 +219,7 @@ def _run_outside(space_dim: int, session: CheckSession) -> CheckResult:
         found = perceived(x.to(session.device), s.to(session.device), box)
         not_finite += sum(int((~tensor.isfinite()).sum()) for tensor in found)
         if offset <= 1e4:
-            # The images of what float32 has made of their coordinates.
+            # The images of coordinates rounded to float32.
             expected = perceived(x.double(), s.double(), box, by_reference=True)
             figures[f"z_{offset:g}"] = error = relative_error(found.z, expected.z)
             allowed = error_limits(x.double(), s.double(), box, expected)
@@ -250,7 +250,7 @@ def values_checks() -> list[Check]:
     by_dimension = {
         "scale": (
             "states of 1e-30 to 1e30 are perceived as the float64 reference has them, forwards and "
-            "backwards; beyond, the largest scale is told",
+            "backwards; beyond, the largest scale is reported",
             _run_scale,
         ),
         "infinite_channel": (

@@ -79,14 +79,14 @@ def gradients_checks(*, quick: bool, rules: Mapping[str, str] | None = None) -> 
             Check(
                 f"gradients/norm/{name}",
                 "gradients of a functional by weights and by states at the start are finite "
-                "whatever the number of steps; their norms are told",
+                "whatever the number of steps; their norms are reported",
                 partial(_run_norm, source),
                 source,
             ),
             Check(
                 f"gradients/float32/{name}",
                 "one step in float32 is within 1e-5 of one in float64, also its gradients; after "
-                "how many steps they still agree to 1e-2 is told",
+                "how many steps they still agree to 1e-2 is reported",
                 partial(_run_float32, source),
                 source,
             ),

@@ -147,7 +147,7 @@ class StressRecord(Record[CheckEntry]):
         return self
 
     def entry(self, name: str) -> CheckEntry | None:
-        """Return what came of a check, None where it has not been run."""
+        """Return the entry of a check, None where it has not been run."""
         return next((entry for entry in self.rows if entry.name == name), None)
 
     def put(self, entry: CheckEntry) -> None:
