@@ -7,7 +7,6 @@ import itertools
 import math
 import os
 import re
-import shlex
 import subprocess
 import sys
 import time
@@ -15,14 +14,14 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import tyro
 
 from npa_envs.cli.output import StepBar, check_numbers, parse_options, writable_folder
-from npa_envs.errors import NPAError, shown, suggest
+from npa_envs.errors import NPAError, suggest
 from npa_envs.files import read_json, write_text
-from npa_envs.measure.record import write_record
+from npa_envs.measure.record import read_record, write_record
 from npa_envs.measure.tables import NONE, markdown_table
 from npa_envs.processes import Child, Places, part_of, run_children
 
@@ -78,9 +77,8 @@ class SweepRun(NamedTuple):
 
 
 class SweepRecord(NamedTuple):
-    """Words of a run, the exit code of its process, and its wall time [s]."""
+    """The exit code of a run's process, and its wall time [s]."""
 
-    words: list[str]
     code: int
     seconds: float
 
@@ -176,31 +174,19 @@ def _folder_names(chosen: Sequence[Mapping[str, str]]) -> list[str]:
 
 
 def is_over(folder: Path, run: SweepRun) -> bool:
-    """Return whether a run has ended well; refuse a folder that holds one of other words."""
+    """Return whether a run has ended well."""
+    held = _record(folder, run)
+    return held is not None and held.code == 0
+
+
+def _record(folder: Path, run: SweepRun) -> SweepRecord | None:
+    """Return the record of a run, None where there is none; one of other words is refused."""
+
+    def read(held: dict[str, Any]) -> SweepRecord:
+        return SweepRecord(int(held["code"]), float(held["seconds"]))
+
     path = folder / run.name / RECORD
-    held = _held(path)
-    if held is None:
-        return False
-    if held.words != run.words:
-        raise NPAError(
-            f"{str(path)!r} holds a run of other words, {shlex.join(held.words)}: choose "
-            "another folder with --out"
-        )
-    return held.code == 0
-
-
-def _held(path: Path) -> SweepRecord | None:
-    """Return the record of a run, None where there is none."""
-    if not path.exists():
-        return None
-    try:
-        held = SweepRecord(**read_json(path))
-        return SweepRecord([str(word) for word in held.words], int(held.code), float(held.seconds))
-    except (TypeError, ValueError) as error:
-        raise NPAError(
-            f"{str(path)!r} must be a record of npa-envs sweep, but cannot be read "
-            f"({shown(error)}): remove it, or choose another folder with --out"
-        ) from error
+    return read_record(path, {"words": run.words}, read, command="sweep")
 
 
 class _Training(Child):
@@ -247,8 +233,9 @@ class _Training(Child):
         """Write its words, exit code and time."""
         assert self._process is not None, "it is over"
         seconds = time.perf_counter() - self._begin
-        record = SweepRecord(self._run.words, int(self._process.returncode), seconds)
-        write_record(self._folder / RECORD, record._asdict())
+        record = SweepRecord(int(self._process.returncode), seconds)
+        content = {"facts": {"words": self._run.words}, **record._asdict()}
+        write_record(self._folder / RECORD, content)
 
 
 def table(folder: Path, runs: Sequence[SweepRun]) -> str:
@@ -257,9 +244,8 @@ def table(folder: Path, runs: Sequence[SweepRun]) -> str:
 
     lines = []
     for run in runs:
-        path = folder / run.name / RECORD
         state, seconds, scores = "not run", NONE, NONE
-        held = _held(path)
+        held = _record(folder, run)
         if held is not None:
             state = "done" if held.code == 0 else f"failed with code {held.code}"
             seconds = f"{held.seconds:.0f}"
