@@ -113,23 +113,18 @@ def test_scaling_varies_one_number_at_a_time_and_slopes_are_those_of_logarithms(
         assert (slope.infer_slope, slope.train_slope) == pytest.approx((1.0, 2.0))
 
 
-def test_what_does_not_fit_into_memory_is_left_out():
+def test_what_does_not_fit_into_memory_or_the_time_is_left_out():
     def large():
         raise torch.OutOfMemoryError("too large")
 
     done = []
-    here = session(progress=done.append)
-    assert here.attempt("large", large) == []
-    assert here.attempt("small", lambda: 3) == [3]
-    assert here.left_out == [LeftOut("large", "not enough memory")]
+    here = session(progress=done.append, enough=iter([False, False, True]).__next__)
+    found = [here.attempt(name, make) for name, make in (("large", large), ("small", lambda: 3))]
+    assert found == [[], [3]]
+    assert here.attempt("late", lambda: 4) == []
+    left = [("large", "not enough memory"), ("late", "no time was left")]
+    assert here.left_out == [LeftOut(*entry) for entry in left]
     assert done == [1, 1]
-
-
-def test_what_has_not_begun_when_time_is_over_is_left_out():
-    here = session(enough=iter([False, True]).__next__)
-    assert here.attempt("first", lambda: 3) == [3]
-    assert here.attempt("second", lambda: 4) == []
-    assert here.left_out == [LeftOut("second", "no time was left")]
 
 
 def test_each_skip_is_measured_with_and_without():
