@@ -24,6 +24,7 @@ from typing import Any, NamedTuple
 
 import torch
 from hash_grid import grid_fields
+from scripts import script_facts, script_parser
 from strategies import STRATEGIES, Strategy
 from torch import Tensor
 
@@ -33,10 +34,8 @@ from npa_envs.errors import NPAError, shown
 from npa_envs.files import read_json, write_bytes, write_text
 from npa_envs.measure.plots import new_figure, number_plainly, png
 from npa_envs.measure.quality import psnr
-from npa_envs.measure.record import script_facts, script_parser
-from npa_envs.measure.speed.drift import drawn_like
 from npa_envs.measure.speed.precisions import PRECISIONS, Precision
-from npa_envs.measure.speed.suites import BenchReport
+from npa_envs.measure.speed.suites import BenchReport, drawn_like
 from npa_envs.measure.speed.timing import (
     NO_TIME,
     Cost,
@@ -45,11 +44,46 @@ from npa_envs.measure.speed.timing import (
     TimingSession,
     relative_error,
 )
-from npa_envs.measure.speed.workloads import Gecko, Workload, gecko
+from npa_envs.measure.speed.workloads import Workload
 from npa_envs.ops import perception_fields
+from npa_envs.rule.files import load_rule
 from npa_envs.rule.rule import NPARule
 from npa_envs.runtime import quiet_warp, start_warp
+from npa_envs.tasks.morphogenesis2d import Morphogenesis2D, Morphogenesis2DConfig
 from npa_envs.world.rollout import rollout, step
+
+
+class Gecko(NamedTuple):
+    """The shipped rule, its task with as many target points as particles, and seeds."""
+
+    rule: NPARule
+    task: Morphogenesis2D
+    x: Tensor
+    s: Tensor
+
+    def grown(self, steps: int) -> Gecko:
+        """Return the same with worlds that are so many float32 steps older."""
+        generator = torch.Generator(self.x.device).manual_seed(1)
+        with torch.no_grad():
+            x, s = rollout(
+                self.rule,
+                self.x,
+                self.s,
+                steps,
+                eps=self.task.eps,
+                update_prob=self.task.update_prob,
+                generator=generator,
+            )
+        return self._replace(x=x, s=s)
+
+
+def gecko(world_count: int, particle_count: int, device: torch.device) -> Gecko:
+    """Return the shipped rule with seeds of its task."""
+    config = Morphogenesis2DConfig(particle_count=particle_count, target_point_count=particle_count)
+    task = Morphogenesis2D(config, device=device)
+    generator = torch.Generator(device).manual_seed(0)
+    x, s, _ = task.seed(world_count, generator=generator, device=device)
+    return Gecko(load_rule("gecko", device=device).float(), task, x, s)
 
 
 @dataclass

@@ -32,12 +32,13 @@ from typing import Any, NamedTuple
 
 import gymnasium
 import torch
+from scripts import script_facts, script_parser
 from torch import Tensor
 from torch.autograd import DeviceType
 from torch.profiler import ProfilerActivity, profile
 
 from npa_envs.agents.learning import Problem
-from npa_envs.measure.record import script_facts, script_parser, write_record
+from npa_envs.measure.record import write_record
 from npa_envs.measure.speed.timing import synchronize
 from npa_envs.measure.tables import markdown_table
 from npa_envs.registration import SIZES, SPECIES_SIZES

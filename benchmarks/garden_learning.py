@@ -29,6 +29,7 @@ from typing import Any
 import gymnasium
 import numpy as np
 import torch
+from scripts import script_facts, script_parser
 from stable_baselines3 import PPO, SAC, HerReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback
 
@@ -42,7 +43,7 @@ from npa_envs.agents.gardening import (
 )
 from npa_envs.agents.learning.problem import EVALUATION_SEEDS
 from npa_envs.files import write_text
-from npa_envs.measure.record import script_facts, script_parser, write_record
+from npa_envs.measure.record import write_record
 from npa_envs.registration import GARDEN_IDS
 from npa_envs.wrappers import WorldVecEnv
 

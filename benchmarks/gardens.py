@@ -22,6 +22,7 @@ from typing import Any
 import gymnasium
 import numpy as np
 import torch
+from scripts import script_facts, script_parser
 
 import npa_envs  # noqa: F401 (registers the environments)
 from npa_envs.agents.gardening import (
@@ -32,7 +33,7 @@ from npa_envs.agents.gardening import (
     StillGardener,
 )
 from npa_envs.agents.learning.problem import EVALUATION_SEEDS
-from npa_envs.measure.record import script_facts, script_parser, write_record
+from npa_envs.measure.record import write_record
 from npa_envs.measure.speed.timing import synchronize
 from npa_envs.registration import GARDEN_IDS
 

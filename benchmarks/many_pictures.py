@@ -31,8 +31,14 @@ from recipes import train_side_by_side
 from torch import Tensor, nn
 
 import npa_envs
-from npa_envs.measure.codes import MEDIAN, PICTURE_CHECKPOINTS, PictureRow, grown, picture_rows
-from npa_envs.measure.quality import psnr
+from npa_envs.measure.quality import (
+    MEDIAN,
+    PICTURE_CHECKPOINTS,
+    PictureRow,
+    grown,
+    picture_rows,
+    psnr,
+)
 from npa_envs.measure.record import machine, write_record
 from npa_envs.rule.files import rule_metadata
 from npa_envs.tasks.many_pictures import ManyPictures, named_targets

@@ -14,9 +14,10 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from scripts import script_facts, script_parser
 
 import npa_envs
-from npa_envs.measure.record import script_facts, script_parser, write_record
+from npa_envs.measure.record import write_record
 from npa_envs.measure.speed.timing import synchronize
 from npa_envs.rule.files import load_rule
 from npa_envs.training.trained_tasks import task_of_rule

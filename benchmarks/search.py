@@ -21,6 +21,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from scipy.stats import t as student
+from scripts import script_facts, script_parser
 
 from npa_envs.agents.search.methods import METHODS
 from npa_envs.agents.search.run import RESULTS, Growth, Search, tried_again
@@ -28,7 +29,7 @@ from npa_envs.agents.search.worlds import SearchWorld
 from npa_envs.devices import check_device
 from npa_envs.files import read_json, write_bytes
 from npa_envs.measure.plots import draw_band, legend_of, new_figure, png
-from npa_envs.measure.record import script_facts, script_parser, write_record
+from npa_envs.measure.record import write_record
 from npa_envs.measure.tables import markdown_table
 
 IMAGE = Path("runs/search_growth.png")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import io
 import os
 import sys
@@ -18,10 +19,10 @@ COMMANDS = {
     "view": "watch and touch a rule, a training run or an environment in the browser",
     "export-web": "rules as one HTML file that runs in any browser, without a server",
     "evaluate": "measure a rule: loss, PSNR, overflow and extent over thousands of steps",
-    "interact": "grow rules beside each other: what each does to the other",
+    "interact": "grow rules next to each other and measure how each changes the other",
     "bench": "run time against error, the paper's table, scaling; a call explained",
     "stress": "hard cases, what is expected of each, and where things break",
-    "robustness": "what rules bear and what they heal: losses and recovery times over many seeds",
+    "robustness": "losses of rules under other conditions and recovery times after damage",
     "compare": "reinforcement learning, evolution and the gradient on the same tasks",
     "search": "rules nobody asked for: an archive of what differs and stays alive, as an atlas",
     "record": "episodes of a policy as a dataset of Minari",
@@ -36,13 +37,9 @@ INTERRUPTED = 130
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command line.
+    """Run the command line, by default the process's words, and return the exit code.
 
-    Args:
-        arguments: The words after `npa-envs`; None takes them from the process.
-
-    Returns:
-        The exit code: 0, 2 for a mistake in what was asked for, 130 after Ctrl-C.
+    That is 0, 2 for a mistake in what was asked for, or 130 after Ctrl-C.
     """
     # Read once, when torch is loaded: where other programs want the cores, threads that wait in
     # busy loops make every operation several times as slow.
@@ -85,60 +82,17 @@ def _dispatch(words: list[str]) -> int:
         print(f"npa-envs {__version__}")
         return 0
     name, rest = words[0], words[1:]
-    # Spelled out, so that the import ladder's test and type checkers see every import.
-    match name:
-        case "demo":
-            from npa_envs.cli.demo import main as command
-        case "train":
-            from npa_envs.cli.train import main as command
-        case "sweep":
-            from npa_envs.cli.sweep import main as command
-        case "rollout":
-            from npa_envs.cli.rollout import main as command
-        case "view":
-            from npa_envs.cli.view import main as command
-        case "export-web":
-            from npa_envs.cli.export_web import main as command
-        case "evaluate":
-            from npa_envs.cli.evaluate import main as command
-        case "interact":
-            from npa_envs.cli.interact import main as command
-        case "bench":
-            from npa_envs.cli.bench import main as command
-        case "stress":
-            from npa_envs.cli.stress import main as command
-        case "robustness":
-            from npa_envs.cli.robustness import main as command
-        case "learn":
-            from npa_envs.cli.learn import main as command
-        case "compare":
-            from npa_envs.cli.compare import main as command
-        case "search":
-            from npa_envs.cli.search import main as command
-        case "record":
-            from npa_envs.cli.record import main as command
-        case "list":
-            from npa_envs.cli.listing import main as command
-        case "warmup":
-            from npa_envs.cli.warmup import main as command
-        case "doctor":
-            from npa_envs.cli.doctor import main as command
-        case _:
-            raise NPAError(f"unknown command {name!r}: {suggest(name, COMMANDS)}")
-    return command(rest)
+    if name not in COMMANDS:
+        raise NPAError(f"unknown command {name!r}: {suggest(name, COMMANDS)}")
+    module = {"list": "listing"}.get(name, name.replace("-", "_"))
+    return int(importlib.import_module(f"npa_envs.cli.{module}").main(rest))
 
 
 def _help() -> str:
     width = max(map(len, COMMANDS))
-    lines = [f"  {name:<{width}}  {summary}" for name, summary in COMMANDS.items()]
-    return "\n".join(
-        [
-            "usage: npa-envs COMMAND [options]",
-            "",
-            "Neural Particle Automata: differentiable particle worlds.",
-            "",
-            *lines,
-            "",
-            "Options of a command: npa-envs COMMAND --help",
-        ]
+    lines = "\n".join(f"  {name:<{width}}  {summary}" for name, summary in COMMANDS.items())
+    return (
+        "usage: npa-envs COMMAND [options]\n\n"
+        "Neural Particle Automata: differentiable particle worlds.\n\n"
+        f"{lines}\n\nOptions of a command: npa-envs COMMAND --help"
     )

@@ -22,8 +22,6 @@ from npa_envs.errors import NPAError
 if TYPE_CHECKING:
     import torch
 
-    from npa_envs.measure.speed.suites import BenchReport
-
 QUICK = "quick"
 """The suite that is run unless another one is asked for."""
 
@@ -34,46 +32,32 @@ class BenchOptions(MeasureOptions):
 
     suite: str | None = None
     """quick (the default), paper, scaling, skips, species or kernels."""
-
     quick: bool = False
     """Small worlds only: about a minute on a CPU."""
-
     repeats: int = 7
     """Readings of every time; tables show their median and range."""
-
     out: Path | None = None
     """Folder for SUITE_DEVICE.json and plots; default: nothing is written."""
-
     max_seconds: float | None = None
     """Leave out what has not begun after this time [s]; the rest is written. Default: never."""
-
     plots: bool = False
     """Also draw plots into the output folder; needs the extra `bench`."""
-
     explain: bool = False
     """Measure nothing: say which kernels a step launches, and why. The options below tell which."""
-
     space_dim: Literal[2, 3] = 2
     """Space dimension of the step explained."""
-
     world_count: int = 1
     """Its worlds B."""
-
     particle_count: int = 4096
     """Its particles in each world N."""
-
     state_dim: int = 16
     """Its state channels C."""
-
     update_prob: float = 0.5
     """Its probability of each particle's update."""
-
     periodic: bool = False
     """Its box is periodic."""
-
     dtype: Literal["float32", "float64"] = "float32"
     """Its precision."""
-
     gradients: Literal["none", "weights", "positions"] = "weights"
     """What it is differentiated by: nothing, weights and states, or positions as well."""
 
@@ -82,35 +66,23 @@ def main(arguments: Sequence[str]) -> int:
     """Measure, print and write."""
     options = parse_options(BenchOptions, "bench", arguments)
     from npa_envs.devices import check_device
-    from npa_envs.measure.plots import check_matplotlib
-    from npa_envs.measure.speed.suites import SUITES
+    from npa_envs.files import write_text
+    from npa_envs.measure.plots import check_matplotlib, write_plots
+    from npa_envs.measure.record import current_commit, time_limit
+    from npa_envs.measure.speed.suites import SUITES, BenchReport, pictures
+    from npa_envs.measure.speed.timing import TimingSession
 
     check_numbers(options, repeats=1, threads=1, world_count=1, particle_count=1, state_dim=1)
     if options.plots and options.out is None:
         raise NPAError("plots need a folder to be written to: give --out DIR as well")
     device = check_device(options.device)
-    chosen_names("suite", [options.suite or QUICK], SUITES)
+    (name,) = chosen_names("suite", [options.suite or QUICK], SUITES)
     if options.explain:
         print(_explanation(options, device))
         return 0
-    if options.out is not None:
-        writable_folder(options.out)
+    folder = None if options.out is None else writable_folder(options.out)
     if options.plots:
         check_matplotlib()
-    report = measured_report(options, device, shlex.join(["npa-envs", "bench", *arguments]))
-    print(report.text())
-    if options.out is not None:
-        _write(report, options.out, plots=options.plots)
-    return 0
-
-
-def measured_report(options: BenchOptions, device: torch.device, command: str) -> BenchReport:
-    """Run a suite and return its report, with the command line in it."""
-    from npa_envs.measure.record import current_commit, time_limit
-    from npa_envs.measure.speed.suites import SUITES, BenchReport
-    from npa_envs.measure.speed.timing import TimingSession
-
-    name = options.suite or QUICK
     with StepBar(None, show=options.progress, unit="row") as bar, torch_threads(options.threads):
         session = TimingSession(
             device=device,
@@ -120,29 +92,25 @@ def measured_report(options: BenchOptions, device: torch.device, command: str) -
             enough=time_limit(options.max_seconds),
         )
         tables = SUITES[name](session)
-    return BenchReport(
+    report = BenchReport(
         suite=name,
-        command=command,
+        command=shlex.join(["npa-envs", "bench", *arguments]),
         commit=options.commit or current_commit(),
         device=device,
         threads=options.threads,
         tables=tables,
         left_out=session.left_out,
     )
-
-
-def _write(report: BenchReport, folder: Path, *, plots: bool) -> None:
-    from npa_envs.files import write_text
-    from npa_envs.measure.plots import write_plots
-    from npa_envs.measure.speed.suites import pictures
-
-    path = folder / f"{report.suite}_{report.device.type}.json"
-    write_text(path, report.json())
-    done = [f"wrote {path}"]
-    if plots:
-        place = path.with_name(f"{path.stem}_*.png")
-        done += write_plots(lambda: pictures(report.tables), place, "plots")
-    print("\n".join(done))
+    print(report.text())
+    if folder is not None:
+        path = folder / f"{name}_{device.type}.json"
+        write_text(path, report.json())
+        done = [f"wrote {path}"]
+        if options.plots:
+            place = path.with_name(f"{path.stem}_*.png")
+            done += write_plots(lambda: pictures(tables), place, "plots")
+        print("\n".join(done))
+    return 0
 
 
 def _explanation(options: BenchOptions, device: torch.device) -> str:
@@ -151,21 +119,7 @@ def _explanation(options: BenchOptions, device: torch.device) -> str:
     from npa_envs.measure.speed.explain import Question, explain
     from npa_envs.measure.speed.workloads import Workload
 
-    workload = Workload(
-        options.space_dim,
-        options.world_count,
-        options.particle_count,
-        1,
-        state_dim=options.state_dim,
-        update_prob=options.update_prob,
-    )
+    sizes = (options.space_dim, options.world_count, options.particle_count, 1)
+    workload = Workload(*sizes, state_dim=options.state_dim, update_prob=options.update_prob)
     dtype = {"float32": torch.float32, "float64": torch.float64}[options.dtype]
-    return explain(
-        Question(
-            workload=workload,
-            device=device,
-            dtype=dtype,
-            periodic=options.periodic,
-            gradients=options.gradients,
-        )
-    )
+    return explain(Question(workload, device, dtype, options.periodic, options.gradients))

@@ -21,6 +21,7 @@ from npa_envs.cli.output import (
     StepBar,
     check_numbers,
     chosen_names,
+    named_values,
     parse_options,
     writable_folder,
 )
@@ -46,7 +47,7 @@ QUICK: dict[str, Any] = {
     "methods": ("gradient", "evolution", "zero"),
     "seeds": 1,
 }
-"""What a quick comparison compares unless it is told."""
+"""Defaults of a quick comparison."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -61,52 +62,39 @@ class CompareOptions(MeasureOptions):
     out: Path = Path("comparison")
     """Folder for AXIS/TASK/METHOD/seed-K/, and for comparison.md, .json, .csv and pictures of what
     the command names (curves need the extra `bench`)."""
-
     suite: Literal["npa-bench-v0", "npa-bench-small-v0"] | None = None
     """Run a frozen benchmark, the small one on a laptop, with its own tasks, budgets and episodes;
     write a row for each method, OUT/rows/METHOD.json, and keep what it has of other tasks and
     seeds."""
-
     tasks: tuple[str, ...] = ()
     """morphogenesis2d, regeneration2d, point_classification, mixing, or those of the suite, its ids
     without npa/; default: all, or the first when quick."""
-
     methods: tuple[str, ...] = ()
     """Methods of npa_envs.agents.learning; default: all but `clone`, which needs a teacher: the run
     of `gradient` from the same seed, or options; of a suite: all of them. NAME=METHOD gives one a
     name of its own, for other options (bold=ppo), or runs your function (mine=module:function)."""
-
     seeds: int | None = None
     """Seeds for each method and task: 0, 1, ...; default: 3, 5 of a suite, or 1 when quick."""
-
     seconds: float | None = None
     """Compare for equal wall time: seconds that each run may learn. Its start and evaluations come
     on top."""
-
     particle_steps: float | None = None
     """Compare for equal particle-steps: as many as each run may learn from, for example 1e8."""
-
     episodes: int | None = None
-    """Held-out episodes that tell what a run has reached; default: 32, or 4 when quick."""
-
+    """Held-out episodes that measure a run; default: 32, or 4 when quick."""
     options: Annotated[tuple[str, ...], tyro.conf.arg(metavar="METHOD.NAME=VALUE")] = ()
     """Options of methods, values as JSON or plain text: evolution.population=64."""
-
     quick: bool = False
     """Tiny worlds and, unless said otherwise, few steps, methods, tasks and one seed, a minute at
     most on two CPU cores: figures that say nothing but that it runs."""
-
     devices: tuple[str, ...] = ()
     """Several devices that runs are dealt out to, for example cuda:0 cuda:1; default: --device."""
-
     jobs: int | None = None
     """Runs at once; default: one for each device. Those on one device share its time, which counts
     where wall time is equal: with --seconds, as many on each device."""
-
     part: Annotated[str | None, tyro.conf.arg(metavar="K/N")] = None
     """Run the K-th of N parts alone: a machine, or a task of a scheduler's array, takes one each,
     all with the same --out on a shared disk."""
-
     max_seconds: float = math.inf
     """No run begins after so long; the next call goes on."""
 
@@ -140,7 +128,7 @@ def main(arguments: Sequence[str]) -> int:
         write_table(plan, whole(), folder, command)
         bar.advance(1)
 
-    places = Places(_devices(options), _jobs(options), options.threads)
+    places = Places((options.devices or (options.device,)), _jobs(options), options.threads)
     with StepBar(len(missing), show=options.progress, unit="run") as bar:
         run_jobs(
             plan,
@@ -151,26 +139,22 @@ def main(arguments: Sequence[str]) -> int:
             max_seconds=options.max_seconds,
             written=written,
         )
-    told = [write_table(plan, whole(), folder, command), *write_pictures(whole(), folder)]
+    lines = [write_table(plan, whole(), folder, command), *write_pictures(whole(), folder)]
     if options.suite is not None:
         rows = write_rows(
             SUITES[options.suite], plan, whole(), writable_folder(folder / ROWS), command
         )
-        told += [f"wrote {path}" for path in rows]
+        lines += [f"wrote {path}" for path in rows]
     failed = [record for record in whole() if record.status == "failed"]
-    told += [f"{record.job} failed: {record.error}" for record in failed]
+    lines += [f"{record.job} failed: {record.error}" for record in failed]
     left = sum(job not in records for job in mine)
-    told += [f"{left} runs are left: call again with the same options"] if left else []
-    print("\n".join(told))
+    lines += [f"{left} runs are left: call again with the same options"] if left else []
+    print("\n".join(lines))
     return RUN_FAILED if failed else 0
 
 
 def make_plan(options: CompareOptions) -> ComparisonPlan:
-    """Return what the command line asks for.
-
-    Raises:
-        NPAError: As for `main`.
-    """
+    """Return the plan that the command line asks for."""
     from npa_envs.agents.comparison.plan import LEFT_OUT, PROBLEMS, ComparisonPlan, make_problem
     from npa_envs.agents.learning import METHODS
     from npa_envs.agents.learning.problem import RUNS
@@ -184,8 +168,8 @@ def make_plan(options: CompareOptions) -> ComparisonPlan:
     if options.suite is not None:
         return _suite_plan(options)
     if options.quick:
-        told = {name: getattr(options, name) or few for name, few in QUICK.items()}
-        options = replace(options, **told)
+        few = {name: getattr(options, name) or value for name, value in QUICK.items()}
+        options = replace(options, **few)
     tasks = chosen_names("task", options.tasks, PROBLEMS)
     methods, own = _chosen_methods(options.methods, METHODS)
     if not options.methods:
@@ -222,8 +206,8 @@ def _suite_plan(options: CompareOptions) -> ComparisonPlan:
     if quick and not options.tasks:
         tasks = tasks[:1]
     methods, own = _chosen_methods(options.methods, suite.methods)
-    told = _method_options(options.options, methods, own)
-    for name in told.keys() - own.keys():
+    chosen = _method_options(options.options, methods, own)
+    for name in chosen.keys() - own.keys():
         raise NPAError(
             f"options of {name!r} are frozen in {suite.name}: give it a name of its own, "
             f"--methods my_{name}={name} --options my_{name}.NAME=VALUE"
@@ -240,7 +224,7 @@ def _suite_plan(options: CompareOptions) -> ComparisonPlan:
             for method in methods
             if suite.leaves_out(task, own.get(method, method))
         ],
-        options=told,
+        options=chosen,
         own=own,
         episodes=QUICK_EPISODES if quick else npa_bench.EPISODES,
         settings=_settings(options),
@@ -276,8 +260,8 @@ def _chosen_methods(words: Sequence[str], known: Iterable[str]) -> tuple[list[st
     own = dict(named)
     for name, count in Counter(name for name, _ in named).items():
         if count > 1:
-            told = " and ".join(word for word in words if word.startswith(f"{name}="))
-            raise NPAError(f"methods must have names of their own, got {told}: rename one")
+            same = " and ".join(word for word in words if word.startswith(f"{name}="))
+            raise NPAError(f"methods must have names of their own, got {same}: rename one")
     for name, method in own.items():
         if not re.fullmatch("[a-z0-9_]+", name) or name in known:
             raise NPAError(
@@ -320,21 +304,13 @@ def _method_options(
             known = method_options(own.get(method, method))
         if option not in known:
             raise NPAError(f"unknown option {option!r} in {word!r}: {suggest(option, known)}")
-        try:
-            plain = json.loads(value)
-        except ValueError:
-            plain = value
-        found.setdefault(method, {})[option] = plain
+        found.setdefault(method, {}).update(named_values("options", [f"{option}={value}"]))
     return found
-
-
-def _devices(options: CompareOptions) -> tuple[str, ...]:
-    return options.devices or (options.device,)
 
 
 def _jobs(options: CompareOptions) -> int:
     """Return how many runs there are at once, as fairly as times are compared."""
-    count = len(_devices(options))
+    count = len(options.devices or (options.device,))
     jobs = count if options.jobs is None else options.jobs
     if options.seconds is not None and jobs % count:
         raise NPAError(
@@ -345,11 +321,11 @@ def _jobs(options: CompareOptions) -> int:
 
 
 def _settings(options: CompareOptions) -> dict[str, Any]:
-    """Return what figures follow from besides problems, budgets and options."""
+    """Return the facts of figures other than problems, budgets and options."""
     from npa_envs.devices import check_device
     from npa_envs.measure.record import installed_version, machine, measured_facts
 
-    places = [check_device(name) for name in _devices(options)]
+    places = [check_device(name) for name in (options.devices or (options.device,))]
     kinds = {(place.type, machine(place)) for place in places}
     if len(kinds) > 1:
         raise NPAError(

@@ -3,22 +3,18 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from npa_envs.cli.output import (
-    StepBar,
-    parse_options,
-    torch_threads,
-    writable_folder,
-)
+from npa_envs.cli.output import StepBar, parse_options, torch_threads, writable_folder
 from npa_envs.errors import NPAError
 
-GROW_STEPS = 512
-HEAL_STEPS = 384
-FRAME_STEPS = 8
+if TYPE_CHECKING:
+    import torch
+
+GROW_STEPS, HEAL_STEPS, FRAME_STEPS = 512, 384, 8
 
 SMALL_RUN: dict[str, Any] = {
     "world_count": 4,
@@ -46,88 +42,63 @@ class DemoOptions:
 
     out: Path = Path("demo")
     """Folder to write to; created where missing."""
-
     rule: str = "gecko"
     """The rule to grow: a shipped one, a file, or the folder of a run."""
-
     target: str = "heart"
     """The picture to train on: a built-in name, an emoji or a path."""
-
     train_seconds: float = 30.0
     """Time for the training [s]."""
-
     seed: int = 0
     """Randomness."""
-
     device: str = "cpu"
     """Where to run: cpu, cuda, cuda:1."""
-
     progress: bool = True
     """Show progress bars."""
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Show what the words after `npa-envs demo` ask for; return 0."""
+    """Grow, heal and train, and print and write what came of it."""
     options = parse_options(DemoOptions, "demo", arguments)
+    from npa_envs.devices import check_device
     from npa_envs.files import write_text
 
     if not 1.0 <= options.train_seconds <= 3600.0:
         raise NPAError(f"train_seconds must lie in [1, 3600], got {options.train_seconds}")
     start = time.perf_counter()
-    writable_folder(options.out)
-    report = DemoReport()
-    # On worlds as small as these several threads gain little, and on a busy machine they wait for
-    # each other at every operation: a step then takes several times as long.
+    device = check_device(options.device)
+    path = writable_folder(options.out) / "report.txt"
+    lines: list[str] = []
+
+    def say(text: str) -> None:
+        print(text, flush=True)
+        lines.append(text)
+
+    # Worlds as small as these gain little from several threads, which wait for each other.
     with torch_threads(1):
-        grow_and_heal(options, report)
-        train_small(options, report)
-    report.line(f"all of it took {time.perf_counter() - start:.0f} s")
-    path = options.out / "report.txt"
-    write_text(path, "\n".join(report.lines) + "\n")
+        grow_and_heal(options, device, say)
+        train_small(options, device, say)
+    say(f"all of it took {time.perf_counter() - start:.0f} s")
+    write_text(path, "\n".join(lines) + "\n")
     print(f"  wrote {path}")
     return 0
 
 
-class DemoReport:
-    """What the demo says, on the screen and in a file."""
-
-    def __init__(self) -> None:
-        self.lines: list[str] = []
-        """All that was said."""
-
-    def line(self, text: str) -> None:
-        """Print a line and keep it."""
-        print(text, flush=True)
-        self.lines.append(text)
-
-    def wrote(self, *paths: Path) -> None:
-        """Say which files were written."""
-        for path in paths:
-            self.line(f"  wrote {path}")
-
-
-def grow_and_heal(options: DemoOptions, report: DemoReport) -> None:
-    """Grow the shipped rule, damage it twice, and film how it heals.
-
-    Raises:
-        NPAError: The rule cannot be loaded, or a file cannot be written.
-    """
+def grow_and_heal(options: DemoOptions, device: torch.device, say: Callable[[str], None]) -> None:
+    """Grow the shipped rule, damage it twice, and film how it heals."""
     import torch
 
     from npa_envs.cli.film import WorldFilm, film_world, write_film
     from npa_envs.measure.quality import measure
     from npa_envs.rule.files import load_rule
     from npa_envs.tasks.damage import DamageEvent, damage_worlds
-    from npa_envs.training import check_device
     from npa_envs.training.trained_tasks import task_of_rule
 
-    device = check_device(options.device)
     rule = load_rule(options.rule, device=device).float()
     trained = task_of_rule(options.rule, rule, device)
     generator = torch.Generator(device).manual_seed(options.seed)
     x, s, goal = trained.task.seed(1, generator=generator, device=device)
     task = trained.task.toward(goal)
-    report.line(f"{options.rule}: {x.shape[1]} particles, {rule.weight_count} weights")
+    say(f"{options.rule}: {x.shape[1]} particles, {rule.weight_count} weights")
 
     def figures(step: int) -> str:
         if trained.doubt is not None:
@@ -151,32 +122,20 @@ def grow_and_heal(options: DemoOptions, report: DemoReport) -> None:
             seconds, step = time.perf_counter() - start, step + steps
             done = "grown" if kind is None else "healed"
             lines.append(f"  {done} for {steps} steps in {seconds:4.1f} s: {figures(step)}")
-    for line in lines:
-        report.line(line)
     name = Path(options.rule.rpartition("#")[2]).stem
-    report.wrote(*write_film(film, options.out, name))
+    for line in [*lines, *(f"  wrote {path}" for path in write_film(film, options.out, name))]:
+        say(line)
 
 
-def train_small(options: DemoOptions, report: DemoReport) -> None:
-    """Train a small rule from a picture, and film what it learned.
-
-    Raises:
-        NPAError: The target cannot be loaded, or a file cannot be written.
-    """
+def train_small(options: DemoOptions, device: torch.device, say: Callable[[str], None]) -> None:
+    """Train a small rule from a picture, and film it."""
     import torch
 
     from npa_envs.cli.film import film_world, write_film
     from npa_envs.measure.quality import measure
     from npa_envs.render import to_uint8, write_filmstrip
     from npa_envs.tasks.morphogenesis2d import HALF_SEEDS
-    from npa_envs.training import (
-        RunFolder,
-        check_device,
-        override,
-        preset,
-        task_entry,
-        train,
-    )
+    from npa_envs.training import RunFolder, override, preset, task_entry, train
 
     task_name = "morphogenesis2d"
     config = preset(
@@ -186,11 +145,11 @@ def train_small(options: DemoOptions, report: DemoReport) -> None:
         seed=options.seed,
         device=options.device,
         out=options.out / "training",
-        # So short a run learns most from seeds; nothing has to last.
+        # So short a run learns most from seeds.
         **HALF_SEEDS,
         **SMALL_RUN,
     )
-    report.line(f"training on {options.target}: {config.task.particle_count} particles")
+    say(f"training on {options.target}: {config.task.particle_count} particles")
     start = time.perf_counter()
     result = train(
         config,
@@ -201,8 +160,7 @@ def train_small(options: DemoOptions, report: DemoReport) -> None:
     )
     if result.interrupted:
         raise KeyboardInterrupt
-    report.line(f"  {result.iteration} iterations in {time.perf_counter() - start:.1f} s")
-    device = check_device(options.device)
+    say(f"  {result.iteration} iterations in {time.perf_counter() - start:.1f} s")
     task = task_entry(task_name).make(override(config, resolution=SCREEN).task, device)
     generator = torch.Generator(device).manual_seed(options.seed + 1)
     x, s, _ = task.seed(1, generator=generator, device=device)
@@ -211,11 +169,11 @@ def train_small(options: DemoOptions, report: DemoReport) -> None:
         x, s, film = film_world(
             result.rule, task, x, s, steps, generator=generator, every=1, progress=bar.advance
         )
-    row = measure(task, x, s, steps)
-    report.line(f"  grown for {steps} steps: {row.figures}")
+    say(f"  grown for {steps} steps: {measure(task, x, s, steps).figures}")
     name = f"trained-{Path(options.target).stem}"
-    report.wrote(*write_film(film, options.out, name))
+    paths = write_film(film, options.out, name)
     comparison = options.out / f"{name}-comparison.png"
     frames = [to_uint8(task.target_picture), film.frames[-1]]
     write_filmstrip(comparison, frames, ["target", f"step {steps}"])
-    report.wrote(comparison, RunFolder(result.folder).rule)
+    for path in (*paths, comparison, RunFolder(result.folder).rule):
+        say(f"  wrote {path}")

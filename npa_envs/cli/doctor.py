@@ -1,4 +1,4 @@
-"""`npa-envs doctor`: what is broken, slow or missing here, and the cure; also for bug reports."""
+"""`npa-envs doctor`: what is broken, slow or missing on this machine, and the cure."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import subprocess
 import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from pathlib import Path
+from typing import NamedTuple
 
 EXTRAS = {
     "envs": "several species, and particles as agents (PettingZoo)",
@@ -41,18 +41,17 @@ class DoctorOptions:
 def main(arguments: Sequence[str]) -> int:
     """Print the report; return 1 where something is broken."""
     if arguments:
-        # A report that needs the parser would be missing where that is broken.
+        # Imported late: the report must not be missing where the parser is broken.
         from npa_envs.cli.output import parse_options
 
         parse_options(DoctorOptions, "doctor", arguments)
-    findings = examine()
-    width = max(len(finding.subject) for finding in findings)
-    for finding in findings:
-        print(f"{finding.mark} {finding.subject:<{width}}  {finding.text}")
-        if finding.cure is not None:
-            print(f"  {'':<{width}}  -> {finding.cure}")
-    broken = sum(finding.mark == "!" for finding in findings)
-    optional = sum(finding.mark == "-" for finding in findings)
+    lines = examine()
+    width = max(len(line.subject) for line in lines)
+    for line in lines:
+        print(f"{line.mark} {line.subject:<{width}}  {line.text}")
+        if line.cure is not None:
+            print(f"  {'':<{width}}  -> {line.cure}")
+    broken, optional = (sum(line.mark == mark for line in lines) for mark in "!-")
     print(f"{broken} broken (!)" if broken else "nothing is broken", end="")
     print(f"; {optional} slow, or missing where not everybody needs it (-)" if optional else "")
     return 1 if broken else 0
@@ -60,14 +59,12 @@ def main(arguments: Sequence[str]) -> int:
 
 @dataclass(frozen=True)
 class DoctorLine:
-    """One line of the report."""
+    """One line of the report; `optional` cures are of what is slow or not needed by everybody."""
 
     subject: str
     text: str
     cure: str | None = None
-    """What to do about it; None where all is well."""
     optional: bool = False
-    """It works without the cure: something is slower, or what not everybody needs is missing."""
 
     @property
     def mark(self) -> str:
@@ -78,11 +75,7 @@ class DoctorLine:
 
 
 def examine() -> list[DoctorLine]:
-    """Look at packages, devices, the kernel cache, fonts and programs, in the order to read them.
-
-    Starts Warp and, where there is one, asks CUDA for its devices. A check that fails in an
-    unforeseen way is a finding itself.
-    """
+    """Return the lines of packages, devices, kernel cache, fonts and programs, in their order."""
     checks: dict[str, Callable[[], list[DoctorLine]]] = {
         "python": _python,
         "packages": _packages,
@@ -95,16 +88,14 @@ def examine() -> list[DoctorLine]:
         "browser": _browser,
         "shipped rules": _shipped_rules,
     }
-    findings = []
+    lines = []
     for subject, check in checks.items():
         try:
-            findings += check()
+            lines += check()
         except Exception as error:
-            # A report that breaks where the machine is broken would be of no use.
-            findings.append(
-                DoctorLine(subject, f"{type(error).__name__}: {error}", "see the message")
-            )
-    return findings
+            # The report must not break where the machine is broken.
+            lines.append(DoctorLine(subject, f"{type(error).__name__}: {error}", "see the message"))
+    return lines
 
 
 def _python() -> list[DoctorLine]:
@@ -116,23 +107,20 @@ def _python() -> list[DoctorLine]:
     ]
 
 
-@dataclass(frozen=True)
-class Requirement:
-    """A package that the installation asks for."""
+class Requirement(NamedTuple):
+    """A package that an extra, or the installation itself, asks for; any version where empty."""
 
     name: str
     oldest: str
-    """The oldest version that will do; empty: any."""
     extra: str | None
 
-    def finding(self) -> str | None:
-        """Return what is wrong with the package as it is installed, None: nothing."""
+    def fault(self) -> str | None:
+        """Return what is wrong with the package, None: nothing."""
         version = _version(self.name)
         if version is None:
             return "not installed"
-        if _numbers(version) < _numbers(self.oldest):
-            return f"{version} is older than {self.oldest}"
-        return None
+        old = _numbers(version) < _numbers(self.oldest)
+        return f"{version} is older than {self.oldest}" if old else None
 
 
 def _version(name: str) -> str | None:
@@ -148,21 +136,19 @@ def _numbers(version: str) -> tuple[int, ...]:
 
 
 def _requirements() -> list[Requirement]:
-    """Return what the installed metadata of npa-envs names; nothing where it is not installed."""
+    """Return the requirements in the installed metadata of npa-envs."""
     try:
         lines = importlib.metadata.requires("npa-envs") or []
     except importlib.metadata.PackageNotFoundError:
         return []
     found = []
     for line in lines:
-        what, _, marker = line.partition(";")
-        name = re.match(r"[\w.-]+", what)
-        oldest = re.search(r">=\s*([\d.]+)", what)
-        extra = re.search(r"extra\s*==\s*['\"]([\w-]+)", marker)
-        if name is not None and name[0] != "npa-envs":
-            found.append(
-                Requirement(name[0], oldest[1] if oldest else "", extra[1] if extra else None)
-            )
+        name, oldest, extra = (
+            match[1] if (match := re.search(pattern, line)) else ""
+            for pattern in (r"^([\w.-]+)", r">=\s*([\d.]+)", r"extra\s*==\s*['\"]([\w-]+)")
+        )
+        if name != "npa-envs":
+            found.append(Requirement(name, oldest, extra or None))
     return found
 
 
@@ -171,34 +157,25 @@ def _packages() -> list[DoctorLine]:
     if version is None:
         text = "not installed, imported from a folder"
         return [DoctorLine("npa-envs", text, "pip install -e . in the clone", optional=True)]
-    findings = [DoctorLine("npa-envs", version)]
+    lines = [DoctorLine("npa-envs", version)]
     for needed in _requirements():
         if needed.extra is None:
-            wrong = needed.finding()
-            text = wrong or _version(needed.name) or ""
-            cure = f"pip install -U '{needed.name}>={needed.oldest}'" if wrong else None
-            findings.append(DoctorLine(needed.name, text, cure))
-    return findings
+            fault = needed.fault()
+            cure = f"pip install -U '{needed.name}>={needed.oldest}'" if fault else None
+            lines.append(DoctorLine(needed.name, fault or _version(needed.name) or "", cure))
+    return lines
 
 
 def _extras() -> list[DoctorLine]:
-    requirements = _requirements()
-    findings = []
+    lines = []
     for extra, purpose in EXTRAS.items():
-        needed = [one for one in requirements if one.extra == extra]
-        if not needed:
-            continue
-        wrong = [f"{one.name} {text}" for one in needed if (text := one.finding()) is not None]
-        have = ", ".join(f"{one.name} {_version(one.name)}" for one in needed)
-        findings.append(
-            DoctorLine(
-                f"[{extra}]",
-                f"{purpose}: {', '.join(wrong) if wrong else have}",
-                f"pip install 'npa-envs[{extra}]'" if wrong else None,
-                optional=True,
-            )
-        )
-    return findings
+        needed = [one for one in _requirements() if one.extra == extra]
+        faults = [f"{one.name} {fault}" for one in needed if (fault := one.fault())]
+        have = [f"{one.name} {_version(one.name)}" for one in needed]
+        text = f"{purpose}: {', '.join(faults or have)}"
+        cure = f"pip install 'npa-envs[{extra}]'" if faults else None
+        lines += [DoctorLine(f"[{extra}]", text, cure, optional=True)] if needed else []
+    return lines
 
 
 def _torch_devices() -> list[DoctorLine]:
@@ -207,9 +184,9 @@ def _torch_devices() -> list[DoctorLine]:
     cores, threads = os.cpu_count() or 1, torch.get_num_threads()
     idle = cores >= 4 and threads < cores // 2
     cure = "more is faster for large worlds: set OMP_NUM_THREADS, or leave it out" if idle else None
-    findings = [DoctorLine("cpu", f"{threads} threads of {cores} cores", cure, optional=True)]
+    lines = [DoctorLine("cpu", f"{threads} threads of {cores} cores", cure, optional=True)]
     if not torch.cuda.is_available():
-        return [*findings, _no_cuda(torch.version.cuda, _cards())]
+        return [*lines, _no_cuda(torch.version.cuda, _cards())]
     for index in range(torch.cuda.device_count()):
         device = torch.cuda.get_device_properties(index)
         text = (
@@ -218,8 +195,8 @@ def _torch_devices() -> list[DoctorLine]:
         )
         slow = (device.major, device.minor) < FAST_CAPABILITY
         cure = "slow: the faster kernels need a card from 8.0 on (Ampere and newer)"
-        findings.append(DoctorLine(f"cuda:{index}", text, cure if slow else None, optional=True))
-    return findings
+        lines.append(DoctorLine(f"cuda:{index}", text, cure if slow else None, optional=True))
+    return lines
 
 
 def _cards() -> list[tuple[str, str]]:
@@ -236,7 +213,7 @@ def _cards() -> list[tuple[str, str]]:
 
 
 def _no_cuda(built: str | None, cards: list[tuple[str, str]]) -> DoctorLine:
-    """Return why torch, built for a version of CUDA or for none, uses none of these cards."""
+    """Return why torch, built for a version of CUDA or for none, uses no card."""
     if not cards:
         cure = (
             "slow for large worlds: use the presets fast and tiny, which are made for CPUs, or a "
@@ -244,21 +221,21 @@ def _no_cuda(built: str | None, cards: list[tuple[str, str]]) -> DoctorLine:
         )
         return DoctorLine("cuda", "no NVIDIA card, or no driver for it", cure, optional=True)
     name, driver = cards[0]
-    if built is None:
-        cure = "pip uninstall torch, then install its CUDA build: https://pytorch.org/get-started"
-        return DoctorLine("cuda", f"{name} is idle: this torch is a build for CPUs alone", cure)
-    oldest = OLDEST_DRIVERS.get(int(built.partition(".")[0]))
-    if oldest is not None and _numbers(driver) < (oldest,):
-        cure = f"install NVIDIA's driver {oldest} or newer, or a torch for an older CUDA"
-        return DoctorLine(
-            "cuda", f"{name} is idle: driver {driver} is too old for CUDA {built}", cure
-        )
     hidden = os.environ.get("CUDA_VISIBLE_DEVICES")
-    if hidden is not None:
+    oldest = OLDEST_DRIVERS.get(int((built or "0").partition(".")[0]), 0)
+    if built is None:
+        why = "this torch is a build for CPUs alone"
+        cure = "pip uninstall torch, then install its CUDA build: https://pytorch.org/get-started"
+    elif _numbers(driver) < (oldest,):
+        why = f"driver {driver} is too old for CUDA {built}"
+        cure = f"install NVIDIA's driver {oldest} or newer, or a torch for an older CUDA"
+    elif hidden is not None:
+        why = f"CUDA_VISIBLE_DEVICES is '{hidden}'"
         cure = "unset CUDA_VISIBLE_DEVICES, or name the card there"
-        return DoctorLine("cuda", f"{name} is idle: CUDA_VISIBLE_DEVICES is '{hidden}'", cure)
-    cure = 'see what python -c "import torch; torch.zeros(1).cuda()" says; often a reboot helps'
-    return DoctorLine("cuda", f"{name} is idle: torch cannot use it (driver {driver})", cure)
+    else:
+        why = f"torch cannot use it (driver {driver})"
+        cure = 'see what python -c "import torch; torch.zeros(1).cuda()" says; often a reboot helps'
+    return DoctorLine("cuda", f"{name} is idle: {why}", cure)
 
 
 def _warp_devices() -> list[DoctorLine]:
@@ -266,12 +243,10 @@ def _warp_devices() -> list[DoctorLine]:
 
     from npa_envs.runtime import warp_devices
 
-    lines = warp_devices()
-    sees_cuda = any(line.startswith("cuda") for line in lines)
-    cure = None
-    if torch.cuda.is_available() and not sees_cuda:
-        cure = "torch sees a CUDA device and Warp does not: install a newer NVIDIA driver"
-    return [DoctorLine("warp devices", "; ".join(lines), cure)]
+    devices = warp_devices()
+    missing = torch.cuda.is_available() and not any(name.startswith("cuda") for name in devices)
+    cure = "torch sees a CUDA device and Warp does not: install a newer NVIDIA driver"
+    return [DoctorLine("warp devices", "; ".join(devices), cure if missing else None)]
 
 
 def _kernel_cache() -> list[DoctorLine]:
@@ -294,26 +269,25 @@ def _emoji_font() -> list[DoctorLine]:
     from npa_envs.tasks.targets.emoji import find_emoji_fonts
 
     fonts = find_emoji_fonts()
-    if fonts:
-        return [DoctorLine("emoji font", str(fonts[0]))]
-    cure = "for emoji as targets: apt install fonts-noto-color-emoji"
-    return [DoctorLine("emoji font", "none", cure, optional=True)]
+    cure = None if fonts else "for emoji as targets: apt install fonts-noto-color-emoji"
+    return [DoctorLine("emoji font", str(fonts[0]) if fonts else "none", cure, optional=True)]
 
 
 def _ffmpeg() -> list[DoctorLine]:
+    again = "pip install -U imageio-ffmpeg"
     try:
         import imageio_ffmpeg
+
+        program = imageio_ffmpeg.get_ffmpeg_exe()
     except ImportError as error:
         return [DoctorLine("ffmpeg", f"not found ({error})", "pip install 'imageio[ffmpeg]'")]
-    try:
-        program = Path(imageio_ffmpeg.get_ffmpeg_exe())
     except RuntimeError as error:
-        return [DoctorLine("ffmpeg", f"not found ({error})", "pip install -U imageio-ffmpeg")]
+        return [DoctorLine("ffmpeg", f"not found ({error})", again)]
     done = subprocess.run(
         [program, "-version"], capture_output=True, encoding="utf-8", errors="replace", check=False
     )
     if done.returncode:
-        return [DoctorLine("ffmpeg", f"{program} does not run", "pip install -U imageio-ffmpeg")]
+        return [DoctorLine("ffmpeg", f"{program} does not run", again)]
     return [DoctorLine("ffmpeg", f"{done.stdout.splitlines()[0]} ({program})")]
 
 
@@ -324,13 +298,13 @@ def has_screen() -> bool:
 
 
 def _browser() -> list[DoctorLine]:
-    if has_screen():
-        return [DoctorLine("browser", "there is a screen")]
+    screen = has_screen()
     cure = (
         "for npa-envs view: run ssh -L 8765:127.0.0.1:8765 THIS-COMPUTER on a computer that has "
         "one, and open the printed link there"
     )
-    return [DoctorLine("browser", "no screen", cure, optional=True)]
+    text = "there is a screen" if screen else "no screen"
+    return [DoctorLine("browser", text, None if screen else cure, optional=True)]
 
 
 def _shipped_rules() -> list[DoctorLine]:
@@ -339,6 +313,5 @@ def _shipped_rules() -> list[DoctorLine]:
     names = list(shipped_rules())
     for name in names:
         load_rule(name)
-    if not names:
-        return [DoctorLine("shipped rules", "none", "install npa-envs again: its data is missing")]
-    return [DoctorLine("shipped rules", ", ".join(names))]
+    cure = None if names else "install npa-envs again: its data is missing"
+    return [DoctorLine("shipped rules", ", ".join(names) or "none", cure)]

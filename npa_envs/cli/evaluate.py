@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, cast
+from typing import TYPE_CHECKING, Any, cast
 
 from npa_envs.cli.output import RuleOptions, StepBar, check_numbers, parse_options
 from npa_envs.errors import NPAError, shown
@@ -27,25 +27,19 @@ class EvaluateOptions(RuleOptions):
 
     data_folder: str | None = None
     """Point clouds only: where torchvision keeps "mnist"; default: as trained."""
-
     checkpoints: tuple[int, ...] | None = None
     """Steps from the seed to measure at, increasing; default: 64, 128, ... 4096, or 8, 16, 24, 32,
     64, 128 of point clouds."""
-
     seed_count: int = 8
     """Worlds to measure, each from a seed of its own; of point clouds all test clouds are taken."""
-
     first_seed: int = 1_000_000
     """The first world's number; training uses others."""
-
     healing: bool = False
     """Also cut the grown worlds and wipe a part, and measure how they heal. Point clouds are
     always cut and changed."""
-
     judge: bool = False
     """Textures only: also judge worlds by three distances from the target that no loss compares, as
     ratios: at 1 they differ from it as drawings of it by particles do."""
-
     json: Path | None = None
     """Also write the table to this JSON file."""
 
@@ -54,10 +48,8 @@ def main(arguments: Sequence[str]) -> int:
     """Measure and print."""
     options = parse_options(EvaluateOptions, "evaluate", arguments)
     from npa_envs.devices import check_device
-    from npa_envs.files import write_text
-    from npa_envs.measure.judge import JudgeRow, TextureJudge
+    from npa_envs.measure.judge import TextureJudge
     from npa_envs.measure.quality import CHECKPOINTS, check_steps, tables_of
-    from npa_envs.measure.tables import UNMEASURED, table_text, tables_json
     from npa_envs.rule.files import load_rule
     from npa_envs.tasks.point_classification import PointClassification
     from npa_envs.training.trained_tasks import task_of_rule
@@ -69,7 +61,7 @@ def main(arguments: Sequence[str]) -> int:
     rule = load_rule(options.rule, device=device).float()
     world = options.world() | {"data_folder": options.data_folder}
     if rule.codes is not None and options.target is None:
-        return evaluate_pictures(options, rule, device)
+        return _pictures(options, rule, device)
     trained = task_of_rule(options.rule, rule, device, **world)
     if trained.doubt is not None:
         raise NPAError(
@@ -77,7 +69,6 @@ def main(arguments: Sequence[str]) -> int:
             "give --target, a built-in name or a picture"
         )
     judge = TextureJudge(trained.task) if options.judge else None
-    judged: list[JudgeRow] = []
     clouds = trained.task.classifies
     known = not (clouds or options.healing)
     with StepBar(max(checkpoints) if known else None, show=options.progress) as bar:
@@ -89,33 +80,19 @@ def main(arguments: Sequence[str]) -> int:
             changed=clouds or options.healing,
             device=device,
             progress=bar.advance,
-            watch=None if judge is None else lambda *world: judged.append(judge.row(*world)),
+            judge=judge,
         )
-    if judged:
-        tables["judge"] = judged
     what = f"{options.seed_count} worlds"
     if clouds:
         task = cast(PointClassification, trained.task)
         what = f"{len(task.clouds.label)} {task.split} clouds"
     print(f"{options.rule}: {what}, loss: {trained.task.metric_name}")
-    for name, rows in tables.items():
-        print(table_text(rows, missing=UNMEASURED if name == "growth" else "never"))
-    if options.json is not None:
-        write_text(options.json, tables_json(tables, metric=trained.task.metric_name))
-        print(f"wrote {options.json}")
-    return 0
+    return _finish(options, tables, trained.task.metric_name)
 
 
-def evaluate_pictures(options: EvaluateOptions, rule: NPARule, device: torch.device) -> int:
-    """Measure and print what each code of a rule of many pictures grows.
-
-    Raises:
-        NPAError: A picture cannot be loaded any more, or something is asked for that is measured of
-            one picture.
-    """
-    from npa_envs.files import write_text
-    from npa_envs.measure.codes import PICTURE_CHECKPOINTS, picture_rows
-    from npa_envs.measure.tables import table_text, tables_json
+def _pictures(options: EvaluateOptions, rule: NPARule, device: torch.device) -> int:
+    """Measure and print the pictures of a rule of many, each by its code."""
+    from npa_envs.measure.quality import PICTURE_CHECKPOINTS, picture_rows
     from npa_envs.training.trained_tasks import tasks_of_codes
 
     assert rule.codes is not None, "asked before"
@@ -124,13 +101,12 @@ def evaluate_pictures(options: EvaluateOptions, rule: NPARule, device: torch.dev
             "healing and judge are measured of one picture at a time, of the rule's "
             f"{len(rule.codes)}: give --target {shown(rule.codes.names[0])}"
         )
-    checkpoints = options.checkpoints or PICTURE_CHECKPOINTS
     tasks = tasks_of_codes(options.rule, rule, device, **options.world())
     with StepBar(None, show=options.progress) as bar:
         rows = picture_rows(
             rule,
             tasks,
-            checkpoints=checkpoints,
+            checkpoints=options.checkpoints or PICTURE_CHECKPOINTS,
             seeds=range(options.first_seed, options.first_seed + options.seed_count),
             device=device,
             progress=bar.advance,
@@ -140,8 +116,17 @@ def evaluate_pictures(options: EvaluateOptions, rule: NPARule, device: torch.dev
         f"{options.rule}: {len(tasks)} pictures, {options.seed_count} worlds each, loss: {metric}, "
         "shuffled: with the code of the next picture"
     )
-    print(table_text(rows))
+    return _finish(options, {"pictures": rows}, metric)
+
+
+def _finish(options: EvaluateOptions, tables: Mapping[str, Sequence[Any]], metric: str) -> int:
+    """Print tables and, if asked for, write them."""
+    from npa_envs.files import write_text
+    from npa_envs.measure.tables import UNMEASURED, table_text, tables_json
+
+    for name, rows in tables.items():
+        print(table_text(rows, missing=UNMEASURED if name == "growth" else "never"))
     if options.json is not None:
-        write_text(options.json, tables_json({"pictures": rows}, metric=metric))
+        write_text(options.json, tables_json(tables, metric=metric))
         print(f"wrote {options.json}")
     return 0

@@ -23,16 +23,12 @@ class ExportOptions:
 
     rules: Annotated[tuple[str, ...], tyro.conf.Positional, tyro.conf.arg(metavar="RULE")] = ()
     """Shipped rules (`npa-envs list`), folders of runs, or files of ours or the authors'."""
-
     out: Annotated[Path, tyro.conf.arg(aliases=("-o",))] = Path("page.html")
     """The file to write."""
-
     gallery: bool = False
     """Begin with pictures to choose from; without RULE of all shipped 2D rules."""
-
     title: str | None = None
     """Title of the page; default: the first rule's name."""
-
     particle_count: int | None = None
     """Particles N of each world; default: as trained, and 4096 in a collection."""
 

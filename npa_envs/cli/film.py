@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from npa_envs.errors import NPAError
+from npa_envs.measure.quality import run_worlds
 from npa_envs.render import (
     to_uint8,
     turntable_frames,
@@ -28,7 +29,6 @@ from npa_envs.render import (
 from npa_envs.rule.rule import NPARule
 from npa_envs.tasks.damage import DamageEvent, damage_worlds
 from npa_envs.training.trained_tasks import task_of_rule
-from npa_envs.world.rollout import rollout
 
 if TYPE_CHECKING:
     from npa_envs.tasks.base import Task
@@ -51,20 +51,14 @@ EARLY_STEPS = (0, 16, 32, 64, 128)
 
 @dataclass
 class WorldFilm:
-    """Frames of one world."""
+    """Frames of one world, uint8, [R, R, 3], each with a caption."""
 
     background: str = "white"
-    """What lies behind the particles: a colour name or "#rrggbb"."""
-
+    """The colour behind the particles: a name or "#rrggbb"."""
     frames: list[NDArray[np.uint8]] = field(default_factory=list)
-    """Pictures, uint8, shape [R, R, 3] each."""
-
     captions: list[str] = field(default_factory=list)
-    """One for each frame."""
-
     marked: list[int] = field(default_factory=list)
     """Frames that show fresh damage."""
-
     steps: dict[int, int] = field(default_factory=dict)
     """Steps from the seed of each frame for which they are known, in order."""
 
@@ -78,10 +72,7 @@ class WorldFilm:
         mark: bool = False,
         step: int | None = None,
     ) -> None:
-        """Add a picture of worlds x [1, N, D], s [1, N, C].
-
-        A marked one is in the filmstrip; others may stand there for their steps from the seed.
-        """
+        """Add a picture of one world; the filmstrip has all marked ones."""
         if mark:
             self.marked.append(len(self.frames))
         if step is not None:
@@ -123,17 +114,10 @@ def film_world(
     progress: Callable[[int], None] = lambda _: None,
     stop: Callable[[], bool] = lambda: False,
 ) -> tuple[Tensor, Tensor, WorldFilm]:
-    """Run one world x [1, N, D], s [1, N, C] with damages on the way, and take pictures of it.
+    """Run one world with damages on the way, and film it `every` so many steps.
 
-    Args:
-        every: Steps between two frames.
-        first_step: Steps that the world has behind it.
-        film: A film to go on with.
-        progress: Called with the number of steps done since its last call.
-        stop: Asked after each frame whether to end here.
-
-    Returns:
-        Positions and states at the end, and the film.
+    `first_step` is its age, `film` one to go on with; `progress` is called with the number of steps
+    done since its last call, and `stop` is asked after each frame whether to end.
     """
     film = WorldFilm() if film is None else film
     last = first_step + steps
@@ -143,16 +127,7 @@ def film_world(
     now = first_step
     with torch.no_grad():
         for step in sorted(stops):
-            x, s = rollout(
-                rule,
-                x,
-                s,
-                step - now,
-                eps=task.eps,
-                box=task.box,
-                update_prob=task.update_prob,
-                generator=generator,
-            )
+            x, s = run_worlds(rule, task, x, s, step - now, generator)
             progress(step - now)
             now = step
             if not film.frames or step > first_step:
@@ -181,37 +156,24 @@ def large_task(
     style: Style = "splats",
     **world: Any,
 ) -> Task:
-    """Return a rule's task with pictures that are large enough to be seen.
+    """Return a rule's task with pictures that are large enough for a film.
 
-    Args:
-        task: The task as trained.
-        source: What the rule was loaded from.
-        rule: The rule.
-        device: Where the task keeps its target.
-        resolution: Pixels on each side; None: as trained, but at least `SCREEN`.
-        style: "splats" are as large as in training, "points" stand apart.
-        world: What was said of the rule's world, as `task_of_rule` takes it.
-
-    Raises:
-        NPAError: As for `task_of_rule`, or particles of this task have one size.
+    `source` is the rule's name or file; a resolution of None is that of training, but at least
+    `SCREEN`; "points" stand apart; `world` are options of `task_of_rule`.
     """
-    told = dict(world)
+    chosen = dict(world)
     if resolution is not None or len(task.target_picture) < SCREEN:
-        told["resolution"] = SCREEN if resolution is None else resolution
+        chosen["resolution"] = SCREEN if resolution is None else resolution
     if style == "points":
         sigma = getattr(getattr(task, "config", None), "sigma", None)
         if sigma is None:
             raise NPAError("style must be 'splats' for clouds that never move, got 'points'")
-        told["sigma"] = POINT_SIZE * sigma
-    return task if told == world else task_of_rule(source, rule, device, **told).task
+        chosen["sigma"] = POINT_SIZE * sigma
+    return task if chosen == world else task_of_rule(source, rule, device, **chosen).task
 
 
 def write_film(film: WorldFilm, folder: Path, name: str, *, fps: float = 25.0) -> list[Path]:
-    """Write a film as GIF, MP4 and filmstrip, and return the files.
-
-    Raises:
-        NPAError: A file cannot be written.
-    """
+    """Write a film as GIF, MP4 and filmstrip, and return the files."""
     strip, captions = film.strip()
     paths = [folder / f"{name}.gif", folder / f"{name}.mp4", folder / f"{name}-filmstrip.png"]
     write_gif(paths[0], film.frames, fps)
@@ -233,20 +195,7 @@ def write_solid(
     resolution: int = SCREEN,
     background: str = "white",
 ) -> list[Path]:
-    """Write a grown 3D world as a turntable and as files for other programs; return the files.
-
-    Args:
-        task: The task, for the files.
-        x: Positions [length units], shape [1, N, 3].
-        s: States (dimensionless), shape [1, N, C].
-        folder: Where to write to.
-        shown: The task that draws the turntable; None: `task`.
-        resolution: Pixels on each side of the turntable.
-        background: What lies behind the particles.
-
-    Raises:
-        NPAError: A file cannot be written.
-    """
+    """Write a grown 3D world as a turntable, drawn by `shown`, and as point files; return them."""
     names = ("turntable.gif", "points.ply", "gaussians.ply", "cloud.splat")
     paths = [folder / name for name in names]
     with torch.no_grad():

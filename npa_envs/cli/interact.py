@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Iterable, Mapping, Sequence
+import itertools
+from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -22,7 +23,7 @@ from npa_envs.errors import NPAError
 if TYPE_CHECKING:
     import torch
 
-    from npa_envs.measure.interaction import InteractionRow, InteractionSettings, RuleUnderTest
+    from npa_envs.measure.interaction import InteractionSettings, RuleUnderTest
     from npa_envs.rule.rule import NPARule
 
 RESULTS = "interactions.json"
@@ -42,7 +43,7 @@ QUICK: dict[str, Any] = {
 
 @dataclass(frozen=True, kw_only=True)
 class InteractOptions(RunOptions):
-    """Grow every rule beside every other one, and measure what that does to it.
+    """Grow every rule next to every other one, and measure how that changes it.
 
     Every ordered pair of rules, also of a rule with itself, at every distance, ratio and radius:
     the first one's task loss on its own particles together and alone, how much both mix, and how
@@ -55,112 +56,105 @@ class InteractOptions(RunOptions):
 
     rules: Annotated[tuple[str, ...], tyro.conf.Positional, tyro.conf.arg(metavar="RULE")] = ()
     """Rules of 2D morphogenesis: shipped ones (`npa-envs list`) or files; default: all shipped."""
-
     seed_count: int = 8
     """Worlds of each encounter, each from seeds of its own."""
-
     first_seed: int = 1_000_000
     """The first world's number; training uses others."""
-
     distances: tuple[float, ...] = (0.0, 0.5, 1.0)
     """Distances between the centres of the two seeds [length units]."""
-
     ratios: tuple[float, ...] = (0.5,)
     """Shares of the particles that are the measured rule's."""
-
     eps_factors: tuple[float, ...] = (1.0,)
     """Perception radii, over that of the rules."""
-
     itself: bool = True
     """Also bring each rule together with itself."""
-
     steps: int = 512
     """Steps from the seeds."""
-
     particle_count: int | None = None
     """Particles of both together; default: the most that one of the rules was trained with."""
-
     update_prob: float | None = None
     """Probability of each particle's update in a step; default: of each rule as trained."""
-
     margin: float = 0.2
     """Share by which a loss must change to count as changed."""
-
     quick: bool = False
     """Two rules, worlds and distances, few particles and steps, unless said otherwise: figures that
     say nothing but that it runs."""
-
     out: Path = Path("runs/interact")
     """Folder to write to; created where missing."""
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Bring together, measure, write."""
+    """Grow the missing pairs, print, draw and write."""
     options = parse_options(InteractOptions, "interact", arguments)
     from npa_envs.devices import check_device
-    from npa_envs.measure.interaction import Encounters, heat_map, read_rows, write_rows
+    from npa_envs.files import plain_numbers
+    from npa_envs.measure.interaction import Encounters, heat_map, interaction_record, phase_diagram
     from npa_envs.measure.plots import write_plots
-    from npa_envs.measure.tables import table_text
     from npa_envs.render import write_filmstrip
+    from npa_envs.rule.files import rule_digest
 
     if options.quick:
         few = InteractOptions(**QUICK)
         options = parse_options(InteractOptions, "interact", arguments, default=few)
     check_numbers(options, seed_count=1)
     device = check_device(options.device)
-    organisms, settings = _organisms(options, device)
-    if len(organisms) < 2 and not options.itself:
+    rules, settings = _rules(options, device)
+    if len(rules) < 2 and not options.itself:
         raise NPAError(
-            f"rules must be two or more without itself, got {organisms[0].name}: name another one, "
+            f"rules must be two or more without itself, got {rules[0].name}: name another one, "
             "or leave out --no-itself"
         )
     folder = writable_folder(options.out)
-    told = _told(organisms, settings)
-    rows = read_rows(folder / RESULTS, told)
-    pairs = [
-        (first, second)
-        for first in organisms
-        for second in organisms
-        if options.itself or first is not second
-    ]
-    files = _pair_names((first.name, second.name) for first, second in pairs)
-    done = {(row.rule, row.beside) for row in rows}
+    weights = {rule.name: rule_digest(rule.rule) for rule in rules}
+    record = interaction_record(
+        folder / RESULTS, {**plain_numbers(asdict(settings)), "rules": weights}
+    )
+    pairs = [pair for pair in itertools.product(rules, rules) if options.itself or len({*pair}) > 1]
+    names = _pair_names((first.name, second.name) for first, second in pairs)
+    done = {(row.rule, row.beside) for row in record.rows}
     missing = [pair for pair in pairs if (pair[0].name, pair[1].name) not in done]
     if done:
         print(f"{len(pairs) - len(missing)} of {len(pairs)} pairs were measured before")
-    # What is grown alone comes once for each ratio and measured rule.
-    runs = len(missing) * len(settings.distances) + len({pair[0].name for pair in missing})
+    # A rule is grown alone once for each ratio and radius.
+    runs = len(missing) * len(settings.distances) + len({first.name for first, _ in missing})
     total = runs * len(settings.ratios) * len(settings.eps_factors) * settings.steps
     with StepBar(total, show=options.progress) as bar:
         encounters = Encounters(settings, device=device, progress=bar.advance)
-        encounters.check(organisms)
+        encounters.check(rules)
         for first, second in missing:
             fresh, scenes = encounters.meet(first, second)
-            path = folder / f"{files[first.name, second.name]}.png"
+            path = folder / f"{names[first.name, second.name]}.png"
             columns = len(scenes.frames) // len(fresh)
             write_filmstrip(path, scenes.frames, scenes.captions, columns=columns)
-            rows += fresh
-            write_rows(folder / RESULTS, told, rows)
-    print(table_text(rows))
+            record.add(*fresh)
+    rows = record.rows
+
+    def phases() -> dict[str, bytes]:
+        return {
+            name: phase_diagram([row for row in rows if (row.rule, row.beside) == pair])
+            for pair, name in names.items()
+        }
+
+    print(record.table())
     print(f"wrote {folder / RESULTS} and a filmstrip of each pair")
     maps = write_plots(lambda: {"": heat_map(rows)}, folder / "interactions.png", "heat map")
     if len(settings.ratios) > 1 or len(settings.eps_factors) > 1:
-        maps += write_plots(lambda: _phases(rows, files), folder / "phases-*.png", "phase diagrams")
+        maps += write_plots(phases, folder / "phases-*.png", "phase diagrams")
     print("\n".join(maps))
     return 0
 
 
-def _organisms(
+def _rules(
     options: InteractOptions, device: torch.device
 ) -> tuple[list[RuleUnderTest], InteractionSettings]:
-    """Load the rules, with what each grows, and settle how they meet."""
+    """Return the rules with their tasks, and how they are brought together."""
     from npa_envs.measure.interaction import InteractionSettings, RuleUnderTest
     from npa_envs.rule.files import load_rule, shipped_rules
     from npa_envs.training.trained_tasks import task_of_rule
 
     sources = list(dict.fromkeys(options.rules))
     sources = sources or list(shipped_rules(TASK))[: 2 if options.quick else None]
-    organisms: list[RuleUnderTest] = []
+    rules: dict[str, RuleUnderTest] = {}
     counts = []
     for source in sources:
         rule = load_rule(source, device=device).float().requires_grad_(False)
@@ -170,61 +164,28 @@ def _organisms(
         if trained.doubt is not None:
             raise NPAError(f"cannot measure {source!r}: {trained.doubt}: leave it out")
         name = source.rpartition("#")[2] if "#" in source else Path(source).stem
-        if name in {organism.name for organism in organisms}:
-            name = f"{name}-{len(organisms) + 1}"
+        if name in rules:
+            name = f"{name}-{len(rules) + 1}"
+
+        def task_of(count: int, source: str = source, rule: NPARule = rule) -> Any:
+            return task_of_rule(source, rule, device, particle_count=count).task
+
         counts.append(trained.task.config.particle_count)
-        task_of = functools.partial(_task_of, source, rule, device)
-        organisms.append(
-            RuleUnderTest(name, rule, functools.cache(task_of), trained.task.update_prob)
-        )
+        rules[name] = RuleUnderTest(name, rule, functools.cache(task_of), trained.task.update_prob)
+    own = ("distances", "ratios", "eps_factors", "steps", "update_prob", "margin")
     settings = InteractionSettings(
-        particle_count=(max(counts) if options.particle_count is None else options.particle_count),
-        distances=options.distances,
-        ratios=options.ratios,
-        eps_factors=options.eps_factors,
-        steps=options.steps,
+        particle_count=max(counts) if options.particle_count is None else options.particle_count,
         seeds=tuple(range(options.first_seed, options.first_seed + options.seed_count)),
-        update_prob=options.update_prob,
-        margin=options.margin,
+        **{name: getattr(options, name) for name in own},
     )
-    return organisms, settings
+    return list(rules.values()), settings
 
 
 def _pair_names(pairs: Iterable[tuple[str, str]]) -> dict[tuple[str, str], str]:
     """Return a name for the files of each pair, also where rules' names have hyphens."""
     names: dict[tuple[str, str], str] = {}
     for pair in pairs:
-        plain = name = "-".join(pair)
-        number = 1
-        while name in names.values():
-            number += 1
-            name = f"{plain}-{number}"
-        names[pair] = name
+        plain = "-".join(pair)
+        every = itertools.chain([plain], (f"{plain}-{number}" for number in itertools.count(2)))
+        names[pair] = next(name for name in every if name not in names.values())
     return names
-
-
-def _phases(
-    rows: Sequence[InteractionRow], names: Mapping[tuple[str, str], str]
-) -> dict[str, bytes]:
-    """Return the phase diagram of each pair, by the pair's name."""
-    from npa_envs.measure.interaction import phase_diagram
-
-    pairs: dict[tuple[str, str], list[InteractionRow]] = {}
-    for row in rows:
-        pairs.setdefault((row.rule, row.beside), []).append(row)
-    return {names[pair]: phase_diagram(own) for pair, own in pairs.items()}
-
-
-def _task_of(source: str, rule: NPARule, device: torch.device, count: int) -> Any:
-    from npa_envs.training.trained_tasks import task_of_rule
-
-    return task_of_rule(source, rule, device, particle_count=count).task
-
-
-def _told(organisms: Sequence[RuleUnderTest], settings: InteractionSettings) -> dict[str, Any]:
-    """Return what rows follow from, as JSON can hold it."""
-    from npa_envs.files import plain_numbers
-    from npa_envs.rule.files import rule_digest
-
-    weights = {organism.name: rule_digest(organism.rule) for organism in organisms}
-    return {**plain_numbers(asdict(settings)), "rules": weights}

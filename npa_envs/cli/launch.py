@@ -28,23 +28,14 @@ if TYPE_CHECKING:
 def launch(count: int, words: Sequence[str], out: Path, device: str) -> int:
     """Run a command in several processes, and return the exit code once all have ended.
 
-    If one ends early, the others are asked to end, and are killed after half a minute.
-
-    Args:
-        count: Number of processes.
-        words: The words after `npa-envs`.
-        out: The folder that the run is written to, for what is said of a lost process.
-        device: Where it runs: each process has a CUDA device of its own, or all share the CPU.
-
-    Raises:
-        NPAError: There are not as many devices, processes cannot reach each other, one was ended
-            from outside, another than the first has left an error, or torch has no launcher here.
+    If one ends early, the others are asked to end, and are killed after half a minute. On CUDA each
+    process has a device of its own. `out` is the folder of the run, for errors.
     """
-    seen = torch.cuda.device_count()
-    if device != "cpu" and count > seen:
+    found = torch.cuda.device_count()
+    if device != "cpu" and count > found:
         raise NPAError(
-            f"processes must be at most the {seen} CUDA devices that torch sees, got {count}: take "
-            "fewer, or --device cpu"
+            f"processes must be at most the {found} CUDA devices that torch sees, got {count}: "
+            "take fewer, or --device cpu"
         )
     if not dist.is_available():
         raise NPAError(
@@ -56,9 +47,9 @@ def launch(count: int, words: Sequence[str], out: Path, device: str) -> int:
     from torch.distributed.elastic.rendezvous.api import RendezvousError
     from torch.distributed.launcher.api import LaunchConfig, elastic_launch
 
-    # It tells of each step that it takes, and of each signal.
+    # It logs each step and each signal.
     logging.getLogger("torch.distributed.elastic").setLevel(logging.CRITICAL)
-    # As torchrun has it: the processes would otherwise wait for each other's cores.
+    # As in torchrun: the processes would otherwise wait for each other's cores.
     os.environ.setdefault("OMP_NUM_THREADS", "1")
     config = LaunchConfig(
         min_nodes=1,
@@ -84,11 +75,10 @@ def launch(count: int, words: Sequence[str], out: Path, device: str) -> int:
     except ChildFailedError as error:
         left = {rank: left_by(failure) for rank, failure in error.failures.items()}
         for reason in left.values():
-            # The first process tells its own.
+            # The first process prints its own.
             if reason not in ("", left.get(0)):
                 raise NPAError(reason) from error
-        # One that was killed comes before what the others say of it, and before those that were
-        # then asked to end.
+        # A killed process comes before those that report it or were then asked to end.
         rank, failure = min(
             error.failures.items(),
             key=lambda item: (item[1].exitcode == -signal.SIGTERM, item[1].exitcode > 0),
@@ -115,11 +105,7 @@ def with_device_of_gpus(words: Sequence[str]) -> list[str]:
 
 
 def asked_count(gpus: int | None, processes: int | None, device: str) -> int | None:
-    """Return how many processes `--gpus` or `--processes` asks for; None for neither.
-
-    Raises:
-        NPAError: Both do, or there are to be fewer than one, or GPUs that are not to be used.
-    """
+    """Return how many processes `--gpus` or `--processes` asks for; None for neither."""
     if gpus is not None and processes is not None:
         raise NPAError(
             f"gpus says how many processes there are, got gpus {gpus} and processes {processes}: "
@@ -135,12 +121,7 @@ def asked_count(gpus: int | None, processes: int | None, device: str) -> int | N
 
 @contextlib.contextmanager
 def print_once(ranks: Ranks) -> Iterator[None]:
-    """Let the first process tell of an error, and leave that of another one to the launcher.
-
-    Raises:
-        NPAError: What was raised within the block, in a process alone and in the first one.
-        SystemExit: It was raised in another one.
-    """
+    """Print an error on the first rank; pass those of others to the launcher."""
     try:
         yield
     except NPAError as error:
@@ -152,11 +133,7 @@ def print_once(ranks: Ranks) -> Iterator[None]:
 
 
 def leave_to_launcher(error: NPAError) -> None:
-    """Leave the reason why this process ends to the launcher: what several say is told once.
-
-    Args:
-        error: The reason; that another process is lost is none.
-    """
+    """Pass the error of this process to the launcher, unless another process is lost."""
     from torch.distributed.elastic.multiprocessing.errors import get_error_handler
 
     if not isinstance(error, LostProcessError):

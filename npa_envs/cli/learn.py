@@ -39,52 +39,37 @@ class LearnOptions(RunOptions):
 
     method: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="METHOD")]
     """ppo or shac."""
-
     env: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="ENV")]
     """Id of an environment, of Gymnasium or of several species (`npa-envs list`)."""
-
     keywords: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME=VALUE")] = ()
     """Keywords of the environment, values as JSON or plain text: target=heart."""
-
     options: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME=VALUE")] = ()
     """Options of the method, likewise: steps=32 (docs/learning.md)."""
-
     episode_steps: int | None = None
     """Steps after which an episode is cut off; default: as registered, or 256."""
-
     worlds: int | None = None
     """Worlds to act in, of all processes; default: 16, of shac 8. On CUDA ppo takes more where it
     can."""
-
     seed: int = 0
     """Of everything that is drawn, from 0 to 99."""
-
     particle_steps: float | None = None
     """Steps of the worlds, times the particles that took them, to learn from: 1e8."""
-
     seconds: float | None = None
     """Time to learn [s]; start and evaluations come on top."""
-
     episodes: int = 16
     """Episodes by which a point of the curve is measured."""
-
     entries: int = 20
-    """Points of the curve besides the first, and checkpoints."""
-
+    """Points of the curve after the first, and checkpoints."""
     out: Path = Path("runs/learn")
     """Folder for checkpoint, rules and curve."""
-
     processes: int | None = None
     """Processes that share the run, on CUDA each with a GPU of its own; by default 1. `torchrun
     --nproc-per-node=4 -m npa_envs learn ...` does the same."""
-
     gpus: int | None = None
     """GPUs that share the run: `--gpus 4` says `--device cuda --processes 4`."""
-
     resume: bool = False
     """Go on from the checkpoint in the folder `out`. `--resume auto`: if there is one; else
     begin."""
-
     overwrite: bool = False
     """Begin anew although the folder `out` holds a run; the run's files are removed."""
 
@@ -109,22 +94,14 @@ def main(arguments: Sequence[str]) -> int:
 
 
 def parse(words: Sequence[str]) -> LearnOptions:
-    """Return what the words after `npa-envs learn` say.
-
-    Raises:
-        NPAError: A number is too small.
-    """
+    """Return the options of `npa-envs learn`."""
     options = parse_options(LearnOptions, "learn", words)
     check_numbers(options, worlds=1, episodes=1, entries=1)
     return options
 
 
 def run(options: LearnOptions, ranks: Ranks) -> int:
-    """Learn as one process of those that share the run, and return the exit code.
-
-    Raises:
-        NPAError: There is no budget, or as for `npa_envs.agents.learning.train`.
-    """
+    """Learn as one process of those that share the run, and return the exit code."""
     from npa_envs.agents.learning import Budget, train
     from npa_envs.agents.learning.problem import FIRST_EVALUATION_SEED
     from npa_envs.cli import INTERRUPTED
@@ -135,7 +112,7 @@ def run(options: LearnOptions, ranks: Ranks) -> int:
     if steps is not None and not math.isfinite(steps):
         raise NPAError(f"particle_steps must be finite, got {steps}: try 1e8")
 
-    def told(entry: CurvePoint) -> None:
+    def show(entry: CurvePoint) -> None:
         if options.progress:
             print(
                 f"{entry.seconds:8.1f} s  {entry.particle_steps:.3g} particle-steps  "
@@ -156,7 +133,7 @@ def run(options: LearnOptions, ranks: Ranks) -> int:
         device=options.device,
         evaluation_seeds=range(FIRST_EVALUATION_SEED, FIRST_EVALUATION_SEED + options.episodes),
         entries=options.entries,
-        on_entry=told,
+        on_entry=show,
         on_stop=lambda: stopped.append(True),
         out=options.out,
         resume=options.resume,
@@ -170,11 +147,7 @@ def run(options: LearnOptions, ranks: Ranks) -> int:
 
 
 def problem_of(options: LearnOptions) -> Problem:
-    """Return what is to be learned.
-
-    Raises:
-        NPAError: There is no such environment or keyword, or a number is out of its range.
-    """
+    """Return the environment to learn."""
     from npa_envs.agents.learning.problem import Problem, registered_steps
 
     steps = options.episode_steps

@@ -6,11 +6,11 @@ import argparse
 import contextlib
 import inspect
 import json
+import re
 import tempfile
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from types import TracebackType
 from typing import Annotated, Any, TypeVar
 
 import tyro
@@ -21,68 +21,61 @@ from npa_envs.files import NEARLY_FULL_BYTES, made_folder
 
 OptionsT = TypeVar("OptionsT")
 
-EXAMPLES: dict[str, tuple[str, ...]] = {
-    "bench": ("bench --quick", "bench --suite scaling --out results --plots"),
-    "compare": (
-        "compare --quick --out quick",
-        "compare --seconds 60 --methods gradient ppo --tasks morphogenesis2d",
-        "compare --suite npa-bench-small-v0 --out bench --jobs 2",
-    ),
-    "demo": ("demo", "demo --target star --train-seconds 60 --out star"),
-    "doctor": ("doctor",),
-    "evaluate": ("evaluate gecko --healing", "evaluate runs/heart --seed-count 2"),
-    "export-web": ("export-web gecko heart -o page.html", "export-web --gallery -o gallery.html"),
-    "interact": ("interact gecko heart", "interact --quick"),
-    "learn": (
-        "learn ppo npa/Morphogenesis2D-v0 --keywords target=heart --particle-steps 1e9 "
-        "--device cuda",
-        "learn shac npa/Mixing-v0 --seconds 600 --gpus 2 --out runs/mixing",
-    ),
-    "list": ("list",),
-    "record": (
-        "record npa/Morphogenesis2D-v0 --policy gecko --options target=gecko "
-        "--dataset npa/gecko-v0",
-        "record npa/Gardener2DSmall-v0 --policy scripted --dataset npa/gardener/scripted-v0",
-    ),
-    "robustness": ("robustness heart --quick", "robustness --device cuda --out results"),
-    "rollout": (
-        "rollout gecko --damage 300:cut 500:wipe --steps 700",
-        "rollout runs/heart",
-        "rollout gecko --resolution 512 --style points --background black",
-    ),
-    "search": (
-        "search",
-        "search --method cma-me --budget 5e7 --out runs/alive",
-    ),
-    "stress": ("stress --quick", "stress --only geometry --out results"),
-    "sweep": (
-        "sweep --over target=heart,ring seed=0,1,2 --devices cuda:0 cuda:1 -- morphogenesis2d",
-    ),
-    "view": ("view gecko", "view runs/heart", "view npa/Morphogenesis2D-v0 --policy gecko"),
-    "warmup": ("warmup", "warmup --device cuda --space-dims 2 3"),
-    "train morphogenesis2d": (
-        "train morphogenesis2d --target heart --out runs/heart",
-        "train morphogenesis2d --preset paper --target lizard.png --device cuda",
-        "train morphogenesis2d --preset paper --target lizard.png --gpus 4",
-    ),
-    "train co_morphogenesis2d": (
-        "train co_morphogenesis2d --targets ring heart",
-        "train co_morphogenesis2d --preset paper --targets gecko heart --device cuda",
-    ),
-    "train morphogenesis3d": (
-        "train morphogenesis3d --target duck --out runs/duck",
-        "train morphogenesis3d --preset paper --target statue.obj --device cuda",
-    ),
-    "train texture": (
-        "train texture --target dots --out runs/dots",
-        "train texture --target wall.png --loss filter_swd",
-    ),
-    "train point_classification": (
-        "train point_classification --out runs/digits",
-        "train point_classification --preset paper --data mnist --device cuda",
-    ),
-}
-"""What the help of each command shows."""
+_EXAMPLES = """
+bench --quick
+bench --suite scaling --out results --plots
+compare --quick --out quick
+compare --seconds 60 --methods gradient ppo --tasks morphogenesis2d
+compare --suite npa-bench-small-v0 --out bench --jobs 2
+demo
+demo --target star --train-seconds 60 --out star
+doctor
+evaluate gecko --healing
+evaluate runs/heart --seed-count 2
+export-web gecko heart -o page.html
+export-web --gallery -o gallery.html
+interact gecko heart
+interact --quick
+learn ppo npa/Morphogenesis2D-v0 --keywords target=heart --particle-steps 1e9 --device cuda
+learn shac npa/Mixing-v0 --seconds 600 --gpus 2 --out runs/mixing
+list
+record npa/Morphogenesis2D-v0 --policy gecko --options target=gecko --dataset npa/gecko-v0
+record npa/Gardener2DSmall-v0 --policy scripted --dataset npa/gardener/scripted-v0
+robustness heart --quick
+robustness --device cuda --out results
+rollout gecko --damage 300:cut 500:wipe --steps 700
+rollout runs/heart
+rollout gecko --resolution 512 --style points --background black
+search
+search --method cma-me --budget 5e7 --out runs/alive
+stress --quick
+stress --only geometry --out results
+sweep --over target=heart,ring seed=0,1,2 --devices cuda:0 cuda:1 -- morphogenesis2d
+view gecko
+view runs/heart
+view npa/Morphogenesis2D-v0 --policy gecko
+warmup
+warmup --device cuda --space-dims 2 3
+train morphogenesis2d --target heart --out runs/heart
+train morphogenesis2d --preset paper --target lizard.png --device cuda
+train morphogenesis2d --preset paper --target lizard.png --gpus 4
+train co_morphogenesis2d --targets ring heart
+train co_morphogenesis2d --preset paper --targets gecko heart --device cuda
+train morphogenesis3d --target duck --out runs/duck
+train morphogenesis3d --preset paper --target statue.obj --device cuda
+train texture --target dots --out runs/dots
+train texture --target wall.png --loss filter_swd
+train point_classification --out runs/digits
+train point_classification --preset paper --data mnist --device cuda
+"""
+
+EXAMPLES: dict[str, list[str]] = {}
+"""Examples that the help of each command shows."""
+
+for _line in _EXAMPLES.split("\n")[1:-1]:
+    _command = re.match(r"train \w+|[\w-]+", _line)
+    assert _command is not None, "every example begins with a command"
+    EXAMPLES.setdefault(_command[0], []).append(_line)
 
 
 def parse_options(
@@ -93,26 +86,20 @@ def parse_options(
     description: str | None = None,
     default: OptionsT | None = None,
 ) -> OptionsT:
-    """Return the options of a command as the words after it say.
+    """Return the options of a command; its words override `default` or the dataclass's defaults.
 
-    Ends the process, as parsers do, after `--help` and with code 2 for a word that is wrong.
-
-    Args:
-        kind: Dataclass of the options; its docstring is what the help begins with.
-        command: Name of the command, a row of `EXAMPLES`.
-        arguments: The words after it.
-        description: What the help begins with instead.
-        default: What the options are where nothing is said; None: as the dataclass has them.
+    Ends the process, as parsers do, after `--help` and with code 2 for a wrong word. The help
+    begins with `description` or the dataclass's docstring.
     """
     shown = "\n".join(f"  npa-envs {example}" for example in EXAMPLES[command])
-    told: dict[str, Any] = {} if default is None else {"default": default}
+    given: dict[str, Any] = {} if default is None else {"default": default}
     options: OptionsT = tyro.cli(
         kind,
         prog=f"npa-envs {command}",
         description=f"{description or inspect.getdoc(kind)}\n\nExamples:\n{shown}",
         args=arguments,
         config=(tyro.conf.OmitArgPrefixes, tyro.conf.DisallowNone, tyro.conf.SuppressFixed),
-        **told,
+        **given,
     )
     return options
 
@@ -123,7 +110,6 @@ class RunOptions:
 
     device: str = "cpu"
     """Where to run: cpu, cuda, cuda:1."""
-
     progress: bool = True
     """Show a progress bar."""
 
@@ -135,41 +121,27 @@ class RuleOptions(RunOptions):
     rule: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="RULE")]
     """A shipped rule (`npa-envs list`), the folder of a run, a file of ours or the authors'
     (.safetensors, .pth), or a rule of their web demo (models.json#name)."""
-
     target: str | None = None
     """The target to measure against; default: the one that the rule was trained on."""
-
     loss: str | None = None
     """Textures only: the loss to measure by (`npa-envs list`); default: as trained."""
-
     data: str | None = None
     """Point clouds only: "digits", "mnist" or a folder of IDX files; default: as trained."""
-
     particle_count: int | None = None
     """Particles N; default: as trained."""
-
     eps: float | None = None
     """Perception radius [length units]; default: as trained."""
-
     update_prob: float | None = None
     """Probability of each particle's update in a step; default: as trained."""
 
     def world(self) -> dict[str, Any]:
-        """Return what was said of the rule's world, as `task_of_rule` takes it."""
+        """Return the options of the rule's world, as `task_of_rule` takes them."""
         names = ("target", "loss", "data", "particle_count", "eps", "update_prob")
         return {name: getattr(self, name) for name in names}
 
 
 def named_rules(words: Iterable[str]) -> dict[str, str]:
-    """Return the rules that words name: name -> what `load_rule` takes, the package's own first.
-
-    Args:
-        words: Names of shipped rules or of rules that runs begin with, files of rules, and folders
-            of runs.
-
-    Raises:
-        NPAError: A name is not known, or two rules have the same.
-    """
+    """Return rules by name, the package's own first: shipped or presets, files, folders of runs."""
     from npa_envs.rule.files import preset_rules, shipped_rules
     from npa_envs.web.rule_world import name_of
 
@@ -200,12 +172,7 @@ def duration(seconds: float) -> str:
 def writable_folder(path: Path, name: str = "out") -> Path:
     """Create a folder where missing, and check that files can be made in it, before work is done.
 
-    Args:
-        path: It.
-        name: The option that names it, for errors.
-
-    Raises:
-        NPAError: It cannot be created, or files in it cannot.
+    Errors call it `name`, which is the option of the command.
     """
     must = "created"
     try:
@@ -228,17 +195,12 @@ class MeasureOptions(RunOptions):
 
     threads: int = 1
     """CPU threads of torch and of the kernels, of each run; figures are the same, times are not."""
-
     commit: str | None = None
     """Commit that is measured; default: that of the checkout."""
 
 
 def check_numbers(options: Any, **least: int) -> None:
-    """Check that options of a command, where given, are at least so large, and its time limit.
-
-    Raises:
-        NPAError: One is smaller, or `max_seconds` is not positive.
-    """
+    """Check that options, where given, are large enough, and that `max_seconds` is positive."""
     for name, smallest in least.items():
         value = getattr(options, name)
         if value is not None and value < smallest:
@@ -249,11 +211,7 @@ def check_numbers(options: Any, **least: int) -> None:
 
 
 def named_values(name: str, words: Iterable[str]) -> dict[str, Any]:
-    """Return what words NAME=VALUE of the option of a name say, values as JSON or plain text.
-
-    Raises:
-        NPAError: A word is none.
-    """
+    """Return the values of words NAME=VALUE of an option, which are JSON or plain text."""
     found: dict[str, Any] = {}
     for word in words:
         key, mark, value = word.partition("=")
@@ -267,15 +225,7 @@ def named_values(name: str, words: Iterable[str]) -> dict[str, Any]:
 
 
 def resolve_resume(words: Sequence[str], out_of: Callable[[Sequence[str]], Path]) -> list[str]:
-    """Return the words of a command with `--resume auto` decided: by the folder that they name.
-
-    Args:
-        words: The words after the command.
-        out_of: Returns the folder that words without it name.
-
-    Raises:
-        NPAError: Another word stands behind `--resume`, or `--overwrite` beside it.
-    """
+    """Return a command's words with `--resume auto` decided by the folder that `out_of` finds."""
     parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False, exit_on_error=False)
     parser.add_argument("--resume", nargs="?", const=True, choices=("auto",))
     parser.add_argument("--overwrite", action="store_true")
@@ -301,11 +251,7 @@ def resolve_resume(words: Sequence[str], out_of: Callable[[Sequence[str]], Path]
 
 
 def chosen_names(kind: str, names: Sequence[str], known: Iterable[str]) -> list[str]:
-    """Return those known names that were asked for, in their own order; all where none was.
-
-    Raises:
-        NPAError: A name is not known.
-    """
+    """Return the known names that were asked for, in their own order; all where none was."""
     known = list(known)
     for name in names:
         if name not in known:
@@ -327,28 +273,19 @@ def torch_threads(count: int) -> Iterator[None]:
 
 
 class StepBar:
-    """A progress bar that counts steps or another unit; a context manager.
-
-    `total` is None where it is not known.
-    """
+    """A progress bar that counts steps or another unit; a context manager."""
 
     def __init__(self, total: int | None, *, show: bool, unit: str = "step") -> None:
         self.done = 0
-        """Steps done so far."""
         self._bar = tqdm(total=total, disable=not show, unit=unit)
 
     def advance(self, steps: int) -> None:
-        """Count steps that are done since the last call."""
+        """Count steps done since the last call."""
         self.done += steps
         self._bar.update(steps)
 
     def __enter__(self) -> StepBar:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self._bar.close()

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from npa_envs.agents.learning import Problem
 
 FIRST_CHOICE_SEED = 2**31
-"""Of the episode that says nothing but that a policy runs."""
+"""Seed of the episode that only checks that a policy runs."""
 
 LEARNS_NOTHING = ("zero", "random", "scripted")
 """Policies that need no file."""
@@ -41,26 +41,19 @@ class RecordOptions(RunOptions):
 
     env: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="ENV")]
     """Id of an environment of one species, such as npa/Morphogenesis2D-v0."""
-
     dataset: Annotated[str, tyro.conf.arg(metavar="ID")]
     """What the dataset is called: NAMESPACE/NAME-v0."""
-
     policy: str = "random"
     """What acts: "zero", "random", "scripted", or a rule that fits: a shipped one, a file, or the
     folder of a run. In gardens also "gradient", or a run's sac.zip or ppo.zip."""
-
     episodes: int = 16
     """Episodes to record, each from a seed of its own."""
-
     first_seed: int = 0
     """The first one's seed; the others follow."""
-
     worlds: int = 16
     """Worlds that run at the same time."""
-
     options: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME=VALUE")] = ()
     """Keywords of the environment, values as JSON or plain text: target=heart."""
-
     root: Path | None = None
     """Folder of datasets; default: Minari's own, which MINARI_DATASETS_PATH names."""
 
@@ -101,11 +94,7 @@ def main(arguments: Sequence[str]) -> int:
 
 
 def problem_of(options: RecordOptions) -> Problem:
-    """Return the environment with its keywords.
-
-    Raises:
-        NPAError: There is no such environment, or it has several species or no such keyword.
-    """
+    """Return the environment with its keywords."""
     from npa_envs.agents.learning.problem import Problem, registered_steps
 
     worlds = min(options.worlds, options.episodes)
@@ -123,11 +112,7 @@ def problem_of(options: RecordOptions) -> Problem:
 
 
 def policy_of(options: RecordOptions, problem: Problem) -> Callable[[Any], Any]:
-    """Return what acts.
-
-    Raises:
-        NPAError: There is no such policy, or it does not fit.
-    """
+    """Return the policy."""
     from npa_envs.agents.learning import Budget, RuleSet, train
 
     known = (*LEARNS_NOTHING, "gradient") if problem.is_garden else LEARNS_NOTHING
@@ -155,11 +140,7 @@ def policy_of(options: RecordOptions, problem: Problem) -> Callable[[Any], Any]:
 
 
 def _choice_seed(options: RecordOptions) -> int:
-    """Return the seed of a run that plays in none of the worlds that are recorded.
-
-    Raises:
-        NPAError: They are those of all runs.
-    """
+    """Return the seed of a run that plays in none of the worlds that are recorded."""
     from npa_envs.agents.learning.problem import RUNS, WORLDS_PER_SEED
 
     first, last = options.first_seed, options.first_seed + options.episodes - 1

@@ -1,4 +1,4 @@
-"""What a training run ends with: figures, a film and a card of the rule, in the run's folder."""
+"""The report of a training run: figures, a film and a card of the rule, in the run's folder."""
 
 from __future__ import annotations
 
@@ -6,10 +6,9 @@ import json
 import math
 import shlex
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from datetime import date
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import torch
 
@@ -17,9 +16,14 @@ from npa_envs.cli.film import film_world, frame_steps, large_task, write_film, w
 from npa_envs.cli.output import StepBar, writable_folder
 from npa_envs.errors import MissingDependencyError
 from npa_envs.files import write_text
-from npa_envs.measure.codes import picture_rows
-from npa_envs.measure.judge import JudgeRow, TextureJudge
-from npa_envs.measure.quality import CHECKPOINTS, CLOUD_CHECKPOINTS, score_line, tables_of
+from npa_envs.measure.judge import TextureJudge
+from npa_envs.measure.quality import (
+    CHECKPOINTS,
+    CLOUD_CHECKPOINTS,
+    picture_rows,
+    score_line,
+    tables_of,
+)
 from npa_envs.measure.record import current_commit, machine, versions
 from npa_envs.measure.tables import UNMEASURED, markdown_table, table_markdown, tables_json
 from npa_envs.rule.files import load_rule
@@ -38,7 +42,7 @@ FILM_STEPS = 512
 """Steps of the film."""
 
 FILM_DAMAGES = (DamageEvent(200, "cut"), DamageEvent(350, "wipe"))
-"""What is done on the way to worlds that are to match their target pixel by pixel."""
+"""Damage of filmed worlds that are to match their target pixel by pixel."""
 
 TITLES: Mapping[str, str] = {
     "growth": "",
@@ -51,42 +55,23 @@ TITLES: Mapping[str, str] = {
 """What stands above each table of a card."""
 
 
-@dataclass(frozen=True)
-class Training:
-    """How a rule came to be, for its card."""
+class Training(NamedTuple):
+    """How a rule came to be, for its card: task, words after `npa-envs`, iterations, time [s]."""
 
     task_name: str
-    """The task."""
     words: Sequence[str]
-    """The words after `npa-envs`."""
     iterations: int
-    """Iterations done."""
     seconds: float
-    """How long they took [s]."""
 
 
 def write_report(
     path: Path, folder: Path, training: Training, device: torch.device, *, progress: bool
 ) -> tuple[Path, str]:
-    """Measure and film a rule that was trained, and write its card.
+    """Measure and film a rule that was trained, write its card, and return its path and scores.
 
-    On a CPU, where worlds take as long as training does, fewer are measured, for fewer steps, and
-    not damaged.
-
-    Args:
-        path: The rule's file.
-        folder: Where to: STEM.md, the card, STEM.json, its figures as `npa-envs evaluate --json`
-            writes them, STEM.gif, STEM.mp4 and STEM-filmstrip.png; of a 3D rule also a turntable
-            and point files.
-        training: How the rule came to be.
-        device: Where to run.
-        progress: Show a progress bar.
-
-    Returns:
-        The card, and the rule's scores in a line, which says what is not installed for its films.
-
-    Raises:
-        NPAError: A file cannot be written, or the rule's target cannot be loaded any more.
+    The folder gets STEM.md, the card, STEM.json as of `npa-envs evaluate --json`, STEM.gif,
+    STEM.mp4 and STEM-filmstrip.png; of a 3D rule also a turntable and point files. On a CPU, where
+    worlds take as long as training does, fewer are measured, for fewer steps, and not damaged.
     """
     writable_folder(folder)
     rule = load_rule(path, device=device).float()
@@ -96,7 +81,6 @@ def write_report(
     checkpoints = (CLOUD_CHECKPOINTS if clouds else CHECKPOINTS)[: None if thorough else 5]
     count = 8 if thorough else 2
     judge = TextureJudge(task) if isinstance(task, Texture) else None
-    judged: list[JudgeRow] = []
     not_filmed = ""
     with StepBar(None, show=progress) as bar:
         tables = tables_of(
@@ -107,14 +91,12 @@ def write_report(
             changed=thorough and (clouds or task.aligned),
             device=device,
             progress=bar.advance,
-            watch=None if judge is None else lambda *world: judged.append(judge.row(*world)),
+            judge=judge,
         )
         try:
             _film(path, rule, task, folder, device, bar)
         except MissingDependencyError as error:
             not_filmed = f"; not all films: {error}"
-    if judged:
-        tables["judge"] = judged
     if len(tasks := tasks_of_codes(str(path), rule, device)) > 1:
         seeds = range(FIRST_SEED, FIRST_SEED + count)
         tables["pictures"] = picture_rows(rule, tasks, seeds=seeds, device=device)
@@ -122,20 +104,20 @@ def write_report(
     if not clouds:
         command += f" --seed-count {count} --checkpoints {' '.join(map(str, checkpoints))}"
         command += " --healing" if "healing" in tables else ""
-        command += " --judge" if judged else ""
+        command += " --judge" if judge else ""
     facts = {"command": command, "commit": current_commit(), "date": date.today().isoformat()}
     facts |= {"machine": machine(device), "metric": task.metric_name}
     text = tables_json(tables, **facts)
     write_text(folder / f"{path.stem}.json", text)
     card = folder / f"{path.stem}.md"
     strip = folder / f"{path.stem}-filmstrip.png"
-    seen = f"\n![A world from the seed on.]({strip.name})\n" if strip.exists() else ""
-    write_text(card, _card(rule, task, training, facts, tables) + seen)
+    picture = f"\n![A world from the seed on.]({strip.name})\n" if strip.exists() else ""
+    write_text(card, _card(rule, task, training, facts, tables) + picture)
     return card, score_line(json.loads(text)) + _decay(tables.get("growth", ())) + not_filmed
 
 
 DECAYED = 4.0
-"""Loss at the last look, as a multiple of the least one, from which on a rule does not hold."""
+"""Last loss over the least one, from which on a rule does not hold."""
 
 
 def _decay(rows: Sequence[Any]) -> str:

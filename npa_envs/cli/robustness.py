@@ -6,7 +6,7 @@ import shlex
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import tyro
 
@@ -19,12 +19,6 @@ from npa_envs.cli.output import (
     torch_threads,
     writable_folder,
 )
-
-if TYPE_CHECKING:
-    import torch
-
-    from npa_envs.measure.robustness.study import RuleRecord
-    from npa_envs.measure.robustness.trials import RuleTrial
 
 QUICK_SEEDS, QUICK_PARTICLES = 2, 256
 """Seeds and particles of a quick run."""
@@ -42,25 +36,19 @@ class RobustnessOptions(MeasureOptions):
     rules: Annotated[tuple[str, ...], tyro.conf.Positional, tyro.conf.arg(metavar="RULES")] = ()
     """Shipped rules (`npa-envs list`), rules that runs begin with (`seven-pictures`), files of
     rules, or folders of runs; default: all shipped ones, or one of each task when quick."""
-
     seed_count: int | None = None
     """Seeds for each figure; default: 8, or 2 when quick."""
-
     first_seed: int = 1_000_000
     """The first seed's number; training uses others."""
-
     most_particles: int | None = None
     """Particles of all seeds' worlds together, above which a condition is left out; default:
     131072 on a CPU, 2097152 on CUDA."""
-
     quick: bool = False
     """Small worlds, few steps and values, a minute at most on two CPU cores: figures that say
     nothing but that it runs."""
-
     out: Path | None = None
     """Folder for robustness_RULE.json, robustness.md, and curves (extra `bench`); default: nothing
     is written."""
-
     max_seconds: float | None = None
     """Stop after this time; the same command goes on. Default: never."""
 
@@ -69,9 +57,12 @@ def main(arguments: Sequence[str]) -> int:
     """Measure, print and write."""
     options = parse_options(RobustnessOptions, "robustness", arguments)
     from npa_envs.devices import check_device
+    from npa_envs.files import write_text
     from npa_envs.measure.accuracy.endurance import rule_names, task_name
+    from npa_envs.measure.plots import write_plots
     from npa_envs.measure.record import measured_facts, time_limit, without_folders
-    from npa_envs.measure.robustness.study import MOST_PARTICLES, RuleRecord, measure_rule, tables
+    from npa_envs.measure.robustness import study
+    from npa_envs.measure.robustness.trials import PLANS, RuleTrial, quick_plan
     from npa_envs.rule.files import load_rule, rule_digest
 
     check_numbers(options, seed_count=1, first_seed=0, most_particles=1, threads=1)
@@ -83,75 +74,48 @@ def main(arguments: Sequence[str]) -> int:
         # One of each task.
         names = list({task_name(name): name for name in reversed(names)}.values())[::-1]
     device = check_device(options.device)
-    most = options.most_particles or MOST_PARTICLES[device.type]
-    seeds = _seeds(options)
-    common = measured_facts(
+    most = options.most_particles or study.MOST_PARTICLES[device.type]
+    count = options.seed_count or (QUICK_SEEDS if options.quick else 8)
+    seeds = range(options.first_seed, options.first_seed + count)
+    facts = measured_facts(
         device, options.commit, quick=options.quick, seeds=list(seeds), most_particles=most
     )
-    # A rule's name stays where it is trained anew.
-    facts = {name: common | {"weights": rule_digest(load_rule(sources[name]))} for name in names}
-    folder = options.out
-    if folder is not None:
-        writable_folder(folder)
-    paths = {name: folder / f"robustness_{name}.json" for name in names} if folder else {}
-    # All are read first: a file of other settings is refused before any work is done.
-    before = {name: RuleRecord.read(path, facts[name]) for name, path in paths.items()}
+    folder = None if options.out is None else writable_folder(options.out)
     words = without_folders(arguments, "--out")
-    records = []
+    records = {}
+    # All are read first: a file of other settings is refused before any work is done.
+    for name in names:
+        # A rule's name stays where it is trained anew.
+        records[name] = study.RuleRecord(
+            facts | {"weights": rule_digest(load_rule(sources[name]))},
+            folder and folder / f"robustness_{name}.json",
+            rule=name,
+            done=False,
+            command=shlex.join(["npa-envs", "robustness", *words]),
+        ).read()
     with (
         StepBar(len(names), show=options.progress, unit="rule") as bar,
         torch_threads(options.threads),
     ):
-        for name in names:
-            record = before.get(name)
-            if (record is None or not record.done) and not enough():
-                record = measure_rule(
-                    name,
-                    _ground(options, sources[name], device),
-                    most,
-                    facts=facts[name],
-                    command=shlex.join(["npa-envs", "robustness", *words]),
-                    before=record,
-                    path=paths.get(name),
-                    enough=enough,
-                )
-            if record is not None and record.done:
-                records.append(record)
+        for name, record in records.items():
+            if not record.done and not enough():
+                task = task_name(sources[name])
+                plan = quick_plan(task) if options.quick else PLANS[task]
+                small = QUICK_PARTICLES if options.quick else None
+                ground = RuleTrial(sources[name], device, plan, seeds, small)
+                study.measure_rule(record, ground, most, enough=enough)
             bar.advance(1)
+    done = [record for record in records.values() if record.done]
     lines = []
-    if records:
-        text = tables(records)
-        # Before it is printed: whoever reads that may have seen enough.
-        written = [] if folder is None else _write(folder, text, records)
-        lines += [text, *written]
-    if left := len(names) - len(records):
+    if done:
+        lines.append(study.tables(done))
+    if done and folder is not None:
+        # Written before anything is printed: whoever reads that may have seen enough.
+        write_text(folder / "robustness.md", lines[0])
+        lines.append(f"wrote {folder}: robustness.md and a record for each rule")
+        place = folder / "robustness_*.png"
+        lines += write_plots(lambda: study.pictures(done), place, "curves")
+    if left := len(names) - len(done):
         lines.append(f"{left} rules are left: call again with the same options")
     print("\n".join(lines))
     return 0
-
-
-def _seeds(options: RobustnessOptions) -> range:
-    count = options.seed_count or (QUICK_SEEDS if options.quick else 8)
-    return range(options.first_seed, options.first_seed + count)
-
-
-def _ground(options: RobustnessOptions, name: str, device: torch.device) -> RuleTrial:
-    from npa_envs.measure.accuracy.endurance import task_name
-    from npa_envs.measure.robustness.plans import PLANS, quick_plan
-    from npa_envs.measure.robustness.trials import RuleTrial
-
-    task = task_name(name)
-    plan = quick_plan(task) if options.quick else PLANS[task]
-    small = QUICK_PARTICLES if options.quick else None
-    return RuleTrial(name, device, plan, _seeds(options), small)
-
-
-def _write(folder: Path, text: str, records: Sequence[RuleRecord]) -> list[str]:
-    """Write the tables and, where matplotlib is installed, the curves; return what was done."""
-    from npa_envs.files import write_text
-    from npa_envs.measure.plots import write_plots
-    from npa_envs.measure.robustness.study import pictures
-
-    write_text(folder / "robustness.md", text)
-    done = [f"wrote {folder}: robustness.md and a record for each rule"]
-    return [*done, *write_plots(lambda: pictures(records), folder / "robustness_*.png", "curves")]

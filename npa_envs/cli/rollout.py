@@ -28,30 +28,22 @@ class RolloutCommand(RuleOptions):
 
     steps: int = 512
     """Steps to run."""
-
     damage: Annotated[tuple[tuple[str, ...], ...], tyro.conf.UseAppendAction] = ()
     """Damage on the way, STEP:KIND or STEP:KIND:SIZE: 200:cut (gap 0.1), 300:wipe (radius 0.2),
     400:clump (radius 0.2); sizes in length units."""
-
     out: Path = Path("runs/rollout")
     """Folder to write to; created where missing."""
-
     resolution: int | None = None
     """Pixels on each side of the film; default: as trained, but at least 256."""
-
     style: Literal["splats", "points"] = "splats"
     """Particles as large as in training, or points that stand apart; for those 512 pixels are
     better."""
-
     background: str = "white"
     """What lies behind them: a colour name such as black, or "#rrggbb"."""
-
     every: int | None = None
     """Steps between two frames; default: as many as make about 150 frames."""
-
     fps: float = 25.0
     """Frames a second, 0.1 to 50."""
-
     seed: int = 0
     """Randomness, 0 to 2^63 - 1; the same seed gives the same film."""
 

@@ -32,40 +32,28 @@ class SearchOptions(RunOptions):
     method: Literal["map-elites", "cma-me", "cma-es", "random"] = "map-elites"
     """What proposes candidates: mutants of elites; CMA-ES rewarded for what is new, or for quality
     alone; chance."""
-
     budget: float = 2e7
     """Particle-steps of the whole search: candidates times worlds, particles and steps."""
-
     particle_count: int = 128
     """Particles N."""
-
     steps: int = 128
     """Steps from the seed, a multiple of 16; the second half of them is judged."""
-
     world_count: int = 1
     """Worlds that each candidate is tried in; figures are their means."""
-
     state_dim: int = 4
     """State channels, at least 3."""
-
     hidden_dim: int = 8
     """Hidden units of a rule."""
-
     eps: float = 0.1
     """Perception radius [length units]."""
-
     batch_size: int = 20
     """Candidates that are proposed together."""
-
     seed: int = 0
     """Of the proposals; all candidates meet the same worlds."""
-
     threads: int = 1
     """CPU threads of torch and of the kernels."""
-
     max_seconds: float | None = None
     """Stop after this time; the same command goes on. Default: never."""
-
     out: Path = Path("runs/search")
     """Folder to write to; created where missing."""
 

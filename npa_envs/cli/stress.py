@@ -37,23 +37,17 @@ class StressOptions(MeasureOptions):
     rules: Annotated[tuple[str, ...], tyro.conf.Positional, tyro.conf.arg(metavar="RULES")] = ()
     """Check these rules alone, in all checks that are of a rule: shipped ones (`npa-envs list`),
     files of rules, or folders of runs; default: the library and the shipped rules."""
-
     quick: bool = False
     """Small worlds, few steps, some rules: about a minute on two CPU cores."""
-
     only: tuple[str, ...] = ()
     """Groups (geometry, values, time, gradients, precision), checks (time/gecko), or the first
     words of checks (geometry/clump); default: all."""
-
     max_seconds: float | None = None
     """Begin no check after so long [s]; what is left is skipped, and run by the next call."""
-
     seed: int = 0
     """What random worlds are drawn from."""
-
     out: Path | None = None
     """Folder for stress_DEVICE.json and heat maps (extra `bench`); default: nothing is written."""
-
     list: bool = False
     """Run nothing: say which checks there are and what each expects."""
 
@@ -70,28 +64,23 @@ def main(arguments: Sequence[str]) -> int:
     check_numbers(options, seed=0, threads=1)
     rules = named_rules(options.rules)
     checks = suite.all_checks(quick=options.quick, seed=options.seed, rules=rules)
-    names = [check.name for check in checks]
     chosen = suite.chosen_checks(checks, options.only)
     if options.list:
         print(_listing(chosen))
         return 0
     device = check_device(options.device)
-    facts = measured_facts(device, options.commit, quick=options.quick, seed=options.seed)
-    record, path = suite.Record(facts), None
+    path = None
     if options.out is not None:
         name = f"stress_{device.type}{'_quick' * options.quick}.json"
         path = writable_folder(options.out) / name
-        record = suite.Record.read(path, facts)
+    facts = measured_facts(device, options.commit, quick=options.quick, seed=options.seed)
+    record = suite.StressRecord(facts, path, [check.name for check in checks]).read()
     weights = suite.rule_weights(chosen)
     record.drop_other_rules(weights)
-    before = sum(record.done(check.name) for check in chosen)
+    done = {entry.name for entry in record.rows if entry.done}
+    before = sum(check.name in done for check in chosen)
     if before:
         print(f"{before} of {len(chosen)} checks were done before")
-
-    def written(record: suite.Record) -> None:
-        if path is not None:
-            record.in_order(names).write(path)
-
     with (
         StepBar(len(chosen), show=options.progress, unit="check") as bar,
         torch_threads(options.threads),
@@ -102,27 +91,22 @@ def main(arguments: Sequence[str]) -> int:
             record,
             max_seconds=options.max_seconds,
             weights=weights,
-            written=written,
             progress=bar.advance,
         )
-    record = record.in_order(names)
     print(record.text())
     if path is not None:
         maps = path.with_name(f"{path.stem}_*.png")
-        print(
-            "\n".join(
-                [f"wrote {path}", *write_plots(lambda: suite.heat_maps(record), maps, "heat maps")]
-            )
-        )
+        drawn = write_plots(lambda: suite.heat_maps(record), maps, "heat maps")
+        print("\n".join([f"wrote {path}", *drawn]))
     return FAILED if record.failed() else 0
 
 
 def _listing(checks: Sequence[Check]) -> str:
-    from npa_envs.measure.accuracy.checks import GROUPS
+    from npa_envs.measure.accuracy.checks import GROUPS, group_of
 
     lines = []
     for group, summary in GROUPS.items():
-        some = [check for check in checks if check.group == group]
+        some = [check for check in checks if group_of(check.name) == group]
         if some:
             lines += [f"{group}: {summary}", *(f"  {c.name}: {c.expected}" for c in some)]
     return "\n".join(lines)

@@ -7,41 +7,36 @@ import itertools
 import math
 import os
 import re
-import shlex
 import subprocess
 import sys
 import time
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any, NamedTuple
 
 import tyro
 
 from npa_envs.cli.output import StepBar, check_numbers, parse_options, writable_folder
-from npa_envs.errors import NPAError, shown, suggest
+from npa_envs.errors import NPAError, suggest
 from npa_envs.files import read_json, write_text
-from npa_envs.measure.record import write_record
+from npa_envs.measure.record import read_record, write_record
 from npa_envs.measure.tables import NONE, markdown_table
 from npa_envs.processes import Child, Places, part_of, run_children
 
 RUN_FAILED = 1
 
 RECORD, OUTPUT, TABLE = "run.json", "output.txt", "sweep.md"
-"""Files: what became of a run, what it printed, and of all of them together."""
+"""Files: record and output of a run, and the table of all runs."""
 
 OWN = ("out", "device", "resume", "overwrite", "max-seconds", "processes", "gpus")
 """Options of `npa-envs train` that a sweep gives by itself, or that would break it."""
 
 PROGRAM = (sys.executable, "-m", "npa_envs", "train")
-"""What a run's process is, before the task."""
 
-TOLD = 300
-"""Characters at most of what a failed run said last."""
-
-HASH = 12
-"""Characters of a hash in a folder's name."""
+SHOWN, HASH = 300, 12
+"""Characters of a failed run's last output, and of a hash in a folder's name."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -56,53 +51,36 @@ class SweepOptions:
 
     over: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME=A,B,C")]
     """Options of `npa-envs train` with the values to take: target=heart,ring seed=0,1,2."""
-
     out: Path = Path("runs/sweep")
     """Folder for a run's folder each, named by its values, and sweep.md, the table of all."""
-
     devices: tuple[str, ...] = ("cpu",)
     """Devices that runs are dealt out to, for example cuda:0 cuda:1."""
-
     jobs: int | None = None
     """Runs at once; default: one for each device."""
-
     threads: int = 1
     """CPU threads of each run."""
-
     part: Annotated[str | None, tyro.conf.arg(metavar="K/N")] = None
     """Run the K-th of N parts alone: a machine, or a task of a scheduler's array, takes one each,
     all with the same --out on a shared disk."""
-
     max_seconds: float = math.inf
     """No run begins after so long [s]; the next call goes on."""
-
     progress: bool = True
     """Show a progress bar."""
 
 
-@dataclass(frozen=True)
-class SweepRun:
-    """One combination."""
+class SweepRun(NamedTuple):
+    """One combination: values by option, words after `npa-envs train`, the name of its folder."""
 
     values: Mapping[str, str]
-    """What is given to each option."""
-
-    words: Sequence[str]
-    """All words after `npa-envs train`, but for the folder and the device."""
-
+    words: list[str]
     name: str
-    """Name of its folder."""
 
 
-@dataclass(frozen=True)
-class SweepRecord:
-    """What became of a run."""
+class SweepRecord(NamedTuple):
+    """The exit code of a run's process, and its wall time [s]."""
 
-    words: Sequence[str]
     code: int
-    """Exit code of its process."""
     seconds: float
-    """Wall time of the process that ended it [s]."""
 
 
 def main(arguments: Sequence[str]) -> int:
@@ -141,7 +119,7 @@ def main(arguments: Sequence[str]) -> int:
     left = [run.name for run in mine if not is_over(folder, run)]
     failed = [name for name in left if (folder / name / RECORD).exists()]
     for name in failed:
-        said = (folder / name / OUTPUT).read_text("utf-8", errors="replace").strip()[-TOLD:]
+        said = (folder / name / OUTPUT).read_text("utf-8", errors="replace").strip()[-SHOWN:]
         print(f"{name} failed: {' '.join(said.split())}")
     if len(left) > len(failed):
         print(f"{len(left) - len(failed)} runs are left: call again with the same words")
@@ -149,21 +127,12 @@ def main(arguments: Sequence[str]) -> int:
 
 
 def combinations(over: Sequence[str], common: Sequence[str]) -> list[SweepRun]:
-    """Return a run for each combination of values.
-
-    Args:
-        over: "NAME=A,B,C" each.
-        common: The words of all runs: a task, and options.
-
-    Raises:
-        NPAError: A word is no such option, an option or a value is given twice, or there is no
-            task.
-    """
+    """Return a run for each combination of values NAME=A,B,C, with a task and common options."""
     from npa_envs.training import TASKS
 
     if not common or common[0] not in TASKS:
-        told = suggest(common[0], TASKS) if common else ", ".join(TASKS)
-        raise NPAError(f"the words after -- must begin with a task of npa-envs train: {told}")
+        cure = suggest(common[0], TASKS) if common else ", ".join(TASKS)
+        raise NPAError(f"the words after -- must begin with a task of npa-envs train: {cure}")
     given = {_option(word.partition("=")[0]) for word in common if word.startswith("--")}
     values: dict[str, list[str]] = {}
     for word in over:
@@ -189,58 +158,35 @@ def combinations(over: Sequence[str], common: Sequence[str]) -> list[SweepRun]:
 
 
 def _option(word: str) -> str:
-    """Return the name of an option as `npa-envs train` shows it: it reads - and _ alike."""
+    """Return the name of an option as `npa-envs train` shows it."""
     return word.removeprefix("--").replace("_", "-")
 
 
 def _folder_names(chosen: Sequence[Mapping[str, str]]) -> list[str]:
-    """Return a folder's name for each combination, no two of them alike.
-
-    Those that differ only in signs that a folder's name leaves out end with a hash of their values.
-    """
-    told = [",".join(f"{name}={value}" for name, value in one.items()) for one in chosen]
-    plain = [re.sub(r"[^\w=,.+-]", "_", words) for words in told]
+    """Return a folder's name for each combination; those that would be alike end with a hash."""
+    full = [",".join(f"{name}={value}" for name, value in one.items()) for one in chosen]
+    plain = [re.sub(r"[^\w=,.+-]", "_", words) for words in full]
     count = Counter(plain)
     return [
         name if count[name] == 1 else f"{name}-{hashlib.sha256(words.encode()).hexdigest()[:HASH]}"
-        for name, words in zip(plain, told, strict=True)
+        for name, words in zip(plain, full, strict=True)
     ]
 
 
 def is_over(folder: Path, run: SweepRun) -> bool:
-    """Return whether a run has ended well.
+    """Return whether a run has ended well."""
+    held = _record(folder, run)
+    return held is not None and held.code == 0
 
-    Raises:
-        NPAError: Its folder holds one of other words, or a record that cannot be read.
-    """
+
+def _record(folder: Path, run: SweepRun) -> SweepRecord | None:
+    """Return the record of a run, None where there is none; one of other words is refused."""
+
+    def read(held: dict[str, Any]) -> SweepRecord:
+        return SweepRecord(int(held["code"]), float(held["seconds"]))
+
     path = folder / run.name / RECORD
-    held = _held(path)
-    if held is None:
-        return False
-    if list(held.words) != list(run.words):
-        raise NPAError(
-            f"{str(path)!r} holds a run of other words, {shlex.join(held.words)}: choose "
-            "another folder with --out"
-        )
-    return held.code == 0
-
-
-def _held(path: Path) -> SweepRecord | None:
-    """Return what became of a run, None where nothing says so.
-
-    Raises:
-        NPAError: The file does not say it.
-    """
-    if not path.exists():
-        return None
-    try:
-        held = SweepRecord(**read_json(path))
-        return SweepRecord([str(word) for word in held.words], int(held.code), float(held.seconds))
-    except (TypeError, ValueError) as error:
-        raise NPAError(
-            f"{str(path)!r} must be a record of npa-envs sweep, but cannot be read "
-            f"({shown(error)}): remove it, or choose another folder with --out"
-        ) from error
+    return read_record(path, {"words": run.words}, read, command="sweep")
 
 
 class _Training(Child):
@@ -263,8 +209,8 @@ class _Training(Child):
                 stdout=output,
                 stderr=output,
                 env=os.environ | {"OMP_NUM_THREADS": str(self._threads)},
-                # A terminal sends Ctrl-C to its whole group. `stop` would then be the second
-                # signal, after which a run ends without a checkpoint.
+                # A terminal sends Ctrl-C to its whole group; `stop` would be a second signal,
+                # after which a run ends without a checkpoint.
                 start_new_session=True,
             )
 
@@ -275,10 +221,8 @@ class _Training(Child):
 
     def stop(self, *, at_once: bool) -> None:
         """Ask it to write its checkpoint and end, or only to end."""
-        if self._process is not None and at_once:
-            self._process.kill()
-        elif self._process is not None:
-            self._process.terminate()
+        if self._process is not None:
+            (self._process.kill if at_once else self._process.terminate)()
 
     def end(self) -> None:
         """Wait until it has ended after `stop`."""
@@ -286,22 +230,22 @@ class _Training(Child):
             self._process.wait()
 
     def write_record(self) -> None:
-        """Write what became of it."""
+        """Write its words, exit code and time."""
         assert self._process is not None, "it is over"
         seconds = time.perf_counter() - self._begin
-        code = int(self._process.returncode)
-        write_record(self._folder / RECORD, asdict(SweepRecord(self._run.words, code, seconds)))
+        record = SweepRecord(int(self._process.returncode), seconds)
+        content = {"facts": {"words": self._run.words}, **record._asdict()}
+        write_record(self._folder / RECORD, content)
 
 
 def table(folder: Path, runs: Sequence[SweepRun]) -> str:
-    """Return the runs with what their reports measured, Markdown."""
+    """Return the runs with the scores of their reports, in Markdown."""
     from npa_envs.measure.quality import score_line
 
     lines = []
     for run in runs:
-        path = folder / run.name / RECORD
         state, seconds, scores = "not run", NONE, NONE
-        held = _held(path)
+        held = _record(folder, run)
         if held is not None:
             state = "done" if held.code == 0 else f"failed with code {held.code}"
             seconds = f"{held.seconds:.0f}"

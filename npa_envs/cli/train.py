@@ -47,14 +47,7 @@ PAIRED_SECONDS = 60.0
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Train what the words after `npa-envs train` ask for.
-
-    Returns:
-        0 when the run is finished or out of time, 130 after Ctrl-C.
-
-    Raises:
-        NPAError: The task or a value is wrong, or as for `npa_envs.training.train`.
-    """
+    """Train; return 0 when the run is finished or out of time, 130 after Ctrl-C."""
     if not arguments or arguments[0].startswith("-"):
         names = "\n".join(f"  {name}  {entry.summary}" for name, entry in TASKS.items())
         text = f"usage: npa-envs train TASK [options]\n\n{names}\n\n"
@@ -76,10 +69,10 @@ def main(arguments: Sequence[str]) -> int:
         words, options, config = asked
         count = process_count(task_name, options, config)
         if count > 1 and not ranks.together:
-            told = ["train", task_name, *words]
+            command = ["train", task_name, *words]
             if options.processes is None and options.gpus is None:
-                told += ["--processes", str(count)]
-            return launch(count, told, config.out, config.device)
+                command += ["--processes", str(count)]
+            return launch(count, command, config.out, config.device)
         with print_once(ranks):
             return run(task_name, options, config, (task_name, *words), ranks)
 
@@ -91,14 +84,9 @@ def run(
     words: Sequence[str],
     ranks: Ranks,
 ) -> int:
-    """Train, say where everything lies and how to go on, and return the exit code.
+    """Train as one of the processes that share the run, and return the exit code.
 
-    Args:
-        task_name: The task.
-        options: How it runs.
-        config: What it runs.
-        words: The words after `npa-envs train`.
-        ranks: The processes that share it; the first one speaks for all.
+    `words` are those after `npa-envs train`, for the report.
     """
     if options.max_seconds is not None and not 0 < options.max_seconds < math.inf:
         raise NPAError(f"max_seconds must be positive and finite, got {options.max_seconds}")
@@ -141,12 +129,12 @@ def run(
         meet += f" --particle-count {sum(config.task.counts[:2])}"
     _say_how_it_ended(result, rules, resume_command)
     if options.report and result.iteration > 0 and not result.interrupted:
-        told = ("train", *words)
-        if options.resume:  # These words do not say what the run began with; its file does.
-            told = ("train", task_name, "--config", str(folder.config))
-            told += ("--processes", str(ranks.count)) if ranks.count > 1 else ()
+        command = ("train", *words)
+        if options.resume:  # The file of the run has what these words leave out.
+            command = ("train", task_name, "--config", str(folder.config))
+            command += ("--processes", str(ranks.count)) if ranks.count > 1 else ()
         seconds = result.record.get("seconds", 0.0)
-        training = Training(task_name, told, result.iteration, seconds)
+        training = Training(task_name, command, result.iteration, seconds)
         for rule in rules:
             device = check_device(config.device)
             try:
@@ -181,10 +169,6 @@ def process_count(task_name: str, options: TrainOptions, config: TrainConfig[Any
 
     They are where batches are too small for several threads. A short run would be over before the
     second process has paid for its start, and one that was begun alone goes on with the same draws.
-
-    Raises:
-        NPAError: There are to be fewer than one, or GPUs that are not to be used; or as for
-            `load_checkpoint`, where a run is resumed.
     """
     asked = asked_count(options.gpus, options.processes, config.device)
     if asked is not None:
@@ -208,7 +192,7 @@ def _species(config: TrainConfig[Any]) -> Sequence[Any]:
 
 
 def _goals(task: Any) -> Sequence[str]:
-    """Return what a task learns, in a word or two each."""
+    """Return the targets of a task, or its data."""
     targets = getattr(task, "targets", ())
     return targets or (getattr(task, "target", None) or f"the data {task.data}",)
 
@@ -216,14 +200,7 @@ def _goals(task: Any) -> Sequence[str]:
 def announcement(
     task_name: str, options: TrainOptions, config: TrainConfig[Any], process_count: int = 1
 ) -> tuple[str, str]:
-    """Return what a run is about to do, in two lines: what it learns, and how large and long it is.
-
-    Args:
-        task_name: The task.
-        options: How it runs.
-        config: What it runs.
-        process_count: Processes that share it.
-    """
+    """Return a run's targets in a line, and its size and expected time in another."""
     species = _species(config)
     goals = [goal for own in species for goal in _goals(own)]
     particles = " and ".join(str(own.particle_count) for own in species)

@@ -31,86 +31,54 @@ COMMON = ("target", "iterations", "device", "out")
 """Fields of configurations that stand among the most common options, where a task has them."""
 
 
-SHOWN = frozenset(
-    {
-        "initial_rule",
-        "initial_rules",
-        "frozen",
-        "repeats",
-        "world_count",
-        "pool_size",
-        "steps",
-        "learning_rate",
-        "seed",
-        "targets",
-        "distance",
-        "particle_count",
-        "hidden_dim",
-        "eps",
-        "resolution",
-        "loss",
-        "data",
-    }
-)
+SHOWN = {
+    *("initial_rule", "initial_rules", "frozen", "repeats", "world_count", "pool_size", "steps"),
+    *("learning_rate", "seed", "targets", "distance", "particle_count", "hidden_dim", "eps"),
+    *("resolution", "loss", "data"),
+}
 """Fields of configurations that `--help` shows; `--help-all` shows all of them."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class TrainOptions:
-    """What most runs are told; the paper's schedule, pool and world follow below."""
+    """The most common options; the paper's schedule, pool and world follow below."""
 
     preset: str = ""
     """Configuration to start from: `paper`, `fast` (minutes on a CPU), `tiny` (seconds), or for
     pictures and textures `best` (minutes on a GPU); `npa-envs list` has their sizes and times. By
     default `best` on CUDA where the task has it, else `fast`."""
-
     target: str = ""
     """What is to be learned: a built-in name (`npa-envs list`), a file, or for morphogenesis2d an
     emoji."""
-
     iterations: int = 0
     """Optimiser steps in one repeat."""
-
     device: str = "cpu"
     """Where to train: cpu, cuda, cuda:1."""
-
     out: Path = Path()
     """Folder that log, pictures, checkpoint and rule are written to; created where missing."""
-
     config: Path | None = None
     """YAML, TOML or JSON file with field names and values, also `preset`; goes over the preset."""
-
     processes: int | None = None
     """Processes that share the run, on CUDA each with a GPU of its own; by default 1, but 2 where
     a CPU has cores for them and the batch is small. `torchrun --nproc-per-node=4 -m npa_envs train
     ...` does the same."""
-
     gpus: int | None = None
     """GPUs that share the run: `--gpus 4` says `--device cuda --processes 4`."""
-
     resume: bool = False
     """Go on from the checkpoint in the folder `out`, with the configuration that lies there.
     `--resume auto`: if there is one; else begin."""
-
     overwrite: bool = False
     """Start anew although the folder `out` holds a run; the run's files are removed."""
-
     max_seconds: float | None = None
     """Stop after this time [s]; the run can be resumed."""
-
     progress: bool = True
     """Show a progress bar."""
-
     report: bool = True
     """End with a report in the folder `out`: figures, a film and a card of the rule."""
 
 
 def resolve_task(task_name: str, words: Sequence[str]) -> list[str]:
-    """Return the options with `--resume auto` decided, and with CUDA as the device of `--gpus`.
-
-    Raises:
-        NPAError: As for `starting_configuration`.
-    """
+    """Return the options with `--resume auto` decided, and with CUDA as the device of `--gpus`."""
 
     def out_of(words: Sequence[str]) -> Path:
         return parse(task_name, starting_configuration(task_name, words), words)[1].out
@@ -121,11 +89,7 @@ def resolve_task(task_name: str, words: Sequence[str]) -> list[str]:
 def _check_preset(
     name: str, run: TrainConfig[Any], task_name: str, folder: RunFolder, arguments: Sequence[str]
 ) -> None:
-    """Check that a run that goes on is of the preset that was named.
-
-    Raises:
-        NPAError: It has other values of what presets differ in, none of which were said.
-    """
+    """Check that a run that goes on is of the preset that was named."""
     names = task_entry(task_name).presets
     flat = {preset_name: _fields_of(preset(preset_name, task_name)) for preset_name in names}
     wanted, held = flat[name], _fields_of(run)
@@ -156,11 +120,7 @@ def _fields_of(config: TrainConfig[Any]) -> dict[str, Any]:
 
 
 def starting_configuration(task_name: str, arguments: Sequence[str]) -> TrainConfig[Any]:
-    """Return the configuration that the options are laid over: preset, file, or the run resumed.
-
-    Raises:
-        NPAError: No such preset, the file is wrong, or there is nothing to resume.
-    """
+    """Return the configuration that the options are laid over: preset, file, or the run resumed."""
     # These options decide what the others' defaults are, so they are looked at first.
     parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False, exit_on_error=False)
     parser.add_argument("--preset")
@@ -184,7 +144,7 @@ def starting_configuration(task_name: str, arguments: Sequence[str]) -> TrainCon
         try:
             base = load_config(folder.config, base)
         except NPAError:
-            # Fields of another task are unknown here; that it is another task says more.
+            # Fields of another task are unknown: its name is the better error.
             check_task(load_checkpoint(folder.checkpoint), task_name, folder.checkpoint)
             raise
         if first.preset and first.config is None:
@@ -217,16 +177,16 @@ def parse(
 
     def read(defaults: Any) -> tuple[TrainOptions, Any]:
         # These stand first, as options of their own, and not once more below.
-        told = {
+        shared = {
             name: getattr(holder, name)
             for name in COMMON
             for holder in (defaults, defaults.task)
             if hasattr(holder, name)
             and not (name == "target" and isinstance(holder, SpeciesOptions))
         }
-        common = _without(TrainOptions(**told), set(COMMON) - told.keys())
-        task = _without(defaults.task, told, whole=whole)
-        training = _without(replace(defaults, task=task), told, whole=whole)
+        common = _without(TrainOptions(**shared), set(COMMON) - shared.keys())
+        task = _without(defaults.task, shared, whole=whole)
+        training = _without(replace(defaults, task=task), shared, whole=whole)
         kinds = [("common", type(common)), ("training", type(training))]
         command = make_dataclass("Command", kinds, frozen=True)
         parsed: Any = parse_options(
@@ -240,7 +200,7 @@ def parse(
         task = _of_type(type(defaults.task), parsed.training.task)
         config = _of_type(type(defaults), parsed.training, task=task)
         return _of_type(TrainOptions, parsed.common), override(
-            config, **{name: getattr(parsed.common, name) for name in told}
+            config, **{name: getattr(parsed.common, name) for name in shared}
         )
 
     return parse_joint(base, read) if isinstance(base, JointTrainConfig) else read(base)
@@ -279,10 +239,8 @@ class SpeciesOptions(Morphogenesis2DConfig):
 
     particle_count: int = 4096
     """Particles of each species."""
-
     targets: tuple[str, ...] = ()
     """What each species grows: built-in names, emoji, or paths of pictures, two or more."""
-
     distance: float = 0.0
     """Distance between the centres of neighbouring seeds, which lie in a row [length units]."""
 
@@ -298,15 +256,11 @@ def parse_joint(
     base: JointTrainConfig[CoMorphogenesis2DConfig],
     read: Callable[[JointOptions], tuple[TrainOptions, JointOptions]],
 ) -> tuple[TrainOptions, JointTrainConfig[CoMorphogenesis2DConfig]]:
-    """Return what the command line says of a run of several species.
-
-    Raises:
-        NPAError: There are fewer than two targets.
-    """
+    """Return the command line's configuration of a run of several species."""
     task = base.task
-    # Once for each species, so that what is not said stays as it is in each of them.
-    launch, told = read(_flat(base, task, 0))
-    targets = told.task.targets
+    # Once for each species, so that fields without an option keep each species' value.
+    launch, shared = read(_flat(base, task, 0))
+    targets = shared.task.targets
     if len(targets) < 2:
         raise NPAError(f"targets must be two or more, got {len(targets)}: --targets ring heart")
     species = []
@@ -315,8 +269,8 @@ def parse_joint(
         species.append(
             _of_type(Morphogenesis2DConfig, replace(own.task, target=target, targets=()))
         )
-    together = replace(task, species=tuple(species), distance=told.task.distance)
-    return launch, _of_type(JointTrainConfig, told, task=together)
+    together = replace(task, species=tuple(species), distance=shared.task.distance)
+    return launch, _of_type(JointTrainConfig, shared, task=together)
 
 
 def _flat(

@@ -43,34 +43,24 @@ class ViewOptions:
     what: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="RULE|RUN|ENV")] = "gecko"
     """A shipped rule (`npa-envs list`), a rule's file, the folder of a run, or the id of an
     environment such as npa/Texture-v0."""
-
     policy: str = "zero"
     """What acts in an environment: "zero", "random", or a rule that fits it."""
-
     options: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME=VALUE")] = ()
     """Keywords of the environment, for example target=dots eps=0.3 eps0=0.3."""
-
     particle_count: int | None = None
     """Particles N; default: as trained."""
-
     seed: int = 0
     """The first world's number."""
-
     device: str = "cpu"
     """Where the world lives: cpu, cuda, cuda:1."""
-
     threads: int = 1
     """CPU threads of torch and of the kernels; the browser needs a core as well."""
-
     host: str = "127.0.0.1"
     """The address to bind; 0.0.0.0 lets other computers in, who need the token."""
-
     port: int | None = None
     """The port; default: the first free one from 8765 on."""
-
     browser: bool = True
     """Open the page in a browser."""
-
     out: Path = Path("runs/view")
     """Folder of recorded films; created where missing."""
 
@@ -85,7 +75,7 @@ def main(arguments: Sequence[str]) -> int:
     device = check_device(options.device)
     make_world = world_maker(options, device)
     with torch_threads(options.threads):
-        # Made once before the server starts: what is wrong with it is said here.
+        # Made once before the server starts, so that errors come at once.
         make_world().close()
     from npa_envs.web.server import address_of, make_site, open_port, serve
 
@@ -106,19 +96,12 @@ def main(arguments: Sequence[str]) -> int:
 
 
 def open_browser(address: str) -> bool:
-    """Open a page in the user's browser; return whether there is one.
-
-    Where there is no screen, a browser for the terminal would take the terminal.
-    """
+    """Open a page in a browser; return whether there is one that leaves the terminal alone."""
     return has_screen() and webbrowser.open(address)
 
 
 def world_maker(options: ViewOptions, device: torch.device) -> Callable[[], LiveWorld]:
-    """Return what makes a world of the rule, the run or the environment that was asked for.
-
-    Raises:
-        NPAError: An option does not fit it.
-    """
+    """Return a function that makes a world of the rule, the run or the environment."""
     from npa_envs.web.environment_world import EnvironmentWorld, make_environment
     from npa_envs.web.rule_world import RuleWorld, RunWorld
 
@@ -136,26 +119,22 @@ def world_maker(options: ViewOptions, device: torch.device) -> Callable[[], Live
         raise NPAError(
             f"{name} is for environments, got --{name} with a rule or a run: leave it out"
         )
-    told: dict[str, Any] = {"device": device, "seed": options.seed}
-    told["particle_count"] = options.particle_count
+    given: dict[str, Any] = {"device": device, "seed": options.seed}
+    given["particle_count"] = options.particle_count
     folder = Path(options.what)
     if folder.is_dir() and any((folder / name).exists() for name in RUN_FILES):
-        return lambda: RunWorld(folder, **told)
-    return lambda: RuleWorld(options.what, **told)
+        return lambda: RunWorld(folder, **given)
+    return lambda: RuleWorld(options.what, **given)
 
 
 def _keywords(options: ViewOptions) -> dict[str, Any]:
-    """Return the keywords of the environment that were told.
-
-    Raises:
-        NPAError: One is the command's own.
-    """
-    told = named_values("options", options.options)
+    """Return the keywords of the environment; the command's own are refused."""
+    found = named_values("options", options.options)
     for name in OWN_KEYWORDS:
-        if name in told:
+        if name in found:
             said = name in ("device", "policy")
-            cure = f"say --{name} {told[name]}" if said else "leave it out"
+            cure = f"say --{name} {found[name]}" if said else "leave it out"
             raise NPAError(
-                f"options must leave {name} to the command, got {name}={told[name]}: {cure}"
+                f"options must leave {name} to the command, got {name}={found[name]}: {cure}"
             )
-    return told
+    return found

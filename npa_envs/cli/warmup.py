@@ -17,10 +17,8 @@ class WarmupOptions:
 
     device: str = "cpu"
     """For which device: cpu, cuda, cuda:1."""
-
     space_dims: tuple[int, ...] = (2,)
     """Space dimensions: 2, 3 or both."""
-
     dtypes: tuple[Literal["float32", "float64"], ...] = ("float32",)
     """Precisions."""
 

@@ -1,7 +1,7 @@
-"""Interaction of trained rules that share a world, in numbers.
+"""Interaction of trained rules that share a world (arXiv 2601.16096), in numbers.
 
-Independently trained rules can share a world (arXiv 2601.16096). Whether one disrupts another is
-measured by the other's own task, on its own particles, against the same seeds grown alone.
+Whether one disrupts another is measured by the other's task, on its own particles, against the same
+seeds grown alone.
 """
 
 from __future__ import annotations
@@ -9,7 +9,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -20,7 +20,7 @@ from torch import Tensor
 
 from npa_envs.errors import NPAError
 from npa_envs.measure.plots import draw_matrix, new_figure, png
-from npa_envs.measure.record import read_record, write_record
+from npa_envs.measure.record import Record
 from npa_envs.measure.tables import as_objects
 from npa_envs.ops import species_fields
 from npa_envs.render import draw_worlds
@@ -84,20 +84,19 @@ class InteractionSettings:
             raise NPAError(f"update_prob must lie in (0, 1], got {self.update_prob}")
 
     def counts(self, ratio: float) -> tuple[int, int]:
-        """Return the particles of the measured species and of the one beside it."""
+        """Return the particles of the measured species and of the other one."""
         own = min(max(round(ratio * self.particle_count), 1), self.particle_count - 1)
         return own, self.particle_count - own
 
 
 @dataclass(frozen=True)
 class InteractionRow:
-    """One rule A, grown beside another one, B; figures are means of the worlds.
+    """One rule A, grown next to another one, B; figures are means of the worlds.
 
-    `alone` and `together` are A's task metric of its own particles where it grows alone and beside
-    B; `change` is together / alone, `mixing` the `mixing_index` at the end, `displacement` how far
-    A's centroid ends from where it ends alone [length units]. `distance` is between the centres of
-    their seeds [length units], `ratio` A's share of the particles, `eps_factor` the perception
-    radius over that of the rules. `low` and `high` are the ends of 95 % intervals over the worlds.
+    `alone` and `together` are A's task metric of its own particles, `change` is together / alone,
+    `mixing` the `mixing_index` at the end, `displacement` the distance of A's centroid from where
+    it ends alone [length units]. `distance` is between the centres of the seeds [length units],
+    `ratio` A's share of the particles. `low` and `high` are the ends of 95 % intervals.
     """
 
     rule: str
@@ -118,11 +117,9 @@ class InteractionRow:
 
 
 def verdict(change: float, mixing: float, margin: float = MARGIN) -> str:
-    """Return what a neighbour does to a rule, in a word or two.
+    """Return "cooperates" below 1 - margin, "disrupted" above 1 + margin or of NaN, "undisturbed".
 
-    "cooperates" where the loss falls below 1 - margin of what it is alone, "disrupted" where it
-    rises above 1 + margin or is no number, else "undisturbed"; and ", mixes" where the mixing index
-    is at least `MIXED`.
+    ", mixes" follows where the mixing index is at least `MIXED`.
     """
     word = "disrupted"
     if change < 1.0 - margin:
@@ -133,14 +130,10 @@ def verdict(change: float, mixing: float, margin: float = MARGIN) -> str:
 
 
 def ratio_interval(above: Tensor, below: Tensor) -> tuple[float, float]:
-    """Return the ends of the 95 % interval of mean(above) / mean(below), by bootstrap over worlds.
+    """Return the 95 % interval of mean(above) / mean(below), by bootstrap over worlds.
 
-    Worlds are drawn anew, with replacement and both numbers together, `RESAMPLES` times. Where
-    a mean below is 0 the ratio is infinite.
-
-    Args:
-        above: A number of each world, infinite where it is lost, shape [B].
-        below: Another one, finite and not negative, shape [B].
+    `above` [B] may be infinite, `below` [B] is finite and not negative; of a mean of 0 the ratio is
+    infinite.
     """
     count = len(above)
     draws = np.random.default_rng(0).integers(count, size=(RESAMPLES, count))
@@ -152,16 +145,10 @@ def ratio_interval(above: Tensor, below: Tensor) -> tuple[float, float]:
 
 
 def mixing_index(x: Tensor, counts: Sequence[int], *, eps: float) -> Tensor:
-    """Return how much the species of each world are mixed, in [0, 1], shape [B].
+    """Return how much the K species of each world are mixed, in [0, 1], shape [B].
 
-    The mean over the particles of the entropy of the species around each, in units of log K: the
-    shares are those of each species in the density at the particle, itself included. 0: nobody
-    sees another species; 1: everybody sees all alike.
-
-    Args:
-        x: Positions [length units], shape [B, N, D], species after species.
-        counts: Particles of each of K species, K at least 2.
-        eps: Perception radius [length units].
+    The mean over the particles of the entropy of the species' shares in the density there, in units
+    of log K. 0: no particle perceives another species; 1: all species are perceived alike.
 
     Raises:
         NPAError: Positions or counts do not fit, or there is one species only.
@@ -172,9 +159,6 @@ def mixing_index(x: Tensor, counts: Sequence[int], *, eps: float) -> Tensor:
     shares = rho / rho.sum(dim=2, keepdim=True)
     entropy: Tensor = torch.special.entr(shares).sum(dim=2)
     return entropy.mean(dim=1) / math.log(rho.shape[2])
-
-
-# Rules grown alone and beside each other, from the same seeds.
 
 
 PROGRESS_STEPS = 32
@@ -189,24 +173,20 @@ FRAME_RESOLUTION = 160
 
 @dataclass(frozen=True)
 class RuleUnderTest:
-    """A trained rule that grows in 2D, and what it grows."""
+    """A trained rule that grows in 2D, and its task with a number of particles."""
 
     name: str
-    """What tables call it."""
     rule: NPARule
-    """The rule, on the device to run on."""
     task_of: Callable[[int], Task]
-    """Returns its task with a number of particles, of which seeds are made and losses taken."""
     update_prob: float
     """Probability of a particle's update in a step, as trained (dimensionless)."""
 
 
-@dataclass
-class Scenes:
+class Scenes(NamedTuple):
     """Pictures of the first worlds, uint8, [R, R, 3]: `len(FRAME_SHARES)` of each encounter."""
 
-    frames: list[NDArray[np.uint8]] = field(default_factory=list)
-    captions: list[str] = field(default_factory=list)
+    frames: list[NDArray[np.uint8]]
+    captions: list[str]
 
 
 class _Solo(NamedTuple):
@@ -217,7 +197,7 @@ class _Solo(NamedTuple):
 
 
 class Encounters:
-    """Grows rules alone and beside each other; what was grown alone is kept.
+    """Grows rules alone and together from the same seeds; what was grown alone is kept.
 
     `progress` is called with the number of steps done since its last call.
     """
@@ -235,11 +215,7 @@ class Encounters:
         self._solos: dict[tuple[str, int, float], _Solo] = {}
 
     def check(self, organisms: Sequence[RuleUnderTest]) -> None:
-        """Check that any two of the rules can share a world.
-
-        Raises:
-            NPAError: They cannot.
-        """
+        """Check that any two of the rules can share a world."""
         for other in organisms:
             weight = other.rule.hidden.weight
             x, s = weight.new_zeros(1, 2, 2), weight.new_zeros(1, 2, other.rule.state_dim)
@@ -254,72 +230,54 @@ class Encounters:
     def meet(
         self, first: RuleUnderTest, second: RuleUnderTest
     ) -> tuple[list[InteractionRow], Scenes]:
-        """Grow one rule, which is measured, beside another or itself, at every setting.
-
-        Returns:
-            One row for each radius, ratio and distance, and pictures.
-        """
-        rows, scenes = [], Scenes()
-        for factor, ratio in itertools.product(self.settings.eps_factors, self.settings.ratios):
-            solo = self._solo(first, self.settings.counts(ratio)[0], factor)
-            for distance in self.settings.distances:
-                rows.append(self._row(first, second, ratio, distance, factor, solo, scenes))
-        return rows, scenes
-
-    def _row(
-        self,
-        first: RuleUnderTest,
-        second: RuleUnderTest,
-        ratio: float,
-        distance: float,
-        factor: float,
-        solo: _Solo,
-        scenes: Scenes,
-    ) -> InteractionRow:
-        counts = self.settings.counts(ratio)
-        task = first.task_of(counts[0])
-        half_width = 1.2 + 0.5 * distance
-
-        def shoot(x: Tensor, s: Tensor, step: int) -> None:
-            spacing = math.sqrt(4.0 / self.settings.particle_count)
-            (picture,) = draw_worlds(
-                x[:1],
-                s[:1],
-                resolution=FRAME_RESOLUTION,
-                pixel_size=0.5 * spacing,
-                half_width=half_width,
-            )
-            scenes.frames.append(picture)
+        """Grow one rule, which is measured, with another or itself: a row for each setting."""
+        rows, scenes, given = [], Scenes([], []), self.settings
+        spacing = math.sqrt(4.0 / given.particle_count)
+        for factor, ratio, distance in itertools.product(
+            given.eps_factors, given.ratios, given.distances
+        ):
+            counts = given.counts(ratio)
+            solo = self._solo(first, counts[0], factor)
             radius = "" if factor == 1.0 else f"eps x {factor:g}, "
-            scenes.captions.append(f"{radius}d {distance:g}, r {ratio:g}, step {step}")
+            caption = f"{radius}d {distance:g}, r {ratio:g}, step"
+            looks = {
+                "resolution": FRAME_RESOLUTION,
+                "pixel_size": 0.5 * spacing,
+                "half_width": 1.2 + 0.5 * distance,
+            }
 
-        x, s, lost = self._grow([first, second], counts, distance, factor, shoot)
-        own = x[:, : counts[0]]
-        losses = task.metric(own, s[:, : counts[0]]).masked_fill(lost, math.inf)
-        away = (own.mean(dim=1) - solo.centroids).norm(dim=-1)
-        alone, together = solo.losses.mean().item(), losses.mean().item()
-        change = together / alone if alone > 0.0 else math.inf
-        mixings = mixing_index(x, counts, eps=factor * first.rule.eps0)
-        mixing = mixings.mean().item()
-        change_low, change_high = ratio_interval(losses, solo.losses)
-        mixing_low, mixing_high = ratio_interval(mixings, torch.ones_like(mixings))
-        return InteractionRow(
-            rule=first.name,
-            beside=second.name,
-            distance=distance,
-            ratio=ratio,
-            alone=alone,
-            together=together,
-            change=change,
-            mixing=mixing,
-            displacement=away.mean().item(),
-            verdict=verdict(change, mixing, self.settings.margin),
-            eps_factor=factor,
-            change_low=change_low,
-            change_high=change_high,
-            mixing_low=mixing_low,
-            mixing_high=mixing_high,
-        )
+            def shoot(
+                x: Tensor, s: Tensor, step: int, looks: Any = looks, caption: str = caption
+            ) -> None:
+                scenes.frames.append(draw_worlds(x[:1], s[:1], **looks)[0])
+                scenes.captions.append(f"{caption} {step}")
+
+            x, s, lost = self._grow([first, second], counts, distance, factor, shoot)
+            own = x[:, : counts[0]]
+            losses = first.task_of(counts[0]).metric(own, s[:, : counts[0]])
+            losses = losses.masked_fill(lost, math.inf)
+            alone, together = solo.losses.mean().item(), losses.mean().item()
+            change = together / alone if alone > 0.0 else math.inf
+            mixings = mixing_index(x, counts, eps=factor * first.rule.eps0)
+            mixing = mixings.mean().item()
+            rows.append(
+                InteractionRow(
+                    first.name,
+                    second.name,
+                    distance,
+                    ratio,
+                    alone,
+                    together,
+                    change,
+                    mixing,
+                    (own.mean(dim=1) - solo.centroids).norm(dim=-1).mean().item(),
+                    verdict(change, mixing, given.margin),
+                    factor,
+                    *ratio_interval(losses, solo.losses),
+                    *ratio_interval(mixings, torch.ones_like(mixings)),
+                )
+            )
+        return rows, scenes
 
     def _solo(self, organism: RuleUnderTest, count: int, factor: float) -> _Solo:
         key = organism.name, count, factor
@@ -337,10 +295,10 @@ class Encounters:
         factor: float,
         shoot: Callable[[Tensor, Tensor, int], None] = lambda x, s, step: None,
     ) -> tuple[Tensor, Tensor, Tensor]:
-        """Grow one or two species from their seeds; also say which worlds blew up on the way.
+        """Return one or two species grown from their seeds, and which worlds blew up.
 
-        The first species is seeded around the origin, the second one `distance` from it along the
-        first axis. The first draws what it draws alone.
+        The first is seeded around the origin and draws what it draws alone; the second is seeded
+        `distance` from it along the first axis.
         """
         settings = self.settings
         random = WorldRandom(settings.seeds, device=self._device)
@@ -384,51 +342,35 @@ class Encounters:
         return x, s, lost
 
 
-# Records and heat maps of what rules do to each other.
-
-
 LARGEST_CHANGE = 4.0
 """Colours end at this many times the loss alone, and at its inverse."""
 
 
-def read_rows(path: Path, settings: Mapping[str, Any]) -> list[InteractionRow]:
-    """Return the rows that an earlier run of the same settings left; infinite ones are null there.
+def interaction_record(path: Path, settings: Mapping[str, Any]) -> Record[InteractionRow]:
+    """Return the record of settings: rows, and each number of them as matrices over the rules.
 
-    Raises:
-        NPAError: As for `read_record`.
+    Rows of an earlier run of the same settings are in it.
     """
+    names = list(settings["rules"])
 
-    def made(held: dict[str, Any]) -> list[InteractionRow]:
+    def content(rows: list[InteractionRow]) -> dict[str, Any]:
+        kinds = ("change", "mixing", "displacement", "verdict")
+        matrices = [
+            {"ratio": ratio, "distance": distance, "eps_factor": factor}
+            | {what: _matrix(some, names, what) for what in kinds}
+            for (factor, ratio, distance), some in _by_setting(rows).items()
+        ]
+        return {"rows": as_objects(rows), "matrices": matrices}
+
+    def read(held: dict[str, Any]) -> list[InteractionRow]:
+        # JSON has no infinite numbers.
         rows: list[dict[str, Any]] = [
             {k: math.inf if v is None else v for k, v in row.items()} for row in held["rows"]
         ]
         return [InteractionRow(**row) for row in rows]
 
-    found = read_record(path, settings, made, command="interact", key="settings")
-    return found or []
-
-
-def write_rows(path: Path, settings: Mapping[str, Any], rows: Sequence[InteractionRow]) -> None:
-    """Write settings, rows, and each number of them as matrices over the rules of the settings.
-
-    Raises:
-        NPAError: They cannot be written.
-    """
-    names = list(settings["rules"])
-    matrices = [
-        {
-            "ratio": ratio,
-            "distance": distance,
-            "eps_factor": factor,
-            **{
-                what: _matrix(some, names, what)
-                for what in ("change", "mixing", "displacement", "verdict")
-            },
-        }
-        for (factor, ratio, distance), some in _by_setting(rows).items()
-    ]
-    content = {"settings": settings, "rows": as_objects(rows), "matrices": matrices}
-    write_record(path, content)
+    record = Record[InteractionRow](settings, path=path, content=content, key="settings")
+    return record.resume(read, command="interact")
 
 
 def _by_setting(
@@ -448,34 +390,29 @@ def _matrix(rows: Sequence[InteractionRow], names: Sequence[str], what: str) -> 
 
 
 def heat_map(rows: Sequence[InteractionRow]) -> bytes:
-    """Return a PNG: how each rule's loss changes beside each other one, and how much they mix.
+    """Return a PNG: how each rule's loss changes next to each other one, and how much they mix.
 
-    One pair of panels for each distance and ratio; rows are the measured rules. Pairs that are
-    missing stay blank. Needs matplotlib.
+    Rows are the measured rules; there are two panels for each setting. Needs matplotlib.
     """
     names = list(dict.fromkeys([row.rule for row in rows] + [row.beside for row in rows]))
     settings = _by_setting(rows)
     side = 1.6 + 0.55 * len(names)
     figure, grid = new_figure(len(settings), 2, (2 * side + 2.0, side * len(settings)))
     for ((factor, ratio, distance), some), panels in zip(settings.items(), grid, strict=True):
-        told = f"distance {distance:g}, ratio {ratio:g}" + _radius(factor)
+        setting = f"distance {distance:g}, ratio {ratio:g}" + _radius(factor)
         for panel, (what, title, colours, norm, bar) in zip(panels, _shades(), strict=True):
             values = _matrix(some, names, what)
             scale = draw_matrix(panel, names, names, values, colours=colours, norm=norm)
-            panel.set(xlabel="beside", title=f"{title}\n{told}")
+            panel.set(xlabel="beside", title=f"{title}\n{setting}")
             figure.colorbar(scale, ax=panel, **bar).minorticks_off()
         panels[0].set_ylabel("rule")
     return png(figure)
 
 
 def phase_diagram(rows: Sequence[InteractionRow]) -> bytes:
-    """Return a PNG: what becomes of one pair of rules over distance, ratio and radius.
+    """Return a PNG of one pair of rules over distance, ratio and radius. Needs matplotlib.
 
-    Above how the loss changes, below how much both mix; each cell with its interval. Panels from
-    left to right are of growing radii. Needs matplotlib.
-
-    Args:
-        rows: All of the same two rules.
+    Above the change of the loss, below the mixing index, each with its interval.
     """
     factors, ratios, distances = (
         sorted(set(each)) for each in zip(*_by_setting(rows), strict=True)
@@ -483,19 +420,16 @@ def phase_diagram(rows: Sequence[InteractionRow]) -> bytes:
     found = {(row.eps_factor, row.ratio, row.distance): row for row in rows}
     size = 1.6 + 0.62 * len(distances), 1.4 + 0.4 * len(ratios)
     figure, grid = new_figure(2, len(factors), (size[0] * len(factors) + 1.0, 2 * size[1]))
+    down, across = ([f"{value:g}" for value in values] for values in (ratios, distances))
     for panels, (what, title, colours, norm, bar) in zip(grid, _shades(), strict=True):
         for panel, factor in zip(panels, factors, strict=True):
             held = [[found.get((factor, r, d)) for d in distances] for r in ratios]
+            values = [
+                [None if row is None else getattr(row, what) for row in line] for line in held
+            ]
+            notes = [["" if row is None else _interval(row, what) for row in line] for line in held]
             scale = draw_matrix(
-                panel,
-                [f"{ratio:g}" for ratio in ratios],
-                [f"{distance:g}" for distance in distances],
-                [[None if row is None else getattr(row, what) for row in line] for line in held],
-                colours=colours,
-                norm=norm,
-                notes=[
-                    ["" if row is None else _interval(row, what) for row in line] for line in held
-                ],
+                panel, down, across, values, colours=colours, norm=norm, notes=notes
             )
             panel.set(xlabel="distance")
             panel.set_title(title + _radius(factor), fontsize=9)
@@ -516,16 +450,12 @@ def _radius(factor: float) -> str:
 
 
 def _shades() -> tuple[tuple[str, str, str, Any, dict[str, Any]], ...]:
-    """Return what is drawn of rows: field, title, colours, their norm, and marks of their bar."""
+    """Return for each drawn field its name, title, colours, their norm, and marks of their bar."""
     from matplotlib.colors import LogNorm, Normalize
 
+    ticks = {"ticks": [0.25, 0.5, 1.0, 2.0, 4.0], "format": "%g"}
+    changes = LogNorm(1.0 / LARGEST_CHANGE, LARGEST_CHANGE)
     return (
-        (
-            "change",
-            "loss together / alone",
-            "RdBu_r",
-            LogNorm(1.0 / LARGEST_CHANGE, LARGEST_CHANGE),
-            {"ticks": [0.25, 0.5, 1.0, 2.0, 4.0], "format": "%g"},
-        ),
+        ("change", "loss together / alone", "RdBu_r", changes, ticks),
         ("mixing", "mixing index", "viridis", Normalize(0.0, 1.0), {}),
     )

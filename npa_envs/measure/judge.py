@@ -1,7 +1,7 @@
-"""The judge of textures, which nobody trains on: three distances from the target, as ratios.
+"""The judge of textures, which no rule trains on: three distances from the target, as ratios.
 
-Each is divided by what another drawing of the target by particles comes to, at least by 2 % of what
-grey noise does: smaller differences do not count. So grey noise is 50 or less.
+Each is divided by the distance of another drawing of the target by particles, at least by 2 % of
+that of grey noise, whose ratio is so 50 or less.
 """
 
 from __future__ import annotations
@@ -17,71 +17,52 @@ from npa_envs.tasks.losses.pieces import quantiles
 from npa_envs.tasks.texture import Texture, colour_image
 
 REFERENCE = 128
-"""Pixels along each side that lengths below are counted in; other pictures are as many times
-smaller or larger as their resolution says."""
-
+"""Pixels along each side of pictures to which the lengths in pixels apply; others scale them."""
 PATCH = 24
-"""Pixels along each side of a patch; no loss looks at this size."""
-
+"""Pixels along each side of a patch; no loss compares patches of this size."""
 DIRECTIONS = 64
-"""Random directions that patches are seen from."""
-
+"""Random directions that patches are projected on."""
 BANDS = 7
 """Bands of the wave number, each `BAND_RATIO` times the one before, up to half a wave a pixel."""
-
 BAND_RATIO = math.sqrt(2.0)
-"""Ratio of the wave numbers at both ends of a band."""
-
 ORIENTATIONS = 8
 """Orientations of waves in half a turn."""
-
 CODES = 12
-"""Colours that a picture is told in."""
-
+"""Colours that a picture is reduced to."""
 DISTANCES = (1, 2, 4, 6, 9, 13, 19, 28)
 """Pixels between two colours that are counted together."""
-
 AXES = ((0, 1), (1, 1), (1, 0), (1, -1))
 """Directions in which they lie, rows and columns."""
-
 SOFTNESS = 0.15
 """Distance from a colour's code at which it counts for little (dimensionless)."""
-
 DRAWINGS = 4
-"""How often the target is drawn from points to be measured."""
-
+"""Drawings of the target by particles that the distances are divided by."""
 FIRST_DRAWING = 1000
 """Number of the first of them."""
-
 LEAST = 0.02
 """Distances are divided by this share of the distance to grey noise at least."""
 
 
 @dataclass(frozen=True)
 class JudgeRow:
-    """Several worlds after some steps, judged; at a ratio of 1 they differ as drawings do."""
+    """Means over worlds of ratios; at 1 worlds differ from the target as drawings of it do.
+
+    `patches` is the ratio of sliced Wasserstein distances of patches, `spectra` that of oriented
+    power spectra, `colours` that of co-occurring colours, `ratio` the mean of the three.
+    """
 
     step: int
-    """Steps from the seed."""
     ratio: float
-    """Mean of the three ratios, mean of the worlds (dimensionless)."""
     ratio_worst: float
-    """The same in the worst world."""
     patches: float
-    """Ratio of the sliced Wasserstein distances of 24-pixel patches, mean of the worlds."""
     spectra: float
-    """Ratio of the distances of oriented power spectra, mean of the worlds."""
     colours: float
-    """Ratio of the distances of co-occurring colours, mean of the worlds."""
 
 
 class TextureJudge:
-    """How far worlds of a texture task look from its target; no loss compares what it compares.
+    """How far worlds of a texture task look from its target.
 
     All is counted in float64 with directions drawn from one seed, so that a CPU and a GPU agree.
-
-    Args:
-        task: The texture task: its target, and how particles are drawn.
 
     Raises:
         NPAError: The task is no texture.
@@ -125,14 +106,7 @@ class TextureJudge:
         self._units = torch.maximum(self._distances(_images(drawn)).mean(0), least)
 
     def __call__(self, pictures: Tensor) -> Tensor:
-        """Return each picture's ratios: of patches, of spectra, of colours; float64, shape [B, 3].
-
-        Args:
-            pictures: What `Texture.picture` returns: colour sums and density, shape [B, R, R, 4].
-
-        Raises:
-            NPAError: The pictures have another resolution than the target.
-        """
+        """Return ratios of patches, spectra and colours, float64, [B, 3], of `Texture.picture`."""
         if pictures.shape[1:] != self._task.target_picture.shape:
             raise NPAError(
                 f"pictures must have shape [B, R, R, 4] with R as the target's "
@@ -144,13 +118,7 @@ class TextureJudge:
             )
 
     def row(self, x: Tensor, s: Tensor, step: int) -> JudgeRow:
-        """Judge worlds as they are.
-
-        Args:
-            x: Positions [length units], shape [B, N, 2].
-            s: States, shape [B, N, C].
-            step: Steps they have behind them.
-        """
+        """Judge worlds as they are, some steps from the seed."""
         ratios = self(self._task.picture(x, s))
         each = ratios.mean(1)
         patches, spectra, colours = ratios.mean(0).tolist()
@@ -166,7 +134,7 @@ class TextureJudge:
         return torch.stack(found)
 
     def _projections(self, image: Tensor, wrap: bool) -> Tensor:
-        """Return the quantiles of what patches look like from each direction, [DIRECTIONS, R²]."""
+        """Return the quantiles of the patches' projections, [DIRECTIONS, R²]."""
         waves = torch.fft.rfft2(image)
         seen = torch.fft.irfft2((waves * self._filters).sum(1), s=image.shape[-2:])
         count = image.shape[-1] ** 2
@@ -186,7 +154,7 @@ class TextureJudge:
         """Return how often two codes lie at each distance and direction, shares, [D, K, K]."""
         away = (image[0].movedim(0, -1)[..., None, :] - self._codes).square().sum(-1)
         near = torch.exp(-0.5 * away / SOFTNESS**2)
-        # What is like none of them counts as one more colour.
+        # Colours near no code count as one more.
         near = torch.cat((near, torch.full_like(near[..., :1], 0.05)), dim=-1)
         near = near / near.sum(-1, keepdim=True)
         result = []
@@ -228,7 +196,7 @@ def _wave_bins(resolution: int) -> Tensor:
 
 
 def _codes(colours: Tensor, count: int) -> Tensor:
-    """Return the colours that most are near to, [K, F]: k-means from the farthest ones."""
+    """Return codes of colours, [K, F]: k-means from the farthest ones."""
     centres = colours.mean(0, keepdim=True)
     for _ in range(count - 1):
         away = torch.cdist(colours, centres).amin(1)

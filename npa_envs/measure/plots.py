@@ -33,15 +33,12 @@ def check_matplotlib() -> None:
 
 
 def write_plots(draw: Callable[[], Mapping[str, bytes]], path: Path, what: str) -> list[str]:
-    """Write pictures where matplotlib is installed, and return what was done, in sentences.
+    """Write PNG files where matplotlib is installed, and return what was done, in sentences.
 
     Args:
         draw: Returns pictures by name, as bytes of PNG files.
         path: Their place; "*" in its name stands for each one's.
         what: What they are, for the sentence that there are none.
-
-    Raises:
-        NPAError: A file cannot be written.
     """
     try:
         check_matplotlib()
@@ -71,7 +68,7 @@ def png(figure: Any, dpi: int = 90) -> bytes:
 
 
 def legend_of(figure: Any, panel: Any, place: str = "lower center", **options: Any) -> None:
-    """Give a figure one legend, outside of its panels: that of one of them."""
+    """Give a figure the legend of one panel, outside of all panels."""
     handles, labels = panel.get_legend_handles_labels()
     figure.legend(handles, labels, loc=f"outside {place}", **options)
 
@@ -100,12 +97,10 @@ def draw_matrix(
     norm: Any,
     notes: Sequence[Sequence[str]] | None = None,
 ) -> Any:
-    """Draw a matrix, write each number into its cell, and return what `figure.colorbar` takes.
+    """Draw a matrix with its numbers, and return what `figure.colorbar` takes.
 
-    `notes` are lines below the numbers, one for each cell.
-
-    NaN is black, None stays blank; `norm` maps numbers to [0, 1] of a colour map, and what is
-    beyond has the colour of the end.
+    `notes` stand below the numbers. NaN is black, None stays blank; `norm` maps numbers to [0, 1]
+    of a colour map, which ends there.
     """
     from matplotlib.cm import ScalarMappable
     from matplotlib.patches import Rectangle

@@ -1,12 +1,11 @@
-"""Quality of trained rules: loss and PSNR over thousands of steps, healing, accuracy, and what was
-measured of the shipped ones.
-"""
+"""Quality of trained rules: loss, PSNR, healing, accuracy; scores of the shipped rules."""
 
 from __future__ import annotations
 
 import copy
 import itertools
 import json
+import statistics
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, cast
@@ -16,34 +15,15 @@ from torch import Tensor
 
 from npa_envs.devices import check_device
 from npa_envs.errors import NPAError, shown, suggest
-from npa_envs.measure.tables import table_text, tables_json
+from npa_envs.measure.judge import JudgeRow, TextureJudge
 from npa_envs.rule.files import shipped_rules
 from npa_envs.rule.rule import NPARule
 from npa_envs.tasks.base import Task
 from npa_envs.tasks.damage import cut, random_particle, wipe_state
+from npa_envs.tasks.morphogenesis2d import Morphogenesis2D
 from npa_envs.tasks.point_classification import PointClassification, majority, particle_classes
+from npa_envs.world.randomness import Randomness, WorldRandom
 from npa_envs.world.rollout import rollout
-
-__all__ = [
-    "CHECKPOINTS",
-    "CLOUD_CHECKPOINTS",
-    "AccuracyRow",
-    "ChangeRow",
-    "EvaluationRow",
-    "HealingRow",
-    "accuracies",
-    "changes_of_mind",
-    "check_steps",
-    "evaluate",
-    "healing",
-    "measure",
-    "psnr",
-    "score_line",
-    "scores",
-    "table_text",
-    "tables_json",
-    "tables_of",
-]
 
 PROGRESS_STEPS = 32
 """Steps between two reports of progress."""
@@ -60,23 +40,21 @@ HEALED = 1.2
 
 @dataclass(frozen=True)
 class EvaluationRow:
-    """Several worlds after a number of steps from the seed."""
+    """Several worlds after a number of steps from the seed; means, and those of the worst world.
+
+    `loss` is the task's metric. `psnr` is that of the picture against the target's, four channels
+    in [0, 1], in 3D of held-out views [dB]; None where a world does not match its target pixel by
+    pixel. `overflow` is mean |s - clip(s, -1, 1)|, `extent` the longest side of the bounding box
+    [length units].
+    """
 
     step: int
-    """Steps from the seed."""
     loss: float
-    """The task's metric, mean of the worlds."""
     loss_worst: float
-    """The task's metric in the worst world."""
     psnr: float | None
-    """PSNR of the picture against the target's, four channels in [0, 1], mean [dB]; in 3D that of
-    held-out views; None where a world is not to match the target pixel by pixel."""
     psnr_worst: float | None
-    """PSNR in the worst world [dB], likewise."""
     overflow: float
-    """mean |s − clip(s, −1, 1)|, mean of the worlds (dimensionless)."""
     extent: float
-    """Longest side of a world's bounding box, mean of the worlds [length units]."""
 
     @property
     def figures(self) -> str:
@@ -87,23 +65,20 @@ class EvaluationRow:
 
 @dataclass(frozen=True)
 class HealingRow:
-    """Several worlds, grown, damaged, and left to themselves."""
+    """Several worlds, grown and damaged: their mean loss before, right after and at the end.
+
+    `steps_to_heal` are those until the mean loss is at most `HEALED` times `before`, None where
+    that takes too long. `worlds_healed` counts the worlds for which this once holds of their own
+    losses, and which have not risen above `LOST` times at the end.
+    """
 
     damage: str
-    """What was done to them."""
     before: float
-    """The task's metric before the damage, mean of the worlds."""
     after: float
-    """Right after it."""
     steps_to_heal: int | None
-    """Steps until the mean is within 20 % of `before`; None: not within the steps allowed."""
     worlds_healed: int
-    """Worlds whose own loss came within 20 % of their own undamaged one, but for those that have by
-    the end run away, to ten times their undamaged loss."""
     world_count: int
-    """Worlds damaged."""
     end: float
-    """The metric at the end, mean of the worlds."""
 
 
 @torch.no_grad()
@@ -121,15 +96,12 @@ def evaluate(
 
     Args:
         rule: The rule, in the precision to run it in.
-        task: What it should do.
+        task: The task that it was trained on.
         checkpoints: Steps to measure at, positive and increasing.
         seeds: One number for each world; the same numbers give the same table.
         device: Where to run.
         progress: Called with the number of steps done since its last call.
         watch: Called at each of `checkpoints` with positions, states and the step.
-
-    Returns:
-        One row for each of `checkpoints`.
 
     Raises:
         NPAError: `checkpoints` or `seeds` are empty or out of order.
@@ -146,14 +118,7 @@ def evaluate(
 
 
 def measure(task: Task, x: Tensor, s: Tensor, step: int) -> EvaluationRow:
-    """Measure worlds as they are.
-
-    Args:
-        task: What they should be.
-        x: Positions [length units], shape [B, N, D].
-        s: States, shape [B, N, C].
-        step: Steps they have behind them.
-    """
+    """Measure worlds as they are, some steps from the seed."""
     loss = task.metric(x, s)
     ratio = None
     if task.has_views:
@@ -174,12 +139,7 @@ def measure(task: Task, x: Tensor, s: Tensor, step: int) -> EvaluationRow:
 
 
 def psnr(picture: Tensor, target: Tensor) -> Tensor:
-    """Return the peak signal-to-noise ratio of pictures against a target [dB], shape [B].
-
-    Args:
-        picture: rgb sums and density, shape [B, R, R, 4]; clipped to [0, 1].
-        target: The same of the target, shape [R, R, 4].
-    """
+    """Return the PSNR of pictures [B, R, R, 4] against a target [R, R, 4], clipped [dB], [B]."""
     error = (picture.clamp(0.0, 1.0) - target.clamp(0.0, 1.0)).square().flatten(1).mean(1)
     return -10.0 * torch.log10(error)
 
@@ -198,23 +158,11 @@ def healing(
     device: str | torch.device = "cpu",
     progress: Callable[[int], None] | None = None,
 ) -> list[HealingRow]:
-    """Grow worlds, damage them, and measure how long they take to be themselves again.
+    """Grow worlds, damage them, and measure how long they take to heal.
 
-    Two damages, each on the same grown worlds: a slit through the middle at a random angle, and a
-    disk around a random particle whose state is wiped. Damage that raises the loss by less than
-    20 % counts as healed at step 0.
-
-    Args:
-        rule: The rule, in the precision to run it in.
-        task: What it should grow.
-        grow_steps: Steps from the seed to the damage.
-        heal_steps: Steps after the damage.
-        every: Steps between two measurements.
-        seeds: One number for each world.
-        wipe_radius: Radius of the wiped disk [length units].
-        cut_gap: Width of the cut [length units].
-        device: Where to run.
-        progress: Called with the number of steps done since its last call.
+    Two damages, each on the same grown worlds: a slit of width `cut_gap` through the middle at a
+    random angle, and a disk of `wipe_radius` around a random particle whose states are wiped
+    [length units]. Losses are taken `every` so many steps. Other arguments are those of `evaluate`.
 
     Raises:
         NPAError: A number of steps is not positive, or there are no seeds.
@@ -267,8 +215,7 @@ def _healing_row(name: str, before: Tensor, losses: Tensor, steps: list[int]) ->
     )
 
 
-# Rules that classify clouds: who is right, and whether clouds change their mind when changed.
-
+# Rules that classify clouds
 
 CLOUD_CHECKPOINTS = (8, 16, 24, 32, 64, 128)
 """Steps after which clouds are asked for their class, unless others are given."""
@@ -282,36 +229,34 @@ BATCH = 256
 
 @dataclass(frozen=True)
 class AccuracyRow:
-    """All clouds after a number of steps."""
+    """All clouds some steps after blank states, shares in [0, 1].
+
+    `majority`: clouds whose majority says the right class; `particle`: particles that say it;
+    `agreement`: particles that say what their cloud's majority says. `loss` is the mean squared
+    error to the class, `overflow` mean |s - clip(s, -1, 1)|.
+    """
 
     step: int
-    """Steps from blank states."""
     majority: float
-    """Share of the clouds whose majority says the right class."""
     particle: float
-    """Share of all particles that say the right class."""
     agreement: float
-    """Share of all particles that say what their cloud's majority says."""
     loss: float
-    """Mean squared error to the class (dimensionless)."""
     overflow: float
-    """mean |s − clip(s, −1, 1)| (dimensionless)."""
 
 
 @dataclass(frozen=True)
 class ChangeRow:
-    """All clouds, some steps after something was done to them."""
+    """All clouds some steps after a change that left the particles' states as they were.
+
+    `majority` and `particle` are shares that say the class which clouds show after the change,
+    `majority_before` the clouds whose majority says the class from before.
+    """
 
     change: str
-    """What was done; the states of the particles were left as they were."""
     steps: int
-    """Steps since."""
     majority: float
-    """Share of the clouds whose majority says the class that they now show."""
     particle: float
-    """Share of all particles that say so."""
     majority_before: float
-    """Share of the clouds whose majority says the class that they showed before."""
 
 
 @torch.no_grad()
@@ -323,17 +268,14 @@ def accuracies(
     seed: int = 0,
     progress: Callable[[int], None] | None = None,
 ) -> list[AccuracyRow]:
-    """Let a rule classify all clouds of a task, and count who is right along the way.
+    """Let a rule classify all clouds of a task's split, and count right answers along the way.
 
     Args:
         rule: The rule, on the device of the task.
-        task: Gives the clouds: those of its split, as they are.
+        task: The task with the clouds.
         checkpoints: Steps to ask at, positive and increasing.
         seed: Randomness of the updates.
         progress: Called with the number of steps done since its last call.
-
-    Returns:
-        One row for each of `checkpoints`.
 
     Raises:
         NPAError: `checkpoints` are empty or out of order.
@@ -370,21 +312,11 @@ def changes_of_mind(
     seed: int = 0,
     progress: Callable[[int], None] | None = None,
 ) -> list[ChangeRow]:
-    """Let clouds settle on a class, change them, and count what they say then.
+    """Let clouds settle on a class, change them, and count the answers after some more steps.
 
     A cut cloud loses a quarter of its particles, on a random side. A mutated one becomes a cloud of
     another class, wholly or in its upper half: its particles move there and keep their states.
-
-    Args:
-        rule: The rule, on the device of the task.
-        task: Gives the clouds, as for `accuracies`.
-        settle_steps: Steps from blank states to the change.
-        steps: Steps after the change to ask at, 0 or more and increasing.
-        seed: Randomness of the updates and of the cuts.
-        progress: Called with the number of steps done since its last call.
-
-    Returns:
-        One row for each change and each of `steps`.
+    Other arguments are those of `accuracies`; the seed is that of the cuts, too.
 
     Raises:
         NPAError: A number of steps is out of range, or half of all clouds or more are of one class.
@@ -461,43 +393,55 @@ def tables_of(
     changed: bool = True,
     device: str | torch.device = "cpu",
     progress: Callable[[int], None] | None = None,
-    watch: Callable[[Tensor, Tensor, int], None] | None = None,
+    judge: TextureJudge | None = None,
 ) -> dict[str, Sequence[Any]]:
     """Return the tables that are measured of a rule of any task, by name.
 
-    Args:
-        rule: The rule, in the precision to run it in.
-        task: What it should do.
-        checkpoints: Steps to measure at; None: `CHECKPOINTS`, of clouds `CLOUD_CHECKPOINTS`.
-        seeds: One number for each world; of clouds the first is the randomness of the updates.
-        changed: Also damage worlds and measure how they heal, or change clouds.
-        device: Where to run; clouds are where their task is.
-        progress: Called with the number of steps done since its last call.
-        watch: As for `evaluate`; clouds are not watched.
-
-    Returns:
-        `growth` and, where asked for, `healing`; of clouds `accuracy` and `changes`.
-
-    Raises:
-        NPAError: As for the functions that measure them.
+    These are `growth` and, if `changed`, `healing`; of clouds `accuracy` and `changes`; and those
+    of a `judge`. Clouds run where their task is, and take the first seed for the updates. Other
+    arguments are those of `evaluate`.
     """
+    tables: dict[str, Sequence[Any]]
     if task.classifies:
         task = cast(PointClassification, task)
-        told: dict[str, Any] = {"seed": seeds[0], "progress": progress}
-        clouds: dict[str, Sequence[Any]] = {
-            "accuracy": accuracies(rule, task, checkpoints=checkpoints or CLOUD_CHECKPOINTS, **told)
-        }
-        return clouds | ({"changes": changes_of_mind(rule, task, **told)} if changed else {})
-    told = {"seeds": seeds, "device": device, "progress": progress}
-    growth = evaluate(rule, task, checkpoints=checkpoints or CHECKPOINTS, watch=watch, **told)
-    return {"growth": growth} | ({"healing": healing(rule, task, **told)} if changed else {})
+        common: dict[str, Any] = {"seed": seeds[0], "progress": progress}
+        steps = checkpoints or CLOUD_CHECKPOINTS
+        tables = {"accuracy": accuracies(rule, task, checkpoints=steps, **common)}
+        if changed:
+            tables["changes"] = changes_of_mind(rule, task, **common)
+        return tables
+    common = {"seeds": seeds, "device": device, "progress": progress}
+    judged: list[JudgeRow] = []
+    tables = {
+        "growth": evaluate(
+            rule,
+            task,
+            checkpoints=checkpoints or CHECKPOINTS,
+            watch=None if judge is None else lambda *world: judged.append(judge.row(*world)),
+            **common,
+        )
+    }
+    if changed:
+        tables["healing"] = healing(rule, task, **common)
+    return tables | ({"judge": judged} if judged else {})
 
 
-# The rule at work
+def run_worlds(
+    rule: NPARule,
+    task: Any,
+    x: Tensor,
+    s: Tensor,
+    steps: int,
+    generator: Randomness,
+    **changed: Any,
+) -> tuple[Tensor, Tensor]:
+    """Return worlds some steps later, as in the task but for options that are changed."""
+    options = {"eps": task.eps, "box": task.box, "update_prob": task.update_prob} | changed
+    return rollout(rule, x, s, steps, generator=generator, **options)
 
 
 class RuleRunner:
-    """A rule on the worlds of a task, on the device and in the precision of the rule's copy.
+    """A copy of a rule that runs worlds of its task, in the rule's precision.
 
     `progress` is called with the number of steps done since its last call.
     """
@@ -515,24 +459,14 @@ class RuleRunner:
         self.dtype = next(rule.parameters()).dtype
         self.task = task.for_rule(self._rule)
         self.generator = torch.Generator(device).manual_seed(seed)
-        self._progress = progress
+        self._progress = progress or (lambda _: None)
 
     def run(self, x: Tensor, s: Tensor, steps: int) -> tuple[Tensor, Tensor]:
-        """Return worlds x [B, N, D], s [B, N, C] some steps later."""
+        """Return worlds some steps later."""
         while steps > 0:
             some = min(steps, PROGRESS_STEPS)
-            x, s = rollout(
-                self._rule,
-                x,
-                s,
-                some,
-                eps=self.task.eps,
-                box=self.task.box,
-                update_prob=self.task.update_prob,
-                generator=self.generator,
-            )
-            if self._progress is not None:
-                self._progress(some)
+            x, s = run_worlds(self._rule, self.task, x, s, some, self.generator)
+            self._progress(some)
             steps -= some
         return x, s
 
@@ -544,7 +478,7 @@ def _from_seeds(
     device: torch.device,
     progress: Callable[[int], None] | None,
 ) -> tuple[RuleRunner, Tensor, Tensor]:
-    """Return what runs one world for each of the seeds, and these, x [B, N, D] and s [B, N, C]."""
+    """Return a runner and one world for each of the seeds."""
     if not seeds:
         raise NPAError("seeds must hold at least one number, got none: for example seeds=(0, 1)")
     runner = RuleRunner(rule, task, device, seeds[0] + len(seeds), progress)
@@ -557,7 +491,7 @@ def _from_seeds(
 
 
 def _batches(task: PointClassification) -> Iterator[tuple[Tensor, Tensor, Tensor]]:
-    """Yield indices [B], classes [B] and blank states [B, N, C] of some clouds after the other."""
+    """Yield indices [B], classes [B] and blank states of batches of clouds."""
     x, label = task.clouds.x, task.clouds.label
     for index in torch.split(torch.arange(len(label), device=x.device), BATCH):
         yield index, label[index], x.new_zeros(len(index), x.shape[1], task.config.state_dim)
@@ -569,16 +503,7 @@ def _sums(*figures: Tensor) -> Tensor:
 
 
 def check_steps(name: str, steps: Sequence[int], at_least: int = 1) -> None:
-    """Check that numbers of steps are increasing and not too small.
-
-    Args:
-        name: What the caller calls them.
-        steps: The numbers.
-        at_least: The smallest that is allowed.
-
-    Raises:
-        NPAError: They are not, or there are none.
-    """
+    """Check that there are steps, that they increase, and are `at_least` so many."""
     ordered = all(a < b for a, b in itertools.pairwise(steps))
     if not steps or min(steps) < at_least or not ordered:
         raise NPAError(
@@ -587,8 +512,125 @@ def check_steps(name: str, steps: Sequence[int], at_least: int = 1) -> None:
         )
 
 
-# What was measured of the shipped rules: the tables of `npa-envs evaluate`, beside each rule.
+# Rules of many pictures: loss and PSNR of each picture by its code, and by another code.
 
+WORLDS = 64
+"""Worlds that are run at once."""
+
+PICTURE_CHECKPOINTS = (64, 256, 1024)
+"""Steps from the seed after which pictures are compared, unless others are asked for."""
+
+MEDIAN = "(median)"
+"""What stands in place of a picture's name in rows of medians."""
+
+
+@dataclass(frozen=True)
+class PictureRow:
+    """Worlds of one picture, or medians of all pictures: means of splat loss and PSNR [dB].
+
+    `shuffled` is the loss with the code of the next picture of the list.
+    """
+
+    step: int
+    target: str
+    loss: float
+    shuffled: float
+    psnr: float
+
+
+@torch.no_grad()
+def grown(
+    rule: NPARule,
+    tasks: Sequence[Morphogenesis2D],
+    *,
+    checkpoints: Sequence[int] = PICTURE_CHECKPOINTS,
+    seeds: Sequence[int],
+    device: str | torch.device = "cpu",
+    progress: Callable[[int], None] | None = None,
+) -> list[tuple[Tensor, Tensor]]:
+    """Return x [T, B, N, 2] and s [T, B, N, C] of T tasks at each of `checkpoints`.
+
+    All tasks have equal worlds, each its own code, and start from the same seeds; `progress` is
+    called with the number of steps done since its last call.
+    """
+    check_steps("checkpoints", checkpoints)
+    together = max(1, WORLDS // len(seeds))
+    found: list[list[tuple[Tensor, Tensor]]] = [[] for _ in checkpoints]
+    for first in range(0, len(tasks), together):
+        some = tasks[first : first + together]
+        fresh = [
+            task.seed(len(seeds), generator=WorldRandom(seeds, device=device), device=device)
+            for task in some
+        ]
+        x, s = (torch.cat(parts) for parts in zip(*fresh, strict=True))
+        random = WorldRandom([*seeds] * len(some), device=device)
+        done = 0
+        for number, step in enumerate(checkpoints):
+            x, s = run_worlds(rule, some[0], x, s, step - done, random)
+            found[number].append((x, s))
+            if progress is not None:
+                progress(step - done)
+            done = step
+    return [
+        (_by_task(tasks, [x for x, _ in parts]), _by_task(tasks, [s for _, s in parts]))
+        for parts in found
+    ]
+
+
+def _by_task(tasks: Sequence[Morphogenesis2D], parts: Sequence[Tensor]) -> Tensor:
+    whole = torch.cat(list(parts))
+    return whole.view(len(tasks), -1, *whole.shape[1:])
+
+
+@torch.no_grad()
+def picture_rows(
+    rule: NPARule,
+    tasks: Sequence[Morphogenesis2D],
+    *,
+    checkpoints: Sequence[int] = PICTURE_CHECKPOINTS,
+    seeds: Sequence[int],
+    device: str | torch.device = "cpu",
+    progress: Callable[[int], None] | None = None,
+) -> list[PictureRow]:
+    """Return for each of `checkpoints` a row for each picture, and one of the medians.
+
+    Arguments are those of `grown`.
+
+    Raises:
+        NPAError: There are fewer than two pictures, or `checkpoints` are empty or out of order.
+    """
+    if len(tasks) < 2:
+        raise NPAError(f"pictures must be two or more, got {len(tasks)}: nothing to tell apart")
+    worlds = grown(
+        rule, tasks, checkpoints=checkpoints, seeds=seeds, device=device, progress=progress
+    )
+    rows = []
+    for step, (x, s) in zip(checkpoints, worlds, strict=True):
+        own = [_picture_row(step, tasks, number, x, s) for number in range(len(tasks))]
+        medians = {
+            name: statistics.median(getattr(row, name) for row in own)
+            for name in ("loss", "shuffled", "psnr")
+        }
+        rows += [*own, PictureRow(step=step, target=MEDIAN, **medians)]
+    return rows
+
+
+def _picture_row(
+    step: int, tasks: Sequence[Morphogenesis2D], number: int, x: Tensor, s: Tensor
+) -> PictureRow:
+    """Return the row of one task from the worlds of all."""
+    task, other = tasks[number], (number + 1) % len(tasks)
+    ratio = psnr(task.picture(x[number], s[number]), task.target_picture)
+    return PictureRow(
+        step=step,
+        target=task.target.name,
+        loss=task.metric(x[number], s[number]).mean().item(),
+        shuffled=task.metric(x[other], s[other]).mean().item(),
+        psnr=ratio.mean().item(),
+    )
+
+
+# Scores of shipped rules: the tables of `npa-envs evaluate`, in a file next to each rule.
 
 SCORED_STEPS = (128, 256, 512, 1024, 4096)
 """Steps from the seed that a line of scores names, where they were measured."""
@@ -598,18 +640,10 @@ CLOUD_STEP = 32
 
 
 def scores(name: str) -> dict[str, Any]:
-    """Return what was measured of a shipped rule.
+    """Return the scores of a shipped rule: command, commit, date, machine, metric, and tables.
 
-    Args:
-        name: A name from `npa_envs.rule.files.shipped_rules`.
-
-    Returns:
-        `command`, `commit`, `date`, `machine`, `metric` (what the loss is), and tables, lists of
-        rows by column: `growth` with `step`, `loss`, `psnr` [dB] and others, for some rules
-        `healing`, for textures `judge`; of a rule that classifies `accuracy` and `changes`.
-
-    Raises:
-        NPAError: There is no such rule.
+    Tables are lists of rows by column: `growth`, for some rules `healing`, for textures `judge`; of
+    a rule that classifies `accuracy` and `changes`.
     """
     rules = shipped_rules()
     if not isinstance(name, str) or name not in rules:
@@ -619,11 +653,7 @@ def scores(name: str) -> dict[str, Any]:
 
 
 def score_line(measured: Mapping[str, Any]) -> str:
-    """Return scores in a line.
-
-    Args:
-        measured: What `scores` returns.
-    """
+    """Return scores, as `scores` returns them, in a line."""
     if "accuracy" in measured:
         (row,) = (row for row in measured["accuracy"] if row["step"] == CLOUD_STEP)
         shares = f"{row['majority']:.1%} of clouds by majority, {row['particle']:.1%} of particles"
@@ -638,10 +668,9 @@ def score_line(measured: Mapping[str, Any]) -> str:
 
 
 def _at_steps(rows: Sequence[Mapping[str, Any]], column: str, form: str, unit: str) -> str:
-    told = []
-    for row in rows:
-        value = row[column]
-        # JSON has no numbers that are not finite.
-        said = "no finite number" if value is None else format(value, form) + unit
-        told.append(f"{said} at {row['step']}")
-    return ", ".join(told)
+    # JSON has no numbers that are not finite.
+    values = [
+        "no finite number" if row[column] is None else format(row[column], form) + unit
+        for row in rows
+    ]
+    return ", ".join(f"{value} at {row['step']}" for value, row in zip(values, rows, strict=True))

@@ -1,63 +1,103 @@
-"""The record of a measurement: JSON written whole, with the facts that its figures follow from.
+"""Records of measurements: JSON written whole, with the facts that the figures follow from.
 
-A record is written after every entry, so that a run that was stopped goes on from it; figures that
-follow from other facts (device, machine, commit, versions, settings) are refused.
+A record is written after every entry, so that a run that was stopped goes on from it. Figures of
+other facts (device, machine, commit, versions, settings) are refused.
 """
 
 from __future__ import annotations
 
-import argparse
 import importlib.metadata
 import math
 import os
 import platform
 import subprocess
-import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
-from datetime import date
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, Generic, TypeVar
 
 import torch
 
 from npa_envs.errors import NPAError, shown
 from npa_envs.files import json_text, plain_numbers, read_json, write_text
+from npa_envs.measure.tables import as_objects, table_text
 
 LIBRARIES = ("npa-envs", "torch", "warp-lang", "numpy", "scipy", "warpSPHCore")
 """Distributions whose versions are recorded."""
 
-Kept = TypeVar("Kept")
+Content = TypeVar("Content")
+Row = TypeVar("Row")
 
 LARGEST_RECORD = 64 * 2**20
 """Bytes of a record, at most."""
 
 
-def write_record(path: Path, content: Any) -> None:
-    """Write JSON, whole or not at all; numbers that are not finite become null.
+@dataclass
+class Record(Generic[Row]):
+    """Rows of a measurement, and what they follow from, in a JSON file."""
 
-    Raises:
-        NPAError: It cannot be written.
-    """
+    facts: Mapping[str, Any]
+    """What the rows follow from: device, machine, settings, commit, versions."""
+    rows: list[Row] = field(default_factory=list)
+    path: Path | None = None
+    """The file that is written after each entry; None: none."""
+    content: Callable[[list[Row]], Mapping[str, Any]] = lambda rows: {"rows": as_objects(rows)}
+    """Returns the file's fields other than the facts."""
+    key: str = "facts"
+    """What the file calls the facts."""
+
+    def resume(self, read: Callable[[dict[str, Any]], list[Row]], *, command: str) -> Record[Row]:
+        """Take over the rows of the file, if there is one, and return this record.
+
+        Args:
+            read: Makes rows of the file's JSON object.
+            command: Name of the command that writes such records, for the errors.
+
+        Raises:
+            NPAError: As for `read_record`.
+        """
+        if self.path is not None:
+            found = read_record(self.path, self.facts, read, command=command, key=self.key)
+            self.rows += found or []
+        return self
+
+    def add(self, *rows: Row) -> None:
+        """Add rows and write the file."""
+        self.rows += rows
+        self.write()
+
+    def write(self) -> None:
+        """Write the file, where there is to be one."""
+        if self.path is not None:
+            write_record(self.path, {self.key: self.facts, **self.content(self.rows)})
+
+    def table(self) -> str:
+        """Return the rows as a plain text table."""
+        return table_text(self.rows)
+
+
+def write_record(path: Path, content: Any) -> None:
+    """Write JSON, whole or not at all; numbers that are not finite become null."""
     write_text(path, json_text(content))
 
 
 def read_record(
     path: Path,
     facts: Mapping[str, Any],
-    make: Callable[[dict[str, Any]], Kept],
+    make: Callable[[dict[str, Any]], Content],
     *,
     command: str,
     key: str = "facts",
-) -> Kept | None:
-    """Return the record that a stopped run left; None where there is none.
+) -> Content | None:
+    """Return what `make` makes of the record that a stopped run left; None where there is none.
 
     Args:
         path: The file that it wrote.
         facts: What figures follow from now.
         make: Makes the record of the JSON object.
         command: Name of the command that writes such records, for the errors.
-        key: Where the object says what its figures follow from.
+        key: What the object calls its facts.
 
     Raises:
         NPAError: The file is no such record, or its figures follow from something else.
@@ -78,8 +118,7 @@ def read_record(
         if before.get(name) != value:
             raise NPAError(
                 f"{str(path)!r} holds figures of other settings: {name} was "
-                f"{shown(before.get(name))}, "
-                f"now {shown(value)}: {cure}"
+                f"{shown(before.get(name))}, now {shown(value)}: {cure}"
             )
     return record
 
@@ -90,7 +129,7 @@ def number(value: float | None) -> float:
 
 
 def time_limit(max_seconds: float | None) -> Callable[[], bool]:
-    """Return what says whether so long [s] has passed since now; never for None."""
+    """Return a function that says whether so long [s] has passed; never for None."""
     end = math.inf if max_seconds is None else time.monotonic() + max_seconds
     return lambda: time.monotonic() >= end
 
@@ -99,13 +138,7 @@ def time_limit(max_seconds: float | None) -> Callable[[], bool]:
 
 
 def measured_facts(device: torch.device, commit: str | None, **settings: Any) -> dict[str, Any]:
-    """Return what figures follow from: device, machine, settings, commit and versions.
-
-    Args:
-        device: Where they are measured.
-        commit: Commit that is measured; None: that of the checkout.
-        settings: What else they follow from.
-    """
+    """Return what figures follow from; without a commit, that of the checkout is measured."""
     return {
         "device": device.type,
         "machine": machine(device),
@@ -116,15 +149,11 @@ def measured_facts(device: torch.device, commit: str | None, **settings: Any) ->
 
 
 def without_folders(words: Sequence[str], *options: str) -> list[str]:
-    """Return a command's words with the values of some options replaced by the options' names.
+    """Return a command's words without the paths of options: "--out", "OUT" or "--out=OUT".
 
-    Records are not to tell where on which machine they were written.
-
-    Args:
-        words: "--out", "PATH" or "--out=PATH" becomes "--out", "OUT" or "--out=OUT".
-        options: Names with their dashes.
+    Records do not name folders of the machine that they were written on.
     """
-    told: list[str] = []
+    plain: list[str] = []
     before = ""
     for word in words:
         name, mark, _ = word.partition("=")
@@ -132,32 +161,9 @@ def without_folders(words: Sequence[str], *options: str) -> list[str]:
             word = before.lstrip("-").upper()
         elif mark and name in options:
             word = f"{name}={name.lstrip('-').upper()}"
-        told.append(word)
+        plain.append(word)
         before = word
-    return told
-
-
-def script_parser(description: str | None) -> argparse.ArgumentParser:
-    """Return a parser of the options that all scripts in `benchmarks/` have."""
-    parser = argparse.ArgumentParser(description=description)
-    parser.add_argument("--device", default="cuda" if torch.cuda.is_available() else "cpu")
-    parser.add_argument("--threads", type=int, default=1, help="CPU threads of torch")
-    parser.add_argument("--commit", help="commit that is measured; default: that of the checkout")
-    parser.add_argument("--output", type=Path, help="JSON file to write")
-    return parser
-
-
-def script_facts(arguments: argparse.Namespace) -> dict[str, str]:
-    """Return what the record of a script begins with, for arguments of `script_parser`."""
-    # Records are not to tell where on which machine they were written.
-    words = ["OUT" if word == str(arguments.output) else word for word in sys.argv]
-    return {
-        "command": " ".join(["python", *words]),
-        "commit": arguments.commit or current_commit(),
-        "date": date.today().isoformat(),
-        "machine": machine(torch.device(arguments.device)),
-        "torch": torch.__version__,
-    }
+    return plain
 
 
 def machine(device: torch.device) -> str:
@@ -182,10 +188,8 @@ def installed_version(name: str) -> str | None:
 
 def versions() -> dict[str, str | None]:
     """Return versions of Python and of `LIBRARIES`; None: not installed."""
-    return {
-        "python": platform.python_version(),
-        **{name: installed_version(name) for name in LIBRARIES},
-    }
+    found = {name: installed_version(name) for name in LIBRARIES}
+    return {"python": platform.python_version(), **found}
 
 
 def current_commit() -> str:

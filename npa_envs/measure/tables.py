@@ -36,12 +36,7 @@ def table_text(rows: Sequence[Any], *, missing: str = "never") -> str:
 
 
 def table_markdown(rows: Sequence[Any], *, missing: str = "never") -> str:
-    """Return rows as a table in Markdown, with the headings and cells of `table_text`.
-
-    Args:
-        rows: Instances of one dataclass, one at least.
-        missing: As for `table_text`.
-    """
+    """Return rows as a table in Markdown, with the headings and cells of `table_text`."""
     heads, *lines = _cells(rows, missing)
     return markdown_table(heads, lines)
 
@@ -62,12 +57,7 @@ def _cell(value: object, missing: str) -> str:
 
 
 def tables_json(tables: Mapping[str, Sequence[Any]], **facts: str) -> str:
-    """Return tables as a JSON object of lists; a number that is not finite becomes null.
-
-    Args:
-        tables: Rows, instances of dataclasses, by the table's name.
-        facts: What else the object says, by name.
-    """
+    """Return tables and facts as a JSON object; a number that is not finite becomes null."""
     return json_text({**facts, **{name: as_objects(rows) for name, rows in tables.items()}})
 
 

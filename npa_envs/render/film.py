@@ -336,8 +336,9 @@ def turntable_frames(
     with torch.no_grad():
         for k in range(frame_count):
             angle = azimuth + 360.0 * k / frame_count
-            size = {"width": resolution, "height": resolution}
-            cameras = orbit(1, elevation, DISTANCE, ANGLE, azimuth=angle, **size)
+            cameras = orbit(
+                1, elevation, DISTANCE, ANGLE, width=resolution, height=resolution, azimuth=angle
+            )
             picture = views(cameras.to(torch.device(device)))[0, 0]
             frames.append(to_uint8(picture.flip(0), background))
     return frames

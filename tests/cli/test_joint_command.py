@@ -14,15 +14,8 @@ from npa_envs.rule.files import load_rule, rule_metadata
 from npa_envs.tasks.co_morphogenesis2d import CoMorphogenesis2DConfig
 from npa_envs.training import RunFolder, load_config, preset, train
 
-TINY = (
-    "co_morphogenesis2d",
-    "--preset",
-    "tiny",
-    "--no-report",
-    "--iterations",
-    "4",
-    "--no-progress",
-)
+TINY = ["co_morphogenesis2d", "--preset", "tiny", "--no-report", "--no-progress"]
+TINY += ["--iterations", "4"]
 
 
 def parsed(*words):

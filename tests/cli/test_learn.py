@@ -16,16 +16,9 @@ from npa_envs.cli import main
 from npa_envs.cli.learn import parse, problem_of
 from npa_envs.training.checkpoint import load_checkpoint
 
-WORDS = [
-    "learn",
-    "ppo",
-    "npa/Morphogenesis2DSmall-v0",
-    "--keywords",
-    "target=ring",
-    "--worlds",
-    "2",
-]
-WORDS += ["--episode-steps", "4", "--episodes", "1", "--entries", "2", "--options", "steps=4"]
+WORDS = ["learn", "ppo", "npa/Morphogenesis2DSmall-v0", "--keywords", "target=ring"]
+WORDS += ["--worlds", "2", "--episode-steps", "4", "--episodes", "1", "--entries", "2"]
+WORDS += ["--options", "steps=4"]
 ROUND = 4 * 2 * 64
 
 
@@ -90,6 +83,7 @@ def test_a_killed_process_ends_a_run_and_a_signal_stops_it(tmp_path):
 @pytest.mark.parametrize(
     ("words", "message"),
     [
+        (["--particle-steps", "nan"], "particle_steps must be finite"),
         (["--options", "tempo=3"], "has no option 'tempo'"),
         (["--keywords", "heart"], "keywords must be NAME=VALUE, got 'heart'"),
         (["--gpus", "2", "--processes", "2"], "gpus says how many processes there are"),
@@ -103,20 +97,18 @@ def test_a_killed_process_ends_a_run_and_a_signal_stops_it(tmp_path):
 def test_mistakes_are_told(words, message, tmp_path, capsys):
     assert main([*WORDS, "--particle-steps", "9", "--out", str(tmp_path), *words]) == 2
     assert message in capsys.readouterr().err
+    assert main([*WORDS, "--out", str(tmp_path)]) == 2
+    assert "learn needs a budget: give --particle-steps" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
     ("env", "steps"),
-    [
-        ("npa/MixingSmall-v0", 32),
-        ("npa/MixingLarge-v0", 256),
-        ("npa/Mixing-v0", 256),
-        ("npa/Morphogenesis2DSmall-v0", 32),
-    ],
+    [("MixingSmall", 32), ("MixingLarge", 256), ("Mixing", 256), ("Morphogenesis2DSmall", 32)],
 )
 def test_episodes_are_as_long_as_registered(env, steps):
-    assert problem_of(parse(["ppo", env])).episode_steps == steps
-    assert problem_of(parse(["ppo", env, "--episode-steps", "5"])).episode_steps == 5
+    words = ["ppo", f"npa/{env}-v0"]
+    assert problem_of(parse(words)).episode_steps == steps
+    assert problem_of(parse([*words, "--episode-steps", "5"])).episode_steps == 5
 
 
 def test_worlds_are_those_of_shac_where_they_are_told(tmp_path):
@@ -142,8 +134,3 @@ def test_what_is_written_takes_no_time_and_what_is_over_has_finished(tmp_path, m
     seconds = [json.loads(line)["seconds"] for line in (tmp_path / "log.jsonl").open()]
     assert 0.5 <= seconds[-1] < 1.0
     assert len(seconds) > 2
-
-
-def test_a_run_needs_a_budget(tmp_path, capsys):
-    assert main([*WORDS, "--out", str(tmp_path)]) == 2
-    assert "learn needs a budget: give --particle-steps" in capsys.readouterr().err

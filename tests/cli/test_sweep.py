@@ -109,12 +109,12 @@ def test_a_run_that_fails_is_tried_again_and_those_that_are_over_are_left(tmp_pa
     assert (tmp_path / "sweep.md").read_text().count("done") == 4
 
 
-@pytest.mark.parametrize("text", ["{}", "[]", '{"words": 1, "code": 0, "seconds": 1}', "x"])
+@pytest.mark.parametrize("text", ["{}", "[]", '{"facts": {}, "code": "x", "seconds": 1}', "x"])
 def test_a_record_that_cannot_be_read_is_told(tmp_path, child, capsys, text):
     (tmp_path / "seed=0,target=a").mkdir()
     (tmp_path / "seed=0,target=a" / "run.json").write_text(text)
     assert call(tmp_path) == 2
-    assert "must be a record of npa-envs sweep" in capsys.readouterr().err
+    assert "must hold a record of npa-envs sweep" in capsys.readouterr().err
 
 
 def test_parts_and_time_limits_leave_runs_to_other_calls(tmp_path, child, capsys):
@@ -135,7 +135,7 @@ def test_a_folder_with_runs_of_other_words_is_refused(tmp_path, child, capsys):
     call(tmp_path)
     words = ["sweep", "--over", "seed=0,1", "target=a,b", "--out", str(tmp_path)]
     assert main([*words, "--", "texture", "--preset", "fast"]) == 2
-    assert "holds a run of other words" in capsys.readouterr().err
+    assert "other settings: words was" in capsys.readouterr().err
 
 
 SAVING = """

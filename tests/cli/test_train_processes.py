@@ -16,6 +16,7 @@ from npa_envs.training import RunFolder, config_to_dict, preset
 from npa_envs.training.checkpoint import load_checkpoint, save_checkpoint
 
 TASK = "morphogenesis2d"
+WITHOUT_AGES = {"world_count": 4, "pool_size": 30, "max_age_range": (0, 0), "stillness_weight": 0}
 
 
 def test_resume_auto_begins_and_later_goes_on(tmp_path):
@@ -39,12 +40,7 @@ def test_resume_auto_begins_and_later_goes_on(tmp_path):
         ("fast", {}, 1, 1),
         ("fast", {"device": "cuda"}, 2, 1),
         ("fast", {"world_count": 3, "pool_size": 30}, 2, 1),
-        (
-            "fast",
-            {"world_count": 4, "pool_size": 30, "max_age_range": (0, 0), "stillness_weight": 0},
-            2,
-            1,
-        ),
+        ("fast", WITHOUT_AGES, 2, 1),
         ("fast", {"iterations": 100}, 2, 1),
         ("paper", {}, 2, 1),
     ],
@@ -71,11 +67,6 @@ def test_a_run_that_was_begun_alone_goes_on_alone(tmp_path):
             process_count(TASK, TrainOptions(resume=True), preset("fast", out=tmp_path / "none"))
 
 
-def test_fewer_processes_than_one_are_refused():
-    with pytest.raises(NPAError, match="processes must be at least 1, got 0"):
-        process_count(TASK, TrainOptions(processes=0), preset("tiny"))
-
-
 def test_a_run_goes_on_with_its_own_preset_only(tmp_path):
     words = ["--out", str(tmp_path), "--resume"]
     config = preset("fast", out=tmp_path, target="ring", iterations=9)
@@ -90,37 +81,25 @@ def test_a_run_goes_on_with_its_own_preset_only(tmp_path):
 
 
 def test_gpus_are_processes_that_have_a_gpu_each():
-    asked = TrainOptions(gpus=4)
-    assert process_count(TASK, asked, preset("fast", device="cuda")) == 4
+    cuda = preset("fast", device="cuda")
+    assert process_count(TASK, TrainOptions(gpus=4), cuda) == 4
     assert resolve_task(TASK, ["--gpus", "4"]) == ["--gpus", "4", "--device", "cuda"]
     given = ["--gpus=4", "--device", "cuda"]
     assert resolve_task(TASK, given) == given
-    with pytest.raises(NPAError, match="gpus goes with device 'cuda', got 'cpu'"):
-        process_count(TASK, asked, preset("fast"))
-    with pytest.raises(NPAError, match="gpus must be at least 1, got 0"):
-        process_count(TASK, TrainOptions(gpus=0), preset("fast", device="cuda"))
-    with pytest.raises(NPAError, match="give one of them"):
-        process_count(TASK, TrainOptions(gpus=2, processes=2), preset("fast", device="cuda"))
+    for options, config, message in (
+        ({"gpus": 4}, preset("fast"), "gpus goes with device 'cuda', got 'cpu'"),
+        ({"gpus": 0}, cuda, "gpus must be at least 1, got 0"),
+        ({"gpus": 2, "processes": 2}, cuda, "give one of them"),
+        ({"processes": 0}, preset("tiny"), "processes must be at least 1, got 0"),
+    ):
+        with pytest.raises(NPAError, match=message):
+            process_count(TASK, TrainOptions(**options), config)
 
 
 def test_more_processes_than_gpus_are_refused_before_anything_starts(tmp_path, capsys):
     count = torch.cuda.device_count() + 2
-    words = [
-        "train",
-        TASK,
-        "--preset",
-        "tiny",
-        "--device",
-        "cuda",
-        "--processes",
-        str(count),
-        "--out",
-        str(tmp_path / "run"),
-    ]
-    assert main(words) == 2
-    said = capsys.readouterr().err
-    assert (
-        f"processes must be at most the {count - 2} CUDA devices that torch sees, got {count}"
-        in said
-    )
+    words = ["train", TASK, "--preset", "tiny", "--device", "cuda", "--processes", str(count)]
+    assert main([*words, "--out", str(tmp_path / "run")]) == 2
+    rule = f"processes must be at most the {count - 2} CUDA devices that torch sees, got {count}"
+    assert rule in capsys.readouterr().err
     assert not (tmp_path / "run").exists()

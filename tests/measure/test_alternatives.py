@@ -17,6 +17,7 @@ from alternatives import (
     draw_fronts,
     drawn_mask,
     front,
+    gecko,
     mask_source,
     peer_rows,
     perception_rows,
@@ -29,7 +30,7 @@ from npa_envs.errors import NPAError
 from npa_envs.measure.plots import png
 from npa_envs.measure.speed.precisions import PRECISIONS
 from npa_envs.measure.speed.timing import LeftOut, Timing
-from npa_envs.measure.speed.workloads import Workload, gecko
+from npa_envs.measure.speed.workloads import Workload
 from npa_envs.world.rollout import rollout
 
 TINY = Workload(2, 2, 150, 2, hidden_dim=16, eps=0.2)

@@ -180,15 +180,16 @@ def test_a_larger_radius_mixes_more_and_figures_lie_in_their_intervals():
     assert usual.change_low <= usual.change <= usual.change_high
 
 
-def test_a_phase_diagram_is_drawn_of_a_pair_with_gaps_and_infinities():
+def test_pictures_are_drawn_of_rows_with_gaps_and_infinities():
     pytest.importorskip("matplotlib")
     row = InteractionRow("a", "b", 0.0, 0.5, 0.1, 0.2, 2.0, 0.1, 0.0, "disrupted")
-    others = (
-        {"ratio": 0.25, "change": math.inf, "change_high": math.inf},
-        {"eps_factor": 2.0},
-    )
-    drawn = phase_diagram([row, *(dataclasses.replace(row, **changed) for changed in others)])
-    assert drawn.startswith(b"\x89PNG")
+    infinite = {"ratio": 0.25, "change": math.inf, "change_high": math.inf}
+    for draw, *others in (
+        (phase_diagram, infinite, {"eps_factor": 2.0}),
+        (heat_map, {"rule": "b", "beside": "a", "change": math.inf}, {"distance": 1.0}),
+    ):
+        rows = [row, *(dataclasses.replace(row, **changed) for changed in others)]
+        assert draw(rows).startswith(b"\x89PNG")
 
 
 def test_rules_that_cannot_share_a_world_are_named():
@@ -218,14 +219,6 @@ def test_wrong_settings_are_clear_errors(options, message):
 def test_a_share_leaves_a_particle_for_either_species():
     shares = (0.5, 0.001, 0.999)
     assert [settings().counts(share) for share in shares] == [(20, 20), (1, 39), (39, 1)]
-
-
-def test_a_heat_map_is_drawn_of_rows_with_gaps_and_infinities():
-    pytest.importorskip("matplotlib")
-    row = InteractionRow("a", "b", 0.0, 0.5, 0.1, 0.2, 2.0, 0.1, 0.0, "disrupted")
-    others = {"rule": "b", "beside": "a", "change": math.inf}, {"distance": 1.0}
-    drawn = heat_map([row, *(dataclasses.replace(row, **changed) for changed in others)])
-    assert drawn.startswith(b"\x89PNG")
 
 
 def rules_metadata(folder):
@@ -289,6 +282,8 @@ class TestCommand:
         path, out = str(rules / "one.safetensors"), tmp_path / "out"
         assert main(["interact", path, "--no-itself", "--out", str(out)]) == 2
         assert "rules must be two or more without itself, got one" in capsys.readouterr().err
+        assert main(self.words(rules, out, "--particle-count", "0")) == 2
+        assert "particle_count must be at least 2, got 0" in capsys.readouterr().err
         assert not out.exists()
 
     def test_a_stopped_run_goes_on_and_ends_as_one_that_was_not(
@@ -355,7 +350,3 @@ class TestCommand:
         # The last is the default, and was said all the same.
         assert (told["steps"], told["seeds"], told["distances"]) == (3, [1_000_000], [0, 0.5, 1])
         assert told["particle_count"] == 512
-
-    def test_no_particles_are_refused(self, rules, tmp_path, capsys):
-        assert main(self.words(rules, tmp_path / "out", "--particle-count", "0")) == 2
-        assert "particle_count must be at least 2, got 0" in capsys.readouterr().err

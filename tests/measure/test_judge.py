@@ -107,15 +107,8 @@ def test_a_target_with_edges_is_not_read_across_them():
 
 def test_no_loss_compares_patches_of_the_judges_size():
     side = judges.REFERENCE
-    sizes = {
-        patch * 2**level
-        for patch in (
-            texture.PATCH,
-            texture.PATCH + texture.SECOND_PATCH - 1,
-            shapes.MATCHED_PATCH,
-        )
-        for level in range(pieces.LEVELS)
-    }
+    patches = (texture.PATCH, texture.PATCH + texture.SECOND_PATCH - 1, shapes.MATCHED_PATCH)
+    sizes = {patch * 2**level for patch in patches for level in range(pieces.LEVELS)}
     assert round(judges.PATCH * 64 / side) == 12
     assert judges.PATCH not in sizes | set(shapes.FILTER_SIZES)
 

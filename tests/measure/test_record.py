@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from scripts import script_facts, script_parser
 
 from npa_envs.errors import NPAError
 from npa_envs.measure.plots import mark_decades, write_plots
@@ -15,8 +16,6 @@ from npa_envs.measure.record import (
     measured_facts,
     number,
     read_record,
-    script_facts,
-    script_parser,
     time_limit,
     without_folders,
     write_record,
@@ -88,14 +87,14 @@ def test_a_time_limit_passes_once_and_never_without_one():
 
 def test_stored_records_can_be_read():
     """Those of robustness are read by the test that their tables are the stored ones."""
-    from npa_envs.measure.accuracy.suite import Record
-    from npa_envs.measure.interaction import read_rows
+    from npa_envs.measure.accuracy.suite import StressRecord
+    from npa_envs.measure.interaction import interaction_record
 
     stress, met = (RESULTS / name for name in ("stress_57ffb7c_h100.json", "interactions_cpu.json"))
     facts = json.loads(stress.read_text("utf-8"))["facts"]
-    assert Record.read(stress, facts).counts()["fail"] == 1
+    assert StressRecord(facts, stress).read().counts()["fail"] == 1
     settings = json.loads(met.read_text("utf-8"))["settings"]
-    assert len(read_rows(met, settings)) == 16
+    assert len(interaction_record(met, settings).rows) == 16
 
 
 @dataclass(frozen=True)

@@ -11,17 +11,6 @@ import torch
 from npa_envs.cli import main
 from npa_envs.measure.accuracy.endurance import rule_names, task_name
 from npa_envs.measure.robustness import study
-from npa_envs.measure.robustness.plans import (
-    BLOB_DISTANCE,
-    CONDITIONS,
-    PLANS,
-    SHAPES,
-    SIZE_FACTOR,
-    TrialPlan,
-    disk,
-    quick_plan,
-    trained_value,
-)
 from npa_envs.measure.robustness.recovery import (
     CONTROL,
     DAMAGES,
@@ -41,7 +30,19 @@ from npa_envs.measure.robustness.study import (
     where_it_works,
     working_range,
 )
-from npa_envs.measure.robustness.trials import RuleTrial, loss_curves
+from npa_envs.measure.robustness.trials import (
+    BLOB_DISTANCE,
+    CONDITIONS,
+    PLANS,
+    SHAPES,
+    SIZE_FACTOR,
+    RuleTrial,
+    TrialPlan,
+    disk,
+    loss_curves,
+    quick_plan,
+    trained_value,
+)
 from npa_envs.rule.files import (
     load_rule,
     rule_digest,
@@ -199,8 +200,8 @@ def record(*found: LossCurve, **changed) -> RuleRecord:
     lost = Response("eps", 4.0, 8, (0.5, math.nan))
     left_out = Response("particles", 2.0, 0, (), note="256 particles in all")
     fields = {"rule": "heart", "task": "morphogenesis2d", "metric": "loss", "update_prob": 0.5}
-    fields["facts"] = {"a": 1}
-    return RuleRecord(**fields | {"courses": found, "responses": (*told, lost, left_out)} | changed)
+    fields |= {"curves": found, "responses": (*told, lost, left_out)}
+    return RuleRecord({"a": 1}, **fields | changed)
 
 
 # Where rules work
@@ -345,6 +346,7 @@ def test_a_world_that_is_lost_stays_lost_and_leaves_the_others_as_they_are(devic
 
 
 def test_plans_are_whole_chunks_and_hold_what_was_trained():
+    assert task_name("seven-pictures") == "morphogenesis2d"
     for name, path in shipped_rules().items():
         update_prob = trained_config(path, rule_metadata(path)).task.update_prob
         for plan in (PLANS[task_name(name)], quick_plan(task_name(name))):
@@ -363,7 +365,7 @@ def test_stored_records_give_the_stored_tables():
     folder = Path(__file__).resolve().parents[2] / "benchmarks" / "results" / "robustness_h200"
     places = [folder / f"robustness_{name}.json" for name in rule_names()]
     held = {path: json.loads(path.read_text("utf-8")) for path in places if path.exists()}
-    records = [RuleRecord.read(path, content["facts"]) for path, content in held.items()]
+    records = [RuleRecord(content["facts"], path).read() for path, content in held.items()]
     assert len(records) == len(list(folder.glob("*.json"))) == 15
     assert all(record.done for record in records)
     assert tables(records) == (folder / "robustness.md").read_text("utf-8")
@@ -383,9 +385,12 @@ def test_records_come_back_as_they_were_written_and_curves_are_drawn_by_task(tmp
     course = LossCurve("wipe", (0, 16), ((2.0, 1.0), (2.0, math.nan)), ((1.0, 1.0), (1.0, 1.0)))
     records = [record(course), record(course, task="texture", rule="dots")]
     path = tmp_path / "robustness_heart.json"
-    records[0].write(path)
+    records[0].path = path
+    records[0].write()
     assert json.loads(path.read_text())["courses"][0]["recovery_steps"] == [16, None]
-    assert repr(RuleRecord.read(path, {"a": 1})) == repr(records[0])
+    found = RuleRecord({"a": 1}, path).read()
+    assert repr((found.rows, found.curves)) == repr((records[0].rows, records[0].curves))
+    assert found.about == records[0].about
     pytest.importorskip("matplotlib")
     drawn = pictures(records)
     assert set(drawn) == {"morphogenesis2d", "texture"}
@@ -448,7 +453,3 @@ def test_a_record_of_a_rule_that_was_trained_anew_is_refused(tmp_path, capsys, m
     save_rule(rule, path, metadata=metadata)
     assert main(words) == 2
     assert "holds figures of other settings: weights was" in capsys.readouterr().err
-
-
-def test_rules_that_runs_begin_with_are_known_by_name():
-    assert task_name("seven-pictures") == "morphogenesis2d"

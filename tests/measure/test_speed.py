@@ -11,13 +11,13 @@ import torch
 from clock import Clock
 
 from npa_envs.cli import main
-from npa_envs.measure.speed import suites, throughput
-from npa_envs.measure.speed.drift import DriftRow, drift_rows
+from npa_envs.measure.speed import suites
 from npa_envs.measure.speed.explain import Question, explain
-from npa_envs.measure.speed.suites import BenchReport
-from npa_envs.measure.speed.throughput import (
+from npa_envs.measure.speed.suites import (
     PAPER,
-    aim_rows,
+    BenchReport,
+    DriftRow,
+    drift_rows,
     roll_one_species,
     scaling_rows,
     skip_rows,
@@ -88,20 +88,13 @@ def test_float32_drifts_little_from_float64_over_a_rollout(device):
         assert 0.0 < row.weight_gradient < 1e-3
 
 
-def test_throughput_stores_and_recomputes_and_an_aim_takes_the_better_of_both():
+def test_throughput_stores_and_recomputes():
     store, recompute = throughput_rows(session(), [TINY])
     assert (store.memory, recompute.memory) == ("store", "recompute")
     assert store.workload == "2D (2, 150, 2)"
     assert store.worlds_mib == pytest.approx(2 * 150 * (2 + 16) * 4 / 2**20)
     for row in (store, recompute):
         assert min(row.infer_us.low, row.train_us.low) > 0.0
-    assert aim_rows([store, recompute]) == []
-    known = {"workload": PAPER[0].name, "infer_us": timing(80.0)}
-    store = replace(store, **known, train_us=timing(150.0), train_mib=900.0)
-    recompute = replace(recompute, **known, train_us=timing(210.0), train_mib=300.0)
-    (row,) = aim_rows([store, recompute])
-    assert (row.train_us, row.recompute_mib, row.recompute_slower) == (150.0, 300.0, 1.4)
-    assert (row.infer_aim, row.train_aim, row.mib_aim) == (72, 163, 395)
 
 
 def test_scaling_varies_one_number_at_a_time_and_slopes_are_those_of_logarithms():
@@ -115,28 +108,23 @@ def test_scaling_varies_one_number_at_a_time_and_slopes_are_those_of_logarithms(
         for n in (16, 64, 256, 1024)
     ]
     slopes = slope_rows(grown)
-    assert [slope.axis for slope in slopes] == list(throughput.AXES)
+    assert [slope.axis for slope in slopes] == list(suites.AXES)
     for slope in slopes:
         assert (slope.infer_slope, slope.train_slope) == pytest.approx((1.0, 2.0))
 
 
-def test_what_does_not_fit_into_memory_is_left_out():
+def test_what_does_not_fit_into_memory_or_the_time_is_left_out():
     def large():
         raise torch.OutOfMemoryError("too large")
 
     done = []
-    here = session(progress=done.append)
-    assert here.attempt("large", large) == []
-    assert here.attempt("small", lambda: 3) == [3]
-    assert here.left_out == [LeftOut("large", "not enough memory")]
+    here = session(progress=done.append, enough=iter([False, False, True]).__next__)
+    found = [here.attempt(name, make) for name, make in (("large", large), ("small", lambda: 3))]
+    assert found == [[], [3]]
+    assert here.attempt("late", lambda: 4) == []
+    left = [("large", "not enough memory"), ("late", "no time was left")]
+    assert here.left_out == [LeftOut(*entry) for entry in left]
     assert done == [1, 1]
-
-
-def test_what_has_not_begun_when_time_is_over_is_left_out():
-    here = session(enough=iter([False, True]).__next__)
-    assert here.attempt("first", lambda: 3) == [3]
-    assert here.attempt("second", lambda: 4) == []
-    assert here.left_out == [LeftOut("second", "no time was left")]
 
 
 def test_each_skip_is_measured_with_and_without():

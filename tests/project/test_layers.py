@@ -59,12 +59,11 @@ LADDER = {
     "npa_envs.render": rung(8, "torch numpy PIL imageio imageio_ffmpeg pygame", never=ORACLES),
     "npa_envs.training": rung(9, "torch numpy tqdm yaml tensorboard", never=ORACLES),
     "npa_envs": Rung(10, frozenset({COMPUTED_NAME}), never=ORACLES),
-    "npa_envs.measure.record": rung(2, "torch", never=INSIDES),
+    "npa_envs.measure.record": rung(3, "torch", never=INSIDES),
     "npa_envs.measure.tables": rung(2),
     "npa_envs.measure.plots": rung(2, "matplotlib"),
     "npa_envs.measure.judge": rung(10, "torch", never=INSIDES),
-    "npa_envs.measure.quality": rung(10, "torch numpy tqdm", never=INSIDES),
-    "npa_envs.measure.codes": rung(11, "torch", never=INSIDES),
+    "npa_envs.measure.quality": rung(11, "torch numpy tqdm", never=INSIDES),
     "npa_envs.measure.interaction": rung(11, "torch numpy matplotlib", never=ORACLES),
     "npa_envs.measure.speed": rung(13, "torch numpy matplotlib", never=("npa_envs.kernels",)),
     "npa_envs.measure.accuracy": rung(14, "torch matplotlib", never=("npa_envs.kernels",)),
@@ -85,7 +84,11 @@ LADDER = {
     ),
     "npa_envs.agents.search": rung(20, "torch numpy cma ribs", never=INSIDES),
     "npa_envs.web": rung(21, "torch numpy gymnasium PIL starlette uvicorn", never=ORACLES),
-    "npa_envs.cli": rung(22, "torch numpy tqdm tyro imageio_ffmpeg", never=ORACLES),
+    "npa_envs.cli": Rung(
+        22,
+        frozenset({COMPUTED_NAME, "torch", "numpy", "tqdm", "tyro", "imageio_ffmpeg"}),
+        never=ORACLES,
+    ),
     "npa_envs.__main__": rung(23),
 }
 WARP_AND_TORCH = {"npa_envs.ops"}

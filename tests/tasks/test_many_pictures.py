@@ -11,7 +11,7 @@ from training_runs import make_cycle
 import npa_envs
 from npa_envs.cli import main
 from npa_envs.errors import NPAError
-from npa_envs.measure.codes import picture_rows
+from npa_envs.measure.quality import picture_rows
 from npa_envs.rule.codes import Codes
 from npa_envs.rule.files import load_rule
 from npa_envs.tasks.many_pictures import ManyPictures, named_targets

@@ -1,4 +1,4 @@
-"""Checks of hard cases: what each is given and finds."""
+"""Checks of hard cases: their sessions, figures, limits and verdicts."""
 
 from __future__ import annotations
 
@@ -22,21 +22,18 @@ GROUPS = {
 
 
 class Skipped(Exception):
-    """A check has nothing to measure here; the message is the reason."""
+    """A check has nothing to measure; the message is the reason."""
 
 
 @dataclass(frozen=True)
 class CheckResult:
-    """What a check found."""
+    """Figures of a check by name, and limits of some of them."""
 
     figures: Mapping[str, float]
-    """What was measured, by name."""
     limits: Mapping[str, float] = field(default_factory=dict)
-    """The largest value that the figure of a name may have; others are only told."""
     holds: str = ""
     """For a range: where it holds, in words."""
     note: str = ""
-    """What else there is to know."""
 
     def exceeded(self) -> list[str]:
         """Return the names whose figure is above its limit, not a number, or missing."""
@@ -56,16 +53,13 @@ class CheckResult:
 
 @dataclass
 class CheckSession:
-    """One run of the command."""
+    """One run of the command; when quick, with small worlds and few steps."""
 
     device: torch.device
-    """Where everything is run."""
     quick: bool = False
-    """Small worlds and few steps: about a minute on two CPU cores."""
     seed: int = 0
-    """What random worlds are drawn from."""
     kept: dict[Any, Any] = field(default_factory=dict)
-    """What several checks need and only one has to make."""
+    """Results that several checks share."""
 
     @property
     def cuda(self) -> bool:
@@ -85,21 +79,13 @@ class CheckSession:
 
 @dataclass(frozen=True)
 class Check:
-    """A hard case GROUP/CASE, what is expected in a sentence, and what measures it.
-
-    `run` raises `Skipped` where there is nothing to measure.
-    """
+    """A hard case GROUP/CASE, its expectation in a sentence, and the function that measures it."""
 
     name: str
     expected: str
     run: Callable[[CheckSession], CheckResult]
     rule: str = ""
     """What `load_rule` takes, of a check of a rule."""
-
-    @property
-    def group(self) -> str:
-        """The group that it belongs to."""
-        return group_of(self.name)
 
 
 def group_of(name: str) -> str:

@@ -32,17 +32,11 @@ HORIZONS = {
 WORKS = 2.0
 """A rule works where its loss is at most this many times that as trained, and all is finite."""
 
-QUICK_HORIZON = 64
-"""The most of them in a quick run."""
-
-QUICK_PARTICLES = 1024
-"""The most particles in a quick run."""
-
-QUICK_CLOUD = 128
-"""The most particles of a cloud in a quick run."""
+QUICK_HORIZON, QUICK_PARTICLES, QUICK_CLOUD = 64, 1024, 128
+"""The most steps, particles, and particles of a cloud in a quick run."""
 
 SMALLEST_VIEWS: dict[str, Any] = {"resolution": 16, "training_views": 1, "held_out_views": 1}
-"""Fields of 3D tasks whose target nobody looks at."""
+"""Fields of 3D tasks whose target is not looked at."""
 
 CHUNK = 50
 """Steps that are recorded in one CUDA graph."""
@@ -50,31 +44,30 @@ CHUNK = 50
 
 @dataclass(frozen=True)
 class EnduranceCase:
-    """A float32 rule, its seeds x [B, N, D], s [B, N, C], and its horizon in steps."""
+    """A float32 rule, its task, worlds of seeds, and its horizon in steps."""
 
     rule: NPARule
     task: Task
-    """What its worlds are for: radius, box, probability of updates, loss and metric."""
     x: Tensor
     s: Tensor
     horizon: int
 
     def options(self, **changed: Any) -> dict[str, Any]:
-        """Return what `rollout` is given: as trained, but for what is changed."""
+        """Return options of `rollout` as in training, but for what is changed."""
         task = self.task
         return {"eps": task.eps, "box": task.box, "update_prob": task.update_prob} | changed
 
     def at_trained_size(self, x: Tensor, eps: float) -> Tensor:
-        """Return positions [B, N, D] as large as they would be at the radius of training.
+        """Return positions scaled to the radius of training.
 
-        Scaling positions and ε alike is a symmetry of the dynamics, so what grows in open space at
-        another ε is as much larger. Boxes and particles that do not move keep their size.
+        Scaling positions and ε alike is a symmetry of the dynamics in open space. Boxes and static
+        particles keep their size.
         """
         free = self.task.box is None and not self.rule.static
         return x * (self.task.eps / eps) if free and eps != self.task.eps else x
 
     def metric(self, x: Tensor, s: Tensor) -> float:
-        """Return how far worlds are from the goal, mean; lower is better."""
+        """Return the mean metric of worlds; lower is better."""
         with torch.no_grad():
             return float(self.task.metric(x, s).mean())
 
@@ -85,11 +78,7 @@ def rule_names() -> list[str]:
 
 
 def task_name(rule: str) -> str:
-    """Return the name of the task that a rule of the package, or of a file of ours, was trained on.
-
-    Raises:
-        NPAError: The file is none of ours, or says nothing of a task.
-    """
+    """Return the name of the task that a rule was trained on, as its file says."""
     metadata = rule_metadata(rule_file(rule))
     if metadata.get("task") not in HORIZONS:
         raise NPAError(
@@ -107,16 +96,26 @@ def habitat(
     particles: float = 1.0,
     looks: bool = True,
 ) -> EnduranceCase:
-    """Return a rule of the package, or of a file, with seeds of its task.
+    """Return a rule, shipped or of a file, with seeds of its task.
 
-    `particles` is over those it was trained with or, in a quick run, over the most there. Where the
-    world `looks` at nothing, neither loss nor metric is asked for: a 3D target takes long to make.
+    `particles` is over those it was trained with or, in a quick run, over the most there. `looks`
+    says whether loss or metric are read: a 3D target takes long to make.
 
     Raises:
         Skipped: It looks at a target that cannot be loaded.
     """
     key = ("task", name, particles, looks)
-    rule, task = session.once(key, lambda: _task(session, name, particles, looks))
+
+    def make() -> tuple[NPARule, Task]:
+        rule = load_rule(name, device=session.device).float().requires_grad_(False)
+        fields = {} if looks or rule.space_dim == 2 else SMALLEST_VIEWS
+        count = max(1, round(particles * trained_particles(session, name)))
+        found = task_of_rule(name, rule, session.device, particle_count=count, **fields)
+        if looks and found.doubt is not None:
+            raise Skipped(found.doubt)
+        return rule, found.task
+
+    rule, task = session.once(key, make)
     x, s, goal = task.seed(world_count, generator=session.generator(), device=session.device)
     horizon = HORIZONS[task_name(name)]
     return EnduranceCase(
@@ -128,33 +127,19 @@ def habitat(
     )
 
 
-def _task(session: CheckSession, name: str, particles: float, looks: bool) -> tuple[NPARule, Task]:
-    """Load a rule and make its task."""
-    rule = load_rule(name, device=session.device).float().requires_grad_(False)
-    fields = {} if looks or rule.space_dim == 2 else SMALLEST_VIEWS
-    count = trained_particles(session, name)
-    found = task_of_rule(
-        name, rule, session.device, particle_count=max(1, round(particles * count)), **fields
-    )
-    if looks and found.doubt is not None:
-        raise Skipped(found.doubt)
-    return rule, found.task
-
-
 def trained_particles(session: CheckSession, name: str) -> int:
-    """Return how many particles a world of a rule has where their number is not what is varied."""
+    """Return how many particles a world of a rule has where their number is not varied."""
     path = rule_file(name)
     count = int(trained_config(path, rule_metadata(path)).task.particle_count)
-    # Clouds are sampled farthest point by farthest point, all of them.
+    # Clouds are sampled farthest point by farthest point, which is slow.
     most = QUICK_CLOUD if task_name(name) == "point_classification" else QUICK_PARTICLES
     return min(count, most) if session.quick else count
 
 
 class LongRun:
-    """Worlds that are run for very long, without gradients; `options` are those of `rollout`.
+    """Long rollouts without gradients; `options` are those of `rollout`.
 
-    On CUDA, a chunk of steps is recorded as a graph, which is replayed: their launches would take
-    most of the time.
+    On CUDA a chunk of steps is recorded as a graph: launches would take most of the time.
     """
 
     def __init__(
@@ -200,7 +185,7 @@ class LongRun:
         self.s.copy_(s)
 
     def marks(self, marks: list[int]) -> Iterator[tuple[int, Tensor, Tensor]]:
-        """Yield steps, positions and states after each of some numbers of steps, increasing."""
+        """Yield steps, positions and states after each of increasing numbers of steps."""
         done = 0
         for mark in marks:
             self.advance(mark - done)
@@ -211,17 +196,15 @@ class LongRun:
 # The group `time`: every shipped rule for 100 000 steps.
 
 STEPS, QUICK_STEPS = 100_000, 200
-"""How long a rule is run."""
 
 SETTLED = 512
 """Step whose worlds later ones are compared with; half of the run where that is sooner."""
 
 MARKS = 16
-"""How often worlds are measured after that."""
+"""Measurements of worlds after that."""
 
 ENERGY_STEPS = 16
-"""Steps that tell the energy. Of a world at rest that of a single one is chance: it varies by a
-hundred times from step to step."""
+"""Steps whose mean is the energy: of a world at rest single steps differ by a hundred times."""
 
 BOUNDS = {
     "not_finite": 0.0,
@@ -258,10 +241,7 @@ def endurance_checks(rules: Mapping[str, str] | None = None) -> list[Check]:
 def measured(
     home: EnduranceCase, x: Tensor, s: Tensor, generator: torch.Generator
 ) -> dict[str, float]:
-    """Return the figures of worlds x [B, N, D], s [B, N, C], none of them compared with others.
-
-    Some more steps, with masks from the generator, tell the energy.
-    """
+    """Return the figures of worlds by themselves; the energy takes some more steps."""
     with torch.no_grad():
         not_finite = (~x.isfinite()).sum() + (~s.isfinite()).sum()
         if int(not_finite):

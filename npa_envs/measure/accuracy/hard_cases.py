@@ -93,9 +93,14 @@ def _run_scene(scene: Scene, session: CheckSession) -> CheckResult:
     return CheckResult(figures, error_limits(scene.x, scene.s, scene.box, expected))
 
 
+def _threshold_states(x: Tensor) -> Tensor:
+    draws = torch.Generator().manual_seed(5)
+    return torch.randn(*x.shape[:2], STATE_DIM, generator=draws).double()
+
+
 def _run_threshold(space_dim: int, session: CheckSession) -> CheckResult:
     x, offsets = threshold_scenes(space_dim, reference.MOMENT_THRESHOLD)
-    s = torch.randn(*x.shape[:2], STATE_DIM, generator=torch.Generator().manual_seed(5)).double()
+    s = _threshold_states(x)
     fields = reference.fields(x, s, EPS)
     corrected = fields.grad0 @ torch.linalg.pinv(fields.moment)
     right = reference.perceive(x, s, EPS, EPS)
@@ -109,33 +114,32 @@ def _run_threshold(space_dim: int, session: CheckSession) -> CheckResult:
         z = perceive(x.to(session.device, dtype), s.to(session.device, dtype), EPS).cpu().double()
         # Only a determinant that rounding moves over the threshold may be taken for the other one.
         near = offsets.abs() <= 1e2 * torch.finfo(dtype).eps / reference.MOMENT_THRESHOLD
-        errors = (z - right).norm(dim=-1) / right.norm(dim=-1)
-        errors_of_other = (z - others).norm(dim=-1) / others.norm(dim=-1)
-        corner = torch.where(near, torch.minimum(errors, errors_of_other)[:, 0], errors[:, 0])
+        errors, errors_of_other = (
+            ((z - exact).norm(dim=-1) / exact.norm(dim=-1))[:, 0] for exact in (right, others)
+        )
+        corner = torch.where(near, torch.minimum(errors, errors_of_other), errors)
         figures[f"z_{name}"] = float(corner.max())
         limits[f"z_{name}"] = LIMITS[f"z_{name}"]
-        # Rounding moved some over the threshold by making float32 of the positions.
-        figures[f"other_side_{name}"] = float((errors_of_other < errors)[:, 0].sum())
+        # Positions in float32 moved some over the threshold.
+        figures[f"other_side_{name}"] = float((errors_of_other < errors).sum())
     return CheckResult(figures, limits)
 
 
 def _run_smooth_inverse(space_dim: int, session: CheckSession) -> CheckResult:
     x, offsets = threshold_scenes(space_dim, reference.MOMENT_THRESHOLD)
-    s = torch.randn(*x.shape[:2], STATE_DIM, generator=torch.Generator().manual_seed(5)).double()
-    # All worlds carry the same states: from one to the next only a determinant changes.
-    s = s[:1].expand_as(s)
+    # All worlds have the same states: from one to the next only a determinant changes.
+    s = _threshold_states(x)[:1].expand(len(x), -1, -1)
     exact = reference.perceive(x, s, EPS, EPS, moment_inverse="smooth")
     near = offsets.abs() <= NEAR_THRESHOLD
     figures: dict[str, float] = {}
     limits: dict[str, float] = {}
     for name, dtype in PRECISIONS.items():
-        y, t = (tensor.to(session.device, dtype) for tensor in (x, s))
-        smooth = perceive(y, t, EPS, moment_inverse="smooth").cpu().double()
+        y, u = (tensor.to(session.device, dtype) for tensor in (x, s))
+        smooth = perceive(y, u, EPS, moment_inverse="smooth").cpu().double()
         figures[f"z_{name}"] = relative_error(smooth, exact)
-        limits[f"z_{name}"] = LIMITS[f"z_{name}"]
         figures[f"jump_{name}"] = _largest_jump(smooth[near])
-        limits[f"jump_{name}"] = 2.0 * NEAR_THRESHOLD
-        figures[f"jump_by_threshold_{name}"] = _largest_jump(perceive(y, t, EPS)[near])
+        figures[f"jump_by_threshold_{name}"] = _largest_jump(perceive(y, u, EPS)[near])
+        limits |= {f"z_{name}": LIMITS[f"z_{name}"], f"jump_{name}": 2.0 * NEAR_THRESHOLD}
     return CheckResult(figures, limits)
 
 
@@ -215,7 +219,7 @@ def _run_outside(space_dim: int, session: CheckSession) -> CheckResult:
         found = perceived(x.to(session.device), s.to(session.device), box)
         not_finite += sum(int((~tensor.isfinite()).sum()) for tensor in found)
         if offset <= 1e4:
-            # The images of what float32 has made of their coordinates.
+            # The images of coordinates rounded to float32.
             expected = perceived(x.double(), s.double(), box, by_reference=True)
             figures[f"z_{offset:g}"] = error = relative_error(found.z, expected.z)
             allowed = error_limits(x.double(), s.double(), box, expected)
@@ -227,13 +231,10 @@ def _run_outside(space_dim: int, session: CheckSession) -> CheckResult:
     )
 
 
-# The group `values`: what states hold; nothing may reach another world.
+# The group `values`: what states hold; no fault may spread to another world.
 
 POWERS = range(-30, 31, 2)
-"""Scales of states that are tried, as powers of ten."""
-
-SAFE_POWERS = (-30, 30)
-"""Scales within which nothing may go wrong in float32."""
+"""Scales of states, as powers of ten, at which float32 is right."""
 
 WORLD, PARTICLE = 1, 7
 """The particle that something is wrong with, and its world, of `WORLD_COUNT`."""
@@ -249,7 +250,7 @@ def values_checks() -> list[Check]:
     by_dimension = {
         "scale": (
             "states of 1e-30 to 1e30 are perceived as the float64 reference has them, forwards and "
-            "backwards; beyond, the largest scale is told",
+            "backwards; beyond, the largest scale is reported",
             _run_scale,
         ),
         "infinite_channel": (
@@ -290,7 +291,7 @@ def values_checks() -> list[Check]:
 
 
 def _worlds(session: CheckSession, space_dim: int, state_dim: int) -> tuple[Tensor, Tensor]:
-    """Return worlds with about 20 neighbours, half of them out of sight of the other half."""
+    """Return worlds with about 20 neighbours, whose halves do not perceive each other."""
     generator = torch.Generator().manual_seed(session.seed)
     shape = (WORLD_COUNT, PARTICLE_COUNT)
     side = EPS * (3.0 if space_dim == 2 else 2.4)
@@ -301,7 +302,7 @@ def _worlds(session: CheckSession, space_dim: int, state_dim: int) -> tuple[Tens
 
 
 def differing(value: Tensor, expected: Tensor) -> float:
-    """Return how many numbers of two tensors are not the same; NaN is the same as NaN."""
+    """Return how many numbers of two tensors differ; NaN equals NaN."""
     same = (value == expected) | (value.isnan() & expected.isnan())
     return float((~same).sum())
 
@@ -319,14 +320,11 @@ def _run_scale(space_dim: int, session: CheckSession) -> CheckResult:
         figures[f"z_1e{power:+d}"] = errors[0]
         if all(error <= LIMITS[name] for error, name in zip(errors, names, strict=True)):
             right.append(power)
-    low, high = SAFE_POWERS
-    figures["wrong"] = float(sum(low <= power <= high and power not in right for power in POWERS))
-    largest = max(
-        (power for power in right if set(range(low, power, 2)) <= set(right)), default=low
-    )
-    return CheckResult(
-        figures, {"wrong": 0.0}, holds=f"float32: states of 1e{low} to 1e{largest:+d}"
-    )
+    low = POWERS[0]
+    figures["wrong"] = float(sum(power not in right for power in POWERS))
+    largest = max((p for p in right if set(range(low, p, 2)) <= set(right)), default=low)
+    words = f"float32: states of 1e{low} to 1e{largest:+d}"
+    return CheckResult(figures, {"wrong": 0.0}, holds=words)
 
 
 def _run_infinite_channel(space_dim: int, session: CheckSession) -> CheckResult:
@@ -429,7 +427,7 @@ def _run_nan_state(session: CheckSession) -> CheckResult:
 
 
 def _unreported(calls: dict[str, Callable[[], Any]], named: str) -> CheckResult:
-    """Return a finding that counts the calls that are not refused by an error with some words."""
+    """Return which calls are not refused by an error with some words."""
     figures = {}
     for name, call in calls.items():
         try:

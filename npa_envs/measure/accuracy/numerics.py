@@ -39,59 +39,54 @@ RULES = ("gecko", "dots", "digits", "duck")
 """One rule of each task."""
 
 QUICK_RULES = ("gecko", "dots")
-"""Rules of a quick run."""
 
 STEPS, QUICK_STEPS = 512, 32
 """The longest rollouts that are differentiated."""
 
 QUICK_SHARE = 0.25
-"""Particles of a quick run, over what others of it have."""
+"""Particles of a quick run, over those of other quick checks."""
 
 COMPARED_STEPS = 128
-"""The longest ones that are also run in float64."""
+"""The longest rollouts that are also run in float64."""
 
 ONE_STEP_ERROR = 1e-5
 """Relative error of float32 that one step may have, forwards and backwards."""
 
 USABLE_ERROR = 1e-2
-"""Relative error of float32 up to which it is told how many steps a gradient takes."""
+"""Relative error of float32 up to which a gradient counts as usable."""
 
 DIFFERENCE = 1e-6
 """Relative distance between a directional derivative and a finite difference in float64."""
 
 
 class RolloutOutcome(NamedTuple):
-    """A rollout, and gradients of a random linear functional of where it ends."""
+    """Worlds after a rollout, and gradients of a random linear functional of them.
+
+    Gradients are by all weights, [1, W], and by the states at the start.
+    """
 
     x: Tensor
-    """Positions [length units], shape [B, N, D]."""
     s: Tensor
-    """States, shape [B, N, C]."""
     by_weights: Tensor
-    """Gradient by all of the rule's weights, shape [1, W]."""
     by_states: Tensor
-    """Gradient by the states at the start, shape [B, N, C]."""
 
 
 def gradients_checks(*, quick: bool, rules: Mapping[str, str] | None = None) -> list[Check]:
-    """Return the checks of the group `gradients`; when quick only of some rules.
-
-    Of `rules`, name -> source, those alone that are of a rule.
-    """
+    """Return the checks of the group `gradients`; of `rules`, name -> source, those of a rule."""
     checks = []
     for name, source in (rules or _named(QUICK_RULES if quick else RULES)).items():
         checks += [
             Check(
                 f"gradients/norm/{name}",
                 "gradients of a functional by weights and by states at the start are finite "
-                "whatever the number of steps; their norms are told",
+                "whatever the number of steps; their norms are reported",
                 partial(_run_norm, source),
                 source,
             ),
             Check(
                 f"gradients/float32/{name}",
                 "one step in float32 is within 1e-5 of one in float64, also its gradients; after "
-                "how many steps they still agree to 1e-2 is told",
+                "how many steps they still agree to 1e-2 is reported",
                 partial(_run_float32, source),
                 source,
             ),
@@ -180,26 +175,25 @@ def _run_float32(name: str, session: CheckSession) -> CheckResult:
             if error <= USABLE_ERROR and usable[what] in (0, steps // 2):
                 usable[what] = steps
     limits = {f"{what}_1": ONE_STEP_ERROR for what in RolloutOutcome._fields}
-    told = ", ".join(f"{what} {steps}" for what, steps in usable.items())
-    return CheckResult(figures, limits, holds=f"steps within 1e-2, of {counts[-1]}: {told}")
+    words = ", ".join(f"{what} {steps}" for what, steps in usable.items())
+    return CheckResult(figures, limits, holds=f"steps within 1e-2, of {counts[-1]}: {words}")
 
 
 def _run_differences(space_dim: int, periodic: bool, session: CheckSession) -> CheckResult:
     figures = {}
     for scene in scenes(space_dim, periodic=periodic, seed=session.seed):
         for what in ("states", "positions"):
-            # Far away there is no number beside a coordinate that is near enough to it.
+            # Far away neighbouring numbers are too far apart.
             if (scene.name, what) != ("far", "positions"):
                 figures[f"{scene.name}_{what}"] = _difference(scene, session, what)
     return CheckResult(figures, dict.fromkeys(figures, DIFFERENCE))
 
 
 def _difference(scene: Scene, session: CheckSession, what: str) -> float:
-    """Return how far a directional derivative is from a finite difference, relatively.
+    """Return the relative distance of a directional derivative from a finite difference.
 
-    Positions move along a smooth periodic field that is 0 at the origin: particles in one place
-    stay together, and those that nearly touch do so in proportion. The correction by the moment
-    matrix is a stopped gradient and is left out.
+    Positions move along a smooth periodic field that is 0 at the origin, so that particles in one
+    place stay together. The correction by the moment matrix, a stopped gradient, is left out.
     """
     x, s = scene.x.to(session.device), scene.s.to(session.device)
     generator = torch.Generator().manual_seed(6)
@@ -235,13 +229,10 @@ def _difference(scene: Scene, session: CheckSession, what: str) -> float:
 # The group `precision`: what must matter little or not at all.
 
 SHORT = ("tf32", "bf16_storage", "mixed")
-"""Precisions below float32, as `npa-envs bench` has them."""
+"""Precisions below float32."""
 
-SHORT_RULES = ("gecko", "dots", "digits")
+SHORT_RULES, QUICK_SHORT_RULES = ("gecko", "dots", "digits"), ("heart", "dots")
 """Rules that are run in them."""
-
-QUICK_SHORT_RULES = ("heart", "dots")
-"""Those of a quick run."""
 
 TWO_ERRORS = 2.0
 """Two answers that are each as far off as the group `geometry` allows are this far apart."""
@@ -251,10 +242,7 @@ BIT_STEPS = 16
 
 
 def precision_checks(*, quick: bool, rules: Mapping[str, str] | None = None) -> list[Check]:
-    """Return the checks of the group `precision`; when quick only of some rules.
-
-    Of `rules`, name -> source, those alone that are of a rule.
-    """
+    """Return the checks of the group `precision`; of `rules`, name -> source, those of a rule."""
     checks = [
         Check(
             f"precision/{name}/{rule}",
@@ -336,7 +324,7 @@ def _metric(home: EnduranceCase, precision: Precision, session: CheckSession) ->
 
 
 def _error_share(scene: Scene, found: PerceptionOutcome, other: PerceptionOutcome) -> float:
-    """Return how far two perceptions of a scene are apart, over the error that one may have."""
+    """Return the distance of two perceptions of a scene over the error that one may have."""
     exact = perceived(scene.x, scene.s, scene.box, by_reference=True)
     allowed = error_limits(scene.x, scene.s, scene.box, exact)
     shares = [
@@ -401,7 +389,7 @@ def _run_repeated(space_dim: int, session: CheckSession) -> CheckResult:
 
 
 def _run_batch(space_dim: int, session: CheckSession) -> CheckResult:
-    """Worlds of other scenes stand beside each, so that all have the same number of particles."""
+    """Compare worlds in a batch, filled to the same number of particles, with single ones."""
     figures = {"open": 0.0, "periodic": 0.0}
     for periodic in (False, True):
         some = [

@@ -1,4 +1,4 @@
-"""Scenes that are hard to perceive, and the float64 reference that says what is right there."""
+"""Scenes that are hard to perceive, and errors against the float64 reference."""
 
 from __future__ import annotations
 
@@ -26,20 +26,17 @@ Box = tuple[float, ...] | None
 
 @dataclass(frozen=True)
 class Scene:
-    """Worlds that are hard to perceive."""
+    """Worlds that are hard to perceive; float32 holds their float64 positions exactly."""
 
     name: str
-    """What it is called."""
     summary: str
     """Where its particles lie, for a sentence."""
     x: Tensor
-    """Positions [length units], float64 that float32 holds as well, shape [B, N, D]."""
     box: Box
-    """Sides of the periodic box [length units], None in open space."""
 
     @property
     def s(self) -> Tensor:
-        """States, drawn from a normal distribution, float64 likewise, shape [B, N, C]."""
+        """States from a normal distribution, float64 that float32 holds exactly."""
         shape = (*self.x.shape[:2], STATE_DIM)
         return torch.randn(shape, generator=torch.Generator().manual_seed(5)).double()
 
@@ -161,9 +158,8 @@ ONLY_3D = ("coplanar",)
 def threshold_scenes(space_dim: int, threshold: float) -> tuple[Tensor, Tensor]:
     """Return worlds whose first particle's moment matrix has a determinant around a threshold.
 
-    The particles are a corner, one on each other axis, and one whose height over those says how
-    flat the corner is. Positions [B, 1 + D, D] come with how far each determinant was to lie from
-    the threshold, relatively, [B].
+    The particles are a corner, one on each other axis, and one whose height sets the determinant.
+    Positions [B, 1 + D, D] come with the determinants' relative distances from the threshold, [B].
     """
     offsets = torch.tensor([1e-1, 1e-3, 1e-5, 1e-7, 0.0, -1e-7, -1e-5, -1e-3, -1e-1]).double()
     worlds = torch.zeros(len(offsets), 1 + space_dim, space_dim, dtype=torch.float64)
@@ -171,7 +167,7 @@ def threshold_scenes(space_dim: int, threshold: float) -> tuple[Tensor, Tensor]:
     worlds[:, -1, 0] = 0.5 * EPS
     s = torch.zeros(*worlds.shape[:2], 1, dtype=torch.float64)
     wanted = threshold * (1.0 + offsets)
-    # The determinant grows with the height, which is halved in on.
+    # The determinant grows with the height: bisection.
     low, high = torch.zeros_like(offsets), torch.full_like(offsets, 0.4 * EPS)
     for _ in range(50):
         worlds[:, -1, -1] = 0.5 * (low + high)
@@ -182,8 +178,7 @@ def threshold_scenes(space_dim: int, threshold: float) -> tuple[Tensor, Tensor]:
     return worlds.float().double(), offsets
 
 
-# How far perception and its adjoints may be from the reference, and how far they are.
-
+# Errors against the reference, and their limits
 
 LIMITS = {
     "z_float32": 2e-6,
@@ -195,32 +190,26 @@ LIMITS = {
 }
 """Relative errors allowed: of z, and of a random functional's gradients by states and positions.
 
-Where a scene's own condition is worse than that, so is what may be asked of it: see `error_limits`.
+`error_limits` raises them by a scene's condition.
 """
 
 ROUNDINGS = 4.0
-"""Roundings of each number given that an answer may be off by, where that is more than `LIMITS`."""
+"""Roundings of each input that an answer may be off by, where that is more than `LIMITS`."""
 
 PRECISIONS = {"float32": torch.float32, "float64": torch.float64}
 """Dtypes by their names."""
 
 
 class PerceptionOutcome(NamedTuple):
-    """A perception and its adjoint."""
+    """A perception, [B, N, P], and gradients of a random functional by states and positions."""
 
     z: Tensor
-    """Perception vectors, shape [B, N, P]."""
     states: Tensor
-    """Gradient of a random functional of z by the states, shape [B, N, C]."""
     positions: Tensor
-    """And by the positions [1 / length unit], shape [B, N, D]."""
 
 
 def relative_error(value: Tensor, expected: Tensor) -> float:
-    """Return the largest relative error of a world [B, ...] in the Euclidean norm, in float64.
-
-    Where a world's expected norm is 0 its error is taken as it is.
-    """
+    """Return the largest error of a world [B, ...] relative to its norm, if not 0, in float64."""
     exact = expected.detach().cpu().double().flatten(1)
     away = (value.detach().cpu().double().flatten(1) - exact).norm(dim=1)
     size = exact.norm(dim=1)
@@ -245,10 +234,9 @@ def perceived(
     weights: Tensor | None = None,
     given: Callable[[Tensor], Tensor] = torch.clone,
 ) -> PerceptionOutcome:
-    """Return z and the gradients of a random functional of it, by the library or the reference.
+    """Return z and its gradients, by the library or the reference.
 
-    `weights` [B, N, P] are by default `functional_weights`; `given` is what to make of positions,
-    states and weights first.
+    `weights` are by default `functional_weights`; `given` changes all inputs first.
     """
     x, s = given(x.detach()).requires_grad_(), given(s.detach()).requires_grad_()
     if by_reference:
@@ -265,10 +253,9 @@ def error_limits(
 ) -> dict[str, float]:
     """Return the relative errors that float64 worlds allow, by the names of `LIMITS`.
 
-    Where sums cancel, or answers grow with 1 / distance, the last bit of what is given shows in
-    many digits of the answer. So an error may be what some roundings of every number given change.
-    Particles in one place stay together, and far away in open space the differences of coordinates
-    are rounded, not they themselves.
+    Where sums cancel, or answers grow with 1 / distance, the last bit of an input shows in many
+    digits of the answer: an error may be as large as the change by some roundings of every input.
+    Particles in one place stay together; far away in open space differences are rounded.
     """
     generator = torch.Generator().manual_seed(4)
     change = 1e-11

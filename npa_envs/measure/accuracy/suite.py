@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -25,8 +25,8 @@ from npa_envs.measure.accuracy.endurance import endurance_checks
 from npa_envs.measure.accuracy.hard_cases import geometry_checks, values_checks
 from npa_envs.measure.accuracy.numerics import gradients_checks, precision_checks
 from npa_envs.measure.plots import draw_matrix, new_figure, png
-from npa_envs.measure.record import read_record, time_limit, write_record
-from npa_envs.measure.tables import table_text
+from npa_envs.measure.record import Record, time_limit
+from npa_envs.measure.tables import as_objects, table_text
 from npa_envs.rule.files import load_rule, rule_digest
 
 MEASURED = ("pass", "range")
@@ -39,10 +39,9 @@ FAR = 1e3
 def all_checks(
     *, quick: bool = False, seed: int = 0, rules: Mapping[str, str] | None = None
 ) -> list[Check]:
-    """Return every check in the order that they are run in; when quick, only of some of the rules.
+    """Return every check in its order; of `rules`, name -> source, the checks of a rule alone.
 
-    Random places are drawn from the seed. Of `rules`, name -> what `load_rule` takes, it is every
-    check of a rule, and nothing else.
+    When quick only some shipped rules are checked. Random places are drawn from the seed.
     """
     return [
         *(() if rules else (*geometry_checks(seed), *values_checks())),
@@ -53,11 +52,7 @@ def all_checks(
 
 
 def chosen_checks(checks: Sequence[Check], names: Sequence[str]) -> list[Check]:
-    """Return the checks that names stand for: groups, checks, beginnings of names up to a slash.
-
-    Raises:
-        NPAError: A name stands for none.
-    """
+    """Return the checks that names stand for: groups, checks, beginnings of names up to a slash."""
 
     def stands_for(name: str, check: Check) -> bool:
         return f"{check.name}/".startswith(f"{name.rstrip('/')}/")
@@ -66,22 +61,18 @@ def chosen_checks(checks: Sequence[Check], names: Sequence[str]) -> list[Check]:
         if not any(stands_for(name, check) for check in checks):
             known = [*GROUPS, *(check.name for check in checks)]
             raise NPAError(f"unknown check {name!r}: {suggest(name, known)}")
-    return [
-        check for check in checks if not names or any(stands_for(name, check) for name in names)
-    ]
+    return [c for c in checks if not names or any(stands_for(name, c) for name in names)]
 
 
 @dataclass(frozen=True)
 class CheckEntry:
-    """A check and what came of it."""
+    """A check, its figures and limits by name, and what came of it."""
 
     name: str
     expected: str
     verdict: Verdict
     figures: Mapping[str, float] = field(default_factory=dict)
-    """What was measured, by name."""
     limits: Mapping[str, float] = field(default_factory=dict)
-    """Largest values allowed, by the figure's name."""
     holds: str = ""
     """For a range: where it holds."""
     note: str = ""
@@ -89,26 +80,17 @@ class CheckEntry:
     seconds: float = 0.0
     """How long it took [s]."""
     weights: str = ""
-    """Of a check of a rule: what `rule_digest` says of it; older records do not tell."""
+    """The `rule_digest` of a check's rule."""
 
     @classmethod
-    def of(cls, check: Check, finding: CheckResult, seconds: float) -> CheckEntry:
+    def of(cls, check: Check, found: CheckResult, seconds: float) -> CheckEntry:
         """Return the entry of a check that ran to its end."""
-        return cls(
-            check.name,
-            check.expected,
-            finding.verdict,
-            dict(finding.figures),
-            dict(finding.limits),
-            finding.holds,
-            finding.note,
-            seconds,
-        )
+        return cls(check.name, check.expected, found.verdict, **vars(found), seconds=seconds)
 
     @property
-    def group(self) -> str:
-        """The group that the check belongs to."""
-        return group_of(self.name)
+    def done(self) -> bool:
+        """Whether a resumed run does not repeat it."""
+        return self.verdict in MEASURED
 
     def share(self, name: str) -> float:
         """Return a figure over its limit: above 1, or not a number, it is exceeded.
@@ -140,84 +122,70 @@ class CheckRow:
     found: str
 
 
-@dataclass
-class Record:
-    """All that a run found."""
+class StressRecord(Record[CheckEntry]):
+    """All that a run found, in the order of names."""
 
-    facts: dict[str, Any]
-    """What its figures follow from: device, machine, size, seed, commit, versions."""
-    entries: dict[str, CheckEntry] = field(default_factory=dict)
-    """What came of each check, by its name."""
+    def __init__(
+        self, facts: Mapping[str, Any], path: Path | None = None, names: Iterable[str] = ()
+    ) -> None:
+        super().__init__(facts, path=path, content=self._content)
+        self._order = {name: place for place, name in enumerate(names)}
 
-    @classmethod
-    def read(cls, path: Path, facts: Mapping[str, Any]) -> Record:
-        """Return the record that a run left, an empty one where there is none.
+    def _content(self, rows: list[CheckEntry]) -> dict[str, Any]:
+        # JSON has no numbers that are not finite: they become words.
+        return {"counts": self.counts(), "checks": _with_words(as_objects(rows))}
 
-        Raises:
-            NPAError: As for `read_record`.
-        """
+    def read(self) -> StressRecord:
+        """Take over the entries of a run that was stopped, and return this record."""
 
-        def made(held: dict[str, Any]) -> dict[str, CheckEntry]:
-            return {fields["name"]: _entry(fields) for fields in held["checks"]}
+        def entry(fields: dict[str, Any]) -> CheckEntry:
+            for name in ("figures", "limits"):
+                fields[name] = {key: float(value) for key, value in fields[name].items()}
+            return CheckEntry(**fields)
 
-        return cls(dict(facts), read_record(path, facts, made, command="stress") or {})
+        self.resume(lambda held: [entry(fields) for fields in held["checks"]], command="stress")
+        return self
 
-    def write(self, path: Path) -> None:
-        """Write everything as JSON; numbers that are not finite become "nan", "inf" and "-inf".
+    def entry(self, name: str) -> CheckEntry | None:
+        """Return the entry of a check, None where it has not been run."""
+        return next((entry for entry in self.rows if entry.name == name), None)
 
-        Raises:
-            NPAError: It cannot be written.
-        """
-        entries = [asdict(entry) for entry in self.entries.values()]
-        content = {"facts": self.facts, "counts": self.counts(), "checks": entries}
-        write_record(path, _with_words(content))
-
-    def done(self, name: str) -> bool:
-        """Return whether a check need not be run again."""
-        return name in self.entries and self.entries[name].verdict in MEASURED
+    def put(self, entry: CheckEntry) -> None:
+        """Add an entry, in the place of one of the same name, and write the file."""
+        self.rows = [row for row in self.rows if row.name != entry.name] + [entry]
+        self.rows.sort(key=lambda row: self._order.get(row.name, len(self._order)))
+        self.write()
 
     def drop_other_rules(self, weights: Mapping[str, str]) -> None:
-        """Drop what was found of rules that have been trained anew.
-
-        Args:
-            weights: What `rule_digest` says now of the rules of checks, by the checks' names.
-        """
-        for name, digest in weights.items():
-            if name in self.entries and self.entries[name].weights != digest:
-                del self.entries[name]
+        """Drop checks whose rule has other weights now: `rule_digest` by the checks' names."""
+        self.rows = [row for row in self.rows if weights.get(row.name, row.weights) == row.weights]
 
     def counts(self) -> dict[str, int]:
         """Return how many checks came to each verdict."""
-        found = [entry.verdict for entry in self.entries.values()]
+        found = [entry.verdict for entry in self.rows]
         return {verdict: found.count(verdict) for verdict in ("pass", "range", "fail", "skipped")}
 
     def failed(self) -> list[CheckEntry]:
         """Return the entries of the checks that failed."""
-        return [entry for entry in self.entries.values() if entry.verdict == "fail"]
+        return [entry for entry in self.rows if entry.verdict == "fail"]
 
     def by_group(self) -> dict[str, list[CheckEntry]]:
         """Return the entries of each group."""
         groups: dict[str, list[CheckEntry]] = {}
-        for entry in self.entries.values():
-            groups.setdefault(entry.group, []).append(entry)
+        for entry in self.rows:
+            groups.setdefault(group_of(entry.name), []).append(entry)
         return groups
 
-    def in_order(self, names: Iterable[str]) -> Record:
-        """Return the same with entries in the order of these names, others last."""
-        order = {name: place for place, name in enumerate(names)}
-        entries = sorted(self.entries.items(), key=lambda item: order.get(item[0], len(order)))
-        return Record(self.facts, dict(entries))
-
     def text(self) -> str:
-        """Return a table of each group, and what is to be known of those that failed."""
+        """Return a table of each group, and the expectations of the checks that failed."""
         parts = [_group_text(entries) for entries in self.by_group().values()]
         parts += [
             f"{entry.name} failed: {entry.worst() or entry.note}\n  expected: {entry.expected}"
             + (f"\n  {entry.note}" if entry.note and entry.worst() else "")
             for entry in self.failed()
         ]
-        told = ", ".join(f"{count} {verdict}" for verdict, count in self.counts().items())
-        return "\n\n".join([*parts, told])
+        counts = ", ".join(f"{count} {verdict}" for verdict, count in self.counts().items())
+        return "\n\n".join([*parts, counts])
 
 
 def _group_text(entries: Sequence[CheckEntry]) -> str:
@@ -239,50 +207,36 @@ def _with_words(value: Any) -> Any:
     return str(value) if isinstance(value, float) and not math.isfinite(value) else value
 
 
-def _entry(fields: dict[str, Any]) -> CheckEntry:
-    for name in ("figures", "limits"):
-        fields[name] = {key: float(value) for key, value in fields[name].items()}
-    return CheckEntry(**fields)
-
-
 def run_checks(
     checks: Sequence[Check],
     session: CheckSession,
-    record: Record,
+    record: StressRecord,
     *,
     max_seconds: float | None = None,
     weights: Mapping[str, str] | None = None,
-    written: Callable[[Record], None] = lambda record: None,
     progress: Callable[[int], None] = lambda done: None,
 ) -> None:
-    """Run checks that the record does not have yet, and put what came of them there.
+    """Run checks that are not done, and put what came of them into the record.
 
-    No check begins after `max_seconds`; those that are left out are skipped, but for what an
-    earlier run found of them. `weights` are those of checks of rules, as `rule_weights` returns
-    them. After each check `written` is called with the record, `progress` with 1.
+    No check begins after `max_seconds`; those that are left are skipped, unless an earlier run has
+    an entry. `weights` are those of `rule_weights`. After each check `progress` is called with 1.
     """
     time_is_up = time_limit(max_seconds)
     for check in checks:
-        if not record.done(check.name):
-            if time_is_up():
-                left = CheckEntry(
-                    check.name, check.expected, "skipped", note="no time was left for it"
-                )
-                record.entries.setdefault(check.name, left)
-            else:
-                found = run_check(check, session)
-                told = (weights or {}).get(check.name, "")
-                record.entries[check.name] = replace(found, weights=told)
-            written(record)
+        entry = record.entry(check.name)
+        if entry is None or not entry.done:
+            if not time_is_up():
+                entry = run_check(check, session)
+                entry = replace(entry, weights=(weights or {}).get(check.name, ""))
+            elif entry is None:
+                note = "no time was left for it"
+                entry = CheckEntry(check.name, check.expected, "skipped", note=note)
+            record.put(entry)
         progress(1)
 
 
 def rule_weights(checks: Iterable[Check]) -> dict[str, str]:
-    """Return what `rule_digest` says of the rules of checks of one, by the checks' names.
-
-    Raises:
-        NPAError: A rule cannot be loaded.
-    """
+    """Return the `rule_digest` of the rules of checks of one, by the checks' names."""
     some = [check for check in checks if check.rule]
     known = {rule: rule_digest(load_rule(rule)) for rule in {check.rule for check in some}}
     return {check.name: known[check.rule] for check in some}
@@ -293,24 +247,20 @@ def run_check(check: Check, session: CheckSession) -> CheckEntry:
     begin = time.perf_counter()
     verdict: Verdict
     try:
-        finding = check.run(session)
-        return CheckEntry.of(check, finding, time.perf_counter() - begin)
+        return CheckEntry.of(check, check.run(session), time.perf_counter() - begin)
     except Skipped as reason:
         verdict, note = "skipped", str(reason)
     except torch.OutOfMemoryError:
         verdict, note = "skipped", "not enough memory"
     except Exception as error:
-        # Whatever breaks here is what the command is looking for.
+        # Whatever breaks is what the command looks for.
         verdict, note = "fail", f"{type(error).__name__}: {' '.join(str(error).split())}"
     seconds = time.perf_counter() - begin
     return CheckEntry(check.name, check.expected, verdict, note=note, seconds=seconds)
 
 
-def heat_maps(record: Record) -> dict[str, bytes]:
-    """Return PNG files by their groups: every figure over its limit; below 1 it is kept.
-
-    Groups without figures that have limits get none.
-    """
+def heat_maps(record: StressRecord) -> dict[str, bytes]:
+    """Return PNG files by group: every figure over its limit, where there are such."""
     drawn = {}
     for group, entries in record.by_group().items():
         limited = [entry for entry in entries if entry.figures and entry.limits]

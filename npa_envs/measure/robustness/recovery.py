@@ -1,4 +1,4 @@
-"""Damage and recovery: the loss after damage beside that of twins that nothing was done to.
+"""Damage and recovery: losses of damaged worlds and of undamaged twins with the same masks.
 
 Damage is batched, around a random place of each world, across the seam of a box.
 """
@@ -20,27 +20,26 @@ from npa_envs.world.brushes import nearest_image, offsets_from
 from npa_envs.world.randomness import StreamId, WorldRandom
 
 STATE_NOISE = 0.3
-"""Standard deviation of what is added to every state (dimensionless)."""
+"""Standard deviation of the noise of states (dimensionless)."""
 
 Box = tuple[float, ...] | None
 Change = Callable[[Tensor, Tensor, WorldRandom, Box], tuple[Tensor, Tensor]]
-"""Makes other worlds of positions [B, N, D], states [B, N, C], randomness and sides of the box."""
+"""Makes damaged worlds of positions, states, randomness and sides of the box."""
 
 
 @dataclass(frozen=True)
 class Damage:
-    """Something done to worlds."""
+    """Damage of worlds.
+
+    `static` worlds can have it, whose particles do not move; it `halves` the number of particles;
+    it is `beyond` what rules are asked to heal.
+    """
 
     name: str
-    """What it is called."""
     apply: Change
-    """Does it, to copies."""
     static: bool
-    """Whether it can be done to worlds whose particles do not move by themselves."""
     halves: bool = False
-    """Whether half of the particles are left; else all are."""
     beyond: bool = False
-    """Whether it is beyond what rules are asked to heal."""
 
 
 def wipe(x: Tensor, s: Tensor, random: WorldRandom, box: Box) -> tuple[Tensor, Tensor]:
@@ -115,7 +114,7 @@ RECOVERED = 1.1
 """A world has recovered once its loss is at most this many times its twin's at the same step."""
 
 CONTROL = "nothing"
-"""Name of what is done to worlds that only draw other masks than their twins."""
+"""Name of worlds that only draw other masks than their twins."""
 
 AFTERWARDS, OTHERWISE = 1001, 1002
 """Streams of the masks after the damage, and of those of the control."""
@@ -123,21 +122,20 @@ AFTERWARDS, OTHERWISE = 1001, 1002
 
 @dataclass(frozen=True)
 class LossCurve:
-    """The losses of all seeds at some numbers of steps after one damage."""
+    """Losses of all seeds, and of their twins without the damage, at steps after one damage.
+
+    A loss is NaN where a world is not finite.
+    """
 
     damage: str
     steps: tuple[int, ...]
     losses: tuple[tuple[float, ...], ...]
-    """Loss of each seed at each of `steps`; NaN where a world is not finite."""
     twins: tuple[tuple[float, ...], ...]
-    """Those of the same worlds without the damage, with the same masks."""
 
     def recovery_steps(self) -> list[int | None]:
         """Return for each seed the first of `steps` at which it has recovered; None: at none."""
-        return [
-            recovery_step(self.steps, loss, twin)
-            for loss, twin in zip(self.losses, self.twins, strict=True)
-        ]
+        pairs = zip(self.losses, self.twins, strict=True)
+        return [recovery_step(self.steps, loss, twin) for loss, twin in pairs]
 
     def recovered(self) -> int:
         """Return how many seeds have recovered."""
@@ -176,24 +174,20 @@ def recovery_step(
 
 @torch.no_grad()
 def healing(ground: RuleTrial, home: TaskTrial) -> list[LossCurve]:
-    """Damage grown worlds in every way, and watch them beside their twins.
+    """Damage grown worlds in every way: a curve for the control and for each damage.
 
-    Returns:
-        A course for the control and for each damage that can be done. Where half of the particles
-        are removed, twins are worlds that were grown from as many.
+    Where half of the particles are removed, twins are worlds that were grown from as many.
     """
     chosen = [d for d in DAMAGES.values() if d.static or not ground.rule.static]
-    found = _beside_twins(ground, home, home, [d for d in chosen if not d.halves], control=True)
+    found = _with_twins(ground, home, home, [d for d in chosen if not d.halves], control=True)
     smaller = ground.home(share=0.5)
     grown = ground.run(smaller, ground.random(StreamId.GROWTH))
     grown.advance(ground.plan.grow_steps)
     twins = smaller.with_worlds(grown.x, grown.s)
-    return found + _beside_twins(
-        ground, home, twins, [d for d in chosen if d.halves], control=False
-    )
+    return found + _with_twins(ground, home, twins, [d for d in chosen if d.halves], control=False)
 
 
-def _beside_twins(
+def _with_twins(
     ground: RuleTrial,
     home: TaskTrial,
     twins: TaskTrial,
@@ -201,7 +195,7 @@ def _beside_twins(
     *,
     control: bool,
 ) -> list[LossCurve]:
-    """Watch twins and damaged worlds as one batch."""
+    """Run twins and damaged worlds as one batch."""
     steps = ground.plan.heal_steps
     copies = [(twins.x, twins.s)]
     keys = [ground.random(AFTERWARDS).keys]

@@ -1,11 +1,11 @@
-"""The study of rules: what each bears and heals, as a record; tables and curves of many."""
+"""Losses of rules under other conditions and after damage: a record of each, tables of many."""
 
 from __future__ import annotations
 
 import math
 import time
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from datetime import date
 from pathlib import Path
 from typing import Any
@@ -14,8 +14,7 @@ import torch
 
 from npa_envs.measure.accuracy.endurance import WORKS
 from npa_envs.measure.plots import draw_band, legend_of, mark_decades, new_figure, png
-from npa_envs.measure.record import number, read_record, write_record
-from npa_envs.measure.robustness.plans import CONDITIONS, trained_value
+from npa_envs.measure.record import Record, number
 from npa_envs.measure.robustness.recovery import (
     CONTROL,
     DAMAGES,
@@ -24,8 +23,14 @@ from npa_envs.measure.robustness.recovery import (
     healing,
     ratio,
 )
-from npa_envs.measure.robustness.trials import RuleTrial, TaskTrial, loss_curves
-from npa_envs.measure.tables import NONE, markdown_table, short
+from npa_envs.measure.robustness.trials import (
+    CONDITIONS,
+    RuleTrial,
+    TaskTrial,
+    loss_curves,
+    trained_value,
+)
+from npa_envs.measure.tables import NONE, as_objects, markdown_table, short
 from npa_envs.world.randomness import StreamId
 
 MOST_PARTICLES = {"cpu": 1 << 17, "cuda": 1 << 21}
@@ -50,128 +55,107 @@ class Response:
         return math.fsum(self.losses) / len(self.losses) if self.losses else math.nan
 
 
-@dataclass(frozen=True)
-class RuleRecord:
-    """What was measured of one rule."""
+class RuleRecord(Record[Response]):
+    """What was measured of one rule: loss curves after damage, and responses to conditions."""
 
-    rule: str
-    task: str
-    metric: str
-    """What losses are."""
-    update_prob: float
-    """Probability of an update as trained."""
-    facts: Mapping[str, Any]
-    """What the figures follow from: the rule's weights, device, machine, size, seeds, commit,
-    versions."""
-    loss_curves: tuple[LossCurve, ...]
-    """After each damage, the control first."""
-    responses: tuple[Response, ...]
-    """Under each condition."""
-    done: bool = True
-    """Whether that is all; else a run goes on with the next value."""
-    seconds: float = 0.0
-    """How long it took [s]."""
-    command: str = ""
-    date: str = ""
+    def __init__(
+        self,
+        facts: Mapping[str, Any],
+        path: Path | None = None,
+        *,
+        curves: Sequence[LossCurve] = (),
+        responses: Sequence[Response] = (),
+        **about: Any,
+    ) -> None:
+        super().__init__(facts, list(responses), path, self._content)
+        self.curves = list(curves)
+        """After each damage, the control first."""
+        self.about: dict[str, Any] = {"done": True, "seconds": 0.0, "command": "", "date": ""}
+        """`rule`, `task`, `metric`, `update_prob` as trained; whether all is `done`, `seconds`."""
+        self.about |= about
 
-    @classmethod
-    def read(cls, path: Path, facts: Mapping[str, Any]) -> RuleRecord | None:
-        """Return the record that a run left, None where there is none.
+    @property
+    def rule(self) -> str:
+        """The rule's name."""
+        return str(self.about["rule"])
 
-        Raises:
-            NPAError: As for `read_record`.
-        """
+    @property
+    def done(self) -> bool:
+        """Whether nothing is left to measure."""
+        return bool(self.about["done"])
+
+    def _content(self, rows: list[Response]) -> dict[str, Any]:
+        courses = [asdict(c) | {"recovery_steps": c.recovery_steps()} for c in self.curves]
+        return {**self.about, "courses": courses, "responses": as_objects(rows)}
+
+    def read(self) -> RuleRecord:
+        """Take over the measurements of the record's file, and return this record."""
 
         def numbers(values: list[float | None]) -> tuple[float, ...]:
             return tuple(map(number, values))
 
-        def course(row: dict[str, Any]) -> LossCurve:
+        def curve(row: dict[str, Any]) -> LossCurve:
             losses, twins = (tuple(map(numbers, row[name])) for name in ("losses", "twins"))
             return LossCurve(row["damage"], tuple(row["steps"]), losses, twins)
 
-        def made(held: dict[str, Any]) -> RuleRecord:
-            held["courses"] = tuple(map(course, held["courses"]))
-            held["responses"] = tuple(
-                Response(**row | {"losses": numbers(row["losses"])}) for row in held["responses"]
-            )
-            return cls(**held)
+        def read(held: dict[str, Any]) -> list[Response]:
+            self.curves = list(map(curve, held.pop("courses")))
+            rows = held.pop("responses")
+            del held["facts"]
+            self.about = held
+            return [Response(**row | {"losses": numbers(row["losses"])}) for row in rows]
 
-        return read_record(path, facts, made, command="robustness")
+        self.resume(read, command="robustness")
+        return self
 
-    def write(self, path: Path) -> None:
-        """Write everything as JSON; what is not finite becomes null.
-
-        Raises:
-            NPAError: It cannot be written.
-        """
-        content = asdict(self)
-        for course, row in zip(self.loss_curves, content["courses"], strict=True):
-            row["recovery_steps"] = course.recovery_steps()
-        write_record(path, content)
+    def of(self, condition: str) -> list[Response]:
+        """Return the responses to a condition."""
+        return [response for response in self.rows if response.condition == condition]
 
     def trained(self) -> Response:
-        """Return what comes of worlds as trained."""
-        return next(r for r in self.responses if (r.condition, r.value) == ("eps", 1.0))
+        """Return the response of worlds as trained."""
+        return next(response for response in self.of("eps") if response.value == 1.0)
 
 
 def measure_rule(
-    name: str,
+    record: RuleRecord,
     ground: RuleTrial,
     most_particles: int,
     *,
-    facts: Mapping[str, Any],
-    command: str = "",
-    before: RuleRecord | None = None,
-    path: Path | None = None,
     enough: Callable[[], bool] = lambda: False,
-) -> RuleRecord:
-    """Return what a rule bears and heals; conditions of more than `most_particles` are left out.
+) -> None:
+    """Measure what a rule's record lacks; it is written after the damages and after each value.
 
-    What an earlier run has measured `before` is not measured again. The file is written after the
-    damages and after each value. Before each value it is asked whether that is `enough`: then the
-    record is not done.
+    Conditions of more than `most_particles` are left out. Before each value `enough` says whether
+    to stop: then the record is not done.
     """
-    begin = time.perf_counter() - (0.0 if before is None else before.seconds)
+    begin = time.perf_counter() - record.about["seconds"]
     home, trained = grow(ground)
-    record = before or RuleRecord(
-        rule=name,
-        task=ground.task_name,
-        metric=ground.metric_name,
-        update_prob=float(ground.task.update_prob),
-        facts=facts,
-        loss_curves=tuple(healing(ground, home)),
-        responses=(),
-        done=False,
-        command=command,
-        date=date.today().isoformat(),
-    )
-
-    def keep() -> None:
-        if path is not None:
-            record.write(path)
-
-    keep()
-    rest = responses(ground, trained, most_particles, done=len(record.responses))
+    if not record.curves:
+        record.curves = healing(ground, home)
+        record.about |= {
+            "task": ground.task_name,
+            "metric": ground.metric_name,
+            "update_prob": float(ground.task.update_prob),
+            "date": date.today().isoformat(),
+            "done": False,
+        }
+    record.write()
+    rest = responses(ground, trained, most_particles, done=len(record.rows))
     while not enough():
         response = next(rest, None)
-        record = replace(record, seconds=round(time.perf_counter() - begin, 2))
+        record.about["seconds"] = round(time.perf_counter() - begin, 2)
         if response is None:
-            record = replace(record, done=True)
-            keep()
+            record.about["done"] = True
+            record.write()
             break
-        record = replace(record, responses=(*record.responses, response))
-        keep()
-    return record
+        record.add(response)
 
 
 def grow(
     ground: RuleTrial, condition: str = "", value: float | str = 1.0
 ) -> tuple[TaskTrial, Response]:
-    """Grow worlds from their seeds under a condition, none by default, and take their losses.
-
-    Returns:
-        The worlds as they are then, and what came of them.
-    """
+    """Return worlds grown from their seeds under a condition, none by default, and their losses."""
     home = ground.home(
         share=float(value) if condition == "particles" else 1.0,
         shape=str(value) if condition == "shape" else "trained",
@@ -180,7 +164,7 @@ def grow(
     pace = 1.0
     if condition in ("update_prob", "dt"):
         changed[condition] = value
-        # As many updates, or as much time, as trained.
+        # As many updates, or as much time, as in training.
         pace = float(value) / (ground.task.update_prob if condition == "update_prob" else 1.0)
     elif condition in ("eps", "noise"):
         name = "eps" if condition == "eps" else "position_noise"
@@ -197,10 +181,7 @@ def grow(
 def responses(
     ground: RuleTrial, trained: Response, most_particles: int, *, done: int = 0
 ) -> Iterator[Response]:
-    """Yield what comes of each value of each condition but for the first `done`.
-
-    Worlds as trained are not measured again; a value of more than `most_particles` is left out.
-    """
+    """Yield the response to each value of each condition but for the first `done`."""
     every = [(name, value) for name, values in ground.plan.values.items() for value in values]
     for condition, value in every[done:]:
         if value == trained_value(condition, ground.task.update_prob):
@@ -225,17 +206,20 @@ def where_it_works(record: RuleRecord, condition: str) -> str:
 
     It works where all seeds are finite and the mean loss is at most `WORKS` times that as trained.
     """
-    found = [response for response in record.responses if response.condition == condition]
+    found = record.of(condition)
     if not found:
         return ""
-    # What was left out has no mean, so a range ends before it.
+    # A value that was left out has no mean, so a range ends before it.
     ratios = [ratio(response.mean(), record.trained().mean()) for response in found]
-    trained = trained_value(condition, record.update_prob)
+    trained = trained_value(condition, record.about["update_prob"])
     if isinstance(trained, str):
-        text = _working_shapes([str(r.value) for r in found], ratios, trained)
+        pairs = zip(found, ratios, strict=True)
+        works = [str(response.value) for response, value in pairs if value <= WORKS]
+        text = ", ".join(works) or f"not from {trained}"
     else:
         text = working_range([float(r.value) for r in found], ratios, trained)
-    return text + _left_out(found)
+    left_out = [short(response.value) for response in found if not response.losses]
+    return text + (f" (not measured: {', '.join(left_out)})" if left_out else "")
 
 
 def working_range(values: Sequence[float], ratios: Sequence[float], trained: float) -> str:
@@ -257,18 +241,6 @@ def working_range(values: Sequence[float], ratios: Sequence[float], trained: flo
     return f"{text}, and {', '.join(apart)}" if apart else text
 
 
-def _working_shapes(shapes: Sequence[str], ratios: Sequence[float], trained: str) -> str:
-    """Return the shapes of seeds from which a rule works, as they come; they have no order."""
-    pairs = zip(shapes, ratios, strict=True)
-    return ", ".join(shape for shape, value in pairs if value <= WORKS) or f"not from {trained}"
-
-
-def _left_out(found: Sequence[Response]) -> str:
-    """Return which values were not measured; nobody knows whether a rule works there."""
-    values = [short(response.value) for response in found if not response.losses]
-    return f" (not measured: {', '.join(values)})" if values else ""
-
-
 # Tables in Markdown
 
 
@@ -276,25 +248,27 @@ SHARES = {
     "what rules are asked to heal": [d.name for d in DAMAGES.values() if not d.beyond],
     "what is beyond that": [d.name for d in DAMAGES.values() if d.beyond],
 }
-"""Damages whose share that recovered is told together; the control does not count."""
+"""Damages whose recovered share is counted together, without the control."""
 
 
 def recovered_share(
     records: Iterable[RuleRecord], damages: Collection[str]
 ) -> tuple[int, int, int]:
     """Return how many seeds of all rules recovered of damages, are so at the end, and there are."""
-    loss_curves = [c for record in records for c in record.loss_curves if c.damage in damages]
-    recovered = sum(course.recovered() for course in loss_curves)
-    at_end = sum(course.within_at_end() for course in loss_curves)
-    return recovered, at_end, sum(len(course.losses) for course in loss_curves)
+    curves = [c for record in records for c in record.curves if c.damage in damages]
+    recovered = sum(curve.recovered() for curve in curves)
+    at_end = sum(curve.within_at_end() for curve in curves)
+    return recovered, at_end, sum(len(curve.losses) for curve in curves)
 
 
 def tables(records: Sequence[RuleRecord]) -> str:
     """Return all tables in Markdown and, last, the shares that recovered."""
+    ranges = [[r.rule, *(where_it_works(r, name) or NONE for name in CONDITIONS)] for r in records]
+    works = markdown_table(["rule", *CONDITIONS], ranges)
     parts = [
         "Where rules work: values around the trained one, without a gap, at which the mean loss is "
         f"at most {WORKS:g} times that as trained and all seeds are finite; others that work stand "
-        f"behind them:\n\n{_by_condition(records)}",
+        f"behind them:\n\n{works}",
         f"Recovered seeds, and their median recovery time [steps]:\n\n{_by_damage(records, _time)}",
         "Loss over the twin's right after the damage → at the end (medians of the seeds; seeds "
         f"within {RECOVERED:g} at the end):\n\n{_by_damage(records, _size)}",
@@ -314,58 +288,43 @@ def tables(records: Sequence[RuleRecord]) -> str:
     return "\n\n".join(parts) + "\n"
 
 
-def _time(course: LossCurve) -> str:
-    step = course.median_step()
-    told = f"{course.recovered()}/{len(course.losses)}"
-    return told if step is None else f"{told}, {step:g}"
+def _time(curve: LossCurve) -> str:
+    step = curve.median_step()
+    share = f"{curve.recovered()}/{len(curve.losses)}"
+    return share if step is None else f"{share}, {step:g}"
 
 
-def _size(course: LossCurve) -> str:
-    first, last = _median(course.ratios(0)), _median(course.ratios(-1))
-    return f"{short(first)} → {short(last)} ({course.within_at_end()}/{len(course.losses)})"
+def _size(curve: LossCurve) -> str:
+    first, last = _median(curve.ratios(0)), _median(curve.ratios(-1))
+    return f"{short(first)} → {short(last)} ({curve.within_at_end()}/{len(curve.losses)})"
 
 
 def _median(values: Sequence[float]) -> float:
-    """Return the median; what is not a number counts as worst."""
+    """Return the median; NaN counts as infinite."""
     ordered = sorted(math.inf if math.isnan(value) else value for value in values)
     low, high = ordered[(len(ordered) - 1) // 2], ordered[len(ordered) // 2]
     return low if low == high else 0.5 * (low + high)
 
 
-def _by_condition(records: Sequence[RuleRecord]) -> str:
-    """Return a table of where each rule works."""
-    rows = [[r.rule, *(where_it_works(r, name) or NONE for name in CONDITIONS)] for r in records]
-    return markdown_table(["rule", *CONDITIONS], rows)
-
-
 def _by_damage(records: Sequence[RuleRecord], cell: Callable[[LossCurve], str]) -> str:
-    done = {course.damage for record in records for course in record.loss_curves}
+    done = {curve.damage for record in records for curve in record.curves}
     names = [name for name in (CONTROL, *DAMAGES) if name in done]
     rows = []
     for record in records:
-        found = {course.damage: course for course in record.loss_curves}
+        found = {curve.damage: curve for curve in record.curves}
         rows.append([record.rule, *(cell(found[n]) if n in found else NONE for n in names)])
     return markdown_table(["rule", *names], rows)
 
 
 def _by_value(records: Sequence[RuleRecord], condition: str) -> str:
-    """Return a table of mean losses over those as trained, which the second column tells."""
-    found = {
-        (record.rule, response.value): response
-        for record in records
-        for response in record.responses
-        if response.condition == condition
-    }
-    values = list(dict.fromkeys(value for _, value in found))
-    rows = [
-        [
-            record.rule,
-            short(record.trained().mean()),
-            *(_change(record, found.get((record.rule, value))) for value in values),
-        ]
-        for record in records
-        if any((record.rule, value) in found for value in values)
-    ]
+    """Return a table of mean losses over those as trained, which the second column has."""
+    values = list(dict.fromkeys(r.value for record in records for r in record.of(condition)))
+    rows = []
+    for record in records:
+        found = {response.value: response for response in record.of(condition)}
+        if found:
+            cells = [_change(record, found.get(value)) for value in values]
+            rows.append([record.rule, short(record.trained().mean()), *cells])
     return markdown_table(["rule", "loss as trained", *map(short, values)], rows) if rows else ""
 
 
@@ -389,15 +348,15 @@ DRAWN = {
 
 def pictures(records: Sequence[RuleRecord]) -> dict[str, bytes]:
     """Return PNG files by their tasks' names. Needs matplotlib."""
-    tasks = dict.fromkeys(record.task for record in records)
-    return {task: _draw([r for r in records if r.task == task]) for task in tasks}
+    tasks = dict.fromkeys(record.about["task"] for record in records)
+    return {task: _draw([r for r in records if r.about["task"] == task]) for task in tasks}
 
 
 def _draw(records: Sequence[RuleRecord]) -> bytes:
     columns = 1 + len(DRAWN)
     figure, grid = new_figure(len(records), columns, (3.1 * columns, 2.3 * len(records)))
     for record, panels in zip(records, grid, strict=True):
-        _draw_courses(panels[0], record)
+        _draw_curves(panels[0], record)
         for condition, panel in zip(DRAWN, panels[1:], strict=True):
             _draw_responses(panel, record, condition)
     for panel, condition in zip(grid[-1], ("", *DRAWN), strict=True):
@@ -406,14 +365,14 @@ def _draw(records: Sequence[RuleRecord]) -> bytes:
     return png(figure, 75)
 
 
-def _draw_courses(panel: Any, record: RuleRecord) -> None:
+def _draw_curves(panel: Any, record: RuleRecord) -> None:
     """Draw losses over the twins' after each damage."""
-    for place, course in enumerate(record.loss_curves):
-        colour = "0.5" if course.damage == CONTROL else f"C{place}"
-        columns = [course.ratios(k) for k in range(len(course.steps))]
-        _draw_seeds(panel, course.steps, columns, colour, course.damage)
+    for place, curve in enumerate(record.curves):
+        colour = "0.5" if curve.damage == CONTROL else f"C{place}"
+        columns = [curve.ratios(k) for k in range(len(curve.steps))]
+        _draw_seeds(panel, curve.steps, columns, colour, curve.damage)
     panel.axhline(RECOVERED, color="black", lw=0.7, ls=":")
-    steps = record.loss_curves[0].steps
+    steps = record.curves[0].steps
     panel.set_xscale("symlog", linthresh=max(1, steps[1]))
     panel.set_xlim(0, steps[-1])
     ticks = [step for step in steps if step & (step - 1) == 0]
@@ -426,7 +385,7 @@ def _draw_courses(panel: Any, record: RuleRecord) -> None:
 
 def _draw_responses(panel: Any, record: RuleRecord, condition: str) -> None:
     """Draw losses by the values of a condition."""
-    found = [r for r in record.responses if r.condition == condition and r.losses]
+    found = [response for response in record.of(condition) if response.losses]
     values = [float(response.value) for response in found]
     _draw_seeds(panel, values, [response.losses for response in found], "C0", CONDITIONS[condition])
     trained = sorted(record.trained().losses)

@@ -1,4 +1,4 @@
-"""The CUDA kernels of a step: their times in suite `kernels`, and why these, by `--explain`."""
+"""The kernels of a step: their times in suite `kernels`, and what decides on them."""
 
 from __future__ import annotations
 
@@ -12,10 +12,9 @@ from torch.profiler import ProfilerActivity, profile
 
 from npa_envs.measure.speed.timing import TimingSession
 from npa_envs.measure.speed.workloads import Workload, rollout_call
-from npa_envs.ops.backend import KernelRequest, describe
+from npa_envs.ops.backend import describe
 from npa_envs.ops.launch import Launch, noted_launches
-from npa_envs.ops.sort import KernelPlan, make_plan
-from npa_envs.rule.rule import NPARule
+from npa_envs.ops.sort import make_plan
 from npa_envs.world.rollout import step
 from npa_envs.world.steps import row_capacity
 
@@ -73,23 +72,15 @@ def _kernel_rows(workload: str, profiler: profile, steps: int) -> list[KernelRow
     return [row for row in rows if row.us >= least]
 
 
-# `--explain`: the kernels that a step of a rule takes, and why these.
-
-
 @dataclass(frozen=True)
 class Question:
-    """A step to explain."""
+    """A step to explain: its workload, and gradients by nothing, weights, or positions as well."""
 
     workload: Workload
-    """Worlds, rule, radius, probability of an update."""
     device: torch.device
-    """Where it runs."""
     dtype: torch.dtype
-    """Precision."""
     periodic: bool
-    """The box is periodic."""
     gradients: Literal["none", "weights", "positions"]
-    """What is differentiated: nothing; by weights and states; by positions as well."""
 
     @property
     def box(self) -> float | None:
@@ -134,82 +125,67 @@ def _launches(question: Question) -> tuple[list[Launch], list[Launch]]:
 
 def _listed(launches: list[Launch]) -> list[str]:
     """Return a line for each launch, in columns."""
-    columns = list(zip(*launches, strict=True))
-    widths = [max(map(len, column)) for column in columns[:-1]]
-    return [
-        "  "
-        + "  ".join(cell.ljust(width) for cell, width in zip(launch, [*widths, 0], strict=True))
-        for launch in launches
-    ]
+    widths = [max(map(len, column)) for column in zip(*launches, strict=True)]
+    widths[-1] = 0
+    rows = ([cell.ljust(width) for cell, width in zip(x, widths, strict=True)] for x in launches)
+    return ["  " + "  ".join(row) for row in rows]
 
 
 def _reasons(question: Question) -> list[str]:
     """Return what decides on the kernels, a line each."""
     workload = question.workload
+    prob, box = workload.update_prob, question.box
     total = workload.world_count * workload.particle_count
-    masked = workload.update_prob < 1.0
-    rows = row_capacity(total, workload.update_prob) if masked else total
-    box = None if question.box is None else (question.box,) * workload.space_dim
-    like = torch.empty(0, dtype=question.dtype, device=question.device)
-    shape = (workload.world_count, workload.particle_count, workload.space_dim)
-    plan = make_plan(like, shape, workload.state_dim, rows, masked, workload.eps, box)
+    masked = prob < 1.0
+    plan = make_plan(
+        torch.empty(0, dtype=question.dtype, device=question.device),
+        (workload.world_count, workload.particle_count, workload.space_dim),
+        workload.state_dim,
+        row_capacity(total, prob) if masked else total,
+        masked,
+        workload.eps,
+        None if box is None else (box,) * workload.space_dim,
+    )
+    hidden, output = workload.rule(question.device).folded()[:2]
+    request = plan.request._replace(
+        row_width=hidden.shape[1], update_width=output.shape[0], hidden_dim=hidden.shape[0]
+    )
+    boundary = "open: positions anywhere, the grid of cells wraps around"
+    if box is not None:
+        boundary = f"periodic, side {box:g}: nearest images, positions are wrapped"
+    neighbours = "searched for in each pass"
+    if plan.lists_neighbours:
+        neighbours = (
+            "listed by the density pass for the perception pass, "
+            f"{plan.listing.lanes} threads a particle, with room for {plan.listing.capacity} each: "
+            "longer lists are searched for again"
+        )
+    rows = "every particle is perceived and updated"
+    if masked and question.device.type == "cpu":
+        rows = f"p {prob:g}: the particles drawn are counted, only they are perceived"
+    elif masked:
+        rows = (
+            f"p {prob:g}: only drawn particles are perceived; {plan.row_capacity} rows of {total} "
+            "hold them with probability 1 - 1e-15, and no count is read back"
+        )
+    gradients = {
+        "none": "none: nothing is kept for a backward pass",
+        "weights": "weights and states: the adjoint gathers state cotangents, positions detached",
+        "positions": "positions too: density and kernel slopes get cotangents of their own",
+    }
     number = str(question.dtype).removeprefix("torch.")
     return [
-        f"One step of {shape[0]} x {shape[1]} particles in {shape[2]}D, C {workload.state_dim}, "
-        f"{number} on {question.device}",
-        f"  boundary    {_boundary(question)}",
+        f"One step of {workload.world_count} x {workload.particle_count} particles in "
+        f"{workload.space_dim}D, C {workload.state_dim}, {number} on {question.device}",
+        f"  boundary    {boundary}",
         f"  cells       {plan.domain.cell_count} a world, eps / {plan.domain.cell_reach} wide: "
         "a neighbourhood is a few ranges of sorted particles",
         f"  channels    {plan.group_count} group(s) of {plan.width}, "
         f"{workload.state_dim} used: a kernel is compiled for a group's width",
-        f"  neighbours  {_neighbours(plan)}",
-        f"  rows        {_rows(plan, question)}",
-        f"  gradients   {_gradients(question)}",
+        f"  neighbours  {neighbours}",
+        f"  rows        {rows}",
+        f"  gradients   {gradients[question.gradients]}",
         "",
         "implementations:",
-        *(f"  {line}" for line in describe(_request(plan, workload.rule(question.device)))),
+        *(f"  {line}" for line in describe(request)),
     ]
-
-
-def _boundary(question: Question) -> str:
-    if question.box is None:
-        return "open: positions anywhere, the grid of cells wraps around"
-    return f"periodic, side {question.box:g}: nearest images, positions are wrapped"
-
-
-def _request(plan: KernelPlan, rule: NPARule) -> KernelRequest:
-    """Return what the backend table asks for."""
-    hidden, output = rule.folded()[:2]
-    return plan.request._replace(
-        row_width=hidden.shape[1], update_width=output.shape[0], hidden_dim=hidden.shape[0]
-    )
-
-
-def _neighbours(plan: KernelPlan) -> str:
-    if not plan.lists_neighbours:
-        return "searched for in each pass"
-    listing = plan.listing
-    return (
-        f"listed by the density pass for the perception pass, {listing.lanes} threads a particle, "
-        f"with room for {listing.capacity} each: longer lists are searched for again"
-    )
-
-
-def _rows(plan: KernelPlan, question: Question) -> str:
-    if not plan.masked:
-        return "every particle is perceived and updated"
-    prob = question.workload.update_prob
-    if question.device.type == "cpu":
-        return f"p {prob:g}: the particles drawn are counted, only they are perceived"
-    return (
-        f"p {prob:g}: only drawn particles are perceived; {plan.row_capacity} rows of {plan.total} "
-        "hold them with probability 1 - 1e-15, and no count is read back"
-    )
-
-
-def _gradients(question: Question) -> str:
-    return {
-        "none": "none: nothing is kept for a backward pass",
-        "weights": "weights and states: the adjoint gathers state cotangents, positions detached",
-        "positions": "positions too: density and kernel slopes get cotangents of their own",
-    }[question.gradients]

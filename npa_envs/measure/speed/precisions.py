@@ -1,4 +1,4 @@
-"""Precisions of a rollout: of the worlds' arithmetic, of the rule's products, of what is kept."""
+"""Precisions of a rollout: of arithmetic, of the rule's products, of states between steps."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from npa_envs.rule.rule import NPARule
 
 
 class TorchRule(NPARule):
-    """A rule whose products torch takes, so that torch's switch for TF32 reaches them."""
+    """A rule whose products are torch's, which has a switch for TF32."""
 
     def forward(self, perception: Tensor) -> Tensor:
         """Map perception vectors, shape [..., P], to raw updates, shape [..., A]."""
@@ -46,9 +46,7 @@ class Precision:
     """How numbers are kept and multiplied."""
 
     name: str
-    """What the command line calls it."""
     summary: str
-    """What it does, in a few words."""
     dtype: torch.dtype
     """Dtype of positions, states and sums over neighbours."""
     short_states: bool = False

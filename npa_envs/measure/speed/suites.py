@@ -1,51 +1,500 @@
-"""Suites of `npa-envs bench`: the tables that each makes, their report and plots."""
+"""Suites of `npa-envs bench`: their workloads, tables, report and plots."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+import math
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, replace
 from datetime import date
+from functools import partial
 from typing import Any
 
+import numpy as np
 import torch
+from torch import Tensor
 
 from npa_envs.files import json_text
 from npa_envs.measure.plots import new_figure, number_plainly, png
 from npa_envs.measure.record import machine, versions
-from npa_envs.measure.speed.drift import drift_rows
 from npa_envs.measure.speed.explain import kernel_rows
-from npa_envs.measure.speed.throughput import (
-    AXES,
-    CPU,
-    ONE_WORLD,
-    PAPER,
-    PROFILED,
-    PUBLIC,
-    SMALL,
-    ScalingRow,
-    aim_rows,
-    one_species_rows,
-    public_rows,
-    scaling_rows,
-    skip_rows,
-    slope_rows,
-    throughput_rows,
+from npa_envs.measure.speed.timing import (
+    LeftOut,
+    Tables,
+    Timing,
+    TimingSession,
+    compare,
+    relative_error,
+    timed_calls,
 )
-from npa_envs.measure.speed.timing import LeftOut, Tables, TimingSession
+from npa_envs.measure.speed.workloads import Workload, rollout_call
 from npa_envs.measure.tables import UNMEASURED, as_objects, table_text
+from npa_envs.rule.rule import NPARule
+from npa_envs.world.recorded import release_recordings
+from npa_envs.world.rollout import Memory, rollout
+from npa_envs.world.species import rollout_species
+
+# Suite `paper`: inference and training, storing and recomputing; float32 against float64.
+
+EIGHT_WORLDS = Workload(2, 8, 4096, 64)
+ONE_WORLD = Workload(2, 1, 4096, 64)
+LARGE_WORLDS = Workload(2, 8, 65536, 8)
+CUBES = Workload(3, 4, 16384, 24, 256)
+MILLION = Workload(2, 1, 2**20, 8)
+SIXTEEN_MILLION = Workload(2, 1, 2**24, 4)
+
+PAPER = (EIGHT_WORLDS, ONE_WORLD, LARGE_WORLDS, CUBES, MILLION, SIXTEEN_MILLION)
+"""Workloads on CUDA."""
+
+PROFILED = PAPER[:4]
+"""Those of the authors' own table."""
+
+PUBLIC = (*PROFILED, Workload(2, 64, 256, 32))
+"""Workloads of the public call, with many small worlds."""
+
+CPU = (Workload(2, 1, 4096, 16), Workload(2, 4, 1024, 16))
+"""Workloads on a CPU."""
+
+SMALL = (Workload(2, 1, 1024, 8),)
+"""Workloads of small sessions."""
+
+INFERENCE_ONLY = (SIXTEEN_MILLION,)
+"""Workloads that are not trained."""
+
+
+@dataclass(frozen=True)
+class ThroughputRow:
+    """A workload (worlds B, particles N, steps T) that stores or recomputes what training reads.
+
+    Times are those of one step [µs], peaks of memory are above the worlds [MiB].
+    """
+
+    workload: str
+    memory: str
+    infer_us: Timing
+    train_us: Timing | None
+    worlds_mib: float
+    infer_mib: float | None
+    train_mib: float | None
+
+
+def throughput_rows(session: TimingSession, workloads: Sequence[Workload]) -> list[ThroughputRow]:
+    """Return two rows for each workload: storing and recomputing."""
+    rows: list[ThroughputRow] = []
+    for workload in workloads:
+        train = workload not in INFERENCE_ONLY
+        if not train:
+            session.leave_out(f"training of {workload.name}", "a workload of inference only")
+        modes: tuple[Memory, ...] = ("store", "recompute") if train else ("store",)
+        for memory in modes:
+            rows += session.attempt(
+                f"{workload.name}, {memory}",
+                partial(throughput_row, session, workload, memory, train=train),
+            )
+    return rows
+
+
+def throughput_row(
+    session: TimingSession, workload: Workload, memory: Memory = "store", *, train: bool = True
+) -> ThroughputRow:
+    """Return what a step of a workload costs."""
+    x, s = workload.worlds(session.device)
+    roll, generator = rollout_call(workload, x, s)
+    infer, training = session.cost(roll, generator=generator), None
+    if train:
+        pull_back, generator = rollout_call(workload, x, s, train=True, memory=memory)
+        training = session.cost(pull_back, generator=generator)
+    return ThroughputRow(
+        workload=workload.name,
+        memory=memory,
+        infer_us=infer.time.divided(workload.steps),
+        train_us=training.time.divided(workload.steps) if training else None,
+        worlds_mib=(x.nbytes + s.nbytes) / 2**20,
+        infer_mib=infer.peak_mib,
+        train_mib=training.peak_mib if training else None,
+    )
+
+
+@dataclass(frozen=True)
+class PublicRow:
+    """Time of a step of `rollout` in a plain loop [µs]; each call is waited for.
+
+    On CUDA the first numbers are of calls that replay a recording, the `launched` ones of calls
+    with `cuda_graph=False`.
+    """
+
+    workload: str
+    infer_us: Timing
+    train_us: Timing
+    launched_infer_us: Timing
+    launched_train_us: Timing
+
+
+def public_rows(session: TimingSession, workloads: Sequence[Workload]) -> list[PublicRow]:
+    """Return a row for each workload."""
+    return [
+        row
+        for workload in workloads
+        for row in session.attempt(workload.name, partial(_public_row, session, workload))
+    ]
+
+
+def _public_row(session: TimingSession, workload: Workload) -> PublicRow:
+    x, s = workload.worlds(session.device)
+    found: dict[tuple[bool, bool], Timing] = {}
+    for recorded in (True, False):
+        for train in (False, True):
+            options: dict[str, Any] = {} if recorded else {"cuda_graph": False}
+            run, _ = rollout_call(workload, x, s, train=train, **options)
+            timing = timed_calls(run, session.device, warm=3, repeats=session.repeats)
+            found[recorded, train] = timing.divided(workload.steps)
+    release_recordings()
+    return PublicRow(workload.name, *found.values())
+
+
+@dataclass(frozen=True)
+class DriftRow:
+    """Relative errors of float32 after all steps of a workload, with float64's update masks.
+
+    Worlds are chaotic: after enough steps errors show how long worlds ran. Gradients are those of a
+    random linear functional by the states at the start and the weights; their errors come from few
+    particles, whose hidden units are on in one precision alone. `state_gradient_median` is the
+    median over the particles, each relative to its own.
+    """
+
+    workload: str
+    positions: float
+    states: float
+    state_gradient: float
+    state_gradient_median: float
+    weight_gradient: float
+
+
+def drift_rows(session: TimingSession, workloads: Iterable[Workload]) -> list[DriftRow]:
+    """Return a row for each workload."""
+    rows: list[DriftRow] = []
+    for workload in workloads:
+        what = f"drift of {workload.name}"
+        for exact in session.attempt(what, partial(_outcome, workload, session, torch.float64)):
+            rows += session.attempt(what, partial(_drift_row, workload, session, exact))
+    return rows
+
+
+def _drift_row(workload: Workload, session: TimingSession, exact: list[Tensor]) -> DriftRow:
+    found = _outcome(workload, session, torch.float32)
+    positions, states, by_states, by_weights = map(relative_error, found, exact)
+    distance = (found[2].double() - exact[2]).norm(dim=-1)
+    median = float((distance / exact[2].norm(dim=-1)).median())
+    return DriftRow(workload.name, positions, states, by_states, median, by_weights)
+
+
+def _outcome(workload: Workload, session: TimingSession, dtype: torch.dtype) -> list[Tensor]:
+    """Return positions and states at the end, and gradients by states and by weights."""
+    device = session.device
+    rule = workload.rule(device).to(dtype)
+    start, states = (tensor.to(dtype) for tensor in workload.worlds(device))
+    states.requires_grad_()
+    x, s = rollout(
+        rule,
+        start,
+        states,
+        workload.steps,
+        eps=workload.eps,
+        update_prob=workload.update_prob,
+        generator=torch.Generator(device).manual_seed(1),
+        memory="recompute",
+    )
+    loss = (x * drawn_like(x)).sum() + (s * drawn_like(s)).sum()
+    by_states, *by_weights = torch.autograd.grad(loss, [states, *rule.parameters()])
+    weights = torch.cat([gradient.flatten() for gradient in by_weights])
+    return [tensor.detach() for tensor in (x, s, by_states, weights)]
+
+
+def drawn_like(like: Tensor) -> Tensor:
+    """Return the weights of a random linear functional, the same numbers in every dtype."""
+    generator = torch.Generator(like.device).manual_seed(2)
+    return torch.randn(like.shape, generator=generator, device=like.device).to(like.dtype)
+
+
+# Suite `scaling`: N, neighbours, B and C, one of them at a time.
+
+AXES = ("particles", "neighbours", "worlds", "channels")
+"""What is varied: N at the same density, neighbours within eps, B, C."""
+
+
+@dataclass(frozen=True)
+class ScalingRow:
+    """One step of a 2D workload; the `neighbours` of a particle include itself."""
+
+    axis: str
+    value: float
+    workload: str
+    neighbours: float
+    channels: int
+    infer_us: Timing
+    train_us: Timing | None
+    infer_mib: float | None
+    train_mib: float | None
+
+
+@dataclass(frozen=True)
+class SlopeRow:
+    """How time grows: the slope of log time over log value, fitted to an axis's larger half."""
+
+    axis: str
+    infer_slope: float
+    train_slope: float
+
+
+def scaling_rows(session: TimingSession) -> list[ScalingRow]:
+    """Return the rows of all axes, increasing along each."""
+    rows: list[ScalingRow] = []
+    for axis, values in zip(AXES, _values(session), strict=True):
+        for value in values:
+            rows += session.attempt(f"{value} {axis}", partial(_scaling_row, session, axis, value))
+    return rows
+
+
+def _values(session: TimingSession) -> tuple[Sequence[int], ...]:
+    """Return the values of each axis."""
+    if session.small:
+        return (256, 1024), (16, 64), (1, 2), (4, 16)
+    neighbours, channels = (8, 16, 32, 64, 128, 256), (4, 8, 16, 32, 64)
+    if session.cuda:
+        return [2**k for k in range(10, 21)], neighbours, [2**k for k in range(8)], channels
+    return [2**k for k in range(8, 17)], neighbours, (1, 2, 4, 8, 16), channels
+
+
+def varied(axis: str, value: int, *, small: bool = False) -> Workload:
+    """Return the workload in which the number of one of `AXES` has a value."""
+    usual = Workload(2, 1, 512 if small else 4096, 4 if small else 8)
+    if axis == "particles":
+        return replace(usual, particle_count=value)
+    if axis == "worlds":
+        return replace(usual, world_count=value, particle_count=min(usual.particle_count, 1024))
+    if axis == "channels":
+        return replace(usual, state_dim=value)
+    share = (value - 1) / (usual.neighbour_count - 1)
+    return replace(usual, eps=usual.eps * math.sqrt(share))
+
+
+def _scaling_row(session: TimingSession, axis: str, value: int) -> ScalingRow:
+    workload = varied(axis, value, small=session.small)
+    cost = throughput_row(session, workload)
+    own = (axis, value, cost.workload, workload.neighbour_count, workload.state_dim)
+    return ScalingRow(*own, cost.infer_us, cost.train_us, cost.infer_mib, cost.train_mib)
+
+
+def slope_rows(rows: Sequence[ScalingRow]) -> list[SlopeRow]:
+    """Return how the times of each axis grow."""
+    slopes = []
+    for axis in AXES:
+        found = [row for row in rows if row.axis == axis]
+        if len(found) > 1:
+            larger = found[-max(2, math.ceil(len(found) / 2)) :]
+            values = np.log([row.value for row in larger])
+            infer = np.log([row.infer_us.median for row in larger])
+            train = np.log([row.train_us.median for row in larger if row.train_us])
+            fits = (float(np.polyfit(values, times, 1)[0]) for times in (infer, train))
+            slopes.append(SlopeRow(axis, *fits))
+    return slopes
+
+
+# Suite `skips`: time saved by computations that a scene does not need.
+
+SKIPPED = {
+    "cuda": Workload(2, 8, 4096, 16),
+    "cpu": Workload(2, 1, 4096, 4),
+    "small": Workload(2, 1, 256, 2),
+}
+"""Worlds to measure on, by kinds of sessions."""
+
+STATIC_STEPS = 32
+"""Steps of a rollout of a static world."""
+
+
+@dataclass(frozen=True)
+class SkipRow:
+    """A computation that rollouts leave out; times of one step with and without it [µs]."""
+
+    left_out: str
+    condition: str
+    done_us: Timing
+    skipped_us: Timing
+    saved: str
+
+
+@dataclass(frozen=True)
+class Skip:
+    """Two rollouts that differ in one condition alone, with options of `rollout_call`."""
+
+    left_out: str
+    condition: str
+    done: dict[str, Any]
+    skipped: dict[str, Any]
+    steps: int | None = None
+    """Steps of both; default: the workload's."""
+
+
+def skips(workload: Workload) -> list[Skip]:
+    """Return all computations that rollouts leave out."""
+    side = 2.0 * workload.half_width
+    training = {"train": True}
+    # Cells and densities are computed anew in each step if positions may get a gradient.
+    rebuilt = {"detach_positions": False}
+    static = {"rule": {"static": True}}
+    return [
+        Skip(
+            "what a backward pass reads: signs of hidden units, volumes, kernel sums",
+            "no gradient is enabled",
+            {"gradients": True},
+            {},
+        ),
+        Skip(
+            "cotangents of positions and densities",
+            "detach_positions (default)",
+            {**training, "detach_positions": False},
+            training,
+        ),
+        Skip(
+            "perception, network and lists of inactive particles",
+            "update_prob < 1",
+            {"update_prob": 1.0},
+            {},
+        ),
+        *(
+            Skip(what, f"{option}=False", {}, {"rule": {option: False}})
+            for what, option in (
+                ("the state gradient", "state_gradient"),
+                ("the moment matrix and its inverse", "moment_correction"),
+                ("columns of the density gradient", "density_gradient"),
+            )
+        ),
+        Skip("displacements", "static=True", rebuilt, {**static, **rebuilt}),
+        Skip(
+            "cells, densities and neighbour lists",
+            "static=True, without position_noise",
+            {**static, **rebuilt},
+            static,
+            STATIC_STEPS,
+        ),
+        Skip("periodic images", "box=None (default)", {"box": (side, side)}, {}),
+        Skip(
+            "a second forward pass, for the backward pass",
+            "memory='store' (default)",
+            {**training, "memory": "minimal"},
+            training,
+        ),
+    ]
+
+
+def skip_rows(session: TimingSession) -> list[SkipRow]:
+    """Return what each omission saves, measured with and without it in one run."""
+    workload = SKIPPED["small" if session.small else session.device.type]
+    x, s = workload.worlds(session.device)
+
+    def cost(options: dict[str, Any], steps: int | None) -> Timing:
+        rolled = replace(workload, steps=steps or workload.steps)
+        run, generator = rollout_call(rolled, x, s, **options)
+        return session.cost(run, generator=generator).time.divided(rolled.steps)
+
+    def row(skip: Skip) -> SkipRow:
+        done, skipped = cost(skip.done, skip.steps), cost(skip.skipped, skip.steps)
+        saved = 1.0 - skipped.median / done.median
+        return SkipRow(skip.left_out, skip.condition, done, skipped, f"{saved:.0%}")
+
+    rows: list[SkipRow] = []
+    for skip in skips(workload):
+        rows += session.attempt(skip.left_out, partial(row, skip))
+    return rows
+
+
+# Suite `species`: overhead of `rollout_species` with one species.
+
+SPECIES = {
+    "cuda": (Workload(2, 8, 4096, 16), Workload(2, 1, 256, 16)),
+    "cpu": (Workload(2, 1, 4096, 4), Workload(2, 1, 256, 4)),
+    "small": (Workload(2, 1, 256, 2),),
+}
+"""Worlds to measure on, by kinds of sessions; small ones show the cost of a call."""
+
+PAIRS_PER_REPEAT = 3
+"""Pairs of readings for each reading of other tables: a ratio of nearly 1 needs more of them."""
+
+
+@dataclass(frozen=True)
+class OneSpeciesRow:
+    """The same rule and worlds by `rollout` and by `rollout_species` with one species.
+
+    Times are those of one step [µs]; `calls` are "graph" where CUDA replays a captured graph.
+    `ratio` is the median over pairs of readings in turn.
+    """
+
+    workload: str
+    what: str
+    calls: str
+    rollout_us: Timing
+    species_us: Timing
+    ratio: float
+
+
+def one_species_rows(session: TimingSession) -> list[OneSpeciesRow]:
+    """Return rows of inference and training."""
+    rows: list[OneSpeciesRow] = []
+    for workload in SPECIES["small" if session.small else session.device.type]:
+        for train in (False, True):
+            for graph in (False, True) if session.cuda else (False,):
+                what = f"one species, {'training' if train else 'inference'} of {workload.name}"
+                rows += session.attempt(
+                    what, partial(_species_row, session, workload, train, graph)
+                )
+    return rows
+
+
+def _species_row(
+    session: TimingSession, workload: Workload, train: bool, graph: bool
+) -> OneSpeciesRow:
+    x, s = workload.worlds(session.device)
+    make: Callable[..., Any] = partial(rollout_call, workload, x, s, train=train)
+    # Each draws the same masks, as often as the other one is called.
+    alone, species = make(), make(roll=roll_one_species)
+    compared = compare(
+        alone, species, session.device, repeats=PAIRS_PER_REPEAT * session.repeats, graph=graph
+    )
+    return OneSpeciesRow(
+        workload.name,
+        "training" if train else "inference",
+        "graph" if graph else "eager",
+        compared.first.divided(workload.steps),
+        compared.second.divided(workload.steps),
+        compared.ratio,
+    )
+
+
+def roll_one_species(
+    rule: NPARule, x: Tensor, s: Tensor, steps: int, **options: Any
+) -> tuple[Tensor, Tensor]:
+    """Roll worlds out as those of one species, with the densities of `rollout`."""
+    count = [x.shape[1]]
+    worlds: tuple[Tensor, Tensor] = rollout_species(
+        [rule], x, s, steps, counts=count, density_counts=count, **options
+    )
+    return worlds
+
+
+# The suites
 
 
 def paper(session: TimingSession) -> Tables:
-    """Return the paper's table, what the public call costs there, and float32's errors."""
+    """Return the paper's table, times of the public call, and errors of float32."""
     workloads = SMALL if session.small else PAPER if session.cuda else CPU
     drifting = SMALL if session.small else PROFILED if session.cuda else (ONE_WORLD,)
-    rows = throughput_rows(session, workloads)
-    tables: Tables = {"throughput": rows, "drift": drift_rows(session, drifting)}
+    tables: Tables = {
+        "throughput": throughput_rows(session, workloads),
+        "drift": drift_rows(session, drifting),
+    }
     if session.cuda:
         # On a CPU the throughput is that of the public call.
         tables["public"] = public_rows(session, SMALL if session.small else PUBLIC)
-    if session.cuda and not session.small:
-        tables["aims"] = aim_rows(rows)
     return tables
 
 
@@ -72,9 +521,6 @@ SUITES: dict[str, Callable[[TimingSession], Tables]] = {
 """What makes the tables of each suite."""
 
 
-# The report
-
-
 @dataclass(frozen=True)
 class BenchReport:
     """One run of one suite."""
@@ -88,7 +534,6 @@ class BenchReport:
     tables: Tables
     """Rows by the table's name."""
     left_out: Sequence[LeftOut]
-    """What was not measured."""
 
     def text(self) -> str:
         """Return the tables as plain text."""
@@ -145,9 +590,13 @@ def pictures(tables: Tables) -> dict[str, bytes]:
 def _draw_scaling(table: Sequence[ScalingRow], what: str) -> Any:
     figure, grid = new_figure(2, 2, (9.2, 7.6))
     panels = grid.ravel()
+    unit = "us" if what == "time" else "mib"
     for name, panel in zip(AXES, panels, strict=True):
         rows = [row for row in table if row.axis == name]
-        for label, values in _curves(rows, what).items():
+        for field, label in (("infer", "inference"), ("train", "training")):
+            found = [getattr(row, f"{field}_{unit}") for row in rows]
+            # A cell that was not measured is a gap.
+            values = [cell.median if isinstance(cell, Timing) else cell for cell in found]
             panel.plot([row.value for row in rows], values, marker="o", ms=4, label=label)
         panel.set(xscale="log", yscale="log", xlabel=AXIS_LABELS[name])
         panel.set_ylabel("time of a step [µs]" if what == "time" else "peak memory [MiB]")
@@ -157,16 +606,3 @@ def _draw_scaling(table: Sequence[ScalingRow], what: str) -> Any:
         panel.grid(alpha=0.3)
     panels[0].legend(fontsize=8)
     return figure
-
-
-def _curves(rows: Sequence[ScalingRow], what: str) -> dict[str, list[float | None]]:
-    """Return the values of each curve; what was not measured is a gap."""
-    if what == "memory":
-        return {
-            "inference": [row.infer_mib for row in rows],
-            "training": [row.train_mib for row in rows],
-        }
-    return {
-        "inference": [row.infer_us.median for row in rows],
-        "training": [row.train_us.median if row.train_us else None for row in rows],
-    }

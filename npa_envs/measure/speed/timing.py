@@ -45,22 +45,19 @@ class Timing:
 
 @dataclass(frozen=True)
 class Cost:
-    """What a call costs."""
+    """The time of a call and the peak of memory that torch allocates [MiB], None on a CPU."""
 
     time: Timing
     peak_mib: float | None
-    """Peak of memory allocated by torch, above what was there before [MiB]; None on a CPU."""
 
 
 @dataclass(frozen=True)
 class Comparison:
-    """What two calls cost that were timed in turn."""
+    """Times of two calls in turn, and the median over pairs of readings of second over first."""
 
     first: Timing
     second: Timing
     ratio: float
-    """Median over pairs of readings, one right after the other, of the second's time over the
-    first's (dimensionless)."""
 
 
 def synchronize(device: torch.device) -> None:
@@ -72,10 +69,9 @@ def synchronize(device: torch.device) -> None:
 def compare(
     first: Sampled, second: Sampled, device: torch.device, *, repeats: int, graph: bool = True
 ) -> Comparison:
-    """Return what two calls cost, timed in turn, so that both see the same machine.
+    """Return what two calls cost, timed in turn, so that both run on the same machine.
 
-    Each comes with the generator that it draws from. Whoever is second is first in the next of the
-    `repeats` pairs of readings. On CUDA, `graph` times replays of captured graphs.
+    The second is first in the next of the `repeats` pairs. On CUDA, `graph` times replays.
     """
     runs: list[Callable[[], object]] = []
     for run, generator in (first, second):
@@ -97,7 +93,7 @@ def compare(
 def timed_calls(
     run: Callable[[], object], device: torch.device, *, warm: int, repeats: int
 ) -> Timing:
-    """Return what single calls take, each waited for, after some that are not timed."""
+    """Return the time of single calls, each waited for, after `warm` that are not timed."""
     for _ in range(warm):
         run()
     return _summary([_reading(run, device, 1) * 1e6 for _ in range(repeats)])
@@ -151,17 +147,15 @@ class TimingSession:
     """One run of the benchmark."""
 
     device: torch.device
-    """Where everything is measured."""
     repeats: int = 7
     """Readings of every time."""
     small: bool = False
-    """Small sizes only: about a minute on a CPU."""
+    """Small sizes only."""
     progress: Callable[[int], None] = lambda done: None
     """Called with 1 after each row."""
     left_out: list[LeftOut] = field(default_factory=list)
-    """What could not be measured, each once."""
     enough: Callable[[], bool] = lambda: False
-    """Says whether the time for it is over: rows that have not begun by then are left out."""
+    """Says whether the time is over: rows that have not begun by then are left out."""
 
     @property
     def cuda(self) -> bool:
@@ -175,11 +169,7 @@ class TimingSession:
         graph: bool = True,
         generator: torch.Generator | None = None,
     ) -> Cost:
-        """Return what a call costs once its kernels are compiled.
-
-        Slow calls get fewer readings. On CUDA, `graph` captures the call, which may draw from the
-        generator, and times its replay.
-        """
+        """Return what a call costs once its kernels are compiled; on CUDA `graph` times replays."""
         device = self.device
         run()
         synchronize(device)

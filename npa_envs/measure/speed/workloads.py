@@ -1,18 +1,16 @@
-"""Worlds to measure on: as many neighbours everywhere, and the gecko as it grows."""
+"""Worlds to measure on, with as many neighbours everywhere."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
 from torch import Tensor
 
-from npa_envs.rule.files import load_rule
 from npa_envs.rule.rule import NPARule
-from npa_envs.tasks.morphogenesis2d import Morphogenesis2D, Morphogenesis2DConfig
 from npa_envs.world.rollout import rollout
 
 SQUARE_HALF_WIDTH = 0.7
@@ -91,11 +89,10 @@ def rollout_call(
     roll: Callable[..., Any] = rollout,
     **options: Any,
 ) -> tuple[Callable[[], None], torch.Generator]:
-    """Return a call that rolls worlds x [B, N, D], s [B, N, C] out, and the source of its masks.
+    """Return a call that rolls worlds out, and the source of its masks.
 
-    To `train` is to take the gradient of a random linear functional by the rule's weights;
-    `gradients` without that let autograd store what it would read. `rule` are options of the rule,
-    `options` those of `roll` instead of the workload's.
+    `train` takes the gradient of a random linear functional by the rule's weights, `gradients`
+    only lets autograd store its inputs. `rule` are options of the rule, `options` those of `roll`.
     """
     network = workload.rule(x.device, **(rule or {}))
     generator = torch.Generator(x.device).manual_seed(1)
@@ -114,36 +111,3 @@ def rollout_call(
                 torch.autograd.grad(terms[0] + terms[1], list(network.parameters()))
 
     return run, generator
-
-
-class Gecko(NamedTuple):
-    """The shipped rule, its task with as many target points as particles, and seeds."""
-
-    rule: NPARule
-    task: Morphogenesis2D
-    x: Tensor
-    s: Tensor
-
-    def grown(self, steps: int) -> Gecko:
-        """Return the same with worlds that are so many float32 steps older."""
-        generator = torch.Generator(self.x.device).manual_seed(1)
-        with torch.no_grad():
-            x, s = rollout(
-                self.rule,
-                self.x,
-                self.s,
-                steps,
-                eps=self.task.eps,
-                update_prob=self.task.update_prob,
-                generator=generator,
-            )
-        return self._replace(x=x, s=s)
-
-
-def gecko(world_count: int, particle_count: int, device: torch.device) -> Gecko:
-    """Return the shipped rule with seeds of its task."""
-    config = Morphogenesis2DConfig(particle_count=particle_count, target_point_count=particle_count)
-    task = Morphogenesis2D(config, device=device)
-    generator = torch.Generator(device).manual_seed(0)
-    x, s, _ = task.seed(world_count, generator=generator, device=device)
-    return Gecko(load_rule("gecko", device=device).float(), task, x, s)

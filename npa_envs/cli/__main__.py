@@ -1,7 +1,0 @@
-"""`python -m npa_envs.cli`, the same as the command `npa-envs`."""
-
-import sys
-
-from npa_envs.cli import main
-
-sys.exit(main())
