@@ -16,7 +16,7 @@ from npa_envs.ops.sort import LARGEST_INDEX, KernelPlan, density_scale, make_pla
 
 
 class SavedPerception(NamedTuple):
-    """What the forward pass leaves to the adjoint of perception, as tensors in this order."""
+    """Tensors that the forward pass saves for the adjoint of perception."""
 
     perception: Tensor
     """Rows of perception, dimensionless, shape [K, row_width]."""

@@ -83,7 +83,7 @@ def compute_densities(
     state_place: Tensor | None = None,
     with_particles: bool = True,
 ) -> Densities:
-    """Compute densities, and what perception wants besides: lists or the rows' density gradients.
+    """Compute densities, and neighbour lists or the rows' density gradients for perception.
 
     Args:
         plan: Plan of the call.

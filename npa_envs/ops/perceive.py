@@ -534,7 +534,7 @@ def update_some_at_a_time(
 
 
 class NeighbourState:
-    """Worlds made ready for perception: sorted, their densities known; `build_neighbours` makes it.
+    """Sorted worlds with densities, ready for perception; `build_neighbours` makes them.
 
     Args:
         launch_of: Returns what to give to a launch that writes rows into a tensor, [B N, P].
@@ -582,8 +582,8 @@ def build_neighbours(
     listed = plan.lists_neighbours
     in_place = listed and plan.state_dim % plan.width == 0 and s.data_ptr() % 16 == 0
     ordered = sort_worlds(plan, x, None if in_place else s, None, with_rows=not listed)
-    # World k of a batch perceives what it would alone, bit for bit: nothing here may follow from
-    # the number of worlds.
+    # World k of a batch equals that world alone, bit for bit: nothing may follow from the number
+    # of worlds.
     densities = compute_densities(
         plan,
         ordered,

@@ -35,7 +35,7 @@ LARGEST_LISTS = 2**31
 
 
 class StaticTensors(NamedTuple):
-    """What perception needs of positions, as tensors in this order; particles are sorted."""
+    """Tensors that follow from positions alone; particles are sorted."""
 
     source: Tensor
     """Caller's index of each sorted particle, int32, shape [B N]."""
@@ -72,7 +72,7 @@ class StaticTensors(NamedTuple):
 
 
 class StaticWorlds(NamedTuple):
-    """Worlds made ready for steps that change states alone; `prepare_static` makes it."""
+    """Sorted worlds of particles that stay; `prepare_static` makes them."""
 
     tensors: StaticTensors
     """What perception needs of positions."""

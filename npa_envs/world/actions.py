@@ -1,7 +1,7 @@
-"""Worlds that are acted on from outside: what particles perceive, and what an action does.
+"""Worlds that environments act on: perception and actions.
 
-The same dynamics as `npa_envs.rollout`, with the rule taken out: an action stands where a rule's
-bounded output stands. Nothing here waits for the device.
+The dynamics of `npa_envs.rollout`, with an action in the place of a rule's bounded output. Nothing
+waits for the device.
 """
 
 from __future__ import annotations
@@ -99,7 +99,7 @@ class Actions:
                 own.copy_(new)
 
     def updated(self) -> Tensor:
-        """Return which particles what was drawn last updates, bool, shape [B, N]."""
+        """Return which particles the last draw updates, bool, shape [B, N]."""
         if self._mask is None:
             return self._everyone
         return self._mask.bool()
@@ -134,7 +134,7 @@ def marginal_gains(
     step. For losses that are quadratic in what particles change, that is the mean of its marginal
     contribution to what all others did and to what they had not yet done (its Shapley value), and
     the mean over the particles is what the loss fell; for others it is so up to third order. What a
-    task holds constant in its gradients is constant here.
+    task holds constant in its gradients stays constant.
 
     Args:
         losses: The named parts of each world's loss, shape [B] each, of positions and states.

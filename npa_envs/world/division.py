@@ -42,7 +42,7 @@ def living(s: Tensor) -> Tensor:
 
 
 def parked(x: Tensor, alive: Tensor, eps: float) -> Tensor:
-    """Return positions with the dead far away, out of reach of all others and of each other.
+    """Return positions with the dead far away from all others and from each other.
 
     Args:
         alive: Which slots hold a living particle, bool, shape [B, N].

@@ -35,14 +35,14 @@ STORED_INTERVAL: dict[Memory, int] = {"store": 1, "recompute": 3, "minimal": 2**
 """The last step and every so-manyth before it store what the backward pass reads."""
 
 FEWEST_STATIC = 3
-"""Steps from which on it pays to prepare worlds whose particles never move."""
+"""Steps of a rollout, at least, for which static worlds are prepared."""
 
 FEWEST_RESTING = 256
-"""Steps from which on it pays to ask whether worlds are at rest."""
+"""Steps of a rollout, at least, that is checked for worlds at rest."""
 
 FIRST_PART = {"cpu": 64, "cuda": 1024}
-"""Steps after which that is asked again, by device; the next parts are twice as long each. A GPU
-idles while it is asked."""
+"""Steps until the next check, by device; each further part is twice as long. A GPU idles during a
+check."""
 
 
 class RolloutSpec(NamedTuple):
@@ -188,7 +188,7 @@ def run_steps(
     """Repeat a step on checked worlds.
 
     Raises:
-        DivergedError: The watch has seen a world diverge.
+        DivergedError: A world diverged under a watch.
     """
     steps, keep_every = spec.steps, spec.keep_every
     particles = step.enter(particles)
@@ -202,7 +202,7 @@ def run_steps(
         # Recomputed, a module that draws would draw otherwise.
         interval = 1
     again = None
-    # What a compiler has taken reads copies.
+    # A compiled function reads copies.
     if interval > 1 and not torch.compiler.is_compiling():
         again = RecomputedSteps(step.advance, rules, {"x": particles.x, "s": particles.s})
     # Worlds keep their dtype under autocast: the kernels read what the rules write.
@@ -252,7 +252,7 @@ def execute(
 
     Raises:
         NPAError: A position is not finite.
-        DivergedError: The watch has seen a world diverge.
+        DivergedError: A world diverged under a watch.
     """
     if watch is None and _may_rest(spec, rules, particles):
         return _run_until_rest(spec, rules, particles, source, graph)
@@ -293,7 +293,7 @@ def resting(
 
 
 def _may_rest(spec: RolloutSpec, rules: Sequence[NPARule], particles: Particles) -> bool:
-    """Return whether a rollout asks whether its worlds are at rest: their steps are left out."""
+    """Return whether a rollout checks if its worlds are at rest, whose steps are skipped."""
     return (
         len(rules) == 1
         and not spec.species
@@ -317,7 +317,7 @@ def _run_until_rest(
     source: Randomness | None,
     graph: CudaGraph,
 ) -> Particles:
-    """Run a rollout in parts, and leave out what comes when all worlds are at rest."""
+    """Run a rollout in parts, and skip the steps after all worlds are at rest."""
     left, part = spec.steps, FIRST_PART[particles.x.device.type]
     while left and not resting(rules, particles, spec.physics, graph).all():
         own = spec._replace(steps=min(part, left))

@@ -26,14 +26,14 @@ from npa_envs.world.recorded import LAUNCHED_FIRST, CallKind, counted, rule_form
 from npa_envs.world.steps import Draws, RuleStep
 
 LARGEST_TOTAL = 4096
-"""Particles of all worlds, at most: larger ones hide what is saved."""
+"""Particles of all worlds, at most: larger worlds hide the host's time."""
 
 MOST_KINDS = 32
 """Kinds of calls that are remembered."""
 
 
 class _Stand:
-    """Stands for a network while a step is recorded: notes what it is given, and where."""
+    """A network's stand-in while a step is recorded: notes its input and its place on the tape."""
 
     def __init__(self, tape: LaunchTape, row_width: int, update_width: int) -> None:
         self.row_width = row_width

@@ -31,13 +31,13 @@ from npa_envs.world.randomness import (
 )
 
 ROWS_TOGETHER = 2**24
-"""Rows of static worlds that are given together, at most, if they are of several steps."""
+"""Rows of static worlds, at most, that are made together for several steps."""
 
 ROWS_KEPT = 2**24
-"""Rows of perception that are kept for the network all together, at most."""
+"""Rows of perception, at most, that the network reads all together."""
 
 MOST_AHEAD = 4
-"""Steps whose draws a recording makes beside the steps before them, at most: these take memory."""
+"""Steps, at most, whose draws a recording makes ahead of time: these take memory."""
 
 OVERFLOW_LOG_PROBABILITY = 34.5
 """Row capacities hold with probability 1 - exp(-34.5), about 1 - 1e-15, for each step."""
@@ -70,7 +70,7 @@ def row_count(mask: Tensor | None, x: Tensor, update_prob: float) -> int:
 
 
 class Draws(NamedTuple):
-    """What a step draws."""
+    """The random numbers of a step, and what follows from them alone."""
 
     mask: Tensor | None
     """Update mask, uint8, shape [B, N]; None: all particles are updated."""
@@ -79,7 +79,7 @@ class Draws(NamedTuple):
     rows: StaticRows | None = None
     """Rows of the active particles, where particles never move."""
     births: Births | None = None
-    """What fates and children hang on, where particles divide."""
+    """Random numbers of divisions, where particles divide."""
 
 
 def draw_step(x: Tensor, physics: Physics, generator: Randomness | None) -> Draws:
@@ -103,12 +103,12 @@ def draw_step(x: Tensor, physics: Physics, generator: Randomness | None) -> Draw
 
 
 def iterate_draws(draw: Callable[[], Draws], like: Tensor, steps: int) -> Iterator[Draws]:
-    """Yield what each of some steps draws, in the same order everywhere.
+    """Yield each step's random draws, in the same order on every device.
 
     In a CUDA graph some steps' draws are made while the steps before them run.
 
     Args:
-        draw: Returns what the next step draws.
+        draw: Returns the next step's draws.
     """
     # Asked in this order: a compiler cannot trace what a stream does.
     recording = not torch.compiler.is_compiling() and like.is_cuda
@@ -265,7 +265,7 @@ class DivisionStep(NamedTuple):
 
     def enter(self, particles: Particles) -> Particles:
         """Return the worlds with states of zero in dead slots."""
-        # What lies in dead slots must not reach gradients either: 0 times NaN is NaN.
+        # Dead slots must not enter gradients either: 0 times NaN is NaN.
         s = particles.s
         return particles._replace(s=torch.where(living(s)[..., None], s, 0.0))
 
@@ -314,7 +314,7 @@ class DivisionStep(NamedTuple):
 
 
 class SpeciesSpec(NamedTuple):
-    """What may differ between species, besides their rules."""
+    """The constants of one species."""
 
     size: int
     """Its particles in a world."""
@@ -336,7 +336,7 @@ class Species(NamedTuple):
     """One past its last particle."""
     update_prob: float
     """Probability of each of its particles' updates."""
-    reach_share: float
+    displacement_share: float
     """Its largest displacement as a share of the largest of all species."""
     count_ratio: float
     """Particles of a world over those by which this species divides densities."""
@@ -406,10 +406,10 @@ class SpeciesStep(NamedTuple):
                 gradient = _recounted(z[:, begin:end], own.count_ratio)
                 z = torch.cat((z[:, :begin], gradient, z[:, end:]), dim=1)
             if appended is not None:
-                beside = appended[:, own.first : own.end].flatten(0, 1).index_select(0, particle)
+                extra = appended[:, own.first : own.end].flatten(0, 1).index_select(0, particle)
                 if own.count_ratio != 1.0:
-                    beside = _recounted_by_species(beside, len(species), own.count_ratio)
-                z = torch.cat((z, beside), dim=1)
+                    extra = _recounted_by_species(extra, len(species), own.count_ratio)
+                z = torch.cat((z, extra), dim=1)
             outputs.append(_update_of(own, z))
             places.append(place)
         width = min(output.shape[1] for output in outputs)
@@ -447,7 +447,7 @@ def make_species_step(
                 first=first,
                 end=first + own.size,
                 update_prob=constant(own.update_prob),
-                reach_share=rule.alpha / longest,
+                displacement_share=rule.alpha / longest,
                 count_ratio=x.shape[1] / own.density_count,
             )
         )
@@ -532,11 +532,11 @@ def _update_of(own: Species, z: Tensor) -> Tensor:
             rest = z.new_zeros(len(z), own.network.row_width - rule.perception_dim - 1)
             z = torch.cat((z[:, : rule.perception_dim], one, rest), dim=1)
         update = own.network(z)
-    if rule.static or own.reach_share == 1.0:
+    if rule.static or own.displacement_share == 1.0:
         return update
-    # The displacement r q δ / (1 + |δ|), with this share q of the common reach r, is that of
+    # The displacement r q δ / (1 + |δ|), a share q of the common largest one r, is that of
     # δ' = q δ / (1 + (1 - q) |δ|), which is pulled back by the same operator.
     delta = update[:, : rule.space_dim]
     length = torch.linalg.vector_norm(delta, dim=1, keepdim=True)
-    delta = own.reach_share * delta / (1.0 + (1.0 - own.reach_share) * length)
+    delta = own.displacement_share * delta / (1.0 + (1.0 - own.displacement_share) * length)
     return torch.cat((delta, update[:, rule.space_dim :]), dim=1)

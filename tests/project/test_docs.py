@@ -666,7 +666,7 @@ def test_the_map_names_what_is_there():
     """Of the drawings' lines, of the way of `eps`, and of "`name` in `file`"."""
     text = MAP.read_text(encoding="utf-8")
     trail = re.findall(r"((?:npa_envs|envs)/[\w/]+\.py): ([\w.]+)", text)
-    assert len(trail) == 9
+    assert len(trail) == 8
     drawn = re.findall(r"((?:world|ops|rule|envs/core)/\w+\.py) +([A-Za-z_]\w*(?:\.\w+)?) ", text)
     assert len(drawn) > 10
     told = [pair[::-1] for pair in re.findall(r"`([\w.]+)` (?:in|of) `([\w/]+\.py)`", text)]
