@@ -324,12 +324,7 @@ class VectorObservations(EpisodeWrapper):
 
 
 class Twin(RecordConstructorArgs):
-    """The common part of a wrapper of one world and its form for many, before their other base.
-
-    Args:
-        env: An environment of this package.
-        recorded: Arguments that the environment's spec holds.
-    """
+    """The common part of a wrapper of one world and its form for many, before their other base."""
 
     def __init__(self, env: Any, **recorded: Any) -> None:
         self.many = isinstance(self, EpisodeWrapper)
