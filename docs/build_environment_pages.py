@@ -99,7 +99,8 @@ def resolved_sections(env_class: type) -> dict[str, str]:
             gardens = {
                 heading: f"As in [every garden]({page}#{heading.lower().replace(' ', '-')})."
                 for heading in gardens
-            }
+                if heading != "Info"
+            } | {"Info": gardens["Info"]}
         shared |= gardens
     found = {"": own[""]}
     for heading in order:

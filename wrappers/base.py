@@ -36,7 +36,7 @@ VectorStep = tuple[Any, Any, Any, Any, dict[str, Any]]
 
 
 def single_env(env: Any, wrapper: str) -> NPAEnv:
-    """Return the environment of this package that lies under wrappers, for a wrapper of that name."""
+    """Return this package's environment under wrappers, for a wrapper of that name."""
     base = getattr(env, "unwrapped", None)
     if isinstance(base, NPAEnv):
         return base
@@ -60,7 +60,7 @@ def vector_env(env: Any, wrapper: str) -> NPAVectorEnv:
 
 
 def torch_env(env: Any, adapter: str) -> NPAVectorEnv:
-    """Return the vector environment under wrappers, for an adapter that keeps tensors it is given."""
+    """Return the vector environment under wrappers, for an adapter that keeps its tensors."""
     base = vector_env(env, adapter)
     if base.config.output != "torch":
         raise NPAError(
@@ -324,12 +324,7 @@ class VectorObservations(EpisodeWrapper):
 
 
 class Twin(RecordConstructorArgs):
-    """The common part of a wrapper of one world and its form for many, before their other base.
-
-    Args:
-        env: An environment of this package.
-        recorded: Arguments that the environment's spec holds.
-    """
+    """The common part of a wrapper of one world and its form for many, before their other base."""
 
     def __init__(self, env: Any, **recorded: Any) -> None:
         self.many = isinstance(self, EpisodeWrapper)

@@ -29,11 +29,7 @@ Event = str | DamageEvent
 
 
 class Schedule:
-    """When worlds are damaged; arguments are those of `DamageEvents`.
-
-    Raises:
-        NPAError: There is no event, one is wrong, or `every` is no whole number of at least 1.
-    """
+    """When worlds are damaged; arguments are those of `DamageEvents`."""
 
     def __init__(self, events: Event | Sequence[Event], every: int | None) -> None:
         several: Any = events

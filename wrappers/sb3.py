@@ -50,15 +50,7 @@ class SharedInfo(dict[str, Any]):
 
 
 class RowVecEnv(VecEnv):
-    """Rows of a batch of worlds, as many of each; subclasses say what a row sees, does and gets.
-
-    Args:
-        env: The environment of many worlds.
-        world_count: Worlds B.
-        row_count: Rows of a world, R.
-        observation_space: Space of a row's observations.
-        action_space: Space of its actions.
-    """
+    """Rows of a batch of worlds, as many of each; subclasses say what a row sees, does and gets."""
 
     def __init__(
         self,

@@ -76,7 +76,7 @@ class SpeciesPlan:
         return blocks[keys.argsort(dim=1, stable=True)]
 
     def space(self, space: Space[Any], wrapper: str) -> Box:
-        """Return the space of observations with tags, for a wrapper of that name, by that without."""
+        """Return the space of observations with tags, by that without, for a wrapper."""
         count = len(self.blocks)
         if not isinstance(space, Box) or len(space.shape) != 2 or space.shape[0] != count:
             raise NPAError(

@@ -1,9 +1,7 @@
 """Wrappers with running statistics: of perception, of observations, rewards and episodes.
 
-`NormalizePerception` and its vector form have one scale for each group of a perception vector. The
-others are Gymnasium's statistics wrappers for vector environments whose arrays are torch tensors:
-they do what `gymnasium.wrappers.vector` does for NumPy, under the same names behind "Torch", stay
-on the device, and know all three ways in which worlds begin their next episode.
+The wrappers named "Torch..." are those of `gymnasium.wrappers.vector` for tensors: they stay on the
+device, and know all three autoreset modes.
 """
 
 from __future__ import annotations
@@ -43,9 +41,6 @@ PRIOR_COUNT = 1e-4
 
 class RunningMoments:
     """Mean and variance of everything seen so far, without waiting for the device.
-
-    Args:
-        shape: Shape of a sample.
 
     Attributes:
         mean: Float64, of the given shape.

@@ -10,7 +10,6 @@ import gymnasium
 import numpy as np
 import pytest
 import torch
-from gymnasium.utils.env_checker import check_env
 from small_envs import IDS, assert_same, make, make_vec, small
 
 import npa_envs
@@ -45,13 +44,6 @@ def episode(env, seed, count=12, beside=None):
         if beside is not None:
             beside.step(-action)
     return trace
-
-
-@every_id
-def test_gymnasium_finds_nothing_to_complain_of(name):
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        check_env(make(name).unwrapped)
 
 
 @every_id

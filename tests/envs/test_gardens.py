@@ -1,17 +1,13 @@
 """Living worlds: brushes, weather, spaces, seeds; tests run over the table of gardens."""
 
-import pickle
-import re
 import warnings
 from hashlib import sha256
-from pathlib import Path
 
 import gymnasium
 import numpy as np
 import pytest
 import torch
-from gymnasium.utils.env_checker import check_env
-from small_envs import assert_batch_of_singles, assert_same
+from small_envs import assert_same
 
 import npa_envs
 from npa_envs.envs.garden.brush_layout import BrushLayout, brushed, grid_places
@@ -32,13 +28,7 @@ SMALL = {
     "rule_steps": 2,
 }
 TOOLS = ("push", "wipe", "inject", "rate")
-FORMS = (
-    {"tools": TOOLS},
-    {"actions": "discrete", "observe": "picture", "tools": TOOLS},
-    {"actions": "free", "brush_count": 3, "observe": "moments"},
-)
 every_id = pytest.mark.parametrize("name", IDS)
-every_form = pytest.mark.parametrize("form", FORMS, ids=("grid", "discrete", "free"))
 
 
 @pytest.fixture(autouse=True)
@@ -65,89 +55,6 @@ def sampled(env, count, seed=0):
     """Actions of one world or of many."""
     env.action_space.seed(seed)
     return [env.action_space.sample() for _ in range(count)]
-
-
-@every_id
-@every_form
-def test_gymnasium_and_sb3_find_nothing_to_complain_of(name, form):
-    checker = pytest.importorskip("stable_baselines3.common.env_checker")
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        check_env(make(name, **form).unwrapped)
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always")
-        checker.check_env(make(name, **form).unwrapped)
-    # Pictures are no images of bytes, and brushes are rows: it advises to flatten both.
-    assert [str(w.message) for w in caught if "flatten" not in str(w.message)] == []
-
-
-@every_id
-@every_form
-def test_vector_equals_single_over_autoresets(name, form, device):
-    keywords = {"max_episode_steps": 4, "device": str(device)} | form
-    if "actions" not in form:
-        keywords |= {"reward": "sparse"}
-    envs = make_vec(name, 3, **keywords)
-    singles = [make(name, **keywords) for _ in range(3)]
-    reasons, _ = assert_batch_of_singles(envs, singles, sampled(envs, 10))
-    assert reasons == {None, "time limit"}
-
-
-@every_id
-def test_gymnasiums_own_batches_of_single_worlds_agree(name):
-    ours = make_vec(name, 2, max_episode_steps=3)
-    theirs = gymnasium.vector.SyncVectorEnv(
-        [lambda: make(name, max_episode_steps=3)] * 2,
-        autoreset_mode=ours.metadata["autoreset_mode"],
-    )
-    assert ours.observation_space == theirs.observation_space
-    assert ours.action_space == theirs.action_space
-    assert_same(ours.reset(seed=0)[0], theirs.reset(seed=0)[0])
-    for action in sampled(ours, 7):
-        left, right = ours.step(action), theirs.step(action)
-        assert_same(left[:4], right[:4])
-        for key, value in right[4].items():
-            if key != "final_info":
-                assert_same(list(left[4][key]), list(value), key)
-
-
-@every_id
-def test_an_episode_follows_from_its_seed_and_survives_pickling(name):
-    env, other = make(name), make(name)
-    actions = sampled(env, 4)
-    first = [env.reset(seed=5), *(env.step(action) for action in actions)]
-    again = [other.reset(seed=5), *(other.step(action) for action in actions)]
-    assert_same(first, again)
-    copied = pickle.loads(pickle.dumps(env.unwrapped))
-    assert_same(env.unwrapped.step(actions[0]), copied.step(actions[0]))
-    other.reset(seed=6)
-    assert other.step(actions[0])[4]["loss"] != first[1][4]["loss"]
-
-
-@every_id
-def test_info_has_the_keys_that_the_page_lists(name):
-    page = Path(__file__).parents[2] / "docs" / "environments" / f"{name[4:-3]}.md"
-    section = page.read_text(encoding="utf-8").split("## Info\n")[1].split("\n## ")[0]
-    rows = [line.split("|")[1:3] for line in section.splitlines() if line.startswith("| `")]
-    listed = [(key, when) for keys, when in rows for key in re.findall("`([^`]+)`", keys)]
-    env = make(name, success_loss=1e6)
-    _, at_reset = env.reset(seed=0)
-    *_, at_step = env.step(env.action_space.sample())
-    assert sorted(key for key, when in listed if "reset" in when) == sorted(at_reset)
-    assert sorted(key for key, _ in listed) == sorted(at_step)
-
-
-@every_id
-def test_masked_reset_leaves_other_worlds_alone(name):
-    envs, others = (make_vec(name, 3) for _ in range(2))
-    actions = sampled(envs, 2)
-    for batch in (envs, others):
-        batch.reset(seed=0)
-        batch.step(actions[0])
-    envs.reset(seed=9, options={"reset_mask": np.array([False, True, False])})
-    left, right = envs.step(actions[1]), others.step(actions[1])
-    assert np.array_equal(left[4]["loss"][[0, 2]], right[4]["loss"][[0, 2]])
-    assert left[4]["loss"][1] != right[4]["loss"][1]
 
 
 @every_id

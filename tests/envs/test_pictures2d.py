@@ -1,13 +1,10 @@
 """Several pictures in one environment: which is asked for, what is paid, what is told."""
 
-import warnings
-
 import gymnasium
 import numpy as np
 import pytest
 import torch
-from gymnasium.utils.env_checker import check_env
-from small_envs import assert_batch_of_singles, assert_same, make, make_vec
+from small_envs import assert_same, make, make_vec
 
 from npa_envs import NPAError
 from npa_envs.agents import RandomPolicy, ZeroPolicy
@@ -62,28 +59,6 @@ def test_rows_end_with_the_picture_that_is_asked_for(device):
         np.testing.assert_allclose(context_info[0], squares.transpose(2, 0, 1), atol=1e-6)
     action = told.action_space.sample()
     assert_same(told.step(action)[0][..., :-TOLD], plain.step(action)[0])
-
-
-@pytest.mark.parametrize("mode", ["same-step", "next-step"])
-def test_a_batch_that_is_told_its_pictures_equals_single_environments(mode, device):
-    keywords = {"observe_target": True, "max_episode_steps": 3, "device": str(device)}
-    envs = make_vec(NAME, 3, autoreset_mode=mode, **keywords)
-    singles = [make(NAME, **keywords) for _ in range(3)]
-    random = np.random.default_rng(0)
-    actions = [random.uniform(-1, 1, envs.action_space.shape).astype(np.float32) for _ in range(8)]
-    reasons, _ = assert_batch_of_singles(envs, singles, actions, mode)
-    assert "time limit" in reasons
-
-
-def test_checkers_find_nothing_to_complain_of_where_pictures_are_told():
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        check_env(make(NAME, observe_target=True).unwrapped, skip_render_check=True)
-    sb3 = pytest.importorskip("stable_baselines3.common.env_checker")
-    with warnings.catch_warnings():
-        # It would rather have flat actions, of any environment whose actions are rows.
-        warnings.filterwarnings("ignore", message=".*")
-        sb3.check_env(make(NAME, observe_target=True))
 
 
 def test_a_world_keeps_its_picture_and_a_pool_knows_those_of_its_worlds():

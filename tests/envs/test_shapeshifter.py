@@ -1,16 +1,12 @@
 """Worlds whose code the agent chooses: spaces, goals that change, seeds, batches."""
 
-import re
-import warnings
 from itertools import pairwise
-from pathlib import Path
 
 import gymnasium
 import numpy as np
 import pytest
 import torch
-from gymnasium.utils.env_checker import check_env
-from small_envs import assert_batch_of_singles, assert_same
+from small_envs import assert_same
 
 import npa_envs
 from npa_envs.agents.shapeshifting import RecognisingShapeshifter
@@ -18,7 +14,6 @@ from npa_envs.errors import DivergedError, NPAError
 
 ID = "npa/Shapeshifter2D-v0"
 NAMES = ("heart", "ring", "letter-a")
-FORMS = pytest.mark.parametrize("actions", ["code", "choice"])
 
 
 @pytest.fixture(scope="module")
@@ -56,24 +51,6 @@ def make_vec(small, world_count, **keywords):
 def sampled(env, count, seed=0):
     env.action_space.seed(seed)
     return [env.action_space.sample() for _ in range(count)]
-
-
-@FORMS
-def test_gymnasium_and_sb3_find_nothing_to_complain_of(small, actions):
-    checker = pytest.importorskip("stable_baselines3.common.env_checker")
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        check_env(make(small, actions=actions).unwrapped)
-        checker.check_env(make(small, actions=actions).unwrapped)
-
-
-@FORMS
-def test_vector_equals_single_over_autoresets(small, actions, device):
-    keywords = {"max_episode_steps": 5, "device": str(device), "actions": actions}
-    envs = make_vec(small, 3, **keywords)
-    singles = [make(small, **keywords) for _ in range(3)]
-    reasons, _ = assert_batch_of_singles(envs, singles, sampled(envs, 12))
-    assert reasons == {None, "time limit"}
 
 
 def test_a_choice_is_the_code_of_that_number(small):
@@ -177,15 +154,3 @@ def test_rules_that_do_not_fit_are_refused(small):
         make(small, state_dim=9)
     with pytest.raises(NPAError, match="picture_size must divide"):
         make(small, picture_size=5)
-
-
-def test_info_has_the_keys_that_the_page_lists(small):
-    page = Path(__file__).parents[2] / "docs" / "environments" / "Shapeshifter2D.md"
-    section = page.read_text(encoding="utf-8").split("## Info\n")[1].split("\n## ")[0]
-    rows = [line.split("|")[1:3] for line in section.splitlines() if line.startswith("| `")]
-    listed = [(key, when) for keys, when in rows for key in re.findall("`([^`]+)`", keys)]
-    env = make(small, success_loss=1e6)
-    _, at_reset = env.reset(seed=0)
-    *_, at_step = env.step(env.action_space.sample())
-    assert sorted(key for key, when in listed if "reset" in when) == sorted(at_reset)
-    assert sorted(key for key, _ in listed) == sorted(at_step)
