@@ -13,7 +13,13 @@ from npa_envs.ops.update import ActionRules, PreparedActions, update_particles
 
 B, N, C = 3, 77, 5
 REACH, DT, STATE_SCALE = 0.07, 0.8, 0.6
-RULES = {"max_displacement": REACH, "dt": DT, "state_scale": STATE_SCALE, "moving": True, "box": None}
+RULES = {
+    "max_displacement": REACH,
+    "dt": DT,
+    "state_scale": STATE_SCALE,
+    "moving": True,
+    "box": None,
+}
 LIMITS = {"position_limit": 50.0, "state_limit": 20.0}
 GIVEN = {"mask": None, "noise": None, "enabled": None, **RULES, **LIMITS}
 ERRORS = {torch.float32: 1e-6, torch.float64: 3e-15}
