@@ -43,6 +43,8 @@ def check_dense(name: str, tensor: Tensor) -> None:
     Raises:
         NPAError: It is sparse, or on another kind of device.
     """
+    if tensor.is_nested:
+        raise NPAError(f"{name} must be one dense tensor, got a nested one: run each by itself")
     if tensor.layout != torch.strided or tensor.device.type not in ("cpu", "cuda"):
         raise NPAError(
             f"{name} must be a dense tensor on 'cpu' or 'cuda', got {tensor.layout} on "
@@ -62,6 +64,7 @@ def check_world(x: Tensor, s: Tensor) -> None:
                 f"{name} must be a torch tensor, got {type(tensor).__name__}: "
                 f"convert it with torch.as_tensor"
             )
+        check_dense(name, tensor)
         if tensor.ndim != 3:
             cure = f"add a world dimension with {name}[None]" if tensor.ndim == 2 else "reshape it"
             raise NPAError(
@@ -71,7 +74,6 @@ def check_world(x: Tensor, s: Tensor) -> None:
             raise NPAError(
                 f"{name} must be float32 or float64, got {tensor.dtype}: convert it with .float()"
             )
-        check_dense(name, tensor)
     if x.shape[2] not in (2, 3):
         raise NPAError(f"x must have 2 or 3 coordinates, got shape {tuple(x.shape)}")
     if x.shape[:2] != s.shape[:2]:

@@ -20,6 +20,7 @@ import torch
 import warp as wp
 from torch import Tensor
 
+from npa_envs.errors import NPAError
 from npa_envs.kernels.access import CUDA_BLOCK
 from npa_envs.kernels.cpu import SMALLEST_RANGES
 from npa_envs.once import alone, made_once
@@ -93,7 +94,7 @@ class _ArrayArgument:
         size = tensor.shape
         if size != self._size or tensor.dtype is not self._dtype or not tensor.is_contiguous():
             self._describe(tensor, size)
-        self._place.data = tensor.data_ptr()
+        self._place.data = tensor.data_ptr() or _null(tensor)
 
     def _describe(self, tensor: Tensor, size: torch.Size) -> None:
         """Write shape and strides: by itself where only the first dimension has changed."""
@@ -107,6 +108,20 @@ class _ArrayArgument:
             self._joined = self._shape[0] // size[0] if size[0] else 0
         # One with strides of its own is described each time.
         self._size, self._dtype = size if dense else NEVER, tensor.dtype
+
+
+def _null(tensor: Tensor) -> int:
+    """Return 0, the address of an empty tensor.
+
+    Raises:
+        NPAError: The tensor has numbers, but no memory of its own.
+    """
+    if tensor.numel():
+        raise NPAError(
+            "tensors must have memory of their own, got a tensor subclass that wraps others "
+            f"({type(tensor).__name__}): give the plain tensors within it"
+        )
+    return 0
 
 
 def _overwrite(place: Any, made: Any) -> None:
@@ -220,7 +235,7 @@ class _Arguments:
 
     def set_address(self, index: int, tensor: Tensor) -> None:
         """Let an array begin elsewhere."""
-        getattr(self._memory, self._names[index]).data = tensor.data_ptr()
+        getattr(self._memory, self._names[index]).data = tensor.data_ptr() or _null(tensor)
 
     def _bounds_of(self, size: tuple[int, ...]) -> Any:
         bounds = self._bounds.get(size)

@@ -9,6 +9,7 @@ from __future__ import annotations
 import functools
 import inspect
 from collections.abc import Callable, Iterator
+from types import NoneType
 from typing import Any, Generic, NoReturn, ParamSpec, TypeVar
 
 import torch
@@ -23,6 +24,9 @@ Result = TypeVar("Result")
 
 
 _transforms_active = torch._C._are_functorch_transforms_active
+
+PLAIN_TYPES = {Tensor, nn.Parameter, torch.dtype, bool, int, float, str, list, tuple, NoneType}
+"""Types of arguments that kernels read as they are; other tensors may wrap some."""
 
 CURE = "or take small worlds with the slow operators of npa_envs.reference, which are plain torch"
 
@@ -39,10 +43,8 @@ def check_derivatives(**given: Any) -> None:
         NPAError: A tensor carries a tangent of forward-mode derivatives, or a function of
             `torch.func` makes the call.
     """
-    # Asked in this order: a compiler cannot trace the other questions.
-    if torch.compiler.is_compiling():
-        return
-    if _transforms_active():
+    # Asked in this order: a compiler cannot trace the other question.
+    if not torch.compiler.is_compiling() and _transforms_active():
         raise NPAError(
             f"{', '.join(given)} must not be given within a function of torch.func (grad, vjp, "
             "jvp, jacrev, jacfwd, vmap, ...), which cannot look into kernels, got a call within "
@@ -55,6 +57,10 @@ def check_derivatives(**given: Any) -> None:
 
 def _check_tangents(given: dict[str, Any]) -> None:
     """Check within a `dual_level` that no tensor carries a tangent."""
+    if torch.compiler.is_compiling():
+        # Only calls that a compiler does not trace show tangents.
+        torch.compiler.disable(_check_tangents)(given)
+        return
     for name, value in given.items():
         for tensor in _tensors(value):
             _, tangent = forward_ad.unpack_dual(tensor)  # type: ignore[no-untyped-call]
@@ -100,17 +106,17 @@ class Opaque(Generic[Arguments, Result]):
 
     def __call__(self, *args: Arguments.args, **kwargs: Arguments.kwargs) -> Result:
         """Run the function on plain tensors, and the operator on all others."""
-        # Asked in this order: a compiler cannot trace the other questions.
-        if torch.compiler.is_compiling() or not _is_plain(args[0]) or is_in_torch_dispatch_mode():
-            result: Result = self._operator(*args, **kwargs)
-            return result
         if forward_ad._current_level >= 0:
             _check_tangents(dict(zip(self._names, args, strict=False)) | kwargs)
+        # Asked in this order: a compiler cannot trace the other questions.
+        if (
+            torch.compiler.is_compiling()
+            or not PLAIN_TYPES.issuperset(map(type, (*args, *kwargs.values())))
+            or is_in_torch_dispatch_mode()
+        ):
+            result: Result = self._operator(*args, **kwargs)
+            return result
         return self._function(*args, **kwargs)
-
-
-def _is_plain(value: Any) -> bool:
-    return type(value) is Tensor or type(value) is nn.Parameter
 
 
 def opaque(name: str) -> Callable[[Callable[Arguments, Result]], Opaque[Arguments, Result]]:

@@ -91,6 +91,24 @@ def test_a_tangent_is_refused(name, gradients, device):
                 EVERYTHING[name](*given)
 
 
+@pytest.mark.parametrize("backend", ["eager", "aot_eager"])
+@pytest.mark.parametrize("name", ["perception", "a rollout", "a picture", "a mean", "fields"])
+def test_compiled_functions_refuse_tangents(name, backend, device):
+    x, s = world(device)
+    torch.compiler.reset()
+    value = torch.compile(EVERYTHING[name], backend=backend)
+    plain = value(x, s)
+    with torch.no_grad(), forward_ad.dual_level():
+        assert_same(value(x, s), plain)
+        dual = forward_ad.make_dual(x, torch.ones_like(x))
+        with pytest.raises(npa_envs.NPAError, match=TANGENT):
+            value(dual, forward_ad.make_dual(s, torch.ones_like(s)))
+    function = functools.partial(EVERYTHING[name], x)
+    jvp = torch.compile(lambda s: torch.func.jvp(function, (s,), (s,)), backend=backend)
+    with pytest.raises(npa_envs.NPAError, match=f"{TANGENT}|{TRANSFORM}"):
+        jvp(s)
+
+
 @everything
 def test_functions_of_torch_func_are_refused(name, device):
     x, s = world(device)

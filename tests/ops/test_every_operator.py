@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import pytest
 import torch
+from torch.testing._internal.two_tensor import TwoTensor
 from worlds import assert_same, lively_rule, random_world
 
 import npa_envs
@@ -110,3 +111,30 @@ def test_a_compiled_function_refuses_second_derivatives_too():
     penalty = gradient.square().sum()
     with pytest.raises(RuntimeError, match="double backward"):
         penalty.backward()
+
+
+@pytest.mark.parametrize("wrapped", ["x", "s", "both"])
+def test_tensors_that_wrap_others_have_the_results_of_each(wrapped):
+    x, s = random_world(1, 31, 3, 5, dtype=torch.float32, device="cpu")
+    pairs = [
+        TwoTensor(value, 0.5 * value) if wrapped in (name, "both") else value
+        for name, value in (("x", x), ("s", s))
+    ]
+    others = [
+        0.5 * value if isinstance(pair, TwoTensor) else value
+        for value, pair in zip((x, s), pairs, strict=True)
+    ]
+    perception = npa_envs.perceive(*pairs, 0.3)
+    assert_same(
+        (perception.a, perception.b),
+        (npa_envs.perceive(x, s, 0.3), npa_envs.perceive(*others, 0.3)),
+    )
+    with pytest.raises(npa_envs.NPAError, match=r"memory of their own, got .*TwoTensor"):
+        npa_envs.perception_fields(*pairs, 0.3)
+
+
+def test_nested_tensors_are_refused():
+    x, s = random_world(2, 31, 3, 5, dtype=torch.float32, device="cpu")
+    nested = [torch.nested.nested_tensor([value[0], value[1, :9]]) for value in (x, s)]
+    with pytest.raises(npa_envs.NPAError, match="x must be one dense tensor, got a nested one"):
+        npa_envs.perceive(*nested, 0.3)
