@@ -12,7 +12,7 @@ from torch import Tensor
 
 import npa_envs
 from npa_envs.rule.rule import NPARule
-from npa_envs.tasks.base import PictureTask
+from npa_envs.tasks.base import Task
 
 IMAGES = Path(__file__).resolve().parent / "images"
 FPS = 20.0
@@ -34,7 +34,7 @@ class FilmedWorld:
     def __init__(
         self,
         rule: NPARule,
-        task: PictureTask,
+        task: Task,
         draw: Callable[[Tensor, Tensor], Frame],
         *,
         seed: int,

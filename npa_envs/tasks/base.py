@@ -276,7 +276,7 @@ class ParticleTask(Generic[ConfigT]):
         return bound
 
 
-Task = ParticleTask[Any]
+Task = PictureTask = ParticleTask[Any]
 """Any task."""
 
 
