@@ -276,8 +276,11 @@ class ParticleTask(Generic[ConfigT]):
         return bound
 
 
-Task = PictureTask = ParticleTask[Any]
+Task = ParticleTask[Any]
 """Any task."""
+
+PictureTask = Task
+"""Any task, where only pictures are asked for."""
 
 
 def check_goal(goal: Tensor, count: int) -> None:
