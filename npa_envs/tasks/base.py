@@ -279,6 +279,9 @@ class ParticleTask(Generic[ConfigT]):
 Task = ParticleTask[Any]
 """Any task."""
 
+PictureTask = Task
+"""Any task, where only pictures are asked for."""
+
 
 def check_goal(goal: Tensor, count: int) -> None:
     """Check the goals of worlds; their range only on a CPU, as no task may wait for a CUDA device.
