@@ -59,7 +59,7 @@ def _check_tangents(given: dict[str, Any]) -> None:
     """Check within a `dual_level` that no tensor carries a tangent."""
     if torch.compiler.is_compiling():
         # Only calls that a compiler does not trace show tangents.
-        torch.compiler.disable(_check_tangents)(given)
+        torch.compiler.disable(_check_tangents)(given)  # type: ignore[no-untyped-call]
         return
     for name, value in given.items():
         for tensor in _tensors(value):
