@@ -68,12 +68,14 @@ def action_tensor(
     came = ""
     if not isinstance(action, Tensor):
         try:
-            if np.iscomplexobj(action):
-                raise TypeError("complex numbers")
+            given = np.asanyarray(action)
+            if given.dtype.kind not in "biufO" or np.ma.is_masked(given):
+                raise TypeError("no real numbers, or some that are masked")
             # Torch cannot read what may not be written.
-            action = torch.from_numpy(np.require(action, np.float32, ("C", "W")))
+            action = torch.from_numpy(np.require(given, np.float32, ("C", "W")))
         except (TypeError, ValueError, OverflowError):
             came = type(action).__name__
+            came += f" of {action.dtype}" if isinstance(action, np.ndarray) else ""
     if not came and (tuple(action.shape) != wanted or action.dtype.is_complex):
         came = f"{tuple(action.shape)} of {action.dtype}"
     elif not came and (action.layout != torch.strided or action.is_meta):

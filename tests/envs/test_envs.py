@@ -457,7 +457,16 @@ def test_action_before_a_reset_or_of_another_shape_is_an_error(name, shape):
         NPAError, match=rf"action must be real numbers of shape \[N, A\] = \(61, {right[1]}\)"
     ):
         env.step(np.zeros(shape, np.float32))
-    for wrong in ("left", np.zeros(right, complex), torch.zeros(right, dtype=torch.complex64)):
+    for wrong in (
+        "left",
+        np.zeros(right, complex),
+        torch.zeros(right, dtype=torch.complex64),
+        np.zeros(right, str),
+        np.full(right, "0.5"),
+        np.zeros(right, "datetime64[s]"),
+        np.zeros(right, "timedelta64[s]"),
+        np.ma.masked_array(np.zeros(right), mask=np.eye(*right)),
+    ):
         with pytest.raises(NPAError, match="action must be real numbers"):
             env.step(wrong)
     fixed = np.zeros(right, np.float32)

@@ -91,12 +91,11 @@ def test_a_tangent_is_refused(name, gradients, device):
                 EVERYTHING[name](*given)
 
 
-@pytest.mark.parametrize("backend", ["eager", "aot_eager"])
-@pytest.mark.parametrize("name", ["perception", "a rollout", "a picture", "a mean", "fields"])
-def test_compiled_functions_refuse_tangents(name, backend, device):
+@pytest.mark.parametrize("name", ["perception", "a rollout", "a picture", "a mean"])
+def test_compiled_functions_refuse_tangents(name, device):
     x, s = world(device)
     torch.compiler.reset()
-    value = torch.compile(EVERYTHING[name], backend=backend)
+    value = torch.compile(EVERYTHING[name], backend="eager")
     plain = value(x, s)
     with torch.no_grad(), forward_ad.dual_level():
         assert_same(value(x, s), plain)
@@ -104,7 +103,7 @@ def test_compiled_functions_refuse_tangents(name, backend, device):
         with pytest.raises(npa_envs.NPAError, match=TANGENT):
             value(dual, forward_ad.make_dual(s, torch.ones_like(s)))
     function = functools.partial(EVERYTHING[name], x)
-    jvp = torch.compile(lambda s: torch.func.jvp(function, (s,), (s,)), backend=backend)
+    jvp = torch.compile(lambda s: torch.func.jvp(function, (s,), (s,)), backend="eager")
     with pytest.raises(npa_envs.NPAError, match=f"{TANGENT}|{TRANSFORM}"):
         jvp(s)
 
