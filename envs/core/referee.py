@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -21,6 +21,9 @@ from npa_envs.world.actions import (
 )
 from npa_envs.world.cuda_graph import pinned_like
 from npa_envs.world.randomness import WorldRandom
+
+if TYPE_CHECKING:
+    from npa_envs.envs.core.worlds import WorldState
 
 FLAGS = ("success", "diverged")
 """Names of the first two endings in `info`."""
@@ -84,13 +87,13 @@ class WorldReferee:
 
     Args:
         task: Gives losses.
-        x: Positions [length units], shape [B, N, D]; read in place.
-        s: States, dimensionless, shape [B, N, C]; read in place.
+        worlds: Whose particles; x and s are read in place.
         episode_steps: Steps after which an episode is cut off, or None for never.
     """
 
-    def __init__(self, task: Any, x: Tensor, s: Tensor, episode_steps: int | None) -> None:
-        self.task, self.x, self.s, self.episode_steps = task, x, s, episode_steps
+    def __init__(self, task: Any, worlds: WorldState, episode_steps: int | None) -> None:
+        self.x, self.s = x, s = worlds.x, worlds.s
+        self.task, self.episode_steps = task, episode_steps
         config, device, (world_count, count) = task.config, x.device, x.shape[:2]
 
         def zeros(*shape: int, dtype: torch.dtype = torch.float32) -> Tensor:

@@ -240,7 +240,7 @@ class BatchedWorlds(WorldState):
         extra, count = task_type.extra_bytes(config, world_count), config.particle_count
         super().__init__(config, task_type, world_count, count, extra)
         self.task: Any = task_type(config, self.device)
-        self.referee = parts.referee(self.task, self.x, self.s, episode_steps)
+        self.referee = parts.referee(self.task, self, episode_steps)
         """What judges the worlds."""
         self.action: Any = parts.action(self)
         """What an action does."""

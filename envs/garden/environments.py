@@ -11,7 +11,7 @@ from npa_envs.envs.core.referee import WorldReferee
 from npa_envs.envs.core.single import NPAEnv
 from npa_envs.envs.core.task import Start
 from npa_envs.envs.core.vector import NPAVectorEnv
-from npa_envs.envs.core.worlds import BatchedWorlds, Parts, not_finite
+from npa_envs.envs.core.worlds import BatchedWorlds, Parts, WorldState, not_finite
 from npa_envs.envs.garden.spaces import BrushSpaces
 from npa_envs.world.randomness import StreamId, WorldRandom
 
@@ -84,9 +84,9 @@ class GardenObserver:
 class GardenReferee(WorldReferee):
     """Pays what the task says a world is worth; arguments are those of `WorldReferee`."""
 
-    def __init__(self, task: Any, x: Tensor, s: Tensor, episode_steps: int | None) -> None:
-        super().__init__(task, x, s, episode_steps)
-        self.context = x.new_zeros(len(x), task.context_count)
+    def __init__(self, task: Any, worlds: WorldState, episode_steps: int | None) -> None:
+        super().__init__(task, worlds, episode_steps)
+        self.context = worlds.x.new_zeros(worlds.world_count, task.context_count)
 
     @property
     def pays_last_step_alone(self) -> bool:
