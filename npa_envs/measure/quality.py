@@ -562,7 +562,7 @@ def grown(
             task.seed(len(seeds), generator=WorldRandom(seeds, device=device), device=device)
             for task in some
         ]
-        x, s = (torch.cat(parts) for parts in zip(*fresh, strict=True))
+        x, s = torch.cat([x for x, *_ in fresh]), torch.cat([s for _, s, _ in fresh])
         random = WorldRandom([*seeds] * len(some), device=device)
         done = 0
         for number, step in enumerate(checkpoints):

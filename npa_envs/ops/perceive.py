@@ -101,18 +101,18 @@ def perceive(
     space_dim, state_dim = x.shape[2], s.shape[2]
     if eps0 is not None:
         eps0 = checked_eps("eps0", eps0, space_dim, x.dtype)
-    made = physics(space_dim, state_dim, x.dtype, eps=eps, eps0=eps0, box=box)
-    check_finite_positions(x)
     inverse = checked_moment_inverse(moment_inverse)
     terms = Terms(
         checked_flag("state_gradient", state_gradient),
         inverse if checked_flag("moment_correction", moment_correction) else None,
         checked_flag("density_gradient", density_gradient),
     )
+    made = physics(space_dim, state_dim, x.dtype, eps=eps, eps0=eps0, box=box, terms=terms)
+    check_finite_positions(x)
     perception, rows = perceive_rows(
         x.detach() if checked_flag("detach_positions", detach_positions) else x,
         s,
-        made._replace(terms=terms),
+        made,
         mask=None,
         row_capacity=x.shape[0] * x.shape[1],
         row_width=terms.perception_dim(space_dim, state_dim),

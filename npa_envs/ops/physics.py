@@ -47,6 +47,9 @@ class Limits(NamedTuple):
     """A state beyond this is out of bounds, dimensionless."""
 
 
+NO_LIMITS = Limits()
+
+
 class Physics(NamedTuple):
     """The constants of worlds; `physics` makes and checks them."""
 
@@ -72,7 +75,7 @@ class Physics(NamedTuple):
     """Time step, dimensionless."""
     position_noise: float = 0.0
     """Standard deviation of the noise on every position in a step [length units]."""
-    limits: Limits = Limits()
+    limits: Limits = NO_LIMITS
     """Bounds of environments."""
 
     @property
@@ -98,14 +101,20 @@ class Physics(NamedTuple):
         if not torch.compiler.is_compiling():
             return self
         sides = self.sides()
-        return self._replace(
-            eps=constant(self.eps),
-            eps0=constant(self.eps0),
-            box=None if sides is None else tuple(sides),
-            max_displacement=constant(self.max_displacement),
-            update_prob=constant(self.update_prob),
-            dt=constant(self.dt),
-            position_noise=constant(self.position_noise),
+        # Compilers lose fields that `_replace` or a default would fill in.
+        return Physics(
+            self.space_dim,
+            self.state_dim,
+            constant(self.eps),
+            constant(self.eps0),
+            None if sides is None else tuple(sides),
+            self.terms,
+            self.moving,
+            constant(self.max_displacement),
+            constant(self.update_prob),
+            constant(self.dt),
+            constant(self.position_noise),
+            self.limits,
         )
 
 
@@ -184,6 +193,7 @@ def _checked(
         update_prob,
         dt,
         position_noise,
+        NO_LIMITS,
     )
 
 

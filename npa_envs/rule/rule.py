@@ -386,7 +386,7 @@ class NPARule(nn.Module):
         hidden, output = layers[:2]
         return (
             (type(self) is NPARule or _steps_alike(type(self)))
-            and STEP_PARTS.isdisjoint(vars(self))
+            and not any(name in self.__dict__ for name in STEP_PARTS)
             and getattr(hidden, "bias", None) is not None
             and getattr(output, "bias", None) is None
             and not any(is_altered(module) or _has_backward_hooks(module) for module in layers)

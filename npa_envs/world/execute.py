@@ -61,22 +61,22 @@ class RolloutSpec(NamedTuple):
 
     def make_step(self, rules: Sequence[NPARule], particles: Particles) -> Step:
         """Return the step of these worlds."""
-        physics = self.physics.constants()
         if self.species:
             return make_species_step(
                 rules,
                 self.species,
-                physics,
+                self.physics.constants(),
                 particles.x,
                 by_species=self.by_species,
                 detach_positions=self.detach_positions,
             )
         (rule,) = rules
-        # A rule without a network runs as the module that it is.
-        step = RuleStep(rule, rule.network(), physics, self.detach_positions)
+        physics = self.physics.constants()
         moving = physics.moving or physics.position_noise > 0.0 or not self.detach_positions
         if not moving and self.steps >= FEWEST_STATIC:
-            return StaticStep.of(step, particles.x)
+            return StaticStep.of(rule, physics, particles.x)
+        # A rule without a network runs as the module that it is.
+        step = RuleStep(rule, rule.network(), physics, self.detach_positions)
         return DivisionStep(step) if rule.divides else step
 
     def run(

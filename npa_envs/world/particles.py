@@ -62,7 +62,9 @@ class Particles(NamedTuple):
         def gathered(value: Tensor) -> Tensor:
             return value.flatten(0, 1).index_select(0, order).view_as(value)
 
-        return self._replace(goal=None).map(gathered)._replace(goal=self.goal)
+        x, s, path_length, goal = self
+        path_length = None if path_length is None else gathered(path_length)
+        return Particles(gathered(x), gathered(s), path_length, goal)
 
     def copy_(self, other: Particles) -> None:
         """Write other worlds here, by one kernel."""

@@ -222,16 +222,18 @@ class StaticStep(NamedTuple):
     """Positions, wrapped."""
 
     @classmethod
-    def of(cls, step: RuleStep, x: Tensor) -> StaticStep:
+    def of(cls, rule: NPARule, physics: Physics, x: Tensor) -> StaticStep:
         """Return the step of worlds at these positions."""
         # Later parts of a rollout begin at wrapped positions, and so does the first.
-        x = wrapped(x, step.physics.box)
-        static = prepare_static(x, step.physics)
-        return cls(step._replace(static=static), static, x)
+        x = wrapped(x, physics.box)
+        # First: compilers trace nothing across it.
+        static = prepare_static(x, physics)
+        return cls(RuleStep(rule, rule.network(), physics, True, static), static, x)
 
     def enter(self, particles: Particles) -> Particles:
         """Return the worlds in sorted order."""
-        return particles._replace(x=self.x).gather(self.static.tensors.source)
+        _, s, path_length, goal = particles
+        return Particles(self.x, s, path_length, goal).gather(self.static.tensors.source)
 
     def draw(self, like: Tensor, steps: int, source: Randomness | None) -> Iterator[Draws]:
         """Yield each step's rows, which are given some steps at a time, in few launches."""
@@ -266,16 +268,17 @@ class DivisionStep(NamedTuple):
     def enter(self, particles: Particles) -> Particles:
         """Return the worlds with states of zero in dead slots."""
         # Dead slots must not enter gradients either: 0 times NaN is NaN.
-        s = particles.s
-        return particles._replace(s=torch.where(living(s)[..., None], s, 0.0))
+        x, s, path_length, goal = particles
+        return Particles(x, torch.where(living(s)[..., None], s, 0.0), path_length, goal)
 
     def draw(self, like: Tensor, steps: int, source: Randomness | None) -> Iterator[Draws]:
         """Yield each step's update mask, position noise, fates and directions of children."""
 
         def draw() -> Draws:
-            drawn = draw_step(like, self.step.physics, source)
+            mask, noise, *_ = draw_step(like, self.step.physics, source)
             chance = uniform_draws(source, like.shape[:2], like)
-            return drawn._replace(births=Births(chance, normal_draws(source, like.shape, like)))
+            births = Births(chance, normal_draws(source, like.shape, like))
+            return Draws(mask, noise, None, births)
 
         return iterate_draws(draw, like, steps)
 
@@ -291,7 +294,7 @@ class DivisionStep(NamedTuple):
         perceived = torch.cat((life.detach(), rest), dim=-1)
         after = self.step.advance(
             Particles(parked(x, alive, eps), perceived, path_length),
-            draws._replace(mask=updated.byte()),
+            Draws(updated.byte(), draws.noise, draws.rows, draws.births),
         )
         # A rule does not change life.
         new_s = torch.cat((life, after.s[..., LIFE + 1 :]), dim=-1)
@@ -367,7 +370,7 @@ class SpeciesStep(NamedTuple):
                 else:
                     chance = torch.rand(like.shape[:2], device=like.device, generator=source)
                 mask, kept = drawn.mask, (chance < self.update_share).to(torch.uint8)
-                drawn = drawn._replace(mask=kept if mask is None else mask * kept)
+                drawn = Draws(kept if mask is None else mask * kept, drawn.noise)
             yield drawn
 
     def advance(self, particles: Particles, draws: Draws) -> Particles:

@@ -46,7 +46,7 @@ LADDER = {
     "npa_envs.reference": rung(1, "torch"),
     "npa_envs.reference_gaussians": rung(1, "torch"),
     "npa_envs.kernels": rung(1, "warp"),
-    "npa_envs.world.cuda_graph": rung(1, "torch numpy"),
+    "npa_envs.world.cuda_graph": rung(3, "torch numpy", never=ORACLES),
     "npa_envs.ops": rung(2, "warp torch", never=("npa_envs.reference",)),
     "npa_envs.world.randomness": rung(3, "torch numpy", never=ORACLES),
     "npa_envs.world.divergence": rung(3, "torch", never=ORACLES),

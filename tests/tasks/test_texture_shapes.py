@@ -151,7 +151,7 @@ def test_an_empty_target_can_be_compared_with(name):
     weightless = Texture(
         dataclasses.replace(SMALL, loss=name, colour_weight=0.0, density_weight=0.0)
     )
-    x, s = weightless.seed(1, generator=torch.Generator().manual_seed(0))
+    x, s, _ = weightless.seed(1, generator=torch.Generator().manual_seed(0))
     metric = weightless.metric(x.requires_grad_(), s)
     (slope,) = torch.autograd.grad(metric.sum(), x)
     assert torch.isfinite(metric).all()
@@ -175,7 +175,7 @@ def test_losses_do_not_depend_on_the_batch(name, resolution, device):
 
 @pytest.mark.parametrize("name", JOINT)
 def test_joint_losses_weigh_colours_and_density(name):
-    x, s = Texture(SMALL).seed(1, generator=torch.Generator().manual_seed(1))
+    x, s, _ = Texture(SMALL).seed(1, generator=torch.Generator().manual_seed(1))
     s[..., -3:] = 0.4 * torch.sin(9.0 * x[..., :1] + torch.tensor([0.0, 1.0, 2.0]))
     task = Texture(dataclasses.replace(SMALL, loss=name))
     colour, density = task.texture_losses(x, s)

@@ -151,6 +151,7 @@ def test_others_draw_while_something_is_recorded():
     torch.cuda.manual_seed(0)
     draw()
     draw()
+    torch.cuda.synchronize()
     assert torch.equal(drawn[1], drawn[3])
     assert torch.equal(drawn[2], drawn[4])
     assert numbers.tolist() == [1.0] * 10
