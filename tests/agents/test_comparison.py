@@ -106,7 +106,9 @@ def child(monkeypatch):
 def pids(folder) -> list[int]:
     """Numbers of processes that wrote them below a folder."""
     # A file that has just appeared may be empty still.
-    return [int(text) for path in folder.glob("pid-*") if (text := path.read_text())]
+    return [
+        int(text) for path in folder.glob("pid-*") if (text := path.read_text(encoding="utf-8"))
+    ]
 
 
 def is_alive(pid: int) -> bool:
@@ -235,7 +237,9 @@ def test_runs_are_spread_over_devices_and_leave_their_records(tmp_path, child):
         (1.0 + job.seed, 2.0 + job.seed) for job in made.jobs()
     ]
     assert {one.command for one in seen} == {"it"}
-    used = {(tmp_path / job.folder / "place.txt").read_text() for job in made.jobs()}
+    used = {
+        (tmp_path / job.folder / "place.txt").read_text(encoding="utf-8") for job in made.jobs()
+    }
     assert used == {"cpu", "other"}
     assert not list(tmp_path.rglob(".seed*"))
     assert not list(tmp_path.rglob("request.json"))
@@ -256,7 +260,9 @@ def test_on_gpus_the_next_process_gets_ready_and_waits_for_its_turn(tmp_path, ch
     for device, seen in {"cuda:0": ["01", "11", "20"], "cpu": ["00", "10", "20"]}.items():
         folder = tmp_path / device
         run_jobs(made, made.jobs(), folder, Places((device,)))
-        assert [(folder / job.folder / "seen").read_text() for job in made.jobs()] == seen
+        assert [
+            (folder / job.folder / "seen").read_text(encoding="utf-8") for job in made.jobs()
+        ] == seen
 
 
 def test_no_place_stays_free_while_a_process_waits(tmp_path, child):
@@ -307,7 +313,7 @@ def test_runs_follow_each_other_in_a_process_until_one_fails(tmp_path, monkeypat
     assert told == dict.fromkeys((0, 1, 3, 5, 6), "done") | {2: "failed", 4: "failed"}
     assert seen[2].error.startswith("its process ended with code 3")
     ran = {
-        one.job.seed: int((tmp_path / one.job.folder / "pid").read_text())
+        one.job.seed: int((tmp_path / one.job.folder / "pid").read_text(encoding="utf-8"))
         for one in seen
         if one.job.seed != 2
     }
@@ -351,7 +357,7 @@ def test_a_run_that_clones_begins_when_its_teacher_is_over(tmp_path, child, devi
     run_jobs(made, made.jobs(), tmp_path, Places((device,), jobs=4), written=seen.append)
     order = [str(one.job.folder) for one in seen]
     for job in made.jobs():
-        taught = (tmp_path / job.folder / "seen").read_text()
+        taught = (tmp_path / job.folder / "seen").read_text(encoding="utf-8")
         assert taught == str(job.method == "clone")
         if job.method == "clone":
             teacher = str(made.teacher(job).folder)
@@ -429,7 +435,7 @@ def test_what_a_killed_comparison_left_half_way_is_swept_away(tmp_path, child):
     (job,) = made.jobs()
     left = tmp_path / job.folder.parent / ".seed-0.1234"
     left.mkdir(parents=True)
-    (left / "run.json").write_text("{")
+    (left / "run.json").write_text("{", encoding="utf-8")
     assert held_records(made, tmp_path) == {}
     run_jobs(made, [job], tmp_path, Places(("cpu",)))
     assert not left.exists()
@@ -663,7 +669,7 @@ def test_a_quick_comparison_stops_goes_on_and_refuses_other_settings(tmp_path, c
     assert first.stat().st_mtime_ns == before
     assert len(list(folder.rglob("run.json"))) == 2
 
-    held = json.loads((folder / "evolution" / "seed-0" / "run.json").read_text())
+    held = json.loads((folder / "evolution" / "seed-0" / "run.json").read_text(encoding="utf-8"))
     assert (held["status"], len(held["returns"])) == ("done", 4)
     assert held["curve"][-1]["particle_steps"] >= 20000
     assert str(tmp_path) not in json.dumps(held)
@@ -671,12 +677,16 @@ def test_a_quick_comparison_stops_goes_on_and_refuses_other_settings(tmp_path, c
     problem = make_problem("morphogenesis2d", quick=True)
     assert len(list(RuleSet.load(folder / "evolution" / "seed-0", problem))) == 1
     assert f"| evolution | 1 | {np.mean(held['returns']):.3f}" in told
-    table = json.loads((tmp_path / "comparison.json").read_text())
+    table = json.loads((tmp_path / "comparison.json").read_text(encoding="utf-8"))
     assert [row["method"] for row in table["rows"]] == ["evolution", "zero"]
-    lines = (tmp_path / "comparison.csv").read_text().splitlines()
+    lines = (tmp_path / "comparison.csv").read_text(encoding="utf-8").splitlines()
     ends = [line for line in lines if ",morphogenesis2d,evolution,0," in line]
     assert len(ends) == len(held["curve"])
-    assert (tmp_path / "comparison.md").read_text().endswith(told.split("wrote")[0].rstrip() + "\n")
+    assert (
+        (tmp_path / "comparison.md")
+        .read_text(encoding="utf-8")
+        .endswith(told.split("wrote")[0].rstrip() + "\n")
+    )
     for name in ("grown_morphogenesis2d_particle-steps.png", "curves_morphogenesis2d.png"):
         assert (tmp_path / name).read_bytes().startswith(b"\x89PNG")
 
@@ -690,13 +700,13 @@ def test_a_method_that_raises_is_in_the_table_and_the_command_says_so(tmp_path, 
     assert "| evolution | 0, 1 failed | – |" in told
     assert "evolution/seed-0 failed: NPAError: population must be a whole number" in told
     output = tmp_path / "particle-steps/morphogenesis2d/evolution/seed-0/output.txt"
-    assert "Traceback" in output.read_text()
+    assert "Traceback" in output.read_text(encoding="utf-8")
 
 
 def request_of(job, made, folder) -> None:
     """Write the request of a job into a folder."""
     request = {"job": dataclasses.asdict(job), "facts": made.facts(job)}
-    (folder / "request.json").write_text(json.dumps(request))
+    (folder / "request.json").write_text(json.dumps(request), encoding="utf-8")
 
 
 def train_wildly(progress):

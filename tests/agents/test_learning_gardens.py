@@ -81,7 +81,7 @@ def test_a_policy_of_another_garden_or_a_file_of_something_else_is_refused(tmp_p
     seen, _ = garden("Shepherd2DSmall").make_envs().reset(seed=0)
     with pytest.raises(NPAError, match="observation must be of a garden like that which"):
         GardenPolicy.load(path)(seen)
-    path.write_text("no archive")
+    path.write_text("no archive", encoding="utf-8")
     with pytest.raises(NPAError, match=r"path must be of a file that sac's `save` wrote, got"):
         GardenPolicy.load(path)
 

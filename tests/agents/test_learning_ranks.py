@@ -135,7 +135,7 @@ def test_a_run_that_two_processes_have_begun_goes_on_alone(tmp_path):
     # It has gone on from where it was, with the entries that there were.
     assert steps == [0, 2, 4, 8]
     assert weights != before
-    lines = (tmp_path / "run" / "log.jsonl").read_text().splitlines()
+    lines = (tmp_path / "run" / "log.jsonl").read_text(encoding="utf-8").splitlines()
     assert [json.loads(line)["particle_steps"] // ROUND["shac"] for line in lines] == steps
     rule = load_rule(tmp_path / "run" / "rule-0.safetensors")
     assert [weight.flatten().tolist() for weight in rule.parameters()] == weights

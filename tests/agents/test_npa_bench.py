@@ -70,9 +70,9 @@ def zero_row(tmp_path):
 
 def changed(path, change) -> None:
     """Change what a file of JSON holds."""
-    held = json.loads(path.read_text())
+    held = json.loads(path.read_text(encoding="utf-8"))
     change(held)
-    path.write_text(json.dumps(held))
+    path.write_text(json.dumps(held), encoding="utf-8")
 
 
 @pytest.mark.parametrize("suite", SUITES.values(), ids=SUITES)
@@ -120,7 +120,7 @@ def test_rows_come_back_from_their_files(tmp_path):
     for env_id in SUITE.entries:
         assert rows["zero"].returns(env_id).tolist() == [0.0, 1.0, 2.0, 3.0, 4.0]
     assert rows["zero"].runs[0].curve == ((0.0, -1.0), (1000.0, 0.5))
-    held = json.loads(first.read_text())
+    held = json.loads(first.read_text(encoding="utf-8"))
     assert (held["commit"], held["command"], held["date"]) == ("c0ffee", "it", "2026-01-02")
 
 
@@ -132,7 +132,8 @@ def _still(tmp_path, monkeypatch):
         "def train(progress, *, patience=1):\n"
         "    rules = progress.first_rules()\n"
         "    progress.start(rules)\n"
-        "    return rules\n"
+        "    return rules\n",
+        encoding="utf-8",
     )
 
 
@@ -149,7 +150,7 @@ def test_a_row_of_ones_own_says_what_was_run(tmp_path):
     assert {made.facts(job)["method"] for job in made.jobs()} == {"zero", "still:train", "ppo"}
     write_rows(small, made, records(made), tmp_path, "it")
     assert read_rows(small, tmp_path)["still"].about == "still:train"
-    held = json.loads((tmp_path / "bold.json").read_text())
+    held = json.loads((tmp_path / "bold.json").read_text(encoding="utf-8"))
     assert (held["about"], held["options"]) == ("ppo", {"credit": "marginal"})
 
 
@@ -159,7 +160,7 @@ def test_a_method_of_ones_own_is_compared(tmp_path):
     words = ["compare", "--quick", "--particle-steps", "100", "--no-progress", "--out", "out"]
     assert main([*words, "--methods", "still=still:train"]) == 0
     (path,) = (tmp_path / "out").glob("particle-steps/*/still/seed-0/run.json")
-    run = json.loads(path.read_text())
+    run = json.loads(path.read_text(encoding="utf-8"))
     assert (run["status"], run["facts"]["method"]) == ("done", "still:train")
 
 
@@ -168,7 +169,7 @@ def test_a_run_that_failed_is_in_no_row_and_one_that_diverged_has_no_returns(tmp
     some = records(made)
     some[0] = RunRecord(job=some[0].job, facts={}, status="failed")
     (path,) = write_rows(SUITE, made, some, tmp_path, "it")
-    assert len(json.loads(path.read_text())["runs"]) == len(some) - 1
+    assert len(json.loads(path.read_text(encoding="utf-8"))["runs"]) == len(some) - 1
     some[0] = RunRecord(job=some[0].job, facts={}, status="diverged", date="2026-01-01")
     write_rows(SUITE, made, some, tmp_path, "it")
     found = read_row(path)
@@ -207,12 +208,12 @@ def test_runs_of_a_row_from_several_machines_say_where_they_ran(zero_row):
 
 def test_a_narrower_call_keeps_the_rest_of_a_row(zero_row, tmp_path):
     made, path = zero_row
-    whole = json.loads(path.read_text())
+    whole = json.loads(path.read_text(encoding="utf-8"))
     fewer = plan_of(methods=("zero",), tasks=("MixingSmall-v0",))
     settings = fewer.settings | {"commit": "decade", "machine": "abacus"}
     fewer = dataclasses.replace(fewer, settings=settings)
     write_rows(SUITE, fewer, records(fewer), tmp_path, "second")
-    held = json.loads(path.read_text())
+    held = json.loads(path.read_text(encoding="utf-8"))
     assert (held["command"], held["commit"]) == ("first; second", "c0ffee; decade")
     assert held["machine"] == f"{whole['machine']}; abacus"
     assert held["versions"] == whole["versions"]
@@ -225,7 +226,7 @@ def test_a_narrower_call_keeps_the_rest_of_a_row(zero_row, tmp_path):
     assert set(where.values()) == {whole["machine"]}
     # What holds all of it takes its place.
     write_rows(SUITE, made, records(made), tmp_path, "first")
-    assert json.loads(path.read_text()) == whole
+    assert json.loads(path.read_text(encoding="utf-8")) == whole
 
 
 @pytest.mark.parametrize(

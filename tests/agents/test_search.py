@@ -188,7 +188,7 @@ def test_each_cell_keeps_its_best_and_the_scores_are_theirs(tmp_path):
     done = search(method="random", path=path)
     done.run(6 * BATCH_COST)
     best: dict[tuple[int, ...], float] = {}
-    held = json.loads(path.read_text())
+    held = json.loads(path.read_text(encoding="utf-8"))
     for batch in held["batches"]:
         for told in batch["found"]:
             if told is not None:
@@ -225,9 +225,9 @@ def test_a_record_of_other_settings_or_candidates_is_refused(tmp_path):
     search(path=path).run(2 * BATCH_COST)
     with pytest.raises(NPAError, match="figures of other settings: seed was 0, now 1"):
         search(path=path, seed=1)
-    held = json.loads(path.read_text())
+    held = json.loads(path.read_text(encoding="utf-8"))
     held["batches"][1]["fingerprint"] += 1
-    path.write_text(json.dumps(held))
+    path.write_text(json.dumps(held), encoding="utf-8")
     with pytest.raises(NPAError, match="batch 1 is of others"):
         search(path=path)
 
@@ -243,7 +243,7 @@ def test_the_command_leaves_elites_that_other_commands_open(tmp_path, capsys):
     files = sorted((out / "elites").glob("*.safetensors"))
     told = json.loads(rule_metadata(files[0])["found"])
     assert sorted(told) == ["crowding", "mixing", "quality", "speed"]
-    page = (out / "atlas.html").read_text()
+    page = (out / "atlas.html").read_text(encoding="utf-8")
     assert page.count("<img") == len(files)
     assert f'href="elites/{files[0].name}"' in page
     assert (out / "atlas.png").read_bytes().startswith(b"\x89PNG")

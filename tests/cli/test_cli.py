@@ -237,7 +237,9 @@ def test_doctor_finds_packages_that_are_missing_or_old(monkeypatch):
 )
 def test_doctor_says_why_no_card_is_used(built, cards, hidden, mark, cure, monkeypatch, tmp_path):
     program = tmp_path / "nvidia-smi"
-    program.write_text(f"#!/bin/sh\necho '{cards}'\n" if cards else "#!/bin/sh\nexit 9\n")
+    program.write_text(
+        f"#!/bin/sh\necho '{cards}'\n" if cards else "#!/bin/sh\nexit 9\n", encoding="utf-8"
+    )
     program.chmod(0o755)
     monkeypatch.setenv("PATH", f"{tmp_path}{os.pathsep}{os.environ['PATH']}")
     monkeypatch.delenv("CUDA_VISIBLE_DEVICES", raising=False)
@@ -295,7 +297,7 @@ def test_train_says_what_it_learns_and_writes_a_rule_that_loads(tmp_path, capsys
     for name in ("rule.safetensors", "log.jsonl", "pictures"):
         assert str(folder / name) in text
         assert (folder / name).exists()
-    config = json.loads((folder / "config.json").read_text())
+    config = json.loads((folder / "config.json").read_text(encoding="utf-8"))
     assert (config["iterations"], config["milestones"]) == (10, [3, 5])
     assert config["task"]["target"] == "heart"
     assert load_rule(folder / "rule.safetensors").hidden_dim == config["task"]["hidden_dim"]
@@ -308,7 +310,7 @@ def test_train_says_what_it_learns_and_writes_a_rule_that_loads(tmp_path, capsys
 
 def test_a_configuration_file_goes_over_the_preset_and_options_over_the_file(tmp_path):
     path = tmp_path / "run.yaml"
-    path.write_text("learning_rate: 0.125\nparticle_count: 77\nseed: 5\n")
+    path.write_text("learning_rate: 0.125\nparticle_count: 77\nseed: 5\n", encoding="utf-8")
     words = ["--config", str(path), "--preset", "tiny", "--seed", "6", "--eps", "0.25"]
     base = starting_configuration("morphogenesis2d", words)
     _, config = parse("morphogenesis2d", base, words)
@@ -340,13 +342,13 @@ def test_runs_that_name_no_preset_take_the_best_one_on_cuda_and_the_fast_one_els
 
 def test_a_configuration_file_may_name_its_preset_and_the_command_line_another(tmp_path, capsys):
     path = tmp_path / "run.yaml"
-    path.write_text("preset: tiny\nseed: 5\n")
+    path.write_text("preset: tiny\nseed: 5\n", encoding="utf-8")
     words = ["--config", str(path)]
     config = starting_configuration("morphogenesis2d", words)
     assert (config.iterations, config.seed) == (40, 5)
     config = starting_configuration("morphogenesis2d", [*words, "--preset", "fast"])
     assert (config.iterations, config.seed) == (preset("fast").iterations, 5)
-    path.write_text("preset: tinny\n")
+    path.write_text("preset: tinny\n", encoding="utf-8")
     assert "did you mean 'tiny'" in error_of(capsys, ["train", "morphogenesis2d", *words])
 
 
@@ -387,7 +389,7 @@ def test_a_quick_encounter_is_of_two_rules(tmp_path, capsys, monkeypatch):
     for name, value in {"steps": 2, "seed_count": 1, "particle_count": 64}.items():
         monkeypatch.setitem(interact.QUICK, name, value)
     assert main(["interact", "--quick", "--no-progress", "--out", str(tmp_path)]) == 0
-    held = json.loads((tmp_path / "interactions.json").read_text())
+    held = json.loads((tmp_path / "interactions.json").read_text(encoding="utf-8"))
     assert (len(held["settings"]["seeds"]), held["settings"]["particle_count"]) == (1, 64)
     assert len(held["rows"]) == 2 * 2 * 2
 
@@ -593,7 +595,7 @@ def test_evaluate_prints_a_row_for_each_checkpoint(rule, tmp_path, capsys):
     words += [str(tmp_path / "table.json"), "--seed-count", "3", "--no-progress"]
     assert main(words) == 0
     text = capsys.readouterr().out
-    rows = json.loads((tmp_path / "table.json").read_text())["growth"]
+    rows = json.loads((tmp_path / "table.json").read_text(encoding="utf-8"))["growth"]
     assert [row["step"] for row in rows] == [2, 5]
     for row in rows:
         assert row["loss_worst"] >= row["loss"] > 0
@@ -641,7 +643,7 @@ def test_demo_shows_growth_healing_and_training(tmp_path, rule, capsys):
     assert main([*words, "--train-seconds", "1", "--no-progress"]) == 0
     text = capsys.readouterr().out
     assert len(re.findall(r"PSNR +\d+\.\d+ dB", text)) == 6
-    assert (out / "report.txt").read_text() in text
+    assert (out / "report.txt").read_text(encoding="utf-8") in text
     written = {Path(name) for name in re.findall(r"wrote (\S+)", text)}
     assert {path.suffix for path in written} == {".gif", ".mp4", ".png", ".txt", ".safetensors"}
     assert all(path.is_file() for path in written)

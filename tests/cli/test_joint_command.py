@@ -40,7 +40,9 @@ def test_options_are_those_of_all_species():
 
 def test_a_file_tells_species_apart_and_options_leave_what_they_do_not_name(tmp_path):
     path = tmp_path / "run.yaml"
-    path.write_text("species:\n- {particle_count: 77}\n- {alpha: 0.25, hidden_dim: 8}\n")
+    path.write_text(
+        "species:\n- {particle_count: 77}\n- {alpha: 0.25, hidden_dim: 8}\n", encoding="utf-8"
+    )
     # The value that the first species has must reach the second one, too.
     words = ("--preset", "tiny", "--config", str(path), "--hidden-dim", "32")
     first, second = parsed(*words).task.species

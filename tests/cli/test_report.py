@@ -75,7 +75,10 @@ def test_the_figures_of_a_report_are_those_of_the_command_that_it_names(tmp_path
     held = json.loads((tmp_path / "run" / "report" / "rule.json").read_text("utf-8"))
     _, *command = held["command"].split()
     assert main([*command, "--no-progress", "--json", str(tmp_path / "again.json")]) == 0
-    assert json.loads((tmp_path / "again.json").read_text())["growth"] == held["growth"]
+    assert (
+        json.loads((tmp_path / "again.json").read_text(encoding="utf-8"))["growth"]
+        == held["growth"]
+    )
     folder = str(tmp_path / "run")  # stands for its rule
     rule = load_rule(folder)
     task = task_of_rule(folder, rule, report.torch.device("cpu"))

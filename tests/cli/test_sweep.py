@@ -99,20 +99,22 @@ def test_a_run_that_fails_is_tried_again_and_those_that_are_over_are_left(tmp_pa
     assert "seed=1,target=a failed: out of luck" in told
     assert call(tmp_path) == 0
     assert capsys.readouterr().out.count("| done |") == 4
-    begun = {path.parent.name: path.read_text() for path in tmp_path.glob("*/begun")}
+    begun = {
+        path.parent.name: path.read_text(encoding="utf-8") for path in tmp_path.glob("*/begun")
+    }
     assert begun == {
         f"seed={seed},target={target}": "x" * (seed + 1) for seed in (0, 1) for target in "ab"
     }
-    words = json.loads((tmp_path / "seed=0,target=b" / "words").read_text())
+    words = json.loads((tmp_path / "seed=0,target=b" / "words").read_text(encoding="utf-8"))
     assert words[words.index("--device") + 1] == "cpu"
     assert words[words.index("--resume") + 1] == "auto"
-    assert (tmp_path / "sweep.md").read_text().count("done") == 4
+    assert (tmp_path / "sweep.md").read_text(encoding="utf-8").count("done") == 4
 
 
 @pytest.mark.parametrize("text", ["{}", "[]", '{"facts": {}, "code": "x", "seconds": 1}', "x"])
 def test_a_record_that_cannot_be_read_is_told(tmp_path, child, capsys, text):
     (tmp_path / "seed=0,target=a").mkdir()
-    (tmp_path / "seed=0,target=a" / "run.json").write_text(text)
+    (tmp_path / "seed=0,target=a" / "run.json").write_text(text, encoding="utf-8")
     assert call(tmp_path) == 2
     assert "must hold a record of npa-envs sweep" in capsys.readouterr().err
 
@@ -179,6 +181,7 @@ def in_a_terminal(tmp_path, words, program=()):
         stderr=subprocess.STDOUT,
         text=True,
         start_new_session=True,
+        encoding="utf-8",
     )
 
 
@@ -215,16 +218,16 @@ def test_a_stopped_sweep_leaves_checkpoints_of_the_last_iteration(tmp_path):
     run = in_a_terminal(tmp_path, [*words, "--iterations", "1000000"])
     logs = [tmp_path / f"seed={seed}" / "log.jsonl" for seed in (0, 1)]
     try:
-        wait_for(run, lambda: all(log.exists() and log.read_text() for log in logs))
+        wait_for(run, lambda: all(log.exists() and log.read_text(encoding="utf-8") for log in logs))
         run.terminate()
         said, _ = run.communicate(timeout=60)
     finally:
         run.kill()
     assert run.returncode == 130, said
     for log in logs:
-        last = json.loads(log.read_text().splitlines()[-1])["iteration"]
+        last = json.loads(log.read_text(encoding="utf-8").splitlines()[-1])["iteration"]
         assert load_checkpoint(log.parent / "checkpoint.pt")["iteration"] == last > 0
-        assert "stopped at iteration" in (log.parent / "output.txt").read_text()
+        assert "stopped at iteration" in (log.parent / "output.txt").read_text(encoding="utf-8")
 
 
 @pytest.mark.slow

@@ -19,10 +19,10 @@ from npa_envs.envs.regeneration2d import Regeneration2DEnvConfig
 from npa_envs.registration import ALL, ENVIRONMENTS, SIZES, SPECIES_SIZES
 from npa_envs.rule.files import rule_file, shipped_rules
 
-FROZEN = json.loads(Path(__file__).with_name("frozen_sizes.json").read_text())
+FROZEN = json.loads(Path(__file__).with_name("frozen_sizes.json").read_text(encoding="utf-8"))
 """Steps of an episode and keywords by id, as they were when the ids were made."""
 
-FROZEN_RULES = json.loads(Path(__file__).with_name("frozen_rules.json").read_text())
+FROZEN_RULES = json.loads(Path(__file__).with_name("frozen_rules.json").read_text(encoding="utf-8"))
 """SHA-256 of the file of the rule that runs or grows the worlds of an id, or of a target."""
 
 FEW = {"particle_count": 64, "resolution": 16, "view_count": 2}

@@ -59,7 +59,13 @@ def run_tests(tree: Path, tests: list[str], again: bool = False) -> tuple[str, s
     command = [sys.executable, "-m", "pytest", *plain, "-m", "not slow", *tests]
     try:
         done = subprocess.run(
-            command, cwd=tree, env=variables, capture_output=True, text=True, timeout=LIMIT
+            command,
+            cwd=tree,
+            env=variables,
+            capture_output=True,
+            text=True,
+            timeout=LIMIT,
+            encoding="utf-8",
         )
     except subprocess.TimeoutExpired:
         return "found", f"no end within {LIMIT:.0f} s"

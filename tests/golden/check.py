@@ -71,7 +71,7 @@ def read(path: Path) -> dict[str, np.ndarray]:
 def main(only: str = "") -> int:
     """Compare, and print what differs."""
     began = time.perf_counter()
-    commit = (HERE / "commit").read_text().strip()
+    commit = (HERE / "commit").read_text(encoding="utf-8").strip()
     with tempfile.TemporaryDirectory() as place:
         folder = Path(place)
         tree = folder / "reference"

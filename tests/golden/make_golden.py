@@ -57,7 +57,10 @@ def run_and_kill(task: str, folder: Path) -> None:
         log = Path(place) / "run" / "log.jsonl"
         while process.poll() is None:
             time.sleep(0.002)
-            if log.is_file() and len(log.read_text().splitlines()) > runs.CHECKPOINT_INTERVAL:
+            if (
+                log.is_file()
+                and len(log.read_text(encoding="utf-8").splitlines()) > runs.CHECKPOINT_INTERVAL
+            ):
                 break
         process.kill()
         process.wait()
@@ -65,8 +68,8 @@ def run_and_kill(task: str, folder: Path) -> None:
         subprocess.run(
             [*command, "--out", "whole"], cwd=place, check=True, stdout=subprocess.DEVNULL
         )
-        whole = (Path(place) / "whole" / "log.jsonl").read_text()
-        (folder / "whole_log.jsonl").write_text(whole)
+        whole = (Path(place) / "whole" / "log.jsonl").read_text(encoding="utf-8")
+        (folder / "whole_log.jsonl").write_text(whole, encoding="utf-8")
 
 
 def main() -> None:
@@ -85,7 +88,9 @@ def main() -> None:
         print(f"{name}: {time.perf_counter() - began:.2f} s")
     np.savez_compressed(scenes.GOLDEN, **arrays)
     content = names.everything() | {"documented": names.documented(FOLDER.parents[1])}
-    (FOLDER / "golden.json").write_text(json.dumps(content, indent=1, sort_keys=True) + "\n")
+    (FOLDER / "golden.json").write_text(
+        json.dumps(content, indent=1, sort_keys=True) + "\n", encoding="utf-8"
+    )
     for task, folder in runs.FOLDERS.items():
         run_and_kill(task, FOLDER / folder)
 

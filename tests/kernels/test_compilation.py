@@ -52,7 +52,7 @@ def test_cuda_kernels_compile(name: str, tmp_path: Path) -> None:
     (ptx,) = wp.compile_aot_module(
         VARIANTS[name]().module, arch=80, module_dir=tmp_path, use_ptx=True
     )
-    assert ".entry" in ptx.read_text(errors="replace")
+    assert ".entry" in ptx.read_text(errors="replace", encoding="utf-8")
 
 
 def test_every_source_file_is_read() -> None:

@@ -96,7 +96,7 @@ def test_kernels_of_warps_do_what_the_portable_ones_do(form, count, tmp_path):
     ]  # fmt: skip
     given[5] = given[5].sign()
     (tmp_path / "in").write_bytes(b"".join(value.numpy().tobytes() for value in given))
-    source = (KERNELS / "network.cuh").read_text()
+    source = (KERNELS / "network.cuh").read_text(encoding="utf-8")
     (adding,) = re.findall(
         r"template <int WARPS>\n__device__ inline void add_partial_sums.*?\n}\n", source, re.DOTALL
     )
@@ -126,7 +126,7 @@ def test_kernels_of_warps_do_what_the_portable_ones_do(form, count, tmp_path):
         steer_warps=cuda.STEER_WARPS,
         steered=cuda.STEERED_ROWS,
     )
-    (tmp_path / "program.cpp").write_text(program)
+    (tmp_path / "program.cpp").write_text(program, encoding="utf-8")
     compiler = ["g++", "-std=c++20", "-O1", "-pthread", "program.cpp", "-o", "program"]
     subprocess.run(compiler, cwd=tmp_path, check=True)
     subprocess.run(["./program"], cwd=tmp_path, check=True, timeout=300)

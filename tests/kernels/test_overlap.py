@@ -19,7 +19,7 @@ GLOBAL_ACCESS = re.compile(r"\b(?:ld|st|atom|red|cp|prefetch)\.(?!param|shared|l
 def kernel_bodies():
     """Yield name and statements after the docstring of each kernel in the folder."""
     for path in sorted(KERNELS.rglob("*.py")):
-        for node in ast.walk(ast.parse(path.read_text())):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
             marks = [ast.unparse(mark) for mark in getattr(node, "decorator_list", ())]
             if isinstance(node, ast.FunctionDef) and any("wp.kernel" in mark for mark in marks):
                 yield f"{path.stem}.{node.name}", node.body[1:]
@@ -49,7 +49,7 @@ def test_kernels_that_wait_do_so_first():
 
 def test_no_load_may_be_moved_ahead_of_the_wait():
     for path in KERNELS.rglob("*.cuh"):
-        code = re.sub(r"//.*", "", path.read_text())
+        code = re.sub(r"//.*", "", path.read_text(encoding="utf-8"))
         # Both promise that nobody writes what is read while the kernel is there.
         assert not re.search(r"__ldg|ld\.global\.nc|__restrict__", code), path.name
 
@@ -59,8 +59,8 @@ def test_memory_is_touched_after_the_wait(capability, waits, tmp_path):
     module = two_layer_kernel(1, 1, "note").module
     wp.compile_aot_module(module, arch=capability, module_dir=tmp_path, use_ptx=True)
     (file,) = tmp_path.glob("*.ptx")
-    assert "ld.global.nc" not in file.read_text()
-    entries = re.findall(r"\.entry \w+\(.*?\n\}\n", file.read_text(), re.DOTALL)
+    assert "ld.global.nc" not in file.read_text(encoding="utf-8")
+    entries = re.findall(r"\.entry \w+\(.*?\n\}\n", file.read_text(encoding="utf-8"), re.DOTALL)
     assert entries
     for entry in entries:
         # Blocks of instructions, of which the first is entered first.

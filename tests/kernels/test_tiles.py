@@ -27,7 +27,9 @@ def told_by(source, *folders):
     program = folders[0] / "program"
     options = ["-std=c++20", "-O2", "-w", *(f"-I{folder}" for folder in (HERE, *folders))]
     subprocess.run([compiler, *options, "-o", str(program), str(HERE / source)], check=True)
-    told = subprocess.run([str(program)], capture_output=True, text=True, timeout=300)
+    told = subprocess.run(
+        [str(program)], capture_output=True, text=True, timeout=300, encoding="utf-8"
+    )
     assert told.returncode == 0, told.stdout
     return told.stdout
 
@@ -38,7 +40,8 @@ def test_tiles_of_pictures_are_ranked_by_their_candidates(tmp_path):
 
 def test_tiles_find_all_neighbours_of_all_particles(tmp_path):
     tiles, mathematics, access = (
-        (KERNELS / name).read_text() for name in ("cuda/tiles.cuh", "mathematics.cuh", "access.cuh")
+        (KERNELS / name).read_text(encoding="utf-8")
+        for name in ("cuda/tiles.cuh", "mathematics.cuh", "access.cuh")
     )
     fetch, wait = function_of(tiles, "fetch"), function_of(tiles, "await_fetched")
     tiles = tiles.replace(fetch, fetch.split("{")[0] + "{ *to = *from; }\n")
@@ -46,5 +49,5 @@ def test_tiles_find_all_neighbours_of_all_particles(tmp_path):
     needed = [function_of(mathematics, name) for name in ("falloff_within", "smoothing")]
     needed.append(function_of(access, "sum_up_to"))
     head = "namespace npa {\n" + "\n".join(needed) + "}\nusing std::fmaf;\n"
-    (tmp_path / "native.h").write_text(head + tiles)
+    (tmp_path / "native.h").write_text(head + tiles, encoding="utf-8")
     assert told_by("tiles_on_cpu.cpp", tmp_path) == "720 worlds, 0 particles wrong\n"

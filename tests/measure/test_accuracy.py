@@ -133,7 +133,7 @@ def test_a_record_comes_back_as_it_was_written(tmp_path: Path):
     figures = {"a": 1.5, "b": math.inf, "c": math.nan}
     record = StressRecord(FACTS, path)
     record.put(CheckEntry("x/y", "s", "fail", figures, {"a": 1.0}, "", "n"))
-    held = json.loads(path.read_text())
+    held = json.loads(path.read_text(encoding="utf-8"))
     assert held["counts"] == {"pass": 0, "range": 0, "fail": 1, "skipped": 0}
     assert held["checks"][0]["figures"] == {"a": 1.5, "b": "inf", "c": "nan"}
     assert repr(StressRecord(FACTS, path).read().rows) == repr(record.rows)
@@ -340,7 +340,7 @@ def test_where_a_picture_is_gone_what_looks_at_it_is_skipped(tmp_path):
 def test_the_command_writes_a_record_draws_it_and_goes_on(tmp_path, capsys, monkeypatch):
     words = ["stress", "--quick", "--no-progress", "--out", str(tmp_path), "--commit", "x"]
     assert main([*words, "--only", "geometry/one", "values/nan_position"]) == 0
-    record = json.loads((tmp_path / "stress_cpu_quick.json").read_text())
+    record = json.loads((tmp_path / "stress_cpu_quick.json").read_text(encoding="utf-8"))
     assert record["counts"] == {"pass": 5, "range": 0, "fail": 0, "skipped": 0}
     assert record["facts"]["commit"] == "x"
     assert (tmp_path / "stress_cpu_quick_geometry.png").read_bytes().startswith(b"\x89PNG")
@@ -363,7 +363,9 @@ def test_checks_of_a_rule_that_was_trained_anew_are_run_again(tmp_path, capsys):
 
     def verdict():
         main(words)
-        (entry,) = json.loads((tmp_path / "stress_cpu_quick.json").read_text())["checks"]
+        (entry,) = json.loads((tmp_path / "stress_cpu_quick.json").read_text(encoding="utf-8"))[
+            "checks"
+        ]
         return entry["weights"], entry["verdict"]
 
     assert verdict() == (rule_digest(rule), "pass")

@@ -187,7 +187,7 @@ def test_pictures_are_drawn_of_what_was_measured():
 
 def stored(tmp_path: Path, **values: float) -> Path:
     path = tmp_path / "ratios.json"
-    path.write_text(json.dumps({"cpu": values}))
+    path.write_text(json.dumps({"cpu": values}), encoding="utf-8")
     return path
 
 
@@ -205,7 +205,7 @@ def test_the_library_is_faster_than_dense_torch_and_stored_ratios_are_those_meas
     measured = alternatives.ratios(session())
     assert measured["perceive: dense torch over library"] > 3.0
     assert all(value > 0.0 for value in measured.values())
-    assert sorted(json.loads(path.read_text())["cpu"]) == sorted(measured)
+    assert sorted(json.loads(path.read_text(encoding="utf-8"))["cpu"]) == sorted(measured)
 
 
 def test_the_script_prints_tables_writes_what_it_says_and_checks_ratios(
@@ -228,7 +228,7 @@ def test_the_script_prints_tables_writes_what_it_says_and_checks_ratios(
     for word in ("perception:", "neighbour_cap", "bf16_storage", "left out:", "times faster:"):
         assert word in text
     assert text.endswith("ratios are held\n")
-    loaded = json.loads(path.read_text())
+    loaded = json.loads(path.read_text(encoding="utf-8"))
     assert loaded["commit"] == "abc"
     assert sorted(loaded["ratios"])[-1] == "step: composed in torch over fused"
     strategies = {row["strategy"] for row in loaded["tables"]["perception"]}
@@ -241,6 +241,6 @@ def test_the_script_prints_tables_writes_what_it_says_and_checks_ratios(
 @pytest.mark.parametrize("text", ["{}", "[]", "no json", '{"cpu": {"a": "fast"}}'])
 def test_a_file_without_ratios_is_refused(text, tmp_path):
     path = tmp_path / "ratios.json"
-    path.write_text(text)
+    path.write_text(text, encoding="utf-8")
     with pytest.raises(NPAError, match="must hold ratios under 'cpu'"):
         alternatives.stored_ratios(path, torch.device("cpu"))

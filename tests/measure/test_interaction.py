@@ -248,7 +248,7 @@ class TestCommand:
 
     def test_every_pair_is_measured_written_and_drawn(self, rules, tmp_path, capsys):
         assert main(self.words(rules, tmp_path)) == 0
-        held = json.loads((tmp_path / "interactions.json").read_text())
+        held = json.loads((tmp_path / "interactions.json").read_text(encoding="utf-8"))
         pairs = [(found["rule"], found["beside"]) for found in held["rows"]]
         names = ["one", "two"]
         assert pairs == [(a, b) for a in names for b in names for _ in range(2)]
@@ -270,7 +270,7 @@ class TestCommand:
         pytest.importorskip("matplotlib")
         more = ("--eps-factors", "1", "1.5", "--no-itself")
         assert main(self.words(rules, tmp_path, *more)) == 0
-        rows = json.loads((tmp_path / "interactions.json").read_text())["rows"]
+        rows = json.loads((tmp_path / "interactions.json").read_text(encoding="utf-8"))["rows"]
         told = [(row["rule"], row["eps_factor"], row["distance"]) for row in rows]
         settings = [(factor, distance) for factor in (1.0, 1.5) for distance in (0.0, 2.0)]
         assert told == [(name, *each) for name in ("one", "two") for each in settings]
@@ -301,12 +301,16 @@ class TestCommand:
 
         monkeypatch.setattr(Encounters, "meet", stopped)
         assert main(self.words(rules, parts)) == 130
-        assert len(json.loads((parts / "interactions.json").read_text())["rows"]) == 4
+        assert (
+            len(json.loads((parts / "interactions.json").read_text(encoding="utf-8"))["rows"]) == 4
+        )
         capsys.readouterr()
         assert main(self.words(rules, parts)) == 0
         assert "2 of 4 pairs were measured before" in capsys.readouterr().out
         assert met[3:] == [("two", "one"), ("two", "two")]
-        texts = [(folder / "interactions.json").read_text() for folder in (whole, parts)]
+        texts = [
+            (folder / "interactions.json").read_text(encoding="utf-8") for folder in (whole, parts)
+        ]
         assert texts[0] == texts[1]
 
     def test_results_of_other_settings_are_not_mixed_with_these(self, rules, tmp_path, capsys):
@@ -346,7 +350,7 @@ class TestCommand:
         words = ["--quick", "--steps", "3", "--seed-count", "1", "--distances", "0", "0.5", "1"]
         words += ["--out", str(tmp_path), "--no-progress"]
         assert main(["interact", *paths, *words]) == 0
-        told = json.loads((tmp_path / "interactions.json").read_text())["settings"]
+        told = json.loads((tmp_path / "interactions.json").read_text(encoding="utf-8"))["settings"]
         # The last is the default, and was said all the same.
         assert (told["steps"], told["seeds"], told["distances"]) == (3, [1_000_000], [0, 0.5, 1])
         assert told["particle_count"] == 512

@@ -125,7 +125,7 @@ def test_the_command_prints_ratios_and_writes_them(tmp_path, capsys):
     asked = ["evaluate", "dots", "--judge", "--checkpoints", "2", "4", "--seed-count", "1"]
     assert main([*asked, "--particle-count", "128", "--no-progress", "--json", str(path)]) == 0
     assert "ratio worst" in capsys.readouterr().out
-    rows = json.loads(path.read_text())["judge"]
+    rows = json.loads(path.read_text(encoding="utf-8"))["judge"]
     assert [row["step"] for row in rows] == [2, 4]
     for row in rows:
         mean = (row["patches"] + row["spectra"] + row["colours"]) / 3.0

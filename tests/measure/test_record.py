@@ -58,7 +58,7 @@ def test_a_record_comes_back_with_null_for_what_is_not_finite(tmp_path):
 )
 def test_other_settings_and_other_files_are_refused(content, facts, message, tmp_path):
     path = tmp_path / "record.json"
-    path.write_text(content)
+    path.write_text(content, encoding="utf-8")
     with pytest.raises(NPAError, match=message) as error:
         read(path, facts)
     assert str(error.value).endswith("remove it, or choose another folder with --out")

@@ -387,7 +387,10 @@ def test_records_come_back_as_they_were_written_and_curves_are_drawn_by_task(tmp
     path = tmp_path / "robustness_heart.json"
     records[0].path = path
     records[0].write()
-    assert json.loads(path.read_text())["courses"][0]["recovery_steps"] == [16, None]
+    assert json.loads(path.read_text(encoding="utf-8"))["courses"][0]["recovery_steps"] == [
+        16,
+        None,
+    ]
     found = RuleRecord({"a": 1}, path).read()
     assert repr((found.rows, found.curves)) == repr((records[0].rows, records[0].curves))
     assert found.about == records[0].about
@@ -406,20 +409,20 @@ def test_the_command_measures_writes_and_goes_on(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr("npa_envs.measure.record.time_limit", lambda _: lambda: next(asked, True))
     assert main(words) == 0
     assert capsys.readouterr().out == "1 rules are left: call again with the same options\n"
-    part = json.loads(path.read_text())
+    part = json.loads(path.read_text(encoding="utf-8"))
     assert (part["done"], len(part["responses"])) == (False, 3)
     monkeypatch.undo()
     # The damages are not measured again.
     monkeypatch.setattr(study, "healing", lambda *_: pytest.fail("measured"))
     assert main(words) == 0
     first = capsys.readouterr().out
-    held = json.loads(path.read_text())
+    held = json.loads(path.read_text(encoding="utf-8"))
     assert held["command"].startswith("npa-envs robustness heart --quick")
     assert held["facts"]["seeds"] == [1_000_000, 1_000_001]
     assert {row["condition"] for row in held["responses"]} == set(CONDITIONS)
     assert all(math.isfinite(v) for row in held["responses"] for v in row["losses"])
     assert (held["courses"], held["responses"][:3]) == (part["courses"], part["responses"])
-    assert (tmp_path / "robustness.md").read_text() in first
+    assert (tmp_path / "robustness.md").read_text(encoding="utf-8") in first
     # Nothing is measured again.
     monkeypatch.setattr(study, "grow", lambda *_: pytest.fail("measured"))
     assert main(words) == 0
@@ -429,7 +432,7 @@ def test_the_command_measures_writes_and_goes_on(tmp_path, capsys, monkeypatch):
     whole = tmp_path / "whole"
     assert main([*words[:-1], str(whole)]) == 0
     (path,) = whole.glob("*.json")
-    whole = json.loads(path.read_text())
+    whole = json.loads(path.read_text(encoding="utf-8"))
     assert (whole["courses"], whole["responses"]) == (held["courses"], held["responses"])
 
 
@@ -445,7 +448,7 @@ def test_a_record_of_a_rule_that_was_trained_anew_is_refused(tmp_path, capsys, m
         "npa_envs.measure.record.time_limit", lambda _: iter([False, True]).__next__
     )
     assert main(words) == 0
-    held = json.loads((tmp_path / "out" / "robustness_mine.json").read_text())
+    held = json.loads((tmp_path / "out" / "robustness_mine.json").read_text(encoding="utf-8"))
     assert held["facts"]["weights"] == rule_digest(rule)
     assert str(tmp_path / "out") not in held["command"]
     with torch.no_grad():

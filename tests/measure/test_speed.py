@@ -259,7 +259,7 @@ def test_the_command_prints_tables_and_writes_what_it_says(tmp_path, monkeypatch
     assert "throughput:" in text
     (path,) = folder.iterdir()
     assert f"wrote {path}" in text
-    loaded = json.loads(path.read_text())
+    loaded = json.loads(path.read_text(encoding="utf-8"))
     assert (path.name, loaded["commit"]) == ("quick_cpu.json", "abc")
     assert loaded["command"].startswith("npa-envs bench --no-progress")
     # Nothing is written unless asked for.

@@ -271,6 +271,7 @@ def printed(program, threads):
         text=True,
         timeout=60,
         check=False,
+        encoding="utf-8",
     )
     assert done.returncode == 0, done.stderr
     return done.stdout.split("\n")[:-1]

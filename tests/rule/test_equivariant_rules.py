@@ -282,10 +282,11 @@ def test_the_authors_equivariant_rules_run_as_theirs(tmp_path):
     assert_runs_as(npa_envs.load_rule(tmp_path / "npa.pth"), rules[0])
     path = tmp_path / "models.json"
     path.write_text(
-        json.dumps({name: packed(demo_tensors(rules[k])) for k, name in enumerate("ab")})
+        json.dumps({name: packed(demo_tensors(rules[k])) for k, name in enumerate("ab")}),
+        encoding="utf-8",
     )
     assert_runs_as(npa_envs.load_rule(f"{path}#b"), rules[1])
-    path.write_text(json.dumps(stack_of(rules)))
+    path.write_text(json.dumps(stack_of(rules)), encoding="utf-8")
     for number, state in enumerate(rules):
         assert_runs_as(npa_envs.load_rule(f"{path}#{number}"), state)
 
@@ -304,7 +305,7 @@ def plain_stack(rules):
 def test_stacks_of_plain_rules_are_by_species_by_numbers(tmp_path):
     torch.manual_seed(0)
     rules, path = [NPARule(2, 5, 8) for _ in range(3)], tmp_path / "models_digits.json"
-    path.write_text(json.dumps(plain_stack(rules)))
+    path.write_text(json.dumps(plain_stack(rules)), encoding="utf-8")
     for number, rule in enumerate(rules):
         assert_same_rule(npa_envs.load_rule(f"{path}#{number}"), rule)
     with pytest.raises(npa_envs.NPAError, match="stack of 3 rules without names: add #0 to #2"):
@@ -312,7 +313,7 @@ def test_stacks_of_plain_rules_are_by_species_by_numbers(tmp_path):
     for wrong in ("3", "-1", "lizard", "", "9" * 5000):
         with pytest.raises(npa_envs.NPAError, match=f"got #{wrong[:20]}.*: give #0 to #2"):
             npa_envs.load_rule(f"{path}#{wrong}")
-    path.write_text(json.dumps(plain_stack(rules[:1])))
+    path.write_text(json.dumps(plain_stack(rules[:1])), encoding="utf-8")
     assert_same_rule(npa_envs.load_rule(path), rules[0])
 
 
@@ -338,7 +339,7 @@ def test_wrong_files_of_equivariant_rules_are_refused(tmp_path, case):
     change, message = BAD_ENTRIES[case]
     entry, path = packed(demo_tensors(authors_rule())), tmp_path / "models.json"
     change(entry)
-    path.write_text(json.dumps({"mine": entry}))
+    path.write_text(json.dumps({"mine": entry}), encoding="utf-8")
     with pytest.raises(npa_envs.NPAError, match=f"cannot load a rule from .*: .*{message}"):
         npa_envs.load_rule(path)
 
@@ -346,7 +347,7 @@ def test_wrong_files_of_equivariant_rules_are_refused(tmp_path, case):
 def test_wrong_stacks_and_state_dicts_are_refused(tmp_path):
     stack, path = stack_of([authors_rule(0), authors_rule(1)]), tmp_path / "models.json"
     stack["w2.bias"] = ones(1, 8)
-    path.write_text(json.dumps(stack))
+    path.write_text(json.dumps(stack), encoding="utf-8")
     with pytest.raises(npa_envs.NPAError, match=r"w2\.bias must be of as many rules as w1\.weight"):
         npa_envs.load_rule(f"{path}#1")
     state = authors_rule()

@@ -401,16 +401,20 @@ def demo_entry(rule: NPARule) -> dict[str, Any]:
 def test_a_rule_of_the_web_demo_is_the_same_rule(tmp_path: Path, state_dim: int) -> None:
     rule = NPARule(state_dim=state_dim)
     path = tmp_path / "models.json"
-    path.write_text(json.dumps({"other": demo_entry(NPARule()), "mine": demo_entry(rule)}))
+    path.write_text(
+        json.dumps({"other": demo_entry(NPARule()), "mine": demo_entry(rule)}), encoding="utf-8"
+    )
     assert_same_rule(load_rule(f"{path}#mine"), rule)
 
 
 def test_a_collection_of_one_needs_no_name(tmp_path: Path) -> None:
     rule = NPARule()
     path = tmp_path / "models.json"
-    path.write_text(json.dumps({"mine": demo_entry(rule)}))
+    path.write_text(json.dumps({"mine": demo_entry(rule)}), encoding="utf-8")
     assert_same_rule(load_rule(path), rule)
-    path.write_text(json.dumps({"mine": demo_entry(rule), "other": demo_entry(rule)}))
+    path.write_text(
+        json.dumps({"mine": demo_entry(rule), "other": demo_entry(rule)}), encoding="utf-8"
+    )
     with pytest.raises(NPAError, match="several rules: add #name; names: mine, other"):
         load_rule(path)
     with pytest.raises(NPAError, match="no rule 'mina': did you mean 'mine'"):
@@ -521,7 +525,9 @@ def test_a_rule_is_loaded_on_to_a_device_that_is_there() -> None:
 def test_the_authors_collection_is_written_as_they_wrote_it(reference, tmp_path):
     theirs = reference / "authors_demo_aubergine.json"
     save_demo_json({"aubergine": load_rule(theirs)}, tmp_path / "models.json")
-    assert (tmp_path / "models.json").read_text() == theirs.read_text()
+    assert (tmp_path / "models.json").read_text(encoding="utf-8") == theirs.read_text(
+        encoding="utf-8"
+    )
 
 
 @pytest.mark.parametrize("channels", [3, 16])
@@ -531,7 +537,7 @@ def test_a_collection_gives_each_of_its_rules_back(tmp_path: Path, channels: int
     save_demo_json(rules, path, particle_counts={"mine": 1000})
     for name, rule in rules.items():
         assert_same_rule(load_rule(f"{path}#{name}"), rule)
-    entries = json.loads(path.read_text())
+    entries = json.loads(path.read_text(encoding="utf-8"))
     assert {name: entry["N0"] for name, entry in entries.items()} == {"mine": 1000, "gecko": 4096}
 
 

@@ -253,7 +253,7 @@ def test_commands_take_the_rule_of_a_task(tmp_path, capsys, name):
     options = ["--checkpoints", "2", "4", "--seed-count", "2", "--no-progress"]
     assert main(["evaluate", rule, *options, *to_evaluate, "--json", str(table)]) == 0
     assert told in capsys.readouterr().out
-    found = json.loads(table.read_text())
+    found = json.loads(table.read_text(encoding="utf-8"))
     assert f"loss: {found['metric']}" == told
     assert [row["step"] for row in found["growth"]] == [2, 4]
     aligned = name != "texture"

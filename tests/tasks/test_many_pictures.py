@@ -48,7 +48,7 @@ def test_a_folder_stands_for_its_pictures(tmp_path):
     folder.mkdir()
     for name in ("b.png", "a.webp"):
         square(folder / name, "red")
-    (folder / "notes.txt").write_text("no picture")
+    (folder / "notes.txt").write_text("no picture", encoding="utf-8")
     named = named_targets(("heart", str(folder)))
     assert list(named) == ["heart", "a", "b"]
     assert named["b"] == str(folder / "b.png")
@@ -188,7 +188,7 @@ def test_the_command_trains_and_evaluates_by_name(tmp_path, capsys):
     words = ["--preset=tiny", *small, "--iterations=2", "--no-progress"]
     assert main(["train", "morphogenesis2d", "--targets", *TARGETS, f"--out={out}", *words]) == 0
     assert "learns heart and ring and letter-a" in capsys.readouterr().out
-    card = (tmp_path / "many" / "report" / "rule.md").read_text()
+    card = (tmp_path / "many" / "report" / "rule.md").read_text(encoding="utf-8")
     assert "for `heart`, one of 3 pictures" in card
     assert len(re.findall(r"\| letter-a \|", card)) == 3
     rule = npa_envs.load_rule(f"{out}/rule.safetensors")
@@ -202,9 +202,14 @@ def test_the_command_trains_and_evaluates_by_name(tmp_path, capsys):
     assert first.target.name == "heart"
     options = ["--no-progress", "--seed-count=1", "--checkpoints", "4"]
     assert main(["evaluate", out, "--target=letter-a", *options, "--json", f"{out}/one.json"]) == 0
-    assert json.loads((tmp_path / "many" / "one.json").read_text())["growth"][0]["step"] == 4
+    assert (
+        json.loads((tmp_path / "many" / "one.json").read_text(encoding="utf-8"))["growth"][0][
+            "step"
+        ]
+        == 4
+    )
     assert main(["evaluate", out, *options, "--json", f"{out}/all.json"]) == 0
-    rows = json.loads((tmp_path / "many" / "all.json").read_text())["pictures"]
+    rows = json.loads((tmp_path / "many" / "all.json").read_text(encoding="utf-8"))["pictures"]
     assert [row["target"] for row in rows] == [*TARGETS, "(median)"]
     assert "3 pictures, 1 worlds each" in capsys.readouterr().out
     assert main(["evaluate", out, "--healing", *options]) == 2

@@ -262,7 +262,7 @@ def trained(folder, tmp_path_factory):
 
 def test_particles_learn_to_say_what_they_form(trained):
     rule = load_rule(trained.folder / "rule.safetensors")
-    config = json.loads((trained.folder / "config.json").read_text())
+    config = json.loads((trained.folder / "config.json").read_text(encoding="utf-8"))
     task = PointClassification(PointClassificationConfig(**config["task"])).on("test")
     (row,) = accuracies(rule, task, checkpoints=(16,))
     assert row.majority >= 0.9
@@ -283,7 +283,7 @@ def test_the_commands_measure_and_film_a_rule_that_classifies(trained, tmp_path,
     text = capsys.readouterr().out
     assert "18 test clouds, loss: mean squared error to the class" in text
     assert "all mutated" in text
-    written = json.loads(figures.read_text())
+    written = json.loads(figures.read_text(encoding="utf-8"))
     assert [row["step"] for row in written["accuracy"]] == [4, 8]
     changes = {row["change"] for row in written["changes"]}
     assert changes == {"25% cut off", "upper half mutated", "all mutated"}

@@ -109,7 +109,7 @@ def test_bad_sources_are_refused(source, options, message):
 def test_bad_pictures_are_refused(tmp_path):
     Image.new("RGBA", (8, 8), (0, 0, 0, 0)).save(tmp_path / "empty.png")
     Image.new("RGB", (1, 9)).save(tmp_path / "thin.png")
-    (tmp_path / "text.png").write_text("no picture")
+    (tmp_path / "text.png").write_text("no picture", encoding="utf-8")
     for name, message in (
         ("empty.png", "alpha above 0.5"),
         ("thin.png", "at least 2 x 2 pixels"),

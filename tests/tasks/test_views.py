@@ -199,7 +199,7 @@ def nerf_folder(folder, side=40):
             )
             frames.append({"file_path": f"./{split}/r_{k}", "transform_matrix": poses[k].tolist()})
         content = {"camera_angle_x": math.radians(50.0), "frames": frames}
-        (folder / f"transforms_{split}.json").write_text(json.dumps(content))
+        (folder / f"transforms_{split}.json").write_text(json.dumps(content), encoding="utf-8")
     return folder
 
 
@@ -243,9 +243,9 @@ def test_nerf_folders_are_turned_upright_and_scaled_into_the_ball(tmp_path):
 )
 def test_damaged_nerf_folders_are_refused(nerf, change, message):
     path = nerf / "transforms_train.json"
-    content = json.loads(path.read_text())
+    content = json.loads(path.read_text(encoding="utf-8"))
     change(content)
-    path.write_text(json.dumps(content))
+    path.write_text(json.dumps(content), encoding="utf-8")
     with pytest.raises(NPAError, match=message):
         load_views(nerf)
 
@@ -258,7 +258,7 @@ def emptied(folder):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (lambda f: (f / "transforms_train.json").write_text("{"), "as JSON"),
+        (lambda f: (f / "transforms_train.json").write_text("{", encoding="utf-8"), "as JSON"),
         (lambda f: (f / "transforms_train.json").unlink(), r"must hold transforms_train\.json"),
         (
             lambda f: (f / "transforms_test.json").unlink(),

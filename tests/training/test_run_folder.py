@@ -84,7 +84,7 @@ def test_a_folder_that_another_process_trains_in_is_refused_until_that_is_killed
                 trainer_of(config, **options)
         holder.send_signal(signal.SIGKILL)
     # The file of the lock is still there, and of no effect.
-    assert f"process {holder.pid}" in (tmp_path / ".lock").read_text()
+    assert f"process {holder.pid}" in (tmp_path / ".lock").read_text(encoding="utf-8")
     assert train(config, resume=True).finished
 
 
@@ -208,15 +208,15 @@ def test_a_damaged_line_of_the_log_is_named_and_the_log_left_alone(tmp_path, lin
     config = circle_config(tmp_path)
     train(config)
     log = tmp_path / "log.jsonl"
-    lines = log.read_text().splitlines()
-    log.write_text("\n".join([lines[0], line, *lines[2:]]) + "\n")
-    before = log.read_text()
+    lines = log.read_text(encoding="utf-8").splitlines()
+    log.write_text("\n".join([lines[0], line, *lines[2:]]) + "\n", encoding="utf-8")
+    before = log.read_text(encoding="utf-8")
     with pytest.raises(
         NPAError, match=r"log\.jsonl' must hold .* but line 2 is .*move the file"
     ) as e:
         trainer_of(config, resume=True)
     assert len(str(e.value)) < 500 + len(str(tmp_path))
-    assert log.read_text() == before
+    assert log.read_text(encoding="utf-8") == before
     log.unlink()
     assert train(override(config, repeats=2), resume=True).finished
     assert [record["iteration"] for record in log_of(tmp_path)] == list(range(7, 13))
@@ -226,5 +226,5 @@ def test_the_last_line_of_a_log_may_be_cut_short_or_lack_its_end(tmp_path):
     log = JsonlLog(tmp_path / "log.jsonl")
     whole = [json.dumps({"iteration": k, "loss": 0.5}) for k in (1, 2)]
     for text, count in (("\n".join(whole), 2), (whole[0] + "\n" + whole[1][:-3], 1), ("", 0)):
-        log.path.write_text(text)
+        log.path.write_text(text, encoding="utf-8")
         assert len(log.records()) == count

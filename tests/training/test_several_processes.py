@@ -29,7 +29,11 @@ def started(out, *options):
     command += ["--processes", "2", "--resume", "auto", "--out", str(out)]
     command += ["--iterations", "1000000", "--checkpoint-interval", str(INTERVAL), "--no-progress"]
     return subprocess.Popen(
-        [*command, *options], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
+        [*command, *options],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        encoding="utf-8",
     )
 
 
@@ -54,6 +58,7 @@ def started_node(number, port, out):
         stderr=subprocess.STDOUT,
         text=True,
         env=os.environ | {"GLOO_SOCKET_IFNAME": "lo", "OMP_NUM_THREADS": "1"},
+        encoding="utf-8",
     )
 
 
@@ -72,7 +77,7 @@ def alive(pid):
 
 def last_iteration(out):
     log = out / "log.jsonl"
-    lines = log.read_text().splitlines() if log.exists() else []
+    lines = log.read_text(encoding="utf-8").splitlines() if log.exists() else []
     return json.loads(lines[-1])["iteration"] if lines else 0
 
 
@@ -171,7 +176,7 @@ def test_a_mistake_is_print_once_and_ends_all(tmp_path):
 
 def test_the_reason_of_any_process_is_told(tmp_path, monkeypatch):
     # Python runs this in each process as it starts.
-    (tmp_path / "sitecustomize.py").write_text(FAILING)
+    (tmp_path / "sitecustomize.py").write_text(FAILING, encoding="utf-8")
     monkeypatch.setenv("PYTHONPATH", f"{tmp_path}{os.pathsep}{os.environ.get('PYTHONPATH', '')}")
     run = started(tmp_path / "run")
     said, _ = run.communicate(timeout=60)
@@ -199,9 +204,13 @@ def test_a_small_batch_is_shared_unasked(tmp_path, monkeypatch):
     monkeypatch.setenv("OMP_NUM_THREADS", "2")
     command = [sys.executable, "-m", "npa_envs", "train", "morphogenesis2d", "--max-seconds", "1"]
     command += ["--target", "ring", "--no-report", "--out", str(tmp_path / "run")]
-    told = subprocess.run(command, capture_output=True, text=True, timeout=120, check=True)
+    told = subprocess.run(
+        command, capture_output=True, text=True, timeout=120, check=True, encoding="utf-8"
+    )
     assert "on 2 processes (cpu)" in told.stdout
     assert "--resume --processes 2" in told.stdout
     again = [*command, "--resume"]
-    told = subprocess.run(again, capture_output=True, text=True, timeout=120, check=True)
+    told = subprocess.run(
+        again, capture_output=True, text=True, timeout=120, check=True, encoding="utf-8"
+    )
     assert "learns ring (goes on)" in told.stdout

@@ -171,11 +171,11 @@ FILES = {
 
 @pytest.mark.parametrize("name", FILES)
 def test_files_of_every_kind_set_the_same_fields(tmp_path, name):
-    (tmp_path / name).write_text(FILES[name])
+    (tmp_path / name).write_text(FILES[name], encoding="utf-8")
     expected = override(preset("tiny"), iterations=5, steps=(2, 4), target="heart")
     expected = override(expected, learning_rate=5e-4)
     assert load_config(tmp_path / name, preset("tiny")) == expected
-    (tmp_path / "empty.yml").write_text("")
+    (tmp_path / "empty.yml").write_text("", encoding="utf-8")
     assert load_config(tmp_path / "empty.yml", PAPER) == PAPER
 
 
@@ -194,7 +194,7 @@ def test_files_of_every_kind_set_the_same_fields(tmp_path, name):
     ],
 )
 def test_wrong_files_are_refused_with_their_name(tmp_path, name, text, rule):
-    (tmp_path / name).write_text(text)
+    (tmp_path / name).write_text(text, encoding="utf-8")
     with pytest.raises(NPAError, match=rule) as caught:
         load_config(tmp_path / name, PAPER)
     assert name in str(caught.value)

@@ -451,7 +451,7 @@ def test_world_that_runs_away_does_not_stay_in_the_pool(tmp_path):
 def test_second_run_in_a_folder_is_refused_unless_it_overwrites(tmp_path):
     config = circle_config(tmp_path, picture_interval=1)
     train(config)
-    (tmp_path / "notes.txt").write_text("mine")
+    (tmp_path / "notes.txt").write_text("mine", encoding="utf-8")
     with pytest.raises(
         NPAError, match=r"holds one: resume it .*, choose another folder .*, or overwrite"
     ):
@@ -463,7 +463,7 @@ def test_second_run_in_a_folder_is_refused_unless_it_overwrites(tmp_path):
     assert result.iteration == 2
     assert [record["iteration"] for record in log_of(tmp_path)] == [1, 2]
     assert sorted(p.name for p in tmp_path.glob("pictures/*")) == ["000001.png", "000002.png"]
-    assert (tmp_path / "notes.txt").read_text() == "mine"
+    assert (tmp_path / "notes.txt").read_text(encoding="utf-8") == "mine"
 
 
 def test_checkpoint_of_another_task_or_configuration_is_refused(tmp_path):
@@ -486,7 +486,7 @@ def test_folders_that_do_not_do_are_named_before_training(tmp_path, monkeypatch)
     with pytest.raises(NPAError, match="there is no checkpoint to resume from"):
         trainer_of(circle_config(tmp_path / "none"), resume=True)
     assert not (tmp_path / "none").exists()
-    (tmp_path / "file").write_text("")
+    (tmp_path / "file").write_text("", encoding="utf-8")
     with pytest.raises(NPAError, match=r"out must be a folder that can be created .*file/run"):
         trainer_of(circle_config(tmp_path / "file" / "run"))
     usage = type("Usage", (), {"free": 100})

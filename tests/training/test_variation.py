@@ -82,7 +82,7 @@ def test_the_command_line_takes_a_range_and_robustness_takes_the_run(tmp_path, c
     capsys.readouterr()
     assert main(["robustness", out, "--quick", "--no-progress", "--out", str(tmp_path / "r")]) == 0
     assert "| run |" in capsys.readouterr().out
-    assert json.loads((tmp_path / "r" / "robustness_run.json").read_text())["done"]
+    assert json.loads((tmp_path / "r" / "robustness_run.json").read_text(encoding="utf-8"))["done"]
     npa_envs.save_rule(npa_envs.NPARule(), tmp_path / "own.safetensors")
     assert main(["robustness", str(tmp_path / "own.safetensors"), "--quick"]) == 2
     assert "must say on which task it was trained" in capsys.readouterr().err

@@ -221,6 +221,7 @@ for _ in range(4):
         text=True,
         timeout=120,
         check=False,
+        encoding="utf-8",
     )
     assert done.returncode == 0, done.stderr[-2000:]
 
