@@ -147,22 +147,22 @@ class Budget(NamedTuple):
 
 
 BUDGETS = {
-    "functions that take x and s": Budget(functions_of_x_and_s, 213, 150),
-    "files with path_length": Budget(files_of_path_length, 20, 10),
-    "isinstance on tasks outside of tasks/": Budget(isinstance_on_tasks, 37, 3),
-    "names of classes used twice": Budget(classes_named_twice, 1, 0),
-    "places that draw masks": Budget(places_that_draw_masks, 2, 1),
+    "functions that take x and s": Budget(functions_of_x_and_s, 208, 150),
+    "files with path_length": Budget(files_of_path_length, 19, 10),
+    "isinstance on tasks outside of tasks/": Budget(isinstance_on_tasks, 4, 3),
+    "names of classes used twice": Budget(classes_named_twice, 0, 0),
+    "places that draw masks": Budget(places_that_draw_masks, 1, 1),
     "options of npa-envs train": Budget(options_of_train, 76, 76),
-    "source files": Budget(lambda: len(files(*PACKAGES, suffixes=SOURCES)), 315, 270),
-    "source lines": Budget(lambda: lines(files(*PACKAGES, suffixes=SOURCES)), 74_600, 58_000),
-    "test lines": Budget(lambda: lines(files("tests")), 40_000, 32_000),
+    "source files": Budget(lambda: len(files(*PACKAGES, suffixes=SOURCES)), 302, 270),
+    "source lines": Budget(lambda: lines(files(*PACKAGES, suffixes=SOURCES)), 70_400, 58_000),
+    "test lines": Budget(lambda: lines(files("tests")), 40_100, 32_000),
     "words of docs": Budget(
         lambda: words([p for p in files("docs", suffixes=(".md",)) if p.parent.name == "docs"]),
-        49_600,
+        45_000,
         45_000,
     ),
     "words of docs/environments": Budget(
-        lambda: words(files("docs/environments", suffixes=(".md",))), 21_500, 18_000
+        lambda: words(files("docs/environments", suffixes=(".md",))), 18_000, 18_000
     ),
     "lines of CHANGELOG": Budget(lambda: lines([ROOT / "CHANGELOG.md"]), 71, 60),
     "bytes of images": Budget(
@@ -171,7 +171,7 @@ BUDGETS = {
         9_000_000,
     ),
     "files of results": Budget(
-        lambda: sum(p.is_file() for p in (ROOT / "benchmarks" / "results").rglob("*")), 73, 70
+        lambda: sum(p.is_file() for p in (ROOT / "benchmarks" / "results").rglob("*")), 72, 70
     ),
 }
 """What is counted, the most that there may be now, and the most that there is to be."""
