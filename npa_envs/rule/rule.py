@@ -386,6 +386,7 @@ class NPARule(nn.Module):
         hidden, output = layers[:2]
         return (
             (type(self) is NPARule or _steps_alike(type(self)))
+            # Compilers trace no set operation on a module's attributes.
             and not any(name in self.__dict__ for name in STEP_PARTS)
             and getattr(hidden, "bias", None) is not None
             and getattr(output, "bias", None) is None

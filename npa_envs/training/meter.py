@@ -87,11 +87,6 @@ class LossMeter:
         self._count = 0
         self._step_sum = 0
 
-    @property
-    def sent_count(self) -> int:
-        """Iterations of the interval that `send` sent last."""
-        return self._sent_counts[0]
-
     def receive(self) -> Interval:
         """Return what `send` sent last; waits for that, and not for what was launched since."""
         if self._arrival is not None:
