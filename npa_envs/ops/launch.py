@@ -335,7 +335,7 @@ class _Ready(threading.local):
 
     def __init__(self) -> None:
         self.by_kernel: dict[tuple[Any, torch.device, int], _Arguments] = {}
-        self.tape: LaunchTape | None = None
+        self.tape: Tape | None = None
         """Where launches are recorded."""
 
 
@@ -379,48 +379,6 @@ def launch(
     ready.run(size)
 
 
-def _form(tensor: Tensor) -> tuple[Any, ...]:
-    return tensor.shape, tensor.dtype, tensor.device, tensor.is_contiguous()
-
-
-class PreparedLaunch:
-    """A launch that is made again and again with one tensor changed.
-
-    Args:
-        changing: The tensor among them that changes; all others stay alive, where they are.
-    """
-
-    def __init__(
-        self,
-        kernel: Any,
-        size: int | tuple[int, ...],
-        device: torch.device,
-        *arguments: Any,
-        changing: Tensor,
-    ) -> None:
-        self._size = (size,) if isinstance(size, int) else size
-        # Arguments hold addresses alone.
-        self._kept = [value for value in arguments if value is not changing]
-        self._place = next(k for k, value in enumerate(arguments) if value is changing)
-        if kernel in SMALLEST_RANGES:
-            arguments = (0, *arguments)
-            self._place += 1
-        self._arguments = _Arguments(kernel, self._size, device, CUDA_BLOCK, arguments)
-        self._arguments.set(arguments)
-        self._form = _form(changing)
-
-    def __call__(self, tensor: Tensor) -> None:
-        """Launch on torch's current stream.
-
-        Args:
-            tensor: The changing argument, contiguous like the first one, of its shape, dtype and
-                device.
-        """
-        assert _form(tensor) == self._form, "only an address is replaced"
-        self._arguments.set_address(self._place, tensor)
-        self._arguments.run(self._size)
-
-
 def aligned(tensor: Tensor) -> Tensor:
     """Return a contiguous tensor that can be read 16 bytes at a time."""
     tensor = tensor.contiguous()
@@ -432,13 +390,19 @@ def is_recorded() -> bool:
     return _ready.tape is not None
 
 
-class LaunchTape:
+class Tape:
     """Launches that are recorded once and made again and again, between tensors that stay."""
 
     def __init__(self) -> None:
         self._launches: list[tuple[_Arguments, tuple[int, ...]]] = []
-        self._given: list[tuple[Any, ...]] = []
+        self._given: list[list[Any]] = []
         """Their arguments, which hold addresses alone by themselves."""
+
+    def add(self, kernel: Any, size: Any, device: torch.device, *arguments: Any) -> None:
+        """Record a launch, which is not made; arguments are those of `launch`."""
+        size = (size,) if isinstance(size, int) else size
+        arguments = (0, *arguments) if kernel in SMALLEST_RANGES else arguments
+        self.arguments(kernel, size, device, CUDA_BLOCK, arguments).set(arguments)
 
     @contextlib.contextmanager
     def recording(self) -> Iterator[None]:
@@ -460,7 +424,7 @@ class LaunchTape:
         """Return memory for the arguments of one more launch."""
         made = _Arguments(kernel, size, device, block_dim, arguments)
         self._launches.append((made, size))
-        self._given.append(arguments)
+        self._given.append(list(arguments))
         return made
 
     def __len__(self) -> int:
@@ -468,13 +432,14 @@ class LaunchTape:
         return len(self._launches)
 
     def places(self, tensor: Tensor) -> list[tuple[_Arguments, int]]:
-        """Return where a tensor is an argument."""
-        return [
-            (made, k)
-            for (made, _), arguments in zip(self._launches, self._given, strict=True)
-            for k, value in enumerate(arguments)
-            if isinstance(value, Tensor) and value.data_ptr() == tensor.data_ptr()
-        ]
+        """Return where a tensor is an argument; the caller keeps it from now on."""
+        places = []
+        for (made, _), arguments in zip(self._launches, self._given, strict=True):
+            for k, value in enumerate(arguments):
+                if isinstance(value, Tensor) and value.data_ptr() == tensor.data_ptr():
+                    arguments[k] = None
+                    places.append((made, k))
+        return places
 
     def move(self, places: list[tuple[_Arguments, int]], tensor: Tensor) -> None:
         """Let arguments be another tensor of the same form, which the caller keeps."""
@@ -484,13 +449,7 @@ class LaunchTape:
     def replay(
         self, begin: int = 0, end: int | None = None, *, last_count: int | None = None
     ) -> None:
-        """Make some of the launches again, the last one along fewer threads if they are given.
-
-        Args:
-            begin: The first launch.
-            end: One past the last.
-            last_count: Threads of the last one along its first dimension.
-        """
+        """Make some of the launches again, the last along `last_count` threads if that is given."""
         launches = self._launches[begin:end]
         for made, size in launches[:-1]:
             made.run(size)

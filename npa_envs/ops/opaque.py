@@ -18,6 +18,7 @@ from torch.autograd import forward_ad
 from torch.utils._python_dispatch import is_in_torch_dispatch_mode
 
 from npa_envs.errors import NPAError
+from npa_envs.ops.physics import Physics
 
 Arguments = ParamSpec("Arguments")
 Result = TypeVar("Result")
@@ -25,7 +26,7 @@ Result = TypeVar("Result")
 
 _transforms_active = torch._C._are_functorch_transforms_active
 
-PLAIN_TYPES = {Tensor, nn.Parameter, torch.dtype, bool, int, float, str, list, tuple, NoneType}
+PLAIN_TYPES = {Tensor, nn.Parameter, Physics, torch.dtype, bool, int, float, str, list, NoneType}
 """Types of arguments that kernels read as they are; other tensors may wrap some."""
 
 CURE = "or take small worlds with the slow operators of npa_envs.reference, which are plain torch"
@@ -35,9 +36,6 @@ def check_derivatives(**given: Any) -> None:
     """Check that torch derives nothing but backward passes from what kernels compute.
 
     Forward-mode derivatives would vanish without a word where nothing requires a gradient.
-
-    Args:
-        given: What the caller was given, by name: tensors, sequences of them, and modules.
 
     Raises:
         NPAError: A tensor carries a tangent of forward-mode derivatives, or a function of
@@ -91,40 +89,56 @@ def _tensors(value: Any) -> Iterator[Tensor]:
 class Opaque(Generic[Arguments, Result]):
     """A function as a torch operator; run as it is where nobody wants to see an operator.
 
-    A call of an operator takes the host as long as several launches do.
-
-    Args:
-        name: The operator's name, "npa::...".
-        function: What it does; results share no memory with each other or with arguments.
+    A call of an operator takes the host as long as several launches do. Results share no memory
+    with each other or with arguments, which are given by place. The operator takes a `Physics` as
+    a list of its numbers.
     """
 
     def __init__(self, name: str, function: Callable[Arguments, Result]) -> None:
         self._function = function
-        self._names = tuple(inspect.signature(function).parameters)
-        self._operator = torch.library.custom_op(name, function, mutates_args=())
-        self.register_fake = self._operator.register_fake
+        self._signature = inspect.signature(function, eval_str=True)
+        self._operator = torch.library.custom_op(name, self._of_numbers(function), mutates_args=())
+
+    def register_fake(self, fake: Callable[..., Any]) -> Callable[..., Any]:
+        """Say what the operator returns of tensors without numbers, by a function like itself."""
+        self._operator.register_fake(self._of_numbers(fake))
+        return fake
+
+    def _of_numbers(self, function: Callable[..., Any]) -> Callable[..., Any]:
+        """Return a function of what the operator takes."""
+        parameters = self._signature.parameters.values()
+        packed = [parameter.annotation is Physics for parameter in parameters]
+
+        def unpacked(*args: Any) -> Any:
+            pairs = zip(args, packed, strict=True)
+            return function(*[Physics.of(value) if flag else value for value, flag in pairs])
+
+        taken = [
+            parameter.replace(annotation=list[float]) if flag else parameter
+            for parameter, flag in zip(parameters, packed, strict=True)
+        ]
+        unpacked.__signature__ = self._signature.replace(parameters=taken)  # type: ignore[attr-defined]
+        return unpacked
 
     def __call__(self, *args: Arguments.args, **kwargs: Arguments.kwargs) -> Result:
         """Run the function on plain tensors, and the operator on all others."""
+        assert not kwargs, "given by place"
         if forward_ad._current_level >= 0:
-            _check_tangents(dict(zip(self._names, args, strict=False)) | kwargs)
+            _check_tangents(dict(zip(self._signature.parameters, args, strict=False)))
         # Asked in this order: a compiler cannot trace the other questions.
         if (
             torch.compiler.is_compiling()
-            or not PLAIN_TYPES.issuperset(map(type, (*args, *kwargs.values())))
+            or not PLAIN_TYPES.issuperset(map(type, args))
             or is_in_torch_dispatch_mode()
         ):
-            result: Result = self._operator(*args, **kwargs)
+            flat = [value.numbers() if isinstance(value, Physics) else value for value in args]
+            result: Result = self._operator(*flat)
             return result
-        return self._function(*args, **kwargs)
+        return self._function(*args)  # type: ignore[call-arg]
 
 
 def opaque(name: str) -> Callable[[Callable[Arguments, Result]], Opaque[Arguments, Result]]:
-    """Return a decorator that makes a function an opaque operator; its first argument is a tensor.
-
-    Args:
-        name: The operator's name, "npa::...".
-    """
+    """Return a decorator that makes a function of tensors the opaque operator "npa::..."."""
     return lambda function: Opaque(name, function)
 
 
@@ -134,9 +148,6 @@ def without_autocast(
     """Return the backward pass of an autograd function, in its tensors' own dtypes.
 
     Forward passes are run without autocast; a backward pass may be asked for within it.
-
-    Args:
-        backward: The backward pass, of a context and cotangents.
     """
 
     @functools.wraps(backward)
@@ -158,9 +169,6 @@ def once_differentiable(
     Torch's own `once_differentiable` says nothing where the cotangent needs no gradient, as that of
     a sum: second derivatives are then zero. Functions that `torch.compile` has taken refuse them by
     themselves, but for its backend "eager", which is there to look for faults.
-
-    Args:
-        backward: The backward pass, of a context and cotangents.
 
     Raises:
         NPAError: When called with `create_graph=True`, or with several cotangents at once.

@@ -1,4 +1,4 @@
-"""The density and the perception pass over sorted worlds: kernels and their arguments."""
+"""The passes over sorted worlds, kernels and their arguments: density, perception, adjoint."""
 
 from __future__ import annotations
 
@@ -7,16 +7,21 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
+from npa_envs.errors import NPAError
 from npa_envs.kernels.access import CUDA_LANES, WARP
+from npa_envs.kernels.cuda.adjoint import SHARE, listed_adjoint
+from npa_envs.kernels.cuda.adjoint import TILE as ADJOINT_TILE
 from npa_envs.kernels.cuda.density import LIST_BLOCK, listed_density
 from npa_envs.kernels.cuda.perceive import listed_perception
 from npa_envs.kernels.cuda.tiles import TILE, tiled_density
+from npa_envs.kernels.portable.adjoint import adjoint_kernels
 from npa_envs.kernels.portable.density import density_kernels
 from npa_envs.kernels.portable.perceive import perception_kernels
 from npa_envs.ops.backend import Listing
 from npa_envs.ops.launch import launch
-from npa_envs.ops.physics import Terms
-from npa_envs.ops.sort import KernelPlan, SortedWorlds, density_scale
+from npa_envs.ops.opaque import opaque
+from npa_envs.ops.physics import Physics
+from npa_envs.ops.sort import LARGEST_INDEX, KernelPlan, SortedWorlds, make_plan
 
 LISTS_TOGETHER = 32
 """Neighbour lists that lie together."""
@@ -61,8 +66,9 @@ class Densities(NamedTuple):
     """The neighbours of static worlds on a CPU."""
 
 
-def portable_kernels(plan: KernelPlan, terms: Terms, listed: bool = False) -> Any:
+def portable_kernels(plan: KernelPlan, listed: bool = False) -> Any:
     """Return the portable perception kernels of a plan."""
+    terms = plan.physics.terms
     return perception_kernels(
         plan.space_dim,
         plan.scalar,
@@ -77,8 +83,7 @@ def portable_kernels(plan: KernelPlan, terms: Terms, listed: bool = False) -> An
 def compute_densities(
     plan: KernelPlan,
     ordered: SortedWorlds,
-    terms: Terms,
-    listing: Listing,
+    listing: Listing | None = None,
     *,
     state_place: Tensor | None = None,
     with_particles: bool = True,
@@ -86,26 +91,13 @@ def compute_densities(
     """Compute densities, and neighbour lists or the rows' density gradients for perception.
 
     Args:
-        plan: Plan of the call.
-        ordered: The sorted worlds.
-        terms: Groups of the perception that follows.
-        listing: How to list neighbours, where the plan says so.
+        listing: How to list neighbours, where the plan says so; default: as in rollouts.
         state_place: Where the states of sorted particles are, int32, shape [B N]; None: in order.
         with_particles: Also leave `particles` where neighbours are listed: the adjoint reads them.
     """
     if not plan.lists_neighbours:
-        return compute_density_gradients(plan, ordered, terms)
-    return list_neighbours(plan, ordered, listing, state_place, with_particles)
-
-
-def list_neighbours(
-    plan: KernelPlan,
-    ordered: SortedWorlds,
-    listing: Listing,
-    state_place: Tensor | None,
-    with_particles: bool,
-) -> Densities:
-    """Compute densities, and list the neighbours of the rows: `compute_densities` on CUDA."""
+        return compute_density_gradients(plan, ordered)
+    listing = listing or plan.listing
     positions = ordered.positions
     records = positions.new_empty(plan.total, 4)
     particles = positions.new_empty(plan.total if with_particles else 0, plan.space_dim + 1)
@@ -148,7 +140,7 @@ def list_neighbours(
     return Densities(particles, no_gradient, NeighbourLists(listing, steps, lengths, records))
 
 
-def compute_density_gradients(plan: KernelPlan, ordered: SortedWorlds, terms: Terms) -> Densities:
+def compute_density_gradients(plan: KernelPlan, ordered: SortedWorlds) -> Densities:
     """Compute densities, and density gradients of the particles that have rows."""
     positions = ordered.positions
     particles = positions.new_empty(plan.total, plan.space_dim + 1)
@@ -159,7 +151,7 @@ def compute_density_gradients(plan: KernelPlan, ordered: SortedWorlds, terms: Te
         positions.device,
         plan.domain,
         plan.particle_count,
-        int(terms.density_gradient),
+        int(plan.physics.terms.density_gradient),
         ordered.starts,
         ordered.source,
         ordered.row_of,
@@ -174,8 +166,6 @@ def perception_launch(
     plan: KernelPlan,
     ordered: SortedWorlds,
     densities: Densities,
-    terms: Terms,
-    scale: float,
     out: Tensor,
     *,
     states: Tensor | None = None,
@@ -188,11 +178,6 @@ def perception_launch(
     """Return what to give to `launch` so that it writes the perception of each row, or of some.
 
     Args:
-        plan: Plan of the call.
-        ordered: The sorted worlds.
-        densities: Their densities.
-        terms: Groups of the perception vector.
-        scale: c = eps / eps0, dimensionless.
         out: Rows to write, shape [K, row_width].
         states: States in the caller's order, where `ordered` has none.
         destination: Row of `out` for each row, int32, shape [K]; default: its own.
@@ -204,11 +189,12 @@ def perception_launch(
     some = row_count is not None
     row_count = plan.row_capacity if row_count is None else row_count
     row_place = ordered.row_place[first_row:] if plan.masked or some else None
+    terms = plan.physics.terms
     numbers = (
         plan.state_dim,
         int(terms.density_gradient),
-        scale,
-        density_scale(scale, plan.space_dim, plan.particle_count),
+        plan.physics.scale(),
+        plan.density_scale,
         plan.row_base + first_row,
     )
     lists = densities.lists
@@ -256,7 +242,7 @@ def perception_launch(
         )
     listed = densities.listed
     return (
-        portable_kernels(plan, terms, listed is not None).perceive,
+        portable_kernels(plan, listed is not None).perceive,
         (row_count, plan.group_count),
         out.device,
         plan.domain,
@@ -276,3 +262,214 @@ def perception_launch(
         out,
         row_kernel_sum,
     )
+
+
+class SavedPerception(NamedTuple):
+    """Tensors that the forward pass saves for the adjoint of perception."""
+
+    perception: Tensor
+    """Rows of perception, dimensionless, shape [K, row_width]."""
+    row_kernel_sum: Tensor
+    """The rows' sums of v K [1 / length units], shape [K, D]; undefined beyond the last one."""
+    row_of: Tensor
+    """Row of each particle, -1 where it has none, int32, shape [B N]."""
+    starts: Tensor
+    """First sorted place of every cell, then first row of every cell (shifted), int32."""
+    source: Tensor
+    """Caller's index of each sorted particle, int32, shape [B N]."""
+    particles: Tensor
+    """Sorted positions [length units] with volumes 1 / rho, shape [B N, D + 1]."""
+    row_positions: Tensor
+    """Positions of the rows [length units], shape [K, D]; undefined beyond the last active row."""
+    states: Tensor | None = None
+    """Sorted states, dimensionless, shape [B N G, W]; None where positions get no gradient."""
+
+
+@opaque("npa::perceive_rows_backward")
+def perceive_rows_backward(
+    perception_bar: Tensor,
+    saved_tensors: list[Tensor],
+    listed: list[Tensor],
+    particle_count: int,
+    state_dim: int,
+    masked: bool,
+    physics: Physics,
+) -> tuple[Tensor, Tensor]:
+    """Return the cotangents of states, [B N, C], and of positions, [B N, D] or empty.
+
+    The tensors are those of a `SavedPerception`, and of the `ListedNeighbours` where there are any;
+    positions are skipped if no states were saved.
+    """
+    saved = SavedPerception(*saved_tensors)
+    total, space_dim = saved.particles.shape[0], saved.particles.shape[1] - 1
+    plan = make_plan(
+        saved.particles,
+        (total // particle_count, particle_count, space_dim),
+        state_dim,
+        saved.perception.shape[0],
+        masked,
+        physics,
+    )
+    bar = perception_bar.contiguous()
+    if plan.runs("adjoint", position_gradient=saved.states is not None) == "cuda":
+        states_bar = _gather_by_tiles(plan, saved, bar)
+        return states_bar, states_bar.new_empty(0)
+    return _gather_by_cells(plan, saved, listed, bar)
+
+
+@perceive_rows_backward.register_fake
+def _(
+    perception_bar: Tensor,
+    saved_tensors: list[Tensor],
+    listed: list[Tensor],
+    particle_count: int,
+    state_dim: int,
+    *options: Any,
+) -> tuple[Tensor, Tensor]:
+    saved = SavedPerception(*saved_tensors)
+    particles = saved.particles
+    total, space_dim = particles.shape[0], particles.shape[1] - 1
+    positions_bar = (
+        particles.new_empty(0) if saved.states is None else particles.new_empty(total, space_dim)
+    )
+    return particles.new_empty(total, state_dim), positions_bar
+
+
+def _gather_by_cells(
+    plan: KernelPlan, saved: SavedPerception, listed: list[Tensor], bar: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Return the cotangents by the portable kernels."""
+    entries, space_dim, width = plan.row_capacity * plan.group_count, plan.space_dim, plan.width
+    largest = entries * space_dim * width
+    if largest >= LARGEST_INDEX:
+        raise NPAError(
+            f"gradients must stay below {LARGEST_INDEX} numbers in one batch, got {largest}: split "
+            "the batch, or take float32 and detach_positions=True"
+        )
+    terms, with_positions = plan.physics.terms, saved.states is not None
+    kernels = adjoint_kernels(
+        space_dim, plan.scalar, width, plan.on_cpu, terms.state_gradient, bool(listed)
+    )
+    # Cotangents of the rows' raw sums: smoothed states, and gradients before their scaling.
+    blur_bar = bar.new_empty(entries, width)
+    gradient_bar = bar.new_empty(entries, space_dim, width)
+    density_gradient_bar = bar.new_empty(plan.row_capacity if with_positions else 0, space_dim)
+    launch(
+        kernels.unscale_cotangents,
+        (plan.row_capacity, plan.group_count * width),
+        bar.device,
+        plan.state_dim,
+        int(terms.density_gradient),
+        plan.physics.scale(),
+        plan.density_scale,
+        plan.row_base,
+        plan.group_count,
+        saved.starts,
+        saved.perception,
+        bar,
+        blur_bar,
+        gradient_bar,
+        density_gradient_bar,
+    )
+    neighbours, ends = listed or (None, None)
+    states_bar = bar.new_empty(plan.total, plan.state_dim)
+    launch(
+        kernels.gather_state_cotangents,
+        (plan.total, plan.group_count),
+        bar.device,
+        plan.domain,
+        plan.particle_count,
+        plan.state_dim,
+        plan.active_offset,
+        plan.row_base,
+        plan.row_capacity,
+        plan.group_count,
+        saved.starts,
+        ends,
+        neighbours,
+        saved.particles,
+        saved.source,
+        saved.row_of,
+        saved.row_positions,
+        saved.row_kernel_sum,
+        bar,
+        blur_bar,
+        gradient_bar,
+        gradient_bar,
+        states_bar,
+    )
+    if not with_positions:
+        return states_bar, bar.new_empty(0)
+    density_bar = bar.new_empty(plan.total)
+    positions_bar = bar.new_empty(plan.total, space_dim)
+    common = (
+        plan.total,
+        bar.device,
+        plan.domain,
+        plan.particle_count,
+        plan.group_count,
+        saved.starts,
+        saved.particles,
+        saved.states,
+        saved.source,
+        saved.row_of,
+    )
+    launch(kernels.gather_density_cotangents, *common, blur_bar, gradient_bar, density_bar)
+    rows = density_bar, blur_bar, gradient_bar, density_gradient_bar
+    launch(kernels.gather_position_cotangents, *common, *rows, positions_bar)
+    return states_bar, positions_bar
+
+
+def _gather_by_tiles(plan: KernelPlan, saved: SavedPerception, bar: Tensor) -> Tensor:
+    """Return the cotangent of states, [B N, C], on CUDA in float32."""
+    state_gradient = plan.physics.terms.state_gradient
+    kernels = listed_adjoint(
+        plan.space_dim, plan.width, state_gradient, plan.periodic, plan.group_count > 1
+    )
+    # All cotangents are multiplied by one kernel's norm, those of the smoothed state before.
+    norm = plan.domain.spiky_norm if state_gradient else plan.domain.smoothing_norm
+    kinds = 1 + plan.space_dim * state_gradient
+    entries = plan.row_capacity * plan.group_count + 1
+    cotangents = bar.new_empty(entries * kinds * plan.width // SHARE, SHARE)
+    launch(
+        kernels.unscale_cotangents,
+        entries * plan.width // SHARE,
+        bar.device,
+        plan.state_dim,
+        plan.physics.scale(),
+        plan.domain.smoothing_norm / norm,
+        plan.row_base,
+        plan.row_capacity,
+        plan.group_count,
+        saved.starts,
+        saved.perception,
+        bar,
+        cotangents,
+    )
+    states_bar = bar.new_empty(plan.total, plan.state_dim)
+    tile_count = -(-plan.particle_count // ADJOINT_TILE)
+    launch(
+        kernels.gather_state_cotangents,
+        plan.world_count * tile_count * plan.group_count * WARP,
+        bar.device,
+        plan.domain,
+        norm,
+        plan.particle_count,
+        tile_count,
+        plan.state_dim,
+        plan.active_offset,
+        plan.row_base,
+        plan.row_capacity,
+        plan.group_count,
+        saved.starts,
+        saved.particles,
+        saved.source,
+        saved.row_of,
+        saved.row_positions,
+        saved.row_kernel_sum,
+        bar,
+        cotangents,
+        cotangents,
+        states_bar,
+    )
+    return states_bar

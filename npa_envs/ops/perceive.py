@@ -20,21 +20,21 @@ from npa_envs.checks import (
     checked_eps,
     checked_flag,
     checked_moment_inverse,
-    constant,
 )
-from npa_envs.ops.adjoint import SavedPerception, perceive_rows_backward
 from npa_envs.ops.backend import batch_listing
-from npa_envs.ops.launch import PreparedLaunch, launch
+from npa_envs.ops.launch import Tape, launch
 from npa_envs.ops.opaque import check_derivatives, once_differentiable, opaque
 from npa_envs.ops.passes import (
+    SavedPerception,
     compute_densities,
     compute_density_gradients,
+    perceive_rows_backward,
     perception_launch,
     portable_kernels,
 )
 from npa_envs.ops.physics import Physics, Terms, physics
 from npa_envs.ops.sort import make_plan, sort_worlds
-from npa_envs.ops.static import StaticRows, StaticTensors, StaticWorlds, all_rows, static_worlds
+from npa_envs.ops.static import StaticRows, StaticWorlds, all_rows, static_worlds
 
 
 class PerceptionFields(NamedTuple):
@@ -144,14 +144,14 @@ def perception_fields(
     terms = Terms(moment_inverse=checked_moment_inverse(moment_inverse))
     check_world(x, s)
     check_derivatives(x=x, s=s)
-    made = physics(x.shape[2], s.shape[2], x.dtype, eps=eps, box=box)
+    made = physics(x.shape[2], s.shape[2], x.dtype, eps=eps, box=box, terms=terms)
     check_finite_positions(x)
     x, s = x.contiguous(), s.contiguous()
     world_count, particle_count, space_dim = x.shape
     state_dim = s.shape[2]
-    plan = make_plan(x, x.shape, state_dim, x.shape[0] * x.shape[1], False, made.eps, made.box)
+    plan = make_plan(x, x.shape, state_dim, world_count * particle_count, False, made)
     ordered = sort_worlds(plan, x, s, None)
-    densities = compute_density_gradients(plan, ordered, terms)
+    densities = compute_density_gradients(plan, ordered)
     fields = PerceptionFields(
         rho=x.new_empty(plan.total),
         blur=x.new_empty(plan.total, state_dim),
@@ -161,7 +161,7 @@ def perception_fields(
         drho=densities.density_gradient[ordered.row_of].to(x.dtype),
     )
     launch(
-        portable_kernels(plan, terms).gather_fields,
+        portable_kernels(plan).gather_fields,
         (plan.total, plan.group_count),
         x.device,
         plan.domain,
@@ -196,45 +196,41 @@ def _perceive_rows(
     x: Tensor,
     s: Tensor,
     mask: Tensor | None,
+    static: list[Tensor],
+    masked: bool,
     row_capacity: int,
     row_width: int,
-    eps: float,
-    scale: float,
-    box: list[float] | None,
-    state_gradient: bool,
-    moment_inverse: str | None,
-    density_gradient: bool,
+    physics: Physics,
     for_adjoint: bool,
 ) -> list[Tensor]:
-    """Return the particles of the rows, `row_source`, and then what a `SavedPerception` holds."""
-    plan = make_plan(x, x.shape, s.shape[2], row_capacity, mask is not None, eps, box)
-    terms = Terms(state_gradient, moment_inverse, density_gradient)
-    ordered = sort_worlds(plan, x, s, mask)
-    densities = compute_densities(plan, ordered, terms, plan.listing, with_particles=for_adjoint)
+    """Return what a `SavedPerception` holds and then the particles of the rows, `row_source`.
+
+    Of static worlds, whose rows and tensors are given, it is what does not follow from these.
+    """
+    plan = make_plan(x, x.shape, s.shape[2], row_capacity, masked, physics)
+    if static:
+        rows, worlds = StaticRows(*static[:4]), StaticWorlds.of(static[4:])
+        ordered, densities = static_worlds(plan, worlds, rows, x, s)
+    else:
+        ordered = sort_worlds(plan, x, s, mask)
+        densities = compute_densities(plan, ordered, with_particles=for_adjoint)
     perception = x.new_empty(row_capacity, row_width)
-    row_kernel_sum = x.new_empty(row_capacity if for_adjoint else 0, plan.space_dim)
-    launch(
-        *perception_launch(
-            plan,
-            ordered,
-            densities,
-            terms,
-            scale,
-            perception,
-            row_kernel_sum=row_kernel_sum if for_adjoint else None,
-        )
-    )
-    saved = SavedPerception(
-        perception=perception,
-        row_of=ordered.row_of,
-        starts=ordered.starts,
-        source=ordered.source,
-        particles=densities.particles,
-        row_positions=ordered.row_positions,
-        row_kernel_sum=row_kernel_sum,
-        states=ordered.states,
-    )
-    return [ordered.row_source, *saved.tensors()]
+    kernel_sum = x.new_empty(row_capacity if for_adjoint else 0, plan.space_dim)
+    written = kernel_sum if for_adjoint else None
+    launch(*perception_launch(plan, ordered, densities, perception, row_kernel_sum=written))
+    if static:
+        return [perception, kernel_sum]
+    return [
+        perception,
+        kernel_sum,
+        ordered.row_of,
+        ordered.starts,
+        ordered.source,
+        densities.particles,
+        ordered.row_positions,
+        ordered.states,
+        ordered.row_source,
+    ]
 
 
 @_perceive_rows.register_fake
@@ -242,198 +238,96 @@ def _(
     x: Tensor,
     s: Tensor,
     mask: Tensor | None,
-    row_capacity: int,
-    row_width: int,
-    eps: float,
-    scale: float,
-    box: list[float] | None,
-    *options: bool,
-) -> list[Tensor]:
-    plan = make_plan(x, x.shape, s.shape[2], row_capacity, mask is not None, eps, box)
-    for_adjoint = options[-1]
-    particle_count = plan.total if for_adjoint or plan.runs("density") == "portable" else 0
-    integers = torch.int32
-    saved = SavedPerception(
-        perception=x.new_empty(row_capacity, row_width),
-        row_of=x.new_empty(plan.total, dtype=integers),
-        starts=x.new_empty(plan.start_count, dtype=integers),
-        source=x.new_empty(plan.total, dtype=integers),
-        particles=x.new_empty(particle_count, plan.space_dim + 1),
-        row_positions=x.new_empty(row_capacity, plan.space_dim),
-        row_kernel_sum=x.new_empty(row_capacity if for_adjoint else 0, plan.space_dim),
-        states=s.new_empty(plan.total * plan.group_count, plan.width),
-    )
-    return [x.new_empty(row_capacity, dtype=integers), *saved.tensors()]
-
-
-@opaque("npa::perceive_static")
-def _perceive_static(
-    x: Tensor,
-    s: Tensor,
-    rows: list[Tensor],
     static: list[Tensor],
     masked: bool,
     row_capacity: int,
     row_width: int,
-    eps: float,
-    scale: float,
-    box: list[float] | None,
-    state_gradient: bool,
-    moment_inverse: str | None,
-    density_gradient: bool,
-    for_adjoint: bool,
-) -> tuple[Tensor, Tensor]:
-    """Return rows of perception of static worlds, and the rows' sums of v K for the adjoint."""
-    plan = make_plan(x, x.shape, s.shape[2], row_capacity, masked, eps, box)
-    terms = Terms(state_gradient, moment_inverse, density_gradient)
-    ordered, densities = static_worlds(plan, StaticTensors.of(static), StaticRows(*rows), x, s)
-    perception = x.new_empty(row_capacity, row_width)
-    kernel_sum = x.new_empty(row_capacity if for_adjoint else 0, plan.space_dim)
-    written = kernel_sum if for_adjoint else None
-    launch(
-        *perception_launch(
-            plan, ordered, densities, terms, scale, perception, row_kernel_sum=written
-        )
-    )
-    return perception, kernel_sum
-
-
-@_perceive_static.register_fake
-def _(
-    x: Tensor,
-    s: Tensor,
-    rows: list[Tensor],
-    static: list[Tensor],
-    masked: bool,
-    row_capacity: int,
-    row_width: int,
-    *options: Any,
-) -> tuple[Tensor, Tensor]:
-    kernel_sum = x.new_empty(row_capacity if options[-1] else 0, x.shape[2])
-    return x.new_empty(row_capacity, row_width), kernel_sum
-
-
-def _numbers(
     physics: Physics,
-) -> tuple[float, float, list[float] | None, bool, str | None, bool]:
-    """Return what operators take of the constants, flat."""
-    return constant(physics.eps), physics.scale(), physics.sides(), *physics.terms
+    for_adjoint: bool,
+) -> list[Tensor]:
+    space_dim = x.shape[2]
+    perception = x.new_empty(row_capacity, row_width)
+    kernel_sum = x.new_empty(row_capacity if for_adjoint else 0, space_dim)
+    if static:
+        return [perception, kernel_sum]
+    plan = make_plan(x, x.shape, s.shape[2], row_capacity, masked, physics)
+    particle_count = plan.total if for_adjoint or plan.runs("density") == "portable" else 0
+    return [
+        perception,
+        kernel_sum,
+        x.new_empty(plan.total, dtype=torch.int32),
+        x.new_empty(plan.start_count, dtype=torch.int32),
+        x.new_empty(plan.total, dtype=torch.int32),
+        x.new_empty(particle_count, space_dim + 1),
+        x.new_empty(row_capacity, space_dim),
+        s.new_empty(plan.total * plan.group_count, plan.width),
+        x.new_empty(row_capacity, dtype=torch.int32),
+    ]
 
 
 class _PerceiveRows(torch.autograd.Function):
     """Perception of the active particles, with gathered adjoints for states and positions."""
 
     @staticmethod
-    def forward(
-        ctx: Any,
-        x: Tensor,
-        s: Tensor,
-        mask: Tensor | None,
-        row_capacity: int,
-        row_width: int,
-        physics: Physics,
-    ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        row_source, *tensors = _perceive_rows(
-            x, s, mask, row_capacity, row_width, *_numbers(physics), for_adjoint=True
-        )
-        saved = SavedPerception(*tensors)
-        ctx.mark_non_differentiable(saved.row_of, row_source, saved.starts)
+    def forward(ctx: Any, x: Tensor, s: Tensor, *given: Any) -> tuple[Tensor, ...]:
+        saved, row_source = _perceived(x, s, *given, for_adjoint=True)
+        _, static, _, masked, *_, physics = given
         ctx.set_materialize_grads(False)
+        ctx.shape, ctx.masked, ctx.physics = s.shape, masked, physics
         kept = saved if ctx.needs_input_grad[0] else saved[:-1]
-        _save(ctx, kept, (), s, mask is not None, physics)
+        listed = () if static is None else static.listed or ()
+        ctx.saved_count = len(kept)
+        ctx.save_for_backward(*kept, *listed)
+        if static is not None:
+            return (saved.perception,)
+        ctx.mark_non_differentiable(saved.row_of, row_source, saved.starts)
         return saved.perception, saved.row_of, row_source, saved.starts
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, *bars: Tensor | None) -> tuple[Tensor | None, ...]:
-        if bars[0] is None:
-            return None, None, None, None, None, None
-        states_bar, positions_bar = _pull_back(ctx, bars[0])
-        x_bar = positions_bar.view(*states_bar.shape[:2], -1) if ctx.needs_input_grad[0] else None
-        return x_bar, states_bar, None, None, None, None
-
-
-class _PerceiveStatic(torch.autograd.Function):
-    """Perception of the active particles of static worlds, with the same adjoint for states."""
-
-    @staticmethod
-    def forward(
-        ctx: Any,
-        s: Tensor,
-        x: Tensor,
-        masked: bool,
-        static: StaticWorlds,
-        rows: StaticRows,
-        row_capacity: int,
-        row_width: int,
-        physics: Physics,
-    ) -> Tensor:
-        tensors = static.tensors
-        perception: Tensor
-        perception, kernel_sum = _perceive_static(
-            x,
-            s,
-            list(rows),
-            tensors.flat(),
-            masked,
-            row_capacity,
-            row_width,
-            *_numbers(physics),
-            for_adjoint=ctx.needs_input_grad[0],
-        )
-        if ctx.needs_input_grad[0]:
-            saved = SavedPerception(
-                perception=perception,
-                row_of=rows.row_of,
-                starts=rows.starts,
-                source=tensors.everyone,
-                particles=tensors.particles,
-                row_positions=rows.row_positions,
-                row_kernel_sum=kernel_sum,
+    def backward(ctx: Any, bar: Tensor | None, *_: None) -> tuple[Tensor | None, ...]:
+        states_bar = x_bar = None
+        if bar is not None:
+            # Read once: unpacking recomputes what a checkpoint has left out.
+            tensors = list(ctx.saved_tensors)
+            count, shape = ctx.saved_count, ctx.shape
+            states_bar, positions_bar = perceive_rows_backward(
+                bar, tensors[:count], tensors[count:], *shape[1:], ctx.masked, ctx.physics
             )
-            listed = () if tensors.listed is None else tensors.listed
-            _save(ctx, saved[:-1], listed, s, masked, physics)
-        return perception
-
-    @staticmethod
-    @once_differentiable
-    def backward(ctx: Any, bar: Tensor) -> tuple[Tensor | None, ...]:
-        return _pull_back(ctx, bar)[0], *[None] * 7
+            states_bar = states_bar.view(shape)
+            x_bar = positions_bar.view(*shape[:2], -1) if ctx.needs_input_grad[0] else None
+        return x_bar, states_bar, *[None] * 7
 
 
-def _save(
-    ctx: Any,
-    tensors: tuple[Tensor | None, ...],
-    listed: tuple[Tensor, ...],
+def _perceived(
+    x: Tensor,
     s: Tensor,
+    mask: Tensor | None,
+    static: StaticWorlds | None,
+    rows: StaticRows | None,
     masked: bool,
+    row_capacity: int,
+    row_width: int,
     physics: Physics,
-) -> None:
-    """Save what `_pull_back` reads."""
-    ctx.physics, ctx.shape, ctx.masked = physics, s.shape, masked
-    ctx.saved_count = len(tensors)
-    ctx.save_for_backward(*tensors, *listed)
-
-
-def _pull_back(ctx: Any, bar: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the cotangents of states, [B, N, C], and of positions, [B N, D] or empty."""
-    physics, shape = ctx.physics, ctx.shape
-    # Read once: unpacking recomputes what a checkpoint has left out.
-    tensors = list(ctx.saved_tensors)
-    states_bar, positions_bar = perceive_rows_backward(
-        bar,
-        tensors[: ctx.saved_count],
-        tensors[ctx.saved_count :],
-        particle_count=shape[1],
-        state_dim=shape[2],
-        masked=ctx.masked,
-        eps=constant(physics.eps),
-        scale=physics.scale(),
-        box=physics.sides(),
-        state_gradient=physics.terms.state_gradient,
-        density_gradient=physics.terms.density_gradient,
+    *,
+    for_adjoint: bool,
+) -> tuple[SavedPerception, Tensor]:
+    """Return perception with what its adjoint reads, and the particles of its rows."""
+    options = masked, row_capacity, row_width, physics, for_adjoint
+    if static is None or rows is None:
+        *found, row_source = _perceive_rows(x, s, mask, [], *options)
+        return SavedPerception(*found), row_source
+    perception, kernel_sum = _perceive_rows(x, s, None, [*rows, *static.flat()], *options)
+    saved = SavedPerception(
+        perception,
+        kernel_sum,
+        row_of=rows.row_of,
+        starts=rows.starts,
+        source=static.everyone,
+        particles=static.particles,
+        row_positions=rows.row_positions,
     )
-    return states_bar.view(shape), positions_bar
+    return saved, rows.row_source
 
 
 def perceive_rows(
@@ -461,25 +355,20 @@ def perceive_rows(
         Rows of perception, dimensionless, shape [K, row_width], zero beyond the last active row,
         and which particles they stand for.
     """
-    x, s = x.contiguous(), s.contiguous()
-    options = row_capacity, row_width, physics
+    x, s, rows = x.contiguous(), s.contiguous(), static_rows
+    masked = (mask if static is None else static_rows) is not None
     if static is not None:
-        rows = all_rows(static, x) if static_rows is None else static_rows
-        masked = static_rows is not None
-        perception = _PerceiveStatic.apply(s, x.detach(), masked, static, rows, *options)  # type: ignore[no-untyped-call]
-        row_base = x.shape[0] * x.shape[1] if masked else 0
-        return perception, Rows(rows.row_of, rows.row_source, rows.starts, row_base)
-    row_base = 0 if mask is None else x.shape[0] * x.shape[1]
-    if not (torch.is_grad_enabled() and (x.requires_grad or s.requires_grad)):
-        row_source, *tensors = _perceive_rows(
-            x, s, mask, row_capacity, row_width, *_numbers(physics), for_adjoint=False
-        )
-        saved = SavedPerception(*tensors)
-        return saved.perception, Rows(saved.row_of, row_source, saved.starts, row_base)
-    perception, row_of, row_source, starts = _PerceiveRows.apply(  # type: ignore[no-untyped-call]
-        x, s, mask, *options
-    )
-    return perception, Rows(row_of, row_source, starts, row_base)
+        x = x.detach()
+        rows = all_rows(static, x) if rows is None else rows
+    given = x, s, mask, static, rows, masked, row_capacity, row_width, physics
+    if torch.is_grad_enabled() and (x.requires_grad or s.requires_grad):
+        perception, *found = _PerceiveRows.apply(*given)  # type: ignore[no-untyped-call]
+    else:
+        saved, row_source = _perceived(*given, for_adjoint=False)
+        perception, *found = saved.perception, saved.row_of, row_source, saved.starts
+    if rows is not None:
+        found = [rows.row_of, rows.row_source, rows.starts]
+    return perception, Rows(*found, x.shape[0] * x.shape[1] if masked else 0)
 
 
 ROWS_TOGETHER = 2**22
@@ -502,26 +391,15 @@ def update_some_at_a_time(
     row. Not differentiable.
     """
     x, s = x.detach().contiguous(), s.detach().contiguous()
-    eps, box, terms = physics.eps, physics.box, physics.terms
-    plan = make_plan(x, x.shape, s.shape[2], row_capacity, mask is not None, eps, box)
+    plan = make_plan(x, x.shape, s.shape[2], row_capacity, mask is not None, physics)
     ordered = sort_worlds(plan, x, s, mask)
-    densities = compute_densities(plan, ordered, terms, plan.listing, with_particles=False)
+    densities = compute_densities(plan, ordered, with_particles=False)
     perception = x.new_empty(min(ROWS_TOGETHER, row_capacity), row_width)
     updates = None
     for first in range(0, row_capacity, ROWS_TOGETHER):
         some = perception[: min(ROWS_TOGETHER, row_capacity - first)]
-        launch(
-            *perception_launch(
-                plan,
-                ordered,
-                densities,
-                terms,
-                physics.scale(),
-                some,
-                first_row=first,
-                row_count=len(some),
-            )
-        )
+        part = {"first_row": first, "row_count": len(some)}
+        launch(*perception_launch(plan, ordered, densities, some, **part))
         mapped = network(some)
         if updates is None:
             updates = mapped.new_empty(row_capacity, mapped.shape[1])
@@ -547,7 +425,7 @@ class NeighbourState:
         self._launch_of = launch_of
         self._shape = shape
         self._like = like
-        self._prepared: PreparedLaunch | None = None
+        self._tape: Tape | None = None
 
     def perceive(self, out: Tensor | None = None) -> Tensor:
         """Return what every particle perceives, clipped, in the caller's order, shape [B, N, P].
@@ -561,9 +439,14 @@ class NeighbourState:
         if out is None:
             out = self._like.new_empty(self._shape)
         rows = out.view(-1, self._shape[-1])
-        if self._prepared is None:
-            self._prepared = PreparedLaunch(*self._launch_of(rows), changing=rows)
-        self._prepared(rows)
+        form = rows.shape, rows.dtype, rows.device, rows.is_contiguous()
+        if self._tape is None:
+            self._tape, self._form = Tape(), form
+            self._tape.add(*self._launch_of(rows))
+            self._places = self._tape.places(rows)
+        assert form == self._form, "only an address is replaced"
+        self._tape.move(self._places, rows)
+        self._tape.replay()
         return out
 
 
@@ -576,9 +459,7 @@ def build_neighbours(
     int64, shape [B]; default: a batch of their own.
     """
     x, s = x.contiguous(), s.contiguous()
-    plan = make_plan(
-        x, x.shape, s.shape[2], x.shape[0] * x.shape[1], False, physics.eps, physics.box
-    )
+    plan = make_plan(x, x.shape, s.shape[2], x.shape[0] * x.shape[1], False, physics)
     listed = plan.lists_neighbours
     in_place = listed and plan.state_dim % plan.width == 0 and s.data_ptr() % 16 == 0
     ordered = sort_worlds(plan, x, None if in_place else s, None, with_rows=not listed)
@@ -587,7 +468,6 @@ def build_neighbours(
     densities = compute_densities(
         plan,
         ordered,
-        physics.terms,
         batch_listing(plan.request),
         state_place=ordered.source if in_place else None,
         with_particles=False,
@@ -602,8 +482,6 @@ def build_neighbours(
             plan,
             ordered,
             densities,
-            physics.terms,
-            physics.scale(),
             rows,
             states=s if in_place else None,
             destination=destination,

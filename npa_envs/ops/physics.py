@@ -33,6 +33,9 @@ class Terms(NamedTuple):
 
 ALL_TERMS = Terms()
 
+INVERSES = (None, "threshold", "smooth")
+"""How moment matrices are inverted, numbered for torch operators."""
+
 
 class Limits(NamedTuple):
     """What bounds the worlds of environments; rollouts have no bounds."""
@@ -88,26 +91,48 @@ class Physics(NamedTuple):
         """Length A of an action: D + C, or C where particles are static."""
         return self.state_dim + (self.space_dim if self.moving else 0)
 
+    @classmethod
+    def of(cls, numbers: list[float]) -> Physics:
+        """Return what `numbers` made a list of: all but limits, and sizes that tensors give."""
+        eps, eps0, state_gradient, inverse, density_gradient, moving, *rest = numbers
+        terms = Terms(bool(state_gradient), INVERSES[int(inverse)], bool(density_gradient))
+        largest, update_prob, dt, noise, *box = rest
+        sides = tuple(box) or None
+        return cls(0, 0, eps, eps0, sides, terms, bool(moving), largest, update_prob, dt, noise)
+
+    def numbers(self) -> list[float]:
+        """Return what torch operators take in place of this: numbers, constants to compilers."""
+        state_gradient, inverse, density_gradient = self.terms
+        given = (
+            self.eps,
+            self.eps0,
+            float(state_gradient),
+            float(INVERSES.index(inverse)),
+            float(density_gradient),
+            float(self.moving),
+            self.max_displacement,
+            self.update_prob,
+            self.dt,
+            self.position_noise,
+            *(self.box or ()),
+        )
+        return [constant(number) for number in given]
+
     def scale(self) -> float:
         """Return c = eps / eps0."""
         return constant(self.eps) / constant(self.eps0)
-
-    def sides(self) -> list[float] | None:
-        """Return the box as operators take it."""
-        return None if self.box is None else [constant(side) for side in self.box]
 
     def constants(self) -> Physics:
         """Return them with numbers that a compiler takes for constants."""
         if not torch.compiler.is_compiling():
             return self
-        sides = self.sides()
         # Compilers lose fields that `_replace` or a default would fill in.
         return Physics(
             self.space_dim,
             self.state_dim,
             constant(self.eps),
             constant(self.eps0),
-            None if sides is None else tuple(sides),
+            None if self.box is None else tuple([constant(side) for side in self.box]),
             self.terms,
             self.moving,
             constant(self.max_displacement),

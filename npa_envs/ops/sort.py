@@ -23,6 +23,7 @@ from npa_envs.ops.backend import (
     rollout_listing,
 )
 from npa_envs.ops.launch import channel_width, is_recorded, launch, scalar_type
+from npa_envs.ops.physics import Physics
 
 LARGEST_INDEX = 2**31 - 1
 """Kernels index with 32 bits."""
@@ -48,6 +49,8 @@ class KernelPlan(NamedTuple):
     state_dim: int
     row_capacity: int
     masked: bool
+    physics: Physics
+    """Constants of the worlds, but for sizes."""
     domain: Any
     request: KernelRequest
     """What the backend table asks for."""
@@ -57,11 +60,7 @@ class KernelPlan(NamedTuple):
     def runs(
         self, operator: Operator, *, aligned: bool = True, position_gradient: bool = False
     ) -> str:
-        """Return the name of the implementation of an operator that runs.
-
-        Args:
-            operator: The operator.
-        """
+        """Return the name of the implementation of an operator that runs."""
         request = self.request
         if not aligned or position_gradient:
             request = request._replace(aligned=aligned, position_gradient=position_gradient)
@@ -112,6 +111,11 @@ class KernelPlan(NamedTuple):
         """What is subtracted from a start of active rows to give a row."""
         return self.total if self.masked else 0
 
+    @property
+    def density_scale(self) -> float:
+        """c^(1+D) / N, by which the density gradient is scaled before the logarithm."""
+        return self.physics.scale() ** (1 + self.space_dim) / self.particle_count
+
 
 class SortedWorlds(NamedTuple):
     """Particles in the order world, cell, index; the active ones have rows in the same order."""
@@ -142,8 +146,7 @@ def make_plan(
     state_dim: int,
     row_capacity: int,
     masked: bool,
-    eps: float,
-    box: Sequence[float] | None,
+    physics: Physics,
 ) -> KernelPlan:
     """Return the plan of a call on positions of a shape [B, N, D] and `state_dim` channels.
 
@@ -152,7 +155,7 @@ def make_plan(
     # As integers: a shape that torch.compile left open is fixed here, another one compiled anew.
     world_count, particle_count, space_dim = (int(size) for size in shape)
     scalar = scalar_type(like.dtype)
-    sides = None if box is None else tuple(box)
+    eps, sides = physics.eps, physics.box
     # In 3D, more and smaller cells mean many short runs, which lanes share badly.
     cell_reach = 1 if space_dim == 3 and like.device.type == "cuda" else 2
     domain = make_domain(space_dim, scalar, eps, sides, particle_count, cell_reach)
@@ -173,6 +176,7 @@ def make_plan(
         state_dim=int(state_dim),
         row_capacity=row_capacity,
         masked=masked,
+        physics=physics,
         domain=domain,
         request=request,
         listing=rollout_listing(request, mean_neighbours(particle_count, eps, sides)),
@@ -379,8 +383,3 @@ def grouped_states(plan: KernelPlan, s: Tensor) -> Tensor:
     # Groups are read 16 bytes at a time.
     states = states.clone() if states.data_ptr() % 16 else states
     return states.contiguous().view(-1, plan.width)
-
-
-def density_scale(scale: float, space_dim: int, particle_count: int) -> float:
-    """Return c^(1+D) / N, by which the density gradient is scaled before the logarithm."""
-    return scale ** (1 + space_dim) / particle_count

@@ -23,7 +23,7 @@ from npa_envs.ops.launch import launch, scalar_type
 from npa_envs.ops.opaque import check_derivatives, opaque
 from npa_envs.ops.perceive import perceive
 from npa_envs.ops.physics import Physics, physics
-from npa_envs.ops.sort import density_scale, make_plan, sort_worlds
+from npa_envs.ops.sort import make_plan, sort_worlds
 
 MOST_SPECIES = 64
 """Species of a world: a thread keeps one sum for each."""
@@ -71,16 +71,11 @@ def checked_counts(counts: Sequence[int], particle_count: int) -> tuple[int, ...
 
 @opaque("npa::gather_species")
 def _gather_species(
-    x: Tensor,
-    counts: list[int],
-    eps: float,
-    box: list[float] | None,
-    density_factor: float,
-    gradient_factor: float,
-    logarithmic: bool,
+    x: Tensor, counts: list[int], physics: Physics, scaled: bool
 ) -> tuple[Tensor, Tensor]:
+    """Return densities and gradients of species, as rules perceive them if they are `scaled`."""
     world_count, particle_count, space_dim = x.shape
-    plan = make_plan(x, x.shape, 1, world_count * particle_count, False, eps, box)
+    plan = make_plan(x, x.shape, 1, world_count * particle_count, False, physics)
     ordered = sort_worlds(plan, x, None, None, with_rows=False)
     place = ordered.source % particle_count
     sorted_species = torch.zeros_like(place)
@@ -95,9 +90,9 @@ def _gather_species(
         x.device,
         plan.domain,
         particle_count,
-        density_factor,
-        gradient_factor,
-        int(logarithmic),
+        physics.scale() ** space_dim / particle_count if scaled else 1.0,
+        plan.density_scale if scaled else 1.0,
+        int(scaled),
         ordered.starts,
         ordered.source,
         sorted_species,
@@ -121,17 +116,7 @@ def perceive_by_species(x: Tensor, counts: tuple[int, ...], physics: Physics) ->
     That is c^D ρ_k / N of each species, then L(c^(1+D) ∇ρ_k / N) of each, species by species. A
     species may have no particles. No gradient flows into positions.
     """
-    scale = physics.scale()
-    particle_count, space_dim = x.shape[1:]
-    density, gradient = _gather_species(
-        x.detach().contiguous(),
-        list(counts),
-        physics.eps,
-        physics.sides(),
-        scale**space_dim / particle_count,
-        density_scale(scale, space_dim, particle_count),
-        True,
-    )
+    density, gradient = _gather_species(x.detach().contiguous(), list(counts), physics, True)
     return torch.cat((density, gradient.flatten(2)), dim=-1)
 
 
@@ -159,11 +144,7 @@ def species_fields(
     checked = checked_counts(counts, x.shape[1])
     made = physics(x.shape[2], 1, x.dtype, eps=eps, box=box)
     check_finite_positions(x)
-    return SpeciesFields(
-        *_gather_species(
-            x.detach().contiguous(), list(checked), made.eps, made.sides(), 1.0, 1.0, False
-        )
-    )
+    return SpeciesFields(*_gather_species(x.detach().contiguous(), list(checked), made, False))
 
 
 def perceive_species(

@@ -21,7 +21,7 @@ from npa_envs.ops.passes import (
     NeighbourLists,
     compute_densities,
 )
-from npa_envs.ops.physics import Physics, Terms
+from npa_envs.ops.physics import Physics
 from npa_envs.ops.sort import (
     KernelPlan,
     SortedWorlds,
@@ -34,8 +34,8 @@ LARGEST_LISTS = 2**31
 """Bytes of all lists on a CPU, at most: where there would be more, each step searches anew."""
 
 
-class StaticTensors(NamedTuple):
-    """Tensors that follow from positions alone; particles are sorted."""
+class StaticWorlds(NamedTuple):
+    """What perception needs of positions that stay: sorted worlds, by `prepare_static`."""
 
     source: Tensor
     """Caller's index of each sorted particle, int32, shape [B N]."""
@@ -65,41 +65,25 @@ class StaticTensors(NamedTuple):
         return ListedNeighbours(*self.lists) if len(self.lists) == 2 else None
 
     @classmethod
-    def of(cls, tensors: list[Tensor]) -> StaticTensors:
+    def of(cls, tensors: list[Tensor]) -> StaticWorlds:
         """Return what `flat` made a list of."""
         count = len(cls._fields) - 1
         return cls._make([*tensors[:count], tensors[count:]])
 
 
-class StaticWorlds(NamedTuple):
-    """Sorted worlds of particles that stay; `prepare_static` makes them."""
-
-    tensors: StaticTensors
-    """What perception needs of positions."""
-
-
 @opaque("npa::prepare_static")
-def _prepare_static(
-    x: Tensor,
-    state_dim: int,
-    eps: float,
-    box: list[float] | None,
-    state_gradient: bool,
-    moment_inverse: str | None,
-    density_gradient: bool,
-) -> list[Tensor]:
-    """Return what a `StaticTensors` holds."""
+def _prepare_static(x: Tensor, state_dim: int, physics: Physics) -> list[Tensor]:
+    """Return what a `StaticWorlds` holds."""
     total = x.shape[0] * x.shape[1]
-    plan = make_plan(x, x.shape, state_dim, total, False, eps, box)
+    plan = make_plan(x, x.shape, state_dim, total, False, physics)
     ordered = sort_worlds(plan, x, None, None)
-    terms = Terms(state_gradient, moment_inverse, density_gradient)
-    densities = compute_densities(plan, ordered, terms, plan.listing)
+    densities = compute_densities(plan, ordered)
     lists: list[Tensor] = []
     if densities.lists is not None:
         lists = [densities.lists.steps, densities.lists.lengths, densities.lists.records]
     elif plan.on_cpu:
         lists = _list_neighbours(plan, ordered.starts, densities.particles)
-    return StaticTensors(
+    return StaticWorlds(
         source=ordered.source,
         place=ordered.row_of,
         everyone=torch.arange(total, dtype=torch.int32, device=x.device),
@@ -128,17 +112,9 @@ def _list_neighbours(plan: KernelPlan, starts: Tensor, particles: Tensor) -> lis
 
 
 @_prepare_static.register_fake
-def _(
-    x: Tensor,
-    state_dim: int,
-    eps: float,
-    box: list[float] | None,
-    state_gradient: bool,
-    moment_inverse: str | None,
-    density_gradient: bool,
-) -> list[Tensor]:
+def _(x: Tensor, state_dim: int, physics: Physics) -> list[Tensor]:
     total, space_dim = x.shape[0] * x.shape[1], x.shape[2]
-    plan = make_plan(x, x.shape, state_dim, total, False, eps, box)
+    plan = make_plan(x, x.shape, state_dim, total, False, physics)
 
     def integers(count: int | torch.SymInt) -> Tensor:
         return x.new_empty(count, dtype=torch.int32)
@@ -154,7 +130,7 @@ def _(
         ]
     elif plan.on_cpu:
         lists = [integers(torch.library.get_ctx().new_dynamic_size()), integers(total)]
-    return StaticTensors(
+    return StaticWorlds(
         source=integers(total),
         place=integers(total),
         everyone=integers(total),
@@ -168,10 +144,7 @@ def _(
 
 def prepare_static(x: Tensor, physics: Physics) -> StaticWorlds:
     """Sort checked worlds whose particles do not move, and list their neighbours; no gradient."""
-    tensors = _prepare_static(
-        x.detach().contiguous(), physics.state_dim, physics.eps, physics.sides(), *physics.terms
-    )
-    return StaticWorlds(StaticTensors.of(tensors))
+    return StaticWorlds.of(_prepare_static(x.detach().contiguous(), physics.state_dim, physics))
 
 
 class StaticRows(NamedTuple):
@@ -243,10 +216,7 @@ def static_rows(
     """
     if not x.is_cuda:
         row_capacity = x.shape[0] * x.shape[1]
-    tensors = worlds.tensors
-    *rows, active = _static_rows(
-        x, torch.stack(masks), tensors.source, tensors.starts, row_capacity
-    )
+    *rows, active = _static_rows(x, torch.stack(masks), worlds.source, worlds.starts, row_capacity)
     steps = [StaticRows(*step) for step in zip(*rows, strict=True)]
     if x.is_cuda:
         return steps
@@ -262,26 +232,21 @@ def static_rows(
 
 def all_rows(worlds: StaticWorlds, x: Tensor) -> StaticRows:
     """Return the rows of a step in which all particles of worlds at x are active."""
-    everyone = worlds.tensors.everyone
-    return StaticRows(everyone, everyone, worlds.tensors.starts, x.flatten(0, 1))
+    return StaticRows(worlds.everyone, worlds.everyone, worlds.starts, x.flatten(0, 1))
 
 
 def static_worlds(
-    plan: KernelPlan, tensors: StaticTensors, rows: StaticRows, x: Tensor, s: Tensor
+    plan: KernelPlan, worlds: StaticWorlds, rows: StaticRows, x: Tensor, s: Tensor
 ) -> tuple[SortedWorlds, Densities]:
-    """Return what the perception pass of a step reads.
-
-    Args:
-        tensors: What was prepared.
-    """
+    """Return what the perception pass of a step reads."""
     lists = None
     if plan.lists_neighbours:
-        steps, lengths, records = tensors.lists
+        steps, lengths, records = worlds.lists
         lists = NeighbourLists(plan.listing, steps, lengths, records, by_place=True)
     ordered = SortedWorlds(
         starts=rows.starts,
-        source=tensors.everyone,
-        cell=tensors.cell,
+        source=worlds.everyone,
+        cell=worlds.cell,
         row_of=rows.row_of,
         row_source=rows.row_source,
         row_place=rows.row_source,
@@ -289,4 +254,4 @@ def static_worlds(
         row_positions=rows.row_positions,
         states=grouped_states(plan, s),
     )
-    return ordered, Densities(tensors.particles, tensors.density_gradient, lists, tensors.listed)
+    return ordered, Densities(worlds.particles, worlds.density_gradient, lists, worlds.listed)

@@ -8,7 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from npa_envs.checks import check_world, constant
+from npa_envs.checks import check_world
 from npa_envs.errors import NPAError
 from npa_envs.kernels.portable.update import (
     CHANNEL_SHARE,
@@ -18,7 +18,7 @@ from npa_envs.kernels.portable.update import (
     find_not_finite,
     update_kernels,
 )
-from npa_envs.ops.launch import PreparedLaunch, launch, scalar_type
+from npa_envs.ops.launch import Tape, launch, scalar_type
 from npa_envs.ops.opaque import check_derivatives, once_differentiable, opaque
 from npa_envs.ops.perceive import Rows
 from npa_envs.ops.physics import Limits, Physics
@@ -37,10 +37,7 @@ def _update_particles(
     s: Tensor,
     path_length: Tensor,
     row_of: Tensor,
-    max_displacement: float,
-    dt: float,
-    moving: bool,
-    box: list[float] | None,
+    physics: Physics,
 ) -> tuple[Tensor, Tensor, Tensor]:
     space_dim, state_dim = x.shape[2], s.shape[2]
     total = x.shape[0] * x.shape[1]
@@ -61,11 +58,11 @@ def _update_particles(
         kernels.apply_update,
         -(-total // TEAM) * TEAM * (1 + _sharers(state_dim)),
         x.device,
-        max_displacement * dt,
-        dt,
-        int(box is not None),
-        tuple(box) if box is not None else (1.0,) * space_dim,
-        int(moving),
+        physics.max_displacement * physics.dt,
+        physics.dt,
+        int(physics.box is not None),
+        physics.box or (1.0,) * space_dim,
+        int(physics.moving),
         state_dim,
         update.shape[1],
         int(aligned),
@@ -95,9 +92,7 @@ def _update_particles_backward(
     row_source: Tensor,
     starts: Tensor,
     row_base: int,
-    max_displacement: float,
-    dt: float,
-    moving: bool,
+    physics: Physics,
 ) -> Tensor:
     space_dim, state_dim = new_x_bar.shape[2], new_s_bar.shape[2]
     kernels = update_kernels(space_dim, scalar_type(update.dtype))
@@ -106,9 +101,9 @@ def _update_particles_backward(
         kernels.pull_back_update,
         update.shape[0] * _sharers(update.shape[1]),
         update.device,
-        max_displacement * dt,
-        dt,
-        int(moving),
+        physics.max_displacement * physics.dt,
+        physics.dt,
+        int(physics.moving),
         row_base,
         state_dim,
         update.shape[1],
@@ -140,17 +135,11 @@ class _UpdateParticles(torch.autograd.Function):
         s: Tensor,
         path_length: Tensor,
         rows: Rows,
-        max_displacement: float,
-        dt: float,
-        moving: bool,
-        box: list[float] | None,
+        physics: Physics,
     ) -> tuple[Tensor, Tensor, Tensor]:
-        ctx.options = (rows.row_base, max_displacement, dt, moving)
+        ctx.options = rows.row_base, physics
         ctx.save_for_backward(update, rows.row_source, rows.starts)
-        outputs: tuple[Tensor, Tensor, Tensor] = _update_particles(
-            update, x, s, path_length, rows.row_of, max_displacement, dt, moving, box
-        )
-        return outputs
+        return _update_particles(update, x, s, path_length, rows.row_of, physics)
 
     @staticmethod
     @once_differentiable
@@ -158,7 +147,7 @@ class _UpdateParticles(torch.autograd.Function):
         update, row_source, starts = ctx.saved_tensors
         given: list[Any] = [update, *bars, row_source, starts, *ctx.options]
         update_bar = _update_particles_backward(*given)
-        return (update_bar, *bars, None, None, None, None, None)
+        return (update_bar, *bars, None, None)
 
 
 def update_particles(
@@ -175,16 +164,10 @@ def update_particles(
     not read.
     """
     x, s = x.contiguous(), s.contiguous()
-    options = (
-        constant(physics.max_displacement),
-        constant(physics.dt),
-        physics.moving,
-        physics.sides(),
-    )
     tensors = (update, x, s, path_length)
     if not (torch.is_grad_enabled() and any(tensor.requires_grad for tensor in tensors)):
-        return _update_particles(*tensors, rows.row_of, *options)
-    outputs: tuple[Tensor, Tensor, Tensor] = _UpdateParticles.apply(*tensors, rows, *options)  # type: ignore[no-untyped-call]
+        return _update_particles(*tensors, rows.row_of, physics)
+    outputs: tuple[Tensor, Tensor, Tensor] = _UpdateParticles.apply(*tensors, rows, physics)  # type: ignore[no-untyped-call]
     return outputs
 
 
@@ -283,15 +266,13 @@ class PreparedActions:
         self._buffer = s.new_zeros(*s.shape[:2], physics.action_dim)
         self._worlds = (x, s)
         self._physics = physics
-        self._enabled = enabled
         self._step = (mask, noise, enabled, diverged)
-        self._check: PreparedLaunch | None = None
-        self._apply: PreparedLaunch | None = None
+        self._tape: Tape | None = None
         _check_worlds(self._buffer, x, s, mask, noise, enabled, diverged, physics.moving)
 
     def __getstate__(self) -> dict[str, Any]:
         """Leave out what cannot be pickled."""
-        return self.__dict__ | {"_check": None, "_apply": None}
+        return self.__dict__ | {"_tape": None, "_places": None}
 
     def __call__(self, action: Tensor) -> None:
         """Apply actions, shape [B, N, A], of any dtype, on any device."""
@@ -321,28 +302,18 @@ class PreparedActions:
         self._run(self._buffer)
 
     def _run(self, action: Tensor) -> None:
-        if self._check is None or self._apply is None:
-            self._check, self._apply = self._record(action)
-        self._check(action)
-        self._apply(action)
-
-    def _record(self, action: Tensor) -> tuple[PreparedLaunch, PreparedLaunch]:
-        """Return the launches that check and that apply, both of actions that are aligned."""
-        x, s = self._worlds
-        thread_count = -(-action.numel() // VALUES_PER_THREAD)
-        check = PreparedLaunch(
-            find_not_finite(scalar_type(x.dtype)),
-            thread_count,
-            x.device,
-            thread_count,
-            action,
-            self._enabled,
-            changing=action,
-        )
-        aligned = s.data_ptr() % 16 == 0
-        launched = _launch_of(action, x, s, self._physics, *self._step, aligned=aligned)
-        apply = PreparedLaunch(*launched, changing=action)
-        return check, apply
+        if self._tape is None:
+            self._tape = Tape()
+            x, s = self._worlds
+            threads = -(-action.numel() // VALUES_PER_THREAD)
+            check = find_not_finite(scalar_type(x.dtype))
+            self._tape.add(check, threads, x.device, threads, action, self._step[2])
+            aligned = s.data_ptr() % 16 == 0
+            launched = _launch_of(action, x, s, self._physics, *self._step, aligned=aligned)
+            self._tape.add(*launched)
+            self._places = self._tape.places(action)
+        self._tape.move(self._places, action)
+        self._tape.replay()
 
 
 def _launch_of(

@@ -2,25 +2,36 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+import threading
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any, Literal, NamedTuple
 
 import torch
 from torch import Tensor
+from torch.utils._python_dispatch import is_in_torch_dispatch_mode
 from torch.utils.checkpoint import checkpoint
 
 from npa_envs.checks import check_finite_positions
 from npa_envs.errors import NPAError
+from npa_envs.ops.launch import Tape
 from npa_envs.ops.physics import Physics
+from npa_envs.ops.sort import sorts_at_once
+from npa_envs.rule.network import Network
 from npa_envs.rule.rule import NPARule
 from npa_envs.world.cuda_graph import draws_alone
 from npa_envs.world.divergence import DivergenceWatch
 from npa_envs.world.particles import Particles, combined
-from npa_envs.world.prepared import may_prepare, run_prepared
 from npa_envs.world.randomness import Randomness
-from npa_envs.world.recorded import CudaGraph, run_recorded
+from npa_envs.world.recorded import (
+    LAUNCHED_FIRST,
+    CallKinds,
+    CudaGraph,
+    rule_form,
+    run_recorded,
+)
 from npa_envs.world.steps import (
     DivisionStep,
+    Draws,
     RuleStep,
     SpeciesSpec,
     StaticStep,
@@ -39,6 +50,12 @@ FEWEST_STATIC = 3
 
 FEWEST_RESTING = 256
 """Steps of a rollout, at least, that is checked for worlds at rest."""
+
+LARGEST_TOTAL = 4096
+"""Particles of all worlds, at most, whose steps are on a tape: larger ones hide the host's time."""
+
+MOST_KINDS = 32
+"""Kinds of calls on tapes that are remembered."""
 
 FIRST_PART = {"cpu": 64, "cuda": 1024}
 """Steps until the next check, by device; each further part is twice as long. A GPU idles during a
@@ -88,8 +105,8 @@ class RolloutSpec(NamedTuple):
     ) -> Particles:
         """Launch the rollout of checked worlds: from a tape on a CPU, in a loop otherwise."""
         step = self.make_step(rules, particles)
-        if isinstance(step, RuleStep) and watch is None and may_prepare(step, particles):
-            kept = run_prepared(step, particles, source, self.steps, self.keep_every)
+        if isinstance(step, RuleStep) and watch is None and may_tape(step, particles):
+            kept = run_taped(step, particles, source, self.steps, self.keep_every)
             if kept is not None:
                 return kept
         return run_steps(step, self, rules, particles, source, watch)
@@ -330,3 +347,126 @@ def _run_until_rest(
     skip_draws(particles.x, spec.physics, left, source)
     # What is returned is the caller's to write to.
     return particles.map(torch.clone) if left == spec.steps else particles
+
+
+# Small worlds on a CPU: a step is some 50 µs of work, and several times as much of Python, for
+# checks, memory and arguments of launches. From the third call with the same shapes and options on,
+# a rollout without gradients goes back and forth between two places in memory, by launches on a
+# tape. The same kernels run on the same numbers. Recorded rollouts on CUDA are the same idea.
+
+
+class _TapedStep:
+    """A step from one place in memory to another; while recorded, the stand-in for its network."""
+
+    def __init__(self, step: RuleStep, particles: Particles, mask: Tensor | None) -> None:
+        assert step.network is not None
+        self.row_width = step.network.row_width
+        self._update_width = step.network.update_width
+        self.tape = Tape()
+        with self.tape.recording():
+            self.after = step._replace(network=self).advance(particles, Draws(mask, None))
+        self._places = self.tape.places(self._updates)
+
+    def __call__(self, rows: Tensor) -> Tensor:
+        """Note what the network reads, [B N, row_width], and its place on the tape."""
+        self.rows = rows
+        self._split = len(self.tape)
+        self._updates = rows.new_zeros(len(rows), self._update_width)
+        return self._updates
+
+    def run(self, network: Network, row_count: int) -> None:
+        """Step the worlds that lie where the recorded ones lay."""
+        self.tape.replay(0, self._split, last_count=row_count)
+        # Held until the launch has read it.
+        updates = network(self.rows[:row_count])
+        self.tape.move(self._places, updates)
+        self.tape.replay(self._split)
+
+
+class TapedSteps:
+    """Steps of worlds of one shape, back and forth between two places in memory."""
+
+    def __init__(self, step: RuleStep, particles: Particles) -> None:
+        # With all particles active there is a row for each.
+        masked = step.physics.update_prob < 1.0
+        self._mask = torch.ones(particles.x.shape[:2], dtype=torch.uint8) if masked else None
+        # Whatever the strides of the worlds: what is made contiguous in a step is on no tape.
+        first = particles.map(lambda value: value.clone(memory_format=torch.contiguous_format))
+        there = _TapedStep(step, first, self._mask)
+        back = _TapedStep(step, there.after, self._mask)
+        for old, new in zip(back.after.tensors(), first.tensors(), strict=True):
+            back.tape.move(back.tape.places(old), new)
+        self._places = first, there.after
+        self._steps = there, back
+
+    def run(
+        self, network: Network, particles: Particles, masks: Iterable[Tensor | None], every: int
+    ) -> list[Particles]:
+        """Step worlds once with each mask; return copies of those after every so many steps."""
+        self._places[0].copy_(particles)
+        kept: list[Particles] = []
+        for number, mask in enumerate(masks):
+            step = self._steps[number % 2]
+            count = len(step.rows)
+            if self._mask is not None and mask is not None:
+                self._mask.copy_(mask)
+                count = max(int(mask.sum()), 1)
+            step.run(network, count)
+            if (number + 1) % every == 0:
+                kept.append(self._places[(number + 1) % 2].map(torch.clone))
+        return kept
+
+
+_kinds = CallKinds()
+
+_lock = threading.Lock()
+"""Held while the above changes."""
+
+
+def may_tape(step: RuleStep, particles: Particles) -> bool:
+    """Return whether steps of worlds may be on a tape: small, on a CPU, without gradients."""
+    x, s, *_ = particles
+    return (
+        not torch.compiler.is_compiling()
+        and not torch.is_grad_enabled()
+        and x.device.type == "cpu"
+        and x.shape[0] * x.shape[1] <= LARGEST_TOTAL
+        and step.network is not None
+        and step.physics.position_noise == 0.0
+        and sorts_at_once(*x.shape[:2])
+        and type(x) is Tensor
+        and type(s) is Tensor
+        and not is_in_torch_dispatch_mode()
+    )
+
+
+def run_taped(
+    step: RuleStep,
+    particles: Particles,
+    source: Randomness | None,
+    steps: int,
+    keep_every: int | None,
+) -> Particles | None:
+    """Run a rollout by taped steps; None where calls of this kind are too few so far."""
+    if steps == 0:
+        return None
+    assert step.network is not None
+    x, s, *_ = particles
+    key = (step.physics, rule_form(step.rule), x.shape, s.shape[2], x.dtype)
+    with _lock:
+        kind = _kinds.count(key, MOST_KINDS)
+    if kind.calls <= LAUNCHED_FIRST:
+        return None
+    # Another thread may have taken the last one meanwhile.
+    try:
+        taped = kind.free.pop()
+    except IndexError:
+        with torch.inference_mode(False), torch.no_grad():
+            taped = TapedSteps(step, particles)
+    masks = (draws.mask for draws in step.draw(x, steps, source))
+    try:
+        with torch.autocast("cpu", enabled=False):
+            kept = taped.run(step.network, particles, masks, keep_every or steps)
+    finally:
+        kind.free.append(taped)
+    return kept[0] if keep_every is None else combined(torch.stack, kept)

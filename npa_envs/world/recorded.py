@@ -21,7 +21,7 @@ import itertools
 import logging
 import weakref
 from collections.abc import Callable, Hashable, Sequence
-from typing import TYPE_CHECKING, Any, Generic, Literal, NamedTuple, TypeVar
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import torch
 from torch import Tensor
@@ -81,11 +81,7 @@ logger = logging.getLogger(__name__)
 
 
 def check_cuda_graph(cuda_graph: CudaGraph) -> None:
-    """Check whether rollouts shall be recorded.
-
-    Raises:
-        NPAError: It is neither "auto" nor True nor False.
-    """
+    """Check whether rollouts shall be recorded."""
     if not isinstance(cuda_graph, bool | str) or cuda_graph not in (True, False, "auto"):
         raise NPAError(f"cuda_graph must be 'auto', True or False, got {shown(cuda_graph)}")
 
@@ -101,16 +97,42 @@ def run_recorded(
 ) -> Particles | None:
     """Run a checked rollout by replaying it; None where it is to be launched.
 
-    Args:
-        call: The rollout.
-        cuda_graph: Whether to record; True also records rules that are not plain.
-
     Raises:
         NPAError: A position is not finite.
     """
-    if cuda_graph is False or not _can_record(call, x):
+    # Asked in this order: a compiler cannot trace what a stream does.
+    if cuda_graph is False or not x.is_cuda or torch.compiler.is_compiling() or call.steps == 0:
         return None
-    return _run_recorded(call, rules, x, s, generator, asked=cuda_graph is True)
+    if not can_capture() or torch.cuda.is_current_stream_capturing():
+        return None
+    asked = cuda_graph is True
+    plain = [rule.has_network() for rule in rules]
+    if not all(plain) and (not asked or torch.is_autocast_enabled(x.device.type)):
+        return None
+    forms, weights = zip(*map(_form, rules, plain), strict=True)
+    tensors = [x, s, *itertools.chain.from_iterable(weights)]
+    wanted: tuple[bool, ...] = ()
+    if torch.is_grad_enabled():
+        wanted = tuple(tensor.requires_grad for tensor in tensors)
+        wanted = (*wanted[:2], False, *wanted[2:]) if any(wanted) else ()
+    by_world = isinstance(generator, WorldRandom)
+    precision = _matmul_precision()
+    shape = (x.shape, s.shape[2], x.dtype, x.device)
+    key = call._replace(steps=0), forms, shape, wanted, by_world, precision
+    with _lock:
+        kind = _kinds.count(key, MOST_KINDS)
+    if kind.refused or kind.calls <= (1 if asked else LAUNCHED_FIRST):
+        return None
+    if wanted and (_hooked() or call.steps > MOST_STEPS):
+        return None
+    blocks = [call.steps] if wanted else _blocks(call)
+    make = functools.partial(_Recording, call, rules, x, s, wanted, by_world)
+    lease = _lease(kind, set(blocks), make, tensors, asked)
+    if lease is None:
+        return None
+    if not all(plain) and not lease.recording.compared.issuperset(blocks):
+        return _compared(call, rules, kind, lease, blocks, tensors, generator)
+    return _replay_blocks(call, lease, blocks, tensors, generator)
 
 
 def recorded_memory(device: torch.device) -> int:
@@ -124,15 +146,8 @@ def release_recordings() -> None:
     """Forget all recorded rollouts, and free their memory; later calls are recorded anew."""
     with _lock:
         for key in list(_kinds):
-            _forget(key)
+            _kinds.forget(key)
     torch.cuda.empty_cache()
-
-
-def _can_record(call: RolloutSpec, x: Tensor) -> bool:
-    # Asked in this order: a compiler cannot trace what a stream does.
-    if not x.is_cuda or torch.compiler.is_compiling() or call.steps == 0:
-        return False
-    return can_capture() and not torch.cuda.is_current_stream_capturing()
 
 
 def _hooked() -> bool:
@@ -188,63 +203,45 @@ def _twin(rule: NPARule, like: Tensor) -> NPARule:
     return twin
 
 
-FreeT = TypeVar("FreeT")
-
-
-class CallKind(Generic[FreeT]):
-    """Calls of one kind: how many there were, and what is free to serve the next of them."""
+class CallKind:
+    """Calls of one kind: how many there were, and what serves the next of them."""
 
     def __init__(self) -> None:
         self.calls = 0
-        self.free: collections.deque[FreeT] = collections.deque()
-
-
-KindT = TypeVar("KindT", bound=CallKind[Any])
-
-
-def counted(
-    kinds: collections.OrderedDict[Hashable, KindT],
-    key: Hashable,
-    make: Callable[[], KindT],
-    forget: Callable[[Hashable], object],
-    most: int,
-) -> KindT:
-    """Return the kind of a call, which is counted; the caller holds the lock of `kinds`.
-
-    Args:
-        kinds: Kinds of calls so far, the least recently used first.
-        key: What makes calls one kind.
-        make: Makes a kind.
-        forget: Takes a kind away, by its key, where there are more than `most`.
-        most: Kinds that are remembered.
-    """
-    kind = kinds.get(key)
-    if kind is None:
-        kind = kinds[key] = make()
-        if len(kinds) > most:
-            forget(next(iter(kinds)))
-    else:
-        kinds.move_to_end(key)
-    kind.calls += 1
-    return kind
-
-
-class _RecordedKind(CallKind["_Recording"]):
-    """Calls that may share recordings."""
-
-    def __init__(self) -> None:
-        super().__init__()
+        self.free: collections.deque[Any] = collections.deque()
+        """Recordings, or taped steps, that nobody uses."""
+        self.recordings: list[_Recording] = []
         self.failures = 0
         """Recordings that failed."""
         self.refused = False
         """One of them could not be recorded."""
-        self.recordings: list[_Recording] = []
+
+
+class CallKinds(collections.OrderedDict[Hashable, CallKind]):
+    """Kinds of calls so far, the least recently used first."""
+
+    def count(self, key: Hashable, most: int) -> CallKind:
+        """Count a call, and return its kind; more kinds than `most` are forgotten."""
+        kind = self.get(key)
+        if kind is None:
+            kind = self[key] = CallKind()
+            if len(self) > most:
+                self.forget(next(iter(self)))
+        else:
+            self.move_to_end(key)
+        kind.calls += 1
+        return kind
+
+    def forget(self, key: Hashable) -> None:
+        """Forget a kind; recordings under way live until their backward pass has run."""
+        for recording in self.pop(key).recordings:
+            recording.finish()
 
 
 class _Lease:
     """The right to a recording: given back when nobody can ask for a backward pass any more."""
 
-    def __init__(self, recording: _Recording, kind: _RecordedKind) -> None:
+    def __init__(self, recording: _Recording, kind: CallKind) -> None:
         self.recording = recording
         self._kind = kind
         self.spoilt = False
@@ -324,14 +321,7 @@ class _Recording:
         return steps in self._graphs
 
     def record(self, steps: int, tensors: Sequence[Tensor]) -> None:
-        """Record rollouts of a number of steps.
-
-        Args:
-            tensors: Worlds and weights that kernels are warmed up with.
-
-        Raises:
-            Exception: They cannot be recorded.
-        """
+        """Record rollouts of a number of steps; kernels are warmed up with worlds and weights."""
         if not self._graphs:
             first = self._call._replace(steps=min(steps, WARM_UP_STEPS), keep_every=None)
             with torch.no_grad():
@@ -569,65 +559,10 @@ def _reserved(device: torch.device) -> int:
     return int(torch.cuda.memory_reserved(device))
 
 
-_kinds: collections.OrderedDict[Hashable, _RecordedKind] = collections.OrderedDict()
-"""Kinds of calls so far, the least recently used first."""
+_kinds = CallKinds()
 
 _lock = recording_lock
 """Held while the above changes: with another lock, two threads could wait for each other."""
-
-
-def _count(key: Hashable) -> _RecordedKind:
-    """Return the kind of a call, which is counted."""
-    with _lock:
-        return counted(_kinds, key, _RecordedKind, _forget, MOST_KINDS)
-
-
-def _forget(key: Hashable) -> None:
-    """Forget a kind; recordings under way live until their backward pass has run."""
-    for recording in _kinds.pop(key).recordings:
-        recording.finish()
-
-
-def _run_recorded(
-    call: RolloutSpec,
-    rules: Sequence[NPARule],
-    x: Tensor,
-    s: Tensor,
-    generator: Randomness | None,
-    *,
-    asked: bool,
-) -> Particles | None:
-    """Run a rollout by replaying it; None where it is to be launched.
-
-    Args:
-        call: What is asked for.
-        asked: The caller asks for a recording.
-    """
-    plain = [rule.has_network() for rule in rules]
-    if not all(plain) and (not asked or torch.is_autocast_enabled(x.device.type)):
-        return None
-    forms, weights = zip(*map(_form, rules, plain), strict=True)
-    tensors = [x, s, *itertools.chain.from_iterable(weights)]
-    wanted: tuple[bool, ...] = ()
-    if torch.is_grad_enabled():
-        wanted = tuple(tensor.requires_grad for tensor in tensors)
-        wanted = (*wanted[:2], False, *wanted[2:]) if any(wanted) else ()
-    by_world = isinstance(generator, WorldRandom)
-    precision = _matmul_precision()
-    shape = (x.shape, s.shape[2], x.dtype, x.device)
-    kind = _count((call._replace(steps=0), forms, shape, wanted, by_world, precision))
-    if kind.refused or kind.calls <= (1 if asked else LAUNCHED_FIRST):
-        return None
-    if wanted and (_hooked() or call.steps > MOST_STEPS):
-        return None
-    blocks = [call.steps] if wanted else _blocks(call)
-    make = functools.partial(_Recording, call, rules, x, s, wanted, by_world)
-    lease = _lease(kind, set(blocks), make, tensors, asked)
-    if lease is None:
-        return None
-    if not all(plain) and not lease.recording.compared.issuperset(blocks):
-        return _compared(call, rules, kind, lease, blocks, tensors, generator)
-    return _replay_blocks(call, lease, blocks, tensors, generator)
 
 
 def _replay_blocks(
@@ -665,7 +600,7 @@ def _replay_blocks(
 def _compared(
     call: RolloutSpec,
     rules: Sequence[NPARule],
-    kind: _RecordedKind,
+    kind: CallKind,
     lease: _Lease,
     blocks: Sequence[int],
     tensors: Sequence[Tensor],
@@ -704,7 +639,7 @@ def _same(one: Tensor, other: Tensor) -> Tensor:
     return ((one == other) | (one.isnan() & other.isnan())).all()
 
 
-def _refuse(kind: _RecordedKind, reason: object, *, asked: bool) -> None:
+def _refuse(kind: CallKind, reason: object, *, asked: bool) -> None:
     """Launch all calls of a kind from now on."""
     level = logging.WARNING if asked else logging.DEBUG
     logger.log(level, "rollouts of this kind are launched, not recorded: %s", reason)
@@ -723,7 +658,7 @@ def _blocks(call: RolloutSpec) -> list[int]:
 
 
 def _lease(
-    kind: _RecordedKind,
+    kind: CallKind,
     steps: set[int],
     make: Callable[[], _Recording],
     tensors: Sequence[Tensor],
@@ -774,7 +709,7 @@ def _make_room(device: torch.device) -> bool:
         if recorded_memory(device) < limit:
             break
         if any(own.device == device for own in _kinds[key].recordings):
-            _forget(key)
+            _kinds.forget(key)
     return recorded_memory(device) < limit
 
 

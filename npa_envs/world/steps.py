@@ -233,7 +233,7 @@ class StaticStep(NamedTuple):
     def enter(self, particles: Particles) -> Particles:
         """Return the worlds in sorted order."""
         _, s, path_length, goal = particles
-        return Particles(self.x, s, path_length, goal).gather(self.static.tensors.source)
+        return Particles(self.x, s, path_length, goal).gather(self.static.source)
 
     def draw(self, like: Tensor, steps: int, source: Randomness | None) -> Iterator[Draws]:
         """Yield each step's rows, which are given some steps at a time, in few launches."""
@@ -256,7 +256,7 @@ class StaticStep(NamedTuple):
 
     def leave(self, particles: Particles) -> Particles:
         """Return the worlds in the caller's order."""
-        return particles.gather(self.static.tensors.place)
+        return particles.gather(self.static.place)
 
 
 class DivisionStep(NamedTuple):

@@ -14,7 +14,7 @@ from npa_envs.kernels.pictures.blending import TILE_PIXELS, block_kernels
 from npa_envs.ops import render_gaussians
 from npa_envs.ops.launch import launch, scalar_type
 from npa_envs.ops.pictures.cameras import Cameras, look_at, orbit
-from npa_envs.ops.pictures.gaussians import _frame, _gaussians
+from npa_envs.ops.pictures.gaussians import Gaussians, _gaussians
 
 # Worst error measured over all scenes, then the bound.
 PICTURE_BOUND = {torch.float32: 1e-5, torch.float64: 1e-13}  # 2e-6, 3e-15
@@ -143,14 +143,14 @@ def test_pictures_and_adjoints_equal_the_oracle(name, dtype, device):
 def test_blocks_and_tiles_draw_the_same(name, device):
     """What CUDA draws with, beside what the CPU draws with."""
     gaussians, cameras = SCENES[name].of(torch.float32, device)
-    means, *_, colours = gaussians
     size = (cameras.width, cameras.height)
-    given = [t.detach() for t in gaussians], cameras.world_to_camera, cameras.intrinsics
+    means, scales, turns, opacities, colours = [t.detach() for t in gaussians]
+    scene = Gaussians(means, scales, turns, colours, cameras.world_to_camera, cameras.intrinsics)
     picture, _, passing, stops, footprints, *lists = _gaussians(
-        *given[0], *given[1:], *size, cameras.near, 0.3, 0
+        opacities, list(scene), *size, cameras.near, 0.3, 0
     )
     _, _, starts, owners, _ = lists
-    frame = _frame(means, colours, cameras.world_to_camera, size, cameras.near, 0.3)
+    frame = scene.frame(*size, cameras.near, 0.3)
     drawn = [torch.full_like(t.view(stops.shape[0], -1), torch.nan) for t in (picture, passing)]
     ends = torch.empty_like(stops)
     launch(

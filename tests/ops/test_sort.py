@@ -5,6 +5,7 @@ import torch
 from worlds import assert_same, random_mask, random_world
 
 from npa_envs.ops import sort as cells
+from npa_envs.ops.physics import physics
 from npa_envs.ops.sort import make_plan, sort_worlds
 
 MASKS = {"all": None, "some": 0.5, "none": 0.0, "full": 1.0}
@@ -15,7 +16,8 @@ def sorted_twice(monkeypatch):
     """Sorts worlds as they come, and as if no block had room for them."""
 
     def sort(x, s, mask, row_capacity, box=None, *, with_states=True, with_rows=True):
-        plan = make_plan(x, x.shape, s.shape[2], row_capacity, mask is not None, 0.1, box)
+        made = physics(x.shape[2], s.shape[2], x.dtype, eps=0.1, box=box)
+        plan = make_plan(x, x.shape, s.shape[2], row_capacity, mask is not None, made)
         given = (plan, x, s if with_states else None, mask)
         found = sort_worlds(*given, with_rows=with_rows)
         monkeypatch.setattr(cells, "block_capacity", lambda *worlds: 0)

@@ -7,14 +7,14 @@ import torch
 from worlds import assert_same, lively_rule, random_world
 
 import npa_envs
-from npa_envs.world import prepared
+from npa_envs.world import execute
 
 BOX = (1.4, 1.4)
 
 
 @pytest.fixture(autouse=True)
 def _nothing_prepared(monkeypatch):
-    monkeypatch.setattr(prepared, "_kinds", type(prepared._kinds)())
+    monkeypatch.setattr(execute, "_kinds", type(execute._kinds)())
 
 
 def make_rule(dtype=torch.float32, seed=0, **options):
@@ -40,7 +40,7 @@ def run(rule, x, s, steps=5, *, by_world=False, seed=3, **options):
 
 
 def steps_ready():
-    return [steps for kind in prepared._kinds.values() for steps in kind.free]
+    return [steps for kind in execute._kinds.values() for steps in kind.free]
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64], ids=str)
@@ -69,7 +69,7 @@ def test_worlds_that_lie_otherwise_in_memory_are_stepped_alike():
     expected = [run(rule, x, s), run(rule, *others)]
     views = x.transpose(0, 1).contiguous().transpose(0, 1), s.mT.contiguous().mT
     assert not any(view.is_contiguous() for view in views)
-    prepared._kinds.clear()
+    execute._kinds.clear()
     for _ in range(4):
         assert_same(run(rule, *views), expected[0])
     # The same kind of worlds: what was prepared for views serves these too.
@@ -89,7 +89,7 @@ def test_weights_are_read_anew_and_results_stay():
     starts = [worlds(seed=seed) for seed in range(3)]
     launched = []
     for rule, start in zip(rules, starts, strict=True):
-        prepared._kinds.clear()
+        execute._kinds.clear()
         launched.append(run(rule, *start))
     for _ in range(2):
         run(rules[0], *starts[0])
@@ -143,12 +143,12 @@ def test_threads_step_worlds_of_their_own():
 
 
 def test_kinds_are_forgotten_in_turn(monkeypatch):
-    monkeypatch.setattr(prepared, "MOST_KINDS", 2)
+    monkeypatch.setattr(execute, "MOST_KINDS", 2)
     rule = make_rule()
     for particle_count in (30, 31, 32):
         for _ in range(3):
             run(rule, *worlds(particle_count=particle_count))
-    assert len(prepared._kinds) == len(steps_ready()) == 2
+    assert len(execute._kinds) == len(steps_ready()) == 2
 
 
 @pytest.mark.parametrize(("world_count", "particle_count"), [(1365, 3), (2048, 2), (1024, 4)])

@@ -14,6 +14,7 @@ from npa_envs.measure.speed.timing import TimingSession
 from npa_envs.measure.speed.workloads import Workload, rollout_call
 from npa_envs.ops.backend import describe
 from npa_envs.ops.launch import Launch, noted_launches
+from npa_envs.ops.physics import physics
 from npa_envs.ops.sort import make_plan
 from npa_envs.world.rollout import step
 from npa_envs.world.steps import row_capacity
@@ -143,8 +144,7 @@ def _reasons(question: Question) -> list[str]:
         workload.state_dim,
         row_capacity(total, prob) if masked else total,
         masked,
-        workload.eps,
-        None if box is None else (box,) * workload.space_dim,
+        physics(workload.space_dim, workload.state_dim, question.dtype, eps=workload.eps, box=box),
     )
     hidden, output = workload.rule(question.device).folded()[:2]
     request = plan.request._replace(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from typing import Any, NamedTuple
 
@@ -141,13 +142,6 @@ def check_cameras(
         )
 
 
-def _room(ends: Tensor, pairs_per_particle: int) -> int:
-    """Return how many pairs a picture has room for."""
-    if pairs_per_particle:
-        return ends.shape[1] * pairs_per_particle
-    return max(int(ends[:, -1].max()), 1)
-
-
 class Pairs(NamedTuple):
     """Pairs of a tile and a Gaussian that covers it: by tile, near Gaussians first."""
 
@@ -173,7 +167,7 @@ def sort_pairs(
     device, images = depths.device, depths.shape[0]
     order = torch.sort(depths, dim=1, stable=True).indices
     ends = torch.cumsum(counts.gather(1, order), 1, dtype=torch.int64)
-    room = _room(ends, pairs_per_particle)
+    room = ends.shape[1] * pairs_per_particle or max(int(ends[:, -1].max()), 1)
     if images * room * PULLS > LARGEST_INDEX:
         raise NPAError(
             f"pairs of tiles and Gaussians must stay below {LARGEST_INDEX // PULLS} in one batch, "
@@ -216,32 +210,6 @@ def blend(frame: Any, footprints: Tensor, pairs: Pairs, images: int) -> tuple[Te
     return picture, passing, stops
 
 
-def pull_back_tiles(
-    frame: Any,
-    footprints: Tensor,
-    pairs: tuple[Tensor, ...],
-    drawn: tuple[Tensor, Tensor],
-    bars: tuple[Tensor, Tensor],
-) -> Tensor:
-    """Return what tiles pull at Gaussians, a row for each slot; empty slots are undefined."""
-    device = footprints.device
-    starts, owners, places = pairs
-    passing, stops = drawn
-    picture_bar, passing_bar = bars
-    pulls = footprints.new_empty(owners.shape[0], PULLS)
-    tiles = starts.shape[0] - 1
-    listed = (starts, owners, places, footprints, stops, picture_bar)
-    scalar = scalar_type(footprints.dtype)
-    if device.type == "cuda":
-        kernel = block_kernels(scalar).pull_back_blocks
-        pulled = (*listed, passing, passing_bar, pulls.view(-1))
-        launch(kernel, tiles * TILE_PIXELS, device, frame, *pulled, block_dim=TILE_PIXELS)
-    else:
-        pulled = (*listed, passing.clone(), passing * passing_bar, pulls)
-        launch(tile_kernels(scalar).pull_back_tiles, tiles, device, frame, *pulled)
-    return pulls
-
-
 PAIRS_PER_PARTICLE = 8
 """Tiles of a picture that its Gaussians cover on average, at most: what CUDA has room for."""
 
@@ -262,64 +230,57 @@ class GaussianPictures(NamedTuple):
     """Pictures without room for all pairs, whose farthest Gaussians are missing: bool, [B, V]."""
 
 
-def _frame(
-    means: Tensor,
-    colours: Tensor,
-    motions: Tensor,
-    sizes: tuple[int, int],
-    near: float,
-    dilation: float,
-) -> Any:
-    # As integers: a shape that torch.compile left open is fixed here, another one compiled anew.
-    shape = (int(means.shape[1]), int(motions.shape[-3]), int(colours.shape[-1]))
-    return make_frame(scalar_type(means.dtype), shape, sizes, near, dilation)
+class Gaussians(NamedTuple):
+    """Gaussians, but for opacities, and cameras: tensors of worlds, and of views."""
 
+    means: Tensor
+    scales: Tensor
+    quaternions: Tensor
+    colours: Tensor
+    motions: Tensor
+    lenses: Tensor
 
-def _scene(
-    means: Tensor,
-    scales: Tensor,
-    quaternions: Tensor,
-    colours: Tensor,
-    motions: Tensor,
-    lenses: Tensor,
-) -> tuple[list[Tensor], Tensor, list[Tensor]]:
-    """Return what kernels read, with worlds, or worlds and views, counted through."""
-    total = means.shape[0] * means.shape[1]
-    shapes = [means.view(total, 3), scales.view(total, 3), quaternions.view(total, 4)]
-    return shapes, colours.view(total, -1), [motions.view(-1, 4, 4), lenses.view(-1, 4)]
+    def frame(self, width: int, height: int, near: float, dilation: float) -> Any:
+        """Return what pictures have in common, as kernels read it."""
+        # As integers: a shape that torch.compile left open is fixed here, another compiled anew.
+        sizes = self.means.shape[1], self.motions.shape[-3], self.colours.shape[-1]
+        shape = int(sizes[0]), int(sizes[1]), int(sizes[2])
+        return make_frame(scalar_type(self.means.dtype), shape, (width, height), near, dilation)
+
+    def flat(self) -> list[Tensor]:
+        """Return the tensors as kernels read them: worlds, or worlds and views, in one."""
+        means, scales, quaternions, colours, motions, lenses = self
+        total = means.shape[0] * means.shape[1]
+        shapes = means.view(total, 3), scales.view(total, 3), quaternions.view(total, 4)
+        return [*shapes, colours.view(total, -1), motions.view(-1, 4, 4), lenses.view(-1, 4)]
 
 
 @opaque("npa::gaussians")
 def _gaussians(
-    means: Tensor,
-    scales: Tensor,
-    quaternions: Tensor,
     opacities: Tensor,
-    colours: Tensor,
-    motions: Tensor,
-    lenses: Tensor,
+    tensors: list[Tensor],
     width: int,
     height: int,
     near: float,
     dilation: float,
     pairs_per_particle: int,
-) -> tuple[
-    Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor
-]:  # picture, overflow and what the adjoint reads
-    frame = _frame(means, colours, motions, (width, height), near, dilation)
+) -> list[Tensor]:
+    """Return pictures, whether pairs found no room, and what the adjoint reads."""
+    scene = Gaussians(*tensors)
+    means, frame = scene.means, scene.frame(width, height, near, dilation)
     worlds, views = means.shape[0], frame.view_count
     images, particles = worlds * views, means.shape[1]
     footprints = means.new_empty(images * particles, FOOTPRINT)
     depths = means.new_empty(images, particles)
     counts = torch.empty(images, particles, dtype=torch.int32, device=means.device)
-    shapes, flat, cameras = _scene(means, scales, quaternions, colours, motions, lenses)
+    flat = scene.flat()
     seen = (footprints, depths.view(-1), counts.view(-1))
     kernels = gaussian_kernels(scalar_type(means.dtype))
-    arguments = (*shapes, opacities.view(-1), flat, *cameras, *seen)
+    arguments = (*flat[:3], opacities.view(-1), *flat[3:], *seen)
     launch(kernels.project_gaussians, images * particles, means.device, frame, *arguments)
     pairs = sort_pairs(frame, footprints, depths, counts, pairs_per_particle)
     picture, passing, stops = blend(frame, footprints, pairs, images)
-    return (
+    return [
         picture.view(worlds, views, height, width, -1),
         pairs.overflow.view(worlds, views),
         passing.view(worlds, views, height, width),
@@ -327,110 +288,92 @@ def _gaussians(
         footprints,
         counts.view(-1),
         *pairs[1:],
-    )
+    ]
 
 
 @_gaussians.register_fake
 def _(
-    means: Tensor,
-    scales: Tensor,
-    quaternions: Tensor,
     opacities: Tensor,
-    colours: Tensor,
-    motions: Tensor,
-    lenses: Tensor,
+    tensors: list[Tensor],
     width: int,
     height: int,
     near: float,
     dilation: float,
     pairs_per_particle: int,
-) -> tuple[Tensor, ...]:
+) -> list[Tensor]:
+    means, *_, colours, motions, _ = tensors
     views = (means.shape[0], motions.shape[-3])
     images = views[0] * views[1]
     seen = images * means.shape[1]
     slots: Any = seen * pairs_per_particle
     if pairs_per_particle == 0:
         slots = torch.library.get_ctx().new_dynamic_size()
-    return (
+    integers = functools.partial(means.new_empty, dtype=torch.int32)
+    return [
         means.new_empty(*views, height, width, colours.shape[-1]),
         means.new_empty(views, dtype=torch.bool),
         means.new_empty(*views, height, width),
-        means.new_empty(images * height * width, dtype=torch.int32),
+        integers(images * height * width),
         means.new_empty(seen, FOOTPRINT),
-        means.new_empty(seen, dtype=torch.int32),
-        means.new_empty(seen, dtype=torch.int32),
-        means.new_empty(images * tile_total(width, height) + 1, dtype=torch.int32),
-        means.new_empty(slots, dtype=torch.int32),
+        integers(seen),
+        integers(seen),
+        integers(images * tile_total(width, height) + 1),
+        integers(slots),
         means.new_empty(slots, dtype=torch.int64),
-    )
+    ]
 
 
 @opaque("npa::gaussians_backward")
 def _gaussians_backward(
-    means: Tensor,
-    scales: Tensor,
-    quaternions: Tensor,
-    colours: Tensor,
-    motions: Tensor,
-    lenses: Tensor,
-    passing: Tensor,
-    stops: Tensor,
-    footprints: Tensor,
-    counts: Tensor,
-    slots: Tensor,
-    starts: Tensor,
-    owners: Tensor,
-    places: Tensor,
-    picture_bar: Tensor,
-    passing_bar: Tensor,
-    near: float,
-    dilation: float,
+    picture_bar: Tensor, passing_bar: Tensor, saved: list[Tensor], near: float, dilation: float
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-    height, width = (int(side) for side in passing.shape[2:])
-    frame = _frame(means, colours, motions, (width, height), near, dilation)
-    bars = (picture_bar.contiguous().view(-1, frame.channels), passing_bar.contiguous().view(-1))
-    drawn = (passing.view(-1), stops)
-    pulls = pull_back_tiles(frame, footprints, (starts, owners, places), drawn, bars)
-    shapes, flat, cameras = _scene(means, scales, quaternions, colours, motions, lenses)
-    out = [torch.empty_like(tensor) for tensor in (means, scales, quaternions)]
-    opacities_bar = means.new_empty(means.shape[:2])
-    colours_bar = torch.empty_like(colours)
-    bars_out = (
-        *(bar.view(shape.shape) for bar, shape in zip(out, shapes, strict=True)),
-        opacities_bar.view(-1),
-        colours_bar.view(flat.shape),
-    )
-    arguments = (*shapes, flat, *cameras, footprints, counts, slots, pulls, *bars_out)
-    kernel = gaussian_kernels(scalar_type(means.dtype)).pull_back_gaussians
-    launch(kernel, opacities_bar.numel(), means.device, frame, *arguments)
-    return out[0], out[1], out[2], opacities_bar, colours_bar
+    """Return the cotangents of means, scales, quaternions, opacities and colours."""
+    scene = Gaussians(*saved[: len(Gaussians._fields)])
+    passing, stops, footprints, counts, slots, starts, owners, places = saved[
+        len(Gaussians._fields) :
+    ]
+    device, scalar = footprints.device, scalar_type(footprints.dtype)
+    frame = scene.frame(int(passing.shape[3]), int(passing.shape[2]), near, dilation)
+    picture_bar = picture_bar.contiguous().view(-1, frame.channels)
+    passing, passing_bar = passing.view(-1), passing_bar.contiguous().view(-1)
+    # What tiles pull at Gaussians, a row for each slot; empty slots are undefined.
+    pulls = footprints.new_empty(owners.shape[0], PULLS)
+    tiles = starts.shape[0] - 1
+    listed = (starts, owners, places, footprints, stops, picture_bar)
+    if device.type == "cuda":
+        kernel = block_kernels(scalar).pull_back_blocks
+        pulled = (*listed, passing, passing_bar, pulls.view(-1))
+        launch(kernel, tiles * TILE_PIXELS, device, frame, *pulled, block_dim=TILE_PIXELS)
+    else:
+        pulled = (*listed, passing.clone(), passing * passing_bar, pulls)
+        launch(tile_kernels(scalar).pull_back_tiles, tiles, device, frame, *pulled)
+    means, scales, quaternions, colours, *_ = scene
+    bars = [torch.empty_like(tensor) for tensor in (means, scales, quaternions)]
+    bars += [means.new_empty(means.shape[:2]), torch.empty_like(colours)]
+    flat = scene.flat()
+    forms = [*flat[:3], bars[3].view(-1), flat[3]]
+    bars_out = [bar.view(form.shape) for bar, form in zip(bars, forms, strict=True)]
+    arguments = (*flat, footprints, counts, slots, pulls, *bars_out)
+    kernel = gaussian_kernels(scalar).pull_back_gaussians
+    launch(kernel, bars[3].numel(), device, frame, *arguments)
+    return bars[0], bars[1], bars[2], bars[3], bars[4]
 
 
 @_gaussians_backward.register_fake
-def _(
-    means: Tensor, scales: Tensor, quaternions: Tensor, colours: Tensor, *rest: Any
-) -> tuple[Tensor, ...]:
-    out = [torch.empty_like(tensor) for tensor in (means, scales, quaternions)]
-    return (*out, means.new_empty(means.shape[:2]), torch.empty_like(colours))
+def _(picture_bar: Tensor, passing_bar: Tensor, saved: list[Tensor], *rest: Any) -> Any:
+    means, scales, quaternions, colours, *_ = saved
+    bars = [torch.empty_like(tensor) for tensor in (means, scales, quaternions)]
+    return (*bars, means.new_empty(means.shape[:2]), torch.empty_like(colours))
 
 
 class _Gaussians(torch.autograd.Function):
     @staticmethod
-    def forward(
-        ctx: Any,
-        means: Tensor,
-        scales: Tensor,
-        quaternions: Tensor,
-        opacities: Tensor,
-        colours: Tensor,
-        motions: Tensor,
-        lenses: Tensor,
-        *sizes: Any,
-    ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        shapes = (means, scales, quaternions)
-        picture, overflow, *saved = _gaussians(*shapes, opacities, colours, motions, lenses, *sizes)
+    def forward(ctx: Any, *given: Any) -> tuple[Tensor, ...]:
+        means, scales, quaternions, opacities, colours, motions, lenses, *sizes = given
+        scene = [means, scales, quaternions, colours, motions, lenses]
+        picture, overflow, *saved = _gaussians(opacities, scene, *sizes)
         ctx.numbers = sizes[2:4]
-        ctx.save_for_backward(*shapes, colours, motions, lenses, *saved)
+        ctx.save_for_backward(*scene, *saved)
         ctx.mark_non_differentiable(overflow, saved[-1])
         ctx.set_materialize_grads(False)
         # The last one for torch.compile alone, which must see every size that data decide.
@@ -441,13 +384,14 @@ class _Gaussians(torch.autograd.Function):
     def backward(
         ctx: Any, picture_bar: Tensor | None, passing_bar: Tensor | None, *_: None
     ) -> tuple[Tensor | None, ...]:
-        colours, passing = ctx.saved_tensors[3], ctx.saved_tensors[6]
+        saved = list(ctx.saved_tensors)
+        colours, passing = saved[3], saved[6]
         if picture_bar is None:
             picture_bar = passing.new_zeros(*passing.shape, colours.shape[-1])
         if passing_bar is None:
             passing_bar = torch.zeros_like(passing)
-        given: list[Any] = [*ctx.saved_tensors, picture_bar, passing_bar, *ctx.numbers]
-        return (*_gaussians_backward(*given), *(None,) * 7)
+        bars = _gaussians_backward(picture_bar, passing_bar, saved, *ctx.numbers)
+        return (*bars, *(None,) * 7)
 
 
 def render_gaussians(
