@@ -327,9 +327,12 @@ def check_scale(eps: float, eps0: float, space_dim: int, dtype: torch.dtype) -> 
 
 
 def checked_box(
-    box: Box, space_dim: int, eps: float, dtype: torch.dtype
+    box: Box, space_dim: int, eps: float | None, dtype: torch.dtype
 ) -> tuple[float, ...] | None:
-    """Return the sides of a periodic box as a tuple of D floats, or None in open space.
+    """Return the sides of a box as a tuple of D floats, or None in open space.
+
+    Args:
+        eps: The perception radius in a periodic box; None: its walls reflect.
 
     Raises:
         NPAError: No numbers, a wrong number of sides, a side below 2 eps, where a particle would
@@ -344,8 +347,12 @@ def checked_box(
         sides = tuple(checked_number("a side of box", side) for side in given)
     if len(sides) != space_dim:
         raise NPAError(f"box must have {space_dim} sides, got {len(sides)}: {shown(sides)}")
+    if eps is None and not all(math.isfinite(side) and side > 0.0 for side in sides):
+        raise NPAError(f"box sides must be finite and positive, got {shown(sides)}")
     # Ten digits of grace: a box of exactly 2 eps must pass however both were rounded.
-    if not all(math.isfinite(side) and side >= 2.0 * eps * (1.0 - 1e-10) for side in sides):
+    if eps is not None and not all(
+        math.isfinite(side) and side >= 2.0 * eps * (1.0 - 1e-10) for side in sides
+    ):
         raise NPAError(
             f"box sides must be finite and at least 2 eps = {2.0 * eps:g}, got {shown(sides)}: "
             f"enlarge the box or perceive at a smaller eps"

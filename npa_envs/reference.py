@@ -44,6 +44,12 @@ def differences(x: Tensor, box: tuple[float, ...] | None = None) -> Tensor:
     return r
 
 
+def reflected(x: Tensor, box: tuple[float, ...]) -> Tensor:
+    """Return positions folded at the walls of a box, a triangle wave of each coordinate."""
+    sides = torch.tensor(box, dtype=x.dtype, device=x.device)
+    return 0.5 * sides - (torch.remainder(x + 0.5 * sides, 2.0 * sides) - sides).abs()
+
+
 def smoothing_kernel(squared_distance: Tensor, eps: float, space_dim: int) -> Tensor:
     """Return the Poly6 kernel W [1 / length^D], zero outside its support."""
     norm = 4.0 / math.pi / eps**8 if space_dim == 2 else 315.0 / (64.0 * math.pi) / eps**9

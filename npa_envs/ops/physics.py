@@ -5,12 +5,23 @@ from __future__ import annotations
 import functools
 import math
 from types import NoneType
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple, get_args
 
 import torch
 
-from npa_envs.checks import Box, check_scale, checked_box, checked_eps, checked_number, constant
+from npa_envs.checks import (
+    Box,
+    check_scale,
+    checked_box,
+    checked_eps,
+    checked_number,
+    constant,
+    shown,
+)
 from npa_envs.errors import NPAError
+
+Boundary = Literal["periodic", "reflecting"]
+"""What the sides of a box do: they are one place with the opposite side, or walls."""
 
 
 class Terms(NamedTuple):
@@ -80,6 +91,8 @@ class Physics(NamedTuple):
     """Standard deviation of the noise on every position in a step [length units]."""
     limits: Limits = NO_LIMITS
     """Bounds of environments."""
+    walls: tuple[float, ...] | None = None
+    """Sides of the box whose walls reflect [length units]; neighbours are those of open space."""
 
     @property
     def perception_dim(self) -> int:
@@ -96,9 +109,10 @@ class Physics(NamedTuple):
         """Return what `numbers` made a list of: all but limits, and sizes that tensors give."""
         eps, eps0, state_gradient, inverse, density_gradient, moving, *rest = numbers
         terms = Terms(bool(state_gradient), INVERSES[int(inverse)], bool(density_gradient))
-        largest, update_prob, dt, noise, *box = rest
-        sides = tuple(box) or None
-        return cls(0, 0, eps, eps0, sides, terms, bool(moving), largest, update_prob, dt, noise)
+        largest, update_prob, dt, noise, reflecting, *sides = rest
+        box, walls = (None, tuple(sides)) if reflecting else (tuple(sides) or None, None)
+        numbers = largest, update_prob, dt, noise
+        return cls(0, 0, eps, eps0, box, terms, bool(moving), *numbers, NO_LIMITS, walls)
 
     def numbers(self) -> list[float]:
         """Return what torch operators take in place of this: numbers, constants to compilers."""
@@ -114,7 +128,8 @@ class Physics(NamedTuple):
             self.update_prob,
             self.dt,
             self.position_noise,
-            *(self.box or ()),
+            float(self.walls is not None),
+            *(self.box or self.walls or ()),
         )
         return [constant(number) for number in given]
 
@@ -132,7 +147,7 @@ class Physics(NamedTuple):
             self.state_dim,
             constant(self.eps),
             constant(self.eps0),
-            None if self.box is None else tuple([constant(side) for side in self.box]),
+            _constants(self.box),
             self.terms,
             self.moving,
             constant(self.max_displacement),
@@ -140,7 +155,12 @@ class Physics(NamedTuple):
             constant(self.dt),
             constant(self.position_noise),
             self.limits,
+            _constants(self.walls),
         )
+
+
+def _constants(sides: tuple[float, ...] | None) -> tuple[float, ...] | None:
+    return None if sides is None else tuple([constant(side) for side in sides])
 
 
 def physics(
@@ -151,6 +171,7 @@ def physics(
     eps: float | None,
     eps0: float | None = None,
     box: Box = None,
+    boundary: Boundary = "periodic",
     terms: Terms = ALL_TERMS,
     moving: bool = True,
     alpha: float = 0.0,
@@ -172,11 +193,15 @@ def physics(
     Raises:
         NPAError: A number is out of its range, or too large or small for the dtype.
     """
+    if boundary not in get_args(Boundary):
+        raise NPAError(f"boundary must be 'periodic' or 'reflecting', got {shown(boundary)}")
+    if boundary == "reflecting" and box is None:
+        raise NPAError("box must be given where boundary is 'reflecting', got None: give its sides")
     numbers = (eps, eps0, box, alpha, update_prob, dt, position_noise)
     # Numbers of other types may change, and tensors are no keys.
     plain = all(type(value) in (float, int, bool, NoneType) for value in numbers)
     check = _known if plain and not torch.compiler.is_compiling() else _checked
-    return check(space_dim, state_dim, dtype, terms, moving, *numbers)
+    return check(space_dim, state_dim, dtype, terms, moving, boundary, *numbers)
 
 
 def _checked(
@@ -185,6 +210,7 @@ def _checked(
     dtype: torch.dtype,
     terms: Terms,
     moving: bool,
+    boundary: Boundary,
     eps: Any,
     eps0: float | None,
     box: Box,
@@ -206,12 +232,14 @@ def _checked(
         raise NPAError(f"dt must be positive and finite, got {dt}")
     if not (math.isfinite(position_noise) and position_noise >= 0.0):
         raise NPAError(f"position_noise must be finite and not negative, got {position_noise}")
+    periodic = boundary == "periodic"
+    sides = checked_box(box, space_dim, radius if periodic else None, dtype)
     return Physics(
         space_dim,
         state_dim,
         radius,
         radius0,
-        checked_box(box, space_dim, radius, dtype),
+        sides if periodic else None,
         terms,
         moving,
         constant(alpha) * radius,
@@ -219,6 +247,7 @@ def _checked(
         dt,
         position_noise,
         NO_LIMITS,
+        None if periodic else sides,
     )
 
 

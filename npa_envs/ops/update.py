@@ -12,6 +12,9 @@ from npa_envs.checks import check_world
 from npa_envs.errors import NPAError
 from npa_envs.kernels.portable.update import (
     CHANNEL_SHARE,
+    OPEN,
+    PERIODIC,
+    REFLECTING,
     TEAM,
     UPDATE_ALIGNMENT,
     VALUES_PER_THREAD,
@@ -30,6 +33,13 @@ def _sharers(count: int) -> int:
     return -(-count // CHANNEL_SHARE)
 
 
+def _boundary(physics: Physics, space_dim: int) -> tuple[int, tuple[float, ...]]:
+    """Return what kernels take of the boundary: its kind, and the sides of its box."""
+    if physics.walls is not None:
+        return REFLECTING, physics.walls
+    return (OPEN, (1.0,) * space_dim) if physics.box is None else (PERIODIC, physics.box)
+
+
 @opaque("npa::update_particles")
 def _update_particles(
     update: Tensor,
@@ -38,8 +48,10 @@ def _update_particles(
     path_length: Tensor,
     row_of: Tensor,
     physics: Physics,
+    within: bool,
 ) -> tuple[Tensor, Tensor, Tensor]:
     space_dim, state_dim = x.shape[2], s.shape[2]
+    boundary, sides = _boundary(physics, space_dim)
     total = x.shape[0] * x.shape[1]
     kernels = update_kernels(space_dim, scalar_type(x.dtype))
     if update.numel() >= LARGEST_INDEX:
@@ -60,8 +72,8 @@ def _update_particles(
         x.device,
         physics.max_displacement * physics.dt,
         physics.dt,
-        int(physics.box is not None),
-        physics.box or (1.0,) * space_dim,
+        boundary if within else OPEN,
+        sides,
         int(physics.moving),
         state_dim,
         update.shape[1],
@@ -138,16 +150,29 @@ class _UpdateParticles(torch.autograd.Function):
         physics: Physics,
     ) -> tuple[Tensor, Tensor, Tensor]:
         ctx.options = rows.row_base, physics
-        ctx.save_for_backward(update, rows.row_source, rows.starts)
-        return _update_particles(update, x, s, path_length, rows.row_of, physics)
+        places = () if physics.walls is None else (x, rows.row_of)
+        ctx.save_for_backward(update, rows.row_source, rows.starts, *places)
+        return _update_particles(update, x, s, path_length, rows.row_of, physics, True)
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, *bars: Tensor) -> tuple[Tensor | None, ...]:
-        update, row_source, starts = ctx.saved_tensors
+        update, row_source, starts, *places = ctx.saved_tensors
+        bars = _facing(ctx.options[1], update, *places, *bars) if places else bars
         given: list[Any] = [update, *bars, row_source, starts, *ctx.options]
         update_bar = _update_particles_backward(*given)
         return (update_bar, *bars, None, None)
+
+
+def _facing(
+    physics: Physics, update: Tensor, x: Tensor, row_of: Tensor, x_bar: Tensor, *others: Tensor
+) -> tuple[Tensor, ...]:
+    """Return the cotangents of positions, states and paths before walls reflected positions."""
+    assert physics.walls is not None
+    # Positions do not depend on states and paths, so any will do.
+    s_bar, path_bar = (bar.contiguous() for bar in others)
+    free, *_ = _update_particles(update, x, s_bar, path_bar, row_of, physics, False)
+    return x_bar * _mirroring(free, physics.walls), *others
 
 
 def update_particles(
@@ -166,21 +191,34 @@ def update_particles(
     x, s = x.contiguous(), s.contiguous()
     tensors = (update, x, s, path_length)
     if not (torch.is_grad_enabled() and any(tensor.requires_grad for tensor in tensors)):
-        return _update_particles(*tensors, rows.row_of, physics)
+        return _update_particles(*tensors, rows.row_of, physics, True)
     outputs: tuple[Tensor, Tensor, Tensor] = _UpdateParticles.apply(*tensors, rows, physics)  # type: ignore[no-untyped-call]
     return outputs
 
 
-def wrapped(x: Tensor, box: tuple[float, ...] | None) -> Tensor:
-    """Return a copy of positions, wrapped into the periodic box if there is one.
+def _images(x: Tensor, sides: tuple[float, ...]) -> Tensor:
+    """Return the whole number of the image of a box in which each coordinate lies."""
+    own = [torch.floor(x.detach()[..., d] / side + 0.5) for d, side in enumerate(sides)]
+    return torch.stack(own, dim=-1)
 
-    Args:
-        box: Sides of the box, centred on the origin [length units], or None.
-    """
+
+def _mirroring(x: Tensor, walls: tuple[float, ...]) -> Tensor:
+    """Return -1 for coordinates in odd images of a box, which its walls mirror, and 1 in others."""
+    return 1.0 - 2.0 * (_images(x, walls) % 2.0)
+
+
+def wrapped(x: Tensor, box: tuple[float, ...] | None) -> Tensor:
+    """Return a copy of positions, wrapped into the periodic box if there is one."""
     if box is None:
         return x.clone()
-    images = [torch.floor(x.detach()[..., d] / side + 0.5) for d, side in enumerate(box)]
+    images = _images(x, box).unbind(dim=-1)
     return x - torch.stack([side * image for side, image in zip(box, images, strict=True)], dim=-1)
+
+
+def bounded(x: Tensor, physics: Physics) -> Tensor:
+    """Return a copy of positions, wrapped into a periodic box or reflected into one of walls."""
+    inside = wrapped(x, physics.walls or physics.box)
+    return inside if physics.walls is None else inside * _mirroring(x, physics.walls)
 
 
 def apply_actions(
@@ -342,8 +380,7 @@ def _launch_of(
         particle_count,
         physics.max_displacement * physics.dt,
         physics.limits.state_scale * physics.dt,
-        int(physics.box is not None),
-        physics.box or (1.0,) * space_dim,
+        *_boundary(physics, space_dim),
         int(physics.moving),
         physics.limits.position,
         physics.limits.state,

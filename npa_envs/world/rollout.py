@@ -9,7 +9,7 @@ from torch import Tensor
 from npa_envs.checks import Box, check_world, checked_count, checked_flag
 from npa_envs.errors import NPAError, shown
 from npa_envs.ops.opaque import check_derivatives
-from npa_envs.ops.physics import Physics, Terms, physics
+from npa_envs.ops.physics import Boundary, Physics, Terms, physics
 from npa_envs.rule.rule import NPARule, check_rule
 from npa_envs.world.divergence import OnDivergence, make_watch
 from npa_envs.world.execute import STORED_INTERVAL, Memory, RolloutSpec, execute, resting
@@ -25,6 +25,7 @@ class RolloutOptions(TypedDict, total=False):
 
     eps: float | None
     box: Box
+    boundary: Boundary
     dt: float
     position_noise: float
     detach_positions: bool
@@ -48,6 +49,7 @@ def checked_physics(
     *,
     eps: float | None,
     box: Box,
+    boundary: Boundary = "periodic",
     update_prob: float = 1.0,
     dt: float,
     position_noise: float = 0.0,
@@ -73,6 +75,7 @@ def checked_physics(
         eps=eps,
         eps0=rule.eps0,
         box=box,
+        boundary=boundary,
         terms=Terms(
             rule.state_gradient,
             rule.moment_inverse if rule.moment_correction else None,
@@ -128,6 +131,7 @@ def step(
     *,
     eps: float | None = None,
     box: Box = None,
+    boundary: Boundary = "periodic",
     update_prob: float = 0.5,
     dt: float = 1.0,
     position_noise: float = 0.0,
@@ -148,6 +152,7 @@ def step(
         1,
         eps=eps,
         box=box,
+        boundary=boundary,
         update_prob=update_prob,
         dt=dt,
         position_noise=position_noise,
@@ -165,6 +170,7 @@ def at_rest(
     *,
     eps: float | None = None,
     box: Box = None,
+    boundary: Boundary = "periodic",
     dt: float = 1.0,
 ) -> Tensor:
     """Return which worlds no step changes any more.
@@ -180,6 +186,7 @@ def at_rest(
         s: Particle states, dimensionless, shape [B, N, C].
         eps: As for `rollout`.
         box: As for `rollout`; in one, only positions within it can be at rest.
+        boundary: As for `rollout`.
         dt: As for `rollout`.
 
     Returns:
@@ -195,7 +202,7 @@ def at_rest(
             "worlds change by chance"
         )
     _check_one_species(rule)
-    made = checked_physics(rule, x, s, eps=eps, box=box, dt=dt)
+    made = checked_physics(rule, x, s, eps=eps, box=box, boundary=boundary, dt=dt)
     return resting((rule,), Particles(x, s), made, "auto")
 
 
@@ -233,6 +240,7 @@ def rollout(
     *,
     eps: float | None = None,
     box: Box = None,
+    boundary: Boundary = "periodic",
     update_prob: float = 0.5,
     dt: float = 1.0,
     position_noise: float = 0.0,
@@ -264,8 +272,10 @@ def rollout(
         s: Particle states, dimensionless, shape [B, N, C].
         steps: Number of steps T, 0 or more.
         eps: Perception radius [length units]; default: the rule's eps0.
-        box: Sides of a periodic box centred on the origin [length units], into which positions are
-            wrapped, or None for open space.
+        box: Sides of a box centred on the origin [length units], or None for open space.
+        boundary: What the sides of the box do. "periodic": particles perceive nearest images, and
+            positions are wrapped. "reflecting": particles perceive as in open space, and positions
+            beyond a wall are mirrored at it, as often as they meet one.
         update_prob: Probability p of each particle's update in a step, in (0, 1].
         dt: Time step, dimensionless.
         position_noise: Standard deviation of the noise added to every position in each step
@@ -307,11 +317,19 @@ def rollout(
     check_rule(rule)
     _check_one_species(rule)
     made = checked_physics(
-        rule, x, s, eps=eps, box=box, update_prob=update_prob, dt=dt, position_noise=position_noise
+        rule,
+        x,
+        s,
+        eps=eps,
+        box=box,
+        boundary=boundary,
+        update_prob=update_prob,
+        dt=dt,
+        position_noise=position_noise,
     )
     detach_positions = checked_flag("detach_positions", detach_positions)
     check_generator(generator, x.device, x.shape[0])
-    if rule.divides and made.box is not None:
+    if rule.divides and box is not None:
         raise NPAError(
             f"box must be None where particles divide, got {shown(box)}: the dead need a place far "
             "from all others"

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from npa_envs.checks import Box, check_world, checked_count, checked_flag, checked_number, entries
 from npa_envs.errors import NPAError, shown
+from npa_envs.ops.physics import Boundary
 from npa_envs.ops.species import checked_counts
 from npa_envs.rule.rule import NPARule
 from npa_envs.world.divergence import OnDivergence, make_watch
@@ -87,6 +88,7 @@ def rollout_species(
     eps: float | None = None,
     update_prob: float | Sequence[float] = 0.5,
     box: Box = None,
+    boundary: Boundary = "periodic",
     dt: float = 1.0,
     position_noise: float = 0.0,
     generator: Randomness | None = None,
@@ -122,7 +124,8 @@ def rollout_species(
         eps: Perception radius [length units]; default: the rules' eps0.
         update_prob: Probability of each particle's update in a step, in (0, 1], for all species or
             one for each.
-        box: Sides of a periodic box centred on the origin [length units], or None for open space.
+        box: Sides of a box centred on the origin [length units], or None for open space.
+        boundary: "periodic" or "reflecting", as in `rollout`.
         dt: Time step, dimensionless.
         position_noise: Standard deviation of the noise added to every position in each step
             [length units].
@@ -164,6 +167,7 @@ def rollout_species(
             steps,
             eps=eps,
             box=box,
+            boundary=boundary,
             update_prob=probabilities[0],
             dt=dt,
             position_noise=position_noise,
@@ -180,7 +184,15 @@ def rollout_species(
     check_cuda_graph(cuda_graph)
     own = [
         checked_physics(
-            rule, x, s, eps=eps, box=box, update_prob=chance, dt=dt, position_noise=position_noise
+            rule,
+            x,
+            s,
+            eps=eps,
+            box=box,
+            boundary=boundary,
+            update_prob=chance,
+            dt=dt,
+            position_noise=position_noise,
         )
         for rule, chance in zip(species_rules, probabilities, strict=True)
     ]

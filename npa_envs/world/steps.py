@@ -15,7 +15,7 @@ from npa_envs.ops.perceive import perceive_rows, update_some_at_a_time
 from npa_envs.ops.physics import Physics
 from npa_envs.ops.species import perceive_by_species
 from npa_envs.ops.static import StaticRows, StaticWorlds, prepare_static, static_rows
-from npa_envs.ops.update import update_particles, wrapped
+from npa_envs.ops.update import bounded, update_particles
 from npa_envs.rule.network import Network
 from npa_envs.rule.rule import LIFE, NPARule
 from npa_envs.world.cuda_graph import SideStream
@@ -219,13 +219,13 @@ class StaticStep(NamedTuple):
     step: RuleStep
     static: StaticWorlds
     x: Tensor
-    """Positions, wrapped."""
+    """Positions, within the boundary."""
 
     @classmethod
     def of(cls, rule: NPARule, physics: Physics, x: Tensor) -> StaticStep:
         """Return the step of worlds at these positions."""
-        # Later parts of a rollout begin at wrapped positions, and so does the first.
-        x = wrapped(x, physics.box)
+        # Later parts of a rollout begin within the boundary, and so does the first.
+        x = bounded(x, physics)
         # First: compilers trace nothing across it.
         static = prepare_static(x, physics)
         return cls(RuleStep(rule, rule.network(), physics, True, static), static, x)

@@ -28,6 +28,9 @@ CHANNEL_SHARE = 4
 UPDATE_ALIGNMENT = {2: 8, 3: 4}
 """Bytes of float32 that the state part of an update's aligned row begins at a multiple of."""
 
+OPEN, PERIODIC, REFLECTING = range(3)
+"""What positions beyond a box's sides become, as kernels read it."""
+
 TEAM = 32
 """Particles that a warp moves; the next warps change their states."""
 
@@ -58,11 +61,16 @@ def update_kernels(space_dim: int, scalar: type) -> SimpleNamespace:
         return result
 
     @wp.func
-    def wrapped(position: vector, box: vector):
-        """Return a position's image in the periodic box around the origin."""
+    def bounded(position: vector, boundary: wp.int32, box: vector):
+        """Return a position's image in the box around the origin; walls mirror odd images."""
         result = position
-        for d in range(wp.static(space_dim)):
-            result[d] -= box[d] * wp.floor(position[d] / box[d] + scalar(0.5))
+        if boundary != wp.static(OPEN):
+            for d in range(wp.static(space_dim)):
+                image = wp.floor(position[d] / box[d] + scalar(0.5))
+                result[d] -= box[d] * image
+                odd = image != scalar(2.0) * wp.floor(scalar(0.5) * image)
+                if odd and boundary == wp.static(REFLECTING):
+                    result[d] = -result[d]
         return result
 
     @wp.func
@@ -87,7 +95,7 @@ def update_kernels(space_dim: int, scalar: type) -> SimpleNamespace:
         range_start: wp.int32,
         largest_step: wp.float64,
         dt: scalar,
-        periodic: wp.int32,
+        boundary: wp.int32,
         box: vector,
         moving: wp.int32,
         state_dim: wp.int32,
@@ -131,8 +139,7 @@ def update_kernels(space_dim: int, scalar: type) -> SimpleNamespace:
                 step = largest_step / (wp.float64(1.0) + length)
                 position = displaced(position, step, delta)
                 path += scalar(step * length)
-            if periodic != 0:
-                position = wrapped(position, box)
+            position = bounded(position, boundary, box)
             new_positions[i] = position
             new_path_length[i] = path
         else:
@@ -222,7 +229,7 @@ def update_kernels(space_dim: int, scalar: type) -> SimpleNamespace:
         particle_count: wp.int32,
         largest_step: wp.float64,
         largest_change: wp.float64,
-        periodic: wp.int32,
+        boundary: wp.int32,
         box: vector,
         moving: wp.int32,
         position_limit: scalar,
@@ -326,8 +333,7 @@ def update_kernels(space_dim: int, scalar: type) -> SimpleNamespace:
                     if not (length <= wp.float64(1.0)):
                         step = largest_step / length
                     position = displaced(position, step, direction)
-                if periodic != 0:
-                    position = wrapped(position, box)
+                position = bounded(position, boundary, box)
                 for d in range(wp.static(space_dim)):
                     coordinate, coordinate_held = held(position[d], position_limit)
                     position[d] = coordinate
