@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from npa_envs.checks import number_tensor
-from npa_envs.envs.multi.agents import AgentsEnv, joined_actions
+from npa_envs.envs.multi.vector import AgentsEnv, joined_actions
 from npa_envs.errors import MissingDependencyError, NPAError, shown, suggest
 
 try:
@@ -86,13 +86,9 @@ class CrowdEnv(AgentsEnv, pettingzoo.ParallelEnv):  # type: ignore[misc]
         Raises:
             gymnasium.error.Error: The seed is no integer of at least 0.
         """
-        keys = self._next_keys(seed, seed)
-        with self.worlds.device_context():
-            observation = self._episodes.start(np.arange(1), keys)
+        observation = self._start(np.arange(1), seed, seed)
         self._count_agents()
-        self._started = True
-        self._show()
-        infos = self._infos(self._episodes.account.numbers())
+        infos = self._infos(self.worlds.account.numbers())
         return self._handed_out(observation), infos
 
     def step(self, actions: Mapping[str, Any]) -> Outcome:
@@ -121,7 +117,7 @@ class CrowdEnv(AgentsEnv, pettingzoo.ParallelEnv):  # type: ignore[misc]
         shapes = [self.action_spaces[agent].shape for agent in acted]
         action = joined_actions(actions, acted, shapes, worlds.device)
         with worlds.device_context():
-            outcome = self._episodes.step(self._everyones(action))
+            outcome = worlds.step(self._everyones(action))
         ended, late = outcome.endings[0] > 0, bool(outcome.late[0])
         infos = self._infos(outcome.numbers)
         for k, agent in zip(live, acted, strict=True):
@@ -167,15 +163,16 @@ class CrowdEnv(AgentsEnv, pettingzoo.ParallelEnv):  # type: ignore[misc]
         if not self.agents:
             raise NPAError("particles need live agents: call reset first")
         with self.worlds.device_context():
-            self.worlds.place(number_tensor("x", x)[None], number_tensor("s", s)[None])
-            observation = self._episodes.carry_over()
+            observation = self.worlds.place(
+                number_tensor("x", x)[None], number_tensor("s", s)[None]
+            )
         self._show()
         return self._handed_out(observation)
 
     def _count_agents(self) -> None:
         """Take down who is to act next."""
         played = len(self.possible_agents)
-        self._live = np.flatnonzero(self._episodes.live[0, :played]).tolist()
+        self._live = np.flatnonzero(self.worlds.live[0, :played]).tolist()
         self.agents = [self.possible_agents[k] for k in self._live]
 
     def _everyones(self, action: Tensor) -> Tensor:
@@ -192,7 +189,7 @@ class CrowdEnv(AgentsEnv, pettingzoo.ParallelEnv):  # type: ignore[misc]
         """Return what `info` says of live agents' losses."""
         rows = torch.stack(list(numbers.values()))[:, 0].tolist()
         columns = dict(zip(numbers, rows, strict=True))
-        species = self._episodes.species
+        species = self.worlds.agent_species
         return {
             agent: {"species": int(species[k])} | {name: row[k] for name, row in columns.items()}
             for k, agent in zip(self._live, self.agents, strict=True)
@@ -200,9 +197,9 @@ class CrowdEnv(AgentsEnv, pettingzoo.ParallelEnv):  # type: ignore[misc]
 
     def _handed_out(self, observation: Tensor) -> dict[str, Any]:
         """Return the rows of what all particles perceive, [1, N, P], that are of `agents`."""
-        rows, spans = self._out(observation[0]), self._episodes.spans
+        rows, spans = self._out(observation[0]), self.worlds.spans
         return {
-            agent: rows[spans[k].start] if self._by_particle else rows[spans[k]]
+            agent: rows[spans[k].start] if self.worlds.by_particle else rows[spans[k]]
             for k, agent in zip(self._live, self.agents, strict=True)
         }
 
