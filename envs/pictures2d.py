@@ -12,10 +12,10 @@ from gymnasium.spaces import Box
 from torch import Tensor
 
 from npa_envs.checks import check_flag, check_positive
+from npa_envs.envs.core.base import ParticleSpaces
 from npa_envs.envs.core.config import EnvConfig, WorldConfig
 from npa_envs.envs.core.memory import OBSERVATION_COPIES
 from npa_envs.envs.core.single import NPAEnv
-from npa_envs.envs.core.spaces import ParticleSpaces
 from npa_envs.envs.core.task import Start
 from npa_envs.envs.core.vector import NPAVectorEnv
 from npa_envs.envs.morphogenesis2d import PictureConfig, PictureEnvTask

@@ -15,9 +15,9 @@ from gymnasium.spaces import Box, Discrete, Space
 from torch import Tensor
 
 from npa_envs.checks import check_positive, number_tensor
+from npa_envs.envs.core.base import ParticleSpaces, action_tensor
 from npa_envs.envs.core.config import EnvConfig
 from npa_envs.envs.core.single import NPAEnv
-from npa_envs.envs.core.spaces import ParticleSpaces, action_tensor
 from npa_envs.envs.core.task import EnvTask, Start
 from npa_envs.envs.core.vector import NPAVectorEnv
 from npa_envs.envs.garden.config import GardenReward

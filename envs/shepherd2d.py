@@ -14,7 +14,7 @@ from torch import Tensor
 
 from npa_envs import world_mean
 from npa_envs.checks import check_non_negative, check_positive
-from npa_envs.envs.core.spaces import to_output
+from npa_envs.envs.core.base import to_output
 from npa_envs.envs.core.task import Start
 from npa_envs.envs.garden.config import GardenConfig, GardenReward
 from npa_envs.envs.garden.environments import GardenEnv, GardenVectorEnv

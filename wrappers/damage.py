@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from npa_envs.checks import is_whole
-from npa_envs.envs.core.spaces import to_output
+from npa_envs.envs.core.base import to_output
 from npa_envs.errors import NPAError, shown
 from npa_envs.tasks.damage import DamageEvent, damage_worlds, parse_damage
 from npa_envs.world.randomness import StreamId

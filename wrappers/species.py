@@ -11,7 +11,7 @@ from gymnasium.spaces import Box, Space
 from torch import Tensor
 
 from npa_envs.checks import is_real, is_whole
-from npa_envs.envs.core.spaces import to_output
+from npa_envs.envs.core.base import to_output
 from npa_envs.errors import NPAError, shown, suggest
 from npa_envs.world.randomness import StreamId, WorldRandom
 from npa_envs.wrappers.base import (

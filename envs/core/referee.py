@@ -8,8 +8,13 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import torch
 from torch import Tensor
 
-from npa_envs.envs.core.task import EnvTask, Start
-from npa_envs.envs.core.task_checks import check_finite, checked_losses, checked_shares
+from npa_envs.envs.core.task import (
+    EnvTask,
+    Start,
+    check_finite,
+    checked_losses,
+    checked_shares,
+)
 from npa_envs.errors import shown
 from npa_envs.world.actions import (
     DIVERGED,

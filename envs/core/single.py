@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from npa_envs.checks import number_tensor
+from npa_envs.envs.core.base import WorldsEnv
 from npa_envs.envs.core.referee import reason
-from npa_envs.envs.core.screen import WorldsEnv
 from npa_envs.envs.core.vector import check_options, plain_seed, rng_keys
 from npa_envs.errors import NPAError
 from npa_envs.world.actions import DIVERGED, SUCCESS, TIME_LIMIT

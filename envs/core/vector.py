@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from npa_envs.checks import is_whole, number_tensor
+from npa_envs.envs.core.base import WorldsEnv
 from npa_envs.envs.core.referee import FLAGS, StepReport, reason
-from npa_envs.envs.core.screen import WorldsEnv
 from npa_envs.errors import NPAError, shown, suggest
 from npa_envs.world.actions import TIME_LIMIT
 from npa_envs.world.cuda_graph import to_device_async

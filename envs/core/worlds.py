@@ -19,8 +19,15 @@ from npa_envs.checks import number_tensor
 from npa_envs.envs.core.config import EnvConfig, WorldConfig
 from npa_envs.envs.core.memory import check_memory
 from npa_envs.envs.core.referee import StepReport, WorldReferee
-from npa_envs.envs.core.task import EnvTask, Start, WorldTask
-from npa_envs.envs.core.task_checks import GlobalDraws, check_finite, check_start, starter
+from npa_envs.envs.core.task import (
+    EnvTask,
+    GlobalDraws,
+    Start,
+    WorldTask,
+    check_finite,
+    check_start,
+    starter,
+)
 from npa_envs.errors import DivergedError, NPAError
 from npa_envs.world.actions import (
     DIVERGED,

@@ -10,7 +10,7 @@ from gymnasium.spaces import Box, MultiDiscrete, Space
 from torch import Tensor
 
 from npa_envs.checks import number_tensor
-from npa_envs.envs.core.spaces import ParticleSpaces, action_tensor
+from npa_envs.envs.core.base import ParticleSpaces, action_tensor
 from npa_envs.envs.garden.brush_layout import BrushLayout, grid_places, tool_table
 from npa_envs.envs.garden.config import GardenConfig
 from npa_envs.envs.garden.task import SEEN_AT_A_PLACE, SEEN_LIMIT

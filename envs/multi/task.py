@@ -289,11 +289,3 @@ class SpeciesTask(WorldTask[Any]):
         colours = torch.tensor([colorsys.hsv_to_rgb(hue, 0.85, 0.8) for hue in hues]).to(s)
         own = (colours[population.species] - COLOUR_OFFSET).expand(len(x), -1, -1)
         return self.draw_particles(x, own, "particles")
-
-
-def by_species(losses: list[Tensor], population: Population) -> Tensor:
-    """Return losses of the species that are there as one tensor, shape [B, K], 0 for the others."""
-    remaining = iter(losses)
-    nothing = population.x.new_zeros(len(population.x))
-    found = [next(remaining) if count else nothing for count in population.counts]
-    return torch.stack(found, dim=1)

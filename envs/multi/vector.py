@@ -17,8 +17,7 @@ from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 from torch import Tensor
 
-from npa_envs.envs.core.screen import Screen, ShownEnv
-from npa_envs.envs.core.spaces import action_tensor
+from npa_envs.envs.core.base import Screen, ShownEnv, action_tensor
 from npa_envs.envs.core.vector import (
     checked_count,
     checked_mode,
