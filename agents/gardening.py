@@ -10,7 +10,7 @@ from torch import Tensor
 
 from npa_envs.agents.policies import PolicyDraws, unwrapped
 from npa_envs.checks import is_real
-from npa_envs.envs.garden.brush_layout import BrushLayout, grid_places
+from npa_envs.envs.garden.brushes import BrushLayout, grid_places
 from npa_envs.envs.garden.task import GardenTask, TargetDeficit
 from npa_envs.envs.shepherd2d import ShepherdTask
 from npa_envs.errors import NPAError, shown

@@ -10,9 +10,9 @@ from torch import Tensor
 
 from npa_envs.checks import check_fraction, check_non_negative, check_positive
 from npa_envs.envs.core.task import Start
-from npa_envs.envs.garden.config import GardenConfig
-from npa_envs.envs.garden.environments import GardenEnv, GardenVectorEnv
-from npa_envs.envs.garden.task import GardenTask, lost_share, marks_of_whole
+from npa_envs.envs.core.vector import NPAVectorEnv
+from npa_envs.envs.garden.brushes import GardenConfig
+from npa_envs.envs.garden.task import GardenEnv, GardenTask, lost_share, marks_of_whole
 from npa_envs.tasks.damage import random_particle
 from npa_envs.world.brushes import push, wipe_state
 from npa_envs.world.randomness import StreamId, WorldRandom
@@ -23,7 +23,6 @@ class Gardener2DEnvConfig(GardenConfig):
     """What befalls the picture."""
 
     episode_steps: int = 32
-    """As elsewhere; it equals the registered `max_episode_steps`."""
 
     position_noise: float = 0.002
     """Standard deviation of the noise added to every position in a step of the rule
@@ -127,7 +126,7 @@ class Gardener2DEnv(GardenEnv):
     task_type = GardenerTask
 
 
-class Gardener2DVectorEnv(GardenVectorEnv):
+class Gardener2DVectorEnv(NPAVectorEnv):
     """Worlds of `Gardener2DEnv`, batched on one device; its docstring describes both."""
 
     task_type = GardenerTask

@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from npa_envs.envs.core.vector import checked_count
-from npa_envs.envs.garden.spaces import BrushSpaces
-from npa_envs.envs.gardener2d import Gardener2DEnv
+from npa_envs.envs.garden.brushes import BrushSpaces
+from npa_envs.envs.gardener2d import Gardener2DEnv, GardenerTask
 from npa_envs.envs.multi.parallel import Outcome, in_turns, register
 from npa_envs.errors import NPAError, shown, suggest
 
@@ -34,8 +34,12 @@ class _BothHands(BrushSpaces):
         return torch.cat(both, dim=1)
 
 
-class _SharedGarden(Gardener2DEnv):
+class _SharedTask(GardenerTask):
     form_type = _BothHands
+
+
+class _SharedGarden(Gardener2DEnv):
+    task_type = _SharedTask
 
 
 class GardenersEnv(pettingzoo.ParallelEnv):  # type: ignore[misc]

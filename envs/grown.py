@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import ClassVar, TypeVar, get_args
+from typing import Any, ClassVar, TypeVar, get_args
 
 import torch
 from torch import Tensor
@@ -110,23 +110,7 @@ class GrownTask(PictureEnvTask[Config]):
 
     def seed(self, random: WorldRandom) -> tuple[Tensor, Tensor]:
         """Return grown worlds."""
-        x, s = super().seed(random)
-        grown = [self._grow(x[k : k + 1], s[k : k + 1], random, k) for k in range(len(x))]
-        return torch.cat([x for x, _ in grown]), torch.cat([s for _, s in grown])
-
-    @torch.no_grad()
-    def _grow(self, x: Tensor, s: Tensor, random: WorldRandom, k: int) -> tuple[Tensor, Tensor]:
-        """Grow world k alone: a rule's products change in the last bit with the batch's size."""
-        return rollout(
-            self.rule,
-            x,
-            s,
-            self.config.grow_steps,
-            eps=self.config.eps,
-            box=self.config.box,
-            update_prob=self.config.update_prob,
-            generator=random.take(slice(k, k + 1)).substream(StreamId.GROWTH),
-        )
+        return grow(self.rule, self.config, *super().seed(random), random)
 
 
 def run_rule(
@@ -153,6 +137,46 @@ def run_rule(
         detach_positions=detach_positions,
         generator=random,
     )
+
+
+def grow(
+    rule: NPARule, config: EnvConfig, x: Tensor, s: Tensor, random: WorldRandom, **more: float
+) -> tuple[Tensor, Tensor]:
+    """Return worlds after `grow_steps` steps of a rule, of time step 1 and without noise.
+
+    Each is grown by itself: a rule's products change in the last bit with the number of worlds.
+    """
+    settings: Any = {"eps": config.eps, "box": config.box, "update_prob": config.update_prob}
+    worlds = []
+    for k in range(len(x)):
+        one = slice(k, k + 1)
+        stream = random.take(one).substream(StreamId.GROWTH)
+        steps: int = config.grow_steps  # type: ignore[attr-defined]
+        worlds.append(rollout(rule, x[one], s[one], steps, generator=stream, **settings, **more))
+    grown_x, grown_s = (torch.cat(part) for part in zip(*worlds, strict=True))
+    return grown_x, grown_s
+
+
+def check_living(config: Any) -> None:
+    """Check what configurations of living worlds share."""
+    if config.resolution % config.picture_size:
+        raise NPAError(
+            f"picture_size must divide resolution = {config.resolution}, got "
+            f"{config.picture_size}: try {config.resolution // 2}"
+        )
+    if config.tell_updated:
+        raise NPAError("tell_updated must be False, as actions do not belong to particles")
+
+
+def check_runs(rule: NPARule, **wanted: Any) -> None:
+    """Check that constants of worlds are those of the rule that runs them."""
+    for name, given in wanted.items():
+        own = getattr(rule, name)
+        if own != given:
+            raise NPAError(
+                f"{name} must be the rule's, {own!r}, got {given!r}: give {name}={own!r}, or "
+                "another rule"
+            )
 
 
 def growing_rule(config: GrownConfig) -> str:

@@ -63,7 +63,10 @@ class PictureEnvTask(TargetEnvTask[Config]):
 
     def __init__(self, config: Config, device: torch.device) -> None:
         super().__init__(config, device)
-        self.goal = self.goal_type(config.goal, device=device)
+        self.goal = self._make_goal()
+
+    def _make_goal(self) -> Morphogenesis2D:
+        return self.goal_type(self.config.goal, device=self.device)
 
     @classmethod
     def extra_bytes(cls, config: Any, world_count: int) -> int:

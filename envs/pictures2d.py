@@ -5,15 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any, Self, get_args
 
-import numpy as np
 import torch
 import torch.nn.functional as F
-from gymnasium.spaces import Box
 from torch import Tensor
 
 from npa_envs.checks import check_flag, check_positive
-from npa_envs.envs.core.base import ParticleSpaces
-from npa_envs.envs.core.config import EnvConfig, WorldConfig
+from npa_envs.envs.core.config import EnvConfig
 from npa_envs.envs.core.memory import OBSERVATION_COPIES
 from npa_envs.envs.core.single import NPAEnv
 from npa_envs.envs.core.task import Start
@@ -23,7 +20,6 @@ from npa_envs.errors import NPAError, shown
 from npa_envs.tasks.many_pictures import ManyPictures, named_targets
 from npa_envs.tasks.morphogenesis2d import Morphogenesis2DConfig
 from npa_envs.tasks.targets.clouds import Split
-from npa_envs.world.actions import Physics
 from npa_envs.world.randomness import WorldRandom
 
 CHANNELS = 4
@@ -132,17 +128,6 @@ class PicturesTask(PictureEnvTask[Pictures2DEnvConfig]):
         return {"target": self._number.clone()}
 
 
-class PictureSpaces(ParticleSpaces):
-    """Rows of what particles perceive, with the numbers of the target behind, where asked."""
-
-    def __init__(self, physics: Physics, config: WorldConfig) -> None:
-        super().__init__(physics, config)
-        assert isinstance(config, Pictures2DEnvConfig), "the environments' own configuration"
-        columns = physics.perception_dim + config.target_dim
-        limit = physics.limits.perception
-        self.observation_space = Box(-limit, limit, (config.particle_count, columns), np.float32)
-
-
 class Pictures2DEnv(NPAEnv):
     """Grow the picture that is asked for from a disk of blank particles.
 
@@ -200,11 +185,9 @@ class Pictures2DEnv(NPAEnv):
     """
 
     task_type = PicturesTask
-    form_type = PictureSpaces
 
 
 class Pictures2DVectorEnv(NPAVectorEnv):
     """Worlds of `Pictures2DEnv`, batched on one device; its docstring describes both."""
 
     task_type = PicturesTask
-    form_type = PictureSpaces

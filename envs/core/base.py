@@ -17,7 +17,7 @@ from torch import Tensor
 
 from npa_envs.envs.core.config import WorldConfig
 from npa_envs.envs.core.task import EnvTask
-from npa_envs.envs.core.worlds import PARTICLES, BatchedWorlds, Parts
+from npa_envs.envs.core.worlds import BatchedWorlds
 from npa_envs.errors import NPAError
 from npa_envs.render import Window, show
 from npa_envs.render.display import side_by_side
@@ -27,37 +27,22 @@ SHOWN_ACROSS = 4
 """A window shows at most so many worlds side by side."""
 
 
-def observation_space(physics: Physics, particle_count: int) -> Box:
-    """Return the space of a world's observations: float32, shape [N, P], ± the perception limit."""
-    limit = physics.limits.perception
-    return Box(-limit, limit, (particle_count, physics.perception_dim), np.float32)
-
-
-def action_space(physics: Physics, particle_count: int) -> Box:
-    """Return the space of a world's actions: float32, shape [N, A], in [-1, 1]."""
-    return Box(-1.0, 1.0, (particle_count, physics.action_dim), np.float32)
-
-
 class ParticleSpaces:
     """How most worlds are seen and acted upon: one row for each particle."""
 
     def __init__(self, physics: Physics, config: WorldConfig) -> None:
-        count = config.particle_count
-        self.observation_space: Space[Any] = observation_space(physics, count)
-        """Of a world."""
-        self.action_space: Space[Any] = action_space(physics, count)
+        count, limit = config.particle_count, physics.limits.perception
+        columns = physics.perception_dim + config.target_dim
+        self.observation_space: Space[Any] = Box(-limit, limit, (count, columns), np.float32)
         """Of a world."""
         self._shape = (count, physics.action_dim)
+        self.action_space: Space[Any] = Box(-1.0, 1.0, self._shape, np.float32)
+        """Of a world."""
         self._output = config.output
 
     def action(self, action: Any, world_count: int | None) -> Tensor:
         """Return actions as worlds take them, float32, [B, N, A]; B is None for a single world."""
-        if world_count is None:
-            return action_tensor("action", action, self._shape, "env.action_space", "[N, A] = ")[
-                None
-            ]
-        shape = (world_count, *self._shape)
-        return action_tensor("action", action, shape, "env.action_space", "[B, N, A] = ")
+        return batch_tensor(action, world_count, self._shape, "N, A")
 
     def seen(self, observation: Tensor) -> Any:
         """Return observations of worlds, or of one, as they are handed out."""
@@ -71,6 +56,15 @@ class ParticleSpaces:
 def to_output(tensor: Tensor, output: str) -> Any:
     """Return a tensor as it is handed out: as it is for "torch", as an array for "numpy"."""
     return tensor if output == "torch" else tensor.cpu().numpy()
+
+
+def batch_tensor(
+    action: Any, world_count: int | None, shape: tuple[int, ...], letters: str
+) -> Tensor:
+    """Return actions of B worlds, or of one where B is None, float32, shape [B, ...]."""
+    batch, first = ((), "") if world_count is None else ((world_count,), "B, ")
+    wanted, letters = (*batch, *shape), f"[{first}{letters}] = "
+    return action_tensor("action", action, wanted, "env.action_space", letters).view(-1, *shape)
 
 
 def action_tensor(
@@ -181,12 +175,6 @@ class WorldsEnv(ShownEnv):
     task_type: ClassVar[type[EnvTask[Any]]]
     """The task: starts and losses."""
 
-    parts: ClassVar[Parts] = PARTICLES
-    """How the worlds are acted on, observed and judged."""
-
-    form_type: ClassVar[type[ParticleSpaces]] = ParticleSpaces
-    """The spaces of observations and actions."""
-
     metadata: Any
     spec: Any
 
@@ -194,11 +182,10 @@ class WorldsEnv(ShownEnv):
         """Make configuration, worlds, spaces and screen."""
         self.config = self.task_type.config_type.from_keywords(keywords)
         self.render_mode = self.config.render_mode
-        self.worlds = BatchedWorlds(
-            self.task_type, self.config, world_count, steps, parts=self.parts
-        )
+        self.worlds = BatchedWorlds(self.task_type, self.config, world_count, steps)
         self.task = self.worlds.task
-        self.form = self.form_type(self.worlds.physics, self.config)
+        form_type = self.task_type.form_type or ParticleSpaces
+        self.form: ParticleSpaces = form_type(self.worlds.physics, self.config)
         self._screen = Screen(self.worlds, self.config, self.metadata["render_fps"])
 
     def _show(self) -> None:

@@ -287,6 +287,11 @@ class EnvConfig(WorldConfig):
             )
 
     @property
+    def target_dim(self) -> int:
+        """Columns of an observation's rows behind perception, T; by default none."""
+        return 0
+
+    @property
     def per_particle_reward(self) -> bool:
         """Whether each particle has a reward of its own."""
         return self.reward in ("particle", "marginal")

@@ -62,6 +62,12 @@ class WorldTask(Generic[AnyConfig]):
     static: ClassVar[bool] = False
     """Whether particles stay where they are; actions are then state steps alone."""
 
+    parts: ClassVar[Any] = None
+    """How worlds are acted on, observed and judged; None: particles act and perceive."""
+
+    form_type: ClassVar[Any] = None
+    """The spaces of observations and actions; None: a row for each particle."""
+
     def __init__(self, config: AnyConfig, device: torch.device) -> None:
         self.config = config
         self.device = device

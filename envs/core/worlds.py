@@ -227,7 +227,6 @@ class BatchedWorlds(WorldState):
         config: The environment's configuration.
         world_count: Worlds B.
         episode_steps: Steps after which an episode is cut off, or None for never.
-        parts: How worlds are acted on, observed and judged.
 
     Raises:
         NPAError: The worlds do not fit into memory.
@@ -240,9 +239,8 @@ class BatchedWorlds(WorldState):
         config: EnvConfig,
         world_count: int,
         episode_steps: int | None = None,
-        *,
-        parts: Parts = PARTICLES,
     ) -> None:
+        parts: Parts = task_type.parts or PARTICLES
         # Memory is checked before the task is made, which may make a target of as many points.
         extra, count = task_type.extra_bytes(config, world_count), config.particle_count
         super().__init__(config, task_type, world_count, count, extra)

@@ -10,7 +10,7 @@ import torch
 from small_envs import assert_same
 
 import npa_envs
-from npa_envs.envs.garden.brush_layout import BrushLayout, brushed, grid_places
+from npa_envs.envs.garden.brushes import BrushLayout, brushed, grid_places
 from npa_envs.errors import DivergedError, NPAError
 from npa_envs.registration import GARDEN_IDS, GARDENS
 from npa_envs.registration import SMALL as SMALL_FORMS
