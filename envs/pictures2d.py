@@ -11,8 +11,8 @@ from torch import Tensor
 
 from npa_envs.checks import check_flag, check_positive
 from npa_envs.envs.core.config import EnvConfig
-from npa_envs.envs.core.memory import OBSERVATION_COPIES
 from npa_envs.envs.core.single import NPAEnv
+from npa_envs.envs.core.state import OBSERVATION_COPIES
 from npa_envs.envs.core.task import Start
 from npa_envs.envs.core.vector import NPAVectorEnv
 from npa_envs.envs.morphogenesis2d import PictureConfig, PictureEnvTask

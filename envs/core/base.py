@@ -182,7 +182,8 @@ class WorldsEnv(ShownEnv):
         """Make configuration, worlds, spaces and screen."""
         self.config = self.task_type.config_type.from_keywords(keywords)
         self.render_mode = self.config.render_mode
-        self.worlds = BatchedWorlds(self.task_type, self.config, world_count, steps)
+        worlds_type = self.task_type.worlds_type or BatchedWorlds
+        self.worlds: BatchedWorlds = worlds_type(self.task_type, self.config, world_count, steps)
         self.task = self.worlds.task
         form_type = self.task_type.form_type or ParticleSpaces
         self.form: ParticleSpaces = form_type(self.worlds.physics, self.config)

@@ -189,7 +189,7 @@ class NPAEnv(WorldsEnv, gymnasium.Env[Any, Any]):
             diverged = bool(endings[0] & DIVERGED)
             ending = int(worlds.guarded(endings, observation)[0])
         ended, late = ending & (SUCCESS | DIVERGED) != 0, ending & TIME_LIMIT != 0
-        names, numbers = worlds.part_names, worlds.host_numbers()
+        names, numbers = worlds.part_names, worlds.host_numbers.numpy()[:, 0].tolist()
         info = self._losses(numbers)
         info |= {f"reward_{name}": numbers[2 + len(names) + k] for k, name in enumerate(names)}
         info |= {"success": bool(ending & SUCCESS), "diverged": diverged}
@@ -198,7 +198,7 @@ class NPAEnv(WorldsEnv, gymnasium.Env[Any, Any]):
         if worlds.particle_reward is not None:
             info["particle_reward"] = self._out(worlds.particle_reward[0].clone())
         info |= self._extras("reset", "step")
-        if worlds.referee.pays_last_step_alone:
+        if worlds.pays_last_step_alone:
             paid = ended or late or int(worlds.elapsed[0]) == config.episode_steps
             self._unpaid_steps = 0 if paid else self._unpaid_steps + 1
         self._show()

@@ -62,7 +62,7 @@ class WorldTask(Generic[AnyConfig]):
     static: ClassVar[bool] = False
     """Whether particles stay where they are; actions are then state steps alone."""
 
-    parts: ClassVar[Any] = None
+    worlds_type: ClassVar[Any] = None
     """How worlds are acted on, observed and judged; None: particles act and perceive."""
 
     form_type: ClassVar[Any] = None

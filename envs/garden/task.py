@@ -5,15 +5,17 @@ from __future__ import annotations
 from functools import partial
 from typing import Any, ClassVar, TypeVar
 
+import numpy as np
 import torch
 import torch.nn.functional as F
+from numpy.typing import NDArray
 from torch import Tensor
 
 from npa_envs import world_mean
-from npa_envs.envs.core.referee import WorldReferee
 from npa_envs.envs.core.single import NPAEnv
+from npa_envs.envs.core.state import not_finite
 from npa_envs.envs.core.task import Start
-from npa_envs.envs.core.worlds import BatchedWorlds, Parts, WorldState, not_finite
+from npa_envs.envs.core.worlds import BatchedWorlds
 from npa_envs.envs.garden.brushes import (
     SEEN_AT_A_PLACE,
     SEEN_LIMIT,
@@ -27,6 +29,7 @@ from npa_envs.envs.garden.brushes import (
 from npa_envs.envs.grown import GrownTask, check_runs, run_rule
 from npa_envs.rule.rule import COLOUR_OFFSET
 from npa_envs.tasks.targets.points import PointTarget
+from npa_envs.world.cuda_graph import makes_plain_tensors, to_device_async
 from npa_envs.world.randomness import StreamId, WorldRandom
 
 SEEN_SCALES = (2.0, 4.0, 4.0, 4.0, 4.0, 4.0)
@@ -35,88 +38,73 @@ SEEN_SCALES = (2.0, 4.0, 4.0, 4.0, 4.0, 4.0)
 Config = TypeVar("Config", bound=GardenConfig)
 
 
-class RuleAction:
-    """What the task's `step` makes of brushes or codes, then the rule's steps.
+class LivingWorlds(BatchedWorlds):
+    """Worlds whose particles a rule runs: what the task makes of an action, observes and pays.
 
     On a CPU worlds are stepped one after the other, as there a rule's products change in the last
     bit with the number of worlds.
     """
 
-    recorded = False
+    def _prepare_actions(self) -> None:
+        self.context = self.x.new_zeros(self.world_count, self.task.context_count)
+        """What the task keeps of the start of each world, shape [B, M]."""
 
-    def __init__(self, worlds: BatchedWorlds) -> None:
-        self._task, self._physics, self._random = worlds.task, worlds.physics, worlds.random
-        self._x, self._s, self._diverged = worlds.x, worlds.s, worlds.referee.diverged
-
-    def apply(self, action: Tensor) -> None:
-        """Apply actions, shape [B, K, W]."""
-        action = action.to(self._x.device)
+    @torch.no_grad()
+    @makes_plain_tensors
+    def queue(self, action: Tensor, out: Tensor | None = None) -> Tensor:
+        """Do what `step` does but wait for the device, and return what is observed there then."""
+        action = action.to(self.device)
         if not bool(torch.isfinite(action).all()):
             raise not_finite(action)
-        diverged = torch.zeros_like(self._diverged, dtype=torch.bool)
-        limits = self._physics.limits.position, self._physics.limits.state
-        for own, new, limit in zip((self._x, self._s), self._stepped(action), limits, strict=True):
+        diverged = torch.zeros_like(self.diverged, dtype=torch.bool)
+        limits = self.physics.limits.position, self.physics.limits.state
+        for own, new, limit in zip((self.x, self.s), self._stepped(action), limits, strict=True):
             # NaN is not within any limit.
             diverged |= ~(new.abs() < limit).flatten(1).all(dim=1)
             own.copy_(torch.nan_to_num(new, nan=0.0).clamp(-limit, limit))
-        self._diverged.copy_(diverged)
+        self.diverged.copy_(diverged)
+        self.judge()
+        if self._side_stream is not None:
+            self._side_stream.mark()
+        return self.perceive(out)
 
     def _stepped(self, action: Tensor) -> tuple[Tensor, Tensor]:
-        x, s = self._x, self._s
+        x, s = self.x, self.s
         if x.is_cuda or len(x) == 1:
-            stepped: tuple[Tensor, Tensor] = self._task.step(x, s, action, self._random)
+            stepped: tuple[Tensor, Tensor] = self.task.step(x, s, action, self.random)
             return stepped
         worlds = []
         for k in range(len(x)):
             one = slice(k, k + 1)
-            random = self._random.take(one)
-            worlds.append(self._task.step(x[one], s[one], action[one], random))
-        self._random.sync_with(random, self._task.config.rule_steps)
+            random = self.random.take(one)
+            worlds.append(self.task.step(x[one], s[one], action[one], random))
+        self.random.sync_with(random, self.task.config.rule_steps)
         x, s = (torch.cat(part) for part in zip(*worlds, strict=True))
         return x, s
 
-    def updated(self) -> Tensor:
-        """Living worlds refuse `tell_updated`."""
-        raise NotImplementedError
-
-
-class GardenObserver:
-    """What the task observes of a whole world."""
-
-    perceives_alone = False
-
-    def __init__(self, worlds: BatchedWorlds) -> None:
-        self._observe = worlds.task.observe
-
-    def observe(
-        self, worlds: BatchedWorlds, perceived: Tensor | None, out: Tensor | None
-    ) -> Tensor:
-        """Return the observations of all worlds as they are, shape [B, O]."""
-        seen: Tensor = self._observe(worlds.x, worlds.s, worlds.loss, worlds.referee.context)
+    @torch.no_grad()
+    @makes_plain_tensors
+    def perceive(self, out: Tensor | None = None) -> Tensor:
+        """Return the observations of all worlds as they are, shape [B, O], written to `out`."""
+        seen: Tensor = self.task.observe(self.x, self.s, self.loss, self.context)
         return seen if out is None else out.copy_(seen)
 
-    def begun(self, worlds: BatchedWorlds, index: Tensor, start: Start) -> Tensor:
-        """Return the observations of worlds that began an episode."""
-        return worlds.perceive()[index]
-
-
-class GardenReferee(WorldReferee):
-    """Pays what the task says a world is worth; arguments are those of `WorldReferee`."""
-
-    def __init__(self, task: Any, worlds: WorldState, episode_steps: int | None) -> None:
-        super().__init__(task, worlds, episode_steps)
-        self.context = worlds.x.new_zeros(worlds.world_count, task.context_count)
+    def restart(self, worlds: NDArray[np.int64], observation: Tensor) -> None:
+        """Start the next episodes of some worlds, [M], and write what is observed there."""
+        index = to_device_async(worlds, self.device)
+        self.start(index)
+        observation[index] = self.perceive()[index]
 
     @property
     def pays_last_step_alone(self) -> bool:
         """Whether an episode's last step is the only one that is paid."""
         return super().pays_last_step_alone and not self.task.pays_each_step
 
-    def begin(self, worlds: Tensor, start: Start, random: WorldRandom, *, check: bool) -> None:
+    def begin(self, worlds: Tensor, start: Start, *, check: bool) -> None:
         """Begin episodes in some worlds, and keep the task's context of their starts."""
-        super().begin(worlds, start, random, check=check)
-        draws, loss = random.take(worlds).substream(StreamId.GOAL), self.report.numbers[1][worlds]
-        self.context[worlds] = self.task.episode_context(start, loss, draws)
+        super().begin(worlds, start, check=check)
+        draws = self.random.take(worlds).substream(StreamId.GOAL)
+        self.context[worlds] = self.task.episode_context(start, self.loss[worlds], draws)
 
     def judge(self) -> None:
         """Write rewards, losses and endings of the worlds as they now are."""
@@ -137,10 +125,6 @@ class GardenReferee(WorldReferee):
         """Return what infos hold besides, shape [B, ...] each."""
         infos: dict[str, Tensor] = self.task.context_info(self.x, self.s, self.context)
         return infos
-
-
-LIVING = Parts(RuleAction, GardenObserver, GardenReferee)
-"""Worlds whose particles a rule runs."""
 
 
 class TargetDeficit:
@@ -178,7 +162,7 @@ class TargetDeficit:
 class Living:
     """The part of tasks whose worlds a rule runs while an agent acts on them from outside."""
 
-    parts = LIVING
+    worlds_type = LivingWorlds
 
     context_count: ClassVar[int]
     """Numbers that a world keeps of its start, M."""

@@ -13,9 +13,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from npa_envs import world_mean
-from npa_envs.envs.core.memory import OBSERVATION_COPIES
 from npa_envs.envs.core.referee import total
-from npa_envs.envs.core.worlds import WorldState
+from npa_envs.envs.core.state import OBSERVATION_COPIES, WorldState
 from npa_envs.envs.multi.task import Population, SpeciesTask
 from npa_envs.envs.multi.tasks import task_type
 from npa_envs.errors import DivergedError

@@ -437,6 +437,6 @@ def test_the_reward_is_one_for_a_whole_picture_and_zero_for_a_grey_one():
     grey = sum(task.losses(worlds.x, torch.zeros_like(worlds.s)).values())
     assert grey > 1.2 * info["loss"]
     losses = torch.cat((grey, torch.tensor([info["loss"], info["loss"] - 1.0, 1e3])))
-    earned = task.reward(worlds.x, worlds.s, losses, worlds.referee.context.expand(4, -1))
+    earned = task.reward(worlds.x, worlds.s, losses, worlds.context.expand(4, -1))
     better = 1.0 + 1.0 / float(grey - info["loss"])
     assert torch.allclose(earned, torch.tensor([0.0, 1.0, better, -1.0]), rtol=1e-4, atol=1e-5)
