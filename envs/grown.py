@@ -140,7 +140,7 @@ def run_rule(
 
 
 def grow(
-    rule: NPARule, config: EnvConfig, x: Tensor, s: Tensor, random: WorldRandom, **more: float
+    rule: NPARule, config: Any, x: Tensor, s: Tensor, random: WorldRandom, **more: Any
 ) -> tuple[Tensor, Tensor]:
     """Return worlds after `grow_steps` steps of a rule, of time step 1 and without noise.
 
@@ -151,8 +151,8 @@ def grow(
     for k in range(len(x)):
         one = slice(k, k + 1)
         stream = random.take(one).substream(StreamId.GROWTH)
-        steps: int = config.grow_steps  # type: ignore[attr-defined]
-        worlds.append(rollout(rule, x[one], s[one], steps, generator=stream, **settings, **more))
+        count = config.grow_steps
+        worlds.append(rollout(rule, x[one], s[one], count, generator=stream, **settings, **more))
     grown_x, grown_s = (torch.cat(part) for part in zip(*worlds, strict=True))
     return grown_x, grown_s
 

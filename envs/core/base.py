@@ -15,13 +15,14 @@ from gymnasium.spaces import Box, Space
 from numpy.typing import NDArray
 from torch import Tensor
 
-from npa_envs.envs.core.config import WorldConfig
+from npa_envs.envs.core.config import EnvConfig, WorldConfig
 from npa_envs.envs.core.task import EnvTask
 from npa_envs.envs.core.worlds import BatchedWorlds
 from npa_envs.errors import NPAError
 from npa_envs.render import Window, show
 from npa_envs.render.display import side_by_side
 from npa_envs.world.actions import Physics
+from npa_envs.world.cuda_graph import to_device_async
 
 SHOWN_ACROSS = 4
 """A window shows at most so many worlds side by side."""
@@ -30,7 +31,7 @@ SHOWN_ACROSS = 4
 class ParticleSpaces:
     """How most worlds are seen and acted upon: one row for each particle."""
 
-    def __init__(self, physics: Physics, config: WorldConfig) -> None:
+    def __init__(self, physics: Physics, config: EnvConfig) -> None:
         count, limit = config.particle_count, physics.limits.perception
         columns = physics.perception_dim + config.target_dim
         self.observation_space: Space[Any] = Box(-limit, limit, (count, columns), np.float32)
@@ -168,6 +169,12 @@ class ShownEnv:
     def _out(self, tensor: Tensor) -> Any:
         return to_output(tensor, self.config.output)
 
+    def _sent(self, values: NDArray[Any]) -> Any:
+        """Return a new array as it is handed out."""
+        if self.config.output == "numpy":
+            return values
+        return to_device_async(values, self.config.torch_device)
+
 
 class WorldsEnv(ShownEnv):
     """The common part of environments of one species; subclasses name the task."""
@@ -188,6 +195,34 @@ class WorldsEnv(ShownEnv):
         form_type = self.task_type.form_type or ParticleSpaces
         self.form: ParticleSpaces = form_type(self.worlds.physics, self.config)
         self._screen = Screen(self.worlds, self.config, self.metadata["render_fps"])
+
+    def _begin(self, worlds: Tensor, keys: Tensor | None, out: Tensor | None = None) -> Tensor:
+        """Start episodes in some worlds, int64, [M]; return what is observed in all, [B, ...]."""
+        with self.worlds.device_context():
+            self.worlds.start(worlds, keys)
+            observation = self.worlds.perceive(out)
+        self._started = True
+        self._show()
+        return observation
+
+    def _place(self, x: Any, s: Any, worlds: Tensor, out: Tensor | None = None) -> Tensor:
+        """Put particles into some worlds, int64, [M]; return what is observed in all, likewise."""
+        count = self.config.particle_count
+        start = self.worlds.checked_particles(x, s, len(worlds), count)
+        with self.worlds.device_context():
+            self.worlds.place(worlds, start)
+            observation = self.worlds.perceive(out)
+        self._show()
+        return observation
+
+    def losses_of(self, numbers: Any) -> dict[str, Any]:
+        """Return the loss and its parts by their names in infos, from a report's numbers."""
+        names = ("loss", *(f"loss_{name}" for name in self.worlds.part_names))
+        return dict(zip(names, numbers[1:], strict=False))
+
+    def _improvements(self, numbers: Any) -> dict[str, Any]:
+        names = self.worlds.part_names
+        return {f"reward_{name}": numbers[2 + len(names) + k] for k, name in enumerate(names)}
 
     def _show(self) -> None:
         self._screen.show(self.spec.id if self.spec is not None else type(self).__name__)

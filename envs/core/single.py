@@ -157,12 +157,8 @@ class NPAEnv(WorldsEnv, gymnasium.Env[Any, Any]):
         if seed is not None or self.np_random is not self._keyed_from:
             self._keyed_from = self.np_random
             keys = rng_keys(None, 1, self.np_random)
-        with self.worlds.device_context():
-            self.worlds.start(self._world, keys)
-            observation = self.worlds.perceive()
-        self._started = True
-        self._show()
-        info = self._losses(self.worlds.report.numbers[:, 0].tolist()) | self._extras("reset")
+        observation = self._begin(self._world, keys)
+        info = self.losses_of(self.worlds.report.numbers[:, 0].tolist()) | self._extras("reset")
         return self.form.seen(observation[0]), info
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
@@ -189,9 +185,8 @@ class NPAEnv(WorldsEnv, gymnasium.Env[Any, Any]):
             diverged = bool(endings[0] & DIVERGED)
             ending = int(worlds.guarded(endings, observation)[0])
         ended, late = ending & (SUCCESS | DIVERGED) != 0, ending & TIME_LIMIT != 0
-        names, numbers = worlds.part_names, worlds.host_numbers.numpy()[:, 0].tolist()
-        info = self._losses(numbers)
-        info |= {f"reward_{name}": numbers[2 + len(names) + k] for k, name in enumerate(names)}
+        numbers = worlds.host_numbers.numpy()[:, 0].tolist()
+        info = self.losses_of(numbers) | self._improvements(numbers)
         info |= {"success": bool(ending & SUCCESS), "diverged": diverged}
         if ended or late:
             info["reason"] = reason(ending)
@@ -231,12 +226,7 @@ class NPAEnv(WorldsEnv, gymnasium.Env[Any, Any]):
         if not self._started:
             raise NPAError("particles need a world: call reset first")
         x, s = (number_tensor(name, value)[None] for name, value in (("x", x), ("s", s)))
-        start = self.worlds.checked_particles(x, s, 1, self.config.particle_count)
-        with self.worlds.device_context():
-            self.worlds.place(self._world, start)
-            observation = self.worlds.perceive()
-        self._show()
-        return self.form.seen(observation[0])
+        return self.form.seen(self._place(x, s, self._world)[0])
 
     def _extras(self, *when: str) -> dict[str, Any]:
         values = {name: value for own in when for name, value in self.worlds.extras(own).items()}
@@ -244,10 +234,6 @@ class NPAEnv(WorldsEnv, gymnasium.Env[Any, Any]):
             name: self._out(value[0].clone()) if value.ndim > 1 else value[0].item()
             for name, value in values.items()
         }
-
-    def _losses(self, numbers: list[float]) -> dict[str, Any]:
-        parts = {f"loss_{n}": numbers[2 + k] for k, n in enumerate(self.worlds.part_names)}
-        return {"loss": numbers[1]} | parts
 
     def _warn_of_unpaid_rewards(self) -> None:
         """Warn once where an episode ended by a limit that the environment does not know of."""

@@ -124,18 +124,14 @@ class NPAVectorEnv(WorldsEnv, VectorEnv[Any, Any, Any]):
         if seed is not None or not self._started:
             keys = rng_keys(seed, self.num_envs, self.np_random)[chosen]
         worlds = torch.from_numpy(chosen).to(self.task.device)
-        with self.worlds.device_context():
-            self.worlds.start(worlds, keys)
-            observation = self.worlds.perceive(self._buffer)
+        observation = self._begin(worlds, keys, self._buffer)
         if not self.copies:
             self._buffer = observation
-        self._started = True
         self._ended[chosen] = False
-        self._show()
         which = np.zeros(self.num_envs, dtype=bool)
         which[chosen] = True
-        numbers = self._numbers(self.worlds.report.copy())
-        infos = self._losses(numbers, self._mask(which)) | self._extras("reset", self._mask(which))
+        losses = self.losses_of(self._numbers(self.worlds.report.copy()))
+        infos = masked(losses, self._mask(which)) | self._extras("reset", self._mask(which))
         return self.form.seen(observation), infos
 
     def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
@@ -235,14 +231,7 @@ class NPAVectorEnv(WorldsEnv, VectorEnv[Any, Any, Any]):
             chosen = torch.arange(self.num_envs)
         else:
             chosen = world_numbers(worlds, self.num_envs)
-        chosen = chosen.to(self.task.device)
-        count = self.config.particle_count
-        start = self.worlds.checked_particles(x, s, len(chosen), count)
-        with self.worlds.device_context():
-            self.worlds.place(chosen, start)
-            observation = self.worlds.perceive(self._buffer)
-        self._show()
-        return self.form.seen(observation)
+        return self.form.seen(self._place(x, s, chosen.to(self.task.device), self._buffer))
 
     def _report(
         self, stepped: NDArray[np.bool_] | None, *, copy: bool
@@ -254,28 +243,18 @@ class NPAVectorEnv(WorldsEnv, VectorEnv[Any, Any, Any]):
         numbers, flags = self._numbers(report), list(self._out(report.endings))
         everyone = self._out(report.everyone if copy else report.everyone.clone())
         which = everyone if stepped is None else self._mask(stepped)
-        infos = self._losses(numbers, everyone) | self._extras("reset", everyone, copy=copy)
-        improvements = numbers[2 + len(worlds.part_names) :]
-        own = {f"reward_{n}": v for n, v in zip(worlds.part_names, improvements, strict=True)}
-        own |= dict(zip(FLAGS, flags[2:], strict=True))
+        infos = masked(self.losses_of(numbers), everyone)
+        infos |= self._extras("reset", everyone, copy=copy)
+        own = self._improvements(numbers) | dict(zip(FLAGS, flags[2:], strict=True))
         if worlds.particle_reward is not None:
             shares = worlds.particle_reward
             own["particle_reward"] = self._out(shares.clone() if copy else shares)
-        for name, value in own.items():
-            infos[name], infos[f"_{name}"] = value, which
-        return numbers, flags, infos | self._extras("step", which, copy=copy)
+        infos |= masked(own, which) | self._extras("step", which, copy=copy)
+        return numbers, flags, infos
 
     def _extras(self, when: str, which: Any, *, copy: bool = True) -> dict[str, Any]:
-        infos: dict[str, Any] = {}
-        for name, value in self.worlds.extras(when).items():
-            infos[name], infos[f"_{name}"] = self._out(value.clone() if copy else value), which
-        return infos
-
-    def _losses(self, numbers: list[Any], which: Any) -> dict[str, Any]:
-        infos = {"loss": numbers[1], "_loss": which}
-        for k, name in enumerate(self.worlds.part_names):
-            infos[f"loss_{name}"], infos[f"_loss_{name}"] = numbers[2 + k], which
-        return infos
+        extras = self.worlds.extras(when).items()
+        return masked({n: self._out(v.clone() if copy else v) for n, v in extras}, which)
 
     def _ending_infos(
         self, infos: dict[str, Any], endings: NDArray[np.uint8], which: Any
@@ -298,8 +277,15 @@ class NPAVectorEnv(WorldsEnv, VectorEnv[Any, Any, Any]):
 
     def _mask(self, mask: NDArray[np.bool_]) -> Any:
         """Return a mask of worlds as a new array to hand out."""
-        given = mask.copy()
-        return given if self.config.output == "numpy" else to_device_async(given, self.task.device)
+        return self._sent(mask.copy())
+
+
+def masked(values: dict[str, Any], which: Any) -> dict[str, Any]:
+    """Return values of worlds, and which worlds have them, as Gymnasium's infos hold them."""
+    infos = {}
+    for name, value in values.items():
+        infos[name], infos[f"_{name}"] = value, which
+    return infos
 
 
 # Arguments of environments that are no fields of a configuration, checked.

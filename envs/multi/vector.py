@@ -244,8 +244,8 @@ class MultiSpeciesVectorEnv(AgentsEnv):
         return (
             self._rows(observation),
             self._columns(outcome.rewards.float()),
-            self._columns(self._sent(outcome.endings > 0)),
-            self._columns(self._sent(outcome.acted & outcome.late[:, None])),
+            self._columns(outcome.endings > 0),
+            self._columns(outcome.acted & outcome.late[:, None]),
             self._step_infos(outcome, final),
         )
 
@@ -268,7 +268,7 @@ class MultiSpeciesVectorEnv(AgentsEnv):
         own = to_device_async(acted, self.worlds.device)
         everyone = torch.stack(list(numbers.values())).float()
         rows = self._out(torch.where(own, everyone, 0.0).movedim(2, 0).contiguous())
-        live = self._columns(self._sent(self.worlds.live.copy()))
+        live = self._columns(self.worlds.live)
         return {
             agent: {"species": k, "live": live[agent]} | dict(zip(numbers, rows[k], strict=True))
             for k, agent in enumerate(self.possible_agents)
@@ -278,7 +278,7 @@ class MultiSpeciesVectorEnv(AgentsEnv):
         self, outcome: AgentOutcome, final: tuple[ByAgent, NDArray[np.int64]] | None
     ) -> Infos:
         infos = self._infos(outcome.numbers, outcome.acted)
-        acted = self._columns(self._sent(outcome.acted))
+        acted = self._columns(outcome.acted)
         reasons = outcome.reasons
         for k, agent in enumerate(self.possible_agents):
             infos[agent]["acted"] = acted[agent]
@@ -287,7 +287,7 @@ class MultiSpeciesVectorEnv(AgentsEnv):
         if final is not None:
             which = np.zeros(self.world_count, dtype=bool)
             which[final[1]] = True
-            restarted = self._out(self._sent(which))
+            restarted = self._sent(which)
             for agent, rows in final[0].items():
                 infos[agent] |= {"final_obs": rows, "_final_obs": restarted}
         return infos
@@ -297,18 +297,11 @@ class MultiSpeciesVectorEnv(AgentsEnv):
         rows, spans = self._out(observation), self.worlds.spans
         return {agent: rows[:, spans[k]] for k, agent in enumerate(self.possible_agents)}
 
-    def _columns(self, values: Tensor) -> ByAgent:
-        """Return values of shape [B, K] agent by agent, shape [B] each."""
-        columns = self._out(values.T.contiguous())
+    def _columns(self, values: Any) -> ByAgent:
+        """Return values, [B, K], agent by agent, shape [B] each."""
+        sent = isinstance(values, Tensor)
+        columns = self._out(values.T.contiguous()) if sent else self._sent(values.T.copy())
         return {agent: columns[k] for k, agent in enumerate(self.possible_agents)}
-
-    def _sent(self, values: NDArray[Any]) -> Tensor:
-        """Return an array where results are wanted: on the device, or not."""
-        return (
-            to_device_async(values, self.worlds.device)
-            if self.config.output == "torch"
-            else torch.from_numpy(values)
-        )
 
 
 def state_space(physics: Physics, particle_count: int) -> Box:
