@@ -9,9 +9,8 @@ from collections.abc import Mapping
 from typing import Any, ClassVar
 
 import numpy as np
-import pettingzoo
 import torch
-from gymnasium.spaces import Box, Space
+from gymnasium.spaces import Box
 from gymnasium.wrappers import TimeLimit
 from numpy.typing import NDArray
 from torch import Tensor
@@ -19,8 +18,8 @@ from torch import Tensor
 from npa_envs.envs.core.vector import checked_count
 from npa_envs.envs.garden.brushes import BrushSpaces
 from npa_envs.envs.gardener2d import Gardener2DEnv, GardenerTask
-from npa_envs.envs.multi.parallel import Outcome, in_turns, register
-from npa_envs.errors import NPAError, shown, suggest
+from npa_envs.envs.multi.parallel import KnownAgents, Outcome, in_turns, register
+from npa_envs.errors import NPAError, shown
 
 AGENTS = ("keeper_0", "raider_0")
 
@@ -42,7 +41,7 @@ class _SharedGarden(Gardener2DEnv):
     task_type = _SharedTask
 
 
-class GardenersEnv(pettingzoo.ParallelEnv):  # type: ignore[misc]
+class GardenersEnv(KnownAgents):
     """Two gardeners at one living picture: the keeper keeps it whole, the raider spoils it.
 
     ## Description
@@ -124,22 +123,6 @@ class GardenersEnv(pettingzoo.ParallelEnv):  # type: ignore[misc]
         self.observation_spaces = dict.fromkeys(AGENTS, self.garden.observation_space)
         self.action_spaces = dict.fromkeys(AGENTS, self.garden.action_space)
 
-    def observation_space(self, agent: str) -> Space[Any]:
-        """Return the space of what an agent sees, the same object each time.
-
-        Raises:
-            NPAError: There is no such agent.
-        """
-        return self.observation_spaces[_known(agent)]
-
-    def action_space(self, agent: str) -> Space[Any]:
-        """Return the space of an agent's actions, the same object each time.
-
-        Raises:
-            NPAError: There is no such agent.
-        """
-        return self.action_spaces[_known(agent)]
-
     def reset(
         self, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, Any], dict[str, dict[str, Any]]]:
@@ -169,7 +152,6 @@ class GardenersEnv(pettingzoo.ParallelEnv):  # type: ignore[misc]
         Raises:
             NPAError: The episode is over, an action is missing or wanted by nobody, or it has
                 another shape; the world is then as it was.
-            DivergedError: An action is not finite; the world is then as it was.
         """
         if not self.agents and not actions:
             return {}, {}, {}, {}, {}
@@ -196,14 +178,6 @@ class GardenersEnv(pettingzoo.ParallelEnv):  # type: ignore[misc]
     def close(self) -> None:
         """Close the window, if there is one."""
         self.garden.close()
-
-
-def _known(agent: str) -> str:
-    if agent not in AGENTS:
-        raise NPAError(
-            f"agent must be one of {AGENTS}, got {shown(agent)}: {suggest(agent, AGENTS)}"
-        )
-    return agent
 
 
 def _for_both(seen: Any) -> dict[str, Any]:

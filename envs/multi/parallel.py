@@ -7,11 +7,9 @@ from typing import Any
 
 import numpy as np
 import torch
-from gymnasium.spaces import Box
 from numpy.typing import NDArray
 from torch import Tensor
 
-from npa_envs.checks import number_tensor
 from npa_envs.envs.multi.vector import AgentsEnv, joined_actions
 from npa_envs.errors import MissingDependencyError, NPAError, shown, suggest
 
@@ -31,7 +29,25 @@ Outcome = tuple[dict[str, Any], dict[str, float], Flags, Flags, Infos]
 """What a step returns: observations, rewards, terminations, truncations, infos."""
 
 
-class CrowdEnv(AgentsEnv, pettingzoo.ParallelEnv):  # type: ignore[misc]
+class KnownAgents(pettingzoo.ParallelEnv):  # type: ignore[misc]
+    """An environment of PettingZoo with spaces by the names of its agents, checked."""
+
+    def observation_space(self, agent: str) -> Any:
+        """Return the space of an agent's observations, the same object each time."""
+        return self.observation_spaces[self._known(agent)]
+
+    def action_space(self, agent: str) -> Any:
+        """Return the space of an agent's actions, the same object each time."""
+        return self.action_spaces[self._known(agent)]
+
+    def _known(self, agent: str) -> str:
+        if agent not in self.observation_spaces:
+            hint = suggest(agent, self.possible_agents[:8])
+            raise NPAError(f"agent must be one that exists, got {shown(agent)}: {hint}")
+        return agent
+
+
+class CrowdEnv(AgentsEnv, KnownAgents):
     """A world whose particles belong to agents; subclasses say to which.
 
     Args:
@@ -52,24 +68,6 @@ class CrowdEnv(AgentsEnv, pettingzoo.ParallelEnv):  # type: ignore[misc]
         self.agents: list[str] = []
         self._live: list[int] = []
 
-    def observation_space(self, agent: str) -> Box:
-        """Return the space of an agent's observations, the same object each time.
-
-        Raises:
-            NPAError: There is no such agent.
-        """
-        self._check_agent(agent)
-        return self.observation_spaces[agent]
-
-    def action_space(self, agent: str) -> Box:
-        """Return the space of an agent's actions, the same object each time.
-
-        Raises:
-            NPAError: There is no such agent.
-        """
-        self._check_agent(agent)
-        return self.action_spaces[agent]
-
     def reset(
         self, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, Any], Infos]:
@@ -82,9 +80,6 @@ class CrowdEnv(AgentsEnv, pettingzoo.ParallelEnv):  # type: ignore[misc]
 
         Returns:
             Observations, and each agent's loss with its parts.
-
-        Raises:
-            gymnasium.error.Error: The seed is no integer of at least 0.
         """
         observation = self._start(np.arange(1), seed, seed)
         self._count_agents()
@@ -132,12 +127,7 @@ class CrowdEnv(AgentsEnv, pettingzoo.ParallelEnv):  # type: ignore[misc]
         return observations, rewards, terminations, dict.fromkeys(acted, late), infos
 
     def state(self) -> Any:
-        """Return what there is to know of the world, for central critics; see `state_space`.
-
-        Returns:
-            A row [position ; state ; 1] for each particle that an episode starts with, zeros for
-            those that are gone, shape [N, 2 + C + 1].
-        """
+        """Return what there is to know of the world, for central critics; see `state_space`."""
         return self._out(self._state()[0])
 
     def render(self) -> NDArray[np.uint8] | None:
@@ -153,19 +143,12 @@ class CrowdEnv(AgentsEnv, pettingzoo.ParallelEnv):  # type: ignore[misc]
     def place_particles(self, x: Any, s: Any) -> dict[str, Any]:
         """Replace the particles of all live agents, at no reward, and return the observations.
 
-        Args:
-            x: Positions [length units], shape [N now, 2].
-            s: States, dimensionless, shape [N now, C].
-
-        Raises:
-            NPAError: A shape is another one, or a number is not finite or beyond its limit.
+        Positions have shape [N now, 2], states [N now, C].
         """
         if not self.agents:
             raise NPAError("particles need live agents: call reset first")
         with self.worlds.device_context():
-            observation = self.worlds.place(
-                number_tensor("x", x)[None], number_tensor("s", s)[None]
-            )
+            observation = self.worlds.place(x, s)
         self._show()
         return self._handed_out(observation)
 
@@ -203,11 +186,6 @@ class CrowdEnv(AgentsEnv, pettingzoo.ParallelEnv):  # type: ignore[misc]
             for k, agent in zip(self._live, self.agents, strict=True)
         }
 
-    def _check_agent(self, agent: str) -> None:
-        if agent not in self.observation_spaces:
-            hint = suggest(agent, self.possible_agents[:8])
-            raise NPAError(f"agent must be one that exists, got {shown(agent)}: {hint}")
-
 
 def in_turns(parallel: Any, *, clips: bool = False) -> Any:
     """Return an environment in which agents act in turn, in an order that PettingZoo checks."""
@@ -217,13 +195,7 @@ def in_turns(parallel: Any, *, clips: bool = False) -> Any:
 
 def register(name: str, module: str, keywords: dict[str, Any]) -> None:
     """Put both kinds of an environment into PettingZoo's registries, unless they are there."""
-    # PettingZoo before 1.27 has no registries.
-    if not hasattr(pettingzoo, "register"):
-        return
-    kinds = (
-        ("parallel", pettingzoo.parallel_registry, "parallel_env"),
-        ("aec", pettingzoo.aec_registry, "env"),
-    )
-    for kind, registry, function in kinds:
-        if name not in registry:
+    for kind, function in (("parallel", "parallel_env"), ("aec", "env")):
+        # PettingZoo before 1.27 has no registries.
+        if name not in getattr(pettingzoo, f"{kind}_registry", {name}):
             pettingzoo.register(kind, name, f"{module}:{function}", kwargs=keywords)

@@ -250,12 +250,7 @@ class MultiSpeciesVectorEnv(AgentsEnv):
         )
 
     def state(self) -> Any:
-        """Return what there is to know of the worlds, for central critics.
-
-        Returns:
-            For each world a row [position ; state ; 1] for each particle that an episode starts
-            with, zeros for those that are gone, shape [B, N, 2 + C + 1].
-        """
+        """Return what there is to know of the worlds, for central critics, [B, N, 2 + C + 1]."""
         return self._out(self._state())
 
     def render(self) -> tuple[NDArray[np.uint8], ...] | None:

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from npa_envs import world_mean
+from npa_envs.checks import number_tensor
 from npa_envs.envs.core.referee import total
 from npa_envs.envs.core.state import OBSERVATION_COPIES, WorldState
 from npa_envs.envs.multi.task import Population, SpeciesTask
@@ -308,13 +309,14 @@ class SpeciesWorlds(WorldState):
     @torch.no_grad()
     @makes_plain_tensors
     def place(self, x: Any, s: Any) -> Tensor:
-        """Replace the particles that are in the worlds, which all have the same ones.
+        """Replace the particles that are in a single world; return what is perceived, [1, N, P].
 
-        Returns what is perceived, [B, N, P]; losses count from now on, at no reward.
+        Losses count from now on, at no reward.
         """
         (cohort,) = self.cohorts
         there = cohort.population
-        placed = self.checked_particles(x, s, self.world_count, there.x.shape[1])
+        one = (number_tensor(name, value)[None] for name, value in (("x", x), ("s", s)))
+        placed = self.checked_particles(*one, 1, there.x.shape[1])
         there.x.copy_(placed.x)
         there.s.copy_(placed.s)
         return self._carry_over()
