@@ -6,7 +6,7 @@ Arrays are of NumPy or torch outside, float32 tensors inside.
 from __future__ import annotations
 
 import math
-from typing import Any, ClassVar, Protocol
+from typing import Any, ClassVar
 
 import gymnasium
 import numpy as np
@@ -15,7 +15,7 @@ from gymnasium.spaces import Box, Space
 from numpy.typing import NDArray
 from torch import Tensor
 
-from npa_envs.envs.core.config import EnvConfig, WorldConfig
+from npa_envs.envs.core.config import EnvConfig
 from npa_envs.envs.core.task import EnvTask
 from npa_envs.envs.core.worlds import BatchedWorlds
 from npa_envs.errors import NPAError
@@ -95,76 +95,56 @@ def action_tensor(
     return checked
 
 
-class Drawn(Protocol):
-    """Worlds that can be drawn."""
-
-    world_count: int
-
-    def pictures(self, count: int) -> NDArray[np.uint8]:
-        """Return pictures of the first worlds, uint8, shape [count, R, R, 3]."""
-
-
-class Screen:
-    """What `render` of an environment returns or shows."""
-
-    def __init__(self, worlds: Drawn, config: WorldConfig, fps: float) -> None:
-        self._worlds = worlds
-        self._config = config
-        self._fps = fps
-        self._window: Window | None = None
-
-    def render(self) -> NDArray[np.uint8] | None:
-        """Return a picture of each world, uint8, shape [B, R, R, 3]; None unless "rgb_array"."""
-        if self._config.render_mode is None:
-            gymnasium.logger.warn(
-                "render() draws nothing without a render_mode: make the environment with "
-                "render_mode='rgb_array' or 'human'"
-            )
-        # A window already shows the worlds as they are.
-        if self._config.render_mode != "rgb_array":
-            return None
-        return self._worlds.pictures(self._worlds.world_count)
-
-    def for_notebook(self, name: str) -> dict[str, Any]:
-        """Return what Jupyter shows of an environment: the worlds as they are, or some."""
-        count = min(self._worlds.world_count, SHOWN_ACROSS**2)
-        picture = show(side_by_side(self._worlds.pictures(count)))
-        return {**picture._repr_mimebundle_(), "text/plain": name}
-
-    def show(self, title: str) -> None:
-        """Show the worlds as they are, the first ones where they are many; only if "human"."""
-        if self._config.render_mode != "human":
-            return
-        count, size = self._worlds.world_count, self._config.render_size
-        across = min(math.ceil(math.sqrt(count)), SHOWN_ACROSS)
-        shown = min(count, across * across)
-        frame = np.full((across * across, size, size, 3), 255, np.uint8)
-        frame[:shown] = self._worlds.pictures(shown)
-        frame = frame.reshape(across, across, size, size, 3).swapaxes(1, 2)
-        if self._window is None:
-            self._window = Window(title, across * size, fps=self._fps)
-        self._window.show(frame.reshape(across * size, across * size, 3))
-
-    def close(self) -> None:
-        """Close the window, if there is one."""
-        if self._window is not None:
-            self._window.close()
-            self._window = None
-
-
 class ShownEnv:
     """The common part of environments of all kinds: pictures, and the type of returned arrays."""
 
     config: Any
     """The environment's configuration."""
-    _screen: Screen
+    worlds: Any
+    """The worlds, with a method `pictures`."""
+    metadata: Any
     _started = False
+    _window: Window | None = None
+
+    def _pictures(self) -> NDArray[np.uint8] | None:
+        """Return a picture of each world, uint8, shape [B, R, R, 3]; None unless "rgb_array"."""
+        if self.config.render_mode is None:
+            gymnasium.logger.warn(
+                "render() draws nothing without a render_mode: make the environment with "
+                "render_mode='rgb_array' or 'human'"
+            )
+        # A window already shows the worlds as they are.
+        if self.config.render_mode != "rgb_array":
+            return None
+        pictures: NDArray[np.uint8] = self.worlds.pictures(self.worlds.world_count)
+        return pictures
 
     def _repr_mimebundle_(self, include: Any = None, exclude: Any = None) -> dict[str, Any]:
         """Return what Jupyter shows: the worlds as they are, or some, from the first reset on."""
+        text = {"text/plain": str(self)}
         if not self._started:
-            return {"text/plain": str(self)}
-        return self._screen.for_notebook(str(self))
+            return text
+        count = min(self.worlds.world_count, SHOWN_ACROSS**2)
+        return show(side_by_side(self.worlds.pictures(count)))._repr_mimebundle_() | text
+
+    def _show_in_window(self, title: str) -> None:
+        """Show the worlds as they are, the first ones where they are many; only if "human"."""
+        if self.config.render_mode != "human":
+            return
+        count, size = self.worlds.world_count, self.config.render_size
+        across = min(math.ceil(math.sqrt(count)), SHOWN_ACROSS)
+        shown = min(count, across * across)
+        frame = np.full((across * across, size, size, 3), 255, np.uint8)
+        frame[:shown] = self.worlds.pictures(shown)
+        frame = frame.reshape(across, across, size, size, 3).swapaxes(1, 2)
+        if self._window is None:
+            self._window = Window(title, across * size, fps=self.metadata["render_fps"])
+        self._window.show(frame.reshape(across * size, across * size, 3))
+
+    def _close_window(self) -> None:
+        if self._window is not None:
+            self._window.close()
+            self._window = None
 
     def _out(self, tensor: Tensor) -> Any:
         return to_output(tensor, self.config.output)
@@ -182,7 +162,6 @@ class WorldsEnv(ShownEnv):
     task_type: ClassVar[type[EnvTask[Any]]]
     """The task: starts and losses."""
 
-    metadata: Any
     spec: Any
 
     def _make_worlds(self, keywords: dict[str, Any], world_count: int, steps: int | None) -> None:
@@ -190,11 +169,10 @@ class WorldsEnv(ShownEnv):
         self.config = self.task_type.config_type.from_keywords(keywords)
         self.render_mode = self.config.render_mode
         worlds_type = self.task_type.worlds_type or BatchedWorlds
-        self.worlds: BatchedWorlds = worlds_type(self.task_type, self.config, world_count, steps)
+        self.worlds = worlds_type(self.task_type, self.config, world_count, steps)
         self.task = self.worlds.task
         form_type = self.task_type.form_type or ParticleSpaces
         self.form: ParticleSpaces = form_type(self.worlds.physics, self.config)
-        self._screen = Screen(self.worlds, self.config, self.metadata["render_fps"])
 
     def _begin(self, worlds: Tensor, keys: Tensor | None, out: Tensor | None = None) -> Tensor:
         """Start episodes in some worlds, int64, [M]; return what is observed in all, [B, ...]."""
@@ -225,4 +203,4 @@ class WorldsEnv(ShownEnv):
         return {f"reward_{name}": numbers[2 + len(names) + k] for k, name in enumerate(names)}
 
     def _show(self) -> None:
-        self._screen.show(self.spec.id if self.spec is not None else type(self).__name__)
+        self._show_in_window(self.spec.id if self.spec is not None else type(self).__name__)

@@ -202,12 +202,12 @@ class NPAEnv(WorldsEnv, gymnasium.Env[Any, Any]):
 
     def render(self) -> NDArray[np.uint8] | None:
         """Return the world's picture, shape [R, R, 3], in the mode "rgb_array"."""
-        pictures = self._screen.render()
+        pictures = self._pictures()
         return None if pictures is None else pictures[0]
 
     def close(self) -> None:
         """Close the window, if there is one."""
-        self._screen.close()
+        self._close_window()
 
     def particles(self) -> tuple[Tensor, Tensor]:
         """Return copies of positions [length units], [N, D], and states, [N, C], on the device."""

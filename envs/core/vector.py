@@ -202,12 +202,12 @@ class NPAVectorEnv(WorldsEnv, VectorEnv[Any, Any, Any]):
         """Return a picture of each world, shape [R, R, 3], in the mode "rgb_array"."""
         if not self._started:
             raise NPAError("render needs worlds: call reset first")
-        pictures = self._screen.render()
+        pictures = self._pictures()
         return None if pictures is None else tuple(pictures)
 
     def close_extras(self, **kwargs: Any) -> None:
         """Close the window, if there is one."""
-        self._screen.close()
+        self._close_window()
 
     def particles(self) -> tuple[Tensor, Tensor]:
         """Return copies of positions [length units], [B, N, D], and states, [B, N, C]."""

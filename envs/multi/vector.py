@@ -17,7 +17,7 @@ from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 from torch import Tensor
 
-from npa_envs.envs.core.base import Screen, ShownEnv, action_tensor
+from npa_envs.envs.core.base import ShownEnv, action_tensor
 from npa_envs.envs.core.vector import (
     checked_count,
     checked_mode,
@@ -71,11 +71,10 @@ class AgentsEnv(ShownEnv):
             self._action_spaces[agent] = Box(-1.0, 1.0, done, np.float32)
         self._state_space = state_space(worlds.physics, worlds.particle_count)
         self.np_random: np.random.Generator | None = None
-        self._screen = Screen(worlds, self.config, self.metadata["render_fps"])
 
     def close(self) -> None:
         """Close the window, if there is one."""
-        self._screen.close()
+        self._close_window()
 
     def _start(self, worlds: NDArray[np.int64], seed: Any, first: Any) -> Tensor:
         """Start episodes in some worlds, [M]; return what is perceived in all, [B, N, P].
@@ -104,10 +103,10 @@ class AgentsEnv(ShownEnv):
     def _pictures(self) -> NDArray[np.uint8] | None:
         if not self._started:
             raise NPAError("render needs a world: call reset first")
-        return self._screen.render()
+        return super()._pictures()
 
     def _show(self) -> None:
-        self._screen.show(f"{self.metadata['name']}: {self._task_name}")
+        self._show_in_window(f"{self.metadata['name']}: {self._task_name}")
 
 
 class MultiSpeciesVectorEnv(AgentsEnv):
