@@ -140,11 +140,9 @@ class DamageEvents(_DamagesWorlds, AnyWrapper):
         before = float(worlds.loss[0])
         x, s = self._particles(due)
         observation = self._base.place_particles(x[0], s[0])
-        loss, *parts = worlds.report.numbers[1 : 2 + len(worlds.part_names), 0].tolist()
-        damage = info.get("loss_damage", 0.0) + loss - before
-        info = info | {"loss": loss, "loss_damage": damage}
-        info |= {f"loss_{n}": value for n, value in zip(worlds.part_names, parts, strict=True)}
-        return observation, info | self._base._extras("reset")
+        losses = self._base.losses_of(worlds.report.numbers[:, 0].tolist())
+        losses["loss_damage"] = info.get("loss_damage", 0.0) + losses["loss"] - before
+        return observation, info | losses | self._base._extras("reset")
 
 
 class VectorDamageEvents(_DamagesWorlds, EpisodeWrapper):
@@ -182,11 +180,9 @@ class VectorDamageEvents(_DamagesWorlds, EpisodeWrapper):
         output = base.config.output
         # Arrays are float64, as those of environments are, and differences as of single ones.
         dtype = torch.float64 if output == "numpy" else torch.float32
-        loss, *parts = worlds.report.numbers[1 : 2 + len(worlds.part_names)].to(dtype, copy=True)
-        now = {"loss": loss, "loss_damage": loss - before.to(dtype)}
-        now |= {f"loss_{n}": part for n, part in zip(worlds.part_names, parts, strict=True)}
-        mask = torch.from_numpy(hurt).to(base.task.device)
-        now |= {"_loss_damage": mask}
+        now = base.losses_of(worlds.report.numbers.to(dtype, copy=True))
+        now["loss_damage"] = now["loss"] - before.to(dtype)
+        now["_loss_damage"] = torch.from_numpy(hurt).to(base.task.device)
         changed = {name: to_output(value, output) for name, value in now.items()}
         if "loss_damage" in infos:
             changed["loss_damage"] = changed["loss_damage"] + infos["loss_damage"]
