@@ -107,11 +107,6 @@ class Gardener2DEnv(GardenEnv):
     1.1 L₀. So 1 is a picture as good as the rule's, 0 one as bad as a grey one; a picture nearer to
     the target than the rule's is worth more than 1.
 
-    | `reward` | Reward of step t |
-    |---|---|
-    | `"dense"` | this, of the world after the step |
-    | `"sparse"` | 0, and this in the last step |
-
     ## Starting state
 
     The rule has grown a world for `grow_steps` steps from a disk of blank particles; it is whole.

@@ -56,11 +56,7 @@ class GrownConfig(Morphogenesis2DEnvConfig):
         check_positive(self, int, "grow_steps")
         if self.split not in get_args(Split):
             raise NPAError(f"split must be 'train' or 'test', got {shown(self.split)}")
-        if self.seed_pool > FIRST_TEST_SEED:
-            raise NPAError(
-                f"seed_pool must be at most {FIRST_TEST_SEED}, got {self.seed_pool}: the worlds "
-                "after those are of the other split"
-            )
+        check_positive(self, int, "seed_pool", at_least=0, at_most=FIRST_TEST_SEED)
         if self.split == "test" and self.seed_pool == 0:
             raise NPAError(
                 "split must be 'train' where seed_pool=0 grows each episode's world anew: evaluate "
@@ -177,6 +173,18 @@ def check_runs(rule: NPARule, **wanted: Any) -> None:
                 f"{name} must be the rule's, {own!r}, got {given!r}: give {name}={own!r}, or "
                 "another rule"
             )
+
+
+def load_read_out(field: str, name: str, state_dim: int, device: torch.device) -> NPARule:
+    """Return the rule that a field of a configuration names, whose read-out reads the states."""
+    rule = load_rule(name, device=device).float().requires_grad_(False)
+    if rule.readout is None or rule.state_dim != state_dim:
+        raise NPAError(
+            f"{field} must be a rule with a read-out of state_dim = {state_dim} channels, but "
+            f"{shown(name)} has {rule.state_dim} channels and {rule.readout_dim} outputs: choose "
+            "another rule, or set state_dim"
+        )
+    return rule
 
 
 def growing_rule(config: GrownConfig) -> str:

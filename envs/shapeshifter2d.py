@@ -303,11 +303,6 @@ class Shapeshifter2DEnv(NPAEnv):
     Worlds are compared with the goal as in `npa/Morphogenesis2D-v0`, by a loss L. The reward is
     1 − L / L₁, and at least -1; L₁ is the loss of an empty picture. So 1 is the goal itself.
 
-    | `reward` | Reward of step t |
-    |---|---|
-    | `"dense"` | this, of the world after the step |
-    | `"sparse"` | 0, and this in the last step |
-
     A step is paid by the goal that was seen before it.
 
     ## Starting state

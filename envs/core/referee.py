@@ -15,7 +15,7 @@ from npa_envs.envs.core.task import (
     Start,
     check_finite,
     checked_losses,
-    checked_shares,
+    checked_tensor,
 )
 from npa_envs.errors import shown
 from npa_envs.world.actions import (
@@ -198,8 +198,7 @@ class JudgedWorlds(WorldState):
         numbers = torch.cat((still[:1], total(values)[None], values, still))
         self.report.numbers.index_copy_(1, worlds, numbers)
         if self.particle_loss is not None:
-            shares = checked_shares(task, task.particle_losses(x, s), (len(x), x.shape[1]))
-            self.particle_loss[worlds] = shares
+            self.particle_loss[worlds] = self._shares(task, x, s)
         if self._before is not None:
             for kept, placed in zip(self._before, (x, s), strict=True):
                 kept.index_copy_(0, worlds, placed)
@@ -233,19 +232,22 @@ class JudgedWorlds(WorldState):
 
     def _particle_gains(self, task: EnvTask[Any]) -> Tensor:
         """Return what each particle has earned in a step, shape [B, N], and keep what it is now."""
-        now, (world_count, count) = (self.x, self.s), self.x.shape[:2]
+        now = self.x, self.s
         if self._before is not None:
-            gains = checked_shares(
-                task, task.particle_gains(self._before, now), (world_count, count)
-            )
+            gains = task.particle_gains(self._before, now)
+            gains = checked_tensor(task, "particle_losses", "shares", gains, self.x.shape[:2])
             for kept, new in zip(self._before, now, strict=True):
                 kept.copy_(new)
             return gains
         assert self.particle_loss is not None, "particles are paid by shares or by actions"
-        shares = checked_shares(task, task.particle_losses(*now), (world_count, count))
+        shares = self._shares(task, *now)
         gains = self.particle_loss - shares
         self.particle_loss.copy_(shares)
         return gains
+
+    def _shares(self, task: EnvTask[Any], x: Tensor, s: Tensor) -> Tensor:
+        shares = task.particle_losses(x, s)
+        return checked_tensor(task, "particle_losses", "shares", shares, x.shape[:2])
 
     def _make_judgement(self) -> PreparedJudgement:
         config = self.task.config

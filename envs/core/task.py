@@ -317,14 +317,7 @@ def starter(task: EnvTask[Any]) -> str:
 
 
 def check_start(task: EnvTask[Any], start: Start, world_count: int, shapes: Any) -> None:
-    """Check the starts of some worlds, without waiting for the device.
-
-    Args:
-        task: Whose they are.
-        start: What it returned.
-        world_count: Worlds B.
-        shapes: Shapes of positions and of states, of B worlds and more.
-    """
+    """Check the starts of some worlds, whose shapes are of more, without waiting for the device."""
     name = starter(task)
     if not isinstance(start, Start):
         raise NPAError(
@@ -332,13 +325,13 @@ def check_start(task: EnvTask[Any], start: Start, world_count: int, shapes: Any)
             "return npa_envs.envs.Start(x, s)"
         )
     for part, value, shape in zip(("positions", "states"), start, shapes, strict=False):
-        _check_tensor(task, name, part, value, (world_count, *shape[1:]), torch.float32)
+        checked_tensor(task, name, part, value, (world_count, *shape[1:]))
     for part, value, dtype in (
         ("success_loss", start.success_loss, torch.float32),
         ("goal", start.goal, torch.int64),
     ):
         if value is not None:
-            _check_tensor(task, name, part, value, (world_count,), dtype)
+            checked_tensor(task, name, part, value, (world_count,), dtype)
 
 
 def checked_losses(
@@ -357,33 +350,28 @@ def checked_losses(
             f"{name} must return the same parts in the same order in each call, got "
             f"{list(losses)} after {list(names)}: return zeros for a part that does not count"
         )
-    for part, value in losses.items():
-        _check_tensor(task, "losses", f"part {shown(part)}", value, (world_count,), torch.float32)
-    return list(losses.values())
+    return [
+        checked_tensor(task, "losses", f"part {shown(part)}", value, (world_count,))
+        for part, value in losses.items()
+    ]
 
 
-def checked_shares(task: EnvTask[Any], shares: Any, shape: tuple[int, int]) -> Tensor:
-    """Return the particles' shares of worlds' losses, shape [B, N]."""
-    _check_tensor(task, "particle_losses", "shares", shares, shape, torch.float32)
-    checked: Tensor = shares
-    return checked
-
-
-def _check_tensor(
+def checked_tensor(
     task: EnvTask[Any],
     method: str,
     part: str,
     value: Any,
     shape: tuple[int, ...],
-    dtype: torch.dtype,
-) -> None:
+    dtype: torch.dtype = torch.float32,
+) -> Tensor:
+    """Return what a method of a task returned, a tensor of this shape and type."""
     device = task.device
     if not isinstance(value, Tensor):
         came = f"a {type(value).__name__}"
     elif tuple(value.shape) != shape or value.dtype != dtype or value.device.type != device.type:
         came = f"{value.dtype} of shape {tuple(value.shape)} on {value.device}"
     else:
-        return
+        return value
     raise NPAError(
         f"{part} of {type(task).__name__}.{method} must be a {dtype} tensor of shape {shape} on "
         f"{device}, got {came}: reshape or convert it there"

@@ -236,8 +236,7 @@ class InvasionConfig(OnePictureConfig):
         if self.reward != "individual":
             raise NPAError(
                 f"reward must be 'individual' in invasion, got {shown(self.reward)}: the sum of "
-                "all "
-                "rewards is zero, so there is nothing to share"
+                "all rewards is zero, so there is nothing to share"
             )
 
 
