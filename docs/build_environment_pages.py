@@ -105,7 +105,11 @@ def resolved_sections(env_class: type) -> dict[str, str]:
         shared |= gardens
     found = {"": own[""]}
     for heading in order:
-        parts = own.get(heading) or first.get(heading), shared.get(heading)
+        said = own.get(heading) or first.get(heading)
+        if heading == "Observation space" and first and said and "| Columns |" not in said:
+            # What a row begins with is said on the first page; here is what follows it.
+            said = f"{first[heading]}\n\n{said}"
+        parts = said, shared.get(heading)
         found[heading] = "\n\n".join(part for part in parts if part)
     return found
 

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from npa_envs.checks import check_fraction, check_non_negative, check_positive
 from npa_envs.envs.core.task import Start
-from npa_envs.envs.core.vector import NPAVectorEnv
+from npa_envs.envs.core.vector import batched
 from npa_envs.envs.garden.brushes import GardenConfig
 from npa_envs.envs.garden.task import GardenEnv, GardenTask, lost_share, marks_of_whole
 from npa_envs.tasks.damage import random_particle
@@ -121,7 +121,4 @@ class Gardener2DEnv(GardenEnv):
     task_type = GardenerTask
 
 
-class Gardener2DVectorEnv(NPAVectorEnv):
-    """Worlds of `Gardener2DEnv`, batched on one device; its docstring describes both."""
-
-    task_type = GardenerTask
+Gardener2DVectorEnv = batched(Gardener2DEnv)

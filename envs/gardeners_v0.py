@@ -126,33 +126,13 @@ class GardenersEnv(KnownAgents):
     def reset(
         self, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, Any], dict[str, dict[str, Any]]]:
-        """Start an episode.
-
-        Args:
-            seed: Begin the sequence of episodes that belongs to this number; without it the
-                sequence goes on.
-            options: Not used.
-
-        Returns:
-            What both see, and the loss with its parts.
-        """
+        """Start an episode, as `npa/Gardener2D-v0`; return what both see, and the loss."""
         seen, info = self._episodes.reset(seed=seed)
         self.agents = list(AGENTS)
         return _for_both(seen), {agent: dict(info) for agent in AGENTS}
 
     def step(self, actions: Mapping[str, Any]) -> Outcome:
-        """Use all brushes, let the rule run, and judge.
-
-        Args:
-            actions: One for each agent, as its action space says.
-
-        Returns:
-            Observations, rewards, terminations, truncations and infos of both.
-
-        Raises:
-            NPAError: The episode is over, an action is missing or wanted by nobody, or it has
-                another shape; the world is then as it was.
-        """
+        """Use all brushes by the actions of both agents, let the rule run, and judge."""
         if not self.agents and not actions:
             return {}, {}, {}, {}, {}
         if not self.agents or set(actions) != set(self.agents):

@@ -16,7 +16,7 @@ from npa_envs.checks import check_positive
 from npa_envs.envs.core.config import EnvConfig
 from npa_envs.envs.core.single import NPAEnv
 from npa_envs.envs.core.task import TURN, TargetEnvTask
-from npa_envs.envs.core.vector import NPAVectorEnv
+from npa_envs.envs.core.vector import batched
 from npa_envs.envs.grown import load_read_out
 from npa_envs.errors import NPAError, shown
 from npa_envs.render import turntable_frames
@@ -206,7 +206,4 @@ class Morphogenesis3DEnv(NPAEnv):
     task_type = SolidTask
 
 
-class Morphogenesis3DVectorEnv(NPAVectorEnv):
-    """Worlds of `Morphogenesis3DEnv`, batched on one device; its docstring describes both."""
-
-    task_type = SolidTask
+Morphogenesis3DVectorEnv = batched(Morphogenesis3DEnv)

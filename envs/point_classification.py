@@ -16,7 +16,7 @@ from npa_envs.checks import check_positive
 from npa_envs.envs.core.config import EnvConfig
 from npa_envs.envs.core.single import NPAEnv
 from npa_envs.envs.core.task import Start, TargetEnvTask
-from npa_envs.envs.core.vector import NPAVectorEnv
+from npa_envs.envs.core.vector import batched
 from npa_envs.envs.grown import load_read_out
 from npa_envs.errors import NPAError, shown
 from npa_envs.rule.rule import COLOUR_OFFSET, NPARule
@@ -240,7 +240,4 @@ class PointClassificationEnv(NPAEnv):
     task_type = PointClassificationTask
 
 
-class PointClassificationVectorEnv(NPAVectorEnv):
-    """Worlds of `PointClassificationEnv`, batched on one device; its docstring describes both."""
-
-    task_type = PointClassificationTask
+PointClassificationVectorEnv = batched(PointClassificationEnv)

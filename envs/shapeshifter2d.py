@@ -17,7 +17,7 @@ from npa_envs.envs.core.base import ParticleSpaces, batch_tensor
 from npa_envs.envs.core.config import EnvConfig
 from npa_envs.envs.core.single import NPAEnv
 from npa_envs.envs.core.task import Start
-from npa_envs.envs.core.vector import NPAVectorEnv
+from npa_envs.envs.core.vector import batched
 from npa_envs.envs.garden.brushes import GardenReward
 from npa_envs.envs.garden.task import Living
 from npa_envs.envs.grown import check_living, check_runs, grow, run_rule
@@ -330,7 +330,4 @@ class Shapeshifter2DEnv(NPAEnv):
     task_type = ShapeshifterTask
 
 
-class Shapeshifter2DVectorEnv(NPAVectorEnv):
-    """Worlds of `Shapeshifter2DEnv`, batched on one device; its docstring describes both."""
-
-    task_type = ShapeshifterTask
+Shapeshifter2DVectorEnv = batched(Shapeshifter2DEnv)

@@ -288,6 +288,17 @@ def masked(values: dict[str, Any], which: Any) -> dict[str, Any]:
     return infos
 
 
+def batched(env_type: type[WorldsEnv]) -> type[NPAVectorEnv]:
+    """Return the class of many worlds of the task of an environment of one."""
+    name = env_type.__name__
+    own = {
+        "__doc__": f"Worlds of `{name}`, batched on one device; its docstring describes both.",
+        "__module__": env_type.__module__,
+        "task_type": env_type.task_type,
+    }
+    return type(name.replace("Env", "VectorEnv"), (NPAVectorEnv,), own)
+
+
 # Arguments of environments that are no fields of a configuration, checked.
 
 

@@ -71,15 +71,10 @@ class CrowdEnv(AgentsEnv, KnownAgents):
     def reset(
         self, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, Any], Infos]:
-        """Start an episode with all agents.
+        """Start an episode with all agents; return observations, and losses with their parts.
 
-        Args:
-            seed: Begin the sequence of episodes that belongs to this number; without it the
-                sequence goes on.
-            options: Not used.
-
-        Returns:
-            Observations, and each agent's loss with its parts.
+        A seed begins the sequence of episodes that belongs to it; without one the sequence goes on.
+        There are no options.
         """
         observation = self._start(np.arange(1), seed, seed)
         self._count_agents()

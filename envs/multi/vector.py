@@ -27,7 +27,6 @@ from npa_envs.envs.core.vector import (
 )
 from npa_envs.envs.multi.worlds import AgentOutcome, SpeciesWorlds
 from npa_envs.errors import DivergedError, NPAError, shown
-from npa_envs.world.actions import Physics
 from npa_envs.world.cuda_graph import to_device_async
 
 ByAgent = dict[str, Any]
@@ -69,7 +68,11 @@ class AgentsEnv(ShownEnv):
             seen, done = (*ahead, worlds.perception_dim), (*ahead, worlds.physics.action_dim)
             self._observation_spaces[agent] = Box(-limit, limit, seen, np.float32)
             self._action_spaces[agent] = Box(-1.0, 1.0, done, np.float32)
-        self._state_space = state_space(worlds.physics, worlds.particle_count)
+        # Position, state, present.
+        limits, physics = worlds.physics.limits, worlds.physics
+        high = [limits.position] * physics.space_dim + [limits.state] * physics.state_dim
+        rows = np.tile(np.float32([*high, 1.0]), (worlds.particle_count, 1))
+        self._state_space = Box(rows * np.float32([-1.0] * len(high) + [0.0]), rows)
         self.np_random: np.random.Generator | None = None
 
     def close(self) -> None:
@@ -183,19 +186,10 @@ class MultiSpeciesVectorEnv(AgentsEnv):
     def reset(
         self, seed: int | Sequence[int] | None = None, options: dict[str, Any] | None = None
     ) -> tuple[ByAgent, Infos]:
-        """Start episodes with all species.
-
-        Args:
-            seed: Begin the sequences of episodes of seed, seed + 1, ..., or of the seeds in a list;
-                without it the sequences go on.
-            options: `{"reset_mask": mask}` resets only the worlds where the mask, bool, shape [B],
-                is True; the others are left as they are, bit for bit.
+        """Start episodes with all species; arguments are those of `NPAVectorEnv.reset`.
 
         Returns:
             Observations of all worlds, and infos: losses with their parts, and who is live.
-
-        Raises:
-            NPAError: The mask or the seeds have a wrong shape.
         """
         chosen = worlds_to_reset(options, self.world_count)
         if not self._started and len(chosen) < self.world_count:
@@ -296,15 +290,6 @@ class MultiSpeciesVectorEnv(AgentsEnv):
         sent = isinstance(values, Tensor)
         columns = self._out(values.T.contiguous()) if sent else self._sent(values.T.copy())
         return {agent: columns[k] for k, agent in enumerate(self.possible_agents)}
-
-
-def state_space(physics: Physics, particle_count: int) -> Box:
-    """Return the space of [position ; state ; present] of N particles, [N, D + C + 1], float32."""
-    places = [physics.limits.position] * physics.space_dim
-    high = np.array([*places, *[physics.limits.state] * physics.state_dim, 1.0], np.float32)
-    low = np.append(-high[:-1], np.float32(0.0))
-    shape = (particle_count, 1)
-    return Box(np.tile(low, shape), np.tile(high, shape), dtype=np.float32)
 
 
 def joined_actions(
