@@ -106,7 +106,8 @@ class GrownTask(PictureEnvTask[Config]):
 
     def seed(self, random: WorldRandom) -> tuple[Tensor, Tensor]:
         """Return grown worlds."""
-        return grow(self.rule, self.config, *super().seed(random), random)
+        x, s = super().seed(random)
+        return grow(self.rule, self.config, x, s, random, dt=1.0, position_noise=0.0)
 
 
 def run_rule(
@@ -116,39 +117,30 @@ def run_rule(
     s: Tensor,
     steps: int,
     random: WorldRandom,
-    *,
-    detach_positions: bool = False,
+    **changes: Any,
 ) -> tuple[Tensor, Tensor]:
-    """Return worlds after some steps of a rule, with the constants of an environment's worlds."""
-    return rollout(
-        rule,
-        x,
-        s,
-        steps,
-        eps=config.eps,
-        box=config.box,
-        update_prob=config.update_prob,
-        dt=config.dt,
-        position_noise=config.position_noise,
-        detach_positions=detach_positions,
-        generator=random,
-    )
+    """Return worlds after some steps of a rule, with the constants of an environment's worlds.
+
+    Changes are other arguments of `rollout`.
+    """
+    names = ("eps", "box", "update_prob", "dt", "position_noise")
+    constants = {name: getattr(config, name) for name in names} | changes
+    stepped: tuple[Tensor, Tensor] = rollout(rule, x, s, steps, generator=random, **constants)
+    return stepped
 
 
 def grow(
-    rule: NPARule, config: Any, x: Tensor, s: Tensor, random: WorldRandom, **more: Any
+    rule: NPARule, config: Any, x: Tensor, s: Tensor, random: WorldRandom, **changes: Any
 ) -> tuple[Tensor, Tensor]:
-    """Return worlds after `grow_steps` steps of a rule, of time step 1 and without noise.
+    """Return worlds after `grow_steps` steps of a rule; arguments are those of `run_rule`.
 
     Each is grown by itself: a rule's products change in the last bit with the number of worlds.
     """
-    settings: Any = {"eps": config.eps, "box": config.box, "update_prob": config.update_prob}
     worlds = []
     for k in range(len(x)):
         one = slice(k, k + 1)
         stream = random.take(one).substream(StreamId.GROWTH)
-        count = config.grow_steps
-        worlds.append(rollout(rule, x[one], s[one], count, generator=stream, **settings, **more))
+        worlds.append(run_rule(rule, config, x[one], s[one], config.grow_steps, stream, **changes))
     grown_x, grown_s = (torch.cat(part) for part in zip(*worlds, strict=True))
     return grown_x, grown_s
 

@@ -203,9 +203,7 @@ class ShapeshifterTask(Living, PictureEnvTask[Shapeshifter2DEnvConfig]):
         x, s, grown = self.goal.seed(random.world_count, generator=random, device=self.device)
         assert grown is not None, "worlds of many pictures have goals"
         s = self.rule.with_code(s, self.codes.table[grown][:, None])
-        config = self.config
-        constants = {"dt": config.dt, "position_noise": config.position_noise}
-        x, s = grow(self.rule, config, x, s, random, **constants)
+        x, s = grow(self.rule, self.config, x, s, random)
         return Start(x, s, goal=self._another(grown, random))
 
     def _another(self, goal: Tensor, random: WorldRandom) -> Tensor:

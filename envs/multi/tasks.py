@@ -17,6 +17,7 @@ from torch import Tensor
 from npa_envs import perceive, world_mean
 from npa_envs.envs.multi.task import Population, SpeciesConfig, SpeciesTask
 from npa_envs.errors import NPAError, shown, suggest
+from npa_envs.registration import SPECIES as ENVIRONMENTS
 from npa_envs.registration import SPECIES_SIZES
 from npa_envs.tasks.morphogenesis2d import Morphogenesis2D, Morphogenesis2DConfig
 from npa_envs.world.randomness import StreamId, WorldRandom
@@ -144,6 +145,8 @@ class PictureLossTask(SpeciesTask):
         super().__init__(config, device)
         self.goals = [Morphogenesis2D(config.goal(*picture), device=device) for picture in pictures]
         """The tasks of growing each picture, with targets and losses."""
+        self.goal = self.goals[0]
+        """The first of them, whose target's colour scripted policies take."""
 
     def picture_parts(self, k: int, x: Tensor, s: Tensor) -> dict[str, Tensor]:
         """Return density error and weighted colour error against picture k, shape [B] each."""
@@ -153,7 +156,7 @@ class PictureLossTask(SpeciesTask):
     @property
     def pixel_size(self) -> float:
         """Size of a particle in pictures: the distance of the first target's points."""
-        return self.goals[0].target.pixel_size
+        return self.goal.target.pixel_size
 
     @property
     def open_half_width(self) -> float:
@@ -247,8 +250,6 @@ class InvasionTask(PictureLossTask):
 
     def __init__(self, config: InvasionConfig, device: torch.device) -> None:
         super().__init__(config, device, (config.target, config.counts[0]))
-        self.goal = self.goals[0]
-        """The picture of species 0, whose target's colour scripted policies take."""
 
     def losses(self, population: Population) -> Mapping[str, Tensor]:
         """Return the parts of species 0's splat loss, and minus an equal share for each other."""
@@ -300,8 +301,6 @@ class SymbiosisTask(PictureLossTask):
 
     def __init__(self, config: SymbiosisConfig, device: torch.device) -> None:
         super().__init__(config, device, (config.target, sum(config.counts)))
-        self.goal = self.goals[0]
-        """The picture of all particles, whose target's colour scripted policies take."""
 
     def losses(self, population: Population) -> Mapping[str, Tensor]:
         """Return the density error and the weighted colour error, the same for every species."""
@@ -338,16 +337,6 @@ TASKS: dict[str, type[SpeciesTask]] = {
     "symbiosis": SymbiosisTask,
 }
 """Tasks by the names that environments take."""
-
-
-ENVIRONMENTS = {
-    "npa/Mixing-v0": "mixing",
-    "npa/Segregation-v0": "segregation",
-    "npa/CoMorphogenesis-v0": "co_morphogenesis",
-    "npa/Invasion-v0": "invasion",
-    "npa/Symbiosis-v0": "symbiosis",
-}
-"""Tasks by the ids that `pettingzoo.make` takes."""
 
 
 def task_settings(name: str) -> tuple[str, dict[str, Any]]:
