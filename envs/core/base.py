@@ -65,7 +65,8 @@ def batch_tensor(
     """Return actions of B worlds, or of one where B is None, float32, shape [B, ...]."""
     batch, first = ((), "") if world_count is None else ((world_count,), "B, ")
     wanted, letters = (*batch, *shape), f"[{first}{letters}] = "
-    return action_tensor("action", action, wanted, "env.action_space", letters).view(-1, *shape)
+    checked = action_tensor("action", action, wanted, "env.action_space", letters)
+    return checked[None] if world_count is None else checked
 
 
 def action_tensor(
@@ -195,8 +196,8 @@ class WorldsEnv(ShownEnv):
 
     def losses_of(self, numbers: Any) -> dict[str, Any]:
         """Return the loss and its parts by their names in infos, from a report's numbers."""
-        names = ("loss", *(f"loss_{name}" for name in self.worlds.part_names))
-        return dict(zip(names, numbers[1:], strict=False))
+        parts = {f"loss_{n}": numbers[2 + k] for k, n in enumerate(self.worlds.part_names)}
+        return {"loss": numbers[1]} | parts
 
     def _improvements(self, numbers: Any) -> dict[str, Any]:
         names = self.worlds.part_names
