@@ -10,7 +10,7 @@ from torch import Tensor
 
 from npa_envs.agents.policies import PolicyDraws, unwrapped
 from npa_envs.checks import is_real
-from npa_envs.envs.garden.brush_layout import BrushLayout, grid_places
+from npa_envs.envs.garden.brushes import BrushLayout, grid_places
 from npa_envs.envs.garden.task import GardenTask, TargetDeficit
 from npa_envs.envs.shepherd2d import ShepherdTask
 from npa_envs.errors import NPAError, shown
@@ -172,8 +172,8 @@ class ScriptedShepherd(BrushPolicy):
     def act(self, world_count: int) -> Tensor:
         """Return pushes towards the goals of the worlds."""
         worlds, action = self.worlds, self.still(world_count)
-        achieved = self.task.achieved(worlds.x, worlds.s, worlds.referee.context)
-        missing = (self.task.desired(worlds.referee.context) - achieved)[:, None, :2]
+        achieved = self.task.achieved(worlds.x, worlds.s, worlds.context)
+        missing = (self.task.desired(worlds.context) - achieved)[:, None, :2]
         if self.config.aim == "move":
             way = missing.expand(-1, len(self._places), -1)
         elif self.config.aim == "reshape":
@@ -261,5 +261,5 @@ class GradientGardener(BrushPolicy):
         for action in plan:
             x, s = task.brush_and_roll(x, s, action, random)
             loss = sum(task.losses(x, s).values())
-            earned = earned + task.reward(x, s, loss, worlds.referee.context)
+            earned = earned + task.reward(x, s, loss, worlds.context)
         return earned

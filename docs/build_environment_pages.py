@@ -33,10 +33,11 @@ from page_parts import (
     write_or_check,
 )
 
+from npa_envs.envs.core.base import ParticleSpaces
 from npa_envs.envs.core.config import EnvConfig
 from npa_envs.envs.core.single import NPAEnv
 from npa_envs.envs.core.vector import NPAVectorEnv
-from npa_envs.envs.garden.environments import LIVING, GardenEnv
+from npa_envs.envs.garden.task import GardenEnv, LivingWorlds
 from npa_envs.registration import CODED, ENVIRONMENTS, GARDENS, SIZES, SMALL, Registration
 
 DOCS = Path(__file__).resolve().parent
@@ -82,7 +83,7 @@ def resolved_sections(env_class: type) -> dict[str, str]:
     first = sections(environment_class(FIRST))
     shared = sections(NPAEnv)
     order = [name for name in (first | shared) if name]
-    if env_class.parts is LIVING:
+    if env_class.task_type.worlds_type is LivingWorlds:
         # They pay and tell otherwise; all else that they do not say is said of all environments.
         del shared["Reward"], shared["Info"]
         first = {}
@@ -104,7 +105,11 @@ def resolved_sections(env_class: type) -> dict[str, str]:
         shared |= gardens
     found = {"": own[""]}
     for heading in order:
-        parts = own.get(heading) or first.get(heading), shared.get(heading)
+        said = own.get(heading) or first.get(heading)
+        if heading == "Observation space" and first and said and "| Columns |" not in said:
+            # What a row begins with is said on the first page; here is what follows it.
+            said = f"{first[heading]}\n\n{said}"
+        parts = said, shared.get(heading)
         found[heading] = "\n\n".join(part for part in parts if part)
     return found
 
@@ -198,11 +203,11 @@ def page(registration: Registration) -> str:
     config = task.config_type()
     physics = config.physics(task.space_dim, static=task.static)
     count = config.particle_count
-    form = env_class.form_type(physics, config)
+    form = (task.form_type or ParticleSpaces)(physics, config)
     spaces = {"Observation space": form.observation_space, "Action space": form.action_space}
     letters = {"C": config.state_dim, "D": task.space_dim, "N": count}
     text = resolved_sections(env_class)
-    if env_class.parts is not LIVING:
+    if task.worlds_type is not LivingWorlds:
         for heading, space in spaces.items():
             text[heading] = numbered_columns(text[heading], letters, space.shape[1])
     text["Arguments"] += "\n\n" + argument_tables(task.config_type)

@@ -95,7 +95,13 @@ def rows(config_type: type[WorldConfig], usual: dict[str, typing.Any]) -> list[t
 def page(name: str) -> str:
     """Return a page, Markdown."""
     module = MODULES[name]
-    text = sections(env_class(name))
+    own, first = (sections(env_class(page)) for page in (name, "MultiSpecies"))
+    # What a page does not say is as on the first one.
+    link = "As for [several species](MultiSpecies.md#{})."
+    text = {
+        heading: own.get(heading) or link.format(heading.lower().replace(" ", "-"))
+        for heading in first
+    }
     text["Version history"] = text["Version history"].partition("\n\nArgs:")[0]
     if name == "MultiSpecies":
         text["Arguments"] += "\n\n" + argument_tables()

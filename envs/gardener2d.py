@@ -10,9 +10,9 @@ from torch import Tensor
 
 from npa_envs.checks import check_fraction, check_non_negative, check_positive
 from npa_envs.envs.core.task import Start
-from npa_envs.envs.garden.config import GardenConfig
-from npa_envs.envs.garden.environments import GardenEnv, GardenVectorEnv
-from npa_envs.envs.garden.task import GardenTask, lost_share, marks_of_whole
+from npa_envs.envs.core.vector import batched
+from npa_envs.envs.garden.brushes import GardenConfig
+from npa_envs.envs.garden.task import GardenEnv, GardenTask, lost_share, marks_of_whole
 from npa_envs.tasks.damage import random_particle
 from npa_envs.world.brushes import push, wipe_state
 from npa_envs.world.randomness import StreamId, WorldRandom
@@ -23,7 +23,6 @@ class Gardener2DEnvConfig(GardenConfig):
     """What befalls the picture."""
 
     episode_steps: int = 32
-    """As elsewhere; it equals the registered `max_episode_steps`."""
 
     position_noise: float = 0.002
     """Standard deviation of the noise added to every position in a step of the rule
@@ -108,11 +107,6 @@ class Gardener2DEnv(GardenEnv):
     1.1 L₀. So 1 is a picture as good as the rule's, 0 one as bad as a grey one; a picture nearer to
     the target than the rule's is worth more than 1.
 
-    | `reward` | Reward of step t |
-    |---|---|
-    | `"dense"` | this, of the world after the step |
-    | `"sparse"` | 0, and this in the last step |
-
     ## Starting state
 
     The rule has grown a world for `grow_steps` steps from a disk of blank particles; it is whole.
@@ -127,7 +121,4 @@ class Gardener2DEnv(GardenEnv):
     task_type = GardenerTask
 
 
-class Gardener2DVectorEnv(GardenVectorEnv):
-    """Worlds of `Gardener2DEnv`, batched on one device; its docstring describes both."""
-
-    task_type = GardenerTask
+Gardener2DVectorEnv = batched(Gardener2DEnv)

@@ -9,18 +9,17 @@ from collections.abc import Mapping
 from typing import Any, ClassVar
 
 import numpy as np
-import pettingzoo
 import torch
-from gymnasium.spaces import Box, Space
+from gymnasium.spaces import Box
 from gymnasium.wrappers import TimeLimit
 from numpy.typing import NDArray
 from torch import Tensor
 
 from npa_envs.envs.core.vector import checked_count
-from npa_envs.envs.garden.spaces import BrushSpaces
-from npa_envs.envs.gardener2d import Gardener2DEnv
-from npa_envs.envs.multi.parallel import Outcome, in_turns, register
-from npa_envs.errors import NPAError, shown, suggest
+from npa_envs.envs.garden.brushes import BrushSpaces
+from npa_envs.envs.gardener2d import Gardener2DEnv, GardenerTask
+from npa_envs.envs.multi.parallel import KnownAgents, Outcome, in_turns, register
+from npa_envs.errors import NPAError, shown
 
 AGENTS = ("keeper_0", "raider_0")
 
@@ -34,11 +33,15 @@ class _BothHands(BrushSpaces):
         return torch.cat(both, dim=1)
 
 
-class _SharedGarden(Gardener2DEnv):
+class _SharedTask(GardenerTask):
     form_type = _BothHands
 
 
-class GardenersEnv(pettingzoo.ParallelEnv):  # type: ignore[misc]
+class _SharedGarden(Gardener2DEnv):
+    task_type = _SharedTask
+
+
+class GardenersEnv(KnownAgents):
     """Two gardeners at one living picture: the keeper keeps it whole, the raider spoils it.
 
     ## Description
@@ -120,53 +123,16 @@ class GardenersEnv(pettingzoo.ParallelEnv):  # type: ignore[misc]
         self.observation_spaces = dict.fromkeys(AGENTS, self.garden.observation_space)
         self.action_spaces = dict.fromkeys(AGENTS, self.garden.action_space)
 
-    def observation_space(self, agent: str) -> Space[Any]:
-        """Return the space of what an agent sees, the same object each time.
-
-        Raises:
-            NPAError: There is no such agent.
-        """
-        return self.observation_spaces[_known(agent)]
-
-    def action_space(self, agent: str) -> Space[Any]:
-        """Return the space of an agent's actions, the same object each time.
-
-        Raises:
-            NPAError: There is no such agent.
-        """
-        return self.action_spaces[_known(agent)]
-
     def reset(
         self, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, Any], dict[str, dict[str, Any]]]:
-        """Start an episode.
-
-        Args:
-            seed: Begin the sequence of episodes that belongs to this number; without it the
-                sequence goes on.
-            options: Not used.
-
-        Returns:
-            What both see, and the loss with its parts.
-        """
+        """Start an episode, as `npa/Gardener2D-v0`; return what both see, and the loss."""
         seen, info = self._episodes.reset(seed=seed)
         self.agents = list(AGENTS)
         return _for_both(seen), {agent: dict(info) for agent in AGENTS}
 
     def step(self, actions: Mapping[str, Any]) -> Outcome:
-        """Use all brushes, let the rule run, and judge.
-
-        Args:
-            actions: One for each agent, as its action space says.
-
-        Returns:
-            Observations, rewards, terminations, truncations and infos of both.
-
-        Raises:
-            NPAError: The episode is over, an action is missing or wanted by nobody, or it has
-                another shape; the world is then as it was.
-            DivergedError: An action is not finite; the world is then as it was.
-        """
+        """Use all brushes by the actions of both agents, let the rule run, and judge."""
         if not self.agents and not actions:
             return {}, {}, {}, {}, {}
         if not self.agents or set(actions) != set(self.agents):
@@ -192,14 +158,6 @@ class GardenersEnv(pettingzoo.ParallelEnv):  # type: ignore[misc]
     def close(self) -> None:
         """Close the window, if there is one."""
         self.garden.close()
-
-
-def _known(agent: str) -> str:
-    if agent not in AGENTS:
-        raise NPAError(
-            f"agent must be one of {AGENTS}, got {shown(agent)}: {suggest(agent, AGENTS)}"
-        )
-    return agent
 
 
 def _for_both(seen: Any) -> dict[str, Any]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import ClassVar, TypeVar, get_args
+from typing import Any, ClassVar, TypeVar, get_args
 
 import torch
 from torch import Tensor
@@ -56,11 +56,7 @@ class GrownConfig(Morphogenesis2DEnvConfig):
         check_positive(self, int, "grow_steps")
         if self.split not in get_args(Split):
             raise NPAError(f"split must be 'train' or 'test', got {shown(self.split)}")
-        if self.seed_pool > FIRST_TEST_SEED:
-            raise NPAError(
-                f"seed_pool must be at most {FIRST_TEST_SEED}, got {self.seed_pool}: the worlds "
-                "after those are of the other split"
-            )
+        check_positive(self, int, "seed_pool", at_least=0, at_most=FIRST_TEST_SEED)
         if self.split == "test" and self.seed_pool == 0:
             raise NPAError(
                 "split must be 'train' where seed_pool=0 grows each episode's world anew: evaluate "
@@ -111,22 +107,7 @@ class GrownTask(PictureEnvTask[Config]):
     def seed(self, random: WorldRandom) -> tuple[Tensor, Tensor]:
         """Return grown worlds."""
         x, s = super().seed(random)
-        grown = [self._grow(x[k : k + 1], s[k : k + 1], random, k) for k in range(len(x))]
-        return torch.cat([x for x, _ in grown]), torch.cat([s for _, s in grown])
-
-    @torch.no_grad()
-    def _grow(self, x: Tensor, s: Tensor, random: WorldRandom, k: int) -> tuple[Tensor, Tensor]:
-        """Grow world k alone: a rule's products change in the last bit with the batch's size."""
-        return rollout(
-            self.rule,
-            x,
-            s,
-            self.config.grow_steps,
-            eps=self.config.eps,
-            box=self.config.box,
-            update_prob=self.config.update_prob,
-            generator=random.take(slice(k, k + 1)).substream(StreamId.GROWTH),
-        )
+        return grow(self.rule, self.config, x, s, random, dt=1.0, position_noise=0.0)
 
 
 def run_rule(
@@ -136,23 +117,66 @@ def run_rule(
     s: Tensor,
     steps: int,
     random: WorldRandom,
-    *,
-    detach_positions: bool = False,
+    **changes: Any,
 ) -> tuple[Tensor, Tensor]:
-    """Return worlds after some steps of a rule, with the constants of an environment's worlds."""
-    return rollout(
-        rule,
-        x,
-        s,
-        steps,
-        eps=config.eps,
-        box=config.box,
-        update_prob=config.update_prob,
-        dt=config.dt,
-        position_noise=config.position_noise,
-        detach_positions=detach_positions,
-        generator=random,
-    )
+    """Return worlds after some steps of a rule, with the constants of an environment's worlds.
+
+    Changes are other arguments of `rollout`.
+    """
+    names = ("eps", "box", "update_prob", "dt", "position_noise")
+    constants = {name: getattr(config, name) for name in names} | changes
+    stepped: tuple[Tensor, Tensor] = rollout(rule, x, s, steps, generator=random, **constants)
+    return stepped
+
+
+def grow(
+    rule: NPARule, config: Any, x: Tensor, s: Tensor, random: WorldRandom, **changes: Any
+) -> tuple[Tensor, Tensor]:
+    """Return worlds after `grow_steps` steps of a rule; arguments are those of `run_rule`.
+
+    Each is grown by itself: a rule's products change in the last bit with the number of worlds.
+    """
+    worlds = []
+    for k in range(len(x)):
+        one = slice(k, k + 1)
+        stream = random.take(one).substream(StreamId.GROWTH)
+        worlds.append(run_rule(rule, config, x[one], s[one], config.grow_steps, stream, **changes))
+    grown_x, grown_s = (torch.cat(part) for part in zip(*worlds, strict=True))
+    return grown_x, grown_s
+
+
+def check_living(config: Any) -> None:
+    """Check what configurations of living worlds share."""
+    if config.resolution % config.picture_size:
+        raise NPAError(
+            f"picture_size must divide resolution = {config.resolution}, got "
+            f"{config.picture_size}: try {config.resolution // 2}"
+        )
+    if config.tell_updated:
+        raise NPAError("tell_updated must be False, as actions do not belong to particles")
+
+
+def check_runs(rule: NPARule, **wanted: Any) -> None:
+    """Check that constants of worlds are those of the rule that runs them."""
+    for name, given in wanted.items():
+        own = getattr(rule, name)
+        if own != given:
+            raise NPAError(
+                f"{name} must be the rule's, {own!r}, got {given!r}: give {name}={own!r}, or "
+                "another rule"
+            )
+
+
+def load_read_out(field: str, name: str, state_dim: int, device: torch.device) -> NPARule:
+    """Return the rule that a field of a configuration names, whose read-out reads the states."""
+    rule = load_rule(name, device=device).float().requires_grad_(False)
+    if rule.readout is None or rule.state_dim != state_dim:
+        raise NPAError(
+            f"{field} must be a rule with a read-out of state_dim = {state_dim} channels, but "
+            f"{shown(name)} has {rule.state_dim} channels and {rule.readout_dim} outputs: choose "
+            "another rule, or set state_dim"
+        )
+    return rule
 
 
 def growing_rule(config: GrownConfig) -> str:

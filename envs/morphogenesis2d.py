@@ -13,7 +13,7 @@ from npa_envs.checks import check_positive
 from npa_envs.envs.core.config import EnvConfig
 from npa_envs.envs.core.single import NPAEnv
 from npa_envs.envs.core.task import TargetEnvTask
-from npa_envs.envs.core.vector import NPAVectorEnv
+from npa_envs.envs.core.vector import batched
 from npa_envs.tasks.morphogenesis2d import Morphogenesis2D, Morphogenesis2DConfig
 from npa_envs.tasks.targets.images import LARGEST_POINT_COUNT
 
@@ -63,7 +63,10 @@ class PictureEnvTask(TargetEnvTask[Config]):
 
     def __init__(self, config: Config, device: torch.device) -> None:
         super().__init__(config, device)
-        self.goal = self.goal_type(config.goal, device=device)
+        self.goal = self._make_goal()
+
+    def _make_goal(self) -> Morphogenesis2D:
+        return self.goal_type(self.config.goal, device=self.device)
 
     @classmethod
     def extra_bytes(cls, config: Any, world_count: int) -> int:
@@ -163,7 +166,4 @@ class Morphogenesis2DEnv(NPAEnv):
     task_type = PictureEnvTask
 
 
-class Morphogenesis2DVectorEnv(NPAVectorEnv):
-    """Worlds of `Morphogenesis2DEnv`, batched on one device; its docstring describes both."""
-
-    task_type = PictureEnvTask
+Morphogenesis2DVectorEnv = batched(Morphogenesis2DEnv)

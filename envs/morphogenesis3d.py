@@ -16,11 +16,10 @@ from npa_envs.checks import check_positive
 from npa_envs.envs.core.config import EnvConfig
 from npa_envs.envs.core.single import NPAEnv
 from npa_envs.envs.core.task import TURN, TargetEnvTask
-from npa_envs.envs.core.vector import NPAVectorEnv
+from npa_envs.envs.core.vector import batched
+from npa_envs.envs.grown import load_read_out
 from npa_envs.errors import NPAError, shown
 from npa_envs.render import turntable_frames
-from npa_envs.rule.files import load_rule
-from npa_envs.rule.rule import NPARule
 from npa_envs.tasks.morphogenesis3d import Morphogenesis3D, Morphogenesis3DConfig
 
 PIXEL_BYTES = 200
@@ -87,7 +86,9 @@ class SolidTask(TargetEnvTask[Morphogenesis3DEnvConfig]):
     def __init__(self, config: Morphogenesis3DEnvConfig, device: torch.device) -> None:
         super().__init__(config, device)
         goal = Morphogenesis3D(config.goal, device=device)
-        self._rule = _read_out(config, device) if config.readout else None
+        self._rule = None
+        if config.readout:
+            self._rule = load_read_out("readout", config.readout, config.state_dim, device)
         self.goal = goal if self._rule is None else goal.for_rule(self._rule)
 
     @classmethod
@@ -117,17 +118,6 @@ class SolidTask(TargetEnvTask[Morphogenesis3DEnvConfig]):
                 device=self.device,
             )
         return np.stack(frames)
-
-
-def _read_out(config: Morphogenesis3DEnvConfig, device: torch.device) -> NPARule:
-    rule = load_rule(config.readout, device=device).float().requires_grad_(False)
-    if rule.state_dim != config.state_dim or rule.readout is None:
-        raise NPAError(
-            f"readout must be a rule that reads out states of {config.state_dim} channels, got "
-            f"state_dim={rule.state_dim}, readout_dim={rule.readout_dim}: set state_dim, or give "
-            "a rule trained by npa-envs train morphogenesis3d"
-        )
-    return rule
 
 
 class Morphogenesis3DEnv(NPAEnv):
@@ -216,7 +206,4 @@ class Morphogenesis3DEnv(NPAEnv):
     task_type = SolidTask
 
 
-class Morphogenesis3DVectorEnv(NPAVectorEnv):
-    """Worlds of `Morphogenesis3DEnv`, batched on one device; its docstring describes both."""
-
-    task_type = SolidTask
+Morphogenesis3DVectorEnv = batched(Morphogenesis3DEnv)

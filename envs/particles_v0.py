@@ -70,10 +70,6 @@ class ParticlesEnv(CrowdEnv):
     and Σ is their sum. With `reward="team"` every particle gets the mean of all rewards. In an
     invasion rewards sum to zero.
 
-    ## Starting state
-
-    As for [several species](MultiSpecies.md#starting-state).
-
     ## Episode end
 
     As for [several species](MultiSpecies.md#episode-end), particle by particle: one that is out of
@@ -88,14 +84,6 @@ class ParticlesEnv(CrowdEnv):
     | `loss_separation`, ... | reset, step | the same by the name of its part, see above |
     | `reward_separation`, ... | step | how much that fell in this step |
     | `reason` | last step | why the particle's episode ended |
-
-    ## State
-
-    As for [several species](MultiSpecies.md#state).
-
-    ## Rendering
-
-    As for [several species](MultiSpecies.md#rendering).
 
     ## Arguments
 

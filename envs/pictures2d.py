@@ -5,25 +5,21 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any, Self, get_args
 
-import numpy as np
 import torch
 import torch.nn.functional as F
-from gymnasium.spaces import Box
 from torch import Tensor
 
 from npa_envs.checks import check_flag, check_positive
-from npa_envs.envs.core.config import EnvConfig, WorldConfig
-from npa_envs.envs.core.memory import OBSERVATION_COPIES
+from npa_envs.envs.core.config import EnvConfig
 from npa_envs.envs.core.single import NPAEnv
-from npa_envs.envs.core.spaces import ParticleSpaces
+from npa_envs.envs.core.state import OBSERVATION_COPIES
 from npa_envs.envs.core.task import Start
-from npa_envs.envs.core.vector import NPAVectorEnv
+from npa_envs.envs.core.vector import batched
 from npa_envs.envs.morphogenesis2d import PictureConfig, PictureEnvTask
 from npa_envs.errors import NPAError, shown
 from npa_envs.tasks.many_pictures import ManyPictures, named_targets
 from npa_envs.tasks.morphogenesis2d import Morphogenesis2DConfig
 from npa_envs.tasks.targets.clouds import Split
-from npa_envs.world.actions import Physics
 from npa_envs.world.randomness import WorldRandom
 
 CHANNELS = 4
@@ -132,17 +128,6 @@ class PicturesTask(PictureEnvTask[Pictures2DEnvConfig]):
         return {"target": self._number.clone()}
 
 
-class PictureSpaces(ParticleSpaces):
-    """Rows of what particles perceive, with the numbers of the target behind, where asked."""
-
-    def __init__(self, physics: Physics, config: WorldConfig) -> None:
-        super().__init__(physics, config)
-        assert isinstance(config, Pictures2DEnvConfig), "the environments' own configuration"
-        columns = physics.perception_dim + config.target_dim
-        limit = physics.limits.perception
-        self.observation_space = Box(-limit, limit, (config.particle_count, columns), np.float32)
-
-
 class Pictures2DEnv(NPAEnv):
     """Grow the picture that is asked for from a disk of blank particles.
 
@@ -162,22 +147,11 @@ class Pictures2DEnv(NPAEnv):
 
     ## Observation space
 
-    `Box(-64, 64, (N, P + T), float32)` with P = 4C + 2, and T = 4 G² numbers of the target where
-    `observe_target=True`, else 0; G is `picture_size`. The first P columns are those of
-    `Morphogenesis2DEnv`.
-
-    | Columns | Perceived | Unit |
-    |---|---|---|
-    | `0 : C` | the particle's own state s | dimensionless |
-    | `C : 2C` | mean state of the neighbourhood, itself included | dimensionless |
-    | `2C : 4C` | gradient of the state: x, y of channel 0, then of channel 1, ... | 1 / length |
-    | `4C : 4C + 2` | gradient of the density over N, x and y: where it gets denser | 1 / length³ |
-
-    The T columns behind these tell of the target, the same in all rows: means over squares of
-    pixels, G × G of red, then of green, of blue, and of density, rows from the bottom up
-    (dimensionless). Policies of `npa_envs.agents` leave them out, and
-    `npa_envs.agents.learning.Problem` refuses `observe_target`, as rules read no target: so none of
-    its methods takes these columns. Learners that read whole observations do, such as
+    With `observe_target=True` T = 4 G² columns more tell of the target, the same in all rows: means
+    over squares of pixels, G × G of red, then of green, of blue, and of density, rows from the
+    bottom up (dimensionless); G is `picture_size`. Policies of `npa_envs.agents` leave them out,
+    and `npa_envs.agents.learning.Problem` refuses `observe_target`, as rules read no target: so
+    none of its methods takes these columns. Learners that read whole observations do, such as
     Stable-Baselines3's through [`ParticleVecEnv`](../integrations.md).
 
     ## Starting state
@@ -200,11 +174,6 @@ class Pictures2DEnv(NPAEnv):
     """
 
     task_type = PicturesTask
-    form_type = PictureSpaces
 
 
-class Pictures2DVectorEnv(NPAVectorEnv):
-    """Worlds of `Pictures2DEnv`, batched on one device; its docstring describes both."""
-
-    task_type = PicturesTask
-    form_type = PictureSpaces
+Pictures2DVectorEnv = batched(Pictures2DEnv)

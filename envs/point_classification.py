@@ -16,9 +16,9 @@ from npa_envs.checks import check_positive
 from npa_envs.envs.core.config import EnvConfig
 from npa_envs.envs.core.single import NPAEnv
 from npa_envs.envs.core.task import Start, TargetEnvTask
-from npa_envs.envs.core.vector import NPAVectorEnv
+from npa_envs.envs.core.vector import batched
+from npa_envs.envs.grown import load_read_out
 from npa_envs.errors import NPAError, shown
-from npa_envs.rule.files import load_rule
 from npa_envs.rule.rule import COLOUR_OFFSET, NPARule
 from npa_envs.tasks.point_classification import (
     PICTURE_MARGIN,
@@ -160,13 +160,7 @@ MAGNIFICATION = 2.0 / (1.0 + 2.0 * PICTURE_MARGIN)
 
 
 def _read_out_rule(config: PointClassificationEnvConfig, device: torch.device) -> NPARule:
-    given = load_rule(config.rule, device=device).float()
-    if given.readout is None or given.state_dim != config.state_dim:
-        raise NPAError(
-            f"rule must have a read-out of state_dim = {config.state_dim} channels, but "
-            f"{shown(config.rule)} has {given.state_dim} channels and {given.readout_dim} outputs: "
-            "choose one that was trained on point_classification"
-        )
+    given = load_read_out("rule", config.rule, config.state_dim, device)
     rule = _WorldByWorld(**given.hyper_parameters()).to(device)
     rule.load_state_dict(given.state_dict())
     return rule.requires_grad_(False)
@@ -204,11 +198,8 @@ class PointClassificationEnv(NPAEnv):
     |---|---|---|---|
     | `0 : C` | change of the state | `state_scale`, no unit | s ← s + dt `state_scale` a |
 
-    In every step each particle is updated with probability `update_prob`, independently of the
-    others. The rows of particles that are not updated are ignored in this step. Entries are clipped
-    to [-1, 1]. A number that is not finite raises `NPAError` and leaves the world as it was. An
-    update rule's output Δs is the action Δs / `state_scale`; see [one
-    step](../mathematics.md#one-step).
+    The rest is as in `npa/Morphogenesis2D-v0`: only particles that are updated act, and entries are
+    clipped to [-1, 1].
 
     ## Reward
 
@@ -249,7 +240,4 @@ class PointClassificationEnv(NPAEnv):
     task_type = PointClassificationTask
 
 
-class PointClassificationVectorEnv(NPAVectorEnv):
-    """Worlds of `PointClassificationEnv`, batched on one device; its docstring describes both."""
-
-    task_type = PointClassificationTask
+PointClassificationVectorEnv = batched(PointClassificationEnv)

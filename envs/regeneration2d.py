@@ -11,7 +11,7 @@ from npa_envs.checks import check_flag, check_fraction, check_positive
 from npa_envs.envs.core.referee import total
 from npa_envs.envs.core.single import NPAEnv
 from npa_envs.envs.core.task import Start
-from npa_envs.envs.core.vector import NPAVectorEnv
+from npa_envs.envs.core.vector import batched
 from npa_envs.envs.grown import GrownConfig, GrownTask
 from npa_envs.envs.morphogenesis2d import PictureEnvTask
 from npa_envs.errors import NPAError, shown, suggest
@@ -186,7 +186,4 @@ class Regeneration2DEnv(NPAEnv):
     task_type = RegenerationTask
 
 
-class Regeneration2DVectorEnv(NPAVectorEnv):
-    """Worlds of `Regeneration2DEnv`, batched on one device; its docstring describes both."""
-
-    task_type = RegenerationTask
+Regeneration2DVectorEnv = batched(Regeneration2DEnv)

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import copy
-from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, ClassVar, Literal, Self, get_args
+from typing import Any, Literal, get_args
 
 import numpy as np
 import torch
@@ -15,14 +13,15 @@ from gymnasium.spaces import Box, Discrete, Space
 from torch import Tensor
 
 from npa_envs.checks import check_positive, number_tensor
+from npa_envs.envs.core.base import ParticleSpaces, batch_tensor
 from npa_envs.envs.core.config import EnvConfig
 from npa_envs.envs.core.single import NPAEnv
-from npa_envs.envs.core.spaces import ParticleSpaces, action_tensor
-from npa_envs.envs.core.task import EnvTask, Start
-from npa_envs.envs.core.vector import NPAVectorEnv
-from npa_envs.envs.garden.config import GardenReward
-from npa_envs.envs.garden.environments import LIVING
-from npa_envs.envs.grown import run_rule
+from npa_envs.envs.core.task import Start
+from npa_envs.envs.core.vector import batched
+from npa_envs.envs.garden.brushes import GardenReward
+from npa_envs.envs.garden.task import Living
+from npa_envs.envs.grown import check_living, check_runs, grow, run_rule
+from npa_envs.envs.morphogenesis2d import PictureConfig, PictureEnvTask
 from npa_envs.errors import NPAError
 from npa_envs.rule.codes import Codes
 from npa_envs.rule.files import load_rule
@@ -31,7 +30,7 @@ from npa_envs.tasks.many_pictures import ManyPictures
 from npa_envs.tasks.morphogenesis2d import Morphogenesis2DConfig
 from npa_envs.training.trained_tasks import sources_of_codes
 from npa_envs.world.actions import Physics
-from npa_envs.world.randomness import StreamId, WorldRandom
+from npa_envs.world.randomness import WorldRandom
 
 SEEN_LIMIT = 8.0
 """What is seen is clipped to plus and minus this (dimensionless)."""
@@ -43,19 +42,16 @@ Actions = Literal["code", "choice"]
 
 
 @dataclass(frozen=True, kw_only=True)
-class Shapeshifter2DEnvConfig(EnvConfig):
+class Shapeshifter2DEnvConfig(PictureConfig):
     """Adds the rule of many pictures and how its goals change."""
 
     words = EnvConfig.words | {"reward": get_args(GardenReward), "actions": get_args(Actions)}
-    task_config_type = Morphogenesis2DConfig
 
     reward: GardenReward = "dense"
     """"dense": how near the world is to the goal, in each step; "sparse": the same, in the last
     step alone."""
 
     episode_steps: int = 64
-    """As elsewhere; it equals the registered `max_episode_steps`."""
-
     particle_count: int = 256
     state_dim: int = 24
     eps: float = 0.2
@@ -86,23 +82,13 @@ class Shapeshifter2DEnvConfig(EnvConfig):
     picture_size: int = 8
     """Pixels on each side of the pictures that are seen, G; it divides `resolution`."""
 
-    sigma: float = Morphogenesis2DConfig.sigma
-    colour_weight: float = Morphogenesis2DConfig.colour_weight
     seed_radius: float = 0.4
 
     def __post_init__(self) -> None:
         """Check every field."""
         super().__post_init__()
         check_positive(self, int, "rule_steps", "hold_steps", "grow_steps", "picture_size")
-        if self.resolution % self.picture_size:
-            raise NPAError(
-                f"picture_size must divide resolution = {self.resolution}, got "
-                f"{self.picture_size}: try {self.resolution // 2}"
-            )
-        if self.tell_updated:
-            raise NPAError("tell_updated must be False, as actions do not belong to particles")
-        self.check_start_radius(self.seed_radius)
-        _ = self.task_config(Morphogenesis2DConfig, target_point_count=self.particle_count)
+        check_living(self)
 
 
 def rule_of(config: Shapeshifter2DEnvConfig, device: torch.device) -> tuple[NPARule, Codes]:
@@ -113,37 +99,68 @@ def rule_of(config: Shapeshifter2DEnvConfig, device: torch.device) -> tuple[NPAR
             f"rule must be one of two pictures or more, got {config.rule!r}: train one with "
             "npa-envs train morphogenesis2d --targets gecko heart"
         )
-    wanted = {
-        "space_dim": 2,
-        "state_dim": config.state_dim,
-        "static": False,
-        "alpha": config.alpha,
-        "eps0": config.eps0,
-        "moment_inverse": config.moment_inverse,
-    }
-    for name, value in wanted.items():
-        own = getattr(rule, name)
-        if own != value:
-            raise NPAError(
-                f"{name} must be the rule's, {own!r}, got {value!r}: give {name}={own!r}, or "
-                "another rule"
-            )
+    check_runs(
+        rule,
+        space_dim=2,
+        state_dim=config.state_dim,
+        static=False,
+        alpha=config.alpha,
+        eps0=config.eps0,
+        moment_inverse=config.moment_inverse,
+    )
     return rule, rule.codes
 
 
-class ShapeshifterTask(EnvTask[Shapeshifter2DEnvConfig]):
+class CodeForm(ParticleSpaces):
+    """Coarse pictures are seen; an action is a code, or the number of one."""
+
+    def __init__(self, physics: Physics, config: Shapeshifter2DEnvConfig) -> None:
+        _, codes = rule_of(config, torch.device("cpu"))
+        self._table = codes.table
+        self._limit = max(1.0, float(self._table.abs().max()))
+        self._chosen = config.actions == "choice"
+        self._output = config.output
+        count, dim = self._table.shape
+        seen = (8 * config.picture_size**2,)
+        self.observation_space: Space[Any] = Box(-SEEN_LIMIT, SEEN_LIMIT, seen, np.float32)
+        self.action_space: Space[Any] = (
+            Discrete(count) if self._chosen else Box(-1.0, 1.0, (dim,), np.float32)
+        )
+
+    def action(self, action: Any, world_count: int | None) -> Tensor:
+        """Return the codes that actions mean, float32, shape [B, 1, K]."""
+        count, dim = self._table.shape
+        if not self._chosen:
+            code = batch_tensor(action, world_count, (dim,), "K")
+            return self._limit * code[:, None].clamp(-1.0, 1.0)
+        batch = () if world_count is None else (world_count,)
+        chosen = number_tensor("action", action)
+        if tuple(chosen.shape) != batch or chosen.is_floating_point():
+            raise NPAError(
+                f"action must be whole numbers of shape {batch}, got {tuple(chosen.shape)} of "
+                f"{chosen.dtype}: see env.action_space"
+            )
+        if not bool(((chosen >= 0) & (chosen < count)).all()):
+            raise NPAError(f"action must be the number of one of {count} codes, from 0 on")
+        return self._table.to(chosen.device)[chosen.long().view(-1, 1)]
+
+    def actions_of_codes(self) -> Tensor:
+        """Return the action of the form "code" that says each of the rule's codes, [T, K]."""
+        return self._table / self._limit
+
+
+class ShapeshifterTask(Living, PictureEnvTask[Shapeshifter2DEnvConfig]):
     """A picture that becomes others; what worlds keep are their goals, the present one first."""
 
     config_type = Shapeshifter2DEnvConfig
-    context_count: ClassVar[int] = 1 + GOAL_COUNT
-    pays_each_step: ClassVar[bool] = False
+    form_type = CodeForm
+    context_count = 1 + GOAL_COUNT
+    goal: ManyPictures
 
-    def __init__(self, config: Shapeshifter2DEnvConfig, device: torch.device) -> None:
-        super().__init__(config, device)
-        self.rule, codes = rule_of(config, device)
-        self.codes = codes
-        """The codes that the rule knows, in the order of goals."""
-        sources = sources_of_codes(config.rule, codes)
+    def _make_goal(self) -> ManyPictures:
+        config = self.config
+        self.rule, self.codes = rule_of(config, self.device)
+        sources = sources_of_codes(config.rule, self.codes)
         own = config.task_config(
             Morphogenesis2DConfig,
             target_point_count=config.particle_count,
@@ -151,8 +168,7 @@ class ShapeshifterTask(EnvTask[Shapeshifter2DEnvConfig]):
             state_dim=config.state_dim - self.rule.code_dim,
             code_dim=self.rule.code_dim,
         )
-        self.pictures = ManyPictures(own, device=device)
-        """The task that such rules are trained on."""
+        return ManyPictures(own, device=self.device)
 
     @classmethod
     def extra_bytes(cls, config: Any, world_count: int) -> int:
@@ -168,7 +184,7 @@ class ShapeshifterTask(EnvTask[Shapeshifter2DEnvConfig]):
     @property
     def pixel_size(self) -> float:
         """Size of a particle in pictures [length units]."""
-        return self.pictures.pixel_size
+        return self.goal.pixel_size
 
     @cached_property
     def blank_losses(self) -> Tensor:
@@ -177,47 +193,23 @@ class ShapeshifterTask(EnvTask[Shapeshifter2DEnvConfig]):
         x = torch.full((len(goals), 1, 2), 1e3, device=self.device)
         s = x.new_zeros(len(goals), 1, self.config.state_dim)
         # Where nothing lies in the picture, colours do not count; the mean is not moved.
-        aimed = self.pictures.toward(goals)
+        aimed = self.goal.toward(goals)
         difference = aimed.picture(x, s, centred=False) - aimed.target_picture
         error = difference[..., 3].square() + difference[..., 3].abs()
         return error.flatten(1).mean(dim=1)
 
     def fresh(self, random: WorldRandom) -> Start:
         """Return grown worlds of random pictures, with another picture as their goal."""
-        x, s, grown = self.pictures.seed(random.world_count, generator=random, device=self.device)
+        x, s, grown = self.goal.seed(random.world_count, generator=random, device=self.device)
         assert grown is not None, "worlds of many pictures have goals"
         s = self.rule.with_code(s, self.codes.table[grown][:, None])
-        count = self.config.grow_steps
-        # One by one: a rule's products change in the last bit with the number of worlds.
-        worlds = [
-            run_rule(
-                self.rule,
-                self.config,
-                x[k : k + 1],
-                s[k : k + 1],
-                count,
-                random.take(slice(k, k + 1)).substream(StreamId.GROWTH),
-            )
-            for k in range(len(x))
-        ]
-        x, s = (torch.cat(part) for part in zip(*worlds, strict=True))
+        x, s = grow(self.rule, self.config, x, s, random)
         return Start(x, s, goal=self._another(grown, random))
 
     def _another(self, goal: Tensor, random: WorldRandom) -> Tensor:
         """Return goals other than those given, int64, shape [B]."""
         count = len(self.codes)
         return (goal + 1 + random.integers(count - 1, 1)[:, 0]) % count
-
-    def toward(self, goal: Tensor) -> Self:
-        """Return the task with losses for worlds of these goals, int64, shape [B]."""
-        bound = copy.copy(self)
-        bound.pictures = self.pictures.toward(goal)
-        return bound
-
-    def losses(self, x: Tensor, s: Tensor) -> Mapping[str, Tensor]:
-        """Return the density error and the weighted colour error of each world."""
-        density, colour = self.pictures.splat_losses(x, s)
-        return {"density": density, "colour": self.config.colour_weight * colour}
 
     def episode_context(self, start: Start, loss: Tensor, random: WorldRandom) -> Tensor:
         """Return the goals of an episode: the present one, then all of them in turn, [B, 1 + G]."""
@@ -261,52 +253,11 @@ class ShapeshifterTask(EnvTask[Shapeshifter2DEnvConfig]):
 
     def observe(self, x: Tensor, s: Tensor, loss: Tensor, context: Tensor) -> Tensor:
         """Return coarse pictures of worlds and of their goals, shape [B, 8 G²]."""
-        aimed = self.pictures.toward(context[:, 0].long())
+        aimed = self.goal.toward(context[:, 0].long())
         both = torch.cat((aimed.picture(x, s), aimed.target_picture), dim=-1)
         pixels = self.config.resolution // self.config.picture_size
         seen = F.avg_pool2d(both.permute(0, 3, 1, 2), pixels).flatten(1)
         return seen.clamp(-SEEN_LIMIT, SEEN_LIMIT)
-
-
-class CodeForm(ParticleSpaces):
-    """Coarse pictures are seen; an action is a code, or the number of one."""
-
-    def __init__(self, physics: Physics, config: Shapeshifter2DEnvConfig) -> None:
-        _, codes = rule_of(config, torch.device("cpu"))
-        self._table = codes.table
-        self._limit = max(1.0, float(self._table.abs().max()))
-        self._chosen = config.actions == "choice"
-        self._output = config.output
-        count, dim = self._table.shape
-        seen = (8 * config.picture_size**2,)
-        self.observation_space: Space[Any] = Box(-SEEN_LIMIT, SEEN_LIMIT, seen, np.float32)
-        self.action_space: Space[Any] = (
-            Discrete(count) if self._chosen else Box(-1.0, 1.0, (dim,), np.float32)
-        )
-
-    def action(self, action: Any, world_count: int | None) -> Tensor:
-        """Return the codes that actions mean, float32, shape [B, 1, K]."""
-        count, dim = self._table.shape
-        batch = () if world_count is None else (world_count,)
-        letters = "" if world_count is None else "B, "
-        if not self._chosen:
-            code = action_tensor(
-                "action", action, (*batch, dim), "env.action_space", f"[{letters}K] = "
-            )
-            return self._limit * code.view(-1, 1, dim).clamp(-1.0, 1.0)
-        chosen = number_tensor("action", action)
-        if tuple(chosen.shape) != batch or chosen.is_floating_point():
-            raise NPAError(
-                f"action must be whole numbers of shape {batch}, got {tuple(chosen.shape)} of "
-                f"{chosen.dtype}: see env.action_space"
-            )
-        if not bool(((chosen >= 0) & (chosen < count)).all()):
-            raise NPAError(f"action must be the number of one of {count} codes, from 0 on")
-        return self._table.to(chosen.device)[chosen.long().view(-1, 1)]
-
-    def actions_of_codes(self) -> Tensor:
-        """Return the action of the form "code" that says each of the rule's codes, [T, K]."""
-        return self._table / self._limit
 
 
 class Shapeshifter2DEnv(NPAEnv):
@@ -350,11 +301,6 @@ class Shapeshifter2DEnv(NPAEnv):
     Worlds are compared with the goal as in `npa/Morphogenesis2D-v0`, by a loss L. The reward is
     1 − L / L₁, and at least -1; L₁ is the loss of an empty picture. So 1 is the goal itself.
 
-    | `reward` | Reward of step t |
-    |---|---|
-    | `"dense"` | this, of the world after the step |
-    | `"sparse"` | 0, and this in the last step |
-
     A step is paid by the goal that was seen before it.
 
     ## Starting state
@@ -380,13 +326,6 @@ class Shapeshifter2DEnv(NPAEnv):
     """
 
     task_type = ShapeshifterTask
-    parts = LIVING
-    form_type: ClassVar[type[CodeForm]] = CodeForm
 
 
-class Shapeshifter2DVectorEnv(NPAVectorEnv):
-    """Worlds of `Shapeshifter2DEnv`, batched on one device; its docstring describes both."""
-
-    task_type = ShapeshifterTask
-    parts = LIVING
-    form_type: ClassVar[type[CodeForm]] = CodeForm
+Shapeshifter2DVectorEnv = batched(Shapeshifter2DEnv)

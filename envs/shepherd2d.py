@@ -14,12 +14,11 @@ from torch import Tensor
 
 from npa_envs import world_mean
 from npa_envs.checks import check_non_negative, check_positive
-from npa_envs.envs.core.spaces import to_output
+from npa_envs.envs.core.base import to_output
 from npa_envs.envs.core.task import Start
-from npa_envs.envs.garden.config import GardenConfig, GardenReward
-from npa_envs.envs.garden.environments import GardenEnv, GardenVectorEnv
-from npa_envs.envs.garden.spaces import BrushSpaces
-from npa_envs.envs.garden.task import SEEN_LIMIT, GardenTask, lost_share, marks_of_whole
+from npa_envs.envs.core.vector import NPAVectorEnv
+from npa_envs.envs.garden.brushes import SEEN_LIMIT, BrushSpaces, GardenConfig, GardenReward
+from npa_envs.envs.garden.task import GardenEnv, GardenTask, lost_share, marks_of_whole
 from npa_envs.errors import NPAError
 from npa_envs.tasks.seeds import uniform_ball
 from npa_envs.world.actions import Physics
@@ -35,7 +34,6 @@ class Shepherd2DEnvConfig(GardenConfig):
     words = GardenConfig.words | {"aim": get_args(Aim)}
 
     episode_steps: int = 32
-    """As elsewhere; it equals the registered `max_episode_steps`."""
 
     reward: GardenReward = "dense"
     """"dense": minus the distance to the goal; "sparse": 0 at the goal and -1 elsewhere."""
@@ -72,10 +70,45 @@ class Shepherd2DEnvConfig(GardenConfig):
             raise NPAError(f"goal_reach must be at most 0.9 to {self.aim}, got {self.goal_reach}")
 
 
+class GoalBrushes(BrushSpaces):
+    """As `BrushSpaces`, with what is seen, achieved and desired as a dictionary."""
+
+    def __init__(self, physics: Physics, config: Shepherd2DEnvConfig) -> None:
+        super().__init__(physics, config)
+        seen = self.observation_space
+        assert seen.shape is not None, "a box has a shape"
+        goal = Box(-SEEN_LIMIT, SEEN_LIMIT, (3,), np.float32)
+        self._seen_count = seen.shape[0]
+        self.observation_space = Dict(
+            {"observation": seen, "achieved_goal": goal, "desired_goal": goal}
+        )
+
+    def seen(self, observation: Tensor) -> Any:
+        """Return observations of worlds, or of one, as they are handed out."""
+        count = self._seen_count
+        parts = torch.split(observation, [count, 3, 3], dim=-1)
+        names = ("observation", "achieved_goal", "desired_goal")
+        return {
+            name: to_output(part.contiguous(), self._output)
+            for name, part in zip(names, parts, strict=True)
+        }
+
+    def last_seen(self, observation: Tensor, ended: NDArray[np.bool_]) -> Any:
+        """Return the last observations as Gymnasium has them: an array of dictionaries, or None."""
+        batched = self.seen(observation)
+        if self._output == "torch":
+            return batched
+        last = np.full(len(ended), None, dtype=object)
+        for k in np.flatnonzero(ended):
+            last[k] = {name: value[k] for name, value in batched.items()}
+        return last
+
+
 class ShepherdTask(GardenTask[Shepherd2DEnvConfig]):
     """A creature that is to come to a place, an angle or a shape."""
 
     config_type = Shepherd2DEnvConfig
+    form_type = GoalBrushes
     # What it is when whole, the goal, then how it lay at the start: mean and second moments.
     context_count = 2 + 2 + 5
     pays_each_step = True
@@ -181,40 +214,6 @@ def turned_back(x: Tensor, middle: Tensor, turn: Tensor) -> Tensor:
     return middle[:, None] + back
 
 
-class GoalBrushes(BrushSpaces):
-    """As `BrushSpaces`, with what is seen, achieved and desired as a dictionary."""
-
-    def __init__(self, physics: Physics, config: Shepherd2DEnvConfig) -> None:
-        super().__init__(physics, config)
-        seen = self.observation_space
-        assert seen.shape is not None, "a box has a shape"
-        goal = Box(-SEEN_LIMIT, SEEN_LIMIT, (3,), np.float32)
-        self._seen_count = seen.shape[0]
-        self.observation_space = Dict(
-            {"observation": seen, "achieved_goal": goal, "desired_goal": goal}
-        )
-
-    def seen(self, observation: Tensor) -> Any:
-        """Return observations of worlds, or of one, as they are handed out."""
-        count = self._seen_count
-        parts = torch.split(observation, [count, 3, 3], dim=-1)
-        names = ("observation", "achieved_goal", "desired_goal")
-        return {
-            name: to_output(part.contiguous(), self._output)
-            for name, part in zip(names, parts, strict=True)
-        }
-
-    def last_seen(self, observation: Tensor, ended: NDArray[np.bool_]) -> Any:
-        """Return the last observations as Gymnasium has them: an array of dictionaries, or None."""
-        batched = self.seen(observation)
-        if self._output == "torch":
-            return batched
-        last = np.full(len(ended), None, dtype=object)
-        for k in np.flatnonzero(ended):
-            last[k] = {name: value[k] for name, value in batched.items()}
-        return last
-
-
 class _GoalReward:
     """What Hindsight Experience Replay asks of an environment."""
 
@@ -307,11 +306,9 @@ class Shepherd2DEnv(_GoalReward, GardenEnv):
     """
 
     task_type = ShepherdTask
-    form_type = GoalBrushes
 
 
-class Shepherd2DVectorEnv(_GoalReward, GardenVectorEnv):
+class Shepherd2DVectorEnv(_GoalReward, NPAVectorEnv):
     """Worlds of `Shepherd2DEnv`, batched on one device; its docstring describes both."""
 
     task_type = ShepherdTask
-    form_type = GoalBrushes

@@ -222,33 +222,35 @@ class SpeciesRegistration(NamedTuple):
         return steps
 
 
+SPECIES = {
+    "npa/Mixing-v0": "mixing",
+    "npa/Segregation-v0": "segregation",
+    "npa/CoMorphogenesis-v0": "co_morphogenesis",
+    "npa/Invasion-v0": "invasion",
+    "npa/Symbiosis-v0": "symbiosis",
+}
+"""Tasks of several species by the ids that `pettingzoo.make` takes."""
+
+
+def _of_species(size: str, name: str, keywords: Mapping[str, Any]) -> SpeciesRegistration:
+    usual = f"npa/{name}-v0"
+    form_id = usual.replace("-v0", f"{size}-v0")
+    return SpeciesRegistration(form_id, SPECIES[usual], MappingProxyType(dict(keywords)))
+
+
 SPECIES_SIZES = (
-    SpeciesRegistration("npa/MixingSmall-v0", "mixing", MappingProxyType(dict(_SMALL_SPECIES))),
-    SpeciesRegistration(
-        "npa/SegregationSmall-v0", "segregation", MappingProxyType(dict(_SMALL_SPECIES))
+    _of_species("Small", "Mixing", _SMALL_SPECIES),
+    _of_species("Small", "Segregation", _SMALL_SPECIES),
+    _of_species(
+        "Small", "CoMorphogenesis", {**_SMALL_PICTURE_OF_SPECIES, "targets": ("heart", "ring")}
     ),
-    SpeciesRegistration(
-        "npa/CoMorphogenesisSmall-v0",
-        "co_morphogenesis",
-        MappingProxyType({**_SMALL_PICTURE_OF_SPECIES, "targets": ("heart", "ring")}),
-    ),
-    SpeciesRegistration(
-        "npa/SymbiosisSmall-v0",
-        "symbiosis",
-        MappingProxyType({**_SMALL_PICTURE_OF_SPECIES, "target": "flower"}),
-    ),
-    SpeciesRegistration("npa/InvasionSmall-v0", "invasion", MappingProxyType(_SMALL_INVASION)),
-    SpeciesRegistration("npa/MixingLarge-v0", "mixing", MappingProxyType(_LARGE_SPECIES)),
-    SpeciesRegistration("npa/SegregationLarge-v0", "segregation", MappingProxyType(_LARGE_SPECIES)),
-    SpeciesRegistration(
-        "npa/CoMorphogenesisLarge-v0",
-        "co_morphogenesis",
-        MappingProxyType(_LARGE_PICTURE_OF_SPECIES),
-    ),
-    SpeciesRegistration(
-        "npa/SymbiosisLarge-v0", "symbiosis", MappingProxyType(_LARGE_PICTURE_OF_SPECIES)
-    ),
-    SpeciesRegistration("npa/InvasionLarge-v0", "invasion", MappingProxyType(_LARGE_INVASION)),
+    _of_species("Small", "Symbiosis", {**_SMALL_PICTURE_OF_SPECIES, "target": "flower"}),
+    _of_species("Small", "Invasion", _SMALL_INVASION),
+    _of_species("Large", "Mixing", _LARGE_SPECIES),
+    _of_species("Large", "Segregation", _LARGE_SPECIES),
+    _of_species("Large", "CoMorphogenesis", _LARGE_PICTURE_OF_SPECIES),
+    _of_species("Large", "Symbiosis", _LARGE_PICTURE_OF_SPECIES),
+    _of_species("Large", "Invasion", _LARGE_INVASION),
 )
 """The same for tasks of several species. The opponent of an invasion is fixed."""
 

@@ -164,30 +164,59 @@ def check_row_actions(actions: Any, *wanted: int) -> None:
         )
 
 
+class Rows:
+    """The part of adapters in which row w N + i is particle i of world w of a vector environment.
+
+    A row is paid its own reward where there is one, else its world's.
+    """
+
+    num_envs: int
+
+    def hold(self, env: Any, base: NPAVectorEnv) -> None:
+        """Keep the environment whose particles are rows, and count them."""
+        self.vector_env = env
+        """The environment whose particles these are."""
+        self.world_count = base.num_envs
+        """Worlds B."""
+        self.particle_count = base.config.particle_count
+        """Particles N of a world."""
+        self.num_envs = self.world_count * self.particle_count
+
+    def step_worlds(self, actions: Any) -> VectorStep:
+        """Step all worlds by actions of rows, [B N, A]; return what all rows get, [B N, ...]."""
+        check_row_actions(actions, self.num_envs, *self.vector_env.single_action_space.shape[1:])
+        by_world = actions.reshape(self.world_count, self.particle_count, -1)
+        observations, rewards, ended, cut, infos = self.vector_env.step(by_world)
+        own = own_rewards(infos)
+        paid = self.spread(rewards) if own is None else own.reshape(-1)
+        rows = observations.reshape(self.num_envs, -1)
+        return rows, paid, self.spread(ended), self.spread(cut), infos
+
+    def spread(self, values: Any) -> Any:
+        """Return what worlds have, [B], for each of their rows, shape [B N]."""
+        if isinstance(values, Tensor):
+            return values.repeat_interleave(self.particle_count, output_size=self.num_envs)
+        return np.repeat(values, self.particle_count)
+
+
 class EpisodeClock:
     """Where each world of a vector environment stands in its episode, kept on the host.
 
     With `AutoresetMode.SAME_STEP` the device is waited for only in steps in which episodes end.
-
-    Args:
-        env: The vector environment.
-
-    Attributes:
-        elapsed: Steps since the start of the running episode, int64, shape [B].
-        lengths: Steps of the episode that the last step belonged to, int64, shape [B].
-        ended: Whether the last step ended an episode, bool, shape [B].
-        restarted: Whether the last observation is the first of an episode, bool, shape [B].
-        observed: Whether the last observation is a new one, bool, shape [B]; a reset of some worlds
-            hands out the old ones of the others once more.
     """
 
     def __init__(self, env: AnyVectorEnv) -> None:
         self._mode = autoreset_mode(env)
         self.elapsed = np.zeros(env.num_envs, dtype=np.int64)
+        """Steps since the start of the running episode, shape [B]."""
         self.lengths = np.zeros_like(self.elapsed)
+        """Steps of the episode that the last step belonged to, shape [B]."""
         self.ended = np.zeros(env.num_envs, dtype=bool)
-        self.restarted = np.zeros(env.num_envs, dtype=bool)
-        self.observed = np.ones(env.num_envs, dtype=bool)
+        """Whether the last step ended an episode, shape [B]."""
+        self.restarted = np.zeros_like(self.ended)
+        """Whether the last observation is the first of an episode, shape [B]."""
+        self.observed = np.ones_like(self.ended)
+        """Whether it is a new one, shape [B]: a reset of some worlds gives the others' old ones."""
 
     def reset(self, options: dict[str, Any] | None) -> None:
         """Follow a reset; `reset_mask` among its options says of which worlds."""

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from npa_envs.checks import is_whole
-from npa_envs.envs.core.spaces import to_output
+from npa_envs.envs.core.base import to_output
 from npa_envs.errors import NPAError, shown
 from npa_envs.tasks.damage import DamageEvent, damage_worlds, parse_damage
 from npa_envs.world.randomness import StreamId
@@ -28,10 +28,12 @@ Event = str | DamageEvent
 """What an event is given as: "STEP:KIND", "STEP:KIND:SIZE", or a `DamageEvent`."""
 
 
-class Schedule:
-    """When worlds are damaged; arguments are those of `DamageEvents`."""
+class _DamagesWorlds(Twin):
+    """The events and the damage that they do, for one world or many."""
 
-    def __init__(self, events: Event | Sequence[Event], every: int | None) -> None:
+    def __init__(
+        self, env: Any, events: Event | Sequence[Event], *, every: int | None = None
+    ) -> None:
         several: Any = events
         listed = isinstance(several, Iterable) and getattr(several, "ndim", 1) != 0
         if isinstance(events, str | DamageEvent) or not listed:
@@ -53,36 +55,26 @@ class Schedule:
         """The events, in the order in which those of one step are applied."""
         self.every = every
         """Steps after which each event comes again."""
-
-    def due(self, elapsed: NDArray[np.int64]) -> NDArray[np.bool_]:
-        """Return which events are due in which worlds, [E, B], by steps of their episodes, [B]."""
-        late = elapsed - np.array([[event.step] for event in self.events])
-        due = late == 0 if self.every is None else (late >= 0) & (late % self.every == 0)
-        return np.asarray(due, dtype=bool)
-
-
-class _DamagesWorlds(Twin):
-    """The events and the damage that they do, for one world or many."""
-
-    def __init__(
-        self, env: Any, events: Event | Sequence[Event], *, every: int | None = None
-    ) -> None:
-        self.schedule = Schedule(events, every)
-        """When worlds are damaged."""
-        super().__init__(env, events=[str(event) for event in self.schedule.events], every=every)
+        super().__init__(env, events=[str(event) for event in self.events], every=every)
         check_untouched(env, type(self).__name__)
         # Events of a stack of wrappers are numbered through, so that no two draw the same place.
         self._first = 0
         while hasattr(env, "env"):
             if isinstance(env, _DamagesWorlds):
-                self._first += len(env.schedule.events)
+                self._first += len(env.events)
             env = env.env
+
+    def _due(self, elapsed: NDArray[np.int64]) -> NDArray[np.bool_]:
+        """Return which events are due in which worlds, [E, B], by steps of their episodes, [B]."""
+        late = elapsed - np.array([[event.step] for event in self.events])
+        due = late == 0 if self.every is None else (late >= 0) & (late % self.every == 0)
+        return np.asarray(due, dtype=bool)
 
     def _particles(self, due: NDArray[np.bool_]) -> tuple[Tensor, Tensor]:
         """Return positions and states of all worlds, damaged where events are due, shape [E, B]."""
         worlds = self._base.worlds
         x, s = worlds.x.clone(), worlds.s.clone()
-        for k, (event, mask) in enumerate(zip(self.schedule.events, due, strict=True), self._first):
+        for k, (event, mask) in enumerate(zip(self.events, due, strict=True), self._first):
             if mask.any():
                 chosen = world_indices(mask, x.device)
                 stream = worlds.random.take(chosen).substream(StreamId.DAMAGE).substream(k)
@@ -133,18 +125,16 @@ class DamageEvents(_DamagesWorlds, AnyWrapper):
         return observation, reward, terminated, truncated, info
 
     def _damaged(self, observation: Any, info: dict[str, Any]) -> tuple[Any, dict[str, Any]]:
-        due = self.schedule.due(np.array([self._elapsed]))
+        due = self._due(np.array([self._elapsed]))
         if not due.any():
             return observation, info
         worlds = self._base.worlds
         before = float(worlds.loss[0])
         x, s = self._particles(due)
         observation = self._base.place_particles(x[0], s[0])
-        loss, *parts = worlds.report.numbers[1 : 2 + len(worlds.part_names), 0].tolist()
-        damage = info.get("loss_damage", 0.0) + loss - before
-        info = info | {"loss": loss, "loss_damage": damage}
-        info |= {f"loss_{n}": value for n, value in zip(worlds.part_names, parts, strict=True)}
-        return observation, info | self._base._extras("reset")
+        losses = self._base.losses_of(worlds.report.numbers[:, 0].tolist())
+        losses["loss_damage"] = info.get("loss_damage", 0.0) + losses["loss"] - before
+        return observation, info | losses | self._base._extras("reset")
 
 
 class VectorDamageEvents(_DamagesWorlds, EpisodeWrapper):
@@ -156,13 +146,13 @@ class VectorDamageEvents(_DamagesWorlds, EpisodeWrapper):
 
     def after_reset(self, observations: Any, infos: dict[str, Any]) -> tuple[Any, dict[str, Any]]:
         """Damage the worlds whose episodes start from damaged ones."""
-        due = self.schedule.due(self.clock.elapsed) & self.clock.restarted
+        due = self._due(self.clock.elapsed) & self.clock.restarted
         return self._damaged(due, observations, infos) if due.any() else (observations, infos)
 
     def after_step(self, outcome: VectorStep) -> VectorStep:
         """Damage the worlds in whose episodes an event is due."""
         observations, rewards, terminations, truncations, infos = outcome
-        due = self.schedule.due(self.clock.elapsed) & (self.clock.restarted | ~self.clock.ended)
+        due = self._due(self.clock.elapsed) & (self.clock.restarted | ~self.clock.ended)
         if due.any():
             # With copy=False these are the buffers that placing particles writes to.
             rewards, terminations, truncations = map(_copy, (rewards, terminations, truncations))
@@ -182,11 +172,9 @@ class VectorDamageEvents(_DamagesWorlds, EpisodeWrapper):
         output = base.config.output
         # Arrays are float64, as those of environments are, and differences as of single ones.
         dtype = torch.float64 if output == "numpy" else torch.float32
-        loss, *parts = worlds.report.numbers[1 : 2 + len(worlds.part_names)].to(dtype, copy=True)
-        now = {"loss": loss, "loss_damage": loss - before.to(dtype)}
-        now |= {f"loss_{n}": part for n, part in zip(worlds.part_names, parts, strict=True)}
-        mask = torch.from_numpy(hurt).to(base.task.device)
-        now |= {"_loss_damage": mask}
+        now = base.losses_of(worlds.report.numbers.to(dtype, copy=True))
+        now["loss_damage"] = now["loss"] - before.to(dtype)
+        now["_loss_damage"] = torch.from_numpy(hurt).to(base.task.device)
         changed = {name: to_output(value, output) for name, value in now.items()}
         if "loss_damage" in infos:
             changed["loss_damage"] = changed["loss_damage"] + infos["loss_damage"]

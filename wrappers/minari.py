@@ -6,6 +6,7 @@ Minari keeps datasets below the folder that the variable `MINARI_DATASETS_PATH` 
 
 from __future__ import annotations
 
+import contextlib
 import os
 import re
 import secrets
@@ -170,7 +171,7 @@ def write_dataset(
     part = root / f".{secrets.token_hex(6)}"
     try:
         part.mkdir()
-        with _DatasetsIn(part), warnings.catch_warnings():
+        with _datasets_in(part), warnings.catch_warnings():
             # It asks for authors, an address and a place of code.
             warnings.simplefilter("ignore", UserWarning)
             made = minari.create_dataset_from_buffers(
@@ -199,21 +200,18 @@ def write_dataset(
     return target
 
 
-class _DatasetsIn:
+@contextlib.contextmanager
+def _datasets_in(folder: Path) -> Iterator[None]:
     """A block in which Minari's datasets lie in a folder."""
-
-    def __init__(self, folder: Path) -> None:
-        self._folder = folder
-
-    def __enter__(self) -> None:
-        self._before = os.environ.get(ROOT)
-        os.environ[ROOT] = str(self._folder)
-
-    def __exit__(self, *_: object) -> None:
-        if self._before is None:
+    before = os.environ.get(ROOT)
+    os.environ[ROOT] = str(folder)
+    try:
+        yield
+    finally:
+        if before is None:
             del os.environ[ROOT]
         else:
-            os.environ[ROOT] = self._before
+            os.environ[ROOT] = before
 
 
 def spec_of(env_id: str, keywords: dict[str, Any], episode_steps: int) -> EnvSpec:

@@ -12,17 +12,16 @@ from numpy.typing import NDArray
 
 from npa_envs.wrappers.base import (
     AnyVectorEnv,
+    Rows,
     autoreset_mode,
     check_autoreset,
-    check_row_actions,
-    own_rewards,
     row_space,
     to_host,
     vector_env,
 )
 
 
-class ParticleRows(AnyVectorEnv):
+class ParticleRows(Rows, AnyVectorEnv):
     """The particles of a vector environment as the rows of another one, arrays on the host.
 
     Row w N + i is particle i of world w: it observes that particle's perception, shape [P], gives
@@ -48,13 +47,7 @@ class ParticleRows(AnyVectorEnv):
         check_autoreset(
             autoreset_mode(env), "next-step", "restart worlds in the step after the last one"
         )
-        self.vector_env = env
-        """The environment whose particles these are."""
-        self.world_count = base.num_envs
-        """Worlds B."""
-        self.particle_count = base.config.particle_count
-        """Particles N of a world."""
-        self.num_envs = self.world_count * self.particle_count
+        self.hold(env, base)
         self.metadata = env.metadata
         self.render_mode = env.render_mode
         self.single_observation_space = row_space(env.single_observation_space)
@@ -108,18 +101,8 @@ class ParticleRows(AnyVectorEnv):
             NPAError: The actions have another shape; the worlds are then as they were.
             DivergedError: An action is not finite; the worlds are then as they were.
         """
-        check_row_actions(actions, self.num_envs, *(self.single_action_space.shape or ()))
-        by_world = actions.reshape(self.world_count, self.particle_count, -1)
-        observations, rewards, ended, cut, infos = self.vector_env.step(by_world)
-        own = own_rewards(infos)
-        paid = self._repeated(rewards) if own is None else to_host(own).reshape(-1)
-        return (
-            to_host(observations).reshape(self.num_envs, -1),
-            paid.astype(np.float64),
-            self._repeated(ended),
-            self._repeated(cut),
-            {},
-        )
+        rows, paid, ended, cut, _ = self.step_worlds(actions)
+        return to_host(rows), to_host(paid).astype(np.float64), to_host(ended), to_host(cut), {}
 
     def render(self) -> Any:
         """Return what the environment shows: a picture of each world."""
@@ -128,7 +111,3 @@ class ParticleRows(AnyVectorEnv):
     def close_extras(self, **kwargs: Any) -> None:
         """Close the environment."""
         self.vector_env.close(**kwargs)
-
-    def _repeated(self, values: Any) -> NDArray[Any]:
-        """Return what worlds have, [B], for each of their rows, shape [B N]."""
-        return np.repeat(to_host(values), self.particle_count)

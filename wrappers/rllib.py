@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection
+from functools import partial
 from typing import Any
 
 import gymnasium
@@ -48,41 +49,25 @@ WHOLE_IDS = frozenset((*GARDEN_IDS, *(row.id for row in CODED)))
 """Those where an action is of a whole world."""
 
 
-class _Maker:
-    """Makes the environment of an id from keywords, as RLlib asks for it."""
-
-    def __init__(self, name: str) -> None:
-        self.name = name
-
-    def __call__(self, keywords: dict[str, Any]) -> ParallelPettingZooEnv:
-        make, task = MAKERS[self.name]
-        return ParallelPettingZooEnv(make(task, **dict(keywords)))
+def _agents(name: str, keywords: dict[str, Any]) -> ParallelPettingZooEnv:
+    """Return the environment of an id and keywords, as RLlib asks for it."""
+    make, task = MAKERS[name]
+    return ParallelPettingZooEnv(make(task, **dict(keywords)))
 
 
-class _Mapping:
-    """Names the policy of an agent."""
-
-    def __init__(self, policies: dict[str, str]) -> None:
-        self.policies = policies
-
-    def __call__(self, agent: str, *_: Any, **__: Any) -> str:
-        return self.policies[agent]
+def _policy_of(policies: dict[str, str], agent: str, *_: Any, **__: Any) -> str:
+    return policies[agent]
 
 
-class _RowMaker:
-    """Makes worlds of an id, as many as give so many rows, as RLlib asks for it."""
-
-    def __init__(self, name: str) -> None:
-        self.name = name
-
-    def __call__(self, keywords: dict[str, Any]) -> AnyVectorEnv:
-        # In a process of RLlib's this module may be all that was imported.
-        register_environments()
-        fields = dict(keywords)
-        count = fields.pop("num_envs")
-        if self.name in WHOLE_IDS:
-            return _flat(_worlds(self.name, count, fields))
-        return ParticleRows(_worlds(self.name, count // fields["particle_count"], fields))
+def _rows(name: str, keywords: dict[str, Any]) -> AnyVectorEnv:
+    """Return worlds of an id, as many as give so many rows, as RLlib asks for them."""
+    # In a process of RLlib's this module may be all that was imported.
+    register_environments()
+    fields = dict(keywords)
+    count = fields.pop("num_envs")
+    if name in WHOLE_IDS:
+        return _flat(_worlds(name, count, fields))
+    return ParticleRows(_worlds(name, count // fields["particle_count"], fields))
 
 
 def _worlds(name: str, count: int, fields: dict[str, Any]) -> AnyVectorEnv:
@@ -130,11 +115,13 @@ def rllib_config(name: str, *, shared: bool = False, **keywords: Any) -> PPOConf
     policies = {
         agent: EVERYONE if shared else f"species_{info['species']}" for agent, info in infos.items()
     }
-    register_env(name, _Maker(name))
+    register_env(name, partial(_agents, name))
     config: PPOConfig = (
         PPOConfig()
         .environment(name, env_config=keywords)
-        .multi_agent(policies=set(policies.values()), policy_mapping_fn=_Mapping(policies))
+        .multi_agent(
+            policies=set(policies.values()), policy_mapping_fn=partial(_policy_of, policies)
+        )
     )
     return config
 
@@ -170,7 +157,7 @@ def rllib_rows_config(
         fields["particle_count"] = vector_env(world, "rllib_rows_config").config.particle_count
         rows *= fields["particle_count"]
     world.close()
-    register_env(name, _RowMaker(name))
+    register_env(name, partial(_rows, name))
     config: PPOConfig = (
         PPOConfig()
         .environment(name, env_config=fields)

@@ -10,10 +10,9 @@ from torch import Tensor
 from npa_envs.errors import MissingDependencyError, NPAError
 from npa_envs.wrappers.base import (
     AnyVectorEnv,
+    Rows,
     autoreset_mode,
-    check_row_actions,
     check_same_step,
-    own_rewards,
     torch_env,
 )
 
@@ -26,7 +25,7 @@ except ImportError as error:
     ) from error
 
 
-class RslRlParticleEnv(VecEnv):  # type: ignore[misc]
+class RslRlParticleEnv(Rows, VecEnv):  # type: ignore[misc]
     """The particles of a vector environment as the rows of RSL-RL's `VecEnv`.
 
     Row w N + i is particle i of world w. It observes that particle's perception, shape [P], in the
@@ -55,15 +54,9 @@ class RslRlParticleEnv(VecEnv):  # type: ignore[misc]
     ) -> None:
         base = torch_env(env, type(self).__name__)
         check_same_step(autoreset_mode(env))
-        self.vector_env = env
-        """The environment whose particles these are."""
+        self.hold(env, base)
         self.bootstrap = bootstrap
         """Whether rows cut off by the step limit say so."""
-        self.world_count = base.num_envs
-        """Worlds B."""
-        self.particle_count = base.config.particle_count
-        """Particles N of a world."""
-        self.num_envs = self.world_count * self.particle_count
         self.num_actions = base.worlds.physics.action_dim
         self.max_episode_length = base.worlds.episode_steps or 2**31 - 1
         self.device = base.worlds.x.device
@@ -102,25 +95,17 @@ class RslRlParticleEnv(VecEnv):  # type: ignore[misc]
             NPAError: The actions have another shape; the worlds are then as they were.
             DivergedError: An action is not finite; the worlds are then as they were.
         """
-        check_row_actions(actions, self.num_envs, self.num_actions)
         # RSL-RL collects in inference mode, whose tensors nobody else could write to afterwards.
         with torch.inference_mode(False), torch.no_grad():
-            by_world = actions.reshape(self.world_count, self.particle_count, -1)
-            self._seen, rewards, ended, cut, infos = self.vector_env.step(by_world.clone())
-            own = own_rewards(infos)
-            paid = self._repeated(rewards) if own is None else own.reshape(-1)
-            over = self._repeated(ended | cut)
+            self._seen, paid, ended, cut, infos = self.step_worlds(actions.clone())
+            over = ended | cut
             self._elapsed = torch.where(over, 0, self._elapsed + 1)
             extras: dict[str, Any] = {}
             if self.bootstrap:
-                extras["time_outs"] = self._repeated(cut & ~ended)
+                extras["time_outs"] = cut & ~ended
             if "final_info" in infos:
                 extras["log"] = _episode_log(infos)
             return self.get_observations(), paid, over.long(), extras
-
-    def _repeated(self, values: Tensor) -> Tensor:
-        """Return what worlds have, [B], for each of their rows, shape [B N]."""
-        return values.repeat_interleave(self.particle_count, output_size=self.num_envs)
 
 
 def _episode_log(infos: dict[str, Any]) -> dict[str, Tensor]:

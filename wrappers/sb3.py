@@ -96,32 +96,15 @@ class RowVecEnv(VecEnv):
         actions, self._actions = self._actions, None
         return actions
 
-    def infos(
-        self,
-        rows: NDArray[np.int64],
-        *,
-        truncated: NDArray[np.bool_] | None = None,
-        last: NDArray[np.float32] | None = None,
-        success: NDArray[Any] | None = None,
-    ) -> list[dict[str, Any]]:
-        """Return an info of its own for some rows, and the shared empty one for the others.
+    def infos(self, rows: NDArray[np.int64], entries: Mapping[str, Any]) -> list[dict[str, Any]]:
+        """Return an info of its own for some rows, [M], and the shared empty one for the others.
 
-        Args:
-            rows: Those whose episodes are over, shape [M].
-            truncated: Whether each was cut off; None: nothing is said of that.
-            last: Their last observations; None: likewise.
-            success: Whether each succeeded; None: likewise.
+        Entries hold something for each of these rows; None: nothing.
         """
         infos: list[dict[str, Any]] = [self.nothing] * self.num_envs
+        told = {name: values for name, values in entries.items() if values is not None}
         for k, row in enumerate(rows.tolist()):
-            own: dict[str, Any] = {}
-            if success is not None:
-                own["is_success"] = bool(success[k])
-            if truncated is not None:
-                own["TimeLimit.truncated"] = bool(truncated[k])
-            if last is not None:
-                own["terminal_observation"] = last[k]
-            infos[row] = own
+            infos[row] = {name: values[k] for name, values in told.items()}
         return infos
 
     def close(self) -> None:
@@ -131,11 +114,7 @@ class RowVecEnv(VecEnv):
     def seed(self, seed: int | None = None) -> list[int | None]:
         """Let the next reset begin the sequences of episodes of seed, seed + 1, ..., one a world.
 
-        Args:
-            seed: None: any.
-
-        Returns:
-            The seed of each row's world.
+        Without a number it is any. Returned is the seed of each row's world.
         """
         if seed is None:
             seed = int(np.random.default_rng().integers(2**32))
@@ -221,12 +200,7 @@ class _EpisodeRows(RowVecEnv):
         return self._shown(observations)
 
     def step_wait(self) -> RowSteps:
-        """Step all worlds.
-
-        Returns:
-            Of each row: observation [B R, ...], reward [B R], whether its episode is over [B R],
-            and infos.
-        """
+        """Step all worlds; return of each row observation, reward, whether it is over, info."""
         shape = self.vector_env.single_action_space.shape
         actions = self.taken_actions().reshape(self.world_count, *shape)
         observations, rewards, terminations, truncations, infos = self.vector_env.step(actions)
@@ -254,17 +228,16 @@ class _EpisodeRows(RowVecEnv):
         """Return the infos of all rows, after a step in which the episodes of some worlds ended."""
         if not len(worlds):
             return [self.nothing] * self.num_envs
-        count = self.row_count
-        final_info, last = infos["final_info"], None
-        success = final_info.get("is_success", final_info.get("success"))
+        count, final, last, cut_off = self.row_count, infos["final_info"], None, None
+        success = final.get("is_success", final.get("success"))
+        if success is not None:
+            success = on_host(success)[0][worlds].repeat(count).tolist()
         if self.bootstrap:
-            last = self._last(infos["final_obs"], worlds)
-        return self.infos(
-            (worlds[:, None] * count + np.arange(count)).reshape(-1),
-            truncated=cut[worlds].repeat(count) if self.bootstrap else None,
-            last=last,
-            success=None if success is None else on_host(success)[0][worlds].repeat(count),
-        )
+            last, cut_off = self._last(infos["final_obs"], worlds), cut[worlds].repeat(count)
+            cut_off = cut_off.tolist()
+        rows = (worlds[:, None] * count + np.arange(count)).reshape(-1)
+        names = ("is_success", "TimeLimit.truncated", "terminal_observation")
+        return self.infos(rows, dict(zip(names, (success, cut_off, last), strict=True)))
 
     def _last(self, final: Any, worlds: NDArray[np.int64]) -> Any:
         """Return the last observations of worlds that are over, one for each of their rows."""
@@ -468,12 +441,7 @@ class SpeciesVecEnv(RowVecEnv):
         return on_host(self._rows(self._seen))[0].reshape(self.num_envs, -1)
 
     def step_wait(self) -> RowSteps:
-        """Step all worlds, the other species by their policies.
-
-        Returns:
-            Of each row: observation [B R, P], reward [B R], whether its episode is over [B R], and
-            infos.
-        """
+        """Step all worlds, the other species by their policies; return as `ParticleVecEnv`."""
         if not self._seen:
             raise NPAError("step needs worlds: call reset first")
         own = np.split(self.taken_actions(), np.cumsum(self._counts)[:-1], axis=1)
@@ -497,7 +465,10 @@ class SpeciesVecEnv(RowVecEnv):
         if len(rows):
             last = {name: infos[name].get("final_obs", seen[name]) for name in self.rows_of}
             final = on_host(self._rows(last))[0].reshape(self.num_envs, -1)[rows]
-        row_infos = self.infos(rows, truncated=(cut & ~ended).reshape(-1)[rows], last=final)
+        cut_off = (cut & ~ended).reshape(-1)[rows].tolist()
+        row_infos = self.infos(
+            rows, {"TimeLimit.truncated": cut_off, "terminal_observation": final}
+        )
         return shown.reshape(self.num_envs, -1), paid.reshape(-1), over.reshape(-1), row_infos
 
     def policy(self, model: Any, species: str, *, deterministic: bool = False) -> RowPolicy:

@@ -11,9 +11,9 @@ from gymnasium.spaces import Box, Space
 from torch import Tensor
 
 from npa_envs.checks import is_real, is_whole
-from npa_envs.envs.core.spaces import to_output
+from npa_envs.envs.core.base import to_output
 from npa_envs.errors import NPAError, shown, suggest
-from npa_envs.world.randomness import StreamId, WorldRandom
+from npa_envs.world.randomness import StreamId
 from npa_envs.wrappers.base import (
     Observations,
     Twin,
@@ -25,16 +25,28 @@ ASSIGNMENTS = ("blocks", "random")
 """How particles come by their species."""
 
 
-class SpeciesPlan:
-    """How many particles each species has, and which; arguments are those of `SpeciesTags`."""
+def tagged(observation: Any, tags: Any) -> Any:
+    """Return observations with tags behind them, arrays or tensors."""
+    if isinstance(observation, Tensor):
+        return torch.cat((observation, tags), dim=-1)
+    return np.concatenate((observation, tags), axis=-1)
+
+
+class _TagsSpecies(Twin):
+    """The species of all particles, and their tags, for one world or many."""
 
     def __init__(
         self,
-        particle_count: int,
-        species_count: int,
-        fractions: Sequence[float] | None,
-        assignment: str,
+        env: Any,
+        species_count: int = 2,
+        *,
+        fractions: Sequence[float] | None = None,
+        assignment: str = "blocks",
     ) -> None:
+        super().__init__(
+            env, species_count=species_count, fractions=fractions, assignment=assignment
+        )
+        particle_count, self._worlds = self._base.config.particle_count, self._base.worlds
         if not is_whole(species_count) or species_count < 1:
             raise NPAError(
                 f"species_count must be a whole number of at least 1, got {shown(species_count)}"
@@ -62,60 +74,32 @@ class SpeciesPlan:
                 f"fractions must leave each species a particle, got {sizes.tolist()} of "
                 f"{particle_count}: give more particles or larger fractions"
             )
-        self.species_count = species_count
-        self.random = assignment == "random"
-        self.blocks = torch.arange(species_count).repeat_interleave(torch.from_numpy(sizes))
-        """Species of particles 0 to N - 1 where they stand in blocks, int64, shape [N]."""
+        self._species_count, self._random = species_count, assignment == "random"
+        blocks = torch.arange(species_count).repeat_interleave(torch.from_numpy(sizes))
+        # Species of particles 0 to N - 1 where they stand in blocks.
+        self._blocks = blocks.to(self._base.task.device)
+        setattr(self, self.space_name, self._tagged_space(getattr(env, self.space_name)))
+        everyone = torch.arange(self._worlds.world_count, device=self._base.task.device)
+        self._assign(self._drawn(everyone).clone())
 
-    def draw(self, random: WorldRandom, worlds: Tensor) -> Tensor:
+    def _drawn(self, worlds: Tensor) -> Tensor:
         """Return the species of all particles of some worlds, int64, shape [M, N]."""
-        blocks = self.blocks.to(worlds.device)
-        if not self.random:
-            return blocks.expand(len(worlds), -1)
-        keys = random.take(worlds).substream(StreamId.SPECIES).uniform(len(blocks))
-        return blocks[keys.argsort(dim=1, stable=True)]
+        if not self._random:
+            return self._blocks.expand(len(worlds), -1)
+        streams = self._worlds.random.take(worlds).substream(StreamId.SPECIES)
+        return self._blocks[streams.uniform(len(self._blocks)).argsort(dim=1, stable=True)]
 
-    def space(self, space: Space[Any], wrapper: str) -> Box:
-        """Return the space of observations with tags, by that without, for a wrapper."""
-        count = len(self.blocks)
+    def _tagged_space(self, space: Space[Any]) -> Box:
+        count = len(self._blocks)
         if not isinstance(space, Box) or len(space.shape) != 2 or space.shape[0] != count:
             raise NPAError(
                 f"observations must be a row for each of {count} particles, got {space}: "
-                f"put {wrapper} under the wrappers that reshape observations"
+                f"put {type(self).__name__} under the wrappers that reshape observations"
             )
-        shape = (count, self.species_count)
+        shape = (count, self._species_count)
         low = np.concatenate((space.low, np.zeros(shape, np.float32)), axis=1)
         high = np.concatenate((space.high, np.ones(shape, np.float32)), axis=1)
         return Box(low, high, dtype=np.float32)
-
-
-def tagged(observation: Any, tags: Any) -> Any:
-    """Return observations with tags behind them, arrays or tensors."""
-    if isinstance(observation, Tensor):
-        return torch.cat((observation, tags), dim=-1)
-    return np.concatenate((observation, tags), axis=-1)
-
-
-class _TagsSpecies(Twin):
-    """The species of all particles, and their tags, for one world or many."""
-
-    def __init__(
-        self,
-        env: Any,
-        species_count: int = 2,
-        *,
-        fractions: Sequence[float] | None = None,
-        assignment: str = "blocks",
-    ) -> None:
-        super().__init__(
-            env, species_count=species_count, fractions=fractions, assignment=assignment
-        )
-        count, self._worlds = self._base.config.particle_count, self._base.worlds
-        self._plan = SpeciesPlan(count, species_count, fractions, assignment)
-        space = self._plan.space(getattr(env, self.space_name), type(self).__name__)
-        setattr(self, self.space_name, space)
-        everyone = torch.arange(self._worlds.world_count, device=self._base.task.device)
-        self._assign(self._plan.draw(self._worlds.random, everyone).clone())
 
     @property
     def species(self) -> Any:
@@ -128,17 +112,16 @@ class _TagsSpecies(Twin):
 
     def _assign(self, species: Tensor) -> None:
         self._species = species
-        tags = torch.nn.functional.one_hot(species, self._plan.species_count).to(torch.float32)
+        tags = torch.nn.functional.one_hot(species, self._species_count).to(torch.float32)
         self._tags = to_output(tags if self.many else tags[0], self._output)
 
     def observations(self, observations: Any) -> Any:
         """Return observations with tags; worlds in a new episode get new ones."""
         restarted = self.restarted_worlds
         self._last_tags = self._tags
-        if self._plan.random and restarted.any():
+        if self._random and restarted.any():
             chosen = world_indices(restarted, self._base.task.device)
-            drawn = self._plan.draw(self._worlds.random, chosen)
-            self._assign(self._species.index_copy(0, chosen, drawn))
+            self._assign(self._species.index_copy(0, chosen, self._drawn(chosen)))
         return tagged(observations, self._tags)
 
     def final_observations(self, observations: Any) -> Any:

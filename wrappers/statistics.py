@@ -40,13 +40,7 @@ PRIOR_COUNT = 1e-4
 
 
 class RunningMoments:
-    """Mean and variance of everything seen so far, without waiting for the device.
-
-    Attributes:
-        mean: Float64, of the given shape.
-        var: Float64, of the given shape.
-        count: Samples seen, and a little more at the beginning.
-    """
+    """Mean and variance of all samples so far, float64, without waiting for the device."""
 
     def __init__(self, *shape: int) -> None:
         self.mean = torch.zeros(shape, dtype=torch.float64)
@@ -56,10 +50,7 @@ class RunningMoments:
     def update(self, mean: Tensor, var: Tensor, count: int) -> None:
         """Take in a batch of samples; from then on the moments are on its device.
 
-        Args:
-            mean: The batch's mean, of the shape of a sample.
-            var: The batch's variance about it (divided by `count`, not by one less), likewise.
-            count: Samples in the batch.
+        Its variance is divided by `count`, not by one less.
         """
         old_mean, old_var = self.mean.to(mean.device), self.var.to(mean.device)
         total = self.count + count
@@ -101,14 +92,6 @@ class PerceptionStatistics:
     and one for the density gradient, each shared by all particles. States are centred as well.
     Gradients are not, and the components of one have one scale, so that directions stay what they
     are.
-
-    Args:
-        physics: The constants of the world that is perceived.
-        clip: What is normalised is clipped to plus and minus this (dimensionless).
-        epsilon: Added to variances (dimensionless).
-
-    Raises:
-        NPAError: `clip` or `epsilon` is not finite or not positive.
     """
 
     def __init__(

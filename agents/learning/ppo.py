@@ -32,7 +32,7 @@ from npa_envs.agents.learning.problem import ROW_REWARDS, WORLDS_PER_SEED, Probl
 from npa_envs.agents.learning.progress import Budget, Progress
 from npa_envs.agents.learning.rules import RuleSet
 from npa_envs.checks import check_flag, check_non_negative, check_positive
-from npa_envs.envs.core.memory import free_bytes, needed_bytes
+from npa_envs.envs.core.state import free_bytes, needed_bytes
 from npa_envs.errors import NPAError
 from npa_envs.training.randomness import registered, restart
 from npa_envs.training.ranks import ALONE, Ranks

@@ -11,11 +11,11 @@ import torch
 from torch import Tensor
 
 from npa_envs.checks import (
+    check_flag,
     check_fraction,
     check_non_negative,
     check_positive,
     is_real,
-    is_whole,
 )
 from npa_envs.devices import check_device
 from npa_envs.errors import NPAError, UnknownKeywordError, shown, suggest
@@ -197,12 +197,7 @@ class WorldConfig:
     def from_keywords(cls, keywords: dict[str, Any]) -> Self:
         """Return the configuration with some fields changed.
 
-        Args:
-            keywords: Fields by name; numbers of NumPy are taken for Python's, lists for tuples.
-
-        Raises:
-            UnknownKeywordError: There is no field of that name.
-            NPAError: A field is wrong.
+        Numbers of NumPy are taken for Python's, lists for tuples.
         """
         known = [field.name for field in fields(cls)]
         for name in keywords:
@@ -276,15 +271,15 @@ class EnvConfig(WorldConfig):
         """Check every field; as `WorldConfig`."""
         super().__post_init__()
         check_positive(self, int, "episode_steps")
-        if not isinstance(self.tell_updated, bool):
-            raise NPAError(f"tell_updated must be True or False, got {shown(self.tell_updated)}")
+        check_flag(self, "tell_updated")
+        check_positive(self, int, "seed_pool", at_least=0)
         if self.success_loss is not None:
             check_non_negative(self, "success_loss")
-        if not is_whole(self.seed_pool) or self.seed_pool < 0:
-            raise NPAError(
-                f"seed_pool must be a whole number of at least 0, got {shown(self.seed_pool)}: "
-                "0 makes a fresh start for each episode"
-            )
+
+    @property
+    def target_dim(self) -> int:
+        """Columns of an observation's rows behind perception, T; by default none."""
+        return 0
 
     @property
     def per_particle_reward(self) -> bool:

@@ -3,13 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
-from npa_envs.envs.core.task import EnvTask, Start
-from npa_envs.envs.core.task_checks import check_finite, checked_losses, checked_shares
+from npa_envs.envs.core.config import EnvConfig
+from npa_envs.envs.core.state import WorldState
+from npa_envs.envs.core.task import (
+    EnvTask,
+    Start,
+    check_finite,
+    checked_losses,
+    checked_tensor,
+)
 from npa_envs.errors import shown
 from npa_envs.world.actions import (
     DIVERGED,
@@ -19,11 +26,7 @@ from npa_envs.world.actions import (
     PreparedJudgement,
     with_mean_reward,
 )
-from npa_envs.world.cuda_graph import pinned_like
-from npa_envs.world.randomness import WorldRandom
-
-if TYPE_CHECKING:
-    from npa_envs.envs.core.worlds import WorldState
+from npa_envs.world.cuda_graph import makes_plain_tensors, pinned_like
 
 FLAGS = ("success", "diverged")
 """Names of the first two endings in `info`."""
@@ -82,19 +85,33 @@ class StepReport(NamedTuple):
         return self.over(self.buffer.clone(), len(self.everyone))
 
 
-class WorldReferee:
-    """Judges B worlds by one launch a step, in float32.
+class JudgedWorlds(WorldState):
+    """B worlds of one task, judged by one launch a step, in float32.
 
     Args:
-        task: Gives losses.
-        worlds: Whose particles; x and s are read in place.
+        task_type: Gives starts and losses.
+        config: The environment's configuration.
+        world_count: Worlds B.
         episode_steps: Steps after which an episode is cut off, or None for never.
+
+    Raises:
+        NPAError: The worlds do not fit into memory.
     """
 
-    def __init__(self, task: Any, worlds: WorldState, episode_steps: int | None) -> None:
-        self.x, self.s = x, s = worlds.x, worlds.s
-        self.task, self.episode_steps = task, episode_steps
-        config, device, (world_count, count) = task.config, x.device, x.shape[:2]
+    def __init__(
+        self,
+        task_type: type[EnvTask[Any]],
+        config: EnvConfig,
+        world_count: int,
+        episode_steps: int | None = None,
+    ) -> None:
+        # Memory is checked before the task is made, which may make a target of as many points.
+        extra, count = task_type.extra_bytes(config, world_count), config.particle_count
+        super().__init__(config, task_type, world_count, count, extra)
+        self.task: Any = task_type(config, self.device)
+        self.episode_steps = episode_steps
+        """Steps after which an episode is cut off, or None for never."""
+        x, s, device = self.x, self.s, self.device
 
         def zeros(*shape: int, dtype: torch.dtype = torch.float32) -> Tensor:
             return torch.zeros(world_count, *shape, dtype=dtype, device=device)
@@ -108,7 +125,7 @@ class WorldReferee:
         self._before = (x.clone(), s.clone()) if config.reward == "marginal" else None
         self.goal = zeros(dtype=torch.int64)
         """Each world's goal, shape [B], where worlds differ in that."""
-        self.aimed: EnvTask[Any] = task.toward(self.goal)
+        self.aimed: EnvTask[Any] = self.task.toward(self.goal)
         """The task with losses for these goals."""
         self._start_loss = zeros()
         self._success_loss = zeros()
@@ -116,8 +133,6 @@ class WorldReferee:
         """Whether a number of each world left its bounds in the last step, shape [B]."""
         self.enabled = torch.ones(1, dtype=torch.uint8, device=device)
         """0 where the last actions were not finite and so not applied, shape [1]."""
-        self.context = x.new_zeros(world_count, 0)
-        """What the task keeps of the start of each world, shape [B, M]; by default nothing."""
         self.part_names: tuple[str, ...] = ()
         """Names of the parts of the loss, known once worlds have been placed."""
         self.report = StepReport.empty(world_count, 0, device)
@@ -141,17 +156,13 @@ class WorldReferee:
         read = (self._endings, self.report.numbers)
         self.host_endings, self.host_numbers = map(pinned_like, read) if self.x.is_cuda else read
 
-    def limit_steps(self, episode_steps: int | None) -> None:
-        """Cut episodes off after so many steps from now on, or never."""
-        self.episode_steps, self._judgement = episode_steps, None
-
     @property
     def pays_last_step_alone(self) -> bool:
         """Whether an episode's last step is the only one that is paid."""
         return bool(self.task.config.reward == "sparse")
 
-    def begin(self, worlds: Tensor, start: Start, random: WorldRandom, *, check: bool) -> None:
-        """Begin episodes in some worlds, int64, [M], of a batch with these streams of randomness.
+    def begin(self, worlds: Tensor, start: Start, *, check: bool) -> None:
+        """Begin episodes in some worlds, int64, [M].
 
         `check` looks whether losses are finite, which waits for the device.
         """
@@ -165,8 +176,10 @@ class WorldReferee:
         else:
             self._success_loss[worlds] = start.success_loss
 
+    @torch.no_grad()
+    @makes_plain_tensors
     def place(self, worlds: Tensor, start: Start) -> None:
-        """Take particles of some worlds, int64, [M], at no reward; x and s get them as well."""
+        """Put particles into some worlds, int64, shape [M], at no reward."""
         x, s = start.x.contiguous(), start.s.contiguous()
         task = self.task
         if self.aimed is not task:
@@ -185,8 +198,7 @@ class WorldReferee:
         numbers = torch.cat((still[:1], total(values)[None], values, still))
         self.report.numbers.index_copy_(1, worlds, numbers)
         if self.particle_loss is not None:
-            shares = checked_shares(task, task.particle_losses(x, s), (len(x), x.shape[1]))
-            self.particle_loss[worlds] = shares
+            self.particle_loss[worlds] = self._shares(task, x, s)
         if self._before is not None:
             for kept, placed in zip(self._before, (x, s), strict=True):
                 kept.index_copy_(0, worlds, placed)
@@ -220,19 +232,22 @@ class WorldReferee:
 
     def _particle_gains(self, task: EnvTask[Any]) -> Tensor:
         """Return what each particle has earned in a step, shape [B, N], and keep what it is now."""
-        now, (world_count, count) = (self.x, self.s), self.x.shape[:2]
+        now = self.x, self.s
         if self._before is not None:
-            gains = checked_shares(
-                task, task.particle_gains(self._before, now), (world_count, count)
-            )
+            gains = task.particle_gains(self._before, now)
+            gains = checked_tensor(task, "particle_losses", "shares", gains, self.x.shape[:2])
             for kept, new in zip(self._before, now, strict=True):
                 kept.copy_(new)
             return gains
         assert self.particle_loss is not None, "particles are paid by shares or by actions"
-        shares = checked_shares(task, task.particle_losses(*now), (world_count, count))
+        shares = self._shares(task, *now)
         gains = self.particle_loss - shares
         self.particle_loss.copy_(shares)
         return gains
+
+    def _shares(self, task: EnvTask[Any], x: Tensor, s: Tensor) -> Tensor:
+        shares = task.particle_losses(x, s)
+        return checked_tensor(task, "particle_losses", "shares", shares, x.shape[:2])
 
     def _make_judgement(self) -> PreparedJudgement:
         config = self.task.config
@@ -278,6 +293,11 @@ class WorldReferee:
                 self.host_numbers.copy_(numbers)
 
         return restore
+
+    @property
+    def loss(self) -> Tensor:
+        """Losses as they are, shape [B]."""
+        return self.report.numbers[1]
 
     def extra_info(self) -> dict[str, Tensor]:
         """Return what infos hold besides since the reset, shape [B, ...] each."""

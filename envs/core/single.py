@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from npa_envs.checks import number_tensor
+from npa_envs.envs.core.base import WorldsEnv
 from npa_envs.envs.core.referee import reason
-from npa_envs.envs.core.screen import WorldsEnv
 from npa_envs.envs.core.vector import check_options, plain_seed, rng_keys
 from npa_envs.errors import NPAError
 from npa_envs.world.actions import DIVERGED, SUCCESS, TIME_LIMIT
@@ -157,12 +157,8 @@ class NPAEnv(WorldsEnv, gymnasium.Env[Any, Any]):
         if seed is not None or self.np_random is not self._keyed_from:
             self._keyed_from = self.np_random
             keys = rng_keys(None, 1, self.np_random)
-        with self.worlds.device_context():
-            self.worlds.start(self._world, keys)
-            observation = self.worlds.perceive()
-        self._started = True
-        self._show()
-        info = self._losses(self.worlds.report.numbers[:, 0].tolist()) | self._extras("reset")
+        observation = self._begin(self._world, keys)
+        info = self.losses_of(self.worlds.report.numbers[:, 0].tolist()) | self._extras("reset")
         return self.form.seen(observation[0]), info
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
@@ -189,16 +185,15 @@ class NPAEnv(WorldsEnv, gymnasium.Env[Any, Any]):
             diverged = bool(endings[0] & DIVERGED)
             ending = int(worlds.guarded(endings, observation)[0])
         ended, late = ending & (SUCCESS | DIVERGED) != 0, ending & TIME_LIMIT != 0
-        names, numbers = worlds.part_names, worlds.host_numbers()
-        info = self._losses(numbers)
-        info |= {f"reward_{name}": numbers[2 + len(names) + k] for k, name in enumerate(names)}
+        numbers = worlds.host_numbers.numpy()[:, 0].tolist()
+        info = self.losses_of(numbers) | self._improvements(numbers)
         info |= {"success": bool(ending & SUCCESS), "diverged": diverged}
         if ended or late:
             info["reason"] = reason(ending)
         if worlds.particle_reward is not None:
             info["particle_reward"] = self._out(worlds.particle_reward[0].clone())
         info |= self._extras("reset", "step")
-        if worlds.referee.pays_last_step_alone:
+        if worlds.pays_last_step_alone:
             paid = ended or late or int(worlds.elapsed[0]) == config.episode_steps
             self._unpaid_steps = 0 if paid else self._unpaid_steps + 1
         self._show()
@@ -207,12 +202,12 @@ class NPAEnv(WorldsEnv, gymnasium.Env[Any, Any]):
 
     def render(self) -> NDArray[np.uint8] | None:
         """Return the world's picture, shape [R, R, 3], in the mode "rgb_array"."""
-        pictures = self._screen.render()
+        pictures = self._pictures()
         return None if pictures is None else pictures[0]
 
     def close(self) -> None:
         """Close the window, if there is one."""
-        self._screen.close()
+        self._close_window()
 
     def particles(self) -> tuple[Tensor, Tensor]:
         """Return copies of positions [length units], [N, D], and states, [N, C], on the device."""
@@ -231,12 +226,7 @@ class NPAEnv(WorldsEnv, gymnasium.Env[Any, Any]):
         if not self._started:
             raise NPAError("particles need a world: call reset first")
         x, s = (number_tensor(name, value)[None] for name, value in (("x", x), ("s", s)))
-        start = self.worlds.checked_particles(x, s, 1, self.config.particle_count)
-        with self.worlds.device_context():
-            self.worlds.place(self._world, start)
-            observation = self.worlds.perceive()
-        self._show()
-        return self.form.seen(observation[0])
+        return self.form.seen(self._place(x, s, self._world)[0])
 
     def _extras(self, *when: str) -> dict[str, Any]:
         values = {name: value for own in when for name, value in self.worlds.extras(own).items()}
@@ -244,10 +234,6 @@ class NPAEnv(WorldsEnv, gymnasium.Env[Any, Any]):
             name: self._out(value[0].clone()) if value.ndim > 1 else value[0].item()
             for name, value in values.items()
         }
-
-    def _losses(self, numbers: list[float]) -> dict[str, Any]:
-        parts = {f"loss_{n}": numbers[2 + k] for k, n in enumerate(self.worlds.part_names)}
-        return {"loss": numbers[1]} | parts
 
     def _warn_of_unpaid_rewards(self) -> None:
         """Warn once where an episode ended by a limit that the environment does not know of."""

@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from npa_envs.checks import is_whole, number_tensor
+from npa_envs.envs.core.base import WorldsEnv
 from npa_envs.envs.core.referee import FLAGS, StepReport, reason
-from npa_envs.envs.core.screen import WorldsEnv
 from npa_envs.errors import NPAError, shown, suggest
 from npa_envs.world.actions import TIME_LIMIT
 from npa_envs.world.cuda_graph import to_device_async
@@ -124,18 +124,14 @@ class NPAVectorEnv(WorldsEnv, VectorEnv[Any, Any, Any]):
         if seed is not None or not self._started:
             keys = rng_keys(seed, self.num_envs, self.np_random)[chosen]
         worlds = torch.from_numpy(chosen).to(self.task.device)
-        with self.worlds.device_context():
-            self.worlds.start(worlds, keys)
-            observation = self.worlds.perceive(self._buffer)
+        observation = self._begin(worlds, keys, self._buffer)
         if not self.copies:
             self._buffer = observation
-        self._started = True
         self._ended[chosen] = False
-        self._show()
         which = np.zeros(self.num_envs, dtype=bool)
         which[chosen] = True
-        numbers = self._numbers(self.worlds.report.copy())
-        infos = self._losses(numbers, self._mask(which)) | self._extras("reset", self._mask(which))
+        losses = self.losses_of(self._numbers(self.worlds.report.copy()))
+        infos = masked(losses, self._mask(which)) | self._extras("reset", self._mask(which))
         return self.form.seen(observation), infos
 
     def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
@@ -206,12 +202,12 @@ class NPAVectorEnv(WorldsEnv, VectorEnv[Any, Any, Any]):
         """Return a picture of each world, shape [R, R, 3], in the mode "rgb_array"."""
         if not self._started:
             raise NPAError("render needs worlds: call reset first")
-        pictures = self._screen.render()
+        pictures = self._pictures()
         return None if pictures is None else tuple(pictures)
 
     def close_extras(self, **kwargs: Any) -> None:
         """Close the window, if there is one."""
-        self._screen.close()
+        self._close_window()
 
     def particles(self) -> tuple[Tensor, Tensor]:
         """Return copies of positions [length units], [B, N, D], and states, [B, N, C]."""
@@ -235,14 +231,7 @@ class NPAVectorEnv(WorldsEnv, VectorEnv[Any, Any, Any]):
             chosen = torch.arange(self.num_envs)
         else:
             chosen = world_numbers(worlds, self.num_envs)
-        chosen = chosen.to(self.task.device)
-        count = self.config.particle_count
-        start = self.worlds.checked_particles(x, s, len(chosen), count)
-        with self.worlds.device_context():
-            self.worlds.place(chosen, start)
-            observation = self.worlds.perceive(self._buffer)
-        self._show()
-        return self.form.seen(observation)
+        return self.form.seen(self._place(x, s, chosen.to(self.task.device), self._buffer))
 
     def _report(
         self, stepped: NDArray[np.bool_] | None, *, copy: bool
@@ -254,28 +243,18 @@ class NPAVectorEnv(WorldsEnv, VectorEnv[Any, Any, Any]):
         numbers, flags = self._numbers(report), list(self._out(report.endings))
         everyone = self._out(report.everyone if copy else report.everyone.clone())
         which = everyone if stepped is None else self._mask(stepped)
-        infos = self._losses(numbers, everyone) | self._extras("reset", everyone, copy=copy)
-        improvements = numbers[2 + len(worlds.part_names) :]
-        own = {f"reward_{n}": v for n, v in zip(worlds.part_names, improvements, strict=True)}
-        own |= dict(zip(FLAGS, flags[2:], strict=True))
+        infos = masked(self.losses_of(numbers), everyone)
+        infos |= self._extras("reset", everyone, copy=copy)
+        own = self._improvements(numbers) | dict(zip(FLAGS, flags[2:], strict=True))
         if worlds.particle_reward is not None:
             shares = worlds.particle_reward
             own["particle_reward"] = self._out(shares.clone() if copy else shares)
-        for name, value in own.items():
-            infos[name], infos[f"_{name}"] = value, which
-        return numbers, flags, infos | self._extras("step", which, copy=copy)
+        infos |= masked(own, which) | self._extras("step", which, copy=copy)
+        return numbers, flags, infos
 
     def _extras(self, when: str, which: Any, *, copy: bool = True) -> dict[str, Any]:
-        infos: dict[str, Any] = {}
-        for name, value in self.worlds.extras(when).items():
-            infos[name], infos[f"_{name}"] = self._out(value.clone() if copy else value), which
-        return infos
-
-    def _losses(self, numbers: list[Any], which: Any) -> dict[str, Any]:
-        infos = {"loss": numbers[1], "_loss": which}
-        for k, name in enumerate(self.worlds.part_names):
-            infos[f"loss_{name}"], infos[f"_loss_{name}"] = numbers[2 + k], which
-        return infos
+        extras = self.worlds.extras(when).items()
+        return masked({n: self._out(v.clone() if copy else v) for n, v in extras}, which)
 
     def _ending_infos(
         self, infos: dict[str, Any], endings: NDArray[np.uint8], which: Any
@@ -298,8 +277,26 @@ class NPAVectorEnv(WorldsEnv, VectorEnv[Any, Any, Any]):
 
     def _mask(self, mask: NDArray[np.bool_]) -> Any:
         """Return a mask of worlds as a new array to hand out."""
-        given = mask.copy()
-        return given if self.config.output == "numpy" else to_device_async(given, self.task.device)
+        return self._sent(mask.copy())
+
+
+def masked(values: dict[str, Any], which: Any) -> dict[str, Any]:
+    """Return values of worlds, and which worlds have them, as Gymnasium's infos hold them."""
+    infos = {}
+    for name, value in values.items():
+        infos[name], infos[f"_{name}"] = value, which
+    return infos
+
+
+def batched(env_type: type[WorldsEnv]) -> type[NPAVectorEnv]:
+    """Return the class of many worlds of the task of an environment of one."""
+    name = env_type.__name__
+    own = {
+        "__doc__": f"Worlds of `{name}`, batched on one device; its docstring describes both.",
+        "__module__": env_type.__module__,
+        "task_type": env_type.task_type,
+    }
+    return type(name.replace("Env", "VectorEnv"), (NPAVectorEnv,), own)
 
 
 # Arguments of environments that are no fields of a configuration, checked.

@@ -7,12 +7,10 @@ from typing import Any
 
 import numpy as np
 import torch
-from gymnasium.spaces import Box
 from numpy.typing import NDArray
 from torch import Tensor
 
-from npa_envs.checks import number_tensor
-from npa_envs.envs.multi.agents import AgentsEnv, joined_actions
+from npa_envs.envs.multi.vector import AgentsEnv, joined_actions
 from npa_envs.errors import MissingDependencyError, NPAError, shown, suggest
 
 try:
@@ -31,7 +29,25 @@ Outcome = tuple[dict[str, Any], dict[str, float], Flags, Flags, Infos]
 """What a step returns: observations, rewards, terminations, truncations, infos."""
 
 
-class CrowdEnv(AgentsEnv, pettingzoo.ParallelEnv):  # type: ignore[misc]
+class KnownAgents(pettingzoo.ParallelEnv):  # type: ignore[misc]
+    """An environment of PettingZoo with spaces by the names of its agents, checked."""
+
+    def observation_space(self, agent: str) -> Any:
+        """Return the space of an agent's observations, the same object each time."""
+        return self.observation_spaces[self._known(agent)]
+
+    def action_space(self, agent: str) -> Any:
+        """Return the space of an agent's actions, the same object each time."""
+        return self.action_spaces[self._known(agent)]
+
+    def _known(self, agent: str) -> str:
+        if agent not in self.observation_spaces:
+            hint = suggest(agent, self.possible_agents[:8])
+            raise NPAError(f"agent must be one that exists, got {shown(agent)}: {hint}")
+        return agent
+
+
+class CrowdEnv(AgentsEnv, KnownAgents):
     """A world whose particles belong to agents; subclasses say to which.
 
     Args:
@@ -52,47 +68,17 @@ class CrowdEnv(AgentsEnv, pettingzoo.ParallelEnv):  # type: ignore[misc]
         self.agents: list[str] = []
         self._live: list[int] = []
 
-    def observation_space(self, agent: str) -> Box:
-        """Return the space of an agent's observations, the same object each time.
-
-        Raises:
-            NPAError: There is no such agent.
-        """
-        self._check_agent(agent)
-        return self.observation_spaces[agent]
-
-    def action_space(self, agent: str) -> Box:
-        """Return the space of an agent's actions, the same object each time.
-
-        Raises:
-            NPAError: There is no such agent.
-        """
-        self._check_agent(agent)
-        return self.action_spaces[agent]
-
     def reset(
         self, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, Any], Infos]:
-        """Start an episode with all agents.
+        """Start an episode with all agents; return observations, and losses with their parts.
 
-        Args:
-            seed: Begin the sequence of episodes that belongs to this number; without it the
-                sequence goes on.
-            options: Not used.
-
-        Returns:
-            Observations, and each agent's loss with its parts.
-
-        Raises:
-            gymnasium.error.Error: The seed is no integer of at least 0.
+        A seed begins the sequence of episodes that belongs to it; without one the sequence goes on.
+        There are no options.
         """
-        keys = self._next_keys(seed, seed)
-        with self.worlds.device_context():
-            observation = self._episodes.start(np.arange(1), keys)
+        observation = self._start(np.arange(1), seed, seed)
         self._count_agents()
-        self._started = True
-        self._show()
-        infos = self._infos(self._episodes.account.numbers())
+        infos = self._infos(self.worlds.account.numbers())
         return self._handed_out(observation), infos
 
     def step(self, actions: Mapping[str, Any]) -> Outcome:
@@ -121,7 +107,7 @@ class CrowdEnv(AgentsEnv, pettingzoo.ParallelEnv):  # type: ignore[misc]
         shapes = [self.action_spaces[agent].shape for agent in acted]
         action = joined_actions(actions, acted, shapes, worlds.device)
         with worlds.device_context():
-            outcome = self._episodes.step(self._everyones(action))
+            outcome = worlds.step(self._everyones(action))
         ended, late = outcome.endings[0] > 0, bool(outcome.late[0])
         infos = self._infos(outcome.numbers)
         for k, agent in zip(live, acted, strict=True):
@@ -136,12 +122,7 @@ class CrowdEnv(AgentsEnv, pettingzoo.ParallelEnv):  # type: ignore[misc]
         return observations, rewards, terminations, dict.fromkeys(acted, late), infos
 
     def state(self) -> Any:
-        """Return what there is to know of the world, for central critics; see `state_space`.
-
-        Returns:
-            A row [position ; state ; 1] for each particle that an episode starts with, zeros for
-            those that are gone, shape [N, 2 + C + 1].
-        """
+        """Return what there is to know of the world, for central critics; see `state_space`."""
         return self._out(self._state()[0])
 
     def render(self) -> NDArray[np.uint8] | None:
@@ -157,25 +138,19 @@ class CrowdEnv(AgentsEnv, pettingzoo.ParallelEnv):  # type: ignore[misc]
     def place_particles(self, x: Any, s: Any) -> dict[str, Any]:
         """Replace the particles of all live agents, at no reward, and return the observations.
 
-        Args:
-            x: Positions [length units], shape [N now, 2].
-            s: States, dimensionless, shape [N now, C].
-
-        Raises:
-            NPAError: A shape is another one, or a number is not finite or beyond its limit.
+        Positions have shape [N now, 2], states [N now, C].
         """
         if not self.agents:
             raise NPAError("particles need live agents: call reset first")
         with self.worlds.device_context():
-            self.worlds.place(number_tensor("x", x)[None], number_tensor("s", s)[None])
-            observation = self._episodes.carry_over()
+            observation = self.worlds.place(x, s)
         self._show()
         return self._handed_out(observation)
 
     def _count_agents(self) -> None:
         """Take down who is to act next."""
         played = len(self.possible_agents)
-        self._live = np.flatnonzero(self._episodes.live[0, :played]).tolist()
+        self._live = np.flatnonzero(self.worlds.live[0, :played]).tolist()
         self.agents = [self.possible_agents[k] for k in self._live]
 
     def _everyones(self, action: Tensor) -> Tensor:
@@ -192,7 +167,7 @@ class CrowdEnv(AgentsEnv, pettingzoo.ParallelEnv):  # type: ignore[misc]
         """Return what `info` says of live agents' losses."""
         rows = torch.stack(list(numbers.values()))[:, 0].tolist()
         columns = dict(zip(numbers, rows, strict=True))
-        species = self._episodes.species
+        species = self.worlds.agent_species
         return {
             agent: {"species": int(species[k])} | {name: row[k] for name, row in columns.items()}
             for k, agent in zip(self._live, self.agents, strict=True)
@@ -200,16 +175,11 @@ class CrowdEnv(AgentsEnv, pettingzoo.ParallelEnv):  # type: ignore[misc]
 
     def _handed_out(self, observation: Tensor) -> dict[str, Any]:
         """Return the rows of what all particles perceive, [1, N, P], that are of `agents`."""
-        rows, spans = self._out(observation[0]), self._episodes.spans
+        rows, spans = self._out(observation[0]), self.worlds.spans
         return {
-            agent: rows[spans[k].start] if self._by_particle else rows[spans[k]]
+            agent: rows[spans[k].start] if self.worlds.by_particle else rows[spans[k]]
             for k, agent in zip(self._live, self.agents, strict=True)
         }
-
-    def _check_agent(self, agent: str) -> None:
-        if agent not in self.observation_spaces:
-            hint = suggest(agent, self.possible_agents[:8])
-            raise NPAError(f"agent must be one that exists, got {shown(agent)}: {hint}")
 
 
 def in_turns(parallel: Any, *, clips: bool = False) -> Any:
@@ -220,13 +190,7 @@ def in_turns(parallel: Any, *, clips: bool = False) -> Any:
 
 def register(name: str, module: str, keywords: dict[str, Any]) -> None:
     """Put both kinds of an environment into PettingZoo's registries, unless they are there."""
-    # PettingZoo before 1.27 has no registries.
-    if not hasattr(pettingzoo, "register"):
-        return
-    kinds = (
-        ("parallel", pettingzoo.parallel_registry, "parallel_env"),
-        ("aec", pettingzoo.aec_registry, "env"),
-    )
-    for kind, registry, function in kinds:
-        if name not in registry:
+    for kind, function in (("parallel", "parallel_env"), ("aec", "env")):
+        # PettingZoo before 1.27 has no registries.
+        if name not in getattr(pettingzoo, f"{kind}_registry", {name}):
             pettingzoo.register(kind, name, f"{module}:{function}", kwargs=keywords)

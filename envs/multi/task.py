@@ -89,12 +89,8 @@ class SpeciesConfig(WorldConfig):
     def __post_init__(self) -> None:
         """Check every field; as `WorldConfig`."""
         super().__post_init__()
-        check_positive(self, int, "species_count", "max_cycles")
-        if self.species_count > LARGEST_COUNT:
-            raise NPAError(
-                f"species_count must be at most {LARGEST_COUNT}, got {self.species_count}: "
-                "give each of fewer species more particles"
-            )
+        check_positive(self, int, "max_cycles")
+        check_positive(self, int, "species_count", at_most=LARGEST_COUNT)
         self._check_counts()
         check_positive(self, float, "seed_radius")
         check_non_negative(self, "seed_distance")
@@ -141,8 +137,7 @@ class SpeciesConfig(WorldConfig):
             raise NPAError(
                 f"particle_counts must be {self.species_count} whole numbers of at least 1, one "
                 f"for each of species_count = {self.species_count}, got {shown(given)}: for "
-                "example "
-                f"particle_counts={(64,) * self.species_count}"
+                f"example particle_counts={(64,) * self.species_count}"
             )
         if not given and self.particle_count < self.species_count:
             raise NPAError(
@@ -289,11 +284,3 @@ class SpeciesTask(WorldTask[Any]):
         colours = torch.tensor([colorsys.hsv_to_rgb(hue, 0.85, 0.8) for hue in hues]).to(s)
         own = (colours[population.species] - COLOUR_OFFSET).expand(len(x), -1, -1)
         return self.draw_particles(x, own, "particles")
-
-
-def by_species(losses: list[Tensor], population: Population) -> Tensor:
-    """Return losses of the species that are there as one tensor, shape [B, K], 0 for the others."""
-    remaining = iter(losses)
-    nothing = population.x.new_zeros(len(population.x))
-    found = [next(remaining) if count else nothing for count in population.counts]
-    return torch.stack(found, dim=1)

@@ -1,24 +1,32 @@
-"""Many worlds of several species, batched on the device."""
+"""Agents that own particles of shared worlds: names, spaces, actions; and many worlds, batched."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from functools import cached_property
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
 import torch.nn.functional as F
 from gymnasium import Space
+from gymnasium.spaces import Box
+from gymnasium.utils import seeding
 from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 from torch import Tensor
 
-from npa_envs.envs.core.vector import checked_count, checked_mode, worlds_to_reset
-from npa_envs.envs.multi.agents import AgentsEnv, joined_actions
-from npa_envs.envs.multi.worlds import AgentOutcome
-from npa_envs.errors import NPAError
+from npa_envs.envs.core.base import ShownEnv, action_tensor
+from npa_envs.envs.core.vector import (
+    checked_count,
+    checked_mode,
+    plain_seed,
+    rng_keys,
+    worlds_to_reset,
+)
+from npa_envs.envs.multi.worlds import AgentOutcome, SpeciesWorlds
+from npa_envs.errors import DivergedError, NPAError, shown
 from npa_envs.world.cuda_graph import to_device_async
 
 ByAgent = dict[str, Any]
@@ -26,6 +34,82 @@ ByAgent = dict[str, Any]
 Infos = dict[str, dict[str, Any]]
 BatchOutcome = tuple[ByAgent, ByAgent, ByAgent, ByAgent, Infos]
 """What a step returns: observations, rewards, terminations, truncations, infos."""
+
+
+class AgentsEnv(ShownEnv):
+    """What environments of agents are made of, be it one world or many."""
+
+    metadata: ClassVar[dict[str, Any]] = {
+        "name": "npa_multispecies_v0",
+        "render_modes": ["rgb_array", "human"],
+        "render_fps": 25,
+        "is_parallelizable": True,
+    }
+
+    def __init__(
+        self, task: str, keywords: dict[str, Any], world_count: int, *, by_particle: bool
+    ) -> None:
+        self.worlds = worlds = SpeciesWorlds(task, keywords, world_count, by_particle=by_particle)
+        """The particles."""
+        self._task_name = task
+        self.config = worlds.config
+        self.render_mode = self.config.render_mode
+        self.max_cycles = self.config.max_cycles
+        """Steps after which an episode is cut off for all."""
+        played = self.config.played_counts
+        word, count = ("particle", sum(played)) if by_particle else ("species", len(played))
+        self.possible_agents = [f"{word}_{k}" for k in range(count)]
+        """Names of the agents."""
+        limit = worlds.physics.limits.perception
+        self._observation_spaces: dict[str, Box] = {}
+        self._action_spaces: dict[str, Box] = {}
+        for agent, span in zip(self.possible_agents, worlds.spans[:count], strict=True):
+            ahead = () if by_particle else (span.stop - span.start,)
+            seen, done = (*ahead, worlds.perception_dim), (*ahead, worlds.physics.action_dim)
+            self._observation_spaces[agent] = Box(-limit, limit, seen, np.float32)
+            self._action_spaces[agent] = Box(-1.0, 1.0, done, np.float32)
+        # Position, state, present.
+        limits, physics = worlds.physics.limits, worlds.physics
+        high = [limits.position] * physics.space_dim + [limits.state] * physics.state_dim
+        rows = np.tile(np.float32([*high, 1.0]), (worlds.particle_count, 1))
+        self._state_space = Box(rows * np.float32([-1.0] * len(high) + [0.0]), rows)
+        self.np_random: np.random.Generator | None = None
+
+    def close(self) -> None:
+        """Close the window, if there is one."""
+        self._close_window()
+
+    def _start(self, worlds: NDArray[np.int64], seed: Any, first: Any) -> Tensor:
+        """Start episodes in some worlds, [M]; return what is perceived in all, [B, N, P].
+
+        The seed is what `reset` was given; the generator of later keys begins with the first one.
+        """
+        keys, batch = None, self.worlds
+        # After a first reset that was refused there are no worlds to go on with.
+        if seed is not None or not self._started:
+            self.np_random, _ = seeding.np_random(plain_seed(first))
+            keys = rng_keys(seed, batch.world_count, self.np_random)[worlds]
+        with batch.device_context():
+            observation: Tensor = batch.start(worlds, keys)
+            if len(worlds) < batch.world_count:
+                observation = batch.perceived()
+        self._started = True
+        self._show()
+        return observation
+
+    def _state(self) -> Tensor:
+        if not self._started:
+            raise NPAError("state needs a world: call reset first")
+        state: Tensor = self.worlds.state()
+        return state
+
+    def _pictures(self) -> NDArray[np.uint8] | None:
+        if not self._started:
+            raise NPAError("render needs a world: call reset first")
+        return super()._pictures()
+
+    def _show(self) -> None:
+        self._show_in_window(f"{self.metadata['name']}: {self._task_name}")
 
 
 class MultiSpeciesVectorEnv(AgentsEnv):
@@ -102,33 +186,17 @@ class MultiSpeciesVectorEnv(AgentsEnv):
     def reset(
         self, seed: int | Sequence[int] | None = None, options: dict[str, Any] | None = None
     ) -> tuple[ByAgent, Infos]:
-        """Start episodes with all species.
-
-        Args:
-            seed: Begin the sequences of episodes of seed, seed + 1, ..., or of the seeds in a list;
-                without it the sequences go on.
-            options: `{"reset_mask": mask}` resets only the worlds where the mask, bool, shape [B],
-                is True; the others are left as they are, bit for bit.
+        """Start episodes with all species; arguments are those of `NPAVectorEnv.reset`.
 
         Returns:
             Observations of all worlds, and infos: losses with their parts, and who is live.
-
-        Raises:
-            NPAError: The mask or the seeds have a wrong shape.
         """
         chosen = worlds_to_reset(options, self.world_count)
         if not self._started and len(chosen) < self.world_count:
             raise NPAError("reset_mask needs worlds to leave alone: reset all of them first")
-        keys = self._next_keys(seed, int(seed) if isinstance(seed, int | np.integer) else None)
-        keys = None if keys is None else keys[chosen]
-        with self.worlds.device_context():
-            observation = self._episodes.start(chosen, keys)
-            if len(chosen) < self.world_count:
-                observation = self.worlds.perceived()
-        self._started = True
-        self._show()
-        live = self._episodes.live
-        return self._rows(observation), self._infos(self._episodes.account.numbers(), live)
+        first = int(seed) if isinstance(seed, int | np.integer) else None
+        observation, worlds = self._start(chosen, seed, first), self.worlds
+        return self._rows(observation), self._infos(worlds.account.numbers(), worlds.live)
 
     def step(self, actions: Mapping[str, Any]) -> BatchOutcome:
         """Apply every species' actions in all worlds, and perceive.
@@ -158,29 +226,24 @@ class MultiSpeciesVectorEnv(AgentsEnv):
         with worlds.device_context():
             action = joined_actions(actions, self.possible_agents, shapes, worlds.device)
             rest = worlds.particle_count - action.shape[1]
-            outcome = self._episodes.step(F.pad(action, (0, 0, 0, rest)) if rest else action)
+            outcome = worlds.step(F.pad(action, (0, 0, 0, rest)) if rest else action)
             observation, final = outcome.observation, None
             over = np.flatnonzero(~worlds.open)
             if len(over) and self.autoreset_mode is AutoresetMode.SAME_STEP:
                 final = self._rows(observation), over
-                seen = self._episodes.start(over)
+                seen = worlds.start(over)
                 observation = observation.index_copy(0, to_device_async(over, worlds.device), seen)
         self._show()
         return (
             self._rows(observation),
             self._columns(outcome.rewards.float()),
-            self._columns(self._sent(outcome.endings > 0)),
-            self._columns(self._sent(outcome.acted & outcome.late[:, None])),
+            self._columns(outcome.endings > 0),
+            self._columns(outcome.acted & outcome.late[:, None]),
             self._step_infos(outcome, final),
         )
 
     def state(self) -> Any:
-        """Return what there is to know of the worlds, for central critics.
-
-        Returns:
-            For each world a row [position ; state ; 1] for each particle that an episode starts
-            with, zeros for those that are gone, shape [B, N, 2 + C + 1].
-        """
+        """Return what there is to know of the worlds, for central critics, [B, N, 2 + C + 1]."""
         return self._out(self._state())
 
     def render(self) -> tuple[NDArray[np.uint8], ...] | None:
@@ -193,7 +256,7 @@ class MultiSpeciesVectorEnv(AgentsEnv):
         own = to_device_async(acted, self.worlds.device)
         everyone = torch.stack(list(numbers.values())).float()
         rows = self._out(torch.where(own, everyone, 0.0).movedim(2, 0).contiguous())
-        live = self._columns(self._sent(self._episodes.live.copy()))
+        live = self._columns(self.worlds.live)
         return {
             agent: {"species": k, "live": live[agent]} | dict(zip(numbers, rows[k], strict=True))
             for k, agent in enumerate(self.possible_agents)
@@ -203,7 +266,7 @@ class MultiSpeciesVectorEnv(AgentsEnv):
         self, outcome: AgentOutcome, final: tuple[ByAgent, NDArray[np.int64]] | None
     ) -> Infos:
         infos = self._infos(outcome.numbers, outcome.acted)
-        acted = self._columns(self._sent(outcome.acted))
+        acted = self._columns(outcome.acted)
         reasons = outcome.reasons
         for k, agent in enumerate(self.possible_agents):
             infos[agent]["acted"] = acted[agent]
@@ -212,25 +275,65 @@ class MultiSpeciesVectorEnv(AgentsEnv):
         if final is not None:
             which = np.zeros(self.world_count, dtype=bool)
             which[final[1]] = True
-            restarted = self._out(self._sent(which))
+            restarted = self._sent(which)
             for agent, rows in final[0].items():
                 infos[agent] |= {"final_obs": rows, "_final_obs": restarted}
         return infos
 
     def _rows(self, observation: Tensor) -> ByAgent:
         """Return what particles perceive, [B, N, P], agent by agent."""
-        rows, spans = self._out(observation), self._episodes.spans
+        rows, spans = self._out(observation), self.worlds.spans
         return {agent: rows[:, spans[k]] for k, agent in enumerate(self.possible_agents)}
 
-    def _columns(self, values: Tensor) -> ByAgent:
-        """Return values of shape [B, K] agent by agent, shape [B] each."""
-        columns = self._out(values.T.contiguous())
+    def _columns(self, values: Any) -> ByAgent:
+        """Return values, [B, K], agent by agent, shape [B] each."""
+        sent = isinstance(values, Tensor)
+        columns = self._out(values.T.contiguous()) if sent else self._sent(values.T.copy())
         return {agent: columns[k] for k, agent in enumerate(self.possible_agents)}
 
-    def _sent(self, values: NDArray[Any]) -> Tensor:
-        """Return an array where results are wanted: on the device, or not."""
-        return (
-            to_device_async(values, self.worlds.device)
-            if self.config.output == "torch"
-            else torch.from_numpy(values)
+
+def joined_actions(
+    actions: Any, agents: Sequence[str], shapes: Sequence[tuple[int, ...]], device: torch.device
+) -> Tensor:
+    """Return the actions of all live agents as rows, float32, shape [N, A] or [B, N, A]."""
+    if not isinstance(actions, Mapping):
+        raise NPAError(
+            f"actions must be a dict with an action for each live agent, got "
+            f"{type(actions).__name__}: see env.agents"
         )
+    missing = [agent for agent in agents if agent not in actions]
+    if missing:
+        raise NPAError(
+            f"actions must have one for each live agent, got none for {_names(missing)}: "
+            "zeros leave an agent's particles as they are"
+        )
+    live = set(agents)
+    extra = [str(agent) for agent in actions if agent not in live]
+    if extra:
+        raise NPAError(
+            f"actions must be of live agents only, got one for {_names(extra)}: agents that ended "
+            "get no more actions until reset; see env.agents"
+        )
+    rows = [
+        action_tensor(
+            f"actions[{shown(agent)}]", actions[agent], shape, f"env.action_space({shown(agent)})"
+        )
+        for agent, shape in zip(agents, shapes, strict=True)
+    ]
+    # What has one row only has no dimension for it.
+    blocks = [row if row.ndim > 1 else row[None] for row in rows]
+    joined = torch.cat([block.to(device) for block in blocks], dim=-2)
+    if not bool(torch.isfinite(joined).all()):
+        bad = next(k for k, row in enumerate(rows) if not bool(torch.isfinite(row).all()))
+        wrong = rows[bad][~torch.isfinite(rows[bad])]
+        raise DivergedError(
+            f"actions[{shown(agents[bad])}] must be finite, got {wrong[0].item()} ({wrong.numel()} "
+            "such "
+            "numbers): check the policy; the world is as it was"
+        )
+    return joined
+
+
+def _names(agents: Sequence[str]) -> str:
+    some = ", ".join(agents[:3])
+    return some if len(agents) <= 3 else f"{some} and {len(agents) - 3} more"

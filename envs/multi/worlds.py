@@ -1,8 +1,6 @@
 """Worlds that several species share: episodes, pay, and particles that come and go.
 
-`AgentReferee` steps agents, pays them and ends them. `SpeciesBatch` holds their particles: how
-they start, act, perceive, and leave. It imports neither Gymnasium nor
-PettingZoo. A single world is a batch of one; world k of a batch is, bit for bit, that world alone.
+A single world is a batch of one; world k of a batch is, bit for bit, that world alone.
 """
 
 from __future__ import annotations
@@ -15,9 +13,9 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from npa_envs import world_mean
-from npa_envs.envs.core.memory import OBSERVATION_COPIES
+from npa_envs.checks import number_tensor
 from npa_envs.envs.core.referee import total
-from npa_envs.envs.core.worlds import WorldState
+from npa_envs.envs.core.state import OBSERVATION_COPIES, WorldState
 from npa_envs.envs.multi.task import Population, SpeciesTask
 from npa_envs.envs.multi.tasks import task_type
 from npa_envs.errors import DivergedError
@@ -72,155 +70,6 @@ class AgentOutcome(NamedTuple):
         """Why agents' episodes ended, in words, None where they go on or went before, [B, A]."""
         late = np.where(self.acted & self.late[:, None], len(REASONS) - 1, 0)
         return REASONS[np.where(self.endings > 0, self.endings, late)]
-
-
-class AgentReferee:
-    """B worlds of a task with their agents, the same for every way in which agents are asked.
-
-    Args:
-        task: A name from `npa_envs.envs.multi.TASKS`.
-        keywords: Fields of the task's configuration.
-        world_count: Worlds B.
-        by_particle: Whether every particle is an agent, and not every species.
-
-    Raises:
-        NPAError: There is no such task, a keyword is unknown or wrong, or the worlds do not fit
-            into memory.
-    """
-
-    def __init__(
-        self, task: str, keywords: dict[str, Any], world_count: int, *, by_particle: bool
-    ) -> None:
-        found = task_type(task)
-        self.config = config = found.config_type.from_keywords(keywords)
-        self.worlds = worlds = SpeciesBatch(found, config, world_count, by_particle=by_particle)
-        sizes = np.bincount(worlds.owner)
-        ends = np.cumsum(sizes)
-        self.spans = [slice(int(e - n), int(e)) for e, n in zip(ends, sizes, strict=True)]
-        """Where each agent's particles stand."""
-        self.species = worlds.species[ends - 1]
-        """Species of each agent, int64, shape [A]."""
-        self.live = np.zeros((world_count, len(sizes)), dtype=bool)
-        """Which agents are to act next, shape [B, A]."""
-        device = worlds.device
-        kinds = to_device_async(self.species, device)
-        self.account = AgentReturns(worlds.task, kinds, world_count, team=config.reward == "team")
-        """The agents' losses."""
-        self._owner = to_device_async(worlds.owner, device)
-        self._by_particle = by_particle
-        deaths = dict(config.deaths)
-        self._last_step = np.array([deaths.get(int(k), 0) for k in self.species])
-        self._side_stream = SideStream(device) if device.type == "cuda" else None
-        self._host_left = torch.zeros(
-            self.live.shape, dtype=torch.bool, device="cpu", pin_memory=device.type == "cuda"
-        )
-
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        """Pin memory again that the device writes to."""
-        self.__dict__.update(state)
-        if self._side_stream is not None:
-            self._host_left = self._host_left.pin_memory()
-
-    def start(self, worlds: NDArray[np.int64], keys: Tensor | None = None) -> Tensor:
-        """Start episodes in some worlds, [M], with all agents; return what is perceived, [M, N, P].
-
-        Keys are those of `SpeciesBatch.start`.
-        """
-        population = self.worlds.start(worlds, keys)
-        seen: Tensor
-        parts, seen = self.worlds.opened(population)
-        self.account.open(parts, to_device_async(worlds, self.worlds.device))
-        self.live[worlds] = True
-        return seen
-
-    def step(self, action: Tensor) -> AgentOutcome:
-        """Apply actions, pay, and take agents that ended out of their worlds.
-
-        What the host reads is whether agents left their worlds, one byte for each agent.
-
-        Args:
-            action: Finite, on the device, shape [B, N, A]; of agents that ended it is not read.
-
-        Raises:
-            DivergedError: An agent is out of bounds, and `on_divergence` is "raise".
-        """
-        worlds, acted = self.worlds, self.live.copy()
-        worlds.act(action)
-        left = worlds.left()
-        if self.config.on_divergence == "ignore":
-            left = torch.zeros_like(left)
-        self._host_left.copy_(left, non_blocking=True)
-        if self._side_stream is not None:
-            self._side_stream.mark()
-        live = to_device_async(acted, worlds.device)
-        rewards = self.account.pay(worlds.measured(stepped=True), live, left & live)
-        numbers = self.account.step_numbers()
-        observation = worlds.perceived(stepped=True)
-        # The device goes on while the host learns who left.
-        if self._side_stream is not None:
-            self._side_stream.wait()
-        fled = self._host_left.numpy() & acted
-        if self.config.on_divergence == "raise" and fled.any():
-            raise DivergedError(self._report(fled))
-        endings = self._endings(fled)
-        late = worlds.open & (worlds.elapsed >= self.config.max_cycles)
-        self.live &= endings == 0
-        if endings.any():
-            observation = self._taken_out(endings, observation)
-        self.live[late] = False
-        if (worlds.open & self._deserted()).any():
-            worlds.close(self._deserted())
-        return AgentOutcome(observation, rewards, numbers, acted, endings, late)
-
-    def carry_over(self) -> Tensor:
-        """Count losses from now on, at no reward, and return what is perceived, [B, N, P]."""
-        self.account.carry_over(self.worlds.measured())
-        seen: Tensor = self.worlds.perceived()
-        return seen
-
-    def _deserted(self) -> NDArray[np.bool_]:
-        """Return in which worlds no agent is to act, shape [B]."""
-        return np.asarray(~self.live.any(axis=1))
-
-    def _endings(self, left: NDArray[np.bool_]) -> NDArray[np.uint8]:
-        """Return why agents' episodes end by themselves in this step, shape [B, A]."""
-        worlds, live = self.worlds, self.live
-        endings = np.zeros(live.shape, dtype=np.uint8)
-        endings[live & (self._last_step == worlds.elapsed[:, None])] = REMOVED
-        endings[live & left] = LEFT
-        staying = live & (endings == 0)
-        for world in np.flatnonzero((live & ~staying).any(axis=1)):
-            present = self.species[staying[world]]
-            counts = np.bincount(present, minlength=self.config.species_count)
-            if worlds.task.is_over(tuple(counts.tolist())):
-                endings[world, staying[world]] = ALONE
-        return endings
-
-    def _report(self, fled: NDArray[np.bool_]) -> str:
-        """Return an error's message about agents that are out of bounds, shape [B, A]."""
-        physics, word = self.worlds.physics, "particle" if self._by_particle else "species"
-        places = np.argwhere(fled)
-        names = [f"{word}_{agent} of world {world}" for world, agent in places[:LARGEST_REPORT]]
-        more = f" and {len(places) - len(names)} more" if len(places) > len(names) else ""
-        return (
-            f"agents must have a particle within position_limit = {physics.limits.position:g} and "
-            f"observation_limit = {physics.limits.state:g}, but {', '.join(names)}{more} had none "
-            f"after step {int(self.worlds.elapsed[places[0, 0]])}: take smaller actions, raise the "
-            "limits, or choose on_divergence='terminate'"
-        )
-
-    def _taken_out(self, endings: NDArray[np.uint8], observation: Tensor) -> Tensor:
-        """Take out particles of agents that ended; return what is perceived without them."""
-        worlds = self.worlds
-        worlds.close(self._deserted())
-        worlds.remove((endings == REMOVED) | (endings == LEFT))
-        if not worlds.open.any():
-            return observation
-        # What others lose or gain by a death is nobody's merit: the next step counts from now.
-        seen = self.carry_over()
-        stays = (endings == 0) & worlds.open[:, None]
-        where = to_device_async(stays, worlds.device)[:, self._owner, None]
-        return torch.where(where, seen, observation)
 
 
 class AgentReturns:
@@ -297,56 +146,87 @@ def _stacked(parts: Parts) -> Tensor:
     return torch.stack(list(parts.values())).double()
 
 
-class SpeciesBatch(WorldState):
-    """B worlds; particles of each species lie one after the other, and those removed are gone.
+class SpeciesWorlds(WorldState):
+    """B worlds of a task with their agents; particles of each species lie one after the other.
 
     A world that lost particles is computed without them. Worlds that have the same ones are
     computed together, as a cohort: all of the batch as long as nobody is gone.
+
+    Args:
+        task: A name from `npa_envs.envs.multi.TASKS`.
+        keywords: Fields of the task's configuration.
+        world_count: Worlds B.
+        by_particle: Whether every particle is an agent, and not every species.
+
+    Raises:
+        NPAError: There is no such task, a keyword is unknown or wrong, or the worlds do not fit
+            into memory.
     """
 
     @makes_plain_tensors
     def __init__(
-        self, task_type: type[SpeciesTask], config: Any, world_count: int, *, by_particle: bool
+        self, task: str, keywords: dict[str, Any], world_count: int, *, by_particle: bool
     ) -> None:
-        self.config = config
-        count = sum(config.counts)
-        self._appended = 0
+        found = task_type(task)
+        self.config = config = found.config_type.from_keywords(keywords)
+        count, appended = sum(config.counts), 0
         if config.perception == "per_species":
             # Numbers that a particle perceives of species one by one.
-            self._appended = config.species_count * (1 + task_type.space_dim)
-        by_species = 4 * OBSERVATION_COPIES * world_count * count * self._appended
-        super().__init__(config, task_type, world_count, count, by_species)
-        self.task = task_type(config, self.device)
+            appended = config.species_count * (1 + found.space_dim)
+        by_species = 4 * OBSERVATION_COPIES * world_count * count * appended
+        super().__init__(config, found, world_count, count, by_species)
+        self.perception_dim = self.physics.perception_dim + appended
+        """Numbers that a particle perceives: P, and K (1 + D) more with per-species perception."""
+        self.task = found(config, self.device)
+        self.by_particle = by_particle
         self.species = np.repeat(np.arange(config.species_count), config.counts)
         """Species of each particle that an episode starts with, int64, shape [N]."""
         self.owner = np.arange(count) if by_particle else self.species
         """Number of the agent that owns each of them, never falling, int64, shape [N]."""
-        self._judge = AgentLosses(self.task, self.physics, self.owner, by_particle)
-        self.there = np.zeros((world_count, self._judge.agent_count), dtype=bool)
+        sizes = np.bincount(self.owner)
+        ends = np.cumsum(sizes)
+        self.spans = [slice(int(e - n), int(e)) for e, n in zip(ends, sizes, strict=True)]
+        """Where each agent's particles stand."""
+        self.agent_species = self.species[ends - 1]
+        """Species of each agent, int64, shape [A]."""
+        self.live = np.zeros((world_count, len(sizes)), dtype=bool)
+        """Which agents are to act next, shape [B, A]."""
+        self.there = np.zeros_like(self.live)
         """Whether each agent's particles are in its world, shape [B, A]."""
         self.open = np.zeros(world_count, dtype=bool)
         """Whether each world goes on; the others stay as they are, shape [B]."""
         self.elapsed = np.zeros(world_count, dtype=np.int64)
         """Steps since the start of each episode, shape [B]."""
-        everyone, all_worlds = np.arange(count), np.arange(world_count)
+        device, team = self.device, config.reward == "team"
+        kinds = to_device_async(self.agent_species, device)
+        self.account = AgentReturns(self.task, kinds, world_count, team=team)
+        """The agents' losses."""
+        self._owner = to_device_async(self.owner, device)
+        deaths = dict(config.deaths)
+        self._last_step = np.array([deaths.get(int(k), 0) for k in self.agent_species])
+        self._side_stream = SideStream(device) if device.type == "cuda" else None
+        self._host_left = torch.zeros(
+            self.live.shape, dtype=torch.bool, device="cpu", pin_memory=device.type == "cuda"
+        )
+        everyone, worlds = np.arange(count), np.arange(world_count)
         # Its work is recorded on CUDA, and worlds come back to it when their next episodes start.
-        self._whole = Cohort(self._judge, all_worlds, everyone, self.x, self.s, self.random)
+        parts = self.task, self.physics, self.owner, by_particle
+        self._whole = Cohort(*parts, worlds, everyone, self.x, self.s, self.random)
         self._cohorts: list[Cohort] | None = None
 
-    @property
-    def perception_dim(self) -> int:
-        """Numbers that a particle perceives: P, and K (1 + D) more with per-species perception."""
-        return self.physics.perception_dim + self._appended
-
-    @property
-    def agent_count(self) -> int:
-        """Agents of a world, A."""
-        return self._judge.agent_count
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Pin memory again that the device writes to."""
+        self.__dict__.update(state)
+        if self._side_stream is not None:
+            self._host_left = self._host_left.pin_memory()
 
     @torch.no_grad()
     @makes_plain_tensors
-    def start(self, worlds: NDArray[np.int64], keys: Tensor | None = None) -> Population:
-        """Start episodes in some worlds, [M], and return their particles."""
+    def start(self, worlds: NDArray[np.int64], keys: Tensor | None = None) -> Tensor:
+        """Start episodes in some worlds, [M], with all agents; return what is perceived, [M, N, P].
+
+        Keys are those of `next_streams`.
+        """
         self._disband()
         index = to_device_async(worlds, self.device)
         random = self.next_streams(index, keys)
@@ -354,89 +234,105 @@ class SpeciesBatch(WorldState):
         self.random.put(index, random)
         self.x.index_copy_(0, index, x)
         self.s.index_copy_(0, index, s)
-        self.there[worlds] = self.open[worlds] = True
+        self.live[worlds] = self.there[worlds] = self.open[worlds] = True
         self.elapsed[worlds] = 0
-        return self._whole.population._replace(x=x.contiguous(), s=s)
+        population = self._whole.population._replace(x=x.contiguous(), s=s)
+        parts, seen = self._whole.measured(population), self._whole.perceived(population)
+        self.account.open(parts, index)
+        return seen
 
     @torch.no_grad()
     @makes_plain_tensors
-    def act(self, action: Tensor) -> None:
-        """Apply actions to the worlds that go on; nothing waits for the device."""
+    def step(self, action: Tensor) -> AgentOutcome:
+        """Apply actions, pay, and take agents that ended out of their worlds.
+
+        What the host reads is whether agents left their worlds, one byte for each agent.
+
+        Args:
+            action: Finite, on the device, shape [B, N, A]; of agents that ended it is not read.
+
+        Raises:
+            DivergedError: An agent is out of bounds, and `on_divergence` is "raise".
+        """
+        acted, left = self.live.copy(), torch.zeros_like(self._host_left, device=self.device)
         for cohort in self.cohorts:
             cohort.act(action if cohort is self._whole else action[cohort.places])
+            if self.config.on_divergence != "ignore":
+                left.index_copy_(0, cohort.worlds, cohort.gone)
         self.elapsed[self.open] += 1
+        self._host_left.copy_(left, non_blocking=True)
+        if self._side_stream is not None:
+            self._side_stream.mark()
+        live = to_device_async(acted, self.device)
+        rewards = self.account.pay(self._measured(stepped=True), live, left & live)
+        numbers = self.account.step_numbers()
+        observation = self.perceived(stepped=True)
+        # The device goes on while the host learns who left.
+        if self._side_stream is not None:
+            self._side_stream.wait()
+        fled = self._host_left.numpy() & acted
+        if self.config.on_divergence == "raise" and fled.any():
+            raise DivergedError(self._report(fled))
+        endings = self._endings(fled)
+        late = self.open & (self.elapsed >= self.config.max_cycles)
+        self.live &= endings == 0
+        if endings.any():
+            observation = self._taken_out(endings, observation)
+        self.live[late] = False
+        self._close_deserted()
+        return AgentOutcome(observation, rewards, numbers, acted, endings, late)
 
     @torch.no_grad()
     @makes_plain_tensors
     def perceived(self, *, stepped: bool = False) -> Tensor:
         """Return what particles perceive, shape [B, N, P]; zeros where they or their world ended.
 
-        `stepped` says, also below, that nothing has changed since the last `act`.
+        `stepped` says that nothing has changed since the cohorts acted.
         """
         if self.cohorts == [self._whole]:
             return self._whole.perceived(stepped=stepped)
-        shape = self.world_count, self.particle_count, self.perception_dim
-        seen = self.x.new_zeros(shape)
+        seen = self.x.new_zeros(self.world_count, self.particle_count, self.perception_dim)
         for cohort in self.cohorts:
             seen[cohort.places] = cohort.perceived(stepped=stepped)
         return seen
 
-    @torch.no_grad()
-    @makes_plain_tensors
-    def measured(self, *, stepped: bool = False) -> dict[str, Tensor]:
+    def _measured(self, *, stepped: bool = False) -> dict[str, Tensor]:
         """Return the parts of every agent's loss, float32, shape [B, A]; 0 of those that ended."""
         found: dict[str, Tensor] = {}
         for cohort in self.cohorts:
             for name, part in (cohort.parts if stepped else cohort.measured()).items():
                 if name not in found:
-                    found[name] = part.new_zeros(self.world_count, self.agent_count)
+                    found[name] = part.new_zeros(self.live.shape)
                 found[name].index_copy_(0, cohort.worlds, part)
         return found
 
     @torch.no_grad()
     @makes_plain_tensors
-    def opened(self, population: Population) -> tuple[dict[str, Tensor], Tensor]:
-        """Return losses, [M, A], and perception, [M, N, P], of worlds that `start` returned."""
-        judge = self._judge
-        return judge.measured(population, self._whole.columns), judge.perceived(population)
+    def place(self, x: Any, s: Any) -> Tensor:
+        """Replace the particles that are in a single world; return what is perceived, [1, N, P].
 
-    @torch.no_grad()
-    @makes_plain_tensors
-    def left(self) -> Tensor:
-        """Return which agents have no particle within bounds after a step, bool, shape [B, A]."""
-        gone = torch.zeros(self.world_count, self.agent_count, dtype=torch.bool, device=self.device)
-        for cohort in self.cohorts:
-            gone.index_copy_(0, cohort.worlds, cohort.gone)
-        return gone
-
-    def remove(self, agents: NDArray[np.bool_]) -> None:
-        """Take the particles of some agents, shape [B, A], out of their worlds."""
-        self._disband()
-        self.there &= ~agents
-
-    def close(self, worlds: NDArray[np.bool_]) -> None:
-        """Let some worlds, shape [B], stay as they are until they start again."""
-        self._disband()
-        self.open &= ~worlds
-
-    def place(self, x: Any, s: Any) -> None:
-        """Replace the particles that are in the worlds, which all have the same ones."""
+        Losses count from now on, at no reward.
+        """
         (cohort,) = self.cohorts
         there = cohort.population
-        count = there.x.shape[1]
-        placed = self.checked_particles(x, s, self.world_count, count)
+        one = (number_tensor(name, value)[None] for name, value in (("x", x), ("s", s)))
+        placed = self.checked_particles(*one, 1, there.x.shape[1])
         there.x.copy_(placed.x)
         there.s.copy_(placed.s)
+        return self._carry_over()
+
+    def _carry_over(self) -> Tensor:
+        self.account.carry_over(self._measured())
+        seen: Tensor = self.perceived()
+        return seen
 
     def population(self, world: int) -> Population:
         """Return the particles that are in a world."""
         self._collect()
         columns = np.flatnonzero(self.there[world][self.owner])
-        kind = self.species[columns]
-        counts = np.bincount(kind, minlength=self.config.species_count)
         index = to_device_async(columns, self.device)
         x, s = self.x[world : world + 1, index], self.s[world : world + 1, index]
-        return Population(x, s, tuple(counts.tolist()), to_device_async(kind, self.device))
+        return population_of(x, s, self.species[columns], self.config.species_count)
 
     @torch.no_grad()
     @makes_plain_tensors
@@ -450,6 +346,53 @@ class SpeciesBatch(WorldState):
     def pictures(self, count: int) -> NDArray[np.uint8]:
         """Return pictures of the first worlds, uint8, shape [count, R, R, 3]."""
         return np.concatenate([self.task.draw(self.population(k)) for k in range(count)])
+
+    def _close_deserted(self) -> None:
+        """Let worlds in which no agent is to act stay as they are until they start again."""
+        deserted = self.open & ~self.live.any(axis=1)
+        if deserted.any():
+            self._disband()
+            self.open &= ~deserted
+
+    def _endings(self, left: NDArray[np.bool_]) -> NDArray[np.uint8]:
+        """Return why agents' episodes end by themselves in this step, shape [B, A]."""
+        live = self.live
+        endings = np.zeros(live.shape, dtype=np.uint8)
+        endings[live & (self._last_step == self.elapsed[:, None])] = REMOVED
+        endings[live & left] = LEFT
+        staying = live & (endings == 0)
+        for world in np.flatnonzero((live & ~staying).any(axis=1)):
+            present = self.agent_species[staying[world]]
+            counts = np.bincount(present, minlength=self.config.species_count)
+            if self.task.is_over(tuple(counts.tolist())):
+                endings[world, staying[world]] = ALONE
+        return endings
+
+    def _report(self, fled: NDArray[np.bool_]) -> str:
+        """Return an error's message about agents that are out of bounds, shape [B, A]."""
+        limits, word = self.physics.limits, "particle" if self.by_particle else "species"
+        places = np.argwhere(fled)
+        names = [f"{word}_{agent} of world {world}" for world, agent in places[:LARGEST_REPORT]]
+        more = f" and {len(places) - len(names)} more" if len(places) > len(names) else ""
+        return (
+            f"agents must have a particle within position_limit = {limits.position:g} and "
+            f"observation_limit = {limits.state:g}, but {', '.join(names)}{more} had none "
+            f"after step {int(self.elapsed[places[0, 0]])}: take smaller actions, raise the "
+            "limits, or choose on_divergence='terminate'"
+        )
+
+    def _taken_out(self, endings: NDArray[np.uint8], observation: Tensor) -> Tensor:
+        """Take out particles of agents that ended; return what is perceived without them."""
+        self._close_deserted()
+        self._disband()
+        self.there &= (endings != REMOVED) & (endings != LEFT)
+        if not self.open.any():
+            return observation
+        # What others lose or gain by a death is nobody's merit: the next step counts from now.
+        seen = self._carry_over()
+        stays = (endings == 0) & self.open[:, None]
+        where = to_device_async(stays, self.device)[:, self._owner, None]
+        return torch.where(where, seen, observation)
 
     @property
     def cohorts(self) -> list[Cohort]:
@@ -467,14 +410,14 @@ class SpeciesBatch(WorldState):
         if not len(going_on):
             return []
         kinds, number = np.unique(self.there[going_on], axis=0, return_inverse=True)
-        cohorts = []
+        cohorts, parts = [], (self.task, self.physics, self.owner, self.by_particle)
         for k, kind in enumerate(kinds):
             worlds = going_on[number.reshape(-1) == k]
             columns = np.flatnonzero(kind[self.owner])
             index = to_device_async(worlds, self.device)
             places = index[:, None], to_device_async(columns, self.device)
             x, s, random = self.x[places], self.s[places], self.random.take(index)
-            cohorts.append(Cohort(self._judge, worlds, columns, x, s, random))
+            cohorts.append(Cohort(*parts, worlds, columns, x, s, random))
         return cohorts
 
     def _disband(self) -> None:
@@ -499,34 +442,37 @@ class Cohort:
 
     def __init__(
         self,
-        judge: AgentLosses,
+        task: SpeciesTask,
+        physics: Physics,
+        owner: NDArray[np.int64],
+        by_particle: bool,
         worlds: NDArray[np.int64],
         columns: NDArray[np.int64],
         x: Tensor,
         s: Tensor,
         random: WorldRandom,
     ) -> None:
-        device, config = x.device, judge.task.config
-        kind = np.repeat(np.arange(config.species_count), config.counts)[columns]
-        counts = np.bincount(kind, minlength=config.species_count)
-        self._judge = judge
+        device, config = x.device, task.config
+        self._task, self._physics, self._by_particle = task, physics, by_particle
         self.random = random
         self.worlds = to_device_async(worlds, device)
-        self.columns = to_device_async(columns, device)
-        self.places = self.worlds[:, None], self.columns
+        self._columns = to_device_async(columns, device)
+        self.places = self.worlds[:, None], self._columns
         """Where the batch has the particles, as an index of two dimensions."""
-        self.population = Population(x, s, tuple(counts.tolist()), to_device_async(kind, device))
+        kind = np.repeat(np.arange(config.species_count), config.counts)[columns]
+        self.population = population_of(x, s, kind, config.species_count)
         """The particles."""
         self.parts: dict[str, Tensor] = {}
         """Parts of every agent's loss after the last step, shape [M, A]."""
-        self.gone = torch.zeros(len(worlds), judge.agent_count, dtype=torch.bool, device=device)
+        self._agent_count = int(owner[-1]) + 1
+        self.gone = torch.zeros(len(worlds), self._agent_count, dtype=torch.bool, device=device)
         """Which agents have no particle within bounds after the last step, shape [M, A]."""
-        self._owners = to_device_async(judge.owner[columns], device)
+        self._owners = to_device_async(owner[columns], device)
         self._surveyed: NeighbourState | None = None
         self._actions = Actions(
             x,
             s,
-            judge.physics,
+            physics,
             random,
             enabled=torch.ones(1, dtype=torch.uint8, device=device),
             diverged=torch.zeros(len(worlds), dtype=torch.uint8, device=device),
@@ -540,67 +486,52 @@ class Cohort:
 
     def act(self, action: Tensor) -> None:
         """Apply finite actions, shape [M, N now, A], and see what came of them without waiting."""
-        action = self._judge.task.played(action, self.population, self.random)
+        action = self._task.played(action, self.population, self.random)
         self._draw()
         self._actions.apply(action)
         self._look()
 
-    def measured(self) -> dict[str, Tensor]:
-        """Return the parts of every agent's loss in the worlds as they are, shape [M, A]."""
-        return self._judge.measured(self.population, self.columns)
+    def measured(self, population: Population | None = None) -> dict[str, Tensor]:
+        """Return the parts of every agent's loss, float32, shape [M, A]; 0 of those that are gone.
 
-    def perceived(self, *, stepped: bool = False) -> Tensor:
-        """Return what the particles perceive, shape [M, N now, P]."""
-        return self._judge.perceived(self.population, self._surveyed if stepped else None)
+        They are of the worlds as they are, or of a population with the same particles.
+        """
+        population = population or self.population
+        if not self._by_particle:
+            return dict(self._task.losses(population))
+        found = {}
+        for name, loss in self._task.particle_losses(population).items():
+            found[name] = loss.new_zeros(len(loss), self._agent_count)
+            found[name].index_copy_(1, self._columns, loss)
+        return found
+
+    def perceived(self, population: Population | None = None, *, stepped: bool = False) -> Tensor:
+        """Return what particles perceive, by one pass for all species, shape [M, N now, P].
+
+        Telling species apart takes another one, again for all of them. Worlds that were sorted
+        after the last step are not sorted again.
+        """
+        x, s, counts, _ = population or self.population
+        surveyed = self._surveyed if stepped else None
+        seen = (surveyed or build_neighbours(x, s, self._physics)).perceive()
+        if self._task.config.perception == "per_species":
+            seen = torch.cat((seen, perceive_each_species(x, counts, self._physics)), dim=-1)
+        return seen
 
     def _look_around(self) -> None:
-        x, s, physics = self.population.x, self.population.s, self._judge.physics
+        x, s, physics = self.population.x, self.population.s, self._physics
         inside = (s.abs() < physics.limits.state).all(dim=-1)
         # In a box nobody gets to the bound but by wrapping onto an edge that may lie there.
         if physics.box is None:
             inside &= (x.abs() < physics.limits.position).all(dim=-1)
         # Sums of ones are exact in any order.
-        count = torch.zeros(len(inside), self._judge.agent_count, device=inside.device)
+        count = torch.zeros(len(inside), self._agent_count, device=inside.device)
         self.gone = count.index_add_(1, self._owners, inside.float()) == 0.0
         self.parts = self.measured()
         self._surveyed = build_neighbours(x, s, physics)
 
 
-class AgentLosses:
-    """What is computed of worlds that have the same particles, whichever of a batch they are."""
-
-    def __init__(
-        self, task: SpeciesTask, physics: Physics, owner: NDArray[np.int64], by_particle: bool
-    ) -> None:
-        self.task = task
-        self.physics = physics
-        self.owner = owner
-        self.by_particle = by_particle
-        self.agent_count = int(owner[-1]) + 1
-        """Agents A."""
-
-    def measured(self, population: Population, columns: Tensor) -> dict[str, Tensor]:
-        """Return the parts of every agent's loss, float32, shape [M, A]; 0 of those that are gone.
-
-        The numbers of the population's particles are its `columns`, int64, shape [N now].
-        """
-        if not self.by_particle:
-            return dict(self.task.losses(population))
-        found = {}
-        for name, loss in self.task.particle_losses(population).items():
-            found[name] = loss.new_zeros(len(loss), self.agent_count)
-            found[name].index_copy_(1, columns, loss)
-        return found
-
-    def perceived(self, population: Population, surveyed: NeighbourState | None = None) -> Tensor:
-        """Return what particles perceive, by one pass for all species, shape [M, N now, P].
-
-        Telling species apart takes another one, again for all of them. Worlds that are surveyed
-        already are not sorted again.
-        """
-        x, s, physics = population.x, population.s, self.physics
-        seen = (surveyed or build_neighbours(x, s, physics)).perceive()
-        if self.task.config.perception == "per_species":
-            apart = perceive_each_species(x, population.counts, physics)
-            seen = torch.cat((seen, apart), dim=-1)
-        return seen
+def population_of(x: Tensor, s: Tensor, kind: NDArray[np.int64], species_count: int) -> Population:
+    """Return particles of these species, [N], as a population."""
+    counts = np.bincount(kind, minlength=species_count).tolist()
+    return Population(x, s, tuple(counts), to_device_async(kind, x.device))

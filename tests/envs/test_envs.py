@@ -553,7 +553,11 @@ def test_bad_keyword_is_a_clear_error(name, keywords, message):
         ("npa/PointClassification-v0", {"rule": "gecko"}, "rule must have a read-out of state_dim"),
         ("npa/PointClassification-v0", {"class_count": 9}, "class_count must be more than the"),
         ("npa/Morphogenesis3D-v0", {"target": "rocke"}, "did you mean 'rocket'"),
-        ("npa/Morphogenesis3D-v0", {"readout": "gecko"}, "reads out states of 16 channels"),
+        (
+            "npa/Morphogenesis3D-v0",
+            {"readout": "gecko"},
+            "readout must be a rule with a read-out",
+        ),
         ("npa/Morphogenesis3D-v0", {"readout": 3}, "for example readout='mushroom'"),
         ("npa/Morphogenesis3D-v0", {"opacity": 1.0}, "opacity must lie below 1"),
         ("npa/Morphogenesis3D-v0", {"seed_radius": 5.0}, "seed_radius must be below"),
@@ -568,14 +572,14 @@ def test_bad_keyword_of_one_environment_is_a_clear_error(name, keywords, message
     "keywords", [{"particle_count": 10**5}, {"resolution": 4096}, {"seed_pool": 10**6}]
 )
 def test_worlds_beyond_memory_are_refused_before_they_are_made(keywords, monkeypatch):
-    monkeypatch.setattr("npa_envs.envs.core.memory.free_bytes", lambda device: 10**8)
+    monkeypatch.setattr("npa_envs.envs.core.state.free_bytes", lambda device: 10**8)
     make(IDS[0])
     with pytest.raises(NPAError, match="particle_count must fit into memory: 1 world"):
         make(IDS[0], **keywords)
 
 
 def test_memory_that_is_counted_is_what_worlds_take():
-    from npa_envs.envs.core.memory import free_bytes
+    from npa_envs.envs.core.state import free_bytes
 
     assert 2**26 < free_bytes(torch.device("cpu")) < 2**44
 

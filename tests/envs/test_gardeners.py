@@ -87,7 +87,9 @@ def test_brushes_of_both_add_up_and_without_a_raider_it_is_the_gardeners_world()
 def test_bad_agents_and_actions_are_clear_errors():
     env = gardeners_v0.parallel_env(**SMALL)
     env.reset(seed=0)
-    with pytest.raises(NPAError, match=r"agent must be one of .*did you mean 'keeper_0'"):
+    with pytest.raises(
+        NPAError, match=r"agent must be one that exists, got .*did you mean 'keeper_0'"
+    ):
         env.action_space("keeper")
     with pytest.raises(NPAError, match=r"for the agents .* got some for"):
         env.step({"keeper_0": env.action_space("keeper_0").sample()})

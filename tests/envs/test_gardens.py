@@ -10,7 +10,7 @@ import torch
 from small_envs import assert_same
 
 import npa_envs
-from npa_envs.envs.garden.brush_layout import BrushLayout, brushed, grid_places
+from npa_envs.envs.garden.brushes import BrushLayout, brushed, grid_places
 from npa_envs.errors import DivergedError, NPAError
 from npa_envs.registration import GARDEN_IDS, GARDENS
 from npa_envs.registration import SMALL as SMALL_FORMS
@@ -437,6 +437,6 @@ def test_the_reward_is_one_for_a_whole_picture_and_zero_for_a_grey_one():
     grey = sum(task.losses(worlds.x, torch.zeros_like(worlds.s)).values())
     assert grey > 1.2 * info["loss"]
     losses = torch.cat((grey, torch.tensor([info["loss"], info["loss"] - 1.0, 1e3])))
-    earned = task.reward(worlds.x, worlds.s, losses, worlds.referee.context.expand(4, -1))
+    earned = task.reward(worlds.x, worlds.s, losses, worlds.context.expand(4, -1))
     better = 1.0 + 1.0 / float(grey - info["loss"])
     assert torch.allclose(earned, torch.tensor([0.0, 1.0, better, -1.0]), rtol=1e-4, atol=1e-5)

@@ -91,7 +91,7 @@ def test_a_step_is_paid_by_the_goal_that_was_seen_before_it(small):
 
 def test_a_goal_itself_earns_one_and_an_empty_picture_nothing(small):
     task = make(small, resolution=32).unwrapped.task
-    single = task.pictures.toward(torch.tensor([1]))
+    single = task.goal.toward(torch.tensor([1]))
     context = torch.tensor([[1.0]])
     no_loss, blank = torch.zeros(1), task.blank_losses[1:2]
     x = s = torch.zeros(1, 1, 1)
@@ -106,7 +106,7 @@ def test_the_goals_picture_is_seen_beside_the_worlds(small):
     seen, info = env.reset(seed=2)
     assert seen.shape == (128,)
     task = env.unwrapped.task
-    target = task.pictures.toward(torch.tensor([info["goal"]])).target_picture[0]
+    target = task.goal.toward(torch.tensor([info["goal"]])).target_picture[0]
     coarse = target.view(4, 4, 4, 4, 4).mean(dim=(1, 3)).permute(2, 0, 1)
     assert seen[64:] == pytest.approx(coarse.flatten().numpy(), abs=1e-6)
 

@@ -9,7 +9,7 @@ from crowds import TASKS, make, small
 from small_envs import assert_same
 
 from npa_envs.envs import multispecies_v0
-from npa_envs.envs.core import memory
+from npa_envs.envs.core import state
 from npa_envs.errors import NPAError
 
 # Species leave, run out of bounds in their states, are removed, and are cut off.
@@ -222,12 +222,12 @@ def test_pictures_are_those_of_the_single_worlds():
 
 def test_telling_species_apart_needs_memory_of_its_own(monkeypatch):
     # 64 worlds of 41 particles: P is 66, and 8 species append 24 numbers, of which 4 copies live.
-    free = memory.needed_bytes(64, 41, batch().worlds.physics, torch.device("cpu"))
-    monkeypatch.setattr(memory, "free_bytes", lambda device: free + 4 * 4 * 64 * 41 * 24 - 1)
+    free = state.needed_bytes(64, 41, batch().worlds.physics, torch.device("cpu"))
+    monkeypatch.setattr(state, "free_bytes", lambda device: free + 4 * 4 * 64 * 41 * 24 - 1)
     assert batch(world_count=64, species_count=8).worlds.perception_dim == 66
     with pytest.raises(NPAError, match="particle_count must fit into memory"):
         batch(world_count=64, species_count=8, perception="per_species")
-    monkeypatch.setattr(memory, "free_bytes", lambda device: free + 4 * 4 * 64 * 41 * 24)
+    monkeypatch.setattr(state, "free_bytes", lambda device: free + 4 * 4 * 64 * 41 * 24)
     envs = batch(world_count=64, species_count=8, perception="per_species")
     assert envs.worlds.perception_dim == 66 + 24
 

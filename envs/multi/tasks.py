@@ -1,7 +1,12 @@
-"""Tasks in which species grow pictures: one each, one together, or one that the others prevent."""
+"""Tasks of several species, with the table of their names and of their ids.
+
+Species that start apart mix, or mixed ones part; or they grow pictures: one each, one together, or
+one that the others prevent.
+"""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -9,11 +14,85 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from npa_envs import world_mean
-from npa_envs.envs.multi.task import Population, SpeciesConfig, SpeciesTask, by_species
-from npa_envs.errors import NPAError, shown
+from npa_envs import perceive, world_mean
+from npa_envs.envs.multi.task import Population, SpeciesConfig, SpeciesTask
+from npa_envs.errors import NPAError, shown, suggest
+from npa_envs.registration import SPECIES as ENVIRONMENTS
+from npa_envs.registration import SPECIES_SIZES
 from npa_envs.tasks.morphogenesis2d import Morphogenesis2D, Morphogenesis2DConfig
 from npa_envs.world.randomness import StreamId, WorldRandom
+
+
+class MixingTask(SpeciesTask):
+    """Every particle is to see all species in equal parts: its loss is 1 less the local entropy."""
+
+    def losses(self, population: Population) -> Mapping[str, Tensor]:
+        """Return the mean of each species' particle losses."""
+        return {
+            name: by_species(
+                [
+                    world_mean(loss[:, span, None])[:, 0]
+                    for span in population.spans
+                    if span.stop > span.start
+                ],
+                population,
+            )
+            for name, loss in self.particle_losses(population).items()
+        }
+
+    def particle_losses(self, population: Population) -> Mapping[str, Tensor]:
+        """Return 1 less the entropy of species around each particle."""
+        return {"separation": 1.0 - self._entropy(population)}
+
+    def _entropy(self, population: Population) -> Tensor:
+        return local_entropy(population, eps=self.config.eps, box=self.config.box)
+
+
+@dataclass(frozen=True, kw_only=True)
+class SegregationConfig(SpeciesConfig):
+    """As elsewhere, but species start in one disk."""
+
+    seed_distance: float = 0.0
+
+
+class SegregationTask(MixingTask):
+    """Every particle is to see its own species alone: its loss is the local entropy."""
+
+    config_type = SegregationConfig
+
+    def particle_losses(self, population: Population) -> Mapping[str, Tensor]:
+        """Return the entropy of species around each particle."""
+        return {"mixture": self._entropy(population)}
+
+
+def local_entropy(population: Population, *, eps: float, box: float | None) -> Tensor:
+    """Return the entropy of species around each particle, in [0, 1], shape [B, N].
+
+    The share of species k around particle i is f_k = b_k / Σ b, where b are the SPH-smoothed tags
+    (1 for a particle of species k, else 0). The entropy is −Σ f_k ln f_k / ln K: 0 where a particle
+    sees its own species alone, 1 where all K are there in equal parts.
+    """
+    species_count = len(population.counts)
+    kinds = torch.arange(species_count, device=population.x.device)
+    tags = (population.species[:, None] == kinds).to(population.x)
+    seen = perceive(
+        population.x,
+        tags.expand(len(population.x), -1, -1).contiguous(),
+        eps,
+        box=box,
+        detach_positions=False,
+        state_gradient=False,
+        moment_correction=False,
+        density_gradient=False,
+    )
+    blur = seen[..., species_count:]
+    shares = blur / blur.sum(dim=2, keepdim=True)
+    # At a share of exactly 0 the entropy has no finite derivative, and NaN would come of it.
+    there = shares > 0.0
+    terms = torch.where(there, torch.special.entr(torch.where(there, shares, 1.0)), 0.0)
+    entropy: Tensor = terms.sum(dim=2)
+    return entropy / math.log(species_count)
+
 
 USUAL = ("gecko", "heart", "butterfly", "flower", "octopus", "ring")
 """What species grow by default, in turn."""
@@ -66,6 +145,8 @@ class PictureLossTask(SpeciesTask):
         super().__init__(config, device)
         self.goals = [Morphogenesis2D(config.goal(*picture), device=device) for picture in pictures]
         """The tasks of growing each picture, with targets and losses."""
+        self.goal = self.goals[0]
+        """The first of them, whose target's colour scripted policies take."""
 
     def picture_parts(self, k: int, x: Tensor, s: Tensor) -> dict[str, Tensor]:
         """Return density error and weighted colour error against picture k, shape [B] each."""
@@ -75,7 +156,7 @@ class PictureLossTask(SpeciesTask):
     @property
     def pixel_size(self) -> float:
         """Size of a particle in pictures: the distance of the first target's points."""
-        return self.goals[0].target.pixel_size
+        return self.goal.target.pixel_size
 
     @property
     def open_half_width(self) -> float:
@@ -158,8 +239,7 @@ class InvasionConfig(OnePictureConfig):
         if self.reward != "individual":
             raise NPAError(
                 f"reward must be 'individual' in invasion, got {shown(self.reward)}: the sum of "
-                "all "
-                "rewards is zero, so there is nothing to share"
+                "all rewards is zero, so there is nothing to share"
             )
 
 
@@ -170,8 +250,6 @@ class InvasionTask(PictureLossTask):
 
     def __init__(self, config: InvasionConfig, device: torch.device) -> None:
         super().__init__(config, device, (config.target, config.counts[0]))
-        self.goal = self.goals[0]
-        """The picture of species 0, whose target's colour scripted policies take."""
 
     def losses(self, population: Population) -> Mapping[str, Tensor]:
         """Return the parts of species 0's splat loss, and minus an equal share for each other."""
@@ -223,8 +301,6 @@ class SymbiosisTask(PictureLossTask):
 
     def __init__(self, config: SymbiosisConfig, device: torch.device) -> None:
         super().__init__(config, device, (config.target, sum(config.counts)))
-        self.goal = self.goals[0]
-        """The picture of all particles, whose target's colour scripted policies take."""
 
     def losses(self, population: Population) -> Mapping[str, Tensor]:
         """Return the density error and the weighted colour error, the same for every species."""
@@ -243,3 +319,37 @@ class SymbiosisTask(PictureLossTask):
 def _present(population: Population) -> list[int]:
     """Return the species that have particles."""
     return [k for k, count in enumerate(population.counts) if count]
+
+
+def by_species(losses: list[Tensor], population: Population) -> Tensor:
+    """Return losses of the species that are there as one tensor, shape [B, K], 0 for the others."""
+    remaining = iter(losses)
+    nothing = population.x.new_zeros(len(population.x))
+    found = [next(remaining) if count else nothing for count in population.counts]
+    return torch.stack(found, dim=1)
+
+
+TASKS: dict[str, type[SpeciesTask]] = {
+    "mixing": MixingTask,
+    "segregation": SegregationTask,
+    "co_morphogenesis": CoMorphogenesisTask,
+    "invasion": InvasionTask,
+    "symbiosis": SymbiosisTask,
+}
+"""Tasks by the names that environments take."""
+
+
+def task_settings(name: str) -> tuple[str, dict[str, Any]]:
+    """Return the task that an id means, and its keywords; a task's name means itself."""
+    for size in SPECIES_SIZES:
+        if name == size.id:
+            return size.task, dict(size.keywords)
+    return (ENVIRONMENTS.get(name, name) if isinstance(name, str) else name), {}
+
+
+def task_type(name: str) -> type[SpeciesTask]:
+    """Return a task's class."""
+    if not isinstance(name, str) or name not in TASKS:
+        known = [*TASKS, *ENVIRONMENTS, *(size.id for size in SPECIES_SIZES)]
+        raise NPAError(f"task must be a known word, got {shown(name)}: {suggest(name, known)}")
+    return TASKS[name]

@@ -1,0 +1,207 @@
+"""What environments are made of: spaces, arrays in and out, pictures and the window of them.
+
+Arrays are of NumPy or torch outside, float32 tensors inside.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any, ClassVar
+
+import gymnasium
+import numpy as np
+import torch
+from gymnasium.spaces import Box, Space
+from numpy.typing import NDArray
+from torch import Tensor
+
+from npa_envs.envs.core.config import EnvConfig
+from npa_envs.envs.core.task import EnvTask
+from npa_envs.envs.core.worlds import BatchedWorlds
+from npa_envs.errors import NPAError
+from npa_envs.render import Window, show
+from npa_envs.render.display import side_by_side
+from npa_envs.world.actions import Physics
+from npa_envs.world.cuda_graph import to_device_async
+
+SHOWN_ACROSS = 4
+"""A window shows at most so many worlds side by side."""
+
+
+class ParticleSpaces:
+    """How most worlds are seen and acted upon: one row for each particle."""
+
+    def __init__(self, physics: Physics, config: EnvConfig) -> None:
+        count, limit = config.particle_count, physics.limits.perception
+        columns = physics.perception_dim + config.target_dim
+        self.observation_space: Space[Any] = Box(-limit, limit, (count, columns), np.float32)
+        """Of a world."""
+        self._shape = (count, physics.action_dim)
+        self.action_space: Space[Any] = Box(-1.0, 1.0, self._shape, np.float32)
+        """Of a world."""
+        self._output = config.output
+
+    def action(self, action: Any, world_count: int | None) -> Tensor:
+        """Return actions as worlds take them, float32, [B, N, A]; B is None for a single world."""
+        return batch_tensor(action, world_count, self._shape, "N, A")
+
+    def seen(self, observation: Tensor) -> Any:
+        """Return observations of worlds, or of one, as they are handed out."""
+        return to_output(observation, self._output)
+
+    def last_seen(self, observation: Tensor, ended: NDArray[np.bool_]) -> Any:
+        """Return worlds' last observations, [B, ...], where some, bool, [B], have ended."""
+        return self.seen(observation)
+
+
+def to_output(tensor: Tensor, output: str) -> Any:
+    """Return a tensor as it is handed out: as it is for "torch", as an array for "numpy"."""
+    return tensor if output == "torch" else tensor.cpu().numpy()
+
+
+def batch_tensor(
+    action: Any, world_count: int | None, shape: tuple[int, ...], letters: str
+) -> Tensor:
+    """Return actions of B worlds, or of one where B is None, float32, shape [B, ...]."""
+    batch, first = ((), "") if world_count is None else ((world_count,), "B, ")
+    wanted, letters = (*batch, *shape), f"[{first}{letters}] = "
+    checked = action_tensor("action", action, wanted, "env.action_space", letters)
+    return checked[None] if world_count is None else checked
+
+
+def action_tensor(
+    name: str, action: Any, wanted: tuple[int, ...], space: str, letters: str = ""
+) -> Tensor:
+    """Return an action as a float32 tensor, on the device where it came from."""
+    came = ""
+    if not isinstance(action, Tensor):
+        try:
+            given = np.asanyarray(action)
+            if given.dtype.kind not in "biufO" or np.ma.is_masked(given):
+                raise TypeError("no real numbers, or some that are masked")
+            # Torch cannot read what may not be written.
+            action = torch.from_numpy(np.require(given, np.float32, ("C", "W")))
+        except (TypeError, ValueError, OverflowError):
+            came = type(action).__name__
+            came += f" of {action.dtype}" if isinstance(action, np.ndarray) else ""
+    if not came and (tuple(action.shape) != wanted or action.dtype.is_complex):
+        came = f"{tuple(action.shape)} of {action.dtype}"
+    elif not came and (action.layout != torch.strided or action.is_meta):
+        came = f"a tensor that is {action.layout} on {action.device}"
+    if came:
+        raise NPAError(
+            f"{name} must be real numbers of shape {letters}{wanted}, got {came}: see {space}"
+        )
+    checked: Tensor = action.detach().to(torch.float32)
+    return checked
+
+
+class ShownEnv:
+    """The common part of environments of all kinds: pictures, and the type of returned arrays."""
+
+    config: Any
+    """The environment's configuration."""
+    worlds: Any
+    """The worlds, with a method `pictures`."""
+    metadata: Any
+    _started = False
+    _window: Window | None = None
+
+    def _pictures(self) -> NDArray[np.uint8] | None:
+        """Return a picture of each world, uint8, shape [B, R, R, 3]; None unless "rgb_array"."""
+        if self.config.render_mode is None:
+            gymnasium.logger.warn(
+                "render() draws nothing without a render_mode: make the environment with "
+                "render_mode='rgb_array' or 'human'"
+            )
+        # A window already shows the worlds as they are.
+        if self.config.render_mode != "rgb_array":
+            return None
+        pictures: NDArray[np.uint8] = self.worlds.pictures(self.worlds.world_count)
+        return pictures
+
+    def _repr_mimebundle_(self, include: Any = None, exclude: Any = None) -> dict[str, Any]:
+        """Return what Jupyter shows: the worlds as they are, or some, from the first reset on."""
+        text = {"text/plain": str(self)}
+        if not self._started:
+            return text
+        count = min(self.worlds.world_count, SHOWN_ACROSS**2)
+        return show(side_by_side(self.worlds.pictures(count)))._repr_mimebundle_() | text
+
+    def _show_in_window(self, title: str) -> None:
+        """Show the worlds as they are, the first ones where they are many; only if "human"."""
+        if self.config.render_mode != "human":
+            return
+        count, size = self.worlds.world_count, self.config.render_size
+        across = min(math.ceil(math.sqrt(count)), SHOWN_ACROSS)
+        shown = min(count, across * across)
+        frame = np.full((across * across, size, size, 3), 255, np.uint8)
+        frame[:shown] = self.worlds.pictures(shown)
+        frame = frame.reshape(across, across, size, size, 3).swapaxes(1, 2)
+        if self._window is None:
+            self._window = Window(title, across * size, fps=self.metadata["render_fps"])
+        self._window.show(frame.reshape(across * size, across * size, 3))
+
+    def _close_window(self) -> None:
+        if self._window is not None:
+            self._window.close()
+            self._window = None
+
+    def _out(self, tensor: Tensor) -> Any:
+        return to_output(tensor, self.config.output)
+
+    def _sent(self, values: NDArray[Any]) -> Any:
+        """Return a new array as it is handed out."""
+        if self.config.output == "numpy":
+            return values
+        return to_device_async(values, self.config.torch_device)
+
+
+class WorldsEnv(ShownEnv):
+    """The common part of environments of one species; subclasses name the task."""
+
+    task_type: ClassVar[type[EnvTask[Any]]]
+    """The task: starts and losses."""
+
+    spec: Any
+
+    def _make_worlds(self, keywords: dict[str, Any], world_count: int, steps: int | None) -> None:
+        """Make configuration, worlds, spaces and screen."""
+        self.config = self.task_type.config_type.from_keywords(keywords)
+        self.render_mode = self.config.render_mode
+        worlds_type = self.task_type.worlds_type or BatchedWorlds
+        self.worlds = worlds_type(self.task_type, self.config, world_count, steps)
+        self.task = self.worlds.task
+        form_type = self.task_type.form_type or ParticleSpaces
+        self.form: ParticleSpaces = form_type(self.worlds.physics, self.config)
+
+    def _begin(self, worlds: Tensor, keys: Tensor | None, out: Tensor | None = None) -> Tensor:
+        """Start episodes in some worlds, int64, [M]; return what is observed in all, [B, ...]."""
+        with self.worlds.device_context():
+            self.worlds.start(worlds, keys)
+            observation = self.worlds.perceive(out)
+        self._started = True
+        self._show()
+        return observation
+
+    def _place(self, x: Any, s: Any, worlds: Tensor, out: Tensor | None = None) -> Tensor:
+        """Put particles into some worlds, int64, [M]; return what is observed in all, likewise."""
+        count = self.config.particle_count
+        start = self.worlds.checked_particles(x, s, len(worlds), count)
+        with self.worlds.device_context():
+            self.worlds.place(worlds, start)
+            observation = self.worlds.perceive(out)
+        self._show()
+        return observation
+
+    def losses_of(self, numbers: Any) -> dict[str, Any]:
+        """Return the loss and its parts by their names in infos, from a report's numbers."""
+        parts = {f"loss_{n}": numbers[2 + k] for k, n in enumerate(self.worlds.part_names)}
+        return {"loss": numbers[1]} | parts
+
+    def _improvements(self, numbers: Any) -> dict[str, Any]:
+        names = self.worlds.part_names
+        return {f"reward_{name}": numbers[2 + len(names) + k] for k, name in enumerate(names)}
+
+    def _show(self) -> None:
+        self._show_in_window(self.spec.id if self.spec is not None else type(self).__name__)

@@ -1,0 +1,169 @@
+"""Particles of worlds on a device: the memory that they need, compared with what is free."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from npa_envs.checks import number_tensor
+from npa_envs.envs.core.config import WorldConfig
+from npa_envs.envs.core.task import Start, WorldTask
+from npa_envs.errors import DivergedError, NPAError
+from npa_envs.world.actions import Physics
+from npa_envs.world.randomness import WorldRandom
+
+OBSERVATION_COPIES = 4
+"""Observations alive at once: the rows, the arrays handed out, the last ones, one to spare."""
+
+LARGEST_INDEX = 2**31 - 1
+"""Kernels index the particles' states with 32 bits."""
+
+LISTED_BYTES = 320
+"""What CUDA keeps of a particle's neighbours, at most: a list of 128, and what is sorted."""
+
+RECORDED_STARTS = 4 / 3
+"""Particles of all recorded restarts together, which have lists of their own, to those of a batch:
+1 + 1/4 + 1/16 + ..."""
+
+
+def needed_bytes(
+    world_count: int, particle_count: int, physics: Physics, device: torch.device
+) -> int:
+    """Return about how much memory worlds take while they are stepped [bytes]."""
+    particles = world_count * particle_count
+    worlds = 6 * (physics.space_dim + physics.state_dim)
+    numbers = OBSERVATION_COPIES * physics.perception_dim + 2 * physics.action_dim + worlds + 16
+    listed = LISTED_BYTES * (1.0 + RECORDED_STARTS) if device.type == "cuda" else 0.0
+    return int(particles * (4 * numbers + listed))
+
+
+def free_bytes(device: torch.device) -> int | None:
+    """Return the memory that is free on a device [bytes], or None where nobody says."""
+    if device.type == "cuda":
+        free, _ = torch.cuda.mem_get_info(device)
+        cached = torch.cuda.memory_reserved(device) - torch.cuda.memory_allocated(device)
+        return int(free) + cached
+    try:
+        for line in Path("/proc/meminfo").read_text(encoding="utf-8").splitlines():
+            if line.startswith("MemAvailable:"):
+                return int(line.split()[1]) * 1024
+    except (OSError, ValueError, IndexError):
+        pass
+    try:
+        return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    except (AttributeError, ValueError, OSError):
+        return None
+
+
+def check_memory(
+    world_count: int,
+    particle_count: int,
+    physics: Physics,
+    device: torch.device,
+    extra_bytes: int = 0,
+) -> None:
+    """Check that B worlds fit into a device's memory and into the kernels' indices."""
+    what = f"{world_count} world(s) of {particle_count} particles"
+    cure = "choose a smaller particle_count or fewer worlds"
+    if world_count * particle_count * (1 + physics.state_dim) > LARGEST_INDEX:
+        raise NPAError(f"particle_count is too large: {what} exceed 32-bit indices: {cure}")
+    needed = needed_bytes(world_count, particle_count, physics, device) + extra_bytes
+    free = free_bytes(device)
+    if free is not None and needed > free:
+        raise NPAError(
+            f"particle_count must fit into memory: {what} need about {needed / 2**30:.1f} GiB "
+            f"with pictures and pool, and {device} has {free / 2**30:.1f} GiB free: {cure}"
+        )
+
+
+def check_default_dtype() -> None:
+    """Check that what tasks make by default is float32, as the worlds are."""
+    dtype = torch.get_default_dtype()
+    if dtype != torch.float32:
+        raise NPAError(
+            f"environments need torch's default dtype to be torch.float32, got {dtype}: call "
+            "torch.set_default_dtype(torch.float32), and give other tensors their dtype"
+        )
+
+
+class WorldState:
+    """Particles of B worlds on a device, a stream of randomness for each world."""
+
+    def __init__(
+        self,
+        config: WorldConfig,
+        task_type: type[WorldTask[Any]],
+        world_count: int,
+        particle_count: int,
+        extra_bytes: int,
+    ) -> None:
+        check_default_dtype()
+        self.device = device = config.torch_device
+        self.world_count = world_count
+        self.particle_count = particle_count
+        self.physics = physics = config.physics(task_type.space_dim, static=task_type.static)
+        """The worlds' constants."""
+        check_memory(world_count, particle_count, physics, device, extra_bytes)
+        self.x = torch.zeros(world_count, particle_count, physics.space_dim, device=device)
+        """Positions [length units], shape [B, N, D]."""
+        self.s = torch.zeros(world_count, particle_count, physics.state_dim, device=device)
+        """States, dimensionless, shape [B, N, C]."""
+        keys = torch.zeros(world_count, dtype=torch.int64, device=device)
+        self.random = WorldRandom.from_keys(keys)
+        """One stream of randomness for each world."""
+
+    def next_streams(self, worlds: Tensor, keys: Tensor | None) -> WorldRandom:
+        """Return the streams of randomness that some worlds', [M], next episodes begin with.
+
+        Those with keys, int64, shape [M], are new and begin with their first episode; without, each
+        world goes on to its next one.
+        """
+        if keys is not None:
+            return WorldRandom.from_keys(keys.to(self.device))
+        random = self.random.take(worlds)
+        random.restart()
+        return random
+
+    def checked_particles(self, x: Any, s: Any, world_count: int, particle_count: int) -> Start:
+        """Return particles to be put into M worlds of N, float32 on the device."""
+        given, physics = [], self.physics
+        for name, value, width, limit, limit_name in (
+            ("x", x, physics.space_dim, physics.limits.position, "position_limit"),
+            ("s", s, physics.state_dim, physics.limits.state, "observation_limit"),
+        ):
+            tensor = number_tensor(name, value).to(self.device, torch.float32)
+            wanted = (world_count, particle_count, width)
+            if tuple(tensor.shape) != wanted:
+                raise NPAError(
+                    f"{name} must have shape {wanted} (worlds, particles, entries), "
+                    f"got {tuple(tensor.shape)}: see env.unwrapped.particles()"
+                )
+            if not bool((tensor.abs() <= limit).all()):
+                raise NPAError(
+                    f"{name} must be finite and within {limit_name} = {limit:g}, got numbers up to "
+                    f"{float(tensor.abs().max())}: clip it, or make the environment with a larger "
+                    "limit"
+                )
+            given.append(tensor)
+        return Start(*given)
+
+    def device_context(self) -> contextlib.AbstractContextManager[Any]:
+        """Return a context in which the worlds' device is the current one."""
+        if not self.x.is_cuda or torch.cuda.current_device() == self.device.index:
+            return contextlib.nullcontext()
+        return torch.cuda.device(self.device)
+
+
+def not_finite(action: Tensor) -> DivergedError:
+    """Return the error about actions, shape [B, K, W], with a number that is not finite."""
+    bad = ~torch.isfinite(action)
+    world, particle, entry = (int(k) for k in bad.nonzero()[0])
+    return DivergedError(
+        f"action must be finite, got {action[world, particle, entry].item()} at world {world}, "
+        f"particle {particle}, entry {entry} ({int(bad.sum())} such numbers): check the policy"
+    )

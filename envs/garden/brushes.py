@@ -1,0 +1,303 @@
+"""Brushes on living worlds: their configuration, what they do, and the spaces of both."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Literal, NamedTuple, get_args
+
+import numpy as np
+import torch
+from gymnasium.spaces import Box, MultiDiscrete, Space
+from torch import Tensor
+
+from npa_envs import world_mean
+from npa_envs.checks import check_flag, check_positive, is_whole, number_tensor
+from npa_envs.envs.core.base import ParticleSpaces, batch_tensor
+from npa_envs.envs.core.config import EnvConfig
+from npa_envs.envs.grown import GrownConfig, check_living
+from npa_envs.errors import NPAError, shown, suggest
+from npa_envs.world.actions import Physics
+from npa_envs.world.brushes import offsets_from, softness
+
+SEEN_LIMIT = 8.0
+"""What is seen is clipped to plus and minus this (dimensionless, or length units)."""
+
+SEEN_AT_A_PLACE = 6
+"""Numbers that are seen at a place of the grid."""
+
+Actions = Literal["grid", "free", "discrete"]
+Observe = Literal["grid", "picture", "moments"]
+GardenReward = Literal["dense", "sparse"]
+
+TOOLS = ("push", "wipe", "inject", "rate")
+"""What a brush can do."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class GardenConfig(GrownConfig):
+    """Adds brushes and what is observed of living worlds."""
+
+    words = EnvConfig.words | {
+        "reward": get_args(GardenReward),
+        "actions": get_args(Actions),
+        "observe": get_args(Observe),
+    }
+
+    reward: GardenReward = "dense"
+    """"dense": how good the world is, in each step; "sparse": the same, in the last step alone."""
+
+    target: str = "heart"
+    particle_count: int = 512
+
+    resolution: int = 32
+    """Pixels on each side of the picture that the loss compares, R."""
+
+    seed_pool: int = 16
+
+    state_scale: float = 0.5
+    """What an injection of 1 adds to a channel in the middle of a brush (dimensionless)."""
+
+    rule_steps: int = 8
+    """Steps of the rule in one step of the environment."""
+
+    brush_radius: float = 0.6
+    """Radius of a brush, which is soft: full strength in its middle, none at its edge
+    [length units]."""
+
+    tools: tuple[str, ...] = ("push",)
+    """What brushes can do: some of "push", "wipe", "inject" and "rate", in this order."""
+
+    push_length: float = 0.15
+    """How far a push of 1 moves a particle in the middle of a brush [length units]."""
+
+    inject_channels: tuple[int, ...] = (-3, -2, -1)
+    """State channels that brushes inject; the last three are the colour."""
+
+    actions: Actions = "grid"
+    """Form of actions: "grid", a brush at each place of a grid; "free", brushes whose places are
+    numbers too; or "discrete", a place of the grid, a tool and a strength for each brush, as
+    Gymnasium's MultiDiscrete."""
+
+    place_count: int = 4
+    """Places on each side of the grid."""
+
+    place_reach: float = 0.75
+    """How far the outermost places of the grid are from its middle along x and y [length units]."""
+
+    brush_count: int = 1
+    """Brushes K where actions are "free" or "discrete"; all of them are used in each step."""
+
+    strength_count: int = 3
+    """Strengths from which to choose, where actions are "discrete"."""
+
+    observe: Observe = "grid"
+    """What is seen: "grid", what lacks at each place of the grid; "picture", a coarse one; or
+    "moments", of positions and states."""
+
+    picture_size: int = 16
+    """Pixels on each side of the picture that is seen; it divides `resolution`."""
+
+    observe_error: bool = False
+    """The picture that is seen has, besides, what it lacks to the target's."""
+
+    def __post_init__(self) -> None:
+        """Check every field."""
+        super().__post_init__()
+        check_positive(self, int, "rule_steps", "brush_count", "strength_count", "picture_size")
+        check_positive(self, int, "place_count", at_least=2)
+        check_positive(self, float, "brush_radius", "push_length", "place_reach")
+        check_living(self)
+        self._check_tools()
+        check_flag(self, "observe_error")
+
+    def _check_tools(self) -> None:
+        given = self.tools
+        if not isinstance(given, tuple) or not given:
+            raise NPAError(f"tools must be some of {TOOLS}, got {shown(given)}: try ('push',)")
+        for tool in given:
+            if tool not in TOOLS:
+                raise NPAError(
+                    f"tools must be some of {TOOLS}, got {shown(tool)}: {suggest(tool, TOOLS)}"
+                )
+        if given != tuple(tool for tool in TOOLS if tool in given):
+            raise NPAError(
+                f"tools must be in the order of {TOOLS}, each once, got {shown(given)}: sort them"
+            )
+        channels, count = self.inject_channels, self.state_dim
+        whole = isinstance(channels, tuple) and bool(channels) and all(map(is_whole, channels))
+        if not whole or len({channel % count for channel in channels}) < len(channels):
+            raise NPAError(
+                f"inject_channels must be different whole numbers, got {shown(channels)}: try (-1,)"
+            )
+        if not all(-count <= channel < count for channel in channels):
+            raise NPAError(
+                f"inject_channels must lie in [{-count}, {count - 1}], got {shown(channels)}: "
+                f"there are {count} channels"
+            )
+
+
+DIRECTIONS = ((1, 0), (1, 1), (0, 1), (-1, 1), (-1, 0), (-1, -1), (0, -1), (1, -1))
+"""Ways in which a brush of the "discrete" form pushes."""
+
+
+class BrushLayout(NamedTuple):
+    """Where the numbers of each tool are in a brush's row; empty for what it lacks."""
+
+    place: slice
+    push: slice
+    wipe: slice
+    inject: slice
+    rate: slice
+    width: int
+
+    @classmethod
+    def of(cls, config: GardenConfig) -> BrushLayout:
+        """Return the columns of a configuration's brushes; those of a grid stay where they are."""
+        widths = {"place": 0 if config.actions == "grid" else 2}
+        widths |= {"push": 2, "wipe": 1, "inject": len(config.inject_channels), "rate": 1}
+        first, found = 0, {}
+        for name, width in widths.items():
+            found[name] = slice(first, first + (width * (name in ("place", *config.tools))))
+            first = found[name].stop
+        return cls(**found, width=first)
+
+
+def grid_places(config: GardenConfig, device: torch.device | None = None) -> Tensor:
+    """Return the places of the grid [length units], row by row from the bottom up, shape [P, 2]."""
+    share = torch.arange(config.place_count, device=device) / (config.place_count - 1)
+    steps = config.place_reach * (2.0 * share - 1.0)
+    up, across = torch.meshgrid(steps, steps, indexing="ij")
+    return torch.stack((across.flatten(), up.flatten()), dim=-1)
+
+
+def offsets(x: Tensor, places: Tensor, config: GardenConfig) -> Tensor:
+    """Return the way from each place to each particle [length units], shape [B, K, N, 2]."""
+    spread = x[:, None].expand(-1, places.shape[1], -1, -1)
+    box = None if config.box is None else (config.box,) * 2
+    return offsets_from(spread.flatten(0, 1), places.flatten(0, 1), box).view(spread.shape)
+
+
+def holds(away: Tensor, config: GardenConfig) -> Tensor:
+    """Return how much soft brushes hold of each particle, dimensionless, shape [B, K, N]."""
+    origin = away.new_zeros(away.shape[0] * away.shape[1], 2)
+    held = softness(away.flatten(0, 1), centre=origin, radius=config.brush_radius)
+    return held.view(away.shape[:3])
+
+
+def brushed(
+    x: Tensor, s: Tensor, action: Tensor, middle: Tensor, config: GardenConfig
+) -> tuple[Tensor, Tensor, Tensor | None]:
+    """Return worlds after their brushes have been used; differentiable in all of them.
+
+    All brushes are used at once: what a particle feels of them adds up.
+
+    Returns:
+        Positions, states, and each particle's rate, the share of its rule's steps that it makes,
+        dimensionless, shape [B, N, 1]; None where no tool sets it.
+    """
+    columns, action = BrushLayout.of(config), action.clamp(-1.0, 1.0)
+    places = action[..., columns.place]
+    if config.actions == "grid":
+        places = grid_places(config, x.device).to(x)
+        # Several hands, each with a brush at every place.
+        places = places.repeat(action.shape[1] // len(places), 1)
+    held = holds(offsets(x, middle[:, None] + places, config), config)
+    doses = held[..., None] * action[:, :, None]
+    # Torch's own sums may change in the last bit with the number of worlds.
+    felt = len(doses[0]) * world_mean(doses.flatten(2)).view(*x.shape[:2], columns.width)
+    if "push" in config.tools:
+        x = x + config.push_length * felt[..., columns.push]
+    if "wipe" in config.tools:
+        s = s * (1.0 - felt[..., columns.wipe].clamp(0.0, 1.0))
+    if "inject" in config.tools:
+        channels = [channel % config.state_dim for channel in config.inject_channels]
+        index = torch.tensor(channels, device=s.device)
+        s = s.index_add(2, index, config.state_scale * felt[..., columns.inject])
+    rate = (1.0 + felt[..., columns.rate]).clamp(0.0, 2.0) if "rate" in config.tools else None
+    return x, s, rate
+
+
+def tool_table(config: GardenConfig) -> Tensor:
+    """Return what a brush of the "discrete" form can do at full strength, shape [M, W - 2].
+
+    Nothing; pushes in eight directions; wipe; inject each channel, up and down; stop, quicken.
+    """
+    columns = BrushLayout.of(config)
+    rows = [torch.zeros(columns.width)]
+
+    def add(column: slice, values: tuple[float, ...]) -> None:
+        row = torch.zeros(columns.width)
+        row[column] = torch.tensor(values)
+        rows.append(row)
+
+    if "push" in config.tools:
+        for x, y in DIRECTIONS:
+            length = (x * x + y * y) ** 0.5
+            add(columns.push, (x / length, y / length))
+    if "wipe" in config.tools:
+        add(columns.wipe, (1.0,))
+    if "inject" in config.tools:
+        count = len(config.inject_channels)
+        for channel in range(count):
+            for sign in (1.0, -1.0):
+                add(columns.inject, tuple(sign * (k == channel) for k in range(count)))
+    if "rate" in config.tools:
+        add(columns.rate, (-1.0,))
+        add(columns.rate, (1.0,))
+    return torch.stack(rows)[:, columns.place.stop :]
+
+
+class BrushSpaces(ParticleSpaces):
+    """A coarse picture or moments are seen; actions say what each brush does."""
+
+    def __init__(self, physics: Physics, config: GardenConfig) -> None:
+        self._config = config
+        self._output = config.output
+        counts = {
+            "grid": SEEN_AT_A_PLACE * config.place_count**2,
+            "picture": (8 if config.observe_error else 4) * config.picture_size**2,
+            "moments": 5 + 3 * config.state_dim,
+        }
+        space = Box(-SEEN_LIMIT, SEEN_LIMIT, (counts[config.observe],), np.float32)
+        self.observation_space: Space[Any] = space
+        self.seen_dim = len(space.shape)
+        """Dimensions of what is seen of one world."""
+        on_grid = config.actions == "grid"
+        count = config.place_count**2 if on_grid else config.brush_count
+        self.rows_shape = (count, BrushLayout.of(config).width)
+        """Of the rows of a world's brushes, (K, W)."""
+        self._tools = tool_table(config)
+        self._choices = [config.place_count] * 2 + [len(self._tools), config.strength_count]
+        self.action_space: Space[Any] = Box(-1.0, 1.0, self.rows_shape, np.float32)
+        if config.actions == "discrete":
+            self.action_space = MultiDiscrete(self._choices * config.brush_count)
+
+    def action(self, action: Any, world_count: int | None) -> Tensor:
+        """Return actions as worlds take them, rows of brushes, float32, shape [B, K, W]."""
+        if self._config.actions != "discrete":
+            return batch_tensor(action, world_count, self.rows_shape, "K, W")
+        batch, letters = ((), "") if world_count is None else ((world_count,), "B, ")
+        brushes = self._config.brush_count
+        wanted = (*batch, 4 * brushes)
+        chosen = number_tensor("action", action)
+        if tuple(chosen.shape) != wanted or chosen.is_floating_point():
+            raise NPAError(
+                f"action must be whole numbers of shape [{letters}4 K] = {wanted}, got "
+                f"{tuple(chosen.shape)} of {chosen.dtype}: see env.action_space"
+            )
+        chosen = chosen.long().view(-1, brushes, 4)
+        highest = torch.tensor(self._choices, device=chosen.device)
+        if not bool(((chosen >= 0) & (chosen < highest)).all()):
+            raise NPAError(
+                f"action must choose below {self._choices} for each brush (place across and up, "
+                f"tool, strength), got numbers up to {shown(int(chosen.abs().max()))}"
+            )
+        return self._rows(chosen)
+
+    def _rows(self, chosen: Tensor) -> Tensor:
+        """Return the rows of brushes that choices mean, shape [B, K, W]."""
+        config, tools = self._config, self._tools.to(chosen.device)
+        across, up = chosen[..., 0], chosen[..., 1]
+        places = grid_places(config, chosen.device)[up * config.place_count + across]
+        strength = (chosen[..., 3:] + 1.0) / config.strength_count
+        return torch.cat((places, strength * tools[chosen[..., 2]]), dim=-1)
