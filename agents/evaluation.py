@@ -77,15 +77,7 @@ def evaluate_policy(env: Any, policy: Callable[[Any], Any], seeds: Iterable[int]
         )
     if getattr(worlds, "episode_steps", None) is None and _step_limit(env) is None:
         raise NPAError("env must end its episodes: make it with max_episode_steps=256")
-    if not isinstance(seeds, Iterable):
-        raise NPAError(
-            f"seeds must be one for each episode, got {shown(seeds)}: give seeds=range(8)"
-        )
-    given = list(seeds)
-    if not given:
-        raise NPAError("seeds must hold at least one seed, got none: give seeds=range(8)")
-    # Wrong seeds are errors now, not in the first episode.
-    WorldRandom(given)
+    given = checked_seeds("seeds", seeds)
     policy = policy_in(env, policy)
     single = isinstance(env, gymnasium.Env)
     count = 1 if single else env.num_envs
@@ -95,6 +87,20 @@ def evaluate_policy(env: Any, policy: Callable[[Any], Any], seeds: Iterable[int]
     joined = [np.concatenate(column)[: len(given)] for column in zip(*ran, strict=True)]
     returns, start_losses, final_losses, steps, endings = joined
     return Episodes(returns, start_losses, final_losses, steps, tuple(endings.tolist()))
+
+
+def checked_seeds(name: str, seeds: Iterable[int]) -> list[int]:
+    """Return the seeds of episodes, which the caller calls so."""
+    if not isinstance(seeds, Iterable):
+        raise NPAError(
+            f"{name} must be one for each episode, got {shown(seeds)}: give {name}=range(8)"
+        )
+    given = list(seeds)
+    if not given:
+        raise NPAError(f"{name} must hold at least one seed, got none: give {name}=range(8)")
+    # Wrong seeds are errors now, not in the first episode.
+    WorldRandom(given)
+    return given
 
 
 def policy_in(env: Any, policy: Callable[[Any], Any]) -> Callable[[Any], Any]:

@@ -17,7 +17,7 @@ from npa_envs.agents.comparison.run import PICTURE, SIZE, RunRecord
 from npa_envs.agents.learning import CurvePoint
 from npa_envs.files import write_text
 from npa_envs.measure.plots import draw_band, legend_of, new_figure, png, write_plots
-from npa_envs.measure.record import write_record
+from npa_envs.measure.record import Record
 from npa_envs.measure.tables import NONE, csv_text, markdown_table, mean_with_error, short
 from npa_envs.render import write_filmstrip
 
@@ -47,7 +47,7 @@ def write_table(
         )
     facts = {"command": command, **asdict(plan), "left_out": sorted(map(list, plan.left_out))}
     write_text(folder / TABLE, f"`{command}`\n\n{shown}")
-    write_record(folder / FIGURES, {"facts": facts, "rows": [row.as_object() for row in table]})
+    Record(facts, table, folder / FIGURES).write()
     write_text(folder / CURVES, curves(records))
     return shown
 
@@ -61,16 +61,17 @@ def write_pictures(records: Sequence[RunRecord], folder: Path) -> list[str]:
 # Rows: the results of a method on a task
 
 
-class Estimate(NamedTuple):
+@dataclass(frozen=True)
+class Estimate:
     """A mean over seeds."""
 
     mean: float
     """The mean; NaN where there are no values."""
-    error: float
-    """Its standard error; NaN where there are fewer than two seeds."""
+    standard_error: float
+    """NaN where there are fewer than two seeds."""
 
     def __str__(self) -> str:
-        return mean_with_error(*self)
+        return mean_with_error(self.mean, self.standard_error)
 
 
 UNKNOWN = Estimate(math.nan, math.nan)
@@ -121,16 +122,6 @@ class ReportRow:
     def runs(self) -> int:
         """All runs."""
         return self.done + self.diverged + self.failed
-
-    def as_object(self) -> dict[str, Any]:
-        """Return the row as a JSON object."""
-        found = {field.name: getattr(self, field.name) for field in fields(self)}
-        return {
-            name: {"mean": value.mean, "standard_error": value.error}
-            if isinstance(value, Estimate)
-            else value
-            for name, value in found.items()
-        }
 
 
 def rows(records: Iterable[RunRecord]) -> list[ReportRow]:
@@ -186,7 +177,8 @@ def fraction(reached: Estimate, nothing: Estimate, yardstick: Estimate) -> Estim
     if not gain > 0.0 or math.isnan(reached.mean):
         return UNKNOWN
     share = (reached.mean - nothing.mean) / gain
-    return Estimate(share, math.hypot(reached.error, share * yardstick.error) / gain)
+    spread = math.hypot(reached.standard_error, share * yardstick.standard_error)
+    return Estimate(share, spread / gain)
 
 
 # Rows in words
@@ -352,16 +344,19 @@ def write_strips(records: Sequence[RunRecord], folder: Path) -> list[Path]:
             seeds = sorted({seed for _, seed in found})
             places = [(method, seed) for seed in seeds for method in methods]
             frames = [_frame(found.get(place), folder) for place in places]
-            captions = []
-            for method, seed in places:
-                record = found.get((method, seed))
-                result = "not run" if record is None else str(record.status)
-                if record is not None and result == "done":
-                    result = f"loss {record.mean_loss:.3f}"
-                captions.append(f"{method}, seed {seed}: {result}")
+            captions = [
+                f"{method}, seed {seed}: {_result(found.get((method, seed)))}"
+                for method, seed in places
+            ]
             written.append(folder / f"grown_{task}_{axis}.png")
             write_filmstrip(written[-1], frames, captions, columns=len(methods))
     return written
+
+
+def _result(record: RunRecord | None) -> str:
+    if record is None or record.status != "done":
+        return "not run" if record is None else record.status
+    return f"loss {record.mean_loss:.3f}"
 
 
 def _frame(record: RunRecord | None, folder: Path) -> NDArray[np.uint8]:

@@ -18,11 +18,10 @@ from typing import Any, NamedTuple
 import torch
 
 from npa_envs.agents.learning.problem import EVALUATION_SEEDS, Problem, check_run_seed
-from npa_envs.agents.learning.progress import Budget, CurvePoint, Keeping, Progress, check_finite
+from npa_envs.agents.learning.progress import Budget, CurvePoint, Progress, check_finite
 from npa_envs.agents.learning.rules import RuleSet, RuleSetPolicy
 from npa_envs.errors import MissingDependencyError, NPAError, shown, suggest
 from npa_envs.training.ranks import Ranks
-from npa_envs.training.run_folder import RunFolder
 
 __all__ = [
     "GARDEN_METHODS",
@@ -159,14 +158,8 @@ def train(
             )
     check_run_seed(seed)
     _check_kept(method, out, resume or overwrite)
-    keeping = None
-    if out is not None:
-        run = {"method": method, "problem": problem.to_json(), "seed": seed, "options": options}
-        run = json.loads(json.dumps(run | {"started": start is not None}))
-        folder = RunFolder(Path(out))
-        keeping = Keeping(
-            folder=folder, run=run, resume=resume, overwrite=overwrite, on_stop=on_stop
-        )
+    run = {"method": method, "problem": problem.to_json(), "seed": seed, "options": options}
+    run |= {"started": start is not None}
     progress = Progress(
         problem,
         budget,
@@ -176,7 +169,11 @@ def train(
         entries=entries,
         on_entry=on_entry,
         initial=start,
-        keeping=keeping,
+        out=None if out is None else Path(out),
+        run=None if out is None else json.loads(json.dumps(run)),
+        resume=resume,
+        overwrite=overwrite,
+        on_stop=on_stop,
     )
     given = {"options": replace(declared, **options)} if declared is not None else options
     result = function(progress, **given)

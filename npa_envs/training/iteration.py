@@ -10,7 +10,6 @@ from typing import Any, Literal, Protocol, TypedDict, Unpack
 import torch
 from torch import Tensor
 
-import npa_envs.world.rollout
 from npa_envs.rule.rule import LIFE, NPARule, fate_parameters
 from npa_envs.tasks.base import Task
 from npa_envs.tasks.damage import counted_together
@@ -18,6 +17,7 @@ from npa_envs.tasks.train_config import TrainConfig
 from npa_envs.training.randomness import registered
 from npa_envs.world.cuda_graph import GraphSequence, capture, host_call
 from npa_envs.world.division import living
+from npa_envs.world.particles import Particles
 from npa_envs.world.randomness import Randomness, WorldRandom
 from npa_envs.world.rollout import Memory
 
@@ -61,8 +61,8 @@ def power_mean(values: Tensor, power: float) -> Tensor:
 class EagerIteration:
     """One iteration up to the gradients, launched kernel by kernel.
 
-    Reads `x0`, `s0`; writes `x`, `s`, `terms` and the `.grad` of every parameter. All of these
-    are the same tensors in every iteration: fill them with `copy_`.
+    Reads `start`; writes `end`, `terms` and the `.grad` of every parameter. All of these are the
+    same tensors in every iteration: fill them with `copy_`.
     """
 
     def __init__(
@@ -70,21 +70,18 @@ class EagerIteration:
         task: Task,
         rule: NPARule,
         config: TrainConfig[Any],
-        x: Tensor,
-        s: Tensor,
+        worlds: Particles,
         generator: Randomness,
-        rollout: Rollout | None = None,
+        rollout: Rollout,
         *,
-        goal: Tensor | None = None,
         mean_over_processes: Callable[[Tensor], Tensor] | None = None,
     ) -> None:
-        self.goal = None if goal is None else goal.clone()
-        """Goals of the worlds, int64, shape [B], or None; filled like `x0`."""
-        task = task.toward(self.goal)
-        self.x0, self.s0 = x.clone(), s.clone()
+        self.start = worlds.map(torch.clone)
         """Worlds before the rollout."""
-        self.x, self.s = torch.empty_like(x), torch.empty_like(s)
-        """Worlds after the rollout."""
+        self.end = self.start._replace(x=torch.empty_like(worlds.x), s=torch.empty_like(worlds.s))
+        """Worlds after the rollout, with the same goals."""
+        x, s, _, goal = self.start
+        task = task.toward(goal)
         self.grown = torch.zeros_like(x[:, 0, 0], dtype=torch.bool)
         """Which worlds are grown and whole, and are to rest, shape [B]."""
         self._stillness_weight = config.stillness_weight
@@ -107,12 +104,7 @@ class EagerIteration:
         self._rule = rule
         self._memory = config.memory
         self._generator = generator
-        self._rollout: Rollout = npa_envs.world.rollout.rollout if rollout is None else rollout
-
-    def aim(self, goal: Tensor) -> None:
-        """Give the worlds their goals, int64, shape [B]."""
-        assert self.goal is not None, "made with goals"
-        self.goal.copy_(goal)
+        self._rollout = rollout
 
     def run(self, steps: int) -> None:
         """Run the rollout, the loss and the backward pass."""
@@ -120,12 +112,12 @@ class EagerIteration:
 
     def _forward_backward(self, steps: int) -> None:
         # Through these states codes learn; the pool holds them as they were.
-        s0 = self._task.coded(self.s0)
-        if s0 is not self.s0:
-            self.s0.copy_(s0.detach())
+        s0 = self._task.coded(self.start.s)
+        if s0 is not self.start.s:
+            self.start.s.copy_(s0.detach())
         x, s, path_length = self._rollout(
             self._rule,
-            self.x0,
+            self.start.x,
             s0,
             steps,
             eps=self._task.eps,
@@ -146,8 +138,8 @@ class EagerIteration:
         for buffer, gradient in zip(self.gradients, gradients, strict=True):
             buffer.copy_(gradient)
         self.terms.copy_(torch.stack([total, *parts.values()]).detach())
-        self.x.copy_(x.detach())
-        self.s.copy_(s.detach())
+        self.end.x.copy_(x.detach())
+        self.end.s.copy_(s.detach())
 
     def _mean(self, value: Tensor) -> Tensor:
         """Return the mean of a tensor over all processes, taken between two graphs."""
@@ -161,10 +153,10 @@ class EagerIteration:
         """Return the task's loss and its parts, and how far grown worlds are from rest."""
         total, parts = self._task.loss(x, s, path_length)
         if self._stillness_weight > 0.0:
-            change = s - self.s0
+            change = s - self.start.s
             if self._divides:
                 # Births and deaths are no unrest; who lives is the business of the task's loss.
-                stayed = (living(s) & living(self.s0))[..., None]
+                stayed = (living(s) & living(self.start.s))[..., None]
                 change = torch.where(stayed, change, 0.0)[..., LIFE + 1 :]
             moved, changed = (
                 power_mean(each, self._stillness_power) for each in (path_length, change)
@@ -192,11 +184,11 @@ class GraphedIteration(EagerIteration):
 
     def run(self, steps: int) -> None:
         """Replay the graph for this number of steps, capturing it when it is first asked for."""
-        with torch.cuda.device(self.x0.device):
+        with torch.cuda.device(self.start.x.device):
             if steps not in self._graphs:
                 self._graphs[steps] = capture(
                     lambda: self._forward_backward(steps),
-                    self.x0.device,
+                    self.start.x.device,
                     pool=self._memory_pool,
                     generator=registered(self._generator),
                     warm_up=None if self._graphs else self._warm_up,

@@ -139,15 +139,11 @@ class LossMeter:
 
     def _observed(self) -> dict[str, Tensor]:
         iteration = self._iteration
-        goals = {} if iteration.goal is None else {"goal": iteration.goal}
-        return goals | {
-            "terms": iteration.terms,
-            "x0": iteration.x0,
-            "s0": iteration.s0,
-            "x": iteration.x,
-            "s": iteration.s,
-            "parameters": torch.nn.utils.parameters_to_vector(iteration.parameters).detach(),
-        }
+        (x0, s0, _, goal), (x, s, *_) = iteration.start, iteration.end
+        seen = {"terms": iteration.terms, "x0": x0, "s0": s0, "x": x, "s": s}
+        flat = torch.nn.utils.parameters_to_vector(iteration.parameters).detach()
+        goals = {} if goal is None else {"goal": goal}
+        return goals | seen | {"parameters": flat}
 
 
 def divergence_error(

@@ -106,8 +106,7 @@ class RuleOptimiser:
         moments = state["state"]
         for optimiser, numbers in self._optimisers:
             own = {at: moments[number] for at, number in enumerate(numbers) if number in moments}
-            groups = optimiser.state_dict()["param_groups"]
-            optimiser.load_state_dict({"state": own, "param_groups": groups})
+            load_moments(optimiser, own)
 
     def _fresh(self, parameters: list[nn.Parameter]) -> list[tuple[Optimizer, list[int]]]:
         """Return optimisers without moments, with the numbers of the parameters that each has."""
@@ -132,6 +131,12 @@ class RuleOptimiser:
             fused = parameters[0].is_cuda
             made.append((torch.optim.AdamW(groups, weight_decay=decay, fused=fused), numbers))
         return made
+
+
+def load_moments(optimiser: Optimizer, state: dict[int, Any]) -> None:
+    """Give an optimiser its state; its groups are those of the options."""
+    groups = optimiser.state_dict()["param_groups"]
+    optimiser.load_state_dict({"state": state, "param_groups": groups})
 
 
 def _moments(optimisers: list[tuple[Optimizer, list[int]]]) -> dict[int, dict[str, Tensor]]:

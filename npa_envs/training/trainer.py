@@ -135,7 +135,8 @@ class Trainer:
         self.pool = self._cycle.pool
         if ranks.first:
             rule_bytes = sum(p.nbytes for p in self.rule.parameters())
-            self.folder.prepare(ranks.count * self._cycle.pool_bytes + 16 * rule_bytes)
+            pool_bytes = self.pool.worlds.x.nbytes + self.pool.worlds.s.nbytes
+            self.folder.prepare(ranks.count * pool_bytes + 16 * rule_bytes)
         with self._kept.held(begin=True):
             if content is not None:
                 self._restore(content)
@@ -340,9 +341,10 @@ class Trainer:
         if not self._ranks.first:
             return
         with torch.no_grad():
-            picture = self._cycle.task.picture(self._cycle.batch.x, self._cycle.batch.s)
+            end = self._cycle.batch.end
+            picture = self._cycle.task.picture(end.x, end.s)
         # Worlds that have goals of their own have no picture in common.
-        target = getattr(self.task, "target_picture", None) if self.pool.goal is None else None
+        target = getattr(self.task, "target_picture", None) if end.goal is None else None
         if target is not None:
             picture = torch.cat((target[None].to(picture), picture))
         path = self.folder.picture(self.iteration)

@@ -260,7 +260,7 @@ def test_worlds_whose_time_is_over_are_damaged_then_and_live_again(tmp_path, sha
     def rollout(rule, x, s, steps, **options):
         cycle = trainer._cycle
         places, ages = cycle._index.tolist(), cycle._age.tolist()
-        same = zip(x, cycle.pool.x[places], s, cycle.pool.s[places], strict=True)
+        same = zip(x, cycle.pool.worlds.x[places], s, cycle.pool.worlds.s[places], strict=True)
         changed = [(torch.equal(a, b), not torch.equal(c, d)) for a, b, c, d in same]
         kept, hurt = zip(*changed, strict=True)
         drawn.extend(zip(places, ages, kept, hurt, strict=True))
@@ -444,7 +444,7 @@ def test_world_that_runs_away_does_not_stay_in_the_pool(tmp_path):
 
     trainer = trainer_of(circle_config(tmp_path), rollout=rollout)
     trainer.run(progress=False)
-    assert trainer.pool.x.abs().max() < 10
+    assert trainer.pool.worlds.x.abs().max() < 10
     assert [record["replaced_worlds"] for record in log_of(tmp_path)] == [1] * 6
 
 
