@@ -147,18 +147,16 @@ def _run_single(
     observation, info = env.reset(seed=seeds[0])
     start_loss, total, steps, over = info["loss"], 0.0, 0, False
     while not over:
-        action = policy(_as_batch(observation))[0]
+        one: Any = (
+            {name: part[None] for name, part in observation.items()}
+            if isinstance(observation, Mapping)
+            else observation[None]
+        )
+        action = policy(one)[0]
         observation, reward, terminated, truncated, info = env.step(action)
         total, steps, over = total + float(reward), steps + 1, terminated or truncated
     ending = np.array([_ending(info)], dtype=object)
     return *(np.array([n]) for n in (total, start_loss, info["loss"], steps)), ending
-
-
-def _as_batch(observation: Any) -> Any:
-    """Return an observation of one world, an array or a dict of such, as one of a batch."""
-    if isinstance(observation, Mapping):
-        return {name: part[None] for name, part in observation.items()}
-    return observation[None]
 
 
 def _ending(info: Mapping[str, Any]) -> str:

@@ -17,7 +17,6 @@ from npa_envs.agents.learning.problem import Problem
 from npa_envs.errors import NPAError, suggest
 from npa_envs.processes import part_of
 
-
 GROWTH = {
     "target": "heart",
     "particle_count": 512,
@@ -78,7 +77,6 @@ LEFT_OUT = frozenset({("point_classification", "scripted")})
 """Pairs (task, method) that are compared only when asked for: no scripted policy classifies."""
 
 QUICK = {"episode_steps": 16, "num_envs": 4, "hidden_dim": 16}
-"""Fields of tiny problems."""
 
 
 def make_problem(name: str, *, quick: bool = False) -> Problem:
@@ -109,7 +107,6 @@ class Job:
     """One run: a method of `npa_envs.agents.learning` on a task of `PROBLEMS`, from a seed."""
 
     axis: Axis
-    """Unit of its budget."""
     task: str
     method: str
     seed: int

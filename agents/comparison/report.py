@@ -30,7 +30,6 @@ HEADINGS: Mapping[Axis, str] = {
 }
 
 TABLE, FIGURES, CURVES = "comparison.md", "comparison.json", "comparison.csv"
-"""Names of the files of the table, and of the curves."""
 
 
 def write_table(
@@ -66,7 +65,6 @@ class Estimate:
     """A mean over seeds."""
 
     mean: float
-    """The mean; NaN where there are no values."""
     standard_error: float
     """NaN where there are fewer than two seeds."""
 
@@ -98,25 +96,19 @@ class ReportRow:
     task: str
     method: str
     done: int
-    """Runs that finished."""
     diverged: int
     """Runs whose numbers became infinite or NaN."""
     failed: int
-    """Runs that ended in another error."""
     counted: int
     """Runs whose return is finite: means are over these."""
     episodes_diverged: float
     """Share of the held-out episodes in which a world diverged; NaN without episodes."""
     final_return: Estimate
-    """Return of held-out episodes."""
     final_loss: Estimate
-    """Loss at the ends of the same episodes."""
     fraction: Estimate
     """Fraction of the gradient's improvement over doing nothing."""
     seconds: float
-    """Mean wall time of training [s]."""
     particle_steps: float
-    """Mean particle-steps of training."""
 
     @property
     def runs(self) -> int:
@@ -248,7 +240,6 @@ ACROSS: dict[str, Callable[[CurvePoint], float]] = {
     "wall time [s]": lambda point: point.seconds,
     "particle-steps": lambda point: point.particle_steps,
 }
-"""What curves are drawn against."""
 
 PLACES = 64
 """Places along a curve at which seeds are averaged."""
@@ -290,10 +281,10 @@ def curve(records: Sequence[RunRecord], across: Callable[[CurvePoint], float]) -
 def pictures(records: Sequence[RunRecord]) -> dict[str, bytes]:
     """Return PNG files of the curves by their tasks' names. Needs matplotlib."""
     tasks = dict.fromkeys(record.job.task for record in records)
-    return {task: _draw([r for r in records if r.job.task == task]) for task in tasks}
+    return {task: _picture([r for r in records if r.job.task == task]) for task in tasks}
 
 
-def _draw(records: Sequence[RunRecord]) -> bytes:
+def _picture(records: Sequence[RunRecord]) -> bytes:
     axes = [axis for axis in AXES if any(record.job.axis == axis for record in records)]
     names = {}
     for method in dict.fromkeys(record.job.method for record in records):
@@ -305,7 +296,7 @@ def _draw(records: Sequence[RunRecord]) -> bytes:
         for (label, across), panel in zip(ACROSS.items(), panels, strict=True):
             for number, (method, name) in enumerate(names.items()):
                 some = [r for r in records if (r.job.axis, r.job.method) == (axis, method)]
-                _draw_method(panel, curve(some, across), f"C{number}", name)
+                _draw(panel, curve(some, across), f"C{number}", name)
             panel.set(xlabel=label, ylabel="return of held-out episodes")
             panel.set_title(HEADINGS[axis], fontsize=9, loc="left")
             panel.grid(alpha=0.3)
@@ -314,7 +305,7 @@ def _draw(records: Sequence[RunRecord]) -> bytes:
     return png(figure)
 
 
-def _draw_method(panel: Any, found: Curve | None, colour: str, name: str) -> None:
+def _draw(panel: Any, found: Curve | None, colour: str, name: str) -> None:
     if found is None:
         panel.plot([], [], color=colour, label=name)
     elif len(found.across) == 1:

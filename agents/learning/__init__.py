@@ -62,8 +62,8 @@ GARDEN_METHODS: dict[str, str] = {
     "gradient": "npa_envs.agents.learning.baselines:tend_gradient",
     "ppo_world": "npa_envs.agents.learning.sb3:train_garden_ppo",
     "sac": "npa_envs.agents.learning.sb3:train_garden_sac",
-    "random": "npa_envs.agents.learning.baselines:tend_random",
-    "zero": "npa_envs.agents.learning.baselines:tend_zero",
+    "random": "npa_envs.agents.learning.baselines:train_random",
+    "zero": "npa_envs.agents.learning.baselines:train_zero",
     "scripted": "npa_envs.agents.learning.baselines:tend_scripted",
 }
 """The same for gardens, where a rule runs the particles: those that learn return policies."""
@@ -157,7 +157,14 @@ def train(
                 f"method {shown(method)} has no option {shown(name)}: {suggest(name, known)}"
             )
     check_run_seed(seed)
-    _check_kept(method, out, resume or overwrite)
+    several = Ranks.current().count > 1
+    if method not in KEPT_METHODS and (several or out is not None):
+        asked = "be shared by processes" if several else "be kept in a folder (out)"
+        raise NPAError(
+            f"method {shown(method)} cannot {asked}: take one of {', '.join(KEPT_METHODS)}"
+        )
+    if (resume or overwrite) and out is None:
+        raise NPAError("resume and overwrite need a folder: give out='runs/heart'")
     run = {"method": method, "problem": problem.to_json(), "seed": seed, "options": options}
     run |= {"started": start is not None}
     progress = Progress(
@@ -182,18 +189,6 @@ def train(
         result.zero_grad()
         return Trained(result, progress.log, result.policy())
     return Trained(None, progress.log, result)
-
-
-def _check_kept(method: str, out: str | Path | None, begins: bool) -> None:
-    """Check that a run can be kept and shared, where that is asked for."""
-    several = Ranks.current().count > 1
-    if method not in KEPT_METHODS and (several or out is not None):
-        asked = "be shared by processes" if several else "be kept in a folder (out)"
-        raise NPAError(
-            f"method {shown(method)} cannot {asked}: take one of {', '.join(KEPT_METHODS)}"
-        )
-    if begins and out is None:
-        raise NPAError("resume and overwrite need a folder: give out='runs/heart'")
 
 
 def methods_for(problem: Problem) -> dict[str, str]:

@@ -23,8 +23,7 @@ from npa_envs.files import json_text, write_text
 from npa_envs.training.checkpoint import check_content, unusable_checkpoint
 from npa_envs.training.optimiser import load_moments
 from npa_envs.training.ranks import Ranks
-from npa_envs.training.run import Run
-from npa_envs.training.run_folder import RunFolder
+from npa_envs.training.run import Run, RunFolder
 from npa_envs.world.randomness import Randomness, WorldRandom
 
 
@@ -82,10 +81,14 @@ class Learner(Protocol):
 
     random: Randomness
     """What it draws from."""
-    modules: dict[str, nn.Module]
-    """What learns, by name."""
-    optimisers: dict[str, torch.optim.Optimizer]
-    """Their optimisers of Adam's kind, by name."""
+
+    @property
+    def modules(self) -> Mapping[str, nn.Module]:
+        """What learns, by name."""
+
+    @property
+    def optimisers(self) -> Mapping[str, torch.optim.Optimizer]:
+        """Their optimisers of Adam's kind, by name."""
 
     def go_on(self, iteration: int, part: int) -> None:
         """Go on after so many iterations, for the part-th time, from 1 on, with other worlds."""
@@ -153,13 +156,9 @@ class Progress:
         on_stop: Callable[[], None] = lambda: None,
     ) -> None:
         self.problem = problem
-        """What is learned."""
         self.budget = budget
-        """What may be spent."""
         self.seed = seed
-        """Seed of new rules and of all that the learner draws."""
         self.device = check_device(device)
-        """Where worlds, rules and evaluations are."""
         self.initial = None
         """Copies of the rules to begin with, on the device; None: new ones."""
         if initial is not None:
@@ -201,13 +200,12 @@ class Progress:
         """Learn until the budget is spent, and return the rules.
 
         Args:
-            rules: What is learned.
             iteration: Lets the rules learn a little, and returns the particle-steps that it took.
             learner: What checkpoints are made of, where the run is kept.
 
         Raises:
-            NPAError: It has started before. Or a file of a run that is kept cannot be written or
-                used, or another run writes there.
+            NPAError: A file of a run that is kept cannot be written or used, or another run writes
+                there.
             DivergedError: A weight of the rules is not finite, or an action.
         """
         kept = self._kept
@@ -233,7 +231,7 @@ class Progress:
             self._save(rules, learner)
 
         with kept.held(begin=True):
-            content = kept.take_content()
+            content, kept.content = kept.content, None
             if content is not None:
                 assert learner is not None, "methods whose runs are kept are learners"
                 self._go_on(learner, content)
@@ -244,9 +242,6 @@ class Progress:
         """Evaluate the rules or the policy that the learner begins with, and begin to count.
 
         A resumed run has this evaluation already.
-
-        Raises:
-            NPAError: It has started before.
         """
         if self._started:
             raise NPAError("progress must start once, got a second start: make one for each run")
@@ -273,11 +268,7 @@ class Progress:
         return self.share >= 1.0
 
     def advance(self, particle_steps: int) -> None:
-        """Count the particle-steps that an iteration took.
-
-        Raises:
-            NPAError: Nothing has started yet.
-        """
+        """Count the particle-steps that an iteration took."""
         self._check_started("advance")
         self.particle_steps += particle_steps
         if self.device.type == "cuda":
@@ -290,14 +281,11 @@ class Progress:
             self._agree_on_time()
 
     def look(self, actor: RuleSet | Callable[[Any], Any], force: bool = False) -> None:
-        """Evaluate where the next share of the budget is spent.
+        """Evaluate where the next share of the budget is spent, or, by `force`, in any case.
 
-        Args:
-            actor: The rules, or a policy.
-            force: Evaluate in any case, but where nothing was done since the last evaluation.
+        Where nothing was done since the last evaluation, there is none.
 
         Raises:
-            NPAError: Nothing has started yet.
             DivergedError: A weight of the rules is not finite, or an action.
         """
         self._check_started("look")
@@ -386,16 +374,31 @@ class Progress:
         assert self._kept.folder is not None, "it holds the checkpoint"
         path, like = self._kept.folder.checkpoint, learner_state(learner)
         like |= {"iteration": 0, "part": 0, "particle_steps": 0, "seconds": 0.0}
-        like["optimisers"] = _moments_like(learner, content.get("optimisers"))
-        random = content.get("random")
-        if not isinstance(random, Tensor) or random.shape != like["random"].shape:
+        moments = content.get("optimisers")
+        for name, optimiser in learner.optimisers.items():
+            own = moments.get(name) if isinstance(moments, dict) else None
+            # Parameters without a gradient have no moments.
+            like["optimisers"][name] = {
+                number: {"step": torch.zeros(()), "exp_avg": value, "exp_avg_sq": value}
+                for number, value in enumerate(optimiser.param_groups[0]["params"])
+                if isinstance(own, dict) and number in own
+            }
+        random, drawn = learner.random, content.get("random")
+        if not isinstance(drawn, Tensor) or drawn.shape != like["random"].shape:
             # Processes that share a run draw by world, and one alone does not: draws begin anew.
             content["random"] = like["random"]
         check_content(content, like, path)
         try:
             self.log = [CurvePoint(**entry) for entry in content.get("curve") or ()]
             numbers = [value for entry in self.log for value in asdict(entry).values()]
-            load_learner_state(learner, content)
+            for name, module in learner.modules.items():
+                module.load_state_dict(content["modules"][name])
+            for name, optimiser in learner.optimisers.items():
+                load_moments(optimiser, content["optimisers"][name])
+            if isinstance(random, WorldRandom):
+                random.episodes.fill_(int(content["random"]))
+            else:
+                random.set_state(content["random"])
         except (TypeError, RuntimeError) as error:
             raise unusable_checkpoint(path, f"it cannot be used ({shown(error)})") from error
         # The error of a single episode is infinite.
@@ -442,30 +445,3 @@ def learner_state(learner: Learner) -> dict[str, Any]:
         "optimisers": {name: optimiser.state_dict()["state"] for name, optimiser in optimisers},
         "random": drawn.cpu(),
     }
-
-
-def load_learner_state(learner: Learner, state: Mapping[str, Any]) -> None:
-    """Load what `learner_state` returned."""
-    for name, module in learner.modules.items():
-        module.load_state_dict(state["modules"][name])
-    for name, optimiser in learner.optimisers.items():
-        load_moments(optimiser, state["optimisers"][name])
-    random = learner.random
-    if isinstance(random, WorldRandom):
-        random.episodes.fill_(int(state["random"]))
-    else:
-        random.set_state(state["random"])
-
-
-def _moments_like(learner: Learner, held: Any) -> dict[str, Any]:
-    """Return Adam's state of those parameters that a checkpoint has some of."""
-    like: dict[str, Any] = {}
-    for name, optimiser in learner.optimisers.items():
-        own = held.get(name) if isinstance(held, dict) else None
-        keys = own.keys() if isinstance(own, dict) else ()
-        like[name] = {
-            number: {"step": torch.zeros(()), "exp_avg": value, "exp_avg_sq": value}
-            for number, value in enumerate(optimiser.param_groups[0]["params"])
-            if number in keys
-        }
-    return like

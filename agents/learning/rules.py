@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Iterator, Mapping, Sequence
-from itertools import accumulate
 from pathlib import Path
 from typing import TYPE_CHECKING, cast
 
 import torch
 from torch import Tensor, nn
 
-from npa_envs.agents.policies import Interface, Policy, bounded_update, check_rule_fits
+from npa_envs.agents.policies import Interface, Policy, bounded_update, check_rule_fits, spans_of
 from npa_envs.checks import is_whole
 from npa_envs.errors import NPAError, shown
 from npa_envs.files import made_folder
@@ -50,9 +49,10 @@ class RuleSet(nn.Module):
             )
         self.rules = nn.ModuleList(rules)
         """The rules, in the order of the species."""
-        ends = list(accumulate(counts))
-        self.spans = [slice(end - count, end) for end, count in zip(ends, counts, strict=True)]
+        self.spans = spans_of(counts)
         """Places of each species' particles."""
+        self.counts = tuple(counts)
+        """How many these are."""
         self.interface = interface
 
     @classmethod
@@ -200,12 +200,13 @@ class RuleSetPolicy(Policy):
         return {agent: known[agent] for agent in counts}
 
 
-def starting_rules(problem: Problem, device: torch.device, start: RuleSet) -> RuleSet:
-    """Return copies of rules for a learner to change, on a device.
+def species_of(counts: Sequence[int]) -> Tensor:
+    """Return the number of the species of each particle, int64, shape [N]."""
+    return torch.arange(len(counts)).repeat_interleave(torch.tensor(tuple(counts)))
 
-    Raises:
-        NPAError: They are no set of rules, or do not fit the problem.
-    """
+
+def starting_rules(problem: Problem, device: torch.device, start: RuleSet) -> RuleSet:
+    """Return copies of rules for a learner to change, on a device."""
     if not isinstance(start, RuleSet):
         raise NPAError(
             f"start must be a RuleSet, got {type(start).__name__}: RuleSet.of(problem, 'heart')"

@@ -18,11 +18,9 @@ from npa_envs.errors import NPAError
 from npa_envs.rule.rule import NPARule
 from npa_envs.tasks.base import Task
 from npa_envs.tasks.train_config import TrainConfig
-from npa_envs.training.iteration import EagerIteration, GraphedIteration, Rollout
-from npa_envs.training.meter import LossMeter
+from npa_envs.training.iteration import EagerIteration, GraphedIteration, LossMeter, Rollout
 from npa_envs.training.optimiser import RuleOptimiser
-from npa_envs.training.randomness import RunRandomness, registered, restart
-from npa_envs.training.ranks import Ranks
+from npa_envs.training.ranks import Ranks, RunRandomness, registered, restart
 from npa_envs.world.cuda_graph import GraphedCallable
 from npa_envs.world.particles import Particles
 from npa_envs.world.randomness import Randomness, WorldRandom, uniform_draws
@@ -52,7 +50,6 @@ class WorldPool:
         total: int | None = None,
     ) -> None:
         self.worlds = worlds
-        """The worlds, W."""
         self.age: Tensor | None = None
         """Steps since the seed, or since a life began by damage, int64, shape [W], or None."""
         self.lifetime: Tensor | None = None
@@ -119,11 +116,7 @@ def _largest(worlds: Tensor) -> Tensor:
 class TrainingCycle:
     """All that changes while a rule is trained.
 
-    Args:
-        by_world: Each world draws by itself, as several processes need it.
-
-    Raises:
-        NPAError: ε is to vary where it cannot.
+    `by_world`: each world draws by itself, as several processes need it.
     """
 
     def __init__(
@@ -139,7 +132,6 @@ class TrainingCycle:
         by_world: bool = False,
     ) -> None:
         self.task = task.for_rule(rule)
-        """The task, as it is for worlds of this rule."""
         _check_varied_eps(self.task, rule, config)
         self._config = config
         self._ranks = ranks = Ranks() if ranks is None else ranks
@@ -152,7 +144,6 @@ class TrainingCycle:
             if by_world
             else RunRandomness.of_batch(config, device, schedule)
         )
-        """What the run draws from."""
         self._places = places.to(device)
         worlds = self._seeds(len(places), self.random.pool)
         self.pool = WorldPool(
@@ -162,7 +153,6 @@ class TrainingCycle:
             places=places,
             total=config.pool_size,
         )
-        """Worlds of this process that live on between batches."""
         numbers = ranks.places(config.world_count)
         # Where each world of a batch has a part of the pool to itself, they take turns.
         whole, fresh = config.world_count, config.fresh_count
@@ -184,11 +174,8 @@ class TrainingCycle:
             npa_envs.world.rollout.rollout if rollout is None else rollout,
             mean_over_processes=None if ranks.count == 1 else ranks.mean,
         )
-        """Worlds before and after the last rollout, the loss and its gradients."""
         self.optimiser = RuleOptimiser(self.batch.parameters, config, rule)
-        """Changes the rule."""
         self.meter = LossMeter(self.batch)
-        """What happened since the last line of the log."""
         self._index = torch.zeros(count, dtype=torch.int64, device=device)
         self._age = torch.zeros_like(self._index)
         self._steps = torch.zeros_like(self._index[0])
@@ -204,11 +191,7 @@ class TrainingCycle:
         )
 
     def run(self, iteration: int, share: float = 0.0) -> int:
-        """Train for one iteration, and return the steps of its rollout, T.
-
-        Args:
-            share: As for `TrainConfig.learning_rate_at`.
-        """
+        """Train for one iteration, and return the steps of its rollout, T."""
         config, batch = self._config, self.batch
         lo, hi = config.steps
         steps = int(torch.randint(lo, hi, (), generator=self.random.schedule))

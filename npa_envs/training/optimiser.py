@@ -73,12 +73,7 @@ class RuleOptimiser:
         normalise_gradients([p.grad for p in self._parameters if p.grad is not None])
 
     def step(self, iteration: int, share: float = 0.0) -> None:
-        """Take a step along the prepared gradients; at a repeat's start, with fresh moments.
-
-        Args:
-            iteration: Iterations done so far in the run.
-            share: As for `TrainConfig.learning_rate_at`.
-        """
+        """Take a step along the prepared gradients; at a repeat's start, with fresh moments."""
         if iteration > 0 and iteration % self._config.iterations == 0:
             self._optimisers = self._fresh(self._parameters)
         rate = self._config.learning_rate_at(iteration, share)

@@ -14,17 +14,16 @@ from npa_envs.errors import NPAError
 from npa_envs.rule.rule import NPARule, fate_parameters
 from npa_envs.training.checkpoint import check_same_run, load_checkpoint, save_checkpoint
 from npa_envs.training.cycle import WorldPool
-from npa_envs.training.iteration import EagerIteration, power_mean
-from npa_envs.training.meter import Interval, LossMeter
+from npa_envs.training.iteration import EagerIteration, Interval, LossMeter, power_mean
 from npa_envs.training.optimiser import (
     FATE_RATE,
     RuleOptimiser,
     layer_weights,
     normalise_gradients,
 )
-from npa_envs.training.overrides import config_to_dict
-from npa_envs.training.randomness import RunRandomness
-from npa_envs.training.run_folder import JsonlLog
+from npa_envs.training.presets import config_to_dict
+from npa_envs.training.ranks import RunRandomness
+from npa_envs.training.run import JsonlLog
 from npa_envs.world.particles import Particles
 
 

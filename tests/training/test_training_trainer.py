@@ -490,7 +490,7 @@ def test_folders_that_do_not_do_are_named_before_training(tmp_path, monkeypatch)
     with pytest.raises(NPAError, match=r"out must be a folder that can be created .*file/run"):
         trainer_of(circle_config(tmp_path / "file" / "run"))
     usage = type("Usage", (), {"free": 100})
-    monkeypatch.setattr("npa_envs.training.run_folder.shutil.disk_usage", lambda path: usage)
+    monkeypatch.setattr("npa_envs.training.run.shutil.disk_usage", lambda path: usage)
     with pytest.raises(NPAError, match="must have room for two checkpoints"):
         trainer_of(circle_config(tmp_path / "full"))
     assert not (tmp_path / "full" / "checkpoint.pt").exists()
