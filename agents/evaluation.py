@@ -75,7 +75,8 @@ def evaluate_policy(env: Any, policy: Callable[[Any], Any], seeds: Iterable[int]
             f"env must be a single or a vector environment, got {type(env).__name__}: of several "
             "species take Problem(...).make_envs() of npa_envs.agents.learning"
         )
-    if getattr(worlds, "episode_steps", None) is None and _step_limit(env) is None:
+    limits = [getattr(holder, "episode_steps", None) for holder in (worlds, env)]
+    if limits == [None, None] and _step_limit(env) is None:
         raise NPAError("env must end its episodes: make it with max_episode_steps=256")
     given = checked_seeds("seeds", seeds)
     policy = policy_in(env, policy)

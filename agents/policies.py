@@ -14,9 +14,9 @@ from gymnasium.vector import SyncVectorEnv, VectorEnv
 from numpy.typing import NDArray
 from torch import Tensor
 
-from npa_envs.checks import checked_finite, checked_positive, is_whole
+from npa_envs.checks import checked_count, checked_finite, checked_positive
 from npa_envs.errors import NPAError, shown
-from npa_envs.rule.rule import COLOUR_OFFSET, NPARule
+from npa_envs.rule.rule import COLOUR_OFFSET, NPARule, check_rule
 from npa_envs.world.actions import Physics
 from npa_envs.world.randomness import StreamId, WorldRandom
 
@@ -243,10 +243,7 @@ class RulePolicy(Policy):
     """
 
     def __init__(self, rule: NPARule, env: Any = None, state_scale: float = 1.0) -> None:
-        if not isinstance(rule, NPARule):
-            raise NPAError(
-                f"rule must be an NPARule, got {type(rule).__name__}: npa_envs.load_rule('gecko')"
-            )
+        check_rule(rule)
         if rule.divides:
             raise NPAError(
                 "a policy acts on particles that stay as many as they are, got a rule with "
@@ -297,9 +294,7 @@ class PolicyDraws:
     """Random numbers of a policy: a stream for each world, from `seed`, `seed + 1`, ..."""
 
     def __init__(self, seed: Any) -> None:
-        if not (is_whole(seed) or isinstance(seed, np.integer)) or seed < 0:
-            raise NPAError(f"a seed must be an integer of at least 0, got {shown(seed)}")
-        self._seed = int(seed)
+        self._seed = checked_count("seed", seed)
         self._random: WorldRandom | None = None
 
     def next(self, world_count: int, device: torch.device) -> WorldRandom:

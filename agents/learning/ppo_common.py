@@ -340,19 +340,12 @@ class Minibatches:
         self._orders = [
             torch.zeros(steps * worlds * n, dtype=torch.int64, device=random.device) for n in rows
         ]
-        # As even as `tensor_split` makes them.
-        self._sizes = [
-            [shared * ((len(order) // shared + k) // self.count) for k in range(self.count)][::-1]
-            for order in self._orders
-        ]
-
-    @property
-    def parts(self) -> list[tuple[Tensor, ...]]:
+        self.parts: list[tuple[Tensor, ...]] = []
         """Rows of each part, int64, by group: views, which `shuffle` writes anew."""
-        return [
-            torch.split(order, sizes)
-            for order, sizes in zip(self._orders, self._sizes, strict=True)
-        ]
+        for order in self._orders:
+            # As even as `tensor_split` makes them.
+            sizes = [shared * ((len(order) // shared + k) // self.count) for k in range(self.count)]
+            self.parts.append(torch.split(order, sizes[::-1]))
 
     def shuffle(self) -> None:
         """Draw the orders of the next pass."""

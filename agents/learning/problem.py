@@ -9,7 +9,6 @@ import json
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
-from types import SimpleNamespace
 from typing import Any, Literal, get_args
 
 import gymnasium
@@ -373,11 +372,7 @@ class ConcatenatedSpeciesEnv:
         self.num_envs, self.config, self.render_mode = num_envs, env.config, env.render_mode
         self.task = env.worlds.task
         self.metadata = {"autoreset_mode": AutoresetMode.SAME_STEP}
-        self.worlds = SimpleNamespace(
-            physics=env.worlds.physics,
-            perception_dim=env.worlds.perception_dim,
-            episode_steps=episode_steps,
-        )
+        self.worlds, self.episode_steps = env.worlds, episode_steps
         counts = env.config.played_counts
         self.spans = dict(zip(env.agents, spans_of(counts), strict=True))
         self.single_observation_space = _concatenated_space(env.single_observation_spaces)

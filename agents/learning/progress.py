@@ -15,7 +15,7 @@ from torch import Tensor, nn
 
 from npa_envs.agents.evaluation import checked_seeds, evaluate_policy
 from npa_envs.agents.learning.problem import Problem
-from npa_envs.agents.learning.rules import RuleSet, starting_rules
+from npa_envs.agents.learning.rules import RuleSet
 from npa_envs.checks import check_count, check_positive, is_real
 from npa_envs.devices import check_device
 from npa_envs.errors import DivergedError, NPAError, shown
@@ -162,7 +162,12 @@ class Progress:
         self.initial = None
         """Copies of the rules to begin with, on the device; None: new ones."""
         if initial is not None:
-            self.initial = starting_rules(problem, self.device, initial)
+            if not isinstance(initial, RuleSet):
+                raise NPAError(
+                    f"start must be a RuleSet, got {type(initial).__name__}: "
+                    "RuleSet.of(problem, 'heart')"
+                )
+            self.initial = RuleSet.of(problem, list(initial)).to(self.device)
         self.particle_steps = 0
         """Particle-steps spent so far."""
         self.log: list[CurvePoint] = []

@@ -325,9 +325,9 @@ class Search:
             asked = self._proposals.ask()
             if _fingerprint(asked) != batch["fingerprint"] or len(asked) != len(batch["found"]):
                 raise NPAError(
-                    f"{str(self._record.path)!r} must hold the candidates that are proposed here, "
-                    f"but batch {number} is of others (another machine?): remove it, or choose "
-                    "another folder with --out"
+                    f"{str(self._record.path)!r} must hold the candidates that this search "
+                    f"proposes, but batch {number} is of others (another machine?): remove it, or "
+                    "choose another folder with --out"
                 )
             self._tell(batch)
 

@@ -570,10 +570,7 @@ def train_together(
         rules: What to start from, one rule for each species; copied. None: the configuration's
             `initial_rules`, or untrained ones.
         resume: Go on from the checkpoint in `config.out`; give the same `rules` again.
-        overwrite: Start anew although `config.out` holds a run; its files are removed.
-        progress: Show a progress bar.
-        max_seconds: Stop after this time [s]; the run can be resumed.
-        begun: Called once when nothing is left to be refused, before the first iteration.
+        overwrite: As `progress`, `max_seconds` and `begun`, those of `train`.
 
     Returns:
         What the run came to; its `rule` holds the rules, in the order of the species. Their files

@@ -195,7 +195,7 @@ def fitted(rule, **keywords):
         (lambda env: RulePolicy("gecko", env), "rule must be an NPARule, got str"),
         (lambda _: RulePolicy(wild_rule(), state_scale=0.0), "state_scale must be positive"),
         (lambda _: ZeroPolicy(gymnasium.make("CartPole-v1")), "an environment of npa_envs"),
-        (lambda env: RandomPolicy(env, seed=-1), "a seed"),
+        (lambda env: RandomPolicy(env, seed=-1), "seed must be an integer"),
         (lambda env: PaintPolicy(env, colour=(0.5,)), "colour must have three numbers"),
         (lambda env: MendPolicy(env, blank="x"), "blank must be a number, got 'x'"),
         *(
