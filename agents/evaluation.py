@@ -75,17 +75,10 @@ def evaluate_policy(env: Any, policy: Callable[[Any], Any], seeds: Iterable[int]
             f"env must be a single or a vector environment, got {type(env).__name__}: of several "
             "species take Problem(...).make_envs() of npa_envs.agents.learning"
         )
-    if getattr(worlds, "episode_steps", None) is None and _step_limit(env) is None:
+    limits = [getattr(holder, "episode_steps", None) for holder in (worlds, env)]
+    if limits == [None, None] and _step_limit(env) is None:
         raise NPAError("env must end its episodes: make it with max_episode_steps=256")
-    if not isinstance(seeds, Iterable):
-        raise NPAError(
-            f"seeds must be one for each episode, got {shown(seeds)}: give seeds=range(8)"
-        )
-    given = list(seeds)
-    if not given:
-        raise NPAError("seeds must hold at least one seed, got none: give seeds=range(8)")
-    # Wrong seeds are errors now, not in the first episode.
-    WorldRandom(given)
+    given = checked_seeds("seeds", seeds)
     policy = policy_in(env, policy)
     single = isinstance(env, gymnasium.Env)
     count = 1 if single else env.num_envs
@@ -95,6 +88,20 @@ def evaluate_policy(env: Any, policy: Callable[[Any], Any], seeds: Iterable[int]
     joined = [np.concatenate(column)[: len(given)] for column in zip(*ran, strict=True)]
     returns, start_losses, final_losses, steps, endings = joined
     return Episodes(returns, start_losses, final_losses, steps, tuple(endings.tolist()))
+
+
+def checked_seeds(name: str, seeds: Iterable[int]) -> list[int]:
+    """Return the seeds of episodes, which the caller calls so."""
+    if not isinstance(seeds, Iterable):
+        raise NPAError(
+            f"{name} must be one for each episode, got {shown(seeds)}: give {name}=range(8)"
+        )
+    given = list(seeds)
+    if not given:
+        raise NPAError(f"{name} must hold at least one seed, got none: give {name}=range(8)")
+    # Wrong seeds are errors now, not in the first episode.
+    WorldRandom(given)
+    return given
 
 
 def policy_in(env: Any, policy: Callable[[Any], Any]) -> Callable[[Any], Any]:
@@ -141,18 +148,16 @@ def _run_single(
     observation, info = env.reset(seed=seeds[0])
     start_loss, total, steps, over = info["loss"], 0.0, 0, False
     while not over:
-        action = policy(_as_batch(observation))[0]
+        one: Any = (
+            {name: part[None] for name, part in observation.items()}
+            if isinstance(observation, Mapping)
+            else observation[None]
+        )
+        action = policy(one)[0]
         observation, reward, terminated, truncated, info = env.step(action)
         total, steps, over = total + float(reward), steps + 1, terminated or truncated
     ending = np.array([_ending(info)], dtype=object)
     return *(np.array([n]) for n in (total, start_loss, info["loss"], steps)), ending
-
-
-def _as_batch(observation: Any) -> Any:
-    """Return an observation of one world, an array or a dict of such, as one of a batch."""
-    if isinstance(observation, Mapping):
-        return {name: part[None] for name, part in observation.items()}
-    return observation[None]
 
 
 def _ending(info: Mapping[str, Any]) -> str:

@@ -9,11 +9,11 @@ import torch
 from torch import Tensor
 
 from npa_envs.agents.policies import PolicyDraws, unwrapped
-from npa_envs.checks import is_real
+from npa_envs.checks import checked_positive
 from npa_envs.envs.garden.brushes import BrushLayout, grid_places
 from npa_envs.envs.garden.task import GardenTask, TargetDeficit
 from npa_envs.envs.shepherd2d import ShepherdTask
-from npa_envs.errors import NPAError, shown
+from npa_envs.errors import NPAError
 from npa_envs.world.randomness import StreamId, WorldRandom
 
 FREE_PLACES = 8
@@ -21,14 +21,7 @@ FREE_PLACES = 8
 
 
 class BrushPolicy:
-    """A policy of a garden, for arrays and tensors alike; subclasses define `act`.
-
-    Args:
-        env: A garden, single or vector, whose actions are numbers: "grid" or "free".
-
-    Raises:
-        NPAError: It is none, or has other actions.
-    """
+    """A policy of a garden, single or vector, whose actions are numbers: "grid" or "free"."""
 
     def __init__(self, env: Any) -> None:
         inner = unwrapped(env)
@@ -73,12 +66,7 @@ class StillGardener(BrushPolicy):
 
 
 class RandomGardener(BrushPolicy):
-    """Act at random, uniformly over the action space.
-
-    Args:
-        env: A garden.
-        seed: Of the sequence of actions, at least 0; one more for each further world.
-    """
+    """Act at random, uniformly over the action space; each further world has one seed more."""
 
     def __init__(self, env: Any, seed: int = 0) -> None:
         super().__init__(env)
@@ -96,13 +84,9 @@ class ScriptedGardener(BrushPolicy):
     no brush before them is.
 
     Args:
-        env: A garden whose brushes push.
         gain: Push for the deficit at a place (dimensionless).
         share: Push towards neighbouring places for the deficit there (dimensionless).
         width: Standard deviation of the distance of neighbours [length units].
-
-    Raises:
-        NPAError: `env` is no garden, its brushes do not push, or a number is not positive.
     """
 
     def __init__(self, env: Any, gain: float = 0.5, share: float = 0.6, width: float = 0.4) -> None:
@@ -145,13 +129,9 @@ class ScriptedShepherd(BrushPolicy):
     """Push everywhere in the direction of the goal: to a place, around, or outwards.
 
     Args:
-        env: `npa/Shepherd2D-v0`, whose brushes push.
         gain: Share of the way to the goal in a step (dimensionless).
         ring: Distance from the middle of the picture at which brushes stand that can go anywhere
             [length units].
-
-    Raises:
-        NPAError: `env` is another one, its brushes do not push, or a number is not positive.
     """
 
     def __init__(self, env: Any, gain: float = 1.0, ring: float = 0.4) -> None:
@@ -188,13 +168,6 @@ class ScriptedShepherd(BrushPolicy):
         return action
 
 
-def checked_positive(name: str, value: Any) -> float:
-    """Return a number that must be positive and finite."""
-    if not is_real(value) or value <= 0.0:
-        raise NPAError(f"{name} must be positive and finite, got {shown(value)}: try 0.2")
-    return float(value)
-
-
 class GradientGardener(BrushPolicy):
     """Plan by the gradient of rewards through brushes, rule and picture.
 
@@ -207,11 +180,6 @@ class GradientGardener(BrushPolicy):
         env: A garden whose brushes push, with dense rewards.
         horizon: Steps of a plan.
         iterations: Gradient steps on each plan.
-        learning_rate: Of Adam (dimensionless).
-        seed: Of its own draws, at least 0.
-
-    Raises:
-        NPAError: `env` is no garden.
     """
 
     def __init__(

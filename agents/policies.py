@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import contextlib
 import math
-from collections.abc import Mapping, Sequence
-from itertools import accumulate
+from collections.abc import Iterable, Mapping, Sequence
+from itertools import accumulate, pairwise
 from typing import Any, NamedTuple, TypeVar, overload
 
 import numpy as np
@@ -14,9 +14,10 @@ from gymnasium.vector import SyncVectorEnv, VectorEnv
 from numpy.typing import NDArray
 from torch import Tensor
 
-from npa_envs.checks import is_real, is_whole
+from npa_envs.checks import checked_count, checked_finite, checked_positive
 from npa_envs.errors import NPAError, shown
-from npa_envs.rule.rule import COLOUR_OFFSET, NPARule
+from npa_envs.rule.rule import COLOUR_OFFSET, NPARule, check_rule
+from npa_envs.world.actions import Physics
 from npa_envs.world.randomness import StreamId, WorldRandom
 
 Array = TypeVar("Array", NDArray[Any], Tensor)
@@ -37,6 +38,13 @@ class Interface(NamedTuple):
     """Species whose densities and density gradients follow in an observation; 0: none."""
     target_dim: int = 0
     """Columns of the world's target at the end of an observation; policies leave them out."""
+
+    @classmethod
+    def of(cls, physics: Physics, species_count: int = 0, target_dim: int = 0) -> Interface:
+        """Return that of worlds with such constants."""
+        scale = physics.limits.state_scale
+        sizes = physics.space_dim, physics.state_dim, physics.moving
+        return cls(*sizes, scale, species_count, target_dim)
 
     @property
     def shared_dim(self) -> int:
@@ -70,11 +78,8 @@ class Interface(NamedTuple):
     def action(self, displacement: Tensor, state_step: Tensor) -> Tensor:
         """Return the action of a displacement and a state step, within the action space.
 
-        Args:
-            displacement: As a fraction of α ε, shape [..., D]; longer ones are shortened to 1.
-                Where particles do not move it is left out.
-            state_step: Change of the states, dimensionless, shape [..., C]; clipped to plus and
-                minus `state_scale`.
+        Displacements, fractions of α ε, shape [..., D], are shortened to 1, and left out where
+        particles do not move; state steps, shape [..., C], are clipped to ± `state_scale`.
         """
         parts = [(state_step / self.state_scale).clamp(-1.0, 1.0)]
         if self.moving:
@@ -84,11 +89,7 @@ class Interface(NamedTuple):
 
 
 def unwrapped(env: Any) -> Any:
-    """Return the NPA environment, single or vector, within wrappers; of `SyncVectorEnv` the first.
-
-    Raises:
-        NPAError: There is none.
-    """
+    """Return the NPA environment within wrappers; of `SyncVectorEnv` the first."""
     inner = getattr(env, "unwrapped", None)
     if isinstance(inner, SyncVectorEnv):
         inner = inner.envs[0].unwrapped
@@ -118,22 +119,12 @@ def interface_of(env: Any) -> Interface:
     physics = worlds.physics
     # Worlds with perception by species perceive more than their physics says.
     appended = getattr(worlds, "perception_dim", physics.perception_dim) - physics.perception_dim
-    return Interface(
-        physics.space_dim,
-        physics.state_dim,
-        physics.moving,
-        physics.limits.state_scale,
-        appended // (1 + physics.space_dim),
-        getattr(worlds, "target_dim", 0),
-    )
+    species = appended // (1 + physics.space_dim)
+    return Interface.of(physics, species, getattr(worlds, "target_dim", 0))
 
 
 def acting_interface(env: Any) -> Interface:
-    """Return `interface_of` an environment whose actions are rows of its particles.
-
-    Raises:
-        NPAError: Actions are something else, such as codes or brushes.
-    """
+    """Return `interface_of` an environment; refuse actions that are no rows of its particles."""
     interface = interface_of(env)
     space = getattr(env, "single_action_space", None) or getattr(env, "action_space", None)
     # Parallel environments of PettingZoo have a method there: their agents are particles' species.
@@ -144,6 +135,12 @@ def acting_interface(env: Any) -> Interface:
             "env.action_space.sample(), or give another environment"
         )
     return interface
+
+
+def spans_of(counts: Iterable[int]) -> list[slice]:
+    """Return the places of groups of so many particles that stand one after the other."""
+    ends = [0, *accumulate(counts)]
+    return [slice(*pair) for pair in pairwise(ends)]
 
 
 class Policy:
@@ -214,11 +211,7 @@ class Policy:
 
     def _places(self, counts: Mapping[str, int]) -> dict[str, slice]:
         """Return the places of the particles of agents with such numbers of them."""
-        ends = accumulate(counts.values())
-        return {
-            agent: slice(end - count, end)
-            for (agent, count), end in zip(counts.items(), ends, strict=True)
-        }
+        return dict(zip(counts, spans_of(counts.values()), strict=True))
 
     def _act_on(self, observation: Tensor) -> Tensor:
         shape, columns = tuple(observation.shape), self.interface.perception_dim
@@ -250,10 +243,7 @@ class RulePolicy(Policy):
     """
 
     def __init__(self, rule: NPARule, env: Any = None, state_scale: float = 1.0) -> None:
-        if not isinstance(rule, NPARule):
-            raise NPAError(
-                f"rule must be an NPARule, got {type(rule).__name__}: npa_envs.load_rule('gecko')"
-            )
+        check_rule(rule)
         if rule.divides:
             raise NPAError(
                 "a policy acts on particles that stay as many as they are, got a rule with "
@@ -265,15 +255,21 @@ class RulePolicy(Policy):
                 f"code_dim={rule.code_dim}: run it with npa_envs.rollout, or in "
                 "npa/Shapeshifter2D-v0"
             )
-        if not (is_real(state_scale) and state_scale > 0.0):
-            raise NPAError(
-                f"state_scale must be positive and finite, got {shown(state_scale)}: give the "
-                "environment's, or env"
-            )
+        state_scale = checked_positive("state_scale", state_scale)
         if env is None:
             _check_correction(rule)
         else:
-            _check_fit(rule, env)
+            spaces = [
+                getattr(e, "single_observation_space", None) or e.observation_space
+                for e in (env, unwrapped(env))
+            ]
+            if spaces[0] != spaces[1]:
+                raise NPAError(
+                    "a rule must see observations as the environment makes them, and a wrapper "
+                    f"changes them from {spaces[1]} to {spaces[0]}: give RulePolicy the "
+                    "environment without it"
+                )
+            check_rule_fits(rule, interface_of(env), unwrapped(env).config)
             state_scale = interface_of(env).state_scale
         super().__init__(rule_interface(rule, state_scale))
         self.rule = rule
@@ -295,16 +291,10 @@ class ZeroPolicy(Policy):
 
 
 class PolicyDraws:
-    """Random numbers of a policy: a stream for each world, from the seeds `seed`, `seed + 1`, ...
-
-    Raises:
-        NPAError: The seed is no integer of at least 0.
-    """
+    """Random numbers of a policy: a stream for each world, from `seed`, `seed + 1`, ..."""
 
     def __init__(self, seed: Any) -> None:
-        if not (is_whole(seed) or isinstance(seed, np.integer)) or seed < 0:
-            raise NPAError(f"a seed must be an integer of at least 0, got {shown(seed)}")
-        self._seed = int(seed)
+        self._seed = checked_count("seed", seed)
         self._random: WorldRandom | None = None
 
     def next(self, world_count: int, device: torch.device) -> WorldRandom:
@@ -355,7 +345,7 @@ class SpreadPolicy(Policy):
 
     def __init__(self, env: Any, gain: float = 0.03) -> None:
         super().__init__(interface_of(env))
-        self._gain = _finite("gain", gain, 0.03)
+        self._gain = checked_finite("gain", gain)
 
     def act(self, observation: Tensor) -> Tensor:
         """Return displacements down the gradient and the subclass's state steps."""
@@ -423,19 +413,13 @@ class MendPolicy(SpreadPolicy):
 
     def __init__(self, env: Any, blank: float = 0.1, gain: float = 0.003) -> None:
         super().__init__(env, gain)
-        self._blank = _finite("blank", blank, 0.1)
+        self._blank = checked_finite("blank", blank)
 
     def state_step(self, observation: Tensor) -> Tensor:
         """Return the way to the neighbours' mean state where a particle is blank."""
         states = self.interface.states(observation)
         blank = states.norm(dim=-1, keepdim=True) < self._blank
         return torch.where(blank, self.interface.mean_states(observation) - states, 0.0)
-
-
-def _finite(name: str, value: float, example: float) -> float:
-    if not is_real(value):
-        raise NPAError(f"{name} must be a finite number, got {shown(value)}: try {example}")
-    return value
 
 
 def rule_interface(rule: NPARule, state_scale: float) -> Interface:
@@ -445,13 +429,10 @@ def rule_interface(rule: NPARule, state_scale: float) -> Interface:
 
 
 def bounded_update(rule: NPARule, observation: Tensor) -> tuple[Tensor, Tensor]:
-    """Return a rule's bounded updates for observations [K, P]; differentiable.
+    """Return a rule's bounded updates for observations [K, P], on its device; differentiable.
 
-    They are computed on the rule's device, in its precision.
-
-    Returns:
-        Displacements δ / (1 + |δ|) as fractions of α ε, shape [K, D], or [K, 0] where particles are
-        static; and state steps Δs, dimensionless, not bounded, shape [K, C].
+    They are displacements δ / (1 + |δ|) as fractions of α ε, shape [K, D], or [K, 0] where
+    particles are static, and state steps Δs, dimensionless, not bounded, shape [K, C].
     """
     weight = rule.hidden.weight
     rows = perceived(rule, observation.to(weight.device, weight.dtype))
@@ -489,25 +470,8 @@ def perceived(rule: NPARule, rows: Tensor) -> Tensor:
     return torch.cat((*groups, rows[:, end:]), dim=1)
 
 
-def _check_fit(rule: NPARule, env: Any) -> None:
-    spaces = [
-        getattr(e, "single_observation_space", None) or e.observation_space
-        for e in (env, unwrapped(env))
-    ]
-    if spaces[0] != spaces[1]:
-        raise NPAError(
-            "a rule must see observations as the environment makes them, and a wrapper changes "
-            f"them from {spaces[1]} to {spaces[0]}: give RulePolicy the environment without it"
-        )
-    check_rule_fits(rule, interface_of(env), unwrapped(env).config)
-
-
 def check_rule_fits(rule: NPARule, wanted: Interface, config: Any) -> None:
-    """Check that a rule can act in an environment as it does in a rollout.
-
-    Raises:
-        NPAError: They differ.
-    """
+    """Check that a rule can act in an environment as it does in a rollout."""
     _check_correction(rule)
     if rule.static == wanted.moving:
         kind, other = ("static", "moving") if rule.static else ("moving", "static")

@@ -15,13 +15,8 @@ from npa_envs.errors import NPAError
 class RecognisingShapeshifter:
     """Say the code of the picture that looks most like the goal; for arrays and tensors alike.
 
-    It knows which code grows which picture, and looks at the observation alone.
-
-    Args:
-        env: `npa/Shapeshifter2D-v0`, single or vector, with either form of actions.
-
-    Raises:
-        NPAError: It is another environment.
+    It knows which code grows which picture in `npa/Shapeshifter2D-v0`, single or vector, with
+    either form of actions, and looks at the observation alone.
     """
 
     def __init__(self, env: Any) -> None:

@@ -47,7 +47,7 @@ from npa_envs.tasks.targets.meshes import (
 from npa_envs.tasks.targets.views import Views, over, some_views, views_of_mesh
 from npa_envs.tasks.train_config import TrainConfig
 from npa_envs.training import Trainer, override, preset
-from npa_envs.training.overrides import config_to_dict
+from npa_envs.training.presets import config_to_dict
 from npa_envs.world.recorded import release_recordings
 
 SEEDS = tuple(range(1_000_000, 1_000_008))

@@ -135,7 +135,7 @@ def measured(trainer: Trainer, size: str, last_step: int = LAST) -> dict[str, An
     pool = trainer.pool
     if pool.age is not None:
         with torch.no_grad():
-            losses = task.metric(pool.x, pool.s).tolist()
+            losses = task.metric(pool.worlds.x, pool.worlds.s).tolist()
         # What training saw last, place by place: age and loss.
         pairs = zip(pool.age.tolist(), losses, strict=True)
         found["pool"] = [[age, round(loss, 4)] for age, loss in pairs]

@@ -23,8 +23,7 @@ from numpy.typing import NDArray
 from scipy.stats import t as student
 from scripts import script_facts, script_parser
 
-from npa_envs.agents.search.methods import METHODS
-from npa_envs.agents.search.run import RESULTS, Growth, Search, tried_again
+from npa_envs.agents.search.run import METHODS, RESULTS, Growth, Search, tried_again
 from npa_envs.agents.search.worlds import SearchWorld
 from npa_envs.devices import check_device
 from npa_envs.files import read_json, write_bytes

@@ -28,7 +28,7 @@ from npa_envs.tasks.targets.points import load_target
 from npa_envs.tasks.targets.textures import load_texture
 from npa_envs.tasks.targets.views import load_views
 from npa_envs.training import TASKS, load_config, override, preset
-from npa_envs.training.overrides import config_to_dict
+from npa_envs.training.presets import config_to_dict
 
 
 def configured(draw: random.Random) -> dict[str, Any]:

@@ -27,7 +27,6 @@ from npa_envs.files import read_json
 from npa_envs.measure.record import number, write_record
 
 AXIS: Axis = "particle-steps"
-"""What is equal for all methods."""
 
 METHODS = {
     "gradient": "descends the loss through the physics; in gardens plans by it, and learns nothing",
@@ -77,7 +76,6 @@ class Suite:
 
     name: str
     groups: Mapping[str, Mapping[str, BenchProblem]]
-    """Problems that are reported together."""
 
     @property
     def entries(self) -> dict[str, BenchProblem]:
@@ -171,7 +169,6 @@ class BenchRun:
     env_id: str
     seed: int
     particle_steps: float
-    """Particle-steps that it learned from."""
     mean_return: float
     """Mean return of the held-out episodes; NaN where it diverged."""
     curve: tuple[tuple[float, float], ...] = ()
@@ -188,7 +185,6 @@ class BenchRow:
     method: str
     runs: tuple[BenchRun, ...]
     about: str = ""
-    """The method in a sentence."""
     machine: str = ""
     """Its machine, or several separated by semicolons."""
 
@@ -219,7 +215,19 @@ def write_rows(
                 "command": command,
                 "date": max(record.date for record in some),
                 **{name: plan.settings[name] for name in ("machine", "commit", "versions")},
-                "runs": [_run_object(suite, record) for record in some],
+                "runs": [
+                    {
+                        "id": suite.tasks[record.job.task],
+                        "seed": record.job.seed,
+                        "particle_steps": record.curve[-1].particle_steps if record.curve else 0,
+                        "seconds": round(record.curve[-1].seconds, 2) if record.curve else 0.0,
+                        "returns": [round(value, 5) for value in record.returns],
+                        "curve": [
+                            [p.particle_steps, round(p.mean_return, 5)] for p in record.curve
+                        ],
+                    }
+                    for record in some
+                ],
             }
             held = _held_row(suite, plan, method, folder)
             write_record(paths[-1], row if held is None else _joined(suite, held, row))
@@ -302,18 +310,6 @@ def _both(first: str | None, second: str | None) -> str | None:
         return first
     parts = [part for text in (first, second) for part in str(text).split("; ")]
     return "; ".join(dict.fromkeys(parts))
-
-
-def _run_object(suite: Suite, record: RunRecord) -> dict[str, Any]:
-    points = record.curve
-    return {
-        "id": suite.tasks[record.job.task],
-        "seed": record.job.seed,
-        "particle_steps": points[-1].particle_steps if points else 0,
-        "seconds": round(points[-1].seconds, 2) if points else 0.0,
-        "returns": [round(value, 5) for value in record.returns],
-        "curve": [[point.particle_steps, round(point.mean_return, 5)] for point in points],
-    }
 
 
 def read_row(path: Path) -> BenchRow:
@@ -432,14 +428,10 @@ def interquartile_mean(*samples: NDArray[np.float64], axis: int = -1) -> Any:
 
 
 def score(samples: Sequence[NDArray[np.float64]], seed: int = 0) -> Score:
-    """Return the interquartile mean of scores, and its interval by bootstrap within problems.
+    """Return the interquartile mean of the problems' scores, and its interval by bootstrap.
 
     Seeds are drawn anew within each problem, 2000 times, and percentiles taken: stratified
     bootstrap (Agarwal et al., arXiv 2108.13264).
-
-    Args:
-        samples: Scores of the runs on each problem.
-        seed: Of the draws.
     """
     try:
         from scipy.stats import bootstrap
@@ -450,14 +442,9 @@ def score(samples: Sequence[NDArray[np.float64]], seed: int = 0) -> Score:
     middle = float(interquartile_mean(*samples))
     if all(np.ptp(values) == 0.0 for values in samples):
         return Score(middle, middle, middle)
-    found = bootstrap(
-        samples,
-        interquartile_mean,
-        n_resamples=2000,
-        method="percentile",
-        rng=np.random.default_rng(seed),
-    )
-    low, high = found.confidence_interval
+    draws = np.random.default_rng(seed)
+    how: dict[str, Any] = {"n_resamples": 2000, "method": "percentile", "rng": draws}
+    low, high = bootstrap(samples, interquartile_mean, **how).confidence_interval
     return Score(middle, float(low), float(high))
 
 

@@ -11,22 +11,11 @@ from __future__ import annotations
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import PurePosixPath
-from typing import Any, Literal, NamedTuple, get_args
+from typing import Any, Literal, get_args
 
 from npa_envs.agents.learning.problem import Problem
 from npa_envs.errors import NPAError, suggest
 from npa_envs.processes import part_of
-
-
-class Sizes(NamedTuple):
-    """A problem: environment, keywords, episode, hidden layer, and keywords of its quick form."""
-
-    env_id: str
-    keywords: Mapping[str, Any]
-    episode_steps: int
-    hidden_dim: int
-    quick: Mapping[str, Any]
-
 
 GROWTH = {
     "target": "heart",
@@ -39,62 +28,66 @@ GROWTH = {
 }
 """Keywords of both tasks of growth: a heart, wide enough neighbourhoods, small steps."""
 
-SMALL = {"particle_count": 64, "eps": 0.2, "eps0": 0.2, "resolution": 32}
-"""Keywords of their quick forms."""
-
-PROBLEMS: Mapping[str, Sizes] = {
-    "morphogenesis2d": Sizes(
-        "npa/Morphogenesis2D-v0", {**GROWTH, "seed_radius": 0.4}, 48, 64, SMALL
-    ),
-    "regeneration2d": Sizes(
-        "npa/Regeneration2D-v0",
-        {**GROWTH, "rule": "picture", "damage": "wipe", "damage_size": 0.4},
-        32,
-        64,
-        SMALL,
-    ),
-    "point_classification": Sizes(
-        "npa/PointClassification-v0",
-        {"particle_count": 256, "state_dim": 16, "state_scale": 0.1, "eps": 0.3, "eps0": 0.3},
-        24,
-        128,
-        {"particle_count": 64},
-    ),
-    "mixing": Sizes(
-        "npa/Mixing-v0",
-        {
+PROBLEMS: Mapping[str, Mapping[str, Any]] = {
+    "morphogenesis2d": {
+        "env_id": "npa/Morphogenesis2D-v0",
+        "keywords": {**GROWTH, "seed_radius": 0.4},
+        "episode_steps": 48,
+        "hidden_dim": 64,
+    },
+    "regeneration2d": {
+        "env_id": "npa/Regeneration2D-v0",
+        "keywords": {**GROWTH, "rule": "picture", "damage": "wipe", "damage_size": 0.4},
+        "episode_steps": 32,
+        "hidden_dim": 64,
+    },
+    "point_classification": {
+        "env_id": "npa/PointClassification-v0",
+        "keywords": {
+            "particle_count": 256, "state_dim": 16, "state_scale": 0.1, "eps": 0.3, "eps0": 0.3
+        },
+        "episode_steps": 24,
+        "hidden_dim": 128,
+    },
+    "mixing": {
+        "env_id": "npa/Mixing-v0",
+        "keywords": {
             "species_count": 2,
             "particle_count": 512,
             "state_dim": 8,
             "state_scale": 0.1,
             "perception": "per_species",
         },
-        48,
-        64,
-        {"particle_count": 64, "eps": 0.2, "eps0": 0.2},
-    ),
+        "episode_steps": 48,
+        "hidden_dim": 64,
+    },
+}  # fmt: skip
+"""Fields of `Problem` by the names of tasks."""
+
+WIDER = {"eps": 0.2, "eps0": 0.2}
+QUICK_KEYWORDS: Mapping[str, Mapping[str, Any]] = {
+    "morphogenesis2d": {**WIDER, "resolution": 32},
+    "regeneration2d": {**WIDER, "resolution": 32},
+    "point_classification": {},
+    "mixing": WIDER,
 }
-"""Tasks by their names."""
+"""Keywords of tiny forms, of 64 particles, for a test that everything runs."""
 
 LEFT_OUT = frozenset({("point_classification", "scripted")})
 """Pairs (task, method) that are compared only when asked for: no scripted policy classifies."""
 
-QUICK_STEPS = 16
-"""Length of an episode of a quick problem."""
+QUICK = {"episode_steps": 16, "num_envs": 4, "hidden_dim": 16}
 
 
 def make_problem(name: str, *, quick: bool = False) -> Problem:
-    """Return one of `PROBLEMS`; a quick one is tiny, for a test that everything runs."""
+    """Return one of `PROBLEMS`, or its tiny form."""
     if name not in PROBLEMS:
         raise NPAError(f"unknown task {name!r}: {suggest(name, PROBLEMS)}")
-    sizes = PROBLEMS[name]
-    return Problem(
-        env_id=sizes.env_id,
-        keywords={**sizes.keywords, **(sizes.quick if quick else {})},
-        episode_steps=QUICK_STEPS if quick else sizes.episode_steps,
-        num_envs=4 if quick else 32,
-        hidden_dim=16 if quick else sizes.hidden_dim,
-    )
+    fields = {"num_envs": 32, **PROBLEMS[name]}
+    if quick:
+        keywords = {**fields["keywords"], "particle_count": 64, **QUICK_KEYWORDS[name]}
+        fields |= {"keywords": keywords, **QUICK}
+    return Problem(**fields)
 
 
 # Every method on every task, from every seed, within every budget.
@@ -114,7 +107,6 @@ class Job:
     """One run: a method of `npa_envs.agents.learning` on a task of `PROBLEMS`, from a seed."""
 
     axis: Axis
-    """Unit of its budget."""
     task: str
     method: str
     seed: int

@@ -17,7 +17,7 @@ from npa_envs.agents.comparison.run import PICTURE, SIZE, RunRecord
 from npa_envs.agents.learning import CurvePoint
 from npa_envs.files import write_text
 from npa_envs.measure.plots import draw_band, legend_of, new_figure, png, write_plots
-from npa_envs.measure.record import write_record
+from npa_envs.measure.record import Record
 from npa_envs.measure.tables import NONE, csv_text, markdown_table, mean_with_error, short
 from npa_envs.render import write_filmstrip
 
@@ -30,7 +30,6 @@ HEADINGS: Mapping[Axis, str] = {
 }
 
 TABLE, FIGURES, CURVES = "comparison.md", "comparison.json", "comparison.csv"
-"""Names of the files of the table, and of the curves."""
 
 
 def write_table(
@@ -47,7 +46,7 @@ def write_table(
         )
     facts = {"command": command, **asdict(plan), "left_out": sorted(map(list, plan.left_out))}
     write_text(folder / TABLE, f"`{command}`\n\n{shown}")
-    write_record(folder / FIGURES, {"facts": facts, "rows": [row.as_object() for row in table]})
+    Record(facts, table, folder / FIGURES).write()
     write_text(folder / CURVES, curves(records))
     return shown
 
@@ -61,16 +60,16 @@ def write_pictures(records: Sequence[RunRecord], folder: Path) -> list[str]:
 # Rows: the results of a method on a task
 
 
-class Estimate(NamedTuple):
+@dataclass(frozen=True)
+class Estimate:
     """A mean over seeds."""
 
     mean: float
-    """The mean; NaN where there are no values."""
-    error: float
-    """Its standard error; NaN where there are fewer than two seeds."""
+    standard_error: float
+    """NaN where there are fewer than two seeds."""
 
     def __str__(self) -> str:
-        return mean_with_error(*self)
+        return mean_with_error(self.mean, self.standard_error)
 
 
 UNKNOWN = Estimate(math.nan, math.nan)
@@ -97,40 +96,24 @@ class ReportRow:
     task: str
     method: str
     done: int
-    """Runs that finished."""
     diverged: int
     """Runs whose numbers became infinite or NaN."""
     failed: int
-    """Runs that ended in another error."""
     counted: int
     """Runs whose return is finite: means are over these."""
     episodes_diverged: float
     """Share of the held-out episodes in which a world diverged; NaN without episodes."""
     final_return: Estimate
-    """Return of held-out episodes."""
     final_loss: Estimate
-    """Loss at the ends of the same episodes."""
     fraction: Estimate
     """Fraction of the gradient's improvement over doing nothing."""
     seconds: float
-    """Mean wall time of training [s]."""
     particle_steps: float
-    """Mean particle-steps of training."""
 
     @property
     def runs(self) -> int:
         """All runs."""
         return self.done + self.diverged + self.failed
-
-    def as_object(self) -> dict[str, Any]:
-        """Return the row as a JSON object."""
-        found = {field.name: getattr(self, field.name) for field in fields(self)}
-        return {
-            name: {"mean": value.mean, "standard_error": value.error}
-            if isinstance(value, Estimate)
-            else value
-            for name, value in found.items()
-        }
 
 
 def rows(records: Iterable[RunRecord]) -> list[ReportRow]:
@@ -186,7 +169,8 @@ def fraction(reached: Estimate, nothing: Estimate, yardstick: Estimate) -> Estim
     if not gain > 0.0 or math.isnan(reached.mean):
         return UNKNOWN
     share = (reached.mean - nothing.mean) / gain
-    return Estimate(share, math.hypot(reached.error, share * yardstick.error) / gain)
+    spread = math.hypot(reached.standard_error, share * yardstick.standard_error)
+    return Estimate(share, spread / gain)
 
 
 # Rows in words
@@ -256,7 +240,6 @@ ACROSS: dict[str, Callable[[CurvePoint], float]] = {
     "wall time [s]": lambda point: point.seconds,
     "particle-steps": lambda point: point.particle_steps,
 }
-"""What curves are drawn against."""
 
 PLACES = 64
 """Places along a curve at which seeds are averaged."""
@@ -298,10 +281,10 @@ def curve(records: Sequence[RunRecord], across: Callable[[CurvePoint], float]) -
 def pictures(records: Sequence[RunRecord]) -> dict[str, bytes]:
     """Return PNG files of the curves by their tasks' names. Needs matplotlib."""
     tasks = dict.fromkeys(record.job.task for record in records)
-    return {task: _draw([r for r in records if r.job.task == task]) for task in tasks}
+    return {task: _picture([r for r in records if r.job.task == task]) for task in tasks}
 
 
-def _draw(records: Sequence[RunRecord]) -> bytes:
+def _picture(records: Sequence[RunRecord]) -> bytes:
     axes = [axis for axis in AXES if any(record.job.axis == axis for record in records)]
     names = {}
     for method in dict.fromkeys(record.job.method for record in records):
@@ -313,7 +296,7 @@ def _draw(records: Sequence[RunRecord]) -> bytes:
         for (label, across), panel in zip(ACROSS.items(), panels, strict=True):
             for number, (method, name) in enumerate(names.items()):
                 some = [r for r in records if (r.job.axis, r.job.method) == (axis, method)]
-                _draw_method(panel, curve(some, across), f"C{number}", name)
+                _draw(panel, curve(some, across), f"C{number}", name)
             panel.set(xlabel=label, ylabel="return of held-out episodes")
             panel.set_title(HEADINGS[axis], fontsize=9, loc="left")
             panel.grid(alpha=0.3)
@@ -322,7 +305,7 @@ def _draw(records: Sequence[RunRecord]) -> bytes:
     return png(figure)
 
 
-def _draw_method(panel: Any, found: Curve | None, colour: str, name: str) -> None:
+def _draw(panel: Any, found: Curve | None, colour: str, name: str) -> None:
     if found is None:
         panel.plot([], [], color=colour, label=name)
     elif len(found.across) == 1:
@@ -352,16 +335,19 @@ def write_strips(records: Sequence[RunRecord], folder: Path) -> list[Path]:
             seeds = sorted({seed for _, seed in found})
             places = [(method, seed) for seed in seeds for method in methods]
             frames = [_frame(found.get(place), folder) for place in places]
-            captions = []
-            for method, seed in places:
-                record = found.get((method, seed))
-                result = "not run" if record is None else str(record.status)
-                if record is not None and result == "done":
-                    result = f"loss {record.mean_loss:.3f}"
-                captions.append(f"{method}, seed {seed}: {result}")
+            captions = [
+                f"{method}, seed {seed}: {_result(found.get((method, seed)))}"
+                for method, seed in places
+            ]
             written.append(folder / f"grown_{task}_{axis}.png")
             write_filmstrip(written[-1], frames, captions, columns=len(methods))
     return written
+
+
+def _result(record: RunRecord | None) -> str:
+    if record is None or record.status != "done":
+        return "not run" if record is None else record.status
+    return f"loss {record.mean_loss:.3f}"
 
 
 def _frame(record: RunRecord | None, folder: Path) -> NDArray[np.uint8]:

@@ -21,7 +21,7 @@ import threading
 import time
 import traceback
 from collections import Counter
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from queue import SimpleQueue
@@ -60,24 +60,18 @@ class RunRecord:
 
     job: Job
     facts: Mapping[str, Any]
-    """What its figures depend on."""
     status: Status
     """"done"; "diverged": numbers became infinite or NaN; "failed": an error of another kind."""
     error: str = ""
-    """The error, where it is not done."""
     curve: Sequence[CurvePoint] = ()
-    """Held-out episodes while it learned."""
     returns: Sequence[float] = ()
-    """Returns of the held-out episodes at the end."""
     final_losses: Sequence[float] = ()
-    """Losses at the ends of the same episodes."""
     endings: Mapping[str, int] | None = None
     """How many of the same episodes ended for each reason."""
     seconds: float = 0.0
     """How long it took with set-up and evaluation [s]."""
     command: str = ""
     date: str = ""
-    """The day, as YYYY-MM-DD."""
 
     @property
     def mean_return(self) -> float:
@@ -121,7 +115,6 @@ class RunRequest:
 
     job: Job
     facts: dict[str, Any]
-    """What its figures depend on: problem, budget, method, options, episodes, and more."""
     threads: int = 1
     command: str = ""
     teacher: str = ""
@@ -157,26 +150,23 @@ def run(folder: Path, device: str) -> None:
     torch.set_num_threads(request.threads)
     begin = time.perf_counter()
     curve: list[CurvePoint] = []
+    status: Status = "done"
     try:
         episodes = _learn(request, folder, device, curve.append)
     except Exception as error:
         # The table reports what breaks in a method.
         traceback.print_exc()
-        status: Status = "diverged" if isinstance(error, DivergedError) else "failed"
-        said = f"{type(error).__name__}: {' '.join(str(error).split())}"
-        record = request.record(status, begin, error=said, curve=tuple(curve))
+        status = "diverged" if isinstance(error, DivergedError) else "failed"
+        found: dict[str, Any] = {"error": f"{type(error).__name__}: {' '.join(str(error).split())}"}
     else:
-        finite = math.isfinite(episodes.mean_return)
-        record = request.record(
-            "done" if finite else "diverged",
-            begin,
-            error="" if finite else "returns of held-out episodes are not finite",
-            curve=tuple(curve),
-            returns=tuple(episodes.returns.tolist()),
-            final_losses=tuple(episodes.final_losses.tolist()),
-            endings=dict(Counter(episodes.endings)),
-        )
-    record.write(folder)
+        found = {
+            "returns": tuple(episodes.returns.tolist()),
+            "final_losses": tuple(episodes.final_losses.tolist()),
+            "endings": dict(Counter(episodes.endings)),
+        }
+        if not math.isfinite(episodes.mean_return):
+            status, found["error"] = "diverged", "returns of held-out episodes are not finite"
+    request.record(status, begin, curve=tuple(curve), **found).write(folder)
 
 
 def _learn(
@@ -214,21 +204,16 @@ def final_picture(
     envs = longer.make_envs(1, device=device)
     policy = policy_in(envs, policy)
     observation, _ = envs.reset(seed=[seed])
-    picture = _rendered(envs)
+    shown: Any = getattr(envs, "species_env", envs)
+    (picture,) = shown.render()
     for _ in range(problem.episode_steps):
         observation, _, terminated, truncated, _ = envs.step(policy(observation))
         if bool(terminated | truncated):
             break
-        picture = _rendered(envs)
+        (picture,) = shown.render()
     envs.close()
-    return picture
-
-
-def _rendered(envs: Any) -> NDArray[np.uint8]:
-    """Return a picture of the only world."""
-    (picture,) = getattr(envs, "species_env", envs).render()
-    frame: NDArray[np.uint8] = picture
-    return frame
+    found: NDArray[np.uint8] = picture
+    return found
 
 
 def main(folder: Path) -> None:
@@ -250,27 +235,21 @@ def main(folder: Path) -> None:
     run(folder, lines.get())
     while lasts:
         folder = Path(json.loads(lines.get()))
-        _redirect_output(folder)
+        for stream in (sys.stdout, sys.stderr):
+            stream.flush()
+        with (folder / OUTPUT).open("wb") as output:
+            for number in (1, 2):
+                os.dup2(output.fileno(), number)
         run(folder, lines.get())
         # Free the memory of a run for the next one.
         gc.collect()
         torch.cuda.empty_cache()
 
 
-def _redirect_output(folder: Path) -> None:
-    """Send the output of this process into a folder's file from now on."""
-    for stream in (sys.stdout, sys.stderr):
-        stream.flush()
-    with (folder / OUTPUT).open("wb") as output:
-        for number in (1, 2):
-            os.dup2(output.fileno(), number)
-
-
 # All runs over cores or GPUs, each of which may fail by itself. What starts with a process, such as
 # libraries, a GPU's context and kernels, takes longer than many runs learn.
 
 PROGRAM = (sys.executable, "-m", "npa_envs.agents.comparison.run")
-"""Command of a run's process, before the folder of the run."""
 
 MEASURED = ("done", "diverged")
 """Runs that a resumed comparison does not repeat."""
@@ -345,23 +324,25 @@ def run_jobs(
     max_seconds: float = math.inf,
     written: Callable[[RunRecord], None] = lambda record: None,
 ) -> None:
-    """Run jobs in processes; one that fails is recorded, and the others go on.
+    """Run jobs of a plan in processes; one that fails is recorded, and the others go on.
 
     Runs that are measured by particle-steps follow each other in processes, as long as none fails;
     all others have a process each, and on GPUs that of the next one is started early, and waits
-    until its turn comes. A run's results appear in its folder all at once, when it is over. If this
-    is interrupted, its processes are ended and leave nothing.
-
-    Args:
-        plan: What they belong to.
-        jobs: Which of the plan's runs.
-        folder: The comparison's folder.
-        places: Where.
-        command: The command line, for the records.
-        max_seconds: No run begins after so long [s].
-        written: Called with each record once it is in its place.
+    until its turn comes. A run's results appear in its folder all at once, when it is over, and
+    `written` is called with them. No run begins after `max_seconds`. If this is interrupted, its
+    processes are ended and leave nothing.
     """
-    _check_teachers(plan, jobs, folder)
+    for job in jobs:
+        teacher = plan.teacher(job)
+        if teacher is None or teacher in jobs:
+            continue
+        record = RunRecord.read(folder / teacher.folder, plan.facts(teacher))
+        if record is None or record.status not in MEASURED:
+            raise NPAError(
+                f"{job.method!r} clones the rules of {teacher.method!r} from the same seed, but "
+                f"{teacher} is neither in {str(folder)!r} nor to be run: add --methods "
+                f"{teacher.method}, or name a rule by --options {job.method}.teacher=NAME"
+            )
     waiting = list(jobs)
     idle: list[subprocess.Popen[bytes]] = []
 
@@ -397,22 +378,6 @@ def run_jobs(
     finally:
         for process in idle:
             process.communicate()
-
-
-def _check_teachers(plan: ComparisonPlan, jobs: Collection[Job], folder: Path) -> None:
-    """Refuse runs whose teacher is neither in the folder, with the same settings, nor to be run."""
-    for job in jobs:
-        teacher = plan.teacher(job)
-        if teacher is None or teacher in jobs:
-            continue
-        record = RunRecord.read(folder / teacher.folder, plan.facts(teacher))
-        if record is not None and record.status in MEASURED:
-            continue
-        raise NPAError(
-            f"{job.method!r} clones the rules of {teacher.method!r} from the same seed, but "
-            f"{teacher} is neither in {str(folder)!r} nor to be run: add --methods "
-            f"{teacher.method}, or name a rule by --options {job.method}.teacher=NAME"
-        )
 
 
 def _start(

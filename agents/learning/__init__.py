@@ -18,11 +18,10 @@ from typing import Any, NamedTuple
 import torch
 
 from npa_envs.agents.learning.problem import EVALUATION_SEEDS, Problem, check_run_seed
-from npa_envs.agents.learning.progress import Budget, CurvePoint, Keeping, Progress, check_finite
+from npa_envs.agents.learning.progress import Budget, CurvePoint, Progress, check_finite
 from npa_envs.agents.learning.rules import RuleSet, RuleSetPolicy
 from npa_envs.errors import MissingDependencyError, NPAError, shown, suggest
 from npa_envs.training.ranks import Ranks
-from npa_envs.training.run_folder import RunFolder
 
 __all__ = [
     "GARDEN_METHODS",
@@ -63,8 +62,8 @@ GARDEN_METHODS: dict[str, str] = {
     "gradient": "npa_envs.agents.learning.baselines:tend_gradient",
     "ppo_world": "npa_envs.agents.learning.sb3:train_garden_ppo",
     "sac": "npa_envs.agents.learning.sb3:train_garden_sac",
-    "random": "npa_envs.agents.learning.baselines:tend_random",
-    "zero": "npa_envs.agents.learning.baselines:tend_zero",
+    "random": "npa_envs.agents.learning.baselines:train_random",
+    "zero": "npa_envs.agents.learning.baselines:train_zero",
     "scripted": "npa_envs.agents.learning.baselines:tend_scripted",
 }
 """The same for gardens, where a rule runs the particles: those that learn return policies."""
@@ -158,15 +157,16 @@ def train(
                 f"method {shown(method)} has no option {shown(name)}: {suggest(name, known)}"
             )
     check_run_seed(seed)
-    _check_kept(method, out, resume or overwrite)
-    keeping = None
-    if out is not None:
-        run = {"method": method, "problem": problem.to_json(), "seed": seed, "options": options}
-        run = json.loads(json.dumps(run | {"started": start is not None}))
-        folder = RunFolder(Path(out))
-        keeping = Keeping(
-            folder=folder, run=run, resume=resume, overwrite=overwrite, on_stop=on_stop
+    several = Ranks.current().count > 1
+    if method not in KEPT_METHODS and (several or out is not None):
+        asked = "be shared by processes" if several else "be kept in a folder (out)"
+        raise NPAError(
+            f"method {shown(method)} cannot {asked}: take one of {', '.join(KEPT_METHODS)}"
         )
+    if (resume or overwrite) and out is None:
+        raise NPAError("resume and overwrite need a folder: give out='runs/heart'")
+    run = {"method": method, "problem": problem.to_json(), "seed": seed, "options": options}
+    run |= {"started": start is not None}
     progress = Progress(
         problem,
         budget,
@@ -176,7 +176,11 @@ def train(
         entries=entries,
         on_entry=on_entry,
         initial=start,
-        keeping=keeping,
+        out=None if out is None else Path(out),
+        run=None if out is None else json.loads(json.dumps(run)),
+        resume=resume,
+        overwrite=overwrite,
+        on_stop=on_stop,
     )
     given = {"options": replace(declared, **options)} if declared is not None else options
     result = function(progress, **given)
@@ -185,18 +189,6 @@ def train(
         result.zero_grad()
         return Trained(result, progress.log, result.policy())
     return Trained(None, progress.log, result)
-
-
-def _check_kept(method: str, out: str | Path | None, begins: bool) -> None:
-    """Check that a run can be kept and shared, where that is asked for."""
-    several = Ranks.current().count > 1
-    if method not in KEPT_METHODS and (several or out is not None):
-        asked = "be shared by processes" if several else "be kept in a folder (out)"
-        raise NPAError(
-            f"method {shown(method)} cannot {asked}: take one of {', '.join(KEPT_METHODS)}"
-        )
-    if begins and out is None:
-        raise NPAError("resume and overwrite need a folder: give out='runs/heart'")
 
 
 def methods_for(problem: Problem) -> dict[str, str]:

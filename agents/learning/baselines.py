@@ -33,24 +33,29 @@ from npa_envs.errors import NPAError, shown
 PolicyT = TypeVar("PolicyT", bound=Callable[[Any], Any])
 
 SCRIPTED: tuple[Callable[..., Policy], ...] = (PaintPolicy, SpreadPolicy, MendPolicy)
-"""Policies to choose from."""
 
 GAINS = (0.001, 0.003, 0.01, 0.03, 0.1, 0.3, -0.01, -0.03, -0.1, -0.3)
 """Displacements at a perceived c^{1+D} ∇ρ / N of 1, as fractions of α ε; below 0 they gather."""
 
 
-def train_random(progress: Progress) -> Policy:
-    """Return the policy that acts at random; nothing is spent."""
-    return _evaluated(progress, RandomPolicy(_one_world(progress), progress.seed))
+def train_random(progress: Progress) -> Policy | Tending:
+    """Return what acts at random; nothing is spent."""
+    return _of_one(progress, RandomPolicy, RandomGardener, seed=progress.seed)
 
 
-def train_zero(progress: Progress) -> Policy:
-    """Return the policy that does nothing; errors of `train_random`."""
-    return _evaluated(progress, ZeroPolicy(_one_world(progress)))
+def train_zero(progress: Progress) -> Policy | Tending:
+    """Return what does nothing; nothing is spent."""
+    return _of_one(progress, ZeroPolicy, StillGardener)
 
 
-def _one_world(progress: Progress) -> Any:
-    return progress.problem.make_envs(1, device=progress.device)
+def _of_one(
+    progress: Progress, policy: Callable[..., Policy], gardener: Any, **given: int
+) -> Policy | Tending:
+    if progress.problem.is_garden:
+        return _evaluated(progress, Tending(lambda env: gardener(env, **given)))
+    return _evaluated(
+        progress, policy(progress.problem.make_envs(1, device=progress.device), **given)
+    )
 
 
 def _evaluated(progress: Progress, policy: PolicyT) -> PolicyT:
@@ -119,7 +124,6 @@ class Tending:
     """A gardener that looks at worlds, not at observations: it is made for each environment."""
 
     made_for: Callable[[Any], BrushPolicy]
-    """Makes it."""
 
     def __call__(self, observation: Any) -> Any:
         """Refuse: observations do not say which worlds they are of."""
@@ -128,22 +132,12 @@ class Tending:
         )
 
 
-def tend_zero(progress: Progress) -> Tending:
-    """Return the gardener that does nothing; errors of `train_random`."""
-    return _evaluated(progress, Tending(StillGardener))
-
-
-def tend_random(progress: Progress) -> Tending:
-    """Return the gardener that acts at random; errors of `train_random`."""
-    return _evaluated(progress, Tending(lambda env: RandomGardener(env, progress.seed)))
-
-
 def tend_scripted(progress: Progress) -> Tending:
-    """Return the scripted gardener, or the scripted shepherd; errors of `train_random`."""
+    """Return the scripted gardener, or the scripted shepherd."""
     shepherd = issubclass(progress.problem.env_type.task_type, ShepherdTask)
     return _evaluated(progress, Tending(ScriptedShepherd if shepherd else ScriptedGardener))
 
 
 def tend_gradient(progress: Progress) -> Tending:
-    """Return the gardener that plans by the world's gradient; errors of `train_random`."""
+    """Return the gardener that plans by the world's gradient."""
     return _evaluated(progress, Tending(lambda env: GradientGardener(env, seed=progress.seed)))

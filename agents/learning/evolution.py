@@ -150,21 +150,20 @@ class RulePopulation(RuleWeights):
 
     @torch.no_grad()
     def actions(self, weights: Tensor, observation: Tensor) -> Tensor:
-        """Return actions, [K * M, N, A], of K candidates in M worlds each.
+        """Return actions, [K * M, N, A], of K candidates, weights [K, W], in M worlds each.
 
-        Weights have shape [K, W]; observations, candidate by candidate, [K * M, N, P].
+        Observations, [K * M, N, P], stand candidate by candidate.
         """
-        candidates = len(weights)
-        parts, at = [], 0
-        for rule, span in zip(self._rules, self._rules.spans, strict=True):
-            size = sum(part.numel() for part in layers_of(rule))
+        sizes = [sum(part.numel() for part in layers_of(rule)) for rule in self._rules]
+        parts = []
+        each = zip(self._rules, self._rules.spans, torch.split(weights, sizes, dim=1), strict=True)
+        for rule, span, own in each:
             seen = observation[:, span]
             rows = perceived(rule, seen.flatten(0, 1))
-            rows = rows.view(candidates, -1, rows.shape[1])
-            update = updates_of(rule, weights[:, at : at + size], rows).flatten(0, 1)
+            rows = rows.view(len(weights), -1, rows.shape[1])
+            update = updates_of(rule, own, rows).flatten(0, 1)
             action = self._rules.interface.action(*bounded(rule, update))
             parts.append(action.view(*seen.shape[:2], -1))
-            at += size
         return torch.cat(parts, dim=1)
 
 

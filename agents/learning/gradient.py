@@ -14,7 +14,7 @@ from torch import Tensor
 import npa_envs
 from npa_envs.agents.learning.problem import Problem
 from npa_envs.agents.learning.progress import Progress, annealed
-from npa_envs.agents.learning.rules import RuleSet
+from npa_envs.agents.learning.rules import RuleSet, species_of
 from npa_envs.checks import check_fraction
 from npa_envs.envs.core.task import EnvTask
 from npa_envs.envs.multi.task import Population, SpeciesConfig, SpeciesTask
@@ -84,7 +84,7 @@ def train(progress: Progress, options: GradientOptions = DEFAULTS) -> RuleSet:
     them. Observations are not clipped.
     """
     problem, device, seed = progress.problem, progress.device, progress.seed
-    task, rules = environment_task(problem, device), progress.first_rules()
+    task, rules = EnvironmentTask(problem, device), progress.first_rules()
     length, steps, pool_size = problem.episode_steps, options.steps, options.pool_size
     if steps is None:
         steps = (length, length + 1) if length <= LONGEST else (LONGEST // 3, LONGEST + 1)
@@ -131,7 +131,6 @@ class _Schedule(TrainConfig[Any]):
     """A trainer's configuration whose learning rate follows the budget."""
 
     progress: Progress
-    """The run's account."""
     last_rate: float
     """Learning rate at the end, as a share of the first (dimensionless)."""
 
@@ -140,60 +139,37 @@ class _Schedule(TrainConfig[Any]):
         return annealed(self.learning_rate, self.last_rate, self.progress.share)
 
 
-def environment_task(problem: Problem, device: torch.device) -> EnvironmentTask:
-    """Return a problem's task for the gradient's trainer."""
-    return EnvironmentTask(problem, device)
-
-
-def _check_one_loss(problem: Problem, task: EnvTask[Any] | SpeciesTask) -> None:
-    """Check that all rules descend one loss, and that no particle leaves a world."""
-    if not isinstance(task, SpeciesTask):
-        return
-    if type(task).settle is not SpeciesTask.settle:
-        raise NPAError(
-            "a method that follows gradients must have one loss to descend, but in "
-            f"{problem.env_id} species are paid at each other's expense: learn by 'ppo' with what "
-            "each particle is paid"
-        )
-    if problem.keywords.get("deaths"):
-        raise NPAError(
-            "a method that follows gradients must keep all particles, got "
-            f"deaths={shown(problem.keywords['deaths'])}: "
-            "leave deaths out, or learn by 'ppo' or 'evolution'"
-        )
-
-
 class EnvironmentTask(ParticleTask[Any]):
     """Worlds as a problem's episodes start, and their loss; worlds move by the problem's physics.
 
-    Episodes are damaged where they start, or not at all. Rules are made by the learner.
+    Episodes are damaged where they start, or not at all. Rules are made by the learner. All rules
+    must descend one loss, and no particle may leave a world.
     """
 
     def __init__(self, problem: Problem, device: torch.device) -> None:
-        self.problem, self.device = problem, device
-        self.physics = problem.physics
-        """The worlds' constants."""
-        self.inner = problem.make_task(device)
-        """The environment's task."""
-        counts = torch.tensor(problem.counts)
-        self._species = torch.arange(len(counts)).repeat_interleave(counts).to(device)
-        _check_one_loss(problem, self.inner)
+        self.problem, self.config, self.physics = problem, problem.config, problem.physics
+        self.inner = task = problem.make_task(device)
+        self._species = species_of(problem.counts).to(device)
         self._clamped: tuple[RuleSet, list[ClampedRule]] | None = None
-
-    @property
-    def eps(self) -> float:
-        """Perception radius ε [length units]."""
-        return self.physics.eps
+        if not isinstance(task, SpeciesTask):
+            return
+        if type(task).settle is not SpeciesTask.settle:
+            raise NPAError(
+                "a method that follows gradients must have one loss to descend, but in "
+                f"{problem.env_id} species are paid at each other's expense: learn by 'ppo' with "
+                "what each particle is paid"
+            )
+        if problem.keywords.get("deaths"):
+            raise NPAError(
+                "a method that follows gradients must keep all particles, got "
+                f"deaths={shown(problem.keywords['deaths'])}: "
+                "leave deaths out, or learn by 'ppo' or 'evolution'"
+            )
 
     @property
     def box(self) -> tuple[float, ...] | None:
         """Sides of the periodic box, None in open space [length units]."""
         return self.physics.box
-
-    @property
-    def update_prob(self) -> float:
-        """Probability of a particle's update in a step (dimensionless)."""
-        return self.physics.update_prob
 
     def seed(
         self, world_count: int, *, generator: Randomness, device: str | torch.device = "cpu"
@@ -236,7 +212,7 @@ class EnvironmentTask(ParticleTask[Any]):
 
         Options are those of `npa_envs.rollout`; the physics is the environment's.
         """
-        physics, config = self.physics, self.problem.config
+        physics, config = self.physics, self.config
         if self._clamped is None or self._clamped[0] is not rules:
             # Made once: recorded rollouts know clamped rules by their identity.
             limit = physics.limits.state_scale

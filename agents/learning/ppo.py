@@ -34,8 +34,7 @@ from npa_envs.agents.learning.rules import RuleSet
 from npa_envs.checks import check_flag, check_non_negative, check_positive
 from npa_envs.envs.core.state import free_bytes, needed_bytes
 from npa_envs.errors import NPAError
-from npa_envs.training.randomness import registered, restart
-from npa_envs.training.ranks import ALONE, Ranks
+from npa_envs.training.ranks import ALONE, Ranks, registered, restart
 from npa_envs.world.cuda_graph import GraphedCallable
 from npa_envs.wrappers.base import own_rewards
 
@@ -146,29 +145,23 @@ class PPOLearner:
             copy=False,
         )
         self.random = learner_random(seed, total, places, device, ranks)
-        """Source of exploration and shuffles."""
         rules = zero_output_rules(problem, seed, start)
         self.actor = GaussianRules(rules, self.pace.initial_std).to(device)
         perception_dim = problem.interface.perception_dim
         self.critic = seeded_critic(problem, perception_dim, options, seed).to(device)
+        self.modules = {"actor": self.actor, "critic": self.critic}
         # Recorded steps read their length where it can be changed.
-        self.optimizer, self.critic_optimizer = (
-            torch.optim.Adam(
+        self.optimisers = {
+            name: torch.optim.Adam(
                 net.parameters(),
                 lr=torch.zeros((), device=device),
                 eps=1e-5,
                 fused=True,
                 capturable=device.type == "cuda",
             )
-            for net in (self.actor, self.critic)
-        )
-        self.modules: dict[str, nn.Module] = {"actor": self.actor, "critic": self.critic}
-        """What learns, by name."""
-        self.optimisers: dict[str, torch.optim.Optimizer] = {
-            "actor": self.optimizer,
-            "critic": self.critic_optimizer,
+            for name, net in self.modules.items()
         }
-        """Their optimisers."""
+        self.optimizer, self.critic_optimizer = self.optimisers.values()
         self._seed, self._places, self._total = seed, places.tolist(), total
         observation = self._worlds_of_part(0)
         self.memory = Memory(
@@ -179,7 +172,6 @@ class PPOLearner:
         )
         self.critic.observe(observation, ranks)
         self.rounds = 0
-        """Rounds done."""
         # Recorded work reads and writes these in place.
         self._now = observation.clone()
         self._action, self._log_prob = (
@@ -217,7 +209,6 @@ class PPOLearner:
         self.memory.seen[-1].copy_(self._worlds_of_part(part))
 
     def _worlds_of_part(self, part: int) -> Tensor:
-        """Begin the episodes of a part of the run, and return observations."""
         seeds = world_seeds(self._seed, self._total, part)
         observation: Tensor
         observation, _ = self.envs.reset(seed=[seeds[place] for place in self._places])
@@ -342,17 +333,18 @@ class PPOLearner:
             self._step()
 
     def _find_gradients(self) -> None:
-        """Find the gradients of critic and rules in a part of the pass."""
         self._find_critic_gradients()
         rows = [Round(*own) for own in self._rows(self._part, self.memory.round)]
         find_gradients(self.optimizer, -self._gain(rows))
 
     def _find_critic_gradients(self) -> None:
         worlds = Round(*self._worlds(self._part, self.memory.round))
-        find_gradients(self.critic_optimizer, self._critic_loss(worlds))
+        error = (self.critic(worlds.observations) - worlds.targets) / self.critic.scale
+        squares = (worlds.acted * error.square()).sum()
+        loss = 0.5 * squares / self._weight(worlds.acted, 0).clamp(min=1.0)
+        find_gradients(self.critic_optimizer, loss)
 
     def _step_both(self) -> None:
-        """Let critic and rules follow their gradients."""
         self._descend(self.critic_optimizer)
         # Rules that have gone too far stay; the host need not know.
         moved, count = self._moved
@@ -432,11 +424,6 @@ class PPOLearner:
             gain = gain + options.entropy_weight * actor.entropy()
         return gain
 
-    def _critic_loss(self, worlds: Round) -> Tensor:
-        error: Tensor = (self.critic(worlds.observations) - worlds.targets) / self.critic.scale
-        squares = (worlds.acted * error.square()).sum()
-        return 0.5 * squares / self._weight(worlds.acted, 0).clamp(min=1.0)
-
 
 class Round(NamedTuple):
     """T steps of B worlds of N particles, flat: M = T B worlds, one after the other."""
@@ -478,7 +465,6 @@ class Memory:
         self.actions = zeros(*single, action_dim)
         self.log_probs, self.acted, self.targets = (zeros(*single) for _ in range(3))
         self.rewards = zeros(*single)
-        """Reward of each particle."""
         self.terminated, self.ended = (zeros(*single, dtype=torch.bool) for _ in range(2))
         """Whether a particle's episode ended by itself in a step; and whether it ended at all."""
         self.values = zeros(steps + 1, worlds, particles)

@@ -12,31 +12,24 @@ import torch
 from torch import Tensor, nn
 
 from npa_envs.agents.learning.problem import Problem
-from npa_envs.agents.learning.rules import RuleSet
+from npa_envs.agents.learning.rules import RuleSet, species_of
 from npa_envs.checks import check_fraction, check_non_negative, check_positive
 from npa_envs.errors import NPAError, shown, suggest
-from npa_envs.training.randomness import restart, world_streams
-from npa_envs.training.ranks import ALONE, Ranks
+from npa_envs.training.ranks import ALONE, Ranks, restart, world_streams
 from npa_envs.world.randomness import Randomness, WorldRandom, normal_draws
 
 
 class Pace(NamedTuple):
-    """The options whose defaults depend on whether a run begins with fresh rules."""
+    """Those of `CommonOptions` whose defaults depend on whether a run begins with fresh rules."""
 
     learning_rate: float
-    """Adam's step at the start, from which it falls to zero over the budget."""
     initial_std: float
-    """Standard deviation of every action column at first (dimensionless)."""
     last_noise: float
-    """What is left of the standard deviations at the end of the budget (dimensionless)."""
     critic_rounds: int
-    """Rounds in which the critic learns alone."""
     target_kl: float
-    """How far particles' actions may move in a round [nats]."""
 
 
 FRESH = Pace(1e-3, 0.2, 0.25, 0, 0.2)
-"""For fresh rules."""
 
 WARM = Pace(1e-4, 0.05, 1.0, 4, 0.05)
 """For rules to begin with: noise, haste and a raw critic would undo what they can do."""
@@ -155,7 +148,6 @@ def zero_output_rules(problem: Problem, seed: int, start: RuleSet | None) -> Rul
 
 
 HALF_LOG_TAU = 0.5 * math.log(2.0 * math.pi)
-"""Constant of the logarithm of a Gaussian's density."""
 
 
 def gaussian_log_prob(mean: Tensor, log_std: Tensor, action: Tensor) -> Tensor:
@@ -177,16 +169,13 @@ class GaussianRules(nn.Module):
     def __init__(self, rules: RuleSet, initial_std: float) -> None:
         super().__init__()
         self.rules = copy.deepcopy(rules)
-        """The means."""
         widths = [rule.update_dim for rule in self.rules]
         start = torch.full((len(widths), widths[0]), math.log(initial_std))
         self.noise_left = 1.0
         """Share of the first standard deviations that is left (dimensionless)."""
         self.log_std = nn.Parameter(start)
         """Logarithms of the standard deviations, a row for each species, shape [K, A]."""
-        counts = [span.stop - span.start for span in self.rules.spans]
-        kinds = torch.arange(len(widths)).repeat_interleave(torch.tensor(counts))
-        self.register_buffer("row_species", kinds, persistent=False)
+        self.register_buffer("row_species", species_of(rules.counts), persistent=False)
         # A tuple, so that modules are registered once.
         self._each = tuple(RuleSet([rule], [1], self.rules.interface) for rule in self.rules)
 
@@ -267,8 +256,7 @@ class Critic(nn.Module):
         nn.init.zeros_(self.species.weight)
         nn.init.zeros_(self.value.weight)
         nn.init.zeros_(self.value.bias)
-        kinds = torch.arange(len(counts)).repeat_interleave(torch.tensor(tuple(counts)))
-        self.register_buffer("row_species", kinds, persistent=False)
+        self.register_buffer("row_species", species_of(counts), persistent=False)
         self.register_buffer("mean", torch.zeros(perception_dim))
         self.register_buffer("square", torch.ones(perception_dim))
         self.register_buffer("scale", torch.ones(()))
@@ -335,13 +323,8 @@ class Minibatches:
     shuffled by its own stream, and a part has as many of each world: so it is the same part of the
     whole round for any number of processes.
 
-    Args:
-        steps: Steps of a round, T.
-        worlds: Worlds of this process, B.
-        rows: Rows of a step of a world, n, in each of the groups that are shuffled by themselves.
-            Those of a group stand as [T, B, n].
-        count: Parts, or fewer where there are not as many rows.
-        random: What the orders are drawn from.
+    Groups are shuffled by themselves; those of n `rows` a world and step stand as [T, B, n]. There
+    are `count` parts, or fewer where there are not as many rows.
     """
 
     def __init__(
@@ -357,19 +340,12 @@ class Minibatches:
         self._orders = [
             torch.zeros(steps * worlds * n, dtype=torch.int64, device=random.device) for n in rows
         ]
-        # As even as `tensor_split` makes them.
-        self._sizes = [
-            [shared * ((len(order) // shared + k) // self.count) for k in range(self.count)][::-1]
-            for order in self._orders
-        ]
-
-    @property
-    def parts(self) -> list[tuple[Tensor, ...]]:
+        self.parts: list[tuple[Tensor, ...]] = []
         """Rows of each part, int64, by group: views, which `shuffle` writes anew."""
-        return [
-            torch.split(order, sizes)
-            for order, sizes in zip(self._orders, self._sizes, strict=True)
-        ]
+        for order in self._orders:
+            # As even as `tensor_split` makes them.
+            sizes = [shared * ((len(order) // shared + k) // self.count) for k in range(self.count)]
+            self.parts.append(torch.split(order, sizes[::-1]))
 
     def shuffle(self) -> None:
         """Draw the orders of the next pass."""

@@ -9,8 +9,6 @@ import json
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
-from itertools import accumulate
-from types import SimpleNamespace
 from typing import Any, Literal, get_args
 
 import gymnasium
@@ -22,7 +20,7 @@ from torch import Tensor
 
 from npa_envs.agents.evaluation import TIME_LIMIT
 from npa_envs.agents.learning.rules import RuleSet
-from npa_envs.agents.policies import Interface
+from npa_envs.agents.policies import Interface, spans_of
 from npa_envs.checks import check_positive, is_whole
 from npa_envs.devices import check_device
 from npa_envs.envs.core.config import EnvConfig
@@ -199,16 +197,10 @@ class Problem:
     @property
     def interface(self) -> Interface:
         """What observations and actions mean, column by column."""
-        physics, config, species = self.physics, self.config, 0
+        config = self.config
         if isinstance(config, SpeciesConfig) and config.perception == "per_species":
-            species = config.species_count
-        return Interface(
-            physics.space_dim,
-            physics.state_dim,
-            physics.moving,
-            physics.limits.state_scale,
-            species,
-        )
+            return Interface.of(self.physics, config.species_count)
+        return Interface.of(self.physics)
 
     @property
     def counts(self) -> tuple[int, ...]:
@@ -332,11 +324,7 @@ def registered_steps(env_id: str) -> int:
 
 
 def check_run_seed(seed: Any) -> None:
-    """Check the seed of a run, which has worlds of its own.
-
-    Raises:
-        NPAError: It is no whole number from 0 to `RUNS` - 1.
-    """
+    """Check the seed of a run, which has worlds of its own: it is below `RUNS`."""
     if not is_whole(seed) or not 0 <= seed < RUNS:
         raise NPAError(
             f"seed must be a whole number from 0 to {RUNS - 1}, as the worlds of later ones are "
@@ -348,9 +336,6 @@ def world_seeds(seed: int, count: int, part: int = 0) -> list[int]:
     """Return the seeds of the worlds that a run learns in, which no other run has.
 
     Each part of a run, from one stop to the next, has others, as long as there are enough.
-
-    Raises:
-        NPAError: There are too many, or as for `check_run_seed`.
     """
     check_run_seed(seed)
     if count > WORLDS_PER_SEED:
@@ -384,25 +369,16 @@ class ConcatenatedSpeciesEnv:
             output="torch",
             **keywords,
         )
-        """The environment with an array for each species."""
         self.num_envs, self.config, self.render_mode = num_envs, env.config, env.render_mode
         self.task = env.worlds.task
-        """Starts and losses."""
         self.metadata = {"autoreset_mode": AutoresetMode.SAME_STEP}
-        self.worlds = SimpleNamespace(
-            physics=env.worlds.physics,
-            perception_dim=env.worlds.perception_dim,
-            episode_steps=episode_steps,
-        )
-        """What policies and their evaluation read."""
+        self.worlds, self.episode_steps = env.worlds, episode_steps
         counts = env.config.played_counts
-        spans = [slice(end - n, end) for end, n in zip(accumulate(counts), counts, strict=True)]
-        self.spans = dict(zip(env.agents, spans, strict=True))
-        """Places of each species' particles."""
+        self.spans = dict(zip(env.agents, spans_of(counts), strict=True))
         self.single_observation_space = _concatenated_space(env.single_observation_spaces)
         self.single_action_space = _concatenated_space(env.single_action_spaces)
         self._counts = torch.tensor(counts, device=device)
-        self._loss = torch.zeros(num_envs, len(spans), device=device)
+        self._loss = torch.zeros(num_envs, len(counts), device=device)
         self._reasons = np.full(num_envs, None, dtype=object)
 
     @property
@@ -423,12 +399,7 @@ class ConcatenatedSpeciesEnv:
         return self._concatenated(rows), {"loss": self._loss.mean(dim=1)}
 
     def step(self, actions: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, dict[str, Any]]:
-        """Apply actions, [B, N, A], in [-1, 1], and perceive.
-
-        Raises:
-            NPAError: The actions have another shape; the worlds are then as they were.
-            DivergedError: An action is not finite; the worlds are then as they were.
-        """
+        """Apply actions, [B, N, A], in [-1, 1], and perceive; wrong ones leave the worlds alone."""
         by_species = {agent: actions[:, span] for agent, span in self.spans.items()}
         rows, rewards, terminations, truncations, infos = self.species_env.step(by_species)
         paid, ended, cut = (
@@ -442,7 +413,13 @@ class ConcatenatedSpeciesEnv:
             "acted": self._by_particle(acted),
             "particle_terminated": self._by_particle(ended),
         }
-        self._remember_reasons(infos)
+        # Why the first species of each world ended, or that one left the world.
+        for agent in self.spans:
+            own = infos[agent].get("reason")
+            if own is not None:
+                given = own != None  # noqa: E711
+                held = (self._reasons != None) & (self._reasons != TIME_LIMIT)  # noqa: E711
+                self._reasons = np.where((given & ~held) | (own == LEFT), own, self._reasons)
         first = infos[self.species_env.agents[0]]
         over = first.get("_final_obs", torch.zeros_like(late))
         if "final_obs" in first:
@@ -471,15 +448,6 @@ class ConcatenatedSpeciesEnv:
         """Return values of species, [B, K], for each of their particles, shape [B, N]."""
         count = self.single_action_space.shape[0]
         return values.repeat_interleave(self._counts, dim=1, output_size=count)
-
-    def _remember_reasons(self, infos: Mapping[str, Mapping[str, Any]]) -> None:
-        """Keep why the first species of each world ended, or that one left the world."""
-        for agent in self.spans:
-            own = infos[agent].get("reason")
-            if own is not None:
-                given = own != None  # noqa: E711
-                held = (self._reasons != None) & (self._reasons != TIME_LIMIT)  # noqa: E711
-                self._reasons = np.where((given & ~held) | (own == LEFT), own, self._reasons)
 
 
 def _concatenated_space(spaces: Mapping[str, Any]) -> Box:

@@ -7,27 +7,23 @@ import math
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import asdict, dataclass
+from pathlib import Path
 from typing import Any, Protocol
 
 import torch
 from torch import Tensor, nn
 
-from npa_envs.agents.evaluation import evaluate_policy
+from npa_envs.agents.evaluation import checked_seeds, evaluate_policy
 from npa_envs.agents.learning.problem import Problem
-from npa_envs.agents.learning.rules import RuleSet, starting_rules
+from npa_envs.agents.learning.rules import RuleSet
 from npa_envs.checks import check_count, check_positive, is_real
 from npa_envs.devices import check_device
 from npa_envs.errors import DivergedError, NPAError, shown
 from npa_envs.files import json_text, write_text
-from npa_envs.training.checkpoint import (
-    check_content,
-    load_checkpoint,
-    save_checkpoint,
-    unusable_checkpoint,
-)
+from npa_envs.training.checkpoint import check_content, unusable_checkpoint
+from npa_envs.training.optimiser import load_moments
 from npa_envs.training.ranks import Ranks
-from npa_envs.training.run_folder import RunFolder, check_choice
-from npa_envs.training.stopping import stop_flag
+from npa_envs.training.run import Run, RunFolder
 from npa_envs.world.randomness import Randomness, WorldRandom
 
 
@@ -85,29 +81,17 @@ class Learner(Protocol):
 
     random: Randomness
     """What it draws from."""
-    modules: dict[str, nn.Module]
-    """What learns, by name."""
-    optimisers: dict[str, torch.optim.Optimizer]
-    """Their optimisers of Adam's kind, by name."""
+
+    @property
+    def modules(self) -> Mapping[str, nn.Module]:
+        """What learns, by name."""
+
+    @property
+    def optimisers(self) -> Mapping[str, torch.optim.Optimizer]:
+        """Their optimisers of Adam's kind, by name."""
 
     def go_on(self, iteration: int, part: int) -> None:
         """Go on after so many iterations, for the part-th time, from 1 on, with other worlds."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Keeping:
-    """Where and how a run is kept."""
-
-    folder: RunFolder
-    """For checkpoint, rules and curve."""
-    run: Mapping[str, Any]
-    """What the run is of, of JSON's types: a resumed run must be of the same."""
-    resume: bool = False
-    """Go on from the checkpoint in the folder."""
-    overwrite: bool = False
-    """Begin anew although the folder holds a run; its files are removed."""
-    on_stop: Callable[[], None] = lambda: None
-    """Called where the run is asked to stop before its budget is spent."""
 
 
 class Progress:
@@ -143,12 +127,15 @@ class Progress:
         entries: Evaluations besides the first, at equal shares of the budget.
         on_entry: Called with each entry.
         initial: Rules to begin with, which are copied; None: new ones.
-        keeping: Where and how the run is kept; None: it is not.
+        out: Folder of the run's checkpoint, rules and curve; None: it is not kept.
+        run: What the run is of, of JSON's types: a resumed run must be of the same.
+        resume: Go on from the checkpoint in `out`.
+        overwrite: Begin anew although `out` holds a run; its files are removed.
+        on_stop: Called where a kept run is asked to stop before its budget is spent.
 
     Raises:
-        NPAError: There are no seeds or wrong ones, or the number of entries is not positive. Or the
-            folder holds a run, without `resume` or `overwrite`; or none or another one, with
-            `resume`.
+        NPAError: There are no seeds or wrong ones, or the number of entries is not positive. Or as
+            for `npa_envs.training.run.Run`.
     """
 
     def __init__(
@@ -162,38 +149,32 @@ class Progress:
         entries: int = 20,
         on_entry: Callable[[CurvePoint], None] | None = None,
         initial: RuleSet | None = None,
-        keeping: Keeping | None = None,
+        out: Path | None = None,
+        run: Mapping[str, Any] | None = None,
+        resume: bool = False,
+        overwrite: bool = False,
+        on_stop: Callable[[], None] = lambda: None,
     ) -> None:
         self.problem = problem
-        """What is learned."""
         self.budget = budget
-        """What may be spent."""
         self.seed = seed
-        """Seed of new rules and of all that the learner draws."""
         self.device = check_device(device)
-        """Where worlds, rules and evaluations are."""
         self.initial = None
         """Copies of the rules to begin with, on the device; None: new ones."""
         if initial is not None:
-            self.initial = starting_rules(problem, self.device, initial)
+            if not isinstance(initial, RuleSet):
+                raise NPAError(
+                    f"start must be a RuleSet, got {type(initial).__name__}: "
+                    "RuleSet.of(problem, 'heart')"
+                )
+            self.initial = RuleSet.of(problem, list(initial)).to(self.device)
         self.particle_steps = 0
         """Particle-steps spent so far."""
         self.log: list[CurvePoint] = []
         """Evaluations so far."""
         self.ranks = Ranks.current()
         """The processes that share the run."""
-        if not isinstance(evaluation_seeds, Iterable):
-            raise NPAError(
-                f"evaluation_seeds must be one for each episode, got {shown(evaluation_seeds)}: "
-                "range(1_000_000, 1_000_016)"
-            )
-        self._seeds = list(evaluation_seeds)
-        if not self._seeds:
-            raise NPAError(
-                "evaluation_seeds must hold at least one seed, got none: range(100, 132)"
-            )
-        # Wrong seeds are errors now, not in the first evaluation.
-        WorldRandom(self._seeds)
+        self._seeds = checked_seeds("evaluation_seeds", evaluation_seeds)
         check_count("entries", entries, ": try 20")
         self._entries = entries
         self._on_entry = on_entry
@@ -203,12 +184,14 @@ class Progress:
         self._seconds = self._elapsed = 0.0
         self._looks = 0
         self._previous: torch.cuda.Event | None = None
-        self._iteration = self._part = 0
-        self._keeping = keeping
-        content = None
-        if keeping is not None and self.ranks.first:
-            content = _prepare(keeping)
-        self._content: dict[str, Any] | None = self.ranks.broadcast(content)
+        self._part = 0
+        self._of, self._on_stop = dict(run or {}), on_stop
+        folder = None if out is None else RunFolder(out)
+        self._kept = Run(
+            folder, self.ranks, self._check_same_run, resume=resume, overwrite=overwrite
+        )
+        if folder is not None and self.ranks.first:
+            folder.prepare(0, pictures=False)
 
     def first_rules(self) -> RuleSet:
         """Return the rules that a learner begins with and may change, on the device."""
@@ -222,38 +205,48 @@ class Progress:
         """Learn until the budget is spent, and return the rules.
 
         Args:
-            rules: What is learned.
             iteration: Lets the rules learn a little, and returns the particle-steps that it took.
             learner: What checkpoints are made of, where the run is kept.
 
         Raises:
-            NPAError: It has started before. Or a file of a run that is kept cannot be written or
-                used, or another run writes there.
+            NPAError: A file of a run that is kept cannot be written or used, or another run writes
+                there.
             DivergedError: A weight of the rules is not finite, or an action.
         """
-        with self._kept(learner) as asked_to_stop:
+        kept = self._kept
+
+        def begin() -> None:
             self.start(rules)
             self._save(rules, learner)
-            while not self.over and not asked_to_stop():
-                self.advance(iteration())
-                self._iteration += 1
-                entries = len(self.log)
-                self.look(rules)
-                if len(self.log) > entries:
-                    self._save(rules, learner)
+
+        def step() -> None:
+            self.advance(iteration())
+            kept.iteration += 1
+            entries = len(self.log)
+            self.look(rules)
+            if len(self.log) > entries:
+                self._save(rules, learner)
+
+        def end(stopped: bool) -> None:
+            if stopped:
+                self._on_stop()
             # An evaluation takes its time, and who asked to stop may not wait.
             self._save(rules, learner)
             self.look(rules, force=True)
             self._save(rules, learner)
+
+        with kept.held(begin=True):
+            content, kept.content = kept.content, None
+            if content is not None:
+                assert learner is not None, "methods whose runs are kept are learners"
+                self._go_on(learner, content)
+            kept.go(step, begin=begin, over=lambda: self.over, end=end)
         return rules
 
     def start(self, actor: RuleSet | Callable[[Any], Any]) -> None:
         """Evaluate the rules or the policy that the learner begins with, and begin to count.
 
         A resumed run has this evaluation already.
-
-        Raises:
-            NPAError: It has started before.
         """
         if self._started:
             raise NPAError("progress must start once, got a second start: make one for each run")
@@ -280,11 +273,7 @@ class Progress:
         return self.share >= 1.0
 
     def advance(self, particle_steps: int) -> None:
-        """Count the particle-steps that an iteration took.
-
-        Raises:
-            NPAError: Nothing has started yet.
-        """
+        """Count the particle-steps that an iteration took."""
         self._check_started("advance")
         self.particle_steps += particle_steps
         if self.device.type == "cuda":
@@ -297,14 +286,11 @@ class Progress:
             self._agree_on_time()
 
     def look(self, actor: RuleSet | Callable[[Any], Any], force: bool = False) -> None:
-        """Evaluate where the next share of the budget is spent.
+        """Evaluate where the next share of the budget is spent, or, by `force`, in any case.
 
-        Args:
-            actor: The rules, or a policy.
-            force: Evaluate in any case, but where nothing was done since the last evaluation.
+        Where nothing was done since the last evaluation, there is none.
 
         Raises:
-            NPAError: Nothing has started yet.
             DivergedError: A weight of the rules is not finite, or an action.
         """
         self._check_started("look")
@@ -358,82 +344,76 @@ class Progress:
         if self.device.type == "cuda":
             torch.cuda.synchronize(self.device)
 
-    @contextlib.contextmanager
-    def _kept(self, learner: Learner | None) -> Iterator[Callable[[], bool]]:
-        """Hold the run's folder, if any, within the block; yields whether to stop."""
-        keeping, first = self._keeping, self.ranks.first
-        if keeping is None:
-            yield lambda: False
-            return
-        assert learner is not None, "methods whose runs are kept are learners"
-        with keeping.folder.locked() if first else contextlib.nullcontext():
-            if first:
-                keeping.folder.tidy()
-            if self._content is not None:
-                self._go_on(keeping, learner, self._content)
-            elif first and keeping.overwrite:
-                keeping.folder.clear()
-            with stop_flag(patient=self.ranks.together) as flag:
-
-                def asked_to_stop() -> bool:
-                    stops = self.ranks.agree_to_stop(flag.is_set(), self._iteration)
-                    if stops:
-                        keeping.on_stop()
-                    return stops
-
-                yield asked_to_stop
-
     def _save(self, rules: RuleSet, learner: Learner | None) -> None:
         """Write a run that is kept, once all processes agree on what was learned."""
-        if self._keeping is not None and learner is not None:
-            with self._stopped_clock():
-                self._write(self._keeping, rules, learner)
-
-    def _write(self, keeping: Keeping, rules: RuleSet, learner: Learner) -> None:
-        state, folder = learner_state(learner), keeping.folder
-        learned = [value for held in state["modules"].values() for value in held.values()]
-        self.ranks.check_same([value for value in learned if isinstance(value, Tensor)])
-        if not self.ranks.first:
+        folder = self._kept.folder
+        if folder is None:
             return
-        curve = [asdict(entry) for entry in self.log]
-        content = {
-            "learner": dict(keeping.run),
-            "iteration": self._iteration,
-            "part": self._part,
-            "particle_steps": self.particle_steps,
-            "seconds": self._elapsed,
-            "curve": curve,
-        }
-        save_checkpoint(folder.checkpoint, content | state)
-        folder.note_checkpoint()
-        rules.save(folder.path)
-        lines = [" ".join(json_text(line).split()) for line in curve]
-        write_text(folder.log, "\n".join(lines) + "\n")
+        assert learner is not None, "methods whose runs are kept are learners"
+        with self._stopped_clock():
+            state = learner_state(learner)
+            learned = [value for held in state["modules"].values() for value in held.values()]
+            self.ranks.check_same([value for value in learned if isinstance(value, Tensor)])
+            if not self.ranks.first:
+                return
+            curve = [asdict(entry) for entry in self.log]
+            content = {"learner": self._of, "part": self._part, "curve": curve}
+            content |= {"iteration": self._kept.iteration, "seconds": self._elapsed}
+            self._kept.keep(content | {"particle_steps": self.particle_steps} | state)
+            rules.save(folder.path)
+            lines = [" ".join(json_text(line).split()) for line in curve]
+            write_text(folder.log, "\n".join(lines) + "\n")
 
-    def _go_on(self, keeping: Keeping, learner: Learner, content: dict[str, Any]) -> None:
+    def _check_same_run(self, content: dict[str, Any], path: Path) -> None:
+        held = content.get("learner")
+        if held != self._of:
+            held = held if isinstance(held, dict) else {}
+            names = [name for name, value in self._of.items() if held.get(name) != value]
+            raise NPAError(
+                f"the checkpoint {str(path)!r} must be of the same run, but "
+                f"differs in {', '.join(names)}: learn what it is of, or choose another folder"
+            )
+
+    def _go_on(self, learner: Learner, content: dict[str, Any]) -> None:
         """Go on from what a checkpoint holds."""
-        path, like = keeping.folder.checkpoint, learner_state(learner)
+        assert self._kept.folder is not None, "it holds the checkpoint"
+        path, like = self._kept.folder.checkpoint, learner_state(learner)
         like |= {"iteration": 0, "part": 0, "particle_steps": 0, "seconds": 0.0}
-        like["optimisers"] = _moments_like(learner, content.get("optimisers"))
-        random = content.get("random")
-        if not isinstance(random, Tensor) or random.shape != like["random"].shape:
+        moments = content.get("optimisers")
+        for name, optimiser in learner.optimisers.items():
+            own = moments.get(name) if isinstance(moments, dict) else None
+            # Parameters without a gradient have no moments.
+            like["optimisers"][name] = {
+                number: {"step": torch.zeros(()), "exp_avg": value, "exp_avg_sq": value}
+                for number, value in enumerate(optimiser.param_groups[0]["params"])
+                if isinstance(own, dict) and number in own
+            }
+        random, drawn = learner.random, content.get("random")
+        if not isinstance(drawn, Tensor) or drawn.shape != like["random"].shape:
             # Processes that share a run draw by world, and one alone does not: draws begin anew.
             content["random"] = like["random"]
         check_content(content, like, path)
         try:
             self.log = [CurvePoint(**entry) for entry in content.get("curve") or ()]
             numbers = [value for entry in self.log for value in asdict(entry).values()]
-            load_learner_state(learner, content)
+            for name, module in learner.modules.items():
+                module.load_state_dict(content["modules"][name])
+            for name, optimiser in learner.optimisers.items():
+                load_moments(optimiser, content["optimisers"][name])
+            if isinstance(random, WorldRandom):
+                random.episodes.fill_(int(content["random"]))
+            else:
+                random.set_state(content["random"])
         except (TypeError, RuntimeError) as error:
             raise unusable_checkpoint(path, f"it cannot be used ({shown(error)})") from error
         # The error of a single episode is infinite.
         if not self.log or not all(is_real(value) or value == math.inf for value in numbers):
             raise unusable_checkpoint(path, "curve must hold the numbers of its entries")
-        self._iteration, self._part = content["iteration"], content["part"] + 1
+        self._kept.iteration, self._part = content["iteration"], content["part"] + 1
         self.particle_steps = content["particle_steps"]
         self._seconds = self._elapsed = content["seconds"]
         self._looks = int(self.share * self._entries)
-        learner.go_on(self._iteration, self._part)
+        learner.go_on(self._kept.iteration, self._part)
 
 
 def annealed(rate: float, last_rate: float, share: float) -> float:
@@ -459,30 +439,6 @@ def check_finite(rules: RuleSet, particle_steps: int) -> None:
                 )
 
 
-def _prepare(keeping: Keeping) -> dict[str, Any] | None:
-    """Prepare the folder of a run, and return the checkpoint that it goes on from, if any."""
-    check_choice(resume=keeping.resume, overwrite=keeping.overwrite)
-    folder, content = keeping.folder, None
-    folder.note_checkpoint()
-    if keeping.resume:
-        content = load_checkpoint(folder.checkpoint)
-        held = content.get("learner")
-        if held != keeping.run:
-            held = held if isinstance(held, dict) else {}
-            names = [name for name, value in keeping.run.items() if held.get(name) != value]
-            raise NPAError(
-                f"the checkpoint {str(folder.checkpoint)!r} must be of the same run, but "
-                f"differs in {', '.join(names)}: learn what it is of, or choose another folder"
-            )
-    elif folder.checkpoint.exists() and not keeping.overwrite:
-        raise NPAError(
-            f"out must be a folder without a run, but {shown(str(folder.path))} holds one: "
-            "resume it, choose another folder, or overwrite it"
-        )
-    folder.prepare(0, pictures=False)
-    return content
-
-
 def learner_state(learner: Learner) -> dict[str, Any]:
     """Return the state of a learner without its worlds."""
     random = learner.random
@@ -494,32 +450,3 @@ def learner_state(learner: Learner) -> dict[str, Any]:
         "optimisers": {name: optimiser.state_dict()["state"] for name, optimiser in optimisers},
         "random": drawn.cpu(),
     }
-
-
-def load_learner_state(learner: Learner, state: Mapping[str, Any]) -> None:
-    """Load what `learner_state` returned."""
-    for name, module in learner.modules.items():
-        module.load_state_dict(state["modules"][name])
-    for name, optimiser in learner.optimisers.items():
-        # The groups are those of the options.
-        groups = optimiser.state_dict()["param_groups"]
-        optimiser.load_state_dict({"state": state["optimisers"][name], "param_groups": groups})
-    random = learner.random
-    if isinstance(random, WorldRandom):
-        random.episodes.fill_(int(state["random"]))
-    else:
-        random.set_state(state["random"])
-
-
-def _moments_like(learner: Learner, held: Any) -> dict[str, Any]:
-    """Return Adam's state of those parameters that a checkpoint has some of."""
-    like: dict[str, Any] = {}
-    for name, optimiser in learner.optimisers.items():
-        own = held.get(name) if isinstance(held, dict) else None
-        keys = own.keys() if isinstance(own, dict) else ()
-        like[name] = {
-            number: {"step": torch.zeros(()), "exp_avg": value, "exp_avg_sq": value}
-            for number, value in enumerate(optimiser.param_groups[0]["params"])
-            if number in keys
-        }
-    return like

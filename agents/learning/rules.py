@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Iterator, Mapping, Sequence
-from itertools import accumulate
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, cast
 
 import torch
 from torch import Tensor, nn
 
-from npa_envs.agents.policies import Interface, Policy, bounded_update, check_rule_fits
-from npa_envs.checks import is_whole
+from npa_envs.agents.policies import Interface, Policy, bounded_update, check_rule_fits, spans_of
+from npa_envs.checks import checked_count
 from npa_envs.errors import NPAError, shown
 from npa_envs.files import made_folder
 from npa_envs.rule.files import load_rule, save_rule
@@ -50,9 +49,10 @@ class RuleSet(nn.Module):
             )
         self.rules = nn.ModuleList(rules)
         """The rules, in the order of the species."""
-        ends = list(accumulate(counts))
-        self.spans = [slice(end - count, end) for end, count in zip(ends, counts, strict=True)]
+        self.spans = spans_of(counts)
         """Places of each species' particles."""
+        self.counts = tuple(counts)
+        """How many these are."""
         self.interface = interface
 
     @classmethod
@@ -62,11 +62,7 @@ class RuleSet(nn.Module):
         Raises:
             NPAError: The seed is no integer of at least 0.
         """
-        if not is_whole(seed) or seed < 0:
-            raise NPAError(
-                f"seed must be a whole number of at least 0, got {shown(seed)}: give seed=0"
-            )
-        interface, config = problem.interface, problem.config
+        seed, interface, config = checked_count("seed", seed), problem.interface, problem.config
         with torch.random.fork_rng(devices=()):
             torch.manual_seed(seed)
             sizes = interface.space_dim, interface.state_dim, problem.hidden_dim
@@ -149,23 +145,16 @@ class RuleSet(nn.Module):
         gradients do not vanish. They are differentiable in the weights and in the observation.
         """
         scale = self.interface.state_scale
-        parts = [
-            torch.cat((displacement, state_step / scale), dim=-1)
-            for displacement, state_step in self.updates(observation)
-        ]
-        return parts[0] if len(parts) == 1 else torch.cat(parts, dim=1)
+        return self.acted(observation, lambda delta, step: torch.cat((delta, step / scale), dim=-1))
 
-    def updates(self, observation: Tensor) -> list[tuple[Tensor, Tensor]]:
-        """Return displacements, [B, N_k, D], and state steps, [B, N_k, C], of each species."""
-        found = []
+    def acted(self, observation: Tensor, action: Callable[[Tensor, Tensor], Tensor]) -> Tensor:
+        """Return actions [B, N, A], made of each species' displacements and state steps."""
+        parts = []
         for rule, span in zip(self, self.spans, strict=True):
             rows = observation[:, span]
-            update = bounded_update(rule, rows.flatten(0, 1))
-            displacement, state_step = (
-                part.view(*rows.shape[:2], part.shape[1]) for part in update
-            )
-            found.append((displacement, state_step))
-        return found
+            own = action(*bounded_update(rule, rows.flatten(0, 1)))
+            parts.append(own.view(*rows.shape[:2], -1))
+        return parts[0] if len(parts) == 1 else torch.cat(parts, dim=1)
 
     def policy(self) -> RuleSetPolicy:
         """Return the rules as a policy, which follows when they are trained on."""
@@ -181,8 +170,7 @@ class RuleSetPolicy(Policy):
 
     def act(self, observation: Tensor) -> Tensor:
         """Return the rules' bounded updates of every particle."""
-        parts = [self.interface.action(*update) for update in self.rules.updates(observation)]
-        return torch.cat(parts, dim=1).float()
+        return self.rules.acted(observation, self.interface.action).float()
 
     def _places(self, counts: Mapping[str, int]) -> dict[str, slice]:
         # Agents that are dead are missing, so that names say which species, or particle, it is.
@@ -200,17 +188,9 @@ class RuleSetPolicy(Policy):
         return {agent: known[agent] for agent in counts}
 
 
-def starting_rules(problem: Problem, device: torch.device, start: RuleSet) -> RuleSet:
-    """Return copies of rules for a learner to change, on a device.
-
-    Raises:
-        NPAError: They are no set of rules, or do not fit the problem.
-    """
-    if not isinstance(start, RuleSet):
-        raise NPAError(
-            f"start must be a RuleSet, got {type(start).__name__}: RuleSet.of(problem, 'heart')"
-        )
-    return RuleSet.of(problem, list(start)).to(device)
+def species_of(counts: Sequence[int]) -> Tensor:
+    """Return the number of the species of each particle, int64, shape [N]."""
+    return torch.arange(len(counts)).repeat_interleave(torch.tensor(tuple(counts)))
 
 
 def _file_name(species: int) -> str:

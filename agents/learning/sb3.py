@@ -128,27 +128,15 @@ class ProgressCallback(BaseCallback):
 
     def __init__(self, progress: Progress, options: WorldOptions, pace: Pace) -> None:
         super().__init__()
-        self.progress = progress
-        self.options = options
-        self.pace = pace
+        self.progress, self.options, self.pace = progress, options, pace
         self.rounds = 0
-        """Rounds begun."""
         self.share_left = 1.0
         """Share of the budget that was left when the round began."""
 
-    @property
-    def actor(self) -> GaussianRules:
-        """Rules that explore."""
-        policy: Any = self.model.policy
-        actor: GaussianRules = policy.actor
-        return actor
-
-    @property
-    def rules(self) -> RuleSet:
-        """What is learned."""
-        return self.actor.rules
-
     def _on_training_start(self) -> None:
+        policy: Any = self.model.policy
+        self.actor: GaussianRules = policy.actor
+        self.rules = self.actor.rules
         self._learned = [p for p in self.actor.parameters() if p.requires_grad]
         self.progress.start(self.rules)
 
@@ -177,8 +165,7 @@ class ProgressCallback(BaseCallback):
 class WorldRulePolicy(ActorCriticPolicy):
     """A policy for rows of `WorldVecEnv`: all particles of a world act by their species' rule.
 
-    Log-probability, entropy and value of a world are means over its particles. The rules, which
-    are copied, are the actor's means to begin with.
+    Log-probability, entropy and value of a world are means over its particles. Rules are copied.
     """
 
     def __init__(
@@ -197,8 +184,7 @@ class WorldRulePolicy(ActorCriticPolicy):
         self.actor = GaussianRules(rules, initial_std)
         """Rules that explore: `actor.rules` acts without."""
         self.log_std = self.actor.log_std
-        counts = [span.stop - span.start for span in rules.spans]
-        self.critic = Critic(rules.interface.perception_dim, counts, critic)
+        self.critic = Critic(rules.interface.perception_dim, rules.counts, critic)
         self.optimizer = self.optimizer_class(
             self.parameters(),
             lr=lr_schedule(1),  # type: ignore[call-arg]
@@ -252,7 +238,7 @@ ALGORITHMS: dict[str, type[SAC] | type[PPO]] = {"sac": SAC, "ppo": PPO}
 
 @dataclass(frozen=True, kw_only=True)
 class GardenOptions:
-    """What both algorithms are settings; all that is not said is as Stable-Baselines3 has it."""
+    """Options of both algorithms; all else is as Stable-Baselines3 has it."""
 
     gamma: float = 0.9
     """Discount of a reward one step later (dimensionless)."""
@@ -301,9 +287,9 @@ SAC_DEFAULTS, GARDEN_PPO_DEFAULTS = SACOptions(), GardenPPOOptions()
 
 def train_garden_sac(progress: Progress, options: SACOptions = SAC_DEFAULTS) -> GardenPolicy:
     """Return the policy that SAC (Haarnoja et al., arXiv 1801.01290) finds within a budget."""
-    gradient_steps = max(1, progress.problem.num_envs // options.world_steps)
-    settings = {"learning_starts": options.learning_starts, "gradient_steps": gradient_steps}
-    return _garden_policy(SAC, progress, options, **settings)
+    steps = max(1, progress.problem.num_envs // options.world_steps)
+    starts = options.learning_starts
+    return _garden_policy(SAC, progress, options, learning_starts=starts, gradient_steps=steps)
 
 
 def train_garden_ppo(
@@ -312,8 +298,8 @@ def train_garden_ppo(
     """Return the policy that PPO (Schulman et al., arXiv 1707.06347) finds within a budget."""
     if options.steps * progress.problem.num_envs < 2:
         raise NPAError("steps must be at least 2 in a single world, got 1: give steps=32")
-    settings = {"n_steps": options.steps, "batch_size": options.batch_size}
-    return _garden_policy(PPO, progress, options, **settings)
+    size = options.batch_size
+    return _garden_policy(PPO, progress, options, n_steps=options.steps, batch_size=size)
 
 
 def _garden_policy(
@@ -359,11 +345,7 @@ class GardenCallback(BaseCallback):
 
 
 class GardenPolicy:
-    """A model of Stable-Baselines3, without noise, as the policy of a garden.
-
-    Args:
-        model: The model; the policy follows while it learns.
-    """
+    """A model of Stable-Baselines3, without noise, as the policy of a garden, also as it learns."""
 
     def __init__(self, model: Any) -> None:
         self.model = model

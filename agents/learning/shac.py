@@ -14,7 +14,7 @@ from typing import NamedTuple, get_args
 import torch
 from torch import Tensor
 
-from npa_envs.agents.learning.gradient import environment_task
+from npa_envs.agents.learning.gradient import EnvironmentTask
 from npa_envs.agents.learning.ppo_common import (
     Critic,
     CriticKind,
@@ -31,8 +31,7 @@ from npa_envs.agents.learning.progress import Progress, annealed
 from npa_envs.agents.learning.rules import RuleSet
 from npa_envs.checks import check_fraction, check_non_negative, check_positive
 from npa_envs.training.optimiser import normalise_gradients
-from npa_envs.training.randomness import restart
-from npa_envs.training.ranks import ALONE, Ranks
+from npa_envs.training.ranks import ALONE, Ranks, restart
 from npa_envs.world.randomness import WorldRandom
 from npa_envs.world.rollout import Memory
 
@@ -137,36 +136,23 @@ class SHACLearner:
         ranks.check_dealt("world_count", options.world_count)
         places = ranks.places(options.world_count)
         self.rules = zero_output_rules(problem, seed, start).to(device)
-        """What is learned."""
         count = -(-problem.episode_steps // options.steps)
         self.window = -(-problem.episode_steps // count)
         """Steps of a window, h."""
-        self.task = environment_task(problem, device)
+        self.task = EnvironmentTask(problem, device)
         self.random = learner_random(seed, options.world_count, places, device, ranks)
-        """Source of worlds, update masks and shuffles."""
         width = problem.physics.space_dim + problem.physics.state_dim + 1
         self.critic = seeded_critic(problem, width, options, seed).to(device)
         self.target = copy.deepcopy(self.critic).requires_grad_(False)
-        """The critic's copy, which follows it slowly."""
         weights = [p for p in self.rules.parameters() if p.requires_grad]
         self._optimizer = torch.optim.AdamW(weights, fused=True)
         self._critic_optimizer = torch.optim.Adam(
             self.critic.parameters(), lr=options.critic_learning_rate, fused=True
         )
-        self.modules: dict[str, torch.nn.Module] = {
-            "rules": self.rules,
-            "critic": self.critic,
-            "target": self.target,
-        }
-        """What learns, by name."""
-        self.optimisers: dict[str, torch.optim.Optimizer] = {
-            "rules": self._optimizer,
-            "critic": self._critic_optimizer,
-        }
-        """Their optimisers."""
+        self.modules = {"rules": self.rules, "critic": self.critic, "target": self.target}
+        self.optimisers = {"rules": self._optimizer, "critic": self._critic_optimizer}
         self._limits = problem.physics.limits.position, problem.physics.limits.state
         self.window_count = count
-        """Windows of an episode."""
         self._places = places.tolist()
         self._minibatches = Minibatches(
             self.window, len(places), (1,), options.minibatches, self.random

@@ -7,13 +7,12 @@ import json
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from npa_envs.agents.search.run import Elite, Search
-from npa_envs.agents.search.worlds import SEED_RADIUS, UPDATE_PROB, Axis, Trials
+from npa_envs.agents.search.worlds import SEED_RADIUS, UPDATE_PROB, Axis
 from npa_envs.files import made_folder
 from npa_envs.measure.plots import new_figure, png
 from npa_envs.render import draw_worlds
@@ -35,40 +34,27 @@ Pictures = Mapping[tuple[int, ...], NDArray[np.uint8]]
 
 def write_elites(search: Search, folder: Path) -> Pictures:
     """Write each elite's rule as `elites/CELL.safetensors`; return its first world's picture."""
-    pictures = {}
+    pictures: dict[tuple[int, ...], NDArray[np.uint8]] = {}
+    count = search.world.particle_count
     for elite in search.elites():
-        trials = search.candidates.try_all(elite.solution[None])
         place = folder / ELITES / f"{elite.name}.safetensors"
-        rule = search.candidates.rule_of(elite.solution)
+        measures = zip(search.axes, elite.found.measures, strict=True)
+        found = {"quality": elite.found.quality} | {axis.name: value for axis, value in measures}
+        world = {"particle_count": count, "update_prob": UPDATE_PROB, "seed_radius": SEED_RADIUS}
+        metadata = {"found": json.dumps(found), "world": json.dumps(world)}
         with made_folder(place.parent):
-            save_rule(rule, place, metadata=_metadata(search, elite))
-        pictures[elite.cell] = _picture(search, trials)
+            save_rule(search.candidates.rule_of(elite.solution), place, metadata=metadata)
+        trials = search.candidates.try_all(elite.solution[None])
+        x, s = trials.x[0, :1], trials.s[0, :1]
+        (pictures[elite.cell],) = draw_worlds(
+            x,
+            s,
+            resolution=SIDE,
+            pixel_size=math.sqrt(math.pi / count) * SEED_RADIUS,
+            centre=x.mean(dim=1),
+            half_width=HALF_WIDTH,
+        )
     return pictures
-
-
-def _metadata(search: Search, elite: Elite) -> dict[str, str]:
-    """Return the metadata of a rule's file: its world, quality and descriptors."""
-    names = [axis.name for axis in search.axes]
-    measures = dict(zip(names, elite.found.measures, strict=True))
-    found = {"quality": elite.found.quality, **measures}
-    world: dict[str, float] = {"particle_count": search.world.particle_count}
-    world |= {"update_prob": UPDATE_PROB, "seed_radius": SEED_RADIUS}
-    return {"found": json.dumps(found), "world": json.dumps(world)}
-
-
-def _picture(search: Search, trials: Trials) -> NDArray[np.uint8]:
-    world = search.world
-    x, s = trials.x[0, :1], trials.s[0, :1]
-    (frame,) = draw_worlds(
-        x,
-        s,
-        resolution=SIDE,
-        pixel_size=math.sqrt(math.pi / world.particle_count) * SEED_RADIUS,
-        centre=x.mean(dim=1),
-        half_width=HALF_WIDTH,
-    )
-    picture: NDArray[np.uint8] = frame
-    return picture
 
 
 def page(search: Search, pictures: Pictures) -> str:
@@ -136,25 +122,20 @@ def _span(axis: Axis, cell: int) -> str:
 def figure(axes: Sequence[Axis], pictures: Pictures) -> bytes:
     """Return the atlas as a PNG file: a panel for each cell of the last axis, two in a row."""
     across, up, last = axes
+    width, height = ((axis.highest - axis.lowest) / axis.cells for axis in (across, up))
     rows = -(-last.cells // 2)
     drawn, panels = new_figure(rows, 2, (9.0, 4.6 * rows))
     for layer, panel in enumerate(panels.flat):
         if layer >= last.cells:
             panel.axis("off")
             continue
-        _draw_layer(panel, axes, pictures, layer)
+        for (column, row, own), picture in pictures.items():
+            if own == layer:
+                left, low = across.lowest + column * width, up.lowest + row * height
+                panel.imshow(picture, extent=(left, left + width, low, low + height), aspect="auto")
+        panel.set(xlim=(across.lowest, across.highest), ylim=(up.lowest, up.highest))
+        panel.set_facecolor("#eeeeee")
+        panel.tick_params(labelsize=7)
         panel.set_title(f"{last.name} {_span(last, layer)}", fontsize=9)
         panel.set(xlabel=across.name, ylabel=up.name)
     return png(drawn, dpi=110)
-
-
-def _draw_layer(panel: Any, axes: Sequence[Axis], pictures: Pictures, layer: int) -> None:
-    across, up, _ = axes
-    width, height = ((axis.highest - axis.lowest) / axis.cells for axis in (across, up))
-    for (column, row, own), picture in pictures.items():
-        if own == layer:
-            left, low = across.lowest + column * width, up.lowest + row * height
-            panel.imshow(picture, extent=(left, left + width, low, low + height), aspect="auto")
-    panel.set(xlim=(across.lowest, across.highest), ylim=(up.lowest, up.highest))
-    panel.set_facecolor("#eeeeee")
-    panel.tick_params(labelsize=7)

@@ -1,28 +1,161 @@
-"""A search that can be stopped: its record, its growth, and the elites that it leaves."""
+"""A search that can be stopped: what it proposes, its record, its growth, and its elites.
+
+The archive is the grid of MAP-Elites (Mouret and Clune, arXiv 1504.04909): a cell keeps the best
+candidate whose descriptors lie in it. Methods differ in what they propose next.
+"""
 
 from __future__ import annotations
 
 import zlib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
-from npa_envs.agents.search.methods import METHODS, make_archive, qualities_and_measures
-from npa_envs.agents.search.worlds import Axis, Candidates, Found, SearchWorld
+from npa_envs.agents.search.worlds import Axis, Candidates, Found, Numbers, SearchWorld
 from npa_envs.checks import is_whole
-from npa_envs.errors import NPAError, shown, suggest
-from npa_envs.measure.record import installed_version, read_record, write_record
+from npa_envs.errors import MissingDependencyError, NPAError, shown, suggest
+from npa_envs.measure.record import Record, installed_version
 
 RESULTS = "search.json"
 """The file that a stopped search goes on from."""
 
 LIBRARIES = ("numpy", "ribs", "cma")
 """Libraries whose other versions may propose other candidates."""
+
+
+SMALLEST, LARGEST = 0.05, 0.8
+"""Sizes of weights that random candidates have, over those of Xavier."""
+
+MUTATION = 0.1
+"""Standard deviation of what a mutation adds to a weight, over its size by Xavier."""
+
+FIRST_STEP = 0.2
+"""Standard deviation that CMA-ES begins with, likewise."""
+
+
+def import_ribs() -> Any:
+    """Return the library with its parts imported."""
+    try:
+        import cma  # noqa: F401
+        import ribs.archives
+        import ribs.emitters  # noqa: F401
+        import ribs.schedulers  # noqa: F401
+    except ImportError as error:
+        raise MissingDependencyError(
+            "the search needs pyribs and cma, which are not both installed: "
+            "pip install 'npa-envs[search]'"
+        ) from error
+    return ribs
+
+
+def make_archive(weight_count: int, axes: tuple[Axis, ...], seed: int = 0) -> Any:
+    """Return an empty `ribs.archives.GridArchive` of candidates with so many weights.
+
+    Only qualities above 0 are kept: all others are dead, or blew up. Elites are drawn by the seed.
+    """
+    return import_ribs().archives.GridArchive(
+        solution_dim=weight_count,
+        dims=[axis.cells for axis in axes],
+        ranges=[(axis.lowest, axis.highest) for axis in axes],
+        # With these two a cell's threshold is 0 at first, and then its best.
+        learning_rate=1.0,
+        threshold_min=0.0,
+        seed=seed,
+    )
+
+
+class RandomProposals:
+    """Random candidates, each with weights of a size of its own, spread evenly in the logarithm."""
+
+    def __init__(self, archive: Any, batch_size: int, seed: int) -> None:
+        self._archive = archive
+        self._batch_size = batch_size
+        self._draws = np.random.default_rng(seed)
+        self._asked: Numbers = np.empty((0, archive.solution_dim))
+
+    def ask(self) -> Numbers:
+        """Return candidates, shape [K, W]."""
+        self._asked = drawn(self._draws, self._batch_size, self._archive.solution_dim)
+        return self._asked
+
+    def tell(self, objective: Numbers, measures: Numbers) -> None:
+        """Put the candidates into the archive."""
+        self._archive.add(self._asked, objective, measures)
+
+
+def drawn(draws: np.random.Generator, count: int, weight_count: int) -> Numbers:
+    """Return random candidates, shape [count, W], weights of sizes from `SMALLEST` to `LARGEST`."""
+    sizes = np.exp(draws.uniform(np.log(SMALLEST), np.log(LARGEST), (count, 1)))
+    return sizes * draws.standard_normal((count, weight_count))
+
+
+def _map_elites(archive: Any, batch_size: int, seed: int) -> Any:
+    emitter = import_ribs().emitters.GaussianEmitter(
+        archive,
+        sigma=MUTATION,
+        initial_solutions=drawn(np.random.default_rng(seed), batch_size, archive.solution_dim),
+        batch_size=batch_size,
+        seed=seed,
+    )
+    return _scheduler(archive, emitter)
+
+
+def _evolution(ranker: str, restart_rule: str) -> Callable[[Any, int, int], Any]:
+    def make(archive: Any, batch_size: int, seed: int) -> Any:
+        ribs = import_ribs()
+        from cma.sigma_adaptation import CMAAdaptSigmaCSA
+
+        # From 300 weights on cma would go by the order of candidates, and pyribs sorts them.
+        options = {"CMA_diagonal": True, "AdaptSigma": CMAAdaptSigmaCSA}
+        emitter = ribs.emitters.EvolutionStrategyEmitter(
+            archive,
+            x0=np.zeros(archive.solution_dim),
+            sigma0=FIRST_STEP,
+            ranker=ranker,
+            restart_rule=restart_rule,
+            es="pycma_es",
+            es_kwargs={"opts": options},
+            batch_size=batch_size,
+            seed=seed,
+        )
+        return _scheduler(archive, emitter)
+
+    return make
+
+
+def _scheduler(archive: Any, emitter: Any) -> Any:
+    return import_ribs().schedulers.Scheduler(archive, [emitter])
+
+
+METHODS: Mapping[str, Callable[[Any, int, int], Any]] = {
+    "map-elites": _map_elites,
+    "cma-me": _evolution("2imp", "no_improvement"),
+    "cma-es": _evolution("obj", "basic"),
+    "random": RandomProposals,
+}
+"""Makes what `ask` returns candidates of, shape [K, W], from an archive, the batch size and a seed;
+it takes qualities and descriptors by `tell`, as pyribs' schedulers do, and fills the archive.
+
+`map-elites` mutates elites drawn at random. `cma-me` (arXiv 1912.02400) is CMA-ES that is rewarded
+for new cells first and for better elites second. `cma-es` is rewarded for quality alone. Both adapt
+a diagonal covariance. `random` draws anew.
+"""
+
+
+def qualities_and_measures(
+    found: list[Found | None], axes: tuple[Axis, ...]
+) -> tuple[Numbers, Numbers]:
+    """Return qualities, shape [K], and descriptors, [K, M]; all are 0 where nothing was found."""
+    nothing = Found(0.0, (0.0,) * len(axes))
+    whole = [nothing if one is None else one for one in found]
+    return np.array([one.quality for one in whole]), np.array([one.measures for one in whole])
+
+
+# The search.
 
 
 class Growth(NamedTuple):
@@ -45,7 +178,7 @@ class Elite(NamedTuple):
     """Place on each axis, from 0."""
     found: Found
     """Its quality and descriptors."""
-    solution: NDArray[np.float64]
+    solution: Numbers
     """Its weights in units of `Candidates.scales`, shape [W]."""
 
     @property
@@ -111,19 +244,18 @@ class Search:
             "axes": [list(axis) for axis in self.axes],
             "versions": {name: installed_version(name) for name in LIBRARIES},
         }
-        """Facts that the elites depend on."""
-        self._batches: list[Batch] = []
-        self._path = path
+        self._record = Record[Batch](
+            self.facts, path=path, content=lambda rows: {"growth": self.growth, "batches": rows}
+        )
         self.archive = make_archive(self.candidates.weight_count, self.axes, seed)
         """The elites, a `ribs.archives.GridArchive`."""
         self._proposals = METHODS[method](self.archive, batch_size, seed)
-        if path is not None:
-            self._replay(path)
+        self._replay()
 
     @property
     def evaluations(self) -> int:
         """Candidates that have been tried."""
-        return sum(len(batch["found"]) for batch in self._batches)
+        return sum(len(batch["found"]) for batch in self._record.rows)
 
     @property
     def particle_steps(self) -> int:
@@ -151,10 +283,7 @@ class Search:
             results = [None if one is None else [one.quality, *one.measures] for one in found]
             self._tell({"fingerprint": _fingerprint(solutions), "found": results})
             progress(len(found) * self.world.particle_steps)
-            if self._path is not None:
-                growth = [list(step) for step in self.growth]
-                content = {"facts": self.facts, "growth": growth, "batches": self._batches}
-                write_record(self._path, content)
+            self._record.write()
 
     def elites(self) -> list[Elite]:
         """Return the best candidate of each cell that has one, cell by cell."""
@@ -175,11 +304,11 @@ class Search:
     def _tell(self, batch: Batch) -> None:
         found = [None if one is None else Found(one[0], tuple(one[1:])) for one in batch["found"]]
         self._proposals.tell(*qualities_and_measures(found, self.axes))
-        self._batches.append(batch)
+        self._record.rows.append(batch)
         self.growth.append(growth_of(self.archive, self.evaluations))
 
-    def _replay(self, path: Path) -> None:
-        """Propose again the candidates of a record, and tell their results."""
+    def _replay(self) -> None:
+        """Propose again the candidates of the record, if there is one, and tell their results."""
 
         def read(held: dict[str, Any]) -> list[Batch]:
             return [
@@ -190,13 +319,15 @@ class Search:
                 for batch in held["batches"]
             ]
 
-        for batch in read_record(path, self.facts, read, command="search") or []:
+        held = self._record.resume(read, command="search").rows
+        self._record.rows = []
+        for number, batch in enumerate(held):
             asked = self._proposals.ask()
             if _fingerprint(asked) != batch["fingerprint"] or len(asked) != len(batch["found"]):
                 raise NPAError(
-                    f"{str(path)!r} must tell of the candidates that are proposed here, but batch "
-                    f"{len(self._batches)} is of others (another machine?): remove it, or choose "
-                    "another folder with --out"
+                    f"{str(self._record.path)!r} must hold the candidates that this search "
+                    f"proposes, but batch {number} is of others (another machine?): remove it, or "
+                    "choose another folder with --out"
                 )
             self._tell(batch)
 
@@ -231,5 +362,5 @@ def tried_again(search: Search, seeds: Sequence[int], *, steps: int | None = Non
     return growth_of(archive, len(elites))
 
 
-def _fingerprint(solutions: NDArray[np.float64]) -> int:
+def _fingerprint(solutions: Numbers) -> int:
     return zlib.crc32(np.ascontiguousarray(solutions, dtype=np.float64).tobytes())

@@ -122,18 +122,13 @@ class RuleStack(NPARule):
     """K rules of one architecture, each of which updates its own worlds of a batch.
 
     Worlds must be as many for each rule, with the same masks for each, so that every rule has as
-    many rows of perception.
-
-    Args:
-        rule: The architecture.
-        weights: The rules' W1, b1 and W2 as `RuleWeights` orders them, shape [K, W].
+    many rows of perception. Weights, shape [K, W], are in the order of `RuleWeights`.
     """
 
     def __init__(self, rule: NPARule, weights: Tensor) -> None:
         with torch.random.fork_rng(devices=()):
             super().__init__(**rule.hyper_parameters())
         self.weights = weights
-        """Weights of each rule, shape [K, W]."""
         self.to(weights.device)
 
     def forward(self, perception: Tensor) -> Tensor:
@@ -199,18 +194,17 @@ class Candidates:
         travelled = (path[-1] - path[late - 1]).mean(dim=1) / ((SNAPSHOTS - late) * every)
         late_x, late_s = (values[late:].unflatten(1, (count, -1)) for values in (xs, ss))
         speeds = travelled.view(count, -1).mean(dim=1) / world.eps
-        found = [self._judge(late_x[:, k], late_s[:, k], float(speeds[k])) for k in range(count)]
+        found: list[Found | None] = []
+        for k in range(count):
+            own_x, own_s = late_x[:, k], late_s[:, k]
+            finite = bool(own_x.isfinite().all() and own_s.isfinite().all())
+            quality = float(quality_of(own_x, own_s)) if finite else 0.0
+            if quality <= 0.0:
+                found.append(None)
+                continue
+            measures = self.crowding_and_mixing(own_x.flatten(0, 1), own_s.flatten(0, 1))
+            found.append(Found(quality, (float(speeds[k]), *measures)))
         return Trials(found, late_x[-1], late_s[-1])
-
-    def _judge(self, xs: Tensor, ss: Tensor, speed: float) -> Found | None:
-        """Return a candidate's result from late moments [T, B, N, ·] of its worlds."""
-        if not (xs.isfinite().all() and ss.isfinite().all()):
-            return None
-        quality = float(quality_of(xs, ss))
-        if quality <= 0.0:
-            return None
-        measures = self.crowding_and_mixing(xs.flatten(0, 1), ss.flatten(0, 1))
-        return Found(quality, (speed, *measures))
 
     def crowding_and_mixing(self, x: Tensor, s: Tensor) -> tuple[float, float]:
         """Return two descriptors of worlds x [B, N, D], s [B, N, C]."""

@@ -236,7 +236,7 @@ def resolve_resume(words: Sequence[str], out_of: Callable[[Sequence[str]], Path]
     chosen = list(words)
     if first.resume is None:
         return chosen
-    from npa_envs.training.run_folder import RunFolder, check_choice
+    from npa_envs.training.run import RunFolder, check_choice
 
     check_choice(resume=True, overwrite=first.overwrite)
     if first.resume == "auto":

@@ -81,7 +81,7 @@ def main(arguments: Sequence[str]) -> int:
     from npa_envs.tasks.damage import parse_damage
     from npa_envs.tasks.point_classification import PointClassification, majority
     from npa_envs.training import check_device
-    from npa_envs.training.stopping import stop_flag
+    from npa_envs.training.run import stop_flag
     from npa_envs.training.trained_tasks import task_of_rule
 
     device = check_device(options.device)

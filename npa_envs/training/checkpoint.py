@@ -16,10 +16,9 @@ from npa_envs.checks import is_real, is_whole
 from npa_envs.errors import NPAError, shown
 from npa_envs.files import atomic_path, check_torch_archive, open_regular
 from npa_envs.tasks.train_config import TrainConfig
-from npa_envs.training.overrides import config_to_dict
+from npa_envs.training.presets import config_to_dict
 
 CHECKPOINT_FORMAT = "npa-envs checkpoint"
-"""Marks a file as ours."""
 
 CHECKPOINT_VERSION = 1
 """Raised whenever what a checkpoint holds changes."""
@@ -74,7 +73,6 @@ class _PatientFile(FileIO):
     """
 
     error: OSError | None = None
-    """What went wrong first."""
 
     def write(self, data: Any, /) -> int:
         """Write all of the data, unless something went wrong before."""
@@ -135,7 +133,22 @@ def check_same_run(
     content: dict[str, Any], task_name: str, config: TrainConfig[Any], path: Path
 ) -> None:
     """Check that a checkpoint belongs to the run that is to be resumed."""
-    _check_complete(content, path)
+    # First what has to be known before the run itself is made.
+    needed = [(name, content.get(name), kind) for name, kind in NEEDED.items()]
+    if isinstance(content.get("config"), dict):
+        needed.append(("config.task", content["config"].get("task"), dict))
+    # A whole number of seconds is a number too.
+    wrong = [
+        name
+        for name, value, kind in needed
+        if not isinstance(value, (int, float) if kind is float else kind)
+    ]
+    if not wrong and not _is_plain(content["config"]):
+        wrong = ["config"]
+    if wrong:
+        raise unusable_checkpoint(path, f"lacks {', '.join(wrong)} or has it of a wrong type")
+    numbers = {name: kind() for name, kind in NEEDED.items() if kind in (int, float)}
+    check_content(content, numbers, path)
     check_task(content, task_name, path)
     theirs = _flat(content["config"])
     ours = _flat(config_to_dict(config))
@@ -204,25 +217,6 @@ def _wrong(name: str, value: Any, like: Any) -> Iterator[str]:
 def _kind(tensor: Tensor) -> str:
     usual = tensor.layout == torch.strided and not tensor.is_meta
     return f"{'' if usual else 'odd '}{str(tensor.dtype)[6:]} {tuple(tensor.shape)}"
-
-
-def _check_complete(content: dict[str, Any], path: Path) -> None:
-    """Check what has to be known before the run itself is made."""
-    needed = [(name, content.get(name), kind) for name, kind in NEEDED.items()]
-    if isinstance(content.get("config"), dict):
-        needed.append(("config.task", content["config"].get("task"), dict))
-    # A whole number of seconds is a number too.
-    wrong = [
-        name
-        for name, value, kind in needed
-        if not isinstance(value, (int, float) if kind is float else kind)
-    ]
-    if not wrong and not _is_plain(content["config"]):
-        wrong = ["config"]
-    if wrong:
-        raise unusable_checkpoint(path, f"lacks {', '.join(wrong)} or has it of a wrong type")
-    numbers = {name: kind() for name, kind in NEEDED.items() if kind in (int, float)}
-    check_content(content, numbers, path)
 
 
 def _is_plain(value: Any) -> bool:

@@ -73,12 +73,7 @@ class RuleOptimiser:
         normalise_gradients([p.grad for p in self._parameters if p.grad is not None])
 
     def step(self, iteration: int, share: float = 0.0) -> None:
-        """Take a step along the prepared gradients; at a repeat's start, with fresh moments.
-
-        Args:
-            iteration: Iterations done so far in the run.
-            share: As for `TrainConfig.learning_rate_at`.
-        """
+        """Take a step along the prepared gradients; at a repeat's start, with fresh moments."""
         if iteration > 0 and iteration % self._config.iterations == 0:
             self._optimisers = self._fresh(self._parameters)
         rate = self._config.learning_rate_at(iteration, share)
@@ -106,8 +101,7 @@ class RuleOptimiser:
         moments = state["state"]
         for optimiser, numbers in self._optimisers:
             own = {at: moments[number] for at, number in enumerate(numbers) if number in moments}
-            groups = optimiser.state_dict()["param_groups"]
-            optimiser.load_state_dict({"state": own, "param_groups": groups})
+            load_moments(optimiser, own)
 
     def _fresh(self, parameters: list[nn.Parameter]) -> list[tuple[Optimizer, list[int]]]:
         """Return optimisers without moments, with the numbers of the parameters that each has."""
@@ -132,6 +126,12 @@ class RuleOptimiser:
             fused = parameters[0].is_cuda
             made.append((torch.optim.AdamW(groups, weight_decay=decay, fused=fused), numbers))
         return made
+
+
+def load_moments(optimiser: Optimizer, state: dict[int, Any]) -> None:
+    """Give an optimiser its state; its groups are those of the options."""
+    groups = optimiser.state_dict()["param_groups"]
+    optimiser.load_state_dict({"state": state, "param_groups": groups})
 
 
 def _moments(optimisers: list[tuple[Optimizer, list[int]]]) -> dict[int, dict[str, Tensor]]:

@@ -1,4 +1,4 @@
-"""Processes that train one rule together: each has a share of the pool and of the batch."""
+"""Processes that train one rule together: each has a share of the worlds; what runs draw from."""
 
 from __future__ import annotations
 
@@ -10,15 +10,18 @@ import sys
 import threading
 import time
 import uuid
-from collections.abc import Iterator, Sequence
-from typing import Any, Protocol, TypeVar
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, TypeVar
 
+import numpy as np
 import torch
 import torch.distributed as dist
 from torch import Tensor
 
 from npa_envs.errors import LostProcessError, NPAError, shown
 from npa_envs.tasks.train_config import TrainConfig
+from npa_envs.world.randomness import Randomness, WorldRandom
 
 ValueT = TypeVar("ValueT")
 
@@ -35,20 +38,13 @@ class Ranks:
 
     Pool and batch are cut into as many sections as the batch has worlds. Section k belongs to
     process k modulo their number. So each process has young and old worlds.
-
-    Args:
-        rank: Number of this process, from 0.
-        count: Number of processes, R.
-        together: They are those of torch's default group, even if there is only one.
     """
 
     def __init__(self, rank: int = 0, count: int = 1, *, together: bool = False) -> None:
         self.rank = rank
-        """Number of this process, from 0."""
         self.count = count
-        """Number of processes, R."""
         self.together = together
-        """Whether they are torch's default group."""
+        """Whether they are torch's default group, even if there is only one."""
         self._parent = os.getppid()
         self._asked_at: tuple[int, float] | None = None
         self._next_question = 0
@@ -85,31 +81,16 @@ class Ranks:
             )
 
     def places(self, total: int, section: int = 1) -> Tensor:
-        """Return which of all worlds are this process's, on the CPU, int64, shape [total / R].
-
-        Args:
-            section: Worlds of a section.
-        """
+        """Return which of all worlds are this process's, on the CPU, int64, shape [total / R]."""
         return self.own(torch.arange(total), section)
 
     def own(self, worlds: Tensor, section: int) -> Tensor:
-        """Return this process's share of all worlds.
-
-        Args:
-            section: Worlds of a section.
-        """
+        """Return this process's share of all worlds, so many of which are a section."""
         dealt = worlds.view(-1, self.count, section, *worlds.shape[1:])
         return dealt[:, self.rank].flatten(0, 1)
 
     def collected(self, worlds: Tensor, section: int) -> Tensor:
-        """Return the worlds of all processes, on the CPU where there are several.
-
-        Args:
-            section: Worlds of a section.
-
-        Returns:
-            Shape [n R, ...] on the first process; what the others get is of no use.
-        """
+        """Return the worlds of all processes, on the first one and the CPU where it has others."""
         if self.count == 1:
             return worlds
         mine = worlds.detach().cpu().contiguous()
@@ -140,11 +121,7 @@ class Ranks:
         return bool(asked)
 
     def agree_to_stop(self, asked: bool, iteration: int) -> bool:
-        """Return whether to stop before an iteration, the same on all processes.
-
-        Args:
-            asked: This process was asked to.
-        """
+        """Return whether to stop before an iteration: any process was asked to."""
         if not self.together:
             return asked
         if self._asked_at is not None and self._asked_at[0] < iteration < self._next_question:
@@ -164,10 +141,7 @@ class Ranks:
     def reduce(self, means: Sequence[Tensor], total: Tensor | None = None) -> None:
         """Replace numbers by their means, and one by its sum, over all processes, in place.
 
-        On CUDA the host waits for nothing.
-
-        Args:
-            means: Tensors of one dtype.
+        All means have one dtype. On CUDA the host waits for nothing.
         """
         if not self.together:
             return
@@ -224,7 +198,94 @@ class Ranks:
 
 
 ALONE = Ranks()
-"""A process that shares nothing."""
+
+
+# Randomness: of the batch at once, or of each world by itself.
+
+
+@dataclass(frozen=True)
+class RunRandomness:
+    """What a run draws from.
+
+    A process alone has one generator for all worlds and one for all masks. Where several share a
+    run, each world has streams of its own, which follow from the seed, the world's number among
+    those of all processes, and the iteration. So they are the same for any number of processes,
+    and nothing of them has to be kept. Numbers of steps and first weights are of the schedule, on
+    the CPU; which worlds a batch has, their damage and fresh ones of `worlds`.
+    """
+
+    schedule: torch.Generator
+    pool: Randomness
+    worlds: Randomness
+    masks: Randomness
+
+    @classmethod
+    def of_batch(
+        cls, config: TrainConfig[Any], device: torch.device, schedule: torch.Generator
+    ) -> RunRandomness:
+        """Return the randomness of a process alone."""
+        worlds = torch.Generator(device).manual_seed(config.seed + 1)
+        masks = torch.Generator(device).manual_seed(config.seed + 2)
+        return cls(schedule, worlds, worlds, masks)
+
+    @classmethod
+    def by_world(
+        cls, config: TrainConfig[Any], device: torch.device, schedule: torch.Generator, ranks: Ranks
+    ) -> RunRandomness:
+        """Return the randomness of worlds that several processes share."""
+        batch, pool = config.world_count, config.pool_size
+
+        def streams(purpose: int, total: int, places: Tensor) -> WorldRandom:
+            return world_streams((config.seed, purpose), total, places, device)
+
+        of_batch = ranks.places(batch)
+        return cls(
+            schedule,
+            pool=streams(0, pool, ranks.places(pool, pool // batch)),
+            worlds=streams(1, batch, of_batch),
+            masks=streams(2, batch, of_batch),
+        )
+
+    def state_dict(self) -> dict[str, Tensor]:
+        """Return the states of all generators, for a checkpoint."""
+        named = {"schedule": self.schedule, "worlds": self.worlds, "masks": self.masks}
+        return {
+            name: source.get_state()
+            for name, source in named.items()
+            if isinstance(source, torch.Generator)
+        }
+
+    def load_state_dict(self, states: Mapping[str, Tensor], iteration: int) -> None:
+        """Go on after so many iterations from what `state_dict` returned."""
+        self.schedule.set_state(states["schedule"])
+        for name, source in (("worlds", self.worlds), ("masks", self.masks)):
+            if isinstance(source, torch.Generator):
+                source.set_state(states[name])
+            else:
+                source.episodes.fill_(iteration)
+
+
+def world_streams(
+    seed: Sequence[int], total: int, places: Tensor, device: torch.device
+) -> WorldRandom:
+    """Return streams of this process's `places` among worlds: the same for any other share."""
+    keys = np.random.default_rng(seed).integers(2**64, size=total, dtype=np.uint64)
+    return WorldRandom.from_keys(torch.from_numpy(keys.view(np.int64))[places].to(device))
+
+
+def restart(*sources: Randomness) -> None:
+    """Begin anew what worlds draw by themselves; a generator just goes on."""
+    for source in sources:
+        if isinstance(source, WorldRandom):
+            source.restart()
+
+
+def registered(source: Randomness) -> torch.Generator | None:
+    """Return what a CUDA graph has to know of: streams of worlds are tensors as all others."""
+    return source if isinstance(source, torch.Generator) else None
+
+
+# Processes that torchrun starts.
 
 
 @contextlib.contextmanager
@@ -247,7 +308,15 @@ def joined_ranks() -> Iterator[Ranks]:
     try:
         dist.init_process_group(backend)
         ranks = Ranks.current()
-        heartbeat = _heartbeat(ranks) if ranks.count > 1 else None
+        heartbeat = None
+        if ranks.count > 1:
+            # A connection of its own: that of the group waits where the group does.
+            address, port = os.environ["MASTER_ADDR"], int(os.environ["MASTER_PORT"])
+            store = dist.TCPStore(address, port, wait_for_workers=False)  # type: ignore[attr-defined]
+            # Torchrun may keep the store where it starts processes again.
+            prefix = ranks.broadcast(uuid.uuid4().hex)
+            own = dist.PrefixStore(prefix, store)  # type: ignore[attr-defined]
+            heartbeat = Heartbeat(own, ranks.rank, ranks.count)
     except (RuntimeError, ValueError) as error:
         raise NPAError(
             f"the processes that torchrun starts must reach each other, but this one cannot "
@@ -263,17 +332,6 @@ def joined_ranks() -> Iterator[Ranks]:
     # Not after an error: others may be gone. Recorded graphs hold on to the group.
     gc.collect()
     dist.destroy_process_group()
-
-
-def _heartbeat(ranks: Ranks) -> Heartbeat:
-    """Let processes notice within a minute where another one is lost, on any machine."""
-    # A connection of its own: that of the group waits where the group does.
-    address, port = os.environ["MASTER_ADDR"], int(os.environ["MASTER_PORT"])
-    store = dist.TCPStore(address, port, wait_for_workers=False)  # type: ignore[attr-defined]
-    # Torchrun may keep the store where it starts processes again.
-    prefix = ranks.broadcast(uuid.uuid4().hex)
-    own = dist.PrefixStore(prefix, store)  # type: ignore[attr-defined]
-    return Heartbeat(own, ranks.rank, ranks.count)
 
 
 def _choose_device(number: int) -> None:
@@ -297,27 +355,15 @@ LOST_CODE = 2
 _LEFT = -(2**62)
 
 
-class Counters(Protocol):
-    """What Heartbeat needs of a store of torch.distributed's."""
-
-    def add(self, key: str, amount: int, /) -> int:
-        """Add to a counter, which begins at 0, and return it."""
-        ...
-
-
 class Heartbeat:
     """Ends this process, with a message, where another one gives no sign of life.
 
     Collectives alone may wait for a process that was stopped, or whose machine is gone, for NCCL's
     10 minutes. Time counts in this process's own pauses: one that was stopped itself blames nobody
     for that. A process that waits or computes gives signs all the same.
-
-    Args:
-        rank: Number of this process, from 0.
-        count: Number of processes, R.
     """
 
-    def __init__(self, store: Counters, rank: int, count: int) -> None:
+    def __init__(self, store: Any, rank: int, count: int) -> None:
         self._store, self._rank = store, rank
         self._signs = [0] * count
         self._ended = threading.Event()
@@ -330,11 +376,7 @@ class Heartbeat:
             thread.start()
 
     def end(self, *, left: bool) -> None:
-        """Watch no longer.
-
-        Args:
-            left: This process has done its part, and the others need not miss it.
-        """
+        """Watch no longer; where it has `left`, the others need not miss this process."""
         self._left = left
         self._ended.set()
         for thread in self._threads:

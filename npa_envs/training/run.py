@@ -1,26 +1,62 @@
-"""Runs that are kept in a folder: one writer, checkpoints, and a stop in order."""
+"""Runs that are kept in a folder: its files, one writer, checkpoints, and a stop in order."""
 
 from __future__ import annotations
 
 import contextlib
+import json
+import math
+import os
+import shutil
+import signal
+import socket
+import sys
+import threading
+import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from types import FrameType
 from typing import Any
 
-from npa_envs.errors import NPAError, shown
+import numpy as np
+from torch import Tensor
+
+from npa_envs.checks import is_real, is_whole
+from npa_envs.errors import MissingDependencyError, NPAError, shown
+from npa_envs.files import made_folder, read_bytes, remove_unfinished, write_bytes, write_text
+from npa_envs.render.colours import to_uint8
+from npa_envs.render.film import encode_frame
 from npa_envs.training.checkpoint import load_checkpoint, save_checkpoint
 from npa_envs.training.ranks import Ranks
-from npa_envs.training.run_folder import RunFolder, check_choice
-from npa_envs.training.stopping import stop_flag
+
+try:
+    import fcntl
+except ImportError:  # Windows
+    fcntl = None  # type: ignore[assignment]
+
+ONE_REQUEST = 1.0
+"""Time within which signals are one request to stop [s]: a scheduler may ask both a run and its
+launcher, which passes it on."""
+
+Check = Callable[[dict[str, Any], Path], None]
+"""Raises NPAError where a checkpoint, given with its path, is of another run."""
+
+
+def check_choice(*, resume: bool, overwrite: bool) -> None:
+    """Check that a run does not both go on and start anew."""
+    if resume and overwrite:
+        raise NPAError(
+            "resume and overwrite exclude each other: resume goes on with the run in the folder, "
+            "overwrite removes it: leave one of them out"
+        )
 
 
 class Run:
     """A run of any learner; the first of the processes that share it reads and writes its files.
 
     Args:
-        folder: Where the run is kept.
+        folder: Where the run is kept; None: nowhere, and no signal stops it.
         ranks: The processes that share it.
-        check: Raises NPAError where a checkpoint, given with its path, is of another run.
+        check: Of the checkpoint that it goes on from.
         resume: Go on from the checkpoint in the folder.
         overwrite: Begin anew although the folder holds a run; its files are removed.
 
@@ -31,36 +67,33 @@ class Run:
 
     def __init__(
         self,
-        folder: RunFolder,
+        folder: RunFolder | None,
         ranks: Ranks,
-        check: Callable[[dict[str, Any], Path], None],
+        check: Check,
         *,
-        resume: bool,
-        overwrite: bool,
+        resume: bool = False,
+        overwrite: bool = False,
     ) -> None:
         self.folder = folder
-        """Where the run is kept."""
-        self.ranks = ranks
-        """The processes that share it."""
         self.iteration = 0
-        """Iterations done."""
+        self._ranks = ranks
         self._overwrite = overwrite
-        content = self._opened(check, resume) if ranks.first else None
-        self._content: dict[str, Any] | None = ranks.broadcast(content)
-
-    def take_content(self) -> dict[str, Any] | None:
-        """Return the checkpoint to go on from, or None, and keep it no longer."""
-        content, self._content = self._content, None
-        return content
+        content = None
+        if folder is not None and ranks.first:
+            check_choice(resume=resume, overwrite=overwrite)
+            content = self._opened(folder, check, resume)
+        self.content: dict[str, Any] | None = ranks.broadcast(content)
+        """The checkpoint to go on from; large, so who has read it sets it to None."""
 
     @contextlib.contextmanager
     def held(self, *, begin: bool = False) -> Iterator[None]:
         """Keep other runs out of the folder within the block; at the beginning, also tidy it."""
-        with self.folder.locked() if self.ranks.first else contextlib.nullcontext():
-            if begin and self.ranks.first:
-                self.folder.tidy()
+        folder = self.folder if self._ranks.first else None
+        with contextlib.nullcontext() if folder is None else folder.locked():
+            if begin and folder is not None:
+                folder.tidy()
                 if self._overwrite:
-                    self.folder.clear()
+                    folder.clear()
             yield
 
     def go(
@@ -68,41 +101,48 @@ class Run:
         step: Callable[[], None],
         *,
         over: Callable[[], bool],
-        late: Callable[[], bool] = lambda: False,
         end: Callable[[bool], None],
+        begin: Callable[[], None] = lambda: None,
+        late: Callable[[], bool] = lambda: False,
     ) -> bool:
         """Repeat a step until all is done, or until SIGTERM, Ctrl-C or the clock asks to stop.
 
         Args:
             step: One iteration; it counts `iteration`.
             over: Whether all is done, the same on all processes.
-            late: Whether the time of this process is up.
             end: Called when a signal may still come, with whether the run was asked to stop.
+            begin: Called before the first step, when a signal may come.
+            late: Whether the time of this process is up.
 
         Returns:
             Whether a signal came.
         """
-        with stop_flag(patient=self.ranks.together) as stop:
+        if self.folder is None:
+            begin()
+            while not over():
+                step()
+            end(False)
+            return False
+        with stop_flag(patient=self._ranks.together) as stop:
+            begin()
             stopped = False
             while not stopped and not over():
                 asked = stop.is_set() or late()
-                stopped = self.ranks.agree_to_stop(asked, self.iteration)
+                stopped = self._ranks.agree_to_stop(asked, self.iteration)
                 if not stopped:
                     step()
             end(stopped)
-            return self.ranks.any(stop.is_set())
+            return self._ranks.any(stop.is_set())
 
     def keep(self, content: dict[str, Any]) -> None:
         """Write the checkpoint; for the first process."""
+        assert self.folder is not None, "kept in a folder"
         save_checkpoint(self.folder.checkpoint, content)
         self.folder.note_checkpoint()
 
-    def _opened(
-        self, check: Callable[[dict[str, Any], Path], None], resume: bool
-    ) -> dict[str, Any] | None:
-        check_choice(resume=resume, overwrite=self._overwrite)
-        folder, path = self.folder, self.folder.checkpoint
+    def _opened(self, folder: RunFolder, check: Check, resume: bool) -> dict[str, Any] | None:
         folder.note_checkpoint()
+        path = folder.checkpoint
         if path.exists():
             # Refused before anything is made where another run goes on there.
             with folder.locked():
@@ -117,3 +157,299 @@ class Run:
                 "resume it (--resume), choose another folder (--out), or overwrite it (--overwrite)"
             )
         return None
+
+
+@contextlib.contextmanager
+def stop_flag(*, patient: bool = False) -> Iterator[threading.Event]:
+    """Within the block, the first SIGINT or SIGTERM sets the event; later ones act as usual.
+
+    What comes within `ONE_REQUEST` of the first one is the same request. In a thread other than
+    the main one, where signals cannot be caught, it stays unset.
+
+    Args:
+        patient: The next ones do nothing: torchrun passes on what a terminal has sent already.
+    """
+    asked = threading.Event()
+    if threading.current_thread() is not threading.main_thread():
+        yield asked
+        return
+    previous: dict[signal.Signals, Any] = {}
+    first = 0.0
+
+    def give_back() -> None:
+        for number, handler in previous.items():
+            signal.signal(number, handler)
+
+    def stop(number: int, frame: FrameType | None) -> None:
+        nonlocal first
+        if not asked.is_set():
+            first = time.monotonic()
+            asked.set()
+            if not patient:
+                print("\nstopping after this iteration; once more to stop at once", file=sys.stderr)
+        elif not patient and time.monotonic() - first > ONE_REQUEST:
+            give_back()
+            signal.raise_signal(number)
+
+    for number in (signal.SIGINT, signal.SIGTERM):
+        previous[number] = signal.signal(number, stop)
+    try:
+        yield asked
+    finally:
+        give_back()
+
+
+# Files.
+
+LARGEST_LOG = 2**29
+"""Bytes of a run's log, at most."""
+
+
+class RunFolder:
+    """Paths of a run's files; `prepare` creates the folder."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.log = path / "log.jsonl"
+        """One JSON object a line: iteration, loss terms, learning rate, steps, seconds."""
+        self.checkpoint = path / "checkpoint.pt"
+        self.rule = path / "rule.safetensors"
+        """The rule as of the last checkpoint, for `load_rule`."""
+        self.config = path / "config.json"
+        self.diagnosis = path / "diverged.pt"
+        """What the first iteration with a loss that is not finite saw."""
+        self.pictures = path / "pictures"
+        """Pictures of a batch, named by iteration."""
+        self.report = path / "report"
+        """What the finished rule is, in figures and films (`npa-envs train`)."""
+        self.tensorboard = path / "tensorboard"
+        self.lock = path / ".lock"
+        """Locked while a trainer writes to the folder; holds the trainer's process and computer."""
+        self._known: tuple[int, int] | None = None
+
+    def prepare(self, byte_count: int, *, pictures: bool = True) -> None:
+        """Create the folder and see that a checkpoint of so many bytes can be written there."""
+        # A new checkpoint is written while the old one is there.
+        needed = 2 * byte_count
+        try:
+            with made_folder(self.pictures if pictures else self.path):
+                free = shutil.disk_usage(self.path).free
+                if free < needed:
+                    raise NPAError(
+                        f"out must have room for two checkpoints ({needed / 2**20:.0f} MiB), but "
+                        f"the disk of {str(self.path)!r} has {free / 2**20:.0f} MiB free: make "
+                        "room, choose another folder, or lower pool_size"
+                    )
+        except OSError as error:
+            raise self._unwritable("created and written to", error) from error
+
+    def _unwritable(self, what: str, error: OSError) -> NPAError:
+        return NPAError(
+            f"out must be a folder that can be {what}, got {str(self.path)!r} "
+            f"({error.strerror or error}): choose another one or mend its permissions"
+        )
+
+    @contextlib.contextmanager
+    def locked(self) -> Iterator[None]:
+        """Keep all other trainers from writing to the folder, within the block.
+
+        The system frees the lock of a process that ends in whatever way, so none is ever left
+        behind. Where the system or the file system has no such locks, nothing is locked. A folder
+        that another trainer has written to since this one's last checkpoint is refused as well.
+        """
+        try:
+            lock = self.lock.open("a+", encoding="utf-8", errors="replace")
+        except OSError as error:
+            raise self._unwritable("written to", error) from error
+        with lock:
+            if fcntl is not None:
+                try:
+                    fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                except BlockingIOError:
+                    lock.seek(0)
+                    holder = lock.read(200).strip() or "another process"
+                    raise NPAError(
+                        f"out must be a folder that no other run writes to, but {holder} is "
+                        f"training in {str(self.path)!r}: let it end, stop it (it saves on "
+                        "SIGTERM), or choose another folder"
+                    ) from None
+                except OSError:
+                    pass  # The file system has no locks.
+            if self._known != _identity(self.checkpoint):
+                raise NPAError(
+                    "out must be a folder that no other run writes to, but another one has written "
+                    f"{str(self.checkpoint)!r} meanwhile: resume it, or choose another folder"
+                )
+            with contextlib.suppress(OSError):  # A full disk; who reads it can do without.
+                lock.truncate(0)
+                lock.write(f"process {os.getpid()} on {socket.gethostname()}")
+                lock.flush()
+            yield
+
+    def note_checkpoint(self) -> None:
+        """Remember the checkpoint, or that there is none: `locked` refuses where it is another."""
+        self._known = _identity(self.checkpoint)
+
+    def tidy(self) -> None:
+        """Remove what killed writes of a run's files have left behind."""
+        own = [self.checkpoint, self.rule, self.log, self.config, self.diagnosis]
+        own += [self.rule_of("*"), self.pictures / "[0-9]*.png"]
+        for path in own:
+            remove_unfinished(path)
+
+    def clear(self) -> None:
+        """Remove an earlier run's files, and nothing else that may lie in the folder."""
+        patterns = (
+            "rule-[0-9]*.safetensors",
+            "pictures/[0-9]*.png",
+            "report/*.*",
+            "tensorboard/events.out.tfevents.*",
+        )
+        for pattern in patterns:
+            for path in self.path.glob(pattern):
+                path.unlink()
+        # The checkpoint last but one: whenever this is killed, there is either a run that can be
+        # resumed or none at all.
+        for path in (self.log, self.rule, self.diagnosis, self.checkpoint, self.config):
+            path.unlink(missing_ok=True)
+
+    def rule_of(self, species: int | str) -> Path:
+        """Return the path of the rule of a species, of a run that trains several together."""
+        return self.path / f"rule-{species}.safetensors"
+
+    def picture(self, iteration: int) -> Path:
+        """Return the path of the picture of an iteration."""
+        return self.pictures / f"{iteration:06d}.png"
+
+
+def _identity(path: Path) -> tuple[int, int] | None:
+    """Return inode and time of a file, which change when it is replaced, or None without one."""
+    try:
+        status = path.stat()
+    except OSError:
+        return None
+    return status.st_ino, status.st_mtime_ns
+
+
+class JsonlLog:
+    """A log of one JSON object a line."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+
+    def append(self, record: dict[str, Any]) -> None:
+        """Add a line and hand it to the system, so that a kill right after it does not lose it.
+
+        If that fails, the file is cut back to what it held before.
+        """
+        line = (json.dumps(record, allow_nan=False) + "\n").encode()
+        try:
+            # Without a buffer: one would be written again when the file closes.
+            with self.path.open("ab", buffering=0) as file:
+                size = file.tell()
+                try:
+                    while line:
+                        line = line[file.write(line) :]
+                except OSError:
+                    with contextlib.suppress(OSError):
+                        file.truncate(size)
+                    raise
+        except OSError as error:
+            raise NPAError(
+                f"cannot write the log {str(self.path)!r} ({error.strerror or error}): free disk "
+                "space or mend the permissions, then resume the run"
+            ) from error
+
+    def truncate(self, iteration: int) -> None:
+        """Drop the lines after an iteration, and a last line that a kill cut short."""
+        write_text(self.path, "".join(json.dumps(r) + "\n" for r in self.records(iteration)))
+
+    def records(self, iteration: int | None = None) -> list[dict[str, Any]]:
+        """Return the lines, up to an iteration if one is given, but for a last one cut short."""
+        if not os.path.exists(self.path):
+            return []
+        content = read_bytes(self.path, limit=LARGEST_LOG, what="the log")
+        lines = content.decode("utf-8", errors="replace").split("\n")
+        # What stands behind the last end of a line was cut short; mostly nothing does.
+        if _parsed_record(lines[-1]) is None:
+            lines.pop()
+        records: list[dict[str, Any]] = []
+        for number, line in enumerate(lines, start=1):
+            record = _parsed_record(line)
+            last = records[-1]["iteration"] if records else -1
+            if record is None or record["iteration"] <= last:
+                raise NPAError(
+                    f"the log {str(self.path)!r} must hold one JSON object of numbers a line, with "
+                    f"growing iterations, but line {number} is {line[:60]!r}: mend that line, or "
+                    "move the file away to go on without it"
+                )
+            if iteration is not None and record["iteration"] > iteration:
+                break
+            records.append(record)
+        return records
+
+
+def _parsed_record(line: str) -> dict[str, Any] | None:
+    """Return a line of a log as `JsonlLog.append` was given it, or None where it is damaged."""
+    try:
+        record = json.loads(line)
+    except (ValueError, RecursionError):
+        return None
+    if not isinstance(record, dict) or not is_whole(record.get("iteration")):
+        return None
+    sound = all(isinstance(value, str) or is_real(value) for value in record.values())
+    return record if sound else None
+
+
+def open_tensorboard(folder: RunFolder, iteration: int) -> Any:
+    """Return a TensorBoard writer that hides what an earlier process wrote after `iteration`."""
+    # TensorBoard would look for TensorFlow, which takes seconds where it is installed.
+    os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
+    try:
+        from torch.utils.tensorboard import SummaryWriter
+    except ImportError as error:
+        raise MissingDependencyError(
+            "tensorboard=True needs TensorBoard: pip install tensorboard, "
+            "or train with tensorboard=False (the JSONL log has the same numbers)"
+        ) from error
+    try:
+        return SummaryWriter(
+            str(folder.tensorboard), purge_step=iteration + 1 if iteration else None
+        )
+    except OSError as error:
+        raise NPAError(
+            f"cannot write to {str(folder.tensorboard)!r} ({error}): mend its permissions or "
+            "train with tensorboard=False"
+        ) from error
+
+
+PICTURE_HEIGHT = 256
+"""Least height of the pictures [pixels]; the pixels of smaller worlds are repeated."""
+
+PICTURE_GAP = 8
+"""Pixels between the worlds of a picture."""
+
+
+def write_batch_picture(path: Path, picture: Tensor, board: Any, iteration: int) -> None:
+    """Write target and worlds of a batch side by side as a PNG, and as a JPEG to TensorBoard."""
+    repeats = math.ceil(PICTURE_HEIGHT / picture.shape[1])
+    frames = to_uint8(picture).repeat(repeats, axis=1).repeat(repeats, axis=2)
+    frames = np.pad(frames, ((0, 0), (0, 0), (0, PICTURE_GAP), (0, 0)), constant_values=255)
+    frame = np.concatenate(list(frames), axis=1)[:, :-PICTURE_GAP]
+    write_bytes(path, encode_frame(frame, "PNG"))
+    if board is None:
+        return
+    # Imported late: only runs with TensorBoard need it.
+    from tensorboard.compat.proto.summary_pb2 import Summary
+
+    # The writer's own add_image makes a PNG, and TensorBoard takes a checksum of it in Python, byte
+    # by byte, which holds up the interpreter for longer than all the rest takes.
+    height, width, channels = frame.shape
+    image = Summary.Image(
+        height=height,
+        width=width,
+        colorspace=channels,
+        encoded_image_string=encode_frame(frame, "JPEG"),
+    )
+    summary = Summary(value=[Summary.Value(tag="batch", image=image)])
+    board.file_writer.add_summary(summary, iteration)

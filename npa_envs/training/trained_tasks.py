@@ -16,9 +16,8 @@ from npa_envs.rule.files import rule_file, rule_metadata
 from npa_envs.rule.rule import NPARule
 from npa_envs.tasks.base import Task
 from npa_envs.tasks.many_pictures import named_targets
-from npa_envs.tasks.morphogenesis2d import Morphogenesis2D, Morphogenesis2DConfig
-from npa_envs.training.overrides import override
-from npa_envs.training.presets import preset, task_entry
+from npa_envs.tasks.morphogenesis2d import Morphogenesis2D
+from npa_envs.training.presets import override, preset, task_entry
 
 
 @dataclass(frozen=True)
@@ -26,13 +25,10 @@ class TrainedTask:
     """The task of a rule, and whether its target is the one that the rule was trained on."""
 
     task: Task
-    """The task."""
 
     doubt: str | None
     """Why figures against the target would mean nothing; None where they do mean something."""
-
     task_name: str
-    """Its name in the table of tasks."""
 
 
 def task_of_rule(
@@ -88,7 +84,10 @@ def task_of_rule(
         config = override(config, task=config.task.with_particle_count(particle_count))
     chosen = fields.get("target") is not None
     if rule.codes is not None:
-        config = override(config, targets=(), target=_one_of(config.task, rule.codes, chosen))
+        # The chosen picture or the first one, wherever it comes from.
+        name = config.task.target if chosen else rule.codes.names[0]
+        named = _named(config.task.targets).get(name, name)
+        config = override(config, targets=(), target=named)
     doubt = None if known or chosen else "its file does not say what it grows"
     try:
         # What a rule was trained on it may know by heart.
@@ -111,20 +110,10 @@ def task_of_rule(
 def tasks_of_codes(
     source: str, rule: NPARule, device: torch.device, **fields: Any
 ) -> list[Morphogenesis2D]:
-    """Return the task of each picture that a rule has a code for, in their order; none without.
-
-    Args:
-        fields: As for `task_of_rule`.
-    """
+    """Return the task of each picture that a rule has a code for, in their order; none without."""
     names = () if rule.codes is None else rule.codes.names
     found = [task_of_rule(source, rule, device, **(fields | {"target": name})) for name in names]
     return [cast(Morphogenesis2D, trained.task) for trained in found]
-
-
-def _one_of(task: Morphogenesis2DConfig, codes: Codes, chosen: bool) -> str:
-    """Return where the target of a rule's code comes from: the chosen or the first one's."""
-    name = task.target if chosen else codes.names[0]
-    return _named(task.targets).get(name, name)
 
 
 def _world_of(path: Path, metadata: Mapping[str, str]) -> dict[str, Any]:
@@ -144,12 +133,7 @@ def _world_of(path: Path, metadata: Mapping[str, str]) -> dict[str, Any]:
 
 
 def sources_of_codes(source: str, codes: Codes) -> dict[str, str]:
-    """Return where the picture of each code of a rule comes from: name -> what `load_target` takes.
-
-    Args:
-        source: What the rule was loaded from.
-        codes: Its codes.
-    """
+    """Return where the picture of each code comes from: name -> what `load_target` takes."""
     path = rule_file(source)
     metadata = rule_metadata(path) if path.suffix == ".safetensors" else {}
     targets = trained_config(path, metadata).task.targets if "config" in metadata else ()
@@ -158,7 +142,7 @@ def sources_of_codes(source: str, codes: Codes) -> dict[str, str]:
 
 
 def _named(targets: Sequence[str]) -> dict[str, str]:
-    """Return what `named_targets` does; nothing where a folder is not there any more."""
+    # A folder may be gone.
     try:
         return named_targets(targets)
     except NPAError:

@@ -32,17 +32,10 @@ from npa_envs.training.checkpoint import (
     unusable_checkpoint,
 )
 from npa_envs.training.cycle import TrainingCycle
-from npa_envs.training.iteration import Rollout, TrainingOptions
-from npa_envs.training.meter import divergence_error
-from npa_envs.training.overrides import config_to_dict
+from npa_envs.training.iteration import Rollout, TrainingOptions, divergence_error
+from npa_envs.training.presets import config_to_dict
 from npa_envs.training.ranks import Ranks
-from npa_envs.training.run import Run
-from npa_envs.training.run_folder import (
-    JsonlLog,
-    RunFolder,
-    open_tensorboard,
-    write_batch_picture,
-)
+from npa_envs.training.run import JsonlLog, Run, RunFolder, open_tensorboard, write_batch_picture
 from npa_envs.world.species import rollout_species
 
 FIRST_PICTURE = 10
@@ -55,19 +48,14 @@ class TrainResult:
 
     rule: NPARule
     """The rule as it stands."""
-
     iteration: int
     """Iterations done."""
-
     finished: bool
     """Whether these were all of them; if not, the run was stopped and can be resumed."""
-
     interrupted: bool
     """Whether Ctrl-C or SIGTERM stopped it."""
-
     record: dict[str, Any]
     """The last line of the log: loss terms (means over the interval), learning rate, seconds."""
-
     folder: Path
     """Where log, pictures, checkpoint and rule lie."""
 
@@ -117,10 +105,12 @@ class Trainer:
         self._seconds_before = 0.0
         self._started: float | None = None
         self._ranks = ranks = Ranks.current() if ranks is None else ranks
-        self._kept = Run(
-            self.folder, ranks, self._check_same_run, resume=resume, overwrite=overwrite
-        )
-        content = self._kept.take_content()
+
+        def check(content: dict[str, Any], path: Path) -> None:
+            check_same_run(content, task_name, config, path)
+
+        self._kept = Run(self.folder, ranks, check, resume=resume, overwrite=overwrite)
+        content, self._kept.content = self._kept.content, None
         device = check_device(config.device)
         # While the host waits for the numbers, a GPU would have nothing to do; a CPU has done all.
         self._log_late = device.type == "cuda"
@@ -135,7 +125,8 @@ class Trainer:
         self.pool = self._cycle.pool
         if ranks.first:
             rule_bytes = sum(p.nbytes for p in self.rule.parameters())
-            self.folder.prepare(ranks.count * self._cycle.pool_bytes + 16 * rule_bytes)
+            pool_bytes = self.pool.worlds.x.nbytes + self.pool.worlds.s.nbytes
+            self.folder.prepare(ranks.count * pool_bytes + 16 * rule_bytes)
         with self._kept.held(begin=True):
             if content is not None:
                 self._restore(content)
@@ -192,7 +183,8 @@ class Trainer:
             self._finish_record()
             if self._due(config.log_interval) or self.iteration == total:
                 self._begin_record()
-            if self._picture_due():
+            interval = config.picture_interval
+            if self._due(interval) or self.iteration == FIRST_PICTURE < interval:
                 self._write_picture()
             if self._due(config.checkpoint_interval) and self.iteration < total:
                 self.save()
@@ -281,7 +273,6 @@ class Trainer:
         save_rule(rule, self.folder.rule, metadata=metadata)
 
     def _origin(self) -> dict[str, Any]:
-        """Return what checkpoint and diagnosis say of where they come from."""
         return {
             "task_name": self.task_name,
             "config": config_to_dict(self.config),
@@ -295,10 +286,6 @@ class Trainer:
 
     def _due(self, interval: int) -> bool:
         return interval > 0 and self.iteration % interval == 0
-
-    def _picture_due(self) -> bool:
-        interval = self.config.picture_interval
-        return self._due(interval) or (self.iteration == FIRST_PICTURE < interval)
 
     def _seconds(self) -> float:
         running = 0.0 if self._started is None else time.perf_counter() - self._started
@@ -340,9 +327,10 @@ class Trainer:
         if not self._ranks.first:
             return
         with torch.no_grad():
-            picture = self._cycle.task.picture(self._cycle.batch.x, self._cycle.batch.s)
+            end = self._cycle.batch.end
+            picture = self._cycle.task.picture(end.x, end.s)
         # Worlds that have goals of their own have no picture in common.
-        target = getattr(self.task, "target_picture", None) if self.pool.goal is None else None
+        target = getattr(self.task, "target_picture", None) if end.goal is None else None
         if target is not None:
             picture = torch.cat((target[None].to(picture), picture))
         path = self.folder.picture(self.iteration)
@@ -365,9 +353,6 @@ class Trainer:
         error = self._ranks.broadcast(error)
         assert error is not None, "made by the first process"
         raise error
-
-    def _check_same_run(self, content: dict[str, Any], path: Path) -> None:
-        check_same_run(content, self.task_name, self.config, path)
 
     def _restore(self, content: dict[str, Any]) -> None:
         path = self.folder.checkpoint
@@ -419,16 +404,11 @@ def take_options(rule: NPARule, config: TrainConfig[Any]) -> None:
 
 
 def initial_rule(config: TrainConfig[Any], untrained: NPARule) -> NPARule:
-    """Return the rule that a run starts from, with its `moment_inverse` and `dead_zone`.
+    """Return the rule that a run starts from, of the shape of the task's untrained one.
 
-    Where particles divide, the rule may be one whose particles did not.
-
-    An equivariant rule has no dead zone, and starts from random weights where the configuration
-    names a first rule, which knows directions, as presets do. A rule with codes may start from one
-    without.
-
-    Args:
-        untrained: The task's own rule, whose shape the rule must have.
+    Where particles divide, it may be one whose particles did not; a rule with codes may start from
+    one without. An equivariant rule has no dead zone, and starts from random weights where the
+    configuration names a first rule, which knows directions, as presets do.
     """
     take_options(untrained, config)
     if not config.initial_rule or (untrained.equivariant and config.initial_rule in preset_rules()):
@@ -472,11 +452,7 @@ JOINT_TASK_NAME = "co_morphogenesis2d"
 
 
 class JointRules(nn.Module):
-    """The rules of one world, one for each species: what the trainer takes for its rule.
-
-    Args:
-        rules: The rules, species by species.
-    """
+    """The rules of one world, one for each species: what the trainer takes for its rule."""
 
     def __init__(self, rules: Sequence[NPARule]) -> None:
         super().__init__()
@@ -502,39 +478,40 @@ class _JointTrainer(Trainer):
         resume: bool,
         overwrite: bool,
     ) -> None:
-        self._species = task
-        self._given = rules
-        self._frozen: tuple[int, ...] = getattr(config, "frozen", ())
         begin_with: tuple[str, ...] = getattr(config, "initial_rules", ())
         if rules is None and begin_with and not resume:
-            self._given = [load_rule(source) for source in begin_with]
+            rules = [load_rule(source) for source in begin_with]
+        self._given, counts = rules, task.config.counts
+
+        def rollout(
+            rule: NPARule, x: Tensor, s: Tensor, steps: int, /, **options: Unpack[TrainingOptions]
+        ) -> tuple[Tensor, Tensor, Tensor]:
+            each = list(cast(JointRules, rule))
+            return rollout_species(
+                each, x, s, steps, counts=counts, density_counts=counts, **options
+            )
+
         super().__init__(
             task,
             config,
             task_name=JOINT_TASK_NAME,
             resume=resume,
             overwrite=overwrite,
-            rollout=self._rollout_together,
+            rollout=rollout,
         )
-
-    def _rollout_together(
-        self, rule: NPARule, x: Tensor, s: Tensor, steps: int, /, **options: Unpack[TrainingOptions]
-    ) -> tuple[Tensor, Tensor, Tensor]:
-        counts = self._species.config.counts
-        rules = list(cast(JointRules, rule))
-        return rollout_species(rules, x, s, steps, counts=counts, density_counts=counts, **options)
 
     def _make_rule(self, generator: torch.Generator, held: dict[str, Any] | None) -> NPARule:
         # The trainer asks of its rule what any module has, and for its hyper-parameters.
-        made = self._species.make_rules(generator)
+        made = cast(CoMorphogenesis2D, self.task).make_rules(generator)
         for rule in made:
             take_options(rule, self.config)
         if held is not None:
             self._given = [rule_like(own) for own in held["rules"]]
+        frozen: tuple[int, ...] = getattr(self.config, "frozen", ())
         if self._given is None:
-            if self._frozen:
+            if frozen:
                 raise NPAError(
-                    f"frozen must name rules that were trained before, got {self._frozen} without "
+                    f"frozen must name rules that were trained before, got {frozen} without "
                     "initial_rules: give one for each species"
                 )
             return cast(NPARule, JointRules(made))
@@ -542,9 +519,10 @@ class _JointTrainer(Trainer):
             raise NPAError(
                 f"rules must be one for each of {len(made)} species, got {len(self._given)}"
             )
-        for number, (rule, own) in enumerate(zip(self._given, made, strict=True)):
+        rules = copy.deepcopy(list(self._given))
+        for number, (rule, own) in enumerate(zip(rules, made, strict=True)):
             if rule.moment_inverse == "threshold":
-                own.moment_inverse = "threshold"
+                rule.moment_inverse = self.config.moment_inverse
             own.dead_zone = rule.dead_zone
             wrong = differing_fields(rule, own)
             if wrong:
@@ -552,10 +530,7 @@ class _JointTrainer(Trainer):
                     f"rules must have the shape of their species, but rule {number} differs in "
                     f"{', '.join(wrong)}: change those fields of species {number}"
                 )
-        rules = copy.deepcopy(list(self._given))
-        for rule in rules:
-            rule.moment_inverse = self.config.moment_inverse
-        for number in self._frozen:
+        for number in frozen:
             if number >= len(rules):
                 raise NPAError(
                     f"frozen must name species from 0 to {len(rules) - 1}, got {shown(number)}"
@@ -595,10 +570,7 @@ def train_together(
         rules: What to start from, one rule for each species; copied. None: the configuration's
             `initial_rules`, or untrained ones.
         resume: Go on from the checkpoint in `config.out`; give the same `rules` again.
-        overwrite: Start anew although `config.out` holds a run; its files are removed.
-        progress: Show a progress bar.
-        max_seconds: Stop after this time [s]; the run can be resumed.
-        begun: Called once when nothing is left to be refused, before the first iteration.
+        overwrite: As `progress`, `max_seconds` and `begun`, those of `train`.
 
     Returns:
         What the run came to; its `rule` holds the rules, in the order of the species. Their files

@@ -26,9 +26,8 @@ from npa_envs.tasks.co_morphogenesis2d import CoMorphogenesis2DConfig
 from npa_envs.tasks.damage import DAMAGE_SIZES, damage_worlds
 from npa_envs.tasks.seeds import uniform_ball
 from npa_envs.tasks.train_config import TrainConfig
-from npa_envs.training.overrides import load_config
-from npa_envs.training.presets import preset
-from npa_envs.training.run_folder import LARGEST_LOG, RunFolder
+from npa_envs.training.presets import load_config, preset
+from npa_envs.training.run import LARGEST_LOG, RunFolder
 from npa_envs.training.trained_tasks import TrainedTask, task_of_rule, trained_config
 from npa_envs.web.colouring import ColouredWorld, Colouring, shows_of
 from npa_envs.web.live import LiveWorld, Range, Touch, WorldView, brushed, checked_seed

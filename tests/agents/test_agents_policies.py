@@ -195,9 +195,9 @@ def fitted(rule, **keywords):
         (lambda env: RulePolicy("gecko", env), "rule must be an NPARule, got str"),
         (lambda _: RulePolicy(wild_rule(), state_scale=0.0), "state_scale must be positive"),
         (lambda _: ZeroPolicy(gymnasium.make("CartPole-v1")), "an environment of npa_envs"),
-        (lambda env: RandomPolicy(env, seed=-1), "a seed"),
+        (lambda env: RandomPolicy(env, seed=-1), "seed must be an integer"),
         (lambda env: PaintPolicy(env, colour=(0.5,)), "colour must have three numbers"),
-        (lambda env: MendPolicy(env, blank="x"), "blank must be a finite number, got 'x'"),
+        (lambda env: MendPolicy(env, blank="x"), "blank must be a number, got 'x'"),
         *(
             (lambda env, shape=shape: ZeroPolicy(env)(np.zeros(shape, np.float32)), "P = 66")
             for shape in ((64,), (64, 65), (1, 1, 64, 66))

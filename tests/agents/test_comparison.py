@@ -487,7 +487,7 @@ def test_an_estimate_is_the_mean_with_its_standard_error():
 def test_a_fraction_counts_from_nothing_to_the_gradient():
     nothing, gradient = Estimate(0.5, 0.0), Estimate(2.5, 0.2)
     half = fraction(Estimate(1.5, 0.1), nothing, gradient)
-    assert half == (0.5, pytest.approx(math.hypot(0.1, 0.5 * 0.2) / 2.0))
+    assert half == Estimate(0.5, pytest.approx(math.hypot(0.1, 0.5 * 0.2) / 2.0))
     assert fraction(Estimate(0.0, 0.1), nothing, gradient).mean == -0.25
     assert fraction(Estimate(4.5, 0.1), nothing, gradient).mean == 2.0
     # No share of an improvement that there is not.
@@ -541,7 +541,7 @@ Fractions need runs of `zero` and `gradient`.
 def test_a_table_has_the_right_numbers_the_best_first_and_leaves_no_method_out():
     assert text(rows(synthetic())) == TABLE
     ppo = next(row for row in rows(synthetic()) if row.method == "ppo")
-    assert ppo.fraction == (0.5, pytest.approx(math.hypot(1.0, 0.5 * 0.5) / 3.0))
+    assert ppo.fraction == Estimate(0.5, pytest.approx(math.hypot(1.0, 0.5 * 0.5) / 3.0))
     assert ppo.episodes_diverged == pytest.approx(2 / 6)
 
 

@@ -18,7 +18,7 @@ from npa_envs.agents import (
 )
 from npa_envs.agents.learning import EVALUATION_SEEDS, Budget, Problem, RuleSet, train
 from npa_envs.agents.learning.clone import Demonstrations, unexplained
-from npa_envs.agents.learning.gradient import ClampedRule, clamp_inward, environment_task
+from npa_envs.agents.learning.gradient import ClampedRule, EnvironmentTask, clamp_inward
 from npa_envs.agents.learning.problem import FIRST_EVALUATION_SEED, world_seeds
 from npa_envs.envs.core.vector import NPAVectorEnv
 from npa_envs.envs.morphogenesis2d import PictureEnvTask
@@ -105,7 +105,7 @@ def test_what_is_differentiated_is_the_environments_own_episode(problem):
     rules, envs = wild_rules(problem), problem.make_envs(1)
     observation, infos = envs.reset(seed=5)
     largest = 0.0
-    task, random = environment_task(problem, torch.device("cpu")), npa_envs.WorldRandom(5)
+    task, random = EnvironmentTask(problem, torch.device("cpu")), npa_envs.WorldRandom(5)
     x, s, *rest = problem.make_task().start(random)
     if rest and rest[1] is not None:
         task = task.toward(rest[1])
@@ -129,7 +129,7 @@ def test_what_is_differentiated_is_the_environments_own_episode(problem):
 @pytest.mark.parametrize("cuda_graph", ["auto", True])
 def test_repeated_rollouts_stay_clamped_where_they_are_recorded(cuda_graph, device):
     problem = heart(state_scale=0.1)
-    rules, task = wild_rules(problem).to(device), environment_task(problem, device)
+    rules, task = wild_rules(problem).to(device), EnvironmentTask(problem, device)
     x, s, _ = task.seed(2, generator=torch.Generator(device).manual_seed(0), device=device)
     found = []
     for _ in range(4):

@@ -10,8 +10,7 @@ import torch
 
 from npa_envs import load_rule, rollout
 from npa_envs.agents.search import Search, SearchWorld, tried_again
-from npa_envs.agents.search.methods import METHODS, import_ribs
-from npa_envs.agents.search.run import RESULTS
+from npa_envs.agents.search.run import METHODS, RESULTS, import_ribs
 from npa_envs.agents.search.worlds import (
     SEED_RADIUS,
     SNAPSHOTS,

@@ -11,10 +11,10 @@ from pathlib import Path
 import pytest
 from clock import Clock
 
-from npa_envs.agents.learning import Progress
 from npa_envs.cli import main
 from npa_envs.cli.learn import parse, problem_of
 from npa_envs.training.checkpoint import load_checkpoint
+from npa_envs.training.run import Run
 
 WORDS = ["learn", "ppo", "npa/Morphogenesis2DSmall-v0", "--keywords", "target=ring"]
 WORDS += ["--worlds", "2", "--episode-steps", "4", "--episodes", "1", "--entries", "2"]
@@ -124,14 +124,14 @@ def test_worlds_are_those_of_shac_where_they_are_told(tmp_path):
 
 
 def test_what_is_written_takes_no_time_and_what_is_over_has_finished(tmp_path, monkeypatch):
-    clock, write = Clock(tick=1 / 64), Progress._write
+    clock, write = Clock(tick=1 / 64), Run.keep
     monkeypatch.setattr("npa_envs.agents.learning.progress.time", clock)
 
-    def slow(progress, *given):
+    def slow(run, content):
         clock.sleep(1.0)
-        write(progress, *given)
+        write(run, content)
 
-    monkeypatch.setattr(Progress, "_write", slow)
+    monkeypatch.setattr(Run, "keep", slow)
     words = [*WORDS, "--seconds", "0.5", "--no-progress", "--out", str(tmp_path)]
     assert main(words) == 0
     seconds = [

@@ -21,7 +21,7 @@ from npa_envs.cli.output import writable_folder
 from npa_envs.errors import NPAError
 from npa_envs.files import atomic_path, made_folder, remove_unfinished, write_bytes, write_text
 from npa_envs.rule.rule import NPARule
-from npa_envs.training.run_folder import RunFolder
+from npa_envs.training.run import RunFolder
 
 
 def write_half_and_raise(target: Path, error: BaseException) -> None:

@@ -10,7 +10,7 @@ from npa_envs.rule.files import load_rule
 from npa_envs.rule.rule import COLOUR_OFFSET, NPARule
 from npa_envs.tasks.base import untrained_rule
 from npa_envs.training import DivergedError, Trainer
-from npa_envs.training.meter import bad_worlds
+from npa_envs.training.iteration import bad_worlds
 
 GOAL = torch.tensor([0.9, -0.7])
 

@@ -10,6 +10,7 @@ from npa_envs.tasks.morphogenesis2d import Morphogenesis2D, Morphogenesis2DConfi
 from npa_envs.training import Trainer, optimiser, preset
 from npa_envs.training.iteration import EagerIteration
 from npa_envs.world.division import living
+from npa_envs.world.particles import Particles
 
 SMALL = {"target": "ring", "target_point_count": 64, "particle_count": 64, "resolution": 32}
 
@@ -145,14 +146,16 @@ def test_births_are_no_unrest(tmp_path):
     torch.nn.init.zeros_(rule.output.weight)
     x, s, _ = task.seed(1, generator=torch.Generator().manual_seed(0))
     s[:, 0, LIFE + 1 :] = 0.5
-    batch = EagerIteration(task, rule, config, x, s, torch.Generator().manual_seed(0))
+    batch = EagerIteration(
+        task, rule, config, Particles(x, s), torch.Generator().manual_seed(0), npa_envs.rollout
+    )
     batch.grown.fill_(True)
     batch.run(12)
-    assert int(living(batch.s).sum()) > 8
+    assert int(living(batch.end.s).sum()) > 8
     rest = dict(zip(batch.term_names, batch.terms.tolist(), strict=True))["rest"]
     # Nobody moves, and children are born without states.
-    assert (batch.s[0, 0, LIFE + 1 :] == 0.5).all()
-    assert not batch.s[0, 1:, LIFE + 1 :].any()
+    assert (batch.end.s[0, 0, LIFE + 1 :] == 0.5).all()
+    assert not batch.end.s[0, 1:, LIFE + 1 :].any()
     assert rest < 1e-6
 
 

@@ -130,7 +130,7 @@ def test_training_changes_codes_and_keeps_them_with_their_worlds(encoder):
         cycle.run(iteration)
     moved = (rule.codes.table.detach() - before).abs().sum(dim=1)
     assert int((moved > 0.0).sum()) >= (3 if encoder else 1)
-    goal, x0, s0 = cycle.batch.goal, cycle.batch.s0, cycle.batch.s
+    goal, x0, s0 = cycle.batch.start.goal, cycle.batch.start.s, cycle.batch.end.s
     assert torch.equal(x0[..., :3], s0[..., :3])
     assert x0[..., :3].unique(dim=1).shape[1] == 1
     assert goal.shape == (2,)
@@ -179,7 +179,7 @@ def test_a_resumed_run_is_the_same_run(tmp_path):
     resumed.run(progress=False)
     assert torch.equal(resumed.rule.codes.table, straight.rule.codes.table)
     assert torch.equal(resumed.rule.hidden.weight, straight.rule.hidden.weight)
-    assert torch.equal(resumed.pool.s, straight.pool.s)
+    assert torch.equal(resumed.pool.worlds.s, straight.pool.worlds.s)
 
 
 def test_the_command_trains_and_evaluates_by_name(tmp_path, capsys):

@@ -174,20 +174,20 @@ def test_classes_stay_with_their_worlds(
 ):
     monkeypatch.setattr("npa_envs.training.cycle.RUNAWAY_LIMIT", runaway_limit)
     cycle, _ = cycle_of(folder, tmp_path, mutated_share=mutated_share, world_count=6)
-    before = cycle.pool.x.clone()
+    before = cycle.pool.worlds.x.clone()
     for iteration in range(5):
         cycle.run(iteration)
-        assert_goals_fit(cycle.pool.x, cycle.pool.goal, cycle.task.clouds)
-        assert torch.equal(cycle.batch.x, cycle.batch.x0)
-    assert not torch.equal(cycle.pool.x, before)
+        assert_goals_fit(cycle.pool.worlds.x, cycle.pool.worlds.goal, cycle.task.clouds)
+        assert torch.equal(cycle.batch.end.x, cycle.batch.start.x)
+    assert not torch.equal(cycle.pool.worlds.x, before)
 
 
 @pytest.mark.parametrize(("share", "count"), [(0.0, 1), (0.5, 3), (1.0, 6)])
 def test_so_many_worlds_of_a_batch_are_fresh_clouds(folder, tmp_path, share, count):
     cycle, _ = cycle_of(folder, tmp_path, fresh_share=share, world_count=6, damage_share=0.0)
-    cycle.pool.s += 0.5
+    cycle.pool.worlds.s.add_(0.5)
     cycle.run(0)
-    blank = (cycle.batch.s0 == 0.0).flatten(1).all(1)
+    blank = (cycle.batch.start.s == 0.0).flatten(1).all(1)
     assert blank.tolist() == [True] * count + [False] * (6 - count)
     with pytest.raises(NPAError, match="fresh_share must be at most 1"):
         small_config(folder, tmp_path, fresh_share=1.1)

@@ -117,10 +117,10 @@ def test_seeds_come_into_the_part_of_the_pool_of_every_world(tmp_path, fresh_sha
     rule = task.make_rule(torch.Generator().manual_seed(0)).double()
     torch.nn.init.zeros_(rule.output.weight)
     cycle = TrainingCycle(task, rule, config, torch.device("cpu"), torch.Generator(), by_world=True)
-    before = cycle.pool.x.clone()
+    before = cycle.pool.worlds.x.clone()
     for iteration in range(4):
         cycle.run(iteration)
-    changed = (cycle.pool.x - before).abs().amax(dim=(1, 2)) > 1e-3
+    changed = (cycle.pool.worlds.x - before).abs().amax(dim=(1, 2)) > 1e-3
     assert changed.view(4, 2).any(dim=1).all()
 
 
@@ -303,7 +303,7 @@ def test_worlds_of_all_processes_are_diagnosed_when_the_loss_is_not_finite(tmp_p
     def diverge():
         trainer = Trainer(Morphogenesis2D(config.task), config, task_name="morphogenesis2d")
         if not Ranks.current().first:
-            trainer.pool.s[:] = 1e200
+            trainer.pool.worlds.s[:] = 1e200
         trainer.run(progress=False)
 
     for said in on_ranks(2, diverge, tmp_path):

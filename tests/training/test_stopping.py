@@ -5,12 +5,12 @@ import signal
 import pytest
 from clock import Clock
 
-from npa_envs.training.stopping import ONE_REQUEST, stop_flag
+from npa_envs.training.run import ONE_REQUEST, stop_flag
 
 
 def test_the_first_signal_sets_the_flag_and_one_much_later_acts_as_usual(monkeypatch, capfd):
     clock = Clock()
-    monkeypatch.setattr("npa_envs.training.stopping.time", clock)
+    monkeypatch.setattr("npa_envs.training.run.time", clock)
     usual = signal.getsignal(signal.SIGINT)
     with stop_flag() as stop:
         assert not stop.is_set()
@@ -28,7 +28,7 @@ def test_the_first_signal_sets_the_flag_and_one_much_later_acts_as_usual(monkeyp
 
 def test_the_patient_are_asked_as_often_as_one_likes(monkeypatch):
     clock = Clock()
-    monkeypatch.setattr("npa_envs.training.stopping.time", clock)
+    monkeypatch.setattr("npa_envs.training.run.time", clock)
     with stop_flag(patient=True) as stop:
         for _ in range(3):
             signal.raise_signal(signal.SIGTERM)

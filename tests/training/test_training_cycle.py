@@ -12,6 +12,7 @@ from npa_envs.tasks.morphogenesis2d import Morphogenesis2D
 from npa_envs.tasks.point_classification import PointClassification
 from npa_envs.training import preset
 from npa_envs.training.iteration import EagerIteration, GraphedIteration
+from npa_envs.world.particles import Particles
 
 
 def circle_cycle(tmp_path, **fields):
@@ -86,8 +87,10 @@ def test_replayed_operations_train_the_same_rule_as_called_ones(tmp_path, make, 
             cycle.run(iteration)
             cycle.meter.send()
         assert replayed.meter.receive() == called.meter.receive()
-        assert_same(replayed.batch.x0, called.batch.x0)
-        assert replayed.batch.goal is None or torch.equal(replayed.batch.goal, called.batch.goal)
+        assert_same(replayed.batch.start.x, called.batch.start.x)
+        assert replayed.batch.start.goal is None or torch.equal(
+            replayed.batch.start.goal, called.batch.start.goal
+        )
         assert_same(replayed_rule.state_dict(), called_rule.state_dict())
     assert_same(replayed.state_dict(), called.state_dict())
     assert len(replayed._draw.recorded) > 5
@@ -115,14 +118,22 @@ def test_recorded_iterations_take_means_over_processes_where_eager_ones_do(tmp_p
             counts.append(float(count))
             return 2.0 * count
 
-        iteration = kind(task, rule, config, x, s, generator, mean_over_processes=mean)
+        iteration = kind(
+            task,
+            rule,
+            config,
+            Particles(x, s),
+            generator,
+            npa_envs.rollout,
+            mean_over_processes=mean,
+        )
         for number in range(3):
             strayed = x.clone()
             strayed[:, : 5 + number] += 3.0
-            iteration.x0.copy_(strayed)
+            iteration.start.x.copy_(strayed)
             generator.manual_seed(number)
             iteration.run(6 + number % 2)
-            rows = [*iteration.gradients, iteration.terms, iteration.x, iteration.s]
+            rows = [*iteration.gradients, iteration.terms, iteration.end.x, iteration.end.s]
             found.append([row.clone() for row in rows])
         # The first capture is after a run that loads kernels.
         assert counts[-3:] == [20.0, 24.0, 28.0]

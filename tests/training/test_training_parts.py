@@ -13,24 +13,24 @@ from npa_envs.devices import check_device, parse_device
 from npa_envs.errors import NPAError
 from npa_envs.rule.rule import NPARule, fate_parameters
 from npa_envs.training.checkpoint import check_same_run, load_checkpoint, save_checkpoint
-from npa_envs.training.iteration import EagerIteration, power_mean
-from npa_envs.training.meter import Interval, LossMeter
+from npa_envs.training.cycle import WorldPool
+from npa_envs.training.iteration import EagerIteration, Interval, LossMeter, power_mean
 from npa_envs.training.optimiser import (
     FATE_RATE,
     RuleOptimiser,
     layer_weights,
     normalise_gradients,
 )
-from npa_envs.training.overrides import config_to_dict
-from npa_envs.training.pool import WorldPool
-from npa_envs.training.randomness import RunRandomness
-from npa_envs.training.run_folder import JsonlLog
+from npa_envs.training.presets import config_to_dict
+from npa_envs.training.ranks import RunRandomness
+from npa_envs.training.run import JsonlLog
+from npa_envs.world.particles import Particles
 
 
 def make_pool(pool_size=6, particle_count=4, limit=10.0, device="cpu"):
     x = torch.arange(pool_size, dtype=torch.float32, device=device)
     x = x[:, None, None].repeat(1, particle_count, 2)
-    return WorldPool(x, x[..., :1].repeat(1, 1, 3), runaway_limit=limit)
+    return WorldPool(Particles(x, x[..., :1].repeat(1, 1, 3)), runaway_limit=limit)
 
 
 def test_pool_draws_different_worlds_and_all_of_them_in_the_long_run():
@@ -44,16 +44,16 @@ def test_pool_draws_different_worlds_and_all_of_them_in_the_long_run():
     # Each count is hypergeometric with mean 200 and standard deviation 8.2.
     assert (counts - 200).abs().max() < 41
     # What is read is a copy.
-    x, s, _ = pool.read(torch.tensor([4, 2]))
+    x, s, *_ = pool.worlds.take(torch.tensor([4, 2]))
     assert x[:, 0, 0].tolist() == [4, 2]
     x.zero_()
     s.zero_()
-    assert (pool.x[4, 0, 0], pool.s[2, 0, 0]) == (4, 2)
+    assert (pool.worlds.x[4, 0, 0], pool.worlds.s[2, 0, 0]) == (4, 2)
 
 
 def test_a_pool_with_max_age_range_draws_one_world_of_each_section():
     x = torch.zeros(12, 2, 2)
-    pool = WorldPool(x, x.clone(), runaway_limit=1.0, max_age_range=(10, 1000))
+    pool = WorldPool(Particles(x, x.clone()), runaway_limit=1.0, max_age_range=(10, 1000))
     max_age_range = pool.lifetime.tolist()
     assert (max_age_range[0], max_age_range[-1]) == (10, 1000)
     ratios = [b / a for a, b in itertools.pairwise(max_age_range)]
@@ -66,10 +66,10 @@ def test_a_pool_with_max_age_range_draws_one_world_of_each_section():
 
 def test_worlds_age_and_are_new_when_they_run_away():
     x = torch.zeros(4, 2, 2)
-    pool = WorldPool(x, x.clone(), runaway_limit=1.0, max_age_range=(5, 40))
+    pool = WorldPool(Particles(x, x.clone()), runaway_limit=1.0, max_age_range=(5, 40))
     index = torch.tensor([0, 2, 3])
     after = torch.tensor([0.0, 0.0, 3.0])[:, None, None].expand(3, 2, 2)
-    pool.write(index, (after, after, None), (x[:3], x[:3], None), age=torch.tensor([7, 8, 9]))
+    pool.write(index, Particles(after, after), Particles(x[:3], x[:3]), age=torch.tensor([7, 8, 9]))
     assert pool.age.tolist() == [7, 0, 8, 0]
     age, over = pool.ages_of(index)
     assert age.tolist() == [7, 8, 0]
@@ -84,11 +84,11 @@ def test_pool_replaces_worlds_that_run_away_and_only_those(bad, where, device):
     (x if where == "x" else s)[1, 2, 1] = bad
     fresh_x, fresh_s = torch.full_like(x, 0.5), torch.full_like(s, 0.25)
     replaced = pool.write(
-        torch.tensor([5, 0, 3], device=device), (x, s, None), (fresh_x, fresh_s, None)
+        torch.tensor([5, 0, 3], device=device), Particles(x, s), Particles(fresh_x, fresh_s)
     )
     assert replaced.tolist() == [False, True, False]
-    assert pool.x[:, 0, 0].tolist() == [0.5, 1, 2, 7, 4, 7]
-    assert pool.s[:, 0, 0].tolist() == [0.25, 1, 2, 8, 4, 8]
+    assert pool.worlds.x[:, 0, 0].tolist() == [0.5, 1, 2, 7, 4, 7]
+    assert pool.worlds.s[:, 0, 0].tolist() == [0.25, 1, 2, 8, 4, 8]
 
 
 def test_each_gradient_is_divided_by_its_own_norm():
@@ -174,7 +174,7 @@ def make_iteration(config, kind=EagerIteration, device="cpu"):
     )
     generator = torch.Generator(device).manual_seed(3)
     x, s = x.to(config.torch_dtype), s.to(config.torch_dtype)
-    return task, rule, kind(task, rule, config, x, s, generator, plain_rollout)
+    return task, rule, kind(task, rule, config, Particles(x, s), generator, plain_rollout)
 
 
 def test_iteration_leaves_the_worlds_the_terms_and_the_gradients(tmp_path):
@@ -186,8 +186,8 @@ def test_iteration_leaves_the_worlds_the_terms_and_the_gradients(tmp_path):
     generator = torch.Generator().manual_seed(3)
     x, s, path_length = plain_rollout(
         rule,
-        iteration.x0,
-        iteration.s0,
+        iteration.start.x,
+        iteration.start.s,
         5,
         eps=task.eps,
         box=None,
@@ -199,8 +199,8 @@ def test_iteration_leaves_the_worlds_the_terms_and_the_gradients(tmp_path):
     total, parts = task.loss(x, s, path_length)
     rule.zero_grad()
     total.backward()
-    assert torch.equal(iteration.x, x.detach())
-    assert torch.equal(iteration.s, s.detach())
+    assert torch.equal(iteration.end.x, x.detach())
+    assert torch.equal(iteration.end.s, s.detach())
     assert iteration.term_names == ("loss", "distance", "state", "motion")
     assert iteration.terms.tolist() == [total.item(), *(v.item() for v in parts.values())]
     for ours, parameter in zip(gradients, rule.parameters(), strict=True):
@@ -208,7 +208,7 @@ def test_iteration_leaves_the_worlds_the_terms_and_the_gradients(tmp_path):
         torch.testing.assert_close(ours, parameter.grad, rtol=1e-12, atol=0)
     # Masks differ from run to run.
     iteration.run(5)
-    assert not torch.equal(iteration.x, x.detach())
+    assert not torch.equal(iteration.end.x, x.detach())
 
 
 @pytest.mark.parametrize("power", [1.0, 2.0, 4.0])
@@ -222,10 +222,10 @@ def test_grown_worlds_are_to_rest(tmp_path, power):
     iteration.grown[1] = True
     for one in (plain, iteration):
         one.run(6)
-    assert torch.equal(iteration.x, plain.x)
+    assert torch.equal(iteration.end.x, plain.end.x)
     # Particles of this task go straight on, so that their path is as long as their way.
-    way = (iteration.x - iteration.x0)[1].norm(dim=-1) / task.eps
-    change = (iteration.s - iteration.s0)[1].abs()
+    way = (iteration.end.x - iteration.start.x)[1].norm(dim=-1) / task.eps
+    change = (iteration.end.s - iteration.start.s)[1].abs()
     way, change = (each.pow(power).mean() ** (1.0 / power) for each in (way, change))
     rest = 3.0 * iteration.terms[-1]
     assert rest >= way + change - 1e-12
@@ -252,7 +252,7 @@ def test_worlds_that_do_not_move_have_finite_gradients_of_rest(tmp_path, power):
         rule.output.weight.zero_()
     iteration.grown[:] = True
     iteration.run(3)
-    assert torch.equal(iteration.x, iteration.x0)
+    assert torch.equal(iteration.end.x, iteration.start.x)
     assert all(gradient.isfinite().all() for gradient in iteration.gradients)
 
 
@@ -262,7 +262,9 @@ def test_a_parameter_outside_the_loss_gets_a_zero_gradient(tmp_path):
     rule.unused = nn.Parameter(torch.ones(2))
     x, s, _ = task.seed(2, generator=torch.Generator(), device=torch.device("cpu"))
     config = circle_config(tmp_path)
-    iteration = EagerIteration(task, rule, config, x, s, torch.Generator(), plain_rollout)
+    iteration = EagerIteration(
+        task, rule, config, Particles(x, s), torch.Generator(), plain_rollout
+    )
     rule.unused.grad.fill_(5.0)
     iteration.run(2)
     assert rule.unused.grad.tolist() == [0.0, 0.0]
@@ -312,7 +314,7 @@ def test_meter_keeps_the_first_bad_iteration_and_not_a_later_one(tmp_path, devic
     for number, (term, mark) in enumerate([(1.0, 10.0), (math.nan, 20.0), (math.inf, 30.0)], 1):
         iteration.terms.fill_(1.0)
         iteration.terms[2] = term
-        iteration.x0.fill_(mark)
+        iteration.start.x.fill_(mark)
         meter.begin(number, 100 + number)
         meter.observe(torch.tensor([False], device=device))
         meter.send()

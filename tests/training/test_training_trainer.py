@@ -260,7 +260,7 @@ def test_worlds_whose_time_is_over_are_damaged_then_and_live_again(tmp_path, sha
     def rollout(rule, x, s, steps, **options):
         cycle = trainer._cycle
         places, ages = cycle._index.tolist(), cycle._age.tolist()
-        same = zip(x, cycle.pool.x[places], s, cycle.pool.s[places], strict=True)
+        same = zip(x, cycle.pool.worlds.x[places], s, cycle.pool.worlds.s[places], strict=True)
         changed = [(torch.equal(a, b), not torch.equal(c, d)) for a, b, c, d in same]
         kept, hurt = zip(*changed, strict=True)
         drawn.extend(zip(places, ages, kept, hurt, strict=True))
@@ -444,7 +444,7 @@ def test_world_that_runs_away_does_not_stay_in_the_pool(tmp_path):
 
     trainer = trainer_of(circle_config(tmp_path), rollout=rollout)
     trainer.run(progress=False)
-    assert trainer.pool.x.abs().max() < 10
+    assert trainer.pool.worlds.x.abs().max() < 10
     assert [record["replaced_worlds"] for record in log_of(tmp_path)] == [1] * 6
 
 
@@ -490,7 +490,7 @@ def test_folders_that_do_not_do_are_named_before_training(tmp_path, monkeypatch)
     with pytest.raises(NPAError, match=r"out must be a folder that can be created .*file/run"):
         trainer_of(circle_config(tmp_path / "file" / "run"))
     usage = type("Usage", (), {"free": 100})
-    monkeypatch.setattr("npa_envs.training.run_folder.shutil.disk_usage", lambda path: usage)
+    monkeypatch.setattr("npa_envs.training.run.shutil.disk_usage", lambda path: usage)
     with pytest.raises(NPAError, match="must have room for two checkpoints"):
         trainer_of(circle_config(tmp_path / "full"))
     assert not (tmp_path / "full" / "checkpoint.pt").exists()

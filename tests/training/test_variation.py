@@ -26,7 +26,7 @@ def test_eps_of_one_factor_is_as_one_of_nearly_one(tmp_path):
     radii = []
     for lo in (1.999, 2.0):
         cycle = trainer_of(tmp_path / str(lo), vary_eps=(lo, 2.0))._cycle
-        radii.append(cycle._seeds(4, cycle.random.worlds)[0].norm(dim=-1).amax().item())
+        radii.append(cycle._seeds(4, cycle.random.worlds).x.norm(dim=-1).amax().item())
     assert radii[0] == pytest.approx(radii[1], rel=2e-3)
 
 
@@ -36,7 +36,7 @@ def test_seeds_are_as_large_as_eps_makes_them(tmp_path):
         for name, fields in (("plain", {"vary_eps": (1.0, 1.0)}), ("varied", {}))
     )
     radius = plain.config.task.seed_radius
-    largest = [t.pool.x.norm(dim=-1).amax(dim=1) / radius for t in (plain, varied)]
+    largest = [t.pool.worlds.x.norm(dim=-1).amax(dim=1) / radius for t in (plain, varied)]
     assert float(largest[0].max()) <= 1.0
     assert float(largest[0].min()) > 0.8
     assert 0.4 < float(largest[1].min()) < 0.7

@@ -19,7 +19,7 @@ from npa_envs.rule.files import preset_rules, rule_metadata, shipped_rules
 from npa_envs.rule.rule import NPARule, dividing
 from npa_envs.tasks.damage import DAMAGE_SIZES
 from npa_envs.training import config_to_dict, preset
-from npa_envs.training.run_folder import JsonlLog
+from npa_envs.training.run import JsonlLog
 from npa_envs.web import rule_world
 from npa_envs.web.colouring import ColouredWorld, Colouring, signed_colours, species_colours
 from npa_envs.web.environment_world import EnvironmentWorld, make_environment
