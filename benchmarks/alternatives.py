@@ -24,6 +24,7 @@ from typing import Any, NamedTuple
 
 import torch
 from hash_grid import grid_fields
+from precisions import PRECISIONS, Precision
 from scripts import script_facts, script_parser
 from strategies import STRATEGIES, Strategy
 from torch import Tensor
@@ -34,7 +35,6 @@ from npa_envs.errors import NPAError, shown
 from npa_envs.files import read_json, write_bytes, write_text
 from npa_envs.measure.plots import new_figure, number_plainly, png
 from npa_envs.measure.quality import psnr
-from npa_envs.measure.speed.precisions import PRECISIONS, Precision
 from npa_envs.measure.speed.suites import BenchReport, drawn_like
 from npa_envs.measure.speed.timing import (
     NO_TIME,

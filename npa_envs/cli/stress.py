@@ -20,7 +20,7 @@ from npa_envs.cli.output import (
 )
 
 if TYPE_CHECKING:
-    from npa_envs.measure.accuracy.checks import Check
+    from npa_envs.measure.accuracy.suite import Check
 
 FAILED = 1
 
@@ -56,14 +56,14 @@ def main(arguments: Sequence[str]) -> int:
     """Check, print and write; return 1 where a check failed."""
     options = parse_options(StressOptions, "stress", arguments)
     from npa_envs.devices import check_device
+    from npa_envs.measure import accuracy
     from npa_envs.measure.accuracy import suite
-    from npa_envs.measure.accuracy.checks import CheckSession
     from npa_envs.measure.plots import write_plots
     from npa_envs.measure.record import measured_facts
 
     check_numbers(options, seed=0, threads=1)
     rules = named_rules(options.rules)
-    checks = suite.all_checks(quick=options.quick, seed=options.seed, rules=rules)
+    checks = accuracy.all_checks(quick=options.quick, seed=options.seed, rules=rules)
     chosen = suite.chosen_checks(checks, options.only)
     if options.list:
         print(_listing(chosen))
@@ -87,7 +87,7 @@ def main(arguments: Sequence[str]) -> int:
     ):
         suite.run_checks(
             chosen,
-            CheckSession(device, quick=options.quick, seed=options.seed),
+            suite.CheckSession(device, quick=options.quick, seed=options.seed),
             record,
             max_seconds=options.max_seconds,
             weights=weights,
@@ -102,7 +102,7 @@ def main(arguments: Sequence[str]) -> int:
 
 
 def _listing(checks: Sequence[Check]) -> str:
-    from npa_envs.measure.accuracy.checks import GROUPS, group_of
+    from npa_envs.measure.accuracy.suite import GROUPS, group_of
 
     lines = []
     for group, summary in GROUPS.items():

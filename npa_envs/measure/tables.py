@@ -27,12 +27,16 @@ def table_text(rows: Sequence[Any], *, missing: str = "never") -> str:
     """
     if not rows:
         return ""
-    cells = _cells(rows, missing)
-    widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
-    return "\n".join(
+    return "\n".join(aligned(_cells(rows, missing)))
+
+
+def aligned(lines: Sequence[Sequence[str]]) -> list[str]:
+    """Return lines of cells in columns, which end below each other."""
+    widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
+    return [
         "  ".join(cell.rjust(width) for cell, width in zip(line, widths, strict=True))
-        for line in cells
-    )
+        for line in lines
+    ]
 
 
 def table_markdown(rows: Sequence[Any], *, missing: str = "never") -> str:

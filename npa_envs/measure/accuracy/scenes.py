@@ -36,9 +36,14 @@ class Scene:
 
     @property
     def s(self) -> Tensor:
-        """States from a normal distribution, float64 that float32 holds exactly."""
-        shape = (*self.x.shape[:2], STATE_DIM)
-        return torch.randn(shape, generator=torch.Generator().manual_seed(5)).double()
+        """The states of `states_at`."""
+        return states_at(self.x)
+
+
+def states_at(x: Tensor) -> Tensor:
+    """Return states from a normal distribution, float64 that float32 holds exactly."""
+    shape = (*x.shape[:2], STATE_DIM)
+    return torch.randn(shape, generator=torch.Generator().manual_seed(5)).double()
 
 
 def scenes(space_dim: int, *, periodic: bool, seed: int = 0) -> list[Scene]:
@@ -216,6 +221,12 @@ def relative_error(value: Tensor, expected: Tensor) -> float:
     errors = away / torch.where(size > 0.0, size, 1.0)
     # max() of a list may skip NaN; that of a tensor does not.
     return float(errors.max())
+
+
+def float32_errors(found: PerceptionOutcome, expected: PerceptionOutcome) -> dict[str, float]:
+    """Return the relative errors of float32, by the names of `LIMITS`."""
+    pairs = zip(PerceptionOutcome._fields, found, expected, strict=True)
+    return {f"{what}_float32": relative_error(a, b) for what, a, b in pairs}
 
 
 def functional_weights(x: Tensor, s: Tensor) -> Tensor:

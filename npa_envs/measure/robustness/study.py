@@ -12,26 +12,26 @@ from typing import Any
 
 import torch
 
-from npa_envs.measure.accuracy.endurance import WORKS
+from npa_envs.measure.accuracy.endurance import TrialWorlds
 from npa_envs.measure.plots import draw_band, legend_of, mark_decades, new_figure, png
 from npa_envs.measure.record import Record, number
-from npa_envs.measure.robustness.recovery import (
+from npa_envs.measure.robustness.trials import (
+    CONDITIONS,
     CONTROL,
     DAMAGES,
     RECOVERED,
     LossCurve,
-    healing,
-    ratio,
-)
-from npa_envs.measure.robustness.trials import (
-    CONDITIONS,
     RuleTrial,
-    TaskTrial,
+    healing,
     loss_curves,
+    ratio,
     trained_value,
 )
 from npa_envs.measure.tables import NONE, as_objects, markdown_table, short
 from npa_envs.world.randomness import StreamId
+
+WORKS = 2.0
+"""A rule works where its loss is at most this many times that as trained, and all is finite."""
 
 MOST_PARTICLES = {"cpu": 1 << 17, "cuda": 1 << 21}
 """Particles of all worlds together; where there would be more, a value is left out."""
@@ -154,7 +154,7 @@ def measure_rule(
 
 def grow(
     ground: RuleTrial, condition: str = "", value: float | str = 1.0
-) -> tuple[TaskTrial, Response]:
+) -> tuple[TrialWorlds, Response]:
     """Return worlds grown from their seeds under a condition, none by default, and their losses."""
     home = ground.home(
         share=float(value) if condition == "particles" else 1.0,
