@@ -42,9 +42,9 @@ from npa_envs.measure.speed.timing import (
     Tables,
     Timing,
     TimingSession,
+    Workload,
     relative_error,
 )
-from npa_envs.measure.speed.workloads import Workload
 from npa_envs.ops import perception_fields
 from npa_envs.rule.files import load_rule
 from npa_envs.rule.rule import NPARule

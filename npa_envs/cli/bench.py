@@ -116,10 +116,11 @@ def main(arguments: Sequence[str]) -> int:
 def _explanation(options: BenchOptions, device: torch.device) -> str:
     import torch
 
-    from npa_envs.measure.speed.explain import Question, explain
-    from npa_envs.measure.speed.workloads import Workload
+    from npa_envs.measure.speed.explain import explain
+    from npa_envs.measure.speed.timing import Workload
 
     sizes = (options.space_dim, options.world_count, options.particle_count, 1)
     workload = Workload(*sizes, state_dim=options.state_dim, update_prob=options.update_prob)
-    dtype = {"float32": torch.float32, "float64": torch.float64}[options.dtype]
-    return explain(Question(workload, device, dtype, options.periodic, options.gradients))
+    dtype = getattr(torch, options.dtype)
+    given = {"periodic": options.periodic, "gradients": options.gradients}
+    return explain(workload, device, dtype, **given)

@@ -22,11 +22,12 @@ from npa_envs.measure.speed.timing import (
     Tables,
     Timing,
     TimingSession,
+    Workload,
     compare,
     relative_error,
+    rollout_call,
     timed_calls,
 )
-from npa_envs.measure.speed.workloads import Workload, rollout_call
 from npa_envs.measure.tables import UNMEASURED, as_objects, table_text
 from npa_envs.rule.rule import NPARule
 from npa_envs.world.recorded import release_recordings
@@ -79,18 +80,16 @@ class ThroughputRow:
 
 def throughput_rows(session: TimingSession, workloads: Sequence[Workload]) -> list[ThroughputRow]:
     """Return two rows for each workload: storing and recomputing."""
-    rows: list[ThroughputRow] = []
+    calls = []
     for workload in workloads:
         train = workload not in INFERENCE_ONLY
         if not train:
             session.leave_out(f"training of {workload.name}", "a workload of inference only")
         modes: tuple[Memory, ...] = ("store", "recompute") if train else ("store",)
         for memory in modes:
-            rows += session.attempt(
-                f"{workload.name}, {memory}",
-                partial(throughput_row, session, workload, memory, train=train),
-            )
-    return rows
+            row = partial(throughput_row, session, workload, memory, train=train)
+            calls.append((f"{workload.name}, {memory}", row))
+    return session.rows(calls)
 
 
 def throughput_row(
@@ -104,13 +103,13 @@ def throughput_row(
         pull_back, generator = rollout_call(workload, x, s, train=True, memory=memory)
         training = session.cost(pull_back, generator=generator)
     return ThroughputRow(
-        workload=workload.name,
-        memory=memory,
-        infer_us=infer.time.divided(workload.steps),
-        train_us=training.time.divided(workload.steps) if training else None,
-        worlds_mib=(x.nbytes + s.nbytes) / 2**20,
-        infer_mib=infer.peak_mib,
-        train_mib=training.peak_mib if training else None,
+        workload.name,
+        memory,
+        infer.time.divided(workload.steps),
+        training.time.divided(workload.steps) if training else None,
+        (x.nbytes + s.nbytes) / 2**20,
+        infer.peak_mib,
+        training.peak_mib if training else None,
     )
 
 
@@ -131,11 +130,7 @@ class PublicRow:
 
 def public_rows(session: TimingSession, workloads: Sequence[Workload]) -> list[PublicRow]:
     """Return a row for each workload."""
-    return [
-        row
-        for workload in workloads
-        for row in session.attempt(workload.name, partial(_public_row, session, workload))
-    ]
+    return session.rows((w.name, partial(_public_row, session, w)) for w in workloads)
 
 
 def _public_row(session: TimingSession, workload: Workload) -> PublicRow:
@@ -247,11 +242,11 @@ class SlopeRow:
 
 def scaling_rows(session: TimingSession) -> list[ScalingRow]:
     """Return the rows of all axes, increasing along each."""
-    rows: list[ScalingRow] = []
-    for axis, values in zip(AXES, _values(session), strict=True):
-        for value in values:
-            rows += session.attempt(f"{value} {axis}", partial(_scaling_row, session, axis, value))
-    return rows
+    return session.rows(
+        (f"{value} {axis}", partial(_scaling_row, session, axis, value))
+        for axis, values in zip(AXES, _values(session), strict=True)
+        for value in values
+    )
 
 
 def _values(session: TimingSession) -> tuple[Sequence[int], ...]:
@@ -389,7 +384,7 @@ def skips(workload: Workload) -> list[Skip]:
 
 def skip_rows(session: TimingSession) -> list[SkipRow]:
     """Return what each omission saves, measured with and without it in one run."""
-    workload = SKIPPED["small" if session.small else session.device.type]
+    workload = SKIPPED[session.size]
     x, s = workload.worlds(session.device)
 
     def cost(options: dict[str, Any], steps: int | None) -> Timing:
@@ -402,10 +397,7 @@ def skip_rows(session: TimingSession) -> list[SkipRow]:
         saved = 1.0 - skipped.median / done.median
         return SkipRow(skip.left_out, skip.condition, done, skipped, f"{saved:.0%}")
 
-    rows: list[SkipRow] = []
-    for skip in skips(workload):
-        rows += session.attempt(skip.left_out, partial(row, skip))
-    return rows
+    return session.rows((skip.left_out, partial(row, skip)) for skip in skips(workload))
 
 
 # Suite `species`: overhead of `rollout_species` with one species.
@@ -439,15 +431,15 @@ class OneSpeciesRow:
 
 def one_species_rows(session: TimingSession) -> list[OneSpeciesRow]:
     """Return rows of inference and training."""
-    rows: list[OneSpeciesRow] = []
-    for workload in SPECIES["small" if session.small else session.device.type]:
-        for train in (False, True):
-            for graph in (False, True) if session.cuda else (False,):
-                what = f"one species, {'training' if train else 'inference'} of {workload.name}"
-                rows += session.attempt(
-                    what, partial(_species_row, session, workload, train, graph)
-                )
-    return rows
+    return session.rows(
+        (
+            f"one species, {'training' if train else 'inference'} of {workload.name}",
+            partial(_species_row, session, workload, train, graph),
+        )
+        for workload in SPECIES[session.size]
+        for train in (False, True)
+        for graph in ((False, True) if session.cuda else (False,))
+    )
 
 
 def _species_row(
