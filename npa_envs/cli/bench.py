@@ -8,15 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
-from npa_envs.cli.output import (
-    MeasureOptions,
-    StepBar,
-    check_numbers,
-    chosen_names,
-    parse_options,
-    torch_threads,
-    writable_folder,
-)
+from npa_envs.cli import common
 from npa_envs.errors import NPAError
 
 if TYPE_CHECKING:
@@ -27,7 +19,7 @@ QUICK = "quick"
 
 
 @dataclass(frozen=True, kw_only=True)
-class BenchOptions(MeasureOptions):
+class BenchOptions(common.MeasureOptions):
     """Measure the paper's table, scaling and other times; or explain what a step runs."""
 
     suite: str | None = None
@@ -64,7 +56,7 @@ class BenchOptions(MeasureOptions):
 
 def main(arguments: Sequence[str]) -> int:
     """Measure, print and write."""
-    options = parse_options(BenchOptions, "bench", arguments)
+    options = common.parse_options(BenchOptions, "bench", arguments)
     from npa_envs.devices import check_device
     from npa_envs.files import write_text
     from npa_envs.measure.plots import check_matplotlib, write_plots
@@ -72,18 +64,20 @@ def main(arguments: Sequence[str]) -> int:
     from npa_envs.measure.speed.suites import SUITES, BenchReport, pictures
     from npa_envs.measure.speed.timing import TimingSession
 
-    check_numbers(options, repeats=1, threads=1, world_count=1, particle_count=1, state_dim=1)
+    common.check_numbers(
+        options, repeats=1, threads=1, world_count=1, particle_count=1, state_dim=1
+    )
     if options.plots and options.out is None:
         raise NPAError("plots need a folder to be written to: give --out DIR as well")
     device = check_device(options.device)
-    (name,) = chosen_names("suite", [options.suite or QUICK], SUITES)
+    (name,) = common.chosen_names("suite", [options.suite or QUICK], SUITES)
     if options.explain:
         print(_explanation(options, device))
         return 0
-    folder = None if options.out is None else writable_folder(options.out)
+    folder = None if options.out is None else common.writable_folder(options.out)
     if options.plots:
         check_matplotlib()
-    with StepBar(None, show=options.progress, unit="row") as bar, torch_threads(options.threads):
+    with common.measuring(options, None, "row") as bar:
         session = TimingSession(
             device=device,
             repeats=options.repeats,

@@ -16,15 +16,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
-from npa_envs.cli.output import (
-    MeasureOptions,
-    StepBar,
-    check_numbers,
-    chosen_names,
-    named_values,
-    parse_options,
-    writable_folder,
-)
+from npa_envs.cli import common
 from npa_envs.errors import NPAError, suggest
 
 if TYPE_CHECKING:
@@ -51,7 +43,7 @@ QUICK: dict[str, Any] = {
 
 
 @dataclass(frozen=True, kw_only=True)
-class CompareOptions(MeasureOptions):
+class CompareOptions(common.MeasureOptions):
     """Compare methods on tasks over seeds, for equal wall time, equal particle-steps, or both.
 
     Runs learn in processes. One that fails is recorded with its error, and the others go on; a
@@ -101,7 +93,7 @@ class CompareOptions(MeasureOptions):
 
 def main(arguments: Sequence[str]) -> int:
     """Run what is missing, print and write; return 1 where a run failed."""
-    options = parse_options(CompareOptions, "compare", arguments)
+    options = common.parse_options(CompareOptions, "compare", arguments)
     from npa_envs.agents.comparison.npa_bench import SUITES, check_rows, write_rows
     from npa_envs.agents.comparison.report import write_pictures, write_table
     from npa_envs.agents.comparison.run import held_records, run_jobs
@@ -111,7 +103,7 @@ def main(arguments: Sequence[str]) -> int:
     words = without_folders(arguments, "--out")
     command = shlex.join(["npa-envs", "compare", *words])
     plan = make_plan(options)
-    folder = writable_folder(options.out)
+    folder = common.writable_folder(options.out)
     # All are read first: a record of other settings is refused before any work is done.
     records = held_records(plan, folder)
     if options.suite is not None:
@@ -129,7 +121,7 @@ def main(arguments: Sequence[str]) -> int:
         bar.advance(1)
 
     places = Places((options.devices or (options.device,)), _jobs(options), options.threads)
-    with StepBar(len(missing), show=options.progress, unit="run") as bar:
+    with common.StepBar(len(missing), show=options.progress, unit="run") as bar:
         run_jobs(
             plan,
             missing,
@@ -142,7 +134,7 @@ def main(arguments: Sequence[str]) -> int:
     lines = [write_table(plan, whole(), folder, command), *write_pictures(whole(), folder)]
     if options.suite is not None:
         rows = write_rows(
-            SUITES[options.suite], plan, whole(), writable_folder(folder / ROWS), command
+            SUITES[options.suite], plan, whole(), common.writable_folder(folder / ROWS), command
         )
         lines += [f"wrote {path}" for path in rows]
     failed = [record for record in whole() if record.status == "failed"]
@@ -159,7 +151,7 @@ def make_plan(options: CompareOptions) -> ComparisonPlan:
     from npa_envs.agents.learning import METHODS
     from npa_envs.agents.learning.problem import RUNS
 
-    check_numbers(options, seeds=1, episodes=1, jobs=1, threads=1)
+    common.check_numbers(options, seeds=1, episodes=1, jobs=1, threads=1)
     if options.seeds is not None and options.seeds > RUNS:
         raise NPAError(
             f"seeds must be at most {RUNS}, got {options.seeds}: later runs would learn in the "
@@ -170,7 +162,7 @@ def make_plan(options: CompareOptions) -> ComparisonPlan:
     if options.quick:
         few = {name: getattr(options, name) or value for name, value in QUICK.items()}
         options = replace(options, **few)
-    tasks = chosen_names("task", options.tasks, PROBLEMS)
+    tasks = common.chosen_names("task", options.tasks, PROBLEMS)
     methods, own = _chosen_methods(options.methods, METHODS)
     if not options.methods:
         methods = [name for name in methods if name not in NEED_MORE]
@@ -202,7 +194,7 @@ def _suite_plan(options: CompareOptions) -> ComparisonPlan:
                 "frozen: leave it out, or compare without a suite"
             )
     quick = options.quick
-    tasks = chosen_names("task", options.tasks, suite.tasks)
+    tasks = common.chosen_names("task", options.tasks, suite.tasks)
     if quick and not options.tasks:
         tasks = tasks[:1]
     methods, own = _chosen_methods(options.methods, suite.methods)
@@ -271,7 +263,7 @@ def _chosen_methods(words: Sequence[str], known: Iterable[str]) -> tuple[list[st
         with _this_folder_searched():
             method_options(method)
     plain = [word for word in words if "=" not in word]
-    return [*(chosen_names("method", plain, known) if plain or not own else []), *own], own
+    return [*(common.chosen_names("method", plain, known) if plain or not own else []), *own], own
 
 
 @contextlib.contextmanager
@@ -304,7 +296,7 @@ def _method_options(
             known = method_options(own.get(method, method))
         if option not in known:
             raise NPAError(f"unknown option {option!r} in {word!r}: {suggest(option, known)}")
-        found.setdefault(method, {}).update(named_values("options", [f"{option}={value}"]))
+        found.setdefault(method, {}).update(common.named_values("options", [f"{option}={value}"]))
     return found
 
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
-from npa_envs.cli.output import RuleOptions, StepBar, check_numbers, parse_options
+from npa_envs.cli import common
 from npa_envs.errors import NPAError, shown
 
 if TYPE_CHECKING:
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, kw_only=True)
-class EvaluateOptions(RuleOptions):
+class EvaluateOptions(common.RuleOptions):
     """Measure loss, PSNR, overflow and extent of a rule over thousands of steps.
 
     Of a rule that classifies point clouds: the accuracy on clouds it was not trained on, and what
@@ -46,7 +46,7 @@ class EvaluateOptions(RuleOptions):
 
 def main(arguments: Sequence[str]) -> int:
     """Measure and print."""
-    options = parse_options(EvaluateOptions, "evaluate", arguments)
+    options = common.parse_options(EvaluateOptions, "evaluate", arguments)
     from npa_envs.devices import check_device
     from npa_envs.measure.judge import TextureJudge
     from npa_envs.measure.quality import CHECKPOINTS, check_steps, tables_of
@@ -56,7 +56,7 @@ def main(arguments: Sequence[str]) -> int:
 
     checkpoints = options.checkpoints or CHECKPOINTS
     check_steps("checkpoints", checkpoints)
-    check_numbers(options, seed_count=1)
+    common.check_numbers(options, seed_count=1)
     device = check_device(options.device)
     rule = load_rule(options.rule, device=device).float()
     world = options.world() | {"data_folder": options.data_folder}
@@ -71,7 +71,7 @@ def main(arguments: Sequence[str]) -> int:
     judge = TextureJudge(trained.task) if options.judge else None
     clouds = trained.task.classifies
     known = not (clouds or options.healing)
-    with StepBar(max(checkpoints) if known else None, show=options.progress) as bar:
+    with common.StepBar(max(checkpoints) if known else None, show=options.progress) as bar:
         tables = tables_of(
             rule,
             trained.task,
@@ -102,7 +102,7 @@ def _pictures(options: EvaluateOptions, rule: NPARule, device: torch.device) -> 
             f"{len(rule.codes)}: give --target {shown(rule.codes.names[0])}"
         )
     tasks = tasks_of_codes(options.rule, rule, device, **options.world())
-    with StepBar(None, show=options.progress) as bar:
+    with common.StepBar(None, show=options.progress) as bar:
         rows = picture_rows(
             rule,
             tasks,

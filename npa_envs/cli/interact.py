@@ -11,13 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
-from npa_envs.cli.output import (
-    RunOptions,
-    StepBar,
-    check_numbers,
-    parse_options,
-    writable_folder,
-)
+from npa_envs.cli import common
 from npa_envs.errors import NPAError
 
 if TYPE_CHECKING:
@@ -42,7 +36,7 @@ QUICK: dict[str, Any] = {
 
 
 @dataclass(frozen=True, kw_only=True)
-class InteractOptions(RunOptions):
+class InteractOptions(common.RunOptions):
     """Grow every rule next to every other one, and measure how that changes it.
 
     Every ordered pair of rules, also of a rule with itself, at every distance, ratio and radius:
@@ -85,7 +79,7 @@ class InteractOptions(RunOptions):
 
 def main(arguments: Sequence[str]) -> int:
     """Grow the missing pairs, print, draw and write."""
-    options = parse_options(InteractOptions, "interact", arguments)
+    options = common.parse_options(InteractOptions, "interact", arguments)
     from npa_envs.devices import check_device
     from npa_envs.files import plain_numbers
     from npa_envs.measure.interaction import Encounters, heat_map, interaction_record, phase_diagram
@@ -95,8 +89,8 @@ def main(arguments: Sequence[str]) -> int:
 
     if options.quick:
         few = InteractOptions(**QUICK)
-        options = parse_options(InteractOptions, "interact", arguments, default=few)
-    check_numbers(options, seed_count=1)
+        options = common.parse_options(InteractOptions, "interact", arguments, default=few)
+    common.check_numbers(options, seed_count=1)
     device = check_device(options.device)
     rules, settings = _rules(options, device)
     if len(rules) < 2 and not options.itself:
@@ -104,7 +98,7 @@ def main(arguments: Sequence[str]) -> int:
             f"rules must be two or more without itself, got {rules[0].name}: name another one, "
             "or leave out --no-itself"
         )
-    folder = writable_folder(options.out)
+    folder = common.writable_folder(options.out)
     weights = {rule.name: rule_digest(rule.rule) for rule in rules}
     record = interaction_record(
         folder / RESULTS, {**plain_numbers(asdict(settings)), "rules": weights}
@@ -118,7 +112,7 @@ def main(arguments: Sequence[str]) -> int:
     # A rule is grown alone once for each ratio and radius.
     runs = len(missing) * len(settings.distances) + len({first.name for first, _ in missing})
     total = runs * len(settings.ratios) * len(settings.eps_factors) * settings.steps
-    with StepBar(total, show=options.progress) as bar:
+    with common.StepBar(total, show=options.progress) as bar:
         encounters = Encounters(settings, device=device, progress=bar.advance)
         encounters.check(rules)
         for first, second in missing:

@@ -11,14 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
-from npa_envs.cli.output import (
-    RunOptions,
-    StepBar,
-    check_numbers,
-    named_values,
-    parse_options,
-    writable_folder,
-)
+from npa_envs.cli import common
 from npa_envs.errors import NPAError
 
 if TYPE_CHECKING:
@@ -32,7 +25,7 @@ LEARNS_NOTHING = ("zero", "random", "scripted")
 
 
 @dataclass(frozen=True, kw_only=True)
-class RecordOptions(RunOptions):
+class RecordOptions(common.RunOptions):
     """Write episodes of a policy as a dataset of Minari, to learn from without the environment.
 
     `minari.load_dataset` reads it; `npa_envs.agents.learning.train("clone", ..., dataset=ID)`
@@ -60,8 +53,8 @@ class RecordOptions(RunOptions):
 
 def main(arguments: Sequence[str]) -> int:
     """Record and write."""
-    options = parse_options(RecordOptions, "record", arguments)
-    check_numbers(options, episodes=1, worlds=1)
+    options = common.parse_options(RecordOptions, "record", arguments)
+    common.check_numbers(options, episodes=1, worlds=1)
     from npa_envs.agents.evaluation import policy_in
     from npa_envs.measure.record import without_folders
     from npa_envs.wrappers.minari import ROOT, record_episodes, spec_of, write_dataset
@@ -73,8 +66,8 @@ def main(arguments: Sequence[str]) -> int:
     seeds = range(options.first_seed, options.first_seed + options.episodes)
     returns: list[float] = []
     if options.root is not None:
-        os.environ[ROOT] = str(writable_folder(options.root, "root").resolve())
-    with StepBar(options.episodes, show=options.progress, unit="episode") as bar:
+        os.environ[ROOT] = str(common.writable_folder(options.root, "root").resolve())
+    with common.StepBar(options.episodes, show=options.progress, unit="episode") as bar:
 
         def episodes() -> Iterator[Any]:
             for episode in record_episodes(envs, policy, seeds):
@@ -100,7 +93,7 @@ def problem_of(options: RecordOptions) -> Problem:
     worlds = min(options.worlds, options.episodes)
     problem = Problem(
         env_id=options.env,
-        keywords=named_values("options", options.options),
+        keywords=common.named_values("options", options.options),
         episode_steps=registered_steps(options.env),
         num_envs=worlds,
     )

@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import torch
 
+from npa_envs.cli import common
 from npa_envs.cli.film import film_world, frame_steps, large_task, write_film, write_solid
-from npa_envs.cli.output import StepBar, writable_folder
 from npa_envs.errors import MissingDependencyError
 from npa_envs.files import write_text
 from npa_envs.measure.judge import TextureJudge
@@ -73,7 +73,7 @@ def write_report(
     STEM.mp4 and STEM-filmstrip.png; of a 3D rule also a turntable and point files. On a CPU, where
     worlds take as long as training does, fewer are measured, for fewer steps, and not damaged.
     """
-    writable_folder(folder)
+    common.writable_folder(folder)
     rule = load_rule(path, device=device).float()
     task = task_of_rule(str(path), rule, device).task
     thorough = device.type == "cuda"
@@ -82,7 +82,7 @@ def write_report(
     count = 8 if thorough else 2
     judge = TextureJudge(task) if isinstance(task, Texture) else None
     not_filmed = ""
-    with StepBar(None, show=progress) as bar:
+    with common.StepBar(None, show=progress) as bar:
         tables = tables_of(
             rule,
             task,
@@ -136,7 +136,7 @@ def _film(
     task: Task,
     folder: Path,
     device: torch.device,
-    bar: StepBar,
+    bar: common.StepBar,
 ) -> None:
     """Film a world of the rule from its seed."""
     generator = torch.Generator(device).manual_seed(FIRST_SEED)

@@ -9,17 +9,12 @@ from typing import Annotated, Literal, cast
 
 import tyro
 
-from npa_envs.cli.output import (
-    RuleOptions,
-    StepBar,
-    parse_options,
-    writable_folder,
-)
+from npa_envs.cli import common
 from npa_envs.errors import NPAError
 
 
 @dataclass(frozen=True, kw_only=True)
-class RolloutCommand(RuleOptions):
+class RolloutCommand(common.RuleOptions):
     """Grow a rule from its seed, damage it on the way, and write a GIF, an MP4 and a filmstrip.
 
     Of a 3D world also a turntable GIF, and the grown cloud as points (PLY) and as Gaussians (PLY,
@@ -64,7 +59,7 @@ class RolloutCommand(RuleOptions):
 
 def main(arguments: Sequence[str]) -> int:
     """Grow, film and write what the words after `npa-envs rollout` ask for; return 0."""
-    options = parse_options(RolloutCommand, "rollout", arguments)
+    options = common.parse_options(RolloutCommand, "rollout", arguments)
     import torch
 
     from npa_envs.cli.film import (
@@ -106,11 +101,11 @@ def main(arguments: Sequence[str]) -> int:
         style=options.style,
         **world,
     )
-    folder = writable_folder(options.out)
+    folder = common.writable_folder(options.out)
     generator = torch.Generator(device).manual_seed(options.seed)
     x, s, goal = task.seed(1, generator=generator, device=device)
     task = task.toward(goal)
-    with stop_flag() as stop, StepBar(options.steps, show=options.progress) as bar:
+    with stop_flag() as stop, common.StepBar(options.steps, show=options.progress) as bar:
         x, s, film = film_world(
             rule,
             shown,

@@ -9,15 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from npa_envs.cli.output import (
-    MeasureOptions,
-    StepBar,
-    check_numbers,
-    named_rules,
-    parse_options,
-    torch_threads,
-    writable_folder,
-)
+from npa_envs.cli import common
 
 if TYPE_CHECKING:
     from npa_envs.measure.accuracy.suite import Check
@@ -26,7 +18,7 @@ FAILED = 1
 
 
 @dataclass(frozen=True, kw_only=True)
-class StressOptions(MeasureOptions):
+class StressOptions(common.MeasureOptions):
     """Check hard geometry, hard values, long runs of rules, gradients, precision.
 
     Every check has an expectation, figures and a verdict: pass, fail, a range (where something
@@ -54,15 +46,15 @@ class StressOptions(MeasureOptions):
 
 def main(arguments: Sequence[str]) -> int:
     """Check, print and write; return 1 where a check failed."""
-    options = parse_options(StressOptions, "stress", arguments)
+    options = common.parse_options(StressOptions, "stress", arguments)
     from npa_envs.devices import check_device
     from npa_envs.measure import accuracy
     from npa_envs.measure.accuracy import suite
     from npa_envs.measure.plots import write_plots
     from npa_envs.measure.record import measured_facts
 
-    check_numbers(options, seed=0, threads=1)
-    rules = named_rules(options.rules)
+    common.check_numbers(options, seed=0, threads=1)
+    rules = common.named_rules(options.rules)
     checks = accuracy.all_checks(quick=options.quick, seed=options.seed, rules=rules)
     chosen = suite.chosen_checks(checks, options.only)
     if options.list:
@@ -72,7 +64,7 @@ def main(arguments: Sequence[str]) -> int:
     path = None
     if options.out is not None:
         name = f"stress_{device.type}{'_quick' * options.quick}.json"
-        path = writable_folder(options.out) / name
+        path = common.writable_folder(options.out) / name
     facts = measured_facts(device, options.commit, quick=options.quick, seed=options.seed)
     record = suite.StressRecord(facts, path, [check.name for check in checks]).read()
     weights = suite.rule_weights(chosen)
@@ -81,10 +73,7 @@ def main(arguments: Sequence[str]) -> int:
     before = sum(check.name in done for check in chosen)
     if before:
         print(f"{before} of {len(chosen)} checks were done before")
-    with (
-        StepBar(len(chosen), show=options.progress, unit="check") as bar,
-        torch_threads(options.threads),
-    ):
+    with common.measuring(options, len(chosen), "check") as bar:
         suite.run_checks(
             chosen,
             suite.CheckSession(device, quick=options.quick, seed=options.seed),

@@ -11,13 +11,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
+from npa_envs.cli import common
 from npa_envs.cli.doctor import has_screen
-from npa_envs.cli.output import (
-    named_values,
-    parse_options,
-    torch_threads,
-    writable_folder,
-)
 from npa_envs.errors import NPAError
 
 if TYPE_CHECKING:
@@ -67,26 +62,26 @@ class ViewOptions:
 
 def main(arguments: Sequence[str]) -> int:
     """Serve what the words after `npa-envs view` ask for until Ctrl-C; return 0."""
-    options = parse_options(ViewOptions, "view", arguments)
+    options = common.parse_options(ViewOptions, "view", arguments)
     if not 1 <= options.threads <= 256:
         raise NPAError(f"threads must be in [1, 256], got {options.threads}")
     from npa_envs.devices import check_device
 
     device = check_device(options.device)
     make_world = world_maker(options, device)
-    with torch_threads(options.threads):
+    with common.torch_threads(options.threads):
         # Made once before the server starts, so that errors come at once.
         make_world().close()
     from npa_envs.web.server import address_of, make_site, open_port, serve
 
     site = make_site(
         make_world,
-        films=writable_folder(options.out),
+        films=common.writable_folder(options.out),
         host=options.host,
         one_at_a_time=device.type == "cuda",
     )
     listener = open_port(options.host, options.port)
-    with contextlib.closing(listener), torch_threads(options.threads):
+    with contextlib.closing(listener), common.torch_threads(options.threads):
         address = address_of(site, listener)
         print(f"{options.what}: {address}  (Ctrl-C ends it)", flush=True)
         if options.browser and not open_browser(address):
@@ -129,7 +124,7 @@ def world_maker(options: ViewOptions, device: torch.device) -> Callable[[], Live
 
 def _keywords(options: ViewOptions) -> dict[str, Any]:
     """Return the keywords of the environment; the command's own are refused."""
-    found = named_values("options", options.options)
+    found = common.named_values("options", options.options)
     for name in OWN_KEYWORDS:
         if name in found:
             said = name in ("device", "policy")

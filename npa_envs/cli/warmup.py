@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
-from npa_envs.cli.output import parse_options
+from npa_envs.cli import common
 from npa_envs.errors import NPAError
 
 
@@ -25,7 +25,7 @@ class WarmupOptions:
 
 def main(arguments: Sequence[str]) -> int:
     """Compile what the words after `npa-envs warmup` ask for; return 0."""
-    options = parse_options(WarmupOptions, "warmup", arguments)
+    options = common.parse_options(WarmupOptions, "warmup", arguments)
     import torch
 
     from npa_envs.ops import warmup

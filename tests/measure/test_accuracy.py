@@ -10,7 +10,7 @@ import torch
 
 from npa_envs import reference
 from npa_envs.cli import main
-from npa_envs.cli.output import named_rules
+from npa_envs.cli.common import named_rules
 from npa_envs.errors import NPAError
 from npa_envs.measure import accuracy
 from npa_envs.measure.accuracy import all_checks, endurance, hard_cases, numerics

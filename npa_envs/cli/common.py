@@ -289,3 +289,10 @@ class StepBar:
 
     def __exit__(self, *_: object) -> None:
         self._bar.close()
+
+
+@contextlib.contextmanager
+def measuring(options: Any, total: int | None, unit: str = "step") -> Iterator[StepBar]:
+    """Show the bar of options with `progress`, and use their number of `threads`, in a block."""
+    with StepBar(total, show=options.progress, unit=unit) as bar, torch_threads(options.threads):
+        yield bar
