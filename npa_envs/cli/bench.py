@@ -57,39 +57,36 @@ class BenchOptions(common.MeasureOptions):
 def main(arguments: Sequence[str]) -> int:
     """Measure, print and write."""
     options = common.parse_options(BenchOptions, "bench", arguments)
-    from npa_envs.devices import check_device
     from npa_envs.files import write_text
-    from npa_envs.measure.plots import check_matplotlib, write_plots
-    from npa_envs.measure.record import current_commit, time_limit
-    from npa_envs.measure.speed.suites import SUITES, BenchReport, pictures
-    from npa_envs.measure.speed.timing import TimingSession
+    from npa_envs.measure import plots, record
+    from npa_envs.measure.speed import suites, timing
 
     common.check_numbers(
         options, repeats=1, threads=1, world_count=1, particle_count=1, state_dim=1
     )
     if options.plots and options.out is None:
         raise NPAError("plots need a folder to be written to: give --out DIR as well")
-    device = check_device(options.device)
-    (name,) = common.chosen_names("suite", [options.suite or QUICK], SUITES)
+    device = options.place()
+    (name,) = common.chosen_names("suite", [options.suite or QUICK], suites.SUITES)
     if options.explain:
         print(_explanation(options, device))
         return 0
     folder = None if options.out is None else common.writable_folder(options.out)
     if options.plots:
-        check_matplotlib()
+        plots.check_matplotlib()
     with common.measuring(options, None, "row") as bar:
-        session = TimingSession(
+        session = timing.TimingSession(
             device=device,
             repeats=options.repeats,
             small=options.quick,
             progress=bar.advance,
-            enough=time_limit(options.max_seconds),
+            enough=record.time_limit(options.max_seconds),
         )
-        tables = SUITES[name](session)
-    report = BenchReport(
+        tables = suites.SUITES[name](session)
+    report = suites.BenchReport(
         suite=name,
         command=shlex.join(["npa-envs", "bench", *arguments]),
-        commit=options.commit or current_commit(),
+        commit=options.commit or record.current_commit(),
         device=device,
         threads=options.threads,
         tables=tables,
@@ -102,7 +99,7 @@ def main(arguments: Sequence[str]) -> int:
         done = [f"wrote {path}"]
         if options.plots:
             place = path.with_name(f"{path.stem}_*.png")
-            done += write_plots(lambda: pictures(tables), place, "plots")
+            done += plots.write_plots(lambda: suites.pictures(tables), place, "plots")
         print("\n".join(done))
     return 0
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import itertools
 import json
 import math
 import re
@@ -146,7 +147,11 @@ def main(arguments: Sequence[str]) -> int:
 
 
 def make_plan(options: CompareOptions) -> ComparisonPlan:
-    """Return the plan that the command line asks for."""
+    """Return the plan that the command line asks for.
+
+    Of a suite, whose protocol is frozen, some tasks, methods and seeds may be chosen.
+    """
+    from npa_envs.agents.comparison import npa_bench
     from npa_envs.agents.comparison.plan import LEFT_OUT, PROBLEMS, ComparisonPlan, make_problem
     from npa_envs.agents.learning import METHODS
     from npa_envs.agents.learning.problem import RUNS
@@ -157,68 +162,55 @@ def make_plan(options: CompareOptions) -> ComparisonPlan:
             f"seeds must be at most {RUNS}, got {options.seeds}: later runs would learn in the "
             "worlds of evaluations"
         )
+    quick, suite = options.quick, None
     if options.suite is not None:
-        return _suite_plan(options)
-    if options.quick:
+        suite = npa_bench.SUITES[options.suite]
+        for name in ("seconds", "particle_steps", "episodes"):
+            if getattr(options, name) is not None:
+                raise NPAError(
+                    f"--{name.replace('_', '-')} must not be given with --suite, whose protocol is "
+                    "frozen: leave it out, or compare without a suite"
+                )
+    elif quick:
         few = {name: getattr(options, name) or value for name, value in QUICK.items()}
         options = replace(options, **few)
-    tasks = common.chosen_names("task", options.tasks, PROBLEMS)
-    methods, own = _chosen_methods(options.methods, METHODS)
-    if not options.methods:
-        methods = [name for name in methods if name not in NEED_MORE]
-    problems = {name: make_problem(name, quick=options.quick) for name in tasks}
-    return ComparisonPlan(
-        tasks={name: json.loads(problem.to_json()) for name, problem in problems.items()},
-        methods=methods,
-        seeds=tuple(range(3 if options.seeds is None else options.seeds)),
-        budgets={axis: dict.fromkeys(tasks, held) for axis, held in _budgets(options).items()},
-        options=_method_options(options.options, methods, own),
-        own=own,
-        left_out=() if options.methods else LEFT_OUT,
-        episodes=options.episodes or (QUICK_EPISODES if options.quick else 32),
-        settings=_settings(options),
-    )
-
-
-def _suite_plan(options: CompareOptions) -> ComparisonPlan:
-    """Return the plan of NPA-Bench, of which some tasks, methods and seeds may be chosen."""
-    from npa_envs.agents.comparison import npa_bench
-    from npa_envs.agents.comparison.plan import ComparisonPlan
-
-    assert options.suite is not None, "asked for by its caller"
-    suite = npa_bench.SUITES[options.suite]
-    for name in ("seconds", "particle_steps", "episodes"):
-        if getattr(options, name) is not None:
-            raise NPAError(
-                f"--{name.replace('_', '-')} must not be given with --suite, whose protocol is "
-                "frozen: leave it out, or compare without a suite"
-            )
-    quick = options.quick
-    tasks = common.chosen_names("task", options.tasks, suite.tasks)
-    if quick and not options.tasks:
+    tasks = common.chosen_names("task", options.tasks, suite.tasks if suite else PROBLEMS)
+    if suite and quick and not options.tasks:
         tasks = tasks[:1]
-    methods, own = _chosen_methods(options.methods, suite.methods)
-    chosen = _method_options(options.options, methods, own)
+    methods, own = _chosen_methods(options.methods, suite.methods if suite else METHODS)
+    chosen = _method_options(options.options, methods, own) if suite else {}
     for name in chosen.keys() - own.keys():
         raise NPAError(
-            f"options of {name!r} are frozen in {suite.name}: give it a name of its own, "
+            f"options of {name!r} are frozen in {options.suite}: give it a name of its own, "
             f"--methods my_{name}={name} --options my_{name}.NAME=VALUE"
         )
-    problems = {name: suite.problem_of(name) for name in tasks}
+    budgets: dict[Axis, dict[str, float]]
+    if suite:
+        problems = {name: suite.problem_of(name) for name in tasks}
+        budgets = {npa_bench.AXIS: {name: suite.budget_of(name, quick=quick) for name in tasks}}
+        left_out = [
+            (task, method)
+            for task, method in itertools.product(tasks, methods)
+            if suite.leaves_out(task, own.get(method, method))
+        ]
+        seeds, episodes = 1 if quick else npa_bench.LEAST_SEEDS, npa_bench.EPISODES
+    else:
+        if not options.methods:
+            methods = [name for name in methods if name not in NEED_MORE]
+        problems = {name: make_problem(name, quick=quick) for name in tasks}
+        budgets = {axis: dict.fromkeys(tasks, held) for axis, held in _budgets(options).items()}
+        chosen = _method_options(options.options, methods, own)
+        left_out = [] if options.methods else list(LEFT_OUT)
+        seeds, episodes = 3, 32
     return ComparisonPlan(
         tasks={name: json.loads(problem.to_json()) for name, problem in problems.items()},
         methods=methods,
-        seeds=tuple(range(options.seeds or (1 if quick else npa_bench.LEAST_SEEDS))),
-        budgets={npa_bench.AXIS: {name: suite.budget_of(name, quick=quick) for name in tasks}},
-        left_out=[
-            (task, method)
-            for task in tasks
-            for method in methods
-            if suite.leaves_out(task, own.get(method, method))
-        ],
+        seeds=tuple(range(options.seeds or seeds)),
+        budgets=budgets,
         options=chosen,
         own=own,
-        episodes=QUICK_EPISODES if quick else npa_bench.EPISODES,
+        left_out=left_out,
+        episodes=options.episodes or (QUICK_EPISODES if quick else episodes),
         settings=_settings(options),
     )
 

@@ -36,7 +36,7 @@ SCREEN = 192
 
 
 @dataclass(frozen=True, kw_only=True)
-class DemoOptions:
+class DemoOptions(common.RunOptions):
     """Grow a shipped rule from its seed, cut it, wipe a part and let it heal each time; then train
     a small rule from a picture."""
 
@@ -50,22 +50,17 @@ class DemoOptions:
     """Time for the training [s]."""
     seed: int = 0
     """Randomness."""
-    device: str = "cpu"
-    """Where to run: cpu, cuda, cuda:1."""
-    progress: bool = True
-    """Show progress bars."""
 
 
 def main(arguments: Sequence[str]) -> int:
     """Grow, heal and train, and print and write what came of it."""
     options = common.parse_options(DemoOptions, "demo", arguments)
-    from npa_envs.devices import check_device
     from npa_envs.files import write_text
 
     if not 1.0 <= options.train_seconds <= 3600.0:
         raise NPAError(f"train_seconds must lie in [1, 3600], got {options.train_seconds}")
     start = time.perf_counter()
-    device = check_device(options.device)
+    device = options.place()
     path = common.writable_folder(options.out) / "report.txt"
     lines: list[str] = []
 

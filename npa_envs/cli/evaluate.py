@@ -47,7 +47,6 @@ class EvaluateOptions(common.RuleOptions):
 def main(arguments: Sequence[str]) -> int:
     """Measure and print."""
     options = common.parse_options(EvaluateOptions, "evaluate", arguments)
-    from npa_envs.devices import check_device
     from npa_envs.measure.judge import TextureJudge
     from npa_envs.measure.quality import CHECKPOINTS, check_steps, tables_of
     from npa_envs.rule.files import load_rule
@@ -57,9 +56,9 @@ def main(arguments: Sequence[str]) -> int:
     checkpoints = options.checkpoints or CHECKPOINTS
     check_steps("checkpoints", checkpoints)
     common.check_numbers(options, seed_count=1)
-    device = check_device(options.device)
+    device = options.place()
     rule = load_rule(options.rule, device=device).float()
-    world = options.world() | {"data_folder": options.data_folder}
+    world = options.world | {"data_folder": options.data_folder}
     if rule.codes is not None and options.target is None:
         return _pictures(options, rule, device)
     trained = task_of_rule(options.rule, rule, device, **world)
@@ -101,7 +100,7 @@ def _pictures(options: EvaluateOptions, rule: NPARule, device: torch.device) -> 
             "healing and judge are measured of one picture at a time, of the rule's "
             f"{len(rule.codes)}: give --target {shown(rule.codes.names[0])}"
         )
-    tasks = tasks_of_codes(options.rule, rule, device, **options.world())
+    tasks = tasks_of_codes(options.rule, rule, device, **options.world)
     with common.StepBar(None, show=options.progress) as bar:
         rows = picture_rows(
             rule,

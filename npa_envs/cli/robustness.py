@@ -48,7 +48,6 @@ class RobustnessOptions(common.MeasureOptions):
 def main(arguments: Sequence[str]) -> int:
     """Measure, print and write."""
     options = common.parse_options(RobustnessOptions, "robustness", arguments)
-    from npa_envs.devices import check_device
     from npa_envs.files import write_text
     from npa_envs.measure.accuracy.endurance import rule_names, task_name
     from npa_envs.measure.plots import write_plots
@@ -65,7 +64,7 @@ def main(arguments: Sequence[str]) -> int:
     if options.quick and not options.rules:
         # One of each task.
         names = list({task_name(name): name for name in reversed(names)}.values())[::-1]
-    device = check_device(options.device)
+    device = options.place()
     most = options.most_particles or study.MOST_PARTICLES[device.type]
     count = options.seed_count or (QUICK_SEEDS if options.quick else 8)
     seeds = range(options.first_seed, options.first_seed + count)

@@ -62,24 +62,15 @@ def main(arguments: Sequence[str]) -> int:
     options = common.parse_options(RolloutCommand, "rollout", arguments)
     import torch
 
-    from npa_envs.cli.film import (
-        SCREEN,
-        WorldFilm,
-        film_world,
-        frame_steps,
-        large_task,
-        write_film,
-        write_solid,
-    )
+    from npa_envs.cli import film
     from npa_envs.measure.quality import measure
     from npa_envs.rule.files import load_rule
     from npa_envs.tasks.damage import parse_damage
     from npa_envs.tasks.point_classification import PointClassification, majority
-    from npa_envs.training import check_device
     from npa_envs.training.stopping import stop_flag
     from npa_envs.training.trained_tasks import task_of_rule
 
-    device = check_device(options.device)
+    device = options.place()
     damages = [parse_damage(text) for words in options.damage for text in words]
     late = [damage for damage in damages if damage.step >= options.steps]
     if late:
@@ -88,25 +79,17 @@ def main(arguments: Sequence[str]) -> int:
             f"raise --steps above {late[0].step}"
         )
     rule = load_rule(options.rule, device=device).float()
-    world = options.world()
-    trained = task_of_rule(options.rule, rule, device, **world)
+    trained = task_of_rule(options.rule, rule, device, **options.world)
     # Drawn as asked for; measured as trained, so that the figures can be compared.
     task = trained.task
-    shown = large_task(
-        task,
-        options.rule,
-        rule,
-        device,
-        resolution=options.resolution,
-        style=options.style,
-        **world,
-    )
+    looks = {"resolution": options.resolution, "style": options.style}
+    shown = film.large_task(task, options.rule, rule, device, **looks, **options.world)
     folder = common.writable_folder(options.out)
     generator = torch.Generator(device).manual_seed(options.seed)
     x, s, goal = task.seed(1, generator=generator, device=device)
     task = task.toward(goal)
     with stop_flag() as stop, common.StepBar(options.steps, show=options.progress) as bar:
-        x, s, film = film_world(
+        x, s, filmed = film.film_world(
             rule,
             shown,
             x,
@@ -114,8 +97,8 @@ def main(arguments: Sequence[str]) -> int:
             options.steps,
             generator=generator,
             damages=damages,
-            every=options.every or frame_steps(options.steps),
-            film=WorldFilm(background=options.background),
+            every=options.every or film.frame_steps(options.steps),
+            film=film.WorldFilm(background=options.background),
             progress=bar.advance,
             stop=stop.is_set,
         )
@@ -130,15 +113,15 @@ def main(arguments: Sequence[str]) -> int:
     if task.classifies and goal is not None:
         vote = int(majority(cast(PointClassification, task).outputs(s)))
         print(f"most particles say {vote}; the cloud is a {int(goal)}")
-    paths = write_film(film, folder, "growth", fps=options.fps)
+    paths = film.write_film(filmed, folder, "growth", fps=options.fps)
     if task.has_views:
-        paths += write_solid(
+        paths += film.write_solid(
             task,
             x,
             s,
             folder,
             shown=shown,
-            resolution=options.resolution or SCREEN,
+            resolution=options.resolution or film.SCREEN,
             background=options.background,
         )
     for path in paths:

@@ -58,7 +58,6 @@ def main(arguments: Sequence[str]) -> int:
     from npa_envs.agents.search.atlas import PAGE, figure, page, write_elites
     from npa_envs.agents.search.run import RESULTS, Search
     from npa_envs.agents.search.worlds import SearchWorld
-    from npa_envs.devices import check_device
     from npa_envs.files import write_text
     from npa_envs.measure.plots import write_plots
     from npa_envs.measure.record import time_limit
@@ -71,7 +70,7 @@ def main(arguments: Sequence[str]) -> int:
             f"budget must be finite and at least that of one batch, {least} particle-steps, got "
             f"{options.budget:g}: raise it"
         )
-    device = check_device(options.device)
+    device = options.place()
     folder = common.writable_folder(options.out)
     search = Search(
         world,

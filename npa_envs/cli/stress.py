@@ -47,7 +47,6 @@ class StressOptions(common.MeasureOptions):
 def main(arguments: Sequence[str]) -> int:
     """Check, print and write; return 1 where a check failed."""
     options = common.parse_options(StressOptions, "stress", arguments)
-    from npa_envs.devices import check_device
     from npa_envs.measure import accuracy
     from npa_envs.measure.accuracy import suite
     from npa_envs.measure.plots import write_plots
@@ -60,7 +59,7 @@ def main(arguments: Sequence[str]) -> int:
     if options.list:
         print(_listing(chosen))
         return 0
-    device = check_device(options.device)
+    device = options.place()
     path = None
     if options.out is not None:
         name = f"stress_{device.type}{'_quick' * options.quick}.json"

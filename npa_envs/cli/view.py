@@ -28,7 +28,7 @@ RUN_FILES = ("config.json", "log.jsonl", "checkpoint.pt")
 
 
 @dataclass(frozen=True, kw_only=True)
-class ViewOptions:
+class ViewOptions(common.DeviceOptions):
     """Watch and touch a live world in the browser: a rule, a training run or an environment.
 
     The page has brushes, sliders, damage and films. A run's world follows its newest checkpoint.
@@ -46,8 +46,6 @@ class ViewOptions:
     """Particles N; default: as trained."""
     seed: int = 0
     """The first world's number."""
-    device: str = "cpu"
-    """Where the world lives: cpu, cuda, cuda:1."""
     threads: int = 1
     """CPU threads of torch and of the kernels; the browser needs a core as well."""
     host: str = "127.0.0.1"
@@ -65,9 +63,7 @@ def main(arguments: Sequence[str]) -> int:
     options = common.parse_options(ViewOptions, "view", arguments)
     if not 1 <= options.threads <= 256:
         raise NPAError(f"threads must be in [1, 256], got {options.threads}")
-    from npa_envs.devices import check_device
-
-    device = check_device(options.device)
+    device = options.place()
     make_world = world_maker(options, device)
     with common.torch_threads(options.threads):
         # Made once before the server starts, so that errors come at once.

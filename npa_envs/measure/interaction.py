@@ -180,6 +180,8 @@ class RuleUnderTest:
     task_of: Callable[[int], Task]
     update_prob: float
     """Probability of a particle's update in a step, as trained (dimensionless)."""
+    particle_count: int = 0
+    """Particles of a world, as trained."""
 
 
 class Scenes(NamedTuple):

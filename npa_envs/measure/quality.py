@@ -184,9 +184,7 @@ def healing(
                 damage=name,
                 before=before.mean().item(),
                 after=losses[0].mean().item(),
-                steps_to_heal=next(
-                    (n for n, ok in zip(steps, mean_within, strict=True) if ok), None
-                ),
+                steps_to_heal=healed[0] if healed else None,
                 worlds_healed=int(((losses <= HEALED * before).any(0) & ~gone).sum()),
                 world_count=len(before),
                 end=losses[-1].mean().item(),
