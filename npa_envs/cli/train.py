@@ -26,7 +26,6 @@ from npa_envs.training import (
     JointTrainConfig,
     RunFolder,
     TrainConfig,
-    TrainResult,
     check_device,
     config_to_dict,
     load_config,
@@ -365,13 +364,10 @@ def run(
         resume_command += f" --processes {ranks.count}"
 
     def begun() -> None:
-        if not ranks.first:
-            return
-        print("\n".join(announcement(task_name, options, config, ranks.count)))
-        print(
-            f"writing to {config.out}/ (Ctrl-C stops in order; {resume_command} goes on)",
-            flush=True,
-        )
+        if ranks.first:
+            print("\n".join(announcement(task_name, options, config, ranks.count)))
+            end = f"(Ctrl-C stops in order; {resume_command} goes on)"
+            print(f"writing to {config.out}/ {end}", flush=True)
 
     try:
         with common.torch_threads(thread_count(config)):
@@ -396,7 +392,16 @@ def run(
         meet = f"npa-envs interact {shlex.join(map(str, rules))}"
         meet += f" --distances {config.task.distance:g}"
         meet += f" --particle-count {sum(config.task.counts[:2])}"
-    _say_how_it_ended(result, rules, resume_command)
+    loss = result.record.get("loss")
+    figures = "" if loss is None else f", training loss {loss:.4g}"
+    if result.finished:
+        print(f"finished: {result.iteration} iterations{figures}")
+    else:
+        print(f"stopped at iteration {result.iteration}{figures}")
+        print(f"  checkpoint  {folder.checkpoint}\n  go on       {resume_command}")
+    for rule in rules:
+        print(f"  rule        {rule}")
+    print(f"  log         {folder.log}\n  pictures    {folder.pictures}/")
     if options.report and result.iteration > 0 and not result.interrupted:
         command = ("train", *words)
         if options.resume:  # The file of the run has what these words leave out.
@@ -404,8 +409,8 @@ def run(
             command += ("--processes", str(ranks.count)) if ranks.count > 1 else ()
         seconds = result.record.get("seconds", 0.0)
         training = Training(task_name, command, result.iteration, seconds)
+        device = check_device(config.device)
         for rule in rules:
-            device = check_device(config.device)
             try:
                 card, scores = write_report(
                     rule, folder.report, training, device, progress=options.progress
@@ -494,19 +499,3 @@ def announcement(
         f"{config.total_iterations} iterations, each of {config.world_count} worlds of "
         f"{particles} particles, on {where}: {time}",
     )
-
-
-def _say_how_it_ended(result: TrainResult, rules: Sequence[Path], resume_command: str) -> None:
-    folder = RunFolder(result.folder)
-    loss = result.record.get("loss")
-    figures = "" if loss is None else f", training loss {loss:.4g}"
-    if result.finished:
-        print(f"finished: {result.iteration} iterations{figures}")
-    else:
-        print(f"stopped at iteration {result.iteration}{figures}")
-        print(f"  checkpoint  {folder.checkpoint}")
-        print(f"  go on       {resume_command}")
-    for rule in rules:
-        print(f"  rule        {rule}")
-    print(f"  log         {folder.log}")
-    print(f"  pictures    {folder.pictures}/")

@@ -149,9 +149,6 @@ def mixing_index(x: Tensor, counts: Sequence[int], *, eps: float) -> Tensor:
 
     The mean over the particles of the entropy of the species' shares in the density there, in units
     of log K. 0: no particle perceives another species; 1: all species are perceived alike.
-
-    Raises:
-        NPAError: Positions or counts do not fit, or there is one species only.
     """
     rho = species_fields(x, counts, eps=eps).rho
     if rho.shape[2] < 2:

@@ -19,11 +19,7 @@ FEW_DECADES = 100.0
 
 
 def check_matplotlib() -> None:
-    """Check that pictures can be drawn.
-
-    Raises:
-        MissingDependencyError: matplotlib is not installed.
-    """
+    """Check that pictures can be drawn: that matplotlib is installed."""
     try:
         import matplotlib  # noqa: F401
     except ImportError as error:
@@ -35,10 +31,8 @@ def check_matplotlib() -> None:
 def write_plots(draw: Callable[[], Mapping[str, bytes]], path: Path, what: str) -> list[str]:
     """Write PNG files where matplotlib is installed, and return what was done, in sentences.
 
-    Args:
-        draw: Returns pictures by name, as bytes of PNG files.
-        path: Their place; "*" in its name stands for each one's.
-        what: What they are, for the sentence that there are none.
+    `draw` returns them by name, for which "*" stands in `path`; `what` they are is said where there
+    are none.
     """
     try:
         check_matplotlib()

@@ -553,11 +553,7 @@ def picture_rows(
     device: str | torch.device = "cpu",
     progress: Callable[[int], None] | None = None,
 ) -> list[PictureRow]:
-    """Return for each of `checkpoints` a row for each picture, and one of the medians, of `grown`.
-
-    Raises:
-        NPAError: There are fewer than two pictures, or `checkpoints` are empty or out of order.
-    """
+    """Return rows of each picture of `grown` at `checkpoints`, and one of their medians."""
     if len(tasks) < 2:
         raise NPAError(f"pictures must be two or more, got {len(tasks)}: nothing to tell apart")
     given: dict[str, Any] = {"seeds": seeds, "device": device, "progress": progress}

@@ -48,15 +48,7 @@ class Record(Generic[Row]):
     """What the file calls the facts."""
 
     def resume(self, read: Callable[[dict[str, Any]], list[Row]], *, command: str) -> Record[Row]:
-        """Take over the rows of the file, if there is one, and return this record.
-
-        Args:
-            read: Makes rows of the file's JSON object.
-            command: Name of the command that writes such records, for the errors.
-
-        Raises:
-            NPAError: As for `read_record`.
-        """
+        """Take over the rows that `read` makes of the file, if there is one; return this record."""
         if self.path is not None:
             found = read_record(self.path, self.facts, read, command=command, key=self.key)
             self.rows += found or []
@@ -90,17 +82,10 @@ def read_record(
     command: str,
     key: str = "facts",
 ) -> Content | None:
-    """Return what `make` makes of the record that a stopped run left; None where there is none.
+    """Return what `make` makes of the JSON that a stopped run left; None where there is none.
 
-    Args:
-        path: The file that it wrote.
-        facts: What figures follow from now.
-        make: Makes the record of the JSON object.
-        command: Name of the command that writes such records, for the errors.
-        key: What the object calls its facts.
-
-    Raises:
-        NPAError: The file is no such record, or its figures follow from something else.
+    Facts that differ from those of the file, where `key` names them, are refused; errors name the
+    command that writes such records.
     """
     if not os.path.exists(path):
         return None

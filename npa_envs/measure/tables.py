@@ -19,11 +19,9 @@ NONE = "–"
 
 
 def table_text(rows: Sequence[Any], *, missing: str = "never") -> str:
-    """Return rows as a plain text table, one line each under a line of headings.
+    """Return rows, instances of one dataclass, as a plain text table under a line of headings.
 
-    Args:
-        rows: Instances of one dataclass, for example those that `evaluate` returns.
-        missing: What a None is shown as; `UNMEASURED`: columns of that alone are left out.
+    A None is shown as `missing`; if that is `UNMEASURED`, columns of it alone are left out.
     """
     if not rows:
         return ""

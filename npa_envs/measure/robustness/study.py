@@ -165,7 +165,7 @@ def grow(
     if condition in ("update_prob", "dt"):
         changed[condition] = value
         # As many updates, or as much time, as in training.
-        pace = float(value) / (ground.task.update_prob if condition == "update_prob" else 1.0)
+        pace = float(value) / float(trained_value(condition, ground.task.update_prob))
     elif condition in ("eps", "noise"):
         name = "eps" if condition == "eps" else "position_noise"
         changed[name] = float(value) * ground.task.eps
@@ -273,9 +273,8 @@ def tables(records: Sequence[RuleRecord]) -> str:
         "Loss over the twin's right after the damage → at the end (medians of the seeds; seeds "
         f"within {RECOVERED:g} at the end):\n\n{_by_damage(records, _size)}",
     ]
-    for condition, summary in CONDITIONS.items():
-        table = _by_value(records, condition)
-        if table:
+    for condition, (summary, *_) in CONDITIONS.items():
+        if table := _by_value(records, condition):
             parts.append(f"Loss over that as trained, by {summary}:\n\n{table}")
     for summary, damages in SHARES.items():
         recovered, at_end, total = recovered_share(records, damages)
@@ -387,7 +386,9 @@ def _draw_responses(panel: Any, record: RuleRecord, condition: str) -> None:
     """Draw losses by the values of a condition."""
     found = [response for response in record.of(condition) if response.losses]
     values = [float(response.value) for response in found]
-    _draw_seeds(panel, values, [response.losses for response in found], "C0", CONDITIONS[condition])
+    _draw_seeds(
+        panel, values, [response.losses for response in found], "C0", CONDITIONS[condition].summary
+    )
     trained = sorted(record.trained().losses)
     panel.axhline(trained[len(trained) // 2], color="black", lw=0.7, ls=":")
     panel.set(xscale="log", yscale="log")

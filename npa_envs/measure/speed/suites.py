@@ -212,8 +212,13 @@ def drawn_like(like: Tensor) -> Tensor:
 
 # Suite `scaling`: N, neighbours, B and C, one of them at a time.
 
-AXES = ("particles", "neighbours", "worlds", "channels")
-"""What is varied: N at the same density, neighbours within eps, B, C."""
+AXES = {
+    "particles": "particles N, same density",
+    "neighbours": "neighbours of a particle",
+    "worlds": "worlds B",
+    "channels": "state channels C",
+}
+"""What is varied, and what plots call it."""
 
 
 @dataclass(frozen=True)
@@ -559,14 +564,6 @@ class BenchReport:
 
 # Plots: how times grow.
 
-AXIS_LABELS = {
-    "particles": "particles N, same density",
-    "neighbours": "neighbours of a particle",
-    "worlds": "worlds B",
-    "channels": "state channels C",
-}
-"""What the axes of the suite `scaling` are called."""
-
 
 def pictures(tables: Tables) -> dict[str, bytes]:
     """Return PNG files by their names, of tables that are there and whole. Needs matplotlib."""
@@ -590,7 +587,7 @@ def _draw_scaling(table: Sequence[ScalingRow], what: str) -> Any:
             # A cell that was not measured is a gap.
             values = [cell.median if isinstance(cell, Timing) else cell for cell in found]
             panel.plot([row.value for row in rows], values, marker="o", ms=4, label=label)
-        panel.set(xscale="log", yscale="log", xlabel=AXIS_LABELS[name])
+        panel.set(xscale="log", yscale="log", xlabel=AXES[name])
         panel.set_ylabel("time of a step [µs]" if what == "time" else "peak memory [MiB]")
         number_plainly(panel.xaxis, [row.value for row in rows])
         number_plainly(panel.yaxis)
