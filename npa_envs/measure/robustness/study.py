@@ -165,7 +165,7 @@ def grow(
     if condition in ("update_prob", "dt"):
         changed[condition] = value
         # As many updates, or as much time, as in training.
-        pace = float(value) / float(trained_value(condition, ground.task.update_prob))
+        pace = float(value) / (ground.task.update_prob if condition == "update_prob" else 1.0)
     elif condition in ("eps", "noise"):
         name = "eps" if condition == "eps" else "position_noise"
         changed[name] = float(value) * ground.task.eps
@@ -273,7 +273,7 @@ def tables(records: Sequence[RuleRecord]) -> str:
         "Loss over the twin's right after the damage → at the end (medians of the seeds; seeds "
         f"within {RECOVERED:g} at the end):\n\n{_by_damage(records, _size)}",
     ]
-    for condition, (summary, *_) in CONDITIONS.items():
+    for condition, summary in CONDITIONS.items():
         if table := _by_value(records, condition):
             parts.append(f"Loss over that as trained, by {summary}:\n\n{table}")
     for summary, damages in SHARES.items():

@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from statistics import median
-from typing import Any, NamedTuple, Self
+from typing import Any, Self
 
 import torch
 from torch import Tensor
@@ -83,57 +83,29 @@ SHAPES: dict[str, Shape] = {
 
 # Conditions and plans
 
-
-class Condition(NamedTuple):
-    """What is varied: a summary, the trained value, and increasing values, of quick runs as well."""
-
-    summary: str
-    trained: float | str | None
-    """None: the task says it."""
-    values: tuple[float | str, ...]
-    quick: tuple[float | str, ...]
-
-
 CONDITIONS = {
-    "eps": Condition(
-        "perception radius ε over the trained one",
-        1.0,
-        (0.5, 0.6, 0.7, 0.85, 1.0, 1.2, 1.4, 1.7, 2.0),
-        (0.7, 1.0, 1.4),
-    ),
-    "particles": Condition(
-        "particles N over the trained number",
-        1.0,
-        (1 / 16, 1 / 8, 1 / 4, 1 / 2, 1.0, 2.0, 4.0, 8.0, 16.0),
-        (0.5, 1.0),
-    ),
-    "update_prob": Condition(
-        "probability p of an update, for as many updates in all",
-        None,
-        (0.05, 0.1, 0.2, 0.35, 0.5, 0.65, 0.8, 1.0),
-        (0.2, 0.5, 1.0),
-    ),
-    "dt": Condition(
-        "time step, for as much time in all",
-        1.0,
-        (0.1, 0.2, 0.35, 0.5, 0.75, 1.0, 1.25, 1.5, 2.0),
-        (0.5, 1.0),
-    ),
-    "noise": Condition(
-        "noise of every position in each step, over the perception radius",
-        0.0,
-        (0.0, 1e-3, 3e-3, 1e-2, 3e-2, 0.1, 0.3, 1.0),
-        (0.0, 1e-2),
-    ),
-    "shape": Condition("shape of the seed", "trained", ("trained", *SHAPES), ("trained", "ring")),
+    "eps": "perception radius ε over the trained one",
+    "particles": "particles N over the trained number",
+    "update_prob": "probability p of an update, for as many updates in all",
+    "dt": "time step, for as much time in all",
+    "noise": "noise of every position in each step, over the perception radius",
+    "shape": "shape of the seed",
 }
-"""Conditions, which are varied one at a time."""
+"""Conditions, varied one at a time, with a summary."""
+
+TRAINED: Mapping[str, float | str] = {
+    "eps": 1.0,
+    "particles": 1.0,
+    "dt": 1.0,
+    "noise": 0.0,
+    "shape": "trained",
+}
+"""The value of each condition as trained; that of `update_prob` is the task's."""
 
 
 def trained_value(condition: str, update_prob: float) -> float | str:
     """Return the value of a condition at which a rule whose task has `update_prob` was trained."""
-    trained = CONDITIONS[condition].trained
-    return update_prob if trained is None else trained
+    return update_prob if condition == "update_prob" else TRAINED[condition]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -154,12 +126,16 @@ class TrialPlan:
 
 _HEAL_STEPS = (0, 16, 32, 48, 64, 96, 128, 192, 256, 384, 512, 768, 1024)
 
-_MOVING = TrialPlan(
-    grow_steps=512,
-    heal_steps=_HEAL_STEPS,
-    chunk=16,
-    values={name: condition.values for name, condition in CONDITIONS.items()},
-)
+_VALUES: dict[str, tuple[float | str, ...]] = {
+    "eps": (0.5, 0.6, 0.7, 0.85, 1.0, 1.2, 1.4, 1.7, 2.0),
+    "particles": (1 / 16, 1 / 8, 1 / 4, 1 / 2, 1.0, 2.0, 4.0, 8.0, 16.0),
+    "update_prob": (0.05, 0.1, 0.2, 0.35, 0.5, 0.65, 0.8, 1.0),
+    "dt": (0.1, 0.2, 0.35, 0.5, 0.75, 1.0, 1.25, 1.5, 2.0),
+    "noise": (0.0, 1e-3, 3e-3, 1e-2, 3e-2, 0.1, 0.3, 1.0),
+    "shape": ("trained", *SHAPES),
+}
+
+_MOVING = TrialPlan(grow_steps=512, heal_steps=_HEAL_STEPS, chunk=16, values=_VALUES)
 
 PLANS = {
     "morphogenesis2d": _MOVING,
@@ -172,7 +148,7 @@ PLANS = {
         # Few clouds are wrong, and nearly all of their particles are.
         worlds_per_seed=128,
         # The shape of a cloud is its class.
-        values={name: values for name, values in _MOVING.values.items() if name != "shape"},
+        values={name: values for name, values in _VALUES.items() if name != "shape"},
     ),
 }
 """What is measured of the rules of each task."""
@@ -180,13 +156,21 @@ PLANS = {
 
 def quick_plan(task_name: str) -> TrialPlan:
     """Return a plan of a task of `PLANS` that takes seconds: few steps, few values."""
+    values: dict[str, tuple[float | str, ...]] = {
+        "eps": (0.7, 1.0, 1.4),
+        "particles": (0.5, 1.0),
+        "update_prob": (0.2, 0.5, 1.0),
+        "dt": (0.5, 1.0),
+        "noise": (0.0, 1e-2),
+        "shape": ("trained", "ring"),
+    }
     full = PLANS[task_name]
     return replace(
         full,
         grow_steps=min(full.grow_steps, 48),
         heal_steps=(0, 16, 32),
         worlds_per_seed=min(full.worlds_per_seed, 4),
-        values={name: CONDITIONS[name].quick for name in full.values},
+        values={name: values[name] for name in full.values},
     )
 
 
