@@ -131,27 +131,17 @@ def _decay(rows: Sequence[Any]) -> str:
 
 
 def _film(
-    path: Path,
-    rule: NPARule,
-    task: Task,
-    folder: Path,
-    device: torch.device,
-    bar: common.StepBar,
+    path: Path, rule: NPARule, task: Task, folder: Path, device: torch.device, bar: common.StepBar
 ) -> None:
     """Film a world of the rule from its seed."""
     generator = torch.Generator(device).manual_seed(FIRST_SEED)
     x, s, _ = task.seed(1, generator=generator, device=device)
+    shown = large_task(task, str(path), rule, device)
+    damages = FILM_DAMAGES if task.aligned else ()
     x, s, film = film_world(
-        rule,
-        large_task(task, str(path), rule, device),
-        x,
-        s,
-        FILM_STEPS,
-        generator=generator,
-        damages=FILM_DAMAGES if task.aligned else (),
-        every=frame_steps(FILM_STEPS),
-        progress=bar.advance,
-    )
+        rule, shown, x, s, FILM_STEPS, generator=generator, damages=damages,
+        every=frame_steps(FILM_STEPS), progress=bar.advance,
+    )  # fmt: skip
     if task.has_views:
         write_solid(task, x, s, folder)
     write_film(film, folder, path.stem)

@@ -231,7 +231,6 @@ class Encounters:
     ) -> tuple[list[InteractionRow], Scenes]:
         """Grow one rule, which is measured, with another or itself: a row for each setting."""
         rows, scenes, given = [], Scenes([], []), self.settings
-        spacing = math.sqrt(4.0 / given.particle_count)
         for factor, ratio, distance in itertools.product(
             given.eps_factors, given.ratios, given.distances
         ):
@@ -239,19 +238,18 @@ class Encounters:
             solo = self._solo(first, counts[0], factor)
             radius = "" if factor == 1.0 else f"eps x {factor:g}, "
             caption = f"{radius}d {distance:g}, r {ratio:g}, step"
-            looks = {
-                "resolution": FRAME_RESOLUTION,
-                "pixel_size": 0.5 * spacing,
-                "half_width": 1.2 + 0.5 * distance,
-            }
-
-            def shoot(
-                x: Tensor, s: Tensor, step: int, looks: Any = looks, caption: str = caption
-            ) -> None:
-                scenes.frames.append(draw_worlds(x[:1], s[:1], **looks)[0])
+            seen: list[tuple[Tensor, Tensor, int]] = []
+            x, s, lost = self._grow([first, second], counts, distance, factor, seen)
+            for then_x, then_s, step in seen:
+                frame = draw_worlds(
+                    then_x,
+                    then_s,
+                    resolution=FRAME_RESOLUTION,
+                    pixel_size=0.5 * math.sqrt(4.0 / given.particle_count),
+                    half_width=1.2 + 0.5 * distance,
+                )[0]
+                scenes.frames.append(frame)
                 scenes.captions.append(f"{caption} {step}")
-
-            x, s, lost = self._grow([first, second], counts, distance, factor, shoot)
             own = x[:, : counts[0]]
             losses = first.task_of(counts[0]).metric(own, s[:, : counts[0]])
             losses = losses.masked_fill(lost, math.inf)
@@ -259,23 +257,15 @@ class Encounters:
             change = together / alone if alone > 0.0 else math.inf
             mixings = mixing_index(x, counts, eps=factor * first.rule.eps0)
             mixing = mixings.mean().item()
-            rows.append(
-                InteractionRow(
-                    first.name,
-                    second.name,
-                    distance,
-                    ratio,
-                    alone,
-                    together,
-                    change,
-                    mixing,
-                    (own.mean(dim=1) - solo.centroids).norm(dim=-1).mean().item(),
-                    verdict(change, mixing, given.margin),
-                    factor,
-                    *ratio_interval(losses, solo.losses),
-                    *ratio_interval(mixings, torch.ones_like(mixings)),
-                )
+            away = (own.mean(dim=1) - solo.centroids).norm(dim=-1).mean().item()
+            said = verdict(change, mixing, given.margin)
+            setting, figures = (distance, ratio), (alone, together, change, mixing, away)
+            intervals = (
+                *ratio_interval(losses, solo.losses),
+                *ratio_interval(mixings, torch.ones_like(mixings)),
             )
+            names = first.name, second.name
+            rows.append(InteractionRow(*names, *setting, *figures, said, factor, *intervals))
         return rows, scenes
 
     def _solo(self, organism: RuleUnderTest, count: int, factor: float) -> _Solo:
@@ -292,12 +282,12 @@ class Encounters:
         counts: tuple[int, ...],
         distance: float,
         factor: float,
-        shoot: Callable[[Tensor, Tensor, int], None] = lambda x, s, step: None,
+        seen: list[tuple[Tensor, Tensor, int]] | None = None,
     ) -> tuple[Tensor, Tensor, Tensor]:
         """Return one or two species grown from their seeds, and which worlds blew up.
 
         The first is seeded around the origin and draws what it draws alone; the second is seeded
-        `distance` from it along the first axis.
+        `distance` from it along the first axis. `seen` gets the first world at `FRAME_SHARES`.
         """
         settings = self.settings
         random = WorldRandom(settings.seeds, device=self._device)
@@ -333,11 +323,11 @@ class Encounters:
             s = torch.where(fine[:, None, None], new_s, s)
             lost |= ~fine
             self._progress(then - now)
-            if then in frames:
+            if then in frames and seen is not None:
                 # The middle of the two seeds is the middle of the picture.
                 shift = x.new_zeros(x.shape[2])
                 shift[0] = 0.5 * distance
-                shoot(x - shift, s, then)
+                seen.append((x[:1] - shift, s[:1], then))
         return x, s, lost
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
@@ -123,15 +123,10 @@ class LongRun:
     """
 
     def __init__(
-        self,
-        home: TrialWorlds,
-        generator: Randomness,
-        options: dict[str, Any],
-        *,
-        chunk: int = CHUNK,
+        self, home: TrialWorlds, random: Randomness, options: dict[str, Any], chunk: int = CHUNK
     ) -> None:
         self.x, self.s = home.x.clone(), home.s.clone()
-        self._rule, self._generator, self._options = home.rule, generator, options
+        self._rule, self._random, self._options = home.rule, random, options
         self.eps: float = options["eps"]
         """Perception radius [length units]."""
         self._steps = chunk
@@ -139,37 +134,28 @@ class LongRun:
 
     def advance(self, steps: int) -> None:
         """Run some steps more."""
-        if self.x.is_cuda:
-            own = self._generator if isinstance(self._generator, torch.Generator) else None
-            while steps >= self._steps:
-                if self._graph is None:
-                    # The warm-up is a chunk of the run.
-                    self._graph = capture(
-                        self._chunk, self.x.device, generator=own, warm_up=self._chunk
-                    )
-                else:
-                    self._graph.replay()
-                steps -= self._steps
+        own = self._random if isinstance(self._random, torch.Generator) else None
+        chunk = partial(self._run, self._steps)
+        while self.x.is_cuda and steps >= self._steps:
+            if self._graph is None:
+                # The warm-up is a chunk of the run.
+                self._graph = capture(chunk, self.x.device, generator=own, warm_up=chunk)
+            else:
+                self._graph.replay()
+            steps -= self._steps
         if steps:
             self._run(steps)
 
-    def _chunk(self) -> None:
-        self._run(self._steps)
-
     @torch.no_grad()
     def _run(self, steps: int) -> None:
-        x, s = rollout(
-            self._rule, self.x, self.s, steps, generator=self._generator, **self._options
-        )
+        x, s = rollout(self._rule, self.x, self.s, steps, generator=self._random, **self._options)
         self.x.copy_(x)
         self.s.copy_(s)
 
-    def marks(self, marks: list[int]) -> Iterator[tuple[int, Tensor, Tensor]]:
+    def marks(self, marks: Sequence[int]) -> Iterator[tuple[int, Tensor, Tensor]]:
         """Yield steps, positions and states after each of increasing numbers of steps."""
-        done = 0
-        for mark in marks:
-            self.advance(mark - done)
-            done = mark
+        for mark, before in zip(marks, (0, *marks), strict=False):
+            self.advance(mark - before)
             yield mark, self.x, self.s
 
 

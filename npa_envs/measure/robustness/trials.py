@@ -93,19 +93,11 @@ CONDITIONS = {
 }
 """Conditions, varied one at a time, with a summary."""
 
-TRAINED: Mapping[str, float | str] = {
-    "eps": 1.0,
-    "particles": 1.0,
-    "dt": 1.0,
-    "noise": 0.0,
-    "shape": "trained",
-}
-"""The value of each condition as trained; that of `update_prob` is the task's."""
-
 
 def trained_value(condition: str, update_prob: float) -> float | str:
     """Return the value of a condition at which a rule whose task has `update_prob` was trained."""
-    return update_prob if condition == "update_prob" else TRAINED[condition]
+    others = {"update_prob": update_prob, "noise": 0.0, "shape": "trained"}
+    return others.get(condition, 1.0)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -203,10 +195,6 @@ class PicturesInTurn(ParticleTask[Morphogenesis2DConfig]):
         x, s, _ = self._tasks[0].seed(world_count, generator=generator, device=device)
         return x, self.coded(s), self._goal
 
-    def damage(self, x: Tensor, s: Tensor, goal: Tensor | None, generator: Randomness) -> Worlds:
-        """Return the worlds damaged as each picture's task does it."""
-        return self._tasks[0].damage(x, s, goal, generator)
-
     def toward(self, goal: Tensor | None) -> Self:
         """Return the task for worlds of other pictures, int64, shape [B]."""
         return self if goal is None else type(self)(self._tasks, goal)
@@ -247,15 +235,11 @@ class RuleTrial:
         self.rule: NPARule = load_rule(name, device=device).float().requires_grad_(False)
         self.task_name = task_name(name)
         self.plan, self.seeds, self._device = plan, seeds, device
-        # Losses are those of held-out views.
-        fields = {"training_views": SMALLEST_VIEWS["training_views"]}
-        found = task_of_rule(
-            name,
-            self.rule,
-            device,
-            particle_count=particle_count,
-            **(fields if self.rule.space_dim == 3 else {}),
-        )
+        fields: dict[str, Any] = {"particle_count": particle_count}
+        if self.rule.space_dim == 3:
+            # Losses are those of held-out views.
+            fields["training_views"] = SMALLEST_VIEWS["training_views"]
+        found = task_of_rule(name, self.rule, device, **fields)
         if found.doubt is not None:
             raise NPAError(f"cannot measure {name!r}: {found.doubt}: choose another rule")
         self.task: Any = found.task
@@ -299,7 +283,9 @@ class RuleTrial:
         random = self.random(StreamId.GROWTH)
         x, s, goal = task.seed(self.world_count, generator=random, device=self._device)
         if shape != "trained":
-            x = SHAPES[shape](count, self.rule.space_dim, self._seed_radius(), random)
+            box = self.task.box
+            radius = self.task.config.seed_radius if box is None else BOX_SHARE * min(box)
+            x = SHAPES[shape](count, self.rule.space_dim, float(radius), random)
         return TrialWorlds(self.rule, task.toward(goal), x.float(), s.float(), goal)
 
     def run(self, home: TrialWorlds, random: WorldRandom, **changed: Any) -> LongRun:
@@ -310,15 +296,6 @@ class RuleTrial:
         """Return the mean loss of each seed's worlds, [..., seeds], from [..., B]."""
         return losses.double().reshape(*losses.shape[:-1], len(self.seeds), -1).mean(-1)
 
-    def _seed_radius(self) -> float:
-        box = self.task.box
-        return float(self.task.config.seed_radius) if box is None else BOX_SHARE * min(box)
-
-
-def finite_worlds(x: Tensor, s: Tensor) -> Tensor:
-    """Return which worlds are finite, [B]."""
-    return x.isfinite().flatten(1).all(1) & s.isfinite().flatten(1).all(1)
-
 
 def loss_curves(home: TrialWorlds, run: LongRun, steps: tuple[int, ...]) -> Tensor:
     """Run worlds and return their losses after numbers of steps, [len(steps), B].
@@ -327,8 +304,8 @@ def loss_curves(home: TrialWorlds, run: LongRun, steps: tuple[int, ...]) -> Tens
     """
     lost = torch.zeros(len(home.x), dtype=torch.bool, device=home.x.device)
     found = []
-    for _, x, s in run.marks(list(steps)):
-        lost |= ~finite_worlds(x, s)
+    for _, x, s in run.marks(steps):
+        lost |= ~(x.isfinite().flatten(1).all(1) & s.isfinite().flatten(1).all(1))
         for worlds, fresh in ((x, home.x), (s, home.s)):
             worlds.copy_(torch.where(lost[:, None, None], fresh, worlds))
         losses = home.losses(home.at_trained_size(x, run.eps), s)
@@ -348,17 +325,16 @@ Change = Callable[[Tensor, Tensor, WorldRandom, Box], tuple[Tensor, Tensor]]
 
 @dataclass(frozen=True)
 class Damage:
-    """Damage of worlds.
-
-    `static` worlds can have it, whose particles do not move; it `halves` the number of particles;
-    it is `beyond` what rules are asked to heal.
-    """
+    """Damage of worlds."""
 
     name: str
     apply: Change
     static: bool
+    """Worlds can have it whose particles do not move."""
     halves: bool = False
+    """It halves the number of particles."""
     beyond: bool = False
+    """It is beyond what rules are asked to heal."""
 
 
 def wipe(x: Tensor, s: Tensor, random: WorldRandom, box: Box) -> tuple[Tensor, Tensor]:
