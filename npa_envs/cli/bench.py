@@ -14,9 +14,6 @@ from npa_envs.errors import NPAError
 if TYPE_CHECKING:
     import torch
 
-QUICK = "quick"
-"""The suite that is run unless another one is asked for."""
-
 
 @dataclass(frozen=True, kw_only=True)
 class BenchOptions(common.MeasureOptions):
@@ -67,7 +64,7 @@ def main(arguments: Sequence[str]) -> int:
     if options.plots and options.out is None:
         raise NPAError("plots need a folder to be written to: give --out DIR as well")
     device = options.place()
-    (name,) = common.chosen_names("suite", [options.suite or QUICK], suites.SUITES)
+    (name,) = common.chosen_names("suite", [options.suite or "quick"], suites.SUITES)
     if options.explain:
         print(_explanation(options, device))
         return 0

@@ -29,9 +29,6 @@ RUN_FAILED = 1
 ROWS = "rows"
 """Folder of a suite's rows, below that of the comparison."""
 
-NEED_MORE = ("clone",)
-"""Methods that are compared only when asked for: they need a teacher."""
-
 QUICK_EPISODES, QUICK_STEPS = 4, 200_000
 """Held-out episodes and particle-steps of a quick comparison."""
 
@@ -196,7 +193,7 @@ def make_plan(options: CompareOptions) -> ComparisonPlan:
         seeds, episodes = 1 if quick else npa_bench.LEAST_SEEDS, npa_bench.EPISODES
     else:
         if not options.methods:
-            methods = [name for name in methods if name not in NEED_MORE]
+            methods = [name for name in methods if name != "clone"]  # It needs a teacher.
         problems = {name: make_problem(name, quick=quick) for name in tasks}
         budgets = {axis: dict.fromkeys(tasks, held) for axis, held in _budgets(options).items()}
         chosen = _method_options(options.options, methods, own)

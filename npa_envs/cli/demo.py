@@ -31,9 +31,6 @@ SMALL_RUN: dict[str, Any] = {
 }
 """Fields over the preset `fast`: the target is learned in half a minute on one core."""
 
-SCREEN = 192
-"""Pixels on each side of the small rule's pictures; its loss saw fewer."""
-
 
 @dataclass(frozen=True, kw_only=True)
 class DemoOptions(common.RunOptions):
@@ -156,7 +153,8 @@ def train_small(options: DemoOptions, device: torch.device, say: Callable[[str],
     if result.interrupted:
         raise KeyboardInterrupt
     say(f"  {result.iteration} iterations in {time.perf_counter() - start:.1f} s")
-    task = task_entry(task_name).make(override(config, resolution=SCREEN).task, device)
+    # The loss saw fewer pixels.
+    task = task_entry(task_name).make(override(config, resolution=192).task, device)
     generator = torch.Generator(device).manual_seed(options.seed + 1)
     x, s, _ = task.seed(1, generator=generator, device=device)
     steps = 4 * config.steps[1]

@@ -27,9 +27,6 @@ EXTRAS = {
 OLDEST_DRIVERS = {12: 525, 13: 580}
 """First version of NVIDIA's driver that serves a version of CUDA (NVIDIA, CUDA Compatibility)."""
 
-FAST_CAPABILITY = (8, 0)
-"""Compute capability from which on the faster kernels run (`npa_envs.ops.backend`)."""
-
 
 @dataclass(frozen=True)
 class DoctorOptions:
@@ -158,7 +155,7 @@ def _torch_devices() -> list[DoctorLine]:
             f"{device.name}, {device.total_memory / 2**30:.0f} GiB, "
             f"compute capability {device.major}.{device.minor}, CUDA {torch.version.cuda}"
         )
-        slow = (device.major, device.minor) < FAST_CAPABILITY
+        slow = (device.major, device.minor) < (8, 0)
         cure = "slow: the faster kernels need a card from 8.0 on (Ampere and newer)"
         lines.append(DoctorLine(f"cuda:{index}", text, cure if slow else None, optional=True))
     return lines

@@ -17,9 +17,6 @@ from npa_envs.errors import NPAError
 if TYPE_CHECKING:
     from npa_envs.agents.learning import Problem
 
-FIRST_CHOICE_SEED = 2**31
-"""Seed of the episode that only checks that a policy runs."""
-
 LEARNS_NOTHING = ("zero", "random", "scripted")
 """Policies that need no file."""
 
@@ -117,7 +114,7 @@ def policy_of(options: RecordOptions, problem: Problem) -> Callable[[Any], Any]:
             Budget(particle_steps=10**12),
             _choice_seed(options) if options.policy == "scripted" else 0,
             device=options.device,
-            evaluation_seeds=[FIRST_CHOICE_SEED],
+            evaluation_seeds=[2**31],  # Its episode only checks that the policy runs.
             entries=1,
         ).policy
     source = options.policy

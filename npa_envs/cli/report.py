@@ -116,16 +116,12 @@ def write_report(
     return card, score_line(json.loads(text)) + _decay(tables.get("growth", ())) + not_filmed
 
 
-DECAYED = 4.0
-"""Last loss over the least one, from which on a rule does not hold."""
-
-
 def _decay(rows: Sequence[Any]) -> str:
     """Return words for worlds that fall apart as they grow old; none where they hold."""
     losses = [row.loss for row in rows]
     least = min(filter(math.isfinite, losses), default=math.nan)
-    # No comparison with NaN holds.
-    if not losses or losses[-1] <= DECAYED * least:
+    # More than four times the least, or NaN: no comparison with it holds.
+    if not losses or losses[-1] <= 4.0 * least:
         return ""
     return f"; worlds do not hold: at step {rows[-1].step} their loss is many times the least"
 

@@ -43,9 +43,6 @@ VIEWER = ("starlette", "uvicorn")
 THREADED_BATCH = 4096
 """Particles of a batch from which on two threads train faster than one (docs/performance.md)."""
 
-PAIRED_SECONDS = 60.0
-"""Shortest run of one process that two share unasked [s]: the start of the second one costs 4."""
-
 COMMON = ("target", "iterations", "device", "out")
 """Fields of configurations that stand among the most common options, where a task has them."""
 
@@ -441,15 +438,16 @@ def thread_count(config: TrainConfig[Any]) -> int:
 def process_count(task_name: str, options: TrainOptions, config: TrainConfig[Any]) -> int:
     """Return how many processes train: by default two where a CPU's other cores would be idle.
 
-    They are where batches are too small for several threads. A short run would be over before the
-    second process has paid for its start, and one that was begun alone goes on with the same draws.
+    They are where batches are too small for several threads. A run of less than a minute is over
+    before the second process has paid for its start, and one that was begun alone goes on with the
+    same draws.
     """
     asked = asked_count(options.gpus, options.processes, config.device)
     if asked is not None:
         return asked
     seconds = task_entry(task_name).expected_seconds(config)
     idle = thread_count(config) < torch.get_num_threads() and dist.is_available()
-    if not idle or seconds is None or seconds < PAIRED_SECONDS:
+    if not idle or seconds is None or seconds < 60.0:
         return 1
     if options.resume and not drawn_by_world(load_checkpoint(RunFolder(config.out).checkpoint)):
         return 1

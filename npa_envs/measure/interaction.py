@@ -32,9 +32,6 @@ from npa_envs.world.species import rollout_species
 MARGIN = 0.2
 """A loss that changes by less than this share of itself counts as undisturbed."""
 
-RESAMPLES = 2000
-"""Draws of a bootstrap."""
-
 MIXED = 0.25
 """Mixing index from which on two species mix (dimensionless)."""
 
@@ -136,7 +133,7 @@ def ratio_interval(above: Tensor, below: Tensor) -> tuple[float, float]:
     infinite.
     """
     count = len(above)
-    draws = np.random.default_rng(0).integers(count, size=(RESAMPLES, count))
+    draws = np.random.default_rng(0).integers(count, size=(2000, count))
     tops, bases = (values.double().cpu().numpy()[draws].mean(axis=1) for values in (above, below))
     ratios = np.divide(tops, bases, out=np.full_like(tops, np.inf), where=bases > 0.0)
     # No interpolation: it makes no number of two infinite ones.
@@ -163,9 +160,6 @@ PROGRESS_STEPS = 32
 
 FRAME_SHARES = (0.0, 0.125, 0.25, 0.5, 1.0)
 """When pictures are taken, as shares of the run."""
-
-FRAME_RESOLUTION = 160
-"""Pixels on each side of a picture."""
 
 
 @dataclass(frozen=True)
@@ -244,7 +238,7 @@ class Encounters:
                 frame = draw_worlds(
                     then_x,
                     then_s,
-                    resolution=FRAME_RESOLUTION,
+                    resolution=160,
                     pixel_size=0.5 * math.sqrt(4.0 / given.particle_count),
                     half_width=1.2 + 0.5 * distance,
                 )[0]

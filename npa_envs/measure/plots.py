@@ -14,9 +14,6 @@ from typing import Any
 from npa_envs.errors import MissingDependencyError
 from npa_envs.files import write_bytes
 
-FEW_DECADES = 100.0
-"""Logarithmic axes whose ends are fewer times apart have marks within decades."""
-
 
 def check_matplotlib() -> None:
     """Check that pictures can be drawn: that matplotlib is installed."""
@@ -151,7 +148,7 @@ def _with_unit(value: float) -> str:
 def mark_decades(panel: Any) -> None:
     """Mark 1, 2 and 5 of each decade of a logarithmic axis y; where they are many, the decades."""
     low, high = panel.get_ylim()
-    fine = high < FEW_DECADES * low
+    fine = high < 100.0 * low
     panel.minorticks_off()
     number_plainly(panel.yaxis, within=(1, 2, 5) if fine else (1,), text="{:g}".format)
     panel.tick_params(labelsize=7)

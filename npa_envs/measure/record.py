@@ -29,9 +29,6 @@ LIBRARIES = ("npa-envs", "torch", "warp-lang", "numpy", "scipy", "warpSPHCore")
 Content = TypeVar("Content")
 Row = TypeVar("Row")
 
-LARGEST_RECORD = 64 * 2**20
-"""Bytes of a record, at most."""
-
 
 @dataclass
 class Record(Generic[Row]):
@@ -91,7 +88,7 @@ def read_record(
         return None
     cure = "remove it, or choose another folder with --out"
     try:
-        held = read_json(path, limit=LARGEST_RECORD)
+        held = read_json(path, limit=64 * 2**20)
         before = dict(held[key])
         record = make(held)
     except (OSError, ValueError, TypeError, KeyError, AttributeError) as error:

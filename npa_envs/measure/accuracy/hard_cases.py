@@ -36,9 +36,6 @@ from npa_envs.rule.rule import LIFE, NPARule
 from npa_envs.world.division import living
 from npa_envs.world.rollout import rollout
 
-CROWD = {"quick": 2_000, "cpu": 20_000, "cuda": 1_000_000}
-"""Particles in one cell."""
-
 NEAR_THRESHOLD = 1e-3
 """Relative distances from the threshold of an inverse at which perception is to change no more."""
 
@@ -134,8 +131,7 @@ def _largest_jump(z: Tensor) -> float:
 def _run_crowd(space_dim: int, session: CheckSession) -> CheckResult:
     """Very many particles in one cell: densities as float64 has them, all is finite, and the
     smoothing's adjoint conserves what it spreads."""
-    size = "quick" if session.quick else "cuda" if session.cuda else "cpu"
-    count, sampled = CROWD[size], 32
+    count, sampled = 2_000 if session.quick else 1_000_000 if session.cuda else 20_000, 32
     generator = torch.Generator().manual_seed(session.seed)
     x = 0.01 + (torch.rand(1, count, space_dim, generator=generator) - 0.5) * (EPS / 4.0)
     s = torch.randn(1, count, 4, generator=generator)
@@ -228,9 +224,6 @@ WORLD, PARTICLE = 1, 7
 
 WORLD_COUNT, PARTICLE_COUNT, STEPS = 3, 150, 8
 
-DEAD_STEPS = {"quick": 100, "whole": 10_000}
-"""Steps of worlds whose particles divide."""
-
 
 VALUES: list[Check] = []
 """The checks of the group `values`."""
@@ -312,7 +305,7 @@ def _run_dead(space_dim: int, session: CheckSession) -> CheckResult:
     other_x, other_s = _worlds(session, space_dim, STATE_DIM)
     other_s[:] = math.nan
     other_x[:, 0], other_s[:, 0] = x[:, 0], s[:, 0]
-    steps = DEAD_STEPS["quick" if session.quick else "whole"]
+    steps = 100 if session.quick else 10_000
     clean, filled = (
         rollout(rule, *worlds, steps, generator=session.generator())
         for worlds in ((x, s), (other_x, other_s))

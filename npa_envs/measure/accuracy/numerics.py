@@ -35,28 +35,8 @@ from npa_envs.world.rollout import rollout
 
 # The group `gradients`: how they grow with the steps, finite differences, float32's errors.
 
-RULES = ("gecko", "dots", "digits", "duck")
-"""One rule of each task."""
-
-QUICK_RULES = ("gecko", "dots")
-
 STEPS, QUICK_STEPS = 512, 32
 """The longest rollouts that are differentiated."""
-
-QUICK_SHARE = 0.25
-"""Particles of a quick run, over those of other quick checks."""
-
-COMPARED_STEPS = 128
-"""The longest rollouts that are also run in float64."""
-
-ONE_STEP_ERROR = 1e-5
-"""Relative error of float32 that one step may have, forwards and backwards."""
-
-USABLE_ERROR = 1e-2
-"""Relative error of float32 up to which a gradient counts as usable."""
-
-DIFFERENCE = 1e-6
-"""Relative distance between a directional derivative and a finite difference in float64."""
 
 
 class RolloutOutcome(NamedTuple):
@@ -73,7 +53,8 @@ class RolloutOutcome(NamedTuple):
 
 def gradients_checks(*, quick: bool, rules: Mapping[str, str] | None = None) -> list[Check]:
     """Return the checks of the group `gradients`; of `rules`, name -> source, those of a rule."""
-    names = QUICK_RULES if quick else RULES
+    # One rule of each task.
+    names = ("gecko", "dots") if quick else ("gecko", "dots", "digits", "duck")
     expected = {
         "norm": "gradients of a functional by weights and by states at the start are finite "
         "whatever the number of steps; their norms are reported",
@@ -132,7 +113,7 @@ def outcome(
 
 
 def _home(session: CheckSession, name: str) -> TrialWorlds:
-    return habitat(session, name, particles=QUICK_SHARE if session.quick else 1.0)
+    return habitat(session, name, particles=0.25 if session.quick else 1.0)
 
 
 def _run_norm(name: str, session: CheckSession) -> CheckResult:
@@ -152,7 +133,7 @@ def _run_float32(name: str, session: CheckSession) -> CheckResult:
     home = _home(session, name)
     if home.rule.divides:
         raise Skipped("particles divide by draws that are others in float64")
-    counts = powers_of_two(QUICK_STEPS if session.quick else COMPARED_STEPS)
+    counts = powers_of_two(QUICK_STEPS if session.quick else 128)
     figures: dict[str, float] = {}
     usable = dict.fromkeys(RolloutOutcome._fields, 0)
     for steps in counts:
@@ -160,9 +141,9 @@ def _run_float32(name: str, session: CheckSession) -> CheckResult:
         exact = outcome(home, session, steps, torch.float64)
         for what, value, right in zip(RolloutOutcome._fields, found, exact, strict=True):
             figures[f"{what}_{steps}"] = error = relative_error(value, right)
-            if error <= USABLE_ERROR and usable[what] in (0, steps // 2):
+            if error <= 1e-2 and usable[what] in (0, steps // 2):
                 usable[what] = steps
-    limits = {f"{what}_1": ONE_STEP_ERROR for what in RolloutOutcome._fields}
+    limits = {f"{what}_1": 1e-5 for what in RolloutOutcome._fields}
     words = ", ".join(f"{what} {steps}" for what, steps in usable.items())
     return CheckResult(figures, limits, holds=f"steps within 1e-2, of {counts[-1]}: {words}")
 
@@ -174,7 +155,7 @@ def _run_differences(space_dim: int, periodic: bool, session: CheckSession) -> C
             # Far away neighbouring numbers are too far apart.
             if (scene.name, what) != ("far", "positions"):
                 figures[f"{scene.name}_{what}"] = _difference(scene, session, what)
-    return CheckResult(figures, dict.fromkeys(figures, DIFFERENCE))
+    return CheckResult(figures, dict.fromkeys(figures, 1e-6))
 
 
 def _difference(scene: Scene, session: CheckSession, what: str) -> float:
@@ -217,9 +198,6 @@ def _difference(scene: Scene, session: CheckSession, what: str) -> float:
 
 TWO_ERRORS = 2.0
 """Two answers that are each as far off as the group `geometry` allows are this far apart."""
-
-BIT_STEPS = 16
-"""Steps of rollouts that are compared bit by bit."""
 
 PRECISION: list[Check] = []
 """The checks of the group `precision`."""
@@ -329,7 +307,7 @@ def _run_graph(session: CheckSession) -> CheckResult:
     x, s = torch.empty_like(home.x), torch.empty_like(home.s)
 
     def run() -> None:
-        worlds = rollout(rule, home.x, home.s, BIT_STEPS, generator=random, **home.options())
+        worlds = rollout(rule, home.x, home.s, 16, generator=random, **home.options())
         x.copy_(worlds[0])
         s.copy_(worlds[1])
 

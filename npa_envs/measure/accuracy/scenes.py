@@ -51,9 +51,10 @@ def scenes(space_dim: int, *, periodic: bool, seed: int = 0) -> list[Scene]:
     made: list[Scene] = []
     for name, (summary, place) in PLACES.items():
         generator = torch.Generator().manual_seed(1000 * seed + len(made))
-        if (name in ONLY_OPEN and periodic) or (name in ONLY_PERIODIC and not periodic):
+        only_periodic = name in ("seam", "tight_box")
+        if (only_periodic and not periodic) or (name == "far" and periodic):
             continue
-        if name in ONLY_3D and space_dim != 3:
+        if name == "coplanar" and space_dim != 3:
             continue
         # Rounded to float32 first, so that both precisions see the same particles.
         x = place(space_dim, generator).float().double()
@@ -155,10 +156,6 @@ PLACES: dict[str, tuple[str, Callable[[int, torch.Generator], Tensor]]] = {
 }
 """What each scene is, and where its particles lie."""
 
-ONLY_OPEN = ("far",)
-ONLY_PERIODIC = ("seam", "tight_box")
-ONLY_3D = ("coplanar",)
-
 
 def threshold_scenes(space_dim: int, threshold: float) -> tuple[Tensor, Tensor]:
     """Return worlds whose first particle's moment matrix has a determinant around a threshold.
@@ -197,9 +194,6 @@ LIMITS = {
 
 `error_limits` raises them by a scene's condition.
 """
-
-ROUNDINGS = 4.0
-"""Roundings of each input that an answer may be off by, where that is more than `LIMITS`."""
 
 PRECISIONS = {"float32": torch.float32, "float64": torch.float64}
 """Dtypes by their names."""
@@ -265,7 +259,7 @@ def error_limits(
     """Return the relative errors that float64 worlds allow, by the names of `LIMITS`.
 
     Where sums cancel, or answers grow with 1 / distance, the last bit of an input shows in many
-    digits of the answer: an error may be as large as the change by some roundings of every input.
+    digits of the answer: an error may be as large as the change by four roundings of every input.
     Particles in one place stay together; far away in open space differences are rounded.
     """
     generator = torch.Generator().manual_seed(4)
@@ -286,5 +280,5 @@ def error_limits(
             for name, dtype in PRECISIONS.items():
                 rounding = 0.5 * torch.finfo(dtype).eps
                 key = f"{what}_{name}"
-                limits[key] = max(limits[key], ROUNDINGS * rounding * condition)
+                limits[key] = max(limits[key], 4.0 * rounding * condition)
     return limits

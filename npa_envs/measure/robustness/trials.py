@@ -168,9 +168,6 @@ def quick_plan(task_name: str) -> TrialPlan:
 
 # Test worlds
 
-BOX_SHARE = 0.25
-"""Radius of seeds of another shape, over the side of a box that is full when trained."""
-
 
 class PicturesInTurn(ParticleTask[Morphogenesis2DConfig]):
     """Worlds of several pictures of one rule: a world's goal is the place of its task."""
@@ -284,7 +281,8 @@ class RuleTrial:
         x, s, goal = task.seed(self.world_count, generator=random, device=self._device)
         if shape != "trained":
             box = self.task.box
-            radius = self.task.config.seed_radius if box is None else BOX_SHARE * min(box)
+            # A box is full when trained.
+            radius = self.task.config.seed_radius if box is None else 0.25 * min(box)
             x = SHAPES[shape](count, self.rule.space_dim, float(radius), random)
         return TrialWorlds(self.rule, task.toward(goal), x.float(), s.float(), goal)
 

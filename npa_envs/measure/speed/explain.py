@@ -19,16 +19,13 @@ from npa_envs.rule.rule import NPARule
 from npa_envs.world.rollout import step
 from npa_envs.world.steps import row_capacity
 
-LEAST_SHARE = 0.005
-"""Kernels that take less of a step are left out."""
-
-LONGEST_NAME = 72
-"""Letters of a kernel's name."""
-
 
 @dataclass(frozen=True)
 class KernelRow:
-    """One kernel in one workload: its time [µs] and its launches in a step, all together."""
+    """One kernel in one workload: its time [µs] and its launches in a step, all together.
+
+    Kernels that take less than 0.5 % of a step have no row.
+    """
 
     workload: str
     us: float
@@ -63,13 +60,13 @@ def _kernel_rows(workload: str, profiler: profile, steps: int) -> list[KernelRow
             workload,
             round(entry.self_device_time_total / steps, 2),
             round(entry.count / steps, 1),
-            entry.key[:LONGEST_NAME],
+            entry.key[:72],
         )
         for entry in profiler.key_averages()
         if entry.device_type == DeviceType.CUDA
     ]
     rows.sort(key=lambda row: -row.us)
-    least = LEAST_SHARE * sum(row.us for row in rows)
+    least = 0.005 * sum(row.us for row in rows)
     return [row for row in rows if row.us >= least]
 
 

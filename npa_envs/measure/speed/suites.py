@@ -36,30 +36,22 @@ from npa_envs.world.species import rollout_species
 
 # Suite `paper`: inference and training, storing and recomputing; float32 against float64.
 
-EIGHT_WORLDS = Workload(2, 8, 4096, 64)
-ONE_WORLD = Workload(2, 1, 4096, 64)
-LARGE_WORLDS = Workload(2, 8, 65536, 8)
-CUBES = Workload(3, 4, 16384, 24, 256)
-MILLION = Workload(2, 1, 2**20, 8)
-SIXTEEN_MILLION = Workload(2, 1, 2**24, 4)
+PROFILED = (
+    Workload(2, 8, 4096, 64),
+    Workload(2, 1, 4096, 64),
+    Workload(2, 8, 65536, 8),
+    Workload(3, 4, 16384, 24, 256),
+)
+"""Workloads of the authors' own table."""
 
-PAPER = (EIGHT_WORLDS, ONE_WORLD, LARGE_WORLDS, CUBES, MILLION, SIXTEEN_MILLION)
-"""Workloads on CUDA."""
-
-PROFILED = PAPER[:4]
-"""Those of the authors' own table."""
-
-PUBLIC = (*PROFILED, Workload(2, 64, 256, 32))
-"""Workloads of the public call, with many small worlds."""
+PAPER = (*PROFILED, Workload(2, 1, 2**20, 8), Workload(2, 1, 2**24, 4))
+"""Workloads on CUDA; the last one is not trained."""
 
 CPU = (Workload(2, 1, 4096, 16), Workload(2, 4, 1024, 16))
 """Workloads on a CPU."""
 
 SMALL = (Workload(2, 1, 1024, 8),)
 """Workloads of small sessions."""
-
-INFERENCE_ONLY = (SIXTEEN_MILLION,)
-"""Workloads that are not trained."""
 
 
 @dataclass(frozen=True)
@@ -82,7 +74,7 @@ def throughput_rows(session: TimingSession, workloads: Sequence[Workload]) -> li
     """Return two rows for each workload: storing and recomputing."""
     calls = []
     for workload in workloads:
-        train = workload not in INFERENCE_ONLY
+        train = workload != PAPER[-1]
         if not train:
             session.leave_out(f"training of {workload.name}", "a workload of inference only")
         modes: tuple[Memory, ...] = ("store", "recompute") if train else ("store",)
@@ -308,9 +300,6 @@ SKIPPED = {
 }
 """Worlds to measure on, by kinds of sessions."""
 
-STATIC_STEPS = 32
-"""Steps of a rollout of a static world."""
-
 
 @dataclass(frozen=True)
 class SkipRow:
@@ -375,7 +364,7 @@ def skips(workload: Workload) -> list[Skip]:
             "static=True, without position_noise",
             {**static, **rebuilt},
             static,
-            STATIC_STEPS,
+            32,
         ),
         Skip("periodic images", "box=None (default)", {"box": (side, side)}, {}),
         Skip(
@@ -414,9 +403,6 @@ SPECIES = {
 }
 """Worlds to measure on, by kinds of sessions; small ones show the cost of a call."""
 
-PAIRS_PER_REPEAT = 3
-"""Pairs of readings for each reading of other tables: a ratio of nearly 1 needs more of them."""
-
 
 @dataclass(frozen=True)
 class OneSpeciesRow:
@@ -454,9 +440,9 @@ def _species_row(
     make: Callable[..., Any] = partial(rollout_call, workload, x, s, train=train)
     # Each draws the same masks, as often as the other one is called.
     alone, species = make(), make(roll=roll_one_species)
-    compared = compare(
-        alone, species, session.device, repeats=PAIRS_PER_REPEAT * session.repeats, graph=graph
-    )
+    # A ratio of nearly 1 needs more readings than other tables.
+    repeats = 3 * session.repeats
+    compared = compare(alone, species, session.device, repeats=repeats, graph=graph)
     return OneSpeciesRow(
         workload.name,
         "training" if train else "inference",
@@ -484,14 +470,15 @@ def roll_one_species(
 def paper(session: TimingSession) -> Tables:
     """Return the paper's table, times of the public call, and errors of float32."""
     workloads = SMALL if session.small else PAPER if session.cuda else CPU
-    drifting = SMALL if session.small else PROFILED if session.cuda else (ONE_WORLD,)
+    drifting = SMALL if session.small else PROFILED if session.cuda else PROFILED[1:2]
     tables: Tables = {
         "throughput": throughput_rows(session, workloads),
         "drift": drift_rows(session, drifting),
     }
     if session.cuda:
         # On a CPU the throughput is that of the public call.
-        tables["public"] = public_rows(session, SMALL if session.small else PUBLIC)
+        many_small = (*PROFILED, Workload(2, 64, 256, 32))
+        tables["public"] = public_rows(session, SMALL if session.small else many_small)
     return tables
 
 

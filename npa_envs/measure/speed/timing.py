@@ -19,12 +19,6 @@ from npa_envs.world.rollout import rollout
 
 # Worlds with as many neighbours everywhere
 
-SQUARE_HALF_WIDTH = 0.7
-"""Half the side of a square of 4096 particles [length units]; larger worlds are as dense."""
-
-CUBE_HALF_WIDTH = 0.8
-"""Half the side of a cube of 16 384 particles [length units]; other cubes are as dense."""
-
 
 @dataclass(frozen=True)
 class Workload:
@@ -54,10 +48,13 @@ class Workload:
 
     @property
     def half_width(self) -> float:
-        """Half the side of the square or cube that the particles fill [length units]."""
+        """Half the side of the square or cube that the particles fill [length units].
+
+        Worlds of all sizes are as dense.
+        """
         if self.space_dim == 2:
-            return SQUARE_HALF_WIDTH * math.sqrt(self.particle_count / 4096)
-        return CUBE_HALF_WIDTH * math.cbrt(self.particle_count / 16384)
+            return 0.7 * math.sqrt(self.particle_count / 4096)
+        return 0.8 * math.cbrt(self.particle_count / 16384)
 
     @property
     def neighbour_count(self) -> float:
@@ -126,9 +123,6 @@ Sampled = tuple[Callable[[], object], torch.Generator]
 
 LEAST_SECONDS = {"cpu": 2e-3, "cuda": 1e-2}
 """Short calls are made so many times in a row that one reading takes at least this long [s]."""
-
-ENOUGH = 1e6
-"""Readings of slow calls end after this long [µs], with three of them at least."""
 
 
 @dataclass(frozen=True)
@@ -211,7 +205,8 @@ def _summary(readings: Sequence[float]) -> Timing:
 def _timing(run: Callable[[], object], device: torch.device, repeats: int) -> Timing:
     calls = _calls(_reading(run, device, 1), device)
     readings = [_reading(run, device, calls) * 1e6]
-    while len(readings) < repeats and (len(readings) < 3 or sum(readings) * calls < ENOUGH):
+    # Those of slow calls end after a second, with three of them at least.
+    while len(readings) < repeats and (len(readings) < 3 or sum(readings) * calls < 1e6):
         readings.append(_reading(run, device, calls) * 1e6)
     return _summary(readings)
 
