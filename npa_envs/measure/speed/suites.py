@@ -312,67 +312,45 @@ class SkipRow:
     saved: str
 
 
-@dataclass(frozen=True)
-class Skip:
-    """Two rollouts that differ in one condition alone, with options of `rollout_call`."""
-
-    left_out: str
-    condition: str
-    done: dict[str, Any]
-    skipped: dict[str, Any]
-    steps: int | None = None
-    """Steps of both; default: the workload's."""
+Skip = tuple[str, str, dict[str, Any], dict[str, Any]]
+"""What is left out, the condition, and options of `rollout_call` with and without it."""
 
 
 def skips(workload: Workload) -> list[Skip]:
     """Return all computations that rollouts leave out."""
     side = 2.0 * workload.half_width
-    training = {"train": True}
+    training: dict[str, Any] = {"train": True}
     # Cells and densities are computed anew in each step if positions may get a gradient.
-    rebuilt = {"detach_positions": False}
-    static = {"rule": {"static": True}}
+    rebuilt: dict[str, Any] = {"detach_positions": False}
+    static: dict[str, Any] = {"rule": {"static": True}}
+    stored = "what a backward pass reads: signs of hidden units, volumes, kernel sums"
+    inactive = "perception, network and lists of inactive particles"
+    built, longer = "cells, densities and neighbour lists", {"steps": 32}
+    again = "a second forward pass, for the backward pass"
+    columns = (
+        ("the state gradient", "state_gradient"),
+        ("the moment matrix and its inverse", "moment_correction"),
+        ("columns of the density gradient", "density_gradient"),
+    )
     return [
-        Skip(
-            "what a backward pass reads: signs of hidden units, volumes, kernel sums",
-            "no gradient is enabled",
-            {"gradients": True},
-            {},
-        ),
-        Skip(
+        (stored, "no gradient is enabled", {"gradients": True}, {}),
+        (
             "cotangents of positions and densities",
             "detach_positions (default)",
-            {**training, "detach_positions": False},
+            training | rebuilt,
             training,
         ),
-        Skip(
-            "perception, network and lists of inactive particles",
-            "update_prob < 1",
-            {"update_prob": 1.0},
-            {},
-        ),
-        *(
-            Skip(what, f"{option}=False", {}, {"rule": {option: False}})
-            for what, option in (
-                ("the state gradient", "state_gradient"),
-                ("the moment matrix and its inverse", "moment_correction"),
-                ("columns of the density gradient", "density_gradient"),
-            )
-        ),
-        Skip("displacements", "static=True", rebuilt, {**static, **rebuilt}),
-        Skip(
-            "cells, densities and neighbour lists",
+        (inactive, "update_prob < 1", {"update_prob": 1.0}, {}),
+        *((what, f"{option}=False", {}, {"rule": {option: False}}) for what, option in columns),
+        ("displacements", "static=True", rebuilt, static | rebuilt),
+        (
+            built,
             "static=True, without position_noise",
-            {**static, **rebuilt},
-            static,
-            32,
+            static | rebuilt | longer,
+            static | longer,
         ),
-        Skip("periodic images", "box=None (default)", {"box": (side, side)}, {}),
-        Skip(
-            "a second forward pass, for the backward pass",
-            "memory='store' (default)",
-            {**training, "memory": "minimal"},
-            training,
-        ),
+        ("periodic images", "box=None (default)", {"box": (side, side)}, {}),
+        (again, "memory='store' (default)", training | {"memory": "minimal"}, training),
     ]
 
 
@@ -381,17 +359,18 @@ def skip_rows(session: TimingSession) -> list[SkipRow]:
     workload = SKIPPED[session.size]
     x, s = workload.worlds(session.device)
 
-    def cost(options: dict[str, Any], steps: int | None) -> Timing:
-        rolled = replace(workload, steps=steps or workload.steps)
-        run, generator = rollout_call(rolled, x, s, **options)
+    def cost(options: dict[str, Any]) -> Timing:
+        given: dict[str, Any] = {"steps": workload.steps} | options
+        rolled = replace(workload, steps=given.pop("steps"))
+        run, generator = rollout_call(rolled, x, s, **given)
         return session.cost(run, generator=generator).time.divided(rolled.steps)
 
-    def row(skip: Skip) -> SkipRow:
-        done, skipped = cost(skip.done, skip.steps), cost(skip.skipped, skip.steps)
+    def row(left_out: str, condition: str, *options: dict[str, Any]) -> SkipRow:
+        done, skipped = map(cost, options)
         saved = 1.0 - skipped.median / done.median
-        return SkipRow(skip.left_out, skip.condition, done, skipped, f"{saved:.0%}")
+        return SkipRow(left_out, condition, done, skipped, f"{saved:.0%}")
 
-    return session.rows((skip.left_out, partial(row, skip)) for skip in skips(workload))
+    return session.rows((skip[0], partial(row, *skip)) for skip in skips(workload))
 
 
 # Suite `species`: overhead of `rollout_species` with one species.
