@@ -121,7 +121,7 @@ def _pictures(options: EvaluateOptions, rule: NPARule, device: torch.device) -> 
 def _finish(options: EvaluateOptions, tables: Mapping[str, Sequence[Any]], metric: str) -> int:
     """Print tables and, if asked for, write them."""
     from npa_envs.files import write_text
-    from npa_envs.measure.tables import UNMEASURED, table_text, tables_json
+    from npa_envs.measure.record import UNMEASURED, table_text, tables_json
 
     for name, rows in tables.items():
         print(table_text(rows, missing=UNMEASURED if name == "growth" else "never"))

@@ -24,8 +24,15 @@ from npa_envs.measure.quality import (
     score_line,
     tables_of,
 )
-from npa_envs.measure.record import current_commit, machine, versions
-from npa_envs.measure.tables import UNMEASURED, markdown_table, table_markdown, tables_json
+from npa_envs.measure.record import (
+    UNMEASURED,
+    current_commit,
+    machine,
+    markdown_table,
+    table_markdown,
+    tables_json,
+    versions,
+)
 from npa_envs.rule.files import load_rule
 from npa_envs.tasks.base import Task
 from npa_envs.tasks.damage import DamageEvent

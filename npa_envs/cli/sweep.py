@@ -21,8 +21,7 @@ import tyro
 from npa_envs.cli import common
 from npa_envs.errors import NPAError, suggest
 from npa_envs.files import read_json, write_text
-from npa_envs.measure.record import read_record, write_record
-from npa_envs.measure.tables import NONE, markdown_table
+from npa_envs.measure.record import NONE, markdown_table, read_record, write_record
 from npa_envs.processes import Child, Places, part_of, run_children
 
 RUN_FAILED = 1

@@ -20,8 +20,7 @@ from torch import Tensor
 
 from npa_envs.errors import NPAError
 from npa_envs.measure.plots import draw_matrix, new_figure, png
-from npa_envs.measure.record import Record
-from npa_envs.measure.tables import as_objects
+from npa_envs.measure.record import Record, as_objects
 from npa_envs.ops import species_fields
 from npa_envs.render import draw_worlds
 from npa_envs.rule.rule import NPARule

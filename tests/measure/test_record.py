@@ -12,20 +12,18 @@ from scripts import script_facts, script_parser
 from npa_envs.errors import NPAError
 from npa_envs.measure.plots import mark_decades, write_plots
 from npa_envs.measure.record import (
+    UNMEASURED,
+    csv_text,
     current_commit,
+    markdown_table,
+    mean_with_error,
     measured_facts,
     number,
     read_record,
+    table_text,
     time_limit,
     without_folders,
     write_record,
-)
-from npa_envs.measure.tables import (
-    UNMEASURED,
-    csv_text,
-    markdown_table,
-    mean_with_error,
-    table_text,
 )
 
 RESULTS = Path(__file__).resolve().parents[2] / "benchmarks" / "results"

@@ -14,8 +14,7 @@ import torch
 
 from npa_envs.errors import NPAError, suggest
 from npa_envs.measure.plots import draw_matrix, new_figure, png
-from npa_envs.measure.record import Record, time_limit
-from npa_envs.measure.tables import aligned, as_objects
+from npa_envs.measure.record import Record, aligned, as_objects, time_limit
 from npa_envs.rule.files import load_rule, rule_digest
 
 Verdict = Literal["pass", "fail", "range", "skipped"]

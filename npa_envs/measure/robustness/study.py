@@ -14,7 +14,7 @@ import torch
 
 from npa_envs.measure.accuracy.endurance import TrialWorlds
 from npa_envs.measure.plots import draw_band, legend_of, mark_decades, new_figure, png
-from npa_envs.measure.record import Record, number
+from npa_envs.measure.record import NONE, Record, as_objects, markdown_table, number, short
 from npa_envs.measure.robustness.trials import (
     CONDITIONS,
     CONTROL,
@@ -27,7 +27,6 @@ from npa_envs.measure.robustness.trials import (
     ratio,
     trained_value,
 )
-from npa_envs.measure.tables import NONE, as_objects, markdown_table, short
 from npa_envs.world.randomness import StreamId
 
 WORKS = 2.0

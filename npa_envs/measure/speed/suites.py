@@ -15,7 +15,7 @@ from torch import Tensor
 
 from npa_envs.files import json_text
 from npa_envs.measure.plots import new_figure, number_plainly, png
-from npa_envs.measure.record import machine, versions
+from npa_envs.measure.record import UNMEASURED, as_objects, machine, table_text, versions
 from npa_envs.measure.speed.explain import kernel_rows
 from npa_envs.measure.speed.timing import (
     LeftOut,
@@ -28,7 +28,6 @@ from npa_envs.measure.speed.timing import (
     rollout_call,
     timed_calls,
 )
-from npa_envs.measure.tables import UNMEASURED, as_objects, table_text
 from npa_envs.rule.rule import NPARule
 from npa_envs.world.recorded import release_recordings
 from npa_envs.world.rollout import Memory, rollout
