@@ -107,7 +107,7 @@ def main(arguments: Sequence[str]) -> int:
     folder = common.writable_folder(options.out)
     weights = {rule.name: rule_digest(rule.rule) for rule in rules}
     facts = {**plain_numbers(asdict(settings)), "rules": weights}
-    record = interaction.interaction_record(folder / RESULTS, facts)
+    record = interaction.InteractionRecord(facts, folder / RESULTS).read()
     files: dict[str, tuple[RuleUnderTest, RuleUnderTest]] = {}
     for pair in itertools.product(rules, rules):
         if options.itself or pair[0] is not pair[1]:

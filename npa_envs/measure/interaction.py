@@ -8,9 +8,8 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -20,7 +19,7 @@ from torch import Tensor
 
 from npa_envs.errors import NPAError
 from npa_envs.measure.plots import draw_matrix, new_figure, png
-from npa_envs.measure.record import Record, as_objects
+from npa_envs.measure.record import Record
 from npa_envs.ops import species_fields
 from npa_envs.render import draw_worlds
 from npa_envs.rule.rule import NPARule
@@ -328,31 +327,27 @@ LARGEST_CHANGE = 4.0
 """Colours end at this many times the loss alone, and at its inverse."""
 
 
-def interaction_record(path: Path, settings: Mapping[str, Any]) -> Record[InteractionRow]:
-    """Return the record of settings: rows, and each number of them as matrices over the rules.
+class InteractionRecord(Record[InteractionRow]):
+    """Rows of settings, and each number of them as matrices over the rules."""
 
-    Rows of an earlier run of the same settings are in it.
-    """
-    names = list(settings["rules"])
+    command, key = "interact", "settings"
 
-    def content(rows: list[InteractionRow]) -> dict[str, Any]:
-        kinds = ("change", "mixing", "displacement", "verdict")
+    def content(self) -> dict[str, Any]:
+        """Return rows and matrices."""
+        kinds, names = ("change", "mixing", "displacement", "verdict"), list(self.facts["rules"])
         matrices = [
             {"ratio": ratio, "distance": distance, "eps_factor": factor}
             | {what: _matrix(some, names, what) for what in kinds}
-            for (factor, ratio, distance), some in _by_setting(rows).items()
+            for (factor, ratio, distance), some in _by_setting(self.rows).items()
         ]
-        return {"rows": as_objects(rows), "matrices": matrices}
+        return {**super().content(), "matrices": matrices}
 
-    def read(held: dict[str, Any]) -> list[InteractionRow]:
-        # JSON has no infinite numbers.
-        rows: list[dict[str, Any]] = [
-            {k: math.inf if v is None else v for k, v in row.items()} for row in held["rows"]
+    def parse(self, held: dict[str, Any]) -> list[InteractionRow]:
+        """Return the rows; JSON has no infinite numbers."""
+        return [
+            InteractionRow(**{k: math.inf if v is None else v for k, v in row.items()})
+            for row in held["rows"]
         ]
-        return [InteractionRow(**row) for row in rows]
-
-    record = Record[InteractionRow](settings, path=path, content=content, key="settings")
-    return record.resume(read, command="interact")
 
 
 def _by_setting(

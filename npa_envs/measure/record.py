@@ -17,7 +17,7 @@ import subprocess
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, Generic, TypeVar
+from typing import Any, Generic, Self, TypeVar
 
 import torch
 
@@ -31,24 +31,32 @@ Content = TypeVar("Content")
 Row = TypeVar("Row")
 
 
-@dataclasses.dataclass
 class Record(Generic[Row]):
-    """Rows of a measurement, and what they follow from, in a JSON file."""
+    """Rows of a measurement, and the facts that they follow from, in a JSON file, if in any."""
 
-    facts: Mapping[str, Any]
-    """What the rows follow from: device, machine, settings, commit, versions."""
-    rows: list[Row] = dataclasses.field(default_factory=list)
-    path: Path | None = None
-    """The file that is written after each entry; None: none."""
-    content: Callable[[list[Row]], Mapping[str, Any]] = lambda rows: {"rows": as_objects(rows)}
-    """Returns the file's fields other than the facts."""
-    key: str = "facts"
+    command: str
+    """The command that writes such records, for errors."""
+    key = "facts"
     """What the file calls the facts."""
 
-    def resume(self, read: Callable[[dict[str, Any]], list[Row]], *, command: str) -> Record[Row]:
-        """Take over the rows that `read` makes of the file, if there is one; return this record."""
+    def __init__(
+        self, facts: Mapping[str, Any], path: Path | None = None, rows: Iterable[Row] = ()
+    ) -> None:
+        self.facts, self.path, self.rows = facts, path, list(rows)
+
+    def content(self) -> Mapping[str, Any]:
+        """Return the file's fields other than the facts."""
+        return {"rows": as_objects(self.rows)}
+
+    def parse(self, held: dict[str, Any]) -> list[Row]:
+        """Return the rows of the file's JSON object."""
+        raise NotImplementedError
+
+    def read(self) -> Self:
+        """Take over the rows of the file, if there is one, and return this record."""
         if self.path is not None:
-            found = read_record(self.path, self.facts, read, command=command, key=self.key)
+            make, command = self.parse, self.command
+            found = read_record(self.path, self.facts, make, command=command, key=self.key)
             self.rows += found or []
         return self
 
@@ -60,7 +68,7 @@ class Record(Generic[Row]):
     def write(self) -> None:
         """Write the file, where there is to be one."""
         if self.path is not None:
-            write_record(self.path, {self.key: self.facts, **self.content(self.rows)})
+            write_record(self.path, {self.key: self.facts, **self.content()})
 
     def table(self) -> str:
         """Return the rows as a plain text table."""

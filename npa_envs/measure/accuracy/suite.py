@@ -182,26 +182,24 @@ class CheckEntry:
 class StressRecord(Record[CheckEntry]):
     """All that a run found, in the order of names."""
 
+    command = "stress"
+
     def __init__(
         self, facts: Mapping[str, Any], path: Path | None = None, names: Iterable[str] = ()
     ) -> None:
-        super().__init__(facts, path=path, content=self._content)
+        super().__init__(facts, path)
         self._order = {name: place for place, name in enumerate(names)}
 
-    def _content(self, rows: list[CheckEntry]) -> dict[str, Any]:
-        # JSON has no numbers that are not finite: they become words.
-        return {"counts": self.counts(), "checks": _with_words(as_objects(rows))}
+    def content(self) -> dict[str, Any]:
+        """Return the entries; numbers that are not finite, which JSON has not, become words."""
+        return {"counts": self.counts(), "checks": _with_words(as_objects(self.rows))}
 
-    def read(self) -> StressRecord:
-        """Take over the entries of a run that was stopped, and return this record."""
-
-        def entry(fields: dict[str, Any]) -> CheckEntry:
+    def parse(self, held: dict[str, Any]) -> list[CheckEntry]:
+        """Return the entries of a run that was stopped."""
+        for fields in held["checks"]:
             for name in ("figures", "limits"):
                 fields[name] = {key: float(value) for key, value in fields[name].items()}
-            return CheckEntry(**fields)
-
-        self.resume(lambda held: [entry(fields) for fields in held["checks"]], command="stress")
-        return self
+        return [CheckEntry(**fields) for fields in held["checks"]]
 
     def put(self, entry: CheckEntry) -> None:
         """Add an entry, in the place of one of the same name, and write the file."""

@@ -57,6 +57,8 @@ class Response:
 class RuleRecord(Record[Response]):
     """What was measured of one rule: loss curves after damage, and responses to conditions."""
 
+    command = "robustness"
+
     def __init__(
         self,
         facts: Mapping[str, Any],
@@ -66,7 +68,7 @@ class RuleRecord(Record[Response]):
         responses: Sequence[Response] = (),
         **about: Any,
     ) -> None:
-        super().__init__(facts, list(responses), path, self._content)
+        super().__init__(facts, path, responses)
         self.curves = list(curves)
         """After each damage, the control first."""
         self.about: dict[str, Any] = {"done": True, "seconds": 0.0, "command": "", "date": ""}
@@ -83,12 +85,13 @@ class RuleRecord(Record[Response]):
         """Whether nothing is left to measure."""
         return bool(self.about["done"])
 
-    def _content(self, rows: list[Response]) -> dict[str, Any]:
+    def content(self) -> dict[str, Any]:
+        """Return what was measured."""
         courses = [asdict(c) | {"recovery_steps": c.recovery_steps()} for c in self.curves]
-        return {**self.about, "courses": courses, "responses": as_objects(rows)}
+        return {**self.about, "courses": courses, "responses": as_objects(self.rows)}
 
-    def read(self) -> RuleRecord:
-        """Take over the measurements of the record's file, and return this record."""
+    def parse(self, held: dict[str, Any]) -> list[Response]:
+        """Take over the curves of a record, and return its responses."""
 
         def numbers(values: list[float | None]) -> tuple[float, ...]:
             return tuple(map(number, values))
@@ -97,15 +100,11 @@ class RuleRecord(Record[Response]):
             losses, twins = (tuple(map(numbers, row[name])) for name in ("losses", "twins"))
             return LossCurve(row["damage"], tuple(row["steps"]), losses, twins)
 
-        def read(held: dict[str, Any]) -> list[Response]:
-            self.curves = list(map(curve, held.pop("courses")))
-            rows = held.pop("responses")
-            del held["facts"]
-            self.about = held
-            return [Response(**row | {"losses": numbers(row["losses"])}) for row in rows]
-
-        self.resume(read, command="robustness")
-        return self
+        self.curves = list(map(curve, held.pop("courses")))
+        rows = held.pop("responses")
+        del held["facts"]
+        self.about = held
+        return [Response(**row | {"losses": numbers(row["losses"])}) for row in rows]
 
     def of(self, condition: str) -> list[Response]:
         """Return the responses to a condition."""
