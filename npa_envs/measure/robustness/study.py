@@ -384,9 +384,7 @@ def _draw_responses(panel: Any, record: RuleRecord, condition: str) -> None:
     """Draw losses by the values of a condition."""
     found = [response for response in record.of(condition) if response.losses]
     values = [float(response.value) for response in found]
-    _draw_seeds(
-        panel, values, [response.losses for response in found], "C0", CONDITIONS[condition].summary
-    )
+    _draw_seeds(panel, values, [response.losses for response in found], "C0", CONDITIONS[condition])
     trained = sorted(record.trained().losses)
     panel.axhline(trained[len(trained) // 2], color="black", lw=0.7, ls=":")
     panel.set(xscale="log", yscale="log")
