@@ -23,6 +23,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import torch
+from drift import drawn_like, relative_error
 from hash_grid import grid_fields
 from precisions import PRECISIONS, Precision
 from scripts import script_facts, script_parser
@@ -35,7 +36,7 @@ from npa_envs.errors import NPAError, shown
 from npa_envs.files import read_json, write_bytes, write_text
 from npa_envs.measure.plots import new_figure, number_plainly, png
 from npa_envs.measure.quality import psnr
-from npa_envs.measure.speed.suites import BenchReport, drawn_like
+from npa_envs.measure.speed.suites import BenchReport
 from npa_envs.measure.speed.timing import (
     NO_TIME,
     Cost,
@@ -43,7 +44,6 @@ from npa_envs.measure.speed.timing import (
     Timing,
     TimingSession,
     Workload,
-    relative_error,
 )
 from npa_envs.ops import perception_fields
 from npa_envs.rule.files import load_rule

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from datetime import date
 from functools import partial
@@ -24,16 +24,15 @@ from npa_envs.measure.speed.timing import (
     TimingSession,
     Workload,
     compare,
-    relative_error,
     rollout_call,
     timed_calls,
 )
 from npa_envs.rule.rule import NPARule
 from npa_envs.world.recorded import release_recordings
-from npa_envs.world.rollout import Memory, rollout
+from npa_envs.world.rollout import Memory
 from npa_envs.world.species import rollout_species
 
-# Suite `paper`: inference and training, storing and recomputing; float32 against float64.
+# Suite `paper`: inference and training, storing and recomputing.
 
 PROFILED = (
     Workload(2, 8, 4096, 64),
@@ -135,70 +134,6 @@ def _public_row(session: TimingSession, workload: Workload) -> PublicRow:
             found[recorded, train] = timing.divided(workload.steps)
     release_recordings()
     return PublicRow(workload.name, *found.values())
-
-
-@dataclass(frozen=True)
-class DriftRow:
-    """Relative errors of float32 after all steps of a workload, with float64's update masks.
-
-    Worlds are chaotic: after enough steps errors show how long worlds ran. Gradients are those of a
-    random linear functional by the states at the start and the weights; their errors come from few
-    particles, whose hidden units are on in one precision alone. `state_gradient_median` is the
-    median over the particles, each relative to its own.
-    """
-
-    workload: str
-    positions: float
-    states: float
-    state_gradient: float
-    state_gradient_median: float
-    weight_gradient: float
-
-
-def drift_rows(session: TimingSession, workloads: Iterable[Workload]) -> list[DriftRow]:
-    """Return a row for each workload."""
-    rows: list[DriftRow] = []
-    for workload in workloads:
-        what = f"drift of {workload.name}"
-        for exact in session.attempt(what, partial(_outcome, workload, session, torch.float64)):
-            rows += session.attempt(what, partial(_drift_row, workload, session, exact))
-    return rows
-
-
-def _drift_row(workload: Workload, session: TimingSession, exact: list[Tensor]) -> DriftRow:
-    found = _outcome(workload, session, torch.float32)
-    positions, states, by_states, by_weights = map(relative_error, found, exact)
-    distance = (found[2].double() - exact[2]).norm(dim=-1)
-    median = float((distance / exact[2].norm(dim=-1)).median())
-    return DriftRow(workload.name, positions, states, by_states, median, by_weights)
-
-
-def _outcome(workload: Workload, session: TimingSession, dtype: torch.dtype) -> list[Tensor]:
-    """Return positions and states at the end, and gradients by states and by weights."""
-    device = session.device
-    rule = workload.rule(device).to(dtype)
-    start, states = (tensor.to(dtype) for tensor in workload.worlds(device))
-    states.requires_grad_()
-    x, s = rollout(
-        rule,
-        start,
-        states,
-        workload.steps,
-        eps=workload.eps,
-        update_prob=workload.update_prob,
-        generator=torch.Generator(device).manual_seed(1),
-        memory="recompute",
-    )
-    loss = (x * drawn_like(x)).sum() + (s * drawn_like(s)).sum()
-    by_states, *by_weights = torch.autograd.grad(loss, [states, *rule.parameters()])
-    weights = torch.cat([gradient.flatten() for gradient in by_weights])
-    return [tensor.detach() for tensor in (x, s, by_states, weights)]
-
-
-def drawn_like(like: Tensor) -> Tensor:
-    """Return the weights of a random linear functional, the same numbers in every dtype."""
-    generator = torch.Generator(like.device).manual_seed(2)
-    return torch.randn(like.shape, generator=generator, device=like.device).to(like.dtype)
 
 
 # Suite `scaling`: N, neighbours, B and C, one of them at a time.
@@ -446,13 +381,9 @@ def roll_one_species(
 
 
 def paper(session: TimingSession) -> Tables:
-    """Return the paper's table, times of the public call, and errors of float32."""
+    """Return the paper's table, and times of the public call."""
     workloads = SMALL if session.small else PAPER if session.cuda else CPU
-    drifting = SMALL if session.small else PROFILED if session.cuda else PROFILED[1:2]
-    tables: Tables = {
-        "throughput": throughput_rows(session, workloads),
-        "drift": drift_rows(session, drifting),
-    }
+    tables: Tables = {"throughput": throughput_rows(session, workloads)}
     if session.cuda:
         # On a CPU the throughput is that of the public call.
         many_small = (*PROFILED, Workload(2, 64, 256, 32))

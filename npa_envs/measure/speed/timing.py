@@ -313,9 +313,3 @@ class TimingSession:
         entry = LeftOut(what, why)
         if entry not in self.left_out:
             self.left_out.append(entry)
-
-
-def relative_error(value: Tensor, expected: Tensor) -> float:
-    """Return |value - expected| / |expected| in the Euclidean norm, taken in float64."""
-    exact = expected.detach().double()
-    return float((value.detach().double() - exact).norm() / exact.norm())
