@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from npa_envs.errors import NPAError
-from npa_envs.measure.accuracy.suite import Check, CheckResult, CheckSession
+from npa_envs.measure.accuracy.suite import Check, CheckResult, CheckSession, check
 from npa_envs.rule.files import load_rule, rule_file, rule_metadata, shipped_rules
 from npa_envs.rule.rule import NPARule
 from npa_envs.tasks.base import Task
@@ -180,29 +180,17 @@ BOUNDS = {
     "energy": 4.0,
     "drift": 1.0,
 }
-"""Bounds of the figures that `endurance_checks` describes."""
+"""Bounds of figures, which are the largest after the world has settled.
 
+`extent`: longest side of the bounding box, over that of the settled world. `overflow`: mean
+|s − clip(s, −1, 1)|. `largest_state`: the largest |s|. `energy`: mean over particles of |Δx|²/ε² +
+mean Δs² of a step, over that of the settled world, each the mean of `ENERGY_STEPS`. `drift`: how
+far the centroid is from where it was, in extents of the settled world; where a rule moves its
+particles in open space.
+"""
 
-def endurance_checks(rules: Mapping[str, str] | None = None) -> list[Check]:
-    """Return the checks of the group `time`, of all shipped rules or of others: name -> source.
-
-    Figures are the largest after the world has settled. `extent`: longest side of the bounding box,
-    over that of the settled world. `overflow`: mean |s − clip(s, −1, 1)|. `largest_state`: the
-    largest |s|. `energy`: mean over particles of |Δx|²/ε² + mean Δs² of a step, over that of the
-    settled world, each the mean of `ENERGY_STEPS`. `drift`: how far the centroid is from where it
-    was, in extents of the settled world; where a rule moves its particles in open space.
-    """
-    expected = (
-        "no number becomes infinite or NaN; the extent at most doubles, updates have at most four "
-        "times the energy of the settled world's, states stay within 8 and on average within 1.1, "
-        "the centroid moves by an extent at most"
-    )
-    names = rule_names()
-    sources = rules or dict(zip(names, names, strict=True))
-    return [
-        Check(f"time/{name}", expected, partial(_run, source), source)
-        for name, source in sources.items()
-    ]
+ENDURANCE: list[Check] = []
+"""The check of the group `time`, of a rule."""
 
 
 def measured(
@@ -230,7 +218,11 @@ def measured(
         }
 
 
+@check(ENDURANCE, "time")
 def _run(name: str, session: CheckSession) -> CheckResult:
+    """No number becomes infinite or NaN; the extent at most doubles, updates have at most four
+    times the energy of the settled world's, states stay within 8 and on average within 1.1, the
+    centroid moves by an extent at most."""
     home = habitat(session, name)
     steps = QUICK_STEPS if session.quick else STEPS
     settled = min(SETTLED, steps // 2)

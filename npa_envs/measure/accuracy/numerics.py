@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Mapping
-from functools import partial
+from collections.abc import Iterable, Iterator
 from typing import NamedTuple
 
 import torch
@@ -39,6 +38,13 @@ STEPS, QUICK_STEPS = 512, 32
 """The longest rollouts that are differentiated."""
 
 
+GRADIENTS: list[Check] = []
+"""The checks of the group `gradients`, each of a rule."""
+
+DIFFERENCES: list[Check] = []
+"""Those that are of none, in open space or a periodic box."""
+
+
 class RolloutOutcome(NamedTuple):
     """Worlds after a rollout, and gradients of a random linear functional of them.
 
@@ -49,33 +55,6 @@ class RolloutOutcome(NamedTuple):
     s: Tensor
     by_weights: Tensor
     by_states: Tensor
-
-
-def gradients_checks(*, quick: bool, rules: Mapping[str, str] | None = None) -> list[Check]:
-    """Return the checks of the group `gradients`; of `rules`, name -> source, those of a rule."""
-    # One rule of each task.
-    names = ("gecko", "dots") if quick else ("gecko", "dots", "digits", "duck")
-    expected = {
-        "norm": "gradients of a functional by weights and by states at the start are finite "
-        "whatever the number of steps; their norms are reported",
-        "float32": "one step in float32 is within 1e-5 of one in float64, also its gradients; "
-        "after how many steps they still agree to 1e-2 is reported",
-    }
-    checks = [
-        Check(f"gradients/{case}/{name}", text, partial(run, source), source)
-        for name, source in (rules or dict(zip(names, names, strict=True))).items()
-        for (case, text), run in zip(expected.items(), (_run_norm, _run_float32), strict=True)
-    ]
-    text = (
-        "in float64, derivatives along smooth motions and along random states are what finite "
-        "differences say, in every hard scene"
-    )
-    for space_dim in () if rules else (2, 3):
-        for periodic in (False, True):
-            name = f"finite_differences/{space_dim}d/{'periodic' if periodic else 'open'}"
-            run = partial(_run_differences, space_dim, periodic)
-            checks.append(Check(f"gradients/{name}", text, run))
-    return checks
 
 
 def powers_of_two(most: int) -> list[int]:
@@ -116,7 +95,10 @@ def _home(session: CheckSession, name: str) -> TrialWorlds:
     return habitat(session, name, particles=0.25 if session.quick else 1.0)
 
 
+@check(GRADIENTS, "gradients/norm")
 def _run_norm(name: str, session: CheckSession) -> CheckResult:
+    """Gradients of a functional by weights and by states at the start are finite whatever the
+    number of steps; their norms are reported."""
     home = _home(session, name)
     figures: dict[str, float] = {}
     not_finite = 0.0
@@ -129,7 +111,10 @@ def _run_norm(name: str, session: CheckSession) -> CheckResult:
     return CheckResult(figures | {"not_finite": not_finite}, {"not_finite": 0.0})
 
 
+@check(GRADIENTS, "gradients/float32")
 def _run_float32(name: str, session: CheckSession) -> CheckResult:
+    """One step in float32 is within 1e-5 of one in float64, also its gradients; after how many
+    steps they still agree to 1e-2 is reported."""
     home = _home(session, name)
     if home.rule.divides:
         raise Skipped("particles divide by draws that are others in float64")
@@ -148,7 +133,10 @@ def _run_float32(name: str, session: CheckSession) -> CheckResult:
     return CheckResult(figures, limits, holds=f"steps within 1e-2, of {counts[-1]}: {words}")
 
 
-def _run_differences(space_dim: int, periodic: bool, session: CheckSession) -> CheckResult:
+@check(DIFFERENCES, "gradients/finite_differences", 2, 3)
+def _run_differences(space_dim: int, session: CheckSession, *, periodic: bool) -> CheckResult:
+    """In float64, derivatives along smooth motions and along random states are what finite
+    differences say, in every hard scene."""
     figures = {}
     for scene in scenes(space_dim, periodic=periodic, seed=session.seed):
         for what in ("states", "positions"):
