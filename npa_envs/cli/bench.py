@@ -6,13 +6,10 @@ import shlex
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import Any, Literal
 
 from npa_envs.cli import common
 from npa_envs.errors import NPAError
-
-if TYPE_CHECKING:
-    import torch
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -66,7 +63,17 @@ def main(arguments: Sequence[str]) -> int:
     device = options.place()
     (name,) = common.chosen_names("suite", [options.suite or "quick"], suites.SUITES)
     if options.explain:
-        print(_explanation(options, device))
+        import torch
+
+        from npa_envs.measure.speed.explain import explain
+
+        sizes = (options.space_dim, options.world_count, options.particle_count, 1)
+        workload = timing.Workload(
+            *sizes, state_dim=options.state_dim, update_prob=options.update_prob
+        )
+        dtype = getattr(torch, options.dtype)
+        given: dict[str, Any] = {"periodic": options.periodic, "gradients": options.gradients}
+        print(explain(workload, device, dtype, **given))
         return 0
     folder = None if options.out is None else common.writable_folder(options.out)
     if options.plots:
@@ -99,16 +106,3 @@ def main(arguments: Sequence[str]) -> int:
             done += plots.write_plots(lambda: suites.pictures(tables), place, "plots")
         print("\n".join(done))
     return 0
-
-
-def _explanation(options: BenchOptions, device: torch.device) -> str:
-    import torch
-
-    from npa_envs.measure.speed.explain import explain
-    from npa_envs.measure.speed.timing import Workload
-
-    sizes = (options.space_dim, options.world_count, options.particle_count, 1)
-    workload = Workload(*sizes, state_dim=options.state_dim, update_prob=options.update_prob)
-    dtype = getattr(torch, options.dtype)
-    given = {"periodic": options.periodic, "gradients": options.gradients}
-    return explain(workload, device, dtype, **given)

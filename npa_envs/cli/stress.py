@@ -5,14 +5,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import tyro
 
 from npa_envs.cli import common
-
-if TYPE_CHECKING:
-    from npa_envs.measure.accuracy.suite import Check
 
 FAILED = 1
 
@@ -57,7 +54,11 @@ def main(arguments: Sequence[str]) -> int:
     checks = accuracy.all_checks(quick=options.quick, seed=options.seed, rules=rules)
     chosen = suite.chosen_checks(checks, options.only)
     if options.list:
-        print(_listing(chosen))
+        for group, summary in suite.GROUPS.items():
+            some = [check for check in chosen if suite.group_of(check.name) == group]
+            if some:
+                print(f"{group}: {summary}")
+                print("\n".join(f"  {check.name}: {check.expected}" for check in some))
         return 0
     device = options.place()
     path = None
@@ -87,14 +88,3 @@ def main(arguments: Sequence[str]) -> int:
         drawn = write_plots(lambda: suite.heat_maps(record), maps, "heat maps")
         print("\n".join([f"wrote {path}", *drawn]))
     return FAILED if record.failed() else 0
-
-
-def _listing(checks: Sequence[Check]) -> str:
-    from npa_envs.measure.accuracy.suite import GROUPS, group_of
-
-    lines = []
-    for group, summary in GROUPS.items():
-        some = [check for check in checks if group_of(check.name) == group]
-        if some:
-            lines += [f"{group}: {summary}", *(f"  {c.name}: {c.expected}" for c in some)]
-    return "\n".join(lines)
