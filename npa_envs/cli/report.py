@@ -34,7 +34,6 @@ from npa_envs.measure.record import (
     versions,
 )
 from npa_envs.rule.files import load_rule
-from npa_envs.tasks.base import Task
 from npa_envs.tasks.damage import DamageEvent
 from npa_envs.tasks.texture import Texture
 from npa_envs.training.trained_tasks import task_of_rule, tasks_of_codes
@@ -100,8 +99,24 @@ def write_report(
             progress=bar.advance,
             judge=judge,
         )
+        generator = torch.Generator(device).manual_seed(FIRST_SEED)
+        x, s, _ = task.seed(1, generator=generator, device=device)
+        shown = large_task(task, str(path), rule, device)
+        x, s, film = film_world(
+            rule,
+            shown,
+            x,
+            s,
+            FILM_STEPS,
+            generator=generator,
+            damages=FILM_DAMAGES if task.aligned else (),
+            every=frame_steps(FILM_STEPS),
+            progress=bar.advance,
+        )
         try:
-            _film(path, rule, task, folder, device, bar)
+            if task.has_views:
+                write_solid(task, x, s, folder)
+            write_film(film, folder, path.stem)
         except MissingDependencyError as error:
             not_filmed = f"; not all films: {error}"
     if len(tasks := tasks_of_codes(str(path), rule, device)) > 1:
@@ -120,34 +135,14 @@ def write_report(
     strip = folder / f"{path.stem}-filmstrip.png"
     picture = f"\n![A world from the seed on.]({strip.name})\n" if strip.exists() else ""
     write_text(card, _card(rule, task, training, facts, tables) + picture)
-    return card, score_line(json.loads(text)) + _decay(tables.get("growth", ())) + not_filmed
-
-
-def _decay(rows: Sequence[Any]) -> str:
-    """Return words for worlds that fall apart as they grow old; none where they hold."""
-    losses = [row.loss for row in rows]
-    least = min(filter(math.isfinite, losses), default=math.nan)
-    # More than four times the least, or NaN: no comparison with it holds.
-    if not losses or losses[-1] <= 4.0 * least:
-        return ""
-    return f"; worlds do not hold: at step {rows[-1].step} their loss is many times the least"
-
-
-def _film(
-    path: Path, rule: NPARule, task: Task, folder: Path, device: torch.device, bar: common.StepBar
-) -> None:
-    """Film a world of the rule from its seed."""
-    generator = torch.Generator(device).manual_seed(FIRST_SEED)
-    x, s, _ = task.seed(1, generator=generator, device=device)
-    shown = large_task(task, str(path), rule, device)
-    damages = FILM_DAMAGES if task.aligned else ()
-    x, s, film = film_world(
-        rule, shown, x, s, FILM_STEPS, generator=generator, damages=damages,
-        every=frame_steps(FILM_STEPS), progress=bar.advance,
-    )  # fmt: skip
-    if task.has_views:
-        write_solid(task, x, s, folder)
-    write_film(film, folder, path.stem)
+    rows = tables.get("growth", ())
+    least = min(filter(math.isfinite, (row.loss for row in rows)), default=math.nan)
+    # A last loss of more than four times the least, or NaN: no comparison with it holds.
+    holds = not rows or rows[-1].loss <= 4.0 * least
+    said = score_line(json.loads(text))
+    if not holds:
+        said += f"; worlds do not hold: at step {rows[-1].step} their loss is many times the least"
+    return card, said + not_filmed
 
 
 def _card(

@@ -463,18 +463,15 @@ def _species(config: TrainConfig[Any]) -> Sequence[Any]:
     return getattr(config.task, "species", (config.task,))
 
 
-def _goals(task: Any) -> Sequence[str]:
-    """Return the targets of a task, or its data."""
-    targets = getattr(task, "targets", ())
-    return targets or (getattr(task, "target", None) or f"the data {task.data}",)
-
-
 def announcement(
     task_name: str, options: TrainOptions, config: TrainConfig[Any], process_count: int = 1
 ) -> tuple[str, str]:
     """Return a run's targets in a line, and its size and expected time in another."""
     species = _species(config)
-    goals = [goal for own in species for goal in _goals(own)]
+    goals: list[str] = []
+    for own in species:
+        targets = getattr(own, "targets", ())
+        goals += targets or (getattr(own, "target", None) or f"the data {own.data}",)
     particles = " and ".join(str(own.particle_count) for own in species)
     named = options.preset or default_preset(task_name, config.device)
     source = f"preset {named}" if options.config is None else str(options.config)

@@ -98,7 +98,15 @@ def world_maker(options: ViewOptions, device: torch.device) -> Callable[[], Live
 
     if options.what.startswith("npa/"):
         policy = options.policy
-        keywords = {"particle_count": options.particle_count} | _keywords(options)
+        keywords = common.named_values("options", options.options)
+        for name in OWN_KEYWORDS:
+            if name in keywords:
+                said = name in ("device", "policy")
+                cure = f"say --{name} {keywords[name]}" if said else "leave it out"
+                raise NPAError(
+                    f"options must leave {name} to the command, got {name}={keywords[name]}: {cure}"
+                )
+        keywords = {"particle_count": options.particle_count} | keywords
 
         def make_world() -> LiveWorld:
             env, acting = make_environment(options.what, policy, device=str(device), **keywords)
@@ -116,16 +124,3 @@ def world_maker(options: ViewOptions, device: torch.device) -> Callable[[], Live
     if folder.is_dir() and any((folder / name).exists() for name in RUN_FILES):
         return lambda: RunWorld(folder, **given)
     return lambda: RuleWorld(options.what, **given)
-
-
-def _keywords(options: ViewOptions) -> dict[str, Any]:
-    """Return the keywords of the environment; the command's own are refused."""
-    found = common.named_values("options", options.options)
-    for name in OWN_KEYWORDS:
-        if name in found:
-            said = name in ("device", "policy")
-            cure = f"say --{name} {found[name]}" if said else "leave it out"
-            raise NPAError(
-                f"options must leave {name} to the command, got {name}={found[name]}: {cure}"
-            )
-    return found
