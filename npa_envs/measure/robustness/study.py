@@ -286,8 +286,7 @@ def tables(records: Sequence[RuleRecord]) -> str:
 
 
 def _time(curve: LossCurve) -> str:
-    step = curve.median_step()
-    share = f"{curve.recovered()}/{len(curve.losses)}"
+    step, share = curve.median_step(), f"{curve.recovered()}/{len(curve.losses)}"
     return share if step is None else f"{share}, {step:g}"
 
 

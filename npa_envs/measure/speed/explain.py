@@ -49,25 +49,21 @@ def kernel_rows(session: TimingSession, workloads: Sequence[Workload]) -> list[K
                 run()
                 torch.cuda.synchronize(session.device)
             name = f"{workload.name} {'training' if train else 'inference'}"
-            rows += _kernel_rows(name, profiler, workload.steps)
+            found = [
+                KernelRow(
+                    name,
+                    round(entry.self_device_time_total / workload.steps, 2),
+                    round(entry.count / workload.steps, 1),
+                    entry.key[:72],
+                )
+                for entry in profiler.key_averages()
+                if entry.device_type == DeviceType.CUDA
+            ]
+            found.sort(key=lambda row: -row.us)
+            least = 0.005 * sum(row.us for row in found)
+            rows += [row for row in found if row.us >= least]
             session.progress(1)
     return rows
-
-
-def _kernel_rows(workload: str, profiler: profile, steps: int) -> list[KernelRow]:
-    rows = [
-        KernelRow(
-            workload,
-            round(entry.self_device_time_total / steps, 2),
-            round(entry.count / steps, 1),
-            entry.key[:72],
-        )
-        for entry in profiler.key_averages()
-        if entry.device_type == DeviceType.CUDA
-    ]
-    rows.sort(key=lambda row: -row.us)
-    least = 0.005 * sum(row.us for row in rows)
-    return [row for row in rows if row.us >= least]
 
 
 Gradients = Literal["none", "weights", "positions"]

@@ -118,11 +118,6 @@ class PublicRow:
     launched_train_us: Timing
 
 
-def public_rows(session: TimingSession, workloads: Sequence[Workload]) -> list[PublicRow]:
-    """Return a row for each workload."""
-    return session.rows((w.name, partial(_public_row, session, w)) for w in workloads)
-
-
 def _public_row(session: TimingSession, workload: Workload) -> PublicRow:
     x, s = workload.worlds(session.device)
     found: dict[tuple[bool, bool], Timing] = {}
@@ -386,8 +381,8 @@ def paper(session: TimingSession) -> Tables:
     tables: Tables = {"throughput": throughput_rows(session, workloads)}
     if session.cuda:
         # On a CPU the throughput is that of the public call.
-        many_small = (*PROFILED, Workload(2, 64, 256, 32))
-        tables["public"] = public_rows(session, SMALL if session.small else many_small)
+        public = SMALL if session.small else (*PROFILED, Workload(2, 64, 256, 32))
+        tables["public"] = session.rows((w.name, partial(_public_row, session, w)) for w in public)
     return tables
 
 
