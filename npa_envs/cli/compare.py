@@ -159,9 +159,9 @@ def make_plan(options: CompareOptions) -> ComparisonPlan:
             f"seeds must be at most {RUNS}, got {options.seeds}: later runs would learn in the "
             "worlds of evaluations"
         )
-    quick, suite = options.quick, None
-    if options.suite is not None:
-        suite = npa_bench.SUITES[options.suite]
+    quick = options.quick
+    suite = None if options.suite is None else npa_bench.SUITES[options.suite]
+    if suite:
         for name in ("seconds", "particle_steps", "episodes"):
             if getattr(options, name) is not None:
                 raise NPAError(

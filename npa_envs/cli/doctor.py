@@ -129,8 +129,10 @@ def _packages() -> list[DoctorLine]:
 
 
 def _extras() -> list[DoctorLine]:
-    lines = []
-    for extra, purpose in EXTRAS.items() if _version("npa-envs") else ():
+    lines: list[DoctorLine] = []
+    if _version("npa-envs") is None:
+        return lines
+    for extra, purpose in EXTRAS.items():
         needed = list(_requirements(extra))
         faults = [f"{name} {fault}" for name, _, fault in needed if fault]
         have = [f"{name} {_version(name)}" for name, *_ in needed]

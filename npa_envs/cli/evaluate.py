@@ -70,7 +70,8 @@ def main(arguments: Sequence[str]) -> int:
         given["checkpoints"] = options.checkpoints or quality.PICTURE_CHECKPOINTS
         with common.StepBar(None, show=options.progress) as bar:
             found = quality.picture_rows(rule, tasks, progress=bar.advance, **given)
-        tables, metric = {"pictures": found}, tasks[0].metric_name
+        tables = {"pictures": found}
+        metric = tasks[0].metric_name
         what = f"{len(tasks)} pictures, {options.seed_count} worlds each"
         metric_words = f"{metric}, shuffled: with the code of the next picture"
     else:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal, cast
+from typing import Annotated, Any, Literal, cast
 
 import tyro
 
@@ -82,7 +82,7 @@ def main(arguments: Sequence[str]) -> int:
     trained = task_of_rule(options.rule, rule, device, **options.world)
     # Drawn as asked for; measured as trained, so that the figures can be compared.
     task = trained.task
-    looks = {"resolution": options.resolution, "style": options.style}
+    looks: dict[str, Any] = {"resolution": options.resolution, "style": options.style}
     shown = film.large_task(task, options.rule, rule, device, **looks, **options.world)
     folder = common.writable_folder(options.out)
     generator = torch.Generator(device).manual_seed(options.seed)

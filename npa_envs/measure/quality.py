@@ -100,10 +100,10 @@ def evaluate(
     check_steps("checkpoints", checkpoints)
     runner, x, s = _from_seeds(rule, task, seeds, device, progress)
     rows = []
-    for step, *worlds in runner.at(checkpoints, x, s):
-        rows.append(measure(runner.task, *worlds, step))
+    for step, new_x, new_s in runner.at(checkpoints, x, s):
+        rows.append(measure(runner.task, new_x, new_s, step))
         if watch is not None:
-            watch(*worlds, step)
+            watch(new_x, new_s, step)
     return rows
 
 

@@ -96,7 +96,7 @@ CONDITIONS = {
 
 def trained_value(condition: str, update_prob: float) -> float | str:
     """Return the value of a condition at which a rule whose task has `update_prob` was trained."""
-    others = {"update_prob": update_prob, "noise": 0.0, "shape": "trained"}
+    others: dict[str, float | str] = {"update_prob": update_prob, "noise": 0.0, "shape": "trained"}
     return others.get(condition, 1.0)
 
 

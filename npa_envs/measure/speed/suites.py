@@ -256,11 +256,14 @@ def skips(workload: Workload) -> list[Skip]:
     inactive = "perception, network and lists of inactive particles"
     built, longer = "cells, densities and neighbour lists", {"steps": 32}
     again = "a second forward pass, for the backward pass"
-    columns = (
-        ("the state gradient", "state_gradient"),
-        ("the moment matrix and its inverse", "moment_correction"),
-        ("columns of the density gradient", "density_gradient"),
-    )
+    columns: list[Skip] = [
+        (what, f"{option}=False", {}, {"rule": {option: False}})
+        for what, option in (
+            ("the state gradient", "state_gradient"),
+            ("the moment matrix and its inverse", "moment_correction"),
+            ("columns of the density gradient", "density_gradient"),
+        )
+    ]
     return [
         (stored, "no gradient is enabled", {"gradients": True}, {}),
         (
@@ -270,7 +273,7 @@ def skips(workload: Workload) -> list[Skip]:
             training,
         ),
         (inactive, "update_prob < 1", {"update_prob": 1.0}, {}),
-        *((what, f"{option}=False", {}, {"rule": {option: False}}) for what, option in columns),
+        *columns,
         ("displacements", "static=True", rebuilt, static | rebuilt),
         (
             built,
