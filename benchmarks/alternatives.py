@@ -23,7 +23,9 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import torch
+from drift import drawn_like, relative_error
 from hash_grid import grid_fields
+from precisions import PRECISIONS, Precision
 from scripts import script_facts, script_parser
 from strategies import STRATEGIES, Strategy
 from torch import Tensor
@@ -34,17 +36,15 @@ from npa_envs.errors import NPAError, shown
 from npa_envs.files import read_json, write_bytes, write_text
 from npa_envs.measure.plots import new_figure, number_plainly, png
 from npa_envs.measure.quality import psnr
-from npa_envs.measure.speed.precisions import PRECISIONS, Precision
-from npa_envs.measure.speed.suites import BenchReport, drawn_like
+from npa_envs.measure.speed.suites import BenchReport
 from npa_envs.measure.speed.timing import (
     NO_TIME,
     Cost,
     Tables,
     Timing,
     TimingSession,
-    relative_error,
+    Workload,
 )
-from npa_envs.measure.speed.workloads import Workload
 from npa_envs.ops import perception_fields
 from npa_envs.rule.files import load_rule
 from npa_envs.rule.rule import NPARule

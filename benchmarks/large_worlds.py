@@ -23,7 +23,7 @@ from pathlib import Path
 
 import torch
 
-from npa_envs.measure.speed.workloads import Workload, rollout_call
+from npa_envs.measure.speed.timing import Workload, rollout_call
 from npa_envs.world.rollout import rollout
 
 INFERENCE = (2**22, 2**24, 40_000_000, 100_000_000, 120_000_000)

@@ -30,8 +30,7 @@ from torch import Tensor
 
 from npa_envs.files import write_text
 from npa_envs.measure.quality import evaluate
-from npa_envs.measure.record import current_commit, machine
-from npa_envs.measure.tables import as_objects
+from npa_envs.measure.record import as_objects, current_commit, machine
 from npa_envs.rule.files import load_rule, save_rule
 from npa_envs.rule.rule import NPARule
 from npa_envs.tasks.morphogenesis3d import Morphogenesis3D

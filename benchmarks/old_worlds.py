@@ -92,7 +92,7 @@ def follow(arguments: argparse.Namespace) -> None:
 
 
 def endurance(
-    home: long_runs.EnduranceCase, steps: int, generators: Sequence[torch.Generator]
+    home: long_runs.TrialWorlds, steps: int, generators: Sequence[torch.Generator]
 ) -> dict[str, Any]:
     """Return losses and figures of all worlds of a case, each against itself when settled.
 
@@ -180,7 +180,7 @@ def run_long(arguments: argparse.Namespace) -> None:
             for seed in SEEDS
         ]
         x, s = torch.cat([x for x, *_ in seeds]), torch.cat([s for _, s, _ in seeds])
-        home = long_runs.EnduranceCase(rule, task, x.float(), s.float(), long_runs.SETTLED)
+        home = long_runs.TrialWorlds(rule, task, x.float(), s.float())
         generators = [torch.Generator(device).manual_seed(seed) for seed in (1, 2)]
         line = {"picture": picture} | endurance(home, arguments.steps, generators)
         append_line(arguments.out / "long.jsonl", line)

@@ -18,10 +18,10 @@ from functools import partial
 
 import gsplat
 import torch
+from drift import relative_error
 from torch import Tensor
 
 import npa_envs
-from npa_envs.measure.speed.timing import relative_error
 from npa_envs.ops import Cameras
 from npa_envs.tasks.appearance import Gaussians, draw_gaussians
 from npa_envs.tasks.targets.views import some_views

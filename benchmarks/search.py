@@ -28,8 +28,7 @@ from npa_envs.agents.search.worlds import SearchWorld
 from npa_envs.devices import check_device
 from npa_envs.files import read_json, write_bytes
 from npa_envs.measure.plots import draw_band, legend_of, new_figure, png
-from npa_envs.measure.record import write_record
-from npa_envs.measure.tables import markdown_table
+from npa_envs.measure.record import markdown_table, write_record
 
 IMAGE = Path("runs/search_growth.png")
 

@@ -28,7 +28,7 @@ from npa_envs.agents.comparison.npa_bench import (
 )
 from npa_envs.agents.comparison.plan import NOTHING, YARDSTICK
 from npa_envs.measure.plots import draw_band, legend_of, new_figure, png
-from npa_envs.measure.tables import NONE
+from npa_envs.measure.record import NONE
 
 DOCS = Path(__file__).resolve().parent
 ROWS = DOCS.parent / "benchmarks" / "results"

@@ -17,8 +17,7 @@ from npa_envs.agents.comparison.run import PICTURE, SIZE, RunRecord
 from npa_envs.agents.learning import CurvePoint
 from npa_envs.files import write_text
 from npa_envs.measure.plots import draw_band, legend_of, new_figure, png, write_plots
-from npa_envs.measure.record import Record
-from npa_envs.measure.tables import NONE, csv_text, markdown_table, mean_with_error, short
+from npa_envs.measure.record import NONE, Record, csv_text, markdown_table, mean_with_error, short
 from npa_envs.render import write_filmstrip
 
 LOST = ("diverged", "left the world")

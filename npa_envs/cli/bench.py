@@ -6,28 +6,14 @@ import shlex
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import Any, Literal
 
-from npa_envs.cli.output import (
-    MeasureOptions,
-    StepBar,
-    check_numbers,
-    chosen_names,
-    parse_options,
-    torch_threads,
-    writable_folder,
-)
+from npa_envs.cli import common
 from npa_envs.errors import NPAError
-
-if TYPE_CHECKING:
-    import torch
-
-QUICK = "quick"
-"""The suite that is run unless another one is asked for."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class BenchOptions(MeasureOptions):
+class BenchOptions(common.MeasureOptions):
     """Measure the paper's table, scaling and other times; or explain what a step runs."""
 
     suite: str | None = None
@@ -64,38 +50,47 @@ class BenchOptions(MeasureOptions):
 
 def main(arguments: Sequence[str]) -> int:
     """Measure, print and write."""
-    options = parse_options(BenchOptions, "bench", arguments)
-    from npa_envs.devices import check_device
+    options = common.parse_options(BenchOptions, "bench", arguments)
     from npa_envs.files import write_text
-    from npa_envs.measure.plots import check_matplotlib, write_plots
-    from npa_envs.measure.record import current_commit, time_limit
-    from npa_envs.measure.speed.suites import SUITES, BenchReport, pictures
-    from npa_envs.measure.speed.timing import TimingSession
+    from npa_envs.measure import plots, record
+    from npa_envs.measure.speed import suites, timing
 
-    check_numbers(options, repeats=1, threads=1, world_count=1, particle_count=1, state_dim=1)
+    common.check_numbers(
+        options, repeats=1, threads=1, world_count=1, particle_count=1, state_dim=1
+    )
     if options.plots and options.out is None:
         raise NPAError("plots need a folder to be written to: give --out DIR as well")
-    device = check_device(options.device)
-    (name,) = chosen_names("suite", [options.suite or QUICK], SUITES)
+    device = options.place()
+    (name,) = common.chosen_names("suite", [options.suite or "quick"], suites.SUITES)
     if options.explain:
-        print(_explanation(options, device))
+        import torch
+
+        from npa_envs.measure.speed.explain import explain
+
+        sizes = (options.space_dim, options.world_count, options.particle_count, 1)
+        workload = timing.Workload(
+            *sizes, state_dim=options.state_dim, update_prob=options.update_prob
+        )
+        dtype = getattr(torch, options.dtype)
+        given: dict[str, Any] = {"periodic": options.periodic, "gradients": options.gradients}
+        print(explain(workload, device, dtype, **given))
         return 0
-    folder = None if options.out is None else writable_folder(options.out)
+    folder = None if options.out is None else common.writable_folder(options.out)
     if options.plots:
-        check_matplotlib()
-    with StepBar(None, show=options.progress, unit="row") as bar, torch_threads(options.threads):
-        session = TimingSession(
+        plots.check_matplotlib()
+    with common.measuring(options, None, "row") as bar:
+        session = timing.TimingSession(
             device=device,
             repeats=options.repeats,
             small=options.quick,
             progress=bar.advance,
-            enough=time_limit(options.max_seconds),
+            enough=record.time_limit(options.max_seconds),
         )
-        tables = SUITES[name](session)
-    report = BenchReport(
+        tables = suites.SUITES[name](session)
+    report = suites.BenchReport(
         suite=name,
         command=shlex.join(["npa-envs", "bench", *arguments]),
-        commit=options.commit or current_commit(),
+        commit=options.commit or record.current_commit(),
         device=device,
         threads=options.threads,
         tables=tables,
@@ -108,18 +103,6 @@ def main(arguments: Sequence[str]) -> int:
         done = [f"wrote {path}"]
         if options.plots:
             place = path.with_name(f"{path.stem}_*.png")
-            done += write_plots(lambda: pictures(tables), place, "plots")
+            done += plots.write_plots(lambda: suites.pictures(tables), place, "plots")
         print("\n".join(done))
     return 0
-
-
-def _explanation(options: BenchOptions, device: torch.device) -> str:
-    import torch
-
-    from npa_envs.measure.speed.explain import Question, explain
-    from npa_envs.measure.speed.workloads import Workload
-
-    sizes = (options.space_dim, options.world_count, options.particle_count, 1)
-    workload = Workload(*sizes, state_dim=options.state_dim, update_prob=options.update_prob)
-    dtype = {"float32": torch.float32, "float64": torch.float64}[options.dtype]
-    return explain(Question(workload, device, dtype, options.periodic, options.gradients))

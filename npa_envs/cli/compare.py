@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import itertools
 import json
 import math
 import re
@@ -16,15 +17,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
-from npa_envs.cli.output import (
-    MeasureOptions,
-    StepBar,
-    check_numbers,
-    chosen_names,
-    named_values,
-    parse_options,
-    writable_folder,
-)
+from npa_envs.cli import common
 from npa_envs.errors import NPAError, suggest
 
 if TYPE_CHECKING:
@@ -35,9 +28,6 @@ RUN_FAILED = 1
 
 ROWS = "rows"
 """Folder of a suite's rows, below that of the comparison."""
-
-NEED_MORE = ("clone",)
-"""Methods that are compared only when asked for: they need a teacher."""
 
 QUICK_EPISODES, QUICK_STEPS = 4, 200_000
 """Held-out episodes and particle-steps of a quick comparison."""
@@ -51,7 +41,7 @@ QUICK: dict[str, Any] = {
 
 
 @dataclass(frozen=True, kw_only=True)
-class CompareOptions(MeasureOptions):
+class CompareOptions(common.MeasureOptions):
     """Compare methods on tasks over seeds, for equal wall time, equal particle-steps, or both.
 
     Runs learn in processes. One that fails is recorded with its error, and the others go on; a
@@ -101,7 +91,7 @@ class CompareOptions(MeasureOptions):
 
 def main(arguments: Sequence[str]) -> int:
     """Run what is missing, print and write; return 1 where a run failed."""
-    options = parse_options(CompareOptions, "compare", arguments)
+    options = common.parse_options(CompareOptions, "compare", arguments)
     from npa_envs.agents.comparison.npa_bench import SUITES, check_rows, write_rows
     from npa_envs.agents.comparison.report import write_pictures, write_table
     from npa_envs.agents.comparison.run import held_records, run_jobs
@@ -111,7 +101,7 @@ def main(arguments: Sequence[str]) -> int:
     words = without_folders(arguments, "--out")
     command = shlex.join(["npa-envs", "compare", *words])
     plan = make_plan(options)
-    folder = writable_folder(options.out)
+    folder = common.writable_folder(options.out)
     # All are read first: a record of other settings is refused before any work is done.
     records = held_records(plan, folder)
     if options.suite is not None:
@@ -129,7 +119,7 @@ def main(arguments: Sequence[str]) -> int:
         bar.advance(1)
 
     places = Places((options.devices or (options.device,)), _jobs(options), options.threads)
-    with StepBar(len(missing), show=options.progress, unit="run") as bar:
+    with common.StepBar(len(missing), show=options.progress, unit="run") as bar:
         run_jobs(
             plan,
             missing,
@@ -142,7 +132,7 @@ def main(arguments: Sequence[str]) -> int:
     lines = [write_table(plan, whole(), folder, command), *write_pictures(whole(), folder)]
     if options.suite is not None:
         rows = write_rows(
-            SUITES[options.suite], plan, whole(), writable_folder(folder / ROWS), command
+            SUITES[options.suite], plan, whole(), common.writable_folder(folder / ROWS), command
         )
         lines += [f"wrote {path}" for path in rows]
     failed = [record for record in whole() if record.status == "failed"]
@@ -154,79 +144,70 @@ def main(arguments: Sequence[str]) -> int:
 
 
 def make_plan(options: CompareOptions) -> ComparisonPlan:
-    """Return the plan that the command line asks for."""
+    """Return the plan that the command line asks for.
+
+    Of a suite, whose protocol is frozen, some tasks, methods and seeds may be chosen.
+    """
+    from npa_envs.agents.comparison import npa_bench
     from npa_envs.agents.comparison.plan import LEFT_OUT, PROBLEMS, ComparisonPlan, make_problem
     from npa_envs.agents.learning import METHODS
     from npa_envs.agents.learning.problem import RUNS
 
-    check_numbers(options, seeds=1, episodes=1, jobs=1, threads=1)
+    common.check_numbers(options, seeds=1, episodes=1, jobs=1, threads=1)
     if options.seeds is not None and options.seeds > RUNS:
         raise NPAError(
             f"seeds must be at most {RUNS}, got {options.seeds}: later runs would learn in the "
             "worlds of evaluations"
         )
-    if options.suite is not None:
-        return _suite_plan(options)
-    if options.quick:
+    quick = options.quick
+    suite = None if options.suite is None else npa_bench.SUITES[options.suite]
+    if suite:
+        for name in ("seconds", "particle_steps", "episodes"):
+            if getattr(options, name) is not None:
+                raise NPAError(
+                    f"--{name.replace('_', '-')} must not be given with --suite, whose protocol is "
+                    "frozen: leave it out, or compare without a suite"
+                )
+    elif quick:
         few = {name: getattr(options, name) or value for name, value in QUICK.items()}
         options = replace(options, **few)
-    tasks = chosen_names("task", options.tasks, PROBLEMS)
-    methods, own = _chosen_methods(options.methods, METHODS)
-    if not options.methods:
-        methods = [name for name in methods if name not in NEED_MORE]
-    problems = {name: make_problem(name, quick=options.quick) for name in tasks}
-    return ComparisonPlan(
-        tasks={name: json.loads(problem.to_json()) for name, problem in problems.items()},
-        methods=methods,
-        seeds=tuple(range(3 if options.seeds is None else options.seeds)),
-        budgets={axis: dict.fromkeys(tasks, held) for axis, held in _budgets(options).items()},
-        options=_method_options(options.options, methods, own),
-        own=own,
-        left_out=() if options.methods else LEFT_OUT,
-        episodes=options.episodes or (QUICK_EPISODES if options.quick else 32),
-        settings=_settings(options),
-    )
-
-
-def _suite_plan(options: CompareOptions) -> ComparisonPlan:
-    """Return the plan of NPA-Bench, of which some tasks, methods and seeds may be chosen."""
-    from npa_envs.agents.comparison import npa_bench
-    from npa_envs.agents.comparison.plan import ComparisonPlan
-
-    assert options.suite is not None, "asked for by its caller"
-    suite = npa_bench.SUITES[options.suite]
-    for name in ("seconds", "particle_steps", "episodes"):
-        if getattr(options, name) is not None:
-            raise NPAError(
-                f"--{name.replace('_', '-')} must not be given with --suite, whose protocol is "
-                "frozen: leave it out, or compare without a suite"
-            )
-    quick = options.quick
-    tasks = chosen_names("task", options.tasks, suite.tasks)
-    if quick and not options.tasks:
+    tasks = common.chosen_names("task", options.tasks, suite.tasks if suite else PROBLEMS)
+    if suite and quick and not options.tasks:
         tasks = tasks[:1]
-    methods, own = _chosen_methods(options.methods, suite.methods)
-    chosen = _method_options(options.options, methods, own)
+    methods, own = _chosen_methods(options.methods, suite.methods if suite else METHODS)
+    chosen = _method_options(options.options, methods, own) if suite else {}
     for name in chosen.keys() - own.keys():
         raise NPAError(
-            f"options of {name!r} are frozen in {suite.name}: give it a name of its own, "
+            f"options of {name!r} are frozen in {options.suite}: give it a name of its own, "
             f"--methods my_{name}={name} --options my_{name}.NAME=VALUE"
         )
-    problems = {name: suite.problem_of(name) for name in tasks}
+    budgets: dict[Axis, dict[str, float]]
+    if suite:
+        problems = {name: suite.problem_of(name) for name in tasks}
+        budgets = {npa_bench.AXIS: {name: suite.budget_of(name, quick=quick) for name in tasks}}
+        left_out = [
+            (task, method)
+            for task, method in itertools.product(tasks, methods)
+            if suite.leaves_out(task, own.get(method, method))
+        ]
+        seeds, episodes = 1 if quick else npa_bench.LEAST_SEEDS, npa_bench.EPISODES
+    else:
+        if not options.methods:
+            methods = [name for name in methods if name != "clone"]  # It needs a teacher.
+        problems = {name: make_problem(name, quick=quick) for name in tasks}
+        budgets = {axis: dict.fromkeys(tasks, held) for axis, held in _budgets(options).items()}
+        chosen = _method_options(options.options, methods, own)
+        left_out = [] if options.methods else list(LEFT_OUT)
+        seeds, episodes = 3, 32
     return ComparisonPlan(
         tasks={name: json.loads(problem.to_json()) for name, problem in problems.items()},
         methods=methods,
-        seeds=tuple(range(options.seeds or (1 if quick else npa_bench.LEAST_SEEDS))),
-        budgets={npa_bench.AXIS: {name: suite.budget_of(name, quick=quick) for name in tasks}},
-        left_out=[
-            (task, method)
-            for task in tasks
-            for method in methods
-            if suite.leaves_out(task, own.get(method, method))
-        ],
+        seeds=tuple(range(options.seeds or seeds)),
+        budgets=budgets,
         options=chosen,
         own=own,
-        episodes=QUICK_EPISODES if quick else npa_bench.EPISODES,
+        left_out=left_out,
+        episodes=options.episodes or (QUICK_EPISODES if quick else episodes),
         settings=_settings(options),
     )
 
@@ -271,7 +252,7 @@ def _chosen_methods(words: Sequence[str], known: Iterable[str]) -> tuple[list[st
         with _this_folder_searched():
             method_options(method)
     plain = [word for word in words if "=" not in word]
-    return [*(chosen_names("method", plain, known) if plain or not own else []), *own], own
+    return [*(common.chosen_names("method", plain, known) if plain or not own else []), *own], own
 
 
 @contextlib.contextmanager
@@ -304,7 +285,7 @@ def _method_options(
             known = method_options(own.get(method, method))
         if option not in known:
             raise NPAError(f"unknown option {option!r} in {word!r}: {suggest(option, known)}")
-        found.setdefault(method, {}).update(named_values("options", [f"{option}={value}"]))
+        found.setdefault(method, {}).update(common.named_values("options", [f"{option}={value}"]))
     return found
 
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from npa_envs.cli.output import StepBar, parse_options, torch_threads, writable_folder
+from npa_envs.cli import common
 from npa_envs.errors import NPAError
 
 if TYPE_CHECKING:
@@ -31,12 +31,9 @@ SMALL_RUN: dict[str, Any] = {
 }
 """Fields over the preset `fast`: the target is learned in half a minute on one core."""
 
-SCREEN = 192
-"""Pixels on each side of the small rule's pictures; its loss saw fewer."""
-
 
 @dataclass(frozen=True, kw_only=True)
-class DemoOptions:
+class DemoOptions(common.RunOptions):
     """Grow a shipped rule from its seed, cut it, wipe a part and let it heal each time; then train
     a small rule from a picture."""
 
@@ -50,23 +47,18 @@ class DemoOptions:
     """Time for the training [s]."""
     seed: int = 0
     """Randomness."""
-    device: str = "cpu"
-    """Where to run: cpu, cuda, cuda:1."""
-    progress: bool = True
-    """Show progress bars."""
 
 
 def main(arguments: Sequence[str]) -> int:
     """Grow, heal and train, and print and write what came of it."""
-    options = parse_options(DemoOptions, "demo", arguments)
-    from npa_envs.devices import check_device
+    options = common.parse_options(DemoOptions, "demo", arguments)
     from npa_envs.files import write_text
 
     if not 1.0 <= options.train_seconds <= 3600.0:
         raise NPAError(f"train_seconds must lie in [1, 3600], got {options.train_seconds}")
     start = time.perf_counter()
-    device = check_device(options.device)
-    path = writable_folder(options.out) / "report.txt"
+    device = options.place()
+    path = common.writable_folder(options.out) / "report.txt"
     lines: list[str] = []
 
     def say(text: str) -> None:
@@ -74,7 +66,7 @@ def main(arguments: Sequence[str]) -> int:
         lines.append(text)
 
     # Worlds as small as these gain little from several threads, which wait for each other.
-    with torch_threads(1):
+    with common.torch_threads(1):
         grow_and_heal(options, device, say)
         train_small(options, device, say)
     say(f"all of it took {time.perf_counter() - start:.0f} s")
@@ -106,7 +98,7 @@ def grow_and_heal(options: DemoOptions, device: torch.device, say: Callable[[str
         return measure(task, x, s, step).figures
 
     lines, film, step = [], WorldFilm(), 0
-    with StepBar(GROW_STEPS + 2 * HEAL_STEPS, show=options.progress) as bar:
+    with common.StepBar(GROW_STEPS + 2 * HEAL_STEPS, show=options.progress) as bar:
         for kind, steps in ((None, GROW_STEPS), ("cut", HEAL_STEPS), ("wipe", HEAL_STEPS)):
             if kind is not None:
                 damage = DamageEvent(step, kind)
@@ -161,11 +153,12 @@ def train_small(options: DemoOptions, device: torch.device, say: Callable[[str],
     if result.interrupted:
         raise KeyboardInterrupt
     say(f"  {result.iteration} iterations in {time.perf_counter() - start:.1f} s")
-    task = task_entry(task_name).make(override(config, resolution=SCREEN).task, device)
+    # The loss saw fewer pixels.
+    task = task_entry(task_name).make(override(config, resolution=192).task, device)
     generator = torch.Generator(device).manual_seed(options.seed + 1)
     x, s, _ = task.seed(1, generator=generator, device=device)
     steps = 4 * config.steps[1]
-    with StepBar(steps, show=options.progress) as bar:
+    with common.StepBar(steps, show=options.progress) as bar:
         x, s, film = film_world(
             result.rule, task, x, s, steps, generator=generator, every=1, progress=bar.advance
         )

@@ -8,9 +8,8 @@ import platform
 import re
 import subprocess
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
 
 EXTRAS = {
     "envs": "several species, and particles as agents (PettingZoo)",
@@ -28,9 +27,6 @@ EXTRAS = {
 OLDEST_DRIVERS = {12: 525, 13: 580}
 """First version of NVIDIA's driver that serves a version of CUDA (NVIDIA, CUDA Compatibility)."""
 
-FAST_CAPABILITY = (8, 0)
-"""Compute capability from which on the faster kernels run (`npa_envs.ops.backend`)."""
-
 
 @dataclass(frozen=True)
 class DoctorOptions:
@@ -42,9 +38,9 @@ def main(arguments: Sequence[str]) -> int:
     """Print the report; return 1 where something is broken."""
     if arguments:
         # Imported late: the report must not be missing where the parser is broken.
-        from npa_envs.cli.output import parse_options
+        from npa_envs.cli import common
 
-        parse_options(DoctorOptions, "doctor", arguments)
+        common.parse_options(DoctorOptions, "doctor", arguments)
     lines = examine()
     width = max(len(line.subject) for line in lines)
     for line in lines:
@@ -69,58 +65,29 @@ class DoctorLine:
     @property
     def mark(self) -> str:
         """How the line begins: "!" for what is broken, "-" for what is slow or missing."""
-        if self.cure is None:
-            return " "
-        return "-" if self.optional else "!"
+        return " " if self.cure is None else "-" if self.optional else "!"
 
 
 def examine() -> list[DoctorLine]:
     """Return the lines of packages, devices, kernel cache, fonts and programs, in their order."""
-    checks: dict[str, Callable[[], list[DoctorLine]]] = {
-        "python": _python,
-        "packages": _packages,
-        "extras": _extras,
-        "torch devices": _torch_devices,
-        "warp devices": _warp_devices,
-        "kernel cache": _kernel_cache,
-        "emoji font": _emoji_font,
-        "ffmpeg": _ffmpeg,
-        "browser": _browser,
-        "shipped rules": _shipped_rules,
-    }
     lines = []
-    for subject, check in checks.items():
+    devices = (_torch_devices, _warp_devices, _kernel_cache)
+    for check in (_python, _packages, _extras, *devices, _emoji_font, _ffmpeg, _browser, _rules):
         try:
             lines += check()
         except Exception as error:
             # The report must not break where the machine is broken.
+            subject = check.__name__[1:].replace("_", " ")
             lines.append(DoctorLine(subject, f"{type(error).__name__}: {error}", "see the message"))
     return lines
 
 
 def _python() -> list[DoctorLine]:
-    version = f"{platform.python_version()} ({sys.executable})"
     system = f"{platform.system()} {platform.release()}, {platform.machine()}"
     return [
-        DoctorLine("python", version),
+        DoctorLine("python", f"{platform.python_version()} ({sys.executable})"),
         DoctorLine("system", f"{system}, {os.cpu_count()} cores"),
     ]
-
-
-class Requirement(NamedTuple):
-    """A package that an extra, or the installation itself, asks for; any version where empty."""
-
-    name: str
-    oldest: str
-    extra: str | None
-
-    def fault(self) -> str | None:
-        """Return what is wrong with the package, None: nothing."""
-        version = _version(self.name)
-        if version is None:
-            return "not installed"
-        old = _numbers(version) < _numbers(self.oldest)
-        return f"{version} is older than {self.oldest}" if old else None
 
 
 def _version(name: str) -> str | None:
@@ -135,21 +102,18 @@ def _numbers(version: str) -> tuple[int, ...]:
     return tuple(int(part) for part in re.findall(r"\d+", version.partition("+")[0])[:3])
 
 
-def _requirements() -> list[Requirement]:
-    """Return the requirements in the installed metadata of npa-envs."""
-    try:
-        lines = importlib.metadata.requires("npa-envs") or []
-    except importlib.metadata.PackageNotFoundError:
-        return []
-    found = []
-    for line in lines:
-        name, oldest, extra = (
+def _requirements(extra: str) -> Iterator[tuple[str, str, str | None]]:
+    """Yield name, oldest version and fault of what an extra, or "" the installation, asks for."""
+    for line in importlib.metadata.requires("npa-envs") or []:
+        name, oldest, own = (
             match[1] if (match := re.search(pattern, line)) else ""
             for pattern in (r"^([\w.-]+)", r">=\s*([\d.]+)", r"extra\s*==\s*['\"]([\w-]+)")
         )
-        if name != "npa-envs":
-            found.append(Requirement(name, oldest, extra or None))
-    return found
+        if own == extra and name != "npa-envs":
+            version = _version(name)
+            old = version is not None and _numbers(version) < _numbers(oldest)
+            fault = f"{version} is older than {oldest}" if old else None
+            yield name, oldest, fault if version else "not installed"
 
 
 def _packages() -> list[DoctorLine]:
@@ -158,20 +122,20 @@ def _packages() -> list[DoctorLine]:
         text = "not installed, imported from a folder"
         return [DoctorLine("npa-envs", text, "pip install -e . in the clone", optional=True)]
     lines = [DoctorLine("npa-envs", version)]
-    for needed in _requirements():
-        if needed.extra is None:
-            fault = needed.fault()
-            cure = f"pip install -U '{needed.name}>={needed.oldest}'" if fault else None
-            lines.append(DoctorLine(needed.name, fault or _version(needed.name) or "", cure))
+    for name, oldest, fault in _requirements(""):
+        cure = f"pip install -U '{name}>={oldest}'" if fault else None
+        lines.append(DoctorLine(name, fault or _version(name) or "", cure))
     return lines
 
 
 def _extras() -> list[DoctorLine]:
-    lines = []
+    lines: list[DoctorLine] = []
+    if _version("npa-envs") is None:
+        return lines
     for extra, purpose in EXTRAS.items():
-        needed = [one for one in _requirements() if one.extra == extra]
-        faults = [f"{one.name} {fault}" for one in needed if (fault := one.fault())]
-        have = [f"{one.name} {_version(one.name)}" for one in needed]
+        needed = list(_requirements(extra))
+        faults = [f"{name} {fault}" for name, _, fault in needed if fault]
+        have = [f"{name} {_version(name)}" for name, *_ in needed]
         text = f"{purpose}: {', '.join(faults or have)}"
         cure = f"pip install 'npa-envs[{extra}]'" if faults else None
         lines += [DoctorLine(f"[{extra}]", text, cure, optional=True)] if needed else []
@@ -186,41 +150,41 @@ def _torch_devices() -> list[DoctorLine]:
     cure = "more is faster for large worlds: set OMP_NUM_THREADS, or leave it out" if idle else None
     lines = [DoctorLine("cpu", f"{threads} threads of {cores} cores", cure, optional=True)]
     if not torch.cuda.is_available():
-        return [*lines, _no_cuda(torch.version.cuda, _cards())]
+        return [*lines, _no_cuda(torch.version.cuda)]
     for index in range(torch.cuda.device_count()):
         device = torch.cuda.get_device_properties(index)
         text = (
             f"{device.name}, {device.total_memory / 2**30:.0f} GiB, "
             f"compute capability {device.major}.{device.minor}, CUDA {torch.version.cuda}"
         )
-        slow = (device.major, device.minor) < FAST_CAPABILITY
+        slow = (device.major, device.minor) < (8, 0)
         cure = "slow: the faster kernels need a card from 8.0 on (Ampere and newer)"
         lines.append(DoctorLine(f"cuda:{index}", text, cure if slow else None, optional=True))
     return lines
 
 
-def _cards() -> list[tuple[str, str]]:
-    """Return name and driver version of each card that NVIDIA's own program lists."""
-    command = ["nvidia-smi", "--query-gpu=name,driver_version", "--format=csv,noheader"]
+def _run(*command: str) -> list[str] | None:
+    """Return what a program prints, in lines; None where it cannot run."""
     try:
         done = subprocess.run(
             command, capture_output=True, encoding="utf-8", errors="replace", check=True, timeout=20
         )
     except (OSError, subprocess.SubprocessError):
-        return []
-    rows = [line.rpartition(", ") for line in done.stdout.splitlines()]
-    return [(name, version) for name, _, version in rows if name]
+        return None
+    return done.stdout.splitlines()
 
 
-def _no_cuda(built: str | None, cards: list[tuple[str, str]]) -> DoctorLine:
+def _no_cuda(built: str | None) -> DoctorLine:
     """Return why torch, built for a version of CUDA or for none, uses no card."""
+    listed = _run("nvidia-smi", "--query-gpu=name,driver_version", "--format=csv,noheader")
+    cards = [line.rpartition(", ") for line in listed or [] if ", " in line]
     if not cards:
         cure = (
             "slow for large worlds: use the presets fast and tiny, which are made for CPUs, or a "
             "machine with an NVIDIA card"
         )
         return DoctorLine("cuda", "no NVIDIA card, or no driver for it", cure, optional=True)
-    name, driver = cards[0]
+    name, _, driver = cards[0]
     hidden = os.environ.get("CUDA_VISIBLE_DEVICES")
     oldest = OLDEST_DRIVERS.get(int((built or "0").partition(".")[0]), 0)
     if built is None:
@@ -279,16 +243,13 @@ def _ffmpeg() -> list[DoctorLine]:
         import imageio_ffmpeg
 
         program = imageio_ffmpeg.get_ffmpeg_exe()
-    except ImportError as error:
-        return [DoctorLine("ffmpeg", f"not found ({error})", "pip install 'imageio[ffmpeg]'")]
-    except RuntimeError as error:
-        return [DoctorLine("ffmpeg", f"not found ({error})", again)]
-    done = subprocess.run(
-        [program, "-version"], capture_output=True, encoding="utf-8", errors="replace", check=False
-    )
-    if done.returncode:
+    except (ImportError, RuntimeError) as error:
+        cure = "pip install 'imageio[ffmpeg]'" if isinstance(error, ImportError) else again
+        return [DoctorLine("ffmpeg", f"not found ({error})", cure)]
+    said = _run(program, "-version")
+    if said is None:
         return [DoctorLine("ffmpeg", f"{program} does not run", again)]
-    return [DoctorLine("ffmpeg", f"{done.stdout.splitlines()[0]} ({program})")]
+    return [DoctorLine("ffmpeg", f"{said[0]} ({program})")]
 
 
 def has_screen() -> bool:
@@ -298,16 +259,16 @@ def has_screen() -> bool:
 
 
 def _browser() -> list[DoctorLine]:
-    screen = has_screen()
+    if has_screen():
+        return [DoctorLine("browser", "there is a screen")]
     cure = (
         "for npa-envs view: run ssh -L 8765:127.0.0.1:8765 THIS-COMPUTER on a computer that has "
         "one, and open the printed link there"
     )
-    text = "there is a screen" if screen else "no screen"
-    return [DoctorLine("browser", text, None if screen else cure, optional=True)]
+    return [DoctorLine("browser", "no screen", cure, optional=True)]
 
 
-def _shipped_rules() -> list[DoctorLine]:
+def _rules() -> list[DoctorLine]:
     from npa_envs.rule.files import load_rule, shipped_rules
 
     names = list(shipped_rules())

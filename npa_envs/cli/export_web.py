@@ -9,7 +9,7 @@ from typing import Annotated
 
 import tyro
 
-from npa_envs.cli.output import check_numbers, parse_options
+from npa_envs.cli import common
 from npa_envs.errors import NPAError
 
 
@@ -35,8 +35,8 @@ class ExportOptions:
 
 def main(arguments: Sequence[str]) -> int:
     """Write what the words after `npa-envs export-web` ask for; return 0."""
-    options = parse_options(ExportOptions, "export-web", arguments)
-    check_numbers(options, particle_count=1)
+    options = common.parse_options(ExportOptions, "export-web", arguments)
+    common.check_numbers(options, particle_count=1)
     from npa_envs.rule.authors import save_demo_json
     from npa_envs.rule.files import load_rule, shipped_rules
     from npa_envs.web.export import distinct_names, export_web

@@ -39,9 +39,6 @@ SCREEN = 256
 Style = Literal["splats", "points"]
 """How large particles are drawn: as in training, or so small that they stand apart."""
 
-POINT_SIZE = 0.35
-"""Size of a particle among "points", as a share of its size in training."""
-
 FRAME_COUNT = 150
 """Frames of a film whose pace is not asked for, without those of damage."""
 
@@ -168,7 +165,8 @@ def large_task(
         sigma = getattr(getattr(task, "config", None), "sigma", None)
         if sigma is None:
             raise NPAError("style must be 'splats' for clouds that never move, got 'points'")
-        chosen["sigma"] = POINT_SIZE * sigma
+        # So small that they stand apart.
+        chosen["sigma"] = 0.35 * sigma
     return task if chosen == world else task_of_rule(source, rule, device, **chosen).task
 
 

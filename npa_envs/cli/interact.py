@@ -4,27 +4,20 @@ from __future__ import annotations
 
 import functools
 import itertools
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
-from npa_envs.cli.output import (
-    RunOptions,
-    StepBar,
-    check_numbers,
-    parse_options,
-    writable_folder,
-)
+from npa_envs.cli import common
 from npa_envs.errors import NPAError
 
 if TYPE_CHECKING:
     import torch
 
-    from npa_envs.measure.interaction import InteractionSettings, RuleUnderTest
-    from npa_envs.rule.rule import NPARule
+    from npa_envs.measure.interaction import RuleUnderTest
 
 RESULTS = "interactions.json"
 """The file that says everything, and that a stopped run goes on from."""
@@ -42,7 +35,7 @@ QUICK: dict[str, Any] = {
 
 
 @dataclass(frozen=True, kw_only=True)
-class InteractOptions(RunOptions):
+class InteractOptions(common.RunOptions):
     """Grow every rule next to every other one, and measure how that changes it.
 
     Every ordered pair of rules, also of a rule with itself, at every distance, ratio and radius:
@@ -85,78 +78,89 @@ class InteractOptions(RunOptions):
 
 def main(arguments: Sequence[str]) -> int:
     """Grow the missing pairs, print, draw and write."""
-    options = parse_options(InteractOptions, "interact", arguments)
-    from npa_envs.devices import check_device
+    options = common.parse_options(InteractOptions, "interact", arguments)
     from npa_envs.files import plain_numbers
-    from npa_envs.measure.interaction import Encounters, heat_map, interaction_record, phase_diagram
+    from npa_envs.measure import interaction
     from npa_envs.measure.plots import write_plots
     from npa_envs.render import write_filmstrip
-    from npa_envs.rule.files import rule_digest
+    from npa_envs.rule.files import rule_digest, shipped_rules
 
     if options.quick:
         few = InteractOptions(**QUICK)
-        options = parse_options(InteractOptions, "interact", arguments, default=few)
-    check_numbers(options, seed_count=1)
-    device = check_device(options.device)
-    rules, settings = _rules(options, device)
+        options = common.parse_options(InteractOptions, "interact", arguments, default=few)
+    common.check_numbers(options, seed_count=1)
+    shipped = list(shipped_rules(TASK))[: 2 if options.quick else None]
+    device = options.place()
+    rules = _rules(options.rules or shipped, device)
+    count = options.particle_count
+    own = ("distances", "ratios", "eps_factors", "steps", "update_prob", "margin")
+    settings = interaction.InteractionSettings(
+        particle_count=max(rule.particle_count for rule in rules) if count is None else count,
+        seeds=tuple(range(options.first_seed, options.first_seed + options.seed_count)),
+        **{name: getattr(options, name) for name in own},
+    )
     if len(rules) < 2 and not options.itself:
         raise NPAError(
             f"rules must be two or more without itself, got {rules[0].name}: name another one, "
             "or leave out --no-itself"
         )
-    folder = writable_folder(options.out)
+    folder = common.writable_folder(options.out)
     weights = {rule.name: rule_digest(rule.rule) for rule in rules}
-    record = interaction_record(
-        folder / RESULTS, {**plain_numbers(asdict(settings)), "rules": weights}
-    )
-    pairs = [pair for pair in itertools.product(rules, rules) if options.itself or len({*pair}) > 1]
-    names = _pair_names((first.name, second.name) for first, second in pairs)
+    facts = {**plain_numbers(asdict(settings)), "rules": weights}
+    record = interaction.InteractionRecord(facts, folder / RESULTS).read()
+    files: dict[str, tuple[RuleUnderTest, RuleUnderTest]] = {}
+    for pair in itertools.product(rules, rules):
+        if options.itself or pair[0] is not pair[1]:
+            # Pairs whose rules' names have hyphens may look alike.
+            plain, number = f"{pair[0].name}-{pair[1].name}", 2
+            name = plain
+            while name in files:
+                name, number = f"{plain}-{number}", number + 1
+            files[name] = pair
     done = {(row.rule, row.beside) for row in record.rows}
-    missing = [pair for pair in pairs if (pair[0].name, pair[1].name) not in done]
+    missing = {n: (a, b) for n, (a, b) in files.items() if (a.name, b.name) not in done}
     if done:
-        print(f"{len(pairs) - len(missing)} of {len(pairs)} pairs were measured before")
+        print(f"{len(files) - len(missing)} of {len(files)} pairs were measured before")
     # A rule is grown alone once for each ratio and radius.
-    runs = len(missing) * len(settings.distances) + len({first.name for first, _ in missing})
+    alone = len({first.name for first, _ in missing.values()})
+    runs = len(missing) * len(settings.distances) + alone
     total = runs * len(settings.ratios) * len(settings.eps_factors) * settings.steps
-    with StepBar(total, show=options.progress) as bar:
-        encounters = Encounters(settings, device=device, progress=bar.advance)
+    with common.StepBar(total, show=options.progress) as bar:
+        encounters = interaction.Encounters(settings, device=device, progress=bar.advance)
         encounters.check(rules)
-        for first, second in missing:
-            fresh, scenes = encounters.meet(first, second)
-            path = folder / f"{names[first.name, second.name]}.png"
+        for name, pair in missing.items():
+            fresh, scenes = encounters.meet(*pair)
             columns = len(scenes.frames) // len(fresh)
-            write_filmstrip(path, scenes.frames, scenes.captions, columns=columns)
+            write_filmstrip(folder / f"{name}.png", scenes.frames, scenes.captions, columns=columns)
             record.add(*fresh)
     rows = record.rows
 
     def phases() -> dict[str, bytes]:
         return {
-            name: phase_diagram([row for row in rows if (row.rule, row.beside) == pair])
-            for pair, name in names.items()
+            name: interaction.phase_diagram(
+                [row for row in rows if (row.rule, row.beside) == (first.name, second.name)]
+            )
+            for name, (first, second) in files.items()
         }
 
     print(record.table())
     print(f"wrote {folder / RESULTS} and a filmstrip of each pair")
-    maps = write_plots(lambda: {"": heat_map(rows)}, folder / "interactions.png", "heat map")
+    place = folder / "interactions.png"
+    maps = write_plots(lambda: {"": interaction.heat_map(rows)}, place, "heat map")
     if len(settings.ratios) > 1 or len(settings.eps_factors) > 1:
         maps += write_plots(phases, folder / "phases-*.png", "phase diagrams")
     print("\n".join(maps))
     return 0
 
 
-def _rules(
-    options: InteractOptions, device: torch.device
-) -> tuple[list[RuleUnderTest], InteractionSettings]:
-    """Return the rules with their tasks, and how they are brought together."""
-    from npa_envs.measure.interaction import InteractionSettings, RuleUnderTest
-    from npa_envs.rule.files import load_rule, shipped_rules
+def _rules(sources: Sequence[str], device: torch.device) -> list[RuleUnderTest]:
+    """Return the rules with their tasks, each under a name of its own."""
+    from npa_envs.measure.interaction import RuleUnderTest
+    from npa_envs.rule.files import load_rule
     from npa_envs.training.trained_tasks import task_of_rule
 
-    sources = list(dict.fromkeys(options.rules))
-    sources = sources or list(shipped_rules(TASK))[: 2 if options.quick else None]
     rules: dict[str, RuleUnderTest] = {}
-    counts = []
-    for source in sources:
+    for source in dict.fromkeys(sources):
         rule = load_rule(source, device=device).float().requires_grad_(False)
         trained = task_of_rule(source, rule, device)
         if trained.task_name != TASK:
@@ -167,25 +171,12 @@ def _rules(
         if name in rules:
             name = f"{name}-{len(rules) + 1}"
 
-        def task_of(count: int, source: str = source, rule: NPARule = rule) -> Any:
+        @functools.cache
+        def task_of(count: int, source: str = source, rule: Any = rule) -> Any:
             return task_of_rule(source, rule, device, particle_count=count).task
 
-        counts.append(trained.task.config.particle_count)
-        rules[name] = RuleUnderTest(name, rule, functools.cache(task_of), trained.task.update_prob)
-    own = ("distances", "ratios", "eps_factors", "steps", "update_prob", "margin")
-    settings = InteractionSettings(
-        particle_count=max(counts) if options.particle_count is None else options.particle_count,
-        seeds=tuple(range(options.first_seed, options.first_seed + options.seed_count)),
-        **{name: getattr(options, name) for name in own},
-    )
-    return list(rules.values()), settings
-
-
-def _pair_names(pairs: Iterable[tuple[str, str]]) -> dict[tuple[str, str], str]:
-    """Return a name for the files of each pair, also where rules' names have hyphens."""
-    names: dict[tuple[str, str], str] = {}
-    for pair in pairs:
-        plain = "-".join(pair)
-        every = itertools.chain([plain], (f"{plain}-{number}" for number in itertools.count(2)))
-        names[pair] = next(name for name in every if name not in names.values())
-    return names
+        task = trained.task
+        rules[name] = RuleUnderTest(
+            name, rule, task_of, task.update_prob, task.config.particle_count
+        )
+    return list(rules.values())

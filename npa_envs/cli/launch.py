@@ -73,7 +73,7 @@ def launch(count: int, words: Sequence[str], out: Path, device: str) -> int:
             "take --processes 1"
         ) from error
     except ChildFailedError as error:
-        left = {rank: left_by(failure) for rank, failure in error.failures.items()}
+        left = {rank: _left_by(failure) for rank, failure in error.failures.items()}
         for reason in left.values():
             # The first process prints its own.
             if reason not in ("", left.get(0)):
@@ -125,22 +125,16 @@ def print_once(ranks: Ranks) -> Iterator[None]:
     try:
         yield
     except NPAError as error:
-        if ranks.together:
-            leave_to_launcher(error)
+        if ranks.together and not isinstance(error, LostProcessError):
+            from torch.distributed.elastic.multiprocessing.errors import get_error_handler
+
+            get_error_handler().record_exception(error)
         if not ranks.first:
             raise SystemExit(USAGE_ERROR) from error
         raise
 
 
-def leave_to_launcher(error: NPAError) -> None:
-    """Pass the error of this process to the launcher, unless another process is lost."""
-    from torch.distributed.elastic.multiprocessing.errors import get_error_handler
-
-    if not isinstance(error, LostProcessError):
-        get_error_handler().record_exception(error)
-
-
-def left_by(failure: ProcessFailure) -> str:
+def _left_by(failure: ProcessFailure) -> str:
     """Return the reason that a process has left, or an empty string."""
     said = failure.error_file_data["message"]
     # Torch writes the error's class before it.

@@ -10,14 +10,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
+from npa_envs.cli import common
 from npa_envs.cli.launch import asked_count, launch, print_once, with_device_of_gpus
-from npa_envs.cli.output import (
-    RunOptions,
-    check_numbers,
-    named_values,
-    parse_options,
-    resolve_resume,
-)
 from npa_envs.errors import NPAError
 
 if TYPE_CHECKING:
@@ -30,7 +24,7 @@ WORLDS = 16
 
 
 @dataclass(frozen=True, kw_only=True)
-class LearnOptions(RunOptions):
+class LearnOptions(common.RunOptions):
     """Learn an environment by reinforcement learning, and keep the run in a folder.
 
     A line is printed, and a checkpoint written, for each point of the learning curve. A run that
@@ -81,7 +75,9 @@ def main(arguments: Sequence[str]) -> int:
     with joined_ranks() as ranks:
         asked = None
         if ranks.first:
-            words = resolve_resume(with_device_of_gpus(arguments), lambda words: parse(words).out)
+            words = common.resolve_resume(
+                with_device_of_gpus(arguments), lambda words: parse(words).out
+            )
             asked = words, parse(words)
         asked = ranks.broadcast(asked)
         assert asked is not None, "said by the first process"
@@ -95,8 +91,8 @@ def main(arguments: Sequence[str]) -> int:
 
 def parse(words: Sequence[str]) -> LearnOptions:
     """Return the options of `npa-envs learn`."""
-    options = parse_options(LearnOptions, "learn", words)
-    check_numbers(options, worlds=1, episodes=1, entries=1)
+    options = common.parse_options(LearnOptions, "learn", words)
+    common.check_numbers(options, worlds=1, episodes=1, entries=1)
     return options
 
 
@@ -120,7 +116,7 @@ def run(options: LearnOptions, ranks: Ranks) -> int:
                 flush=True,
             )
 
-    given = named_values("options", options.options)
+    given = common.named_values("options", options.options)
     if options.method == "shac" and options.worlds is not None:
         given.setdefault("world_count", options.worlds)
     stopped: list[bool] = []
@@ -153,7 +149,7 @@ def problem_of(options: LearnOptions) -> Problem:
     steps = options.episode_steps
     return Problem(
         env_id=options.env,
-        keywords=named_values("keywords", options.keywords),
+        keywords=common.named_values("keywords", options.keywords),
         episode_steps=registered_steps(options.env) if steps is None else steps,
         num_envs=WORLDS if options.worlds is None else options.worlds,
     )

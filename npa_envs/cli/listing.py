@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from npa_envs.cli.output import duration, parse_options
+from npa_envs.cli import common
 
 
 @dataclass(frozen=True)
@@ -15,7 +15,7 @@ class ListOptions:
 
 def main(arguments: Sequence[str]) -> int:
     """Print everything that has a name."""
-    parse_options(ListOptions, "list", arguments)
+    common.parse_options(ListOptions, "list", arguments)
     from npa_envs.envs.multi.tasks import ENVIRONMENTS as OF_SPECIES
     from npa_envs.measure.quality import score_line, scores
     from npa_envs.registration import ALL, SPECIES_SIZES
@@ -32,7 +32,7 @@ def main(arguments: Sequence[str]) -> int:
             repeats = "" if config.repeats == 1 else f" ({config.repeats} x {config.iterations})"
             print(
                 f"    {preset}: {config.total_iterations} iterations{repeats} of "
-                f"{config.world_count} worlds, about {duration(seconds)} on one core"
+                f"{config.world_count} worlds, about {common.duration(seconds)} on one core"
             )
     print("environments (import npa_envs; gymnasium.make(NAME) or make_vec(NAME, num_envs=64))")
     for environment in ALL:

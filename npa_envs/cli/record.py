@@ -11,28 +11,18 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
-from npa_envs.cli.output import (
-    RunOptions,
-    StepBar,
-    check_numbers,
-    named_values,
-    parse_options,
-    writable_folder,
-)
+from npa_envs.cli import common
 from npa_envs.errors import NPAError
 
 if TYPE_CHECKING:
     from npa_envs.agents.learning import Problem
-
-FIRST_CHOICE_SEED = 2**31
-"""Seed of the episode that only checks that a policy runs."""
 
 LEARNS_NOTHING = ("zero", "random", "scripted")
 """Policies that need no file."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class RecordOptions(RunOptions):
+class RecordOptions(common.RunOptions):
     """Write episodes of a policy as a dataset of Minari, to learn from without the environment.
 
     `minari.load_dataset` reads it; `npa_envs.agents.learning.train("clone", ..., dataset=ID)`
@@ -60,8 +50,8 @@ class RecordOptions(RunOptions):
 
 def main(arguments: Sequence[str]) -> int:
     """Record and write."""
-    options = parse_options(RecordOptions, "record", arguments)
-    check_numbers(options, episodes=1, worlds=1)
+    options = common.parse_options(RecordOptions, "record", arguments)
+    common.check_numbers(options, episodes=1, worlds=1)
     from npa_envs.agents.evaluation import policy_in
     from npa_envs.measure.record import without_folders
     from npa_envs.wrappers.minari import ROOT, record_episodes, spec_of, write_dataset
@@ -73,8 +63,8 @@ def main(arguments: Sequence[str]) -> int:
     seeds = range(options.first_seed, options.first_seed + options.episodes)
     returns: list[float] = []
     if options.root is not None:
-        os.environ[ROOT] = str(writable_folder(options.root, "root").resolve())
-    with StepBar(options.episodes, show=options.progress, unit="episode") as bar:
+        os.environ[ROOT] = str(common.writable_folder(options.root, "root").resolve())
+    with common.StepBar(options.episodes, show=options.progress, unit="episode") as bar:
 
         def episodes() -> Iterator[Any]:
             for episode in record_episodes(envs, policy, seeds):
@@ -100,7 +90,7 @@ def problem_of(options: RecordOptions) -> Problem:
     worlds = min(options.worlds, options.episodes)
     problem = Problem(
         env_id=options.env,
-        keywords=named_values("options", options.options),
+        keywords=common.named_values("options", options.options),
         episode_steps=registered_steps(options.env),
         num_envs=worlds,
     )
@@ -124,7 +114,7 @@ def policy_of(options: RecordOptions, problem: Problem) -> Callable[[Any], Any]:
             Budget(particle_steps=10**12),
             _choice_seed(options) if options.policy == "scripted" else 0,
             device=options.device,
-            evaluation_seeds=[FIRST_CHOICE_SEED],
+            evaluation_seeds=[2**31],  # Its episode only checks that the policy runs.
             entries=1,
         ).policy
     source = options.policy

@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import torch
 
+from npa_envs.cli import common
 from npa_envs.cli.film import film_world, frame_steps, large_task, write_film, write_solid
-from npa_envs.cli.output import StepBar, writable_folder
 from npa_envs.errors import MissingDependencyError
 from npa_envs.files import write_text
 from npa_envs.measure.judge import TextureJudge
@@ -24,10 +24,16 @@ from npa_envs.measure.quality import (
     score_line,
     tables_of,
 )
-from npa_envs.measure.record import current_commit, machine, versions
-from npa_envs.measure.tables import UNMEASURED, markdown_table, table_markdown, tables_json
+from npa_envs.measure.record import (
+    UNMEASURED,
+    current_commit,
+    machine,
+    markdown_table,
+    table_markdown,
+    tables_json,
+    versions,
+)
 from npa_envs.rule.files import load_rule
-from npa_envs.tasks.base import Task
 from npa_envs.tasks.damage import DamageEvent
 from npa_envs.tasks.texture import Texture
 from npa_envs.training.trained_tasks import task_of_rule, tasks_of_codes
@@ -73,7 +79,7 @@ def write_report(
     STEM.mp4 and STEM-filmstrip.png; of a 3D rule also a turntable and point files. On a CPU, where
     worlds take as long as training does, fewer are measured, for fewer steps, and not damaged.
     """
-    writable_folder(folder)
+    common.writable_folder(folder)
     rule = load_rule(path, device=device).float()
     task = task_of_rule(str(path), rule, device).task
     thorough = device.type == "cuda"
@@ -82,7 +88,7 @@ def write_report(
     count = 8 if thorough else 2
     judge = TextureJudge(task) if isinstance(task, Texture) else None
     not_filmed = ""
-    with StepBar(None, show=progress) as bar:
+    with common.StepBar(None, show=progress) as bar:
         tables = tables_of(
             rule,
             task,
@@ -93,8 +99,24 @@ def write_report(
             progress=bar.advance,
             judge=judge,
         )
+        generator = torch.Generator(device).manual_seed(FIRST_SEED)
+        x, s, _ = task.seed(1, generator=generator, device=device)
+        shown = large_task(task, str(path), rule, device)
+        x, s, film = film_world(
+            rule,
+            shown,
+            x,
+            s,
+            FILM_STEPS,
+            generator=generator,
+            damages=FILM_DAMAGES if task.aligned else (),
+            every=frame_steps(FILM_STEPS),
+            progress=bar.advance,
+        )
         try:
-            _film(path, rule, task, folder, device, bar)
+            if task.has_views:
+                write_solid(task, x, s, folder)
+            write_film(film, folder, path.stem)
         except MissingDependencyError as error:
             not_filmed = f"; not all films: {error}"
     if len(tasks := tasks_of_codes(str(path), rule, device)) > 1:
@@ -113,48 +135,14 @@ def write_report(
     strip = folder / f"{path.stem}-filmstrip.png"
     picture = f"\n![A world from the seed on.]({strip.name})\n" if strip.exists() else ""
     write_text(card, _card(rule, task, training, facts, tables) + picture)
-    return card, score_line(json.loads(text)) + _decay(tables.get("growth", ())) + not_filmed
-
-
-DECAYED = 4.0
-"""Last loss over the least one, from which on a rule does not hold."""
-
-
-def _decay(rows: Sequence[Any]) -> str:
-    """Return words for worlds that fall apart as they grow old; none where they hold."""
-    losses = [row.loss for row in rows]
-    least = min(filter(math.isfinite, losses), default=math.nan)
-    # No comparison with NaN holds.
-    if not losses or losses[-1] <= DECAYED * least:
-        return ""
-    return f"; worlds do not hold: at step {rows[-1].step} their loss is many times the least"
-
-
-def _film(
-    path: Path,
-    rule: NPARule,
-    task: Task,
-    folder: Path,
-    device: torch.device,
-    bar: StepBar,
-) -> None:
-    """Film a world of the rule from its seed."""
-    generator = torch.Generator(device).manual_seed(FIRST_SEED)
-    x, s, _ = task.seed(1, generator=generator, device=device)
-    x, s, film = film_world(
-        rule,
-        large_task(task, str(path), rule, device),
-        x,
-        s,
-        FILM_STEPS,
-        generator=generator,
-        damages=FILM_DAMAGES if task.aligned else (),
-        every=frame_steps(FILM_STEPS),
-        progress=bar.advance,
-    )
-    if task.has_views:
-        write_solid(task, x, s, folder)
-    write_film(film, folder, path.stem)
+    rows = tables.get("growth", ())
+    least = min(filter(math.isfinite, (row.loss for row in rows)), default=math.nan)
+    # A last loss of more than four times the least, or NaN: no comparison with it holds.
+    holds = not rows or rows[-1].loss <= 4.0 * least
+    said = score_line(json.loads(text))
+    if not holds:
+        said += f"; worlds do not hold: at step {rows[-1].step} their loss is many times the least"
+    return card, said + not_filmed
 
 
 def _card(

@@ -10,22 +10,14 @@ from typing import Annotated
 
 import tyro
 
-from npa_envs.cli.output import (
-    MeasureOptions,
-    StepBar,
-    check_numbers,
-    named_rules,
-    parse_options,
-    torch_threads,
-    writable_folder,
-)
+from npa_envs.cli import common
 
 QUICK_SEEDS, QUICK_PARTICLES = 2, 256
 """Seeds and particles of a quick run."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class RobustnessOptions(MeasureOptions):
+class RobustnessOptions(common.MeasureOptions):
     """Measure how rules grow under other conditions, and how they recover from damage.
 
     Unlike `npa-envs stress` this expects nothing and gives no verdicts: it is a table of figures
@@ -55,8 +47,7 @@ class RobustnessOptions(MeasureOptions):
 
 def main(arguments: Sequence[str]) -> int:
     """Measure, print and write."""
-    options = parse_options(RobustnessOptions, "robustness", arguments)
-    from npa_envs.devices import check_device
+    options = common.parse_options(RobustnessOptions, "robustness", arguments)
     from npa_envs.files import write_text
     from npa_envs.measure.accuracy.endurance import rule_names, task_name
     from npa_envs.measure.plots import write_plots
@@ -65,22 +56,22 @@ def main(arguments: Sequence[str]) -> int:
     from npa_envs.measure.robustness.trials import PLANS, RuleTrial, quick_plan
     from npa_envs.rule.files import load_rule, rule_digest
 
-    check_numbers(options, seed_count=1, first_seed=0, most_particles=1, threads=1)
+    common.check_numbers(options, seed_count=1, first_seed=0, most_particles=1, threads=1)
     enough = time_limit(options.max_seconds)
     # Rules that runs begin with are measured where they are named.
-    sources = named_rules(options.rules or rule_names())
+    sources = common.named_rules(options.rules or rule_names())
     names = list(sources)
     if options.quick and not options.rules:
         # One of each task.
         names = list({task_name(name): name for name in reversed(names)}.values())[::-1]
-    device = check_device(options.device)
+    device = options.place()
     most = options.most_particles or study.MOST_PARTICLES[device.type]
     count = options.seed_count or (QUICK_SEEDS if options.quick else 8)
     seeds = range(options.first_seed, options.first_seed + count)
     facts = measured_facts(
         device, options.commit, quick=options.quick, seeds=list(seeds), most_particles=most
     )
-    folder = None if options.out is None else writable_folder(options.out)
+    folder = None if options.out is None else common.writable_folder(options.out)
     words = without_folders(arguments, "--out")
     records = {}
     # All are read first: a file of other settings is refused before any work is done.
@@ -93,10 +84,7 @@ def main(arguments: Sequence[str]) -> int:
             done=False,
             command=shlex.join(["npa-envs", "robustness", *words]),
         ).read()
-    with (
-        StepBar(len(names), show=options.progress, unit="rule") as bar,
-        torch_threads(options.threads),
-    ):
+    with common.measuring(options, len(names), "rule") as bar:
         for name, record in records.items():
             if not record.done and not enough():
                 task = task_name(sources[name])

@@ -5,21 +5,16 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal, cast
+from typing import Annotated, Any, Literal, cast
 
 import tyro
 
-from npa_envs.cli.output import (
-    RuleOptions,
-    StepBar,
-    parse_options,
-    writable_folder,
-)
+from npa_envs.cli import common
 from npa_envs.errors import NPAError
 
 
 @dataclass(frozen=True, kw_only=True)
-class RolloutCommand(RuleOptions):
+class RolloutCommand(common.RuleOptions):
     """Grow a rule from its seed, damage it on the way, and write a GIF, an MP4 and a filmstrip.
 
     Of a 3D world also a turntable GIF, and the grown cloud as points (PLY) and as Gaussians (PLY,
@@ -64,27 +59,18 @@ class RolloutCommand(RuleOptions):
 
 def main(arguments: Sequence[str]) -> int:
     """Grow, film and write what the words after `npa-envs rollout` ask for; return 0."""
-    options = parse_options(RolloutCommand, "rollout", arguments)
+    options = common.parse_options(RolloutCommand, "rollout", arguments)
     import torch
 
-    from npa_envs.cli.film import (
-        SCREEN,
-        WorldFilm,
-        film_world,
-        frame_steps,
-        large_task,
-        write_film,
-        write_solid,
-    )
+    from npa_envs.cli import film
     from npa_envs.measure.quality import measure
     from npa_envs.rule.files import load_rule
     from npa_envs.tasks.damage import parse_damage
     from npa_envs.tasks.point_classification import PointClassification, majority
-    from npa_envs.training import check_device
     from npa_envs.training.run import stop_flag
     from npa_envs.training.trained_tasks import task_of_rule
 
-    device = check_device(options.device)
+    device = options.place()
     damages = [parse_damage(text) for words in options.damage for text in words]
     late = [damage for damage in damages if damage.step >= options.steps]
     if late:
@@ -93,25 +79,17 @@ def main(arguments: Sequence[str]) -> int:
             f"raise --steps above {late[0].step}"
         )
     rule = load_rule(options.rule, device=device).float()
-    world = options.world()
-    trained = task_of_rule(options.rule, rule, device, **world)
+    trained = task_of_rule(options.rule, rule, device, **options.world)
     # Drawn as asked for; measured as trained, so that the figures can be compared.
     task = trained.task
-    shown = large_task(
-        task,
-        options.rule,
-        rule,
-        device,
-        resolution=options.resolution,
-        style=options.style,
-        **world,
-    )
-    folder = writable_folder(options.out)
+    looks: dict[str, Any] = {"resolution": options.resolution, "style": options.style}
+    shown = film.large_task(task, options.rule, rule, device, **looks, **options.world)
+    folder = common.writable_folder(options.out)
     generator = torch.Generator(device).manual_seed(options.seed)
     x, s, goal = task.seed(1, generator=generator, device=device)
     task = task.toward(goal)
-    with stop_flag() as stop, StepBar(options.steps, show=options.progress) as bar:
-        x, s, film = film_world(
+    with stop_flag() as stop, common.StepBar(options.steps, show=options.progress) as bar:
+        x, s, filmed = film.film_world(
             rule,
             shown,
             x,
@@ -119,8 +97,8 @@ def main(arguments: Sequence[str]) -> int:
             options.steps,
             generator=generator,
             damages=damages,
-            every=options.every or frame_steps(options.steps),
-            film=WorldFilm(background=options.background),
+            every=options.every or film.frame_steps(options.steps),
+            film=film.WorldFilm(background=options.background),
             progress=bar.advance,
             stop=stop.is_set,
         )
@@ -135,15 +113,15 @@ def main(arguments: Sequence[str]) -> int:
     if task.classifies and goal is not None:
         vote = int(majority(cast(PointClassification, task).outputs(s)))
         print(f"most particles say {vote}; the cloud is a {int(goal)}")
-    paths = write_film(film, folder, "growth", fps=options.fps)
+    paths = film.write_film(filmed, folder, "growth", fps=options.fps)
     if task.has_views:
-        paths += write_solid(
+        paths += film.write_solid(
             task,
             x,
             s,
             folder,
             shown=shown,
-            resolution=options.resolution or SCREEN,
+            resolution=options.resolution or film.SCREEN,
             background=options.background,
         )
     for path in paths:

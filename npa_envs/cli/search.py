@@ -7,19 +7,12 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Literal
 
-from npa_envs.cli.output import (
-    RunOptions,
-    StepBar,
-    check_numbers,
-    parse_options,
-    torch_threads,
-    writable_folder,
-)
+from npa_envs.cli import common
 from npa_envs.errors import NPAError
 
 
 @dataclass(frozen=True, kw_only=True)
-class SearchOptions(RunOptions):
+class SearchOptions(common.RunOptions):
     """Search for rules that differ from each other and stay alive.
 
     An archive keeps the best candidate of each kind: by speed, by how crowded particles stand, and
@@ -60,12 +53,11 @@ class SearchOptions(RunOptions):
 
 def main(arguments: Sequence[str]) -> int:
     """Search, and write elites and atlas."""
-    options = parse_options(SearchOptions, "search", arguments)
-    check_numbers(options, threads=1)
+    options = common.parse_options(SearchOptions, "search", arguments)
+    common.check_numbers(options, threads=1)
     from npa_envs.agents.search.atlas import PAGE, figure, page, write_elites
     from npa_envs.agents.search.run import RESULTS, Search
     from npa_envs.agents.search.worlds import SearchWorld
-    from npa_envs.devices import check_device
     from npa_envs.files import write_text
     from npa_envs.measure.plots import write_plots
     from npa_envs.measure.record import time_limit
@@ -78,8 +70,8 @@ def main(arguments: Sequence[str]) -> int:
             f"budget must be finite and at least that of one batch, {least} particle-steps, got "
             f"{options.budget:g}: raise it"
         )
-    device = check_device(options.device)
-    folder = writable_folder(options.out)
+    device = options.place()
+    folder = common.writable_folder(options.out)
     search = Search(
         world,
         method=options.method,
@@ -91,10 +83,7 @@ def main(arguments: Sequence[str]) -> int:
     if search.evaluations:
         print(f"{search.evaluations} candidates were tried before")
     budget = int(options.budget)
-    with (
-        StepBar(budget, show=options.progress, unit="particle-step") as bar,
-        torch_threads(options.threads),
-    ):
+    with common.measuring(options, budget, "particle-step") as bar:
         bar.advance(search.particle_steps)
         search.run(budget, enough=enough, progress=bar.advance)
         if not search.growth:

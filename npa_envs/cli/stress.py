@@ -5,28 +5,17 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import tyro
 
-from npa_envs.cli.output import (
-    MeasureOptions,
-    StepBar,
-    check_numbers,
-    named_rules,
-    parse_options,
-    torch_threads,
-    writable_folder,
-)
-
-if TYPE_CHECKING:
-    from npa_envs.measure.accuracy.checks import Check
+from npa_envs.cli import common
 
 FAILED = 1
 
 
 @dataclass(frozen=True, kw_only=True)
-class StressOptions(MeasureOptions):
+class StressOptions(common.MeasureOptions):
     """Check hard geometry, hard values, long runs of rules, gradients, precision.
 
     Every check has an expectation, figures and a verdict: pass, fail, a range (where something
@@ -54,25 +43,28 @@ class StressOptions(MeasureOptions):
 
 def main(arguments: Sequence[str]) -> int:
     """Check, print and write; return 1 where a check failed."""
-    options = parse_options(StressOptions, "stress", arguments)
-    from npa_envs.devices import check_device
+    options = common.parse_options(StressOptions, "stress", arguments)
+    from npa_envs.measure import accuracy
     from npa_envs.measure.accuracy import suite
-    from npa_envs.measure.accuracy.checks import CheckSession
     from npa_envs.measure.plots import write_plots
     from npa_envs.measure.record import measured_facts
 
-    check_numbers(options, seed=0, threads=1)
-    rules = named_rules(options.rules)
-    checks = suite.all_checks(quick=options.quick, seed=options.seed, rules=rules)
+    common.check_numbers(options, seed=0, threads=1)
+    rules = common.named_rules(options.rules)
+    checks = accuracy.all_checks(quick=options.quick, seed=options.seed, rules=rules)
     chosen = suite.chosen_checks(checks, options.only)
     if options.list:
-        print(_listing(chosen))
+        for group, summary in suite.GROUPS.items():
+            some = [check for check in chosen if suite.group_of(check.name) == group]
+            if some:
+                print(f"{group}: {summary}")
+                print("\n".join(f"  {check.name}: {check.expected}" for check in some))
         return 0
-    device = check_device(options.device)
+    device = options.place()
     path = None
     if options.out is not None:
         name = f"stress_{device.type}{'_quick' * options.quick}.json"
-        path = writable_folder(options.out) / name
+        path = common.writable_folder(options.out) / name
     facts = measured_facts(device, options.commit, quick=options.quick, seed=options.seed)
     record = suite.StressRecord(facts, path, [check.name for check in checks]).read()
     weights = suite.rule_weights(chosen)
@@ -81,13 +73,10 @@ def main(arguments: Sequence[str]) -> int:
     before = sum(check.name in done for check in chosen)
     if before:
         print(f"{before} of {len(chosen)} checks were done before")
-    with (
-        StepBar(len(chosen), show=options.progress, unit="check") as bar,
-        torch_threads(options.threads),
-    ):
+    with common.measuring(options, len(chosen), "check") as bar:
         suite.run_checks(
             chosen,
-            CheckSession(device, quick=options.quick, seed=options.seed),
+            suite.CheckSession(device, quick=options.quick, seed=options.seed),
             record,
             max_seconds=options.max_seconds,
             weights=weights,
@@ -99,14 +88,3 @@ def main(arguments: Sequence[str]) -> int:
         drawn = write_plots(lambda: suite.heat_maps(record), maps, "heat maps")
         print("\n".join([f"wrote {path}", *drawn]))
     return FAILED if record.failed() else 0
-
-
-def _listing(checks: Sequence[Check]) -> str:
-    from npa_envs.measure.accuracy.checks import GROUPS, group_of
-
-    lines = []
-    for group, summary in GROUPS.items():
-        some = [check for check in checks if group_of(check.name) == group]
-        if some:
-            lines += [f"{group}: {summary}", *(f"  {c.name}: {c.expected}" for c in some)]
-    return "\n".join(lines)

@@ -14,15 +14,14 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, Any
 
 import tyro
 
-from npa_envs.cli.output import StepBar, check_numbers, parse_options, writable_folder
+from npa_envs.cli import common
 from npa_envs.errors import NPAError, suggest
 from npa_envs.files import read_json, write_text
-from npa_envs.measure.record import read_record, write_record
-from npa_envs.measure.tables import NONE, markdown_table
+from npa_envs.measure.record import NONE, markdown_table, read_record, write_record
 from npa_envs.processes import Child, Places, part_of, run_children
 
 RUN_FAILED = 1
@@ -68,65 +67,124 @@ class SweepOptions:
     """Show a progress bar."""
 
 
-class SweepRun(NamedTuple):
-    """One combination: values by option, words after `npa-envs train`, the name of its folder."""
+@dataclass
+class SweepRun(Child):
+    """One combination: a process that trains, or goes on training, in a folder."""
 
     values: Mapping[str, str]
+    """Values by option."""
     words: list[str]
-    name: str
+    """Words after `npa-envs train`."""
+    folder: Path
+    threads: int = 1
+    process: subprocess.Popen[bytes] | None = None
+    begin: float = 0.0
 
+    @property
+    def name(self) -> str:
+        """The name of its folder."""
+        return self.folder.name
 
-class SweepRecord(NamedTuple):
-    """The exit code of a run's process, and its wall time [s]."""
+    def go(self, device: str) -> None:
+        """Start it on a device."""
+        self.begin = time.perf_counter()
+        self.folder.mkdir(parents=True, exist_ok=True)
+        given = ("--out", str(self.folder), "--device", device, "--resume", "auto")
+        with (self.folder / OUTPUT).open("wb") as output:
+            self.process = subprocess.Popen(
+                [*PROGRAM, *self.words, *given, "--no-progress"],
+                stdin=subprocess.DEVNULL,
+                stdout=output,
+                stderr=output,
+                env=os.environ | {"OMP_NUM_THREADS": str(self.threads)},
+                # A terminal sends Ctrl-C to its whole group; `stop` would be a second signal,
+                # after which a run ends without a checkpoint.
+                start_new_session=True,
+            )
 
-    code: int
-    seconds: float
+    @property
+    def over(self) -> bool:
+        """Whether the process has ended."""
+        return self.process is not None and self.process.poll() is not None
+
+    def stop(self, *, at_once: bool) -> None:
+        """Ask it to write its checkpoint and end, or only to end."""
+        if self.process is not None:
+            (self.process.kill if at_once else self.process.terminate)()
+
+    def end(self) -> None:
+        """Wait until it has ended after `stop`."""
+        if self.process is not None:
+            self.process.wait()
+
+    def write(self) -> None:
+        """Write its words, exit code and wall time [s]."""
+        assert self.process is not None, "it is over"
+        seconds = time.perf_counter() - self.begin
+        held = {"code": int(self.process.returncode), "seconds": seconds}
+        write_record(self.folder / RECORD, {"facts": {"words": self.words}, **held})
+
+    def record(self) -> tuple[int, float] | None:
+        """Return the exit code and time that were written; None: none. Refuses other words."""
+
+        def read(held: dict[str, Any]) -> tuple[int, float]:
+            return int(held["code"]), float(held["seconds"])
+
+        return read_record(self.folder / RECORD, {"words": self.words}, read, command="sweep")
+
+    @property
+    def done(self) -> bool:
+        """Whether it has ended well, as its record says."""
+        held = self.record()
+        return held is not None and held[0] == 0
 
 
 def main(arguments: Sequence[str]) -> int:
     """Run what is missing, print and write; return 1 where a run failed."""
     words = list(arguments)
     place = words.index("--") if "--" in words else len(words)
-    options = parse_options(SweepOptions, "sweep", words[:place])
-    check_numbers(options, jobs=1, threads=1)
-    folder = writable_folder(options.out)
-    runs = combinations(options.over, words[place + 1 :])
+    options = common.parse_options(SweepOptions, "sweep", words[:place])
+    common.check_numbers(options, jobs=1, threads=1)
+    folder = common.writable_folder(options.out)
+    runs = combinations(options.over, words[place + 1 :], folder, options.threads)
     mine = part_of(runs, options.part, lambda run: run.name)
-    waiting = [run for run in mine if not is_over(folder, run)]
+    waiting = [run for run in mine if not run.done]
     places = Places(options.devices, options.jobs or len(options.devices), options.threads)
-    with StepBar(len(waiting), show=options.progress, unit="run") as bar:
+    with common.StepBar(len(waiting), show=options.progress, unit="run") as bar:
 
-        def finished(child: _Training) -> None:
-            child.write_record()
-            write_text(folder / TABLE, table(folder, runs))
+        def finished(run: SweepRun) -> None:
+            run.write()
+            write_text(folder / TABLE, table(runs))
             bar.advance(1)
 
         try:
             run_children(
-                lambda _: _Training(folder, waiting.pop(0), places.threads) if waiting else None,
+                lambda _: waiting.pop(0) if waiting else None,
                 finished,
                 places,
                 ahead=False,
                 max_seconds=options.max_seconds,
             )
         except KeyboardInterrupt:
-            left_count = sum(not is_over(folder, run) for run in mine)
+            left_count = sum(not run.done for run in mine)
             print(f"interrupted; {left_count} runs are left: call again with the same words")
             raise
-    text = table(folder, runs)
+    text = table(runs)
     write_text(folder / TABLE, text)
     print(text, end="")
-    left = [run.name for run in mine if not is_over(folder, run)]
-    failed = [name for name in left if (folder / name / RECORD).exists()]
-    for name in failed:
-        said = (folder / name / OUTPUT).read_text("utf-8", errors="replace").strip()[-SHOWN:]
-        print(f"{name} failed: {' '.join(said.split())}")
+    left = [run for run in mine if not run.done]
+    failed = [run for run in left if (run.folder / RECORD).exists()]
+    for run in failed:
+        said = (run.folder / OUTPUT).read_text("utf-8", errors="replace").strip()[-SHOWN:]
+        print(f"{run.name} failed: {' '.join(said.split())}")
     if len(left) > len(failed):
         print(f"{len(left) - len(failed)} runs are left: call again with the same words")
     return RUN_FAILED if failed else 0
 
 
-def combinations(over: Sequence[str], common: Sequence[str]) -> list[SweepRun]:
+def combinations(
+    over: Sequence[str], common: Sequence[str], folder: Path = Path(), threads: int = 1
+) -> list[SweepRun]:
     """Return a run for each combination of values NAME=A,B,C, with a task and common options."""
     from npa_envs.training import TASKS
 
@@ -137,13 +195,13 @@ def combinations(over: Sequence[str], common: Sequence[str]) -> list[SweepRun]:
     values: dict[str, list[str]] = {}
     for word in over:
         name, mark, listed = word.partition("=")
-        name = _option(name)
-        if not (mark and name and all(listed.split(","))):
+        name, each = _option(name), listed.split(",")
+        if not (mark and name and all(each)):
             raise NPAError(f"over must be NAME=A,B,C, got {word!r}: seed=0,1,2")
         if name in values or name in given:
             raise NPAError(f"--{name} must be given once, in --over or after --, got it twice")
-        values[name] = listed.split(",")
-        twice = [value for value, count in Counter(values[name]).items() if count > 1]
+        values[name] = each
+        twice = [value for value, count in Counter(each).items() if count > 1]
         if twice:
             raise NPAError(f"over must name each value once, got {word!r}: leave out {twice[0]!r}")
     for name in OWN:
@@ -151,9 +209,9 @@ def combinations(over: Sequence[str], common: Sequence[str]) -> list[SweepRun]:
             raise NPAError(f"--{name} must not be given to the runs: a sweep does so by itself")
     chosen = [dict(zip(values, one, strict=True)) for one in itertools.product(*values.values())]
     runs = []
-    for one, folder in zip(chosen, _folder_names(chosen), strict=True):
-        own = [word for name, value in one.items() for word in (f"--{name}", value)]
-        runs.append(SweepRun(one, [*common, *own], folder))
+    for one, name in zip(chosen, _folder_names(chosen), strict=True):
+        own = [word for option, value in one.items() for word in (f"--{option}", value)]
+        runs.append(SweepRun(one, [*common, *own], folder / name, threads))
     return runs
 
 
@@ -173,83 +231,18 @@ def _folder_names(chosen: Sequence[Mapping[str, str]]) -> list[str]:
     ]
 
 
-def is_over(folder: Path, run: SweepRun) -> bool:
-    """Return whether a run has ended well."""
-    held = _record(folder, run)
-    return held is not None and held.code == 0
-
-
-def _record(folder: Path, run: SweepRun) -> SweepRecord | None:
-    """Return the record of a run, None where there is none; one of other words is refused."""
-
-    def read(held: dict[str, Any]) -> SweepRecord:
-        return SweepRecord(int(held["code"]), float(held["seconds"]))
-
-    path = folder / run.name / RECORD
-    return read_record(path, {"words": run.words}, read, command="sweep")
-
-
-class _Training(Child):
-    """A process that trains, or goes on training, in its folder."""
-
-    def __init__(self, folder: Path, run: SweepRun, threads: int) -> None:
-        self._folder, self._run, self._threads = folder / run.name, run, threads
-        self._process: subprocess.Popen[bytes] | None = None
-        self._begin = 0.0
-
-    def go(self, device: str) -> None:
-        """Start it on a device."""
-        self._begin = time.perf_counter()
-        self._folder.mkdir(parents=True, exist_ok=True)
-        given = ("--out", str(self._folder), "--device", device, "--resume", "auto")
-        with (self._folder / OUTPUT).open("wb") as output:
-            self._process = subprocess.Popen(
-                [*PROGRAM, *self._run.words, *given, "--no-progress"],
-                stdin=subprocess.DEVNULL,
-                stdout=output,
-                stderr=output,
-                env=os.environ | {"OMP_NUM_THREADS": str(self._threads)},
-                # A terminal sends Ctrl-C to its whole group; `stop` would be a second signal,
-                # after which a run ends without a checkpoint.
-                start_new_session=True,
-            )
-
-    @property
-    def over(self) -> bool:
-        """Whether it has ended."""
-        return self._process is not None and self._process.poll() is not None
-
-    def stop(self, *, at_once: bool) -> None:
-        """Ask it to write its checkpoint and end, or only to end."""
-        if self._process is not None:
-            (self._process.kill if at_once else self._process.terminate)()
-
-    def end(self) -> None:
-        """Wait until it has ended after `stop`."""
-        if self._process is not None:
-            self._process.wait()
-
-    def write_record(self) -> None:
-        """Write its words, exit code and time."""
-        assert self._process is not None, "it is over"
-        seconds = time.perf_counter() - self._begin
-        record = SweepRecord(int(self._process.returncode), seconds)
-        content = {"facts": {"words": self._run.words}, **record._asdict()}
-        write_record(self._folder / RECORD, content)
-
-
-def table(folder: Path, runs: Sequence[SweepRun]) -> str:
+def table(runs: Sequence[SweepRun]) -> str:
     """Return the runs with the scores of their reports, in Markdown."""
     from npa_envs.measure.quality import score_line
 
     lines = []
     for run in runs:
         state, seconds, scores = "not run", NONE, NONE
-        held = _record(folder, run)
+        held = run.record()
         if held is not None:
-            state = "done" if held.code == 0 else f"failed with code {held.code}"
-            seconds = f"{held.seconds:.0f}"
-            reports = sorted((folder / run.name / "report").glob("rule*.json"))
+            state = "done" if held[0] == 0 else f"failed with code {held[0]}"
+            seconds = f"{held[1]:.0f}"
+            reports = sorted((run.folder / "report").glob("rule*.json"))
             scores = "; ".join(score_line(read_json(report)) for report in reports) or NONE
         lines.append([*run.values.values(), state, seconds, scores])
     names = list(runs[0].values) if runs else []

@@ -11,13 +11,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
+from npa_envs.cli import common
 from npa_envs.cli.doctor import has_screen
-from npa_envs.cli.output import (
-    named_values,
-    parse_options,
-    torch_threads,
-    writable_folder,
-)
 from npa_envs.errors import NPAError
 
 if TYPE_CHECKING:
@@ -33,7 +28,7 @@ RUN_FILES = ("config.json", "log.jsonl", "checkpoint.pt")
 
 
 @dataclass(frozen=True, kw_only=True)
-class ViewOptions:
+class ViewOptions(common.DeviceOptions):
     """Watch and touch a live world in the browser: a rule, a training run or an environment.
 
     The page has brushes, sliders, damage and films. A run's world follows its newest checkpoint.
@@ -51,8 +46,6 @@ class ViewOptions:
     """Particles N; default: as trained."""
     seed: int = 0
     """The first world's number."""
-    device: str = "cpu"
-    """Where the world lives: cpu, cuda, cuda:1."""
     threads: int = 1
     """CPU threads of torch and of the kernels; the browser needs a core as well."""
     host: str = "127.0.0.1"
@@ -67,26 +60,24 @@ class ViewOptions:
 
 def main(arguments: Sequence[str]) -> int:
     """Serve what the words after `npa-envs view` ask for until Ctrl-C; return 0."""
-    options = parse_options(ViewOptions, "view", arguments)
+    options = common.parse_options(ViewOptions, "view", arguments)
     if not 1 <= options.threads <= 256:
         raise NPAError(f"threads must be in [1, 256], got {options.threads}")
-    from npa_envs.devices import check_device
-
-    device = check_device(options.device)
+    device = options.place()
     make_world = world_maker(options, device)
-    with torch_threads(options.threads):
+    with common.torch_threads(options.threads):
         # Made once before the server starts, so that errors come at once.
         make_world().close()
     from npa_envs.web.server import address_of, make_site, open_port, serve
 
     site = make_site(
         make_world,
-        films=writable_folder(options.out),
+        films=common.writable_folder(options.out),
         host=options.host,
         one_at_a_time=device.type == "cuda",
     )
     listener = open_port(options.host, options.port)
-    with contextlib.closing(listener), torch_threads(options.threads):
+    with contextlib.closing(listener), common.torch_threads(options.threads):
         address = address_of(site, listener)
         print(f"{options.what}: {address}  (Ctrl-C ends it)", flush=True)
         if options.browser and not open_browser(address):
@@ -107,7 +98,15 @@ def world_maker(options: ViewOptions, device: torch.device) -> Callable[[], Live
 
     if options.what.startswith("npa/"):
         policy = options.policy
-        keywords = {"particle_count": options.particle_count} | _keywords(options)
+        keywords = common.named_values("options", options.options)
+        for name in OWN_KEYWORDS:
+            if name in keywords:
+                said = name in ("device", "policy")
+                cure = f"say --{name} {keywords[name]}" if said else "leave it out"
+                raise NPAError(
+                    f"options must leave {name} to the command, got {name}={keywords[name]}: {cure}"
+                )
+        keywords = {"particle_count": options.particle_count} | keywords
 
         def make_world() -> LiveWorld:
             env, acting = make_environment(options.what, policy, device=str(device), **keywords)
@@ -125,16 +124,3 @@ def world_maker(options: ViewOptions, device: torch.device) -> Callable[[], Live
     if folder.is_dir() and any((folder / name).exists() for name in RUN_FILES):
         return lambda: RunWorld(folder, **given)
     return lambda: RuleWorld(options.what, **given)
-
-
-def _keywords(options: ViewOptions) -> dict[str, Any]:
-    """Return the keywords of the environment; the command's own are refused."""
-    found = named_values("options", options.options)
-    for name in OWN_KEYWORDS:
-        if name in found:
-            said = name in ("device", "policy")
-            cure = f"say --{name} {found[name]}" if said else "leave it out"
-            raise NPAError(
-                f"options must leave {name} to the command, got {name}={found[name]}: {cure}"
-            )
-    return found

@@ -7,16 +7,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
-from npa_envs.cli.output import parse_options
+from npa_envs.cli import common
 from npa_envs.errors import NPAError
 
 
 @dataclass(frozen=True, kw_only=True)
-class WarmupOptions:
+class WarmupOptions(common.DeviceOptions):
     """Compile the kernels ahead of time, into Warp's cache (`npa-envs doctor` says where)."""
 
-    device: str = "cpu"
-    """For which device: cpu, cuda, cuda:1."""
     space_dims: tuple[int, ...] = (2,)
     """Space dimensions: 2, 3 or both."""
     dtypes: tuple[Literal["float32", "float64"], ...] = ("float32",)
@@ -25,12 +23,11 @@ class WarmupOptions:
 
 def main(arguments: Sequence[str]) -> int:
     """Compile what the words after `npa-envs warmup` ask for; return 0."""
-    options = parse_options(WarmupOptions, "warmup", arguments)
+    options = common.parse_options(WarmupOptions, "warmup", arguments)
     import torch
 
     from npa_envs.ops import warmup
     from npa_envs.runtime import kernel_cache_folder
-    from npa_envs.training import check_device
 
     if not options.space_dims or not options.dtypes or not set(options.space_dims) <= {2, 3}:
         raise NPAError(
@@ -38,11 +35,8 @@ def main(arguments: Sequence[str]) -> int:
             f"{options.dtypes}: for example --space-dims 2 3 --dtypes float32"
         )
     start = time.perf_counter()
-    warmup(
-        check_device(options.device),
-        space_dims=options.space_dims,
-        dtypes=[getattr(torch, name) for name in options.dtypes],
-    )
+    dtypes = [getattr(torch, name) for name in options.dtypes]
+    warmup(options.place(), space_dims=options.space_dims, dtypes=dtypes)
     seconds = time.perf_counter() - start
     print(f"kernels for {options.device} are ready ({seconds:.1f} s), in {kernel_cache_folder()}")
     return 0

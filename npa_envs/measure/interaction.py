@@ -8,9 +8,8 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -21,7 +20,6 @@ from torch import Tensor
 from npa_envs.errors import NPAError
 from npa_envs.measure.plots import draw_matrix, new_figure, png
 from npa_envs.measure.record import Record
-from npa_envs.measure.tables import as_objects
 from npa_envs.ops import species_fields
 from npa_envs.render import draw_worlds
 from npa_envs.rule.rule import NPARule
@@ -31,9 +29,6 @@ from npa_envs.world.species import rollout_species
 
 MARGIN = 0.2
 """A loss that changes by less than this share of itself counts as undisturbed."""
-
-RESAMPLES = 2000
-"""Draws of a bootstrap."""
 
 MIXED = 0.25
 """Mixing index from which on two species mix (dimensionless)."""
@@ -136,7 +131,7 @@ def ratio_interval(above: Tensor, below: Tensor) -> tuple[float, float]:
     infinite.
     """
     count = len(above)
-    draws = np.random.default_rng(0).integers(count, size=(RESAMPLES, count))
+    draws = np.random.default_rng(0).integers(count, size=(2000, count))
     tops, bases = (values.double().cpu().numpy()[draws].mean(axis=1) for values in (above, below))
     ratios = np.divide(tops, bases, out=np.full_like(tops, np.inf), where=bases > 0.0)
     # No interpolation: it makes no number of two infinite ones.
@@ -149,9 +144,6 @@ def mixing_index(x: Tensor, counts: Sequence[int], *, eps: float) -> Tensor:
 
     The mean over the particles of the entropy of the species' shares in the density there, in units
     of log K. 0: no particle perceives another species; 1: all species are perceived alike.
-
-    Raises:
-        NPAError: Positions or counts do not fit, or there is one species only.
     """
     rho = species_fields(x, counts, eps=eps).rho
     if rho.shape[2] < 2:
@@ -167,9 +159,6 @@ PROGRESS_STEPS = 32
 FRAME_SHARES = (0.0, 0.125, 0.25, 0.5, 1.0)
 """When pictures are taken, as shares of the run."""
 
-FRAME_RESOLUTION = 160
-"""Pixels on each side of a picture."""
-
 
 @dataclass(frozen=True)
 class RuleUnderTest:
@@ -180,6 +169,8 @@ class RuleUnderTest:
     task_of: Callable[[int], Task]
     update_prob: float
     """Probability of a particle's update in a step, as trained (dimensionless)."""
+    particle_count: int = 0
+    """Particles of a world, as trained."""
 
 
 class Scenes(NamedTuple):
@@ -232,7 +223,6 @@ class Encounters:
     ) -> tuple[list[InteractionRow], Scenes]:
         """Grow one rule, which is measured, with another or itself: a row for each setting."""
         rows, scenes, given = [], Scenes([], []), self.settings
-        spacing = math.sqrt(4.0 / given.particle_count)
         for factor, ratio, distance in itertools.product(
             given.eps_factors, given.ratios, given.distances
         ):
@@ -240,19 +230,18 @@ class Encounters:
             solo = self._solo(first, counts[0], factor)
             radius = "" if factor == 1.0 else f"eps x {factor:g}, "
             caption = f"{radius}d {distance:g}, r {ratio:g}, step"
-            looks = {
-                "resolution": FRAME_RESOLUTION,
-                "pixel_size": 0.5 * spacing,
-                "half_width": 1.2 + 0.5 * distance,
-            }
-
-            def shoot(
-                x: Tensor, s: Tensor, step: int, looks: Any = looks, caption: str = caption
-            ) -> None:
-                scenes.frames.append(draw_worlds(x[:1], s[:1], **looks)[0])
+            seen: list[tuple[Tensor, Tensor, int]] = []
+            x, s, lost = self._grow([first, second], counts, distance, factor, seen)
+            for then_x, then_s, step in seen:
+                frame = draw_worlds(
+                    then_x,
+                    then_s,
+                    resolution=160,
+                    pixel_size=0.5 * math.sqrt(4.0 / given.particle_count),
+                    half_width=1.2 + 0.5 * distance,
+                )[0]
+                scenes.frames.append(frame)
                 scenes.captions.append(f"{caption} {step}")
-
-            x, s, lost = self._grow([first, second], counts, distance, factor, shoot)
             own = x[:, : counts[0]]
             losses = first.task_of(counts[0]).metric(own, s[:, : counts[0]])
             losses = losses.masked_fill(lost, math.inf)
@@ -260,23 +249,15 @@ class Encounters:
             change = together / alone if alone > 0.0 else math.inf
             mixings = mixing_index(x, counts, eps=factor * first.rule.eps0)
             mixing = mixings.mean().item()
-            rows.append(
-                InteractionRow(
-                    first.name,
-                    second.name,
-                    distance,
-                    ratio,
-                    alone,
-                    together,
-                    change,
-                    mixing,
-                    (own.mean(dim=1) - solo.centroids).norm(dim=-1).mean().item(),
-                    verdict(change, mixing, given.margin),
-                    factor,
-                    *ratio_interval(losses, solo.losses),
-                    *ratio_interval(mixings, torch.ones_like(mixings)),
-                )
+            away = (own.mean(dim=1) - solo.centroids).norm(dim=-1).mean().item()
+            said = verdict(change, mixing, given.margin)
+            setting, figures = (distance, ratio), (alone, together, change, mixing, away)
+            intervals = (
+                *ratio_interval(losses, solo.losses),
+                *ratio_interval(mixings, torch.ones_like(mixings)),
             )
+            names = first.name, second.name
+            rows.append(InteractionRow(*names, *setting, *figures, said, factor, *intervals))
         return rows, scenes
 
     def _solo(self, organism: RuleUnderTest, count: int, factor: float) -> _Solo:
@@ -293,12 +274,12 @@ class Encounters:
         counts: tuple[int, ...],
         distance: float,
         factor: float,
-        shoot: Callable[[Tensor, Tensor, int], None] = lambda x, s, step: None,
+        seen: list[tuple[Tensor, Tensor, int]] | None = None,
     ) -> tuple[Tensor, Tensor, Tensor]:
         """Return one or two species grown from their seeds, and which worlds blew up.
 
         The first is seeded around the origin and draws what it draws alone; the second is seeded
-        `distance` from it along the first axis.
+        `distance` from it along the first axis. `seen` gets the first world at `FRAME_SHARES`.
         """
         settings = self.settings
         random = WorldRandom(settings.seeds, device=self._device)
@@ -334,11 +315,11 @@ class Encounters:
             s = torch.where(fine[:, None, None], new_s, s)
             lost |= ~fine
             self._progress(then - now)
-            if then in frames:
+            if then in frames and seen is not None:
                 # The middle of the two seeds is the middle of the picture.
                 shift = x.new_zeros(x.shape[2])
                 shift[0] = 0.5 * distance
-                shoot(x - shift, s, then)
+                seen.append((x[:1] - shift, s[:1], then))
         return x, s, lost
 
 
@@ -346,31 +327,27 @@ LARGEST_CHANGE = 4.0
 """Colours end at this many times the loss alone, and at its inverse."""
 
 
-def interaction_record(path: Path, settings: Mapping[str, Any]) -> Record[InteractionRow]:
-    """Return the record of settings: rows, and each number of them as matrices over the rules.
+class InteractionRecord(Record[InteractionRow]):
+    """Rows of settings, and each number of them as matrices over the rules."""
 
-    Rows of an earlier run of the same settings are in it.
-    """
-    names = list(settings["rules"])
+    command, key = "interact", "settings"
 
-    def content(rows: list[InteractionRow]) -> dict[str, Any]:
-        kinds = ("change", "mixing", "displacement", "verdict")
+    def content(self) -> dict[str, Any]:
+        """Return rows and matrices."""
+        kinds, names = ("change", "mixing", "displacement", "verdict"), list(self.facts["rules"])
         matrices = [
             {"ratio": ratio, "distance": distance, "eps_factor": factor}
             | {what: _matrix(some, names, what) for what in kinds}
-            for (factor, ratio, distance), some in _by_setting(rows).items()
+            for (factor, ratio, distance), some in _by_setting(self.rows).items()
         ]
-        return {"rows": as_objects(rows), "matrices": matrices}
+        return {**super().content(), "matrices": matrices}
 
-    def read(held: dict[str, Any]) -> list[InteractionRow]:
-        # JSON has no infinite numbers.
-        rows: list[dict[str, Any]] = [
-            {k: math.inf if v is None else v for k, v in row.items()} for row in held["rows"]
+    def parse(self, held: dict[str, Any]) -> list[InteractionRow]:
+        """Return the rows; JSON has no infinite numbers."""
+        return [
+            InteractionRow(**{k: math.inf if v is None else v for k, v in row.items()})
+            for row in held["rows"]
         ]
-        return [InteractionRow(**row) for row in rows]
-
-    record = Record[InteractionRow](settings, path=path, content=content, key="settings")
-    return record.resume(read, command="interact")
 
 
 def _by_setting(

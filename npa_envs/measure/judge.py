@@ -27,20 +27,12 @@ BANDS = 7
 BAND_RATIO = math.sqrt(2.0)
 ORIENTATIONS = 8
 """Orientations of waves in half a turn."""
-CODES = 12
-"""Colours that a picture is reduced to."""
 DISTANCES = (1, 2, 4, 6, 9, 13, 19, 28)
 """Pixels between two colours that are counted together."""
 AXES = ((0, 1), (1, 1), (1, 0), (1, -1))
 """Directions in which they lie, rows and columns."""
-SOFTNESS = 0.15
-"""Distance from a colour's code at which it counts for little (dimensionless)."""
 DRAWINGS = 4
 """Drawings of the target by particles that the distances are divided by."""
-FIRST_DRAWING = 1000
-"""Number of the first of them."""
-LEAST = 0.02
-"""Distances are divided by this share of the distance to grey noise at least."""
 
 
 @dataclass(frozen=True)
@@ -93,7 +85,7 @@ class TextureJudge:
             ramp = torch.hann_window(resolution, periodic=False, dtype=torch.float64)
             self._window = torch.outer(ramp, ramp).to(device)
         target = _images(task.drawable[None])
-        self._codes = _codes(target[0].flatten(1).T, CODES)
+        self._codes = _codes(target[0].flatten(1).T, 12)
         wrap = task.target.tiles
         self._patches = self._projections(target, wrap)
         self._spectra = self._amplitudes(target)
@@ -101,8 +93,8 @@ class TextureJudge:
         noise = torch.rand(DRAWINGS, resolution, resolution, 2, generator=generator)
         grey, density = noise[..., :1].to(device), noise[..., 1:].to(device)
         noisy = torch.cat((grey * density,) * 3 + (density,), dim=3)
-        drawn = torch.cat([task.drawing(FIRST_DRAWING + number) for number in range(DRAWINGS)])
-        least = LEAST * self._distances(_images(noisy)).mean(0)
+        drawn = torch.cat([task.drawing(1000 + number) for number in range(DRAWINGS)])
+        least = 0.02 * self._distances(_images(noisy)).mean(0)
         self._units = torch.maximum(self._distances(_images(drawn)).mean(0), least)
 
     def __call__(self, pictures: Tensor) -> Tensor:
@@ -153,7 +145,7 @@ class TextureJudge:
     def _counts(self, image: Tensor, wrap: bool) -> Tensor:
         """Return how often two codes lie at each distance and direction, shares, [D, K, K]."""
         away = (image[0].movedim(0, -1)[..., None, :] - self._codes).square().sum(-1)
-        near = torch.exp(-0.5 * away / SOFTNESS**2)
+        near = torch.exp(-0.5 * away / 0.15**2)
         # Colours near no code count as one more.
         near = torch.cat((near, torch.full_like(near[..., :1], 0.05)), dim=-1)
         near = near / near.sum(-1, keepdim=True)

@@ -14,16 +14,9 @@ from typing import Any
 from npa_envs.errors import MissingDependencyError
 from npa_envs.files import write_bytes
 
-FEW_DECADES = 100.0
-"""Logarithmic axes whose ends are fewer times apart have marks within decades."""
-
 
 def check_matplotlib() -> None:
-    """Check that pictures can be drawn.
-
-    Raises:
-        MissingDependencyError: matplotlib is not installed.
-    """
+    """Check that pictures can be drawn: that matplotlib is installed."""
     try:
         import matplotlib  # noqa: F401
     except ImportError as error:
@@ -35,10 +28,8 @@ def check_matplotlib() -> None:
 def write_plots(draw: Callable[[], Mapping[str, bytes]], path: Path, what: str) -> list[str]:
     """Write PNG files where matplotlib is installed, and return what was done, in sentences.
 
-    Args:
-        draw: Returns pictures by name, as bytes of PNG files.
-        path: Their place; "*" in its name stands for each one's.
-        what: What they are, for the sentence that there are none.
+    `draw` returns them by name, for which "*" stands in `path`; `what` they are is said where there
+    are none.
     """
     try:
         check_matplotlib()
@@ -157,7 +148,7 @@ def _with_unit(value: float) -> str:
 def mark_decades(panel: Any) -> None:
     """Mark 1, 2 and 5 of each decade of a logarithmic axis y; where they are many, the decades."""
     low, high = panel.get_ylim()
-    fine = high < FEW_DECADES * low
+    fine = high < 100.0 * low
     panel.minorticks_off()
     number_plainly(panel.yaxis, within=(1, 2, 5) if fine else (1,), text="{:g}".format)
     panel.tick_params(labelsize=7)

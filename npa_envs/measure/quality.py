@@ -92,50 +92,41 @@ def evaluate(
     progress: Callable[[int], None] | None = None,
     watch: Callable[[Tensor, Tensor, int], None] | None = None,
 ) -> list[EvaluationRow]:
-    """Grow one world from every seed and measure them along the way.
+    """Grow one world from every seed and measure them at `checkpoints`, steps that increase.
 
-    Args:
-        rule: The rule, in the precision to run it in.
-        task: The task that it was trained on.
-        checkpoints: Steps to measure at, positive and increasing.
-        seeds: One number for each world; the same numbers give the same table.
-        device: Where to run.
-        progress: Called with the number of steps done since its last call.
-        watch: Called at each of `checkpoints` with positions, states and the step.
-
-    Raises:
-        NPAError: `checkpoints` or `seeds` are empty or out of order.
+    `progress` is called with the number of steps done since its last call, `watch` at each of
+    `checkpoints` with positions, states and the step. The same seeds give the same table.
     """
     check_steps("checkpoints", checkpoints)
-    runner, x, s = _from_seeds(rule, task, seeds, check_device(device), progress)
+    runner, x, s = _from_seeds(rule, task, seeds, device, progress)
     rows = []
-    for step, before in zip(checkpoints, (0, *checkpoints), strict=False):
-        x, s = runner.run(x, s, step - before)
-        rows.append(measure(runner.task, x, s, step))
+    for step, new_x, new_s in runner.at(checkpoints, x, s):
+        rows.append(measure(runner.task, new_x, new_s, step))
         if watch is not None:
-            watch(x, s, step)
+            watch(new_x, new_s, step)
     return rows
 
 
 def measure(task: Task, x: Tensor, s: Tensor, step: int) -> EvaluationRow:
     """Measure worlds as they are, some steps from the seed."""
-    loss = task.metric(x, s)
-    ratio = None
+    loss, ratio = task.metric(x, s), None
     if task.has_views:
         ratio = task.view_psnr(x, s)
     elif task.aligned:
         ratio = psnr(task.picture(x, s), task.target_picture.to(x.device))
-    overflow = (s - s.clamp(-1.0, 1.0)).abs().mean()
-    extent = (x.amax(1) - x.amin(1)).amax(1).mean()
     return EvaluationRow(
         step=step,
         loss=loss.mean().item(),
         loss_worst=loss.max().item(),
         psnr=None if ratio is None else ratio.mean().item(),
         psnr_worst=None if ratio is None else ratio.min().item(),
-        overflow=overflow.item(),
-        extent=extent.item(),
+        overflow=_overflow(s).mean().item(),
+        extent=(x.amax(1) - x.amin(1)).amax(1).mean().item(),
     )
+
+
+def _overflow(s: Tensor) -> Tensor:
+    return (s - s.clamp(-1.0, 1.0)).abs()
 
 
 def psnr(picture: Tensor, target: Tensor) -> Tensor:
@@ -162,15 +153,11 @@ def healing(
 
     Two damages, each on the same grown worlds: a slit of width `cut_gap` through the middle at a
     random angle, and a disk of `wipe_radius` around a random particle whose states are wiped
-    [length units]. Losses are taken `every` so many steps. Other arguments are those of `evaluate`.
-
-    Raises:
-        NPAError: A number of steps is not positive, or there are no seeds.
+    [length units]. Losses are taken `every` so many steps.
     """
-    check_steps("grow_steps", [grow_steps])
-    check_steps("heal_steps", [heal_steps])
-    check_steps("every", [every])
-    runner, x, s = _from_seeds(rule, task, seeds, check_device(device), progress)
+    for what, count in (("grow_steps", grow_steps), ("heal_steps", heal_steps), ("every", every)):
+        check_steps(what, [count])
+    runner, x, s = _from_seeds(rule, task, seeds, device, progress)
     x, s = runner.run(x, s, grow_steps)
     task = runner.task
     before = task.metric(x, s)
@@ -178,41 +165,32 @@ def healing(
         len(x), x.shape[2], generator=runner.generator, dtype=x.dtype, device=x.device
     )
     centre = random_particle(x, generator=runner.generator)
+    wiped = task.coded(wipe_state(x, s, centre=centre, radius=wipe_radius, box=task.box))
     damaged = {
         f"cut, gap {cut_gap:g}": cut(
             x, s, centre=x.mean(1), normal=normal, gap=cut_gap, box=task.box
         ),
-        f"wiped disk, radius {wipe_radius:g}": (
-            x,
-            task.coded(wipe_state(x, s, centre=centre, radius=wipe_radius, box=task.box)),
-        ),
+        f"wiped disk, radius {wipe_radius:g}": (x, wiped),
     }
+    steps = [*range(0, heal_steps, every), heal_steps]
     rows = []
-    for name, (hurt_x, hurt_s) in damaged.items():
-        losses = [task.metric(hurt_x, hurt_s)]
-        steps = [0]
-        while steps[-1] < heal_steps:
-            more = min(every, heal_steps - steps[-1])
-            hurt_x, hurt_s = runner.run(hurt_x, hurt_s, more)
-            losses.append(task.metric(hurt_x, hurt_s))
-            steps.append(steps[-1] + more)
-        rows.append(_healing_row(name, before, torch.stack(losses), steps))
+    for name, worlds in damaged.items():
+        losses = torch.stack([task.metric(x, s) for _, x, s in runner.at(steps, *worlds)])
+        gone = ~(losses[-1] <= LOST * before)
+        mean_within = ((losses.mean(1) <= HEALED * before.mean()) & ~gone.all()).tolist()
+        healed = [step for step, within in zip(steps, mean_within, strict=True) if within]
+        rows.append(
+            HealingRow(
+                damage=name,
+                before=before.mean().item(),
+                after=losses[0].mean().item(),
+                steps_to_heal=healed[0] if healed else None,
+                worlds_healed=int(((losses <= HEALED * before).any(0) & ~gone).sum()),
+                world_count=len(before),
+                end=losses[-1].mean().item(),
+            )
+        )
     return rows
-
-
-def _healing_row(name: str, before: Tensor, losses: Tensor, steps: list[int]) -> HealingRow:
-    gone = ~(losses[-1] <= LOST * before)
-    mean_within = ((losses.mean(1) <= HEALED * before.mean()) & ~gone.all()).tolist()
-    worlds_within = (losses <= HEALED * before).any(0) & ~gone
-    return HealingRow(
-        damage=name,
-        before=before.mean().item(),
-        after=losses[0].mean().item(),
-        steps_to_heal=next((n for n, ok in zip(steps, mean_within, strict=True) if ok), None),
-        worlds_healed=int(worlds_within.sum()),
-        world_count=len(before),
-        end=losses[-1].mean().item(),
-    )
 
 
 # Rules that classify clouds
@@ -268,27 +246,18 @@ def accuracies(
     seed: int = 0,
     progress: Callable[[int], None] | None = None,
 ) -> list[AccuracyRow]:
-    """Let a rule classify all clouds of a task's split, and count right answers along the way.
+    """Let a rule classify all clouds of a task's split, and count right answers at `checkpoints`.
 
-    Args:
-        rule: The rule, on the device of the task.
-        task: The task with the clouds.
-        checkpoints: Steps to ask at, positive and increasing.
-        seed: Randomness of the updates.
-        progress: Called with the number of steps done since its last call.
-
-    Raises:
-        NPAError: `checkpoints` are empty or out of order.
+    The rule is on the device of the task; `seed` is that of the updates.
     """
     check_steps("checkpoints", checkpoints)
     runner = RuleRunner(rule, task, task.clouds.x.device, seed, progress)
     places = task.clouds.x.to(runner.dtype)
     sums = torch.zeros(len(checkpoints), 5, dtype=torch.float64)
     for index, label, blank in _batches(task):
-        x, s = places[index], blank.to(runner.dtype)
         aimed = runner.task.toward(label)
-        for row, (step, before) in enumerate(zip(checkpoints, (0, *checkpoints), strict=False)):
-            _, s = runner.run(x, s, step - before)
+        worlds = runner.at(checkpoints, places[index], blank.to(runner.dtype), still=True)
+        for row, (_, x, s) in enumerate(worlds):
             outputs = runner.task.outputs(s)
             says, most = particle_classes(outputs), majority(outputs)
             sums[row] += _sums(
@@ -296,7 +265,7 @@ def accuracies(
                 (says == label[:, None]).double().mean(1),
                 (says == most[:, None]).double().mean(1),
                 aimed.metric(x, s),
-                (s - s.clamp(-1.0, 1.0)).abs().mean((1, 2)),
+                _overflow(s).mean((1, 2)),
             )
     means = (sums / len(places)).tolist()
     return [AccuracyRow(step, *row) for step, row in zip(checkpoints, means, strict=True)]
@@ -316,10 +285,7 @@ def changes_of_mind(
 
     A cut cloud loses a quarter of its particles, on a random side. A mutated one becomes a cloud of
     another class, wholly or in its upper half: its particles move there and keep their states.
-    Other arguments are those of `accuracies`; the seed is that of the cuts, too.
-
-    Raises:
-        NPAError: A number of steps is out of range, or half of all clouds or more are of one class.
+    `seed` is that of the updates and of the cuts.
     """
     check_steps("settle_steps", [settle_steps])
     check_steps("steps", steps, at_least=0)
@@ -337,9 +303,8 @@ def changes_of_mind(
             (other_x, s, other),
         )
         for number, (new_x, new_s, goal) in enumerate(changed):
-            for row, (step, before) in enumerate(zip(steps, (0, *steps), strict=False)):
-                _, new_s = runner.run(new_x, new_s, step - before)
-                outputs = runner.task.outputs(new_s)
+            for row, (_, _, then) in enumerate(runner.at(steps, new_x, new_s, still=True)):
+                outputs = runner.task.outputs(then)
                 most = majority(outputs)
                 right = (particle_classes(outputs) == goal[:, None]).double().mean(1)
                 sums[number, row] += _sums(most == goal, right, most == label)
@@ -398,31 +363,22 @@ def tables_of(
     """Return the tables that are measured of a rule of any task, by name.
 
     These are `growth` and, if `changed`, `healing`; of clouds `accuracy` and `changes`; and those
-    of a `judge`. Clouds run where their task is, and take the first seed for the updates. Other
-    arguments are those of `evaluate`.
+    of a `judge`. Clouds run where their task is, and take the first seed for the updates.
     """
-    tables: dict[str, Sequence[Any]]
     if task.classifies:
-        task = cast(PointClassification, task)
-        common: dict[str, Any] = {"seed": seeds[0], "progress": progress}
+        clouds = cast(PointClassification, task)
         steps = checkpoints or CLOUD_CHECKPOINTS
-        tables = {"accuracy": accuracies(rule, task, checkpoints=steps, **common)}
-        if changed:
-            tables["changes"] = changes_of_mind(rule, task, **common)
-        return tables
-    common = {"seeds": seeds, "device": device, "progress": progress}
+        given: dict[str, Any] = {"seed": seeds[0], "progress": progress}
+        tables: dict[str, Sequence[Any]] = {
+            "accuracy": accuracies(rule, clouds, checkpoints=steps, **given)
+        }
+        return tables | ({"changes": changes_of_mind(rule, clouds, **given)} if changed else {})
+    given = {"seeds": seeds, "device": device, "progress": progress}
     judged: list[JudgeRow] = []
-    tables = {
-        "growth": evaluate(
-            rule,
-            task,
-            checkpoints=checkpoints or CHECKPOINTS,
-            watch=None if judge is None else lambda *world: judged.append(judge.row(*world)),
-            **common,
-        )
-    }
-    if changed:
-        tables["healing"] = healing(rule, task, **common)
+    watch = None if judge is None else lambda *world: judged.append(judge.row(*world))
+    steps = checkpoints or CHECKPOINTS
+    tables = {"growth": evaluate(rule, task, checkpoints=steps, watch=watch, **given)}
+    tables |= {"healing": healing(rule, task, **given)} if changed else {}
     return tables | ({"judge": judged} if judged else {})
 
 
@@ -470,17 +426,27 @@ class RuleRunner:
             steps -= some
         return x, s
 
+    def at(
+        self, steps: Sequence[int], x: Tensor, s: Tensor, *, still: bool = False
+    ) -> Iterator[tuple[int, Tensor, Tensor]]:
+        """Yield worlds after each of increasing numbers of steps; `still` ones keep positions."""
+        for step, before in zip(steps, (0, *steps), strict=False):
+            new_x, s = self.run(x, s, step - before)
+            x = x if still else new_x
+            yield step, x, s
+
 
 def _from_seeds(
     rule: NPARule,
     task: Task,
     seeds: Sequence[int],
-    device: torch.device,
+    device: str | torch.device,
     progress: Callable[[int], None] | None,
 ) -> tuple[RuleRunner, Tensor, Tensor]:
     """Return a runner and one world for each of the seeds."""
     if not seeds:
         raise NPAError("seeds must hold at least one number, got none: for example seeds=(0, 1)")
+    device = check_device(device)
     runner = RuleRunner(rule, task, device, seeds[0] + len(seeds), progress)
     worlds = [
         task.seed(1, generator=torch.Generator(device).manual_seed(seed), device=device)[:2]
@@ -564,22 +530,17 @@ def grown(
         ]
         x, s = torch.cat([x for x, *_ in fresh]), torch.cat([s for _, s, _ in fresh])
         random = WorldRandom([*seeds] * len(some), device=device)
-        done = 0
-        for number, step in enumerate(checkpoints):
-            x, s = run_worlds(rule, some[0], x, s, step - done, random)
-            found[number].append((x, s))
+        for kept, step, before in zip(found, checkpoints, (0, *checkpoints), strict=False):
+            x, s = run_worlds(rule, some[0], x, s, step - before, random)
+            kept.append((x, s))
             if progress is not None:
-                progress(step - done)
-            done = step
-    return [
-        (_by_task(tasks, [x for x, _ in parts]), _by_task(tasks, [s for _, s in parts]))
-        for parts in found
-    ]
+                progress(step - before)
+    whole = ([torch.cat(parts) for parts in zip(*kept, strict=True)] for kept in found)
+    return [(_by_task(tasks, x), _by_task(tasks, s)) for x, s in whole]
 
 
-def _by_task(tasks: Sequence[Morphogenesis2D], parts: Sequence[Tensor]) -> Tensor:
-    whole = torch.cat(list(parts))
-    return whole.view(len(tasks), -1, *whole.shape[1:])
+def _by_task(tasks: Sequence[Morphogenesis2D], worlds: Tensor) -> Tensor:
+    return worlds.view(len(tasks), -1, *worlds.shape[1:])
 
 
 @torch.no_grad()
@@ -592,42 +553,23 @@ def picture_rows(
     device: str | torch.device = "cpu",
     progress: Callable[[int], None] | None = None,
 ) -> list[PictureRow]:
-    """Return for each of `checkpoints` a row for each picture, and one of the medians.
-
-    Arguments are those of `grown`.
-
-    Raises:
-        NPAError: There are fewer than two pictures, or `checkpoints` are empty or out of order.
-    """
+    """Return rows of each picture of `grown` at `checkpoints`, and one of their medians."""
     if len(tasks) < 2:
         raise NPAError(f"pictures must be two or more, got {len(tasks)}: nothing to tell apart")
-    worlds = grown(
-        rule, tasks, checkpoints=checkpoints, seeds=seeds, device=device, progress=progress
-    )
+    given: dict[str, Any] = {"seeds": seeds, "device": device, "progress": progress}
     rows = []
+    worlds = grown(rule, tasks, checkpoints=checkpoints, **given)
     for step, (x, s) in zip(checkpoints, worlds, strict=True):
-        own = [_picture_row(step, tasks, number, x, s) for number in range(len(tasks))]
-        medians = {
-            name: statistics.median(getattr(row, name) for row in own)
-            for name in ("loss", "shuffled", "psnr")
-        }
-        rows += [*own, PictureRow(step=step, target=MEDIAN, **medians)]
+        own = []
+        for number, task in enumerate(tasks):
+            other = (number + 1) % len(tasks)
+            loss, shuffled = (task.metric(x[k], s[k]).mean().item() for k in (number, other))
+            ratio = psnr(task.picture(x[number], s[number]), task.target_picture)
+            own.append(PictureRow(step, task.target.name, loss, shuffled, ratio.mean().item()))
+        figures = ([row.loss, row.shuffled, row.psnr] for row in own)
+        medians = map(statistics.median, zip(*figures, strict=True))
+        rows += [*own, PictureRow(step, MEDIAN, *medians)]
     return rows
-
-
-def _picture_row(
-    step: int, tasks: Sequence[Morphogenesis2D], number: int, x: Tensor, s: Tensor
-) -> PictureRow:
-    """Return the row of one task from the worlds of all."""
-    task, other = tasks[number], (number + 1) % len(tasks)
-    ratio = psnr(task.picture(x[number], s[number]), task.target_picture)
-    return PictureRow(
-        step=step,
-        target=task.target.name,
-        loss=task.metric(x[number], s[number]).mean().item(),
-        shuffled=task.metric(x[other], s[other]).mean().item(),
-        psnr=ratio.mean().item(),
-    )
 
 
 # Scores of shipped rules: the tables of `npa-envs evaluate`, in a file next to each rule.

@@ -1,4 +1,4 @@
-"""Records of measurements: JSON written whole, with the facts that the figures follow from.
+"""Records and tables of measurements: JSON written whole, with facts that figures follow from.
 
 A record is written after every entry, so that a run that was stopped goes on from it. Figures of
 other facts (device, machine, commit, versions, settings) are refused.
@@ -6,22 +6,23 @@ other facts (device, machine, commit, versions, settings) are refused.
 
 from __future__ import annotations
 
+import csv
+import dataclasses
 import importlib.metadata
+import io
 import math
 import os
 import platform
 import subprocess
 import time
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, Generic, TypeVar
+from typing import Any, Generic, Self, TypeVar
 
 import torch
 
 from npa_envs.errors import NPAError, shown
 from npa_envs.files import json_text, plain_numbers, read_json, write_text
-from npa_envs.measure.tables import as_objects, table_text
 
 LIBRARIES = ("npa-envs", "torch", "warp-lang", "numpy", "scipy", "warpSPHCore")
 """Distributions whose versions are recorded."""
@@ -29,36 +30,33 @@ LIBRARIES = ("npa-envs", "torch", "warp-lang", "numpy", "scipy", "warpSPHCore")
 Content = TypeVar("Content")
 Row = TypeVar("Row")
 
-LARGEST_RECORD = 64 * 2**20
-"""Bytes of a record, at most."""
 
-
-@dataclass
 class Record(Generic[Row]):
-    """Rows of a measurement, and what they follow from, in a JSON file."""
+    """Rows of a measurement, and the facts that they follow from, in a JSON file, if in any."""
 
-    facts: Mapping[str, Any]
-    """What the rows follow from: device, machine, settings, commit, versions."""
-    rows: list[Row] = field(default_factory=list)
-    path: Path | None = None
-    """The file that is written after each entry; None: none."""
-    content: Callable[[list[Row]], Mapping[str, Any]] = lambda rows: {"rows": as_objects(rows)}
-    """Returns the file's fields other than the facts."""
-    key: str = "facts"
+    command: str
+    """The command that writes such records, for errors."""
+    key = "facts"
     """What the file calls the facts."""
 
-    def resume(self, read: Callable[[dict[str, Any]], list[Row]], *, command: str) -> Record[Row]:
-        """Take over the rows of the file, if there is one, and return this record.
+    def __init__(
+        self, facts: Mapping[str, Any], path: Path | None = None, rows: Iterable[Row] = ()
+    ) -> None:
+        self.facts, self.path, self.rows = facts, path, list(rows)
 
-        Args:
-            read: Makes rows of the file's JSON object.
-            command: Name of the command that writes such records, for the errors.
+    def content(self) -> Mapping[str, Any]:
+        """Return the file's fields other than the facts."""
+        return {"rows": as_objects(self.rows)}
 
-        Raises:
-            NPAError: As for `read_record`.
-        """
+    def parse(self, held: dict[str, Any]) -> list[Row]:
+        """Return the rows of the file's JSON object."""
+        raise NotImplementedError
+
+    def read(self) -> Self:
+        """Take over the rows of the file, if there is one, and return this record."""
         if self.path is not None:
-            found = read_record(self.path, self.facts, read, command=command, key=self.key)
+            make, command = self.parse, self.command
+            found = read_record(self.path, self.facts, make, command=command, key=self.key)
             self.rows += found or []
         return self
 
@@ -70,7 +68,7 @@ class Record(Generic[Row]):
     def write(self) -> None:
         """Write the file, where there is to be one."""
         if self.path is not None:
-            write_record(self.path, {self.key: self.facts, **self.content(self.rows)})
+            write_record(self.path, {self.key: self.facts, **self.content()})
 
     def table(self) -> str:
         """Return the rows as a plain text table."""
@@ -90,23 +88,16 @@ def read_record(
     command: str,
     key: str = "facts",
 ) -> Content | None:
-    """Return what `make` makes of the record that a stopped run left; None where there is none.
+    """Return what `make` makes of the JSON that a stopped run left; None where there is none.
 
-    Args:
-        path: The file that it wrote.
-        facts: What figures follow from now.
-        make: Makes the record of the JSON object.
-        command: Name of the command that writes such records, for the errors.
-        key: What the object calls its facts.
-
-    Raises:
-        NPAError: The file is no such record, or its figures follow from something else.
+    Facts that differ from those of the file, where `key` names them, are refused; errors name the
+    command that writes such records.
     """
     if not os.path.exists(path):
         return None
     cure = "remove it, or choose another folder with --out"
     try:
-        held = read_json(path, limit=LARGEST_RECORD)
+        held = read_json(path, limit=64 * 2**20)
         before = dict(held[key])
         record = make(held)
     except (OSError, ValueError, TypeError, KeyError, AttributeError) as error:
@@ -202,3 +193,90 @@ def current_commit() -> str:
     except (OSError, subprocess.CalledProcessError):
         return "unknown"
     return done.stdout.strip()
+
+
+# Tables: plain text, Markdown, comma-separated values, JSON
+
+UNMEASURED = "-"
+"""What tables show where nothing was measured."""
+
+NONE = "–"
+"""What Markdown shows where nothing was measured."""
+
+
+def table_text(rows: Sequence[Any], *, missing: str = "never") -> str:
+    """Return rows, instances of one dataclass, as a plain text table under a line of headings.
+
+    A None is shown as `missing`; if that is `UNMEASURED`, columns of it alone are left out.
+    """
+    if not rows:
+        return ""
+    return "\n".join(aligned(_cells(rows, missing)))
+
+
+def aligned(lines: Sequence[Sequence[str]]) -> list[str]:
+    """Return lines of cells in columns, which end below each other."""
+    widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
+    return [
+        "  ".join(cell.rjust(width) for cell, width in zip(line, widths, strict=True))
+        for line in lines
+    ]
+
+
+def table_markdown(rows: Sequence[Any], *, missing: str = "never") -> str:
+    """Return rows as a table in Markdown, with the headings and cells of `table_text`."""
+    heads, *lines = _cells(rows, missing)
+    return markdown_table(heads, lines)
+
+
+def _cells(rows: Sequence[Any], missing: str) -> list[list[str]]:
+    """Return headings, and the cells of each row."""
+    names = [field.name for field in dataclasses.fields(rows[0])]
+    if missing == UNMEASURED:
+        names = [name for name in names if any(getattr(row, name) is not None for row in rows)]
+    heads = [name.replace("_", " ") for name in names]
+    return [heads, *([_cell(getattr(row, name), missing) for name in names] for row in rows)]
+
+
+def _cell(value: object, missing: str) -> str:
+    if value is None:
+        return missing
+    return f"{value:.4g}" if isinstance(value, float) else str(value)
+
+
+def tables_json(tables: Mapping[str, Sequence[Any]], **facts: str) -> str:
+    """Return tables and facts as a JSON object; a number that is not finite becomes null."""
+    return json_text({**facts, **{name: as_objects(rows) for name, rows in tables.items()}})
+
+
+def as_objects(rows: Iterable[Any]) -> list[dict[str, Any]]:
+    """Return instances of dataclasses as JSON objects."""
+    return [dataclasses.asdict(row) for row in rows]
+
+
+def markdown_table(heads: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    """Return a table in Markdown."""
+    lines = [heads, ["---"] * len(heads), *rows]
+    return "\n".join("| " + " | ".join(line) + " |" for line in lines)
+
+
+def csv_text(heads: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
+    """Return comma-separated values; floats have 12 digits."""
+    written = io.StringIO()
+    writer = csv.writer(written, lineterminator="\n")
+    writer.writerow(heads)
+    for row in rows:
+        writer.writerow([f"{v:.12g}" if isinstance(v, float) else v for v in row])
+    return written.getvalue()
+
+
+def short(value: float | str) -> str:
+    """Return a number with three digits, a word as it is."""
+    return value if isinstance(value, str) else f"{value:.3g}"
+
+
+def mean_with_error(mean: float, error: float, digits: int = 3) -> str:
+    """Return a mean with its standard error; either may be NaN, for not known."""
+    if math.isnan(mean):
+        return NONE
+    return f"{mean:.{digits}f}" + ("" if math.isnan(error) else f" ± {error:.{digits}f}")

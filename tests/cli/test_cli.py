@@ -16,8 +16,8 @@ import torch
 from PIL import Image
 
 from npa_envs.cli import COMMANDS, demo, doctor, main
+from npa_envs.cli.common import EXAMPLES, torch_threads
 from npa_envs.cli.film import WorldFilm, film_world
-from npa_envs.cli.output import EXAMPLES, torch_threads
 from npa_envs.cli.train import announcement, parse, starting_configuration, thread_count
 from npa_envs.errors import NPAError
 from npa_envs.rule.files import load_rule, save_rule
@@ -527,7 +527,7 @@ def test_rollout_notices_before_the_first_step_that_it_cannot_write(
     rule, tmp_path, monkeypatch, capsys
 ):
     refuse = raising(PermissionError(13, "Permission denied"))
-    monkeypatch.setattr("npa_envs.cli.output.tempfile.TemporaryFile", refuse)
+    monkeypatch.setattr("npa_envs.cli.common.tempfile.TemporaryFile", refuse)
     monkeypatch.setattr("npa_envs.cli.film.run_worlds", lambda *_, **__: pytest.fail("a step ran"))
     words = ["rollout", rule, "--steps", "9", "--out", str(tmp_path)]
     assert "out must be a folder that can be written to" in error_of(capsys, words)

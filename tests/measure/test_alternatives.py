@@ -23,14 +23,13 @@ from alternatives import (
     perception_rows,
     rollout_rows,
 )
+from precisions import PRECISIONS
 from strategies import NEIGHBOUR_CAP, STRATEGIES, nearest
 
 from npa_envs import reference
 from npa_envs.errors import NPAError
 from npa_envs.measure.plots import png
-from npa_envs.measure.speed.precisions import PRECISIONS
-from npa_envs.measure.speed.timing import LeftOut, Timing
-from npa_envs.measure.speed.workloads import Workload
+from npa_envs.measure.speed.timing import LeftOut, Timing, Workload
 from npa_envs.world.rollout import rollout
 
 TINY = Workload(2, 2, 150, 2, hidden_dim=16, eps=0.2)

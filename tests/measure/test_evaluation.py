@@ -11,7 +11,7 @@ from circle_task import PARTICLE_COUNT, STATE_DIM, CircleTask
 import npa_envs.measure.quality
 from npa_envs.errors import NPAError
 from npa_envs.measure.quality import EvaluationRow, HealingRow, evaluate, healing, psnr
-from npa_envs.measure.tables import table_text, tables_json
+from npa_envs.measure.record import table_text, tables_json
 from npa_envs.rule.rule import NPARule
 
 

@@ -12,20 +12,18 @@ from scripts import script_facts, script_parser
 from npa_envs.errors import NPAError
 from npa_envs.measure.plots import mark_decades, write_plots
 from npa_envs.measure.record import (
+    UNMEASURED,
+    csv_text,
     current_commit,
+    markdown_table,
+    mean_with_error,
     measured_facts,
     number,
     read_record,
+    table_text,
     time_limit,
     without_folders,
     write_record,
-)
-from npa_envs.measure.tables import (
-    UNMEASURED,
-    csv_text,
-    markdown_table,
-    mean_with_error,
-    table_text,
 )
 
 RESULTS = Path(__file__).resolve().parents[2] / "benchmarks" / "results"
@@ -88,13 +86,13 @@ def test_a_time_limit_passes_once_and_never_without_one():
 def test_stored_records_can_be_read():
     """Those of robustness are read by the test that their tables are the stored ones."""
     from npa_envs.measure.accuracy.suite import StressRecord
-    from npa_envs.measure.interaction import interaction_record
+    from npa_envs.measure.interaction import InteractionRecord
 
     stress, met = (RESULTS / name for name in ("stress_57ffb7c_h100.json", "interactions_cpu.json"))
     facts = json.loads(stress.read_text("utf-8"))["facts"]
     assert StressRecord(facts, stress).read().counts()["fail"] == 1
     settings = json.loads(met.read_text("utf-8"))["settings"]
-    assert len(interaction_record(met, settings).rows) == 16
+    assert len(InteractionRecord(settings, met).read().rows) == 16
 
 
 @dataclass(frozen=True)

@@ -11,14 +11,6 @@ import torch
 from npa_envs.cli import main
 from npa_envs.measure.accuracy.endurance import rule_names, task_name
 from npa_envs.measure.robustness import study
-from npa_envs.measure.robustness.recovery import (
-    CONTROL,
-    DAMAGES,
-    STATE_NOISE,
-    LossCurve,
-    healing,
-    recovery_step,
-)
 from npa_envs.measure.robustness.study import (
     Response,
     RuleRecord,
@@ -33,14 +25,20 @@ from npa_envs.measure.robustness.study import (
 from npa_envs.measure.robustness.trials import (
     BLOB_DISTANCE,
     CONDITIONS,
+    CONTROL,
+    DAMAGES,
     PLANS,
     SHAPES,
     SIZE_FACTOR,
+    STATE_NOISE,
+    LossCurve,
     RuleTrial,
     TrialPlan,
     disk,
+    healing,
     loss_curves,
     quick_plan,
+    recovery_step,
     trained_value,
 )
 from npa_envs.rule.files import (

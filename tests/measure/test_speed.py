@@ -9,15 +9,14 @@ from functools import partial
 import pytest
 import torch
 from clock import Clock
+from drift import DriftRow, drift_rows
 
 from npa_envs.cli import main
 from npa_envs.measure.speed import suites
-from npa_envs.measure.speed.explain import Question, explain
+from npa_envs.measure.speed.explain import explain
 from npa_envs.measure.speed.suites import (
     PAPER,
     BenchReport,
-    DriftRow,
-    drift_rows,
     roll_one_species,
     scaling_rows,
     skip_rows,
@@ -25,8 +24,7 @@ from npa_envs.measure.speed.suites import (
     throughput_rows,
     varied,
 )
-from npa_envs.measure.speed.timing import LeftOut, Timing, TimingSession, compare
-from npa_envs.measure.speed.workloads import Workload
+from npa_envs.measure.speed.timing import LeftOut, Timing, TimingSession, Workload, compare
 from npa_envs.ops import perceive
 from npa_envs.ops.launch import noted_launches
 from npa_envs.world.rollout import rollout
@@ -146,7 +144,7 @@ def test_kernels_are_cudas(device):
 def test_the_suites_measure_all_their_tables():
     here = TimingSession(torch.device("cpu"), repeats=1)
     tables = suites.quick(here)
-    assert list(tables) == ["throughput", "drift"]
+    assert list(tables) == ["throughput"]
     assert all(tables.values())
     assert here.small
 
@@ -215,23 +213,22 @@ def test_a_report_is_json_without_numbers_that_json_has_not():
 # Explanations
 
 
-def question(**options) -> Question:
-    usual = {"workload": TINY, "device": torch.device("cpu"), "dtype": torch.float32}
-    return Question(**usual | {"periodic": False, "gradients": "weights"} | options)
+def explained(workload=TINY, dtype=torch.float32, **options) -> str:
+    return explain(workload, torch.device("cpu"), dtype, **options)
 
 
 def test_an_explanation_names_the_kernels_and_follows_what_is_asked_for():
-    forward, backward = explain(question()).split("backward:")
+    forward, backward = explained().split("backward:")
     for kernel in ("sort_worlds", "compute_density", "perceive", "apply_update"):
         assert f"  {kernel} " in forward
     assert "  gather_state_cotangents " in backward
     assert "Sort a world" in forward
     wide = Workload(2, 1, 900, 1)
-    plain = explain(question(workload=wide, gradients="none", periodic=True))
+    plain = explained(workload=wide, gradients="none", periodic=True)
     assert "backward:" not in plain
     assert "periodic" in plain
-    assert "gather_position_cotangents" in explain(question(gradients="positions"))
-    assert "f64" in explain(question(dtype=torch.float64))
+    assert "gather_position_cotangents" in explained(gradients="positions")
+    assert "f64" in explained(dtype=torch.float64)
 
 
 def test_noted_launches_are_those_of_the_block():

@@ -17,7 +17,7 @@ import pytest
 from PIL import Image
 
 from npa_envs.agents.learning.rules import RuleSet
-from npa_envs.cli.output import writable_folder
+from npa_envs.cli.common import writable_folder
 from npa_envs.errors import NPAError
 from npa_envs.files import atomic_path, made_folder, remove_unfinished, write_bytes, write_text
 from npa_envs.rule.rule import NPARule

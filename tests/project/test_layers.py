@@ -60,7 +60,6 @@ LADDER = {
     "npa_envs.training": rung(9, "torch numpy tqdm yaml tensorboard", never=ORACLES),
     "npa_envs": Rung(10, frozenset({COMPUTED_NAME}), never=ORACLES),
     "npa_envs.measure.record": rung(3, "torch", never=INSIDES),
-    "npa_envs.measure.tables": rung(2),
     "npa_envs.measure.plots": rung(2, "matplotlib"),
     "npa_envs.measure.judge": rung(10, "torch", never=INSIDES),
     "npa_envs.measure.quality": rung(11, "torch numpy tqdm", never=INSIDES),

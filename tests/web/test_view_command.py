@@ -10,7 +10,7 @@ import torch
 from npa_envs import NPAError, load_rule, save_rule
 from npa_envs.cli import main
 from npa_envs.cli import view as command
-from npa_envs.cli.output import EXAMPLES
+from npa_envs.cli.common import EXAMPLES
 from npa_envs.cli.view import ViewOptions, open_browser, world_maker
 from npa_envs.web.environment_world import EnvironmentWorld
 from npa_envs.web.rule_world import RuleWorld, RunWorld

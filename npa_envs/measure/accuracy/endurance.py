@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from npa_envs.errors import NPAError
-from npa_envs.measure.accuracy.checks import Check, CheckResult, CheckSession, Skipped
+from npa_envs.measure.accuracy.suite import Check, CheckResult, CheckSession, check
 from npa_envs.rule.files import load_rule, rule_file, rule_metadata, shipped_rules
 from npa_envs.rule.rule import NPARule
 from npa_envs.tasks.base import Task
@@ -21,36 +21,31 @@ from npa_envs.world.cuda_graph import GraphSequence, capture
 from npa_envs.world.randomness import Randomness
 from npa_envs.world.rollout import rollout
 
-HORIZONS = {
-    "morphogenesis2d": 512,
-    "morphogenesis3d": 128,
-    "texture": 512,
-    "point_classification": 32,
-}
-"""Steps after which rules of a task are judged."""
+TASKS = ("morphogenesis2d", "morphogenesis3d", "texture", "point_classification")
+"""Tasks whose rules are measured."""
 
-WORKS = 2.0
-"""A rule works where its loss is at most this many times that as trained, and all is finite."""
-
-QUICK_HORIZON, QUICK_PARTICLES, QUICK_CLOUD = 64, 1024, 128
-"""The most steps, particles, and particles of a cloud in a quick run."""
+QUICK_PARTICLES, QUICK_CLOUD = 1024, 128
+"""The most particles, and particles of a cloud, in a quick run."""
 
 SMALLEST_VIEWS: dict[str, Any] = {"resolution": 16, "training_views": 1, "held_out_views": 1}
-"""Fields of 3D tasks whose target is not looked at."""
+"""Fields of 3D tasks whose target is not looked at: it takes long to make."""
+
+SEEN_AT_ONCE = 1 << 17
+"""Particles of the worlds whose loss is taken at once; views of Gaussians take much memory."""
 
 CHUNK = 50
 """Steps that are recorded in one CUDA graph."""
 
 
 @dataclass(frozen=True)
-class EnduranceCase:
-    """A float32 rule, its task, worlds of seeds, and its horizon in steps."""
+class TrialWorlds:
+    """A float32 rule in worlds of its task, with their goals, where the task has such."""
 
     rule: NPARule
     task: Task
     x: Tensor
     s: Tensor
-    horizon: int
+    goal: Tensor | None = None
 
     def options(self, **changed: Any) -> dict[str, Any]:
         """Return options of `rollout` as in training, but for what is changed."""
@@ -66,10 +61,21 @@ class EnduranceCase:
         free = self.task.box is None and not self.rule.static
         return x * (self.task.eps / eps) if free and eps != self.task.eps else x
 
-    def metric(self, x: Tensor, s: Tensor) -> float:
-        """Return the mean metric of worlds; lower is better."""
-        with torch.no_grad():
-            return float(self.task.metric(x, s).mean())
+    def with_worlds(self, x: Tensor, s: Tensor) -> TrialWorlds:
+        """Return the same with other particles of K copies of all worlds, [K B, N, ...]."""
+        goal = None if self.goal is None else self.goal.repeat(len(x) // len(self.goal))
+        return replace(self, x=x, s=s, goal=goal)
+
+    @torch.no_grad()
+    def losses(self, x: Tensor, s: Tensor) -> Tensor:
+        """Return the task's metric, [B]; of clouds, the share of particles that are wrong."""
+        some = max(1, SEEN_AT_ONCE // x.shape[1])
+        found = []
+        for start in range(0, len(x), some):
+            worlds = slice(start, start + some)
+            goal = None if self.goal is None else self.goal[worlds]
+            found.append(self.task.toward(goal).trial_metric(x[worlds], s[worlds]))
+        return torch.cat(found)
 
 
 def rule_names() -> list[str]:
@@ -80,7 +86,7 @@ def rule_names() -> list[str]:
 def task_name(rule: str) -> str:
     """Return the name of the task that a rule was trained on, as its file says."""
     metadata = rule_metadata(rule_file(rule))
-    if metadata.get("task") not in HORIZONS:
+    if metadata.get("task") not in TASKS:
         raise NPAError(
             f"the rule's file must say on which task it was trained, {rule!r} says "
             f"{metadata.get('task')!r}: give a rule that npa-envs train has saved"
@@ -89,51 +95,25 @@ def task_name(rule: str) -> str:
 
 
 def habitat(
-    session: CheckSession,
-    name: str,
-    *,
-    world_count: int = 1,
-    particles: float = 1.0,
-    looks: bool = True,
-) -> EnduranceCase:
-    """Return a rule, shipped or of a file, with seeds of its task.
+    session: CheckSession, name: str, *, world_count: int = 1, particles: float = 1.0
+) -> TrialWorlds:
+    """Return a rule, shipped or of a file, with seeds of its task, whose target is not looked at.
 
-    `particles` is over those it was trained with or, in a quick run, over the most there. `looks`
-    says whether loss or metric are read: a 3D target takes long to make.
-
-    Raises:
-        Skipped: It looks at a target that cannot be loaded.
+    `particles` is over those it was trained with or, in a quick run, over the most there.
     """
-    key = ("task", name, particles, looks)
-
-    def make() -> tuple[NPARule, Task]:
+    if (name, particles) not in session.kept:
         rule = load_rule(name, device=session.device).float().requires_grad_(False)
-        fields = {} if looks or rule.space_dim == 2 else SMALLEST_VIEWS
-        count = max(1, round(particles * trained_particles(session, name)))
+        fields = {} if rule.space_dim == 2 else SMALLEST_VIEWS
+        path = rule_file(name)
+        count = int(trained_config(path, rule_metadata(path)).task.particle_count)
+        # Clouds are sampled farthest point by farthest point, which is slow.
+        most = QUICK_CLOUD if task_name(name) == "point_classification" else QUICK_PARTICLES
+        count = max(1, round(particles * (min(count, most) if session.quick else count)))
         found = task_of_rule(name, rule, session.device, particle_count=count, **fields)
-        if looks and found.doubt is not None:
-            raise Skipped(found.doubt)
-        return rule, found.task
-
-    rule, task = session.once(key, make)
+        session.kept[name, particles] = rule, found.task
+    rule, task = session.kept[name, particles]
     x, s, goal = task.seed(world_count, generator=session.generator(), device=session.device)
-    horizon = HORIZONS[task_name(name)]
-    return EnduranceCase(
-        rule,
-        task.toward(goal),
-        x.float(),
-        s.float(),
-        min(horizon, QUICK_HORIZON) if session.quick else horizon,
-    )
-
-
-def trained_particles(session: CheckSession, name: str) -> int:
-    """Return how many particles a world of a rule has where their number is not varied."""
-    path = rule_file(name)
-    count = int(trained_config(path, rule_metadata(path)).task.particle_count)
-    # Clouds are sampled farthest point by farthest point, which is slow.
-    most = QUICK_CLOUD if task_name(name) == "point_classification" else QUICK_PARTICLES
-    return min(count, most) if session.quick else count
+    return TrialWorlds(rule, task.toward(goal), x.float(), s.float(), goal)
 
 
 class LongRun:
@@ -143,15 +123,10 @@ class LongRun:
     """
 
     def __init__(
-        self,
-        home: EnduranceCase,
-        generator: Randomness,
-        options: dict[str, Any],
-        *,
-        chunk: int = CHUNK,
+        self, home: TrialWorlds, random: Randomness, options: dict[str, Any], chunk: int = CHUNK
     ) -> None:
         self.x, self.s = home.x.clone(), home.s.clone()
-        self._rule, self._generator, self._options = home.rule, generator, options
+        self._rule, self._random, self._options = home.rule, random, options
         self.eps: float = options["eps"]
         """Perception radius [length units]."""
         self._steps = chunk
@@ -159,37 +134,28 @@ class LongRun:
 
     def advance(self, steps: int) -> None:
         """Run some steps more."""
-        if self.x.is_cuda:
-            own = self._generator if isinstance(self._generator, torch.Generator) else None
-            while steps >= self._steps:
-                if self._graph is None:
-                    # The warm-up is a chunk of the run.
-                    self._graph = capture(
-                        self._chunk, self.x.device, generator=own, warm_up=self._chunk
-                    )
-                else:
-                    self._graph.replay()
-                steps -= self._steps
+        own = self._random if isinstance(self._random, torch.Generator) else None
+        chunk = partial(self._run, self._steps)
+        while self.x.is_cuda and steps >= self._steps:
+            if self._graph is None:
+                # The warm-up is a chunk of the run.
+                self._graph = capture(chunk, self.x.device, generator=own, warm_up=chunk)
+            else:
+                self._graph.replay()
+            steps -= self._steps
         if steps:
             self._run(steps)
 
-    def _chunk(self) -> None:
-        self._run(self._steps)
-
     @torch.no_grad()
     def _run(self, steps: int) -> None:
-        x, s = rollout(
-            self._rule, self.x, self.s, steps, generator=self._generator, **self._options
-        )
+        x, s = rollout(self._rule, self.x, self.s, steps, generator=self._random, **self._options)
         self.x.copy_(x)
         self.s.copy_(s)
 
-    def marks(self, marks: list[int]) -> Iterator[tuple[int, Tensor, Tensor]]:
+    def marks(self, marks: Sequence[int]) -> Iterator[tuple[int, Tensor, Tensor]]:
         """Yield steps, positions and states after each of increasing numbers of steps."""
-        done = 0
-        for mark in marks:
-            self.advance(mark - done)
-            done = mark
+        for mark, before in zip(marks, (0, *marks), strict=False):
+            self.advance(mark - before)
             yield mark, self.x, self.s
 
 
@@ -214,32 +180,21 @@ BOUNDS = {
     "energy": 4.0,
     "drift": 1.0,
 }
-"""Bounds of the figures that `endurance_checks` describes."""
+"""Bounds of figures, which are the largest after the world has settled.
 
+`extent`: longest side of the bounding box, over that of the settled world. `overflow`: mean
+|s − clip(s, −1, 1)|. `largest_state`: the largest |s|. `energy`: mean over particles of |Δx|²/ε² +
+mean Δs² of a step, over that of the settled world, each the mean of `ENERGY_STEPS`. `drift`: how
+far the centroid is from where it was, in extents of the settled world; where a rule moves its
+particles in open space.
+"""
 
-def endurance_checks(rules: Mapping[str, str] | None = None) -> list[Check]:
-    """Return the checks of the group `time`, of all shipped rules or of others: name -> source.
-
-    Figures are the largest after the world has settled. `extent`: longest side of the bounding box,
-    over that of the settled world. `overflow`: mean |s − clip(s, −1, 1)|. `largest_state`: the
-    largest |s|. `energy`: mean over particles of |Δx|²/ε² + mean Δs² of a step, over that of the
-    settled world, each the mean of `ENERGY_STEPS`. `drift`: how far the centroid is from where it
-    was, in extents of the settled world; where a rule moves its particles in open space.
-    """
-    expected = (
-        "no number becomes infinite or NaN; the extent at most doubles, updates have at most four "
-        "times the energy of the settled world's, states stay within 8 and on average within 1.1, "
-        "the centroid moves by an extent at most"
-    )
-    sources = rules or {name: name for name in rule_names()}
-    return [
-        Check(f"time/{name}", expected, partial(_run, source), source)
-        for name, source in sources.items()
-    ]
+ENDURANCE: list[Check] = []
+"""The check of the group `time`, of a rule."""
 
 
 def measured(
-    home: EnduranceCase, x: Tensor, s: Tensor, generator: torch.Generator
+    home: TrialWorlds, x: Tensor, s: Tensor, generator: torch.Generator
 ) -> dict[str, float]:
     """Return the figures of worlds by themselves; the energy takes some more steps."""
     with torch.no_grad():
@@ -263,8 +218,12 @@ def measured(
         }
 
 
+@check(ENDURANCE, "time")
 def _run(name: str, session: CheckSession) -> CheckResult:
-    home = habitat(session, name, looks=False)
+    """No number becomes infinite or NaN; the extent at most doubles, updates have at most four
+    times the energy of the settled world's, states stay within 8 and on average within 1.1, the
+    centroid moves by an extent at most."""
+    home = habitat(session, name)
     steps = QUICK_STEPS if session.quick else STEPS
     settled = min(SETTLED, steps // 2)
     # Evenly spread on a logarithmic scale.

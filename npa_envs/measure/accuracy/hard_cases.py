@@ -12,7 +12,6 @@ from torch import Tensor
 
 from npa_envs import reference
 from npa_envs.errors import NPAError
-from npa_envs.measure.accuracy.checks import Check, CheckResult, CheckSession, in_2d_and_3d
 from npa_envs.measure.accuracy.scenes import (
     EPS,
     LIMITS,
@@ -22,22 +21,27 @@ from npa_envs.measure.accuracy.scenes import (
     PerceptionOutcome,
     Scene,
     error_limits,
+    float32_errors,
+    functional_weights,
     perceived,
     relative_error,
     scenes,
+    states_at,
     threshold_scenes,
 )
+from npa_envs.measure.accuracy.suite import Check, CheckResult, CheckSession, by_dimension, check
 from npa_envs.ops import perceive, perception_fields
 from npa_envs.rule.files import load_rule
 from npa_envs.rule.rule import LIFE, NPARule
 from npa_envs.world.division import living
 from npa_envs.world.rollout import rollout
 
-CROWD = {"quick": 2_000, "cpu": 20_000, "cuda": 1_000_000}
-"""Particles in one cell."""
-
 NEAR_THRESHOLD = 1e-3
 """Relative distances from the threshold of an inverse at which perception is to change no more."""
+
+
+PLACED: list[Check] = []
+"""Checks of the group `geometry` that are of no scene."""
 
 
 def geometry_checks(seed: int = 0) -> list[Check]:
@@ -52,34 +56,7 @@ def geometry_checks(seed: int = 0) -> list[Check]:
         for periodic in (False, True)
         for scene in scenes(space_dim, periodic=periodic, seed=seed)
     ]
-    others = {
-        "threshold": (
-            "a moment matrix at the threshold of its inverse is inverted or is not, and nothing "
-            "between",
-            _run_threshold,
-        ),
-        "smooth_inverse": (
-            "perception with moment_inverse='smooth' is as the float64 reference has it, and does "
-            "not jump where that by the threshold does",
-            _run_smooth_inverse,
-        ),
-        "crowd": (
-            "very many particles in one cell: densities as float64 has them, all is finite, and "
-            "the smoothing's adjoint conserves what it spreads",
-            _run_crowd,
-        ),
-        "nearest": (
-            "a pair is perceived as such from 1e-19 length units on (float32), below it counts as "
-            "coincident; all is finite down to denormal distances",
-            _run_nearest,
-        ),
-        "outside": (
-            "particles outside of a periodic box are perceived as their images: in float32 with "
-            "the rounding of their coordinates; all is finite",
-            _run_outside,
-        ),
-    }
-    return [*hard, *in_2d_and_3d("geometry", others)]
+    return [*hard, *by_dimension(PLACED)]
 
 
 def _run_scene(scene: Scene, session: CheckSession) -> CheckResult:
@@ -93,14 +70,12 @@ def _run_scene(scene: Scene, session: CheckSession) -> CheckResult:
     return CheckResult(figures, error_limits(scene.x, scene.s, scene.box, expected))
 
 
-def _threshold_states(x: Tensor) -> Tensor:
-    draws = torch.Generator().manual_seed(5)
-    return torch.randn(*x.shape[:2], STATE_DIM, generator=draws).double()
-
-
+@check(PLACED, "geometry/threshold", 2, 3)
 def _run_threshold(space_dim: int, session: CheckSession) -> CheckResult:
+    """A moment matrix at the threshold of its inverse is inverted or is not, and nothing
+    between."""
     x, offsets = threshold_scenes(space_dim, reference.MOMENT_THRESHOLD)
-    s = _threshold_states(x)
+    s = states_at(x)
     fields = reference.fields(x, s, EPS)
     corrected = fields.grad0 @ torch.linalg.pinv(fields.moment)
     right = reference.perceive(x, s, EPS, EPS)
@@ -125,10 +100,13 @@ def _run_threshold(space_dim: int, session: CheckSession) -> CheckResult:
     return CheckResult(figures, limits)
 
 
+@check(PLACED, "geometry/smooth_inverse", 2, 3)
 def _run_smooth_inverse(space_dim: int, session: CheckSession) -> CheckResult:
+    """Perception with moment_inverse='smooth' is as the float64 reference has it, and does not
+    jump where that by the threshold does."""
     x, offsets = threshold_scenes(space_dim, reference.MOMENT_THRESHOLD)
     # All worlds have the same states: from one to the next only a determinant changes.
-    s = _threshold_states(x)[:1].expand(len(x), -1, -1)
+    s = states_at(x)[:1].expand(len(x), -1, -1)
     exact = reference.perceive(x, s, EPS, EPS, moment_inverse="smooth")
     near = offsets.abs() <= NEAR_THRESHOLD
     figures: dict[str, float] = {}
@@ -149,9 +127,11 @@ def _largest_jump(z: Tensor) -> float:
     return float(corner.diff(dim=0).norm(dim=-1).max() / corner.norm(dim=-1).max())
 
 
+@check(PLACED, "geometry/crowd", 2, 3)
 def _run_crowd(space_dim: int, session: CheckSession) -> CheckResult:
-    size = "quick" if session.quick else "cuda" if session.cuda else "cpu"
-    count, sampled = CROWD[size], 32
+    """Very many particles in one cell: densities as float64 has them, all is finite, and the
+    smoothing's adjoint conserves what it spreads."""
+    count, sampled = 2_000 if session.quick else 1_000_000 if session.cuda else 20_000, 32
     generator = torch.Generator().manual_seed(session.seed)
     x = 0.01 + (torch.rand(1, count, space_dim, generator=generator) - 0.5) * (EPS / 4.0)
     s = torch.randn(1, count, 4, generator=generator)
@@ -179,32 +159,35 @@ def _run_crowd(space_dim: int, session: CheckSession) -> CheckResult:
     )
 
 
+@check(PLACED, "geometry/nearest", 2, 3)
 def _run_nearest(space_dim: int, session: CheckSession) -> CheckResult:
+    """A pair is perceived as such from 1e-19 length units on (float32), below it counts as
+    coincident; all is finite down to denormal distances."""
     figures: dict[str, float] = {}
     not_finite = 0
     holds = 0
-    s = torch.randn(1, 2, STATE_DIM, generator=torch.Generator().manual_seed(5)).double()
+    s = states_at(torch.empty(1, 2, space_dim))
     for power in range(1, 45):
         x = torch.zeros(1, 2, space_dim)
         x[0, 1, 0] = 10.0**-power if power > 1 else 0.5 * EPS
         found = perceived(x.to(session.device), s.to(session.device, torch.float32), None)
         expected = perceived(x.double(), s, None, by_reference=True)
         not_finite += sum(int((~tensor.isfinite()).sum()) for tensor in found)
-        names = ("z_float32", "states_float32", "positions_float32")
-        errors = [relative_error(a, b) for a, b in zip(found, expected, strict=True)]
+        errors = float32_errors(found, expected)
         if power % 4 == 0:
-            figures[f"z_1e-{power}"] = errors[0]
-            figures[f"positions_1e-{power}"] = errors[2]
-        if holds == power - 1 and all(
-            error <= LIMITS[name] for name, error in zip(names, errors, strict=True)
-        ):
+            figures[f"z_1e-{power}"] = errors["z_float32"]
+            figures[f"positions_1e-{power}"] = errors["positions_float32"]
+        if holds == power - 1 and all(error <= LIMITS[name] for name, error in errors.items()):
             holds = power
     figures |= {"not_finite": float(not_finite), "nearest": 10.0**-holds}
     limits = {"not_finite": 0.0, "nearest": 1e-19 * (1.0 + 1e-9)}
     return CheckResult(figures, limits, holds=f"float32: from 1e-{holds} on")
 
 
+@check(PLACED, "geometry/outside", 2, 3)
 def _run_outside(space_dim: int, session: CheckSession) -> CheckResult:
+    """Particles outside of a periodic box are perceived as their images: in float32 with the
+    rounding of their coordinates; all is finite."""
     generator = torch.Generator().manual_seed(session.seed)
     inside = (torch.rand(1, 60, space_dim, generator=generator) - 0.5) * SIDE
     s = torch.randn(1, 60, STATE_DIM, generator=generator)
@@ -241,53 +224,9 @@ WORLD, PARTICLE = 1, 7
 
 WORLD_COUNT, PARTICLE_COUNT, STEPS = 3, 150, 8
 
-DEAD_STEPS = {"quick": 100, "whole": 10_000}
-"""Steps of worlds whose particles divide."""
 
-
-def values_checks() -> list[Check]:
-    """Return the checks of the group `values`."""
-    by_dimension = {
-        "scale": (
-            "states of 1e-30 to 1e30 are perceived as the float64 reference has them, forwards and "
-            "backwards; beyond, the largest scale is reported",
-            _run_scale,
-        ),
-        "infinite_channel": (
-            "a channel that is infinite at one particle changes no bit of other channels, of "
-            "particles that do not see it, and of other worlds",
-            _run_infinite_channel,
-        ),
-        "dead": (
-            "what lies in the slots of dead particles, NaN as well, changes no bit; one particle "
-            "that divides fills its world, whose numbers stay finite",
-            _run_dead,
-        ),
-    }
-    return [
-        *in_2d_and_3d("values", by_dimension),
-        Check(
-            "values/gradient_of_nan",
-            "cotangents and states that are NaN in one world change no bit of other worlds' "
-            "gradients by states and positions",
-            _run_gradient,
-        ),
-        Check(
-            "values/nan_state",
-            "NaN in one state spreads in its own world only; other worlds' rollouts keep every bit",
-            _run_nan_state,
-        ),
-        Check(
-            "values/nan_position",
-            "a position that is NaN is refused, by an error that names its world and particle",
-            _run_nan_position,
-        ),
-        Check(
-            "values/blown_up",
-            "positions that a rollout has made NaN are reported by the next call, with their world",
-            _run_blown_up,
-        ),
-    ]
+VALUES: list[Check] = []
+"""The checks of the group `values`."""
 
 
 def _worlds(session: CheckSession, space_dim: int, state_dim: int) -> tuple[Tensor, Tensor]:
@@ -307,7 +246,10 @@ def differing(value: Tensor, expected: Tensor) -> float:
     return float((~same).sum())
 
 
+@check(VALUES, "values/scale", 2, 3)
 def _run_scale(space_dim: int, session: CheckSession) -> CheckResult:
+    """States of 1e-30 to 1e30 are perceived as the float64 reference has them, forwards and
+    backwards; beyond, the largest scale is reported."""
     x, s = (tensor[:1] for tensor in _worlds(session, space_dim, STATE_DIM))
     figures = {}
     right = []
@@ -315,10 +257,9 @@ def _run_scale(space_dim: int, session: CheckSession) -> CheckResult:
         scaled = s * 10.0**power
         found = perceived(x, scaled, None)
         expected = perceived(x.cpu().double(), scaled.cpu().double(), None, by_reference=True)
-        names = [f"{what}_float32" for what in found._fields]
-        errors = [relative_error(a, b) for a, b in zip(found, expected, strict=True)]
-        figures[f"z_1e{power:+d}"] = errors[0]
-        if all(error <= LIMITS[name] for error, name in zip(errors, names, strict=True)):
+        errors = float32_errors(found, expected)
+        figures[f"z_1e{power:+d}"] = errors["z_float32"]
+        if all(error <= LIMITS[name] for name, error in errors.items()):
             right.append(power)
     low = POWERS[0]
     figures["wrong"] = float(sum(power not in right for power in POWERS))
@@ -327,7 +268,10 @@ def _run_scale(space_dim: int, session: CheckSession) -> CheckResult:
     return CheckResult(figures, {"wrong": 0.0}, holds=words)
 
 
+@check(VALUES, "values/infinite_channel", 2, 3)
 def _run_infinite_channel(space_dim: int, session: CheckSession) -> CheckResult:
+    """A channel that is infinite at one particle changes no bit of other channels, of particles
+    that do not see it, and of other worlds."""
     x, s = _worlds(session, space_dim, 16)
     clean = perceive(x, s, EPS)
     broken = s.clone()
@@ -348,8 +292,11 @@ def _run_infinite_channel(space_dim: int, session: CheckSession) -> CheckResult:
     return CheckResult(figures, dict.fromkeys(list(figures)[:3], 0.0))
 
 
+@check(VALUES, "values/dead", 2, 3)
 @torch.no_grad()
 def _run_dead(space_dim: int, session: CheckSession) -> CheckResult:
+    """What lies in the slots of dead particles, NaN as well, changes no bit; one particle that
+    divides fills its world, whose numbers stay finite."""
     torch.manual_seed(session.seed)
     rule = NPARule(space_dim, STATE_DIM, eps0=EPS, divides=True).to(session.device)
     x, s = _worlds(session, space_dim, STATE_DIM)
@@ -358,7 +305,7 @@ def _run_dead(space_dim: int, session: CheckSession) -> CheckResult:
     other_x, other_s = _worlds(session, space_dim, STATE_DIM)
     other_s[:] = math.nan
     other_x[:, 0], other_s[:, 0] = x[:, 0], s[:, 0]
-    steps = DEAD_STEPS["quick" if session.quick else "whole"]
+    steps = 100 if session.quick else 10_000
     clean, filled = (
         rollout(rule, *worlds, steps, generator=session.generator())
         for worlds in ((x, s), (other_x, other_s))
@@ -373,26 +320,21 @@ def _run_dead(space_dim: int, session: CheckSession) -> CheckResult:
     return CheckResult(figures, {"x": 0.0, "s": 0.0, "not_finite": 0.0, "empty_slots": 5.0})
 
 
+@check(VALUES, "values/gradient_of_nan")
 def _run_gradient(session: CheckSession) -> CheckResult:
+    """Cotangents and states that are NaN in one world change no bit of other worlds' gradients
+    by states and positions."""
     x, s = _worlds(session, 2, 16)
     others = torch.arange(WORLD_COUNT, device=x.device) != WORLD
 
-    def gradients(broken: bool) -> tuple[Tensor, ...]:
-        given_x, given_s = x.clone(), s.clone()
-        if broken:
-            given_s[WORLD, PARTICLE, 0] = math.nan
-        given_x.requires_grad_()
-        given_s.requires_grad_()
-        z = perceive(given_x, given_s, EPS, detach_positions=False)
-        weights = torch.randn(z.shape, generator=torch.Generator().manual_seed(3)).to(z)
-        if broken:
-            weights[WORLD, PARTICLE + 1] = math.nan
-        return torch.autograd.grad((z * weights).sum(), (given_s, given_x))
-
-    pairs = list(zip(gradients(True), gradients(False), strict=True))
+    broken, weights = s.clone(), functional_weights(x, s)
+    broken[WORLD, PARTICLE, 0] = math.nan
+    clean = perceived(x, s, None, weights=weights)
+    weights[WORLD, PARTICLE + 1] = math.nan
+    found = perceived(x, broken, None, weights=weights)
     figures = {
-        name: differing(found[others], clean[others])
-        for name, (found, clean) in zip(("states", "positions"), pairs, strict=True)
+        "states": differing(found.states[others], clean.states[others]),
+        "positions": differing(found.positions[others], clean.positions[others]),
     }
     return CheckResult(figures, dict.fromkeys(figures, 0.0))
 
@@ -411,7 +353,9 @@ def _broken_rollout(session: CheckSession) -> tuple[tuple[Tensor, Tensor], tuple
     return run(broken), run(s)
 
 
+@check(VALUES, "values/nan_state")
 def _run_nan_state(session: CheckSession) -> CheckResult:
+    """NaN in one state spreads in its own world only; other worlds' rollouts keep every bit."""
     (x, s), (clean_x, clean_s) = _broken_rollout(session)
     others = torch.arange(WORLD_COUNT, device=x.device) != WORLD
     lost = (~s[WORLD].isfinite()).any(-1) | (~x[WORLD].isfinite()).any(-1)
@@ -438,7 +382,9 @@ def _unreported(calls: dict[str, Callable[[], Any]], named: str) -> CheckResult:
     return CheckResult(figures, dict.fromkeys(figures, 0.0))
 
 
+@check(VALUES, "values/nan_position")
 def _run_nan_position(session: CheckSession) -> CheckResult:
+    """A position that is NaN is refused, by an error that names its world and particle."""
     rule = load_rule("gecko", device=session.device).float()
     x, s = _worlds(session, 2, rule.state_dim)
     x[WORLD, PARTICLE, 1] = math.nan
@@ -449,7 +395,9 @@ def _run_nan_position(session: CheckSession) -> CheckResult:
     return _unreported(calls, f"world {WORLD}, particle {PARTICLE}")
 
 
+@check(VALUES, "values/blown_up")
 def _run_blown_up(session: CheckSession) -> CheckResult:
+    """Positions that a rollout has made NaN are reported by the next call, with their world."""
     rule = load_rule("gecko", device=session.device).float()
     (x, s), _ = _broken_rollout(session)
     if bool(x.isfinite().all()):

@@ -1,31 +1,30 @@
-"""Numerics: how far gradients can be trusted, and what precision, order and batches change."""
+"""Numerics: how far gradients can be trusted, and what order, batches and devices change."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Mapping
-from functools import partial
+from collections.abc import Iterable, Iterator
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from npa_envs.measure.accuracy.checks import Check, CheckResult, CheckSession, Skipped, in_2d_and_3d
-from npa_envs.measure.accuracy.endurance import WORKS, EnduranceCase, habitat
+from npa_envs.measure.accuracy.endurance import TrialWorlds, habitat
 from npa_envs.measure.accuracy.hard_cases import differing
 from npa_envs.measure.accuracy.scenes import (
     EPS,
     SIDE,
-    STATE_DIM,
     PerceptionOutcome,
     Scene,
     error_limits,
+    float32_errors,
     functional_weights,
     perceived,
     relative_error,
     scenes,
+    states_at,
 )
-from npa_envs.measure.speed.precisions import PRECISIONS, Precision
+from npa_envs.measure.accuracy.suite import Check, CheckResult, CheckSession, Skipped, check
 from npa_envs.ops import perceive
 from npa_envs.rule.files import load_rule
 from npa_envs.rule.rule import NPARule
@@ -35,28 +34,15 @@ from npa_envs.world.rollout import rollout
 
 # The group `gradients`: how they grow with the steps, finite differences, float32's errors.
 
-RULES = ("gecko", "dots", "digits", "duck")
-"""One rule of each task."""
-
-QUICK_RULES = ("gecko", "dots")
-
 STEPS, QUICK_STEPS = 512, 32
 """The longest rollouts that are differentiated."""
 
-QUICK_SHARE = 0.25
-"""Particles of a quick run, over those of other quick checks."""
 
-COMPARED_STEPS = 128
-"""The longest rollouts that are also run in float64."""
+GRADIENTS: list[Check] = []
+"""The checks of the group `gradients`, each of a rule."""
 
-ONE_STEP_ERROR = 1e-5
-"""Relative error of float32 that one step may have, forwards and backwards."""
-
-USABLE_ERROR = 1e-2
-"""Relative error of float32 up to which a gradient counts as usable."""
-
-DIFFERENCE = 1e-6
-"""Relative distance between a directional derivative and a finite difference in float64."""
+DIFFERENCES: list[Check] = []
+"""Those that are of none, in open space or a periodic box."""
 
 
 class RolloutOutcome(NamedTuple):
@@ -71,51 +57,13 @@ class RolloutOutcome(NamedTuple):
     by_states: Tensor
 
 
-def gradients_checks(*, quick: bool, rules: Mapping[str, str] | None = None) -> list[Check]:
-    """Return the checks of the group `gradients`; of `rules`, name -> source, those of a rule."""
-    checks = []
-    for name, source in (rules or _named(QUICK_RULES if quick else RULES)).items():
-        checks += [
-            Check(
-                f"gradients/norm/{name}",
-                "gradients of a functional by weights and by states at the start are finite "
-                "whatever the number of steps; their norms are reported",
-                partial(_run_norm, source),
-                source,
-            ),
-            Check(
-                f"gradients/float32/{name}",
-                "one step in float32 is within 1e-5 of one in float64, also its gradients; after "
-                "how many steps they still agree to 1e-2 is reported",
-                partial(_run_float32, source),
-                source,
-            ),
-        ]
-    for space_dim in () if rules else (2, 3):
-        for periodic in (False, True):
-            where = f"{space_dim}d/{'periodic' if periodic else 'open'}"
-            checks.append(
-                Check(
-                    f"gradients/finite_differences/{where}",
-                    "in float64, derivatives along smooth motions and along random states are what "
-                    "finite differences say, in every hard scene",
-                    partial(_run_differences, space_dim, periodic),
-                )
-            )
-    return checks
-
-
-def _named(names: Iterable[str]) -> dict[str, str]:
-    return {name: name for name in names}
-
-
 def powers_of_two(most: int) -> list[int]:
     """Return 1, 2, 4, ... up to a number."""
     return [2**k for k in range(int(math.log2(most)) + 1)]
 
 
 def outcome(
-    home: EnduranceCase, session: CheckSession, steps: int, dtype: torch.dtype
+    home: TrialWorlds, session: CheckSession, steps: int, dtype: torch.dtype
 ) -> RolloutOutcome:
     """Return a rollout from the seed and its gradients; the same masks in every dtype."""
     rule = NPARule(**home.rule.hyper_parameters()).to(home.x.device)
@@ -143,11 +91,14 @@ def outcome(
     return RolloutOutcome(x.detach(), s.detach(), torch.cat(flat)[None], by_states)
 
 
-def _home(session: CheckSession, name: str) -> EnduranceCase:
-    return habitat(session, name, particles=QUICK_SHARE if session.quick else 1.0, looks=False)
+def _home(session: CheckSession, name: str) -> TrialWorlds:
+    return habitat(session, name, particles=0.25 if session.quick else 1.0)
 
 
+@check(GRADIENTS, "gradients/norm")
 def _run_norm(name: str, session: CheckSession) -> CheckResult:
+    """Gradients of a functional by weights and by states at the start are finite whatever the
+    number of steps; their norms are reported."""
     home = _home(session, name)
     figures: dict[str, float] = {}
     not_finite = 0.0
@@ -160,11 +111,14 @@ def _run_norm(name: str, session: CheckSession) -> CheckResult:
     return CheckResult(figures | {"not_finite": not_finite}, {"not_finite": 0.0})
 
 
+@check(GRADIENTS, "gradients/float32")
 def _run_float32(name: str, session: CheckSession) -> CheckResult:
+    """One step in float32 is within 1e-5 of one in float64, also its gradients; after how many
+    steps they still agree to 1e-2 is reported."""
     home = _home(session, name)
     if home.rule.divides:
         raise Skipped("particles divide by draws that are others in float64")
-    counts = powers_of_two(QUICK_STEPS if session.quick else COMPARED_STEPS)
+    counts = powers_of_two(QUICK_STEPS if session.quick else 128)
     figures: dict[str, float] = {}
     usable = dict.fromkeys(RolloutOutcome._fields, 0)
     for steps in counts:
@@ -172,21 +126,24 @@ def _run_float32(name: str, session: CheckSession) -> CheckResult:
         exact = outcome(home, session, steps, torch.float64)
         for what, value, right in zip(RolloutOutcome._fields, found, exact, strict=True):
             figures[f"{what}_{steps}"] = error = relative_error(value, right)
-            if error <= USABLE_ERROR and usable[what] in (0, steps // 2):
+            if error <= 1e-2 and usable[what] in (0, steps // 2):
                 usable[what] = steps
-    limits = {f"{what}_1": ONE_STEP_ERROR for what in RolloutOutcome._fields}
+    limits = {f"{what}_1": 1e-5 for what in RolloutOutcome._fields}
     words = ", ".join(f"{what} {steps}" for what, steps in usable.items())
     return CheckResult(figures, limits, holds=f"steps within 1e-2, of {counts[-1]}: {words}")
 
 
-def _run_differences(space_dim: int, periodic: bool, session: CheckSession) -> CheckResult:
+@check(DIFFERENCES, "gradients/finite_differences", 2, 3)
+def _run_differences(space_dim: int, session: CheckSession, *, periodic: bool) -> CheckResult:
+    """In float64, derivatives along smooth motions and along random states are what finite
+    differences say, in every hard scene."""
     figures = {}
     for scene in scenes(space_dim, periodic=periodic, seed=session.seed):
         for what in ("states", "positions"):
             # Far away neighbouring numbers are too far apart.
             if (scene.name, what) != ("far", "positions"):
                 figures[f"{scene.name}_{what}"] = _difference(scene, session, what)
-    return CheckResult(figures, dict.fromkeys(figures, DIFFERENCE))
+    return CheckResult(figures, dict.fromkeys(figures, 1e-6))
 
 
 def _difference(scene: Scene, session: CheckSession, what: str) -> float:
@@ -207,8 +164,7 @@ def _difference(scene: Scene, session: CheckSession, what: str) -> float:
         z = perceive(
             moved_x, moved_s, EPS, EPS, scene.box, detach_positions=False, moment_correction=False
         )
-        weights = torch.randn(z.shape, generator=torch.Generator().manual_seed(3)).to(z)
-        return (z * weights).sum()
+        return (z * functional_weights(x, s)).sum()
 
     def at(way: float) -> Tensor:
         moved = way * along
@@ -228,63 +184,11 @@ def _difference(scene: Scene, session: CheckSession, what: str) -> float:
 
 # The group `precision`: what must matter little or not at all.
 
-SHORT = ("tf32", "bf16_storage", "mixed")
-"""Precisions below float32."""
-
-SHORT_RULES, QUICK_SHORT_RULES = ("gecko", "dots", "digits"), ("heart", "dots")
-"""Rules that are run in them."""
-
 TWO_ERRORS = 2.0
 """Two answers that are each as far off as the group `geometry` allows are this far apart."""
 
-BIT_STEPS = 16
-"""Steps of rollouts that are compared bit by bit."""
-
-
-def precision_checks(*, quick: bool, rules: Mapping[str, str] | None = None) -> list[Check]:
-    """Return the checks of the group `precision`; of `rules`, name -> source, those of a rule."""
-    checks = [
-        Check(
-            f"precision/{name}/{rule}",
-            f"the rule at its horizon is finite, its metric at most {WORKS:g} times that of "
-            f"float32, with {PRECISIONS[name].summary}",
-            partial(_run_short, PRECISIONS[name], source),
-            source,
-        )
-        for name in SHORT
-        for rule, source in (rules or _named(QUICK_SHORT_RULES if quick else SHORT_RULES)).items()
-    ]
-    if rules:
-        return checks
-    by_dimension = {
-        "order": (
-            "particles in another order perceive the same but for rounding, in every hard scene",
-            _run_order,
-        ),
-        "repeated": (
-            "perception and gradients of every hard scene are the same bits when repeated",
-            _run_repeated,
-        ),
-        "batch": (
-            "every world of a batch perceives the bits that it perceives alone",
-            _run_batch,
-        ),
-    }
-    return [
-        *checks,
-        *in_2d_and_3d("precision", by_dimension),
-        Check(
-            "precision/devices",
-            "a CUDA device perceives what the CPU does but for rounding, in every hard scene",
-            _run_devices,
-        ),
-        Check(
-            "precision/graph",
-            f"a rollout of {BIT_STEPS} steps recorded in a CUDA graph has the bits of one that "
-            "is not",
-            _run_graph,
-        ),
-    ]
+PRECISION: list[Check] = []
+"""The checks of the group `precision`."""
 
 
 def _every_scene(space_dim: int, session: CheckSession) -> Iterator[Scene]:
@@ -297,50 +201,16 @@ def _on(scene: Scene, device: torch.device) -> tuple[Tensor, Tensor]:
     return scene.x.to(device, torch.float32), scene.s.to(device, torch.float32)
 
 
-def _run_short(precision: Precision, name: str, session: CheckSession) -> CheckResult:
-    why = precision.obstacle(session.device)
-    if why is not None:
-        raise Skipped(why)
-    home = habitat(session, name)
-    found = _metric(home, precision, session)
-    base = _metric(home, PRECISIONS["float32"], session)
-    figures = {"metric": found, "metric_float32": base, "ratio": found / base}
-    return CheckResult(figures, {"ratio": WORKS})
-
-
-@torch.no_grad()
-def _metric(home: EnduranceCase, precision: Precision, session: CheckSession) -> float:
-    """Return the metric at the horizon; NaN where worlds are not finite."""
-    rule = precision.rule(home.rule)
-    x, s = home.x, precision.kept(home.s)
-    generator = session.generator(1)
-    at_once = 1 if precision.short_states else home.horizon
-    with precision.active():
-        for _ in range(home.horizon // at_once):
-            x, s = rollout(rule, x, s, at_once, generator=generator, **home.options())
-            s = precision.kept(s)
-    finite = bool(x.isfinite().all()) and bool(s.isfinite().all())
-    return home.metric(x, s) if finite else float("nan")
-
-
-def _error_share(scene: Scene, found: PerceptionOutcome, other: PerceptionOutcome) -> float:
-    """Return the distance of two perceptions of a scene over the error that one may have."""
-    exact = perceived(scene.x, scene.s, scene.box, by_reference=True)
-    allowed = error_limits(scene.x, scene.s, scene.box, exact)
-    shares = [
-        relative_error(a, b) / allowed[f"{what}_float32"]
-        for what, a, b in zip(PerceptionOutcome._fields, found, other, strict=True)
-    ]
-    # NaN must not be skipped.
-    return float(torch.tensor(shares).max())
-
-
 def _compared(pairs: Iterable[tuple[Scene, PerceptionOutcome, PerceptionOutcome]]) -> CheckResult:
-    """Return the largest distance of two perceptions, and the scenes where it is too large."""
-    shares = {
-        f"{scene.name}/{'open' if scene.box is None else 'periodic'}": _error_share(scene, a, b)
-        for scene, a, b in pairs
-    }
+    """Return the largest distance of two perceptions over the error that one may have."""
+    shares = {}
+    for scene, found, other in pairs:
+        exact = perceived(scene.x, scene.s, scene.box, by_reference=True)
+        allowed = error_limits(scene.x, scene.s, scene.box, exact)
+        errors = [error / allowed[name] for name, error in float32_errors(found, other).items()]
+        name = f"{scene.name}/{'open' if scene.box is None else 'periodic'}"
+        # NaN must not be skipped.
+        shares[name] = float(torch.tensor(errors).max())
     largest = float(torch.tensor(list(shares.values())).max())
     wrong = [name for name, share in shares.items() if not share <= TWO_ERRORS]
     return CheckResult(
@@ -350,7 +220,10 @@ def _compared(pairs: Iterable[tuple[Scene, PerceptionOutcome, PerceptionOutcome]
     )
 
 
+@check(PRECISION, "precision/order", 2, 3)
 def _run_order(space_dim: int, session: CheckSession) -> CheckResult:
+    """Particles in another order perceive the same but for rounding, in every hard scene."""
+
     def pairs() -> Iterator[tuple[Scene, PerceptionOutcome, PerceptionOutcome]]:
         for scene in _every_scene(space_dim, session):
             x, s = _on(scene, session.device)
@@ -365,7 +238,39 @@ def _run_order(space_dim: int, session: CheckSession) -> CheckResult:
     return _compared(pairs())
 
 
+@check(PRECISION, "precision/repeated", 2, 3)
+def _run_repeated(space_dim: int, session: CheckSession) -> CheckResult:
+    """Perception and gradients of every hard scene are the same bits when repeated."""
+    figures = dict.fromkeys(PerceptionOutcome._fields, 0.0)
+    for scene in _every_scene(space_dim, session):
+        x, s = _on(scene, session.device)
+        first, second = (perceived(x, s, scene.box) for _ in range(2))
+        for what, a, b in zip(PerceptionOutcome._fields, first, second, strict=True):
+            figures[what] += differing(a, b)
+    return CheckResult(figures, dict.fromkeys(figures, 0.0))
+
+
+@check(PRECISION, "precision/batch", 2, 3)
+def _run_batch(space_dim: int, session: CheckSession) -> CheckResult:
+    """Every world of a batch perceives the bits that it perceives alone."""
+    figures = {"open": 0.0, "periodic": 0.0}
+    for periodic in (False, True):
+        every = scenes(space_dim, periodic=periodic, seed=session.seed)
+        some = [scene for scene in every if scene.name != "tight_box"]
+        # Each scene over and over until the world is full.
+        count = max(scene.x.shape[1] for scene in some)
+        x = torch.cat([scene.x.repeat(1, count, 1)[:, :count] for scene in some])
+        x, s = (tensor.to(session.device, torch.float32) for tensor in (x, states_at(x)))
+        together = perceive(x, s, EPS, box=some[0].box)
+        for k in range(len(x)):
+            alone = perceive(x[k : k + 1], s[k : k + 1], EPS, box=some[0].box)
+            figures["periodic" if periodic else "open"] += differing(together[k], alone[0])
+    return CheckResult(figures, dict.fromkeys(figures, 0.0))
+
+
+@check(PRECISION, "precision/devices")
 def _run_devices(session: CheckSession) -> CheckResult:
+    """A CUDA device perceives what the CPU does but for rounding, in every hard scene."""
     if not session.cuda:
         raise Skipped("there is one device only: run it with --device cuda")
 
@@ -378,49 +283,19 @@ def _run_devices(session: CheckSession) -> CheckResult:
     return _compared(pairs())
 
 
-def _run_repeated(space_dim: int, session: CheckSession) -> CheckResult:
-    figures = dict.fromkeys(PerceptionOutcome._fields, 0.0)
-    for scene in _every_scene(space_dim, session):
-        x, s = _on(scene, session.device)
-        first, second = (perceived(x, s, scene.box) for _ in range(2))
-        for what, a, b in zip(PerceptionOutcome._fields, first, second, strict=True):
-            figures[what] += differing(a, b)
-    return CheckResult(figures, dict.fromkeys(figures, 0.0))
-
-
-def _run_batch(space_dim: int, session: CheckSession) -> CheckResult:
-    """Compare worlds in a batch, filled to the same number of particles, with single ones."""
-    figures = {"open": 0.0, "periodic": 0.0}
-    for periodic in (False, True):
-        some = [
-            scene
-            for scene in scenes(space_dim, periodic=periodic, seed=session.seed)
-            if scene.name != "tight_box"
-        ]
-        # Each scene over and over until the world is full.
-        count = max(scene.x.shape[1] for scene in some)
-        x = torch.cat([scene.x.repeat(1, count, 1)[:, :count] for scene in some])
-        x = x.to(session.device, torch.float32)
-        s = torch.randn(*x.shape[:2], STATE_DIM, generator=torch.Generator().manual_seed(5))
-        s = s.to(session.device)
-        together = perceive(x, s, EPS, box=some[0].box)
-        for k in range(len(x)):
-            alone = perceive(x[k : k + 1], s[k : k + 1], EPS, box=some[0].box)
-            figures["periodic" if periodic else "open"] += differing(together[k], alone[0])
-    return CheckResult(figures, dict.fromkeys(figures, 0.0))
-
-
+@check(PRECISION, "precision/graph")
 @torch.no_grad()
 def _run_graph(session: CheckSession) -> CheckResult:
+    """A rollout of 16 steps recorded in a CUDA graph has the bits of one that is not."""
     if not session.cuda:
         raise Skipped("graphs are CUDA's: run it with --device cuda")
     rule = load_rule("gecko", device=session.device).float()
-    home = habitat(session, "gecko", world_count=3, looks=False)
+    home = habitat(session, "gecko", world_count=3)
     random = WorldRandom([0, 1, 2], device=session.device)
     x, s = torch.empty_like(home.x), torch.empty_like(home.s)
 
     def run() -> None:
-        worlds = rollout(rule, home.x, home.s, BIT_STEPS, generator=random, **home.options())
+        worlds = rollout(rule, home.x, home.s, 16, generator=random, **home.options())
         x.copy_(worlds[0])
         s.copy_(worlds[1])
 

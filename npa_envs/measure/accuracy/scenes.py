@@ -36,9 +36,14 @@ class Scene:
 
     @property
     def s(self) -> Tensor:
-        """States from a normal distribution, float64 that float32 holds exactly."""
-        shape = (*self.x.shape[:2], STATE_DIM)
-        return torch.randn(shape, generator=torch.Generator().manual_seed(5)).double()
+        """The states of `states_at`."""
+        return states_at(self.x)
+
+
+def states_at(x: Tensor) -> Tensor:
+    """Return states from a normal distribution, float64 that float32 holds exactly."""
+    shape = (*x.shape[:2], STATE_DIM)
+    return torch.randn(shape, generator=torch.Generator().manual_seed(5)).double()
 
 
 def scenes(space_dim: int, *, periodic: bool, seed: int = 0) -> list[Scene]:
@@ -46,9 +51,10 @@ def scenes(space_dim: int, *, periodic: bool, seed: int = 0) -> list[Scene]:
     made: list[Scene] = []
     for name, (summary, place) in PLACES.items():
         generator = torch.Generator().manual_seed(1000 * seed + len(made))
-        if (name in ONLY_OPEN and periodic) or (name in ONLY_PERIODIC and not periodic):
+        only_periodic = name in ("seam", "tight_box")
+        if (only_periodic and not periodic) or (name == "far" and periodic):
             continue
-        if name in ONLY_3D and space_dim != 3:
+        if name == "coplanar" and space_dim != 3:
             continue
         # Rounded to float32 first, so that both precisions see the same particles.
         x = place(space_dim, generator).float().double()
@@ -150,10 +156,6 @@ PLACES: dict[str, tuple[str, Callable[[int, torch.Generator], Tensor]]] = {
 }
 """What each scene is, and where its particles lie."""
 
-ONLY_OPEN = ("far",)
-ONLY_PERIODIC = ("seam", "tight_box")
-ONLY_3D = ("coplanar",)
-
 
 def threshold_scenes(space_dim: int, threshold: float) -> tuple[Tensor, Tensor]:
     """Return worlds whose first particle's moment matrix has a determinant around a threshold.
@@ -193,9 +195,6 @@ LIMITS = {
 `error_limits` raises them by a scene's condition.
 """
 
-ROUNDINGS = 4.0
-"""Roundings of each input that an answer may be off by, where that is more than `LIMITS`."""
-
 PRECISIONS = {"float32": torch.float32, "float64": torch.float64}
 """Dtypes by their names."""
 
@@ -216,6 +215,12 @@ def relative_error(value: Tensor, expected: Tensor) -> float:
     errors = away / torch.where(size > 0.0, size, 1.0)
     # max() of a list may skip NaN; that of a tensor does not.
     return float(errors.max())
+
+
+def float32_errors(found: PerceptionOutcome, expected: PerceptionOutcome) -> dict[str, float]:
+    """Return the relative errors of float32, by the names of `LIMITS`."""
+    pairs = zip(PerceptionOutcome._fields, found, expected, strict=True)
+    return {f"{what}_float32": relative_error(a, b) for what, a, b in pairs}
 
 
 def functional_weights(x: Tensor, s: Tensor) -> Tensor:
@@ -254,7 +259,7 @@ def error_limits(
     """Return the relative errors that float64 worlds allow, by the names of `LIMITS`.
 
     Where sums cancel, or answers grow with 1 / distance, the last bit of an input shows in many
-    digits of the answer: an error may be as large as the change by some roundings of every input.
+    digits of the answer: an error may be as large as the change by four roundings of every input.
     Particles in one place stay together; far away in open space differences are rounded.
     """
     generator = torch.Generator().manual_seed(4)
@@ -275,5 +280,5 @@ def error_limits(
             for name, dtype in PRECISIONS.items():
                 rounding = 0.5 * torch.finfo(dtype).eps
                 key = f"{what}_{name}"
-                limits[key] = max(limits[key], ROUNDINGS * rounding * condition)
+                limits[key] = max(limits[key], 4.0 * rounding * condition)
     return limits

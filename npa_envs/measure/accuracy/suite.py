@@ -1,4 +1,4 @@
-"""The suite of `npa-envs stress`: every check, how checks are run, and their record."""
+"""Checks of `npa-envs stress`: what each finds and may find, how they run, and their record."""
 
 from __future__ import annotations
 
@@ -6,49 +6,116 @@ import math
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import torch
 
 from npa_envs.errors import NPAError, suggest
-from npa_envs.measure.accuracy.checks import (
-    GROUPS,
-    Check,
-    CheckResult,
-    CheckSession,
-    Skipped,
-    Verdict,
-    group_of,
-)
-from npa_envs.measure.accuracy.endurance import endurance_checks
-from npa_envs.measure.accuracy.hard_cases import geometry_checks, values_checks
-from npa_envs.measure.accuracy.numerics import gradients_checks, precision_checks
 from npa_envs.measure.plots import draw_matrix, new_figure, png
-from npa_envs.measure.record import Record, time_limit
-from npa_envs.measure.tables import as_objects, table_text
+from npa_envs.measure.record import Record, aligned, as_objects, time_limit
 from npa_envs.rule.files import load_rule, rule_digest
 
-MEASURED = ("pass", "range")
-"""Verdicts of checks that a resumed run does not repeat."""
+Verdict = Literal["pass", "fail", "range", "skipped"]
+
+GROUPS = {
+    "geometry": "where particles lie: forwards and backwards, against a float64 reference",
+    "values": "what states hold: tiny, huge, infinite, no number",
+    "time": "every shipped rule for 100 000 steps",
+    "gradients": "how gradients grow with the steps; finite differences; float32's errors",
+    "precision": "order, batches, repetitions, devices, recorded graphs",
+}
+"""Every group of checks with its summary."""
 
 FAR = 1e3
 """Colours of heat maps end at this many times a limit, and at its inverse."""
 
 
-def all_checks(
-    *, quick: bool = False, seed: int = 0, rules: Mapping[str, str] | None = None
-) -> list[Check]:
-    """Return every check in its order; of `rules`, name -> source, the checks of a rule alone.
+class Skipped(Exception):
+    """A check has nothing to measure; the message is the reason."""
 
-    When quick only some shipped rules are checked. Random places are drawn from the seed.
+
+@dataclass(frozen=True)
+class CheckResult:
+    """Figures of a check by name, and limits of some of them."""
+
+    figures: Mapping[str, float]
+    limits: Mapping[str, float] = field(default_factory=dict)
+    holds: str = ""
+    """For a range: where it holds, in words."""
+    note: str = ""
+
+    @property
+    def verdict(self) -> Verdict:
+        """Whether it is as expected; a figure that is missing or NaN is above its limit."""
+        nan = float("nan")
+        # Comparisons with NaN are false.
+        if not all(self.figures.get(name, nan) <= limit for name, limit in self.limits.items()):
+            return "fail"
+        return "range" if self.holds else "pass"
+
+
+@dataclass
+class CheckSession:
+    """One run of the command; when quick, with small worlds and few steps."""
+
+    device: torch.device
+    quick: bool = False
+    seed: int = 0
+    kept: dict[Any, Any] = field(default_factory=dict)
+    """Results that several checks share."""
+
+    @property
+    def cuda(self) -> bool:
+        """Whether the device is a CUDA device."""
+        return self.device.type == "cuda"
+
+    def generator(self, number: int = 0) -> torch.Generator:
+        """Return a source of randomness on the device; others for other numbers."""
+        return torch.Generator(self.device).manual_seed(1000 * self.seed + number)
+
+
+@dataclass(frozen=True)
+class Check:
+    """A hard case GROUP/CASE, its expectation in a sentence, and the function that measures it."""
+
+    name: str
+    expected: str
+    run: Callable[[CheckSession], CheckResult]
+    rule: str = ""
+    """What `load_rule` takes, of a check of a rule."""
+
+
+def group_of(name: str) -> str:
+    """Return the group of a check's name."""
+    return name.partition("/")[0]
+
+
+Run = Callable[..., CheckResult]
+
+
+def check(checks: list[Check], name: str, *space_dims: int) -> Callable[[Run], Run]:
+    """Return a decorator that adds a check to a list, or one NAME/2d for each space dimension.
+
+    The docstring of what it decorates says what is expected.
     """
-    return [
-        *(() if rules else (*geometry_checks(seed), *values_checks())),
-        *endurance_checks(rules),
-        *gradients_checks(quick=quick, rules=rules),
-        *precision_checks(quick=quick, rules=rules),
-    ]
+
+    def add(run: Run) -> Run:
+        expected = " ".join((run.__doc__ or "").split()).removesuffix(".")
+        if not expected.startswith("NaN"):
+            expected = expected[:1].lower() + expected[1:]
+        checks.extend(Check(f"{name}/{d}d", expected, partial(run, d)) for d in space_dims)
+        if not space_dims:
+            checks.append(Check(name, expected, run))
+        return run
+
+    return add
+
+
+def by_dimension(checks: Iterable[Check]) -> list[Check]:
+    """Return checks in 2D first, then those in 3D, then others."""
+    return sorted(checks, key=lambda one: {"2d": 0, "3d": 1}.get(one.name.rpartition("/")[2], 2))
 
 
 def chosen_checks(checks: Sequence[Check], names: Sequence[str]) -> list[Check]:
@@ -90,7 +157,7 @@ class CheckEntry:
     @property
     def done(self) -> bool:
         """Whether a resumed run does not repeat it."""
-        return self.verdict in MEASURED
+        return self.verdict in ("pass", "range")
 
     def share(self, name: str) -> float:
         """Return a figure over its limit: above 1, or not a number, it is exceeded.
@@ -112,43 +179,27 @@ class CheckEntry:
         return f"{name} {value:.2g} (at most {self.limits[name]:.2g})"
 
 
-@dataclass(frozen=True)
-class CheckRow:
-    """A line of the printed tables."""
-
-    check: str
-    verdict: str
-    seconds: float
-    found: str
-
-
 class StressRecord(Record[CheckEntry]):
     """All that a run found, in the order of names."""
+
+    command = "stress"
 
     def __init__(
         self, facts: Mapping[str, Any], path: Path | None = None, names: Iterable[str] = ()
     ) -> None:
-        super().__init__(facts, path=path, content=self._content)
+        super().__init__(facts, path)
         self._order = {name: place for place, name in enumerate(names)}
 
-    def _content(self, rows: list[CheckEntry]) -> dict[str, Any]:
-        # JSON has no numbers that are not finite: they become words.
-        return {"counts": self.counts(), "checks": _with_words(as_objects(rows))}
+    def content(self) -> dict[str, Any]:
+        """Return the entries; numbers that are not finite, which JSON has not, become words."""
+        return {"counts": self.counts(), "checks": _with_words(as_objects(self.rows))}
 
-    def read(self) -> StressRecord:
-        """Take over the entries of a run that was stopped, and return this record."""
-
-        def entry(fields: dict[str, Any]) -> CheckEntry:
+    def parse(self, held: dict[str, Any]) -> list[CheckEntry]:
+        """Return the entries of a run that was stopped."""
+        for fields in held["checks"]:
             for name in ("figures", "limits"):
                 fields[name] = {key: float(value) for key, value in fields[name].items()}
-            return CheckEntry(**fields)
-
-        self.resume(lambda held: [entry(fields) for fields in held["checks"]], command="stress")
-        return self
-
-    def entry(self, name: str) -> CheckEntry | None:
-        """Return the entry of a check, None where it has not been run."""
-        return next((entry for entry in self.rows if entry.name == name), None)
+        return [CheckEntry(**fields) for fields in held["checks"]]
 
     def put(self, entry: CheckEntry) -> None:
         """Add an entry, in the place of one of the same name, and write the file."""
@@ -178,7 +229,15 @@ class StressRecord(Record[CheckEntry]):
 
     def text(self) -> str:
         """Return a table of each group, and the expectations of the checks that failed."""
-        parts = [_group_text(entries) for entries in self.by_group().values()]
+        parts = []
+        for entries in self.by_group().values():
+            found = [entry.holds or entry.worst() or entry.note for entry in entries]
+            width = max(map(len, found))
+            lines = [["check", "verdict", "seconds", "found"]]
+            for entry, words in zip(entries, found, strict=True):
+                seconds = f"{round(entry.seconds, 2):.4g}"
+                lines.append([entry.name, entry.verdict, seconds, words.ljust(width)])
+            parts.append("\n".join(line.rstrip() for line in aligned(lines)))
         parts += [
             f"{entry.name} failed: {entry.worst() or entry.note}\n  expected: {entry.expected}"
             + (f"\n  {entry.note}" if entry.note and entry.worst() else "")
@@ -186,16 +245,6 @@ class StressRecord(Record[CheckEntry]):
         ]
         counts = ", ".join(f"{count} {verdict}" for verdict, count in self.counts().items())
         return "\n\n".join([*parts, counts])
-
-
-def _group_text(entries: Sequence[CheckEntry]) -> str:
-    found = [entry.holds or entry.worst() or entry.note for entry in entries]
-    width = max(map(len, found))
-    rows = [
-        CheckRow(entry.name, entry.verdict, round(entry.seconds, 2), words.ljust(width))
-        for entry, words in zip(entries, found, strict=True)
-    ]
-    return "\n".join(line.rstrip() for line in table_text(rows).splitlines())
 
 
 def _with_words(value: Any) -> Any:
@@ -223,7 +272,7 @@ def run_checks(
     """
     time_is_up = time_limit(max_seconds)
     for check in checks:
-        entry = record.entry(check.name)
+        entry = next((row for row in record.rows if row.name == check.name), None)
         if entry is None or not entry.done:
             if not time_is_up():
                 entry = run_check(check, session)

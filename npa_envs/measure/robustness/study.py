@@ -12,26 +12,25 @@ from typing import Any
 
 import torch
 
-from npa_envs.measure.accuracy.endurance import WORKS
+from npa_envs.measure.accuracy.endurance import TrialWorlds
 from npa_envs.measure.plots import draw_band, legend_of, mark_decades, new_figure, png
-from npa_envs.measure.record import Record, number
-from npa_envs.measure.robustness.recovery import (
+from npa_envs.measure.record import NONE, Record, as_objects, markdown_table, number, short
+from npa_envs.measure.robustness.trials import (
+    CONDITIONS,
     CONTROL,
     DAMAGES,
     RECOVERED,
     LossCurve,
-    healing,
-    ratio,
-)
-from npa_envs.measure.robustness.trials import (
-    CONDITIONS,
     RuleTrial,
-    TaskTrial,
+    healing,
     loss_curves,
+    ratio,
     trained_value,
 )
-from npa_envs.measure.tables import NONE, as_objects, markdown_table, short
 from npa_envs.world.randomness import StreamId
+
+WORKS = 2.0
+"""A rule works where its loss is at most this many times that as trained, and all is finite."""
 
 MOST_PARTICLES = {"cpu": 1 << 17, "cuda": 1 << 21}
 """Particles of all worlds together; where there would be more, a value is left out."""
@@ -58,6 +57,8 @@ class Response:
 class RuleRecord(Record[Response]):
     """What was measured of one rule: loss curves after damage, and responses to conditions."""
 
+    command = "robustness"
+
     def __init__(
         self,
         facts: Mapping[str, Any],
@@ -67,7 +68,7 @@ class RuleRecord(Record[Response]):
         responses: Sequence[Response] = (),
         **about: Any,
     ) -> None:
-        super().__init__(facts, list(responses), path, self._content)
+        super().__init__(facts, path, responses)
         self.curves = list(curves)
         """After each damage, the control first."""
         self.about: dict[str, Any] = {"done": True, "seconds": 0.0, "command": "", "date": ""}
@@ -84,12 +85,13 @@ class RuleRecord(Record[Response]):
         """Whether nothing is left to measure."""
         return bool(self.about["done"])
 
-    def _content(self, rows: list[Response]) -> dict[str, Any]:
+    def content(self) -> dict[str, Any]:
+        """Return what was measured."""
         courses = [asdict(c) | {"recovery_steps": c.recovery_steps()} for c in self.curves]
-        return {**self.about, "courses": courses, "responses": as_objects(rows)}
+        return {**self.about, "courses": courses, "responses": as_objects(self.rows)}
 
-    def read(self) -> RuleRecord:
-        """Take over the measurements of the record's file, and return this record."""
+    def parse(self, held: dict[str, Any]) -> list[Response]:
+        """Take over the curves of a record, and return its responses."""
 
         def numbers(values: list[float | None]) -> tuple[float, ...]:
             return tuple(map(number, values))
@@ -98,15 +100,11 @@ class RuleRecord(Record[Response]):
             losses, twins = (tuple(map(numbers, row[name])) for name in ("losses", "twins"))
             return LossCurve(row["damage"], tuple(row["steps"]), losses, twins)
 
-        def read(held: dict[str, Any]) -> list[Response]:
-            self.curves = list(map(curve, held.pop("courses")))
-            rows = held.pop("responses")
-            del held["facts"]
-            self.about = held
-            return [Response(**row | {"losses": numbers(row["losses"])}) for row in rows]
-
-        self.resume(read, command="robustness")
-        return self
+        self.curves = list(map(curve, held.pop("courses")))
+        rows = held.pop("responses")
+        del held["facts"]
+        self.about = held
+        return [Response(**row | {"losses": numbers(row["losses"])}) for row in rows]
 
     def of(self, condition: str) -> list[Response]:
         """Return the responses to a condition."""
@@ -154,7 +152,7 @@ def measure_rule(
 
 def grow(
     ground: RuleTrial, condition: str = "", value: float | str = 1.0
-) -> tuple[TaskTrial, Response]:
+) -> tuple[TrialWorlds, Response]:
     """Return worlds grown from their seeds under a condition, none by default, and their losses."""
     home = ground.home(
         share=float(value) if condition == "particles" else 1.0,
@@ -274,8 +272,7 @@ def tables(records: Sequence[RuleRecord]) -> str:
         f"within {RECOVERED:g} at the end):\n\n{_by_damage(records, _size)}",
     ]
     for condition, summary in CONDITIONS.items():
-        table = _by_value(records, condition)
-        if table:
+        if table := _by_value(records, condition):
             parts.append(f"Loss over that as trained, by {summary}:\n\n{table}")
     for summary, damages in SHARES.items():
         recovered, at_end, total = recovered_share(records, damages)
@@ -289,8 +286,7 @@ def tables(records: Sequence[RuleRecord]) -> str:
 
 
 def _time(curve: LossCurve) -> str:
-    step = curve.median_step()
-    share = f"{curve.recovered()}/{len(curve.losses)}"
+    step, share = curve.median_step(), f"{curve.recovered()}/{len(curve.losses)}"
     return share if step is None else f"{share}, {step:g}"
 
 

@@ -1,23 +1,31 @@
-"""Test worlds of a rule, from unseen seeds, a stream each; plans of what is measured in them."""
+"""Test worlds of a rule, from unseen seeds, a stream each; plans of what is measured in them.
+
+Damaged worlds run next to undamaged twins with the same masks.
+"""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
+from statistics import median
 from typing import Any, Self
 
 import torch
 from torch import Tensor
 
 from npa_envs.errors import NPAError
-from npa_envs.measure.accuracy.endurance import SMALLEST_VIEWS, EnduranceCase, LongRun, task_name
+from npa_envs.measure.accuracy.endurance import SMALLEST_VIEWS, LongRun, TrialWorlds, task_name
+from npa_envs.ops import world_mean
 from npa_envs.rule.files import load_rule
 from npa_envs.rule.rule import NPARule
 from npa_envs.tasks.base import ParticleTask, Worlds
+from npa_envs.tasks.damage import DAMAGE_SIZES, clump, cut, random_particle, wipe_state
 from npa_envs.tasks.morphogenesis2d import Morphogenesis2D, Morphogenesis2DConfig
 from npa_envs.tasks.seeds import uniform_ball, uniform_box
 from npa_envs.training.trained_tasks import task_of_rule, tasks_of_codes
+from npa_envs.world.brushes import nearest_image, offsets_from
 from npa_envs.world.randomness import Randomness, StreamId, WorldRandom
 
 # Seeds of other shapes than the trained one, as dense where their size allows it.
@@ -85,19 +93,11 @@ CONDITIONS = {
 }
 """Conditions, varied one at a time, with a summary."""
 
-TRAINED: Mapping[str, float | str] = {
-    "eps": 1.0,
-    "particles": 1.0,
-    "dt": 1.0,
-    "noise": 0.0,
-    "shape": "trained",
-}
-"""The value of each condition as trained; that of `update_prob` is the task's."""
-
 
 def trained_value(condition: str, update_prob: float) -> float | str:
     """Return the value of a condition at which a rule whose task has `update_prob` was trained."""
-    return update_prob if condition == "update_prob" else TRAINED[condition]
+    others: dict[str, float | str] = {"update_prob": update_prob, "noise": 0.0, "shape": "trained"}
+    return others.get(condition, 1.0)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -168,38 +168,6 @@ def quick_plan(task_name: str) -> TrialPlan:
 
 # Test worlds
 
-SEEN_AT_ONCE = 1 << 17
-"""Particles of the worlds whose loss is taken at once; views of Gaussians take much memory."""
-
-BOX_SHARE = 0.25
-"""Radius of seeds of another shape, over the side of a box that is full when trained."""
-
-
-@dataclass(frozen=True)
-class TaskTrial(EnduranceCase):
-    """A rule in worlds of its task, with their goals, where the task has such."""
-
-    goal: Tensor | None = None
-
-    def with_worlds(self, x: Tensor, s: Tensor) -> TaskTrial:
-        """Return the same with other particles of K copies of all worlds, [K B, N, ...]."""
-        goal = None if self.goal is None else self.goal.repeat(len(x) // len(self.goal))
-        return replace(self, x=x, s=s, goal=goal)
-
-    def losses(self, x: Tensor, s: Tensor) -> Tensor:
-        """Return the task's metric, [B]; of clouds, the share of particles that are wrong."""
-        some = max(1, SEEN_AT_ONCE // x.shape[1])
-        found = []
-        with torch.no_grad():
-            for start in range(0, len(x), some):
-                worlds = slice(start, start + some)
-                found.append(self._losses(x[worlds], s[worlds], worlds))
-        return torch.cat(found)
-
-    def _losses(self, x: Tensor, s: Tensor, worlds: slice) -> Tensor:
-        goal = None if self.goal is None else self.goal[worlds]
-        return self.task.toward(goal).trial_metric(x, s)
-
 
 class PicturesInTurn(ParticleTask[Morphogenesis2DConfig]):
     """Worlds of several pictures of one rule: a world's goal is the place of its task."""
@@ -223,10 +191,6 @@ class PicturesInTurn(ParticleTask[Morphogenesis2DConfig]):
         """Return fresh worlds with the codes of their pictures, and which ones these are."""
         x, s, _ = self._tasks[0].seed(world_count, generator=generator, device=device)
         return x, self.coded(s), self._goal
-
-    def damage(self, x: Tensor, s: Tensor, goal: Tensor | None, generator: Randomness) -> Worlds:
-        """Return the worlds damaged as each picture's task does it."""
-        return self._tasks[0].damage(x, s, goal, generator)
 
     def toward(self, goal: Tensor | None) -> Self:
         """Return the task for worlds of other pictures, int64, shape [B]."""
@@ -268,15 +232,11 @@ class RuleTrial:
         self.rule: NPARule = load_rule(name, device=device).float().requires_grad_(False)
         self.task_name = task_name(name)
         self.plan, self.seeds, self._device = plan, seeds, device
-        # Losses are those of held-out views.
-        fields = {"training_views": SMALLEST_VIEWS["training_views"]}
-        found = task_of_rule(
-            name,
-            self.rule,
-            device,
-            particle_count=particle_count,
-            **(fields if self.rule.space_dim == 3 else {}),
-        )
+        fields: dict[str, Any] = {"particle_count": particle_count}
+        if self.rule.space_dim == 3:
+            # Losses are those of held-out views.
+            fields["training_views"] = SMALLEST_VIEWS["training_views"]
+        found = task_of_rule(name, self.rule, device, **fields)
         if found.doubt is not None:
             raise NPAError(f"cannot measure {name!r}: {found.doubt}: choose another rule")
         self.task: Any = found.task
@@ -311,7 +271,7 @@ class RuleTrial:
         """Return how many particles a share of the trained number is."""
         return max(2, round(share * self.particle_count))
 
-    def home(self, share: float = 1.0, shape: str = "trained") -> TaskTrial:
+    def home(self, share: float = 1.0, shape: str = "trained") -> TrialWorlds:
         """Return fresh worlds: a share of the trained number of particles, a shape of `SHAPES`."""
         count = self.particles(share)
         if count not in self._tasks:
@@ -320,12 +280,13 @@ class RuleTrial:
         random = self.random(StreamId.GROWTH)
         x, s, goal = task.seed(self.world_count, generator=random, device=self._device)
         if shape != "trained":
-            x = SHAPES[shape](count, self.rule.space_dim, self._seed_radius(), random)
-        return TaskTrial(
-            self.rule, task.toward(goal), x.float(), s.float(), self.plan.grow_steps, goal
-        )
+            box = self.task.box
+            # A box is full when trained.
+            radius = self.task.config.seed_radius if box is None else 0.25 * min(box)
+            x = SHAPES[shape](count, self.rule.space_dim, float(radius), random)
+        return TrialWorlds(self.rule, task.toward(goal), x.float(), s.float(), goal)
 
-    def run(self, home: TaskTrial, random: WorldRandom, **changed: Any) -> LongRun:
+    def run(self, home: TrialWorlds, random: WorldRandom, **changed: Any) -> LongRun:
         """Return a run of worlds; `changed` are options of `rollout` that differ from training."""
         return LongRun(home, random, home.options(**changed), chunk=self.plan.chunk)
 
@@ -333,27 +294,223 @@ class RuleTrial:
         """Return the mean loss of each seed's worlds, [..., seeds], from [..., B]."""
         return losses.double().reshape(*losses.shape[:-1], len(self.seeds), -1).mean(-1)
 
-    def _seed_radius(self) -> float:
-        box = self.task.box
-        return float(self.task.config.seed_radius) if box is None else BOX_SHARE * min(box)
 
-
-def finite_worlds(x: Tensor, s: Tensor) -> Tensor:
-    """Return which worlds are finite, [B]."""
-    return x.isfinite().flatten(1).all(1) & s.isfinite().flatten(1).all(1)
-
-
-def loss_curves(home: TaskTrial, run: LongRun, steps: tuple[int, ...]) -> Tensor:
+def loss_curves(home: TrialWorlds, run: LongRun, steps: tuple[int, ...]) -> Tensor:
     """Run worlds and return their losses after numbers of steps, [len(steps), B].
 
     A world that is not finite has the loss NaN from then on; the others are not disturbed.
     """
     lost = torch.zeros(len(home.x), dtype=torch.bool, device=home.x.device)
     found = []
-    for _, x, s in run.marks(list(steps)):
-        lost |= ~finite_worlds(x, s)
+    for _, x, s in run.marks(steps):
+        lost |= ~(x.isfinite().flatten(1).all(1) & s.isfinite().flatten(1).all(1))
         for worlds, fresh in ((x, home.x), (s, home.s)):
             worlds.copy_(torch.where(lost[:, None, None], fresh, worlds))
         losses = home.losses(home.at_trained_size(x, run.eps), s)
         found.append(torch.where(lost, torch.nan, losses))
     return torch.stack(found)
+
+
+# Damage, batched, around a random place of each world, across the seam of a box
+
+STATE_NOISE = 0.3
+"""Standard deviation of the noise of states (dimensionless)."""
+
+Box = tuple[float, ...] | None
+Change = Callable[[Tensor, Tensor, WorldRandom, Box], tuple[Tensor, Tensor]]
+"""Makes damaged worlds of positions, states, randomness and sides of the box."""
+
+
+@dataclass(frozen=True)
+class Damage:
+    """Damage of worlds."""
+
+    name: str
+    apply: Change
+    static: bool
+    """Worlds can have it whose particles do not move."""
+    halves: bool = False
+    """It halves the number of particles."""
+    beyond: bool = False
+    """It is beyond what rules are asked to heal."""
+
+
+def wipe(x: Tensor, s: Tensor, random: WorldRandom, box: Box) -> tuple[Tensor, Tensor]:
+    """Set all states in a disk around a random particle to zero, a ball in 3D."""
+    centre = random_particle(x, random)
+    return x, wipe_state(x, s, centre=centre, radius=DAMAGE_SIZES["wipe"], box=box)
+
+
+def slit(x: Tensor, s: Tensor, random: WorldRandom, box: Box) -> tuple[Tensor, Tensor]:
+    """Open a slit at a random angle: through the middle, in a box through a random particle."""
+    centre = world_mean(x) if box is None else random_particle(x, random)
+    normal = random.normal(x.shape[2], dtype=x.dtype)
+    change = partial(cut, normal=normal, gap=DAMAGE_SIZES["cut"])
+    return _around(x, s, centre, box, change)
+
+
+def pull_together(x: Tensor, s: Tensor, random: WorldRandom, box: Box) -> tuple[Tensor, Tensor]:
+    """Pull all particles in a disk around a random one to its place."""
+    change = partial(clump, radius=DAMAGE_SIZES["clump"], factor=1.0)
+    return _around(x, s, random_particle(x, random), box, change)
+
+
+def _around(
+    x: Tensor, s: Tensor, centre: Tensor, box: Box, change: Callable[..., tuple[Tensor, Tensor]]
+) -> tuple[Tensor, Tensor]:
+    """Change worlds around a place of each, in a box those images that are nearest to it."""
+    away, s = change(offsets_from(x, centre, box), s, centre=torch.zeros_like(centre))
+    return nearest_image(away + centre[:, None], box), s
+
+
+def add_state_noise(x: Tensor, s: Tensor, random: WorldRandom, box: Box) -> tuple[Tensor, Tensor]:
+    """Add normal noise to all states."""
+    return x, s + STATE_NOISE * random.normal(*s.shape[1:], dtype=s.dtype)
+
+
+def remove_half(x: Tensor, s: Tensor, random: WorldRandom, box: Box) -> tuple[Tensor, Tensor]:
+    """Leave N // 2 particles, chosen at random."""
+    return _lowest_half(x, s, random.uniform(x.shape[1]))
+
+
+def remove_side(x: Tensor, s: Tensor, random: WorldRandom, box: Box) -> tuple[Tensor, Tensor]:
+    """Leave the N // 2 particles on one side of a line at a random angle, a plane in 3D.
+
+    In a box the line runs through its middle, up to rounding.
+    """
+    normal = random.normal(x.shape[2], dtype=x.dtype)
+    return _lowest_half(x, s, (x * normal[:, None]).sum(-1))
+
+
+def _lowest_half(x: Tensor, s: Tensor, key: Tensor) -> tuple[Tensor, Tensor]:
+    """Leave the particles with the lower keys [B, N], in the order that they have."""
+    kept = key.argsort(dim=1)[:, : x.shape[1] // 2].sort(dim=1).values[..., None]
+    return x.take_along_dim(kept, dim=1), s.take_along_dim(kept, dim=1)
+
+
+DAMAGES = {
+    damage.name: damage
+    for damage in (
+        Damage("wipe", wipe, static=True),
+        Damage("cut", slit, static=False),
+        Damage("clump", pull_together, static=False),
+        Damage("noise", add_state_noise, static=True, beyond=True),
+        Damage("half", remove_half, static=True, halves=True),
+        Damage("side", remove_side, static=True, halves=True, beyond=True),
+    )
+}
+"""Every damage by its name."""
+
+
+# Recovery
+
+RECOVERED = 1.1
+"""A world has recovered once its loss is at most this many times its twin's at the same step."""
+
+CONTROL = "nothing"
+"""Name of worlds that only draw other masks than their twins."""
+
+AFTERWARDS, OTHERWISE = 1001, 1002
+"""Streams of the masks after the damage, and of those of the control."""
+
+
+@dataclass(frozen=True)
+class LossCurve:
+    """Losses of all seeds, and of their twins without the damage, at steps after one damage.
+
+    A loss is NaN where a world is not finite.
+    """
+
+    damage: str
+    steps: tuple[int, ...]
+    losses: tuple[tuple[float, ...], ...]
+    twins: tuple[tuple[float, ...], ...]
+
+    def recovery_steps(self) -> list[int | None]:
+        """Return for each seed the first of `steps` at which it has recovered; None: at none."""
+        pairs = zip(self.losses, self.twins, strict=True)
+        return [recovery_step(self.steps, loss, twin) for loss, twin in pairs]
+
+    def recovered(self) -> int:
+        """Return how many seeds have recovered."""
+        return sum(step is not None for step in self.recovery_steps())
+
+    def median_step(self) -> float | None:
+        """Return the median recovery time of those that recovered [steps]; None: none did."""
+        found = [step for step in self.recovery_steps() if step is not None]
+        return median(found) if found else None
+
+    def ratios(self, place: int) -> list[float]:
+        """Return for each seed the loss over its twin's at a place of `steps`: -1 is the end."""
+        pairs = zip(self.losses, self.twins, strict=True)
+        return [ratio(loss[place], twin[place]) for loss, twin in pairs]
+
+    def within_at_end(self) -> int:
+        """Return how many seeds are within `RECOVERED` at the last of `steps`."""
+        return sum(value <= RECOVERED for value in self.ratios(-1))
+
+
+def ratio(loss: float, twin: float) -> float:
+    """Return a loss over a twin's; of two zeros it is 1."""
+    if twin == 0.0:
+        return 1.0 if loss == 0.0 else math.nan if math.isnan(loss) else math.inf
+    return loss / twin
+
+
+def recovery_step(
+    steps: Sequence[int], losses: Sequence[float], twins: Sequence[float]
+) -> int | None:
+    """Return the first step at which a loss is at most `RECOVERED` times the twin's."""
+    # Comparisons with NaN are false.
+    rows = zip(steps, losses, twins, strict=True)
+    return next((step for step, loss, twin in rows if loss <= RECOVERED * twin), None)
+
+
+@torch.no_grad()
+def healing(ground: RuleTrial, home: TrialWorlds) -> list[LossCurve]:
+    """Damage grown worlds in every way: a curve for the control and for each damage.
+
+    Where half of the particles are removed, twins are worlds that were grown from as many.
+    """
+    chosen = [d for d in DAMAGES.values() if d.static or not ground.rule.static]
+    found = _with_twins(ground, home, home, [d for d in chosen if not d.halves], control=True)
+    smaller = ground.home(share=0.5)
+    grown = ground.run(smaller, ground.random(StreamId.GROWTH))
+    grown.advance(ground.plan.grow_steps)
+    twins = smaller.with_worlds(grown.x, grown.s)
+    return found + _with_twins(ground, home, twins, [d for d in chosen if d.halves], control=False)
+
+
+def _with_twins(
+    ground: RuleTrial,
+    home: TrialWorlds,
+    twins: TrialWorlds,
+    damages: Sequence[Damage],
+    *,
+    control: bool,
+) -> list[LossCurve]:
+    """Run twins and damaged worlds as one batch."""
+    steps = ground.plan.heal_steps
+    copies = [(twins.x, twins.s)]
+    keys = [ground.random(AFTERWARDS).keys]
+    names = [damage.name for damage in damages]
+    for damage in damages:
+        random = ground.random(StreamId.DAMAGE)
+        x, s = damage.apply(home.x, home.s, random, home.task.box)
+        copies.append((x, home.task.coded(s)))
+        keys.append(keys[0])
+    if control:
+        copies.append(copies[0])
+        keys.append(ground.random(OTHERWISE).keys)
+        names.append(CONTROL)
+    x, s = (torch.cat(parts) for parts in zip(*copies, strict=True))
+    batch = twins.with_worlds(x, s)
+    run = ground.run(batch, WorldRandom.from_keys(torch.cat(keys)))
+    losses = loss_curves(batch, run, steps).view(len(steps), len(copies), -1)
+    # One row for each copy and seed.
+    twin, *others = ground.by_seed(losses).permute(1, 2, 0).tolist()
+    rows = [
+        LossCurve(name, steps, tuple(map(tuple, other)), tuple(map(tuple, twin)))
+        for name, other in zip(names, others, strict=True)
+    ]
+    return rows[-1:] + rows[:-1] if control else rows

@@ -7,28 +7,26 @@ from dataclasses import dataclass
 from typing import Literal
 
 import torch
+from torch import Tensor
 from torch.autograd import DeviceType  # type: ignore[attr-defined]
 from torch.profiler import ProfilerActivity, profile
 
-from npa_envs.measure.speed.timing import TimingSession
-from npa_envs.measure.speed.workloads import Workload, rollout_call
+from npa_envs.measure.speed.timing import TimingSession, Workload, rollout_call
 from npa_envs.ops.backend import describe
 from npa_envs.ops.launch import Launch, noted_launches
 from npa_envs.ops.physics import physics
 from npa_envs.ops.sort import make_plan
+from npa_envs.rule.rule import NPARule
 from npa_envs.world.rollout import step
 from npa_envs.world.steps import row_capacity
-
-LEAST_SHARE = 0.005
-"""Kernels that take less of a step are left out."""
-
-LONGEST_NAME = 72
-"""Letters of a kernel's name."""
 
 
 @dataclass(frozen=True)
 class KernelRow:
-    """One kernel in one workload: its time [µs] and its launches in a step, all together."""
+    """One kernel in one workload: its time [µs] and its launches in a step, all together.
+
+    Kernels that take less than 0.5 % of a step have no row.
+    """
 
     workload: str
     us: float
@@ -52,60 +50,41 @@ def kernel_rows(session: TimingSession, workloads: Sequence[Workload]) -> list[K
                 run()
                 torch.cuda.synchronize(session.device)
             name = f"{workload.name} {'training' if train else 'inference'}"
-            rows += _kernel_rows(name, profiler, workload.steps)
+            found = [
+                KernelRow(
+                    name,
+                    round(entry.self_device_time_total / workload.steps, 2),
+                    round(entry.count / workload.steps, 1),
+                    entry.key[:72],
+                )
+                for entry in profiler.key_averages()
+                if entry.device_type == DeviceType.CUDA
+            ]
+            found.sort(key=lambda row: -row.us)
+            least = 0.005 * sum(row.us for row in found)
+            rows += [row for row in found if row.us >= least]
             session.progress(1)
     return rows
 
 
-def _kernel_rows(workload: str, profiler: profile, steps: int) -> list[KernelRow]:
-    rows = [
-        KernelRow(
-            workload,
-            round(entry.self_device_time_total / steps, 2),
-            round(entry.count / steps, 1),
-            entry.key[:LONGEST_NAME],
-        )
-        for entry in profiler.key_averages()
-        if entry.device_type == DeviceType.CUDA
-    ]
-    rows.sort(key=lambda row: -row.us)
-    least = LEAST_SHARE * sum(row.us for row in rows)
-    return [row for row in rows if row.us >= least]
+Gradients = Literal["none", "weights", "positions"]
+"""What a step is differentiated by: nothing, weights and states, or positions as well."""
 
 
-@dataclass(frozen=True)
-class Question:
-    """A step to explain: its workload, and gradients by nothing, weights, or positions as well."""
-
-    workload: Workload
-    device: torch.device
-    dtype: torch.dtype
-    periodic: bool
-    gradients: Literal["none", "weights", "positions"]
-
-    @property
-    def box(self) -> float | None:
-        """Side of the periodic box [length units], None in open space."""
-        return 2.0 * self.workload.half_width if self.periodic else None
-
-
-def explain(question: Question) -> str:
+def explain(
+    workload: Workload,
+    device: torch.device,
+    dtype: torch.dtype,
+    *,
+    periodic: bool = False,
+    gradients: Gradients = "weights",
+) -> str:
     """Run a step, and return which kernels it launched and what decided on them."""
-    forward, backward = _launches(question)
-    lines = [*_reasons(question), "", "forward:", *_listed(forward)]
-    if question.gradients != "none":
-        lines += ["", "backward:", *_listed(backward)]
-    lines += ["", "Torch's own operations are not listed."]
-    return "\n".join(lines)
-
-
-def _launches(question: Question) -> tuple[list[Launch], list[Launch]]:
-    """Return the launches of a step's forward and backward pass."""
-    workload = question.workload
-    x, s = (tensor.to(question.dtype) for tensor in workload.worlds(question.device))
-    rule = workload.rule(question.device).to(question.dtype)
-    needed = question.gradients != "none"
-    x.requires_grad_(question.gradients == "positions")
+    box = 2.0 * workload.half_width if periodic else None
+    x, s = (tensor.to(dtype) for tensor in workload.worlds(device))
+    rule = workload.rule(device).to(dtype)
+    needed = gradients != "none"
+    x.requires_grad_(gradients == "positions")
     s.requires_grad_(needed)
     with torch.set_grad_enabled(needed), noted_launches() as forward:
         new_x, new_s = step(
@@ -113,15 +92,17 @@ def _launches(question: Question) -> tuple[list[Launch], list[Launch]]:
             x,
             s,
             eps=workload.eps,
-            box=question.box,
+            box=box,
             update_prob=workload.update_prob,
-            detach_positions=question.gradients != "positions",
-            generator=torch.Generator(question.device).manual_seed(0),
+            detach_positions=gradients != "positions",
+            generator=torch.Generator(device).manual_seed(0),
         )
     with noted_launches() as backward:
         if needed:
             torch.autograd.backward(new_x.sum() + new_s.sum())
-    return forward, backward
+    lines = [*_reasons(workload, x, rule, box, gradients), "", "forward:", *_listed(forward)]
+    lines += ["", "backward:", *_listed(backward)] if needed else []
+    return "\n".join([*lines, "", "Torch's own operations are not listed."])
 
 
 def _listed(launches: list[Launch]) -> list[str]:
@@ -132,21 +113,20 @@ def _listed(launches: list[Launch]) -> list[str]:
     return ["  " + "  ".join(row) for row in rows]
 
 
-def _reasons(question: Question) -> list[str]:
+def _reasons(
+    workload: Workload, x: Tensor, rule: NPARule, box: float | None, gradients: Gradients
+) -> list[str]:
     """Return what decides on the kernels, a line each."""
-    workload = question.workload
-    prob, box = workload.update_prob, question.box
-    total = workload.world_count * workload.particle_count
-    masked = prob < 1.0
+    prob, total, masked = workload.update_prob, x.shape[0] * x.shape[1], workload.update_prob < 1.0
     plan = make_plan(
-        torch.empty(0, dtype=question.dtype, device=question.device),
+        torch.empty(0, dtype=x.dtype, device=x.device),
         (workload.world_count, workload.particle_count, workload.space_dim),
         workload.state_dim,
         row_capacity(total, prob) if masked else total,
         masked,
         physics(workload.space_dim, workload.state_dim, question.dtype, eps=workload.eps, box=box),
     )
-    hidden, output = workload.rule(question.device).folded()[:2]
+    hidden, output = rule.folded()[:2]
     request = plan.request._replace(
         row_width=hidden.shape[1], update_width=output.shape[0], hidden_dim=hidden.shape[0]
     )
@@ -161,22 +141,22 @@ def _reasons(question: Question) -> list[str]:
             "longer lists are searched for again"
         )
     rows = "every particle is perceived and updated"
-    if masked and question.device.type == "cpu":
+    if masked and x.device.type == "cpu":
         rows = f"p {prob:g}: the particles drawn are counted, only they are perceived"
     elif masked:
         rows = (
             f"p {prob:g}: only drawn particles are perceived; {plan.row_capacity} rows of {total} "
             "hold them with probability 1 - 1e-15, and no count is read back"
         )
-    gradients = {
+    kept = {
         "none": "none: nothing is kept for a backward pass",
         "weights": "weights and states: the adjoint gathers state cotangents, positions detached",
         "positions": "positions too: density and kernel slopes get cotangents of their own",
     }
-    number = str(question.dtype).removeprefix("torch.")
+    number = str(x.dtype).removeprefix("torch.")
     return [
         f"One step of {workload.world_count} x {workload.particle_count} particles in "
-        f"{workload.space_dim}D, C {workload.state_dim}, {number} on {question.device}",
+        f"{workload.space_dim}D, C {workload.state_dim}, {number} on {x.device}",
         f"  boundary    {boundary}",
         f"  cells       {plan.domain.cell_count} a world, eps / {plan.domain.cell_reach} wide: "
         "a neighbourhood is a few ranges of sorted particles",
@@ -184,7 +164,7 @@ def _reasons(question: Question) -> list[str]:
         f"{workload.state_dim} used: a kernel is compiled for a group's width",
         f"  neighbours  {neighbours}",
         f"  rows        {rows}",
-        f"  gradients   {gradients[question.gradients]}",
+        f"  gradients   {kept[gradients]}",
         "",
         "implementations:",
         *(f"  {line}" for line in describe(request)),

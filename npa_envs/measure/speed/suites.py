@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from datetime import date
 from functools import partial
@@ -15,50 +15,41 @@ from torch import Tensor
 
 from npa_envs.files import json_text
 from npa_envs.measure.plots import new_figure, number_plainly, png
-from npa_envs.measure.record import machine, versions
+from npa_envs.measure.record import UNMEASURED, as_objects, machine, table_text, versions
 from npa_envs.measure.speed.explain import kernel_rows
 from npa_envs.measure.speed.timing import (
     LeftOut,
     Tables,
     Timing,
     TimingSession,
+    Workload,
     compare,
-    relative_error,
+    rollout_call,
     timed_calls,
 )
-from npa_envs.measure.speed.workloads import Workload, rollout_call
-from npa_envs.measure.tables import UNMEASURED, as_objects, table_text
 from npa_envs.rule.rule import NPARule
 from npa_envs.world.recorded import release_recordings
-from npa_envs.world.rollout import Memory, rollout
+from npa_envs.world.rollout import Memory
 from npa_envs.world.species import rollout_species
 
-# Suite `paper`: inference and training, storing and recomputing; float32 against float64.
+# Suite `paper`: inference and training, storing and recomputing.
 
-EIGHT_WORLDS = Workload(2, 8, 4096, 64)
-ONE_WORLD = Workload(2, 1, 4096, 64)
-LARGE_WORLDS = Workload(2, 8, 65536, 8)
-CUBES = Workload(3, 4, 16384, 24, 256)
-MILLION = Workload(2, 1, 2**20, 8)
-SIXTEEN_MILLION = Workload(2, 1, 2**24, 4)
+PROFILED = (
+    Workload(2, 8, 4096, 64),
+    Workload(2, 1, 4096, 64),
+    Workload(2, 8, 65536, 8),
+    Workload(3, 4, 16384, 24, 256),
+)
+"""Workloads of the authors' own table."""
 
-PAPER = (EIGHT_WORLDS, ONE_WORLD, LARGE_WORLDS, CUBES, MILLION, SIXTEEN_MILLION)
-"""Workloads on CUDA."""
-
-PROFILED = PAPER[:4]
-"""Those of the authors' own table."""
-
-PUBLIC = (*PROFILED, Workload(2, 64, 256, 32))
-"""Workloads of the public call, with many small worlds."""
+PAPER = (*PROFILED, Workload(2, 1, 2**20, 8), Workload(2, 1, 2**24, 4))
+"""Workloads on CUDA; the last one is not trained."""
 
 CPU = (Workload(2, 1, 4096, 16), Workload(2, 4, 1024, 16))
 """Workloads on a CPU."""
 
 SMALL = (Workload(2, 1, 1024, 8),)
 """Workloads of small sessions."""
-
-INFERENCE_ONLY = (SIXTEEN_MILLION,)
-"""Workloads that are not trained."""
 
 
 @dataclass(frozen=True)
@@ -79,18 +70,16 @@ class ThroughputRow:
 
 def throughput_rows(session: TimingSession, workloads: Sequence[Workload]) -> list[ThroughputRow]:
     """Return two rows for each workload: storing and recomputing."""
-    rows: list[ThroughputRow] = []
+    calls = []
     for workload in workloads:
-        train = workload not in INFERENCE_ONLY
+        train = workload != PAPER[-1]
         if not train:
             session.leave_out(f"training of {workload.name}", "a workload of inference only")
         modes: tuple[Memory, ...] = ("store", "recompute") if train else ("store",)
         for memory in modes:
-            rows += session.attempt(
-                f"{workload.name}, {memory}",
-                partial(throughput_row, session, workload, memory, train=train),
-            )
-    return rows
+            row = partial(throughput_row, session, workload, memory, train=train)
+            calls.append((f"{workload.name}, {memory}", row))
+    return session.rows(calls)
 
 
 def throughput_row(
@@ -104,13 +93,13 @@ def throughput_row(
         pull_back, generator = rollout_call(workload, x, s, train=True, memory=memory)
         training = session.cost(pull_back, generator=generator)
     return ThroughputRow(
-        workload=workload.name,
-        memory=memory,
-        infer_us=infer.time.divided(workload.steps),
-        train_us=training.time.divided(workload.steps) if training else None,
-        worlds_mib=(x.nbytes + s.nbytes) / 2**20,
-        infer_mib=infer.peak_mib,
-        train_mib=training.peak_mib if training else None,
+        workload.name,
+        memory,
+        infer.time.divided(workload.steps),
+        training.time.divided(workload.steps) if training else None,
+        (x.nbytes + s.nbytes) / 2**20,
+        infer.peak_mib,
+        training.peak_mib if training else None,
     )
 
 
@@ -129,15 +118,6 @@ class PublicRow:
     launched_train_us: Timing
 
 
-def public_rows(session: TimingSession, workloads: Sequence[Workload]) -> list[PublicRow]:
-    """Return a row for each workload."""
-    return [
-        row
-        for workload in workloads
-        for row in session.attempt(workload.name, partial(_public_row, session, workload))
-    ]
-
-
 def _public_row(session: TimingSession, workload: Workload) -> PublicRow:
     x, s = workload.worlds(session.device)
     found: dict[tuple[bool, bool], Timing] = {}
@@ -151,74 +131,15 @@ def _public_row(session: TimingSession, workload: Workload) -> PublicRow:
     return PublicRow(workload.name, *found.values())
 
 
-@dataclass(frozen=True)
-class DriftRow:
-    """Relative errors of float32 after all steps of a workload, with float64's update masks.
-
-    Worlds are chaotic: after enough steps errors show how long worlds ran. Gradients are those of a
-    random linear functional by the states at the start and the weights; their errors come from few
-    particles, whose hidden units are on in one precision alone. `state_gradient_median` is the
-    median over the particles, each relative to its own.
-    """
-
-    workload: str
-    positions: float
-    states: float
-    state_gradient: float
-    state_gradient_median: float
-    weight_gradient: float
-
-
-def drift_rows(session: TimingSession, workloads: Iterable[Workload]) -> list[DriftRow]:
-    """Return a row for each workload."""
-    rows: list[DriftRow] = []
-    for workload in workloads:
-        what = f"drift of {workload.name}"
-        for exact in session.attempt(what, partial(_outcome, workload, session, torch.float64)):
-            rows += session.attempt(what, partial(_drift_row, workload, session, exact))
-    return rows
-
-
-def _drift_row(workload: Workload, session: TimingSession, exact: list[Tensor]) -> DriftRow:
-    found = _outcome(workload, session, torch.float32)
-    positions, states, by_states, by_weights = map(relative_error, found, exact)
-    distance = (found[2].double() - exact[2]).norm(dim=-1)
-    median = float((distance / exact[2].norm(dim=-1)).median())
-    return DriftRow(workload.name, positions, states, by_states, median, by_weights)
-
-
-def _outcome(workload: Workload, session: TimingSession, dtype: torch.dtype) -> list[Tensor]:
-    """Return positions and states at the end, and gradients by states and by weights."""
-    device = session.device
-    rule = workload.rule(device).to(dtype)
-    start, states = (tensor.to(dtype) for tensor in workload.worlds(device))
-    states.requires_grad_()
-    x, s = rollout(
-        rule,
-        start,
-        states,
-        workload.steps,
-        eps=workload.eps,
-        update_prob=workload.update_prob,
-        generator=torch.Generator(device).manual_seed(1),
-        memory="recompute",
-    )
-    loss = (x * drawn_like(x)).sum() + (s * drawn_like(s)).sum()
-    by_states, *by_weights = torch.autograd.grad(loss, [states, *rule.parameters()])
-    weights = torch.cat([gradient.flatten() for gradient in by_weights])
-    return [tensor.detach() for tensor in (x, s, by_states, weights)]
-
-
-def drawn_like(like: Tensor) -> Tensor:
-    """Return the weights of a random linear functional, the same numbers in every dtype."""
-    generator = torch.Generator(like.device).manual_seed(2)
-    return torch.randn(like.shape, generator=generator, device=like.device).to(like.dtype)
-
-
 # Suite `scaling`: N, neighbours, B and C, one of them at a time.
 
-AXES = ("particles", "neighbours", "worlds", "channels")
-"""What is varied: N at the same density, neighbours within eps, B, C."""
+AXES = {
+    "particles": "particles N, same density",
+    "neighbours": "neighbours of a particle",
+    "worlds": "worlds B",
+    "channels": "state channels C",
+}
+"""What is varied, and what plots call it."""
 
 
 @dataclass(frozen=True)
@@ -247,11 +168,11 @@ class SlopeRow:
 
 def scaling_rows(session: TimingSession) -> list[ScalingRow]:
     """Return the rows of all axes, increasing along each."""
-    rows: list[ScalingRow] = []
-    for axis, values in zip(AXES, _values(session), strict=True):
-        for value in values:
-            rows += session.attempt(f"{value} {axis}", partial(_scaling_row, session, axis, value))
-    return rows
+    return session.rows(
+        (f"{value} {axis}", partial(_scaling_row, session, axis, value))
+        for axis, values in zip(AXES, _values(session), strict=True)
+        for value in values
+    )
 
 
 def _values(session: TimingSession) -> tuple[Sequence[int], ...]:
@@ -308,9 +229,6 @@ SKIPPED = {
 }
 """Worlds to measure on, by kinds of sessions."""
 
-STATIC_STEPS = 32
-"""Steps of a rollout of a static world."""
-
 
 @dataclass(frozen=True)
 class SkipRow:
@@ -323,89 +241,68 @@ class SkipRow:
     saved: str
 
 
-@dataclass(frozen=True)
-class Skip:
-    """Two rollouts that differ in one condition alone, with options of `rollout_call`."""
-
-    left_out: str
-    condition: str
-    done: dict[str, Any]
-    skipped: dict[str, Any]
-    steps: int | None = None
-    """Steps of both; default: the workload's."""
+Skip = tuple[str, str, dict[str, Any], dict[str, Any]]
+"""What is left out, the condition, and options of `rollout_call` with and without it."""
 
 
 def skips(workload: Workload) -> list[Skip]:
     """Return all computations that rollouts leave out."""
     side = 2.0 * workload.half_width
-    training = {"train": True}
+    training: dict[str, Any] = {"train": True}
     # Cells and densities are computed anew in each step if positions may get a gradient.
-    rebuilt = {"detach_positions": False}
-    static = {"rule": {"static": True}}
+    rebuilt: dict[str, Any] = {"detach_positions": False}
+    static: dict[str, Any] = {"rule": {"static": True}}
+    stored = "what a backward pass reads: signs of hidden units, volumes, kernel sums"
+    inactive = "perception, network and lists of inactive particles"
+    built, longer = "cells, densities and neighbour lists", {"steps": 32}
+    again = "a second forward pass, for the backward pass"
+    columns: list[Skip] = [
+        (what, f"{option}=False", {}, {"rule": {option: False}})
+        for what, option in (
+            ("the state gradient", "state_gradient"),
+            ("the moment matrix and its inverse", "moment_correction"),
+            ("columns of the density gradient", "density_gradient"),
+        )
+    ]
     return [
-        Skip(
-            "what a backward pass reads: signs of hidden units, volumes, kernel sums",
-            "no gradient is enabled",
-            {"gradients": True},
-            {},
-        ),
-        Skip(
+        (stored, "no gradient is enabled", {"gradients": True}, {}),
+        (
             "cotangents of positions and densities",
             "detach_positions (default)",
-            {**training, "detach_positions": False},
+            training | rebuilt,
             training,
         ),
-        Skip(
-            "perception, network and lists of inactive particles",
-            "update_prob < 1",
-            {"update_prob": 1.0},
-            {},
-        ),
-        *(
-            Skip(what, f"{option}=False", {}, {"rule": {option: False}})
-            for what, option in (
-                ("the state gradient", "state_gradient"),
-                ("the moment matrix and its inverse", "moment_correction"),
-                ("columns of the density gradient", "density_gradient"),
-            )
-        ),
-        Skip("displacements", "static=True", rebuilt, {**static, **rebuilt}),
-        Skip(
-            "cells, densities and neighbour lists",
+        (inactive, "update_prob < 1", {"update_prob": 1.0}, {}),
+        *columns,
+        ("displacements", "static=True", rebuilt, static | rebuilt),
+        (
+            built,
             "static=True, without position_noise",
-            {**static, **rebuilt},
-            static,
-            STATIC_STEPS,
+            static | rebuilt | longer,
+            static | longer,
         ),
-        Skip("periodic images", "box=None (default)", {"box": (side, side)}, {}),
-        Skip(
-            "a second forward pass, for the backward pass",
-            "memory='store' (default)",
-            {**training, "memory": "minimal"},
-            training,
-        ),
+        ("periodic images", "box=None (default)", {"box": (side, side)}, {}),
+        (again, "memory='store' (default)", training | {"memory": "minimal"}, training),
     ]
 
 
 def skip_rows(session: TimingSession) -> list[SkipRow]:
     """Return what each omission saves, measured with and without it in one run."""
-    workload = SKIPPED["small" if session.small else session.device.type]
+    workload = SKIPPED[session.size]
     x, s = workload.worlds(session.device)
 
-    def cost(options: dict[str, Any], steps: int | None) -> Timing:
-        rolled = replace(workload, steps=steps or workload.steps)
-        run, generator = rollout_call(rolled, x, s, **options)
+    def cost(options: dict[str, Any]) -> Timing:
+        given: dict[str, Any] = {"steps": workload.steps} | options
+        rolled = replace(workload, steps=given.pop("steps"))
+        run, generator = rollout_call(rolled, x, s, **given)
         return session.cost(run, generator=generator).time.divided(rolled.steps)
 
-    def row(skip: Skip) -> SkipRow:
-        done, skipped = cost(skip.done, skip.steps), cost(skip.skipped, skip.steps)
+    def row(left_out: str, condition: str, *options: dict[str, Any]) -> SkipRow:
+        done, skipped = map(cost, options)
         saved = 1.0 - skipped.median / done.median
-        return SkipRow(skip.left_out, skip.condition, done, skipped, f"{saved:.0%}")
+        return SkipRow(left_out, condition, done, skipped, f"{saved:.0%}")
 
-    rows: list[SkipRow] = []
-    for skip in skips(workload):
-        rows += session.attempt(skip.left_out, partial(row, skip))
-    return rows
+    return session.rows((skip[0], partial(row, *skip)) for skip in skips(workload))
 
 
 # Suite `species`: overhead of `rollout_species` with one species.
@@ -416,9 +313,6 @@ SPECIES = {
     "small": (Workload(2, 1, 256, 2),),
 }
 """Worlds to measure on, by kinds of sessions; small ones show the cost of a call."""
-
-PAIRS_PER_REPEAT = 3
-"""Pairs of readings for each reading of other tables: a ratio of nearly 1 needs more of them."""
 
 
 @dataclass(frozen=True)
@@ -439,15 +333,15 @@ class OneSpeciesRow:
 
 def one_species_rows(session: TimingSession) -> list[OneSpeciesRow]:
     """Return rows of inference and training."""
-    rows: list[OneSpeciesRow] = []
-    for workload in SPECIES["small" if session.small else session.device.type]:
-        for train in (False, True):
-            for graph in (False, True) if session.cuda else (False,):
-                what = f"one species, {'training' if train else 'inference'} of {workload.name}"
-                rows += session.attempt(
-                    what, partial(_species_row, session, workload, train, graph)
-                )
-    return rows
+    return session.rows(
+        (
+            f"one species, {'training' if train else 'inference'} of {workload.name}",
+            partial(_species_row, session, workload, train, graph),
+        )
+        for workload in SPECIES[session.size]
+        for train in (False, True)
+        for graph in ((False, True) if session.cuda else (False,))
+    )
 
 
 def _species_row(
@@ -457,9 +351,9 @@ def _species_row(
     make: Callable[..., Any] = partial(rollout_call, workload, x, s, train=train)
     # Each draws the same masks, as often as the other one is called.
     alone, species = make(), make(roll=roll_one_species)
-    compared = compare(
-        alone, species, session.device, repeats=PAIRS_PER_REPEAT * session.repeats, graph=graph
-    )
+    # A ratio of nearly 1 needs more readings than other tables.
+    repeats = 3 * session.repeats
+    compared = compare(alone, species, session.device, repeats=repeats, graph=graph)
     return OneSpeciesRow(
         workload.name,
         "training" if train else "inference",
@@ -485,16 +379,13 @@ def roll_one_species(
 
 
 def paper(session: TimingSession) -> Tables:
-    """Return the paper's table, times of the public call, and errors of float32."""
+    """Return the paper's table, and times of the public call."""
     workloads = SMALL if session.small else PAPER if session.cuda else CPU
-    drifting = SMALL if session.small else PROFILED if session.cuda else (ONE_WORLD,)
-    tables: Tables = {
-        "throughput": throughput_rows(session, workloads),
-        "drift": drift_rows(session, drifting),
-    }
+    tables: Tables = {"throughput": throughput_rows(session, workloads)}
     if session.cuda:
         # On a CPU the throughput is that of the public call.
-        tables["public"] = public_rows(session, SMALL if session.small else PUBLIC)
+        public = SMALL if session.small else (*PROFILED, Workload(2, 64, 256, 32))
+        tables["public"] = session.rows((w.name, partial(_public_row, session, w)) for w in public)
     return tables
 
 
@@ -567,14 +458,6 @@ class BenchReport:
 
 # Plots: how times grow.
 
-AXIS_LABELS = {
-    "particles": "particles N, same density",
-    "neighbours": "neighbours of a particle",
-    "worlds": "worlds B",
-    "channels": "state channels C",
-}
-"""What the axes of the suite `scaling` are called."""
-
 
 def pictures(tables: Tables) -> dict[str, bytes]:
     """Return PNG files by their names, of tables that are there and whole. Needs matplotlib."""
@@ -598,7 +481,7 @@ def _draw_scaling(table: Sequence[ScalingRow], what: str) -> Any:
             # A cell that was not measured is a gap.
             values = [cell.median if isinstance(cell, Timing) else cell for cell in found]
             panel.plot([row.value for row in rows], values, marker="o", ms=4, label=label)
-        panel.set(xscale="log", yscale="log", xlabel=AXIS_LABELS[name])
+        panel.set(xscale="log", yscale="log", xlabel=AXES[name])
         panel.set_ylabel("time of a step [µs]" if what == "time" else "peak memory [MiB]")
         number_plainly(panel.xaxis, [row.value for row in rows])
         number_plainly(panel.yaxis)

@@ -1,4 +1,4 @@
-"""Time and memory of a call, and the session that every suite measures in."""
+"""Worlds to measure on, time and memory of a call, and the session that suites measure in."""
 
 from __future__ import annotations
 
@@ -6,23 +6,123 @@ import gc
 import math
 import statistics
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, TypeVar
 
 import torch
 from torch import Tensor
 
+from npa_envs.rule.rule import NPARule
 from npa_envs.world.cuda_graph import capture
+from npa_envs.world.rollout import rollout
+
+# Worlds with as many neighbours everywhere
+
+
+@dataclass(frozen=True)
+class Workload:
+    """Worlds of uniformly scattered particles and a fresh rule; about 66 neighbours in 2D."""
+
+    space_dim: int
+    """Space dimension D."""
+    world_count: int
+    """Worlds B."""
+    particle_count: int
+    """Particles in each world N."""
+    steps: int
+    """Steps of a rollout T."""
+    hidden_dim: int = 128
+    """Width of the rule's hidden layer."""
+    state_dim: int = 16
+    """State channels C."""
+    eps: float = 0.1
+    """Perception radius [length units]."""
+    update_prob: float = 0.5
+    """Probability of each particle's update in a step (dimensionless)."""
+
+    @property
+    def name(self) -> str:
+        """Short name: dimension and (B, N, T)."""
+        return f"{self.space_dim}D ({self.world_count}, {self.particle_count}, {self.steps})"
+
+    @property
+    def half_width(self) -> float:
+        """Half the side of the square or cube that the particles fill [length units].
+
+        Worlds of all sizes are as dense.
+        """
+        if self.space_dim == 2:
+            return 0.7 * math.sqrt(self.particle_count / 4096)
+        return 0.8 * math.cbrt(self.particle_count / 16384)
+
+    @property
+    def neighbour_count(self) -> float:
+        """Mean number of particles within eps of one, itself included, far from the edges."""
+        ball = math.pi * self.eps**2 if self.space_dim == 2 else 4 / 3 * math.pi * self.eps**3
+        volume = math.prod((2.0 * self.half_width,) * self.space_dim)
+        return 1.0 + self.particle_count * ball / volume
+
+    def worlds(self, device: torch.device) -> tuple[Tensor, Tensor]:
+        """Return float32 positions [length units], [B, N, D], and states, [B, N, C]."""
+        generator = torch.Generator(device).manual_seed(0)
+        shape = (self.world_count, self.particle_count)
+        x = torch.rand(*shape, self.space_dim, generator=generator, device=device)
+        s = torch.randn(*shape, self.state_dim, generator=generator, device=device)
+        return x.mul_(2.0).sub_(1.0).mul_(self.half_width), s.mul_(0.1)
+
+    def rule(self, device: torch.device, **options: Any) -> NPARule:
+        """Return a rule with the same fresh weights at every call, and options of `NPARule`."""
+        # Weights are drawn from torch's global generators, which must be left as they were.
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(0)
+            dims = (self.space_dim, self.state_dim, self.hidden_dim)
+            rule = NPARule(*dims, eps0=self.eps, **options)
+        return rule.to(device)
+
+
+def rollout_call(
+    workload: Workload,
+    x: Tensor,
+    s: Tensor,
+    *,
+    train: bool = False,
+    gradients: bool = False,
+    rule: Mapping[str, bool] | None = None,
+    roll: Callable[..., Any] = rollout,
+    **options: Any,
+) -> tuple[Callable[[], None], torch.Generator]:
+    """Return a call that rolls worlds out, and the source of its masks.
+
+    `train` takes the gradient of a random linear functional by the rule's weights, `gradients`
+    only lets autograd store its inputs. `rule` are options of the rule, `options` those of `roll`.
+    """
+    network = workload.rule(x.device, **(rule or {}))
+    generator = torch.Generator(x.device).manual_seed(1)
+    given = {"eps": workload.eps, "update_prob": workload.update_prob, **options}
+    draws = torch.Generator(x.device).manual_seed(2)
+    weights = [
+        torch.randn(worlds.shape, generator=draws, device=x.device)
+        for worlds in ((x, s) if train else ())
+    ]
+
+    def run() -> None:
+        with torch.set_grad_enabled(train or gradients):
+            worlds = roll(network, x, s, workload.steps, generator=generator, **given)
+            if train:
+                terms = [(a * b).sum() for a, b in zip(worlds, weights, strict=True)]
+                torch.autograd.grad(terms[0] + terms[1], list(network.parameters()))
+
+    return run, generator
+
+
+# Time
 
 Sampled = tuple[Callable[[], object], torch.Generator]
 """A call, and the generator that it draws from."""
 
 LEAST_SECONDS = {"cpu": 2e-3, "cuda": 1e-2}
 """Short calls are made so many times in a row that one reading takes at least this long [s]."""
-
-ENOUGH = 1e6
-"""Readings of slow calls end after this long [µs], with three of them at least."""
 
 
 @dataclass(frozen=True)
@@ -80,8 +180,7 @@ def compare(
         runs.append(
             capture(run, device, generator=generator, warm_up=run).replay if captured else run
         )
-    longest = max(_reading(run, device, 1) for run in runs)
-    calls = max(1, math.ceil(LEAST_SECONDS[device.type] / longest))
+    calls = _calls(max(_reading(run, device, 1) for run in runs), device)
     readings: list[list[float]] = [[], []]
     for number in range(repeats):
         for which in (0, 1) if number % 2 == 0 else (1, 0):
@@ -104,12 +203,16 @@ def _summary(readings: Sequence[float]) -> Timing:
 
 
 def _timing(run: Callable[[], object], device: torch.device, repeats: int) -> Timing:
-    first = _reading(run, device, 1)
-    calls = max(1, math.ceil(LEAST_SECONDS[device.type] / first))
+    calls = _calls(_reading(run, device, 1), device)
     readings = [_reading(run, device, calls) * 1e6]
-    while len(readings) < repeats and (len(readings) < 3 or sum(readings) * calls < ENOUGH):
+    # Those of slow calls end after a second, with three of them at least.
+    while len(readings) < repeats and (len(readings) < 3 or sum(readings) * calls < 1e6):
         readings.append(_reading(run, device, calls) * 1e6)
     return _summary(readings)
+
+
+def _calls(seconds: float, device: torch.device) -> int:
+    return max(1, math.ceil(LEAST_SECONDS[device.type] / seconds))
 
 
 def _reading(run: Callable[[], object], device: torch.device, calls: int) -> float:
@@ -162,6 +265,11 @@ class TimingSession:
         """Whether the device is a CUDA device."""
         return self.device.type == "cuda"
 
+    @property
+    def size(self) -> str:
+        """Whose sizes are measured: "small", "cpu" or "cuda"."""
+        return "small" if self.small else self.device.type
+
     def cost(
         self,
         run: Callable[[], object],
@@ -196,14 +304,12 @@ class TimingSession:
         finally:
             self.progress(1)
 
+    def rows(self, calls: Iterable[tuple[str, Callable[[], Row]]]) -> list[Row]:
+        """Return the rows of `attempt` of calls with names."""
+        return [row for what, make in calls for row in self.attempt(what, make)]
+
     def leave_out(self, what: str, why: str) -> None:
         """Note that something is not measured."""
         entry = LeftOut(what, why)
         if entry not in self.left_out:
             self.left_out.append(entry)
-
-
-def relative_error(value: Tensor, expected: Tensor) -> float:
-    """Return |value - expected| / |expected| in the Euclidean norm, taken in float64."""
-    exact = expected.detach().double()
-    return float((value.detach().double() - exact).norm() / exact.norm())

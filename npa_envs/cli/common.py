@@ -11,13 +11,16 @@ import tempfile
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 
 import tyro
 from tqdm import tqdm
 
 from npa_envs.errors import NPAError, suggest
 from npa_envs.files import NEARLY_FULL_BYTES, made_folder
+
+if TYPE_CHECKING:
+    import torch
 
 OptionsT = TypeVar("OptionsT")
 
@@ -105,11 +108,23 @@ def parse_options(
 
 
 @dataclass(frozen=True, kw_only=True)
-class RunOptions:
-    """Options of commands that run worlds."""
+class DeviceOptions:
+    """Options of commands that need a device."""
 
     device: str = "cpu"
     """Where to run: cpu, cuda, cuda:1."""
+
+    def place(self) -> torch.device:
+        """Return the checked device."""
+        from npa_envs.devices import check_device
+
+        return check_device(self.device)
+
+
+@dataclass(frozen=True, kw_only=True)
+class RunOptions(DeviceOptions):
+    """Options of commands that run worlds."""
+
     progress: bool = True
     """Show a progress bar."""
 
@@ -134,8 +149,9 @@ class RuleOptions(RunOptions):
     update_prob: float | None = None
     """Probability of each particle's update in a step; default: as trained."""
 
+    @property
     def world(self) -> dict[str, Any]:
-        """Return the options of the rule's world, as `task_of_rule` takes them."""
+        """The options of the rule's world, as `task_of_rule` takes them."""
         names = ("target", "loss", "data", "particle_count", "eps", "update_prob")
         return {name: getattr(self, name) for name in names}
 
@@ -289,3 +305,10 @@ class StepBar:
 
     def __exit__(self, *_: object) -> None:
         self._bar.close()
+
+
+@contextlib.contextmanager
+def measuring(options: Any, total: int | None, unit: str = "step") -> Iterator[StepBar]:
+    """Show the bar of options with `progress`, and use their number of `threads`, in a block."""
+    with StepBar(total, show=options.progress, unit=unit) as bar, torch_threads(options.threads):
+        yield bar

@@ -1,4 +1,9 @@
-"""Precisions of a rollout: of arithmetic, of the rule's products, of states between steps."""
+"""Precisions of a rollout: of arithmetic, of the rule's products, of states between steps.
+
+    python benchmarks/precisions.py gecko dots digits --device cuda
+
+prints what the metric of rules at their horizon is in each precision, over that of float32.
+"""
 
 from __future__ import annotations
 
@@ -7,12 +12,20 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import torch
+from scripts import script_parser
 from torch import Tensor
 from torch.nn import functional
 
+from npa_envs.devices import check_device
 from npa_envs.ops.equivariance import invariants, steered
+from npa_envs.rule.files import load_rule
 from npa_envs.rule.network import without_small
 from npa_envs.rule.rule import NPARule
+from npa_envs.training.trained_tasks import task_of_rule
+from npa_envs.world.rollout import rollout
+
+HORIZONS = {"morphogenesis3d": 128, "point_classification": 32}
+"""Steps after which rules of a task are judged; of others 512."""
 
 
 class TorchRule(NPARule):
@@ -102,3 +115,44 @@ PRECISIONS = {
     )
 }
 """Every precision by its name."""
+
+
+@torch.no_grad()
+def metric(name: str, precision: Precision, device: torch.device) -> float:
+    """Return the metric of one world of a rule at its horizon; NaN where it is not finite."""
+    rule = load_rule(name, device=device).float().requires_grad_(False)
+    trained = task_of_rule(name, rule, device)
+    generator = torch.Generator(device).manual_seed(0)
+    x, s, goal = trained.task.seed(1, generator=generator, device=device)
+    task = trained.task.toward(goal)
+    x, s, own = x.float(), precision.kept(s.float()), precision.rule(rule)
+    x, s = x.to(precision.dtype), s.to(precision.dtype)
+    steps = HORIZONS.get(trained.task_name or "", 512)
+    at_once = 1 if precision.short_states else steps
+    options = {"eps": task.eps, "box": task.box, "update_prob": task.update_prob}
+    generator.manual_seed(1)
+    with precision.active():
+        for _ in range(steps // at_once):
+            x, s = rollout(own, x, s, at_once, generator=generator, **options)
+            s = precision.kept(s)
+    finite = bool(x.isfinite().all()) and bool(s.isfinite().all())
+    return float(task.metric(x.float(), s.float()).mean()) if finite else float("nan")
+
+
+def main() -> None:
+    """Print a line for each rule and precision."""
+    parser = script_parser(__doc__)
+    parser.add_argument("rules", nargs="+")
+    arguments = parser.parse_args()
+    torch.set_num_threads(arguments.threads)
+    device = check_device(arguments.device)
+    for name in arguments.rules:
+        base = metric(name, PRECISIONS["float32"], device)
+        for precision in PRECISIONS.values():
+            if precision.obstacle(device) is None:
+                ratio = metric(name, precision, device) / base
+                print(f"{name}  {precision.name}  {ratio:.3f} times that of float32", flush=True)
+
+
+if __name__ == "__main__":
+    main()
