@@ -8,14 +8,7 @@ from npa_envs.errors import NPAError, shown
 
 
 def parse_device(name: str) -> torch.device:
-    """Return the device of that name, whether or not this machine has it.
-
-    Args:
-        name: "cpu", "cuda" or "cuda:1".
-
-    Raises:
-        NPAError: It names no such device.
-    """
+    """Return the device of that name, whether or not this machine has it."""
     cure = "use 'cpu', 'cuda' or 'cuda:1'"
     if not isinstance(name, str):
         raise NPAError(f"device must be text, got {shown(name)}: {cure}")
@@ -36,14 +29,7 @@ def parse_device(name: str) -> torch.device:
 
 
 def check_device(name: str | torch.device) -> torch.device:
-    """Return the device of that name, with its number where it is a CUDA device.
-
-    Args:
-        name: "cpu", "cuda" or "cuda:1", or torch's own device.
-
-    Raises:
-        NPAError: It names no device, or one that this machine does not have.
-    """
+    """Return the device of that name, with its number where it is a CUDA device."""
     device = parse_device(str(name) if isinstance(name, torch.device) else name)
     if device.type != "cuda":
         return device

@@ -122,28 +122,24 @@ def check_finite(weights: Mapping[str, Tensor]) -> None:
 
 
 def read_state_dict(data: bytes) -> RuleParts:
-    """Read the authors' state dict.
-
-    The space dimension and the number of channels follow from the shapes.
-    """
-    state = _unpickle(data)
+    """Read the authors' state dict; dimension and channels follow from the shapes."""
+    state, has_checksum = _unpickle(data), data.startswith(_ZIP_MARK)
+    known, kind, more = _WEIGHT_NAMES, "", f" and, with a read-out, {sorted(_DECODER_NAMES)}"
     if state.keys() & _EQUIVARIANT_NAMES:
-        return _read_equivariant_state(state, has_checksum=data.startswith(_ZIP_MARK))
-    required = {"model.0.weight", "model.0.bias", "model.2.weight", "eps0", "alpha"}
+        known, kind, more = _EQUIVARIANT_NAMES, " of an equivariant rule", ""
+    decoder = _DECODER_NAMES & known.keys()
+    required = {*known, "eps0", "alpha"} - decoder
     missing = required - state.keys()
-    if state.keys() & _DECODER_NAMES:
-        missing |= _DECODER_NAMES - state.keys()
-    unknown = state.keys() - required - _DECODER_NAMES - _IGNORED
+    missing |= decoder - state.keys() if state.keys() & decoder else set()
+    unknown = state.keys() - required - decoder - _IGNORED
     if missing or unknown:
         raise NPAError(
-            f"the state dict must hold {sorted(required)} and, with a read-out, "
-            f"{sorted(_DECODER_NAMES)}; missing: {sorted(missing)}, unknown: "
-            f"{shown(sorted(map(str, unknown)))}"
+            f"the state dict{kind} must hold {sorted(required)}{more}; missing: "
+            f"{sorted(missing)}, unknown: {shown(sorted(map(str, unknown)))}"
         )
-    weights = {}
-    for theirs, ours in _WEIGHT_NAMES.items():
-        if theirs in state:
-            weights[ours] = _matrix(theirs, state[theirs])
+    weights = {known[name]: _matrix(name, state[name]) for name in known if name in state}
+    if known is _EQUIVARIANT_NAMES:
+        return _equivariant_parts(weights, state, has_checksum=has_checksum)
     hidden_dim, perception_dim = weights["hidden.weight"].shape
     update_dim = weights["output.weight"].shape[0]
     has_readout = "readout.0.weight" in weights
@@ -160,20 +156,7 @@ def read_state_dict(data: bytes) -> RuleParts:
     if has_readout:
         hyper_parameters["readout_dim"] = weights["readout.2.weight"].shape[0]
         hyper_parameters["readout_hidden_dim"] = weights["readout.0.weight"].shape[0]
-    return RuleParts(hyper_parameters, weights, has_checksum=data.startswith(_ZIP_MARK))
-
-
-def _read_equivariant_state(state: Mapping[Any, Any], *, has_checksum: bool) -> RuleParts:
-    """Read the state dict of an equivariant rule."""
-    required = {*_EQUIVARIANT_NAMES, "eps0", "alpha"}
-    missing, unknown = required - state.keys(), state.keys() - required - _IGNORED
-    if missing or unknown:
-        raise NPAError(
-            f"the state dict of an equivariant rule must hold {sorted(required)}; missing: "
-            f"{sorted(missing)}, unknown: {shown(sorted(map(str, unknown)))}"
-        )
-    tensors = {name: _matrix(theirs, state[theirs]) for theirs, name in _EQUIVARIANT_NAMES.items()}
-    return _equivariant_parts(tensors, state, has_checksum=has_checksum)
+    return RuleParts(hyper_parameters, weights, has_checksum=has_checksum)
 
 
 def _equivariant_parts(
@@ -321,9 +304,6 @@ def save_demo_json(
     """Write rules as a collection of the authors' web demo, in float32, whole or not at all.
 
     `load_rule("models.json#name")` gives each of them back.
-
-    Args:
-        particle_counts: With how many particles a rule starts there; 4096 where nothing is said.
     """
     path = checked_path(path)
     if path.suffix != ".json":
@@ -348,7 +328,7 @@ def _demo_entry(name: str, rule: NPARule, particle_count: int) -> dict[str, Any]
         if made.get(field, wanted) != wanted:
             raise NPAError(
                 f"the authors' demo runs rules with {field}={wanted!r} only, {shown(name)} has "
-                f"{made[field]!r}: save it with npa_envs.save_rule"  # type: ignore[literal-required]
+                f"{made[field]!r}: save it with npa_envs.save_rule"
             )
     if not rule.is_plain():
         raise NPAError(

@@ -11,9 +11,9 @@ import hashlib
 import json
 import os
 import warnings
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, Literal, get_origin, get_type_hints
+from typing import Any, Literal, get_origin
 
 import torch
 from safetensors import SafetensorError, safe_open
@@ -36,16 +36,13 @@ from npa_envs.rule.authors import (
     read_demo_json,
     read_state_dict,
 )
-from npa_envs.rule.rule import NPARule, RuleHyperParameters, check_rule, is_altered
+from npa_envs.rule.rule import HYPER_PARAMETERS, NPARule, check_rule, is_altered
 
 FORMAT_NAME = "npa-envs rule"
 FORMAT_VERSION = "1"
 
-_PLAIN: dict[Any, type] = {Literal: str, tuple: tuple}
-_FIELDS = {
-    name: _PLAIN.get(get_origin(kind), kind)
-    for name, kind in get_type_hints(RuleHyperParameters).items()
-}
+_PLAIN: dict[Any, type] = {Literal: str, Sequence: tuple}
+_FIELDS = {name: _PLAIN.get(get_origin(kind), kind) for name, kind in HYPER_PARAMETERS.items()}
 _RESERVED = {"format", "version", "checksum", *_FIELDS}
 _SUFFIXES = (".safetensors", ".pth", ".pt", ".json")
 _LARGEST_FILE = 64 * 2**20
@@ -217,11 +214,7 @@ def _with_sorted_metadata(file: bytes) -> bytes:
 
 
 def rule_metadata(path: str | Path) -> dict[str, str]:
-    """Return the text in the header of a file that `save_rule` wrote, all of it.
-
-    Raises:
-        NPAError: The file is missing, garbage, truncated, or not a rule.
-    """
+    """Return the text in the header of a file that `save_rule` wrote, all of it."""
     try:
         return _read_header(checked_path(path))
     except NPAError as error:
@@ -237,11 +230,7 @@ def rule_digest(rule: NPARule) -> str:
 
 
 def rule_file(source: str | Path) -> Path:
-    """Return the file of a rule.
-
-    Raises:
-        NPAError: The name is unknown, it is no such path, or a folder without one rule.
-    """
+    """Return the file of a rule."""
     return _locate(source)[0]
 
 
