@@ -25,12 +25,7 @@ PICTURE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp")
 
 
 def named_targets(targets: Sequence[str]) -> dict[str, str]:
-    """Return what a list of targets holds: name -> what `load_target` takes, in their order.
-
-    Args:
-        targets: Built-in names, emoji, picture files, and folders, which stand for the pictures in
-            them, sorted by name. A file's name is its own without suffix.
-    """
+    """Return what targets hold: name -> what `load_target` takes; a folder stands for its files."""
     named: dict[str, str] = {}
     for target in targets:
         for source in _pictures_of(target):
@@ -63,9 +58,6 @@ class ManyPictures(Morphogenesis2D):
 
     A world's goal is the place of its target among `targets`. Particles of all targets are drawn
     equally large, and pictures are scaled so that each target's density is about 1.
-
-    Raises:
-        NPAError: There are no targets, one cannot be loaded, or the rule is to know no direction.
     """
 
     def __init__(

@@ -11,14 +11,20 @@ from typing import Any, Self
 import torch
 from torch import Tensor
 
-from npa_envs.checks import check_flag, check_non_negative, check_positive, check_text
-from npa_envs.errors import NPAError, shown
+from npa_envs.checks import (
+    are_texts,
+    check_field,
+    check_flag,
+    check_non_negative,
+    check_positive,
+    check_text,
+)
+from npa_envs.errors import NPAError
 from npa_envs.ops import splat, world_mean
 from npa_envs.ops.pictures.losses import picture_losses
 from npa_envs.rule.rule import COLOUR_OFFSET, LIFE, NPARule
-from npa_envs.tasks.base import Worlds
+from npa_envs.tasks.base import GrowthConfig, GrowthTask, Worlds
 from npa_envs.tasks.damage import damage_pool
-from npa_envs.tasks.growth import GrowthConfig, GrowthTask
 from npa_envs.tasks.targets.images import LARGEST_POINT_COUNT
 from npa_envs.tasks.targets.points import PointTarget, load_target
 from npa_envs.tasks.train_config import TrainConfig, fast_run, tiny_run
@@ -115,10 +121,13 @@ class Morphogenesis2DConfig(GrowthConfig):
         check_non_negative(self, "splat_weight", "colour_weight", "drift_weight")
         check_non_negative(self, "seed_axis", "seed_across")
         check_flag(self, "equivariant", "chiral", "encoder", "division", "keep_background")
-        self._check_targets()
+        rule, cure = "be a tuple of names, emoji, files or folders", "targets=('gecko', 'heart')"
+        check_field(self, "targets", are_texts(self.targets), rule, f"for example {cure}")
+        check_positive(self, int, "code_dim", at_most=LARGEST_CODE)
+        check_non_negative(self, "switch_share", at_most=1.0)
         check_positive(self, int, "angles", at_least=0)
-        if 0 < self.angles < 4:
-            raise NPAError(f"angles must be 0 or at least 4, got {self.angles}: the usual 16 do")
+        few = 0 < self.angles < 4
+        check_field(self, "angles", not few, "be 0 or at least 4", "the usual 16 do")
         upright = self.seed_across > 0.0 or (self.chiral and self.seed_axis > 0.0)
         if self.equivariant and self.angles == 0 and not upright:
             raise NPAError(
@@ -131,18 +140,6 @@ class Morphogenesis2DConfig(GrowthConfig):
                 "division goes neither with equivariant, because one particle has no axis, nor "
                 "with targets: leave them out"
             )
-
-    def _check_targets(self) -> None:
-        targets = self.targets
-        if not isinstance(targets, tuple) or not all(isinstance(t, str) and t for t in targets):
-            raise NPAError(
-                f"targets must be a tuple of names, emoji, files or folders, got {shown(targets)}: "
-                "for example targets=('gecko', 'heart')"
-            )
-        check_positive(self, int, "code_dim", at_most=LARGEST_CODE)
-        check_non_negative(self, "switch_share")
-        if self.switch_share > 1.0:
-            raise NPAError(f"switch_share must be at most 1, got {self.switch_share}: try 0.1")
 
     def with_particle_count(self, particle_count: int) -> Morphogenesis2DConfig:
         """Return the same task with another number of particles, and of the target's points."""
@@ -172,9 +169,6 @@ class Morphogenesis2D(GrowthTask[Morphogenesis2DConfig]):
     """The task of arXiv 2601.16096, section 4.1, with its loss.
 
     Of a rule of many pictures, `for_rule` gives the task of one of them.
-
-    Raises:
-        NPAError: The target cannot be loaded.
     """
 
     metric_name = "splat loss"
@@ -216,11 +210,7 @@ class Morphogenesis2D(GrowthTask[Morphogenesis2DConfig]):
         return self.with_code(codes.encode(self.target_picture[None].to(codes.table))[0])
 
     def with_code(self, code: Tensor) -> Self:
-        """Return the task whose fresh worlds carry a code, in front of the other states.
-
-        Args:
-            code: Dimensionless, shape [K].
-        """
+        """Return the task whose fresh worlds carry a code [K], in front of the other states."""
         return self._with(_code=code.detach())
 
     def seed(
@@ -381,10 +371,7 @@ class Morphogenesis2D(GrowthTask[Morphogenesis2DConfig]):
         """Return the turn of each world around its mean that brings it closest to the target.
 
         Angles are tried evenly spread, and then finer near the best. Where the rule is not chiral
-        mirrored worlds are tried too.
-
-        Returns:
-            Matrices, shape [B, 2, 2]; without gradient. Where no angles are tried, the identity.
+        mirrored worlds are tried too. Matrices, [B, 2, 2]; where no angles are tried, the identity.
         """
         config = self.config
         if config.angles == 0:

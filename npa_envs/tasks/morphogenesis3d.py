@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from npa_envs.checks import (
+    check_field,
     check_fraction,
     check_non_negative,
     check_positive,
@@ -22,8 +23,7 @@ from npa_envs.errors import NPAError
 from npa_envs.ops import Cameras, world_mean
 from npa_envs.rule.rule import NPARule
 from npa_envs.tasks.appearance import OUTPUTS, Appearance, Gaussians, draw_gaussians
-from npa_envs.tasks.base import shares_of_loss
-from npa_envs.tasks.growth import GrowthConfig, GrowthTask
+from npa_envs.tasks.base import GrowthConfig, GrowthTask, shares_of_loss
 from npa_envs.tasks.losses.similarity import MultiScaleSimilarity
 from npa_envs.tasks.targets.views import ViewTarget, load_views, nearest_camera, over, some_views
 from npa_envs.tasks.train_config import TrainConfig, fast_run, tiny_run
@@ -111,8 +111,7 @@ class Morphogenesis3DConfig(GrowthConfig):
         check_fraction(self, "opacity")
         check_non_negative(self, "anisotropy", "blur_sigma")
         check_non_negative(self, "view_weight", "ssim_weight", "isotropy_weight")
-        if self.opacity == 1.0:
-            raise NPAError("opacity must lie below 1, got 1: for example opacity=0.99")
+        check_field(self, "opacity", self.opacity < 1.0, "lie below 1", "for example opacity=0.99")
         check_seed(self, "view_seed", bits=31)
 
 
@@ -128,10 +127,6 @@ class Morphogenesis3D(GrowthTask[Morphogenesis3DConfig]):
 
     As it is, the last three channels of a state are its colour and particles are round; `for_rule`
     gives the task that sees what a rule reads out of the states.
-
-    Raises:
-        NPAError: The target cannot be loaded, or its views have another size.
-        MissingDependencyError: The library that reads a mesh file is not installed.
     """
 
     space_dim = 3
@@ -287,12 +282,6 @@ class ViewSchedule:
 
     All follow from the seed and the iteration alone, so a resumed run goes on as it would have; the
     tensors stay the same ones, so a recorded graph reads what was written last.
-
-    Args:
-        view_count: Views to choose from.
-        chosen_count: Views of an iteration, all different; at most `view_count`.
-        blur_sigma: Standard deviation of the blur at first [pixels].
-        blur_iterations: Iterations after which there is none; it goes evenly.
     """
 
     def __init__(
@@ -335,10 +324,7 @@ def blurred(pictures: Tensor, sigma: Tensor) -> Tensor:
     """Return pictures blurred by a Gaussian; beyond their edges they are 0.
 
     Two products with a matrix of weights: the standard deviation may change without the host
-    knowing it, and one of 0 leaves the pictures as they are, bit for bit.
-
-    Args:
-        sigma: Standard deviation [pixels], shape [].
+    knowing it [pixels], and one of 0 leaves the pictures as they are, bit for bit.
     """
     rows, columns = (_weights(size, sigma, pictures) for size in pictures.shape[1:3])
     across = torch.einsum("xw,vhwk->vhxk", columns, pictures)

@@ -81,10 +81,8 @@ class PointClassificationConfig(TaskConfig):
         check_seed(self, "sample_seed")
         check_positive(self, int, "readout_hidden_dim")
         check_positive(self, int, "class_count", at_least=2)
-        check_non_negative(self, "rotation", "stretch", "jitter", "mutated_share")
-        for name in ("stretch", "mutated_share"):
-            if getattr(self, name) > 1.0:
-                raise NPAError(f"{name} must be at most 1, got {getattr(self, name)}: try 0.1")
+        check_non_negative(self, "rotation", "jitter")
+        check_non_negative(self, "stretch", "mutated_share", at_most=1.0)
 
 
 SIGMA = 0.7
@@ -248,11 +246,7 @@ class PointClassification(ParticleTask[PointClassificationConfig]):
         return (self.outputs(s).argmax(dim=-1) != self.wanted[:, None]).to(s.dtype)
 
     def cross_entropies(self, s: Tensor, sharpness: float) -> Tensor:
-        """Return each particle's cross-entropy of softmax(sharpness × outputs), [B, N].
-
-        Args:
-            sharpness: How surely outputs are taken as probabilities (dimensionless).
-        """
+        """Return each particle's cross-entropy of softmax(sharpness × outputs), [B, N]."""
         chances = torch.log_softmax(sharpness * self.outputs(s), dim=-1)
         wanted = self.wanted[:, None, None].expand(*s.shape[:2], 1)
         return -chances.gather(-1, wanted).squeeze(-1)
@@ -364,11 +358,7 @@ def class_colours(outputs: Tensor) -> Tensor:
 
 
 def channel_mean(values: Tensor) -> Tensor:
-    """Return the mean over the last dimension, rounded alike in every batch.
-
-    Args:
-        values: Shape [..., K].
-    """
+    """Return the mean over the last dimension, rounded alike in every batch, [...]."""
     # One by one: torch's mean may round otherwise in another batch.
     total, *rest = values.unbind(-1)
     for term in rest:

@@ -12,13 +12,14 @@ import torch
 from torch import Tensor
 
 from npa_envs.checks import (
+    check_field,
     check_flag,
     check_non_negative,
     check_positive,
     check_seed,
     check_text,
 )
-from npa_envs.errors import NPAError, shown
+from npa_envs.errors import NPAError
 from npa_envs.ops import periodic_splat
 from npa_envs.rule.rule import COLOUR_OFFSET
 from npa_envs.tasks.base import ParticleTask, TaskConfig, Worlds, shares_of_loss
@@ -96,19 +97,17 @@ class TextureConfig(TaskConfig):
         check_flag(self, "target_tiles", "see_across")
         check_loss_name(self.loss)
         check_seed(self, "loss_seed")
-        if not isinstance(self.vgg_weights, str):
-            raise NPAError(f"vgg_weights must be a path as a string, got {shown(self.vgg_weights)}")
+        is_text = isinstance(self.vgg_weights, str)
+        check_field(self, "vgg_weights", is_text, "be a path as a string")
         check_positive(self, int, "state_dim", at_least=3)
         check_positive(self, int, "resolution", at_least=12)
         check_positive(self, float, "alpha", "box_size", "sigma")
         check_non_negative(
             self, "damage_radius", "colour_weight", "density_weight", "motion_weight"
         )
-        if self.box_size < 2.0 * self.eps:
-            raise NPAError(
-                f"box_size must be at least 2 eps = {2.0 * self.eps:g}, got {self.box_size}: "
-                "enlarge the box or perceive at a smaller eps"
-            )
+        rule = f"be at least 2 eps = {2.0 * self.eps:g}"
+        cure = "enlarge the box or perceive at a smaller eps"
+        check_field(self, "box_size", self.box_size >= 2.0 * self.eps, rule, cure)
 
 
 LARGEST_EPS = 0.3
@@ -131,11 +130,7 @@ DRAWINGS = 16
 
 
 class Texture(ParticleTask[TextureConfig]):
-    """The texture task of arXiv 2601.16096, with its loss.
-
-    Raises:
-        NPAError: The target cannot be loaded.
-    """
+    """The texture task of arXiv 2601.16096, with its loss."""
 
     def __init__(
         self,
@@ -203,13 +198,9 @@ class Texture(ParticleTask[TextureConfig]):
         return self.splat(x, s[..., -3:] + COLOUR_OFFSET)
 
     def drawing(self, number: int, *, shifted: bool = True) -> Tensor:
-        """Return the target as particles draw it: a jittered lattice of them, with its colours.
+        """Return the target as a jittered lattice of particles draws it, shape [1, R, R, 4].
 
-        Args:
-            shifted: Whether the target is moved round the box, so that another part is cut out.
-
-        Returns:
-            Colour sums and density, dimensionless, shape [1, R, R, 4].
+        It is moved round the box if `shifted`, so that another part is cut out.
         """
         side, resolution = self.config.box_size, self.config.resolution
         generator = torch.Generator().manual_seed(number)
@@ -338,11 +329,7 @@ class Texture(ParticleTask[TextureConfig]):
 
 
 def colour_image(channels: Tensor) -> Tensor:
-    """Return colours as they are compared, and shown: where particles overlap, their mean.
-
-    Returns:
-        Red, green and blue, shape [..., 3, R, R]; black where nothing is.
-    """
+    """Return colours [..., 3, R, R] as they are compared: where particles overlap, their mean."""
     sums, density = channels[..., :3, :, :], channels[..., 3:, :, :]
     return sums / density.clamp_min(1.0)
 

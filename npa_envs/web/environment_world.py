@@ -16,8 +16,16 @@ from npa_envs.rule.files import load_rule
 from npa_envs.rule.rule import COLOUR_OFFSET
 from npa_envs.tasks.base import Task
 from npa_envs.tasks.damage import DAMAGE_SIZES, damage_worlds
-from npa_envs.web.colouring import ColouredWorld, Colouring, shows_of
-from npa_envs.web.live import LiveWorld, Touch, WorldView, brushed, checked_seed
+from npa_envs.web.live import (
+    ColouredWorld,
+    Colouring,
+    LiveWorld,
+    Touch,
+    WorldView,
+    brushed,
+    checked_seed,
+    shows_of,
+)
 from npa_envs.world.brushes import nearest_image
 
 

@@ -21,15 +21,11 @@ from npa_envs.files import atomic_path, checked_path
 from npa_envs.rule.files import load_rule
 from npa_envs.rule.rule import NPARule, check_rule
 from npa_envs.tasks.point_classification import PALETTE, UNDECIDED, PointClassification
-from npa_envs.web.colouring import colour_ramp
-from npa_envs.web.live import checked_seed
+from npa_envs.web.live import checked_seed, colour_ramp
 from npa_envs.web.rule_world import RuleWorld, name_of
 
 PAGE = Path(__file__).resolve().parent / "page"
 """The folder of the page's own files."""
-
-STYLES = ("page.css", "exported.css")
-"""Style sheets of the exported page."""
 
 PREVIEW_STEPS = 256
 """Steps of a world before its preview; half as many for textures and clouds."""
@@ -257,7 +253,7 @@ def page_text(rules: Sequence[Mapping[str, Any]], *, title: str, seed: int = 0) 
     data = json.dumps(settings, separators=(",", ":")).replace("<", "\\u003c")
     worker = f"{joined_modules(['live_world.js'])}\nlive_world.serve(self);\n"
     code = f"{joined_modules(['exported.js'])}\nexported.begin();\n"
-    style = "\n".join((PAGE / name).read_text(encoding="utf-8") for name in STYLES)
+    style = (PAGE / "page.css").read_text(encoding="utf-8")
     policy = POLICY.format(scripts=_digest(code), styles=_digest(style))
     page = (PAGE / "index.html").read_text(encoding="utf-8")
     limits = f'<meta http-equiv="Content-Security-Policy" content="{policy}">'

@@ -16,12 +16,10 @@ from torch import Tensor
 
 from npa_envs.checks import is_real, is_whole
 from npa_envs.errors import NPAError, shown, suggest
-from npa_envs.files import open_regular, parse_json
+from npa_envs.files import parse_json, read_bytes
 from npa_envs.rule.files import load_rule, rule_file, rule_metadata, shipped_rules
 from npa_envs.rule.rule import NPARule
-from npa_envs.tasks.base import (
-    Task,
-)
+from npa_envs.tasks.base import Task
 from npa_envs.tasks.co_morphogenesis2d import CoMorphogenesis2DConfig
 from npa_envs.tasks.damage import DAMAGE_SIZES, damage_worlds
 from npa_envs.tasks.seeds import uniform_ball
@@ -30,8 +28,17 @@ from npa_envs.training.overrides import load_config
 from npa_envs.training.presets import preset
 from npa_envs.training.run_folder import LARGEST_LOG, RunFolder
 from npa_envs.training.trained_tasks import TrainedTask, task_of_rule, trained_config
-from npa_envs.web.colouring import ColouredWorld, Colouring, shows_of
-from npa_envs.web.live import LiveWorld, Range, Touch, WorldView, brushed, checked_seed
+from npa_envs.web.live import (
+    ColouredWorld,
+    Colouring,
+    LiveWorld,
+    Range,
+    Touch,
+    WorldView,
+    brushed,
+    checked_seed,
+    shows_of,
+)
 from npa_envs.world.brushes import inside_ball, removed, wipe_state
 from npa_envs.world.division import living
 from npa_envs.world.rollout import at_rest, rollout
@@ -449,8 +456,10 @@ class FollowedLog:
     def __init__(self, path: Path) -> None:
         self._path = path
         self._seen: tuple[int, ...] = ()
-        self._end = 0
-        self._last_line = b""
+        self._forget()
+
+    def _forget(self) -> None:
+        self._text = b""
         self.iteration = -1
         """Iteration of the last record, or -1."""
 
@@ -464,29 +473,22 @@ class FollowedLog:
         if (seen := (now.st_ino, now.st_size, now.st_mtime_ns)) == self._seen:
             return [], False
         self._seen = seen
-        with open_regular(self._path, limit=LARGEST_LOG, what="the log") as file:
-            file.seek(self._end - len(self._last_line))
-            if file.read(len(self._last_line)) != self._last_line:
-                # The run was resumed from a checkpoint, or another one has begun in its folder.
-                self._forget()
-                file.seek(0)
-            text = file.read(LARGEST_LOG)
+        text = read_bytes(self._path, limit=LARGEST_LOG, what="the log")
         # The last line is complete once it ends with a newline.
         text = text[: text.rfind(b"\n") + 1]
+        if not text.startswith(self._text):
+            # The run was resumed from a checkpoint, or another one has begun in its folder.
+            self._forget()
+        lines, self._text = text[len(self._text) :].splitlines(), text
         anew = self.iteration < 0
         records = []
-        for line in text.splitlines(keepends=True):
-            self._end += len(line)
-            self._last_line = line
+        for line in lines:
             with contextlib.suppress(NPAError):
                 record = parse_json(line)
                 if isinstance(record, dict) and is_whole(record.get("iteration")):
                     self.iteration = record["iteration"]
                     records.append(record)
         return records, anew
-
-    def _forget(self) -> None:
-        self._end, self._last_line, self.iteration = 0, b"", -1
 
 
 class RunWorld(RuleWorld):

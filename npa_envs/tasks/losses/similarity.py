@@ -45,12 +45,7 @@ class MultiScaleSimilarity:
         self._halvings = [_halving(size).to(device) for size in sizes[:-1]]
 
     def __call__(self, found: Tensor, wanted: Tensor) -> Tensor:
-        """Return the similarity of each picture, at most 1, shape [...].
-
-        Args:
-            found: Pictures of one channel, shape [..., R, R].
-            wanted: What they are to be, of a shape that spreads to theirs.
-        """
+        """Return how alike pictures [..., R, R] of one channel are, at most 1, shape [...]."""
         total = found.new_zeros(found.shape[:-2])
         last = len(WEIGHTS) - 1
         for size, (weight, window) in enumerate(zip(WEIGHTS, self._windows, strict=True)):

@@ -175,11 +175,9 @@ OVERSAMPLING = 4
 
 
 def draw_pattern(name: str, resolution: int, *, seed: int = 0) -> Array:
-    """Draw a built-in texture.
+    """Draw a texture: colours times alpha, and alpha, float64, [R, R, 4]; rows point up.
 
-    Returns:
-        Red, green and blue, each times alpha, and alpha, float64, shape [R, R, 4]; pixel r is
-        centred at (r + 1/2) / R, and rows point up.
+    Pixel r is centred at (r + 1/2) / R.
     """
     if name not in PATTERNS:
         raise NPAError(f"unknown texture {shown(name)}: {suggest(name, PATTERNS)}")

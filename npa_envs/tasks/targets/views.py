@@ -112,12 +112,7 @@ def load_views(
 def views_of_mesh(
     mesh: Mesh, name: str, resolution: int, training_count: int, held_out_count: int
 ) -> ViewTarget:
-    """Draw a mesh that fits into the ball of radius 0.85 from cameras all around.
-
-    Args:
-        training_count: Views to train with.
-        held_out_count: Views to measure by.
-    """
+    """Draw a mesh that fits into the ball of radius 0.85 from cameras all around."""
     views = []
     for count, turn in ((training_count, 0.0), (held_out_count, 0.5)):
         cameras = surrounding_cameras(count, resolution, turn=turn)
@@ -129,10 +124,7 @@ def surrounding_cameras(count: int, resolution: int, *, turn: float = 0.0) -> Ca
     """Return cameras evenly spread over a sphere around the origin, which they look at.
 
     They lie on a Fibonacci spiral from below to above, so that any number of them is spread evenly.
-
-    Args:
-        count: Cameras V.
-        turn: The spiral is turned by so much of a full turn: others than those at 0.
+    The spiral is turned by a share `turn` of a full turn.
     """
     k = torch.arange(count, dtype=torch.float64)
     height = (2.0 * k + 1.0) / count - 1.0
@@ -150,11 +142,7 @@ def surrounding_cameras(count: int, resolution: int, *, turn: float = 0.0) -> Ca
 
 
 def over(views: Tensor, background: Tensor) -> Tensor:
-    """Return colours before a background, shape [..., 3].
-
-    Args:
-        background: Red, green and blue; broadcasts to [..., 3].
-    """
+    """Return colours before a background [..., 3], shape [..., 3]."""
     return views[..., :3] + (1.0 - views[..., 3:]) * background
 
 
@@ -171,11 +159,7 @@ def some_views(views: Views, index: Tensor) -> Views:
 
 
 def nearest_camera(cameras: Cameras, elevation: float) -> int:
-    """Return which camera looks at the origin from nearest to the front, at an elevation.
-
-    Args:
-        elevation: Above the horizon [degrees]; the front is where z points to.
-    """
+    """Return which camera is nearest to the front, where z points, at an elevation [degrees]."""
     motions = cameras.world_to_camera.double().cpu()
     places = -(motions[:, :3, :3].mT @ motions[:, :3, 3:])[..., 0]
     tilt = math.radians(elevation)
@@ -208,12 +192,7 @@ class _Split:
 def read_nerf(
     folder: Path, resolution: int, training_count: int, held_out_count: int
 ) -> ViewTarget:
-    """Read a scene; `load_views` says what becomes of it.
-
-    Args:
-        training_count: Views to train with, at most.
-        held_out_count: Views to measure by, at most.
-    """
+    """Read a scene; `load_views` says what becomes of it."""
     held_out = next((folder / name for name in HELD_OUT if (folder / name).is_file()), None)
     if held_out is None:
         raise NPAError(
