@@ -109,6 +109,7 @@ class ParticleTask(Generic[ConfigT]):
     """Whether particles that stay where they are say what their cloud shows."""
 
     _target_picture: Tensor | None = None
+    _pixel_size: float | None = None
 
     @property
     def eps(self) -> float:
@@ -131,6 +132,11 @@ class ParticleTask(Generic[ConfigT]):
         open_space = 1.1 if self.space_dim == 2 else 0.95
         half_width = open_space if self.box is None else 0.5 * min(self.box)
         return Frame((0.0,) * self.space_dim, half_width)
+
+    @property
+    def pixel_size(self) -> float:
+        """Usual distance between particles: the side of what one fills [length units]."""
+        return self._pixel_size or (0.1 / self.config.particle_count) ** (1.0 / 3.0)
 
     @property
     def target_picture(self) -> Tensor:

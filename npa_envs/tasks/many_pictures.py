@@ -89,11 +89,6 @@ class ManyPictures(Morphogenesis2D):
         self._target_mean = torch.zeros_like(self._target_mean)
 
     @property
-    def pixel_size(self) -> float:
-        """Size of a particle in pictures, a mean of the targets' [length units]."""
-        return self._pixel_size
-
-    @property
     def rule_shape(self) -> dict[str, Any]:
         """Further arguments of `NPARule`: all but hidden width and ε0."""
         config = self.config

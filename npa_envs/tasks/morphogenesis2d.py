@@ -409,7 +409,7 @@ class Morphogenesis2D(GrowthTask[Morphogenesis2DConfig]):
             self.target_picture,
             goal=self._target_mean,
             shift=COLOUR_OFFSET,
-            pixel_size=self._pixel_size,
+            pixel_size=self.pixel_size,
             sigma=self.config.sigma,
         )
 
@@ -429,7 +429,7 @@ class Morphogenesis2D(GrowthTask[Morphogenesis2DConfig]):
             x,
             colour,
             resolution=self.config.resolution,
-            pixel_size=self._pixel_size,
+            pixel_size=self.pixel_size,
             sigma=self.config.sigma,
         )
 

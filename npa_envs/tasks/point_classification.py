@@ -147,7 +147,7 @@ class PointClassification(ParticleTask[PointClassificationConfig]):
 
     @property
     def pixel_size(self) -> float:
-        """Side of the square that a particle fills [length units]."""
+        """Usual distance between particles: the side of what one fills [length units]."""
         return math.sqrt(self.clouds.coverage / self.config.particle_count)
 
     @property

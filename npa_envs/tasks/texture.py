@@ -161,9 +161,8 @@ class Texture(ParticleTask[TextureConfig]):
         """What worlds are to look like."""
         self._target_picture = target.picture.to(device)
         self.metric_name = config.loss
-        self.pixel_size: float = config.box_size * (target.coverage / config.particle_count) ** 0.5
-        """Side of the square that a particle fills [length units]: all together have the target's
-        mean density."""
+        # All particles together have the target's mean density.
+        self._pixel_size = config.box_size * (target.coverage / config.particle_count) ** 0.5
 
     @property
     def box(self) -> tuple[float, float]:

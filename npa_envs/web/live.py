@@ -81,9 +81,6 @@ class Range(NamedTuple):
         return {"value": value, "low": self.low, "high": self.high} | given
 
 
-SPEED = Range(1, MOST_STEPS, "log", whole=True)
-
-
 class LiveWorld(ABC):
     """A world that a page shows and changes while it runs."""
 
@@ -106,7 +103,7 @@ class LiveWorld(ABC):
             "type": "world",
             "shows": self._shows(),
             "show": self.show,
-            "settings": self._settings(),
+            "settings": {k: r.to_dict(getattr(self, k)) for k, r in self._ranges().items()},
             "playing": self.playing,
             "seed": self.seed,
         }
@@ -175,21 +172,23 @@ class LiveWorld(ABC):
     def _shows(self) -> list[str]: ...
 
     def _set(self, name: str, value: Any) -> bool:
+        ranges = self._ranges()
         match name:
-            case "speed":
-                self.speed = int(SPEED.checked("speed", value))
             case "show":
                 if value not in self._shows():
                     raise NPAError(f"unknown show {shown(value)}: {suggest(value, self._shows())}")
                 self.show = str(value)
             case "loss":
                 self._loss_wanted = checked_flag("loss", value)
+            case _ if name in ranges:
+                setattr(self, name, ranges[name].checked(name, value))
             case _:
-                raise NPAError(f"unknown setting {shown(name)}: {suggest(name, self._settings())}")
+                raise NPAError(f"unknown setting {shown(name)}: {suggest(name, ranges)}")
         return bool(name != "loss")
 
-    def _settings(self) -> dict[str, Any]:
-        return {"speed": SPEED.to_dict(self.speed)}
+    def _ranges(self) -> dict[str, Range]:
+        """Return the ranges of the attributes that the page sets, by name."""
+        return {"speed": Range(1, MOST_STEPS, "log", whole=True)}
 
     def _timed(self, steps: int) -> None:
         start = time.perf_counter()
