@@ -108,6 +108,13 @@ class ParticleTask(Generic[ConfigT]):
     classifies: bool = False
     """Whether particles that stay where they are say what their cloud shows."""
 
+    goal_count: int = 0
+    """Goals that a world may have; 0: none."""
+
+    _kept: tuple[str, ...] = ()
+    """Attributes that are arguments, too, and that a task of another size keeps."""
+
+    _goal: Tensor | None = None
     _target_picture: Tensor | None = None
     _pixel_size: float | None = None
 
@@ -191,11 +198,21 @@ class ParticleTask(Generic[ConfigT]):
         return self
 
     def toward(self, goal: Tensor | None) -> Self:
-        """Return the task with loss and metric for worlds of these goals; most have none.
+        """Return the task with loss and metric for worlds of these goals, int64, shape [B].
 
-        The tensor is read anew at each call. The task itself stays as it is.
+        Most have none. The tensor is read anew at each call. The task itself stays as it is.
         """
-        return self
+        if goal is None or self.goal_count == 0:
+            return self
+        check_goal(goal, self.goal_count)
+        return self._with(_goal=goal)
+
+    @property
+    def goal(self) -> Tensor:
+        """Goals of the worlds, int64, shape [B]."""
+        if self._goal is None:
+            raise NPAError("the worlds' goals must be given first: task.toward(goal), int64 [B]")
+        return self._goal
 
     def coded(self, s: Tensor) -> Tensor:
         """Return states with the code of each world, which damage takes away, where it has one.
@@ -210,12 +227,10 @@ class ParticleTask(Generic[ConfigT]):
 
     def resized(self, particle_count: int) -> Self:
         """Return the task with another number of particles; for a rule call `for_rule` again."""
-        return self._remade(self.config.with_particle_count(particle_count))
-
-    def _remade(self, config: ConfigT) -> Self:
-        """Return the task of another configuration, on the same device."""
         make: Any = type(self)
-        found: Self = make(config, device=self.target_picture.device)
+        kept = {name: getattr(self, name) for name in self._kept}
+        config = self.config.with_particle_count(particle_count)
+        found: Self = make(config, device=self.target_picture.device, **kept)
         return found
 
     def compare(self, x: Tensor, s: Tensor) -> tuple[Tensor, dict[str, Tensor]]:

@@ -13,12 +13,12 @@ from npa_envs.errors import NPAError, shown
 from npa_envs.files import home_path
 from npa_envs.rule.codes import Codes
 from npa_envs.rule.rule import NPARule
-from npa_envs.tasks.base import Worlds, check_goal
+from npa_envs.tasks.base import Worlds
 from npa_envs.tasks.morphogenesis2d import Morphogenesis2D, Morphogenesis2DConfig
-from npa_envs.tasks.seeds import drawn_indices
+from npa_envs.tasks.seeds import drawn_indices, drawn_worlds
 from npa_envs.tasks.targets.images import looks_like_path
 from npa_envs.tasks.targets.points import builtin_targets
-from npa_envs.world.randomness import Randomness, uniform_draws
+from npa_envs.world.randomness import Randomness
 
 PICTURE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp")
 """Files of a folder that are targets."""
@@ -80,7 +80,7 @@ class ManyPictures(Morphogenesis2D):
         sizes = torch.tensor([task.target.pixel_size for task in alone])
         self._pixel_size = float(sizes.square().mean().sqrt())
         self._scales = (sizes / self._pixel_size).square().to(device)
-        self._goal: Tensor | None = None
+        self.goal_count = len(named)
         self._codes: Codes | None = None
         drawn = [
             self._splat(task.target.points[None], task.target.colours[None])[0] for task in alone
@@ -109,13 +109,6 @@ class ManyPictures(Morphogenesis2D):
                 self._read_codes(rule.codes)
         return self._with(_codes=rule.codes)
 
-    def toward(self, goal: Tensor | None) -> Self:
-        """Return the task with loss and metric for worlds of these targets, int64, shape [B]."""
-        if goal is None:
-            return self
-        check_goal(goal, len(self.names))
-        return self._with(_goal=goal)
-
     def seed(
         self, world_count: int, *, generator: Randomness, device: str | torch.device = "cpu"
     ) -> Worlds:
@@ -134,15 +127,13 @@ class ManyPictures(Morphogenesis2D):
         if goal is None or self.config.switch_share == 0.0:
             return x, s, goal
         other = drawn_indices(len(self.names), len(x), generator, x.device)
-        single = x.new_empty(0, dtype=torch.float32)
-        switched = uniform_draws(generator, (len(x), 1), single)[:, 0] < self.config.switch_share
-        return x, s, torch.where(switched, other, goal)
+        return x, s, torch.where(drawn_worlds(x, generator, self.config.switch_share), other, goal)
 
     def coded(self, s: Tensor) -> Tensor:
         """Return states with the codes of their worlds' goals, differentiable in the codes."""
         if self._codes is None or self._goal is None:
             return s
-        return self._carrying(s, self._read_codes(self._codes), self._goal)
+        return self._carrying(s, self._read_codes(self._codes), self.goal)
 
     def _read_codes(self, codes: Codes) -> Tensor:
         """Return the targets' codes, those of an encoder as it is now, shape [T, K]."""
@@ -162,9 +153,7 @@ class ManyPictures(Morphogenesis2D):
     @property
     def target_picture(self) -> Tensor:
         """Pictures of the worlds' targets: rgb sums and density, shape [B, R, R, 4]."""
-        if self._goal is None:
-            raise NPAError("the worlds' targets must be given first: task.toward(goal), int64 [B]")
-        return self._target_pictures.index_select(0, self._goal)
+        return self._target_pictures.index_select(0, self.goal)
 
     def splat_losses(self, x: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
         """Return each world's density loss and colour loss, dimensionless, shape [B] each."""

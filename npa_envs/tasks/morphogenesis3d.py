@@ -132,6 +132,7 @@ class Morphogenesis3D(GrowthTask[Morphogenesis3DConfig]):
     space_dim = 3
     metric_name = "view loss"
     has_views = True
+    _kept = ("target",)
 
     def __init__(
         self,
@@ -142,9 +143,8 @@ class Morphogenesis3D(GrowthTask[Morphogenesis3DConfig]):
     ) -> None:
         self.config = config = config or Morphogenesis3DConfig()
         side = config.resolution
-        self._similarity = None
-        if config.ssim_weight > 0.0:
-            self._similarity = MultiScaleSimilarity(side, device=device)
+        compared = config.ssim_weight > 0.0
+        self._similarity = MultiScaleSimilarity(side, device=device) if compared else None
         if target is None:
             target = load_views(
                 config.target,
@@ -165,19 +165,9 @@ class Morphogenesis3D(GrowthTask[Morphogenesis3DConfig]):
         # The view that pictures show; rows point up.
         self._target_picture = self._shown.pictures[0].flip(0)
         self._appearance = Appearance(config.sigma, config.anisotropy, config.opacity)
-        self.schedule = ViewSchedule(
-            len(target.training.pictures),
-            config.views_per_iteration,
-            seed=config.view_seed,
-            blur_sigma=config.blur_sigma,
-            blur_iterations=config.blur_iterations,
-            device=device,
-        )
+        self.schedule = ViewSchedule(len(target.training.pictures), config, device)
         """Which views, how much blur and which backgrounds an iteration has."""
         self._rule: NPARule | None = None
-
-    def _remade(self, config: Morphogenesis3DConfig) -> Self:
-        return type(self)(config, target=self.target, device=self.target_picture.device)
 
     def for_rule(self, rule: NPARule) -> Self:
         """Return the task that sees what a rule reads out of the states; all else is shared."""
@@ -285,20 +275,10 @@ class ViewSchedule:
     """
 
     def __init__(
-        self,
-        view_count: int,
-        chosen_count: int,
-        *,
-        seed: int,
-        blur_sigma: float,
-        blur_iterations: int,
-        device: str | torch.device,
+        self, view_count: int, config: Morphogenesis3DConfig, device: str | torch.device
     ) -> None:
-        self._view_count = view_count
-        self._seed = seed
-        self._blur_sigma = blur_sigma
-        self._blur_iterations = blur_iterations
-        chosen_count = min(chosen_count, view_count)
+        self._view_count, self._config = view_count, config
+        chosen_count = min(config.views_per_iteration, view_count)
         self.index = torch.zeros(chosen_count, dtype=torch.int64, device=device)
         """Which views, shape [V]."""
         self.backgrounds = torch.zeros(chosen_count, 3, device=device)
@@ -309,15 +289,15 @@ class ViewSchedule:
 
     def begin(self, iteration: int) -> None:
         """Write what an iteration sees; the host does not wait for the device."""
-        random = np.random.default_rng((self._seed, iteration))
+        config = self._config
+        random = np.random.default_rng((config.view_seed, iteration))
         index = random.choice(self._view_count, len(self.index), replace=False)
         backgrounds = random.random(self.backgrounds.shape, dtype=np.float32)
-        left = max(0.0, 1.0 - iteration / self._blur_iterations)
-        sigma = np.array(self._blur_sigma * left, dtype=np.float32)
-        device = self.sigma.device
-        self.index.copy_(to_device_async(index.astype(np.int64), device))
-        self.backgrounds.copy_(to_device_async(backgrounds, device))
-        self.sigma.copy_(to_device_async(sigma, device))
+        left = max(0.0, 1.0 - iteration / config.blur_iterations)
+        sigma = np.array(config.blur_sigma * left, dtype=np.float32)
+        written = (self.index, index.astype(np.int64)), (self.backgrounds, backgrounds)
+        for tensor, values in (*written, (self.sigma, sigma)):
+            tensor.copy_(to_device_async(values, tensor.device))
 
 
 def blurred(pictures: Tensor, sigma: Tensor) -> Tensor:

@@ -16,8 +16,8 @@ from npa_envs.checks import check_non_negative, check_positive, check_seed, chec
 from npa_envs.errors import NPAError
 from npa_envs.ops import splat, world_mean
 from npa_envs.rule.rule import NPARule
-from npa_envs.tasks.base import Frame, ParticleTask, TaskConfig, Worlds, check_goal
-from npa_envs.tasks.seeds import drawn_indices
+from npa_envs.tasks.base import Frame, ParticleTask, TaskConfig, Worlds
+from npa_envs.tasks.seeds import drawn_indices, drawn_worlds
 from npa_envs.tasks.targets.clouds import (
     PointClouds,
     Split,
@@ -25,7 +25,7 @@ from npa_envs.tasks.targets.clouds import (
     varied,
 )
 from npa_envs.tasks.train_config import TrainConfig, fast_run, tiny_run
-from npa_envs.world.randomness import Randomness, uniform_draws
+from npa_envs.world.randomness import Randomness
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -102,6 +102,7 @@ class PointClassification(ParticleTask[PointClassificationConfig]):
     metric_name = "mean squared error to the class"
     trial_name = "share of particles that are wrong"
     classifies = True
+    _kept = ("split",)
 
     def __init__(
         self,
@@ -115,7 +116,7 @@ class PointClassification(ParticleTask[PointClassificationConfig]):
         """Which clouds worlds are made of."""
         self._device = torch.device(device)
         self._rule: NPARule | None = None
-        self._goal: Tensor | None = None
+        self.goal_count = config.class_count
         # There is no picture to match.
         side = config.resolution
         self._target_picture = torch.zeros(side, side, 4, device=self._device)
@@ -174,16 +175,6 @@ class PointClassification(ParticleTask[PointClassificationConfig]):
         """Return the task with the clouds of "test": those of "train" may be known by heart."""
         return self.on("test")
 
-    def _remade(self, config: PointClassificationConfig) -> Self:
-        return type(self)(config, device=self._device, split=self.split)
-
-    def toward(self, goal: Tensor | None) -> Self:
-        """Return the task with loss and metric for worlds of these classes, int64, shape [B]."""
-        if goal is None:
-            return self
-        check_goal(goal, self.config.class_count)
-        return self._with(_goal=goal)
-
     def seed(
         self, world_count: int, *, generator: Randomness, device: str | torch.device = "cpu"
     ) -> Worlds:
@@ -211,8 +202,7 @@ class PointClassification(ParticleTask[PointClassificationConfig]):
         if goal is None or share == 0.0:
             return x, s, goal
         other, _, other_goal = self.seed(len(x), generator=generator, device=x.device)
-        single = x.new_empty(0, dtype=torch.float32)
-        mutated = uniform_draws(generator, (len(x), 1), single)[:, 0] < share
+        mutated = drawn_worlds(x, generator, share)
         x = torch.where(mutated[:, None, None], other.to(x.dtype), x)
         assert other_goal is not None, "clouds come with their classes"
         return x, s, torch.where(mutated, other_goal, goal)
@@ -231,24 +221,17 @@ class PointClassification(ParticleTask[PointClassificationConfig]):
         """Return each particle's mean squared error to the one-hot of its world's class, [B, N]."""
         outputs = self.outputs(s)
         classes = torch.arange(self.config.class_count, device=s.device)
-        wanted = (self.wanted[:, None] == classes).to(outputs.dtype)
+        wanted = (self.goal[:, None] == classes).to(outputs.dtype)
         return channel_mean((outputs - wanted[:, None]).square())
-
-    @property
-    def wanted(self) -> Tensor:
-        """Classes of the worlds, int64, shape [B]."""
-        if self._goal is None:
-            raise NPAError("the worlds' classes must be given first: task.toward(goal), int64 [B]")
-        return self._goal
 
     def mistakes(self, s: Tensor) -> Tensor:
         """Return 1 for particles that say another class than their world's most loudly, [B, N]."""
-        return (self.outputs(s).argmax(dim=-1) != self.wanted[:, None]).to(s.dtype)
+        return (self.outputs(s).argmax(dim=-1) != self.goal[:, None]).to(s.dtype)
 
     def cross_entropies(self, s: Tensor, sharpness: float) -> Tensor:
         """Return each particle's cross-entropy of softmax(sharpness × outputs), [B, N]."""
         chances = torch.log_softmax(sharpness * self.outputs(s), dim=-1)
-        wanted = self.wanted[:, None, None].expand(*s.shape[:2], 1)
+        wanted = self.goal[:, None, None].expand(*s.shape[:2], 1)
         return -chances.gather(-1, wanted).squeeze(-1)
 
     def metric(self, x: Tensor, s: Tensor) -> Tensor:

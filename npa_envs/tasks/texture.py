@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Self
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -132,6 +132,8 @@ DRAWINGS = 16
 class Texture(ParticleTask[TextureConfig]):
     """The texture task of arXiv 2601.16096, with its loss."""
 
+    _kept = ("target",)
+
     def __init__(
         self,
         config: TextureConfig | None = None,
@@ -168,9 +170,6 @@ class Texture(ParticleTask[TextureConfig]):
     def box(self) -> tuple[float, float]:
         """Sides of the periodic box [length units]."""
         return (self.config.box_size, self.config.box_size)
-
-    def _remade(self, config: TextureConfig) -> Self:
-        return type(self)(config, target=self.target, device=self.target_picture.device)
 
     @property
     def rule_shape(self) -> dict[str, Any]:
