@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Any, Self
 
 import torch
@@ -27,7 +26,7 @@ from npa_envs.tasks.base import GrowthConfig, GrowthTask, Worlds
 from npa_envs.tasks.damage import damage_pool
 from npa_envs.tasks.targets.images import LARGEST_POINT_COUNT
 from npa_envs.tasks.targets.points import PointTarget, load_target
-from npa_envs.tasks.train_config import TrainConfig, fast_run, tiny_run
+from npa_envs.tasks.train_config import TrainConfig, fast_run, presets_of, tiny_run
 from npa_envs.world.division import living
 from npa_envs.world.randomness import Randomness, WorldRandom, uniform_draws
 
@@ -470,8 +469,6 @@ def _pixel_mean(errors: Tensor) -> Tensor:
 Morphogenesis2DTrainConfig = TrainConfig[Morphogenesis2DConfig]
 """A training run of 2D morphogenesis."""
 
-_OUT = Path("runs/morphogenesis2d")
-
 _TOGETHER: Mapping[str, Any] = {
     "escape_weight": 10.0,
     "bound_weight": 10.0,
@@ -490,10 +487,11 @@ HALF_SEEDS: Mapping[str, Any] = {
 }
 """What `fast` had before Muon: half of its worlds are seeds, and none has to rest."""
 
-MORPHOGENESIS2D_PRESETS: Mapping[str, Morphogenesis2DTrainConfig] = {
-    "paper": TrainConfig(task=Morphogenesis2DConfig(), out=_OUT),
+MORPHOGENESIS2D_PRESETS = presets_of(
+    "morphogenesis2d",
+    paper=TrainConfig(task=Morphogenesis2DConfig()),
     # Found by experiment on pictures that nobody tuned for: docs/recipes.md.
-    "best": TrainConfig(
+    best=TrainConfig(
         task=Morphogenesis2DConfig(
             escape_share=2e-4,
             damage_radius=0.2,
@@ -516,11 +514,10 @@ MORPHOGENESIS2D_PRESETS: Mapping[str, Morphogenesis2DTrainConfig] = {
         stillness_power=4.0,
         dead_zone=1e-3,
         initial_rule="heart-first",
-        out=_OUT,
     ),
     # A few particles that see far; of two worlds one is young, one grown and at rest:
     # docs/recipes.md.
-    "fast": fast_run(
+    fast=fast_run(
         Morphogenesis2DConfig(
             target_point_count=512,
             particle_count=512,
@@ -541,9 +538,8 @@ MORPHOGENESIS2D_PRESETS: Mapping[str, Morphogenesis2DTrainConfig] = {
         stillness_min_age=64,
         stillness_weight=2.0,
         picture_interval=200,
-        out=_OUT,
     ),
-    "tiny": tiny_run(
+    tiny=tiny_run(
         Morphogenesis2DConfig(
             target="ring",
             target_point_count=128,
@@ -555,8 +551,7 @@ MORPHOGENESIS2D_PRESETS: Mapping[str, Morphogenesis2DTrainConfig] = {
         iterations=40,
         steps=(8, 16),
         milestones=(30,),
-        out=_OUT,
     ),
-}
+)
 """2D morphogenesis: `paper` (arXiv 2601.16096), `best` (any picture, one run of minutes on a GPU),
 `fast` (minutes on one core), `tiny` (tests)."""

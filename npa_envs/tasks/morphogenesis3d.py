@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any, Self
 
 import numpy as np
@@ -26,7 +25,7 @@ from npa_envs.tasks.appearance import OUTPUTS, Appearance, Gaussians, draw_gauss
 from npa_envs.tasks.base import GrowthConfig, GrowthTask, shares_of_loss
 from npa_envs.tasks.losses.similarity import MultiScaleSimilarity
 from npa_envs.tasks.targets.views import ViewTarget, load_views, nearest_camera, over, some_views
-from npa_envs.tasks.train_config import TrainConfig, fast_run, tiny_run
+from npa_envs.tasks.train_config import TrainConfig, fast_run, presets_of, tiny_run
 from npa_envs.world.cuda_graph import to_device_async
 
 
@@ -320,8 +319,6 @@ def _weights(size: int, sigma: Tensor, like: Tensor) -> Tensor:
     return torch.exp(-0.5 * (place[:, None] - place).square() / variance) / whole
 
 
-_OUT = Path("runs/morphogenesis3d")
-
 _STRETCHED: Mapping[str, Any] = {
     "anisotropy": 1.0,
     "isotropy_weight": 0.02,
@@ -331,8 +328,9 @@ _STRETCHED: Mapping[str, Any] = {
 }
 """Particles that may stretch, and what keeps worlds together and heals clumps and cuts."""
 
-MORPHOGENESIS3D_PRESETS: Mapping[str, TrainConfig[Morphogenesis3DConfig]] = {
-    "paper": TrainConfig(
+MORPHOGENESIS3D_PRESETS = presets_of(
+    "morphogenesis3d",
+    paper=TrainConfig(
         task=Morphogenesis3DConfig(),
         iterations=20_000,
         repeats=1,
@@ -342,11 +340,10 @@ MORPHOGENESIS3D_PRESETS: Mapping[str, TrainConfig[Morphogenesis3DConfig]] = {
         learning_rate=1e-3,
         milestones=(2_000, 10_000),
         seed_interval=1,
-        out=_OUT,
     ),
     # Half as many particles, which see as many neighbours; half of a batch are seeds:
     # docs/morphogenesis3d.md.
-    "best": TrainConfig(
+    best=TrainConfig(
         task=Morphogenesis3DConfig(
             particle_count=8192,
             state_dim=24,
@@ -373,11 +370,10 @@ MORPHOGENESIS3D_PRESETS: Mapping[str, TrainConfig[Morphogenesis3DConfig]] = {
         fresh_share=0.5,
         damage_share=0.25,
         initial_rule="rocket-8192",
-        out=_OUT,
     ),
     # Of two worlds one is young, one grown and at rest, so that what has grown stays:
     # docs/morphogenesis3d.md.
-    "fast": fast_run(
+    fast=fast_run(
         Morphogenesis3DConfig(
             particle_count=768,
             hidden_dim=64,
@@ -406,10 +402,9 @@ MORPHOGENESIS3D_PRESETS: Mapping[str, TrainConfig[Morphogenesis3DConfig]] = {
         damage_share=0.5,
         stillness_min_age=48,
         stillness_weight=0.5,
-        out=_OUT,
         picture_interval=100,
     ),
-    "tiny": tiny_run(
+    tiny=tiny_run(
         Morphogenesis3DConfig(
             target="doughnut",
             particle_count=200,
@@ -430,8 +425,7 @@ MORPHOGENESIS3D_PRESETS: Mapping[str, TrainConfig[Morphogenesis3DConfig]] = {
         pool_size=4,
         steps=(6, 10),
         seed_interval=1,
-        out=_OUT,
     ),
-}
+)
 """`paper` (arXiv 2601.16096), `best` (any mesh, one run of minutes on a GPU), `fast` (on one core),
 `tiny` (tests)."""

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
-from pathlib import Path
 from typing import Any
 
 import torch
@@ -34,7 +32,7 @@ from npa_envs.tasks.losses.texture import (
 )
 from npa_envs.tasks.seeds import uniform_box
 from npa_envs.tasks.targets.textures import TextureTarget, load_texture
-from npa_envs.tasks.train_config import TrainConfig, tiny_run
+from npa_envs.tasks.train_config import TrainConfig, presets_of, tiny_run
 from npa_envs.world.randomness import Randomness
 
 
@@ -337,8 +335,6 @@ def density_image(density: Tensor) -> Tensor:
     return (density + DENSITY_FLOOR) ** DENSITY_POWER
 
 
-_OUT = Path("runs/texture")
-
 # Found by experiment: docs/textures.md. What is learned with 2048 particles holds for more.
 _BEST = TrainConfig(
     task=TextureConfig(
@@ -359,11 +355,11 @@ _BEST = TrainConfig(
     schedule="cosine",
     max_age_range=(64, 8192),
     damage_share=0.5,
-    out=_OUT,
 )
 
-TEXTURE_PRESETS: Mapping[str, TrainConfig[TextureConfig]] = {
-    "paper": TrainConfig(
+TEXTURE_PRESETS = presets_of(
+    "texture",
+    paper=TrainConfig(
         task=TextureConfig(loss="vgg_ot"),
         iterations=12_000,
         repeats=1,
@@ -371,11 +367,10 @@ TEXTURE_PRESETS: Mapping[str, TrainConfig[TextureConfig]] = {
         learning_rate=1e-4,
         weight_decay=0.1,
         milestones=(3_000, 6_000, 9_000),
-        out=_OUT,
     ),
-    "best": _BEST,
+    best=_BEST,
     # Three minutes on two cores.
-    "fast": replace(
+    fast=replace(
         _BEST,
         task=replace(_BEST.task, target="dots", particle_count=1024, hidden_dim=64, resolution=64),
         iterations=600,
@@ -385,12 +380,11 @@ TEXTURE_PRESETS: Mapping[str, TrainConfig[TextureConfig]] = {
         checkpoint_interval=200,
         tensorboard=False,
     ),
-    "tiny": tiny_run(
+    tiny=tiny_run(
         TextureConfig(target="dots", particle_count=256, hidden_dim=32, eps=0.3, resolution=24),
         steps=(8, 16),
         seed_interval=4,
-        out=_OUT,
     ),
-}
+)
 """Textures: `paper` (arXiv 2601.16096, needs VGG16's weights), `best` (any texture, one run of
 minutes on a GPU), `fast` (`best` in small, on a CPU), `tiny`."""

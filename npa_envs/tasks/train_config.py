@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Generic, Literal, TypeVar, get_args
 
@@ -362,3 +362,10 @@ def fast_run(task: TaskConfigT, **fields: Any) -> TrainConfig[TaskConfigT]:
 def tiny_run(task: TaskConfigT, **fields: Any) -> TrainConfig[TaskConfigT]:
     """Return a run of seconds, for tests."""
     return TrainConfig(task=task, **{**TINY, **fields})
+
+
+def presets_of(
+    task_name: str, **runs: TrainConfig[TaskConfigT]
+) -> Mapping[str, TrainConfig[TaskConfigT]]:
+    """Return the presets of a task, each with the task's folder of runs."""
+    return {name: replace(run, out=Path("runs") / task_name) for name, run in runs.items()}

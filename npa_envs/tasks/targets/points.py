@@ -120,25 +120,19 @@ def load_target_image(
             f"target must be a string or a Path, got {type(source).__name__}: "
             "for a Pillow picture in memory use target_from_image"
         )
-    name, image = _named_image(source, open_image if keep_background else read_image)
-    return name, with_background(image) if keep_background else image
-
-
-def _named_image(
-    source: str | Path, read: Callable[[Path], Image.Image]
-) -> tuple[str, Image.Image]:
-    """Return the name and the RGBA picture of a source; files are read by the function."""
     if isinstance(source, str) and source in DRAWINGS:
-        return source, _drawing(source).copy()
-    if isinstance(source, Path) or looks_like_path(source):
+        name, image = source, _drawing(source).copy()
+    elif isinstance(source, Path) or looks_like_path(source):
         path = home_path(source)
-        return path.stem, read(path)
-    if is_emoji(source):
-        return source, render_emoji(source)
-    raise NPAError(
-        "target must be a built-in name, the path of a picture file or one emoji, got "
-        f"{shown(source)}: {suggest(source, DRAWINGS)}"
-    )
+        name, image = path.stem, (open_image if keep_background else read_image)(path)
+    elif is_emoji(source):
+        name, image = source, render_emoji(source)
+    else:
+        raise NPAError(
+            "target must be a built-in name, the path of a picture file or one emoji, got "
+            f"{shown(source)}: {suggest(source, DRAWINGS)}"
+        )
+    return name, with_background(image) if keep_background else image
 
 
 @functools.cache
