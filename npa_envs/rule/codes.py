@@ -91,6 +91,12 @@ class Codes(nn.Module):
         return codes
 
 
+def carrying(states: Tensor, code: Tensor) -> Tensor:
+    """Return states [..., C] that begin with a code, of a shape that expands to [..., K]."""
+    carried = code.to(states).expand(*states.shape[:-1], code.shape[-1])
+    return torch.cat((carried, states[..., code.shape[-1] :]), dim=-1)
+
+
 def check_names(names: object) -> None:
     """Check that what codes are to be called is several texts."""
     several = isinstance(names, Collection) and not isinstance(names, str)

@@ -22,7 +22,7 @@ from npa_envs.checks import (
 )
 from npa_envs.errors import NPAError, shown
 from npa_envs.ops.equivariance import MIXED_VECTORS, VectorForm, invariants, signed_gates, steered
-from npa_envs.rule.codes import Codes, check_names
+from npa_envs.rule.codes import Codes, carrying, check_names
 from npa_envs.rule.network import (
     FOLD,
     FoldedInvariants,
@@ -473,13 +473,12 @@ class NPARule(nn.Module):
             )
         shape = (*states.shape[:-1], self.code_dim)
         try:
-            carried = code.to(states).expand(shape)
+            return carrying(states, code.expand(shape))
         except RuntimeError as error:
             raise NPAError(
                 f"code must have shape [K], [B, 1, K] or [B, N, K] for {shape}, got "
                 f"{tuple(code.shape)}"
             ) from error
-        return torch.cat((carried, states[..., self.code_dim :]), dim=-1)
 
     def _repr_html_(self) -> str:
         """Return what Jupyter shows: what the rule sees, what it does, how large it is."""

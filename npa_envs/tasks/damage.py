@@ -27,28 +27,17 @@ from npa_envs.tasks.seeds import drawn_indices, uniform_ball
 from npa_envs.world.brushes import clump, cut, wipe_state
 from npa_envs.world.randomness import Randomness, check_generator, normal_draws, uniform_draws
 
-__all__ = [
-    "CLUMP_FACTOR",
-    "DAMAGE_SIZES",
-    "DamageEvent",
-    "PoolDamage",
-    "clump",
-    "cut",
-    "damage_pool",
-    "damage_worlds",
-    "displace",
-    "escape_motion",
-    "parse_damage",
-    "random_particle",
-    "tear_off",
-    "wipe_state",
-]
-
 DAMAGE_SIZES = {"wipe": 0.2, "cut": 0.1, "clump": 0.2, "noise": 0.05}
 """Kinds of damage with their usual size: radius, gap, radius, standard deviation [length units]."""
 
 CLUMP_FACTOR = 0.9
 """Share of its distance from the centre that a particle loses when it is clumped."""
+
+
+def check_damage(kind: object) -> None:
+    """Check that there is such a kind of damage."""
+    if not isinstance(kind, str) or kind not in DAMAGE_SIZES:
+        raise NPAError(f"unknown damage {shown(kind)}: {suggest(kind, DAMAGE_SIZES)}")
 
 
 @dataclass(frozen=True)
@@ -66,8 +55,7 @@ class DamageEvent:
 
     def __post_init__(self) -> None:
         """Check every field."""
-        if not isinstance(self.kind, str) or self.kind not in DAMAGE_SIZES:
-            raise NPAError(f"unknown damage {shown(self.kind)}: {suggest(self.kind, DAMAGE_SIZES)}")
+        check_damage(self.kind)
         if not is_whole(self.step) or self.step < 0:
             raise NPAError(f"step must be a whole number of at least 0, got {shown(self.step)}")
         if not is_real(self.extent) or self.extent <= 0:
@@ -131,8 +119,7 @@ def damage_worlds(
     Raises:
         NPAError: An unknown kind, a wrong shape or dtype, or a size that is negative or not finite.
     """
-    if not isinstance(kind, str) or kind not in DAMAGE_SIZES:
-        raise NPAError(f"unknown damage {shown(kind)}: {suggest(kind, DAMAGE_SIZES)}")
+    check_damage(kind)
     check_world(x, s)
     check_generator(generator, x.device, x.shape[0])
     extent = DAMAGE_SIZES[kind] if size is None else checked_number("size", size)

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from npa_envs.errors import NPAError, shown
 from npa_envs.files import home_path
-from npa_envs.rule.codes import Codes
+from npa_envs.rule.codes import Codes, carrying
 from npa_envs.rule.rule import NPARule
 from npa_envs.tasks.base import Worlds
 from npa_envs.tasks.morphogenesis2d import Morphogenesis2D, Morphogenesis2DConfig
@@ -118,7 +118,7 @@ class ManyPictures(Morphogenesis2D):
         blank = s.new_zeros(*s.shape[:2], self.config.code_dim)
         s = torch.cat((blank, s), dim=-1)
         if self._codes is not None:
-            s = self._carrying(s, self._codes.table.detach(), goal)
+            s = carrying(s, self._codes.table.detach().index_select(0, goal)[:, None])
         return x, s, goal
 
     def damage(self, x: Tensor, s: Tensor, goal: Tensor | None, generator: Randomness) -> Worlds:
@@ -133,7 +133,7 @@ class ManyPictures(Morphogenesis2D):
         """Return states with the codes of their worlds' goals, differentiable in the codes."""
         if self._codes is None or self._goal is None:
             return s
-        return self._carrying(s, self._read_codes(self._codes), self.goal)
+        return carrying(s, self._read_codes(self._codes).index_select(0, self.goal)[:, None])
 
     def _read_codes(self, codes: Codes) -> Tensor:
         """Return the targets' codes, those of an encoder as it is now, shape [T, K]."""
@@ -144,11 +144,6 @@ class ManyPictures(Morphogenesis2D):
         with torch.no_grad():
             codes.table.copy_(read)
         return read
-
-    def _carrying(self, s: Tensor, table: Tensor, goal: Tensor) -> Tensor:
-        """Return states with the codes of goals."""
-        code = table.index_select(0, goal).to(s)[:, None].expand(-1, s.shape[1], -1)
-        return torch.cat((code, s[..., self.config.code_dim :]), dim=-1)
 
     @property
     def target_picture(self) -> Tensor:

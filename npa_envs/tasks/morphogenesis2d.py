@@ -21,6 +21,7 @@ from npa_envs.checks import (
 from npa_envs.errors import NPAError
 from npa_envs.ops import splat, world_mean
 from npa_envs.ops.pictures.losses import picture_losses
+from npa_envs.rule.codes import carrying
 from npa_envs.rule.rule import COLOUR_OFFSET, LIFE, NPARule
 from npa_envs.tasks.base import GrowthConfig, GrowthTask, Worlds
 from npa_envs.tasks.damage import damage_pool
@@ -28,7 +29,7 @@ from npa_envs.tasks.targets.images import LARGEST_POINT_COUNT
 from npa_envs.tasks.targets.points import PointTarget, load_target
 from npa_envs.tasks.train_config import TrainConfig, fast_run, presets_of, tiny_run
 from npa_envs.world.division import living
-from npa_envs.world.randomness import Randomness, WorldRandom, uniform_draws
+from npa_envs.world.randomness import Randomness, uniform_draws
 
 LARGEST_CODE = 1024
 """Numbers of a code, at most."""
@@ -223,11 +224,7 @@ class Morphogenesis2D(GrowthTask[Morphogenesis2DConfig]):
             s[:, 0, LIFE] = 1.0
             return torch.zeros_like(x), s, goal
         if config.equivariant and max(config.seed_axis, config.seed_across) > 0.0:
-            share = (
-                generator.uniform(1, dtype=x.dtype)
-                if isinstance(generator, WorldRandom)
-                else torch.rand(world_count, 1, generator=generator, device=x.device, dtype=x.dtype)
-            )
+            share = uniform_draws(generator, (world_count, 1), x)
             angle = 2.0 * math.pi * (share if config.angles > 0 else torch.zeros_like(share))
             cos, sin = angle.cos(), angle.sin()
             along = x[..., 0] * cos + x[..., 1] * sin
@@ -241,10 +238,7 @@ class Morphogenesis2D(GrowthTask[Morphogenesis2DConfig]):
 
     def coded(self, s: Tensor) -> Tensor:
         """Return states with the task's code, or as they are where it has none."""
-        if self._code is None:
-            return s
-        code = self._code.to(s).expand(*s.shape[:2], -1)
-        return torch.cat((code, s[..., len(self._code) :]), dim=-1)
+        return s if self._code is None else carrying(s, self._code)
 
     def damage(self, x: Tensor, s: Tensor, goal: Tensor | None, generator: Randomness) -> Worlds:
         """Return the worlds damaged; of one that divides particles die, but never all."""

@@ -21,7 +21,7 @@ from npa_envs.errors import NPAError
 from npa_envs.ops import periodic_splat
 from npa_envs.rule.rule import COLOUR_OFFSET
 from npa_envs.tasks.base import ParticleTask, TaskConfig, Worlds, shares_of_loss
-from npa_envs.tasks.damage import random_particle, wipe_state
+from npa_envs.tasks.damage import random_particle
 from npa_envs.tasks.losses.texture import (
     DEFAULT_LOSS,
     LossOptions,
@@ -33,6 +33,7 @@ from npa_envs.tasks.losses.texture import (
 from npa_envs.tasks.seeds import uniform_box
 from npa_envs.tasks.targets.textures import TextureTarget, load_texture
 from npa_envs.tasks.train_config import TrainConfig, presets_of, tiny_run
+from npa_envs.world.brushes import wipe_state
 from npa_envs.world.randomness import Randomness
 
 

@@ -19,7 +19,7 @@ from npa_envs.checks import is_real, is_whole
 from npa_envs.errors import NPAError, shown, suggest
 from npa_envs.ops import species_fields
 from npa_envs.render.colours import GOLDEN_ANGLE, STATE_CHROMA, STATE_GAIN, ramp, srgb
-from npa_envs.tasks.damage import DAMAGE_SIZES
+from npa_envs.tasks.damage import check_damage
 from npa_envs.world.brushes import clump, cut, inject, push, state_around
 
 MOST_STEPS = 64
@@ -130,10 +130,8 @@ class LiveWorld(ABC):
             case "brush":
                 return self._brush(message)
             case "damage":
-                name = message.get("name")
-                if not isinstance(name, str) or name not in DAMAGE_SIZES:
-                    raise NPAError(f"unknown damage {shown(name)}: {suggest(name, DAMAGE_SIZES)}")
-                self._damage(name)
+                check_damage(name := message.get("name"))
+                self._damage(str(name))
             case _:
                 known = ("play", "step", "reset", "set", "brush", "damage")
                 raise NPAError(f"unknown message {shown(kind)}: {suggest(kind, known)}")

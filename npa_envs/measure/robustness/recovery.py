@@ -15,8 +15,8 @@ from torch import Tensor
 
 from npa_envs.measure.robustness.trials import RuleTrial, TaskTrial, loss_curves
 from npa_envs.ops import world_mean
-from npa_envs.tasks.damage import DAMAGE_SIZES, clump, cut, random_particle, wipe_state
-from npa_envs.world.brushes import nearest_image, offsets_from
+from npa_envs.tasks.damage import DAMAGE_SIZES, random_particle
+from npa_envs.world.brushes import clump, cut, nearest_image, offsets_from, wipe_state
 from npa_envs.world.randomness import StreamId, WorldRandom
 
 STATE_NOISE = 0.3
