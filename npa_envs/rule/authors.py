@@ -20,6 +20,7 @@ from __future__ import annotations
 
 import base64
 import binascii
+import inspect
 import io
 import json
 import math
@@ -38,21 +39,8 @@ from npa_envs.files import check_torch_archive, checked_path, parse_json, write_
 from npa_envs.rule.rule import NPARule, check_rule
 
 _DEMO_SPACE_DIM = 2
-_DEMO_KIND = {
-    "space_dim": _DEMO_SPACE_DIM,
-    "static": False,
-    "readout_dim": 0,
-    "moment_correction": True,
-    "moment_inverse": "threshold",
-    "state_gradient": True,
-    "density_gradient": True,
-    "species_count": 0,
-    "equivariant": False,
-    "code_dim": 0,
-    "divides": False,
-    "dead_zone": 0.0,
-}
-"""What rules of the web demo are like; its files do not say it."""
+_DEMO_FREE = {"state_dim", "hidden_dim", "eps0", "alpha", "readout_hidden_dim", "mixed_vectors"}
+"""In these rules of the web demo may differ from `NPARule()`; its files do not hold the others."""
 
 DEMO_PARTICLE_COUNT = 4096
 """Particles of a world in the web demo where nothing else is said."""
@@ -323,12 +311,13 @@ def save_demo_json(
 
 def _demo_entry(name: str, rule: NPARule, particle_count: int) -> dict[str, Any]:
     check_rule(rule)
-    made = rule.hyper_parameters()
-    for field, wanted in _DEMO_KIND.items():
-        if made.get(field, wanted) != wanted:
+    defaults = inspect.signature(NPARule).parameters
+    for field, made in rule.hyper_parameters().items():
+        wanted = defaults[field].default
+        if field not in _DEMO_FREE and made != wanted:
             raise NPAError(
                 f"the authors' demo runs rules with {field}={wanted!r} only, {shown(name)} has "
-                f"{made[field]!r}: save it with npa_envs.save_rule"
+                f"{made!r}: save it with npa_envs.save_rule"
             )
     if not rule.is_plain():
         raise NPAError(

@@ -107,8 +107,13 @@ def load_rule(source: str | Path, *, device: str | torch.device = "cpu") -> NPAR
         else:
             parts = read_state_dict(read_bytes(path, limit=_LARGEST_FILE))
         rule = _assemble(parts)
-        if parts.header is not None:
-            _verify(parts.header, parts.weights)
+        header = parts.header
+        if header is not None and header.get("checksum") != _checksum(header, parts.weights):
+            raise NPAError(
+                "the checksum must be that of the weights and of the metadata, got another one: "
+                "the file is damaged, or another program has changed it; copy it again from where "
+                "it came"
+            )
     except NPAError as error:
         raise NPAError(f"cannot load a rule from {shown(str(source))}: {error}") from error
     if not parts.has_checksum:
@@ -160,15 +165,13 @@ def save_rule(
             "metadata={'trained by': 'me'}"
         )
     for name, text in (metadata or {}).items():
+        fault, cure = "", ""
         if not isinstance(name, str) or not isinstance(text, str):
-            raise NPAError(
-                f"metadata must map text to text, got {shown(name)}: {shown(text)}: use str()"
-            )
-        if not (_is_utf8(name) and _is_utf8(text)):
-            raise NPAError(
-                f"metadata must be text that UTF-8 can write, got {shown(name)}: {shown(text)}: "
-                "leave single surrogates out"
-            )
+            fault, cure = "map text to text", "use str()"
+        elif any("\ud800" <= letter <= "\udfff" for letter in name + text):
+            fault, cure = "be text that UTF-8 can write", "leave single surrogates out"
+        if fault:
+            raise NPAError(f"metadata must {fault}, got {shown(name)}: {shown(text)}: {cure}")
         if name in _RESERVED:
             raise NPAError(
                 f"metadata must not use the name {shown(name)}: the format holds it itself"
@@ -191,14 +194,6 @@ def _is_as_made(rule: NPARule) -> bool:
     for name, part in loaded.named_modules():
         if name and (type(own.get(name)) is not type(part) or is_altered(own[name])):
             return False
-    return True
-
-
-def _is_utf8(text: str) -> bool:
-    try:
-        text.encode()
-    except UnicodeEncodeError:
-        return False
     return True
 
 
@@ -317,15 +312,6 @@ def _checksum(header: Mapping[str, str], weights: Mapping[str, Tensor]) -> str:
     for _, tensor in sorted(weights.items()):
         found.update(tensor.numpy().tobytes())
     return found.hexdigest()
-
-
-def _verify(header: Mapping[str, str], weights: Mapping[str, Tensor]) -> None:
-    """Check that a file is as it was written."""
-    if header.get("checksum") != _checksum(header, weights):
-        raise NPAError(
-            "the checksum must be that of the weights and of the metadata, got another one: the "
-            "file is damaged, or another program has changed it; copy it again from where it came"
-        )
 
 
 def _parse(header: Mapping[str, str], name: str, kind: type) -> Any:

@@ -176,33 +176,21 @@ export class LiveWorld {
 
   // Does what a message of the page says.
   async receive(message) {
-    switch (message.type) {
-      case "drawn":
-        this.onTheWay = Math.max(0, this.onTheWay - 1);
-        return;
-      case "play":
-        this.playing = Boolean(message.on);
-        return;
-      case "step":
+    const acts = {
+      drawn: () => (this.onTheWay = Math.max(0, this.onTheWay - 1)),
+      play: () => (this.playing = Boolean(message.on)),
+      step: () => {
         this.playing = false;
-        await this.step();
-        break;
-      case "reset":
-        this.reset(message.seed ?? this.seed + 1);
-        break;
-      case "set":
-        this.set(message.name, message.value);
-        break;
-      case "brush":
-        this.brush(message);
-        break;
-      case "damage":
-        this.damage(message.name);
-        break;
-      default:
-        throw Error(`no message is called ${message.type}`);
-    }
-    this.changed = true;
+        return this.step();
+      },
+      reset: () => this.reset(message.seed ?? this.seed + 1),
+      set: () => this.set(message.name, message.value),
+      brush: () => this.brush(message),
+      damage: () => this.damage(message.name),
+    };
+    if (!Object.hasOwn(acts, message.type)) throw Error(`no message is called ${message.type}`);
+    await acts[message.type]();
+    if (message.type !== "drawn" && message.type !== "play") this.changed = true;
   }
 
   set(name, value) {
