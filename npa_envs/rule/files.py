@@ -248,7 +248,14 @@ def _locate(source: str | Path) -> tuple[Path, str | None]:
     if text in named:
         return named[text], None
     if os.path.isdir(text):
-        return _rule_in(Path(text)), None
+        rule = Path(text) / "rule.safetensors"
+        if rule.is_file():
+            return rule, None
+        others = sorted(Path(text).glob("rule-*.safetensors"))
+        cure = f"one of its rules, such as {str(others[0])!r}" if others else "another one"
+        raise NPAError(
+            f"a folder must hold the {rule.name} of a run, {text!r} does not: name {cure}"
+        )
     base, mark, name = text.rpartition("#")
     path, inner = (Path(base), name) if mark and base.endswith(".json") else (Path(text), None)
     if path.suffix in _SUFFIXES:
@@ -259,16 +266,6 @@ def _locate(source: str | Path) -> tuple[Path, str | None]:
         f"unknown rule {shown(text)}: {suggest(text, known)}; or give the path of a "
         f"file that ends in {suffixes}, or a run's folder"
     )
-
-
-def _rule_in(folder: Path) -> Path:
-    """Return the file of the rule in a training run's folder, which exists."""
-    rule = folder / "rule.safetensors"
-    if rule.is_file():
-        return rule
-    others = sorted(folder.glob("rule-*.safetensors"))
-    cure = f"name one of its rules, such as {str(others[0])!r}" if others else "name another one"
-    raise NPAError(f"a folder must hold the {rule.name} of a run, {str(folder)!r} does not: {cure}")
 
 
 def _read_header(path: Path) -> dict[str, str]:

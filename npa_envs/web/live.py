@@ -109,11 +109,7 @@ class LiveWorld(ABC):
         }
 
     def handle(self, message: Mapping[str, Any]) -> bool:
-        """Apply a message; return whether `describe` has changed.
-
-        Raises:
-            NPAError: The message is not valid. The world is unchanged.
-        """
+        """Apply a message, or none of a wrong one; return whether `describe` has changed."""
         kind = message.get("type") if isinstance(message, Mapping) else None
         match kind:
             case "play":

@@ -77,15 +77,7 @@ class LiveRule:
 class RuleWorld(LiveWorld):
     """A world of one rule, and of others that the brushes graft and add bring in.
 
-    Args:
-        source: The rule: a shipped one or a file.
-        device: The world's device.
-        seed: The seed of the first world.
-        particle_count: Particles N; None: as trained.
-        choices: Other rules that may be chosen, by their names; None: the shipped ones.
-
-    Raises:
-        NPAError: The rule cannot be loaded, or a number is out of its range.
+    The choices are other rules by their names: the shipped ones, unless some are given.
     """
 
     def __init__(
@@ -482,13 +474,7 @@ class FollowedLog:
 
 
 class RunWorld(RuleWorld):
-    """A world of the rules of a training run, replaced by those of each new checkpoint.
-
-    Args are those of `RuleWorld`, with the run's folder in place of a rule.
-
-    Raises:
-        NPAError: The folder holds no run, or one that has not written a rule yet.
-    """
+    """A world of the rules of a run's folder, replaced by those of each new checkpoint."""
 
     def __init__(
         self,
@@ -619,11 +605,7 @@ class RunWorld(RuleWorld):
 
 
 def rules_of_run(folder: RunFolder) -> list[Path]:
-    """Return the file of a run's rule, or those of the species that it trains together.
-
-    Raises:
-        NPAError: There are none.
-    """
+    """Return the file of a run's rule, or those of the species that it trains together."""
     path = str(folder.path)
     if not folder.path.is_dir():
         raise NPAError(f"a run must be a folder, got {shown(path)}: name the one given as --out")

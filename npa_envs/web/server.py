@@ -114,7 +114,9 @@ class Site:
 
     def knows(self, host: str) -> bool:
         """Return whether a request's `Host` may name this server."""
-        name = _host_name(host)
+        # Without its port and without brackets.
+        closed = host.startswith("[")
+        name = host[1:].partition("]")[0] if closed else host.partition(":")[0].lower()
         if self.token is not None:
             # The token is proof enough, under any name of this computer.
             return bool(name)
@@ -227,13 +229,6 @@ def _file(folder: Path, name: str, kinds: Mapping[str, str]) -> Response:
 
 def _refused(reason: str) -> Response:
     return PlainTextResponse(f"refused: {reason}", 403, SECURITY)
-
-
-def _host_name(host: str) -> str:
-    """Return the name in a `Host` header, without its port and without brackets."""
-    if host.startswith("["):
-        return host[1:].partition("]")[0]
-    return host.partition(":")[0].lower()
 
 
 def frame_bytes(frame: WorldView) -> bytes:

@@ -110,7 +110,10 @@ def sample_ink(
         cells, places = _places(side, share.shape[1:], random)
         finer = []
         for part in torch.split(waiting, max(1, min(chunk, CHUNK_CELLS // side**2))):
-            has_ink = _look(share[part], cells, side)
+            enlarged = torch.nn.functional.interpolate(
+                share[part][:, None], size=(side, side), mode="bilinear", align_corners=False
+            )
+            has_ink = enlarged.flatten(1)[:, cells] >= INK
             counts = has_ink.sum(1)
             enough = (counts >= least) | (side >= FINEST)
             finer.append(part[~enough])
@@ -136,14 +139,6 @@ def _places(side: int, shape: tuple[int, ...], random: torch.Generator) -> tuple
     places = (corner + within) * (LEVELS / side)
     places *= torch.tensor((width / longer, height / longer))
     return order, places.floor().clamp(max=LEVELS - 1)
-
-
-def _look(share: Tensor, cells: Tensor, side: int) -> Tensor:
-    """Return whether there is ink in each cell of a grid, [M, K], in the order of `cells`."""
-    enlarged = torch.nn.functional.interpolate(
-        share[:, None], size=(side, side), mode="bilinear", align_corners=False
-    )
-    return enlarged.flatten(1)[:, cells] >= INK
 
 
 def _first(has_ink: Tensor, most: int) -> Tensor:

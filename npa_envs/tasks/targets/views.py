@@ -242,7 +242,8 @@ def _scaled(views: Views, scale: float) -> Views:
 
 
 def _views(split: _Split, resolution: int, count: int) -> Views:
-    chosen = _evenly(len(split.files), count)
+    total = len(split.files)
+    chosen = [k * total // min(count, total) for k in range(min(count, total))]
     poses = split.poses[chosen]
     turned = poses.clone()
     turned[:, :3] = torch.tensor(UPRIGHT, dtype=poses.dtype) @ poses[:, :3]
@@ -254,10 +255,6 @@ def _views(split: _Split, resolution: int, count: int) -> Views:
         raise NPAError(f"in {shown(str(split.path))}: {error}") from error
     pictures = [_read_picture(split.files[k], resolution) for k in chosen]
     return Views(cameras, torch.stack(pictures))
-
-
-def _evenly(total: int, count: int) -> list[int]:
-    return [k * total // min(count, total) for k in range(min(count, total))]
 
 
 def _read_picture(path: Path, resolution: int) -> Tensor:
