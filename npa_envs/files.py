@@ -160,7 +160,9 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
         if os.name == "posix":
             _sync(target.parent)
     except OSError as error:
-        if _concerns_another_file(error, temporary, target):
+        ours = {str(temporary), str(target), str(target.parent)}
+        if error.filename is not None and os.fsdecode(error.filename) not in ours:
+            # It concerns another file.
             raise
         raise NPAError(_explain(given, error)) from error
     except Exception as error:
@@ -240,11 +242,6 @@ def _sync(path: Path) -> None:
         os.fsync(descriptor)
     finally:
         os.close(descriptor)
-
-
-def _concerns_another_file(error: OSError, temporary: Path, target: Path) -> bool:
-    ours = {str(temporary), str(target), str(target.parent)}
-    return error.filename is not None and os.fsdecode(error.filename) not in ours
 
 
 def _disk_is_full(folder: Path) -> bool:

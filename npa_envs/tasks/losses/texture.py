@@ -184,15 +184,10 @@ FLOOR = 0.01
 """Variance that is added to the target's, so that an even target can be compared with, too."""
 
 
-class Descriptor(Protocol):
-    """What numbers describe images."""
-
-    def __call__(self, images: Tensor, *, wrap: bool, thinned: bool) -> list[Tensor]:
-        """Return the numbers at each place of images, a table for each size, [B, M, F] each.
-
-        `wrap`: opposite edges meet, else places near them are left out. `thinned`: at most
-        `PLACES` along each side.
-        """
+Descriptor = Callable[..., list[Tensor]]
+"""Returns the numbers at each place of images, a table for each size, [B, M, F] each. With `wrap`
+opposite edges meet, else places near them are left out; `thinned` leaves at most `PLACES` along
+each side."""
 
 
 class SlicedWasserstein:
