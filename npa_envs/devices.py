@@ -16,15 +16,16 @@ def parse_device(name: str) -> torch.device:
         device = torch.device(name)
     except (RuntimeError, TypeError) as error:
         raise NPAError(f"device must name a device, got {shown(name)}: {cure}") from error
+    rule = ""
     if device.type not in ("cpu", "cuda"):
-        raise NPAError(f"device must be 'cpu' or 'cuda', got {shown(name)}: {cure}")
-    if device.type == "cpu" and name not in ("cpu", "cpu:0"):
-        raise NPAError(f"device must be 'cpu' without a number, got {shown(name)}: {cure}")
-    # Torch keeps the number in eight bits: "cuda:256" would be the first device.
-    if str(device) != name:
-        raise NPAError(
-            f"device must have a number that torch can count to, got {shown(name)}: {cure}"
-        )
+        rule = "be 'cpu' or 'cuda'"
+    elif device.type == "cpu" and name not in ("cpu", "cpu:0"):
+        rule = "be 'cpu' without a number"
+    elif str(device) != name:
+        # Torch keeps the number in eight bits: "cuda:256" would be the first device.
+        rule = "have a number that torch can count to"
+    if rule:
+        raise NPAError(f"device must {rule}, got {shown(name)}: {cure}")
     return device
 
 

@@ -179,16 +179,6 @@ UPRIGHT = ((1.0, 0.0, 0.0), (0.0, 0.0, 1.0), (0.0, -1.0, 0.0))
 """Rotation from their world, whose z is up, to ours, whose y is."""
 
 
-@dataclass(frozen=True)
-class _Split:
-    """What one `transforms_*.json` holds."""
-
-    path: Path
-    angle: float
-    files: tuple[Path, ...]
-    poses: Tensor
-
-
 def read_nerf(
     folder: Path, resolution: int, training_count: int, held_out_count: int
 ) -> ViewTarget:
@@ -199,8 +189,8 @@ def read_nerf(
             f"a folder of views must hold {' or '.join(HELD_OUT)}, {shown(str(folder))} does not: "
             "views to measure by must be others than those trained with"
         )
-    training = _views(_read_split(folder / TRAINING), resolution, training_count)
-    measured = _views(_read_split(held_out), resolution, held_out_count)
+    training = _views(folder / TRAINING, resolution, training_count)
+    measured = _views(held_out, resolution, held_out_count)
     reach = max(scene_reach(training), scene_reach(measured))
     if reach == 0.0:
         raise NPAError(
@@ -241,22 +231,6 @@ def _scaled(views: Views, scale: float) -> Views:
     return Views(cameras, views.pictures)
 
 
-def _views(split: _Split, resolution: int, count: int) -> Views:
-    total = len(split.files)
-    chosen = [k * total // min(count, total) for k in range(min(count, total))]
-    poses = split.poses[chosen]
-    turned = poses.clone()
-    turned[:, :3] = torch.tensor(UPRIGHT, dtype=poses.dtype) @ poses[:, :3]
-    try:
-        cameras: Cameras = cameras_of_poses(
-            turned.float(), split.angle, width=resolution, height=resolution
-        )
-    except NPAError as error:
-        raise NPAError(f"in {shown(str(split.path))}: {error}") from error
-    pictures = [_read_picture(split.files[k], resolution) for k in chosen]
-    return Views(cameras, torch.stack(pictures))
-
-
 def _read_picture(path: Path, resolution: int) -> Tensor:
     image = open_image(path)
     if image.width != image.height:
@@ -267,7 +241,8 @@ def _read_picture(path: Path, resolution: int) -> Tensor:
     return torch.from_numpy(scaled_square(image, resolution))
 
 
-def _read_split(path: Path) -> _Split:
+def _views(path: Path, resolution: int, count: int) -> Views:
+    """Return evenly chosen views of a `transforms_*.json`, turned so that y is up."""
     if not os.path.exists(path):
         raise NPAError(
             f"a folder of views must hold {path.name}, {shown(str(path.parent))} does not: give a "
@@ -289,7 +264,18 @@ def _read_split(path: Path) -> _Split:
     files, poses = zip(
         *(_read_frame(path, k, frame) for k, frame in enumerate(frames)), strict=True
     )
-    return _Split(path, float(angle or 0.0), files, torch.stack(poses))
+    total = len(files)
+    chosen = [k * total // min(count, total) for k in range(min(count, total))]
+    turned = torch.stack(poses)[chosen]
+    turned[:, :3] = torch.tensor(UPRIGHT, dtype=turned.dtype) @ turned[:, :3]
+    try:
+        cameras: Cameras = cameras_of_poses(
+            turned.float(), float(angle or 0.0), width=resolution, height=resolution
+        )
+    except NPAError as error:
+        raise NPAError(f"in {shown(str(path))}: {error}") from error
+    pictures = [_read_picture(files[k], resolution) for k in chosen]
+    return Views(cameras, torch.stack(pictures))
 
 
 def _read_frame(path: Path, number: int, frame: Any) -> tuple[Path, Tensor]:
