@@ -282,17 +282,18 @@ class RuleWorld(LiveWorld):
     def _go(self, steps: int, options: Mapping[str, Any]) -> Tensor:
         """Run steps and return the path length of each particle."""
         rules = [own.rule for own in self.live_rules]
-        world: tuple[Any, ...] = self.x, self.s, steps
-        options = {**options, "return_path_length": True}
         if self._is_as_planted():
-            self.x, self.s, path_length = rollout(rules[0], *world, **options)
+            self.x, self.s, path_length = rollout(
+                rules[0], self.x, self.s, steps, return_path_length=True, **options
+            )
         else:
             # Densities are divided by the particles of a fresh world, so that particles that a
             # brush adds or removes change densities in their neighbourhood only.
-            options |= {"density_counts": [own.divisor for own in self.live_rules]}
+            divisors = [own.divisor for own in self.live_rules]
             self.x, self.s, path_length = rollout_species(
-                rules, *world, counts=self.counts, **options
-            )
+                rules, self.x, self.s, steps, counts=self.counts, density_counts=divisors,
+                return_path_length=True, **options,
+            )  # fmt: skip
         return path_length
 
     def frame(self) -> WorldView:
