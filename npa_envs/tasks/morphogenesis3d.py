@@ -23,7 +23,7 @@ from npa_envs.ops import Cameras, world_mean
 from npa_envs.rule.rule import NPARule
 from npa_envs.tasks.appearance import OUTPUTS, Appearance, Gaussians, draw_gaussians
 from npa_envs.tasks.base import GrowthConfig, GrowthTask, shares_of_loss
-from npa_envs.tasks.losses.similarity import MultiScaleSimilarity
+from npa_envs.tasks.losses.pieces import MultiScaleSimilarity
 from npa_envs.tasks.targets.views import ViewTarget, load_views, nearest_camera, over, some_views
 from npa_envs.tasks.train_config import TrainConfig, fast_run, presets_of, tiny_run
 from npa_envs.world.cuda_graph import to_device_async

@@ -10,7 +10,7 @@ from PIL import Image
 
 from npa_envs.errors import NPAError
 from npa_envs.ops import Cameras, orbit
-from npa_envs.tasks.losses.similarity import MultiScaleSimilarity
+from npa_envs.tasks.losses.pieces import MultiScaleSimilarity
 from npa_envs.tasks.morphogenesis3d import Morphogenesis3DConfig, ViewSchedule, blurred
 from npa_envs.tasks.targets.meshes import (
     AMBIENT,
