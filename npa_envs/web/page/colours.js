@@ -199,7 +199,7 @@ function product(a, b) {
 }
 
 // Eigenvalues and eigenvectors of a symmetric matrix, the largest first, by Jacobi's rotations.
-export function eigenvectors(matrix, size) {
+function eigenvectors(matrix, size) {
   const m = Float64Array.from(matrix);
   const vectors = new Float64Array(size * size);
   for (let k = 0; k < size; k++) vectors[k * size + k] = 1;
