@@ -184,11 +184,8 @@ class Texture(ParticleTask[TextureConfig]):
         """Return the worlds with the states in a disk around one random particle set to zero."""
         if self.config.damage_radius == 0.0:
             return x, s, goal
-        side = self.config.box_size
-        away = x - random_particle(x, generator)[:, None]
-        away = away - side * (away / side).round()
-        centre = torch.zeros_like(away[:, 0])
-        return x, wipe_state(away, s, centre=centre, radius=self.config.damage_radius), goal
+        centre, radius = random_particle(x, generator), self.config.damage_radius
+        return x, wipe_state(x, s, centre=centre, radius=radius, box=self.box), goal
 
     def picture(self, x: Tensor, s: Tensor) -> Tensor:
         """Return the picture of each world: colour sums and density, shape [B, R, R, 4]."""
