@@ -48,8 +48,8 @@ DEMO_PARTICLE_COUNT = 4096
 _TEXEL = 4
 """The web demo keeps its weights in RGBA textures: rows are padded to a multiple of this."""
 
-_ZIP_MARK = b"PK\x03\x04"
-"""What a file of torch.save begins with, unless it is in torch's legacy format."""
+ZIP_MARK = b"PK\x03\x04"
+"""What a file of torch.save begins with, which has checksums, unless it is in the legacy format."""
 
 _EQUIVARIANT_NAMES = {
     "model.W_hidden": "W_hidden",
@@ -80,10 +80,6 @@ class RuleParts:
 
     hyper_parameters: dict[str, Any]
     weights: dict[str, Tensor]
-    header: dict[str, str] | None = None
-    """Metadata of a file in our format."""
-    has_checksum: bool = False
-    """Whether the file has one, which shows damage."""
 
 
 def check_precision(weights: Mapping[str, Tensor]) -> None:
@@ -111,7 +107,7 @@ def check_finite(weights: Mapping[str, Tensor]) -> None:
 
 def read_state_dict(data: bytes) -> RuleParts:
     """Read the authors' state dict; dimension and channels follow from the shapes."""
-    state, has_checksum = _unpickle(data), data.startswith(_ZIP_MARK)
+    state = _unpickle(data)
     known, kind, more = _WEIGHT_NAMES, "", f" and, with a read-out, {sorted(_DECODER_NAMES)}"
     if state.keys() & _EQUIVARIANT_NAMES:
         known, kind, more = _EQUIVARIANT_NAMES, " of an equivariant rule", ""
@@ -127,7 +123,7 @@ def read_state_dict(data: bytes) -> RuleParts:
         )
     weights = {known[name]: _matrix(name, state[name]) for name in known if name in state}
     if known is _EQUIVARIANT_NAMES:
-        return _equivariant_parts(weights, state, has_checksum=has_checksum)
+        return _equivariant_parts(weights, state)
     hidden_dim, perception_dim = weights["hidden.weight"].shape
     update_dim = weights["output.weight"].shape[0]
     has_readout = "readout.0.weight" in weights
@@ -144,12 +140,10 @@ def read_state_dict(data: bytes) -> RuleParts:
     if has_readout:
         hyper_parameters["readout_dim"] = weights["readout.2.weight"].shape[0]
         hyper_parameters["readout_hidden_dim"] = weights["readout.0.weight"].shape[0]
-    return RuleParts(hyper_parameters, weights, has_checksum=has_checksum)
+    return RuleParts(hyper_parameters, weights)
 
 
-def _equivariant_parts(
-    tensors: Mapping[str, Tensor], numbers: Mapping[Any, Any], *, has_checksum: bool = False
-) -> RuleParts:
+def _equivariant_parts(tensors: Mapping[str, Tensor], numbers: Mapping[Any, Any]) -> RuleParts:
     """Return an equivariant rule of 2D worlds from its tensors, by their names in the web demo."""
     mixing, first, second = (tensors[name] for name in ("W_hidden", "w1.weight", "w2.weight"))
     state_dim, mixed = mixing.shape[0] - 1, mixing.shape[1]
@@ -187,7 +181,7 @@ def _equivariant_parts(
         "equivariant": True,
         "mixed_vectors": mixed,
     }
-    return RuleParts(hyper_parameters, weights, has_checksum=has_checksum)
+    return RuleParts(hyper_parameters, weights)
 
 
 def read_demo_json(data: bytes, name: str | None) -> RuleParts:
@@ -348,7 +342,7 @@ def _encode(tensor: Tensor) -> dict[str, Any]:
 
 
 def _unpickle(data: bytes) -> Mapping[Any, Any]:
-    is_zip = data.startswith(_ZIP_MARK)
+    is_zip = data.startswith(ZIP_MARK)
     if is_zip:
         check_torch_archive(io.BytesIO(data))
     try:

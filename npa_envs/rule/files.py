@@ -30,6 +30,7 @@ from npa_envs.files import (
     write_bytes,
 )
 from npa_envs.rule.authors import (
+    ZIP_MARK,
     RuleParts,
     check_finite,
     check_precision,
@@ -100,15 +101,17 @@ def load_rule(source: str | Path, *, device: str | torch.device = "cpu") -> NPAR
     target = check_device(device)
     path, name = _locate(source)
     try:
-        if path.suffix == ".safetensors":
-            parts = _read_ours(path)
-        elif path.suffix == ".json":
-            parts = read_demo_json(read_bytes(path, limit=_LARGEST_FILE), name)
+        content, ours = b"", path.suffix == ".safetensors"
+        if ours:
+            header, weights = _read_ours(path, with_weights=True)
+            given = {name: _parse(header, name, kind) for name, kind in _FIELDS.items()}
+            parts = RuleParts(given, weights)
         else:
-            parts = read_state_dict(read_bytes(path, limit=_LARGEST_FILE))
+            content = read_bytes(path, limit=_LARGEST_FILE)
+            is_demo = path.suffix == ".json"
+            parts = read_demo_json(content, name) if is_demo else read_state_dict(content)
         rule = _assemble(parts)
-        header = parts.header
-        if header is not None and header.get("checksum") != _checksum(header, parts.weights):
+        if ours and header.get("checksum") != _checksum(header, weights):
             raise NPAError(
                 "the checksum must be that of the weights and of the metadata, got another one: "
                 "the file is damaged, or another program has changed it; copy it again from where "
@@ -116,7 +119,7 @@ def load_rule(source: str | Path, *, device: str | torch.device = "cpu") -> NPAR
             )
     except NPAError as error:
         raise NPAError(f"cannot load a rule from {shown(str(source))}: {error}") from error
-    if not parts.has_checksum:
+    if not (ours or content.startswith(ZIP_MARK)):
         warnings.warn(
             f"the rule's file {shown(str(path))} has no checksum, so that damage cannot be told: "
             "if it is known to be good, save it again with npa_envs.save_rule",
@@ -211,7 +214,7 @@ def _with_sorted_metadata(file: bytes) -> bytes:
 def rule_metadata(path: str | Path) -> dict[str, str]:
     """Return the text in the header of a file that `save_rule` wrote, all of it."""
     try:
-        return _read_header(checked_path(path))
+        return _read_ours(checked_path(path), with_weights=False)[0]
     except NPAError as error:
         raise NPAError(f"cannot read the header of {shown(str(path))}: {error}") from error
 
@@ -268,11 +271,14 @@ def _locate(source: str | Path) -> tuple[Path, str | None]:
     )
 
 
-def _read_header(path: Path) -> dict[str, str]:
+def _read_ours(path: Path, *, with_weights: bool) -> tuple[dict[str, str], dict[str, Tensor]]:
+    """Return the metadata of a file in our format, and its weights or none."""
     check_regular(path, limit=_LARGEST_FILE)
     try:
         with safe_open(path, framework="pt") as file:
             header: dict[str, str] = file.metadata() or {}
+            names = list(file.keys()) if with_weights else []
+            weights = {name: file.get_tensor(name).clone() for name in names}
     except (OSError, ValueError, SafetensorError) as error:
         raise NPAError(
             f"this is no safetensors file, or a truncated one ({shown(error)})"
@@ -287,18 +293,7 @@ def _read_header(path: Path) -> dict[str, str]:
             f"the metadata's version must be {FORMAT_VERSION}, got "
             f"{shown(header.get('version'))}: upgrade with pip install -U npa-envs"
         )
-    return header
-
-
-def _read_ours(path: Path) -> RuleParts:
-    header = _read_header(path)
-    hyper_parameters = {name: _parse(header, name, kind) for name, kind in _FIELDS.items()}
-    try:
-        with safe_open(path, framework="pt") as file:
-            weights = {name: file.get_tensor(name).clone() for name in file.keys()}  # noqa: SIM118
-    except (OSError, SafetensorError) as error:
-        raise NPAError(f"the weights cannot be read ({shown(error)})") from error
-    return RuleParts(hyper_parameters, weights, header, has_checksum=True)
+    return header, weights
 
 
 def _checksum(header: Mapping[str, str], weights: Mapping[str, Tensor]) -> str:
