@@ -198,6 +198,7 @@ class TrainConfig(Generic[TaskConfigT]):
             check_field(self, name, known, f"be one of {', '.join(allowed)}")
         parse_device(self.device)
         milestones, ages = self.milestones, self.max_age_range
+        are_ages = _is_pair(ages, is_whole)
         are_whole = isinstance(milestones, tuple) and all(map(is_whole, milestones))
         for name, fits, rule, cure in (
             (
@@ -239,13 +240,13 @@ class TrainConfig(Generic[TaskConfigT]):
             ),
             (
                 "max_age_range",
-                _is_pair(ages, is_whole) and (1 <= ages[0] <= ages[1] or ages == (0, 0)),
+                are_ages and (1 <= ages[0] <= ages[1] or ages == (0, 0)),
                 "be two whole numbers (lo, hi) with 1 <= lo <= hi, or (0, 0)",
                 "for example max_age_range=(64, 16384)",
             ),
             (
                 "pool_size",
-                ages == (0, 0) or self.pool_size % self.world_count == 0,
+                not are_ages or not self.ages or self.pool_size % self.world_count == 0,
                 f"be a multiple of world_count={self.world_count} where max_age_range is set",
                 f"set pool_size={self.pool_size // self.world_count * self.world_count}",
             ),
