@@ -134,7 +134,7 @@ class PointClassificationTask(TargetEnvTask[PointClassificationEnvConfig]):
 
     def extra_info(self, s: Tensor) -> dict[str, Tensor]:
         """Return each world's class, int64, and accuracy, shape [B] each."""
-        return {"label": self.goal.wanted.clone(), "accuracy": self.accuracy(s)}
+        return {"label": self.goal.goal.clone(), "accuracy": self.accuracy(s)}
 
     def _scores(self, s: Tensor) -> Tensor:
         """Return the loss of what each particle says, [B, N]."""

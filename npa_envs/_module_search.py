@@ -18,10 +18,6 @@ def extend_path(package_path: list[str], package_file: str) -> None:
 
     Does nothing for an installed package, so that a folder called `envs` which some other project
     left in site-packages is never taken for ours.
-
-    Args:
-        package_path: `npa_envs.__path__`, extended in place.
-        package_file: `npa_envs.__file__`.
     """
     package = Path(package_file).resolve().parent
     root = package.parent

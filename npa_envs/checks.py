@@ -38,11 +38,7 @@ Box = float | Sequence[float] | None
 
 
 def check_dense(name: str, tensor: Tensor) -> None:
-    """Check that a tensor has its numbers one beside the other, on a CPU or a CUDA device.
-
-    Raises:
-        NPAError: It is sparse, or on another kind of device.
-    """
+    """Check that a tensor has its numbers one beside the other, on a CPU or a CUDA device."""
     if tensor.is_nested:
         raise NPAError(f"{name} must be one dense tensor, got a nested one: run each by itself")
     if tensor.layout != torch.strided or tensor.device.type not in ("cpu", "cuda"):
@@ -53,11 +49,7 @@ def check_dense(name: str, tensor: Tensor) -> None:
 
 
 def check_world(x: Tensor, s: Tensor) -> None:
-    """Check shapes, dtypes and devices of positions and states.
-
-    Raises:
-        NPAError: They are not [B, N, D] and [B, N, C] of one floating dtype on one device.
-    """
+    """Check shapes, dtypes and devices of positions and states."""
     for name, tensor, last in (("x", x, "D"), ("s", s, "C")):
         if not isinstance(tensor, Tensor):
             raise NPAError(
@@ -93,11 +85,7 @@ def check_world(x: Tensor, s: Tensor) -> None:
 
 
 def check_finite_positions(x: Tensor) -> None:
-    """Check that every position is finite; skipped while compiled or captured.
-
-    Raises:
-        NPAError: A coordinate is NaN or infinite; the message names the first such particle.
-    """
+    """Check that every position is finite; skipped while compiled or captured."""
     # Asked in this order: a compiler cannot trace what a stream does.
     if torch.compiler.is_compiling():
         return
@@ -109,10 +97,7 @@ def check_finite_positions(x: Tensor) -> None:
 class FiniteCheck:
     """The check that every position is finite: asked of the device now, answered by `wait`.
 
-    Args:
-        x: Positions [length units], shape [B, N, D]; they stay as they are until `wait` returns.
-        ready: When they are there, on CUDA: they are looked at beside what the current stream does
-            after that. None: once it has done its work so far.
+    x stays as it is until then. With an event, on CUDA, it is read on another stream after that.
     """
 
     def __init__(self, x: Tensor, ready: torch.cuda.Event | None = None) -> None:
@@ -132,11 +117,7 @@ class FiniteCheck:
             self._arrival.record(stream)
 
     def wait(self) -> None:
-        """Wait for the answer, and for nothing that was launched since the question.
-
-        Raises:
-            NPAError: A coordinate is NaN or infinite; the message names the first such particle.
-        """
+        """Wait for the answer, and for nothing that was launched since the question."""
         if self._arrival is not None:
             self._arrival.synchronize()
         if math.isfinite(self._answer):
@@ -163,7 +144,7 @@ def _side_stream(device: torch.device) -> torch.cuda.Stream:
 def constant(number: float) -> float:
     """Return a number; one that `torch.compile(dynamic=True)` takes for a variable as a constant.
 
-    Kernels are told numbers, and the compiler loses its variables on the way to them.
+    Kernels take numbers, and the compiler loses its variables on the way to them.
     """
     if not torch.compiler.is_compiling():
         return number
@@ -172,22 +153,14 @@ def constant(number: float) -> float:
 
 
 def checked_flag(name: str, value: Any) -> bool:
-    """Return whether something is true.
-
-    Raises:
-        NPAError: It is neither true nor false, as an array of several numbers is.
-    """
+    """Return whether something is true."""
     with contextlib.suppress(TypeError, ValueError, RuntimeError):
         return bool(value)
     raise NPAError(f"{name} must be True or False, got {shown(value)}")
 
 
 def checked_moment_inverse(value: Any) -> MomentInverse:
-    """Return how moment matrices are inverted.
-
-    Raises:
-        NPAError: It is neither "threshold" nor "smooth".
-    """
+    """Return how moment matrices are inverted."""
     if isinstance(value, str) and value == "threshold":
         return "threshold"
     if isinstance(value, str) and value == "smooth":
@@ -199,11 +172,7 @@ def checked_moment_inverse(value: Any) -> MomentInverse:
 
 
 def checked_number(name: str, value: Any) -> float:
-    """Return a number as a float; zero-dimensional tensors and NumPy scalars are numbers too.
-
-    Raises:
-        NPAError: It is no number.
-    """
+    """Return a number as a float; zero-dimensional tensors and NumPy scalars are numbers too."""
     if not isinstance(value, str | bytes | bool):
         with contextlib.suppress(TypeError, ValueError, RuntimeError, OverflowError):
             return constant(float(value))
@@ -211,11 +180,7 @@ def checked_number(name: str, value: Any) -> float:
 
 
 def checked_count(name: str, value: Any) -> int:
-    """Return a number of things as an int; NumPy's integers are integers too.
-
-    Raises:
-        NPAError: It is no integer of at least 0.
-    """
+    """Return a number of things as an int; NumPy's integers are integers too."""
     if not isinstance(value, bool):
         with contextlib.suppress(TypeError):
             count = operator.index(value)
@@ -225,16 +190,7 @@ def checked_count(name: str, value: Any) -> int:
 
 
 def checked_positive(name: str, value: Any, unit: str = "") -> float:
-    """Return a number that must be positive and finite, as a float.
-
-    Args:
-        name: What the caller calls it.
-        value: The number.
-        unit: Its unit, for the error, for example " [length units]".
-
-    Raises:
-        NPAError: It is not.
-    """
+    """Return a number that must be positive and finite, as a float."""
     number = checked_number(name, value)
     if not (math.isfinite(number) and number > 0.0):
         raise NPAError(f"{name} must be positive and finite{unit}, got {number:g}")
@@ -242,7 +198,7 @@ def checked_positive(name: str, value: Any, unit: str = "") -> float:
 
 
 def checked_finite(name: str, value: Any, unit: str = "") -> float:
-    """Return a number that must be finite, as a float; arguments and errors as above."""
+    """Return a number that must be finite, as a float."""
     number = checked_number(name, value)
     if not math.isfinite(number):
         raise NPAError(f"{name} must be finite{unit}, got {number:g}")
@@ -250,11 +206,7 @@ def checked_finite(name: str, value: Any, unit: str = "") -> float:
 
 
 def checked_side(name: str, value: Any) -> int:
-    """Return how many pixels a side of a picture has.
-
-    Raises:
-        NPAError: It is no integer from 1 to `LARGEST_SIDE`.
-    """
+    """Return how many pixels a side of a picture has."""
     side = checked_count(name, value)
     if not 1 <= side <= LARGEST_SIDE:
         raise NPAError(f"{name} must lie in [1, {LARGEST_SIDE}] pixels, got {shown(side)}")
@@ -271,11 +223,7 @@ def entries(value: Any) -> list[Any] | None:
 
 
 def number_tensor(name: str, value: Any) -> Tensor:
-    """Return real numbers of any library as a tensor.
-
-    Raises:
-        NPAError: They are none.
-    """
+    """Return real numbers of any library as a tensor."""
     try:
         made = torch.as_tensor(value)
     except (TypeError, ValueError, RuntimeError, OverflowError) as error:
@@ -287,20 +235,8 @@ def number_tensor(name: str, value: Any) -> Tensor:
 
 
 def checked_eps(name: str, eps: float, space_dim: int, dtype: torch.dtype) -> float:
-    """Return a perception radius as a float [length units].
-
-    Args:
-        name: What the caller calls it.
-        eps: The radius.
-        space_dim: Space dimension D of the worlds.
-        dtype: Floating dtype of the worlds, in which powers of the radius must not overflow.
-
-    Raises:
-        NPAError: It is not positive and finite, or too small or large for the dtype.
-    """
-    value = checked_number(name, eps)
-    if not (math.isfinite(value) and value > 0.0):
-        raise NPAError(f"{name} must be positive and finite [length units], got {shown(eps)}")
+    """Return a perception radius as a float [length units], whose powers the dtype can hold."""
+    value = checked_positive(name, eps, " [length units]")
     low, high = LENGTH_RANGE[space_dim, dtype]
     if not low <= value <= high:
         raise NPAError(
@@ -311,11 +247,7 @@ def checked_eps(name: str, eps: float, space_dim: int, dtype: torch.dtype) -> fl
 
 
 def check_scale(eps: float, eps0: float, space_dim: int, dtype: torch.dtype) -> None:
-    """Check that (eps / eps0)^(1+D), which scales the density gradient, is a number of the dtype.
-
-    Raises:
-        NPAError: It over- or underflows.
-    """
+    """Check that (eps / eps0)^(1+D), a factor of density gradients, is a number of the dtype."""
     limits = torch.finfo(dtype)
     # As logarithms: the power of a ratio may be beyond any number.
     scale = (1 + space_dim) * (math.log(eps) - math.log(eps0))
@@ -329,15 +261,7 @@ def check_scale(eps: float, eps0: float, space_dim: int, dtype: torch.dtype) -> 
 def checked_box(
     box: Box, space_dim: int, eps: float | None, dtype: torch.dtype
 ) -> tuple[float, ...] | None:
-    """Return the sides of a box as a tuple of D floats, or None in open space.
-
-    Args:
-        eps: The perception radius in a periodic box; None: its walls reflect.
-
-    Raises:
-        NPAError: No numbers, a wrong number of sides, a side below 2 eps, where a particle would
-            see another one twice, or one too large for the dtype of the worlds.
-    """
+    """Return the sides of a box as a tuple of D floats, or None; eps None: its walls reflect."""
     if box is None:
         return None
     given = entries(box)
@@ -369,95 +293,66 @@ def checked_box(
 # Fields of configurations: each error names field, rule, value and cure.
 
 
+def check_field(
+    config: object, name: str, ok: bool, rule: str, cure: str = "", *, otherwise: object = None
+) -> None:
+    """Refuse a field that is wrong; without `cure` it shows the default, or `otherwise`."""
+    if not ok:
+        cure = cure or f"for example {name}={getattr(type(config), name, otherwise)!r}"
+        raise NPAError(f"{name} must {rule}, got {shown(getattr(config, name))}: {cure}")
+
+
 def check_positive(
     config: object, kind: type, *names: str, at_least: int = 1, at_most: int = sys.maxsize
 ) -> None:
-    """Check that fields are whole numbers >= `at_least` (`kind` int) or finite and > 0 (float).
-
-    Args:
-        config: The dataclass that holds the fields.
-        kind: `int` or `float`.
-        names: The fields to check.
-        at_least: Smallest whole number allowed; ignored for floats.
-        at_most: Largest one.
-
-    Raises:
-        NPAError: A field breaks the rule.
-    """
+    """Check that fields are whole numbers >= `at_least` (`kind` int) or finite and > 0 (float)."""
     for name in names:
         value = getattr(config, name)
-        if kind is int:
-            ok = is_whole(value) and value >= at_least
-            _require(ok, config, name, f"be a whole number of at least {at_least}", at_least)
-            _require(value <= at_most, config, name, f"be at most {at_most}", at_least)
-        else:
-            ok = is_real(value) and value > 0
-            _require(ok, config, name, "be a finite number greater than 0", 1.0)
+        if kind is float:
+            rule = "be a finite number greater than 0"
+            check_field(config, name, is_real(value) and value > 0, rule, otherwise=1.0)
+            continue
+        rule = f"be a whole number of at least {at_least}"
+        check_field(config, name, is_whole(value) and value >= at_least, rule, otherwise=at_least)
+        check_field(config, name, value <= at_most, f"be at most {at_most}", otherwise=at_least)
 
 
-def check_non_negative(config: object, *names: str) -> None:
-    """Check that fields are finite numbers of at least 0.
-
-    Raises:
-        NPAError: A field breaks the rule.
-    """
+def check_non_negative(config: object, *names: str, at_most: float = math.inf) -> None:
+    """Check that fields are finite numbers of at least 0, and at most `at_most`."""
     for name in names:
         value = getattr(config, name)
-        ok = is_real(value) and value >= 0
-        _require(ok, config, name, "be a finite number of at least 0", 0.0)
+        rule = "be a finite number of at least 0"
+        check_field(config, name, is_real(value) and value >= 0, rule, otherwise=0.0)
+        check_field(config, name, value <= at_most, f"be at most {at_most:g}", otherwise=at_most)
 
 
 def check_fraction(config: object, *names: str) -> None:
-    """Check that fields are numbers in (0, 1].
-
-    Raises:
-        NPAError: A field breaks the rule.
-    """
+    """Check that fields are numbers in (0, 1]."""
     for name in names:
         value = getattr(config, name)
-        _require(is_real(value) and 0 < value <= 1, config, name, "lie in (0, 1]", 0.5)
+        check_field(config, name, is_real(value) and 0 < value <= 1, "lie in (0, 1]", otherwise=0.5)
 
 
 def check_flag(config: object, *names: str) -> None:
-    """Check that fields are True or False.
-
-    Raises:
-        NPAError: A field is neither.
-    """
+    """Check that fields are True or False."""
     for name in names:
-        value = getattr(config, name)
-        _require(isinstance(value, bool), config, name, "be True or False", False)
+        is_flag = isinstance(getattr(config, name), bool)
+        check_field(config, name, is_flag, "be True or False", otherwise=False)
 
 
 def check_text(config: object, name: str, what: str) -> None:
-    """Check that a field is text and not empty.
-
-    Args:
-        config: The dataclass that holds the field.
-        name: The field.
-        what: What the text may be, for the error.
-
-    Raises:
-        NPAError: It is not.
-    """
+    """Check that a field is text and not empty; the error calls it `what`."""
     value = getattr(config, name)
-    _require(isinstance(value, str) and value != "", config, name, f"be {what}", "name")
+    ok = isinstance(value, str) and value != ""
+    check_field(config, name, ok, f"be {what}", otherwise="name")
 
 
 def check_seed(config: object, name: str, *, bits: int = 63) -> None:
-    """Check that a field can seed a random generator: a whole number in [0, 2**bits).
-
-    Args:
-        config: The dataclass that holds the field.
-        name: The field.
-        bits: Bits that the generator takes.
-
-    Raises:
-        NPAError: It cannot.
-    """
+    """Check that a field can seed a random generator: a whole number in [0, 2**bits)."""
     value = getattr(config, name)
     ok = is_whole(value) and 0 <= value < 2**bits
-    _require(ok, config, name, f"be a whole number of at least 0 and below 2**{bits}", 0)
+    rule = f"be a whole number of at least 0 and below 2**{bits}"
+    check_field(config, name, ok, rule, otherwise=0)
 
 
 def is_whole(value: Any) -> TypeGuard[int]:
@@ -472,22 +367,13 @@ def is_real(value: Any) -> bool:
     return real and -sys.float_info.max <= value <= sys.float_info.max
 
 
-def _require(ok: bool, config: object, name: str, rule: str, otherwise: object) -> None:
-    """Raise an error that shows the field's default, or `otherwise`, for example."""
-    if not ok:
-        example = getattr(type(config), name, otherwise)
-        raise NPAError(
-            f"{name} must {rule}, got {shown(getattr(config, name))}: for example "
-            f"{name}={example!r}"
-        )
+def are_texts(value: Any) -> bool:
+    """Return whether `value` is a tuple of texts, none of them empty."""
+    return isinstance(value, tuple) and all(isinstance(part, str) and part for part in value)
 
 
 def check_count(name: str, value: object, cure: str = "", *, at_most: int = sys.maxsize) -> None:
-    """Check that an argument is a whole number of at least 1, and at most `at_most`.
-
-    Raises:
-        NPAError: It is not.
-    """
+    """Check that an argument is a whole number of at least 1, and at most `at_most`."""
     if not is_whole(value) or value < 1:
         raise NPAError(f"{name} must be an integer of at least 1, got {shown(value)}{cure}")
     if value > at_most:

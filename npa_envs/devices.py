@@ -8,14 +8,7 @@ from npa_envs.errors import NPAError, shown
 
 
 def parse_device(name: str) -> torch.device:
-    """Return the device of that name, whether or not this machine has it.
-
-    Args:
-        name: "cpu", "cuda" or "cuda:1".
-
-    Raises:
-        NPAError: It names no such device.
-    """
+    """Return the device of that name, whether or not this machine has it."""
     cure = "use 'cpu', 'cuda' or 'cuda:1'"
     if not isinstance(name, str):
         raise NPAError(f"device must be text, got {shown(name)}: {cure}")
@@ -23,27 +16,21 @@ def parse_device(name: str) -> torch.device:
         device = torch.device(name)
     except (RuntimeError, TypeError) as error:
         raise NPAError(f"device must name a device, got {shown(name)}: {cure}") from error
+    rule = ""
     if device.type not in ("cpu", "cuda"):
-        raise NPAError(f"device must be 'cpu' or 'cuda', got {shown(name)}: {cure}")
-    if device.type == "cpu" and name not in ("cpu", "cpu:0"):
-        raise NPAError(f"device must be 'cpu' without a number, got {shown(name)}: {cure}")
-    # Torch keeps the number in eight bits: "cuda:256" would be the first device.
-    if str(device) != name:
-        raise NPAError(
-            f"device must have a number that torch can count to, got {shown(name)}: {cure}"
-        )
+        rule = "be 'cpu' or 'cuda'"
+    elif device.type == "cpu" and name not in ("cpu", "cpu:0"):
+        rule = "be 'cpu' without a number"
+    elif str(device) != name:
+        # Torch keeps the number in eight bits: "cuda:256" would be the first device.
+        rule = "have a number that torch can count to"
+    if rule:
+        raise NPAError(f"device must {rule}, got {shown(name)}: {cure}")
     return device
 
 
 def check_device(name: str | torch.device) -> torch.device:
-    """Return the device of that name, with its number where it is a CUDA device.
-
-    Args:
-        name: "cpu", "cuda" or "cuda:1", or torch's own device.
-
-    Raises:
-        NPAError: It names no device, or one that this machine does not have.
-    """
+    """Return the device of that name, with its number where it is a CUDA device."""
     device = parse_device(str(name) if isinstance(name, torch.device) else name)
     if device.type != "cuda":
         return device

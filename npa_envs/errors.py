@@ -43,9 +43,6 @@ def shown(value: object) -> str:
     """Return what came as an error shows it: in about 200 characters, however large it is.
 
     Nested values that share parts, numbers of many digits and whole files cost no more than that.
-
-    Args:
-        value: Whatever came; of an exception its words, of everything else its `repr`.
     """
     try:
         brief = str(value) if isinstance(value, BaseException) else _brief.repr(value)
@@ -59,12 +56,7 @@ def shown(value: object) -> str:
 
 
 def suggest(name: object, known: Iterable[str]) -> str:
-    """Return the tail of an error about an unknown name: the nearest known one, then all of them.
-
-    Args:
-        name: What was asked for.
-        known: Every name that would have been accepted.
-    """
+    """Return the tail of an error about an unknown name: the nearest known one, then all."""
     names = sorted(known)
     nearest = difflib.get_close_matches(name, names, n=1) if isinstance(name, str) else []
     hint = f"did you mean {shown(nearest[0])}? " if nearest else ""

@@ -104,10 +104,7 @@ def check_torch_archive(file: IO[bytes], *, checksums: bool = True) -> None:
     """Check the archive that `torch.save` writes before anything of it is unpacked.
 
     Torch neither compresses nor shares entries: an archive whose entries declare more than the file
-    holds would take more memory than it is worth.
-
-    Args:
-        checksums: Whether to compare those too, which torch does not look at.
+    holds would take more memory than it is worth. Torch itself compares no checksums.
     """
     try:
         held = file.seek(0, os.SEEK_END)
@@ -163,7 +160,9 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
         if os.name == "posix":
             _sync(target.parent)
     except OSError as error:
-        if _concerns_another_file(error, temporary, target):
+        ours = {str(temporary), str(target), str(target.parent)}
+        if error.filename is not None and os.fsdecode(error.filename) not in ours:
+            # It concerns another file.
             raise
         raise NPAError(_explain(given, error)) from error
     except Exception as error:
@@ -178,11 +177,7 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
 
 @contextlib.contextmanager
 def made_folder(path: Path) -> Iterator[None]:
-    """Create a folder and its parents where missing; remove those that a failed block leaves empty.
-
-    Args:
-        path: The folder.
-    """
+    """Create a folder and its parents where missing; if the block fails, remove the empty ones."""
     missing = [folder for folder in (path, *path.parents) if not folder.exists()]
     try:
         path.mkdir(parents=True, exist_ok=True)
@@ -221,30 +216,22 @@ def write_text(path: str | Path, text: str) -> None:
 
 
 def _check_target(given: Path, target: Path) -> None:
+    folder, fault = shown(str(target.parent)), ""
     try:
         if target.is_dir():
-            raise NPAError(
-                f"cannot write {shown(str(given))}: that is a folder: give the path of a file "
-                "inside it"
-            )
+            fault = "that is a folder: give the path of a file inside it"
         # Asked of what was given: a link of the system to a pipe leads to a name that is none.
-        if given.exists() and not given.is_file():
-            raise NPAError(
-                f"cannot write {shown(str(given))}: that is a pipe or a device, which must not be "
-                "replaced by a file: give the path of a file"
-            )
-        if not target.parent.exists():
-            raise NPAError(
-                f"cannot write {shown(str(given))}: the folder {shown(str(target.parent))} does "
-                f"not exist: create it first (mkdir -p {shown(str(target.parent))})"
-            )
-        if not target.parent.is_dir():
-            raise NPAError(
-                f"cannot write {shown(str(given))}: {shown(str(target.parent))} is a file, not a "
-                "folder: give a path in a folder"
-            )
+        elif given.exists() and not given.is_file():
+            fault = "that is a pipe or a device, which must not be replaced by a file: give the "
+            fault += "path of a file"
+        elif not target.parent.exists():
+            fault = f"the folder {folder} does not exist: create it first (mkdir -p {folder})"
+        elif not target.parent.is_dir():
+            fault = f"{folder} is a file, not a folder: give a path in a folder"
     except OSError as error:
         raise NPAError(_explain(given, error)) from error
+    if fault:
+        raise NPAError(f"cannot write {shown(str(given))}: {fault}")
 
 
 def _sync(path: Path) -> None:
@@ -255,11 +242,6 @@ def _sync(path: Path) -> None:
         os.fsync(descriptor)
     finally:
         os.close(descriptor)
-
-
-def _concerns_another_file(error: OSError, temporary: Path, target: Path) -> bool:
-    ours = {str(temporary), str(target), str(target.parent)}
-    return error.filename is not None and os.fsdecode(error.filename) not in ours
 
 
 def _disk_is_full(folder: Path) -> bool:

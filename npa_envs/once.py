@@ -30,9 +30,6 @@ def made_once(kept: int | None = None) -> Callable[[Callable[P, R]], Callable[P,
     """Return a decorator that caches a function as `functools.lru_cache` does, for all threads.
 
     Threads that call the function at the same time get the same object, of one call.
-
-    Args:
-        kept: Results that are remembered; None: all.
     """
 
     def decorate(make: Callable[P, R]) -> Callable[P, R]:

@@ -62,11 +62,7 @@ class Child(ABC):
         """Whether it has ended by itself, in whatever way."""
 
     def stop(self, *, at_once: bool) -> None:  # noqa: B027 - not all have something to save
-        """Ask it to end, and do not wait for it: `end` follows.
-
-        Args:
-            at_once: It has no time to save what it has done.
-        """
+        """Ask it to end, without time to save anything if `at_once`; `end` follows and waits."""
 
     @abstractmethod
     def end(self) -> None:
@@ -86,15 +82,9 @@ def run_children(
 ) -> None:
     """Run children until none is left; if this is interrupted, all of them are ended.
 
-    All are asked to end before one is waited for. A second signal ends them at once.
-
-    Args:
-        start: Returns the next child, given those that are not over; None where none is left, or
-            those that are left wait for one that is not over.
-        finished: Called with each that is over.
-        places: Where.
-        ahead: Start as many children early, which get ready and wait.
-        max_seconds: None begins after so long [s].
+    All are asked to end before one is waited for. A second signal ends them at once. `start` gets
+    those that are not over, and returns the next one, or None where none is left or can begin yet.
+    With `ahead` as many children start early, which get ready and wait.
     """
     ready, running = deque[SomeChild](), dict[int, SomeChild]()
     until = time.monotonic() + max_seconds
@@ -199,10 +189,8 @@ def part_of(
 ) -> list[Item]:
     """Return the items of one of several machines, as "2/8" says; all of them for None.
 
-    Args:
-        items: All of them, in the same order on all machines.
-        words: Which part of how many, counted from 1.
-        together: Items for which this is equal belong to the same part.
+    The order of items is the same on all machines. Items for which `together` is equal belong to
+    the same part.
     """
     if words is None:
         return list(items)

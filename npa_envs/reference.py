@@ -1,7 +1,9 @@
 """The SPH operators in plain torch, O(N^2), any floating dtype: the oracle of the tests.
 
 Everything is written as the formulas of arXiv 2601.16096, section 3, stand; autograd gives the
-adjoints. Memory is B N^2 C D numbers: for a few hundred particles.
+adjoints. Memory is B N^2 C D numbers: for a few hundred particles. Positions x [B, N, D], the
+perception radius eps and the sides of a periodic box are in length units, states s [B, N, C] are
+dimensionless.
 """
 
 from __future__ import annotations
@@ -31,12 +33,7 @@ class ReferenceFields(NamedTuple):
 
 
 def differences(x: Tensor, box: tuple[float, ...] | None = None) -> Tensor:
-    """Return r_ji = x_j - x_i [length units], the minimum image in a box, shape [B, N, N, D].
-
-    Args:
-        x: Positions [length units], shape [B, N, D].
-        box: Sides of the periodic box [length units], or None in open space.
-    """
+    """Return r_ji = x_j - x_i [length units], the minimum image in a box, shape [B, N, N, D]."""
     r = x[:, None, :, :] - x[:, :, None, :]
     if box is not None:
         sides = torch.tensor(box, dtype=x.dtype, device=x.device)
@@ -62,10 +59,6 @@ def spiky_gradient(r: Tensor, eps: float) -> Tensor:
 
     In 2D its factor is 30 / (pi eps^5): the gradient of the normalised spiky kernel, whose own
     factor is 10 / (pi eps^5).
-
-    Args:
-        r: Differences [length units], shape [..., D].
-        eps: Perception radius [length units].
     """
     space_dim = r.shape[-1]
     norm = 30.0 / math.pi / eps**5 if space_dim == 2 else 45.0 / math.pi / eps**6
@@ -127,15 +120,7 @@ def fields(
     box: tuple[float, ...] | None = None,
     moment_inverse: str = "threshold",
 ) -> ReferenceFields:
-    """Return the unscaled SPH fields of every particle, differentiable in x and s.
-
-    Args:
-        x: Positions [length units], shape [B, N, D].
-        s: States, dimensionless, shape [B, N, C].
-        eps: Perception radius [length units].
-        box: Sides of the periodic box [length units], or None in open space.
-        moment_inverse: "threshold" or "smooth", as in `npa_envs.perceive`.
-    """
+    """Return the unscaled SPH fields of every particle, differentiable in x and s."""
     r = differences(x, box)
     weight = smoothing_kernel((r * r).sum(dim=-1), eps, x.shape[2])
     kernel = spiky_gradient(r, eps)

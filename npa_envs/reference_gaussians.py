@@ -45,13 +45,7 @@ def projected(
 ) -> tuple[Tensor, Tensor]:
     """Return means [N, 2] and covariances [N, 2, 2] on the picture [pixels, pixels squared].
 
-    Args:
-        places: Means in the camera's frame [length units], in front of it, shape [N, 3].
-        spreads: Square roots of the covariances in the camera's frame [length units], [N, 3, 3].
-        intrinsics: fx, fy, cx and cy [pixels], shape [4].
-        width: Pixels across.
-        height: Pixels down.
-        dilation: Added to both variances [pixels squared].
+    Means and roots of covariances are in the camera's frame [length units], intrinsics in pixels.
     """
     focal, middle = intrinsics[:2], intrinsics[2:]
     depth = places[:, 2:]

@@ -31,12 +31,7 @@ _BROKEN_CACHE = ("Failed to load CPU", "Failed to load CUDA")
 
 @contextlib.contextmanager
 def quiet_warp() -> Iterator[None]:
-    """Keep Warp's banner and its notes on loading modules out of the caller's output.
-
-    Raises:
-        NPAError: The block started Warp or loaded kernels, and its cache of compiled kernels is
-            damaged or cannot be written to.
-    """
+    """Keep Warp's banner and its notes on loading modules out of the caller's output."""
     level = wp.config.log_level
     wp.config.log_level = max(level, wp.LOG_WARNING)
     try:
@@ -97,9 +92,6 @@ def in_turn(module: str) -> Iterator[None]:
     compiles. The others wait, and load what it has left. The system frees the lock of a process
     that ends in whatever way. Where it has no such locks, or the cache cannot be written to, each
     process does all by itself.
-
-    Args:
-        module: The module's name.
     """
     with contextlib.ExitStack() as held:
         with contextlib.suppress(OSError):

@@ -19,9 +19,10 @@ from npa_envs.measure.judge import JudgeRow, TextureJudge
 from npa_envs.rule.files import shipped_rules
 from npa_envs.rule.rule import NPARule
 from npa_envs.tasks.base import Task
-from npa_envs.tasks.damage import cut, random_particle, wipe_state
+from npa_envs.tasks.damage import random_particle
 from npa_envs.tasks.morphogenesis2d import Morphogenesis2D
 from npa_envs.tasks.point_classification import PointClassification, majority, particle_classes
+from npa_envs.world.brushes import cut, wipe_state
 from npa_envs.world.randomness import Randomness, WorldRandom
 from npa_envs.world.rollout import rollout
 

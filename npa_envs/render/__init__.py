@@ -4,7 +4,7 @@ Wrong arguments and files that cannot be written raise an `NPAError`.
 """
 
 from npa_envs.render.colours import to_uint8
-from npa_envs.render.display import Shown, show, show_worlds
+from npa_envs.render.display import Shown, Window, show, show_worlds
 from npa_envs.render.film import (
     turntable_frames,
     write_filmstrip,
@@ -14,7 +14,6 @@ from npa_envs.render.film import (
     write_webp,
 )
 from npa_envs.render.point_files import write_gaussians, write_points, write_splat
-from npa_envs.render.window import Window
 from npa_envs.render.worlds import STYLES, draw_worlds
 
 __all__ = [

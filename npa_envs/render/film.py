@@ -18,7 +18,7 @@ from torch import Tensor
 
 from npa_envs.checks import checked_count, checked_finite, is_real, is_whole
 from npa_envs.errors import MissingDependencyError, NPAError, shown
-from npa_envs.files import atomic_path
+from npa_envs.files import atomic_path, write_bytes
 from npa_envs.ops import Cameras, orbit
 from npa_envs.render.colours import Background, background_colour, to_uint8
 from npa_envs.tasks.targets.views import ANGLE, DISTANCE
@@ -38,17 +38,19 @@ _MARGIN = 8
 
 def write_png(path: str | Path, frame: Frame) -> None:
     """Write one picture, uint8, shape [H, W, 3], as small as a PNG can be."""
-    (checked,) = checked_frames([frame])
-    with atomic_path(path) as temporary:
-        Image.fromarray(checked).save(temporary, format="PNG", optimize=True)
+    write_bytes(path, _encoded([frame], format="PNG", optimize=True))
 
 
 def encode_frame(frame: Frame, kind: Literal["PNG", "JPEG"]) -> bytes:
     """Return the content of a picture's file, fast rather than small."""
-    (checked,) = checked_frames([frame])
-    options = {"compress_level": 1} if kind == "PNG" else {"quality": 90}
+    return _encoded([frame], format=kind, compress_level=1, quality=90)
+
+
+def _encoded(frames: Iterable[Frame], **options: Any) -> bytes:
+    """Return the content of the file that Pillow makes of pictures."""
+    first, *others = map(Image.fromarray, checked_frames(frames))
     buffer = io.BytesIO()
-    Image.fromarray(checked).save(buffer, format=kind, **options)
+    first.save(buffer, append_images=others, **options)
     return buffer.getvalue()
 
 
@@ -104,23 +106,19 @@ def write_webp(
         fps: Frames a second.
         quality: 0 to 100.
     """
-    content = encode_webp(frames, fps, quality=quality)
-    with atomic_path(path) as temporary:
-        temporary.write_bytes(content)
+    write_bytes(path, encode_webp(frames, fps, quality=quality))
 
 
 def encode_webp(frames: Iterable[Frame], fps: float = 25, *, quality: int = 50) -> bytes:
     """Return the content of the file that `write_webp` writes."""
-    first, *others = map(Image.fromarray, checked_frames(frames))
+    pictures = checked_frames(frames)
     check_rate(fps)
     if not (is_real(quality) and 0 <= quality <= 100):
         raise NPAError(f"quality must be in [0, 100], got {shown(quality)}: try 50")
-    buffer = io.BytesIO()
-    first.save(
-        buffer, format="WebP", save_all=True, append_images=others, duration=round(1000 / fps),
-        loop=0, quality=quality, method=4,
-    )  # fmt: skip
-    return buffer.getvalue()
+    duration = round(1000 / fps)
+    return _encoded(
+        pictures, format="WebP", save_all=True, duration=duration, loop=0, quality=quality, method=4
+    )
 
 
 def write_mp4(path: str | Path, frames: Iterable[Frame], fps: float = 25) -> None:
@@ -169,17 +167,16 @@ def write_filmstrip(
     """
     pictures = checked_frames(frames)
     count = len(pictures)
-    if captions is not None:
-        captions = _checked_captions(captions, count)
+    captions = [] if captions is None else _checked_captions(captions, count)
     across = min(count, 8) if columns is None else columns
     if not is_whole(across) or across < 1:
         raise NPAError(f"columns must be an integer of at least 1, got {shown(columns)}: try 4")
     across = min(across, count)
     height, width, _ = pictures[0].shape
-    font = _caption_font(captions or [], width)
+    font = _caption_font(captions, width)
     _, top, _, bottom = font.getbbox("Ågjy")
     text_height = math.ceil(bottom - top) + _MARGIN if captions else 0
-    cell = max([width, *(math.ceil(font.getlength(caption)) for caption in captions or [])])
+    cell = max([width, *(math.ceil(font.getlength(caption)) for caption in captions)])
     pitch_x, pitch_y = cell + _MARGIN, height + text_height + _MARGIN
     down = -(-count // across)
     red, green, blue = (round(255 * part) for part in background_colour(background))
@@ -241,9 +238,10 @@ def checked_frames(frames: Iterable[Frame]) -> list[Frame]:
     first = pictures[0].shape
     for k, picture in enumerate(pictures):
         if picture.dtype != np.uint8 or picture.ndim != 3 or picture.shape[-1] != 3:
+            name = "frame" if len(pictures) == 1 else f"frame {k}"
             raise NPAError(
-                f"frame {k} must be uint8 of shape [H, W, 3], got {picture.dtype} "
-                f"{picture.shape}: make frames with npa_envs.render.to_uint8"
+                f"{name} must be uint8 of shape [H, W, 3], got {picture.dtype} {picture.shape}: "
+                "make frames with npa_envs.render.to_uint8"
             )
         if picture.shape != first or 0 in first:
             raise NPAError(

@@ -20,6 +20,7 @@ from __future__ import annotations
 
 import base64
 import binascii
+import inspect
 import io
 import json
 import math
@@ -38,21 +39,8 @@ from npa_envs.files import check_torch_archive, checked_path, parse_json, write_
 from npa_envs.rule.rule import NPARule, check_rule
 
 _DEMO_SPACE_DIM = 2
-_DEMO_KIND = {
-    "space_dim": _DEMO_SPACE_DIM,
-    "static": False,
-    "readout_dim": 0,
-    "moment_correction": True,
-    "moment_inverse": "threshold",
-    "state_gradient": True,
-    "density_gradient": True,
-    "species_count": 0,
-    "equivariant": False,
-    "code_dim": 0,
-    "divides": False,
-    "dead_zone": 0.0,
-}
-"""What rules of the web demo are like; its files do not say it."""
+_DEMO_FREE = {"state_dim", "hidden_dim", "eps0", "alpha", "readout_hidden_dim", "mixed_vectors"}
+"""In these rules of the web demo may differ from `NPARule()`; its files do not hold the others."""
 
 DEMO_PARTICLE_COUNT = 4096
 """Particles of a world in the web demo where nothing else is said."""
@@ -60,8 +48,8 @@ DEMO_PARTICLE_COUNT = 4096
 _TEXEL = 4
 """The web demo keeps its weights in RGBA textures: rows are padded to a multiple of this."""
 
-_ZIP_MARK = b"PK\x03\x04"
-"""What a file of torch.save begins with, unless it is in torch's legacy format."""
+ZIP_MARK = b"PK\x03\x04"
+"""What a file of torch.save begins with, which has checksums, unless it is in the legacy format."""
 
 _EQUIVARIANT_NAMES = {
     "model.W_hidden": "W_hidden",
@@ -92,10 +80,6 @@ class RuleParts:
 
     hyper_parameters: dict[str, Any]
     weights: dict[str, Tensor]
-    header: dict[str, str] | None = None
-    """Metadata of a file in our format."""
-    has_checksum: bool = False
-    """Whether the file has one, which shows damage."""
 
 
 def check_precision(weights: Mapping[str, Tensor]) -> None:
@@ -122,28 +106,24 @@ def check_finite(weights: Mapping[str, Tensor]) -> None:
 
 
 def read_state_dict(data: bytes) -> RuleParts:
-    """Read the authors' state dict.
-
-    The space dimension and the number of channels follow from the shapes.
-    """
+    """Read the authors' state dict; dimension and channels follow from the shapes."""
     state = _unpickle(data)
+    known, kind, more = _WEIGHT_NAMES, "", f" and, with a read-out, {sorted(_DECODER_NAMES)}"
     if state.keys() & _EQUIVARIANT_NAMES:
-        return _read_equivariant_state(state, has_checksum=data.startswith(_ZIP_MARK))
-    required = {"model.0.weight", "model.0.bias", "model.2.weight", "eps0", "alpha"}
+        known, kind, more = _EQUIVARIANT_NAMES, " of an equivariant rule", ""
+    decoder = _DECODER_NAMES & known.keys()
+    required = {*known, "eps0", "alpha"} - decoder
     missing = required - state.keys()
-    if state.keys() & _DECODER_NAMES:
-        missing |= _DECODER_NAMES - state.keys()
-    unknown = state.keys() - required - _DECODER_NAMES - _IGNORED
+    missing |= decoder - state.keys() if state.keys() & decoder else set()
+    unknown = state.keys() - required - decoder - _IGNORED
     if missing or unknown:
         raise NPAError(
-            f"the state dict must hold {sorted(required)} and, with a read-out, "
-            f"{sorted(_DECODER_NAMES)}; missing: {sorted(missing)}, unknown: "
-            f"{shown(sorted(map(str, unknown)))}"
+            f"the state dict{kind} must hold {sorted(required)}{more}; missing: "
+            f"{sorted(missing)}, unknown: {shown(sorted(map(str, unknown)))}"
         )
-    weights = {}
-    for theirs, ours in _WEIGHT_NAMES.items():
-        if theirs in state:
-            weights[ours] = _matrix(theirs, state[theirs])
+    weights = {known[name]: _matrix(name, state[name]) for name in known if name in state}
+    if known is _EQUIVARIANT_NAMES:
+        return _equivariant_parts(weights, state)
     hidden_dim, perception_dim = weights["hidden.weight"].shape
     update_dim = weights["output.weight"].shape[0]
     has_readout = "readout.0.weight" in weights
@@ -160,25 +140,10 @@ def read_state_dict(data: bytes) -> RuleParts:
     if has_readout:
         hyper_parameters["readout_dim"] = weights["readout.2.weight"].shape[0]
         hyper_parameters["readout_hidden_dim"] = weights["readout.0.weight"].shape[0]
-    return RuleParts(hyper_parameters, weights, has_checksum=data.startswith(_ZIP_MARK))
+    return RuleParts(hyper_parameters, weights)
 
 
-def _read_equivariant_state(state: Mapping[Any, Any], *, has_checksum: bool) -> RuleParts:
-    """Read the state dict of an equivariant rule."""
-    required = {*_EQUIVARIANT_NAMES, "eps0", "alpha"}
-    missing, unknown = required - state.keys(), state.keys() - required - _IGNORED
-    if missing or unknown:
-        raise NPAError(
-            f"the state dict of an equivariant rule must hold {sorted(required)}; missing: "
-            f"{sorted(missing)}, unknown: {shown(sorted(map(str, unknown)))}"
-        )
-    tensors = {name: _matrix(theirs, state[theirs]) for theirs, name in _EQUIVARIANT_NAMES.items()}
-    return _equivariant_parts(tensors, state, has_checksum=has_checksum)
-
-
-def _equivariant_parts(
-    tensors: Mapping[str, Tensor], numbers: Mapping[Any, Any], *, has_checksum: bool = False
-) -> RuleParts:
+def _equivariant_parts(tensors: Mapping[str, Tensor], numbers: Mapping[Any, Any]) -> RuleParts:
     """Return an equivariant rule of 2D worlds from its tensors, by their names in the web demo."""
     mixing, first, second = (tensors[name] for name in ("W_hidden", "w1.weight", "w2.weight"))
     state_dim, mixed = mixing.shape[0] - 1, mixing.shape[1]
@@ -216,7 +181,7 @@ def _equivariant_parts(
         "equivariant": True,
         "mixed_vectors": mixed,
     }
-    return RuleParts(hyper_parameters, weights, has_checksum=has_checksum)
+    return RuleParts(hyper_parameters, weights)
 
 
 def read_demo_json(data: bytes, name: str | None) -> RuleParts:
@@ -321,9 +286,6 @@ def save_demo_json(
     """Write rules as a collection of the authors' web demo, in float32, whole or not at all.
 
     `load_rule("models.json#name")` gives each of them back.
-
-    Args:
-        particle_counts: With how many particles a rule starts there; 4096 where nothing is said.
     """
     path = checked_path(path)
     if path.suffix != ".json":
@@ -343,12 +305,13 @@ def save_demo_json(
 
 def _demo_entry(name: str, rule: NPARule, particle_count: int) -> dict[str, Any]:
     check_rule(rule)
-    made = rule.hyper_parameters()
-    for field, wanted in _DEMO_KIND.items():
-        if made.get(field, wanted) != wanted:
+    defaults = inspect.signature(NPARule).parameters
+    for field, made in rule.hyper_parameters().items():
+        wanted = defaults[field].default
+        if field not in _DEMO_FREE and made != wanted:
             raise NPAError(
                 f"the authors' demo runs rules with {field}={wanted!r} only, {shown(name)} has "
-                f"{made[field]!r}: save it with npa_envs.save_rule"  # type: ignore[literal-required]
+                f"{made!r}: save it with npa_envs.save_rule"
             )
     if not rule.is_plain():
         raise NPAError(
@@ -379,7 +342,7 @@ def _encode(tensor: Tensor) -> dict[str, Any]:
 
 
 def _unpickle(data: bytes) -> Mapping[Any, Any]:
-    is_zip = data.startswith(_ZIP_MARK)
+    is_zip = data.startswith(ZIP_MARK)
     if is_zip:
         check_torch_archive(io.BytesIO(data))
     try:

@@ -26,15 +26,8 @@ class Codes(nn.Module):
     """Codes by name, each of `dim` numbers in about [-1, 1] (dimensionless).
 
     A code is state that a rule perceives and never changes: the first `code_dim` channels of each
-    particle.
-
-    Args:
-        dim: Numbers of a code, K.
-        encoder: Codes are read from pictures by a network, so that a picture that was never trained
-            on has one too. Without, each is learned by itself.
-
-    Raises:
-        NPAError: There are no names, too many, or two are the same.
+    particle. It is learned by itself, or a trained network, the encoder, reads it from a picture,
+    so that a picture that was never trained on has one too.
     """
 
     table: Tensor
@@ -42,7 +35,6 @@ class Codes(nn.Module):
 
     def __init__(self, names: Sequence[str], dim: int, *, encoder: bool = False) -> None:
         super().__init__()
-        check_names(names)
         if len(set(names)) < len(names) or len(names) > LARGEST_CODE_COUNT:
             raise NPAError(
                 f"code_names must be different names, at most {LARGEST_CODE_COUNT}, got "
@@ -69,22 +61,14 @@ class Codes(nn.Module):
         """Return the names, one by one."""
         return iter(self.names)
 
-    def number(self, name: str) -> int:
-        """Return the place of a name."""
-        if name not in self.names:
-            raise NPAError(f"unknown code {shown(name)}: {suggest(name, self.names)}")
-        return self.names.index(name)
-
     def __getitem__(self, name: str) -> Tensor:
         """Return the code of a name, shape [K]."""
-        return self.table[self.number(name)]
+        if name not in self.names:
+            raise NPAError(f"unknown code {shown(name)}: {suggest(name, self.names)}")
+        return self.table[self.names.index(name)]
 
     def blend(self, shares: Mapping[str, float]) -> Tensor:
-        """Return the mean of codes, each weighted by its share, shape [K].
-
-        Args:
-            shares: Weight of each name, for example {"gecko": 0.5, "butterfly": 0.5}.
-        """
+        """Return the mean of codes, each weighted by its share, shape [K]."""
         total = sum(shares.values())
         if not (math.isfinite(total) and total > 0.0):
             raise NPAError(
@@ -107,13 +91,16 @@ class Codes(nn.Module):
         return codes
 
 
+def carrying(states: Tensor, code: Tensor) -> Tensor:
+    """Return states [..., C] that begin with a code, of a shape that expands to [..., K]."""
+    carried = code.to(states).expand(*states.shape[:-1], code.shape[-1])
+    return torch.cat((carried, states[..., code.shape[-1] :]), dim=-1)
+
+
 def check_names(names: object) -> None:
     """Check that what codes are to be called is several texts."""
-    if (
-        not isinstance(names, Collection)
-        or isinstance(names, str)
-        or not all(isinstance(name, str) for name in names)
-    ):
+    several = isinstance(names, Collection) and not isinstance(names, str)
+    if not several or not all(isinstance(name, str) for name in names):
         raise NPAError(
             f"code_names must be a list of names, got {shown(names)}: for example ['gecko', "
             "'heart'], or () for a rule without codes"
@@ -121,11 +108,7 @@ def check_names(names: object) -> None:
 
 
 class PictureEncoder(nn.Module):
-    """A small convolutional network from a picture to a code in [-1, 1].
-
-    Args:
-        dim: Numbers of a code, K.
-    """
+    """A small convolutional network from a picture to a code in [-1, 1]."""
 
     def __init__(self, dim: int) -> None:
         super().__init__()

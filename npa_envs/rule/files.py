@@ -11,9 +11,9 @@ import hashlib
 import json
 import os
 import warnings
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, Literal, get_origin, get_type_hints
+from typing import Any, Literal, get_origin
 
 import torch
 from safetensors import SafetensorError, safe_open
@@ -30,22 +30,20 @@ from npa_envs.files import (
     write_bytes,
 )
 from npa_envs.rule.authors import (
+    ZIP_MARK,
     RuleParts,
     check_finite,
     check_precision,
     read_demo_json,
     read_state_dict,
 )
-from npa_envs.rule.rule import NPARule, RuleHyperParameters, check_rule, is_altered
+from npa_envs.rule.rule import HYPER_PARAMETERS, NPARule, check_rule, is_altered
 
 FORMAT_NAME = "npa-envs rule"
 FORMAT_VERSION = "1"
 
-_PLAIN: dict[Any, type] = {Literal: str, tuple: tuple}
-_FIELDS = {
-    name: _PLAIN.get(get_origin(kind), kind)
-    for name, kind in get_type_hints(RuleHyperParameters).items()
-}
+_PLAIN: dict[Any, type] = {Literal: str, Sequence: tuple}
+_FIELDS = {name: _PLAIN.get(get_origin(kind), kind) for name, kind in HYPER_PARAMETERS.items()}
 _RESERVED = {"format", "version", "checksum", *_FIELDS}
 _SUFFIXES = (".safetensors", ".pth", ".pt", ".json")
 _LARGEST_FILE = 64 * 2**20
@@ -103,18 +101,25 @@ def load_rule(source: str | Path, *, device: str | torch.device = "cpu") -> NPAR
     target = check_device(device)
     path, name = _locate(source)
     try:
-        if path.suffix == ".safetensors":
-            parts = _read_ours(path)
-        elif path.suffix == ".json":
-            parts = read_demo_json(read_bytes(path, limit=_LARGEST_FILE), name)
+        content, ours = b"", path.suffix == ".safetensors"
+        if ours:
+            header, weights = _read_ours(path, with_weights=True)
+            given = {name: _parse(header, name, kind) for name, kind in _FIELDS.items()}
+            parts = RuleParts(given, weights)
         else:
-            parts = read_state_dict(read_bytes(path, limit=_LARGEST_FILE))
+            content = read_bytes(path, limit=_LARGEST_FILE)
+            is_demo = path.suffix == ".json"
+            parts = read_demo_json(content, name) if is_demo else read_state_dict(content)
         rule = _assemble(parts)
-        if parts.header is not None:
-            _verify(parts.header, parts.weights)
+        if ours and header.get("checksum") != _checksum(header, weights):
+            raise NPAError(
+                "the checksum must be that of the weights and of the metadata, got another one: "
+                "the file is damaged, or another program has changed it; copy it again from where "
+                "it came"
+            )
     except NPAError as error:
         raise NPAError(f"cannot load a rule from {shown(str(source))}: {error}") from error
-    if not parts.has_checksum:
+    if not (ours or content.startswith(ZIP_MARK)):
         warnings.warn(
             f"the rule's file {shown(str(path))} has no checksum, so that damage cannot be told: "
             "if it is known to be good, save it again with npa_envs.save_rule",
@@ -163,15 +168,13 @@ def save_rule(
             "metadata={'trained by': 'me'}"
         )
     for name, text in (metadata or {}).items():
+        fault, cure = "", ""
         if not isinstance(name, str) or not isinstance(text, str):
-            raise NPAError(
-                f"metadata must map text to text, got {shown(name)}: {shown(text)}: use str()"
-            )
-        if not (_is_utf8(name) and _is_utf8(text)):
-            raise NPAError(
-                f"metadata must be text that UTF-8 can write, got {shown(name)}: {shown(text)}: "
-                "leave single surrogates out"
-            )
+            fault, cure = "map text to text", "use str()"
+        elif any("\ud800" <= letter <= "\udfff" for letter in name + text):
+            fault, cure = "be text that UTF-8 can write", "leave single surrogates out"
+        if fault:
+            raise NPAError(f"metadata must {fault}, got {shown(name)}: {shown(text)}: {cure}")
         if name in _RESERVED:
             raise NPAError(
                 f"metadata must not use the name {shown(name)}: the format holds it itself"
@@ -197,14 +200,6 @@ def _is_as_made(rule: NPARule) -> bool:
     return True
 
 
-def _is_utf8(text: str) -> bool:
-    try:
-        text.encode()
-    except UnicodeEncodeError:
-        return False
-    return True
-
-
 def _with_sorted_metadata(file: bytes) -> bytes:
     """Return a safetensors file with sorted metadata, so that equal rules make equal files."""
     size = int.from_bytes(file[:8], "little")
@@ -217,13 +212,9 @@ def _with_sorted_metadata(file: bytes) -> bytes:
 
 
 def rule_metadata(path: str | Path) -> dict[str, str]:
-    """Return the text in the header of a file that `save_rule` wrote, all of it.
-
-    Raises:
-        NPAError: The file is missing, garbage, truncated, or not a rule.
-    """
+    """Return the text in the header of a file that `save_rule` wrote, all of it."""
     try:
-        return _read_header(checked_path(path))
+        return _read_ours(checked_path(path), with_weights=False)[0]
     except NPAError as error:
         raise NPAError(f"cannot read the header of {shown(str(path))}: {error}") from error
 
@@ -237,11 +228,7 @@ def rule_digest(rule: NPARule) -> str:
 
 
 def rule_file(source: str | Path) -> Path:
-    """Return the file of a rule.
-
-    Raises:
-        NPAError: The name is unknown, it is no such path, or a folder without one rule.
-    """
+    """Return the file of a rule."""
     return _locate(source)[0]
 
 
@@ -264,7 +251,14 @@ def _locate(source: str | Path) -> tuple[Path, str | None]:
     if text in named:
         return named[text], None
     if os.path.isdir(text):
-        return _rule_in(Path(text)), None
+        rule = Path(text) / "rule.safetensors"
+        if rule.is_file():
+            return rule, None
+        others = sorted(Path(text).glob("rule-*.safetensors"))
+        cure = f"one of its rules, such as {str(others[0])!r}" if others else "another one"
+        raise NPAError(
+            f"a folder must hold the {rule.name} of a run, {text!r} does not: name {cure}"
+        )
     base, mark, name = text.rpartition("#")
     path, inner = (Path(base), name) if mark and base.endswith(".json") else (Path(text), None)
     if path.suffix in _SUFFIXES:
@@ -277,21 +271,14 @@ def _locate(source: str | Path) -> tuple[Path, str | None]:
     )
 
 
-def _rule_in(folder: Path) -> Path:
-    """Return the file of the rule in a training run's folder, which exists."""
-    rule = folder / "rule.safetensors"
-    if rule.is_file():
-        return rule
-    others = sorted(folder.glob("rule-*.safetensors"))
-    cure = f"name one of its rules, such as {str(others[0])!r}" if others else "name another one"
-    raise NPAError(f"a folder must hold the {rule.name} of a run, {str(folder)!r} does not: {cure}")
-
-
-def _read_header(path: Path) -> dict[str, str]:
+def _read_ours(path: Path, *, with_weights: bool) -> tuple[dict[str, str], dict[str, Tensor]]:
+    """Return the metadata of a file in our format, and its weights or none."""
     check_regular(path, limit=_LARGEST_FILE)
     try:
         with safe_open(path, framework="pt") as file:
             header: dict[str, str] = file.metadata() or {}
+            names = list(file.keys()) if with_weights else []
+            weights = {name: file.get_tensor(name).clone() for name in names}
     except (OSError, ValueError, SafetensorError) as error:
         raise NPAError(
             f"this is no safetensors file, or a truncated one ({shown(error)})"
@@ -306,18 +293,7 @@ def _read_header(path: Path) -> dict[str, str]:
             f"the metadata's version must be {FORMAT_VERSION}, got "
             f"{shown(header.get('version'))}: upgrade with pip install -U npa-envs"
         )
-    return header
-
-
-def _read_ours(path: Path) -> RuleParts:
-    header = _read_header(path)
-    hyper_parameters = {name: _parse(header, name, kind) for name, kind in _FIELDS.items()}
-    try:
-        with safe_open(path, framework="pt") as file:
-            weights = {name: file.get_tensor(name).clone() for name in file.keys()}  # noqa: SIM118
-    except (OSError, SafetensorError) as error:
-        raise NPAError(f"the weights cannot be read ({shown(error)})") from error
-    return RuleParts(hyper_parameters, weights, header, has_checksum=True)
+    return header, weights
 
 
 def _checksum(header: Mapping[str, str], weights: Mapping[str, Tensor]) -> str:
@@ -328,15 +304,6 @@ def _checksum(header: Mapping[str, str], weights: Mapping[str, Tensor]) -> str:
     for _, tensor in sorted(weights.items()):
         found.update(tensor.numpy().tobytes())
     return found.hexdigest()
-
-
-def _verify(header: Mapping[str, str], weights: Mapping[str, Tensor]) -> None:
-    """Check that a file is as it was written."""
-    if header.get("checksum") != _checksum(header, weights):
-        raise NPAError(
-            "the checksum must be that of the weights and of the metadata, got another one: the "
-            "file is damaged, or another program has changed it; copy it again from where it came"
-        )
 
 
 def _parse(header: Mapping[str, str], name: str, kind: type) -> Any:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import difflib
 import math
 from collections.abc import Sequence
-from typing import Any, TypedDict, cast
+from typing import Any, get_type_hints
 
 import torch
 from torch import Tensor, nn
@@ -18,10 +18,11 @@ from npa_envs.checks import (
     checked_number,
     checked_positive,
     constant,
+    is_whole,
 )
 from npa_envs.errors import NPAError, shown
 from npa_envs.ops.equivariance import MIXED_VECTORS, VectorForm, invariants, signed_gates, steered
-from npa_envs.rule.codes import Codes, check_names
+from npa_envs.rule.codes import Codes, carrying, check_names
 from npa_envs.rule.network import (
     FOLD,
     FoldedInvariants,
@@ -70,32 +71,6 @@ STEP_PARTS = frozenset(
     ]
 )
 """What a step of a rule is made of: where a subclass changes any of it, the rule is not plain."""
-
-
-class RuleHyperParameters(TypedDict):
-    """Everything that makes an `NPARule`, but its weights."""
-
-    space_dim: int
-    state_dim: int
-    hidden_dim: int
-    eps0: float
-    alpha: float
-    static: bool
-    readout_dim: int
-    readout_hidden_dim: int
-    moment_correction: bool
-    state_gradient: bool
-    density_gradient: bool
-    species_count: int
-    moment_inverse: MomentInverse
-    equivariant: bool
-    chiral: bool
-    mixed_vectors: int
-    code_dim: int
-    code_names: tuple[str, ...]
-    encoder: bool
-    divides: bool
-    dead_zone: float
 
 
 class NPARule(nn.Module):
@@ -172,55 +147,24 @@ class NPARule(nn.Module):
         dead_zone: float = 0.0,
     ) -> None:
         super().__init__()
-        sizes = {
-            "space_dim": space_dim,
-            "state_dim": state_dim,
-            "hidden_dim": hidden_dim,
-            "readout_dim": readout_dim,
-            "readout_hidden_dim": readout_hidden_dim,
-            "mixed_vectors": mixed_vectors,
-            "species_count": species_count,
-            "code_dim": code_dim,
-        }
-        for name, size in sizes.items():
-            if isinstance(size, bool) or not isinstance(size, int):
-                raise NPAError(f"{name} must be an integer, got {shown(size)}: try 2")
-        if space_dim not in (2, 3):
-            raise NPAError(f"space_dim must be 2 or 3, got {shown(space_dim)}")
-        for name, size in sizes.items():
-            if size > LARGEST_DIM:
-                raise NPAError(f"{name} must be at most {LARGEST_DIM}, got {shown(size)}")
-        positive = {"state_dim": state_dim, "hidden_dim": hidden_dim}
-        for name, value in (positive | {"mixed_vectors": mixed_vectors}).items():
-            if value < 1:
-                raise NPAError(f"{name} must be at least 1, got {shown(value)}")
-        if readout_dim < 0 or (readout_dim > 0 and readout_hidden_dim < 1):
-            raise NPAError(
-                f"readout_dim must be 0, or positive with readout_hidden_dim at least 1, "
-                f"got {shown(readout_dim)} and {shown(readout_hidden_dim)}"
-            )
-        if species_count < 0:
-            raise NPAError(f"species_count must be at least 0, got {shown(species_count)}")
         self.space_dim, self.state_dim, self.hidden_dim = space_dim, state_dim, hidden_dim
+        self.readout_dim, self.readout_hidden_dim = readout_dim, readout_hidden_dim
+        self.species_count, self.mixed_vectors = species_count, mixed_vectors
+        self.code_dim = code_dim
+        self._check_sizes()
         self.eps0 = checked_positive("eps0", eps0, " [length units]")
         self.alpha = checked_positive("alpha", alpha)
         self.static = checked_flag("static", static)
-        self.readout_dim, self.readout_hidden_dim = readout_dim, readout_hidden_dim
         self.moment_correction = checked_flag("moment_correction", moment_correction)
         self.moment_inverse = checked_moment_inverse(moment_inverse)
         self.state_gradient = checked_flag("state_gradient", state_gradient)
         self.density_gradient = checked_flag("density_gradient", density_gradient)
-        self.species_count = species_count
         self.equivariant = checked_flag("equivariant", equivariant)
         self.chiral = checked_flag("chiral", chiral)
-        self.mixed_vectors = mixed_vectors
-        self.code_dim = code_dim
         self.divides = checked_flag("divides", divides)
-        self.dead_zone = _checked_dead_zone(dead_zone, self.equivariant)
-        self._check_equivariance()
+        self.dead_zone = checked_number("dead_zone", dead_zone)
         check_names(code_names)
-        self._check_codes(len(code_names), checked_flag("encoder", encoder))
-        self._check_division()
+        self._check_parts(len(code_names), checked_flag("encoder", encoder))
 
         self.hidden = nn.Linear(self.input_dim, hidden_dim)
         self.output = nn.Linear(hidden_dim, self.output_dim, bias=False)
@@ -250,51 +194,84 @@ class NPARule(nn.Module):
         self.codes = Codes(code_names, code_dim, encoder=encoder) if code_dim else None
         """The codes that the rule knows, where it perceives such."""
 
-    def _check_codes(self, name_count: int, encoder: bool) -> None:
-        if not 0 <= self.code_dim < self.state_dim:
+    def _check_sizes(self) -> None:
+        positive = ("state_dim", "hidden_dim", "mixed_vectors")
+        names = (*positive, "readout_dim", "readout_hidden_dim", "species_count", "code_dim")
+        sizes = {name: getattr(self, name) for name in ("space_dim", *names)}
+        for name, size in sizes.items():
+            if not is_whole(size):
+                raise NPAError(f"{name} must be an integer, got {shown(size)}: try 2")
+        if self.space_dim not in (2, 3):
+            raise NPAError(f"space_dim must be 2 or 3, got {shown(self.space_dim)}")
+        for name, size in sizes.items():
+            if size > LARGEST_DIM:
+                raise NPAError(f"{name} must be at most {LARGEST_DIM}, got {shown(size)}")
+        for name, least in (*((name, 1) for name in positive), ("species_count", 0)):
+            if sizes[name] < least:
+                raise NPAError(f"{name} must be at least {least}, got {shown(sizes[name])}")
+        if self.readout_dim < 0 or (self.readout_dim > 0 and self.readout_hidden_dim < 1):
             raise NPAError(
-                f"code_dim must be at least 0 and below state_dim = {self.state_dim}, got "
-                f"{self.code_dim}: a code is among the state channels"
+                f"readout_dim must be 0, or positive with readout_hidden_dim at least 1, "
+                f"got {shown(self.readout_dim)} and {shown(self.readout_hidden_dim)}"
             )
-        if (self.code_dim > 0) != (name_count > 0) or (encoder and not self.code_dim):
-            raise NPAError(
-                f"code_dim and code_names go together, and an encoder needs both, got code_dim="
-                f"{self.code_dim}, {name_count} code_names, encoder={encoder}: for example "
-                "code_dim=8, code_names=['gecko', 'heart']"
-            )
-        if self.code_dim and self.equivariant:
-            raise NPAError("an equivariant rule has no codes, got code_dim and equivariant=True")
 
-    def _check_equivariance(self) -> None:
-        if not self.equivariant:
-            if self.chiral:
-                raise NPAError("chiral is for equivariant rules: give equivariant=True as well")
-            return
-        if self.chiral and self.space_dim != 2:
-            raise NPAError(
-                f"chiral needs space_dim=2, where vectors can be turned by 90 degrees, got "
-                f"{self.space_dim}: leave it out"
-            )
-        if self.species_count:
-            raise NPAError(
-                f"an equivariant rule perceives all species alike, got species_count="
-                f"{self.species_count}: leave one of the two out"
-            )
-        if not (self.state_gradient or self.density_gradient):
-            raise NPAError(
+    def _check_parts(self, name_count: int, encoder: bool) -> None:
+        """Check what the dead zone, equivariance, codes and division need and exclude."""
+        turning, code_dim, zone = self.equivariant, self.code_dim, self.dead_zone
+        for fails, fault in (
+            (
+                not 0.0 <= zone < math.inf,
+                "dead_zone must be a finite number of at least 0 (dimensionless), got "
+                f"{shown(zone)}: try 0.001",
+            ),
+            (
+                zone and turning,
+                "an equivariant rule has no dead zone, whose edges would be directions, got "
+                f"dead_zone={shown(zone)} and equivariant=True: leave one of the two out",
+            ),
+            (
+                self.chiral and not turning,
+                "chiral is for equivariant rules: give equivariant=True as well",
+            ),
+            (
+                self.chiral and self.space_dim != 2,
+                "chiral needs space_dim=2, where vectors can be turned by 90 degrees, got "
+                f"{self.space_dim}: leave it out",
+            ),
+            (
+                turning and self.species_count,
+                "an equivariant rule perceives all species alike, got species_count="
+                f"{self.species_count}: leave one of the two out",
+            ),
+            (
+                turning and not (self.state_gradient or self.density_gradient),
                 "an equivariant rule needs vectors to perceive, got state_gradient=False and "
-                "density_gradient=False: leave one of them out"
-            )
-
-    def _check_division(self) -> None:
-        if not self.divides:
-            return
-        if self.static or self.species_count or self.code_dim:
-            raise NPAError(
-                f"rules that divide move their particles, of one species and without codes, got "
+                "density_gradient=False: leave one of them out",
+            ),
+            (
+                not 0 <= code_dim < self.state_dim,
+                f"code_dim must be at least 0 and below state_dim = {self.state_dim}, got "
+                f"{code_dim}: a code is among the state channels",
+            ),
+            (
+                (code_dim > 0) != (name_count > 0) or (encoder and not code_dim),
+                "code_dim and code_names go together, and an encoder needs both, got code_dim="
+                f"{code_dim}, {name_count} code_names, encoder={encoder}: for example "
+                "code_dim=8, code_names=['gecko', 'heart']",
+            ),
+            (
+                code_dim and turning,
+                "an equivariant rule has no codes, got code_dim and equivariant=True",
+            ),
+            (
+                self.divides and (self.static or self.species_count or code_dim),
+                "rules that divide move their particles, of one species and without codes, got "
                 f"static={self.static}, species_count={self.species_count} and code_dim="
-                f"{self.code_dim}: leave these out"
-            )
+                f"{code_dim}: leave these out",
+            ),
+        ):
+            if fails:
+                raise NPAError(fault)
 
     @property
     def vector_form(self) -> VectorForm:
@@ -496,13 +473,12 @@ class NPARule(nn.Module):
             )
         shape = (*states.shape[:-1], self.code_dim)
         try:
-            carried = code.to(states).expand(shape)
+            return carrying(states, code.expand(shape))
         except RuntimeError as error:
             raise NPAError(
                 f"code must have shape [K], [B, 1, K] or [B, N, K] for {shape}, got "
                 f"{tuple(code.shape)}"
             ) from error
-        return torch.cat((carried, states[..., self.code_dim :]), dim=-1)
 
     def _repr_html_(self) -> str:
         """Return what Jupyter shows: what the rule sees, what it does, how large it is."""
@@ -520,13 +496,14 @@ class NPARule(nn.Module):
             "and then": f"{done}: {self.update_dim} numbers",
             "state": f"{self.state_dim} channels",
             "network": f"{self.hidden_dim} hidden units, {self.weight_count} weights",
+            "dead zone": f"{self.dead_zone:g}: smaller numbers count as 0" * bool(self.dead_zone),
+            "read-out": f"{self.readout_dim} outputs" * (self.readout is not None),
         }
-        if self.dead_zone:
-            rows["dead zone"] = f"{self.dead_zone:g}: smaller numbers count as 0"
-        if self.readout is not None:
-            rows["read-out"] = f"{self.readout_dim} outputs"
-        cells = "".join(f"<tr><th>{name}</th><td>{text}</td></tr>" for name, text in rows.items())
-        return f"<table><caption>a rule of {self.space_dim}D worlds</caption>{cells}</table>"
+        shown_rows = [
+            f"<tr><th>{name}</th><td>{text}</td></tr>" for name, text in rows.items() if text
+        ]
+        caption = f"<caption>a rule of {self.space_dim}D worlds</caption>"
+        return f"<table>{caption}{''.join(shown_rows)}</table>"
 
     def __getattr__(self, name: str) -> Any:
         try:
@@ -540,34 +517,19 @@ class NPARule(nn.Module):
             hint = f": did you mean {nearest[0]!r}?" if nearest else ""
             raise AttributeError(f"{error}{hint}", name=name, obj=self) from None
 
-    def hyper_parameters(self) -> RuleHyperParameters:
+    def hyper_parameters(self) -> dict[str, Any]:
         """Return all that `NPARule` takes: `NPARule(**rule.hyper_parameters())` has this shape."""
         codes = self.codes
         own = {
             "code_names": () if codes is None else codes.names,
             "encoder": codes is not None and codes.encoder is not None,
         }
-        found = {
-            name: own[name] if name in own else getattr(self, name)
-            for name in RuleHyperParameters.__annotations__
-        }
-        return cast(RuleHyperParameters, found)
+        names = HYPER_PARAMETERS
+        return {name: own[name] if name in own else getattr(self, name) for name in names}
 
 
-def _checked_dead_zone(value: Any, equivariant: bool) -> float:
-    """Return a rule's dead zone as a float."""
-    zone = checked_number("dead_zone", value)
-    if not (0.0 <= zone < math.inf):
-        raise NPAError(
-            f"dead_zone must be a finite number of at least 0 (dimensionless), got {shown(value)}: "
-            "try 0.001"
-        )
-    if zone and equivariant:
-        raise NPAError(
-            f"an equivariant rule has no dead zone, whose edges would be directions, got dead_zone="
-            f"{shown(value)} and equivariant=True: leave one of the two out"
-        )
-    return zone
+HYPER_PARAMETERS = {k: v for k, v in get_type_hints(NPARule.__init__).items() if k != "return"}
+"""What makes a rule, but for its weights: name -> type."""
 
 
 def _steps_alike(kind: type[NPARule]) -> bool:
@@ -589,13 +551,6 @@ def with_codes(rule: NPARule, untrained: NPARule) -> NPARule:
     """Return an untrained rule with the weights that a rule without codes has.
 
     What is new, the columns of the codes, stays as it is, and so do further hidden units.
-
-    Args:
-        untrained: A rule with codes, otherwise of the same shape, but for as many hidden units or
-            more; it is changed where the shapes fit.
-
-    Returns:
-        The untrained rule; or `rule`, where the shapes do not fit.
     """
     count, space_dim, code_dim = untrained.state_dim, untrained.space_dim, untrained.code_dim
     own = torch.ones(untrained.perception_dim, dtype=torch.bool)

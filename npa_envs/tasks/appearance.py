@@ -81,14 +81,7 @@ class Appearance:
 
 
 def draw_gaussians(x: Tensor, gaussians: Gaussians, cameras: Cameras) -> tuple[Tensor, Tensor]:
-    """Return what cameras see before a black background; differentiable but by the cameras.
-
-    Args:
-        gaussians: How particles look.
-
-    Returns:
-        Red, green and blue, shape [B, V, H, W, 3], and alpha, shape [B, V, H, W].
-    """
+    """Return colours [B, V, H, W, 3] before black, and alpha [B, V, H, W]."""
     pictures = render_gaussians(
         x,
         gaussians.scales,

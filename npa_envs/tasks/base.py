@@ -1,6 +1,7 @@
 """Tasks: what the trainer asks of one, and what most of them have in common.
 
-Any object with the methods of `Task` can be trained on; `ParticleTask` has those that are alike.
+Any object with the methods of `Task` can be trained on; `ParticleTask` has those that are alike,
+`GrowthTask` those of what grows from a ball of blank particles.
 """
 
 from __future__ import annotations
@@ -17,6 +18,8 @@ from npa_envs.errors import NPAError, shown
 from npa_envs.ops import Cameras, world_mean
 from npa_envs.rule.rule import COLOUR_OFFSET, NPARule
 from npa_envs.tasks.appearance import Gaussians
+from npa_envs.tasks.damage import PoolDamage, damage_pool, escape_motion
+from npa_envs.tasks.seeds import uniform_ball
 from npa_envs.world.randomness import Randomness
 
 Worlds = tuple[Tensor, Tensor, Tensor | None]
@@ -105,7 +108,15 @@ class ParticleTask(Generic[ConfigT]):
     classifies: bool = False
     """Whether particles that stay where they are say what their cloud shows."""
 
+    goal_count: int = 0
+    """Goals that a world may have; 0: none."""
+
+    _kept: tuple[str, ...] = ()
+    """Attributes that are arguments, too, and that a task of another size keeps."""
+
+    _goal: Tensor | None = None
     _target_picture: Tensor | None = None
+    _pixel_size: float | None = None
 
     @property
     def eps(self) -> float:
@@ -128,6 +139,11 @@ class ParticleTask(Generic[ConfigT]):
         open_space = 1.1 if self.space_dim == 2 else 0.95
         half_width = open_space if self.box is None else 0.5 * min(self.box)
         return Frame((0.0,) * self.space_dim, half_width)
+
+    @property
+    def pixel_size(self) -> float:
+        """Usual distance between particles: the side of what one fills [length units]."""
+        return self._pixel_size or (0.1 / self.config.particle_count) ** (1.0 / 3.0)
 
     @property
     def target_picture(self) -> Tensor:
@@ -182,11 +198,21 @@ class ParticleTask(Generic[ConfigT]):
         return self
 
     def toward(self, goal: Tensor | None) -> Self:
-        """Return the task with loss and metric for worlds of these goals; most have none.
+        """Return the task with loss and metric for worlds of these goals, int64, shape [B].
 
-        The tensor is read anew at each call. The task itself stays as it is.
+        Most have none. The tensor is read anew at each call. The task itself stays as it is.
         """
-        return self
+        if goal is None or self.goal_count == 0:
+            return self
+        check_goal(goal, self.goal_count)
+        return self._with(_goal=goal)
+
+    @property
+    def goal(self) -> Tensor:
+        """Goals of the worlds, int64, shape [B]."""
+        if self._goal is None:
+            raise NPAError("the worlds' goals must be given first: task.toward(goal), int64 [B]")
+        return self._goal
 
     def coded(self, s: Tensor) -> Tensor:
         """Return states with the code of each world, which damage takes away, where it has one.
@@ -201,12 +227,10 @@ class ParticleTask(Generic[ConfigT]):
 
     def resized(self, particle_count: int) -> Self:
         """Return the task with another number of particles; for a rule call `for_rule` again."""
-        return self._remade(self.config.with_particle_count(particle_count))
-
-    def _remade(self, config: ConfigT) -> Self:
-        """Return the task of another configuration, on the same device."""
         make: Any = type(self)
-        found: Self = make(config, device=self.target_picture.device)
+        kept = {name: getattr(self, name) for name in self._kept}
+        config = self.config.with_particle_count(particle_count)
+        found: Self = make(config, device=self.target_picture.device, **kept)
         return found
 
     def compare(self, x: Tensor, s: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
@@ -283,12 +307,83 @@ PictureTask = Task
 """Any task, where only pictures are asked for."""
 
 
-def check_goal(goal: Tensor, count: int) -> None:
-    """Check the goals of worlds; their range only on a CPU, as no task may wait for a CUDA device.
+@dataclass(frozen=True, kw_only=True)
+class GrowthConfig(PoolDamage, TaskConfig):
+    """What is grown from a ball, how it is damaged, and what the loss penalises."""
 
-    Args:
-        count: How many goals there are to choose from.
-    """
+    target: str
+    """What to grow."""
+
+    alpha: float = 0.5
+    """Largest displacement in one step, as a fraction of ε (dimensionless)."""
+
+    seed_radius: float = 0.2
+    """Radius of the ball that the particles start in [length units]."""
+
+    motion_weight: float = 0.01
+    """Weight of the path length Σ|Δx| of a rollout (per length unit)."""
+
+    bound_weight: float = 100.0
+    """Weight of mean |x − clip(x, −1, 1)| (per length unit)."""
+
+    escape_weight: float = 0.0
+    """Weight of the mean path length of particles outside of [−1, 1] (per length unit)."""
+
+    def __post_init__(self) -> None:
+        """Check every field; raise NPAError where one has a wrong type or lies out of its range."""
+        TaskConfig.__post_init__(self)
+        PoolDamage.__post_init__(self)
+        check_positive(self, int, "state_dim", at_least=3)
+        check_positive(self, int, "resolution", at_least=8)
+        check_positive(self, float, "alpha", "seed_radius")
+        check_non_negative(self, "motion_weight", "bound_weight", "escape_weight")
+
+
+GrowthConfigT = TypeVar("GrowthConfigT", bound=GrowthConfig)
+
+
+class GrowthTask(ParticleTask[GrowthConfigT]):
+    """A thing that grows in open space; a subclass compares it with its target."""
+
+    aligned = True
+    """What is grown is compared with the target pixel by pixel."""
+
+    @property
+    def rule_shape(self) -> dict[str, Any]:
+        """Further arguments of `NPARule`: all but channels, hidden width and ε0."""
+        return {"space_dim": self.space_dim, "alpha": self.config.alpha}
+
+    def places(self, world_count: int, generator: Randomness, device: torch.device) -> Tensor:
+        """Return positions uniform in a ball around the origin."""
+        count, radius = self.config.particle_count, self.config.seed_radius
+        return uniform_ball(
+            world_count, count, self.space_dim, radius, generator=generator, device=device
+        )
+
+    def damage(self, x: Tensor, s: Tensor, goal: Tensor | None, generator: Randomness) -> Worlds:
+        """Return the worlds damaged as the configuration says, each at a place of its own."""
+        return *damage_pool(x, s, self.config, generator=generator), goal
+
+    def penalties(
+        self, x: Tensor, s: Tensor, path_length: Tensor
+    ) -> dict[str, tuple[float, Tensor]]:
+        """Return motion, overflow, what lies outside of [-1, 1]^D, and the paths of strays."""
+        config = self.config
+        terms = {"motion": (config.motion_weight, path_length.mean())}
+        terms |= super().penalties(x, s, path_length)
+        inside = self.bounded(x)
+        terms["bound"] = config.bound_weight, (inside - inside.clamp(-1.0, 1.0)).abs().mean()
+        if config.escape_weight > 0.0:
+            terms["stray"] = config.escape_weight, escape_motion(inside, path_length)
+        return terms
+
+    def bounded(self, x: Tensor) -> Tensor:
+        """Return what should lie in [-1, 1], of positions [B, N, D]: their coordinates."""
+        return x
+
+
+def check_goal(goal: Tensor, count: int) -> None:
+    """Check goals, each below `count`; their range only on a CPU, as no task may wait for CUDA."""
     if not isinstance(goal, Tensor) or goal.dtype != torch.int64 or goal.ndim != 1:
         came = f"{goal.dtype} {tuple(goal.shape)}" if isinstance(goal, Tensor) else shown(goal)
         raise NPAError(
@@ -306,22 +401,14 @@ def shares_of_loss(loss: Tensor, amounts: Tensor) -> Tensor:
 
     To first order, the loss changes by some amount with what a particle adds to the world. Its
     share is the loss plus N times what its amount exceeds the mean by; so the mean of the shares is
-    the loss, up to rounding.
-
-    Args:
-        loss: Each world's loss, shape [B].
-        amounts: The change that each particle brings, shape [B, N].
+    the loss, up to rounding. Losses have shape [B], amounts, what each particle adds, [B, N].
     """
     worse = amounts - world_mean(amounts[..., None])
     return loss[:, None] + amounts.shape[1] * worse
 
 
 def untrained_rule(generator: torch.Generator, **hyper_parameters: Any) -> NPARule:
-    """Return a rule on the CPU whose weights are drawn from `generator` alone.
-
-    Args:
-        hyper_parameters: What `NPARule` takes.
-    """
+    """Return a rule on the CPU whose weights are drawn from `generator` alone."""
     with torch.random.fork_rng(devices=()):
         torch.manual_seed(int(torch.randint(2**31, (), generator=generator)))
         return NPARule(**hyper_parameters)

@@ -71,9 +71,6 @@ class CoMorphogenesis2D(ParticleTask[Any]):
     """`Morphogenesis2D` of every species, each on its own particles.
 
     Worlds hold the particles of all species, one species after the other.
-
-    Raises:
-        NPAError: A target cannot be loaded.
     """
 
     def __init__(

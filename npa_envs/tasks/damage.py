@@ -27,28 +27,17 @@ from npa_envs.tasks.seeds import drawn_indices, uniform_ball
 from npa_envs.world.brushes import clump, cut, wipe_state
 from npa_envs.world.randomness import Randomness, check_generator, normal_draws, uniform_draws
 
-__all__ = [
-    "CLUMP_FACTOR",
-    "DAMAGE_SIZES",
-    "DamageEvent",
-    "PoolDamage",
-    "clump",
-    "cut",
-    "damage_pool",
-    "damage_worlds",
-    "displace",
-    "escape_motion",
-    "parse_damage",
-    "random_particle",
-    "tear_off",
-    "wipe_state",
-]
-
 DAMAGE_SIZES = {"wipe": 0.2, "cut": 0.1, "clump": 0.2, "noise": 0.05}
 """Kinds of damage with their usual size: radius, gap, radius, standard deviation [length units]."""
 
 CLUMP_FACTOR = 0.9
 """Share of its distance from the centre that a particle loses when it is clumped."""
+
+
+def check_damage(kind: object) -> None:
+    """Check that there is such a kind of damage."""
+    if not isinstance(kind, str) or kind not in DAMAGE_SIZES:
+        raise NPAError(f"unknown damage {shown(kind)}: {suggest(kind, DAMAGE_SIZES)}")
 
 
 @dataclass(frozen=True)
@@ -66,8 +55,7 @@ class DamageEvent:
 
     def __post_init__(self) -> None:
         """Check every field."""
-        if not isinstance(self.kind, str) or self.kind not in DAMAGE_SIZES:
-            raise NPAError(f"unknown damage {shown(self.kind)}: {suggest(self.kind, DAMAGE_SIZES)}")
+        check_damage(self.kind)
         if not is_whole(self.step) or self.step < 0:
             raise NPAError(f"step must be a whole number of at least 0, got {shown(self.step)}")
         if not is_real(self.extent) or self.extent <= 0:
@@ -89,14 +77,7 @@ class DamageEvent:
 
 
 def parse_damage(text: str) -> DamageEvent:
-    """Read "STEP:KIND" or "STEP:KIND:SIZE".
-
-    Args:
-        text: For example "300:cut" or "500:wipe:0.3".
-
-    Raises:
-        NPAError: It is written in another way, or the kind is unknown.
-    """
+    """Read "STEP:KIND" or "STEP:KIND:SIZE", for example "300:cut" or "500:wipe:0.3"."""
     if not isinstance(text, str):
         raise NPAError(f"damage must be text, got {shown(text)}: for example '300:cut'")
     parts = text.split(":")
@@ -138,8 +119,7 @@ def damage_worlds(
     Raises:
         NPAError: An unknown kind, a wrong shape or dtype, or a size that is negative or not finite.
     """
-    if not isinstance(kind, str) or kind not in DAMAGE_SIZES:
-        raise NPAError(f"unknown damage {shown(kind)}: {suggest(kind, DAMAGE_SIZES)}")
+    check_damage(kind)
     check_world(x, s)
     check_generator(generator, x.device, x.shape[0])
     extent = DAMAGE_SIZES[kind] if size is None else checked_number("size", size)
@@ -157,11 +137,7 @@ def damage_worlds(
 
 
 def random_particle(x: Tensor, generator: Randomness | None = None) -> Tensor:
-    """Return the position of one particle of each world, each as likely as the others.
-
-    Returns:
-        The chosen positions [length units], shape [B, D].
-    """
+    """Return the position of a random particle of each world [length units], shape [B, D]."""
     check_world(x, x)
     check_generator(generator, x.device, x.shape[0])
     chosen = drawn_indices(x.shape[1], x.shape[0], generator, x.device)
@@ -177,13 +153,7 @@ NEAREST, FARTHEST = 2.0, 4.0
 
 
 def displace(x: Tensor, *, share: float, generator: Randomness | None = None) -> Tensor:
-    """Return the positions with some particles thrown out, far from the others, on all sides.
-
-    Nothing waits for the device.
-
-    Args:
-        share: Probability of each particle to be thrown out (dimensionless).
-    """
+    """Return positions with a share of the particles, drawn one by one, thrown out on all sides."""
     world_count, particle_count, space_dim = x.shape
     check_generator(generator, x.device, world_count)
     chance = uniform_draws(generator, (world_count, particle_count, 1), x)
@@ -200,12 +170,8 @@ def tear_off(
     """Return the positions with a flake of some worlds torn off and thrown out, as a whole.
 
     Particles that leave together see each other, and may walk on where a lone one has learned to
-    rest. Nothing waits for the device.
-
-    Args:
-        radius: Flakes are disks (balls in 3D) around random particles, of any radius up to this
-            [length units].
-        chance: Probability of a world to lose one (dimensionless).
+    rest. A flake is a ball around a random particle, of any radius up to `radius` [length units];
+    a world loses one with the probability `chance`.
     """
     world_count, _, space_dim = x.shape
     centre = random_particle(x, generator)
@@ -230,11 +196,7 @@ _counting: ContextVar[Callable[[Tensor], Tensor] | None] = ContextVar("counting"
 
 @contextmanager
 def counted_together(mean: Callable[[Tensor], Tensor]) -> Iterator[None]:
-    """Let losses in the block take their means over the strays of all processes of a run.
-
-    Args:
-        mean: Returns the mean of a tensor over all processes, each of which asks for it.
-    """
+    """Let losses in the block count the strays of all processes; `mean` is over these."""
     before = _counting.set(mean)
     try:
         yield
@@ -296,11 +258,7 @@ class PoolDamage:
 def damage_pool(
     x: Tensor, s: Tensor, damage: PoolDamage, *, generator: Randomness
 ) -> tuple[Tensor, Tensor]:
-    """Return worlds that are damaged at random places; nothing waits for the device.
-
-    Args:
-        damage: What is done.
-    """
+    """Return worlds that are damaged at random places; nothing waits for the device."""
     if damage.damage_radius > 0.0:
         centre = random_particle(x, generator)
         s = wipe_state(x, s, centre=centre, radius=damage.damage_radius)

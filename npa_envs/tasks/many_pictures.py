@@ -11,26 +11,21 @@ from torch import Tensor
 
 from npa_envs.errors import NPAError, shown
 from npa_envs.files import home_path
-from npa_envs.rule.codes import Codes
+from npa_envs.rule.codes import Codes, carrying
 from npa_envs.rule.rule import NPARule
-from npa_envs.tasks.base import Worlds, check_goal
+from npa_envs.tasks.base import Worlds
 from npa_envs.tasks.morphogenesis2d import Morphogenesis2D, Morphogenesis2DConfig
-from npa_envs.tasks.seeds import drawn_indices
+from npa_envs.tasks.seeds import drawn_indices, drawn_worlds
 from npa_envs.tasks.targets.images import looks_like_path
 from npa_envs.tasks.targets.points import builtin_targets
-from npa_envs.world.randomness import Randomness, uniform_draws
+from npa_envs.world.randomness import Randomness
 
 PICTURE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp")
 """Files of a folder that are targets."""
 
 
 def named_targets(targets: Sequence[str]) -> dict[str, str]:
-    """Return what a list of targets holds: name -> what `load_target` takes, in their order.
-
-    Args:
-        targets: Built-in names, emoji, picture files, and folders, which stand for the pictures in
-            them, sorted by name. A file's name is its own without suffix.
-    """
+    """Return what targets hold: name -> what `load_target` takes; a folder stands for its files."""
     named: dict[str, str] = {}
     for target in targets:
         for source in _pictures_of(target):
@@ -63,9 +58,6 @@ class ManyPictures(Morphogenesis2D):
 
     A world's goal is the place of its target among `targets`. Particles of all targets are drawn
     equally large, and pictures are scaled so that each target's density is about 1.
-
-    Raises:
-        NPAError: There are no targets, one cannot be loaded, or the rule is to know no direction.
     """
 
     def __init__(
@@ -88,18 +80,13 @@ class ManyPictures(Morphogenesis2D):
         sizes = torch.tensor([task.target.pixel_size for task in alone])
         self._pixel_size = float(sizes.square().mean().sqrt())
         self._scales = (sizes / self._pixel_size).square().to(device)
-        self._goal: Tensor | None = None
+        self.goal_count = len(named)
         self._codes: Codes | None = None
         drawn = [
             self._splat(task.target.points[None], task.target.colours[None])[0] for task in alone
         ]
         self._target_pictures = torch.stack(drawn) * self._scales[:, None, None, None]
         self._target_mean = torch.zeros_like(self._target_mean)
-
-    @property
-    def pixel_size(self) -> float:
-        """Size of a particle in pictures, a mean of the targets' [length units]."""
-        return self._pixel_size
 
     @property
     def rule_shape(self) -> dict[str, Any]:
@@ -122,13 +109,6 @@ class ManyPictures(Morphogenesis2D):
                 self._read_codes(rule.codes)
         return self._with(_codes=rule.codes)
 
-    def toward(self, goal: Tensor | None) -> Self:
-        """Return the task with loss and metric for worlds of these targets, int64, shape [B]."""
-        if goal is None:
-            return self
-        check_goal(goal, len(self.names))
-        return self._with(_goal=goal)
-
     def seed(
         self, world_count: int, *, generator: Randomness, device: str | torch.device = "cpu"
     ) -> Worlds:
@@ -138,7 +118,7 @@ class ManyPictures(Morphogenesis2D):
         blank = s.new_zeros(*s.shape[:2], self.config.code_dim)
         s = torch.cat((blank, s), dim=-1)
         if self._codes is not None:
-            s = self._carrying(s, self._codes.table.detach(), goal)
+            s = carrying(s, self._codes.table.detach().index_select(0, goal)[:, None])
         return x, s, goal
 
     def damage(self, x: Tensor, s: Tensor, goal: Tensor | None, generator: Randomness) -> Worlds:
@@ -147,15 +127,13 @@ class ManyPictures(Morphogenesis2D):
         if goal is None or self.config.switch_share == 0.0:
             return x, s, goal
         other = drawn_indices(len(self.names), len(x), generator, x.device)
-        single = x.new_empty(0, dtype=torch.float32)
-        switched = uniform_draws(generator, (len(x), 1), single)[:, 0] < self.config.switch_share
-        return x, s, torch.where(switched, other, goal)
+        return x, s, torch.where(drawn_worlds(x, generator, self.config.switch_share), other, goal)
 
     def coded(self, s: Tensor) -> Tensor:
         """Return states with the codes of their worlds' goals, differentiable in the codes."""
         if self._codes is None or self._goal is None:
             return s
-        return self._carrying(s, self._read_codes(self._codes), self._goal)
+        return carrying(s, self._read_codes(self._codes).index_select(0, self.goal)[:, None])
 
     def _read_codes(self, codes: Codes) -> Tensor:
         """Return the targets' codes, those of an encoder as it is now, shape [T, K]."""
@@ -167,17 +145,10 @@ class ManyPictures(Morphogenesis2D):
             codes.table.copy_(read)
         return read
 
-    def _carrying(self, s: Tensor, table: Tensor, goal: Tensor) -> Tensor:
-        """Return states with the codes of goals."""
-        code = table.index_select(0, goal).to(s)[:, None].expand(-1, s.shape[1], -1)
-        return torch.cat((code, s[..., self.config.code_dim :]), dim=-1)
-
     @property
     def target_picture(self) -> Tensor:
         """Pictures of the worlds' targets: rgb sums and density, shape [B, R, R, 4]."""
-        if self._goal is None:
-            raise NPAError("the worlds' targets must be given first: task.toward(goal), int64 [B]")
-        return self._target_pictures.index_select(0, self._goal)
+        return self._target_pictures.index_select(0, self.goal)
 
     def splat_losses(self, x: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
         """Return each world's density loss and colour loss, dimensionless, shape [B] each."""

@@ -5,25 +5,31 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Any, Self
 
 import torch
 from torch import Tensor
 
-from npa_envs.checks import check_flag, check_non_negative, check_positive, check_text
-from npa_envs.errors import NPAError, shown
+from npa_envs.checks import (
+    are_texts,
+    check_field,
+    check_flag,
+    check_non_negative,
+    check_positive,
+    check_text,
+)
+from npa_envs.errors import NPAError
 from npa_envs.ops import splat, world_mean
 from npa_envs.ops.pictures.losses import picture_losses
+from npa_envs.rule.codes import carrying
 from npa_envs.rule.rule import COLOUR_OFFSET, LIFE, NPARule
-from npa_envs.tasks.base import Worlds
+from npa_envs.tasks.base import GrowthConfig, GrowthTask, Worlds
 from npa_envs.tasks.damage import damage_pool
-from npa_envs.tasks.growth import GrowthConfig, GrowthTask
 from npa_envs.tasks.targets.images import LARGEST_POINT_COUNT
 from npa_envs.tasks.targets.points import PointTarget, load_target
-from npa_envs.tasks.train_config import TrainConfig, fast_run, tiny_run
+from npa_envs.tasks.train_config import TrainConfig, fast_run, presets_of, tiny_run
 from npa_envs.world.division import living
-from npa_envs.world.randomness import Randomness, WorldRandom, uniform_draws
+from npa_envs.world.randomness import Randomness, uniform_draws
 
 LARGEST_CODE = 1024
 """Numbers of a code, at most."""
@@ -115,10 +121,13 @@ class Morphogenesis2DConfig(GrowthConfig):
         check_non_negative(self, "splat_weight", "colour_weight", "drift_weight")
         check_non_negative(self, "seed_axis", "seed_across")
         check_flag(self, "equivariant", "chiral", "encoder", "division", "keep_background")
-        self._check_targets()
+        rule, cure = "be a tuple of names, emoji, files or folders", "targets=('gecko', 'heart')"
+        check_field(self, "targets", are_texts(self.targets), rule, f"for example {cure}")
+        check_positive(self, int, "code_dim", at_most=LARGEST_CODE)
+        check_non_negative(self, "switch_share", at_most=1.0)
         check_positive(self, int, "angles", at_least=0)
-        if 0 < self.angles < 4:
-            raise NPAError(f"angles must be 0 or at least 4, got {self.angles}: the usual 16 do")
+        few = 0 < self.angles < 4
+        check_field(self, "angles", not few, "be 0 or at least 4", "the usual 16 do")
         upright = self.seed_across > 0.0 or (self.chiral and self.seed_axis > 0.0)
         if self.equivariant and self.angles == 0 and not upright:
             raise NPAError(
@@ -131,18 +140,6 @@ class Morphogenesis2DConfig(GrowthConfig):
                 "division goes neither with equivariant, because one particle has no axis, nor "
                 "with targets: leave them out"
             )
-
-    def _check_targets(self) -> None:
-        targets = self.targets
-        if not isinstance(targets, tuple) or not all(isinstance(t, str) and t for t in targets):
-            raise NPAError(
-                f"targets must be a tuple of names, emoji, files or folders, got {shown(targets)}: "
-                "for example targets=('gecko', 'heart')"
-            )
-        check_positive(self, int, "code_dim", at_most=LARGEST_CODE)
-        check_non_negative(self, "switch_share")
-        if self.switch_share > 1.0:
-            raise NPAError(f"switch_share must be at most 1, got {self.switch_share}: try 0.1")
 
     def with_particle_count(self, particle_count: int) -> Morphogenesis2DConfig:
         """Return the same task with another number of particles, and of the target's points."""
@@ -172,9 +169,6 @@ class Morphogenesis2D(GrowthTask[Morphogenesis2DConfig]):
     """The task of arXiv 2601.16096, section 4.1, with its loss.
 
     Of a rule of many pictures, `for_rule` gives the task of one of them.
-
-    Raises:
-        NPAError: The target cannot be loaded.
     """
 
     metric_name = "splat loss"
@@ -216,11 +210,7 @@ class Morphogenesis2D(GrowthTask[Morphogenesis2DConfig]):
         return self.with_code(codes.encode(self.target_picture[None].to(codes.table))[0])
 
     def with_code(self, code: Tensor) -> Self:
-        """Return the task whose fresh worlds carry a code, in front of the other states.
-
-        Args:
-            code: Dimensionless, shape [K].
-        """
+        """Return the task whose fresh worlds carry a code [K], in front of the other states."""
         return self._with(_code=code.detach())
 
     def seed(
@@ -234,11 +224,7 @@ class Morphogenesis2D(GrowthTask[Morphogenesis2DConfig]):
             s[:, 0, LIFE] = 1.0
             return torch.zeros_like(x), s, goal
         if config.equivariant and max(config.seed_axis, config.seed_across) > 0.0:
-            share = (
-                generator.uniform(1, dtype=x.dtype)
-                if isinstance(generator, WorldRandom)
-                else torch.rand(world_count, 1, generator=generator, device=x.device, dtype=x.dtype)
-            )
+            share = uniform_draws(generator, (world_count, 1), x)
             angle = 2.0 * math.pi * (share if config.angles > 0 else torch.zeros_like(share))
             cos, sin = angle.cos(), angle.sin()
             along = x[..., 0] * cos + x[..., 1] * sin
@@ -252,10 +238,7 @@ class Morphogenesis2D(GrowthTask[Morphogenesis2DConfig]):
 
     def coded(self, s: Tensor) -> Tensor:
         """Return states with the task's code, or as they are where it has none."""
-        if self._code is None:
-            return s
-        code = self._code.to(s).expand(*s.shape[:2], -1)
-        return torch.cat((code, s[..., len(self._code) :]), dim=-1)
+        return s if self._code is None else carrying(s, self._code)
 
     def damage(self, x: Tensor, s: Tensor, goal: Tensor | None, generator: Randomness) -> Worlds:
         """Return the worlds damaged; of one that divides particles die, but never all."""
@@ -381,10 +364,7 @@ class Morphogenesis2D(GrowthTask[Morphogenesis2DConfig]):
         """Return the turn of each world around its mean that brings it closest to the target.
 
         Angles are tried evenly spread, and then finer near the best. Where the rule is not chiral
-        mirrored worlds are tried too.
-
-        Returns:
-            Matrices, shape [B, 2, 2]; without gradient. Where no angles are tried, the identity.
+        mirrored worlds are tried too. Matrices, [B, 2, 2]; where no angles are tried, the identity.
         """
         config = self.config
         if config.angles == 0:
@@ -422,7 +402,7 @@ class Morphogenesis2D(GrowthTask[Morphogenesis2DConfig]):
             self.target_picture,
             goal=self._target_mean,
             shift=COLOUR_OFFSET,
-            pixel_size=self._pixel_size,
+            pixel_size=self.pixel_size,
             sigma=self.config.sigma,
         )
 
@@ -442,7 +422,7 @@ class Morphogenesis2D(GrowthTask[Morphogenesis2DConfig]):
             x,
             colour,
             resolution=self.config.resolution,
-            pixel_size=self._pixel_size,
+            pixel_size=self.pixel_size,
             sigma=self.config.sigma,
         )
 
@@ -483,8 +463,6 @@ def _pixel_mean(errors: Tensor) -> Tensor:
 Morphogenesis2DTrainConfig = TrainConfig[Morphogenesis2DConfig]
 """A training run of 2D morphogenesis."""
 
-_OUT = Path("runs/morphogenesis2d")
-
 _TOGETHER: Mapping[str, Any] = {
     "escape_weight": 10.0,
     "bound_weight": 10.0,
@@ -503,10 +481,11 @@ HALF_SEEDS: Mapping[str, Any] = {
 }
 """What `fast` had before Muon: half of its worlds are seeds, and none has to rest."""
 
-MORPHOGENESIS2D_PRESETS: Mapping[str, Morphogenesis2DTrainConfig] = {
-    "paper": TrainConfig(task=Morphogenesis2DConfig(), out=_OUT),
+MORPHOGENESIS2D_PRESETS = presets_of(
+    "morphogenesis2d",
+    paper=TrainConfig(task=Morphogenesis2DConfig()),
     # Found by experiment on pictures that nobody tuned for: docs/recipes.md.
-    "best": TrainConfig(
+    best=TrainConfig(
         task=Morphogenesis2DConfig(
             escape_share=2e-4,
             damage_radius=0.2,
@@ -529,11 +508,10 @@ MORPHOGENESIS2D_PRESETS: Mapping[str, Morphogenesis2DTrainConfig] = {
         stillness_power=4.0,
         dead_zone=1e-3,
         initial_rule="heart-first",
-        out=_OUT,
     ),
     # A few particles that see far; of two worlds one is young, one grown and at rest:
     # docs/recipes.md.
-    "fast": fast_run(
+    fast=fast_run(
         Morphogenesis2DConfig(
             target_point_count=512,
             particle_count=512,
@@ -554,9 +532,8 @@ MORPHOGENESIS2D_PRESETS: Mapping[str, Morphogenesis2DTrainConfig] = {
         stillness_min_age=64,
         stillness_weight=2.0,
         picture_interval=200,
-        out=_OUT,
     ),
-    "tiny": tiny_run(
+    tiny=tiny_run(
         Morphogenesis2DConfig(
             target="ring",
             target_point_count=128,
@@ -568,8 +545,7 @@ MORPHOGENESIS2D_PRESETS: Mapping[str, Morphogenesis2DTrainConfig] = {
         iterations=40,
         steps=(8, 16),
         milestones=(30,),
-        out=_OUT,
     ),
-}
+)
 """2D morphogenesis: `paper` (arXiv 2601.16096), `best` (any picture, one run of minutes on a GPU),
 `fast` (minutes on one core), `tiny` (tests)."""

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any, Self
 
 import numpy as np
@@ -12,6 +11,7 @@ import torch
 from torch import Tensor
 
 from npa_envs.checks import (
+    check_field,
     check_fraction,
     check_non_negative,
     check_positive,
@@ -22,11 +22,10 @@ from npa_envs.errors import NPAError
 from npa_envs.ops import Cameras, world_mean
 from npa_envs.rule.rule import NPARule
 from npa_envs.tasks.appearance import OUTPUTS, Appearance, Gaussians, draw_gaussians
-from npa_envs.tasks.base import shares_of_loss
-from npa_envs.tasks.growth import GrowthConfig, GrowthTask
-from npa_envs.tasks.losses.similarity import MultiScaleSimilarity
+from npa_envs.tasks.base import GrowthConfig, GrowthTask, shares_of_loss
+from npa_envs.tasks.losses.pieces import MultiScaleSimilarity
 from npa_envs.tasks.targets.views import ViewTarget, load_views, nearest_camera, over, some_views
-from npa_envs.tasks.train_config import TrainConfig, fast_run, tiny_run
+from npa_envs.tasks.train_config import TrainConfig, fast_run, presets_of, tiny_run
 from npa_envs.world.cuda_graph import to_device_async
 
 
@@ -111,8 +110,7 @@ class Morphogenesis3DConfig(GrowthConfig):
         check_fraction(self, "opacity")
         check_non_negative(self, "anisotropy", "blur_sigma")
         check_non_negative(self, "view_weight", "ssim_weight", "isotropy_weight")
-        if self.opacity == 1.0:
-            raise NPAError("opacity must lie below 1, got 1: for example opacity=0.99")
+        check_field(self, "opacity", self.opacity < 1.0, "lie below 1", "for example opacity=0.99")
         check_seed(self, "view_seed", bits=31)
 
 
@@ -128,15 +126,12 @@ class Morphogenesis3D(GrowthTask[Morphogenesis3DConfig]):
 
     As it is, the last three channels of a state are its colour and particles are round; `for_rule`
     gives the task that sees what a rule reads out of the states.
-
-    Raises:
-        NPAError: The target cannot be loaded, or its views have another size.
-        MissingDependencyError: The library that reads a mesh file is not installed.
     """
 
     space_dim = 3
     metric_name = "view loss"
     has_views = True
+    _kept = ("target",)
 
     def __init__(
         self,
@@ -147,9 +142,8 @@ class Morphogenesis3D(GrowthTask[Morphogenesis3DConfig]):
     ) -> None:
         self.config = config = config or Morphogenesis3DConfig()
         side = config.resolution
-        self._similarity = None
-        if config.ssim_weight > 0.0:
-            self._similarity = MultiScaleSimilarity(side, device=device)
+        compared = config.ssim_weight > 0.0
+        self._similarity = MultiScaleSimilarity(side, device=device) if compared else None
         if target is None:
             target = load_views(
                 config.target,
@@ -170,19 +164,9 @@ class Morphogenesis3D(GrowthTask[Morphogenesis3DConfig]):
         # The view that pictures show; rows point up.
         self._target_picture = self._shown.pictures[0].flip(0)
         self._appearance = Appearance(config.sigma, config.anisotropy, config.opacity)
-        self.schedule = ViewSchedule(
-            len(target.training.pictures),
-            config.views_per_iteration,
-            seed=config.view_seed,
-            blur_sigma=config.blur_sigma,
-            blur_iterations=config.blur_iterations,
-            device=device,
-        )
+        self.schedule = ViewSchedule(len(target.training.pictures), config, device)
         """Which views, how much blur and which backgrounds an iteration has."""
         self._rule: NPARule | None = None
-
-    def _remade(self, config: Morphogenesis3DConfig) -> Self:
-        return type(self)(config, target=self.target, device=self.target_picture.device)
 
     def for_rule(self, rule: NPARule) -> Self:
         """Return the task that sees what a rule reads out of the states; all else is shared."""
@@ -287,29 +271,13 @@ class ViewSchedule:
 
     All follow from the seed and the iteration alone, so a resumed run goes on as it would have; the
     tensors stay the same ones, so a recorded graph reads what was written last.
-
-    Args:
-        view_count: Views to choose from.
-        chosen_count: Views of an iteration, all different; at most `view_count`.
-        blur_sigma: Standard deviation of the blur at first [pixels].
-        blur_iterations: Iterations after which there is none; it goes evenly.
     """
 
     def __init__(
-        self,
-        view_count: int,
-        chosen_count: int,
-        *,
-        seed: int,
-        blur_sigma: float,
-        blur_iterations: int,
-        device: str | torch.device,
+        self, view_count: int, config: Morphogenesis3DConfig, device: str | torch.device
     ) -> None:
-        self._view_count = view_count
-        self._seed = seed
-        self._blur_sigma = blur_sigma
-        self._blur_iterations = blur_iterations
-        chosen_count = min(chosen_count, view_count)
+        self._view_count, self._config = view_count, config
+        chosen_count = min(config.views_per_iteration, view_count)
         self.index = torch.zeros(chosen_count, dtype=torch.int64, device=device)
         """Which views, shape [V]."""
         self.backgrounds = torch.zeros(chosen_count, 3, device=device)
@@ -320,25 +288,22 @@ class ViewSchedule:
 
     def begin(self, iteration: int) -> None:
         """Write what an iteration sees; the host does not wait for the device."""
-        random = np.random.default_rng((self._seed, iteration))
+        config = self._config
+        random = np.random.default_rng((config.view_seed, iteration))
         index = random.choice(self._view_count, len(self.index), replace=False)
         backgrounds = random.random(self.backgrounds.shape, dtype=np.float32)
-        left = max(0.0, 1.0 - iteration / self._blur_iterations)
-        sigma = np.array(self._blur_sigma * left, dtype=np.float32)
-        device = self.sigma.device
-        self.index.copy_(to_device_async(index.astype(np.int64), device))
-        self.backgrounds.copy_(to_device_async(backgrounds, device))
-        self.sigma.copy_(to_device_async(sigma, device))
+        left = max(0.0, 1.0 - iteration / config.blur_iterations)
+        sigma = np.array(config.blur_sigma * left, dtype=np.float32)
+        written = (self.index, index.astype(np.int64)), (self.backgrounds, backgrounds)
+        for tensor, values in (*written, (self.sigma, sigma)):
+            tensor.copy_(to_device_async(values, tensor.device))
 
 
 def blurred(pictures: Tensor, sigma: Tensor) -> Tensor:
     """Return pictures blurred by a Gaussian; beyond their edges they are 0.
 
     Two products with a matrix of weights: the standard deviation may change without the host
-    knowing it, and one of 0 leaves the pictures as they are, bit for bit.
-
-    Args:
-        sigma: Standard deviation [pixels], shape [].
+    knowing it [pixels], and one of 0 leaves the pictures as they are, bit for bit.
     """
     rows, columns = (_weights(size, sigma, pictures) for size in pictures.shape[1:3])
     across = torch.einsum("xw,vhwk->vhxk", columns, pictures)
@@ -354,8 +319,6 @@ def _weights(size: int, sigma: Tensor, like: Tensor) -> Tensor:
     return torch.exp(-0.5 * (place[:, None] - place).square() / variance) / whole
 
 
-_OUT = Path("runs/morphogenesis3d")
-
 _STRETCHED: Mapping[str, Any] = {
     "anisotropy": 1.0,
     "isotropy_weight": 0.02,
@@ -365,8 +328,9 @@ _STRETCHED: Mapping[str, Any] = {
 }
 """Particles that may stretch, and what keeps worlds together and heals clumps and cuts."""
 
-MORPHOGENESIS3D_PRESETS: Mapping[str, TrainConfig[Morphogenesis3DConfig]] = {
-    "paper": TrainConfig(
+MORPHOGENESIS3D_PRESETS = presets_of(
+    "morphogenesis3d",
+    paper=TrainConfig(
         task=Morphogenesis3DConfig(),
         iterations=20_000,
         repeats=1,
@@ -376,11 +340,10 @@ MORPHOGENESIS3D_PRESETS: Mapping[str, TrainConfig[Morphogenesis3DConfig]] = {
         learning_rate=1e-3,
         milestones=(2_000, 10_000),
         seed_interval=1,
-        out=_OUT,
     ),
     # Half as many particles, which see as many neighbours; half of a batch are seeds:
     # docs/morphogenesis3d.md.
-    "best": TrainConfig(
+    best=TrainConfig(
         task=Morphogenesis3DConfig(
             particle_count=8192,
             state_dim=24,
@@ -407,11 +370,10 @@ MORPHOGENESIS3D_PRESETS: Mapping[str, TrainConfig[Morphogenesis3DConfig]] = {
         fresh_share=0.5,
         damage_share=0.25,
         initial_rule="rocket-8192",
-        out=_OUT,
     ),
     # Of two worlds one is young, one grown and at rest, so that what has grown stays:
     # docs/morphogenesis3d.md.
-    "fast": fast_run(
+    fast=fast_run(
         Morphogenesis3DConfig(
             particle_count=768,
             hidden_dim=64,
@@ -440,10 +402,9 @@ MORPHOGENESIS3D_PRESETS: Mapping[str, TrainConfig[Morphogenesis3DConfig]] = {
         damage_share=0.5,
         stillness_min_age=48,
         stillness_weight=0.5,
-        out=_OUT,
         picture_interval=100,
     ),
-    "tiny": tiny_run(
+    tiny=tiny_run(
         Morphogenesis3DConfig(
             target="doughnut",
             particle_count=200,
@@ -464,8 +425,7 @@ MORPHOGENESIS3D_PRESETS: Mapping[str, TrainConfig[Morphogenesis3DConfig]] = {
         pool_size=4,
         steps=(6, 10),
         seed_interval=1,
-        out=_OUT,
     ),
-}
+)
 """`paper` (arXiv 2601.16096), `best` (any mesh, one run of minutes on a GPU), `fast` (on one core),
 `tiny` (tests)."""

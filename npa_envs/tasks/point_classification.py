@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from pathlib import Path
 from typing import Any, Self
 
 import torch
@@ -16,16 +14,16 @@ from npa_envs.checks import check_non_negative, check_positive, check_seed, chec
 from npa_envs.errors import NPAError
 from npa_envs.ops import splat, world_mean
 from npa_envs.rule.rule import NPARule
-from npa_envs.tasks.base import Frame, ParticleTask, TaskConfig, Worlds, check_goal
-from npa_envs.tasks.seeds import drawn_indices
+from npa_envs.tasks.base import Frame, ParticleTask, TaskConfig, Worlds
+from npa_envs.tasks.seeds import drawn_indices, drawn_worlds
 from npa_envs.tasks.targets.clouds import (
     PointClouds,
     Split,
     load_clouds,
     varied,
 )
-from npa_envs.tasks.train_config import TrainConfig, fast_run, tiny_run
-from npa_envs.world.randomness import Randomness, uniform_draws
+from npa_envs.tasks.train_config import TrainConfig, fast_run, presets_of, tiny_run
+from npa_envs.world.randomness import Randomness
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -81,10 +79,8 @@ class PointClassificationConfig(TaskConfig):
         check_seed(self, "sample_seed")
         check_positive(self, int, "readout_hidden_dim")
         check_positive(self, int, "class_count", at_least=2)
-        check_non_negative(self, "rotation", "stretch", "jitter", "mutated_share")
-        for name in ("stretch", "mutated_share"):
-            if getattr(self, name) > 1.0:
-                raise NPAError(f"{name} must be at most 1, got {getattr(self, name)}: try 0.1")
+        check_non_negative(self, "rotation", "jitter")
+        check_non_negative(self, "stretch", "mutated_share", at_most=1.0)
 
 
 SIGMA = 0.7
@@ -104,6 +100,7 @@ class PointClassification(ParticleTask[PointClassificationConfig]):
     metric_name = "mean squared error to the class"
     trial_name = "share of particles that are wrong"
     classifies = True
+    _kept = ("split",)
 
     def __init__(
         self,
@@ -117,7 +114,7 @@ class PointClassification(ParticleTask[PointClassificationConfig]):
         """Which clouds worlds are made of."""
         self._device = torch.device(device)
         self._rule: NPARule | None = None
-        self._goal: Tensor | None = None
+        self.goal_count = config.class_count
         # There is no picture to match.
         side = config.resolution
         self._target_picture = torch.zeros(side, side, 4, device=self._device)
@@ -149,7 +146,7 @@ class PointClassification(ParticleTask[PointClassificationConfig]):
 
     @property
     def pixel_size(self) -> float:
-        """Side of the square that a particle fills [length units]."""
+        """Usual distance between particles: the side of what one fills [length units]."""
         return math.sqrt(self.clouds.coverage / self.config.particle_count)
 
     @property
@@ -175,16 +172,6 @@ class PointClassification(ParticleTask[PointClassificationConfig]):
     def held_out(self) -> Self:
         """Return the task with the clouds of "test": those of "train" may be known by heart."""
         return self.on("test")
-
-    def _remade(self, config: PointClassificationConfig) -> Self:
-        return type(self)(config, device=self._device, split=self.split)
-
-    def toward(self, goal: Tensor | None) -> Self:
-        """Return the task with loss and metric for worlds of these classes, int64, shape [B]."""
-        if goal is None:
-            return self
-        check_goal(goal, self.config.class_count)
-        return self._with(_goal=goal)
 
     def seed(
         self, world_count: int, *, generator: Randomness, device: str | torch.device = "cpu"
@@ -213,8 +200,7 @@ class PointClassification(ParticleTask[PointClassificationConfig]):
         if goal is None or share == 0.0:
             return x, s, goal
         other, _, other_goal = self.seed(len(x), generator=generator, device=x.device)
-        single = x.new_empty(0, dtype=torch.float32)
-        mutated = uniform_draws(generator, (len(x), 1), single)[:, 0] < share
+        mutated = drawn_worlds(x, generator, share)
         x = torch.where(mutated[:, None, None], other.to(x.dtype), x)
         assert other_goal is not None, "clouds come with their classes"
         return x, s, torch.where(mutated, other_goal, goal)
@@ -233,28 +219,17 @@ class PointClassification(ParticleTask[PointClassificationConfig]):
         """Return each particle's mean squared error to the one-hot of its world's class, [B, N]."""
         outputs = self.outputs(s)
         classes = torch.arange(self.config.class_count, device=s.device)
-        wanted = (self.wanted[:, None] == classes).to(outputs.dtype)
+        wanted = (self.goal[:, None] == classes).to(outputs.dtype)
         return channel_mean((outputs - wanted[:, None]).square())
-
-    @property
-    def wanted(self) -> Tensor:
-        """Classes of the worlds, int64, shape [B]."""
-        if self._goal is None:
-            raise NPAError("the worlds' classes must be given first: task.toward(goal), int64 [B]")
-        return self._goal
 
     def mistakes(self, s: Tensor) -> Tensor:
         """Return 1 for particles that say another class than their world's most loudly, [B, N]."""
-        return (self.outputs(s).argmax(dim=-1) != self.wanted[:, None]).to(s.dtype)
+        return (self.outputs(s).argmax(dim=-1) != self.goal[:, None]).to(s.dtype)
 
     def cross_entropies(self, s: Tensor, sharpness: float) -> Tensor:
-        """Return each particle's cross-entropy of softmax(sharpness × outputs), [B, N].
-
-        Args:
-            sharpness: How surely outputs are taken as probabilities (dimensionless).
-        """
+        """Return each particle's cross-entropy of softmax(sharpness × outputs), [B, N]."""
         chances = torch.log_softmax(sharpness * self.outputs(s), dim=-1)
-        wanted = self.wanted[:, None, None].expand(*s.shape[:2], 1)
+        wanted = self.goal[:, None, None].expand(*s.shape[:2], 1)
         return -chances.gather(-1, wanted).squeeze(-1)
 
     def metric(self, x: Tensor, s: Tensor) -> Tensor:
@@ -364,11 +339,7 @@ def class_colours(outputs: Tensor) -> Tensor:
 
 
 def channel_mean(values: Tensor) -> Tensor:
-    """Return the mean over the last dimension, rounded alike in every batch.
-
-    Args:
-        values: Shape [..., K].
-    """
+    """Return the mean over the last dimension, rounded alike in every batch, [...]."""
     # One by one: torch's mean may round otherwise in another batch.
     total, *rest = values.unbind(-1)
     for term in rest:
@@ -376,10 +347,9 @@ def channel_mean(values: Tensor) -> Tensor:
     return total / values.shape[-1]
 
 
-_OUT = Path("runs/point_classification")
-
-POINT_CLASSIFICATION_PRESETS: Mapping[str, TrainConfig[PointClassificationConfig]] = {
-    "paper": TrainConfig(
+POINT_CLASSIFICATION_PRESETS = presets_of(
+    "point_classification",
+    paper=TrainConfig(
         task=PointClassificationConfig(),
         iterations=50_000,
         repeats=1,
@@ -391,10 +361,9 @@ POINT_CLASSIFICATION_PRESETS: Mapping[str, TrainConfig[PointClassificationConfig
         milestones=(20_000, 40_000),
         seed_interval=1,
         fresh_share=0.5,
-        out=_OUT,
     ),
     # Of clouds never seen 91 % are classified rightly, after some four minutes on one core.
-    "fast": fast_run(
+    fast=fast_run(
         PointClassificationConfig(
             stretch=0.1,
             mutated_share=0.25,
@@ -411,11 +380,10 @@ POINT_CLASSIFICATION_PRESETS: Mapping[str, TrainConfig[PointClassificationConfig
         milestones=(1100, 1400),
         seed_interval=1,
         fresh_share=0.5,
-        out=_OUT,
         picture_interval=500,
         checkpoint_interval=300,
     ),
-    "tiny": tiny_run(
+    tiny=tiny_run(
         PointClassificationConfig(
             particle_count=64,
             hidden_dim=32,
@@ -428,7 +396,6 @@ POINT_CLASSIFICATION_PRESETS: Mapping[str, TrainConfig[PointClassificationConfig
         steps=(6, 10),
         seed_interval=1,
         fresh_share=0.5,
-        out=_OUT,
     ),
-}
+)
 """Classification of point clouds: `paper` (arXiv 2601.16096), `fast` (on one core), `tiny`."""

@@ -9,7 +9,7 @@ from npa_envs.checks import DTYPES, checked_count, checked_finite, entries
 from npa_envs.devices import check_device
 from npa_envs.errors import NPAError, shown
 from npa_envs.ops.sort import LARGEST_INDEX
-from npa_envs.world.randomness import Randomness, WorldRandom, check_generator
+from npa_envs.world.randomness import Randomness, WorldRandom, check_generator, uniform_draws
 
 
 def uniform_ball(
@@ -88,6 +88,12 @@ def drawn_indices(
     if isinstance(generator, WorldRandom):
         return generator.integers(count, 1)[:, 0]
     return torch.randint(count, (world_count,), generator=generator, device=device)
+
+
+def drawn_worlds(x: Tensor, generator: Randomness, share: float) -> Tensor:
+    """Return which of some worlds are drawn, each with the probability `share`, bool, shape [B]."""
+    single = x.new_empty(0, dtype=torch.float32)
+    return uniform_draws(generator, (len(x), 1), single)[:, 0] < share
 
 
 def _check_points(number_count: int, dtype: torch.dtype) -> None:

@@ -2,27 +2,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
-from pathlib import Path
-from typing import Any, Self
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from npa_envs.checks import (
+    check_field,
     check_flag,
     check_non_negative,
     check_positive,
     check_seed,
     check_text,
 )
-from npa_envs.errors import NPAError, shown
+from npa_envs.errors import NPAError
 from npa_envs.ops import periodic_splat
 from npa_envs.rule.rule import COLOUR_OFFSET
 from npa_envs.tasks.base import ParticleTask, TaskConfig, Worlds, shares_of_loss
-from npa_envs.tasks.damage import random_particle, wipe_state
+from npa_envs.tasks.damage import random_particle
 from npa_envs.tasks.losses.texture import (
     DEFAULT_LOSS,
     LossOptions,
@@ -33,7 +32,8 @@ from npa_envs.tasks.losses.texture import (
 )
 from npa_envs.tasks.seeds import uniform_box
 from npa_envs.tasks.targets.textures import TextureTarget, load_texture
-from npa_envs.tasks.train_config import TrainConfig, tiny_run
+from npa_envs.tasks.train_config import TrainConfig, presets_of, tiny_run
+from npa_envs.world.brushes import wipe_state
 from npa_envs.world.randomness import Randomness
 
 
@@ -96,19 +96,17 @@ class TextureConfig(TaskConfig):
         check_flag(self, "target_tiles", "see_across")
         check_loss_name(self.loss)
         check_seed(self, "loss_seed")
-        if not isinstance(self.vgg_weights, str):
-            raise NPAError(f"vgg_weights must be a path as a string, got {shown(self.vgg_weights)}")
+        is_text = isinstance(self.vgg_weights, str)
+        check_field(self, "vgg_weights", is_text, "be a path as a string")
         check_positive(self, int, "state_dim", at_least=3)
         check_positive(self, int, "resolution", at_least=12)
         check_positive(self, float, "alpha", "box_size", "sigma")
         check_non_negative(
             self, "damage_radius", "colour_weight", "density_weight", "motion_weight"
         )
-        if self.box_size < 2.0 * self.eps:
-            raise NPAError(
-                f"box_size must be at least 2 eps = {2.0 * self.eps:g}, got {self.box_size}: "
-                "enlarge the box or perceive at a smaller eps"
-            )
+        rule = f"be at least 2 eps = {2.0 * self.eps:g}"
+        cure = "enlarge the box or perceive at a smaller eps"
+        check_field(self, "box_size", self.box_size >= 2.0 * self.eps, rule, cure)
 
 
 LARGEST_EPS = 0.3
@@ -131,11 +129,9 @@ DRAWINGS = 16
 
 
 class Texture(ParticleTask[TextureConfig]):
-    """The texture task of arXiv 2601.16096, with its loss.
+    """The texture task of arXiv 2601.16096, with its loss."""
 
-    Raises:
-        NPAError: The target cannot be loaded.
-    """
+    _kept = ("target",)
 
     def __init__(
         self,
@@ -166,17 +162,13 @@ class Texture(ParticleTask[TextureConfig]):
         """What worlds are to look like."""
         self._target_picture = target.picture.to(device)
         self.metric_name = config.loss
-        self.pixel_size: float = config.box_size * (target.coverage / config.particle_count) ** 0.5
-        """Side of the square that a particle fills [length units]: all together have the target's
-        mean density."""
+        # All particles together have the target's mean density.
+        self._pixel_size = config.box_size * (target.coverage / config.particle_count) ** 0.5
 
     @property
     def box(self) -> tuple[float, float]:
         """Sides of the periodic box [length units]."""
         return (self.config.box_size, self.config.box_size)
-
-    def _remade(self, config: TextureConfig) -> Self:
-        return type(self)(config, target=self.target, device=self.target_picture.device)
 
     @property
     def rule_shape(self) -> dict[str, Any]:
@@ -192,24 +184,17 @@ class Texture(ParticleTask[TextureConfig]):
         """Return the worlds with the states in a disk around one random particle set to zero."""
         if self.config.damage_radius == 0.0:
             return x, s, goal
-        side = self.config.box_size
-        away = x - random_particle(x, generator)[:, None]
-        away = away - side * (away / side).round()
-        centre = torch.zeros_like(away[:, 0])
-        return x, wipe_state(away, s, centre=centre, radius=self.config.damage_radius), goal
+        centre, radius = random_particle(x, generator), self.config.damage_radius
+        return x, wipe_state(x, s, centre=centre, radius=radius, box=self.box), goal
 
     def picture(self, x: Tensor, s: Tensor) -> Tensor:
         """Return the picture of each world: colour sums and density, shape [B, R, R, 4]."""
         return self.splat(x, s[..., -3:] + COLOUR_OFFSET)
 
     def drawing(self, number: int, *, shifted: bool = True) -> Tensor:
-        """Return the target as particles draw it: a jittered lattice of them, with its colours.
+        """Return the target as a jittered lattice of particles draws it, shape [1, R, R, 4].
 
-        Args:
-            shifted: Whether the target is moved round the box, so that another part is cut out.
-
-        Returns:
-            Colour sums and density, dimensionless, shape [1, R, R, 4].
+        It is moved round the box if `shifted`, so that another part is cut out.
         """
         side, resolution = self.config.box_size, self.config.resolution
         generator = torch.Generator().manual_seed(number)
@@ -338,11 +323,7 @@ class Texture(ParticleTask[TextureConfig]):
 
 
 def colour_image(channels: Tensor) -> Tensor:
-    """Return colours as they are compared, and shown: where particles overlap, their mean.
-
-    Returns:
-        Red, green and blue, shape [..., 3, R, R]; black where nothing is.
-    """
+    """Return colours [..., 3, R, R] as they are compared: where particles overlap, their mean."""
     sums, density = channels[..., :3, :, :], channels[..., 3:, :, :]
     return sums / density.clamp_min(1.0)
 
@@ -351,8 +332,6 @@ def density_image(density: Tensor) -> Tensor:
     """Return densities as they are compared: (D + 1e-6) to the power of 0.1 (dimensionless)."""
     return (density + DENSITY_FLOOR) ** DENSITY_POWER
 
-
-_OUT = Path("runs/texture")
 
 # Found by experiment: docs/textures.md. What is learned with 2048 particles holds for more.
 _BEST = TrainConfig(
@@ -374,11 +353,11 @@ _BEST = TrainConfig(
     schedule="cosine",
     max_age_range=(64, 8192),
     damage_share=0.5,
-    out=_OUT,
 )
 
-TEXTURE_PRESETS: Mapping[str, TrainConfig[TextureConfig]] = {
-    "paper": TrainConfig(
+TEXTURE_PRESETS = presets_of(
+    "texture",
+    paper=TrainConfig(
         task=TextureConfig(loss="vgg_ot"),
         iterations=12_000,
         repeats=1,
@@ -386,11 +365,10 @@ TEXTURE_PRESETS: Mapping[str, TrainConfig[TextureConfig]] = {
         learning_rate=1e-4,
         weight_decay=0.1,
         milestones=(3_000, 6_000, 9_000),
-        out=_OUT,
     ),
-    "best": _BEST,
+    best=_BEST,
     # Three minutes on two cores.
-    "fast": replace(
+    fast=replace(
         _BEST,
         task=replace(_BEST.task, target="dots", particle_count=1024, hidden_dim=64, resolution=64),
         iterations=600,
@@ -400,12 +378,11 @@ TEXTURE_PRESETS: Mapping[str, TrainConfig[TextureConfig]] = {
         checkpoint_interval=200,
         tensorboard=False,
     ),
-    "tiny": tiny_run(
+    tiny=tiny_run(
         TextureConfig(target="dots", particle_count=256, hidden_dim=32, eps=0.3, resolution=24),
         steps=(8, 16),
         seed_interval=4,
-        out=_OUT,
     ),
-}
+)
 """Textures: `paper` (arXiv 2601.16096, needs VGG16's weights), `best` (any texture, one run of
 minutes on a GPU), `fast` (`best` in small, on a CPU), `tiny`."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Generic, Literal, TypeVar, get_args
 
@@ -12,6 +12,8 @@ import torch
 
 from npa_envs.checks import (
     MomentInverse,
+    are_texts,
+    check_field,
     check_flag,
     check_non_negative,
     check_positive,
@@ -180,105 +182,83 @@ class TrainConfig(Generic[TaskConfigT]):
         check_positive(self, int, "iterations", "repeats", "world_count", "pool_size")
         check_positive(self, int, "seed_interval", "log_interval", "checkpoint_interval")
         check_positive(self, int, "stillness_min_age")
+        check_positive(self, int, "picture_interval", at_least=0)
         check_positive(self, float, "learning_rate", "stillness_power")
-        check_non_negative(self, "weight_decay", "fresh_share", "stillness_weight")
-        check_non_negative(self, "dead_zone", "damage_and_keep_share", "damage_share")
-        if not 1.0 <= self.stillness_power <= LARGEST_POWER:
-            raise NPAError(
-                f"stillness_power must be at least 1 and at most {LARGEST_POWER:g}, got "
-                f"{self.stillness_power}: 1 for plain means"
-            )
-        for name in ("fresh_share", "damage_share"):
-            if (share := getattr(self, name)) > 1.0:
-                raise NPAError(f"{name} must be at most 1, got {share}: try 0.5")
-        if self.damage_and_keep_share >= 1.0:
-            raise NPAError(
-                f"damage_and_keep_share must be below 1, got {self.damage_and_keep_share}: with 1 "
-                "there are no seeds"
-            )
-        interval = self.picture_interval
-        if not is_whole(interval) or interval < 0:
-            raise NPAError(
-                f"picture_interval must be a whole number of at least 0, got {shown(interval)}"
-            )
+        check_non_negative(self, "weight_decay", "stillness_weight", "dead_zone")
+        check_non_negative(
+            self, "fresh_share", "damage_share", "damage_and_keep_share", at_most=1.0
+        )
         check_seed(self, "seed")
         check_flag(self, "cuda_graph", "tensorboard")
-        if not isinstance(self.initial_rule, str):
-            raise NPAError(
-                f"initial_rule must be the name of a rule or of a file, or '' for none, got "
-                f"{shown(self.initial_rule)}"
-            )
-        self._check_pair(
-            "steps",
-            is_whole,
-            lambda lo, hi: 1 <= lo < hi,
-            "whole numbers (lo, hi) with 1 <= lo < hi",
-            "hi is exclusive, so exactly 32 steps are steps=(32, 33)",
-        )
-        self._check_schedule()
-        if self.world_count > self.pool_size:
-            raise NPAError(
-                f"world_count must be at most pool_size (batches are drawn without replacement), "
-                f"got world_count={self.world_count} and pool_size={self.pool_size}: "
-                f"set pool_size={self.world_count} or more"
-            )
-        self._check_max_age_range()
-        self._check_pair(
-            "vary_eps",
-            is_real,
-            lambda lo, hi: 0.0 < lo <= hi,
-            "factors (lo, hi) with 0 < lo <= hi",
-            "for example vary_eps=(0.5, 2.0)",
-        )
         choices = {"optimiser": OptimiserName, "schedule": Schedule, "memory": Memory}
         choices |= {"moment_inverse": MomentInverse, "dtype": Literal["float32", "float64"]}
         for name, kind in choices.items():
             value, allowed = getattr(self, name), get_args(kind)
-            if not isinstance(value, str) or value not in allowed:
-                raise NPAError(f"{name} must be one of {', '.join(allowed)}, got {shown(value)}")
+            known = isinstance(value, str) and value in allowed
+            check_field(self, name, known, f"be one of {', '.join(allowed)}")
         parse_device(self.device)
-        if not isinstance(self.out, Path):
-            raise NPAError(
-                f"out must be a pathlib.Path, got {shown(self.out)}: Path({shown(self.out)})"
-            )
-
-    def _check_pair(
-        self,
-        name: str,
-        kind: Callable[[object], bool],
-        fits: Callable[[Any, Any], bool],
-        rule: str,
-        cure: str,
-    ) -> None:
-        pair = getattr(self, name)
-        right = isinstance(pair, tuple) and len(pair) == 2 and all(map(kind, pair))
-        if not right or not fits(*pair):
-            raise NPAError(f"{name} must be two {rule}, got {shown(pair)}: {cure}")
-
-    def _check_schedule(self) -> None:
-        milestones = self.milestones
-        if not isinstance(milestones, tuple) or not all(is_whole(m) for m in milestones):
-            raise NPAError(f"milestones must be a tuple of whole numbers, got {shown(milestones)}")
-        if any(m < 1 for m in milestones) or list(milestones) != sorted(set(milestones)):
-            raise NPAError(
-                f"milestones must be positive and increasing, got {shown(milestones)}: "
-                "for example milestones=(2000, 4000)"
-            )
-
-    def _check_max_age_range(self) -> None:
-        self._check_pair(
-            "max_age_range",
-            is_whole,
-            lambda lo, hi: 1 <= lo <= hi or lo == hi == 0,
-            "whole numbers (lo, hi) with 1 <= lo <= hi, or (0, 0)",
-            "for example max_age_range=(64, 16384)",
-        )
-        if self.ages and self.pool_size % self.world_count:
-            raise NPAError(
-                f"pool_size must be a multiple of world_count where max_age_range are set, got "
-                f"{self.pool_size} and {self.world_count}: set "
-                f"pool_size={self.pool_size // self.world_count * self.world_count}"
-            )
+        milestones, ages = self.milestones, self.max_age_range
+        are_ages = _is_pair(ages, is_whole)
+        are_whole = isinstance(milestones, tuple) and all(map(is_whole, milestones))
+        for name, fits, rule, cure in (
+            (
+                "stillness_power",
+                1.0 <= self.stillness_power <= LARGEST_POWER,
+                f"be at least 1 and at most {LARGEST_POWER:g}",
+                "1 for plain means",
+            ),
+            (
+                "damage_and_keep_share",
+                self.damage_and_keep_share < 1.0,
+                "be below 1",
+                "with 1 there are no seeds",
+            ),
+            (
+                "initial_rule",
+                isinstance(self.initial_rule, str),
+                "be the name of a rule or of a file, or '' for none",
+                "",
+            ),
+            (
+                "steps",
+                _is_pair(self.steps, is_whole) and 1 <= self.steps[0] < self.steps[1],
+                "be two whole numbers (lo, hi) with 1 <= lo < hi",
+                "hi is exclusive, so exactly 32 steps are steps=(32, 33)",
+            ),
+            ("milestones", are_whole, "be a tuple of whole numbers", ""),
+            (
+                "milestones",
+                are_whole and list(milestones) == sorted({m for m in milestones if m >= 1}),
+                "be positive and increasing",
+                "for example milestones=(2000, 4000)",
+            ),
+            (
+                "world_count",
+                self.world_count <= self.pool_size,
+                f"be at most pool_size={self.pool_size} (batches are drawn without replacement)",
+                f"set pool_size={self.world_count} or more",
+            ),
+            (
+                "max_age_range",
+                are_ages and (1 <= ages[0] <= ages[1] or ages == (0, 0)),
+                "be two whole numbers (lo, hi) with 1 <= lo <= hi, or (0, 0)",
+                "for example max_age_range=(64, 16384)",
+            ),
+            (
+                "pool_size",
+                not are_ages or not self.ages or self.pool_size % self.world_count == 0,
+                f"be a multiple of world_count={self.world_count} where max_age_range is set",
+                f"set pool_size={self.pool_size // self.world_count * self.world_count}",
+            ),
+            (
+                "vary_eps",
+                _is_pair(self.vary_eps, is_real) and 0.0 < self.vary_eps[0] <= self.vary_eps[1],
+                "be two factors (lo, hi) with 0 < lo <= hi",
+                "for example vary_eps=(0.5, 2.0)",
+            ),
+            ("out", isinstance(self.out, Path), "be a pathlib.Path", f"Path({shown(self.out)})"),
+        ):
+            check_field(self, name, fits, rule, cure)
         for name in ("stillness_weight", "damage_and_keep_share"):
             if getattr(self, name) > 0 and not self.ages:
                 raise NPAError(
@@ -317,10 +297,6 @@ class TrainConfig(Generic[TaskConfigT]):
         It is a function of the iteration alone, restarted with each repeat, so that a resumed run
         needs no scheduler state: MultiStepLR, or a cosine with a short linear rise before it
         (Loshchilov and Hutter, arXiv 1608.03983).
-
-        Args:
-            share: How much of a cosine is over, in [0, 1], where the iterations say less: a caller
-                who counts seconds makes it fall with them.
         """
         within = iteration % self.iterations
         if self.schedule == "milestones":
@@ -353,17 +329,16 @@ class JointTrainConfig(TrainConfig[TaskConfigT]):
                 f"initial_rule is for one rule, got {shown(self.initial_rule)}: give "
                 "initial_rules, one for each species"
             )
-        rules = self.initial_rules
-        if not isinstance(rules, tuple) or not all(isinstance(r, str) and r for r in rules):
-            raise NPAError(
-                f"initial_rules must be a tuple of names or files, got {shown(rules)}: "
-                "for example initial_rules=('gecko', 'heart')"
-            )
+        cure = "for example initial_rules=('gecko', 'heart')"
+        rule = "be a tuple of names or files"
+        check_field(self, "initial_rules", are_texts(self.initial_rules), rule, cure)
         frozen = self.frozen
-        if not isinstance(frozen, tuple) or not all(is_whole(n) and n >= 0 for n in frozen):
-            raise NPAError(
-                f"frozen must be a tuple of species' numbers from 0, got {shown(frozen)}"
-            )
+        numbers = isinstance(frozen, tuple) and all(is_whole(n) and n >= 0 for n in frozen)
+        check_field(self, "frozen", numbers, "be a tuple of species' numbers from 0")
+
+
+def _is_pair(value: object, kind: Callable[[object], bool]) -> bool:
+    return isinstance(value, tuple) and len(value) == 2 and all(map(kind, value))
 
 
 SMALL: Mapping[str, Any] = {"repeats": 1, "world_count": 2, "tensorboard": False}
@@ -388,3 +363,10 @@ def fast_run(task: TaskConfigT, **fields: Any) -> TrainConfig[TaskConfigT]:
 def tiny_run(task: TaskConfigT, **fields: Any) -> TrainConfig[TaskConfigT]:
     """Return a run of seconds, for tests."""
     return TrainConfig(task=task, **{**TINY, **fields})
+
+
+def presets_of(
+    task_name: str, **runs: TrainConfig[TaskConfigT]
+) -> Mapping[str, TrainConfig[TaskConfigT]]:
+    """Return the presets of a task, each with the task's folder of runs."""
+    return {name: replace(run, out=Path("runs") / task_name) for name, run in runs.items()}

@@ -16,8 +16,16 @@ from npa_envs.rule.files import load_rule
 from npa_envs.rule.rule import COLOUR_OFFSET
 from npa_envs.tasks.base import Task
 from npa_envs.tasks.damage import DAMAGE_SIZES, damage_worlds
-from npa_envs.web.colouring import ColouredWorld, Colouring, shows_of
-from npa_envs.web.live import LiveWorld, Touch, WorldView, brushed, checked_seed
+from npa_envs.web.live import (
+    ColouredWorld,
+    Colouring,
+    LiveWorld,
+    Touch,
+    WorldView,
+    brushed,
+    checked_seed,
+    shows_of,
+)
 from npa_envs.world.brushes import nearest_image
 
 
@@ -26,14 +34,8 @@ def make_environment(
 ) -> tuple[Any, Callable[[Any], Any]]:
     """Return an environment of this package, and a policy for it.
 
-    Args:
-        id: Its id, such as "npa/Texture-v0".
-        policy: "zero", "random", or the source of a rule that fits it.
-        device: The world's device.
-        keywords: More of its keywords; those that are None keep their defaults.
-
-    Raises:
-        NPAError: There is no such environment or rule, or a keyword is wrong.
+    The policy is "zero", "random", or the source of a rule. Keywords that are None keep their
+    defaults.
     """
     others = {*GARDEN_IDS, *(environment.id for environment in CODED)}
     if id in others:
@@ -58,17 +60,7 @@ def make_environment(
 
 
 class EnvironmentWorld(LiveWorld):
-    """An environment of this package in which a policy acts.
-
-    Args:
-        env: The environment, single, wrapped or not; it is closed with the world.
-        policy: Maps an observation [N, P] to an action [N, A].
-        seed: The seed of the first episode.
-        title: The page's title; None: the environment's id.
-
-    Raises:
-        NPAError: The environment is none of this package.
-    """
+    """An environment of this package in which a policy acts; it is closed with the world."""
 
     def __init__(
         self, env: Any, policy: Callable[[Any], Any], *, seed: int = 0, title: str | None = None

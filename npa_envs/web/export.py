@@ -21,15 +21,11 @@ from npa_envs.files import atomic_path, checked_path
 from npa_envs.rule.files import load_rule
 from npa_envs.rule.rule import NPARule, check_rule
 from npa_envs.tasks.point_classification import PALETTE, UNDECIDED, PointClassification
-from npa_envs.web.colouring import colour_ramp
-from npa_envs.web.live import checked_seed
+from npa_envs.web.live import checked_seed, colour_ramp
 from npa_envs.web.rule_world import RuleWorld, name_of
 
 PAGE = Path(__file__).resolve().parent / "page"
 """The folder of the page's own files."""
-
-STYLES = ("page.css", "exported.css")
-"""Style sheets of the exported page."""
 
 PREVIEW_STEPS = 256
 """Steps of a world before its preview; half as many for textures and clouds."""
@@ -55,10 +51,6 @@ def joined_modules(names: Sequence[str], folder: Path = PAGE) -> str:
     """Return modules and all that they import as one script, each in a scope of its own.
 
     The exports of `page.js` become members of the constant `page`, and so on.
-
-    Raises:
-        ValueError: An import or an export has an unknown form, or modules import each other in a
-            circle.
     """
     order: list[str] = []
     texts: dict[str, str] = {}
@@ -149,11 +141,7 @@ def export_web(
 
 
 def distinct_names(sources: Sequence[str], what: str) -> list[str]:
-    """Return the names of rules in one file, which errors call `what`.
-
-    Raises:
-        NPAError: There are none, or two have one name.
-    """
+    """Return the names of rules in one file, which errors call `what`."""
     names = [name_of(source) for source in sources]
     if not names or len(set(names)) < len(names):
         raise NPAError(
@@ -164,18 +152,17 @@ def distinct_names(sources: Sequence[str], what: str) -> list[str]:
 
 
 def page_rule(source: str, *, particle_count: int | None = None) -> dict[str, Any]:
-    """Return a rule and its world as the page's engine reads them: numbers as float32 in base64.
-
-    Raises:
-        NPAError: It cannot be loaded, or a browser cannot run it.
-    """
+    """Return a rule and its world as the page's engine reads them: numbers as float32 in base64."""
     check_browser_rule(load_rule(source), name_of(source))
     live = RuleWorld(source, device=torch.device("cpu"), particle_count=particle_count, choices={})
     rule, task = live.main.rule, live.task
     seed: dict[str, Any]
     if task.classifies:
-        clouds = one_of_each(cast(PointClassification, task))
-        seed = {"kind": "clouds", "clouds": [_packed(cloud) for cloud in clouds]}
+        clouds = cast(PointClassification, task).clouds
+        label = clouds.label.tolist()
+        # The first cloud of each class.
+        chosen = [clouds.x[label.index(kind)] for kind in sorted(set(label))]
+        seed = {"kind": "clouds", "clouds": [_packed(cloud) for cloud in chosen]}
     elif task.box is not None:
         seed = {"kind": "box"}
     elif hasattr(task.config, "seed_radius"):
@@ -221,12 +208,6 @@ def check_browser_rule(rule: NPARule, name: str) -> None:
             raise NPAError(f"a page runs rules {rule_of_page}, {shown(name)} {given}: {cure}")
 
 
-def one_of_each(task: PointClassification) -> list[Tensor]:
-    """Return the first cloud of each class, shape [N, 2]."""
-    label = task.clouds.label.tolist()
-    return [task.clouds.x[label.index(kind)] for kind in sorted(set(label))]
-
-
 def preview(source: str, *, particle_count: int | None = None, seed: int = 0) -> str:
     """Return a picture of a rule's grown world as a data address: WebP with transparency."""
     live = RuleWorld(
@@ -257,7 +238,7 @@ def page_text(rules: Sequence[Mapping[str, Any]], *, title: str, seed: int = 0) 
     data = json.dumps(settings, separators=(",", ":")).replace("<", "\\u003c")
     worker = f"{joined_modules(['live_world.js'])}\nlive_world.serve(self);\n"
     code = f"{joined_modules(['exported.js'])}\nexported.begin();\n"
-    style = "\n".join((PAGE / name).read_text(encoding="utf-8") for name in STYLES)
+    style = (PAGE / "page.css").read_text(encoding="utf-8")
     policy = POLICY.format(scripts=_digest(code), styles=_digest(style))
     page = (PAGE / "index.html").read_text(encoding="utf-8")
     limits = f'<meta http-equiv="Content-Security-Policy" content="{policy}">'

@@ -5,9 +5,9 @@ from __future__ import annotations
 import contextlib
 import time
 from collections.abc import Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import torch
@@ -19,9 +19,7 @@ from npa_envs.errors import NPAError, shown, suggest
 from npa_envs.files import open_regular, parse_json
 from npa_envs.rule.files import load_rule, rule_file, rule_metadata, shipped_rules
 from npa_envs.rule.rule import NPARule
-from npa_envs.tasks.base import (
-    Task,
-)
+from npa_envs.tasks.base import Task
 from npa_envs.tasks.co_morphogenesis2d import CoMorphogenesis2DConfig
 from npa_envs.tasks.damage import DAMAGE_SIZES, damage_worlds
 from npa_envs.tasks.seeds import uniform_ball
@@ -29,8 +27,17 @@ from npa_envs.tasks.train_config import TrainConfig
 from npa_envs.training.presets import load_config, preset
 from npa_envs.training.run import LARGEST_LOG, RunFolder
 from npa_envs.training.trained_tasks import TrainedTask, task_of_rule, trained_config
-from npa_envs.web.colouring import ColouredWorld, Colouring, shows_of
-from npa_envs.web.live import LiveWorld, Range, Touch, WorldView, brushed, checked_seed
+from npa_envs.web.live import (
+    ColouredWorld,
+    Colouring,
+    LiveWorld,
+    Range,
+    Touch,
+    WorldView,
+    brushed,
+    checked_seed,
+    shows_of,
+)
 from npa_envs.world.brushes import inside_ball, removed, wipe_state
 from npa_envs.world.division import living
 from npa_envs.world.rollout import at_rest, rollout
@@ -55,25 +62,21 @@ POLL_SECONDS = 1.0
 """Time between two looks at the files of a run [s]."""
 
 
-class LiveRule(NamedTuple):
-    """A float32 rule with its name."""
+@dataclass
+class LiveRule:
+    """A float32 rule and its particles."""
 
     name: str
     rule: NPARule
+    count: int = 0
+    divisor: float = 0.0
+    """Its densities are divided by this number of particles."""
 
 
 class RuleWorld(LiveWorld):
     """A world of one rule, and of others that the brushes graft and add bring in.
 
-    Args:
-        source: The rule: a shipped one or a file.
-        device: The world's device.
-        seed: The seed of the first world.
-        particle_count: Particles N; None: as trained.
-        choices: Other rules that may be chosen, by their names; None: the shipped ones.
-
-    Raises:
-        NPAError: The rule cannot be loaded, or a number is out of its range.
+    The choices are other rules by their names: the shipped ones, unless some are given.
     """
 
     def __init__(
@@ -137,8 +140,7 @@ class RuleWorld(LiveWorld):
             1, generator=self._generator, device=self._device
         )
         self.full = self.x.shape[1]
-        self.live_rules, self.counts = [self.main], [self.full]
-        self._divisors = [float(self.full)]
+        self.live_rules = [replace(self.main, count=self.full, divisor=float(self.full))]
         self._colouring = Colouring()
         self._travelled: Tensor | None = None
         self._updated: Tensor | None = None
@@ -154,9 +156,14 @@ class RuleWorld(LiveWorld):
         return self.trained.task
 
     @property
-    def dimension(self) -> int:
-        """Space dimension D."""
-        return self.main.rule.space_dim
+    def counts(self) -> list[int]:
+        """Particles of each rule, rule after rule."""
+        return [own.count for own in self.live_rules]
+
+    @property
+    def count(self) -> int:
+        """Particles of a fresh world."""
+        return self.full
 
     def describe(self) -> dict[str, Any]:
         """Return the event "world"."""
@@ -170,11 +177,11 @@ class RuleWorld(LiveWorld):
         return super().describe() | {
             "title": self.main.name,
             "note": "",
-            "dimension": self.dimension,
+            "dimension": self.main.rule.space_dim,
             "box": None if box is None else list(box),
             "half_width": half_width,
             "centre": centre,
-            "spot": self._spot(),
+            "spot": 0.7 * self.task.pixel_size,
             "rules": sorted(self._choices),
             "rule": self.main.name,
             "others": [name for name in self._choices if self._may_join(name)],
@@ -197,34 +204,18 @@ class RuleWorld(LiveWorld):
         alike = all(getattr(other, field) == getattr(own, field) for field in AGREEMENTS)
         return alike and not (other.divides or own.divides)
 
-    def _spot(self) -> float:
-        """Return the standard deviation of a particle's spot [length units]."""
-        target = getattr(self.task, "target", None)
-        size = getattr(self.task, "pixel_size", None) or getattr(target, "pixel_size", None)
-        spacing = (0.1 / self.full) ** (1.0 / 3.0) if size is None else float(size)
-        return 0.7 * spacing
-
     def _ranges(self) -> dict[str, Range]:
         eps0, box = self.main.rule.eps0, self.task.box
         # A periodic box holds at least two cells of width ε.
         most = 2.5 * eps0 if box is None else min(2.5 * eps0, 0.499 * min(box))
-        return {
+        ranges = super()._ranges() | {
             "eps": Range(0.4 * eps0, most, "log"),
             "update_prob": Range(0.05, 1.0),
             "noise": Range(0.0, 0.2 * eps0),
-            "count": Range(64, MOST_PARTICLES[self._device.type], "log", whole=True),
         }
-
-    def _settings(self) -> dict[str, Any]:
-        ranges = self._ranges()
-        values = {
-            "eps": self.eps, "update_prob": self.update_prob, "noise": self.noise,
-            "count": self.full,
-        }  # fmt: skip
-        if self.task.classifies:
-            del values["count"]
-        own = {name: ranges[name].to_dict(value) for name, value in values.items()}
-        return super()._settings() | own
+        if not self.task.classifies:
+            ranges["count"] = Range(64, MOST_PARTICLES[self._device.type], "log", whole=True)
+        return ranges
 
     def _shows(self) -> list[str]:
         return shows_of(self.main.rule.state_dim)
@@ -232,16 +223,13 @@ class RuleWorld(LiveWorld):
     def _set(self, name: str, value: Any) -> bool:
         if name == "rule":
             self._plant(value)
-            return True
-        if name not in self._settings() or name == "speed":
-            return super()._set(name, value)
-        number = self._ranges()[name].checked(name, value)
-        if name == "count":
+        elif name == "count" and name in self._ranges():
+            number = self._ranges()[name].checked(name, value)
             if number != self.full:
                 self.trained = self._task_of(self.main, int(number))
                 self.reset(self.seed)
         else:
-            setattr(self, name, number)
+            return super()._set(name, value)
         return True
 
     @torch.no_grad()
@@ -288,11 +276,11 @@ class RuleWorld(LiveWorld):
 
     def _is_as_planted(self) -> bool:
         """Return whether the particles are those of a fresh world of one rule."""
-        return self.counts == [self.full] and self._divisors == [float(self.full)]
+        return [(own.count, own.divisor) for own in self.live_rules] == [(self.full, self.full)]
 
     def _go(self, steps: int, options: Mapping[str, Any]) -> Tensor:
         """Run steps and return the path length of each particle."""
-        rules = [live_rule.rule for live_rule in self.live_rules]
+        rules = [own.rule for own in self.live_rules]
         if self._is_as_planted():
             self.x, self.s, path_length = rollout(
                 rules[0], self.x, self.s, steps, return_path_length=True, **options
@@ -300,9 +288,10 @@ class RuleWorld(LiveWorld):
         else:
             # Densities are divided by the particles of a fresh world, so that particles that a
             # brush adds or removes change densities in their neighbourhood only.
+            divisors = [own.divisor for own in self.live_rules]
             self.x, self.s, path_length = rollout_species(
-                rules, self.x, self.s, steps, counts=self.counts, return_path_length=True,
-                density_counts=self._divisors, **options,
+                rules, self.x, self.s, steps, counts=self.counts, density_counts=divisors,
+                return_path_length=True, **options,
             )  # fmt: skip
         return path_length
 
@@ -346,7 +335,7 @@ class RuleWorld(LiveWorld):
     @torch.no_grad()
     def _brush(self, message: Mapping[str, Any]) -> bool:
         touch = Touch.read(message, self.x)
-        before = [live_rule.name for live_rule in self.live_rules]
+        before = [own.name for own in self.live_rules]
         match touch.tool:
             case "remove" if self.main.rule.divides:
                 self.s = wipe_state(self.x, self.s, centre=touch.at, radius=touch.radius)
@@ -359,7 +348,7 @@ class RuleWorld(LiveWorld):
                 self._add(touch, self._joining(message.get("rule")))
             case _:
                 self.x, self.s = brushed(self.x, self.s, touch, self.task.box)
-        return before != [live_rule.name for live_rule in self.live_rules]
+        return before != [own.name for own in self.live_rules]
 
     def _graft(self, touch: Touch, live_rule: LiveRule) -> None:
         inside = inside_ball(self.x, centre=touch.at, radius=touch.radius, box=self.task.box)
@@ -374,7 +363,7 @@ class RuleWorld(LiveWorld):
         if count > room:
             raise NPAError(f"the world has room for {max(room, 0)} particles more, got {count}")
         ball = uniform_ball(
-            1, count, self.dimension, touch.radius, generator=self._generator,
+            1, count, self.x.shape[2], touch.radius, generator=self._generator,
             device=self._device, dtype=self.x.dtype,
         )  # fmt: skip
         # A new species divides densities by its own number of particles, as if it grew alone.
@@ -410,9 +399,7 @@ class RuleWorld(LiveWorld):
         names = [own.name for own in self.live_rules]
         if live_rule.name not in names:
             names.append(live_rule.name)
-            self.live_rules.append(live_rule)
-            self.counts.append(0)
-            self._divisors.append(divisor)
+            self.live_rules.append(replace(live_rule, divisor=divisor))
         return names.index(live_rule.name)
 
     def _species(self) -> Tensor:
@@ -426,12 +413,11 @@ class RuleWorld(LiveWorld):
         if not torch.equal(order, torch.arange(self.x.shape[1], device=order.device)):
             # The page's tracers follow particles by their index.
             self._news.append({"type": "reordered"})
-        counts = torch.bincount(species, minlength=len(self.live_rules)).tolist()
-        living = [k for k, count in enumerate(counts) if count] or [0]
         self.x, self.s = x[:, order], s[:, order]
-        self.live_rules = [self.live_rules[k] for k in living]
-        self._divisors = [self._divisors[k] for k in living]
-        self.counts = [counts[k] for k in living]
+        counts = torch.bincount(species, minlength=len(self.live_rules)).tolist()
+        for own, count in zip(self.live_rules, counts, strict=True):
+            own.count = count
+        self.live_rules = [own for own in self.live_rules if own.count] or self.live_rules[:1]
 
 
 def name_of(source: str) -> str:
@@ -448,8 +434,10 @@ class FollowedLog:
     def __init__(self, path: Path) -> None:
         self._path = path
         self._seen: tuple[int, ...] = ()
-        self._end = 0
-        self._last_line = b""
+        self._forget()
+
+    def _forget(self) -> None:
+        self._end, self._last_line = 0, b""
         self.iteration = -1
         """Iteration of the last record, or -1."""
 
@@ -484,18 +472,9 @@ class FollowedLog:
                     records.append(record)
         return records, anew
 
-    def _forget(self) -> None:
-        self._end, self._last_line, self.iteration = 0, b"", -1
-
 
 class RunWorld(RuleWorld):
-    """A world of the rules of a training run, replaced by those of each new checkpoint.
-
-    Args are those of `RuleWorld`, with the run's folder in place of a rule.
-
-    Raises:
-        NPAError: The folder holds no run, or one that has not written a rule yet.
-    """
+    """A world of the rules of a run's folder, replaced by those of each new checkpoint."""
 
     def __init__(
         self,
@@ -512,7 +491,8 @@ class RunWorld(RuleWorld):
         self._centres = [0.0]
         if len(files) > 1:
             # Seeds lie in a row, as in training.
-            config = load_config(self._run_folder.config, joint_preset())
+            joint: TrainConfig[CoMorphogenesis2DConfig] = preset("fast", "co_morphogenesis2d")
+            config = load_config(self._run_folder.config, joint)
             self._centres = list(config.task.centres)
         self._each = None if particle_count is None else max(1, particle_count // len(files))
         self._written = self._stamp()
@@ -532,16 +512,15 @@ class RunWorld(RuleWorld):
             return
         self.live_rules = [self._live_rule(name) for name in self._files]
         worlds = []
-        for live_rule, centre in zip(self.live_rules, self._centres, strict=True):
-            task = self._task_of(live_rule, self._each).task
+        for own, centre in zip(self.live_rules, self._centres, strict=True):
+            task = self._task_of(own, self._each).task
             x, s, _ = task.seed(1, generator=self._generator, device=self._device)
             x[..., 0] += centre
             worlds.append((x, s))
+            # As in training, each species divides densities by its own number of particles.
+            own.count, own.divisor = x.shape[1], float(x.shape[1])
         self.x, self.s = (torch.cat(parts, dim=1) for parts in zip(*worlds, strict=True))
-        self.counts = [x.shape[1] for x, _ in worlds]
         self.full = sum(self.counts)
-        # As in training, each species divides densities by its own number of particles.
-        self._divisors = [float(count) for count in self.counts]
 
     def describe(self) -> dict[str, Any]:
         """Return the event "world", without a choice of rules."""
@@ -552,11 +531,11 @@ class RunWorld(RuleWorld):
             "rule": None,
         }
 
-    def _settings(self) -> dict[str, Any]:
-        settings = super()._settings()
+    def _ranges(self) -> dict[str, Range]:
+        ranges = super()._ranges()
         if len(self._files) > 1:
-            del settings["count"]
-        return settings
+            del ranges["count"]
+        return ranges
 
     def news(self) -> list[dict[str, Any]]:
         """Return other events since the last call, with the run's new losses and rules."""
@@ -625,18 +604,8 @@ class RunWorld(RuleWorld):
         return found
 
 
-def joint_preset() -> TrainConfig[CoMorphogenesis2DConfig]:
-    """Return the preset that the configuration of a run of several rules overrides."""
-    config: TrainConfig[CoMorphogenesis2DConfig] = preset("fast", "co_morphogenesis2d")
-    return config
-
-
 def rules_of_run(folder: RunFolder) -> list[Path]:
-    """Return the file of a run's rule, or those of the species that it trains together.
-
-    Raises:
-        NPAError: There are none.
-    """
+    """Return the file of a run's rule, or those of the species that it trains together."""
     path = str(folder.path)
     if not folder.path.is_dir():
         raise NPAError(f"a run must be a folder, got {shown(path)}: name the one given as --out")

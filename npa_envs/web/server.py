@@ -114,11 +114,18 @@ class Site:
 
     def knows(self, host: str) -> bool:
         """Return whether a request's `Host` may name this server."""
-        name = _host_name(host)
+        # Without its port and without brackets.
+        closed = host.startswith("[")
+        name = host[1:].partition("]")[0] if closed else host.partition(":")[0].lower()
         if self.token is not None:
             # The token is proof enough, under any name of this computer.
             return bool(name)
         return name == self.host or name in ("localhost", "127.0.0.1", "::1")
+
+    @property
+    def query(self) -> str:
+        """The token as the end of an address, or nothing."""
+        return "" if self.token is None else f"?token={self.token}"
 
     def admits(self, token: str | None) -> bool:
         """Return whether a token is right, or none is asked for."""
@@ -224,13 +231,6 @@ def _refused(reason: str) -> Response:
     return PlainTextResponse(f"refused: {reason}", 403, SECURITY)
 
 
-def _host_name(host: str) -> str:
-    """Return the name in a `Host` header, without its port and without brackets."""
-    if host.startswith("["):
-        return host[1:].partition("]")[0]
-    return host.partition(":")[0].lower()
-
-
 def frame_bytes(frame: WorldView) -> bytes:
     """Return the bytes of a frame: header, positions, colours."""
     count, dimension = frame.positions.shape
@@ -275,10 +275,12 @@ class ViewerSession:
             received = await self._reader.receive()
             if received["type"] == "websocket.disconnect":
                 return
-            data = received.get("bytes")
-            message = data if data is not None else _parsed(received.get("text") or "")
-            if isinstance(message, str):
-                self._tell({"type": "error", "message": message})
+            text, message = received.get("text") or "", received.get("bytes")
+            if message is None:
+                with contextlib.suppress(ValueError, RecursionError):
+                    message = json.loads(text)
+            if not isinstance(message, dict | bytes):
+                self._complain(f"a message must be a JSON object, got {shown(text)}")
             elif isinstance(message, dict) and message.get("type") == "drawn":
                 self._give_room()
             else:
@@ -288,7 +290,7 @@ class ViewerSession:
         try:
             self._inbox.put_nowait(message)
         except queue.Full:
-            self._tell({"type": "error", "message": "too many messages: some are lost"})
+            self._complain("too many messages: some are lost")
 
     async def _write(self) -> None:
         while (data := await self._outbox.get()) is not None:
@@ -307,27 +309,29 @@ class ViewerSession:
     def _tell(self, event: Mapping[str, Any]) -> None:
         self._post(json.dumps(event))
 
-    def _post(self, data: bytes | str | None) -> None:
-        with contextlib.suppress(RuntimeError):  # The loop has ended.
-            self._loop.call_soon_threadsafe(self._put, data)
+    def _complain(self, message: str) -> None:
+        self._tell({"type": "error", "message": message})
 
-    def _put(self, data: bytes | str | None) -> None:
-        # A page that does not read gets no more events; None ends the loop of `_write`.
-        if data is None or self._outbox.qsize() < MESSAGES_KEPT:
-            self._outbox.put_nowait(data)
+    def _post(self, data: bytes | str | None) -> None:
+        def put() -> None:
+            # A page that does not read gets no more events; None ends the loop of `_write`.
+            if data is None or self._outbox.qsize() < MESSAGES_KEPT:
+                self._outbox.put_nowait(data)
+
+        with contextlib.suppress(RuntimeError):  # The loop has ended.
+            self._loop.call_soon_threadsafe(put)
 
     def _live(self) -> None:
         try:
             with self._site.alone():
                 world = self._site.make_world()
         except NPAError as error:
-            self._tell({"type": "error", "message": str(error)})
-            return
+            return self._complain(str(error))
         try:
             self._go_on(world)
         except Exception as error:
             # A bug or a failed device: shown in the page, and raised for the log.
-            self._tell({"type": "error", "message": f"the world has ended: {shown(error)}"})
+            self._complain(f"the world has ended: {shown(error)}")
             raise
         finally:
             world.close()
@@ -335,7 +339,8 @@ class ViewerSession:
     def _go_on(self, world: LiveWorld) -> None:
         self._tell(world.describe())
         changed = True
-        due = self._clock()
+        clock = self._loop.time
+        due = clock()
         while not self._stopped.is_set():
             changed |= self._take(world, wait=not (world.playing or changed))
             with self._site.alone():
@@ -348,10 +353,8 @@ class ViewerSession:
             # A hidden page draws nothing; its messages are answered meanwhile.
             if not self._room.acquire(timeout=0.25):
                 continue
-            pause = due - self._clock()
-            if pause > 0.0:
-                self._stopped.wait(pause)
-            due = max(due, self._clock() - FRAME_SECONDS) + FRAME_SECONDS
+            self._stopped.wait(max(0.0, due - clock()))
+            due = max(due, clock() - FRAME_SECONDS) + FRAME_SECONDS
             try:
                 with self._site.alone():
                     if world.playing:
@@ -361,12 +364,9 @@ class ViewerSession:
             except NPAError as error:
                 world.playing = False
                 self._give_room()
-                self._tell({"type": "error", "message": f"{error}; the world is paused"})
+                self._complain(f"{error}; the world is paused")
                 self._tell(world.describe())
             changed = False
-
-    def _clock(self) -> float:
-        return self._loop.time()
 
     def _take(self, world: LiveWorld, *, wait: bool) -> bool:
         """Apply messages; return whether there were any."""
@@ -388,49 +388,44 @@ class ViewerSession:
                     if changed:
                         self._tell(world.describe())
             except NPAError as error:
-                self._tell({"type": "error", "message": str(error)})
+                self._complain(str(error))
         return taken
 
     def _direct(self, action: Any) -> None:
         if action == "start":
             self._film = PageFilm()
         elif action == "stop" and self._film is not None:
-            self._end_film()
+            self._end_film(self._film)
         else:
             raise NPAError(f"a film's action must be 'start', then 'stop', got {shown(action)}")
 
-    def _end_film(self) -> None:
-        film, self._film = self._film, None
-        # The world runs meanwhile.
-        threading.Thread(target=self._write_film, args=(film,), daemon=True).start()
+    def _end_film(self, film: PageFilm) -> None:
+        def write() -> None:
+            try:
+                for path in film.write(self._site.films):
+                    url = f"films/{path.name}{self._site.query}"
+                    self._tell({"type": "file", "name": path.name, "url": url})
+            except NPAError as error:
+                self._complain(str(error))
 
-    def _write_film(self, film: PageFilm) -> None:
-        token = "" if self._site.token is None else f"?token={self._site.token}"
-        try:
-            for path in film.write(self._site.films):
-                self._tell({"type": "file", "name": path.name, "url": f"films/{path.name}{token}"})
-        except NPAError as error:
-            self._tell({"type": "error", "message": str(error)})
+        self._film = None
+        # The world runs meanwhile.
+        threading.Thread(target=write, daemon=True).start()
 
     def _add_picture(self, data: bytes) -> None:
         # Pictures that come after the film's end are ignored.
         if self._film is not None:
             self._film.add(data)
-            if self._film.is_full:
+            if len(self._film.pictures) >= MOST_PICTURES:
                 self._tell({"type": "film", "action": "stop"})
-                self._end_film()
+                self._end_film(self._film)
 
 
 class PageFilm:
     """A film of pictures that a page has drawn."""
 
     def __init__(self) -> None:
-        self._pictures: list[bytes] = []
-
-    @property
-    def is_full(self) -> bool:
-        """Whether it has `MOST_PICTURES`."""
-        return len(self._pictures) >= MOST_PICTURES
+        self.pictures: list[bytes] = []
 
     def add(self, data: bytes) -> None:
         """Add a picture, a JPEG file."""
@@ -444,16 +439,16 @@ class PageFilm:
                 f"a film's picture must have at most {LARGEST_PICTURE} pixels on each side, got "
                 f"{size}"
             )
-        self._pictures.append(data)
+        self.pictures.append(data)
 
     def write(self, folder: Path) -> Iterator[Path]:
         """Write the film as GIF and as MP4; yield each file once it is written."""
-        if not self._pictures:
+        if not self.pictures:
             raise NPAError("the film has no pictures: let the world move while it records")
         try:
             frames = [
                 np.asarray(Image.open(io.BytesIO(data), formats=["JPEG"]).convert("RGB"))
-                for data in self._pictures
+                for data in self.pictures
             ]
             # Several readers may end their films within a second.
             name = f"{time.strftime('film-%Y%m%d-%H%M%S')}-{secrets.token_hex(3)}"
@@ -467,16 +462,6 @@ class PageFilm:
             raise
         except (OSError, ValueError) as error:
             raise NPAError(f"the film cannot be written: {error}") from error
-
-
-def _parsed(text: str) -> dict[str, Any] | str:
-    """Return a message's object, or an error."""
-    message = None
-    with contextlib.suppress(ValueError, RecursionError):
-        message = json.loads(text)
-    if isinstance(message, dict):
-        return message
-    return f"a message must be a JSON object, got {shown(text)}"
 
 
 def open_port(host: str, port: int | None) -> socket.socket:
@@ -517,8 +502,7 @@ def address_of(site: Site, listener: socket.socket) -> str:
     # The link of a server on all addresses opens the page on this computer.
     name = {"0.0.0.0": "127.0.0.1", "": "127.0.0.1", "::": "::1"}.get(site.host, site.host)
     name = f"[{name}]" if ":" in name else name
-    token = "" if site.token is None else f"?token={site.token}"
-    return f"http://{name}:{port}/{token}"
+    return f"http://{name}:{port}/{site.query}"
 
 
 def make_server(site: Site) -> uvicorn.Server:

@@ -17,7 +17,7 @@ from torch import Tensor
 from npa_envs.errors import NPAError
 from npa_envs.rule.authors import save_demo_json
 from npa_envs.rule.files import load_rule, preset_rules, rule_metadata, save_rule, shipped_rules
-from npa_envs.rule.rule import NPARule, RuleHyperParameters
+from npa_envs.rule.rule import HYPER_PARAMETERS, NPARule
 
 RULES: dict[str, Callable[[], NPARule]] = {
     "plain 2D": lambda: NPARule(),
@@ -83,7 +83,7 @@ def test_metadata_is_kept_and_holds_every_hyper_parameter(tmp_path: Path) -> Non
     assert (metadata["format"], metadata["version"]) == ("npa-envs rule", "1")
     assert metadata["eps0"] == "0.125"
     assert metadata["static"] == "false"
-    assert set(RuleHyperParameters.__required_keys__) <= set(metadata)
+    assert set(HYPER_PARAMETERS) <= set(metadata)
 
 
 @pytest.mark.parametrize(

@@ -4,7 +4,8 @@ import pytest
 import torch
 
 from npa_envs.errors import NPAError
-from npa_envs.tasks.damage import clump, cut, random_particle, wipe_state
+from npa_envs.tasks.damage import random_particle
+from npa_envs.world.brushes import clump, cut, wipe_state
 
 B, N, C = 3, 257, 5
 

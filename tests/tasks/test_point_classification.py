@@ -117,7 +117,7 @@ def test_without_read_out_the_last_channels_are_the_classes(task, device):
     goals = [torch.tensor([k], device=device) for k in range(3)]
     errors = [task.toward(goal).metric(s, s).item() for goal in goals]
     assert errors == pytest.approx([2 / 3, 0.0, 2 / 3])
-    with pytest.raises(NPAError, match="classes must be given first"):
+    with pytest.raises(NPAError, match="goals must be given first"):
         task.metric(s, s)
     with pytest.raises(NPAError, match="at least as many outputs as there are classes, 3, got 2"):
         task.outputs(s[..., :2])

@@ -7,12 +7,12 @@ import pytest
 import torch
 
 from npa_envs.errors import NPAError
-from npa_envs.tasks.losses.pieces import pyramid
-from npa_envs.tasks.losses.shapes import (
+from npa_envs.tasks.losses.pieces import (
     EVEN,
     MATCHED_PATCH,
     PatchTransport,
     RandomFilters,
+    pyramid,
 )
 from npa_envs.tasks.losses.texture import TEXTURE_LOSSES, make_texture_loss
 from npa_envs.tasks.texture import Texture, TextureConfig

@@ -10,8 +10,8 @@ from PIL import Image
 
 from npa_envs.errors import NPAError
 from npa_envs.ops import Cameras, orbit
-from npa_envs.tasks.losses.similarity import MultiScaleSimilarity
-from npa_envs.tasks.morphogenesis3d import ViewSchedule, blurred
+from npa_envs.tasks.losses.pieces import MultiScaleSimilarity
+from npa_envs.tasks.morphogenesis3d import Morphogenesis3DConfig, ViewSchedule, blurred
 from npa_envs.tasks.targets.meshes import (
     AMBIENT,
     MESHES,
@@ -324,7 +324,8 @@ def test_blur_is_a_gaussian_and_none_at_zero():
 
 def test_schedules_follow_from_seed_and_iteration_alone():
     def make(seed):
-        return ViewSchedule(20, 4, seed=seed, blur_sigma=10.0, blur_iterations=50, device="cpu")
+        config = Morphogenesis3DConfig(view_seed=seed, blur_sigma=10.0, blur_iterations=50)
+        return ViewSchedule(20, config, "cpu")
 
     def drawn(schedule, iteration):
         schedule.begin(iteration)
@@ -345,5 +346,5 @@ def test_schedules_follow_from_seed_and_iteration_alone():
     assert not torch.equal(drawn(make(1), 0)[1], history[0][1])
     backgrounds = torch.stack([h[1] for h in history])
     assert 0.4 < float(backgrounds.mean()) < 0.6
-    few = ViewSchedule(2, 4, seed=0, blur_sigma=0.0, blur_iterations=1, device="cpu")
+    few = ViewSchedule(2, Morphogenesis3DConfig(blur_sigma=0.0, blur_iterations=1), "cpu")
     assert sorted(few.index.tolist()) == [0, 1]

@@ -33,7 +33,6 @@ from npa_envs.errors import NPAError
 from npa_envs.rule.files import load_rule, save_rule
 from npa_envs.rule.rule import NPARule
 from npa_envs.tasks.point_classification import class_colours
-from npa_envs.web.colouring import ColouredWorld, Colouring
 from npa_envs.web.export import (
     PAGE,
     check_browser_rule,
@@ -42,6 +41,7 @@ from npa_envs.web.export import (
     page_rule,
     page_text,
 )
+from npa_envs.web.live import ColouredWorld, Colouring
 from npa_envs.world import brushes
 from npa_envs.world.rollout import rollout
 from npa_envs.world.species import rollout_species

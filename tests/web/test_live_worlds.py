@@ -21,8 +21,8 @@ from npa_envs.tasks.damage import DAMAGE_SIZES
 from npa_envs.training import config_to_dict, preset
 from npa_envs.training.run import JsonlLog
 from npa_envs.web import rule_world
-from npa_envs.web.colouring import ColouredWorld, Colouring, signed_colours, species_colours
 from npa_envs.web.environment_world import EnvironmentWorld, make_environment
+from npa_envs.web.live import ColouredWorld, Colouring, signed_colours, species_colours
 from npa_envs.web.rule_world import RuleWorld, RunWorld
 from npa_envs.web.server import frame_bytes
 from npa_envs.world.division import living

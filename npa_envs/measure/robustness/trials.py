@@ -21,11 +21,11 @@ from npa_envs.ops import world_mean
 from npa_envs.rule.files import load_rule
 from npa_envs.rule.rule import NPARule
 from npa_envs.tasks.base import ParticleTask, Worlds
-from npa_envs.tasks.damage import DAMAGE_SIZES, clump, cut, random_particle, wipe_state
+from npa_envs.tasks.damage import DAMAGE_SIZES, random_particle
 from npa_envs.tasks.morphogenesis2d import Morphogenesis2D, Morphogenesis2DConfig
 from npa_envs.tasks.seeds import uniform_ball, uniform_box
 from npa_envs.training.trained_tasks import task_of_rule, tasks_of_codes
-from npa_envs.world.brushes import nearest_image, offsets_from
+from npa_envs.world.brushes import clump, cut, nearest_image, offsets_from, wipe_state
 from npa_envs.world.randomness import Randomness, StreamId, WorldRandom
 
 # Seeds of other shapes than the trained one, as dense where their size allows it.

@@ -17,6 +17,9 @@ from npa_envs.errors import NPAError, shown, suggest
 from npa_envs.files import check_torch_archive, home_path, open_regular
 from npa_envs.ops import world_mean
 from npa_envs.tasks.losses.pieces import (
+    FeatureTransport,
+    PatchTransport,
+    RandomFilters,
     TextureDistance,
     check_images,
     check_size,
@@ -29,11 +32,6 @@ from npa_envs.tasks.losses.pieces import (
     quantiles,
     relaxed_transport,
     stride_of,
-)
-from npa_envs.tasks.losses.shapes import (
-    FeatureTransport,
-    PatchTransport,
-    RandomFilters,
 )
 
 DEFAULT_LOSS = "patch_swd"
@@ -150,17 +148,9 @@ class LossSum:
 def make_texture_loss(
     name: str, target: Tensor, options: LossOptions = DEFAULT_OPTIONS
 ) -> TextureLoss:
-    """Prepare a texture to be compared with.
+    """Prepare a texture [K, R, R] to be compared with: colours, K = 3, a density, 1, or both, 4.
 
-    Args:
-        name: One of `TEXTURE_LOSSES`, or several joint ones joined by "+", which are summed.
-        target: The texture (dimensionless), shape [K, R, R]; K is 3 for colours, 1 for a density,
-            4 for both.
-        options: Options of the loss.
-
-    Raises:
-        NPAError: There is no such loss, the target's shape does not fit, or weights that the loss
-            needs are missing or damaged.
+    Several joint losses are summed where their names are joined by "+".
     """
     check_loss_name(name)
     if not isinstance(target, Tensor):
@@ -194,16 +184,10 @@ FLOOR = 0.01
 """Variance that is added to the target's, so that an even target can be compared with, too."""
 
 
-class Descriptor(Protocol):
-    """What numbers describe images."""
-
-    def __call__(self, images: Tensor, *, wrap: bool, thinned: bool) -> list[Tensor]:
-        """Return the numbers at each place of images, a table for each size, [B, M, F] each.
-
-        Args:
-            wrap: Whether their opposite edges meet; otherwise places near them are left out.
-            thinned: Whether at most `PLACES` along each side are enough.
-        """
+Descriptor = Callable[..., list[Tensor]]
+"""Returns the numbers at each place of images, a table for each size, [B, M, F] each. With `wrap`
+opposite edges meet, else places near them are left out; `thinned` leaves at most `PLACES` along
+each side."""
 
 
 class SlicedWasserstein:
@@ -403,11 +387,7 @@ class VGGFeatures:
         self._deviation = like.new_tensor(VGG_DEVIATION)[:, None, None]
 
     def __call__(self, images: Tensor, *, wrap: bool) -> list[Tensor]:
-        """Return the features at each layer, shape [B, F, R', R'] each, ever coarser.
-
-        Args:
-            wrap: Whether opposite edges meet; otherwise images are mirrored at their edges.
-        """
+        """Return features [B, F, R', R'] of each layer; opposite edges meet, or are mirrored."""
         mode = "circular" if wrap else "reflect"
         # In the weights' precision, whatever the worlds' is.
         field = (images.to(self._mean) - self._mean) / self._deviation

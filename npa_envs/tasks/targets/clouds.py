@@ -72,19 +72,7 @@ def load_clouds(
     sample_seed: int = 0,
     device: torch.device,
 ) -> PointClouds:
-    """Return all clouds of a data set; computed once and kept in memory.
-
-    Args:
-        data: Data set, as for `npa_envs.tasks.targets.clouds.load_pictures`.
-        split: "train" or "test".
-        particle_count: Points N of each cloud.
-        folder: Where torchvision keeps "mnist".
-        sample_seed: What the places are drawn from that points are chosen among.
-        device: Where the clouds are made and kept.
-
-    Raises:
-        NPAError: The data cannot be loaded, or a picture has no ink.
-    """
+    """Return all clouds of a data set; computed once and kept in memory."""
     pictures = load_pictures(data, split, folder=folder)
     x, share = sample_ink(pictures.ink, particle_count, sample_seed=sample_seed, device=device)
     height, width = pictures.ink.shape[1:]
@@ -102,15 +90,8 @@ def sample_ink(
     """Return farthest-point samples of the ink of pictures, the same on every device.
 
     The picture, enlarged bilinearly, is looked at in one random place of each cell of a grid; the
-    grid is refined until there are enough places with ink.
-
-    Args:
-        ink: Pictures, shape [M, H, W]; the longer side becomes 1 length unit.
-        sample_seed: What the places are drawn from.
-
-    Returns:
-        Positions in [0, 1]² [length units], shape [M, N, 2], and the mean share of each picture
-        that has ink.
+    grid is refined until there are enough places with ink. Positions, [M, N, 2], lie in [0, 1]²
+    [length units]: the longer side is 1. The mean share that has ink comes along.
     """
     darkest = ink.max((1, 2))
     if (darkest <= 0).any():
@@ -129,7 +110,10 @@ def sample_ink(
         cells, places = _places(side, share.shape[1:], random)
         finer = []
         for part in torch.split(waiting, max(1, min(chunk, CHUNK_CELLS // side**2))):
-            has_ink = _look(share[part], cells, side)
+            enlarged = torch.nn.functional.interpolate(
+                share[part][:, None], size=(side, side), mode="bilinear", align_corners=False
+            )
+            has_ink = enlarged.flatten(1)[:, cells] >= INK
             counts = has_ink.sum(1)
             enough = (counts >= least) | (side >= FINEST)
             finer.append(part[~enough])
@@ -155,14 +139,6 @@ def _places(side: int, shape: tuple[int, ...], random: torch.Generator) -> tuple
     places = (corner + within) * (LEVELS / side)
     places *= torch.tensor((width / longer, height / longer))
     return order, places.floor().clamp(max=LEVELS - 1)
-
-
-def _look(share: Tensor, cells: Tensor, side: int) -> Tensor:
-    """Return whether there is ink in each cell of a grid, [M, K], in the order of `cells`."""
-    enlarged = torch.nn.functional.interpolate(
-        share[:, None], size=(side, side), mode="bilinear", align_corners=False
-    )
-    return enlarged.flatten(1)[:, cells] >= INK
 
 
 def _first(has_ink: Tensor, most: int) -> Tensor:
@@ -194,14 +170,7 @@ def _farthest_points(candidates: Tensor, counts: Tensor, particle_count: int) ->
 def varied(
     x: Tensor, *, rotation: float, stretch: float, jitter: float, generator: Randomness
 ) -> Tensor:
-    """Return clouds turned, stretched and shaken around the middle of the unit square.
-
-    Args:
-        rotation: Largest angle [degrees], either way.
-        stretch: Largest share by which a cloud grows or shrinks, along each axis by itself, and by
-            which it is sheared (dimensionless).
-        jitter: Standard deviation of what is added to every coordinate [length units].
-    """
+    """Return clouds turned, stretched, sheared and shaken around the middle of the unit square."""
     world_count, particle_count = x.shape[:2]
     if rotation > 0.0 or stretch > 0.0:
         draws = 2.0 * uniform_draws(generator, (world_count, 4), x) - 1.0
@@ -252,11 +221,7 @@ class DigitPictures:
 
 
 def load_pictures(data: str, split: Split = "train", *, folder: str = "data") -> DigitPictures:
-    """Return the pictures of a data set.
-
-    Args:
-        split: "train" or "test"; no picture is in both.
-    """
+    """Return the pictures of a data set; no picture is in both splits."""
     if split not in get_args(Split):
         raise NPAError(f"split must be 'train' or 'test', got {shown(split)}")
     if data == "digits":

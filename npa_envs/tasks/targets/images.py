@@ -120,11 +120,7 @@ def looks_like_path(source: str) -> bool:
 
 
 def scaled_square(image: Image.Image, side: int) -> FloatImage:
-    """Return a square RGBA picture scaled to `side` pixels: colours times alpha, and alpha.
-
-    Returns:
-        In [0, 1], shape [side, side, 4]; the first row is the upper one.
-    """
+    """Return a square picture scaled: colours times alpha, and alpha, in [0, 1], [S, S, 4]."""
     kind = Image.Resampling.BOX if image.width >= side else Image.Resampling.BICUBIC
     # Pillow's premultiplied mode: colours of transparent pixels do not leak.
     scaled = image.convert("RGBa").resize((side, side), kind)

@@ -46,11 +46,7 @@ class Mesh:
     """Red, green and blue of each corner, in [0, 1], shape [K, 3]."""
 
     def fitted(self, radius: float = RADIUS) -> Mesh:
-        """Return the mesh with its bounding box around the origin, reaching just `radius` away.
-
-        Args:
-            radius: Distance of the farthest corner [length units].
-        """
+        """Return the mesh with its bounding box around the origin, reaching just `radius` away."""
         used = self.vertices[np.unique(self.faces)]
         middle = 0.5 * (used.min(axis=0) + used.max(axis=0))
         reach = np.linalg.norm(used - middle, axis=1).max()
@@ -73,13 +69,7 @@ def turned(
     paint: Callable[[FloatArray], FloatArray],
     corners: int = ROUND,
 ) -> Mesh:
-    """Return a profile turned around the y axis.
-
-    Args:
-        profile: Points (distance from the axis, height) from the bottom to the top [length units].
-        paint: Returns colours [K, 3] of corners [K, 3].
-        corners: Corners around the axis.
-    """
+    """Return a profile (distance from the axis, height), upwards, turned around the y axis."""
     rings = np.asarray(profile, dtype=np.float64)
     angle = np.linspace(0.0, 2.0 * np.pi, corners, endpoint=False)
     x = rings[:, :1] * np.sin(angle)
@@ -92,14 +82,7 @@ def turned(
 def ellipsoid(
     centre: Sequence[float], radii: Sequence[float], colour: Sequence[float], turns: int = 18
 ) -> Mesh:
-    """Return an ellipsoid of one colour.
-
-    Args:
-        centre: Its middle [length units].
-        radii: Its half-axes [length units].
-        colour: Red, green and blue in [0, 1].
-        turns: Rings from pole to pole.
-    """
+    """Return an ellipsoid of one colour with half-axes `radii` and so many rings."""
     tilt = np.linspace(-0.5 * np.pi, 0.5 * np.pi, turns)
     profile = [(float(np.cos(t)), float(np.sin(t))) for t in tilt]
     ball = turned(profile, lambda v: np.broadcast_to(np.asarray(colour, float), v.shape).copy())
@@ -336,10 +319,7 @@ def draw_mesh(mesh: Mesh, cameras: Cameras) -> NDArray[np.float32]:
 
     Light stays where it is when a camera goes round, so all views show one coloured surface. Both
     sides of a triangle are seen. Triangles with a corner nearer than `cameras.near` are left out.
-
-    Returns:
-        Red, green and blue, each times alpha, and alpha, in [0, 1], shape [V, H, W, 4]; the first
-        row is the upper one.
+    Colours times alpha, and alpha, lie in [0, 1], [V, H, W, 4]; the first row is the upper one.
     """
     light = np.asarray(LIGHT) / np.linalg.norm(LIGHT)
     lit = AMBIENT + (1.0 - AMBIENT) * (mesh.normals() @ light).clip(0.0, 1.0)

@@ -114,35 +114,25 @@ def load_target(
 def load_target_image(
     source: str | Path, *, keep_background: bool = False
 ) -> tuple[str, Image.Image]:
-    """Return the name and the full-size RGBA picture of what `load_target` accepts as source.
-
-    Args:
-        keep_background: As for `load_target`.
-    """
+    """Return the name and the full-size RGBA picture of what `load_target` accepts as source."""
     if not isinstance(source, str | Path):
         raise NPAError(
             f"target must be a string or a Path, got {type(source).__name__}: "
             "for a Pillow picture in memory use target_from_image"
         )
-    name, image = _named_image(source, open_image if keep_background else read_image)
-    return name, with_background(image) if keep_background else image
-
-
-def _named_image(
-    source: str | Path, read: Callable[[Path], Image.Image]
-) -> tuple[str, Image.Image]:
-    """Return the name and the RGBA picture of a source; files are read by the function."""
     if isinstance(source, str) and source in DRAWINGS:
-        return source, _drawing(source).copy()
-    if isinstance(source, Path) or looks_like_path(source):
+        name, image = source, _drawing(source).copy()
+    elif isinstance(source, Path) or looks_like_path(source):
         path = home_path(source)
-        return path.stem, read(path)
-    if is_emoji(source):
-        return source, render_emoji(source)
-    raise NPAError(
-        "target must be a built-in name, the path of a picture file or one emoji, got "
-        f"{shown(source)}: {suggest(source, DRAWINGS)}"
-    )
+        name, image = path.stem, (open_image if keep_background else read_image)(path)
+    elif is_emoji(source):
+        name, image = source, render_emoji(source)
+    else:
+        raise NPAError(
+            "target must be a built-in name, the path of a picture file or one emoji, got "
+            f"{shown(source)}: {suggest(source, DRAWINGS)}"
+        )
+    return name, with_background(image) if keep_background else image
 
 
 @functools.cache
@@ -159,11 +149,7 @@ def target_from_image(
     extent: float = 1.8,
     device: str | torch.device = "cpu",
 ) -> PointTarget:
-    """Make a target from the opaque pixels of a picture in memory.
-
-    Args:
-        extent: Side of the square around the origin that the target just fits in [length units].
-    """
+    """Make a target from the opaque pixels of a picture; it fits into a square of side `extent`."""
     rgba = image.convert("RGBA")
     require_opaque_pixels(rgba, label=name)
     pixels = np.array(resample(rgba, point_count, label=name))
@@ -194,12 +180,7 @@ Points = Sequence[tuple[float, float]]
 
 
 def smooth_curve(points: Points, *, closed: bool = False, steps: int = 16) -> Points:
-    """Return a Catmull-Rom curve through the points.
-
-    Args:
-        closed: Whether the last point joins the first.
-        steps: Samples between two corner points.
-    """
+    """Return a Catmull-Rom curve through the points, of `steps` samples from one to the next."""
     corner = np.asarray(points, dtype=np.float64)
     if closed:
         padded = np.concatenate([corner[-1:], corner, corner[:2]])
@@ -258,12 +239,7 @@ def ellipse(
 
 
 def stroke(points: Points, widths: Sequence[float], *, grow: float = 0) -> Image.Image:
-    """Return the mask of a brush stroke along a smooth curve, with round ends.
-
-    Args:
-        widths: Widths of the stroke, spread evenly along the curve and interpolated in between.
-        grow: How far the stroke is widened on each side.
-    """
+    """Return the mask of a brush stroke along a smooth curve; widths are spread evenly along it."""
     mask, draw = _blank()
     curve = np.asarray(smooth_curve(points))
     lengths = np.hypot(*np.diff(curve, axis=0).T)
@@ -302,13 +278,7 @@ class Canvas:
     def paint(
         self, mask: Image.Image, paint: str | Image.Image, *, within: Image.Image | None = None
     ) -> None:
-        """Cover the mask with a colour or a picture.
-
-        Args:
-            mask: What is painted.
-            paint: A colour such as "#20a040", or a picture of the working size (see `gradient`).
-            within: Another mask that the paint must not leave.
-        """
+        """Cover the mask, or what of it lies within another one, with a colour or a picture."""
         if within is not None:
             mask = ImageChops.darker(mask, within)
         if isinstance(paint, str):

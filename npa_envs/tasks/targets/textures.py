@@ -175,11 +175,9 @@ OVERSAMPLING = 4
 
 
 def draw_pattern(name: str, resolution: int, *, seed: int = 0) -> Array:
-    """Draw a built-in texture.
+    """Draw a texture: colours times alpha, and alpha, float64, [R, R, 4]; rows point up.
 
-    Returns:
-        Red, green and blue, each times alpha, and alpha, float64, shape [R, R, 4]; pixel r is
-        centred at (r + 1/2) / R, and rows point up.
+    Pixel r is centred at (r + 1/2) / R.
     """
     if name not in PATTERNS:
         raise NPAError(f"unknown texture {shown(name)}: {suggest(name, PATTERNS)}")
@@ -337,17 +335,11 @@ def stars(u: Array, v: Array, random: np.random.Generator) -> Array:
     for number, (place, turn) in enumerate(zip(places, turns, strict=True)):
         across, up = _away(u, v, place)
         # The angle to the nearest of the five points, and the straight edge that lies there.
-        fifth = 2.0 * math.pi / 5.0
-        angle = np.abs((np.arctan2(across, up) + turn + 0.5 * fifth) % fifth - 0.5 * fifth)
-        inner = 0.45
-        edge = (
-            inner
-            * math.sin(0.5 * fifth)
-            / (
-                np.sin(angle) * (1.0 - inner * math.cos(0.5 * fifth))
-                + np.cos(angle) * inner * math.sin(0.5 * fifth)
-            )
-        )
+        fifth, inner = 2.0 * math.pi / 5.0, 0.45
+        half = 0.5 * fifth
+        angle = np.abs((np.arctan2(across, up) + turn + half) % fifth - half)
+        below = np.sin(angle) * (1.0 - inner * math.cos(half))
+        edge = inner * math.sin(half) / (below + np.cos(angle) * inner * math.sin(half))
         colour[np.hypot(across, up) < 0.105 * edge] = tints[number % 2]
     return _opaque(colour)
 

@@ -112,12 +112,7 @@ def load_views(
 def views_of_mesh(
     mesh: Mesh, name: str, resolution: int, training_count: int, held_out_count: int
 ) -> ViewTarget:
-    """Draw a mesh that fits into the ball of radius 0.85 from cameras all around.
-
-    Args:
-        training_count: Views to train with.
-        held_out_count: Views to measure by.
-    """
+    """Draw a mesh that fits into the ball of radius 0.85 from cameras all around."""
     views = []
     for count, turn in ((training_count, 0.0), (held_out_count, 0.5)):
         cameras = surrounding_cameras(count, resolution, turn=turn)
@@ -129,10 +124,7 @@ def surrounding_cameras(count: int, resolution: int, *, turn: float = 0.0) -> Ca
     """Return cameras evenly spread over a sphere around the origin, which they look at.
 
     They lie on a Fibonacci spiral from below to above, so that any number of them is spread evenly.
-
-    Args:
-        count: Cameras V.
-        turn: The spiral is turned by so much of a full turn: others than those at 0.
+    The spiral is turned by a share `turn` of a full turn.
     """
     k = torch.arange(count, dtype=torch.float64)
     height = (2.0 * k + 1.0) / count - 1.0
@@ -150,11 +142,7 @@ def surrounding_cameras(count: int, resolution: int, *, turn: float = 0.0) -> Ca
 
 
 def over(views: Tensor, background: Tensor) -> Tensor:
-    """Return colours before a background, shape [..., 3].
-
-    Args:
-        background: Red, green and blue; broadcasts to [..., 3].
-    """
+    """Return colours before a background [..., 3], shape [..., 3]."""
     return views[..., :3] + (1.0 - views[..., 3:]) * background
 
 
@@ -171,11 +159,7 @@ def some_views(views: Views, index: Tensor) -> Views:
 
 
 def nearest_camera(cameras: Cameras, elevation: float) -> int:
-    """Return which camera looks at the origin from nearest to the front, at an elevation.
-
-    Args:
-        elevation: Above the horizon [degrees]; the front is where z points to.
-    """
+    """Return which camera is nearest to the front, where z points, at an elevation [degrees]."""
     motions = cameras.world_to_camera.double().cpu()
     places = -(motions[:, :3, :3].mT @ motions[:, :3, 3:])[..., 0]
     tilt = math.radians(elevation)
@@ -195,33 +179,18 @@ UPRIGHT = ((1.0, 0.0, 0.0), (0.0, 0.0, 1.0), (0.0, -1.0, 0.0))
 """Rotation from their world, whose z is up, to ours, whose y is."""
 
 
-@dataclass(frozen=True)
-class _Split:
-    """What one `transforms_*.json` holds."""
-
-    path: Path
-    angle: float
-    files: tuple[Path, ...]
-    poses: Tensor
-
-
 def read_nerf(
     folder: Path, resolution: int, training_count: int, held_out_count: int
 ) -> ViewTarget:
-    """Read a scene; `load_views` says what becomes of it.
-
-    Args:
-        training_count: Views to train with, at most.
-        held_out_count: Views to measure by, at most.
-    """
+    """Read a scene; `load_views` says what becomes of it."""
     held_out = next((folder / name for name in HELD_OUT if (folder / name).is_file()), None)
     if held_out is None:
         raise NPAError(
             f"a folder of views must hold {' or '.join(HELD_OUT)}, {shown(str(folder))} does not: "
             "views to measure by must be others than those trained with"
         )
-    training = _views(_read_split(folder / TRAINING), resolution, training_count)
-    measured = _views(_read_split(held_out), resolution, held_out_count)
+    training = _views(folder / TRAINING, resolution, training_count)
+    measured = _views(held_out, resolution, held_out_count)
     reach = max(scene_reach(training), scene_reach(measured))
     if reach == 0.0:
         raise NPAError(
@@ -262,25 +231,6 @@ def _scaled(views: Views, scale: float) -> Views:
     return Views(cameras, views.pictures)
 
 
-def _views(split: _Split, resolution: int, count: int) -> Views:
-    chosen = _evenly(len(split.files), count)
-    poses = split.poses[chosen]
-    turned = poses.clone()
-    turned[:, :3] = torch.tensor(UPRIGHT, dtype=poses.dtype) @ poses[:, :3]
-    try:
-        cameras: Cameras = cameras_of_poses(
-            turned.float(), split.angle, width=resolution, height=resolution
-        )
-    except NPAError as error:
-        raise NPAError(f"in {shown(str(split.path))}: {error}") from error
-    pictures = [_read_picture(split.files[k], resolution) for k in chosen]
-    return Views(cameras, torch.stack(pictures))
-
-
-def _evenly(total: int, count: int) -> list[int]:
-    return [k * total // min(count, total) for k in range(min(count, total))]
-
-
 def _read_picture(path: Path, resolution: int) -> Tensor:
     image = open_image(path)
     if image.width != image.height:
@@ -291,7 +241,8 @@ def _read_picture(path: Path, resolution: int) -> Tensor:
     return torch.from_numpy(scaled_square(image, resolution))
 
 
-def _read_split(path: Path) -> _Split:
+def _views(path: Path, resolution: int, count: int) -> Views:
+    """Return evenly chosen views of a `transforms_*.json`, turned so that y is up."""
     if not os.path.exists(path):
         raise NPAError(
             f"a folder of views must hold {path.name}, {shown(str(path.parent))} does not: give a "
@@ -313,7 +264,18 @@ def _read_split(path: Path) -> _Split:
     files, poses = zip(
         *(_read_frame(path, k, frame) for k, frame in enumerate(frames)), strict=True
     )
-    return _Split(path, float(angle or 0.0), files, torch.stack(poses))
+    total = len(files)
+    chosen = [k * total // min(count, total) for k in range(min(count, total))]
+    turned = torch.stack(poses)[chosen]
+    turned[:, :3] = torch.tensor(UPRIGHT, dtype=turned.dtype) @ turned[:, :3]
+    try:
+        cameras: Cameras = cameras_of_poses(
+            turned.float(), float(angle or 0.0), width=resolution, height=resolution
+        )
+    except NPAError as error:
+        raise NPAError(f"in {shown(str(path))}: {error}") from error
+    pictures = [_read_picture(files[k], resolution) for k in chosen]
+    return Views(cameras, torch.stack(pictures))
 
 
 def _read_frame(path: Path, number: int, frame: Any) -> tuple[Path, Tensor]:

@@ -1,6 +1,6 @@
-// Colours of particles by state, density, species, speed or update mask, as npa_envs/web/colouring.py.
+// Colours of particles by state, density, species, speed or update mask, as npa_envs/web/live.py.
 
-// Of npa_envs/render/colours.py and npa_envs/web/colouring.py.
+// Of npa_envs/render/colours.py and npa_envs/web/live.py.
 const COLOUR_OFFSET = 0.5;
 const GOLDEN_ANGLE = Math.PI * (3 - Math.sqrt(5));
 const STATE_CHROMA = 0.16;
@@ -199,7 +199,7 @@ function product(a, b) {
 }
 
 // Eigenvalues and eigenvectors of a symmetric matrix, the largest first, by Jacobi's rotations.
-export function eigenvectors(matrix, size) {
+function eigenvectors(matrix, size) {
   const m = Float64Array.from(matrix);
   const vectors = new Float64Array(size * size);
   for (let k = 0; k < size; k++) vectors[k * size + k] = 1;

@@ -26,22 +26,12 @@ export function padded(channels) {
   return LANES * Math.ceil(channels / LANES);
 }
 
-export function tiled(outputs) {
-  return TILE_OUTPUTS * Math.ceil(outputs / TILE_OUTPUTS);
-}
-
-// The length P of the perception vector of a rule, as NPARule.perception_dim.
-export function perceptionLength(rule) {
-  const { space_dim: dimension, state_dim: channels } = rule;
-  const gradients = (rule.state_gradient ? channels * dimension : 0) + (rule.density_gradient ? dimension : 0);
-  return 2 * channels + gradients;
-}
-
 // A rule ready to run: hyper-parameters by NPARule's names, weights by those of its file.
 export function prepareRule(description, kernels) {
   const rule = { ...description };
-  const { weights, hidden_dim: hidden, state_dim: channels } = rule;
-  rule.inputs = perceptionLength(rule);
+  const { weights, hidden_dim: hidden, state_dim: channels, space_dim: dimension } = rule;
+  // The length P of the perception vector, as NPARule.perception_dim.
+  rule.inputs = 2 * channels + (rule.state_gradient ? channels * dimension : 0) + (rule.density_gradient ? dimension : 0);
   rule.outputs = channels + (rule.static ? 0 : rule.space_dim);
   rule.hidden = kernels.layer(weights["hidden.weight"], weights["hidden.bias"], rule.inputs, hidden);
   rule.output = kernels.layer(weights["output.weight"], null, hidden, rule.outputs);
@@ -169,7 +159,7 @@ export function plainKernels() {
 // A matrix [outputs, inputs], row by row, and a bias or null, as products read them: eight outputs at a
 // time are contiguous, [tiles, inputs, 8].
 export function tiledLayer(floats, weight, bias, inputs, outputs) {
-  const width = tiled(outputs);
+  const width = TILE_OUTPUTS * Math.ceil(outputs / TILE_OUTPUTS);
   const weights = floats(width * inputs), offset = floats(width);
   if (bias !== null) offset.set(bias);
   for (let a = 0; a < outputs; a++) {
