@@ -32,9 +32,9 @@ for garden in GARDENS:
 for form in ("code", "choice"):
     CASES[f"{SHAPESHIFTER}-{form}"] = (SHAPESHIFTER, {"actions": form})
 
-SIZED = {
+SIZED = {row.id: (row.id, {"seed_pool": 2, "grow_steps": 4}) for row in SMALL_GARDENS} | {
     row.id: (row.id, {} if "Small" in row.id else small_envs.small(row.id.replace("Large", "")))
-    for row in (*SMALL_GARDENS, *SIZES)
+    for row in SIZES
 }
 """Small forms as they are registered; large ones with few particles."""
 
@@ -146,19 +146,20 @@ class TestEveryEnvironment:
         assert gymnasium.make_vec(batched).num_envs == 2
 
     @every_case
-    @pytest.mark.parametrize("copy", [True, False])
-    def test_it_survives_pickling_in_the_midst_of_an_episode(self, copy, device):
-        env = begun(self.make(device=str(device)).unwrapped)
-        envs = begun(self.make_vec(2, device=str(device), copy=copy, max_episode_steps=5))
-        actions, batches = self.sampled(env, 7), self.sampled(envs, 7)
-        for action, batch in zip(actions[:3], batches[:3], strict=True):
-            env.step(action)
-            envs.step(batch)
-        again, envs_again = pickle.loads(pickle.dumps((env, envs)))
-        # Episodes of the batch end meanwhile.
-        for action, batch in zip(actions[3:], batches[3:], strict=True):
-            assert_same(env.step(action), again.step(action))
-            assert_same(envs.step(batch), envs_again.step(batch))
+    def test_it_survives_pickling_in_the_midst_of_an_episode(self, device):
+        given = {"device": str(device), "max_episode_steps": 5}
+        kept = [self.make(**given).unwrapped]
+        kept += [self.make_vec(2, copy=copy, **given) for copy in (True, False)]
+        begun(*kept)
+        actions = [self.sampled(env, 7) for env in kept]
+        for env, given in zip(kept, actions, strict=True):
+            for action in given[:3]:
+                env.step(action)
+        again = pickle.loads(pickle.dumps(kept))
+        # Episodes of the batches end meanwhile.
+        for env, copied, given in zip(kept, again, actions, strict=True):
+            for action in given[3:]:
+                assert_same(env.step(action), copied.step(action))
 
     @every_case
     def test_info_has_the_keys_that_the_page_lists(self):
@@ -174,9 +175,8 @@ class TestEveryEnvironment:
         assert sorted(key for key, _ in listed) == sorted(at_step)
 
     @every_case
-    @pytest.mark.parametrize("output", ["numpy", "torch"])
-    def test_disabled_mode_resets_only_the_worlds_of_the_mask(self, output):
-        given = {"autoreset_mode": "disabled", "output": output}
+    def test_disabled_mode_resets_only_the_worlds_of_the_mask(self):
+        given = {"autoreset_mode": "disabled", "output": "torch"}
         ended = begun(self.make_vec(4, max_episode_steps=3, **given))
         envs, others = begun(*(self.make_vec(4, **given) for _ in range(2)))
         actions = self.sampled(envs, 6)
@@ -186,10 +186,9 @@ class TestEveryEnvironment:
             _, _, _, _, before = others.step(action)
         assert truncated.all()
         mask = np.array([True, False, False, True])
-        given = torch.from_numpy(mask) if output == "torch" else mask
-        _, fresh = self.make_vec(4, output=output).reset(seed=0)
+        _, fresh = self.make_vec(4).reset(seed=0)
         for batch in (ended, envs):
-            _, infos = batch.reset(options={"reset_mask": given})
+            _, infos = batch.reset(options={"reset_mask": torch.from_numpy(mask)})
             assert (np.asarray(infos["loss"] == before["loss"]) != mask).all()
             assert np.asarray(infos["_loss"]).tolist() == mask.tolist()
         refused(r"the episodes of worlds \[1, 2\] are over", ended.step, actions[3])
@@ -197,11 +196,14 @@ class TestEveryEnvironment:
         for action in actions[3:]:
             left, right = envs.step(action)[4]["loss"], others.step(action)[4]["loss"]
             assert (np.asarray(left == right) != mask).all()
-        _, again = envs.reset(seed=0, options={"reset_mask": given})
-        assert (np.asarray(again["loss"] == fresh["loss"]) == mask).all()
+        _, again = envs.reset(seed=0, options={"reset_mask": mask})
+        assert ((np.asarray(again["loss"]) == fresh["loss"]) == mask).all()
 
-    @every_case
-    @pytest.mark.parametrize("style", ["particles", "density", "states"])
+    @pytest.mark.parametrize(
+        ("case", "style"),
+        [(case, "particles") for case in CASES]
+        + [(name, style) for name in IDS for style in ("density", "states")],
+    )
     def test_pictures_show_each_world(self, style):
         given = {"render_mode": "rgb_array", "render_style": style}
         env, envs = begun(self.make(**given), seed=1), begun(self.make_vec(3, **given))
@@ -215,7 +217,7 @@ class TestEveryEnvironment:
         # Grown pictures leave the corners empty.
         assert (picture[0, 0] == 255).all() or env.unwrapped.config.box is not None
 
-    @every_case
+    @pytest.mark.parametrize("case", IDS)
     def test_frames_come_as_a_list_and_windows_close_twice(self):
         env = begun(self.make(render_mode="rgb_array_list"))
         for action in self.sampled(env, 3):
