@@ -21,7 +21,7 @@ from npa_envs.agents import (
 from npa_envs.agents.learning import EVALUATION_SEEDS, Budget, Problem, RuleSet, train
 from npa_envs.agents.learning.clone import Demonstrations, unexplained
 from npa_envs.agents.learning.evolution import RulePopulation, costs, fitness
-from npa_envs.agents.learning.gradient import clamp_inward, environment_task
+from npa_envs.agents.learning.gradient import ClampedRule, clamp_inward, environment_task
 from npa_envs.agents.learning.problem import FIRST_EVALUATION_SEED, world_seeds
 from npa_envs.agents.learning.shac import SHACLearner, SHACOptions, td_lambda_targets, values
 from npa_envs.envs.core.vector import NPAVectorEnv
@@ -79,6 +79,16 @@ def test_clamped_numbers_are_clipped_and_let_gradients_lead_back():
     clamped.backward(torch.tensor([2.0, -2.0, 2.0, 2.0, -2.0]))
     # A step against the gradient would lead the first and the last further out.
     assert values.grad.tolist() == [0.0, -2.0, 2.0, 2.0, 0.0]
+
+
+def test_a_clamped_rule_shares_its_weights():
+    (rule,) = wild_rules(heart())
+    clamped = ClampedRule(rule, 0.1)
+    assert [id(p) for p in clamped.parameters()] == [id(p) for p in rule.parameters()]
+    z = torch.randn(50, rule.perception_dim)
+    torch.testing.assert_close(clamped(z)[:, :2], rule(z)[:, :2])
+    torch.testing.assert_close(clamped(z)[:, 2:], rule(z)[:, 2:].clamp(-0.1, 0.1))
+    assert (clamped(z)[:, 2:].abs() == 0.1).float().mean() > 0.3
 
 
 @pytest.mark.parametrize(
