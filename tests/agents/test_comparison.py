@@ -197,9 +197,6 @@ def test_the_command_line_becomes_a_plan():
     assert asked.left_out == ()
 
 
-# Records
-
-
 def test_a_record_comes_back_as_it_was_written_but_for_what_is_not_finite(tmp_path):
     written = record("one", 0, (0.25, 0.5), curve=points((0.0, 0.0), (1.0, 0.25)))
     written.write(tmp_path)

@@ -1,4 +1,4 @@
-"""Problems, sets of rules and species in one array: what all learners share."""
+"""Problems, sets of rules, species in one array, budgets and curves: what all learners share."""
 
 import dataclasses
 
@@ -303,9 +303,6 @@ def test_a_species_that_left_its_world_is_the_reason_of_the_episode(deaths):
     for _ in range(problem.episode_steps):
         *_, infos = envs.step(torch.zeros_like(action))
     assert infos["final_info"]["reason"].tolist() == [other] * 2
-
-
-# Rules to begin with
 
 
 @pytest.mark.parametrize("method", ["ppo", "ppo_world", "evolution"])

@@ -1,4 +1,4 @@
-"""The gradient, cloning, and the methods that learn nothing: each learns what it should."""
+"""The gradient, cloning, SHAC, evolution, and methods that learn nothing: all do as they should."""
 
 import copy
 from dataclasses import replace

@@ -1,4 +1,4 @@
-"""Every registered environment: Gymnasium's rules, seeds, rewards, endings, bad input."""
+"""Every registered environment whose actions belong to particles: rewards, endings, targets."""
 
 import subprocess
 import sys

@@ -1,4 +1,4 @@
-"""Batched environments: world k is the single environment, whatever else the batch does."""
+"""Batches, worlds whose numbers run away, and torch's modes: each world is as if it were alone."""
 
 import functools
 import pickle
@@ -7,6 +7,7 @@ import threading
 import numpy as np
 import pytest
 import torch
+from crowds import still
 from gymnasium.vector import AutoresetMode
 from refusals import refused
 from small_envs import IDS, assert_batch_of_singles, assert_same, begun, make, make_vec
@@ -16,12 +17,6 @@ from npa_envs.envs import multispecies_v0
 from npa_envs.errors import DivergedError
 
 every_id = pytest.mark.parametrize("name", IDS)
-
-
-@pytest.fixture
-def where(device):
-    """Keywords that put worlds on the device of the numerical tests."""
-    return {"device": str(device)}
 
 
 def batches(env, count, seed=0, scale=1.0):
@@ -257,19 +252,15 @@ def test_an_ignored_world_goes_on_held_at_the_limits_and_rewards_telescope(devic
     assert paid == pytest.approx(start["loss"] - infos["loss"], abs=1e-5)
 
 
-# ----------------------------------------------------------------------------------------------
-# Several species: an agent has diverged once none of its particles is within bounds
-
-
-def species_actions(count, width, world_count=None):
-    """Return actions of two species that push all states of the second one."""
-    shape = (count, width) if world_count is None else (world_count, count, width)
-    still, pushing = np.zeros(shape, np.float32), np.zeros(shape, np.float32)
-    pushing[..., 2:] = 1.0
-    return {"species_0": still, "species_1": pushing}
-
-
 SPECIES = {"particle_count": 40, "state_dim": 4, "observation_limit": LIMIT, "update_prob": 1.0}
+
+
+def species_pushed(env):
+    """Return actions that push all states of the second species."""
+    actions = still(env)
+    if "species_1" in actions:
+        actions["species_1"][..., 2:] = 1.0
+    return actions
 
 
 def test_species_that_diverge_are_terminated_told_or_let_be(device):
@@ -277,7 +268,7 @@ def test_species_that_diverge_are_terminated_told_or_let_be(device):
         keywords = SPECIES | {"on_divergence": way, "device": str(device)}
         env = begun(multispecies_v0.parallel_env("mixing", **keywords))
         for _ in range(LAST):
-            observations, _, terminations, *_ = env.step(species_actions(20, 6))
+            observations, _, terminations, *_ = env.step(species_pushed(env))
         assert terminations == {"species_0": False, "species_1": way == "terminate"}
         assert env.agents == ["species_0"] + ["species_1"] * (way == "ignore")
         assert all(np.isfinite(rows).all() for rows in observations.values())
@@ -287,7 +278,7 @@ def test_species_that_diverge_are_terminated_told_or_let_be(device):
 def test_an_error_names_species_and_world(device):
     keywords = SPECIES | {"on_divergence": "raise", "device": str(device)}
     envs = begun(multispecies_v0.batched("mixing", world_count=2, **keywords))
-    action = species_actions(20, 6, 2)
+    action = species_pushed(envs)
     action["species_1"][0] = 0.0
     for _ in range(LAST - 1):
         envs.step(action)

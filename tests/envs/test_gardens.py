@@ -1,4 +1,4 @@
-"""Living worlds: brushes, weather, spaces, seeds; tests run over the table of gardens."""
+"""Living worlds: brushes, weather, rewards; two gardeners; worlds whose code the agent chooses."""
 
 import warnings
 from itertools import pairwise
@@ -19,10 +19,8 @@ from npa_envs.envs.garden.brush_layout import BrushLayout, brushed, grid_places
 from npa_envs.envs.gardener2d import Gardener2DEnv
 from npa_envs.registration import GARDENS
 
-IDS = [environment.id for environment in GARDENS]
-GARDENER, SHEPHERD = IDS
+GARDENER, SHEPHERD = (environment.id for environment in GARDENS)
 TOOLS = ("push", "wipe", "inject", "rate")
-every_id = pytest.mark.parametrize("name", IDS)
 
 
 def sampled(env, count, seed=0):

@@ -1,4 +1,4 @@
-"""Species as agents: seeds, turns, deaths, pictures, errors."""
+"""Species and particles as agents: turns, deaths, opponents, pictures, PettingZoo's own tests."""
 
 import numpy as np
 import pettingzoo

@@ -26,12 +26,6 @@ DEADLY = {
 }
 
 
-@pytest.fixture
-def where(device):
-    """Keywords that put worlds on the device of the numerical tests."""
-    return {"device": str(device)}
-
-
 def batch(task="mixing", world_count=3, autoreset_mode="same-step", **keywords):
     fields = small(task, **keywords)
     return multispecies_v0.batched(world_count=world_count, autoreset_mode=autoreset_mode, **fields)
