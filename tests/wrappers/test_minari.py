@@ -164,19 +164,19 @@ def test_episodes_of_an_environment_of_ones_own_are_as_long_as_it_is_registered(
 
 
 @pytest.mark.parametrize(
-    ("first", "count", "seed"),
-    [(0, 16, 1), (10_000, 16, 0), (9_999, 1, 1), (9_999, 2, 2), (2_000_000, 16, 0)],
+    ("policy", "first", "count", "seed"),
+    [
+        ("scripted", 0, 16, 1),
+        ("scripted", 10_000, 16, 0),
+        ("scripted", 9_999, 1, 1),
+        ("scripted", 9_999, 2, 2),
+        ("scripted", 2_000_000, 16, 0),
+        ("random", 0, 16, 0),
+    ],
 )
-def test_a_scripted_policy_is_chosen_in_worlds_that_are_not_recorded(first, count, seed):
-    options = RecordOptions(
-        env="npa/Morphogenesis2DSmall-v0", dataset="a/b-v0", first_seed=first, episodes=count
-    )
-    assert record._choice_seed(options) == seed
-    recorded = set(range(first, first + count))
-    assert recorded.isdisjoint(world_seeds(seed, 16))
-
-
-def test_only_a_scripted_policy_is_chosen_elsewhere(monkeypatch):
+def test_a_scripted_policy_is_chosen_in_worlds_that_are_not_recorded(
+    policy, first, count, seed, monkeypatch
+):
     asked = []
 
     def train(method, problem, budget, seed, **_):
@@ -184,13 +184,15 @@ def test_only_a_scripted_policy_is_chosen_elsewhere(monkeypatch):
         return SimpleNamespace(policy=None)
 
     monkeypatch.setattr("npa_envs.agents.learning.train", train)
-    words = {"env": "npa/Morphogenesis2DSmall-v0", "dataset": "a/b-v0"}
-    for policy in ("scripted", "random"):
-        options = RecordOptions(**words, policy=policy)
-        record.policy_of(options, record.problem_of(options))
-    assert asked == [("scripted", 1), ("random", 0)]
-    with pytest.raises(NPAError, match="episodes must leave 10000 seeds below 1000000"):
-        record._choice_seed(RecordOptions(**words, episodes=10**6))
+    given = {"env": "npa/Morphogenesis2DSmall-v0", "dataset": "a/b-v0", "policy": policy}
+    options = RecordOptions(**given, first_seed=first, episodes=count)
+    record.policy_of(options, record.problem_of(options))
+    assert asked == [(policy, seed)]
+    assert policy == "random" or set(world_seeds(seed, 16)).isdisjoint(range(first, first + count))
+    endless = RecordOptions(**given, episodes=10**6)
+    if policy == "scripted":
+        problem = record.problem_of(endless)
+        refused("leave 10000 seeds below 1000000", record.policy_of, endless, problem)
 
 
 @pytest.mark.slow
