@@ -31,12 +31,12 @@ def few(task: str, **keywords: Any) -> dict[str, Any]:
 
 
 def still(env: Any) -> dict[str, Any]:
-    return {a: np.zeros(env.action_space(a).shape, np.float32) for a in env.agents}
+    return {a: np.zeros(env.action_spaces[a].shape, np.float32) for a in env.agents}
 
 
 def drawn(env: Any, generator: np.random.Generator) -> dict[str, Any]:
     return {
-        a: generator.uniform(-1, 1, env.action_space(a).shape).astype(np.float32)
+        a: generator.uniform(-1, 1, env.action_spaces[a].shape).astype(np.float32)
         for a in env.agents
     }
 

@@ -10,12 +10,16 @@ from npa_envs.registration import ENVIRONMENTS
 
 IDS = [environment.id for environment in ENVIRONMENTS]
 
+LIVING = {"eps": 0.2, "picture_size": 8, "seed_pool": 3, "grow_steps": 4, "rule_steps": 2}
 SMALL: dict[str, Any] = {"particle_count": 61, "eps": 0.3, "resolution": 16, "render_size": 24}
 # None: the environment has no such field.
 SPECIAL: dict[str, dict[str, Any]] = {
     "npa/Pictures2D-v0": {"targets": ("heart", "ring"), "test_targets": ("letter-a",)},
     "npa/Regeneration2D-v0": {"rule": "picture"},
     "npa/PointClassification-v0": {"resolution": None},
+    "npa/Gardener2D-v0": LIVING,
+    "npa/Shepherd2D-v0": LIVING,
+    "npa/Shapeshifter2D-v0": LIVING | {"eps": 0.3, "picture_size": 4, "hold_steps": 2},
     "npa/Morphogenesis3D-v0": {"seed_radius": 0.2, "view_count": 2, "target": "doughnut"},
 }
 
@@ -38,13 +42,20 @@ def make_vec(name: str, world_count: int, **keywords: Any) -> gymnasium.vector.V
     )
 
 
+def begun(*envs: Any, seed: int = 0) -> Any:
+    """Reset environments alike; return them, or the only one."""
+    for env in envs:
+        env.reset(seed=seed)
+    return envs if len(envs) > 1 else envs[0]
+
+
 def assert_same(left: Any, right: Any, where: str = "") -> None:
     """Compare what steps and resets return, bit for bit: tuples and dicts of arrays or tensors."""
     if isinstance(left, dict):
         assert left.keys() == right.keys(), where
         for key, value in left.items():
             assert_same(value, right[key], f"{where}.{key}")
-    elif isinstance(left, tuple | list):
+    elif isinstance(left, tuple | list) or (isinstance(left, np.ndarray) and left.dtype == "O"):
         for k, (value, other) in enumerate(zip(left, right, strict=True)):
             assert_same(value, other, f"{where}[{k}]")
     else:
@@ -63,6 +74,8 @@ def assert_info_equal(infos, k, info):
     for name, value in info.items():
         assert np.array_equal(infos[name][k], value), name
         assert infos[f"_{name}"][k], name
+    told = {name for name in infos if f"_{name}" in infos and infos[f"_{name}"][k]}
+    assert told - {"final_obs", "final_info"} == info.keys()
 
 
 def assert_batch_of_singles(

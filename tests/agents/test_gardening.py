@@ -1,11 +1,16 @@
 """Gardeners and shepherds: scripts help and are simple; the gradient's plans are worth more."""
 
+from dataclasses import replace
+
 import gymnasium
 import numpy as np
 import pytest
+from refusals import refused
+from small_envs import begun
 
 import npa_envs
 from npa_envs.agents import evaluate_policy
+from npa_envs.agents.evaluation import policy_in
 from npa_envs.agents.gardening import (
     GradientGardener,
     RandomGardener,
@@ -13,7 +18,7 @@ from npa_envs.agents.gardening import (
     ScriptedShepherd,
     StillGardener,
 )
-from npa_envs.errors import NPAError
+from npa_envs.agents.learning import GARDEN_METHODS, Budget, Problem, methods_for, train
 
 GARDENER, SHEPHERD = "npa/Gardener2DSmall-v0", "npa/Shepherd2DSmall-v0"
 QUICK = {"seed_pool": 2, "grow_steps": 128}
@@ -82,8 +87,7 @@ def test_what_a_scripted_gardener_does_is_linear_in_what_is_seen():
 
 
 def test_a_plan_by_the_gradient_is_worth_more_than_the_script_that_it_begins_with():
-    envs = make_vec(GARDENER, 2, rule_steps=2)
-    envs.reset(seed=1)
+    envs = begun(make_vec(GARDENER, 2, rule_steps=2), seed=1)
     for _ in range(3):
         envs.step(np.zeros(envs.action_space.shape, np.float32))
     planner, script = GradientGardener(envs, horizon=1, iterations=8), ScriptedGardener(envs)
@@ -92,18 +96,6 @@ def test_a_plan_by_the_gradient_is_worth_more_than_the_script_that_it_begins_wit
         for policy in (planner, script)
     )
     assert bool((planned > scripted).all())
-
-
-def test_gardeners_need_a_garden_whose_brushes_are_numbers():
-    with pytest.raises(NPAError, match="env must be a garden with actions='grid' or 'free'"):
-        StillGardener(make_vec(GARDENER, 2, actions="discrete"))
-    with pytest.raises(NPAError, match="env must have brushes that push"):
-        ScriptedGardener(make_vec(GARDENER, 2, tools=("wipe",)))
-    with pytest.raises(NPAError, match="env must be npa/Shepherd2D-v0"):
-        ScriptedShepherd(make_vec(GARDENER, 2))
-    for given in ({"gain": 0.0}, {"share": -1.0}, {"width": float("nan")}):
-        with pytest.raises(NPAError, match=f"{next(iter(given))} must be positive"):
-            ScriptedGardener(make_vec(GARDENER, 2), **given)
 
 
 @pytest.mark.slow
@@ -123,3 +115,83 @@ def test_ppo_learns_to_garden_as_it_comes():
     still, taught = (np.asarray(one.returns) / 32 for one in episodes)
     error = np.std(taught - still, ddof=1) / np.sqrt(len(still))
     assert np.mean(taught - still) > max(0.3, 3.0 * error)
+
+
+# Behind the interface of learners
+
+
+SEEDS = range(1_000_000, 1_000_002)
+STEP = 2 * 64 * 8
+"""Particle-steps of a step of two worlds of 64 particles."""
+
+
+def garden(name="Gardener2DSmall") -> Problem:
+    keywords = {"particle_count": 64, "seed_pool": 1, "grow_steps": 4}
+    return Problem(
+        env_id=f"npa/{name}-v0", keywords=keywords, episode_steps=2, num_envs=2, hidden_dim=4
+    )
+
+
+def learned(method, problem, budget=1, seed=0, **options):
+    return train(
+        method, problem, Budget(particle_steps=budget), seed, evaluation_seeds=SEEDS, **options
+    )
+
+
+def test_a_problem_has_the_settings_that_its_id_is_registered_with():
+    problem = garden()
+    assert methods_for(problem) is GARDEN_METHODS
+    assert problem.config.tools == ("push",)
+    assert problem.make_envs().config == replace(problem.config, output="torch")
+
+
+@pytest.mark.parametrize("name", ["Gardener2DSmall", "Shepherd2DSmall"])
+def test_gardeners_that_learn_nothing_act_in_the_worlds_that_they_are_asked_about(name):
+    problem, found = garden(name), {}
+    for method in ("zero", "random", "scripted"):
+        trained = learned(method, problem)
+        assert (trained.rules, len(trained.log), trained.log[0].particle_steps) == (None, 1, 0)
+        envs = problem.make_envs()
+        again = evaluate_policy(envs, trained.policy, SEEDS)
+        assert again.mean_return == trained.log[0].mean_return
+        found[method] = policy_in(envs, trained.policy)(envs.reset(seed=0)[0]).abs().sum()
+    assert found["zero"] == 0.0
+    assert found["random"] > 0.0
+    assert found["scripted"] > 0.0
+
+
+@pytest.mark.parametrize("method", ["sac", "ppo_world"])
+@pytest.mark.parametrize("name", ["Gardener2DSmall", "Shepherd2DSmall"])
+def test_algorithms_as_they_come_learn_within_their_budget_and_can_be_loaded(
+    name, method, tmp_path
+):
+    baselines = pytest.importorskip("stable_baselines3")
+    problem = garden(name)
+    options = {"learning_starts": 2} if method == "sac" else {"steps": 2, "batch_size": 4}
+    trained = learned(method, problem, 6 * STEP, **options)
+    assert trained.log[-1].particle_steps == 6 * STEP
+    observation, _ = problem.make_envs().reset(seed=0)
+    action = trained.policy(observation)
+    assert action.shape == (2, *problem.make_envs().single_action_space.shape)
+    (path,) = trained.save(tmp_path)
+    kind = baselines.SAC if method == "sac" else baselines.PPO
+    trained.policy.model = kind.load(path)
+    assert np.array_equal(trained.policy(observation), action)
+
+
+def test_a_policy_of_another_garden_or_a_file_of_something_else_is_refused(tmp_path):
+    pytest.importorskip("stable_baselines3")
+    from npa_envs.agents.learning.sb3 import GardenPolicy
+
+    problem = garden()
+    (path,) = learned("sac", problem, 1, learning_starts=2).save(tmp_path)
+    seen, _ = problem.make_envs().reset(seed=0)
+    assert GardenPolicy.load(path)(seen).shape[0] == 2
+    seen, _ = garden("Shepherd2DSmall").make_envs().reset(seed=0)
+    refused("observation must be of a garden like that which", GardenPolicy.load(path), seen)
+    path.write_text("no archive", encoding="utf-8")
+    refused(r"path must be of a file that sac's `save` wrote, got", GardenPolicy.load, path)
+
+
+def test_a_policy_that_learned_nothing_looks_at_worlds():
+    refused("looks at worlds: call made_for", learned("zero", garden()).policy, None)

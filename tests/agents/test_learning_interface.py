@@ -1,17 +1,29 @@
-"""Problems, sets of rules and species in one array: what all learners share."""
+"""Problems, sets of rules, species in one array, budgets and curves: what all learners share."""
 
 import dataclasses
 
 import numpy as np
 import pytest
 import torch
+from clock import Clock
 from learning_problems import digits, heart, species, wild_rules
+from refusals import refused
+from small_envs import begun
 
 import npa_envs
-from npa_envs.agents import RandomPolicy, SpreadPolicy
-from npa_envs.agents.learning import Budget, Problem, RuleSet, train
+from npa_envs.agents import RandomPolicy, SpreadPolicy, evaluate_policy
+from npa_envs.agents.learning import (
+    METHODS,
+    Budget,
+    Problem,
+    Progress,
+    RuleSet,
+    method_options,
+    train,
+)
+from npa_envs.agents.learning.progress import annealed
 from npa_envs.envs import multispecies_v0, particles_v0
-from npa_envs.errors import NPAError
+from npa_envs.errors import DivergedError
 from npa_envs.registration import ENVIRONMENTS
 from npa_envs.rule.rule import NPARule
 
@@ -42,33 +54,6 @@ def test_json_keeps_a_problem(problem):
     assert problem != dataclasses.replace(problem, keywords={**problem.keywords, "eps": 0.2})
 
 
-@pytest.mark.parametrize(
-    ("fields", "message"),
-    [
-        ({"env_id": "npa/Mixng-v0"}, "did you mean 'npa/Mixing-v0'"),
-        ({"env_id": "CartPole-v1"}, "env_id must be of an environment of many worlds"),
-        ({"keywords": {"epsilon": 0.1}}, "unexpected keyword argument 'epsilon'"),
-        ({"keywords": {"eps": -0.1}}, "eps must be"),
-        ({"keywords": {"device": "cuda"}}, "given to train and make_envs"),
-        ({"keywords": {"max_cycles": 3}}, "field episode_steps"),
-        ({"keywords": {"reward": "particle"}}, "row_rewards='particle'"),
-        ({"keywords": {"box_size": {1, 2}}}, "JSON"),
-        ({"keywords": [1]}, "keywords must map names"),
-        ({"episode_steps": 0}, "episode_steps"),
-        ({"num_envs": 1.5}, "num_envs"),
-    ],
-)
-def test_a_wrong_problem_is_refused_when_it_is_made(fields, message):
-    with pytest.raises(NPAError, match=message):
-        Problem(**({"env_id": "npa/Morphogenesis2D-v0", "episode_steps": 4} | fields))
-
-
-@pytest.mark.parametrize("text", ["{", "[1]", '{"env": 1}'])
-def test_json_of_something_else_is_refused(text):
-    with pytest.raises(NPAError, match="text must be"):
-        Problem.from_json(text)
-
-
 @pytest.mark.parametrize("name", [r.id for r in ENVIRONMENTS] + list(multispecies_v0.ENVIRONMENTS))
 def test_every_environment_is_a_problem_with_rules_that_fit(name):
     problem = Problem(env_id=name, episode_steps=4)
@@ -88,37 +73,44 @@ def test_rows_are_paid_where_that_is_asked_for():
     _, reward, _, _, infos = envs.step(rules(observation))
     assert reward.abs().min() > 1e-3
     torch.testing.assert_close(infos["particle_reward"].mean(dim=1), reward, atol=1e-5, rtol=0.0)
-    with pytest.raises(NPAError, match="row_rewards"):
-        heart(reward="sparse").make_envs(row_rewards="particle")
+    refused("row_rewards", heart(reward="sparse").make_envs, row_rewards="particle")
 
 
 # Sets of rules
 
 
 @pytest.mark.parametrize("module", [multispecies_v0, particles_v0])
-def test_the_policy_of_rules_acts_for_agents_whoever_is_left(module):
+@pytest.mark.parametrize("output", ["numpy", "torch"])
+@pytest.mark.parametrize("kind", ["rules", "script"])
+def test_a_policy_acts_for_agents_whoever_is_left(module, output, kind):
     problem = species(particle_counts=(5, 7))
-    env = module.parallel_env(task="mixing", **problem.keywords, deaths=((0, 2),))
-    policy = wild_rules(problem).policy()
+    given = {"deaths": ((0, 2),), "output": output, **problem.keywords}
+    env = module.parallel_env(task="mixing", **given)
+    policy = wild_rules(problem).policy() if kind == "rules" else SpreadPolicy(env)
+    places = {"species_0": slice(0, 5), "species_1": slice(5, 12)}
+    places |= {f"particle_{k}": slice(k, k + 1) for k in range(12)}
     observations, _ = env.reset(seed=0)
     for _ in range(3):
         together = np.zeros((12, problem.interface.perception_dim), np.float32)
-        places = {"species_0": slice(0, 5), "species_1": slice(5, 12)}
-        places |= {f"particle_{k}": slice(k, k + 1) for k in range(12)}
         for agent, seen in observations.items():
             together[places[agent]] = seen
         everyone, actions = policy(together), policy(observations)
         assert list(actions) == env.agents
         for agent, action in actions.items():
             np.testing.assert_array_equal(np.atleast_2d(action), everyone[places[agent]])
+            assert action.shape == env.action_space(agent).shape
+            assert type(action) is type(observations[agent])
         observations, *_ = env.step(actions)
         # The dead have a last observation.
         observations = {agent: observations[agent] for agent in env.agents}
     assert len(env.agents) == (1 if module is multispecies_v0 else 7)
-    with pytest.raises(NPAError, match="must be of agents of 2 species and 12 particles, got one"):
-        policy({"agent_0": np.zeros((5, 4), np.float32)})
-    with pytest.raises(NPAError, match=r"observation\['species_1'\] must have shape \(7, "):
-        policy({"species_1": np.zeros((5, 4), np.float32)})
+    assert policy({}) == {}
+    wrong = np.zeros((5, 4), np.float32)
+    if kind == "script":
+        refused("observation must have shape", policy, {"species_0": wrong})
+        return
+    refused("be of agents of 2 species and 12 particles, got one", policy, {"agent_0": wrong})
+    refused(r"observation\['species_1'\] must have shape \(7, ", policy, {"species_1": wrong})
 
 
 @pytest.mark.parametrize("problem", [heart(state_scale=0.1), digits(), species()])
@@ -216,22 +208,6 @@ def test_a_shipped_rule_fits_where_the_world_is_like_its_own():
     assert copies.rules[0] is not copies.rules[1]
 
 
-@pytest.mark.parametrize(
-    ("problem", "source", "message"),
-    [
-        (heart(), "heart", "state_dim"),
-        (heart(state_dim=16), "heart", "eps0"),
-        (digits(state_dim=16), "heart", "static"),
-        (species(state_dim=16, eps0=0.1, perception="per_species"), "heart", "species apart"),
-        (species(state_dim=16, eps0=0.1), ["heart"] * 3, "one for each of 2 species"),
-        (heart(), "hart", "unknown rule"),
-    ],
-)
-def test_rules_that_do_not_fit_are_refused(problem, source, message):
-    with pytest.raises(NPAError, match=message):
-        RuleSet.of(problem, source)
-
-
 # Species in one array
 
 
@@ -281,8 +257,7 @@ def test_episodes_of_species_end_with_their_last_observations():
 
 def test_species_that_ended_keep_their_loss_where_another_world_is_reset():
     problem = species(particle_counts=[30, 18], deaths=[[1, 2]])
-    envs = problem.make_envs(2)
-    envs.reset(seed=0)
+    envs = begun(problem.make_envs(2))
     still = torch.zeros(2, 48, problem.interface.action_dim)
     for _ in range(4):
         *_, infos = envs.step(still)
@@ -315,8 +290,7 @@ def test_a_world_terminates_where_its_last_species_ends():
 @pytest.mark.parametrize("deaths", [[], [[0, 1]]], ids=["alone", "after a death"])
 def test_a_species_that_left_its_world_is_the_reason_of_the_episode(deaths):
     problem = species(observation_limit=1.5, update_prob=1.0, deaths=deaths, species_count=3)
-    envs = problem.make_envs(2)
-    envs.reset(seed=0)
+    envs = begun(problem.make_envs(2))
     action = torch.zeros(2, problem.particle_count, problem.interface.action_dim)
     # Its states grow in the first world alone.
     action[0, problem.new_rules(0).spans[1], 2:] = 1.0
@@ -331,20 +305,6 @@ def test_a_species_that_left_its_world_is_the_reason_of_the_episode(deaths):
     assert infos["final_info"]["reason"].tolist() == [other] * 2
 
 
-# Rules to begin with
-
-
-@pytest.mark.parametrize("method", ["ppo", "ppo_world", "evolution", "gradient"])
-def test_every_method_refuses_to_begin_with_what_does_not_fit(method):
-    problem, budget = heart(), Budget(particle_steps=1)
-    if method.startswith("ppo_"):
-        pytest.importorskip("stable_baselines3")
-    with pytest.raises(NPAError, match="start must be a RuleSet"):
-        train(method, problem, budget, 0, start=next(iter(problem.new_rules(0))))
-    with pytest.raises(NPAError, match="state_dim"):
-        train(method, problem, budget, 0, start=heart(state_dim=8).new_rules(0))
-
-
 @pytest.mark.parametrize("method", ["ppo", "ppo_world", "evolution"])
 def test_rules_of_other_numbers_of_particles_begin_with_those_of_the_problem(method):
     if method.startswith("ppo_"):
@@ -355,3 +315,158 @@ def test_rules_of_other_numbers_of_particles_begin_with_those_of_the_problem(met
     trained = train(method, problem, Budget(particle_steps=1), 0, start=start, **options)
     assert [span.stop - span.start for span in trained.rules.spans] == [20, 15]
     assert [span.stop - span.start for span in start.spans] == [6, 8]
+
+
+# Budgets and learning curves
+
+
+PROBLEM = heart(episode_steps=2)
+
+ITERATION = 480
+"""Particle-steps of an iteration of the learner below."""
+
+
+@pytest.fixture
+def rules():
+    return PROBLEM.new_rules(0)
+
+
+@pytest.fixture
+def clock(monkeypatch):
+    clock = Clock()
+    monkeypatch.setattr("npa_envs.agents.learning.progress.time", clock)
+    return clock
+
+
+def progress_of(problem, seeds=range(100, 103), **given):
+    budget = Budget(**{k: given.pop(k) for k in ("seconds", "particle_steps") if k in given})
+    return Progress(problem, budget, device="cpu", evaluation_seeds=seeds, **given)
+
+
+def learn_nothing(progress, rules, pause=lambda: None):
+    """Spend a budget as a learner does."""
+
+    def iteration():
+        pause()
+        return ITERATION
+
+    assert progress.run(rules, iteration) is rules
+    return progress.log
+
+
+def test_particle_steps_are_kept_up_to_one_iteration(rules):
+    log = learn_nothing(progress_of(PROBLEM, particle_steps=10_000, entries=5), rules)
+    assert 10_000 <= log[-1].particle_steps < 10_000 + ITERATION
+    # At the start, and at the first iteration after each fifth.
+    assert [entry.particle_steps for entry in log] == [0, 2400, 4320, 6240, 8160, 10080]
+
+
+def test_time_is_kept_and_evaluations_take_none_of_it(rules, clock):
+    progress = progress_of(PROBLEM, seconds=0.25, entries=4, on_entry=lambda _: clock.sleep(1.0))
+    log = learn_nothing(progress, rules, lambda: clock.sleep(1 / 64))
+    assert [entry.seconds for entry in log] == [0.0, 0.0625, 0.125, 0.1875, 0.25]
+    assert clock.now == 5 * 1.0 + 0.25
+
+
+@pytest.mark.parametrize("entries", [1, 3])
+def test_a_budget_of_seconds_makes_at_most_as_many_evaluations_as_it_says(
+    rules, monkeypatch, clock, entries
+):
+    ran = []
+    monkeypatch.setattr(
+        "npa_envs.agents.learning.progress.evaluate_policy",
+        lambda *given: ran.append(given) or evaluate_policy(*given),
+    )
+    # Each iteration takes more than one share of the budget, or less.
+    for pause in (1 / 512, 1 / 32):
+        progress = progress_of(PROBLEM, seconds=1 / 16, entries=entries)
+        learn_nothing(progress, rules, lambda pause=pause: clock.sleep(pause))
+        assert 2 <= len(ran) <= entries + 2
+        ran.clear()
+
+
+def test_whichever_is_spent_first_ends_it(rules, clock):
+    for seconds, iterations in ((1000.0, 3), (2.0, 2)):
+        progress = progress_of(PROBLEM, seconds=seconds, particle_steps=1000)
+        log = learn_nothing(progress, rules, lambda: clock.sleep(1.0))
+        assert log[-1].seconds == iterations
+        assert log[-1].particle_steps == iterations * ITERATION
+
+
+def test_entries_are_evaluations_from_the_seeds_given():
+    problem = heart()
+    rules = wild_rules(problem)
+    log = learn_nothing(progress_of(problem, particle_steps=1000, entries=1), rules)
+    episodes = evaluate_policy(problem.make_envs(), rules.policy(), range(100, 103))
+    for entry in log:
+        assert entry.mean_return == episodes.mean_return
+        assert entry.standard_error == episodes.standard_error
+        assert entry.final_loss == pytest.approx(episodes.final_losses.mean())
+    assert len(log) == 2
+
+
+def test_a_forced_look_after_nothing_was_done_adds_no_entry(rules):
+    progress = progress_of(PROBLEM, particle_steps=1000, entries=2)
+    progress.start(rules)
+    progress.look(rules, force=True)
+    assert len(progress.log) == 1
+    progress.advance(1)
+    progress.look(rules)
+    assert len(progress.log) == 1
+    progress.look(rules, force=True)
+    assert len(progress.log) == 2
+
+
+def test_progress_has_to_start_first_and_once(rules):
+    progress = progress_of(PROBLEM, particle_steps=1000)
+    refused("advance needs a start", progress.advance, 1)
+    refused("look needs a start", progress.look, rules)
+    progress.start(rules)
+    refused("start once", progress.start, rules)
+
+
+def test_rules_that_diverged_are_reported(rules):
+    progress = progress_of(PROBLEM, particle_steps=1000)
+    progress.start(rules)
+    with torch.no_grad():
+        rules.rules[0].output.weight[3, 5] = torch.nan
+    progress.advance(96)
+    with pytest.raises(DivergedError, match=r"1 of \d+ in 'output.weight' of rule 0 .* after 96"):
+        progress.look(rules, force=True)
+
+
+def test_learning_rates_fall_from_the_first_to_the_last():
+    rates = [annealed(2e-3, 0.1, share) for share in (0.0, 0.25, 0.5, 0.75, 1.0, 1.3)]
+    assert rates[0] == 2e-3
+    assert rates[2] == pytest.approx(1.1e-3)
+    assert rates[-1] == rates[-2] == pytest.approx(2e-4)
+    assert rates == sorted(rates, reverse=True)
+
+
+def test_a_range_of_steps_may_be_a_list_as_command_lines_give_it():
+    log = train("gradient", heart(), Budget(particle_steps=1), 0, steps=[2, 3], entries=1).log
+    # Eight worlds of 48 particles, two steps.
+    assert log[-1].particle_steps == 8 * 48 * 2
+
+
+def test_options_are_named_with_their_defaults():
+    assert method_options("gradient")["world_count"] == 8
+    assert method_options("ppo")["ratio"] == "particle"
+    assert method_options("scripted").keys() == {"gains"}
+    assert method_options("zero") == {}
+
+
+def test_a_method_of_ones_own_is_a_row_of_the_table(monkeypatch):
+    monkeypatch.setitem(METHODS, "own", f"{__name__}:train_wildly")
+    trained = train("own", heart(), Budget(particle_steps=10), 3, factor=2.0)
+    assert trained.rules is not None
+    assert len(trained.log) == 1
+    assert torch.equal(
+        trained.rules.rules[0].output.weight, wild_rules(heart(), 3, 2.0).rules[0].output.weight
+    )
+
+
+def train_wildly(progress, *, factor=1.0):
+    rules = wild_rules(progress.problem, progress.seed, factor)
+    progress.start(rules)
+    return rules

@@ -1,11 +1,13 @@
-"""The gradient, cloning, and the methods that learn nothing: each learns what it should."""
+"""The gradient, cloning, SHAC, evolution, and methods that learn nothing: all do as they should."""
 
 import copy
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
 from learning_problems import digits, heart, species, wild_rules
+from refusals import refused
 
 import npa_envs
 from npa_envs.agents import (
@@ -18,12 +20,15 @@ from npa_envs.agents import (
 )
 from npa_envs.agents.learning import EVALUATION_SEEDS, Budget, Problem, RuleSet, train
 from npa_envs.agents.learning.clone import Demonstrations, unexplained
+from npa_envs.agents.learning.evolution import RulePopulation, costs, fitness
 from npa_envs.agents.learning.gradient import ClampedRule, EnvironmentTask, clamp_inward
 from npa_envs.agents.learning.problem import FIRST_EVALUATION_SEED, world_seeds
+from npa_envs.agents.learning.shac import SHACLearner, SHACOptions, td_lambda_targets, values
 from npa_envs.envs.core.vector import NPAVectorEnv
 from npa_envs.envs.morphogenesis2d import PictureEnvTask
 from npa_envs.envs.multi.task import Population
-from npa_envs.errors import NPAError
+
+GROWTH = {"eps": 0.2, "eps0": 0.2, "colour_weight": 20.0, "resolution": 32, "state_scale": 0.1}
 
 GRADIENT_TOLERANCE = 1e-6
 """Of a directional derivative in float64 against a central difference; measured: 2e-9."""
@@ -40,12 +45,6 @@ def run(problem, method="gradient", iterations=30, seed=0, worlds=4, **options):
 def damaged(**keywords):
     keywords = heart(**keywords).keywords | {"rule": "picture", "damage": "wipe"}
     return replace(heart(), env_id="npa/Regeneration2D-v0", keywords=keywords)
-
-
-def learned(problem, **options):
-    """Return the first and the last point of the gradient's learning curve."""
-    first, last = run(problem, world_count=4, learning_rate=1e-2, **options).log
-    return first, last
 
 
 # The gradient
@@ -145,25 +144,32 @@ def test_repeated_rollouts_stay_clamped_where_they_are_recorded(cuda_graph, devi
     assert all(torch.allclose(after, found[0], atol=1e-5) for after in found)
 
 
-@pytest.mark.parametrize(
-    ("problem", "share", "gain", "options"),
-    [
-        (heart(), 0.55, 0.4, {}),
-        (heart(episode_steps=12), 0.7, 0.0, {"steps": (3, 7), "pool_size": 8, "fresh_share": 0.5}),
-        (species(perception="per_species"), 0.5, 0.0, {}),
-        (species("npa/Segregation-v0", seed_distance=0, perception="per_species"), 0.6, 0.0, {}),
-        # States that say nothing have a loss of 0.1.
-        (digits(), 0.93, 0.0, {"iterations": 60}),
-        (damaged(), 1.0, 0.01, {"iterations": 40}),
-    ],
-    ids=["grows", "learns long episodes in pieces", "mixes", "parts", "tells digits", "heals"],
-)
-def test_the_gradient_leaves_a_share_of_the_loss_and_raises_the_return(
-    problem, share, gain, options
-):
-    if problem == digits():
-        pytest.importorskip("sklearn")
-    first, last = learned(problem, **options)
+GRADIENT = {"world_count": 4, "learning_rate": 1e-2}
+SHAC = {"method": "shac", "steps": 4, **GRADIENT}
+PIECES = {"steps": (3, 7), "pool_size": 8, "fresh_share": 0.5, **GRADIENT}
+EVOLUTION = {"method": "evolution", "iterations": 40, "worlds": 16, "population": 16}
+EVOLVING = replace(heart(episode_steps=16, num_envs=8, **GROWTH), hidden_dim=12)
+APART = {"perception": "per_species"}
+LEARNED = {
+    "grows": (heart(), 0.55, 0.4, GRADIENT),
+    "learns long episodes in pieces": (heart(episode_steps=12), 0.7, 0.0, PIECES),
+    "mixes": (species(**APART), 0.5, 0.0, GRADIENT),
+    "parts": (species("npa/Segregation-v0", seed_distance=0, **APART), 0.6, 0.0, GRADIENT),
+    # States that say nothing have a loss of 0.1.
+    "tells digits": (digits(), 0.93, 0.0, {"iterations": 60, **GRADIENT}),
+    "heals": (damaged(), 1.0, 0.01, {"iterations": 40, **GRADIENT}),
+    "grows by SHAC": (heart(), 0.9, 0.0, {"iterations": 20, **SHAC}),
+    "mixes by SHAC": (species(**APART), 0.9, 0.0, {"iterations": 8, **SHAC}),
+    "evolves": (EVOLVING, 1.0, 0.2, EVOLUTION),
+}
+"""Problems, what is left of the loss, how much more is returned, and by which method."""
+
+
+@pytest.mark.parametrize("case", LEARNED)
+def test_what_is_learned_leaves_a_share_of_the_loss_and_raises_the_return(case, device):
+    problem, share, gain, options = LEARNED[case]
+    pytest.importorskip({"tells digits": "sklearn", "evolves": "cma"}.get(case, "torch"))
+    first, last = run(problem, device=device, **options).log
     assert last.final_loss < share * first.final_loss
     assert last.mean_return - first.mean_return > gain
 
@@ -235,26 +241,12 @@ def test_a_run_follows_from_its_seed_and_learns_in_worlds_of_its_own(method, use
         assert not torch.equal(ours, other)
 
 
-def test_what_cannot_be_descended_is_refused():
-    with pytest.raises(NPAError, match=r"that follows gradients .* each other's expense"):
-        run(species("npa/Invasion-v0", seed_distance=0.5))
-    with pytest.raises(NPAError, match="a method that follows gradients must keep all particles"):
-        run(species(deaths=[[0, 2]]))
-
-
-def test_no_method_learns_what_code_to_say():
-    problem = Problem(env_id="npa/Shapeshifter2D-v0", episode_steps=4)
-    with pytest.raises(NPAError, match="'ppo' learns no codes"):
-        train("ppo", problem, Budget(particle_steps=1), 0)
-
-
 def test_a_loss_without_a_gradient_is_refused(monkeypatch):
     def counted(self, x, s):
         return {"far": (x.norm(dim=-1) > 0.5).float().mean(dim=1)}
 
     monkeypatch.setattr(PictureEnvTask, "losses", counted)
-    with pytest.raises(NPAError, match="losses of PictureEnvTask must be differentiable"):
-        run(heart())
+    refused("losses of PictureEnvTask must be differentiable", run, heart())
 
 
 # Cloning
@@ -374,10 +366,217 @@ def test_worlds_of_one_seed_follow_each_other_and_end_before_those_of_the_next()
     assert world_seeds(0, 6_000, 1)[3_999:4_001] == [9_999, 0]
 
 
-@pytest.mark.parametrize(
-    ("seed", "count", "words"),
-    [(100, 1, "seed must be a whole number"), (0, 10_001, "at most 10000")],
-)
-def test_seeds_that_reach_other_worlds_are_refused(seed, count, words):
-    with pytest.raises(NPAError, match=words):
-        world_seeds(seed, count)
+# The short-horizon actor-critic
+
+
+CPU = torch.device("cpu")
+
+
+def actor_critic(problem, **options):
+    given = SHACOptions(**{"world_count": 3} | options)
+    return SHACLearner(problem, given, 0, CPU, wild_rules(problem))
+
+
+@pytest.mark.parametrize("td_lambda", [0.0, 0.7, 1.0])
+def test_targets_are_weighted_means_of_sums_over_one_step_two_steps_and_so_on(td_lambda):
+    generator = torch.Generator().manual_seed(0)
+    rewards, following = torch.randn(2, 4, 3, generator=generator)
+    gamma = 0.9
+    found = td_lambda_targets(rewards, following, gamma=gamma, td_lambda=td_lambda)
+    for t in range(4):
+        sums, paid = [], torch.zeros(3)
+        for k in range(t, 4):
+            paid = paid + gamma ** (k - t) * rewards[k]
+            sums.append(paid + gamma ** (k - t + 1) * following[k])
+        weights = [(1.0 - td_lambda) * td_lambda**k for k in range(len(sums) - 1)]
+        weights.append(1.0 - sum(weights))
+        wanted = sum(w * value for w, value in zip(weights, sums, strict=True))
+        torch.testing.assert_close(found[t], wanted)
+
+
+@pytest.mark.parametrize("problem", [heart(), species(), digits()], ids=lambda p: p.env_id)
+def test_an_undiscounted_gain_is_what_the_windows_took_off_the_loss_and_what_is_foreseen(problem):
+    if problem == digits():
+        pytest.importorskip("sklearn")
+    made = actor_critic(problem, steps=4, gamma=1.0, value_weight=1.0)
+    window = made.play()
+    assert window.losses.shape == (5, 3)
+    fell = window.losses[0] - window.losses[-1]
+    torch.testing.assert_close(made.gain(window), fell.mean())
+    with torch.no_grad():
+        made.target.value.bias.fill_(0.25)
+    torch.testing.assert_close(made.gain(window), fell.mean() + 0.25)
+    assert window.losses.requires_grad
+    # The next window begins where this one ended, but where an episode of two windows was over; no
+    # gradient leads back.
+    assert not made.x.requires_grad
+    assert not made.s.requires_grad
+    now = made.task.world_losses(made.x, made.s) if made.goal is None else made.play().losses[0]
+    torch.testing.assert_close(now[1], window.losses[-1, 1])
+    assert ((now - window.losses[-1]).abs()[[0, 2]] > 1e-3).all()
+
+
+def test_worlds_begin_anew_where_their_episode_is_over():
+    made = actor_critic(heart(episode_steps=10), steps=4, world_count=4)
+    # Three windows of four steps: twelve steps are the fewest that are enough.
+    assert (made.window, made.window_count) == (4, 3)
+    assert made.windows_left == [1, 2, 3, 1]
+    fresh = made.task.world_losses(made.x, made.s)
+    for _ in range(4):
+        made.learn(0.05)
+    now = made.task.world_losses(made.x, made.s)
+    begun = [left == 3 for left in made.windows_left]
+    assert begun == [True, False, False, True]
+    assert (now[begun] - fresh[begun]).abs().max() < (now - fresh).abs()[[1, 2]].min()
+
+
+def test_the_critic_learns_what_is_paid_and_its_copy_follows():
+    made = actor_critic(heart(), steps=4, critic_epochs=40, target_rate=0.5)
+    window = made.play()
+    window = type(window)(*(part.detach() for part in window))
+    made.learn_values(window)
+    seen = window.features[:-1].flatten(0, 1)
+    paid = td_lambda_targets(window.rewards, torch.zeros(4, 3), gamma=0.9, td_lambda=0.95)
+    with torch.no_grad():
+        learned, followed = values(made.critic, seen), values(made.target, seen)
+    spread = (paid.flatten() - paid.mean()).square().mean()
+    assert (learned - paid.flatten()).square().mean() < 0.5 * (spread + paid.mean().square())
+    assert 0.0 < followed.abs().mean() < learned.abs().mean()
+
+
+@pytest.mark.slow
+def test_it_grows_a_heart_nearly_as_well_as_the_whole_gradient():
+    small = {"target": "heart", "particle_count": 64, "eps": 0.2, "eps0": 0.1, "state_dim": 4}
+    keywords = small | {"state_scale": 0.1, "seed_radius": 0.4, "colour_weight": 20.0}
+    problem = Problem(env_id="npa/Morphogenesis2D-v0", keywords=keywords, episode_steps=32)
+    budget = Budget(particle_steps=1_000_000)
+    returns = [
+        train(m, problem, budget, 0, entries=1).log[-1].mean_return for m in ("shac", "zero")
+    ]
+    assert returns[0] > 1.5
+    assert returns[1] == 0.0
+
+
+# Evolution
+
+
+SMALL = {
+    "growth": heart(**GROWTH),
+    "points": digits(particle_count=40, state_dim=16, eps=0.2, eps0=0.2),
+    "mixing": species(episode_steps=6, particle_counts=[24, 17], perception="per_species"),
+}
+PROBLEMS = {name: replace(problem, hidden_dim=12) for name, problem in SMALL.items()}
+
+
+@pytest.fixture(params=PROBLEMS)
+def problem(request):
+    if request.param == "points":
+        pytest.importorskip("sklearn")
+    return PROBLEMS[request.param]
+
+
+def candidates_of(problem: Problem, device: torch.device, count: int):
+    """A population, and the weights of some candidates that differ much, one a row."""
+    population = RulePopulation(problem.new_rules(0).to(device))
+    draws = np.random.default_rng(1)
+    spread = draws.standard_normal((count, len(population.vector()))) * population.scales()
+    weights = population.vector() + 0.5 * spread
+    return population, torch.as_tensor(weights, dtype=torch.float32, device=device)
+
+
+def rules_of(problem: Problem, device: torch.device, weights: torch.Tensor) -> RuleSet:
+    rules = problem.new_rules(5).to(device)
+    RulePopulation(rules).put(weights.cpu().double().numpy())
+    return rules
+
+
+def test_scales_are_those_that_layers_are_drawn_with():
+    problem = PROBLEMS["growth"]
+    rules = problem.new_rules(0)
+    (rule,) = rules
+    torch.nn.init.xavier_normal_(rule.hidden.weight)
+    torch.nn.init.xavier_normal_(rule.output.weight)
+    torch.nn.init.zeros_(rule.hidden.bias)
+    population = RulePopulation(rules)
+    drawn = population.vector() / population.scales()
+    hidden, output = rule.hidden.weight.numel(), rule.output.weight.numel()
+    assert drawn[:hidden].std() == pytest.approx(1.0, abs=0.15)
+    assert drawn[-output:].std() == pytest.approx(1.0, abs=0.3)
+
+
+def test_a_candidate_acts_in_its_own_worlds_as_its_rules_do(problem, device):
+    population, weights = candidates_of(problem, device, 3)
+    envs = problem.make_envs(6, device=device)
+    observation, _ = envs.reset(seed=3)
+    for _ in range(2):
+        actions = population.actions(weights, observation)
+        for k, own in enumerate(weights):
+            mine = slice(2 * k, 2 * k + 2)
+            alone = rules_of(problem, device, own).policy()(observation[mine])
+            assert torch.allclose(actions[mine], alone, atol=1e-5)
+        assert not torch.allclose(actions[:2], actions[2:4], atol=1e-2)
+        observation, *_ = envs.step(actions)
+
+
+def test_candidates_have_the_dead_zone_of_their_rules(problem, device):
+    rules = problem.new_rules(0).to(device)
+    weights = 0.5 * torch.randn(2, len(RulePopulation(rules).vector()), device=device)
+    population = RulePopulation(rules)
+    envs = problem.make_envs(4, device=device)
+    observation, _ = envs.reset(seed=3)
+    assert population.actions(weights, observation).any()
+    for rule in rules:
+        rule.dead_zone = 1e6
+    assert not population.actions(weights, observation).any()
+
+
+def test_candidates_act_alike_however_many_are_computed_at_once(monkeypatch, device):
+    problem = PROBLEMS["mixing"]
+    population, weights = candidates_of(problem, device, 5)
+    observation, _ = problem.make_envs(10, device=device).reset(seed=3)
+    together = population.actions(weights, observation)
+    monkeypatch.setattr("npa_envs.agents.learning.evolution.MOST_HIDDEN", 2 * 2 * 24 * 12)
+    assert torch.allclose(population.actions(weights, observation), together, atol=1e-6)
+
+
+def test_the_fitness_of_a_population_is_that_of_one_candidate_after_the_other(problem, device):
+    population, weights = candidates_of(problem, device, 3)
+    seeds = [11, 7]
+    envs = problem.make_envs(6, device=device, copy=False)
+    found = fitness(envs, population, weights, seeds, problem.episode_steps)
+    alone = problem.make_envs(2, device=device)
+    for k, own in enumerate(weights):
+        episodes = evaluate_policy(alone, rules_of(problem, device, own).policy(), seeds)
+        assert float(found[k]) == pytest.approx(episodes.mean_return, rel=1e-3, abs=1e-3)
+    assert float(found.std()) > 0.01
+
+
+def test_what_comes_after_an_episode_is_over_does_not_count(device):
+    # Every step succeeds, so that a world begins a new episode with each.
+    problem = replace(heart(**GROWTH, success_loss=1e6), hidden_dim=12)
+    population, weights = candidates_of(problem, device, 2)
+    envs = problem.make_envs(2, device=device)
+    found = fitness(envs, population, weights, [4], problem.episode_steps)
+    alone = problem.make_envs(1, device=device)
+    for k, own in enumerate(weights):
+        episodes = evaluate_policy(alone, rules_of(problem, device, own).policy(), [4])
+        assert episodes.steps.tolist() == [1]
+        assert float(found[k]) == pytest.approx(episodes.mean_return, abs=1e-4)
+
+
+def test_candidates_without_a_finite_return_are_the_worst():
+    assert costs(np.array([1.0, np.nan, 3.0, -np.inf])) == [-1.0, 0.0, -3.0, 0.0]
+    assert costs(np.array([np.nan, np.nan])) == [0.0, 0.0]
+
+
+def test_a_start_is_the_first_mean_and_stays_as_it_is():
+    pytest.importorskip("cma")
+    start = PROBLEMS["growth"].new_rules(9)
+    before = RulePopulation(start).vector()
+    options = {"population": 4, "sigma": 0.01, "evaluation_seeds": range(2)}
+    trained = train(
+        "evolution", PROBLEMS["growth"], Budget(particle_steps=1), 1, start=start, **options
+    )
+    assert np.array_equal(RulePopulation(start).vector(), before)
+    far = np.abs(RulePopulation(trained.rules).vector() - before) / RulePopulation(start).scales()
+    assert 0.0 < far.max() < 0.1

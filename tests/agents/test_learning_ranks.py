@@ -7,12 +7,11 @@ import signal
 
 import pytest
 import torch
-import torch.distributed as dist
 from learning_problems import heart, species
 from processes import on_ranks
+from refusals import refused
 
 from npa_envs.agents.learning import Budget, ppo, shac, train
-from npa_envs.errors import NPAError
 from npa_envs.rule.files import load_rule
 from npa_envs.training.checkpoint import load_checkpoint, save_checkpoint
 from npa_envs.training.ranks import Ranks
@@ -208,15 +207,13 @@ def finished(one_round, tmp_path):
     ],
 )
 def test_a_folder_with_another_run_is_refused(method, given, message, finished):
-    with pytest.raises(NPAError, match=message):
-        train(method, HEART, Budget(particle_steps=1), 0, out=finished, **given)
+    refused(message, train, method, HEART, Budget(particle_steps=1), 0, out=finished, **given)
 
 
 def test_a_run_goes_on_with_rules_to_begin_with_if_it_began_with_some(tmp_path):
     start = train("ppo", HEART, Budget(particle_steps=1), 1, **METHODS["ppo"]).rules
     kept("ppo", tmp_path, 1, start=start)
-    with pytest.raises(NPAError, match="differs in started"):
-        kept("ppo", tmp_path, 2, resume=True)
+    refused("differs in started", kept, "ppo", tmp_path, 2, resume=True)
     kept("ppo", tmp_path, 2, resume=True, start=start)
 
 
@@ -232,8 +229,7 @@ def test_a_checkpoint_that_was_changed_is_refused(finished):
     modules = content["modules"] | {"actor": content["modules"]["actor"] | {name: torch.ones(1)}}
     for change in (*spoilt, {"modules": modules}):
         save_checkpoint(finished / "checkpoint.pt", content | change)
-        with pytest.raises(NPAError, match="must hold all that a run needs"):
-            kept("ppo", finished, 2, resume=True)
+        refused("must hold all that a run needs", kept, "ppo", finished, 2, resume=True)
 
 
 def test_what_a_killed_run_left_half_written_is_removed_by_the_next_start(finished):
@@ -259,30 +255,3 @@ def test_what_cannot_be_shared_is_refused(tmp_path):
         assert "method 'evolution' cannot be shared by processes: take one of ppo, shac" in told
     for told in on_ranks(2, uneven, tmp_path):
         assert "worlds must be a multiple of the number of processes, got 3 and 2" in told
-
-
-def test_recorded_pieces_of_a_shared_round_are_those_of_kernels_one_by_one(
-    device, tmp_path, monkeypatch
-):
-    if device.type != "cuda":
-        pytest.skip("rounds are recorded on CUDA only")
-    store = dist.FileStore(str(tmp_path / "store"), 1)
-    dist.init_process_group("cpu:gloo,cuda:nccl", store=store, rank=0, world_size=1)
-
-    def rounds():
-        how = ppo.PPOOptions(steps=4, minibatches=2)
-        made = ppo.PPOLearner(HEART, how, 0, device, None, Ranks.current())
-        # The third call of what is recorded is the first replay that nothing was recorded in.
-        for share_left in (1.0, 0.8, 0.6, 0.4):
-            batch = made.play()
-            made.improve(share_left)
-        return [*batch, *made.actor.parameters(), *made.critic.parameters()]
-
-    try:
-        recorded = rounds()
-        monkeypatch.setattr(ppo, "GraphedCallable", lambda function, *_, **__: function)
-        for value, wanted in zip(recorded, rounds(), strict=True):
-            assert float(wanted.detach().norm()) > 0.0
-            torch.testing.assert_close(value, wanted, rtol=1e-3, atol=1e-5)
-    finally:
-        dist.destroy_process_group()

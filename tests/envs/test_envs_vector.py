@@ -1,22 +1,22 @@
-"""Batched environments: world k is the single environment, whatever else the batch does."""
+"""Batches, worlds whose numbers run away, and torch's modes: each world is as if it were alone."""
 
+import functools
 import pickle
+import threading
 
 import numpy as np
 import pytest
 import torch
+from crowds import still
 from gymnasium.vector import AutoresetMode
-from small_envs import IDS, assert_batch_of_singles, assert_same, make, make_vec
+from refusals import refused
+from small_envs import IDS, assert_batch_of_singles, assert_same, begun, make, make_vec
 
-from npa_envs.errors import DivergedError, NPAError
+import npa_envs
+from npa_envs.envs import multispecies_v0
+from npa_envs.errors import DivergedError
 
 every_id = pytest.mark.parametrize("name", IDS)
-
-
-@pytest.fixture
-def where(device):
-    """Keywords that put worlds on the device of the numerical tests."""
-    return {"device": str(device)}
 
 
 def batches(env, count, seed=0, scale=1.0):
@@ -61,50 +61,6 @@ def test_vector_equals_single_over_six_episodes_with_autoresets(name, changes, w
 
 
 @every_id
-@pytest.mark.parametrize("output", ["numpy", "torch"])
-def test_disabled_mode_resets_only_the_worlds_of_the_mask(name, output):
-    envs = make_vec(name, 4, max_episode_steps=3, autoreset_mode="disabled", output=output)
-    others = make_vec(name, 4, max_episode_steps=30, autoreset_mode="disabled", output=output)
-    envs.reset(seed=0)
-    others.reset(seed=0)
-    actions = batches(envs, 8, scale=0.1)
-    for action in actions[:3]:
-        before, _, _, truncated, _ = envs.step(action)
-        others.step(action)
-    assert truncated.all()
-    mask = np.array([True, False, False, True])
-    given = torch.from_numpy(mask) if output == "torch" else mask
-    after, _ = envs.reset(options={"reset_mask": given})
-    fresh, _ = make_vec(name, 4, output=output).reset(seed=0)
-    for k in range(4):
-        assert np.array_equal(after[k], before[k]) != mask[k]
-        assert not np.array_equal(after[k], fresh[k])
-    with pytest.raises(NPAError, match=r"the episodes of worlds \[1, 2\] are over"):
-        envs.step(actions[3])
-    # Where the others may go on, they go on as if nothing had happened to their neighbours.
-    longer = make_vec(name, 4, autoreset_mode="disabled", output=output)
-    longer.reset(seed=0)
-    for action in actions[:3]:
-        longer.step(action)
-    longer.reset(options={"reset_mask": given})
-    for action in actions[3:]:
-        left, right = longer.step(action)[0], others.step(action)[0]
-        assert np.array_equal(left[1:3], right[1:3])
-        assert not np.array_equal(left[0], right[0])
-
-
-@every_id
-def test_masked_reset_with_a_seed_starts_that_seed(name):
-    envs = make_vec(name, 3)
-    fresh, _ = envs.reset(seed=5)
-    fresh = fresh.copy()
-    envs.step(batches(envs, 1)[0])
-    again, _ = envs.reset(seed=5, options={"reset_mask": np.array([False, True, False])})
-    assert np.array_equal(again[1], fresh[1])
-    assert not np.array_equal(again[0], fresh[0])
-
-
-@every_id
 def test_what_was_handed_out_may_be_changed(name):
     """Callers normalise in place; what follows must not depend on it."""
     kept, spoilt = make_vec(name, 3), make_vec(name, 3)
@@ -129,8 +85,7 @@ def test_what_was_handed_out_may_be_changed(name):
 
 
 def test_action_of_a_restarting_world_may_be_anything():
-    envs = make_vec(IDS[0], 2, max_episode_steps=1, autoreset_mode="next-step")
-    envs.reset(seed=0)
+    envs = begun(make_vec(IDS[0], 2, max_episode_steps=1, autoreset_mode="next-step"))
     action = np.zeros((2, *envs.single_action_space.shape), np.float32)
     envs.step(action)
     envs.step(action * np.nan)
@@ -191,94 +146,6 @@ def test_shared_arrays_hold_what_new_ones_would_which_are_the_callers(name, mode
     assert_same(handed, [pickle.loads(then) for then in bytes_then])
 
 
-@every_id
-@pytest.mark.parametrize("world_count", [None, 3])
-def test_action_that_is_no_number_is_an_error_and_changes_no_world(name, world_count, where):
-    one = world_count is None
-    env, other = (make(name, **where) if one else make_vec(name, 3, **where) for _ in range(2))
-    env.reset(seed=0)
-    other.reset(seed=0)
-    random, world = np.random.default_rng(0), 0 if one else 2
-    for number in (np.nan, np.inf):
-        action = random.uniform(-1, 1, env.action_space.shape).astype(np.float32)
-        wrong = action.copy()
-        wrong[(7, 3) if one else (2, 7, 3)] = number
-        told = f"action must be finite, got {number} at world {world}, particle 7, entry 3"
-        with pytest.raises(DivergedError, match=told):
-            env.unwrapped.step(wrong)
-        assert np.array_equal(env.step(action)[0], other.step(action)[0])
-
-
-@every_id
-def test_wrong_use_is_a_clear_error(name):
-    envs = make_vec(name, 3)
-    zeros = np.zeros((3, *envs.single_action_space.shape), np.float32)
-
-    def reset(mask):
-        return lambda: envs.reset(options={"reset_mask": np.array(mask)})
-
-    def placed_elsewhere():
-        envs.unwrapped.place_particles(*envs.unwrapped.particles(), worlds=[0, 1, 3])
-
-    before = [
-        (lambda: envs.step(zeros), "call reset first"),
-        (reset([True, False, False]), "reset all of them first"),
-    ]
-    after = [
-        (lambda: envs.step(zeros[:2]), r"action must be real numbers of shape \[B, N, A\]"),
-        (reset([1, 0, 0]), "reset_mask must be bool"),
-        (reset([False] * 3), "reset_mask must choose"),
-        (lambda: envs.reset(seed=[1, 2]), "seed must be one whole number, or one for each of 3"),
-        (lambda: envs.reset(seed=1.5), r"seed must be one whole number.*got 1.5"),
-        (lambda: envs.reset(options={"reset_masks": 0}), "unknown reset option .*: did you mean"),
-        (placed_elsewhere, "worlds must be indices below 3"),
-        (lambda: make_vec(name, 0), "num_envs must be"),
-        (lambda: make_vec(name, 1, max_episode_steps=0), "max_episode_steps must be"),
-        (lambda: make_vec(name, 1, autoreset_mode="disable"), "did you mean 'disabled'"),
-    ]
-    for cases in (before, after):
-        for call, message in cases:
-            with pytest.raises(NPAError, match=message):
-                call()
-        envs.reset(seed=0)
-    assert make_vec(name, np.int64(2), max_episode_steps=-1).num_envs == 2
-
-
-@pytest.mark.parametrize(
-    "worlds",
-    [[3], [-1], [1, 1], [True, False, True], np.array([True, True, True]), [0.5], [[0]], 1, []],
-)
-def test_particles_are_placed_in_worlds_that_exist_each_once(worlds):
-    envs = make_vec(IDS[0], 3).unwrapped
-    envs.reset(seed=0)
-    x, s = envs.particles()
-    # As many as a mask has entries, or as there are indices.
-    count = np.asarray(worlds).size
-    with pytest.raises(NPAError, match="worlds must be indices below 3, each once"):
-        envs.place_particles(x[:1].repeat(count, 1, 1), s[:1].repeat(count, 1, 1), worlds=worlds)
-    assert torch.equal(envs.particles()[0], x)
-
-
-def test_worlds_to_place_particles_in_are_numbers():
-    envs = make_vec(IDS[0], 3).unwrapped
-    envs.reset(seed=0)
-    with pytest.raises(NPAError, match="worlds must be numbers, got"):
-        envs.place_particles(*envs.particles(), worlds="all")
-
-
-@every_id
-def test_each_world_has_its_picture(name):
-    envs = make_vec(name, 3, render_mode="rgb_array")
-    envs.reset(seed=0)
-    envs.step(batches(envs, 1)[0])
-    pictures = envs.render()
-    assert [picture.shape for picture in pictures] == [(24, 24, 3)] * 3
-    single = make(name, render_mode="rgb_array")
-    single.reset(seed=1)
-    single.step(batches(envs, 1)[0][1])
-    assert np.array_equal(pictures[1], single.render())
-
-
 @pytest.mark.gpu
 @every_id
 def test_cpu_and_cuda_agree(name):
@@ -290,3 +157,243 @@ def test_cpu_and_cuda_agree(name):
         left, right = cpu.step(action), cuda.step(action)
         assert np.allclose(left[0], right[0], atol=2e-3)
         assert np.allclose(left[1], right[1], rtol=1e-3, atol=1e-4)
+
+
+# Worlds whose numbers run away
+
+
+NAME = "npa/Morphogenesis2D-v0"
+LIMIT, LAST = 3.5, 4
+"""States grow by 1 a step where they are pushed, and so leave the limit in step 4."""
+
+
+def pushed(env, world=1):
+    """Return actions that do nothing but push all states of one world."""
+    shape = env.action_space.shape
+    action = np.zeros(shape, dtype=np.float32)
+    (action if len(shape) == 2 else action[world])[:, -env.unwrapped.config.state_dim :] = 1.0
+    return action
+
+
+def vector(device, way, name=NAME, **keywords):
+    keywords = {"observation_limit": LIMIT, "update_prob": 1.0, "device": str(device)} | keywords
+    return make_vec(name, 3, on_divergence=way, **keywords)
+
+
+def stepped(envs, count=LAST, seed=5):
+    """Return what the last of some steps gave, the states of one world pushed."""
+    envs.reset(seed=seed)
+    for _ in range(count):
+        result = envs.step(pushed(envs))
+    return result
+
+
+@pytest.mark.parametrize("name", [NAME, "npa/Texture-v0"])
+def test_an_error_names_world_step_number_and_cure(name, device):
+    envs = vector(device, "raise", name)
+    with pytest.raises(DivergedError) as caught:
+        stepped(envs)
+    text = str(caught.value)
+    assert "observation_limit = 3.5, but left them in world 1 in step 4: states channel" in text
+    assert "of particle 0 got to 3.5 (" in text
+    assert "on_divergence='terminate' or 'reset'" in text
+    observations, _ = envs.reset(seed=5)
+    assert np.array_equal(observations, vector(device, "raise", name).reset(seed=5)[0])
+
+
+def test_a_world_that_left_is_named_by_its_coordinate(device):
+    env = begun(make(NAME, on_divergence="raise", position_limit=0.21, update_prob=1.0))
+    action = np.zeros(env.action_space.shape, dtype=np.float32)
+    action[:, 1] = 1.0
+    # Half of eps in a step takes particles of a disk of radius 0.2 out of 0.21.
+    with pytest.raises(DivergedError, match="in step 1: positions coordinate 1 of particle"):
+        env.step(action)
+
+
+@pytest.mark.parametrize(
+    ("name", "reward"), [(name, "dense") for name in IDS] + [(NAME, "particle"), (NAME, "sparse")]
+)
+def test_a_reset_world_begins_its_next_episode_within_this_one(name, reward, device):
+    keywords = {"max_episode_steps": LAST + 2, "reward": reward}
+    envs, other = vector(device, "reset", name, **keywords), vector(device, "terminate", name)
+    observations, rewards, _, _, infos = stepped(envs)
+    other.reset(seed=5)
+    first, start = other.reset(options={"reset_mask": np.array([False, True, False])})
+    assert np.array_equal(observations[1], first[1])
+    assert infos["loss"][1] == start["loss"][1]
+    assert infos["diverged"][1]
+    if reward == "dense":
+        assert rewards[1] == stepped(other)[1][1] <= 0.0
+    if reward == "particle":
+        assert infos["particle_reward"][1] == pytest.approx(rewards[1])
+    if reward == "sparse":
+        assert rewards.tolist() == [0.0, 0.0, 0.0]
+    still = 0.0 * pushed(envs)
+    _, rewards, terminations, truncations, infos = envs.step(still)
+    assert not infos["diverged"].any()
+    assert not (terminations | truncations).any()
+    if reward == "dense":
+        assert rewards[1] == start["loss"][1] - infos["loss"][1]
+    *_, truncations, infos = envs.step(still)
+    assert truncations.all()
+    assert infos["final_info"]["reason"].tolist() == ["time limit"] * 3
+
+
+def test_an_ignored_world_goes_on_held_at_the_limits_and_rewards_telescope(device):
+    envs = vector(device, "ignore")
+    _, start = envs.reset(seed=5)
+    paid = 0.0
+    for t in range(1, 9):
+        _, rewards, terminations, _, infos = envs.step(pushed(envs))
+        paid += rewards
+        assert not terminations.any()
+        assert infos["diverged"].tolist() == [False, t >= LAST, False]
+    assert (envs.unwrapped.particles()[1][1] == LIMIT).all()
+    assert paid == pytest.approx(start["loss"] - infos["loss"], abs=1e-5)
+
+
+SPECIES = {"particle_count": 40, "state_dim": 4, "observation_limit": LIMIT, "update_prob": 1.0}
+
+
+def species_pushed(env):
+    """Return actions that push all states of the second species."""
+    actions = still(env)
+    if "species_1" in actions:
+        actions["species_1"][..., 2:] = 1.0
+    return actions
+
+
+def test_species_that_diverge_are_terminated_told_or_let_be(device):
+    for way in ("terminate", "ignore"):
+        keywords = SPECIES | {"on_divergence": way, "device": str(device)}
+        env = begun(multispecies_v0.parallel_env("mixing", **keywords))
+        for _ in range(LAST):
+            observations, _, terminations, *_ = env.step(species_pushed(env))
+        assert terminations == {"species_0": False, "species_1": way == "terminate"}
+        assert env.agents == ["species_0"] + ["species_1"] * (way == "ignore")
+        assert all(np.isfinite(rows).all() for rows in observations.values())
+    assert (env.particles()[1][20:] == LIMIT).all()
+
+
+def test_an_error_names_species_and_world(device):
+    keywords = SPECIES | {"on_divergence": "raise", "device": str(device)}
+    envs = begun(multispecies_v0.batched("mixing", world_count=2, **keywords))
+    action = species_pushed(envs)
+    action["species_1"][0] = 0.0
+    for _ in range(LAST - 1):
+        envs.step(action)
+    with pytest.raises(DivergedError, match="species_1 of world 1 had none after step 4: take"):
+        envs.step(action)
+
+
+# Among torch's modes, in threads, and made again and again
+
+
+NAMES = ("npa/Morphogenesis2D-v0", "npa/Texture-v0")
+
+
+def made(name, device, count=2):
+    return make_vec(name, count, max_episode_steps=3, device=device.type, output="torch")
+
+
+def play(envs, steps=6, *, reset=True):
+    """Return all that is observed and rewarded."""
+    seen = [envs.reset(seed=3)[0].clone()] if reset else []
+    for step in range(steps):
+        generator = torch.Generator().manual_seed(step)
+        action = torch.rand(envs.action_space.shape, generator=generator, device="cpu") * 2 - 1
+        observation, reward, *_ = envs.step(action)
+        seen += [observation.clone(), reward.clone()]
+    return seen
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_environments_go_on_outside_of_inference_mode(name, device):
+    expected = made(name, device)
+    with torch.inference_mode():
+        envs = made(name, device)
+        first = play(envs)
+    assert_same(first, play(expected))
+    assert_same(play(envs, reset=False), play(expected, reset=False))
+    with torch.inference_mode():
+        assert_same(play(envs, reset=False), play(expected, reset=False))
+    assert_same(play(envs), play(expected))
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_environments_do_not_mind_the_default_device(name, device):
+    expected = play(made(name, device))
+    torch.set_default_device("meta" if device.type == "cpu" else device)
+    try:
+        found = play(made(name, device))
+    finally:
+        torch.set_default_device(None)
+    assert_same(found, expected)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_environments_refuse_another_default_dtype(name, device):
+    envs = made(name, device)
+    torch.set_default_dtype(torch.float64)
+    try:
+        for call in (functools.partial(made, name, device), envs.reset):
+            refused(r"default dtype to be torch\.float32, got", call)
+    finally:
+        torch.set_default_dtype(torch.float32)
+    play(envs)
+
+
+@pytest.mark.gpu
+def test_environments_in_threads_are_as_alone():
+    device = torch.device("cuda")
+    kinds = [(NAMES[k % 2], 2 + k % 3) for k in range(4)]
+    expected = [play(made(name, device, count)) for name, count in kinds]
+    errors = []
+
+    def work(k):
+        try:
+            with torch.cuda.stream(torch.cuda.Stream()):
+                for _ in range(4):
+                    name, count = kinds[k]
+                    found = play(made(name, device, count))
+                    torch.cuda.current_stream().synchronize()
+                    assert_same(found, expected[k])
+        except BaseException as error:
+            errors.append(error)
+
+    def roll():
+        try:
+            rule = npa_envs.NPARule(2, 8, 32, eps0=0.3).to(device)
+            with torch.cuda.stream(torch.cuda.Stream()):
+                for count in range(30):
+                    # Environments look whether torch's own generators move.
+                    random = torch.Generator().manual_seed(count)
+                    x, s = (
+                        torch.rand(2, 40 + count, width, generator=random).to(device)
+                        for width in (2, 8)
+                    )
+                    for _ in range(3):
+                        generator = torch.Generator(device).manual_seed(0)
+                        npa_envs.rollout(rule, x, s, 4, generator=generator)[1].sum().backward()
+        except BaseException as error:
+            errors.append(error)
+
+    threads = [threading.Thread(target=work, args=(k,)) for k in range(4)]
+    threads.append(threading.Thread(target=roll))
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert not errors, errors[0]
+
+
+@pytest.mark.gpu
+def test_environments_made_again_and_again_keep_no_memory():
+    device = torch.device("cuda")
+    taken = []
+    for number in range(60):
+        play(made(NAMES[0], device), 4)
+        if number in (9, 59):
+            torch.cuda.synchronize()
+            taken.append(torch.cuda.memory_reserved())
+    assert taken[1] <= taken[0] + 2**26

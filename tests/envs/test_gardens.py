@@ -1,194 +1,32 @@
-"""Living worlds: brushes, weather, spaces, seeds; tests run over the table of gardens."""
+"""Living worlds: brushes, weather, rewards; two gardeners; worlds whose code the agent chooses."""
 
 import warnings
-from hashlib import sha256
+from itertools import pairwise
 
-import gymnasium
 import numpy as np
+import pettingzoo
 import pytest
 import torch
-from small_envs import assert_same
+from pettingzoo.test import api_test, parallel_api_test, parallel_seed_test
+from refusals import refused
+from small_envs import assert_same, begun, make, make_vec, small
 
 import npa_envs
-from npa_envs.envs.garden.brushes import BrushLayout, brushed, grid_places
-from npa_envs.errors import DivergedError, NPAError
-from npa_envs.registration import GARDEN_IDS, GARDENS
-from npa_envs.registration import SMALL as SMALL_FORMS
+from npa_envs.agents.gardening import ScriptedGardener
+from npa_envs.agents.shapeshifting import RecognisingShapeshifter
+from npa_envs.envs import gardeners_v0
+from npa_envs.envs.garden.brush_layout import BrushLayout, brushed, grid_places
+from npa_envs.envs.gardener2d import Gardener2DEnv
+from npa_envs.registration import GARDENS
 
-IDS = [environment.id for environment in GARDENS]
-GARDENER, SHEPHERD = IDS
-SMALL = {
-    "particle_count": 61,
-    "eps": 0.2,
-    "resolution": 16,
-    "picture_size": 8,
-    "render_size": 24,
-    "seed_pool": 3,
-    "grow_steps": 4,
-    "rule_steps": 2,
-}
+GARDENER, SHEPHERD = (environment.id for environment in GARDENS)
 TOOLS = ("push", "wipe", "inject", "rate")
-every_id = pytest.mark.parametrize("name", IDS)
-
-
-@pytest.fixture(autouse=True)
-def _no_screen(monkeypatch):
-    monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
-
-
-def make(name, **keywords):
-    return gymnasium.make(name, **(SMALL | keywords))
-
-
-def make_vec(name, world_count, **keywords):
-    return gymnasium.make_vec(
-        name, world_count, vectorization_mode="vector_entry_point", **(SMALL | keywords)
-    )
-
-
-def rows(env):
-    """Shape of the actions of a world."""
-    return env.unwrapped.form.action_space.shape
 
 
 def sampled(env, count, seed=0):
     """Actions of one world or of many."""
     env.action_space.seed(seed)
     return [env.action_space.sample() for _ in range(count)]
-
-
-@every_id
-def test_bad_actions_are_clear_errors_and_change_nothing(name):
-    env, other = make(name), make(name)
-    env.reset(seed=0)
-    other.reset(seed=0)
-    action = sampled(env, 1)[0]
-    with pytest.raises(NPAError, match=r"action must be real numbers of shape \[K, W\]"):
-        env.unwrapped.step(action[:1])
-    with pytest.raises(DivergedError, match="action must be finite, got nan at world 0"):
-        env.unwrapped.step(np.where(action == action[0, 0], np.nan, action).astype(np.float32))
-    assert_same(env.step(action), other.step(action))
-    chosen = make(name, actions="discrete")
-    chosen.reset(seed=0)
-    with pytest.raises(NPAError, match="action must choose below"):
-        chosen.unwrapped.step(np.full(4, 99))
-    with pytest.raises(NPAError, match="whole numbers of shape"):
-        chosen.unwrapped.step(np.zeros(4, np.float32))
-
-
-@pytest.mark.parametrize(
-    "small", [row for row in SMALL_FORMS if row.id in GARDEN_IDS], ids=lambda row: row.id
-)
-def test_a_small_form_is_the_environment_with_other_keywords(small):
-    quick = {"grow_steps": 4, "seed_pool": 1}
-    usual = small.id.replace("Small", "")
-    env = gymnasium.make(small.id, **quick)
-    other = gymnasium.make(usual, **(dict(small.keywords) | quick))
-    assert env.unwrapped.config == other.unwrapped.config
-    assert env.spec.max_episode_steps == other.spec.max_episode_steps == 32
-    batched = gymnasium.make_vec(small.id, 2, vectorization_mode="vector_entry_point", **quick)
-    assert batched.config == env.unwrapped.config
-    action = sampled(env, 1)[0]
-    again = gymnasium.make(gymnasium.envs.registration.EnvSpec.from_json(env.spec.to_json()))
-    for made in (env, other, again):
-        made.reset(seed=3)
-    first = env.step(action)
-    assert_same(first, other.step(action))
-    assert_same(first, again.step(action))
-
-
-FROZEN = {
-    "npa/Gardener2D-v0": {
-        "particle_count": 512,
-        "brush_radius": 0.6,
-        "push_length": 0.15,
-        "place_count": 4,
-        "place_reach": 0.75,
-        "gust_chance": 1.0,
-        "gust_radius": 0.4,
-        "gust_length": 0.4,
-        "blight_chance": 0.5,
-        "blight_radius": 0.3,
-        "position_noise": 0.002,
-    },
-    "npa/Gardener2DSmall-v0": {
-        "particle_count": 256,
-        "brush_radius": 0.6,
-        "push_length": 0.1,
-        "place_count": 4,
-        "place_reach": 0.75,
-        "gust_chance": 0.5,
-        "gust_radius": 0.6,
-        "gust_length": 0.4,
-        "blight_chance": 0.25,
-        "blight_radius": 0.3,
-        "position_noise": 0.002,
-    },
-    "npa/Shepherd2D-v0": {
-        "particle_count": 512,
-        "brush_radius": 0.6,
-        "push_length": 0.1,
-        "place_count": 2,
-        "place_reach": 0.4,
-        "aim": "move",
-        "goal_reach": 0.6,
-        "tolerance": 0.1,
-        "lost_limit": 0.5,
-        "reward_weight": 1.0,
-    },
-}
-FROZEN["npa/Shepherd2DSmall-v0"] = FROZEN["npa/Shepherd2D-v0"] | {"particle_count": 256}
-FOR_ALL = {
-    "target": "heart",
-    "rule": None,
-    "grow_steps": 256,
-    "seed_pool": 16,
-    "rule_steps": 8,
-    "tools": ("push",),
-    "actions": "grid",
-    "observe": "grid",
-    "reward": "dense",
-    "eps": 0.1,
-    "resolution": 32,
-}
-
-
-@pytest.mark.parametrize("name", FROZEN)
-def test_settings_stay_what_they_are_as_long_as_the_version_does(name):
-    config = gymnasium.make(name).unwrapped.config
-    for key, value in (FOR_ALL | FROZEN[name]).items():
-        assert getattr(config, key) == value, key
-
-
-def test_the_rule_that_runs_a_frozen_world_stays_what_it_is():
-    rule = gymnasium.make("npa/Gardener2DSmall-v0").unwrapped.task.rule
-    weights = b"".join(p.detach().cpu().numpy().tobytes() for p in rule.parameters())
-    assert sha256(weights).hexdigest()[-12:] == "bfc570262e4d"
-    assert not torch.equal(rule.hidden.weight, npa_envs.load_rule("heart").hidden.weight)
-
-
-@pytest.mark.parametrize(
-    ("keywords", "message"),
-    [
-        ({"tell_updated": True}, "actions do not belong to particles"),
-        ({"tools": ("pull",)}, "tools must be some of"),
-        ({"tools": ("rate", "push")}, "in the order of"),
-        ({"inject_channels": (16,)}, r"inject_channels must lie in \[-16, 15\]"),
-        ({"inject_channels": (-1, 15)}, "inject_channels must be different"),
-        ({"picture_size": 7}, "picture_size must divide resolution = 16"),
-        ({"actions": "discreet"}, "did you mean 'discrete'"),
-        ({"reward": "particle"}, "reward must be a known word"),
-        ({"alpha": 0.25}, "alpha must be the rule's, 0.5, got 0.25"),
-        ({"target": "ring"}, "no shipped rule grows 'ring'"),
-        ({"rule": "seven-pictures", "state_dim": 24}, "rule must have code_dim=0"),
-        ({"actions": "box"}, "actions must be a known word"),
-        ({"place_count": 1}, "place_count must be"),
-        ({"brush_radius": 0.0}, "brush_radius must be a finite number greater than 0"),
-    ],
-)
-def test_bad_keywords_are_clear_errors(keywords, message):
-    with pytest.raises(NPAError, match=message):
-        make(GARDENER, **keywords)
 
 
 def brush(config, **numbers):
@@ -237,8 +75,7 @@ def test_brushes_stand_on_the_grid_and_what_they_do_adds_up():
 
 
 def test_what_lacks_is_seen_where_it_lacks():
-    env = make(GARDENER, particle_count=256, eps=0.1, resolution=32)
-    env.reset(seed=0)
+    env = begun(make(GARDENER, particle_count=256, eps=0.1, resolution=32))
     task, target = env.unwrapped.task, env.unwrapped.task.goal.target
     whole = torch.cat((torch.zeros(256, 13), target.colours - 0.5), dim=1)
     seen = env.unwrapped.place_particles(target.points, whole)
@@ -286,8 +123,7 @@ def test_brushes_reach_across_the_edges_of_a_box_and_may_be_too_small_to_hold_an
 
 def test_a_world_that_is_stopped_stays_as_it_is():
     calm = {"gust_chance": 0.0, "blight_chance": 0.0, "position_noise": 0.0}
-    env = make(GARDENER, **(FREE | {"brush_radius": 1e3} | calm))
-    env.reset(seed=0)
+    env = begun(make(GARDENER, **(FREE | {"brush_radius": 1e3} | calm)))
     x, s = env.unwrapped.particles()
     action = np.zeros(env.action_space.shape, np.float32)
     env.step(action)
@@ -372,8 +208,7 @@ def test_a_shepherd_sees_what_became_of_a_creature_that_stays_whole(aim, moved, 
 
 @pytest.mark.parametrize("reward", ["dense", "sparse"])
 def test_rewards_of_goals_are_those_of_steps_and_of_any_other_goals(reward):
-    envs = make_vec(SHEPHERD, 3, reward=reward, tolerance=0.3, max_episode_steps=99)
-    envs.reset(seed=0)
+    envs = begun(make_vec(SHEPHERD, 3, reward=reward, tolerance=0.3, max_episode_steps=99))
     compute = envs.unwrapped.compute_reward
     paid = set()
     for action in sampled(envs, 12):
@@ -390,8 +225,7 @@ def test_rewards_of_goals_are_those_of_steps_and_of_any_other_goals(reward):
 
 @pytest.mark.parametrize(("name", "warned"), [(GARDENER, True), (SHEPHERD, False)])
 def test_only_rewards_that_come_in_the_last_step_can_be_missed(name, warned):
-    env = make(name, reward="sparse")
-    env.reset(seed=0)
+    env = begun(make(name, reward="sparse"))
     with warnings.catch_warnings(record=True) as told:
         warnings.simplefilter("always")
         _, reward, *_ = env.step(env.action_space.sample())
@@ -421,8 +255,7 @@ def test_hindsight_experience_replay_runs_as_it_is():
 def test_weather_comes_as_often_as_it_is_told_to():
     still = {"position_noise": 0.0, "gust_length": 0.3}
     for chances, expected in (((1.0, 0.0), (1, 0)), ((0.0, 1.0), (0, 1)), ((0.0, 0.0), (0, 0))):
-        env = make(GARDENER, gust_chance=chances[0], blight_chance=chances[1], **still)
-        env.reset(seed=0)
+        env = begun(make(GARDENER, gust_chance=chances[0], blight_chance=chances[1], **still))
         x, s = env.unwrapped.particles()
         task = env.unwrapped.task
         new_x, new_s = task.disturb(x[None], s[None], npa_envs.WorldRandom([3]))
@@ -440,3 +273,149 @@ def test_the_reward_is_one_for_a_whole_picture_and_zero_for_a_grey_one():
     earned = task.reward(worlds.x, worlds.s, losses, worlds.context.expand(4, -1))
     better = 1.0 + 1.0 / float(grey - info["loss"])
     assert torch.allclose(earned, torch.tensor([0.0, 1.0, better, -1.0]), rtol=1e-4, atol=1e-5)
+
+
+# Two gardeners with opposed aims
+
+
+GARDEN = small(GARDENER)
+
+
+@pytest.mark.parametrize("form", [{}, {"actions": "discrete"}])
+def test_pettingzoo_finds_nothing_to_complain_of(form):
+    parallel_api_test(gardeners_v0.parallel_env(max_cycles=5, **GARDEN, **form), num_cycles=12)
+    parallel_seed_test(lambda: gardeners_v0.parallel_env(max_cycles=5, **GARDEN, **form), 2)
+    api_test(gardeners_v0.env(max_cycles=5, **GARDEN, **form), num_cycles=12)
+
+
+def test_policies_of_gardens_act_for_either_agent():
+    env = gardeners_v0.parallel_env(**GARDEN)
+    seen, _ = env.reset(seed=0)
+    script = ScriptedGardener(env.garden)
+    left, right = (script(seen[agent]) for agent in env.agents)
+    assert np.array_equal(left, right)
+    assert np.abs(left).max() > 0.0
+    # One undoes what the other does.
+    x, _ = env.garden.particles()
+    env.step({"keeper_0": left, "raider_0": -right})
+    still = begun(gardeners_v0.parallel_env(**GARDEN))
+    still.step(dict.fromkeys(still.agents, 0.0 * left))
+    assert torch.allclose(env.garden.particles()[0], still.garden.particles()[0], atol=1e-5)
+    assert not torch.allclose(env.garden.particles()[0], x, atol=1e-5)
+
+
+@pytest.mark.skipif(not hasattr(pettingzoo, "make"), reason="PettingZoo has no registry yet")
+def test_pettingzoo_makes_it():
+    made = pettingzoo.make("parallel", "npa/Gardeners-v0", max_cycles=7, **GARDEN)
+    assert made.unwrapped.max_cycles == 7
+
+
+def test_what_one_earns_the_other_loses_until_the_time_limit():
+    env = begun(gardeners_v0.parallel_env(max_cycles=3, **GARDEN))
+    for step in range(3):
+        assert env.agents == ["keeper_0", "raider_0"]
+        actions = {agent: env.action_space(agent).sample() for agent in env.agents}
+        seen, rewards, ended, late, _ = env.step(actions)
+        assert np.array_equal(seen["keeper_0"], seen["raider_0"])
+        assert rewards["keeper_0"] == -rewards["raider_0"] != 0.0
+        assert not any(ended.values())
+        assert set(late.values()) == {step == 2}
+    assert env.agents == []
+    refused("actions must be given for the agents", env.step, actions)
+
+
+def test_brushes_of_both_add_up_and_without_a_raider_it_is_the_gardeners_world():
+    both, alone = begun(
+        gardeners_v0.parallel_env(**GARDEN),
+        Gardener2DEnv(gust_chance=0.0, blight_chance=0.0, **GARDEN),
+        seed=4,
+    )
+    half = np.full(alone.action_space.shape, 0.25, np.float32)
+    _, rewards, *_ = both.step({"keeper_0": half, "raider_0": half})
+    _, earned, *_ = alone.step(2.0 * half)
+    assert rewards["keeper_0"] == pytest.approx(earned, abs=1e-5)
+    _, rewards, *_ = both.step({"keeper_0": half, "raider_0": -half})
+    _, earned, *_ = alone.step(0.0 * half)
+    assert rewards["keeper_0"] == pytest.approx(earned, abs=1e-5)
+
+
+# Worlds whose code the agent chooses
+
+
+SHAPESHIFTER = "npa/Shapeshifter2D-v0"
+
+
+def test_a_choice_is_the_code_of_that_number(coded):
+    by_number, by_code = begun(
+        make(SHAPESHIFTER, **coded, actions="choice"), make(SHAPESHIFTER, **coded), seed=1
+    )
+    codes = by_code.unwrapped.task.codes.table
+    left, right = by_number.step(2), by_code.step(codes[2].numpy())
+    assert_same(left[:4], right[:4])
+    _, s = by_code.unwrapped.particles()
+    assert torch.equal(s[:, :3], codes[2].expand(61, 3))
+
+
+def test_goals_change_after_they_were_held_and_are_never_the_same_twice_on_end(coded):
+    env = make(SHAPESHIFTER, **coded)
+    _, info = env.reset(seed=3)
+    goals = [info["goal"]]
+    for action in sampled(env, 40):
+        goals.append(env.step(action)[4]["goal"])
+    held = [goals[k] for k in range(0, len(goals), 2)]
+    assert all(first == second for first, second in zip(goals[::2], goals[1::2], strict=False))
+    assert all(first != second for first, second in pairwise(held))
+    assert set(goals) == {0, 1, 2}
+
+
+def test_a_step_is_paid_by_the_goal_that_was_seen_before_it(coded):
+    env = make(SHAPESHIFTER, **coded)
+    _, info = env.reset(seed=0)
+    task = env.unwrapped.task
+    for action in sampled(env, 4):
+        goal = info["goal"]
+        _, reward, _, _, info = env.step(action)
+        x, s = (part[None] for part in env.unwrapped.particles())
+        loss = sum(task.toward(torch.tensor([goal])).losses(x, s).values())
+        blank = float(task.blank_losses[goal])
+        assert reward == pytest.approx(max(-1.0, 1.0 - float(loss) / blank), rel=1e-5)
+
+
+def test_a_goal_itself_earns_one_and_an_empty_picture_nothing(coded):
+    task = make(SHAPESHIFTER, **coded, resolution=32).unwrapped.task
+    single = task.goal.toward(torch.tensor([1]))
+    context = torch.tensor([[1.0]])
+    no_loss, blank = torch.zeros(1), task.blank_losses[1:2]
+    x = s = torch.zeros(1, 1, 1)
+    assert task.reward(x, s, no_loss, context).tolist() == [1.0]
+    assert task.reward(x, s, blank, context).tolist() == [0.0]
+    density = single.target_picture[..., 3]
+    assert float(blank) == pytest.approx(float((density + density * density).mean()), rel=1e-6)
+
+
+def test_the_goals_picture_is_seen_beside_the_worlds(coded):
+    env = make(SHAPESHIFTER, **coded)
+    seen, info = env.reset(seed=2)
+    assert seen.shape == (128,)
+    task = env.unwrapped.task
+    target = task.goal.toward(torch.tensor([info["goal"]])).target_picture[0]
+    coarse = target.view(4, 4, 4, 4, 4).mean(dim=(1, 3)).permute(2, 0, 1)
+    assert seen[64:] == pytest.approx(coarse.flatten().numpy(), abs=1e-6)
+
+
+@pytest.mark.parametrize("actions", ["code", "choice"])
+def test_a_script_recognises_goals_and_says_their_codes(coded, actions):
+    env = make(SHAPESHIFTER, **coded, actions=actions)
+    policy = RecognisingShapeshifter(env)
+    seen, info = env.reset(seed=0)
+    for _ in range(6):
+        goal = info["goal"]
+        seen, _, _, _, info = env.step(policy(seen))
+        _, s = env.unwrapped.particles()
+        codes = env.unwrapped.task.codes.table
+        assert s[0, :3].numpy() == pytest.approx(codes[goal].numpy(), abs=1e-6)
+    batch = make_vec(SHAPESHIFTER, 3, **coded, actions=actions)
+    seen, _ = batch.reset(seed=0)
+    assert RecognisingShapeshifter(batch)(seen).shape[0] == 3
+    plain = make("npa/Morphogenesis2D-v0")
+    refused("env must be one whose agent chooses codes", RecognisingShapeshifter, plain)

@@ -1,23 +1,25 @@
-"""Species as agents: seeds, turns, deaths, pictures, errors."""
-
-import pickle
+"""Species and particles as agents: turns, deaths, opponents, pictures, PettingZoo's own tests."""
 
 import numpy as np
+import pettingzoo
 import pytest
 import torch
-from crowds import TASKS, drawn, make, placed, small, still
-from small_envs import assert_same
+from crowds import HALF_WAY, TASKS, drawn, few, make, module_of, placed, small, still
+from pettingzoo.test import api_test, parallel_api_test, render_test, seed_test
+from pettingzoo.test.max_cycles_test import max_cycles_test
+from pettingzoo.test.seed_test import parallel_seed_test
+from pettingzoo.test.state_test import state_test
+from refusals import refused
+from small_envs import begun
 
 import npa_envs
 from npa_envs.envs import multispecies_v0, particles_v0
-from npa_envs.errors import NPAError
+from npa_envs.envs.multi import TASKS as TABLE
 from npa_envs.world.randomness import StreamId
 
 
 def test_turns_lead_to_the_same_world_as_acting_at_once():
-    together, turns = make(), multispecies_v0.env(**small("mixing"))
-    together.reset(seed=3)
-    turns.reset(seed=3)
+    together, turns = begun(make(), multispecies_v0.env(**small("mixing")), seed=3)
     generator = np.random.default_rng(1)
     for _ in range(6):
         actions = drawn(together, generator)
@@ -34,8 +36,7 @@ def test_turns_lead_to_the_same_world_as_acting_at_once():
 def test_turns_clip_actions_that_are_too_large(recwarn):
     states = []
     for size in (3.0, 1.0):
-        env = multispecies_v0.env(**small("mixing", update_prob=1.0))
-        env.reset(seed=0)
+        env = begun(multispecies_v0.env(**small("mixing", update_prob=1.0)))
         for agent in env.agents:
             env.step(np.full(env.action_space(agent).shape, size, np.float32))
         states.append(env.state())
@@ -55,8 +56,7 @@ def test_species_have_spaces_of_their_own_sizes_and_the_state_shows_all():
 
 
 def test_a_species_that_is_removed_is_gone():
-    env = make(species_count=3, deaths=((1, 2),), update_prob=1.0)
-    env.reset(seed=0)
+    env = begun(make(species_count=3, deaths=((1, 2),), update_prob=1.0))
     _, _, terminations, _, _ = env.step(still(env))
     assert not any(terminations.values())
     observations, rewards, terminations, truncations, infos = env.step(still(env))
@@ -78,16 +78,15 @@ def test_a_species_that_is_removed_is_gone():
     assert list(observations) == ["species_0", "species_2"]
     # That neighbours vanished is no merit and no fault.
     assert rewards == {"species_0": 0.0, "species_2": 0.0}
-    with pytest.raises(NPAError, match="got one for species_1: agents that ended"):
-        env.step(dict.fromkeys(("species_0", "species_1", "species_2"), np.zeros((14, 18))))
+    everyone = dict.fromkeys(env.possible_agents, np.zeros((14, 18)))
+    refused("got one for species_1: agents that ended", env.step, everyone)
     env.reset()
     assert env.agents == ["species_0", "species_1", "species_2"]
     assert env.particles()[0].shape == (41, 2)
 
 
 def test_the_last_observation_of_a_species_is_of_the_world_with_it():
-    env = make(particle_counts=(1, 1), deaths=((1, 1),))
-    env.reset(seed=0)
+    env = begun(make(particle_counts=(1, 1), deaths=((1, 1),)))
     s = np.zeros((2, 16))
     s[0, 0] = 1.0
     env.place_particles([[0.0, 0.0], [0.15, 0.0]], s)
@@ -110,16 +109,19 @@ def test_a_species_ends_when_all_of_its_particles_have_left():
     torch.testing.assert_close(x, torch.tensor([[0.7, 0.0], [0.15, 0.0]]))
 
 
+@pytest.mark.parametrize("opponent", [None, "random"])
 @pytest.mark.parametrize("dead", [0, 1])
-def test_an_invasion_is_over_when_one_side_is_gone(dead):
-    env = make("invasion", deaths=((dead, 2),))
-    env.reset(seed=0)
-    env.step(still(env))
+def test_an_invasion_is_over_when_one_side_is_gone(dead, opponent):
+    env = begun(make("invasion", opponent=opponent, deaths=((dead, 2),)))
+    _, _, terminations, _, _ = env.step(still(env))
+    assert not any(terminations.values())
     _, rewards, terminations, _, infos = env.step(drawn(env, np.random.default_rng(0)))
-    assert terminations == {"species_0": True, "species_1": True}
-    assert infos[f"species_{dead}"]["reason"] == "removed"
-    assert infos[f"species_{1 - dead}"]["reason"] == "no opponent"
-    assert rewards["species_0"] == -rewards["species_1"] != 0.0
+    assert terminations == dict.fromkeys(env.possible_agents, True)
+    for agent in env.possible_agents:
+        is_dead = agent == f"species_{dead}"
+        assert infos[agent]["reason"] == ("removed" if is_dead else "no opponent")
+    assert rewards["species_0"] != 0.0
+    assert opponent or rewards["species_0"] == -rewards["species_1"]
     assert env.agents == []
 
 
@@ -145,19 +147,6 @@ def test_an_opponent_acts_as_agents_would_that_act_uniformly_at_random(device):
         assert own == {"species_0": paid["species_0"]}
         assert torch.equal(alone.particles()[0], both.particles()[0])
     assert moved / 4 == pytest.approx(0.5, abs=0.05)
-    with pytest.raises(NPAError, match="opponent must be a known word, got 'rnadom': did you mean"):
-        make("invasion", opponent="rnadom")
-
-
-@pytest.mark.parametrize("dead", [0, 1])
-def test_an_episode_against_an_opponent_ends_when_one_side_is_gone(dead):
-    env = make("invasion", opponent="random", deaths=((dead, 2),))
-    env.reset(seed=0)
-    for ended in (False, True):
-        _, _, terminations, _, infos = env.step(still(env))
-        assert terminations == {"species_0": ended}
-    assert infos["species_0"]["reason"] == ("removed" if dead == 0 else "no opponent")
-    assert env.agents == []
 
 
 def test_particles_of_one_species_can_be_agents_against_an_opponent():
@@ -173,21 +162,17 @@ def test_particles_of_one_species_can_be_agents_against_an_opponent():
 
 
 def test_a_world_without_particles_can_be_drawn_and_described():
-    env = make(deaths=((0, 1), (1, 1)), render_mode="rgb_array")
-    env.reset(seed=0)
+    env = begun(make(deaths=((0, 1), (1, 1)), render_mode="rgb_array"))
     env.step(still(env))
     assert env.agents == []
     assert env.render().min() == 255
     assert not env.state().any()
     # PettingZoo's loops may call this once more.
     assert env.step({}) == ({}, {}, {}, {}, {})
-    with pytest.raises(NPAError, match="there is none: call reset first"):
-        env.step({"species_0": np.zeros(1)})
-    with pytest.raises(NPAError, match="actions must be a dict"):
-        env.step(None)
+    refused("there is none: call reset first", env.step, {"species_0": np.zeros(1)})
+    refused("actions must be a dict", env.step, None)
     env.reset()
-    with pytest.raises(NPAError, match="got none for species_0, species_1"):
-        env.step({})
+    refused("got none for species_0, species_1", env.step, {})
 
 
 def test_pictures_tell_species_apart():
@@ -197,8 +182,7 @@ def test_pictures_tell_species_apart():
     left, right = picture[16, 8], picture[16, 24]
     assert left[0] > left[1] + 50
     assert right[1] > right[0] + 50
-    grey = make(particle_counts=(1, 1), render_mode="rgb_array", render_style="particles")
-    grey.reset(seed=0)
+    grey = begun(make(particle_counts=(1, 1), render_mode="rgb_array", render_style="particles"))
     assert np.ptp(grey.render().astype(int), axis=2).max() <= 1
 
 
@@ -220,133 +204,9 @@ def test_arrays_and_tensors_are_taken_for_tuples():
         config = make(particle_counts=counts, deaths=np.array([[1, 5]])).config
         assert config.counts == (30, 20)
         assert config.deaths == ((1, 5),)
-        with pytest.raises(NPAError, match="exclude each other"):
-            make(particle_counts=counts, particle_count=50)
+        refused("exclude each other", make, particle_counts=counts, particle_count=50)
     named = make("co_morphogenesis", targets=np.array(["heart", "ring"])).config
     assert named.targets == ("heart", "ring")
-
-
-def test_a_copy_by_pickle_goes_on_alike():
-    env = make(deaths=((1, 3),))
-    env.reset(seed=0)
-    generator = np.random.default_rng(0)
-    env.step(drawn(env, generator))
-    copy = pickle.loads(pickle.dumps(env))
-    while env.agents:
-        actions = drawn(env, generator)
-        assert_same(env.step(actions), copy.step(actions))
-    assert_same(env.reset(), copy.reset())
-
-
-REFUSED = {
-    multispecies_v0.parallel_env: [
-        ({"task": "mixin"}, "task must be a known word, got 'mixin': did you mean 'mixing'"),
-        ({"task": 3}, "task must be a known word, got 3"),
-        ({"species_count": 0}, "species_count must be a whole number of at least 1, got 0"),
-        ({"species_count": 1}, "species_count must be at least 2 in this task, got 1"),
-        ({"species_count": 65}, "species_count must be at most 64, got 65"),
-        ({"particle_count": 1}, "particle_count must be at least species_count = 2, got 1"),
-        ({"particle_counts": (3,)}, r"particle_counts must be 2 whole numbers .* got \(3,\)"),
-        ({"particle_counts": (3, 0)}, "particle_counts must be 2 whole numbers of at least 1"),
-        ({"particle_count": 9, "particle_counts": (3, 6)}, "exclude each other"),
-        ({"seed_radius": 4.0}, "seed_radius and seed_distance must keep all disks within 4"),
-        ({"seed_distance": -1.0}, "seed_distance must be a finite number of at least 0"),
-        ({"deaths": ((2, 5),)}, "each species from 0 to 1 at most once, each step at least 1"),
-        ({"deaths": ((1, 0),)}, r"deaths must be pairs .* got \(\(1, 0\),\)"),
-        ({"deaths": ((1, 5), (1, 6))}, "deaths must be pairs"),
-        ({"deaths": (1, 5)}, "deaths must be pairs"),
-        ({"reward": "dense"}, "reward must be a known word, got 'dense'"),
-        ({"task": "invasion", "reward": "team"}, "reward must be 'individual' in invasion"),
-        ({"task": "co_morphogenesis", "targets": ("heart",)}, "targets must be 2 names"),
-        ({"task": "symbiosis", "target": "hart"}, "did you mean 'heart'"),
-        ({"task": "symbiosis", "state_dim": 2}, "state_dim must be a whole number of at least 3"),
-        ({"render_style": "art"}, "render_style must be a known word"),
-        ({"render_mode": "ansi"}, "render_mode must be a known word"),
-        ({"boundary": "periodic", "box_size": "2"}, "box_size must be a finite number greater"),
-        ({"task": "symbiosis", "sigma": 1e20}, r"sigma must be at most 1e\+09, got 1e\+20"),
-        ({"task": "invasion", "colour_weight": 1e38}, "colour_weight must be at most"),
-        ({"max_cycles": 0}, "max_cycles must be a whole number of at least 1"),
-        ({"epsilon": 0.2}, "unexpected keyword argument 'epsilon': did you mean 'eps'"),
-        ({"seed": 1}, r"unexpected keyword argument 'seed': give it to reset\(seed=...\)"),
-        ({"eps": -0.1}, "eps must be a finite number greater than 0"),
-        ({"perception": "own"}, r"perception must be a known word, got 'own'"),
-        ({"on_divergence": "reset"}, "on_divergence must be a known word, got 'reset'"),
-    ],
-    multispecies_v0.batched: [
-        ({"world_count": 0}, "world_count must be a whole number of at least 1, got 0"),
-        ({"autoreset_mode": "next-step"}, "autoreset_mode must be 'same-step' or 'disabled'"),
-        ({"autoreset_mode": "never"}, "autoreset_mode must be a known word, got 'never'"),
-        ({"eps": -1.0}, "eps must be a finite number greater than 0"),
-        ({"num_envs": 3}, "unexpected keyword argument 'num_envs'"),
-        ({"world_count": 10**7, "particle_count": 10**4}, "particle_count is too large"),
-    ],
-    particles_v0.parallel_env: [
-        ({"particle_count": 513}, "particle_count must be at most 512 .* got 513"),
-        ({"particle_counts": (500, 20)}, "particle_count must be at most 512 .* got 520"),
-        ({"species_count": 0}, "species_count must be a whole number of at least 1"),
-        ({"task": "mixin"}, "did you mean 'mixing'"),
-        ({"particles": 4}, "unexpected keyword argument 'particles': did you mean"),
-    ],
-}
-
-
-@pytest.mark.parametrize(
-    ("make", "keywords", "message"),
-    [(make, *row) for make in REFUSED for row in REFUSED[make]],
-)
-def test_a_wrong_configuration_is_refused(make, keywords, message):
-    with pytest.raises(NPAError, match=message):
-        make(**keywords)
-
-
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        (lambda a: a.pop("species_1"), "got none for species_1"),
-        (lambda a: a.update(species_2=a["species_0"]), "got one for species_2"),
-        (
-            lambda a: a.update(species_1=np.zeros((3, 18))),
-            r"actions\['species_1'\] must be real numbers of shape \(20, 18\), got \(3, 18\)",
-        ),
-        (lambda a: a.update(species_0="left"), r"actions\['species_0'\] must be real numbers"),
-        (lambda a: a.update(species_0=None), r"actions\['species_0'\] must be real numbers"),
-        (lambda a: a.update(species_0=a["species_0"] + 1j), "must be real numbers"),
-        (
-            lambda a: a["species_1"].__setitem__((4, 7), np.nan),
-            r"actions\['species_1'\] must be finite, got nan \(1 such",
-        ),
-        (lambda a: a["species_1"].fill(np.inf), "must be finite, got inf"),
-    ],
-)
-def test_a_wrong_action_is_refused_and_leaves_the_world_as_it_was(change, message):
-    env, untouched = make(), make()
-    for e in (env, untouched):
-        e.reset(seed=0)
-    actions = still(env)
-    change(actions)
-    before = env.state()
-    with pytest.raises(NPAError, match=message):
-        env.step(actions)
-    assert np.array_equal(env.state(), before)
-    actions = drawn(env, np.random.default_rng(0))
-    assert env.step(actions)[1] == untouched.step(actions)[1]
-
-
-def test_what_needs_a_world_says_so():
-    env = make()
-    for call in (env.state, env.render, lambda: env.step({}), lambda: env.place_particles(0, 0)):
-        with pytest.raises(NPAError, match="call reset first"):
-            call()
-    env.reset()
-    for x in ([[0.0, 0.0], [1.0]], "left", None, {}):
-        with pytest.raises(NPAError, match="x must be numbers, got"):
-            env.place_particles(x, np.zeros((41, 16)))
-    with pytest.raises(NPAError, match=r"actions must be a dict .* got list"):
-        env.step([])
-    with pytest.raises(NPAError, match="agent must be one that exists, got 'species_9'"):
-        env.action_space("species_9")
-    env.close()
-    env.close()
 
 
 def test_a_species_that_is_gone_leaves_nothing_to_perceive():
@@ -364,3 +224,144 @@ def test_a_species_that_is_gone_leaves_nothing_to_perceive():
     assert np.all(own[:, 1] == 0.0)
     assert np.all(own[:, 5:7] == 0.0)
     assert np.any(own[:, 3:5] != 0.0)
+
+
+# Particles as agents
+
+
+def crowd(task="mixing", **keywords):
+    return particles_v0.parallel_env(**few(task, **keywords))
+
+
+def test_every_particle_is_an_agent_and_is_told_its_species():
+    env = crowd(particle_counts=(2, 3))
+    observations, infos = env.reset(seed=0)
+    assert env.agents == [f"particle_{k}" for k in range(5)]
+    assert [infos[agent]["species"] for agent in env.agents] == [0, 0, 1, 1, 1]
+    assert env.observation_space("particle_4").shape == (66,)
+    assert env.action_space("particle_4").shape == (18,)
+    assert env.action_space("particle_4") is not env.action_space("particle_3")
+    assert observations["particle_4"].shape == (66,)
+    assert len(particles_v0.parallel_env().possible_agents) == 64
+    assert len(crowd(particle_counts=np.array([2, 3])).possible_agents) == 5
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_the_world_is_that_of_species_as_agents(task):
+    apart, species = crowd(task), multispecies_v0.parallel_env(**few(task))
+    seen, _ = apart.reset(seed=3)
+    there, _ = species.reset(seed=3)
+    generator = np.random.default_rng(0)
+    for _ in range(4):
+        actions = drawn(species, generator)
+        rows = np.concatenate(list(actions.values()))
+        seen, rewards, *_ = apart.step(dict(zip(apart.agents, rows, strict=True)))
+        there, payment, *_ = species.step(actions)
+        assert np.array_equal(np.stack(list(seen.values())), np.concatenate(list(there.values())))
+        assert np.array_equal(apart.state(), species.state())
+        paid = np.array(list(rewards.values()))
+        means = {"species_0": paid[:5].mean(), "species_1": paid[5:].mean()}
+        if task == "symbiosis":
+            # A species is paid for the whole picture, a particle for its own share of it.
+            means = dict.fromkeys(means, paid.mean())
+        if task == "invasion":
+            # Means of five and of four particles.
+            means["species_1"] *= 4 / 5
+            assert paid.sum() == pytest.approx(0.0, abs=1e-12)
+        assert payment == pytest.approx(means, abs=2e-6)
+        assert paid.std() > 0.0
+
+
+def test_a_particle_is_paid_for_its_own_entropy_or_for_that_of_all():
+    for reward in ("individual", "team"):
+        env = begun(crowd(particle_counts=(1, 2), update_prob=1.0, reward=reward))
+        env.place_particles([[0.0, 0.0], [0.15, 0.0], [2.0, 2.0]], np.zeros((3, 16)))
+        actions = still(env)
+        actions["particle_1"][0] = 1.0
+        _, rewards, _, _, infos = env.step(actions)
+        own = [-HALF_WAY, -HALF_WAY, 0.0]
+        expected = own if reward == "individual" else [np.mean(own)] * 3
+        assert list(rewards.values()) == pytest.approx(expected, abs=1e-6)
+        assert infos["particle_1"]["reward_separation"] == pytest.approx(-HALF_WAY, abs=1e-6)
+        assert infos["particle_2"]["loss"] == pytest.approx(1.0, abs=1e-6)
+
+
+def test_a_particle_that_leaves_ends_alone():
+    env = begun(crowd(particle_counts=(2, 1), position_limit=0.7, update_prob=1.0))
+    env.place_particles([[0.0, 0.0], [0.65, 0.0], [0.1, 0.0]], np.zeros((3, 16)))
+    actions = still(env)
+    actions["particle_1"][0] = 1.0
+    observations, _, terminations, _, infos = env.step(actions)
+    assert terminations == {"particle_0": False, "particle_1": True, "particle_2": False}
+    assert infos["particle_1"]["reason"] == "left the world"
+    assert set(observations) == set(terminations)
+    assert env.agents == ["particle_0", "particle_2"]
+    assert env.state()[:, -1].tolist() == [1.0, 0.0, 1.0]
+    refused("got one for particle_1: agents that ended", env.step, actions)
+    observations, *_ = env.step(still(env))
+    assert set(observations) == {"particle_0", "particle_2"}
+
+
+def test_particles_of_a_removed_species_end_together():
+    env = begun(crowd("co_morphogenesis", deaths=((0, 1),)))
+    _, _, terminations, _, _ = env.step(still(env))
+    assert list(terminations.values()) == [True] * 5 + [False] * 4
+    assert env.agents == [f"particle_{k}" for k in range(5, 9)]
+    _, rewards, *_ = env.step(drawn(env, np.random.default_rng(0)))
+    assert len(rewards) == 4
+    assert all(rewards.values())
+
+
+# PettingZoo's own tests
+
+
+pytestmark = pytest.mark.filterwarnings("ignore::UserWarning:pettingzoo")
+
+KINDS = {"species": (multispecies_v0, small), "particle": (particles_v0, few)}
+"""Modules by what their agents are called, and keywords of small worlds."""
+
+every_task = pytest.mark.parametrize("task", TASKS)
+every_kind = pytest.mark.parametrize("kind", KINDS)
+
+
+@every_kind
+@every_task
+def test_passes_the_api_tests(task, kind, capsys):
+    module, keywords = KINDS[kind]
+    deadly = keywords(task, deaths=((1, 3),))
+    parallel_api_test(module.parallel_env(**deadly), num_cycles=8)
+    api_test(module.env(**deadly), num_cycles=8)
+    api_test(module.raw_env(**keywords(task)), num_cycles=8)
+
+
+@every_kind
+@every_task
+def test_passes_the_seed_tests(task, kind):
+    module, keywords = KINDS[kind]
+    parallel_seed_test(lambda: module.parallel_env(**keywords(task)), num_cycles=5)
+    seed_test(lambda: module.env(**keywords(task)), num_cycles=5)
+
+
+@every_kind
+@every_task
+def test_passes_the_render_state_and_max_cycles_tests(task, kind, recwarn):
+    module, keywords = KINDS[kind]
+    given = keywords(task)
+    render_test(lambda **mode: module.env(**given, **mode))
+    state_test(module.env(**given), module.parallel_env(**given), num_cycles=3)
+    max_cycles_test(module_of(module, **given))
+
+
+@every_kind
+@pytest.mark.parametrize("api", ["parallel", "aec"])
+@pytest.mark.skipif(not hasattr(pettingzoo, "make"), reason="PettingZoo has no registry yet")
+def test_the_registry_of_pettingzoo_makes_every_task(kind, api):
+    module, keywords = KINDS[kind]
+    assert tuple(module.ENVIRONMENTS.values()) == TASKS == tuple(TABLE)
+    for name, task in module.ENVIRONMENTS.items():
+        given = keywords(task)
+        del given["task"]
+        env = begun(pettingzoo.make(api, name, **given))
+        assert type(env.unwrapped.worlds.task) is TABLE[task]
+        assert env.possible_agents == [f"{kind}_{k}" for k in range(2 if kind == "species" else 9)]
+        assert pettingzoo.spec(api, name).id == name

@@ -13,6 +13,7 @@ from crowds import (
     placed,
     still,
 )
+from small_envs import begun
 
 from npa_envs.envs.multi.worlds import AgentReturns
 from npa_envs.tasks.morphogenesis2d import Morphogenesis2D, Morphogenesis2DConfig
@@ -75,8 +76,7 @@ def test_entropy_reaches_across_the_edge_of_a_periodic_box():
 
 
 def test_each_species_of_co_morphogenesis_is_paid_for_its_own_picture():
-    env = make("co_morphogenesis", targets=("heart", "ring"), particle_counts=(40, 30))
-    env.reset(seed=0)
+    env = begun(make("co_morphogenesis", targets=("heart", "ring"), particle_counts=(40, 30)))
     x0, s0 = env.particles()
     actions = drawn(env, np.random.default_rng(0))
     _, rewards, _, _, infos = env.step(actions)
@@ -124,8 +124,7 @@ def test_after_a_death_each_survivor_is_still_paid_for_its_own_picture():
 
 @pytest.mark.parametrize("species_count", [2, 4])
 def test_what_the_invaded_gain_the_invaders_lose(species_count):
-    env = make("invasion", species_count=species_count, target="heart")
-    env.reset(seed=0)
+    env = begun(make("invasion", species_count=species_count, target="heart"))
     count = env.action_space("species_0").shape[0]
     generator = np.random.default_rng(0)
     for _ in range(5):
@@ -142,8 +141,7 @@ def test_what_the_invaded_gain_the_invaders_lose(species_count):
 
 
 def test_all_of_a_symbiosis_are_paid_alike():
-    env = make("symbiosis", target="heart", species_count=3)
-    env.reset(seed=0)
+    env = begun(make("symbiosis", target="heart", species_count=3))
     x0, s0 = env.particles()
     _, rewards, *_ = env.step(drawn(env, np.random.default_rng(0)))
     gain = splat_loss("heart", x0, s0, 41) - splat_loss("heart", *env.particles(), 41)
@@ -151,29 +149,19 @@ def test_all_of_a_symbiosis_are_paid_alike():
     assert gain != 0.0
 
 
-def test_leaving_the_world_never_pays():
-    # Alone at the bound, it would see nobody else: an entropy of almost 0.
-    env = pair("segregation", position_limit=0.29, seed_radius=0.01)
+@pytest.mark.parametrize("keywords", [{}, {"seed_distance": 0.5}])
+def test_leaving_the_world_never_pays_nor_gives_back_what_came_at_no_charge(keywords):
+    env = pair("segregation", position_limit=0.29, seed_radius=0.01, **keywords)
     at_start = env.reset(seed=0)[1]["species_1"]["loss"]
-    assert at_start > 0.99
+    # A radius apart, each sees itself alone, and the least loss is reached.
+    assert at_start == 0.0 if keywords else at_start > 0.99
     env.place_particles([[0.0, 0.0], [0.15, 0.0]], np.zeros((2, 16)))
     _, rewards, terminations, _, infos = env.step(apart(env))
     assert terminations == {"species_0": False, "species_1": True}
-    assert infos["species_1"]["loss"] == at_start
+    # Alone at the bound, it would see nobody else: an entropy of almost 0.
     assert infos["species_1"]["loss_mixture"] < 0.01
-    assert rewards["species_1"] == pytest.approx(HALF_WAY - at_start, abs=1e-6)
-    assert rewards["species_0"] == pytest.approx(HALF_WAY, abs=0.01)
-
-
-def test_leaving_does_not_give_back_what_came_at_no_charge():
-    # A radius apart at the start: each sees itself alone, and the least loss is reached.
-    env = pair("segregation", position_limit=0.29, seed_radius=0.01, seed_distance=0.5)
-    assert env.reset(seed=0)[1]["species_1"]["loss"] == 0.0
-    env.place_particles([[0.0, 0.0], [0.15, 0.0]], np.zeros((2, 16)))
-    _, rewards, terminations, _, infos = env.step(apart(env))
-    assert terminations == {"species_0": False, "species_1": True}
-    assert infos["species_1"]["loss"] == pytest.approx(HALF_WAY, abs=1e-6)
-    assert rewards["species_1"] == 0.0
+    assert infos["species_1"]["loss"] == pytest.approx(max(at_start, HALF_WAY), abs=1e-6)
+    assert rewards["species_1"] == pytest.approx(min(0.0, HALF_WAY - at_start), abs=1e-6)
     assert rewards["species_0"] == pytest.approx(HALF_WAY, abs=0.01)
 
 

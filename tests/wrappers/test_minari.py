@@ -6,6 +6,7 @@ import gymnasium
 import numpy as np
 import pytest
 from learning_problems import heart, wild_rules
+from refusals import refused
 
 from npa_envs.agents import evaluate_policy
 from npa_envs.agents.learning import Budget, Problem, RuleSet, train
@@ -77,10 +78,8 @@ def test_a_dataset_is_written_whole_or_not_at_all(root):
         write_dataset("npa/test-v0", spec, broken(), algorithm="wild", description="a test")
     assert not list(root.iterdir())
     recorded(problem, rules)
-    with pytest.raises(NPAError, match="'npa/test-v0' exists already"):
-        recorded(problem, rules)
-    with pytest.raises(NPAError, match="there is no dataset 'npa/other-v0'"):
-        read_pairs("npa/other-v0")
+    refused("'npa/test-v0' exists already", recorded, problem, rules)
+    refused("there is no dataset 'npa/other-v0'", read_pairs, "npa/other-v0")
     with pytest.raises(NPAError, match="must be an id with a version, got 'no version'"):
         recorded(problem, rules, "no version")
     assert not list(root.glob(".*"))
@@ -109,8 +108,7 @@ def test_rules_learn_from_a_dataset_without_a_world(monkeypatch):
     with pytest.raises(NPAError, match="teacher must be None where a dataset is given"):
         train("clone", problem, Budget(particle_steps=1), 0, teacher=list(teacher), **told)
     other = heart(particle_count=32)
-    with pytest.raises(NPAError, match="record it in this problem"):
-        train("clone", other, Budget(particle_steps=1), 0, **told)
+    refused("record it in this problem", train, "clone", other, Budget(particle_steps=1), 0, **told)
 
 
 @pytest.mark.parametrize(
@@ -166,19 +164,19 @@ def test_episodes_of_an_environment_of_ones_own_are_as_long_as_it_is_registered(
 
 
 @pytest.mark.parametrize(
-    ("first", "count", "seed"),
-    [(0, 16, 1), (10_000, 16, 0), (9_999, 1, 1), (9_999, 2, 2), (2_000_000, 16, 0)],
+    ("policy", "first", "count", "seed"),
+    [
+        ("scripted", 0, 16, 1),
+        ("scripted", 10_000, 16, 0),
+        ("scripted", 9_999, 1, 1),
+        ("scripted", 9_999, 2, 2),
+        ("scripted", 2_000_000, 16, 0),
+        ("random", 0, 16, 0),
+    ],
 )
-def test_a_scripted_policy_is_chosen_in_worlds_that_are_not_recorded(first, count, seed):
-    options = RecordOptions(
-        env="npa/Morphogenesis2DSmall-v0", dataset="a/b-v0", first_seed=first, episodes=count
-    )
-    assert record._choice_seed(options) == seed
-    recorded = set(range(first, first + count))
-    assert recorded.isdisjoint(world_seeds(seed, 16))
-
-
-def test_only_a_scripted_policy_is_chosen_elsewhere(monkeypatch):
+def test_a_scripted_policy_is_chosen_in_worlds_that_are_not_recorded(
+    policy, first, count, seed, monkeypatch
+):
     asked = []
 
     def train(method, problem, budget, seed, **_):
@@ -186,33 +184,15 @@ def test_only_a_scripted_policy_is_chosen_elsewhere(monkeypatch):
         return SimpleNamespace(policy=None)
 
     monkeypatch.setattr("npa_envs.agents.learning.train", train)
-    words = {"env": "npa/Morphogenesis2DSmall-v0", "dataset": "a/b-v0"}
-    for policy in ("scripted", "random"):
-        options = RecordOptions(**words, policy=policy)
-        record.policy_of(options, record.problem_of(options))
-    assert asked == [("scripted", 1), ("random", 0)]
-    with pytest.raises(NPAError, match="episodes must leave 10000 seeds below 1000000"):
-        record._choice_seed(RecordOptions(**words, episodes=10**6))
-
-
-@pytest.mark.parametrize(
-    ("words", "told"),
-    [
-        ("npa/Morphogenesis2D-v1", "did you mean 'npa/Morphogenesis2D-v0'"),
-        ("npa/Mixing-v0", "must be of one species"),
-        ("npa/Morphogenesis2D-v0 --options target", "NAME=VALUE"),
-        ("npa/Morphogenesis2D-v0 --episodes 0", "episodes must be at least 1"),
-        ("npa/Gardener2DSmal-v0", "did you mean 'npa/Gardener2DSmall-v0'"),
-        ("npa/Gardener2DSmall-v0 --policy heart", "policy must be one of"),
-        ("npa/Gardener2DSmall-v0 --policy none/sac.zip", "must be of a file that exists"),
-        ("npa/Gardener2DSmall-v0 --policy best.zip", "must be of a file sac.zip or ppo.zip"),
-        ("npa/Gardener2DSmall-v0 --episodes 1 --dataset heart", "must be an id with a version"),
-        ("npa/Gardener2DSmall-v0 --episodes 1 --dataset ../heart-first", "must be an id"),
-    ],
-)
-def test_what_cannot_be_recorded_is_told(words, told, capsys):
-    assert main(["record", "--dataset", "npa/test-v0", *words.split()]) == 2
-    assert told in capsys.readouterr().err
+    given = {"env": "npa/Morphogenesis2DSmall-v0", "dataset": "a/b-v0", "policy": policy}
+    options = RecordOptions(**given, first_seed=first, episodes=count)
+    record.policy_of(options, record.problem_of(options))
+    assert asked == [(policy, seed)]
+    assert policy == "random" or set(world_seeds(seed, 16)).isdisjoint(range(first, first + count))
+    endless = RecordOptions(**given, episodes=10**6)
+    if policy == "scripted":
+        problem = record.problem_of(endless)
+        refused("leave 10000 seeds below 1000000", record.policy_of, endless, problem)
 
 
 @pytest.mark.slow

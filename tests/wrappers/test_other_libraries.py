@@ -3,9 +3,10 @@
 import numpy as np
 import pytest
 from crowds import small, still
+from refusals import refused
+from small_envs import begun
 
 from npa_envs.envs import multispecies_v0, particles_v0
-from npa_envs.errors import NPAError
 from npa_envs.registration import ALL, SPECIES_SIZES
 from npa_envs.wrappers import NumericInfos
 
@@ -51,8 +52,7 @@ def test_torchrl_finds_the_specs_right_and_rolls_out(module, keywords):
     torchrl.check_env_specs(env)
     env.set_seed(3)
     rolled = env.rollout(20)
-    single = module.parallel_env(**fields)
-    single.reset(seed=3)
+    single = begun(module.parallel_env(**fields), seed=3)
     # TorchRL resets to set the seed, and again to begin.
     observations, _ = single.reset()
     group = next(iter(env.group_map))
@@ -70,10 +70,29 @@ def test_torchrl_finds_the_specs_right_and_rolls_out(module, keywords):
         assert paid == np.float32(rewards[agent])
 
 
+@pytest.fixture
+def trained():
+    """Builds an algorithm of RLlib's and trains it for some rounds, where RLlib is installed."""
+    ray = pytest.importorskip("ray")
+    ray.init(num_cpus=3, include_dashboard=False, log_to_driver=False, logging_level="ERROR")
+    built = []
+
+    def train(config, rounds=1):
+        built.append(config.build_algo())
+        for _ in range(rounds):
+            results = built[0].train()
+        assert results["env_runners"]["episode_len_mean"] == 6
+        return built[0], results
+
+    yield train
+    for algorithm in built:
+        algorithm.stop()
+    ray.shutdown()
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(("shared", "runner_count"), [(False, 0), (True, 0), (False, 2)])
-def test_rllib_trains_a_policy_for_each_species_or_one_for_all(shared, runner_count):
-    ray = pytest.importorskip("ray")
+def test_rllib_trains_a_policy_for_each_species_or_one_for_all(shared, runner_count, trained):
     from npa_envs.wrappers.rllib import rllib_config
 
     keywords = small("mixing", particle_count=8, state_dim=4, **DEATH)
@@ -84,30 +103,19 @@ def test_rllib_trains_a_policy_for_each_species_or_one_for_all(shared, runner_co
         .learners(num_learners=0)
         .training(train_batch_size_per_learner=48, minibatch_size=48, num_epochs=1)
     )
-    ray.init(num_cpus=3, include_dashboard=False, log_to_driver=False, logging_level="ERROR")
-    try:
-        algorithm = config.build_algo()
-        results = algorithm.train()
-        names = {"everyone"} if shared else {"species_0", "species_1"}
-        assert set(results["learners"]) == names | {"__all_modules__"}
-        assert results["env_runners"]["episode_len_mean"] == 6
-        assert algorithm.env_runner_group.num_remote_env_runners() == runner_count
-        for name in names:
-            steps = results["learners"][name]["num_module_steps_trained"]
-            assert steps > 0
-        algorithm.stop()
-    finally:
-        ray.shutdown()
-    with pytest.raises(NPAError, match="name must be a known id, got 'npa/Mixin-v0'"):
-        rllib_config("npa/Mixin-v0")
-    with pytest.raises(NPAError, match="'npa/TextureSmall-v0': take rllib_rows_config for it"):
-        rllib_config("npa/TextureSmall-v0")
+    algorithm, results = trained(config)
+    names = {"everyone"} if shared else {"species_0", "species_1"}
+    assert set(results["learners"]) == names | {"__all_modules__"}
+    assert algorithm.env_runner_group.num_remote_env_runners() == runner_count
+    for name in names:
+        assert results["learners"][name]["num_module_steps_trained"] > 0
+    refused("name must be a known id, got 'npa/Mixin-v0'", rllib_config, "npa/Mixin-v0")
+    refused("'npa/TextureSmall-v0': take rllib_rows_config", rllib_config, "npa/TextureSmall-v0")
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("runner_count", [0, 2])
-def test_rllib_trains_one_policy_on_the_particles_of_worlds_of_one_species(runner_count):
-    ray = pytest.importorskip("ray")
+def test_rllib_trains_one_policy_on_the_particles_of_worlds_of_one_species(runner_count, trained):
     from npa_envs.wrappers.rllib import rllib_rows_config
 
     keywords = {"particle_count": 16, "eps": 0.3, "resolution": 16, "max_episode_steps": 6}
@@ -118,19 +126,11 @@ def test_rllib_trains_one_policy_on_the_particles_of_worlds_of_one_species(runne
         )
         .training(train_batch_size_per_learner=12 * 32, minibatch_size=12 * 32, num_epochs=1)
     )
-    ray.init(num_cpus=3, include_dashboard=False, log_to_driver=False, logging_level="ERROR")
-    try:
-        algorithm = config.build_algo()
-        for _ in range(2):
-            results = algorithm.train()
-        assert results["env_runners"]["episode_len_mean"] == 6
-        assert results["learners"]["default_policy"]["num_module_steps_trained"] > 0
-        module = algorithm.get_module()
-        observed, acted = module.observation_space, module.action_space
-        assert (observed.shape, acted.shape) == ((66,), (18,))
-        algorithm.stop()
-    finally:
-        ray.shutdown()
+    algorithm, results = trained(config, rounds=2)
+    assert results["learners"]["default_policy"]["num_module_steps_trained"] > 0
+    module = algorithm.get_module()
+    observed, acted = module.observation_space, module.action_space
+    assert (observed.shape, acted.shape) == ((66,), (18,))
 
 
 @pytest.mark.slow
@@ -143,8 +143,7 @@ def test_rllib_trains_one_policy_on_the_particles_of_worlds_of_one_species(runne
         ("npa/Shepherd2DSmall-v0", {}, 30, 8, 2),
     ],
 )
-def test_rllib_trains_on_small_worlds_and_in_gardens(name, fields, observed, acted, rows):
-    ray = pytest.importorskip("ray")
+def test_rllib_trains_on_small_worlds_and_in_gardens(name, fields, observed, acted, rows, trained):
     from npa_envs.wrappers.rllib import rllib_rows_config
 
     config = (
@@ -153,17 +152,10 @@ def test_rllib_trains_on_small_worlds_and_in_gardens(name, fields, observed, act
         .training(train_batch_size_per_learner=14 * rows, minibatch_size=12, num_epochs=1)
     )
     assert config.num_envs_per_env_runner == rows
-    ray.init(num_cpus=1, include_dashboard=False, log_to_driver=False, logging_level="ERROR")
-    try:
-        algorithm = config.build_algo()
-        results = algorithm.train()
-        assert results["env_runners"]["episode_len_mean"] == 6
-        module = algorithm.get_module()
-        spaces = module.observation_space, module.action_space
-        assert [space.shape for space in spaces] == [(observed,), (acted,)]
-        algorithm.stop()
-    finally:
-        ray.shutdown()
+    algorithm, _ = trained(config)
+    module = algorithm.get_module()
+    spaces = module.observation_space, module.action_space
+    assert [space.shape for space in spaces] == [(observed,), (acted,)]
 
 
 def test_rllib_knows_every_id():
@@ -178,17 +170,17 @@ def test_rllib_knows_every_id():
         assert "species_0" in rllib_config(size.id).policies
 
 
-def test_rllib_rows_need_a_known_id_and_right_keywords():
+@pytest.mark.parametrize(
+    ("name", "given", "message"),
+    [
+        ("npa/Texure-v0", {}, "name must be a known id, got 'npa/Texure-v0': did you mean"),
+        ("npa/Texture-v0", {"world_count": 0}, "world_count must be a whole number of at least 1"),
+        ("npa/MixingParticles-v0", {}, "'npa/MixingParticles-v0': take rllib_config for it"),
+        ("npa/Morphogenesis2D-v0", {"targets": "heart"}, "did you mean 'target'"),
+    ],
+)
+def test_rllib_rows_need_a_known_id_and_right_keywords(name, given, message):
     pytest.importorskip("ray.rllib")
     from npa_envs.wrappers.rllib import rllib_rows_config
 
-    with pytest.raises(
-        NPAError, match="name must be a known id, got 'npa/Texure-v0': did you mean"
-    ):
-        rllib_rows_config("npa/Texure-v0", particle_count=8)
-    with pytest.raises(NPAError, match="world_count must be a whole number of at least 1, got 0"):
-        rllib_rows_config("npa/Texture-v0", particle_count=8, world_count=0)
-    with pytest.raises(NPAError, match="'npa/MixingParticles-v0': take rllib_config for it"):
-        rllib_rows_config("npa/MixingParticles-v0")
-    with pytest.raises(NPAError, match="did you mean 'target'"):
-        rllib_rows_config("npa/Morphogenesis2D-v0", particle_count=8, targets="heart")
+    refused(message, rllib_rows_config, name, **given)

@@ -3,6 +3,8 @@
 import pytest
 import torch
 import wrapped_envs
+from refusals import refused
+from small_envs import begun
 from wrapped_envs import ACTIONS, STEPS, policy
 
 from npa_envs.errors import NPAError
@@ -52,8 +54,7 @@ def test_logs_are_means_over_the_worlds_that_ended():
     for _ in range(STEPS - 1):
         *_, dones, extras = rows.step(torch.zeros(192, ACTIONS))
     assert dones.reshape(3, 64).all(dim=1).tolist() == [False, True, False]
-    alone = batched(1)
-    alone.reset(seed=1)
+    alone = begun(batched(1), seed=1)
     for _ in range(STEPS):
         *_, infos = alone.step(torch.zeros(1, 64, ACTIONS))
     expected = infos["final_info"]["loss"].item()
@@ -106,10 +107,8 @@ def test_the_runner_of_rsl_rl_updates_the_policy():
 
 
 def test_what_is_refused():
-    with pytest.raises(NPAError, match="needs torch tensors, got output='numpy'"):
-        RslRlParticleEnv(wrapped_envs.batched(2))
-    with pytest.raises(NPAError, match="make the environment with copy=True"):
-        RslRlParticleEnv(batched(copy=False))
+    refused("needs torch tensors, got output='numpy'", RslRlParticleEnv, wrapped_envs.batched(2))
+    refused("make the environment with copy=True", RslRlParticleEnv, batched(copy=False))
     with pytest.raises(NPAError, match="make it with autoreset_mode='same-step'"):
         RslRlParticleEnv(batched(autoreset_mode="next-step"))
     rows = RslRlParticleEnv(batched(2))

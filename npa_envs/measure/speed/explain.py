@@ -124,7 +124,7 @@ def _reasons(
         workload.state_dim,
         row_capacity(total, prob) if masked else total,
         masked,
-        physics(workload.space_dim, workload.state_dim, question.dtype, eps=workload.eps, box=box),
+        physics(workload.space_dim, workload.state_dim, x.dtype, eps=workload.eps, box=box),
     )
     hidden, output = rule.folded()[:2]
     request = plan.request._replace(

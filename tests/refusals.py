@@ -1,0 +1,14 @@
+"""How tests say that a call is refused, and in which words."""
+
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+
+from npa_envs.errors import NPAError
+
+
+def refused(message: str, call: Callable[..., Any], *given: Any, **named: Any) -> None:
+    """Check that a call raises `NPAError` with words that match."""
+    with pytest.raises(NPAError, match=message):
+        call(*given, **named)

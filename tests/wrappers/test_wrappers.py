@@ -1,0 +1,390 @@
+"""Damage, species tags, rows of particles, and Gymnasium's own wrappers."""
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch
+from gymnasium import spaces, wrappers
+from gymnasium.vector import AutoresetMode
+from gymnasium.wrappers import vector
+from gymnasium.wrappers.vector import DictInfoToList, RecordEpisodeStatistics
+from small_envs import assert_batch_of_singles, assert_same, begun
+from wrapped_envs import ACTIONS, STEPS, batched, policy, single
+
+import npa_envs  # noqa: F401 (registers the environments)
+from npa_envs.tasks.damage import DamageEvent, parse_damage
+from npa_envs.wrappers import (
+    DamageEvents,
+    NormalizePerception,
+    ParticleRows,
+    SpeciesTags,
+    VectorDamageEvents,
+    VectorSpeciesTags,
+)
+
+
+def test_an_event_is_written_as_it_is_read_and_has_the_usual_size_without_one():
+    for text in ("100:cut", "0:wipe:0.25", "7:noise:0.01"):
+        assert str(parse_damage(text)) == text
+    assert (parse_damage("5:clump").extent, parse_damage("5:clump").text) == (0.2, "clump 0.2")
+    assert DamageEvent(5, "clump", 0.3).extent == 0.3
+
+
+def test_damage_comes_after_the_step_of_its_number_and_not_before():
+    plain, hurt = single(), DamageEvents(single(), "3:wipe:0.2")
+    observation, _ = plain.reset(seed=5)
+    np.testing.assert_array_equal(hurt.reset(seed=5)[0], observation)
+    for step in range(1, 4):
+        action = policy(observation)
+        expected, seen = plain.step(action), hurt.step(action)
+        assert seen[1] == expected[1]
+        assert ("loss_damage" in seen[4]) == (step == 3)
+        observation = expected[0]
+        if step < 3:
+            np.testing.assert_array_equal(seen[0], observation)
+    x, s = plain.unwrapped.particles()
+    hurt_x, hurt_s = hurt.unwrapped.particles()
+    wiped = (hurt_s != s).any(dim=1)
+    assert torch.equal(hurt_x, x)
+    assert (hurt_s[wiped] == 0).all()
+    assert 1 <= wiped.sum() < 64
+    assert torch.pdist(x[wiped]).max() <= 0.4
+
+
+def test_damage_gives_no_reward_and_info_says_how_much_was_lost():
+    env = DamageEvents(single(), "4:clump:0.5")
+    observation, info = env.reset(seed=2)
+    losses, rewards, damage = [info["loss"]], [None], [0.0]
+    for _ in range(STEPS):
+        observation, reward, _, _, info = env.step(policy(observation))
+        losses.append(info["loss"])
+        rewards.append(reward)
+        damage.append(info.get("loss_damage", 0.0))
+        parts = info["loss_density"] + info["loss_colour"]
+        assert parts == pytest.approx(info["loss"], rel=1e-6)
+    assert damage[4] != 0.0
+    assert sum(value != 0 for value in damage) == 1
+    for k in range(1, STEPS + 1):
+        assert rewards[k] == pytest.approx(losses[k - 1] - losses[k] + damage[k], abs=1e-5)
+
+
+def test_damage_leaves_the_randomness_of_later_steps_as_it_is():
+    plain, hurt = single(), DamageEvents(single(), ["2:cut", "2:noise"])
+    observation, _ = plain.reset(seed=1)
+    hurt.reset(seed=1)
+    for _ in range(2):
+        action = policy(observation)
+        observation, *_ = plain.step(action)
+        damaged, *_ = hurt.step(action)
+    assert not np.array_equal(damaged, observation)
+    hurt.unwrapped.place_particles(*plain.unwrapped.particles())
+    for _ in range(3):
+        action = policy(observation)
+        observation, *_ = plain.step(action)
+        np.testing.assert_array_equal(hurt.step(action)[0], observation)
+
+
+@pytest.mark.parametrize("kind", ["wipe:0.3", "cut", "clump:0.4", "noise"])
+def test_a_stack_of_wrappers_damages_as_one_with_all_events(kind):
+    events = [f"2:{kind}", "5:cut"]
+    one, alone = DamageEvents(single(), [*events, f"2:{kind}"]), DamageEvents(single(), events[0])
+    stack = DamageEvents(wrappers.ClipAction(DamageEvents(single(), events)), f"2:{kind}")
+    begun(one, stack, alone, seed=6)
+    for step in range(1, 6):
+        action = actions(step)
+        expected, seen, lone = (env.step(action) for env in (one, stack, alone))
+        np.testing.assert_array_equal(seen[0], expected[0])
+        assert seen[4]["loss"] == expected[4]["loss"]
+        lost = [info.get("loss_damage") for info in (seen[4], expected[4])]
+        assert (lost == [None, None]) == (step not in (2, 5))
+        assert lost[0] == (lost[1] and pytest.approx(lost[1], abs=1e-6))
+        if step == 2:
+            assert not np.array_equal(lone[0], expected[0]), "the two events damaged one place"
+
+
+@pytest.mark.parametrize("output", ["numpy", "torch"])
+def test_a_stack_tells_of_worlds_that_only_one_of_its_wrappers_damaged(output):
+    envs = VectorDamageEvents(batched(output=output), "2:cut")
+    envs = VectorDamageEvents(envs, "3:wipe:1")
+    observations, _ = envs.reset(seed=0)
+    envs.step(policy(observations))
+    observations, _ = envs.reset(options={"reset_mask": np.array([True, False, False])})
+    observations, *_ = envs.step(policy(observations))
+    observations, *_, infos = envs.step(policy(observations))
+    assert infos["_loss_damage"].tolist() == [True, True, True]
+    assert all(infos["loss_damage"].tolist())
+    assert isinstance(infos["loss_damage"], torch.Tensor) == (output == "torch")
+    assert isinstance(observations, torch.Tensor) == (output == "torch")
+
+
+def test_worlds_are_damaged_by_their_own_episodes():
+    envs = VectorDamageEvents(batched(), "3:cut")
+    observations, _ = envs.reset(seed=0)
+    for _ in range(2):
+        observations, *_ = envs.step(policy(observations))
+    observations, _ = envs.reset(options={"reset_mask": np.array([False, True, False])})
+    seen = []
+    for _ in range(4):
+        observations, _, _, _, infos = envs.step(policy(observations))
+        seen.append(infos.get("_loss_damage", np.zeros(3, bool)).tolist())
+    none = [False] * 3
+    assert seen == [[True, False, True], none, [False, True, False], none]
+
+
+@pytest.mark.parametrize("mode", ["same-step", "next-step", "disabled"])
+def test_an_episode_that_is_over_is_left_alone(mode):
+    envs = VectorDamageEvents(batched(autoreset_mode=mode), [f"{STEPS}:wipe:3", "0:cut"])
+    observations, infos = envs.reset(seed=0)
+    assert infos["_loss_damage"].all()
+    for _ in range(STEPS):
+        observations, _, _, truncations, infos = envs.step(policy(observations))
+    assert truncations.all()
+    _, s = envs.unwrapped.particles()
+    assert ("_loss_damage" in infos) == (mode == "same-step")
+    assert bool((s == 0).all()) == (mode == "same-step")
+    if mode == "next-step":
+        *_, infos = envs.step(policy(observations))
+        assert infos["_loss_damage"].all()
+
+
+def test_reused_buffers_show_the_same():
+    ways = []
+    for copy in (True, False):
+        envs = VectorDamageEvents(batched(copy=copy, reward="particle"), "2:clump:0.4", every=2)
+        observations, _ = envs.reset(seed=4)
+        way = []
+        for _ in range(STEPS - 1):
+            observations, rewards, _, _, infos = envs.step(policy(observations))
+            way += [observations.copy(), rewards.copy(), infos["particle_reward"].copy()]
+        ways.append(way)
+    assert all((reward != 0).all() for reward in ways[0][1::3])
+    assert_same(*ways)
+
+
+def test_the_spec_says_what_is_done():
+    env = DamageEvents(single(), ["3:cut", DamageEvent(5, "wipe", 0.3)], every=4)
+    wrapper = env.spec.additional_wrappers[-1]
+    assert wrapper.kwargs == {"events": ["3:cut", "5:wipe:0.3"], "every": 4}
+
+
+def test_what_is_context_info_a_damaged_world_is_context_info_it_as_it_is():
+    keywords = {"particle_count": 64, "grow_steps": 32}
+    env = begun(DamageEvents(gym.make("npa/Shepherd2DSmall-v0", **keywords), "1:clump:0.6"))
+    env.action_space.seed(0)
+    observation, *_, info = env.step(env.action_space.sample())
+    assert info["loss_damage"] > 0.0
+    assert info["lost"] == pytest.approx(float(observation["achieved_goal"][2]), rel=1e-5)
+    vector = gym.make_vec("npa/Shepherd2DSmall-v0", num_envs=2, **keywords)
+    envs = begun(VectorDamageEvents(vector, "1:clump:0.6"))
+    envs.action_space.seed(0)
+    observations, *_, infos = envs.step(envs.action_space.sample())
+    lost = observations["achieved_goal"][:, 2]
+    # What is observed stays within the space.
+    largest = envs.observation_space["achieved_goal"].high[:, 2]
+    np.testing.assert_allclose(np.minimum(infos["lost"], largest), lost, rtol=1e-5)
+
+
+# World k is as the single one
+
+
+def stacked(events, clip):
+    """Return a wrapper of two layers of damage."""
+    return lambda env: events(clip(events(env, ["2:cut", "5:wipe:0.3"])), "2:cut")
+
+
+STACK = stacked(DamageEvents, wrappers.ClipAction)
+STACKS = stacked(VectorDamageEvents, vector.ClipAction)
+DAMAGE, TAGS = (DamageEvents, VectorDamageEvents), (SpeciesTags, VectorSpeciesTags)
+WRAPPERS = {
+    "damage": (DAMAGE, (["3:cut", "5:wipe:0.3", "5:noise"],), {}),
+    "damage of the start": (DAMAGE, ("0:clump:0.3",), {}),
+    "damage that comes again": (DAMAGE, (["2:wipe:0.2"],), {"every": 3}),
+    "a stack of damage": ((STACK, STACKS), (), {}),
+    "tags": (TAGS, (3,), {}),
+    "drawn tags": (TAGS, (3,), {"assignment": "random"}),
+}
+
+
+@pytest.mark.parametrize("mode", ["same-step", "next-step"])
+@pytest.mark.parametrize("output", ["numpy", "torch"])
+@pytest.mark.parametrize("kind", WRAPPERS)
+def test_world_k_is_as_the_single_environment_over_autoresets(kind, output, mode):
+    (one, many), given, named = WRAPPERS[kind]
+    envs = many(batched(autoreset_mode=mode, output=output), *given, **named)
+    singles = [one(single(), *given, **named) for _ in range(3)]
+    envs.action_space.seed(0)
+    actions = [envs.action_space.sample() for _ in range(2 * STEPS + 1)]
+    reasons, _ = assert_batch_of_singles(envs, singles, actions, mode)
+    assert reasons == {None, "time limit"}
+
+
+@pytest.mark.parametrize("output", ["numpy", "torch"])
+def test_a_mask_gives_species_anew_to_its_worlds_alone(output):
+    given = {"autoreset_mode": "disabled", "output": output}
+    envs = VectorSpeciesTags(batched(**given), 3, assignment="random")
+    envs.reset(seed=20)
+    first = np.asarray(envs.species)
+    observations, _ = envs.reset(options={"reset_mask": np.array([True, False, True])})
+    species = np.asarray(envs.species)
+    assert (species == first).all(axis=1).tolist() == [False, True, False]
+    np.testing.assert_array_equal(np.asarray(observations)[..., 66:].argmax(axis=-1), species)
+
+
+# Species tags
+
+
+SLOW = np.full((64, 18), 0.1, np.float32)
+
+
+def test_tags_stand_behind_the_observation():
+    env, plain = SpeciesTags(single(), 2), single()
+    observation, _ = env.reset(seed=0)
+    np.testing.assert_array_equal(observation[:, :66], plain.reset(seed=0)[0])
+    np.testing.assert_array_equal(env.species, np.repeat([0, 1], 32))
+    np.testing.assert_array_equal(observation[:, 66:], np.eye(2, dtype=np.float32)[env.species])
+    later, *_ = env.step(SLOW)
+    np.testing.assert_array_equal(later[:, 66:], observation[:, 66:])
+    assert env.observation_space.shape == (64, 68)
+    assert env.observation_space.contains(later)
+    assert env.observation_space.high[0, -1] == 1.0
+    assert env.observation_space.low[0, -1] == 0.0
+
+
+@pytest.mark.parametrize("assignment", ["blocks", "random"])
+def test_fractions_are_kept_and_the_worlds_left_as_they_are(assignment):
+    env, plain = begun(
+        SpeciesTags(single(), 3, fractions=[2, 1, 1], assignment=assignment), single()
+    )
+    assert np.bincount(env.species).tolist() == [32, 16, 16]
+    for _ in range(3):
+        np.testing.assert_array_equal(env.step(SLOW)[0][:, :66], plain.step(SLOW)[0])
+
+
+def test_random_species_are_drawn_for_each_episode_and_hold_through_it():
+    env = SpeciesTags(single(), 2, assignment="random")
+    first, _ = env.reset(seed=4)
+    species = env.species
+    for _ in range(3):
+        observation, *_ = env.step(SLOW)
+        np.testing.assert_array_equal(observation[:, 66:], first[:, 66:])
+    env.reset()
+    assert (env.species != species).any()
+    env.reset(seed=4)
+    np.testing.assert_array_equal(env.species, species)
+
+
+def test_tags_stand_behind_what_other_wrappers_make_of_the_rows():
+    env, plain = SpeciesTags(NormalizePerception(single()), 2), NormalizePerception(single())
+    observation, _ = env.reset(seed=0)
+    np.testing.assert_array_equal(observation[:, :66], plain.reset(seed=0)[0])
+    np.testing.assert_array_equal(observation[:, 66:].argmax(axis=1), env.species)
+
+
+# Gymnasium's own wrappers
+
+
+def actions(step, *shape):
+    return np.random.default_rng(step).uniform(-1, 1, (*shape, 64, ACTIONS)).astype(np.float32)
+
+
+ROW = spaces.Box(-1.0, 1.0, (64 * ACTIONS,))
+BINS = np.arange(64 * ACTIONS) % 5
+ACTION = actions(0)
+
+
+@pytest.mark.parametrize(
+    ("wrap", "given", "expected"),
+    [
+        (wrappers.ClipAction, 3 * ACTION, np.clip(3 * ACTION, -1, 1)),
+        (
+            lambda env: wrappers.RescaleAction(env, np.float32(0.0), np.float32(1.0)),
+            (ACTION + 1) / 2,
+            ACTION,
+        ),
+        # The middles of five bins of [-1, 1].
+        pytest.param(
+            lambda env: wrappers.DiscretizeAction(env, bins=5, multidiscrete=True),
+            BINS,
+            (0.4 * BINS - 0.8).astype(np.float32).reshape(64, ACTIONS),
+            marks=pytest.mark.skipif(
+                not hasattr(wrappers, "DiscretizeAction"), reason="Gymnasium before 1.2"
+            ),
+        ),
+        # In one row, as RLlib takes them.
+        (
+            lambda env: wrappers.TransformAction(env, lambda a: a.reshape(64, ACTIONS), ROW),
+            ACTION.ravel(),
+            ACTION,
+        ),
+    ],
+    ids=["clipped", "rescaled", "numbers of bins", "one row"],
+)
+def test_actions_of_other_forms(wrap, given, expected):
+    env, plain = begun(wrap(single()), single())
+    np.testing.assert_allclose(env.step(given)[0], plain.step(expected)[0], atol=1e-4)
+
+
+def test_record_video(tmp_path):
+    pytest.importorskip("moviepy")
+    env = wrappers.RecordVideo(single(render_mode="rgb_array", render_size=32), str(tmp_path))
+    env.reset(seed=0)
+    for step in range(STEPS):
+        env.step(actions(step))
+    env.close()
+    assert [path.suffix for path in tmp_path.glob("*.mp4")] == [".mp4"]
+
+
+def test_partial_resets_pass_through_gymnasiums_statistics():
+    env = begun(VectorDamageEvents(vector.RecordEpisodeStatistics(batched()), "0:cut"))
+    options = {"reset_mask": np.array([True, False, False])}
+    _, infos = env.reset(options=options)
+    assert infos["_loss_damage"].tolist() == [True, False, False]
+    assert "reset_mask" in options
+
+
+# Particles as rows
+
+
+def worlds_of(count=2, **keywords):
+    return batched(count, autoreset_mode="next-step", **keywords)
+
+
+@pytest.mark.parametrize("output", ["numpy", "torch"])
+@pytest.mark.parametrize("own", [False, True])
+def test_rows_are_the_particles_of_the_worlds_in_order(own, output):
+    keywords = {"reward": "particle"} if own else {}
+    rows, envs = ParticleRows(worlds_of(output=output, **keywords)), worlds_of(**keywords)
+    assert rows.num_envs == 128
+    assert rows.single_observation_space == gym.spaces.Box(-64.0, 64.0, (66,), np.float32)
+    assert rows.action_space.shape == (128, ACTIONS)
+    assert rows.metadata["autoreset_mode"] is AutoresetMode.NEXT_STEP
+    seen, _ = rows.reset(seed=3)
+    observation, _ = envs.reset(seed=3)
+    for step in range(1, 2 * STEPS + 1):
+        np.testing.assert_array_equal(seen, observation.reshape(128, 66))
+        seen, rewards, ended, cut, infos = rows.step(policy(seen))
+        observation, paid, _, truncations, own_infos = envs.step(policy(observation))
+        expected = own_infos["particle_reward"].reshape(-1) if own else np.repeat(paid, 64)
+        np.testing.assert_array_equal(rewards, expected.astype(np.float64))
+        np.testing.assert_array_equal(cut, np.repeat(truncations, 64))
+        assert cut.all() == cut.any() == (step % (STEPS + 1) == STEPS)
+        assert not ended.any()
+        assert infos == {}
+
+
+def test_gymnasiums_wrappers_lie_over_rows():
+    rows = begun(RecordEpisodeStatistics(ParticleRows(worlds_of())))
+    for _ in range(STEPS):
+        *_, infos = rows.step(np.zeros((128, ACTIONS), np.float32))
+    assert infos["episode"]["l"].tolist() == [STEPS] * 128
+    listed = DictInfoToList(ParticleRows(worlds_of()))
+    assert listed.reset(seed=0)[1] == [{}] * 128
+
+
+def test_rows_close_their_worlds_once():
+    envs = worlds_of(2)
+    rows = ParticleRows(envs)
+    assert not envs.closed
+    rows.close()
+    assert envs.closed
+    rows.close()
