@@ -52,10 +52,8 @@ def compare(new, old):
     found, both = [], (("new", new), ("old", old))
     for name in sorted({*new, *old}):
         if name.endswith("/EXCEPTION"):
-            sides = {"new": new, "old": old}
-            found.append(
-                (name, "; ".join(f"{k}: {v[name]}" for k, v in sides.items() if name in v))
-            )
+            said = [f"{word}: {side[name]}" for word, side in both if name in side]
+            found.append((name, "; ".join(said)))
         elif name not in new or name not in old:
             found.append((name, "is not there any more" if name in old else "was not there"))
         elif (change := difference(new[name], old[name])) is not None:
