@@ -17,14 +17,14 @@ import numpy as np
 HERE = Path(__file__).resolve().parent
 ROOT = HERE.parents[1]
 
-ACCEPTED: dict[str, str] = {
+ACCEPTED = {
     "film/gecko/growth-filmstrip.png": "its caption says wipe for erase",
     "healing/heart/healing/1/damage": "the word is wiped, was erased",
 }
 """Beginnings of names of arrays that may differ, or be there on one side alone, and why."""
 
 
-def start(tree: Path, script: Path, out: Path, only: str) -> "subprocess.Popen[bytes]":
+def start(tree, script, out, only):
     """Run a script of scenes by the library of a tree."""
     paths = os.pathsep.join(map(str, (tree, tree / "tests" / "golden")))
     variables = os.environ | {"PYTHONPATH": paths, "OMP_NUM_THREADS": "1", "COLUMNS": "200"}
@@ -32,7 +32,7 @@ def start(tree: Path, script: Path, out: Path, only: str) -> "subprocess.Popen[b
     return subprocess.Popen(command, cwd=out.parent, env=variables)
 
 
-def difference(left: np.ndarray, right: np.ndarray) -> str | None:
+def difference(left, right):
     """Return in what two arrays differ, or None where all bits are the same."""
     # Texts have types by their length.
     if left.shape != right.shape or (left.dtype != right.dtype and left.dtype.kind != "U"):
@@ -47,17 +47,13 @@ def difference(left: np.ndarray, right: np.ndarray) -> str | None:
     return f"by up to {np.nanmax(error):.3g}, where the largest is {np.nanmax(np.abs(right)):.3g}"
 
 
-def compare(new: dict[str, np.ndarray], old: dict[str, np.ndarray]) -> list[tuple[str, str]]:
+def compare(new, old):
     """Return names and differences: of arrays, of which are there, and scenes that failed."""
-    found = []
+    found, both = [], (("new", new), ("old", old))
     for name in sorted({*new, *old}):
         if name.endswith("/EXCEPTION"):
-            sides = [
-                f"{word}: {side[name]}"
-                for word, side in (("new", new), ("old", old))
-                if name in side
-            ]
-            found.append((name, "; ".join(sides)))
+            said = [f"{word}: {side[name]}" for word, side in both if name in side]
+            found.append((name, "; ".join(said)))
         elif name not in new or name not in old:
             found.append((name, "is not there any more" if name in old else "was not there"))
         elif (change := difference(new[name], old[name])) is not None:
@@ -65,13 +61,7 @@ def compare(new: dict[str, np.ndarray], old: dict[str, np.ndarray]) -> list[tupl
     return found
 
 
-def read(path: Path) -> dict[str, np.ndarray]:
-    """Return the arrays of a file."""
-    with np.load(path) as file:
-        return {name.replace("|", "/"): file[name] for name in file.files}
-
-
-def main(only: str = "") -> int:
+def main(only=""):
     """Compare, and print what differs."""
     began = time.perf_counter()
     commit = (HERE / "commit").read_text(encoding="utf-8").strip()
@@ -92,7 +82,10 @@ def main(only: str = "") -> int:
             codes = [run.wait() for run in runs]
             if any(codes):
                 return 2
-            new, old = (read(folder / name / "out.npz") for name in sides)
+            new, old = ({}, {})
+            for name, arrays in (("new", new), ("old", old)):
+                with np.load(folder / name / "out.npz") as file:
+                    arrays |= {key.replace("|", "/"): file[key] for key in file.files}
         finally:
             subprocess.run([*git, "remove", "--force", str(tree)], check=True)
     found = compare(new, old)
@@ -100,11 +93,9 @@ def main(only: str = "") -> int:
     for name, said in found:
         print(f"{'accepted' if name in accepted else 'DIFFERS '} {name}: {said}")
     wrong = len(found) - len(accepted)
-    seconds = time.perf_counter() - began
-    print(
-        f"{len(new)} arrays, {sum(a.size for a in new.values())} numbers, against {commit}: "
-        f"{wrong} differ, {len(accepted)} accepted; {seconds:.0f} s"
-    )
+    size, seconds = sum(array.size for array in new.values()), time.perf_counter() - began
+    print(f"{len(new)} arrays, {size} numbers, against {commit}:")
+    print(f"{wrong} differ, {len(accepted)} accepted; {seconds:.0f} s")
     return 1 if wrong or not new else 0
 
 

@@ -5,6 +5,7 @@ Run by hand with the library importable: `OMP_NUM_THREADS=1 python tests/golden/
 
 import json
 import os
+import shutil
 import subprocess
 import sys
 import tempfile
@@ -13,12 +14,11 @@ from pathlib import Path
 
 import names
 import numpy as np
-import runs
 import scenes
 import torch
 
 import npa_envs
-from npa_envs.trained_tasks import task_of_rule
+from npa_envs.training.trained_tasks import task_of_rule
 
 FOLDER = Path(__file__).resolve().parent
 
@@ -32,7 +32,21 @@ SEEDS = {"gecko": 1, "dots": 5, "duck": 6, "digits": 3}
 """Seeds of worlds in which rounding stays small: no particle is near a jump of the dynamics."""
 
 
-def grow(name: str) -> dict[str, np.ndarray]:
+CHECKPOINT_INTERVAL, ITERATIONS = 6, 12
+"""Of the runs that are killed."""
+
+OPTIONS = [
+    *("--preset", "tiny", "--iterations", str(ITERATIONS), "--no-progress"),
+    *("--checkpoint-interval", str(CHECKPOINT_INTERVAL)),
+    *("--picture-interval", str(CHECKPOINT_INTERVAL)),
+]
+"""What they were started with."""
+
+RUNS = {"morphogenesis2d": "unfinished_run", "co_morphogenesis2d": "unfinished_joint_run"}
+"""Their folders by task."""
+
+
+def grow(name):
     """Return two worlds of a shipped rule after some steps from the seed of its task."""
     rule = scenes.rule_named(name)
     # As many particles as are stored fill a smaller ball.
@@ -49,37 +63,32 @@ def grow(name: str) -> dict[str, np.ndarray]:
     return {f"world/{name}/x": x.numpy(), f"world/{name}/s": s.numpy()}
 
 
-def run_and_kill(task: str, folder: Path) -> None:
+def run_and_kill(task, folder):
     """Write the folder of a run that was killed between two checkpoints."""
     with tempfile.TemporaryDirectory() as place:
-        command = [sys.executable, "-m", "npa_envs.cli", "train", task, *runs.OPTIONS]
+        command = [sys.executable, "-m", "npa_envs.cli", "train", task, *OPTIONS]
         process = subprocess.Popen([*command, "--out", "run"], cwd=place)
         log = Path(place) / "run" / "log.jsonl"
         while process.poll() is None:
             time.sleep(0.002)
-            if (
-                log.is_file()
-                and len(log.read_text(encoding="utf-8").splitlines()) > runs.CHECKPOINT_INTERVAL
-            ):
+            lines = log.read_text(encoding="utf-8").splitlines() if log.is_file() else []
+            if len(lines) > CHECKPOINT_INTERVAL:
                 break
         process.kill()
         process.wait()
-        runs.keep(Path(place) / "run", folder)
-        subprocess.run(
-            [*command, "--out", "whole"], cwd=place, check=True, stdout=subprocess.DEVNULL
-        )
-        whole = (Path(place) / "whole" / "log.jsonl").read_text(encoding="utf-8")
-        (folder / "whole_log.jsonl").write_text(whole, encoding="utf-8")
+        shutil.rmtree(folder, ignore_errors=True)
+        shutil.copytree(Path(place) / "run", folder)
+        whole = [*command, "--out", "whole"]
+        subprocess.run(whole, cwd=place, check=True, stdout=subprocess.DEVNULL)
+        shutil.copy(Path(place) / "whole" / "log.jsonl", folder / "whole_log.jsonl")
 
 
-def main() -> None:
+def main():
     """Write all of it."""
     torch.set_num_threads(1)
     # Helps of commands are wrapped no narrower than the test reads them.
     os.environ["COLUMNS"] = "200"
-    arrays: dict[str, np.ndarray] = {}
-    for name in scenes.RULES:
-        arrays |= grow(name)
+    arrays = {key: array for name in scenes.RULES for key, array in grow(name).items()}
     # Scenes read the worlds from the file.
     np.savez_compressed(scenes.GOLDEN, **arrays)
     for name in scenes.SCENES:
@@ -88,10 +97,9 @@ def main() -> None:
         print(f"{name}: {time.perf_counter() - began:.2f} s")
     np.savez_compressed(scenes.GOLDEN, **arrays)
     content = names.everything() | {"documented": names.documented(FOLDER.parents[1])}
-    (FOLDER / "golden.json").write_text(
-        json.dumps(content, indent=1, sort_keys=True) + "\n", encoding="utf-8"
-    )
-    for task, folder in runs.FOLDERS.items():
+    text = json.dumps(content, indent=1, sort_keys=True) + "\n"
+    (FOLDER / "golden.json").write_text(text, encoding="utf-8")
+    for task, folder in RUNS.items():
         run_and_kill(task, FOLDER / folder)
 
 

@@ -1,38 +1,30 @@
 """What is public besides numbers: names, ids, commands with their options, documented imports."""
 
 import contextlib
+import functools
 import importlib
 import inspect
 import io
 import re
-from pathlib import Path
-from typing import Any
 
 import gymnasium
+import pettingzoo
 
 import npa_envs
 from npa_envs.cli import COMMANDS, main
+from npa_envs.training import TASKS
 
-PACKAGES = (
-    "npa_envs",
-    "npa_envs.agents",
-    "npa_envs.agents.learning",
-    "npa_envs.envs",
-    "npa_envs.envs.multi",
-    "npa_envs.ops",
-    "npa_envs.render",
-    "npa_envs.training",
-    "npa_envs.wrappers",
-)
+OF_PACKAGE = ("agents", "agents.learning", "envs", "envs.multi", "ops", "render", "training")
+PACKAGES = ("npa_envs", *(f"npa_envs.{name}" for name in (*OF_PACKAGE, "wrappers")))
 """Packages that list their public names."""
 
 
-def public_names() -> dict[str, list[str]]:
+def public_names():
     """Return each package's public names."""
     return {name: sorted(importlib.import_module(name).__all__) for name in PACKAGES}
 
 
-def signatures() -> dict[str, list[str]]:
+def signatures():
     """Return what each public callable of the library takes: names, kinds, whether optional."""
     found = {}
     for name in npa_envs.__all__:
@@ -46,10 +38,8 @@ def signatures() -> dict[str, list[str]]:
     return found
 
 
-def ids() -> dict[str, list[str]]:
+def ids():
     """Return the ids that Gymnasium and PettingZoo know of ours."""
-    import pettingzoo
-
     for module in ("multispecies_v0", "particles_v0"):
         importlib.import_module(f"npa_envs.envs.{module}")
     # PettingZoo before 1.27 has no registries.
@@ -64,7 +54,7 @@ def ids() -> dict[str, list[str]]:
     }
 
 
-def options(*words: str) -> list[str]:
+def options(*words):
     """Return the options that a command's help names."""
     text = io.StringIO()
     with contextlib.redirect_stdout(text), contextlib.suppress(SystemExit):
@@ -72,12 +62,8 @@ def options(*words: str) -> list[str]:
     return sorted(set(re.findall(r"--[a-z][a-z0-9-]*[a-z0-9]", text.getvalue())))
 
 
-def documented(folder: Path) -> list[str]:
-    """Return the names that documents take from the library and that are there.
-
-    Args:
-        folder: The repository.
-    """
+def documented(folder):
+    """Return the names that documents of a repository take from the library and that are there."""
     texts = [path.read_text(encoding="utf-8") for path in sorted(folder.glob("docs/**/*.md"))]
     text = "\n".join([*texts, (folder / "README.md").read_text(encoding="utf-8")])
     names = set(re.findall(r"\bnpa_envs(?:\.\w+)+", text))
@@ -88,27 +74,21 @@ def documented(folder: Path) -> list[str]:
     return sorted(name for name in names if is_there(name))
 
 
-def is_there(name: str) -> bool:
+def is_there(name):
     """Return whether a dotted name can be imported."""
     parts = name.split(".")
     for size in range(len(parts), 0, -1):
-        try:
-            value = importlib.import_module(".".join(parts[:size]))
-        except ImportError:
-            continue
-        try:
-            for part in parts[size:]:
-                value = getattr(value, part)
-        except (AttributeError, ImportError):
+        with contextlib.suppress(ImportError):
+            module = importlib.import_module(".".join(parts[:size]))
+            with contextlib.suppress(AttributeError):
+                functools.reduce(getattr, parts[size:], module)
+                return True
             return False
-        return True
     return False
 
 
-def everything() -> dict[str, Any]:
+def everything():
     """Return all of it but the documented names."""
-    from npa_envs.training import TASKS
-
     commands = {name: options(name) for name in COMMANDS if name != "train"}
     commands |= {f"train {task}": options("train", task) for task in TASKS}
     return {

@@ -4,26 +4,23 @@ A scene returns arrays by name. Its numbers come from stored worlds or from seed
 short, because the dynamics amplify rounding.
 """
 
+import functools
 import math
-from collections.abc import Callable, Mapping
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import gymnasium
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 import npa_envs
-
-Arrays = dict[str, NDArray[Any]]
+from npa_envs.envs import multispecies_v0, particles_v0
 
 GOLDEN = Path(__file__).resolve().parent / "golden.npz"
 """Stored worlds, and what each scene gave."""
 
-RULES: dict[str, dict[str, Any]] = {
+RULES = {
     "gecko": {"eps": 0.1, "box": None},
     "dots": {"eps": 0.2, "box": (2.0, 2.0)},
     "duck": {"eps": 0.1, "box": None},
@@ -39,25 +36,11 @@ KEPT_RULES = {
 }
 """Rules that are no longer shipped as they were when their worlds were stored."""
 
-
-def rule_named(name: str) -> npa_envs.NPARule:
-    """Return the rule whose world is stored under a name."""
-    return npa_envs.load_rule(KEPT_RULES.get(name, name))
-
-
-KEPT = 512
-"""Numbers kept of an array; of more, every so-manyth."""
-
 DTYPES = {"f32": torch.float32, "f64": torch.float64}
 
 
-def kept(values: Any, limit: int = KEPT) -> NDArray[Any]:
-    """Return an array as it is, or where it is large every so-manyth number of it.
-
-    Args:
-        values: An array or a tensor.
-        limit: About how many numbers to keep.
-    """
+def kept(values, limit=512):
+    """Return an array as it is, or where it is larger than a limit every so-manyth number of it."""
     array = values.detach().numpy() if isinstance(values, Tensor) else np.asarray(values)
     if array.size <= limit:
         return array.copy()
@@ -68,37 +51,42 @@ def kept(values: Any, limit: int = KEPT) -> NDArray[Any]:
     return array.reshape(-1)[::stride].copy()
 
 
-def drawn(seed: int, like: Tensor) -> Tensor:
-    """Return normal numbers of a tensor's shape and dtype."""
-    return torch.from_numpy(np.random.default_rng(seed).standard_normal(like.shape)).to(like)
-
-
-def functional(*tensors: Tensor) -> Tensor:
+def functional(*tensors):
     """Return a fixed linear functional of tensors."""
-    return torch.stack([(drawn(90 + k, t) * t).sum() for k, t in enumerate(tensors)]).sum()
+    parts = []
+    for k, tensor in enumerate(tensors):
+        weights = np.random.default_rng(90 + k).standard_normal(tensor.shape)
+        parts.append((torch.from_numpy(weights).to(tensor) * tensor).sum())
+    return torch.stack(parts).sum()
 
 
-def stored_world(name: str, dtype: torch.dtype) -> tuple[Tensor, Tensor]:
+def rule_named(name, dtype=torch.float32):
+    """Return the rule whose world is stored under a name."""
+    return npa_envs.load_rule(KEPT_RULES.get(name, name)).to(dtype)
+
+
+def stored_world(name, dtype):
     """Return the stored world of a rule: positions and states."""
     with np.load(GOLDEN) as stored:
-        x, s = (torch.from_numpy(stored[f"world/{name}/{part}"]) for part in "xs")
-    return x.to(dtype), s.to(dtype)
+        return [torch.from_numpy(stored[f"world/{name}/{part}"]).to(dtype) for part in "xs"]
 
 
-def random_world(
-    seed: int, particle_count: int, sides: tuple[float, ...], channels: int, dtype: torch.dtype
-) -> tuple[Tensor, Tensor]:
+def random_world(seed, particle_count, sides, channels, dtype):
     """Return two worlds uniform in a box around the origin, with normal states."""
     generator = np.random.default_rng(seed)
     shape = (2, particle_count, len(sides))
     x = (generator.uniform(size=shape) - 0.5) * np.array(sides)
     s = 0.5 * generator.standard_normal((2, particle_count, channels))
     # Rounded first, so that both precisions see the same world.
-    x, s = x.astype(np.float32), s.astype(np.float32)
-    return torch.from_numpy(x).to(dtype), torch.from_numpy(s).to(dtype)
+    return [torch.from_numpy(values.astype(np.float32)).to(dtype) for values in (x, s)]
 
 
-def gradients(loss: Tensor, x: Tensor, s: Tensor, *rules: npa_envs.NPARule) -> Arrays:
+def watched(x, s):
+    """Return positions and states that gradients are taken by."""
+    return x.detach().requires_grad_(), s.detach().requires_grad_()
+
+
+def gradients(loss, x, s, *rules):
     """Return gradients of a scalar by worlds and all weights."""
     named = {"x": x, "s": s}
     for k, rule in enumerate(rules):
@@ -108,202 +96,128 @@ def gradients(loss: Tensor, x: Tensor, s: Tensor, *rules: npa_envs.NPARule) -> A
     return {f"grad/{n}": kept(g) for n, g in zip(named, got, strict=True) if g is not None}
 
 
-def by_precision(scene: Callable[[torch.dtype], Arrays]) -> Arrays:
-    """Return what a scene gives in float32 and in float64."""
-    return {
-        f"{word}/{name}": array
-        for word, dtype in DTYPES.items()
-        for name, array in scene(dtype).items()
-    }
+def by_precision(scene):
+    """Make of a scene in one precision a scene in float32 and in float64."""
+
+    @functools.wraps(scene)
+    def both(*args, **options):
+        results = {word: scene(dtype, *args, **options) for word, dtype in DTYPES.items()}
+        return {f"{word}/{name}": a for word, found in results.items() for name, a in found.items()}
+
+    return both
 
 
 # Rollouts of one rule.
 
 
-def grown(name: str, steps: int) -> Arrays:
+@by_precision
+@torch.no_grad()
+def grown(dtype, name, steps):
     """Some steps of a shipped rule from its stored world."""
-
-    def scene(dtype: torch.dtype) -> Arrays:
-        rule, (x, s) = rule_named(name).to(dtype), stored_world(name, dtype)
-        x, s, path = npa_envs.rollout(
-            rule,
-            x,
-            s,
-            steps,
-            generator=npa_envs.WorldRandom([7, 8]),
-            return_path_length=True,
-            **RULES[name],
-        )
-        return {
-            "x": kept(x),
-            "s": kept(s),
-            "path": kept(path),
-            "outputs": kept(rule.read_out(s)),
-            "colour": kept(rule.colour(s)),
-        }
-
-    with torch.no_grad():
-        return by_precision(scene)
+    rule, (x, s) = rule_named(name, dtype), stored_world(name, dtype)
+    options = {"generator": npa_envs.WorldRandom([7, 8]), "return_path_length": True}
+    x, s, path = npa_envs.rollout(rule, x, s, steps, **options, **RULES[name])
+    found = {"x": x, "s": s, "path": path, "outputs": rule.read_out(s), "colour": rule.colour(s)}
+    return {name: kept(tensor) for name, tensor in found.items()}
 
 
-def differentiated(name: str, steps: int, **options: Any) -> Arrays:
+@by_precision
+def differentiated(dtype, name, steps, **options):
     """A few steps of a shipped rule, and gradients by the worlds and all weights."""
-
-    def scene(dtype: torch.dtype) -> Arrays:
-        rule, (x, s) = rule_named(name).to(dtype), stored_world(name, dtype)
-        x.requires_grad_()
-        s.requires_grad_()
-        after_x, after_s, path = npa_envs.rollout(
-            rule,
-            x,
-            s,
-            steps,
-            generator=torch.Generator().manual_seed(3),
-            return_path_length=True,
-            **(RULES[name] | options),
-        )
-        loss = functional(after_x, after_s, rule.read_out(after_s))
-        if path.requires_grad:
-            loss = loss + functional(path)
-        results = {"x": kept(after_x), "s": kept(after_s), "path": kept(path)}
-        return results | gradients(loss, x, s, rule)
-
-    return by_precision(scene)
+    rule, (x, s) = rule_named(name, dtype), watched(*stored_world(name, dtype))
+    options = RULES[name] | {"return_path_length": True} | options
+    generator = torch.Generator().manual_seed(3)
+    after_x, after_s, path = npa_envs.rollout(rule, x, s, steps, generator=generator, **options)
+    loss = functional(after_x, after_s, rule.read_out(after_s))
+    if path.requires_grad:
+        loss = loss + functional(path)
+    results = {"x": kept(after_x), "s": kept(after_s), "path": kept(path)}
+    return results | gradients(loss, x, s, rule)
 
 
-def untrained(space_dim: int, box: tuple[float, ...] | None, **parts: Any) -> Arrays:
+@by_precision
+def untrained(dtype, space_dim, box, **parts):
     """Three steps of a small random rule with other parts of perception, at another radius."""
-
-    def scene(dtype: torch.dtype) -> Arrays:
-        sides = (1.0, 0.8, 0.9)[:space_dim] if box is None else box
-        x, s = random_world(11, 96, sides, 5, dtype)
-        torch.manual_seed(5)
-        rule = npa_envs.NPARule(space_dim, 5, 24, eps0=0.2, **parts).to(dtype)
-        x.requires_grad_()
-        s.requires_grad_()
-        generator = npa_envs.WorldRandom([1, 2])
-        after = npa_envs.rollout(
-            rule, x, s, 3, eps=0.25, box=box, generator=generator, detach_positions=False
-        )
-        results = {"x": kept(after[0]), "s": kept(after[1])}
-        one = npa_envs.step(rule, x.detach(), s.detach(), eps=0.25, box=box, update_prob=1.0)
-        results |= {"step/x": kept(one[0]), "step/s": kept(one[1])}
-        return results | gradients(functional(*after), x, s, rule)
-
-    return by_precision(scene)
+    x, s = watched(*random_world(11, 96, box or (1.0, 0.8, 0.9)[:space_dim], 5, dtype))
+    torch.manual_seed(5)
+    rule = npa_envs.NPARule(space_dim, 5, 24, eps0=0.2, **parts).to(dtype)
+    options = {"generator": npa_envs.WorldRandom([1, 2]), "detach_positions": False}
+    after = npa_envs.rollout(rule, x, s, 3, eps=0.25, box=box, **options)
+    one = npa_envs.step(rule, x.detach(), s.detach(), eps=0.25, box=box, update_prob=1.0)
+    results = {"x": after[0], "s": after[1], "step/x": one[0], "step/s": one[1]}
+    results = {name: kept(tensor) for name, tensor in results.items()}
+    return results | gradients(functional(*after), x, s, rule)
 
 
 # Perception.
 
 
-def perceived(sides: tuple[float, ...], periodic: bool) -> Arrays:
+@by_precision
+def perceived(dtype, sides, periodic):
     """Perception vectors with gradients, and fields, of a random world."""
-
-    def scene(dtype: torch.dtype) -> Arrays:
-        x, s = random_world(21, 300 if len(sides) == 2 else 200, sides, 5, dtype)
-        box = sides if periodic else None
-        eps = 0.2 if len(sides) == 2 else 0.3
-        results: Arrays = {}
-        for inverse in ("threshold", "smooth"):
-            fields = npa_envs.perception_fields(x, s, eps, box, moment_inverse=inverse)
-            names = fields._fields if inverse == "threshold" else ("grad1",)
-            results |= {f"{inverse}/{n}": kept(getattr(fields, n), 400) for n in names}
-            x.requires_grad_()
-            s.requires_grad_()
-            z = npa_envs.perceive(
-                x, s, eps, 0.8 * eps, box, detach_positions=False, moment_inverse=inverse
-            )
-            results[f"{inverse}/z"] = kept(z)
-            found = gradients(functional(z), x, s)
-            results |= {f"{inverse}/{name}": array for name, array in found.items()}
-            x, s = x.detach(), s.detach()
-        results["detached/z"] = kept(npa_envs.perceive(x, s, eps, box=box, state_gradient=False))
-        results["plain/z"] = kept(npa_envs.perceive(x, s, eps, box=box, moment_correction=False))
-        results["mean"] = kept(npa_envs.world_mean(s))
-        return results
-
-    return by_precision(scene)
+    count, eps = (300, 0.2) if len(sides) == 2 else (200, 0.3)
+    x, s = random_world(21, count, sides, 5, dtype)
+    box = sides if periodic else None
+    results = {}
+    for inverse in ("threshold", "smooth"):
+        fields = npa_envs.perception_fields(x, s, eps, box, moment_inverse=inverse)
+        names = fields._fields if inverse == "threshold" else ("grad1",)
+        results |= {f"{inverse}/{n}": kept(getattr(fields, n), 400) for n in names}
+        own, options = watched(x, s), {"detach_positions": False, "moment_inverse": inverse}
+        z = npa_envs.perceive(*own, eps, 0.8 * eps, box, **options)
+        found = {"z": kept(z)} | gradients(functional(z), *own)
+        results |= {f"{inverse}/{name}": array for name, array in found.items()}
+    results["detached/z"] = kept(npa_envs.perceive(x, s, eps, box=box, state_gradient=False))
+    results["plain/z"] = kept(npa_envs.perceive(x, s, eps, box=box, moment_correction=False))
+    return results | {"mean": kept(npa_envs.world_mean(s))}
 
 
-def perceived_by_species(sides: tuple[float, ...], periodic: bool) -> Arrays:
+@by_precision
+def perceived_by_species(dtype, sides, periodic):
     """Perception vectors and fields of three species in a random world."""
-
-    def scene(dtype: torch.dtype) -> Arrays:
-        x, s = random_world(31, 120, sides, 4, dtype)
-        box, counts = sides if periodic else None, (60, 47, 13)
-        fields = npa_envs.species_fields(x, counts, eps=0.3, box=box)
-        results = {name: kept(getattr(fields, name)) for name in fields._fields}
-        x.requires_grad_()
-        s.requires_grad_()
-        z = npa_envs.perceive_species(x, s, counts, 0.3, 0.25, box, detach_positions=False)
-        return results | {"z": kept(z)} | gradients(functional(z), x, s)
-
-    return by_precision(scene)
+    x, s = watched(*random_world(31, 120, sides, 4, dtype))
+    box, counts = sides if periodic else None, (60, 47, 13)
+    fields = npa_envs.species_fields(x.detach(), counts, eps=0.3, box=box)
+    results = {name: kept(getattr(fields, name)) for name in fields._fields}
+    z = npa_envs.perceive_species(x, s, counts, 0.3, 0.25, box, detach_positions=False)
+    return results | {"z": kept(z)} | gradients(functional(z), x, s)
 
 
 # Rollouts of several rules.
 
 
-def together(perception: str, box: tuple[float, ...] | None, steps: int, **options: Any) -> Arrays:
+@by_precision
+def together(dtype, perception, box, steps, **options):
     """A few steps of two or three rules in one world, with gradients."""
-    counts = (60, 36) if perception == "shared" else (50, 30, 16)
-
-    def scene(dtype: torch.dtype) -> Arrays:
-        x, s = random_world(41, 96, (0.9, 0.7) if box is None else box, 5, dtype)
-        torch.manual_seed(6)
-        by_species = 0 if perception == "shared" else len(counts)
-        rules = [
-            npa_envs.NPARule(2, 5, 16 + 8 * k, eps0=0.2, species_count=by_species).to(dtype)
-            for k in range(len(counts))
-        ]
-        x.requires_grad_()
-        s.requires_grad_()
-        generator = npa_envs.WorldRandom([5, 9])
-        after = npa_envs.rollout_species(
-            rules,
-            x,
-            s,
-            steps,
-            counts=counts,
-            eps=0.25,
-            box=box,
-            perception=perception,
-            generator=generator,
-            return_path_length=True,
-            **options,
-        )
-        results = {n: kept(a) for n, a in zip(("x", "s", "path"), after, strict=True)}
-        return results | gradients(functional(*after), x, s, *rules)
-
-    return by_precision(scene)
+    shared = perception == "shared"
+    counts = (60, 36) if shared else (50, 30, 16)
+    x, s = watched(*random_world(41, 96, box or (0.9, 0.7), 5, dtype))
+    torch.manual_seed(6)
+    species = {"eps0": 0.2, "species_count": 0 if shared else len(counts)}
+    rules = [npa_envs.NPARule(2, 5, 16 + 8 * k, **species).to(dtype) for k in range(len(counts))]
+    options |= {"counts": counts, "eps": 0.25, "box": box, "perception": perception}
+    options |= {"generator": npa_envs.WorldRandom([5, 9]), "return_path_length": True}
+    after = npa_envs.rollout_species(rules, x, s, steps, **options)
+    results = {n: kept(a) for n, a in zip(("x", "s", "path"), after, strict=True)}
+    return results | gradients(functional(*after), x, s, *rules)
 
 
-def shipped_together() -> Arrays:
+@by_precision
+@torch.no_grad()
+def shipped_together(dtype):
     """Four steps of two shipped rules in the worlds of one, side by side."""
-
-    def scene(dtype: torch.dtype) -> Arrays:
-        x, s = stored_world("gecko", dtype)
-        counts = (x.shape[1] // 2, x.shape[1] - x.shape[1] // 2)
-        rules = [rule_named(name).to(dtype) for name in ("gecko", "heart")]
-        after = npa_envs.rollout_species(
-            rules,
-            x,
-            s,
-            4,
-            counts=counts,
-            update_prob=(0.5, 0.8),
-            density_counts=counts,
-            generator=torch.Generator().manual_seed(2),
-        )
-        return {"x": kept(after[0]), "s": kept(after[1])}
-
-    with torch.no_grad():
-        return by_precision(scene)
+    x, s = stored_world("gecko", dtype)
+    counts = (x.shape[1] // 2, x.shape[1] - x.shape[1] // 2)
+    rules = [rule_named(name, dtype) for name in ("gecko", "heart")]
+    options = {"counts": counts, "density_counts": counts, "update_prob": (0.5, 0.8)}
+    generator = torch.Generator().manual_seed(2)
+    after = npa_envs.rollout_species(rules, x, s, 4, generator=generator, **options)
+    return {"x": kept(after[0]), "s": kept(after[1])}
 
 
 # Environments.
 
-SMALL: dict[str, Any] = {
+SMALL = {
     "particle_count": 64,
     "eps": 0.3,
     "resolution": 16,
@@ -311,19 +225,14 @@ SMALL: dict[str, Any] = {
     "render_mode": "rgb_array",
 }
 
-OWN: dict[str, dict[str, Any]] = {
-    "npa/Regeneration2D-v0": {
-        "rule": "picture",
-        "target": "ring",
-        "seed_pool": 4,
-        "split_damage": False,
-    },
+OWN = {
+    "npa/Regeneration2D-v0": {"rule": "picture", "seed_pool": 4, "split_damage": False},
     "npa/PointClassification-v0": {"resolution": None},
     "npa/Morphogenesis3D-v0": {"seed_radius": 0.2, "view_count": 2, "target": "doughnut"},
 }
 
 
-def small(name: str, **keywords: Any) -> dict[str, Any]:
+def small(name, **keywords):
     """Return keywords of a small environment; None stands for a field that it does not have."""
     fields = SMALL | {"target": "ring"} | OWN.get(name, {}) | keywords
     if "Classification" in name or "Texture" in name:
@@ -331,26 +240,25 @@ def small(name: str, **keywords: Any) -> dict[str, Any]:
     return {key: value for key, value in fields.items() if value is not None}
 
 
-def actions(generator: np.random.Generator, shape: tuple[int, ...]) -> NDArray[np.float32]:
-    """Return random small actions."""
-    return generator.uniform(-0.3, 0.3, shape).astype(np.float32)
+def actions(generator, space):
+    """Return random small actions of a space."""
+    return generator.uniform(-0.3, 0.3, space.shape).astype(np.float32)
 
 
-def floats(info: Mapping[str, Any]) -> list[float]:
+def floats(info):
     """Return the numbers among what is told besides, by name in order."""
     return [info[name] for name in sorted(info) if name.startswith(("loss", "reward_"))]
 
 
-def episode(name: str, steps: int = 12, **keywords: Any) -> Arrays:
+def episode(name, steps=12, **keywords):
     """An episode of one environment by seeded actions."""
     env = gymnasium.make(name, **small(name, **keywords))
     generator = np.random.default_rng(12)
     observation, info = env.reset(seed=5)
-    losses = [np.array(floats(info), np.float32)]
+    losses = np.array([floats(info)], np.float32)
     observations, reports, ends, shares = [observation], [], [], []
     for _ in range(steps):
-        assert env.action_space.shape is not None
-        action = actions(generator, env.action_space.shape)
+        action = actions(generator, env.action_space)
         observation, reward, terminated, truncated, info = env.step(action)
         observations.append(observation)
         # Side by side, because rewards are differences of losses and as exact as those.
@@ -363,52 +271,43 @@ def episode(name: str, steps: int = 12, **keywords: Any) -> Arrays:
             observations.append(observation)
     results = {
         "observations": kept(np.stack(observations), 1100),
-        "reset": np.stack(losses),
+        "reset": losses,
         "reports": np.stack(reports),
         "ends": np.array(ends),
         "picture": np.asarray(env.render()),
     }
     if shares:
         results["shares"] = kept(np.stack(shares))
-    for part, tensor in zip("xs", env.unwrapped.particles(), strict=True):  # type: ignore[attr-defined]
-        results[part] = kept(tensor)
+    particles = zip("xs", env.unwrapped.particles(), strict=True)
+    results |= {part: kept(tensor) for part, tensor in particles}
     env.close()
     return results
 
 
-def batch_of_episodes(name: str, **keywords: Any) -> Arrays:
+def batch_of_episodes(name):
     """Twelve steps of two worlds of one environment, which start anew by themselves."""
-    envs = gymnasium.make_vec(
-        name,
-        num_envs=2,
-        vectorization_mode="vector_entry_point",
-        max_episode_steps=7,
-        **small(name, **keywords),
-    )
+    limits = {"vectorization_mode": "vector_entry_point", "max_episode_steps": 7}
+    envs = gymnasium.make_vec(name, num_envs=2, **limits, **small(name))
     generator = np.random.default_rng(13)
     observation, _ = envs.reset(seed=6)
     observations, reports, ends = [observation], [], []
     for _ in range(12):
-        assert envs.action_space.shape is not None
-        action = actions(generator, envs.action_space.shape)
+        action = actions(generator, envs.action_space)
         observation, reward, terminated, truncated, info = envs.step(action)
         observations.append(observation)
         reports.append(np.stack([reward, info["loss"]]).astype(np.float32))
         ends.append(np.stack([terminated, truncated]))
     envs.close()
-    return {
-        "observations": kept(np.stack(observations), 1100),
-        "reports": np.stack(reports),
-        "ends": np.stack(ends),
-    }
+    results = {"reports": np.stack(reports), "ends": np.stack(ends)}
+    return results | {"observations": kept(np.stack(observations), 1100)}
 
 
 # Environments of several species.
 
 
-def few(task: str, **keywords: Any) -> dict[str, Any]:
+def few(task, **keywords):
     """Return keywords of a small world of several species."""
-    fields: dict[str, Any] = {"eps": 0.3, "max_cycles": 10, "render_size": 24}
+    fields = {"eps": 0.3, "max_cycles": 10, "render_size": 24}
     if "particle_counts" not in keywords:
         fields["particle_count"] = 48
     if task in ("co_morphogenesis", "invasion", "symbiosis"):
@@ -416,12 +315,9 @@ def few(task: str, **keywords: Any) -> dict[str, Any]:
     return {"task": task, "render_mode": "rgb_array"} | fields | keywords
 
 
-def crowd(module: str, task: str, **keywords: Any) -> Arrays:
+def crowd(module, task, **keywords):
     """An episode of several agents, all at once, by seeded actions."""
-    from npa_envs.envs import multispecies_v0, particles_v0
-
-    makers = {"species": multispecies_v0, "particles": particles_v0}
-    env = makers[module].parallel_env(**few(task, **keywords))
+    env = module.parallel_env(**few(task, **keywords))
     generator = np.random.default_rng(14)
     observations, infos = env.reset(seed=5)
     seen, ends = [], []
@@ -430,12 +326,11 @@ def crowd(module: str, task: str, **keywords: Any) -> Arrays:
         if not env.agents:
             break
         seen.append(np.concatenate([observations[agent].ravel() for agent in env.agents]))
-        chosen = {a: actions(generator, env.action_space(a).shape) for a in env.agents}
-        acted = list(env.agents)
+        chosen = {a: actions(generator, env.action_space(a)) for a in env.agents}
         observations, rewards, terminated, truncated, infos = env.step(chosen)
-        report = [[rewards[agent], *floats(infos[agent])] for agent in acted]
+        report = [[rewards[agent], *floats(infos[agent])] for agent in chosen]
         reports.append(np.array(report, np.float32).ravel())
-        ends.append(np.array([[terminated[a], truncated[a]] for a in acted]).ravel())
+        ends.append(np.array([[terminated[a], truncated[a]] for a in chosen]).ravel())
     results = {
         "observations": kept(np.concatenate(seen), 1100),
         "reports": np.concatenate(reports),
@@ -447,11 +342,9 @@ def crowd(module: str, task: str, **keywords: Any) -> Arrays:
     return results
 
 
-def in_turn(task: str, **keywords: Any) -> Arrays:
+def in_turn(task):
     """An episode of several species, one after the other."""
-    from npa_envs.envs import multispecies_v0
-
-    env = multispecies_v0.env(**few(task, **keywords))
+    env = multispecies_v0.env(**few(task))
     generator = np.random.default_rng(15)
     env.reset(seed=5)
     seen, rewards, ends = [], [], []
@@ -462,40 +355,31 @@ def in_turn(task: str, **keywords: Any) -> Arrays:
         rewards.append([reward, info["loss"]])
         ends.append([terminated, truncated])
         over = terminated or truncated
-        env.step(None if over else actions(generator, env.action_space(agent).shape))
+        env.step(None if over else actions(generator, env.action_space(agent)))
     env.close()
-    return {
-        "observations": np.concatenate(seen),
-        "reports": np.array(rewards, np.float32),
-        "ends": np.array(ends),
-    }
+    results = {"reports": np.array(rewards, np.float32), "ends": np.array(ends)}
+    return results | {"observations": np.concatenate(seen)}
 
 
-def batch_of_crowds(task: str, **keywords: Any) -> Arrays:
+def batch_of_crowds(task, **keywords):
     """Ten steps of two worlds of several species, which start anew by themselves."""
-    from npa_envs.envs import multispecies_v0
-
     envs = multispecies_v0.batched(world_count=2, **few(task, **keywords))
     generator = np.random.default_rng(16)
     observations, _ = envs.reset(seed=5)
     seen, reports, ends = [], [], []
     for _ in range(10):
         seen.append(np.concatenate([rows.ravel() for rows in observations.values()]))
-        chosen = {a: actions(generator, space.shape) for a, space in envs.action_spaces.items()}
+        chosen = {a: actions(generator, space) for a, space in envs.action_spaces.items()}
         observations, rewards, terminated, truncated, infos = envs.step(chosen)
         reports.append([[rewards[a], infos[a]["loss"]] for a in envs.agents])
         ends.append([[terminated[a], truncated[a], infos[a]["live"]] for a in envs.agents])
-    results = {
-        "observations": kept(np.stack(seen), 1100),
-        "reports": np.array(reports, np.float32),
-        "ends": np.array(ends),
-        "state": kept(envs.state()),
-    }
+    results = {"reports": np.array(reports, np.float32), "ends": np.array(ends)}
+    results |= {"observations": kept(np.stack(seen), 1100), "state": kept(envs.state())}
     envs.close()
     return results
 
 
-def randomness() -> Arrays:
+def randomness():
     """Numbers that worlds draw."""
     random = npa_envs.WorldRandom([3, 4])
     random.advance()
@@ -511,15 +395,19 @@ def randomness() -> Arrays:
 NOISE = 0.004
 """Standard deviation of position noise [length units]."""
 
+THREE = {
+    "species_count": 3,
+    "particle_counts": (20, 16, 9),
+    "deaths": ((1, 4),),
+    "seed_distance": 0.3,
+}
+
 MORPHOGENESIS, REGENERATION = "npa/Morphogenesis2D-v0", "npa/Regeneration2D-v0"
 TEXTURE, POINTS = "npa/Texture-v0", "npa/PointClassification-v0"
 MORPHOGENESIS3D = "npa/Morphogenesis3D-v0"
 
-SCENES: dict[str, Callable[[], Arrays]] = {
-    **{
-        f"grown-{name}": partial(grown, name, 6 if name in ("dots", "duck") else 8)
-        for name in RULES
-    },
+SCENES = {
+    **{f"grown-{n}": partial(grown, n, 6 if n in ("dots", "duck") else 8) for n in RULES},
     **{f"gradients-{name}": partial(differentiated, name, 3, memory="store") for name in RULES},
     "gradients-gecko-all": partial(differentiated, "gecko", 2, update_prob=1.0),
     "gradients-gecko-noise": partial(differentiated, "gecko", 3, position_noise=NOISE),
@@ -568,21 +456,13 @@ SCENES: dict[str, Callable[[], Arrays]] = {
     "env-morphogenesis3d-shares": partial(episode, MORPHOGENESIS3D, 4, reward="particle"),
     "batch-morphogenesis": partial(batch_of_episodes, MORPHOGENESIS),
     "batch-points": partial(batch_of_episodes, POINTS),
-    "crowd-mixing": partial(crowd, "species", "mixing", perception="per_species"),
-    "crowd-segregation": partial(
-        crowd,
-        "species",
-        "segregation",
-        species_count=3,
-        particle_counts=(20, 16, 9),
-        deaths=((1, 4),),
-        seed_distance=0.3,
-    ),
-    "crowd-co_morphogenesis": partial(crowd, "species", "co_morphogenesis"),
-    "crowd-invasion": partial(crowd, "species", "invasion"),
-    "crowd-symbiosis": partial(crowd, "species", "symbiosis", reward="team"),
-    "crowd-particles-mixing": partial(crowd, "particles", "mixing", particle_count=12),
-    "crowd-particles-invasion": partial(crowd, "particles", "invasion", particle_count=12),
+    "crowd-mixing": partial(crowd, multispecies_v0, "mixing", perception="per_species"),
+    "crowd-segregation": partial(crowd, multispecies_v0, "segregation", **THREE),
+    "crowd-co_morphogenesis": partial(crowd, multispecies_v0, "co_morphogenesis"),
+    "crowd-invasion": partial(crowd, multispecies_v0, "invasion"),
+    "crowd-symbiosis": partial(crowd, multispecies_v0, "symbiosis", reward="team"),
+    "crowd-particles-mixing": partial(crowd, particles_v0, "mixing", particle_count=12),
+    "crowd-particles-invasion": partial(crowd, particles_v0, "invasion", particle_count=12),
     "crowd-in-turn": partial(in_turn, "mixing"),
     "batch-crowd-symbiosis": partial(batch_of_crowds, "symbiosis", max_cycles=6),
     "batch-crowd-mixing": partial(batch_of_crowds, "mixing", boundary="periodic"),
@@ -591,6 +471,6 @@ SCENES: dict[str, Callable[[], Arrays]] = {
 """All scenes by name."""
 
 
-def compute(name: str) -> Arrays:
+def compute(name):
     """Return a scene's arrays by their full names."""
     return {f"{name}/{key}": array for key, array in SCENES[name]().items()}

@@ -2,17 +2,15 @@
 
 import json
 import os
-from collections.abc import Iterator
+import shutil
 from pathlib import Path
-from typing import Any
 
 import names
 import numpy as np
 import pytest
-import runs
 import scenes
 import torch
-from numpy.typing import NDArray
+from make_golden import CHECKPOINT_INTERVAL, ITERATIONS, RUNS
 
 import npa_envs
 from npa_envs.cli import main
@@ -20,18 +18,12 @@ from npa_envs.cli import main
 FOLDER = Path(__file__).resolve().parent
 EXACT = os.environ.get("NPA_GOLDEN") == "exact"
 
-DOUBLE = 1e-11
-"""Bound on errors in float64, relative to the largest number of the array."""
-
-SINGLE = 2e-5
-"""Likewise in float32: states, observations, reports."""
-
-SINGLE_GRADIENT = 5e-3
-"""Likewise of gradients in float32."""
+DOUBLE, SINGLE, SINGLE_GRADIENT = 1e-11, 2e-5, 5e-3
+"""Bounds on errors relative to an array's largest number: float64, float32, its gradients."""
 
 
 @pytest.fixture(autouse=True)
-def one_thread() -> Iterator[None]:
+def one_thread():
     before = torch.get_num_threads()
     torch.set_num_threads(1)
     yield
@@ -39,26 +31,17 @@ def one_thread() -> Iterator[None]:
 
 
 @pytest.fixture(scope="module")
-def stored() -> dict[str, NDArray[Any]]:
+def stored():
     with np.load(scenes.GOLDEN) as file:
         return {name: file[name] for name in file.files}
 
 
 @pytest.fixture(scope="module")
-def content() -> dict[str, Any]:
+def content():
     return json.loads((FOLDER / "golden.json").read_text(encoding="utf-8"))
 
 
-def bound(key: str, dtype: np.dtype[Any]) -> float:
-    """Return what the largest error may be, relative to the largest number."""
-    if dtype == np.float64:
-        return DOUBLE
-    return SINGLE_GRADIENT if "/grad/" in key else SINGLE
-
-
-def complaint(
-    key: str, got: NDArray[Any], expected: NDArray[Any], exact: bool = EXACT
-) -> str | None:
+def complaint(key, got, expected, exact=EXACT):
     """Return what is wrong with an array, or None."""
     if got.dtype != expected.dtype or got.shape != expected.shape:
         return f"{key}: {got.dtype} {got.shape}, was {expected.dtype} {expected.shape}"
@@ -68,19 +51,20 @@ def complaint(
         return None
     difference = np.abs(got.astype(np.float64) - expected.astype(np.float64))
     if got.dtype.kind == "f":
-        limit = bound(key, got.dtype)
+        single = SINGLE_GRADIENT if "/grad/" in key else SINGLE
+        limit = DOUBLE if got.dtype == np.float64 else single
         error = float(difference.max() / max(np.abs(expected).max(), np.finfo(np.float32).tiny))
-        fine = error <= limit
     else:
         # A colour that is rounded to whole numbers may fall to the next one.
         limit = 1.0 if key.endswith("/picture") else 0.0
         error = float(difference.max())
-        fine = error <= limit
-    return None if fine and not exact else f"{key}: error {error:.3g}, allowed {limit:.3g}"
+    if error <= limit and not exact:
+        return None
+    return f"{key}: error {error:.3g}, allowed {limit:.3g}"
 
 
 @pytest.mark.parametrize("name", scenes.SCENES)
-def test_scene_is_as_it_was(name: str, stored: dict[str, NDArray[Any]]) -> None:
+def test_scene_is_as_it_was(name, stored):
     got = scenes.compute(name)
     assert sorted(got) == sorted(key for key in stored if key.startswith(f"{name}/"))
     found = [complaint(key, array, stored[key]) for key, array in got.items()]
@@ -88,14 +72,14 @@ def test_scene_is_as_it_was(name: str, stored: dict[str, NDArray[Any]]) -> None:
     assert not wrong, "\n".join(wrong)
 
 
-def test_all_that_is_stored_is_compared(stored: dict[str, NDArray[Any]]) -> None:
+def test_all_that_is_stored_is_compared(stored):
     worlds = {f"world/{rule}" for rule in scenes.RULES}
     found = {key.rsplit("/", 1)[0] for key in stored if key.startswith("world/")}
     assert found == worlds
     assert {key.split("/")[0] for key in stored} == {*scenes.SCENES, "world"}
 
 
-def test_wrong_numbers_are_found(stored: dict[str, NDArray[Any]]) -> None:
+def test_wrong_numbers_are_found(stored):
     for key, limit in (
         ("grown-gecko/f32/s", SINGLE),
         ("grown-gecko/f64/s", DOUBLE),
@@ -112,7 +96,7 @@ def test_wrong_numbers_are_found(stored: dict[str, NDArray[Any]]) -> None:
     assert complaint("env-texture/ends", ~ends, ends, exact=False) is not None
 
 
-def test_public_names_are_there(content: dict[str, Any]) -> None:
+def test_public_names_are_there(content):
     got = names.public_names()
     assert got["npa_envs"] == content["packages"]["npa_envs"]
     for package, expected in content["packages"].items():
@@ -129,13 +113,11 @@ def test_public_names_are_there(content: dict[str, Any]) -> None:
     assert set(content["rules"]) <= set(npa_envs.shipped_rules())
 
 
-def test_documented_names_are_there(content: dict[str, Any]) -> None:
+def test_documented_names_are_there(content):
     assert [name for name in content["documented"] if not names.is_there(name)] == []
 
 
-def test_commands_still_take_their_options(
-    content: dict[str, Any], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_commands_still_take_their_options(content, monkeypatch):
     monkeypatch.setenv("COLUMNS", "200")
     got = names.everything()
     for kind in ("presets", "commands"):
@@ -143,18 +125,18 @@ def test_commands_still_take_their_options(
             assert set(expected) <= set(got[kind][name]), name
 
 
-@pytest.mark.parametrize("task", runs.FOLDERS)
-def test_run_killed_at_the_old_commit_goes_on(task: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize("task", RUNS)
+def test_run_killed_at_the_old_commit_goes_on(task, tmp_path):
     """Its next iterations are those of a run that was never killed."""
     folder = tmp_path / "run"
-    runs.keep(FOLDER / runs.FOLDERS[task], folder)
+    shutil.copytree(FOLDER / RUNS[task], folder)
     whole = records(folder / "whole_log.jsonl")
-    assert len(records(folder / "log.jsonl")) < runs.ITERATIONS
+    assert len(records(folder / "log.jsonl")) < ITERATIONS
     words = ["train", task, "--out", str(folder), "--resume", "--no-progress", "--no-report"]
     assert main(words) == 0
     resumed = records(folder / "log.jsonl")
     assert [r["iteration"] for r in resumed] == [r["iteration"] for r in whole]
-    count = runs.ITERATIONS if EXACT else runs.CHECKPOINT_INTERVAL + 1
+    count = ITERATIONS if EXACT else CHECKPOINT_INTERVAL + 1
     for got, expected in zip(resumed[:count], whole, strict=False):
         assert got.keys() == expected.keys()
         for name, value in expected.items():
@@ -165,11 +147,5 @@ def test_run_killed_at_the_old_commit_goes_on(task: str, tmp_path: Path) -> None
         assert np.isfinite([p.detach().sum() for p in npa_envs.load_rule(path).parameters()]).all()
 
 
-def records(path: Path) -> list[dict[str, Any]]:
+def records(path):
     return [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()]
-
-
-def test_kept_runs_are_not_written_to() -> None:
-    """The resumed ones were copies."""
-    for folder in runs.FOLDERS.values():
-        assert len(records(FOLDER / folder / "log.jsonl")) < runs.ITERATIONS

@@ -1,11 +1,12 @@
 """Results all over the library, for `make golden-check`: run by each of two trees on one machine.
 
 A scene returns whatever of numbers, arrays, tensors, lists and dictionaries; `flat` names each. The
-names of arrays must stay the same when the library's own names change, so the library is imported
-in `Names` alone, and commands are called by `command`. `python wide.py OUT.npz` writes all.
+names of arrays must stay the same when the library's own names change.
+`python wide.py OUT.npz` writes all.
 """
 
 import contextlib
+import functools
 import gc
 import io
 import json
@@ -13,20 +14,25 @@ import os
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Mapping
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import gymnasium
 import numpy as np
+import scenes as golden
 import torch
 
 import npa_envs
 from npa_envs import WorldRandom, load_rule, rollout
+from npa_envs.agents import learning
+from npa_envs.cli import main as npa_envs_command
+from npa_envs.envs import gardeners_v0, multispecies_v0, particles_v0
+from npa_envs.tasks.damage import damage_worlds
+from npa_envs.training.trained_tasks import task_of_rule
+from npa_envs.world import brushes
 
 SMALL = {"particle_count": 61, "eps": 0.3, "resolution": 16, "render_size": 24}
-OWN: dict[str, dict[str, Any]] = {
+OWN = {
     "Pictures2D": {"targets": ("heart", "ring"), "test_targets": ("letter-a",)},
     "Regeneration2D": {"rule": "picture"},
     "PointClassification": {"resolution": None},
@@ -38,24 +44,9 @@ TRAINED = ("morphogenesis2d", "co_morphogenesis2d", "morphogenesis3d", "texture"
 """Tasks of `npa-envs train` besides `point_classification`, whose data are drawn elsewhere."""
 
 
-class Names:
-    """What the library calls things."""
-
-    from npa_envs.agents.learning import Budget, Problem, train
-    from npa_envs.cli import main
-    from npa_envs.envs import gardeners_v0, multispecies_v0, particles_v0
-    from npa_envs.tasks.damage import damage_worlds
-    from npa_envs.training.trained_tasks import task_of_rule
-    from npa_envs.world import brushes
-
-    damages = ("wipe", "cut", "clump", "noise")
-    renamed: Mapping[str, str] = {}
-    """What ids and rules are called now, by what the names of arrays call them."""
-
-
-def flat(value: Any, name: str, into: dict[str, np.ndarray]) -> None:
+def flat(value, name, into):
     """Put what a scene returned under names."""
-    if isinstance(value, Mapping):
+    if isinstance(value, dict):
         for key, part in value.items():
             flat(part, f"{name}/{key}", into)
     elif isinstance(value, torch.Tensor):
@@ -68,42 +59,40 @@ def flat(value: Any, name: str, into: dict[str, np.ndarray]) -> None:
         into[name] = array.astype(str) if array.dtype == object else array
 
 
-def command(*words: str, codes: tuple[int, ...] = (0,)) -> None:
+def command(*words, codes=(0,)):
     """Run a command of `npa-envs` in the current folder."""
     with contextlib.redirect_stdout(io.StringIO()) as out:
-        code = Names.main([*words, "--no-progress"])
+        code = npa_envs_command([*words, "--no-progress"])
     if code not in codes:
         raise RuntimeError(f"{words} returned {code}: {out.getvalue()[-500:]}")
 
 
-def gradients(value: torch.Tensor, rule: torch.nn.Module, **others: torch.Tensor) -> Any:
+def gradients(value, rule, **others):
     """Return derivatives by all weights and some tensors."""
     named = dict(rule.named_parameters()) | others
     found = torch.autograd.grad(value, list(named.values()), allow_unused=True)
     return dict(zip(named, found, strict=True))
 
 
-def of_rule(name: str) -> Any:
+def of_rule(name):
     """Sixteen steps of a shipped rule from its task's seed, its loss, and gradients over three."""
     rule = load_rule(name)
-    task = Names.task_of_rule(name, rule, torch.device("cpu"), particle_count=160).task
-    options = {"eps": task.eps, "box": task.box}
+    task = task_of_rule(name, rule, torch.device("cpu"), particle_count=160).task
+    run = functools.partial(rollout, rule, eps=task.eps, box=task.box)
     x, s, goal = task.seed(2, generator=WorldRandom([3, 4]), device=torch.device("cpu"))
     task = task.toward(goal)
     with torch.no_grad():
-        x, s = rollout(rule, x, s, 16, generator=WorldRandom([5, 6]), **options)
+        x, s = run(x, s, 16, generator=WorldRandom([5, 6]))
     results = {"x": x, "s": s, "colour": rule.colour(s), "picture": task.picture(x, s)}
     x.requires_grad_()
     s.requires_grad_()
-    after = rollout(
-        rule, x, s, 3, generator=WorldRandom([7, 8]), return_path_length=True, **options
-    )
+    after = run(x, s, 3, generator=WorldRandom([7, 8]), return_path_length=True)
     loss, terms = task.loss(*after)
     results |= {"loss": loss, "terms": terms, "metric": task.metric(*after[:2])}
     return results | {"gradients": gradients(loss.sum(), rule, x=x, s=s)}
 
 
-KINDS: dict[str, tuple[dict[str, Any], dict[str, Any]]] = {
+KINDS = {
     "plain": ({}, {"return_path_length": True}),
     "periodic": ({}, {"box": (1.2, 0.9), "keep_every": 2}),
     "static": ({"static": True}, {"update_prob": 0.7}),
@@ -117,10 +106,10 @@ KINDS: dict[str, tuple[dict[str, Any], dict[str, Any]]] = {
 """Rules and rollouts of all kinds: options of a rule, and of its rollout."""
 
 
-def of_kind(name: str) -> Any:
+def of_kind(name):
     """Some steps of an untrained rule, with and without gradients, in both precisions."""
     of_rule, options = KINDS[name]
-    results: dict[str, Any] = {}
+    results = {}
     for dtype in (torch.float32, torch.float64):
         random = np.random.default_rng(1)
         x = torch.from_numpy(random.uniform(-0.45, 0.45, (3, 90, 2))).to(dtype)
@@ -134,23 +123,15 @@ def of_kind(name: str) -> Any:
             long = rollout(rule, x, s, 40, eps=0.22, generator=WorldRandom([1, 2, 3]), **options)
         x.requires_grad_()
         s.requires_grad_()
-        short = rollout(
-            rule,
-            x,
-            s,
-            4,
-            eps=0.22,
-            generator=torch.Generator().manual_seed(9),
-            detach_positions=False,
-            **options,
-        )
+        draws = {"generator": torch.Generator().manual_seed(9), "detach_positions": False}
+        short = rollout(rule, x, s, 4, eps=0.22, **draws, **options)
         value = short[0].square().sum() + short[1].pow(3).sum()
         word = str(dtype).removeprefix("torch.")
         results[word] = {"long": long, "short": short, "d": gradients(value, rule, x=x, s=s)}
     return results
 
 
-def at_rest() -> Any:
+def at_rest():
     """A rollout whose steps are left out once the worlds are at rest."""
     torch.manual_seed(3)
     rule = npa_envs.NPARule(2, 8, 16, eps0=0.2, dead_zone=50.0)
@@ -160,7 +141,7 @@ def at_rest() -> Any:
         return {"world": rollout(rule, x, s, 300, generator=source), "after": source.uniform(5)}
 
 
-def fields_of(name: str) -> dict[str, Any]:
+def fields_of(name):
     """Return keywords of a small environment."""
     if "Shapeshifter" in name:
         return {"particle_count": 61}
@@ -170,41 +151,35 @@ def fields_of(name: str) -> dict[str, Any]:
     return {key: value for key, value in (SMALL | own).items() if value is not None}
 
 
-def drawn(random: np.random.Generator, space: gymnasium.spaces.Box) -> Any:
+def drawn(random, space):
     """Return an action in the inner part of a space."""
     share = random.uniform(0.3, 0.7, space.shape)
     low, high = np.maximum(space.low, -1.0), np.minimum(space.high, 1.0)
     return (low + share * (high - low)).astype(space.dtype)
 
 
-def of_environment(name: str, world_count: int | None) -> Any:
+def of_environment(name, world_count):
     """Six steps of an environment, single or a batch of two that start anew after four."""
     fields = fields_of(name)
     if world_count is None:
-        env: Any = gymnasium.make(name, render_mode="rgb_array", **fields)
+        env = gymnasium.make(name, render_mode="rgb_array", **fields)
     else:
-        env = gymnasium.make_vec(
-            name,
-            world_count,
-            vectorization_mode="vector_entry_point",
-            max_episode_steps=4,
-            **fields,
-        )
+        fields |= {"vectorization_mode": "vector_entry_point", "max_episode_steps": 4}
+        env = gymnasium.make_vec(name, world_count, **fields)
     random = np.random.default_rng(4)
-    steps: list[Any] = [env.reset(seed=11)]
-    for _ in range(6):
-        steps.append(env.step(drawn(random, env.action_space)))
-    results: dict[str, Any] = {"steps": steps}
+    steps = [env.reset(seed=11)]
+    steps += [env.step(drawn(random, env.action_space)) for _ in range(6)]
+    results = {"steps": steps}
     if world_count is None:
         results |= {"picture": env.render(), "world": env.unwrapped.particles()}
     env.close()
     return results
 
 
-def of_agents(env: Any) -> Any:
+def of_agents(env):
     """Six steps of a parallel environment, or of a batch of worlds."""
     random = np.random.default_rng(5)
-    steps: list[Any] = [env.reset(seed=12)]
+    steps = [env.reset(seed=12)]
     spaces = getattr(env, "action_spaces", None)
     for _ in range(6):
         if not env.agents:
@@ -219,31 +194,31 @@ def of_agents(env: Any) -> Any:
     return results
 
 
-def of_species(task: str, kind: str) -> Any:
+def of_species(task, kind):
     """Several species: a world, a batch, or each particle an agent."""
-    fields: dict[str, Any] = {"task": task, "eps": 0.3, "particle_count": 48, "max_cycles": 5}
+    fields = {"task": task, "eps": 0.3, "particle_count": 48, "max_cycles": 5}
     if task in ("co_morphogenesis", "invasion", "symbiosis"):
         fields["resolution"] = 16
     if kind == "parallel":
-        return of_agents(Names.multispecies_v0.parallel_env(**fields))
+        return of_agents(multispecies_v0.parallel_env(**fields))
     if kind == "batch":
-        return of_agents(Names.multispecies_v0.batched(world_count=2, **fields))
-    return of_agents(Names.particles_v0.parallel_env(**fields | {"particle_count": 10}))
+        return of_agents(multispecies_v0.batched(world_count=2, **fields))
+    return of_agents(particles_v0.parallel_env(**fields | {"particle_count": 10}))
 
 
-def two_gardeners() -> Any:
+def two_gardeners():
     """The keeper and the raider of one garden."""
     fields = GARDEN | {"particle_count": 61, "resolution": 16, "max_cycles": 5}
-    return of_agents(Names.gardeners_v0.parallel_env(**fields))
+    return of_agents(gardeners_v0.parallel_env(**fields))
 
 
-def lines_of(path: Path) -> Any:
+def lines_of(path):
     """Return a log's numbers without times."""
     records = [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()]
     return [{k: v for k, v in record.items() if "second" not in k} for record in records]
 
 
-def of_training(task: str, *words: str) -> Any:
+def of_training(task, *words):
     """Ten iterations of a task's tiny preset: the log, and the rules it ends with."""
     last = ("--iterations", "10", "--no-report", "--out", "run")
     command("train", task, "--preset", "tiny", *words, *last)
@@ -251,7 +226,7 @@ def of_training(task: str, *words: str) -> Any:
     return {"log": lines_of(Path("run/log.jsonl")), "rules": [r.state_dict() for r in rules]}
 
 
-def resumed() -> Any:
+def resumed():
     """A run that is stopped somewhere and goes on: where it was stopped does not matter."""
     words = ("train", "morphogenesis2d", "--preset", "tiny", "--no-report", "--out", "run")
     command(*words, "--iterations", "30", "--max-seconds", "1", codes=(0, 1, 75, 130))
@@ -259,45 +234,40 @@ def resumed() -> Any:
     return lines_of(Path("run/log.jsonl"))
 
 
-def of_learning(method: str, name: str, fields: dict[str, Any], **options: Any) -> Any:
+def of_learning(method, name, fields, **options):
     """A few updates of a learner: its curve and its rules."""
-    name = Names.renamed.get(name, name)
-    problem = Names.Problem(env_id=name, keywords=fields, episode_steps=4, num_envs=2)
-    few = Names.Budget(particle_steps=4096)
-    done = Names.train(
-        method, problem, few, 1, evaluation_seeds=range(100, 102), entries=2, **options
-    )
+    problem = learning.Problem(env_id=name, keywords=fields, episode_steps=4, num_envs=2)
+    options |= {"evaluation_seeds": range(100, 102), "entries": 2}
+    done = learning.train(method, problem, learning.Budget(particle_steps=4096), 1, **options)
     curve = [{k: v for k, v in vars(e).items() if "second" not in k} for e in done.log]
     rules = None if done.rules is None else [rule.state_dict() for rule in done.rules.rules]
     return {"curve": curve, "rules": rules}
 
 
-def of_evaluation(rule: str, *words: str) -> Any:
+def of_evaluation(rule, *words):
     """What `npa-envs evaluate` measures."""
-    out = ("--seed-count", "2", "--json", "table.json")
-    command("evaluate", Names.renamed.get(rule, rule), *words, *out)
+    command("evaluate", rule, *words, "--seed-count", "2", "--json", "table.json")
     return json.loads(Path("table.json").read_text(encoding="utf-8"))
 
 
-def of_film(rule: str, *words: str) -> Any:
+def of_film(rule, *words):
     """Bytes of what `npa-envs rollout` writes."""
     fixed = ("--steps", "24", "--particle-count", "200", "--every", "12", "--resolution", "48")
-    command("rollout", Names.renamed.get(rule, rule), *fixed, "--out", "film", *words)
+    command("rollout", rule, *fixed, "--out", "film", *words)
     files = sorted(p for p in Path("film").iterdir() if p.suffix != ".mp4")
     return {path.name: np.frombuffer(path.read_bytes(), np.uint8) for path in files}
 
 
-def page() -> Any:
+def page():
     """The collection of rules that the authors' web demo reads."""
     with contextlib.redirect_stdout(io.StringIO()):
-        Names.main(["export-web", "gecko", "dots", "-o", "models.json"])
+        npa_envs_command(["export-web", "gecko", "dots", "-o", "models.json"])
     return json.loads(Path("models.json").read_text(encoding="utf-8"))
 
 
-def brushed() -> Any:
+def brushed():
     """All brushes and damages, soft ones with gradients."""
-    brushes, results = Names.brushes, {}
-    random = np.random.default_rng(6)
+    results, random = {}, np.random.default_rng(6)
     x = torch.from_numpy(random.uniform(-0.5, 0.5, (2, 80, 2))).float().requires_grad_()
     s = torch.from_numpy(random.normal(size=(2, 80, 4))).float().requires_grad_()
     centre, move = torch.tensor([[0.1, 0.0], [-0.45, 0.4]]), torch.tensor([[0.1, 0.2], [0.0, 0.3]])
@@ -313,74 +283,62 @@ def brushed() -> Any:
         }
         d = torch.autograd.grad(found["push"].square().sum() + found["inject"].pow(3).sum(), (x, s))
         results[word] = found | {"d": d}
-    for k, kind in enumerate(Names.damages):
-        source = WorldRandom([1, 2])
-        results[f"damage{k}"] = Names.damage_worlds(
-            x.detach(), s.detach(), kind=kind, generator=source
-        )
+    x, s = x.detach(), s.detach()
+    for k, kind in enumerate(("wipe", "cut", "clump", "noise")):
+        results[f"damage{k}"] = damage_worlds(x, s, kind=kind, generator=WorldRandom([1, 2]))
     return results
 
 
-def scenes() -> dict[str, Callable[[], Any]]:
+def scenes():
     """Return all scenes by name."""
     names = sorted(name for name in gymnasium.registry if name.startswith("npa/"))
-    small = "npa/Morphogenesis2DSmall-v0"
+    rules = npa_envs.shipped_rules()
+    small = ("npa/Morphogenesis2DSmall-v0", {"target": "ring"})
+    crowd = ("npa/MixingSmall-v0", {})
     learners = ("ppo", "shac", "gradient", "evolution")
-    crowd: tuple[str, dict[str, Any]] = ("npa/MixingSmall-v0", {})
-    back = {new: old for old, new in Names.renamed.items()}
-    return {
-        **{f"rule/{back.get(n, n)}": partial(of_rule, n) for n in npa_envs.shipped_rules()},
-        **{f"kind/{name}": partial(of_kind, name) for name in KINDS},
-        "at-rest": at_rest,
-        **{f"env/{back.get(n, n)}": partial(of_environment, n, None) for n in names},
-        **{f"batch/{back.get(n, n)}": partial(of_environment, n, 2) for n in names},
-        **{
-            f"species/{task}/{kind}": partial(of_species, task, kind)
-            for task in SPECIES_TASKS
-            for kind in ("parallel", "batch", "particles")
+    few = ("--checkpoints", "4", "12", "--particle-count", "128")
+    healing = ("heart", "--checkpoints", "16", "--particle-count", "128", "--healing")
+    kinds = ("parallel", "batch", "particles")
+    made = {
+        "rule": {name: partial(of_rule, name) for name in rules},
+        "kind": {name: partial(of_kind, name) for name in KINDS},
+        "env": {name: partial(of_environment, name, None) for name in names},
+        "batch": {name: partial(of_environment, name, 2) for name in names},
+        "species": {f"{t}/{k}": partial(of_species, t, k) for t in SPECIES_TASKS for k in kinds},
+        "train": {
+            **{task: partial(of_training, task) for task in TRAINED},
+            "points": partial(of_training, "point_classification", "--data", "digits"),
+            "resumed": resumed,
         },
-        "gardeners": two_gardeners,
-        **{f"train/{task}": partial(of_training, task) for task in TRAINED},
-        "train/points": partial(of_training, "point_classification", "--data", "digits"),
-        "train/resumed": resumed,
-        **{
-            f"learn/{method}": partial(of_learning, method, small, {"target": "ring"})
-            for method in learners
+        "learn": {
+            **{method: partial(of_learning, method, *small) for method in learners},
+            **{
+                f"{method}-species": partial(of_learning, method, *crowd) for method in learners[:2]
+            },
         },
-        "learn/ppo-species": partial(of_learning, "ppo", *crowd),
-        "learn/shac-species": partial(of_learning, "shac", *crowd),
-        **{
-            f"evaluate/{back.get(n, n)}": partial(
-                of_evaluation, n, "--checkpoints", "4", "12", "--particle-count", "128"
-            )
-            for n in npa_envs.shipped_rules()
+        "evaluate": {name: partial(of_evaluation, name, *few) for name in rules},
+        "healing": {"heart": partial(of_evaluation, *healing)},
+        "film": {
+            "gecko": partial(of_film, "gecko", "--damage", "8:cut", "10:wipe", "12:clump"),
+            "dots": partial(of_film, "dots", "--style", "points", "--background", "black"),
+            "duck": partial(of_film, "duck"),
         },
-        "healing/heart": partial(
-            of_evaluation,
-            *("heart", "--checkpoints", "16", "--particle-count", "128", "--healing"),
-        ),
-        "film/gecko": partial(
-            of_film, "gecko", "--damage", "8:cut", f"10:{Names.damages[0]}", "12:clump"
-        ),
-        "film/dots": partial(of_film, "dots", "--style", "points", "--background", "black"),
-        "film/duck": partial(of_film, "duck"),
-        "page": page,
-        "brushes": brushed,
+    }
+    alone = {"at-rest": at_rest, "gardeners": two_gardeners, "page": page, "brushes": brushed}
+    return alone | {
+        f"{group}/{n}": scene for group, own in made.items() for n, scene in own.items()
     }
 
 
-def main(out: Path, only: str = "") -> None:
+def main(out, only=""):
     """Compute what begins with a word, beginning with the golden scenes, and write it."""
     torch.set_num_threads(1)
     gymnasium.logger.min_level = gymnasium.logger.ERROR
-    import scenes as golden
-
     root = Path(golden.__file__).resolve().parents[2]
-    assert Path(npa_envs.__file__).resolve().parents[1] == root, npa_envs.__file__
-    assert Path(Names.multispecies_v0.__file__).resolve().parents[1] == root, "envs of another tree"
-    found: dict[str, np.ndarray] = {}
-    every: dict[str, Callable[[], Any]] = scenes()
-    every |= {f"golden/{name}": scene for name, scene in golden.SCENES.items()}
+    for module in (npa_envs, multispecies_v0):
+        assert Path(module.__file__).resolve().is_relative_to(root), module.__file__
+    found = {}
+    every = scenes() | {f"golden/{name}": scene for name, scene in golden.SCENES.items()}
     for name, scene in every.items():
         if not name.startswith(only):
             continue

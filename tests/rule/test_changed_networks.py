@@ -7,6 +7,10 @@ from worlds import lively_rule, random_world
 import npa_envs
 
 
+def world(device):
+    return random_world(1, 50, 2, 5, dtype=torch.float64, device=device)
+
+
 def nothing(z):
     return z.new_zeros(*z.shape[:-1], 12)
 
@@ -14,8 +18,7 @@ def nothing(z):
 @pytest.mark.parametrize("equivariant", [False, True])
 @pytest.mark.parametrize("gradients", [False, True])
 def test_a_layer_whose_forward_was_replaced_is_used_as_it_is(equivariant, gradients, device):
-    rule = lively_rule(device, equivariant=equivariant)
-    x, s = random_world(1, 50, 2, 5, dtype=torch.float64, device=device)
+    rule, (x, s) = lively_rule(device, equivariant=equivariant), world(device)
     with torch.set_grad_enabled(gradients):
         _, moved = npa_envs.rollout(rule, x, s, 2, update_prob=1.0)
         rule.hidden.forward = nothing
@@ -31,14 +34,18 @@ def test_a_layer_whose_forward_was_replaced_is_used_as_it_is(equivariant, gradie
 
 @pytest.mark.parametrize("equivariant", [False, True])
 def test_a_hidden_layer_without_biases_is_as_one_whose_biases_are_zero(equivariant, device):
-    rule = lively_rule(device, equivariant=equivariant)
-    x, s = random_world(1, 50, 2, 5, dtype=torch.float64, device=device)
+    rule, (x, s) = lively_rule(device, equivariant=equivariant), world(device)
     torch.nn.init.zeros_(rule.hidden.bias)
     _, expected = npa_envs.rollout(rule, x, s, 2, update_prob=1.0)
     rule.hidden.bias = None
     assert not rule.has_network()
     _, found = npa_envs.rollout(rule, x, s, 2, update_prob=1.0)
     torch.testing.assert_close(found, expected, rtol=1e-12, atol=1e-13)
+
+
+class Overridden(npa_envs.NPARule):
+    def forward(self, perception):
+        return 2.0 * super().forward(perception)
 
 
 class Called(npa_envs.NPARule):
@@ -58,75 +65,106 @@ class Fated(npa_envs.NPARule):
         return 0.0 * divide, 0.0 * die + 1.0
 
 
-class Halved(torch.nn.Module):
+class Twofold(torch.nn.Module):
     def forward(self, weight):
-        return 0.5 * weight
+        return 2.0 * weight
 
 
-def doubled_output(rule, module):
+def of_class(kind):
+    def made(rule):
+        changed = kind(**rule.hyper_parameters()).to(rule.hidden.weight)
+        changed.load_state_dict(rule.state_dict())
+        return changed
+
+    return made
+
+
+def hooked(name):
+    def made(rule):
+        module = getattr(rule, name) if name else rule
+        module.register_forward_hook(lambda own, inputs, output: 2.0 * output)
+        return rule
+
+    return made
+
+
+def parametrised(name):
+    def made(rule):
+        layer = getattr(rule, name)
+        torch.nn.utils.parametrize.register_parametrization(layer, "weight", Twofold())
+        return rule
+
+    return made
+
+
+CHANGED = {
+    "forward": of_class(Overridden),
+    "call": of_class(Called),
+    "a hook": hooked(""),
+    "a hook of the output": hooked("output"),
+    "a parametrised output": parametrised("output"),
+    "a hook of the hidden layer": hooked("hidden"),
+    "a parametrised hidden layer": parametrised("hidden"),
+}
+"""Rules that say twice what they said, or what twice the hidden layer makes of it."""
+
+
+@pytest.mark.parametrize("gradients", [False, True])
+@pytest.mark.parametrize("how", CHANGED)
+def test_a_changed_network_is_run_as_the_module_that_it_is(how, gradients, device):
+    rule, (x, s) = lively_rule(device), world(device)
+    with torch.set_grad_enabled(gradients):
+        _, once = npa_envs.step(rule, x, s, update_prob=1.0)
+        changed = CHANGED[how](rule)
+        _, twice = npa_envs.step(changed, x, s, update_prob=1.0)
+    assert not changed.is_plain()
+    if "hidden" in how:
+        assert float((twice - once).detach().abs().max()) > 1e-3
+    else:
+        torch.testing.assert_close(twice - s, 2.0 * (once - s), rtol=1e-12, atol=1e-13)
+
+
+def doubled_output(module):
     return lambda own, inputs, output: 2.0 * output if own is module else None
 
 
-def test_hooks_of_all_modules_are_called(device):
-    rule = lively_rule(device)
-    x, s = random_world(1, 50, 2, 5, dtype=torch.float64, device=device)
+@pytest.mark.parametrize("name", ["", "hidden", "output"])
+def test_hooks_of_all_modules_are_called(name, device):
+    rule, (x, s) = lively_rule(device), world(device)
+    module, seen, hooks = getattr(rule, name) if name else rule, [], torch.nn.modules.module
     _, once = npa_envs.step(rule, x, s, update_prob=1.0)
-    hooks = torch.nn.modules.module
-    for module in (rule, rule.hidden, rule.output):
-        seen = []
-        handles = [
-            hooks.register_module_forward_hook(doubled_output(rule, module)),
-            hooks.register_module_forward_pre_hook(lambda own, inputs: seen.append(own)),  # noqa: B023
-        ]
-        try:
-            assert not rule.is_plain()
-            _, twice = npa_envs.step(rule, x, s, update_prob=1.0)
-        finally:
-            for handle in handles:
-                handle.remove()
-        assert rule.is_plain()
-        assert module in seen
-        if module is not rule.hidden:
-            torch.testing.assert_close(twice - s, 2.0 * (once - s), rtol=1e-12, atol=1e-13)
-        else:
-            assert float((twice - once).detach().abs().max()) > 1e-3
-
-
-def test_backward_hooks_of_all_modules_are_called(device):
-    rule = lively_rule(device)
-    x, s = random_world(1, 50, 2, 5, dtype=torch.float64, device=device)
-    seen = []
-    handle = torch.nn.modules.module.register_module_full_backward_hook(
-        lambda own, bars, output_bars: seen.append(own)
-    )
+    handles = [
+        hooks.register_module_forward_hook(doubled_output(module)),
+        hooks.register_module_forward_pre_hook(lambda own, inputs: seen.append(own)),
+        hooks.register_module_full_backward_hook(lambda own, *bars: seen.append((own, "back"))),
+    ]
     try:
         assert not rule.is_plain()
-        npa_envs.step(rule, x, s.requires_grad_())[1].sum().backward()
+        _, twice = npa_envs.step(rule, x, s.requires_grad_(), update_prob=1.0)
+        twice.sum().backward()
+    finally:
+        for handle in handles:
+            handle.remove()
+    assert rule.is_plain()
+    assert {module, (module, "back")} <= set(seen)
+    if name == "hidden":
+        assert float((twice - once).detach().abs().max()) > 1e-3
+    else:
+        torch.testing.assert_close(twice - s, 2.0 * (once - s), rtol=1e-12, atol=1e-13)
+
+
+@pytest.mark.parametrize("register", ["forward_pre_hook", "full_backward_hook"])
+def test_one_kind_of_hook_of_all_modules_is_enough(register):
+    rule = npa_envs.NPARule(2, 4, 8)
+    handle = getattr(torch.nn.modules.module, f"register_module_{register}")(lambda *args: None)
+    try:
+        assert not rule.is_plain()
     finally:
         handle.remove()
-    assert {rule, rule.hidden, rule.output} <= set(seen)
+    assert rule.is_plain()
 
 
-def test_a_subclass_that_overrides_call_is_called(device):
-    plain = lively_rule(device)
-    rule = Called(**plain.hyper_parameters()).to(device, torch.float64)
-    rule.load_state_dict(plain.state_dict())
-    x, s = random_world(1, 50, 2, 5, dtype=torch.float64, device=device)
-    _, once = npa_envs.step(plain, x, s, update_prob=1.0)
-    for gradients in (False, True):
-        with torch.set_grad_enabled(gradients):
-            _, twice = npa_envs.step(rule, x, s, update_prob=1.0)
-        torch.testing.assert_close(twice - s, 2.0 * (once - s), rtol=1e-12, atol=1e-13)
-    assert not rule.is_plain()
-
-
-@pytest.mark.parametrize("kind", [Called, Weighted])
-def test_a_subclass_that_changes_what_a_step_runs_is_not_plain(kind):
-    assert not kind(2, 4, 8).is_plain()
-    assert not kind(2, 4, 8, equivariant=True).has_network()
-
-
-def test_a_subclass_that_changes_nothing_of_a_step_is_plain():
+def test_what_changes_a_step_is_not_plain_and_a_subclass_that_changes_nothing_is():
     class Named(npa_envs.NPARule):
         name = "gecko"
 
@@ -134,6 +172,12 @@ def test_a_subclass_that_changes_nothing_of_a_step_is_plain():
             return states[..., :3]
 
     assert Named(2, 4, 8).is_plain()
+    for kind in (Called, Weighted):
+        assert not kind(2, 4, 8).is_plain()
+        assert not kind(2, 4, 8, equivariant=True).has_network()
+    rule = npa_envs.NPARule(2, 4, 8)
+    rule.output = torch.nn.Linear(8, 6)
+    assert not rule.is_plain()
 
 
 @pytest.mark.parametrize("how", ["override", "attribute", "hook", "layer"])
@@ -148,17 +192,3 @@ def test_fates_of_their_own_make_a_rule_that_is_not_plain(how):
     elif how == "layer":
         rule.fate = torch.nn.Sequential(rule.fate)
     assert not rule.is_plain()
-
-
-@pytest.mark.parametrize("layer", ["hidden", "output"])
-def test_a_parametrised_layer_is_run_as_the_module_that_it_is(layer, device):
-    rule = lively_rule(device)
-    x, s = random_world(1, 50, 2, 5, dtype=torch.float64, device=device)
-    _, once = npa_envs.step(rule, x, s, update_prob=1.0)
-    torch.nn.utils.parametrize.register_parametrization(getattr(rule, layer), "weight", Halved())
-    assert not rule.is_plain()
-    _, halved = npa_envs.step(rule, x, s, update_prob=1.0)
-    if layer == "output":
-        torch.testing.assert_close(halved - s, 0.5 * (once - s), rtol=1e-12, atol=1e-13)
-    else:
-        assert float((halved - once).detach().abs().max()) > 1e-3

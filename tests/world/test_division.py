@@ -20,11 +20,13 @@ def dividing_rule(device, odds=(0.0, -8.0), **options):
     return rule
 
 
-def third_full(device, particle_count=64, world_count=2, space_dim=2):
-    """Worlds in which every third slot holds a living particle."""
-    x, s = random_world(
-        world_count, particle_count, space_dim, 6, dtype=torch.float64, device=device
-    )
+def seeded(device, seed=1):
+    return torch.Generator(device).manual_seed(seed)
+
+
+def third_full(device, particle_count=64, space_dim=2):
+    """Two worlds in which every third slot holds a living particle."""
+    x, s = random_world(2, particle_count, space_dim, 6, dtype=torch.float64, device=device)
     s[..., LIFE] = (torch.arange(particle_count) % 3 == 0).to(s)
     return x, s
 
@@ -57,13 +59,8 @@ def test_what_lies_in_dead_slots_influences_nothing(update_prob, device):
         other = random_world(2, 64, 2, 6, dtype=x.dtype, device=device, seed=seed)
         other[1][..., LIFE] = 0.0
         given = [torch.where(dead, new, own) for new, own in zip(other, (x, s), strict=True)]
-        generator = torch.Generator(device).manual_seed(1)
-        found.append(
-            npa_envs.rollout(
-                rule, *given, 6, update_prob=update_prob, generator=generator,
-                return_path_length=True,
-            )
-        )  # fmt: skip
+        options = {"update_prob": update_prob, "return_path_length": True}
+        found.append(npa_envs.rollout(rule, *given, 6, generator=seeded(device), **options))
     assert_same(*found)
     assert int(living(found[0][1]).sum()) > int(living(s).sum())
 
@@ -74,13 +71,10 @@ def test_not_a_number_in_dead_slots_leaves_gradients_finite(device):
     gradients = []
     for fill in (0.0, float("nan")):
         start = torch.where(living(s)[..., None], s, fill).requires_grad_()
-        x_after, s_after = npa_envs.rollout(
-            rule, x, start, 3, generator=torch.Generator(device).manual_seed(1)
-        )
+        after = npa_envs.rollout(rule, x, start, 3, generator=seeded(device))
+        loss = sum(part.square().sum() for part in after)
         weights = [start, rule.hidden.weight, rule.fate.weight]
-        gradients.append(
-            torch.autograd.grad(x_after.square().sum() + s_after.square().sum(), weights)
-        )
+        gradients.append(torch.autograd.grad(loss, weights))
     assert_same(*gradients)
 
 
@@ -193,15 +187,8 @@ def test_where_there_is_no_slot_nothing_is_learned_of_dividing(device):
     s[..., LIFE] = 1.0
     s[:, 4, LIFE] = 0.0
     odds = x.new_tensor([0.6, 0.1])[:, None, None].repeat(1, 2, 9).requires_grad_()
-    after = divided(
-        x,
-        s,
-        x[..., 0],
-        division_probabilities=tuple(odds),
-        updated=living(s),
-        births=births_of(x),
-        eps=EPS,
-    )
+    fates = {"division_probabilities": tuple(odds), "updated": living(s), "births": births_of(x)}
+    after = divided(x, s, x[..., 0], eps=EPS, **fates)
     (found,) = torch.autograd.grad(after[1][..., LIFE].sum(), odds)
     # All would divide; the first does, and both particles that come of it stand for it.
     expected = torch.zeros_like(found[0])
@@ -214,14 +201,7 @@ def test_one_particle_fills_its_world_and_stays_within_it(device):
     x = torch.zeros(2, 60, 2, dtype=torch.float64, device=device)
     s = torch.zeros(2, 60, 6, dtype=torch.float64, device=device)
     s[:, 0, LIFE] = 1.0
-    found = [
-        npa_envs.rollout(
-            rule, x, s, 100, keep_every=5, generator=torch.Generator(device).manual_seed(5)
-        )
-        for _ in range(2)
-    ]
-    assert_same(*found)
-    x, s = found[0]
+    x, s = npa_envs.rollout(rule, x, s, 100, keep_every=5, generator=seeded(device, 5))
     assert (x.shape, s.shape) == ((20, 2, 60, 2), (20, 2, 60, 6))
     number = living(s).sum(dim=-1)
     assert number[0].max() < 30
@@ -234,10 +214,9 @@ def test_one_particle_fills_its_world_and_stays_within_it(device):
 def test_worlds_of_a_batch_grow_as_alone(device):
     rule = dividing_rule(device)
     x, s = third_full(device)
-    both = npa_envs.rollout(rule, x, s, 8, generator=npa_envs.WorldRandom([7, 8], device=device))
-    alone = npa_envs.rollout(
-        rule, x[1:], s[1:], 8, generator=npa_envs.WorldRandom([8], device=device)
-    )
+    streams = [npa_envs.WorldRandom(seeds, device=device) for seeds in ([7, 8], [8])]
+    both = npa_envs.rollout(rule, x, s, 8, generator=streams[0])
+    alone = npa_envs.rollout(rule, x[1:], s[1:], 8, generator=streams[1])
     assert_near([part[1:] for part in both], alone, 1e-12)
 
 
@@ -246,8 +225,7 @@ def test_recomputed_steps_give_the_same_gradients(device):
     x, s = third_full(device)
     found = []
     for memory in ("store", "recompute"):
-        generator = torch.Generator(device).manual_seed(2)
-        after = npa_envs.rollout(rule, x, s, 4, memory=memory, generator=generator)
+        after = npa_envs.rollout(rule, x, s, 4, memory=memory, generator=seeded(device))
         loss = sum((part**2).sum() for part in after)
         found.append(torch.autograd.grad(loss, list(rule.parameters())))
     assert_same(*found)
@@ -264,13 +242,12 @@ def test_a_rule_learns_to_divide_with_the_weights_it_has(device):
 
 
 def test_rules_that_divide_refuse_what_they_cannot_be(device):
-    rule = dividing_rule(device)
-    x, s = third_full(device)
-    with pytest.raises(NPAError, match="box must be None where particles divide"):
-        npa_envs.rollout(rule, x, s, 1, box=(2.0, 2.0))
-    with pytest.raises(NPAError, match="must not divide, got divides=True for rule 0"):
-        npa_envs.rollout_species([rule], x, s, 1, counts=(64,))
-    with pytest.raises(NPAError, match="got static=True"):
-        npa_envs.NPARule(static=True, divides=True)
-    with pytest.raises(NPAError, match="divides must be True or False"):
-        npa_envs.NPARule(divides=torch.zeros(2))
+    rule, (x, s) = dividing_rule(device), third_full(device)
+    for call, message in (
+        (lambda: npa_envs.rollout(rule, x, s, 1, box=2.0), "box must be None where part.* divide"),
+        (lambda: npa_envs.rollout_species([rule], x, s, 1, counts=(64,)), "must not divide, got d"),
+        (lambda: npa_envs.NPARule(static=True, divides=True), "got static=True"),
+        (lambda: npa_envs.NPARule(divides=torch.zeros(2)), "divides must be True or False"),
+    ):
+        with pytest.raises(NPAError, match=message):
+            call()

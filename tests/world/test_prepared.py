@@ -1,6 +1,6 @@
 """Prepared steps on a CPU: what they give is what launched ones give, bit for bit."""
 
-import threading
+from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 import torch
@@ -21,10 +21,8 @@ def make_rule(dtype=torch.float32, seed=0, **options):
     return lively_rule("cpu", dtype, eps0=0.3, gain=1.0, seed=seed, **options)
 
 
-def worlds(dtype=torch.float32, world_count=2, particle_count=40, space_dim=2, seed=0):
-    return random_world(
-        world_count, particle_count, space_dim, 5, dtype=dtype, device="cpu", seed=seed
-    )
+def worlds(dtype=torch.float32, world_count=2, particle_count=40, seed=0):
+    return random_world(world_count, particle_count, 2, 5, dtype=dtype, device="cpu", seed=seed)
 
 
 @torch.no_grad()
@@ -33,9 +31,8 @@ def run(rule, x, s, steps=5, *, by_world=False, seed=3, **options):
     generator = torch.Generator().manual_seed(seed)
     if by_world:
         generator = npa_envs.WorldRandom(range(seed, seed + len(x)))
-    found = npa_envs.rollout(
-        rule, x, s, steps, generator=generator, return_path_length=True, **options
-    )
+    options = {"generator": generator, "return_path_length": True, **options}
+    found = npa_envs.rollout(rule, x, s, steps, **options)
     return *found, generator.uniform(2) if by_world else torch.rand(2, generator=generator)
 
 
@@ -51,11 +48,14 @@ def steps_ready():
         {"box": BOX, "update_prob": 1.0},
         {"update_prob": 0.001, "keep_every": 2, "steps": 4},
         {"by_world": True, "dt": 0.5, "steps": 1},
+        {"equivariant": True},
     ],
-    ids=["open", "box", "few", "by world"],
+    ids=["open", "box", "few", "by world", "equivariant"],
 )
 def test_prepared_rollouts_are_the_launched_ones(options, dtype):
-    rule, (x, s) = make_rule(dtype), worlds(dtype)
+    options = dict(options)
+    chiral = options.pop("equivariant", False)
+    rule, (x, s) = make_rule(dtype, equivariant=chiral, chiral=chiral), worlds(dtype)
     launched = [run(rule, x, s, seed=seed, **options) for seed in (3, 4)]
     assert not steps_ready()
     ready = [run(rule, x, s, seed=seed, **options) for seed in (3, 4)]
@@ -74,14 +74,6 @@ def test_worlds_that_lie_otherwise_in_memory_are_stepped_alike():
         assert_same(run(rule, *views), expected[0])
     # The same kind of worlds: what was prepared for views serves these too.
     assert_same(run(rule, *others), expected[1])
-
-
-def test_equivariant_rules_are_prepared_too():
-    rule, (x, s) = make_rule(equivariant=True, chiral=True), worlds()
-    launched = [run(rule, x, s, seed=seed) for seed in (3, 4)]
-    ready = [run(rule, x, s, seed=seed) for seed in (3, 4)]
-    assert len(steps_ready()) == 1
-    assert_same(ready, launched)
 
 
 def test_weights_are_read_anew_and_results_stay():
@@ -127,18 +119,9 @@ def test_what_needs_gradients_noise_or_a_rule_of_its_own_is_launched():
 def test_threads_step_worlds_of_their_own():
     rule, starts = make_rule(), [worlds(seed=seed) for seed in range(4)]
     expected = [run(rule, *start) for start in starts]
-    found = [None] * len(starts)
-
-    def go(k):
-        for _ in range(20):
-            found[k] = run(rule, *starts[k])
-
-    threads = [threading.Thread(target=go, args=(k,)) for k in range(len(starts))]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
-    assert_same(found, expected)
+    with ThreadPoolExecutor(len(starts)) as pool:
+        found = pool.map(lambda start: [run(rule, *start) for _ in range(20)][-1], starts)
+    assert_same(list(found), expected)
     assert 1 <= len(steps_ready()) <= len(starts)
 
 

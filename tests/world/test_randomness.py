@@ -189,6 +189,9 @@ def test_no_two_purposes_of_the_package_have_one_number():
 
 def test_draws_have_their_dtypes_and_keep_their_limits(device):
     random = WorldRandom(range(4), device=device)
+    assert random.uniform().shape == (4,)
+    assert random.normal(0, 3).shape == (4, 0, 3)
+    assert random.bernoulli(0.5, 4, 0).shape == (4, 4, 0)
     assert random.uniform(3, dtype=torch.float64).dtype == torch.float64
     assert random.normal(3).dtype == torch.float32
     for probability in (0.0, 1.0):
@@ -219,9 +222,8 @@ def test_a_seeded_world_grows_in_a_batch_as_it_grows_alone(position_noise, task,
         random = WorldRandom(seeds, device=device)
         x, s, _ = task.seed(random.world_count, generator=random, device=device)
         with torch.no_grad():
-            return npa_envs.rollout(
-                rule, x, s, steps, generator=random, position_noise=position_noise
-            )
+            noise = {"generator": random, "position_noise": position_noise}
+            return npa_envs.rollout(rule, x, s, steps, **noise)
 
     together = grown([7, 8])
     for world, seed in enumerate((7, 8)):
@@ -285,11 +287,6 @@ def test_points_of_a_ball_are_uniform_in_it(by_world, space_dim, device):
     assert float(points.mean(dim=(0, 1)).abs().max()) < SIGMAS * deviation
 
 
-def test_more_points_than_there_is_room_for_are_refused():
-    with pytest.raises(NPAError, match=r"coordinates must be at most .*, got <int>"):
-        uniform_ball(10**5000, 5, 2, 0.2)
-
-
 def test_damage_chooses_every_particle_about_equally_often(device):
     random = WorldRandom(range(50), device=device)
     x = torch.arange(10.0, device=device).view(1, 10, 1).expand(50, 10, 2).contiguous()
@@ -300,16 +297,22 @@ def test_damage_chooses_every_particle_about_equally_often(device):
     assert float((counts - 100.0).abs().max()) < SIGMAS * 10.0
 
 
-def test_shapes_may_be_empty(device):
-    random = WorldRandom([1, 2], device=device)
-    assert random.uniform().shape == (2,)
-    assert random.normal(0, 3).shape == (2, 0, 3)
-    assert random.bernoulli(0.5, 4, 0).shape == (2, 4, 0)
+RULE, WORLD = npa_envs.NPARule(2, 4, 8), torch.rand(2, 9, 4)
+PLACES, THREE = WORLD[..., :2].contiguous(), WorldRandom([1, 2, 3])
+AS_MANY = "generator must have one stream for each world, B = 2, got 3"
 
 
 @pytest.mark.parametrize(
     ("call", "message"),
     [
+        (lambda: uniform_ball(2, 5, 2, 0.2, generator=THREE), AS_MANY),
+        (lambda: npa_envs.rollout(RULE, PLACES, WORLD, 1, generator=THREE), AS_MANY),
+        (lambda: random_particle(PLACES, THREE), AS_MANY),
+        (lambda: uniform_ball(10**5000, 5, 2, 0.2), "coordinates must be at most .*, got <int>"),
+        (
+            lambda: check_generator(WorldRandom(1), torch.device("cuda", 1), 1),
+            "worlds' device, cuda:1, got cpu: make it with W",
+        ),
         (lambda: WorldRandom(-1), "a seed must be an integer of at least 0, got -1"),
         (lambda: WorldRandom([1, 0.5]), "a seed must be an integer of at least 0, got 0.5"),
         (lambda: WorldRandom("12"), "a seed must be an integer of at least 0, got '1'"),
@@ -333,20 +336,3 @@ def test_shapes_may_be_empty(device):
 def test_wrong_arguments_are_clear_errors(call, message):
     with pytest.raises(NPAError, match=message):
         call()
-
-
-def test_streams_must_be_as_many_as_the_worlds(task):
-    random = WorldRandom([1, 2, 3])
-    message = r"generator must have one stream for each world, B = 2, got 3"
-    rule, x, s = npa_envs.NPARule(2, 4, 8), torch.rand(2, 9, 2), torch.rand(2, 9, 4)
-    with pytest.raises(NPAError, match=message):
-        task.seed(2, generator=random)
-    with pytest.raises(NPAError, match=message):
-        npa_envs.rollout(rule, x, s, 1, generator=random)
-    with pytest.raises(NPAError, match=message):
-        random_particle(x, random)
-
-
-def test_streams_must_be_on_the_worlds_device():
-    with pytest.raises(NPAError, match=r"worlds' device, cuda:1, got cpu: make it with W"):
-        check_generator(WorldRandom(1), torch.device("cuda", 1), 1)

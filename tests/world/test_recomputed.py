@@ -22,6 +22,10 @@ class Own(npa_envs.NPARule):
         return self.factor * super().forward(perception)
 
 
+def world(device):
+    return random_world(1, 40, 2, 5, dtype=torch.float64, device=device)
+
+
 def made(kind, device):
     plain = lively_rule(device, divides=kind == "dividing", equivariant=kind == "equivariant")
     if kind != "own":
@@ -35,11 +39,6 @@ def replace(value):
     value.data = value.data * 3.0
 
 
-def write(value):
-    with torch.no_grad():
-        value *= 3.0
-
-
 def replace_parameter(rule):
     rule.output.weight = torch.nn.Parameter(3.0 * rule.output.weight.detach())
 
@@ -47,7 +46,7 @@ def replace_parameter(rule):
 CHANGES = {
     "weight.data": lambda rule: replace(rule.output.weight),
     "hidden.weight.data": lambda rule: replace(rule.hidden.weight),
-    "weight in place": lambda rule: write(rule.output.weight),
+    "weight in place": lambda rule: rule.output.weight.detach().mul_(3.0),
     "parameter": replace_parameter,
     "eps0": lambda rule: setattr(rule, "eps0", 0.3),
     "alpha": lambda rule: setattr(rule, "alpha", 0.1),
@@ -73,7 +72,7 @@ def gradients(rule, x, s, memory, change, steps=4):
 def test_what_changes_before_the_backward_pass_is_refused_or_changes_nothing(
     kind, change, memory, device
 ):
-    x, s = random_world(1, 40, 2, 5, dtype=torch.float64, device=device)
+    x, s = world(device)
     expected = gradients(made(kind, device), x, s, "store", lambda rule: None)
     try:
         found = gradients(made(kind, device), x, s, memory, CHANGES[change])
@@ -96,7 +95,7 @@ def test_what_changes_before_the_backward_pass_is_refused_or_changes_nothing(
 @pytest.mark.parametrize("memory", RECOMPUTED)
 @pytest.mark.parametrize("name", ["x", "s"])
 def test_worlds_that_are_written_to_meanwhile_are_refused(name, memory, device):
-    x, s = random_world(1, 40, 2, 5, dtype=torch.float64, device=device)
+    x, s = world(device)
     rule = made("plain", device)
     new_x, new_s = npa_envs.rollout(rule, x, s, 4, memory=memory)
     (x if name == "x" else s).mul_(2.0)
@@ -106,7 +105,7 @@ def test_worlds_that_are_written_to_meanwhile_are_refused(name, memory, device):
 
 @pytest.mark.parametrize("memory", RECOMPUTED)
 def test_a_constant_of_an_own_network_that_changes_is_refused(memory, device):
-    x, s = random_world(1, 40, 2, 5, dtype=torch.float64, device=device)
+    x, s = world(device)
     with pytest.raises(npa_envs.NPAError, match=r"factor of the rule must stay as it is"):
         gradients(made("own", device), x, s, memory, lambda rule: setattr(rule, "factor", 2.0))
     with pytest.raises(npa_envs.NPAError, match=r"training of the rule must stay as it is"):
@@ -127,7 +126,7 @@ class Normalised(npa_envs.NPARule):
 
 
 def test_a_network_that_counts_and_normalises_has_the_gradients_of_stored_steps(device):
-    x, s = random_world(1, 40, 2, 5, dtype=torch.float64, device=device)
+    x, s = world(device)
     found = []
     for memory in ("store", *RECOMPUTED):
         torch.manual_seed(0)
@@ -139,7 +138,7 @@ def test_a_network_that_counts_and_normalises_has_the_gradients_of_stored_steps(
 
 
 def test_a_retained_graph_gives_the_same_gradients_again(device):
-    x, s = random_world(1, 40, 2, 5, dtype=torch.float64, device=device)
+    x, s = world(device)
     rule = made("own", device)
     s.requires_grad_()
     value = npa_envs.rollout(rule, x, s, 7, memory="recompute")[1].square().sum()
@@ -149,7 +148,7 @@ def test_a_retained_graph_gives_the_same_gradients_again(device):
 
 @pytest.mark.parametrize("memory", RECOMPUTED)
 def test_species_refuse_it_too(memory, device):
-    x, s = random_world(1, 40, 2, 5, dtype=torch.float64, device=device)
+    x, s = world(device)
     rules = [made("plain", device), made("own", device)]
     for change, name in (
         (lambda: setattr(rules[0], "alpha", 0.1), "alpha of rule 0"),

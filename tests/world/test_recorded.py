@@ -1,7 +1,7 @@
 """Recorded rollouts: what they give is what launched ones give, bit for bit."""
 
 import functools
-import threading
+from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 import torch
@@ -11,17 +11,10 @@ from worlds import random_world
 import npa_envs
 from npa_envs.world import recorded
 
-pytestmark = pytest.mark.gpu
+pytestmark = [pytest.mark.gpu, pytest.mark.usefixtures("nothing_recorded")]
 
 DEVICE = torch.device("cuda", 0)
 EPS = 0.3
-
-
-@pytest.fixture(autouse=True)
-def _nothing_recorded():
-    recorded.release_recordings()
-    yield
-    recorded.release_recordings()
 
 
 def worlds(count=3, particles=60, space_dim=2, seed=0, dtype=torch.float32):
@@ -36,31 +29,21 @@ def make_rule(space_dim=2, dtype=torch.float32, seed=0, **options):
     return rule.to(DEVICE, dtype)
 
 
-def run(rule, x, s, steps=7, *, cuda_graph, seed=0, gradients=True, by_world=False, **options):
+def run(rule, x, s, steps=7, *, seed=0, gradients=True, by_world=False, **options):
     """Return what a rollout gives, its gradients, and what its generator draws next."""
     generator = torch.Generator(DEVICE).manual_seed(seed)
     if by_world:
         generator = npa_envs.WorldRandom([seed + k for k in range(len(x))], device=DEVICE)
     x, s = x.clone().requires_grad_(gradients), s.clone().requires_grad_(gradients)
+    options = {"generator": generator, "return_path_length": True, **options}
     with torch.set_grad_enabled(gradients):
-        results = npa_envs.rollout(
-            rule,
-            x,
-            s,
-            steps,
-            generator=generator,
-            return_path_length=True,
-            cuda_graph=cuda_graph,
-            **options,
-        )
+        results = npa_envs.rollout(rule, x, s, steps, **options)
     found = list(results)
     if gradients:
         loss = sum(value.sin().sum() for value in results)
         found += torch.autograd.grad(loss, [x, s, *rule.parameters()], allow_unused=True)
-    found.append(
-        generator.uniform(3) if by_world else torch.rand(3, device=DEVICE, generator=generator)
-    )
-    return found
+    drawn = generator.uniform(3) if by_world else torch.rand(3, device=DEVICE, generator=generator)
+    return [*found, drawn]
 
 
 def same(first, second):
@@ -70,36 +53,32 @@ def same(first, second):
         assert one is None or (torch.equal(one, other) and one.isfinite().all())
 
 
+def as_launched(rule, calls=4, cuda_graph="auto", **options):
+    """Check that calls that may be recorded give what launched ones give."""
+    for call in range(calls):
+        form = {"space_dim": rule.space_dim, "dtype": rule.hidden.weight.dtype}
+        x, s = worlds(seed=call, **form)
+        expected = run(rule, x, s, seed=call, cuda_graph=False, **options)
+        same(run(rule, x, s, seed=call, cuda_graph=cuda_graph, **options), expected)
+
+
+def together(*works):
+    """Run works in threads of their own, and raise their first error."""
+    with ThreadPoolExecutor(len(works)) as pool:
+        for done in [pool.submit(work) for work in works]:
+            done.result()
+
+
 def is_recorded():
     return recorded.recorded_memory(DEVICE) > 0
 
 
-@pytest.mark.parametrize("gradients", [False, True])
-@pytest.mark.parametrize(
-    "options",
-    [
-        {},
-        {"update_prob": 1.0, "box": (1.4, 1.8)},
-        {"position_noise": 0.01, "dt": 0.5},
-        {"detach_positions": False},
-        {"memory": "recompute"},
-        {"memory": "minimal"},
-        {"keep_every": 7},
-        {"keep_every": 1},
-        {"by_world": True, "position_noise": 0.01},
-        {"steps": 1},
-        {"steps": 150},
-    ],
-    ids=str,
-)
 def test_a_recorded_rollout_is_the_launched_one(options, gradients):
     rule = make_rule()
-    for call in range(5):
-        x, s = worlds(seed=call)
-        expected = run(rule, x, s, seed=call, gradients=gradients, cuda_graph=False, **options)
-        found = run(rule, x, s, seed=call, gradients=gradients, cuda_graph="auto", **options)
-        same(found, expected)
-        assert is_recorded() == (call >= 2)
+    as_launched(rule, 2, gradients=gradients, **options)
+    assert not is_recorded()
+    as_launched(rule, 3, gradients=gradients, **options)
+    assert is_recorded()
 
 
 @pytest.mark.parametrize(
@@ -116,11 +95,7 @@ def test_a_recorded_rollout_is_the_launched_one(options, gradients):
     ids=str,
 )
 def test_every_form_of_rule_is_recorded(dtype, space_dim, options):
-    rule = make_rule(space_dim, dtype, **options)
-    for call in range(4):
-        x, s = worlds(space_dim=space_dim, dtype=dtype, seed=call)
-        expected = run(rule, x, s, seed=call, cuda_graph=False)
-        same(run(rule, x, s, seed=call, cuda_graph="auto"), expected)
+    as_launched(make_rule(space_dim, dtype, **options))
     assert is_recorded()
 
 
@@ -222,19 +197,11 @@ def with_autocast(roll, x, s):
     [two_before_one_backward, one_after_the_other, retained, abandoned, with_autocast],
 )
 def test_training_follows_the_same_path(arrange, memory):
+    def arranged(roll, x, s):
+        arrange(functools.partial(roll, memory=memory), x, s)
+
     x, s = worlds()
-    ways = []
-    for cuda_graph in (False, "auto"):
-        ways.append(
-            optimise(
-                make_rule(),
-                x,
-                s,
-                cuda_graph,
-                lambda roll, x, s: arrange(functools.partial(roll, memory=memory), x, s),
-            )
-        )
-    same(*ways)
+    same(*(optimise(make_rule(), x, s, graph, arranged) for graph in (False, "auto")))
     assert is_recorded()
 
 
@@ -269,10 +236,7 @@ def test_positions_that_are_not_finite_are_refused_and_nothing_is_drawn():
         with pytest.raises(npa_envs.NPAError, match=r"x must be finite.*world 1, particle 7"):
             npa_envs.rollout(rule, broken, s, 5, generator=generator)
         assert torch.equal(generator.get_state(), state)
-        same(
-            run(rule, x, s, cuda_graph="auto", gradients=False),
-            run(rule, x, s, cuda_graph=False, gradients=False),
-        )
+    as_launched(rule, 1, gradients=False)
 
 
 class Doubled(npa_envs.NPARule):
@@ -286,38 +250,26 @@ class Doubled(npa_envs.NPARule):
 def test_rules_with_a_network_of_their_own_are_recorded_where_asked():
     torch.manual_seed(0)
     rule = Doubled(2, 8, 32, eps0=EPS).to(DEVICE)
-    x, s = worlds()
-    for call in range(4):
-        expected = run(rule, x, s, seed=call, cuda_graph=False)
-        same(run(rule, x, s, seed=call, cuda_graph="auto"), expected)
+    as_launched(rule)
     assert not is_recorded()
-    for call in range(4):
-        expected = run(rule, x, s, seed=call, cuda_graph=False)
-        before = Doubled.runs
-        same(run(rule, x, s, seed=call, cuda_graph=True), expected)
+    as_launched(rule, cuda_graph=True)
     assert is_recorded()
+    before = Doubled.runs
+    run(rule, *worlds(), cuda_graph=True)
     assert Doubled.runs == before
 
 
 def test_species_are_recorded():
     rules = [make_rule(seed=k) for k in range(2)]
+    parameters = [own for rule in rules for own in rule.parameters()]
     for call in range(4):
         x, s = worlds(particles=50, seed=call)
         found = []
         for cuda_graph in (False, "auto"):
             generator = torch.Generator(DEVICE).manual_seed(call)
-            after = npa_envs.rollout_species(
-                rules,
-                x,
-                s,
-                6,
-                counts=(20, 30),
-                update_prob=(0.5, 0.3),
-                generator=generator,
-                cuda_graph=cuda_graph,
-            )
+            options = {"counts": (20, 30), "update_prob": (0.5, 0.3), "generator": generator}
+            after = npa_envs.rollout_species(rules, x, s, 6, cuda_graph=cuda_graph, **options)
             loss = after[0].sum() + after[1].square().sum()
-            parameters = [own for rule in rules for own in rule.parameters()]
             found.append([*after, *torch.autograd.grad(loss, parameters)])
         same(*found)
     assert is_recorded()
@@ -327,33 +279,17 @@ def test_streams_and_threads():
     rule = make_rule()
     cases = [(worlds(seed=k), k) for k in range(4)]
     expected = [run(rule, *given, seed=k, cuda_graph=False) for given, k in cases]
-    for _ in range(3):
-        for (given, k), right in zip(cases, expected, strict=True):
-            with torch.cuda.stream(torch.cuda.Stream()):
-                found = run(rule, *given, seed=k, cuda_graph="auto")
-                torch.cuda.current_stream().synchronize()
-            same(found, right)
-    wrong = []
 
-    def work(given, k, right):
-        for _ in range(10):
+    def work(k, calls=1):
+        for _ in range(calls):
             with torch.cuda.stream(torch.cuda.Stream()):
-                found = run(rule, *given, seed=k, cuda_graph="auto")
+                found = run(rule, *cases[k][0], seed=k, cuda_graph="auto")
                 torch.cuda.current_stream().synchronize()
-            try:
-                same(found, right)
-            except AssertionError as error:
-                wrong.append(error)
+            same(found, expected[k])
 
-    threads = [
-        threading.Thread(target=work, args=(given, k, right))
-        for (given, k), right in zip(cases, expected, strict=True)
-    ]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
-    assert not wrong
+    for k in 3 * [0, 1, 2, 3]:
+        work(k)
+    together(*(functools.partial(work, k, 10) for k in range(4)))
 
 
 def test_inside_a_graph_of_the_caller():
@@ -372,11 +308,7 @@ def test_inside_a_graph_of_the_caller():
 
 def test_memory_is_bounded(monkeypatch):
     monkeypatch.setattr(recorded, "MEMORY_SHARE", 1e-12)
-    rule = make_rule()
-    x, s = worlds()
-    for call in range(5):
-        expected = run(rule, x, s, seed=call, cuda_graph=False)
-        same(run(rule, x, s, seed=call, cuda_graph="auto"), expected)
+    as_launched(make_rule(), 5)
 
 
 @pytest.mark.slow

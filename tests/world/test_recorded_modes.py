@@ -7,41 +7,23 @@ import threading
 
 import pytest
 import torch
-from test_recorded import DEVICE, is_recorded, make_rule, run, same, worlds
+from test_recorded import (
+    DEVICE,
+    as_launched,
+    is_recorded,
+    make_rule,
+    run,
+    same,
+    together,
+    worlds,
+)
 
 import npa_envs
 from npa_envs.ops import launch
-from npa_envs.world import recorded
 from npa_envs.world.cuda_graph import capture, plain_tensors
 from npa_envs.world.randomness import give_back_draws, reserve_draws
 
-pytestmark = pytest.mark.gpu
-
-
-@pytest.fixture(autouse=True)
-def _nothing_recorded():
-    recorded.release_recordings()
-    yield
-    recorded.release_recordings()
-
-
-def together(*works):
-    """Run works in threads of their own, and raise their first error."""
-    errors = []
-
-    def guarded(work):
-        try:
-            work()
-        except BaseException as error:
-            errors.append(error)
-
-    threads = [threading.Thread(target=guarded, args=(work,)) for work in works]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
-    if errors:
-        raise errors[0]
+pytestmark = [pytest.mark.gpu, pytest.mark.usefixtures("nothing_recorded")]
 
 
 @pytest.mark.parametrize("by_world", [False, True])
@@ -94,41 +76,24 @@ def test_draws_are_reserved_and_given_back():
 
 def test_with_cuda_as_default_device():
     rule = make_rule()
-    x, s = worlds()
-    expected = [run(rule, x, s, seed=k, cuda_graph=False) for k in range(4)]
     torch.set_default_device(DEVICE)
     try:
-        for k in range(4):
-            same(run(rule, x, s, seed=k, cuda_graph="auto"), expected[k])
-        npa_envs.perceive(x, s, 0.3)
-    finally:
-        torch.set_default_device(None)
-    assert is_recorded()
-
-
-def test_plain_tensors_are_made_on_the_cpu_and_can_be_written_to():
-    torch.set_default_device(DEVICE)
-    try:
+        as_launched(rule)
+        npa_envs.perceive(*worlds(), 0.3)
         with torch.inference_mode(), plain_tensors():
             made = torch.zeros(2)
     finally:
         torch.set_default_device(None)
+    assert is_recorded()
     assert made.device.type == "cpu"
     made.add_(1)
 
 
-def test_matrix_precision_chosen_in_the_new_way():
+def test_matrix_precision_chosen_in_the_new_way(monkeypatch):
     rule = make_rule()
-    x, s = worlds()
-    before = torch.backends.cuda.matmul.fp32_precision
     for precision in ("ieee", "tf32"):
-        torch.backends.cuda.matmul.fp32_precision = precision
-        try:
-            for call in range(4):
-                expected = run(rule, x, s, seed=call, cuda_graph=False)
-                same(run(rule, x, s, seed=call, cuda_graph="auto"), expected)
-        finally:
-            torch.backends.cuda.matmul.fp32_precision = before
+        monkeypatch.setattr(torch.backends.cuda.matmul, "fp32_precision", precision)
+        as_launched(rule)
 
 
 def test_others_draw_while_something_is_recorded():
@@ -214,15 +179,9 @@ envs.reset(seed=0)
 for _ in range(4):
     envs.step(torch.zeros(envs.action_space.shape))
 """
-    done = subprocess.run(
-        [sys.executable, "-c", code],
-        env=os.environ | {name: value},
-        capture_output=True,
-        text=True,
-        timeout=120,
-        check=False,
-        encoding="utf-8",
-    )
+    options = {"capture_output": True, "encoding": "utf-8", "timeout": 120, "check": False}
+    command = [sys.executable, "-c", code]
+    done = subprocess.run(command, env=os.environ | {name: value}, **options)
     assert done.returncode == 0, done.stderr[-2000:]
 
 

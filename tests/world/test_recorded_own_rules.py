@@ -1,24 +1,20 @@
 """Recorded rules with a network of their own: changes are followed, or they are launched."""
 
+import functools
+
 import pytest
 import torch
 from test_recorded import DEVICE, EPS, is_recorded, make_rule, run, same, worlds
+from test_recorded import as_launched as follows
 from torch import nn
 
 import npa_envs
-from npa_envs.world import recorded
 from npa_envs.world.own_rules import rule_settings, rule_tensors
 
+pytestmark = pytest.mark.usefixtures("nothing_recorded")
+
 CPU = torch.device("cpu")
-
-
-@pytest.fixture(autouse=True)
-def _nothing_recorded():
-    if torch.cuda.is_available():
-        recorded.release_recordings()
-    yield
-    if torch.cuda.is_available():
-        recorded.release_recordings()
+as_launched = functools.partial(follows, calls=3, cuda_graph=True)
 
 
 class Scaled(npa_envs.NPARule):
@@ -86,14 +82,6 @@ def of_type(kind, **options):
     return rule
 
 
-def as_launched(rule, calls=3, **options):
-    """Check that calls that may be recorded give what launched ones give."""
-    for call in range(calls):
-        x, s = worlds(seed=call)
-        expected = run(rule, x, s, seed=call, cuda_graph=False, **options)
-        same(run(rule, x, s, seed=call, cuda_graph=True, **options), expected)
-
-
 CHANGES = {
     "a number": lambda rule: setattr(rule, "number", 3.0),
     "a list": lambda rule: rule.listed.append(1),
@@ -102,6 +90,11 @@ CHANGES = {
     "a mode": lambda rule: rule.eval(),
     "a module": lambda rule: setattr(rule, "output", nn.Linear(32, 10)),
 }
+
+
+def written_in_place(rule):
+    rule.factor.fill_(3.0)
+    rule.shift.data.fill_(0.1)
 
 
 @pytest.mark.parametrize("change", CHANGES)
@@ -123,23 +116,15 @@ def test_tensors_of_a_rule_are_its_parameters_buffers_and_attributes():
 
 
 @pytest.mark.gpu
-@pytest.mark.parametrize("change", [name for name in CHANGES if name != "a module"])
-def test_a_changed_rule_is_recorded_anew(change):
+@pytest.mark.parametrize(
+    "change", [written_in_place, *(made for name, made in CHANGES.items() if name != "a module")]
+)
+def test_a_changed_rule_is_followed(change):
     rule = of_type(Scaled)
     as_launched(rule)
     assert is_recorded()
-    CHANGES[change](rule)
+    change(rule)
     as_launched(rule)
-
-
-@pytest.mark.gpu
-def test_tensors_that_change_in_place_are_read_anew():
-    rule = of_type(Scaled)
-    as_launched(rule)
-    rule.factor.fill_(3.0)
-    rule.shift.data.fill_(0.1)
-    as_launched(rule)
-    assert is_recorded()
 
 
 @pytest.mark.gpu
@@ -211,9 +196,9 @@ def test_running_statistics_go_on(gradients):
     for cuda_graph in (False, True):
         rule = of_type(Normed)
         for call in range(5):
-            x, s = worlds(seed=call)
+            options = {"update_prob": 1.0, "cuda_graph": cuda_graph}
             with torch.set_grad_enabled(gradients):
-                npa_envs.rollout(rule, x, s, 70, update_prob=1.0, cuda_graph=cuda_graph)
+                npa_envs.rollout(rule, *worlds(seed=call), 70, **options)
         states.append([rule.norm.running_mean, rule.norm.running_var])
         assert int(rule.norm.num_batches_tracked) == 350
     same(*states)

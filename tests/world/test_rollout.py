@@ -89,6 +89,10 @@ def pulled(values):
     return sum((bar * v).sum() for bar, v in zip(cotangents(values), values, strict=True))
 
 
+def seeded(device, seed):
+    return torch.Generator(device).manual_seed(seed)
+
+
 @pytest.mark.parametrize("update_prob", [1.0, 0.4])
 @pytest.mark.parametrize("static", [False, True])
 @pytest.mark.parametrize("box", [None, (1.4, 1.8)])
@@ -99,16 +103,14 @@ def test_rollout_and_its_gradients_equal_plain_torch(
 ):
     x, s = random_world(2, 60, 2, 5, dtype=torch.float64, device="cpu")
     options = {"eps": 0.3, "box": box, "dt": 0.7, "detach_positions": detach_positions}
+    terms = {"moment_correction": False} if inverse == "none" else {"moment_inverse": inverse}
     masks = None
     if update_prob < 1.0:
-        generator = torch.Generator(device).manual_seed(9)
+        draws = seeded(device, 9)
         blank = torch.empty(2, 60, dtype=torch.uint8, device=device)
-        masks = [
-            blank.bernoulli_(update_prob, generator=generator).cpu().double() for _ in range(4)
-        ]
+        masks = [blank.bernoulli_(update_prob, generator=draws).cpu().double() for _ in range(4)]
 
     def run(rollout, device, **more):
-        terms = {"moment_correction": False} if inverse == "none" else {"moment_inverse": inverse}
         rule = lively_rule(device, static=static, **terms)
         start, states = (value.to(device).clone().requires_grad_() for value in (x, s))
         found = rollout(rule, start, states, 4, **options, **more)
@@ -116,8 +118,7 @@ def test_rollout_and_its_gradients_equal_plain_torch(
         return found, torch.autograd.grad(pulled(found), inputs, allow_unused=True)
 
     expected, wanted = run(plain_rollout, "cpu", masks=masks)
-    generator = torch.Generator(device).manual_seed(9)
-    more = {"update_prob": update_prob, "generator": generator, "return_path_length": True}
+    more = {"update_prob": update_prob, "generator": seeded(device, 9), "return_path_length": True}
     found, gradients = run(npa_envs.rollout, device, **more)
     assert_near(found, expected, 1e-12)
     for value, answer in zip(gradients, wanted, strict=True):
@@ -138,15 +139,11 @@ def test_recomputing_gives_the_gradients_of_storing(device, monkeypatch):
     results = []
     for memory in ("store", "recompute", "minimal"):
         advanced.append(0)
-        s_ = s.clone().requires_grad_()
-        generator = torch.Generator(device).manual_seed(1)
-        out = npa_envs.rollout(
-            rule, x, s_, 5, position_noise=0.01, memory=memory, generator=generator
-        )
-        gradients = torch.autograd.grad(
-            out[0].square().sum() + out[1].square().sum(), [s_, *rule.parameters()]
-        )
-        results.append((*out, *gradients))
+        start = s.clone().requires_grad_()
+        options = {"position_noise": 0.01, "memory": memory, "generator": seeded(device, 1)}
+        out = npa_envs.rollout(rule, x, start, 5, **options)
+        loss = out[0].square().sum() + out[1].square().sum()
+        results.append((*out, *torch.autograd.grad(loss, [start, *rule.parameters()])))
     assert_same(results[1:], [results[0]] * 2)
     # Of five steps, "recompute" stores the last and the second, "minimal" the last.
     assert advanced == [5, 5 + 3, 5 + 4]
@@ -156,14 +153,13 @@ def test_seeded_rollouts_are_bit_identical_also_step_by_step(device):
     rule = lively_rule(device, dtype=torch.float32)
     x, s = random_world(3, 300, 2, 5, dtype=torch.float32, device=device)
 
-    def run(seed):
-        generator = torch.Generator(device).manual_seed(seed)
-        return npa_envs.rollout(rule, x, s, 6, position_noise=0.01, generator=generator)
-
-    expected = run(5)
-    assert_same(run(5), expected)
-    assert not torch.equal(run(6)[0], expected[0])
-    generator, here = torch.Generator(device).manual_seed(5), (x, s)
+    expected, again, other = (
+        npa_envs.rollout(rule, x, s, 6, position_noise=0.01, generator=seeded(device, seed))
+        for seed in (5, 5, 6)
+    )
+    assert_same(again, expected)
+    assert not torch.equal(other[0], expected[0])
+    generator, here = seeded(device, 5), (x, s)
     for _ in range(6):
         here = npa_envs.step(rule, *here, position_noise=0.01, generator=generator)
     assert_same(here, expected)
@@ -200,10 +196,8 @@ def test_rows_beyond_the_last_active_one_pull_nothing_back(device):
         row_base=6,
     )
     update = torch.randn(4, 5, dtype=torch.float64, device=device, requires_grad=True)
-    path = x.new_zeros(1, 6)
-    moved = update_particles(
-        update, x, s, path, rows, Physics(2, 3, 1.0, 1.0, max_displacement=0.1)
-    )
+    physics = Physics(2, 3, 1.0, 1.0, max_displacement=0.1)
+    moved = update_particles(update, x, s, x.new_zeros(1, 6), rows, physics)
     (gradient,) = torch.autograd.grad(sum(value.sum() for value in moved), update)
     assert (gradient[2:] == 0).all()
     assert (gradient[:2] != 0).all()
@@ -224,14 +218,13 @@ def test_columns_that_nothing_reads_change_nothing(space_dim, state_dim, moving,
     width = state_dim + space_dim * moving
     update = torch.randn(120, width, generator=generator).to(device)
 
+    sides = None if box is None else (box,) * space_dim
+    options = {"moving": moving, "max_displacement": 0.1, "dt": 0.7}
+    physics = Physics(space_dim, state_dim, 0.1, 0.1, sides, **options)
+
     def run(padding):
         padded = torch.nn.functional.pad(update, (0, padding), value=7.0).requires_grad_()
-        sides = None if box is None else (box,) * space_dim
-        path = x.new_ones(3, 85)
-        physics = Physics(
-            space_dim, state_dim, 0.1, 0.1, sides, moving=moving, max_displacement=0.1, dt=0.7
-        )
-        moved = update_particles(padded, x, s, path, rows, physics)
+        moved = update_particles(padded, x, s, x.new_ones(3, 85), rows, physics)
         (bar,) = torch.autograd.grad(moved, padded, cotangents(moved))
         assert (bar[:, width:] == 0).all()
         return *moved, bar[:, :width]
@@ -244,31 +237,6 @@ def test_columns_that_nothing_reads_change_nothing(space_dim, state_dim, moving,
     change[row_source.long()] = 0.7 * update[:, width - state_dim :]
     assert relative_error(plain[1], s.double() + change.view_as(s)) < 1e-7
     assert torch.equal(plain[1][~changed], s[~changed])
-
-
-class Doubled(npa_envs.NPARule):
-    def forward(self, perception):
-        return 2.0 * super().forward(perception)
-
-
-@pytest.mark.parametrize("how", ["hook", "override"])
-def test_a_rule_that_is_no_plain_network_is_used_as_it_is(how, device):
-    plain, doubled = lively_rule(device), lively_rule(device)
-    if how == "hook":
-        handle = doubled.register_forward_hook(lambda module, inputs, output: 2.0 * output)
-    else:
-        doubled = Doubled(**plain.hyper_parameters()).to(device, torch.float64)
-        doubled.load_state_dict(plain.state_dict())
-    x, s = random_world(1, 50, 2, 5, dtype=torch.float64, device=device)
-    _, once = npa_envs.step(plain, x, s, update_prob=1.0)
-    _, twice = npa_envs.step(doubled, x, s, update_prob=1.0)
-    torch.testing.assert_close(twice - s, 2.0 * (once - s), rtol=1e-12, atol=1e-13)
-    assert not doubled.is_plain()
-    if how == "hook":
-        handle.remove()
-        assert doubled.is_plain()
-        doubled.output = torch.nn.Linear(12, 7, dtype=torch.float64, device=device)
-        assert not doubled.is_plain()
 
 
 def test_worlds_keep_their_precision_under_autocast(device):
@@ -295,7 +263,7 @@ def test_recomputed_steps_of_a_rule_that_draws_draw_the_same(device, memory, spe
     found = []
     for mode in ("store", memory):
         torch.manual_seed(1)
-        options = {"generator": torch.Generator(device).manual_seed(2), "memory": mode}
+        options = {"generator": seeded(device, 2), "memory": mode}
         if species:
             ends = npa_envs.rollout_species([rule], x, s, 5, counts=[30], **options)
         else:
@@ -329,11 +297,7 @@ def test_a_rollout_of_no_steps_returns_worlds_of_its_own():
 
 @pytest.mark.parametrize(
     ("gradients", "options"),
-    [
-        (False, {}),
-        (True, {}),
-        (True, {"memory": "minimal", "box": 1.5, "eps": 0.25}),
-    ],
+    [(False, {}), (True, {}), (True, {"memory": "minimal", "box": 1.5, "eps": 0.25})],
     ids=("quiet", "stored", "recomputed"),
 )
 def test_a_rollout_compiled_for_all_sizes_is_a_rollout(gradients, options):
@@ -347,9 +311,8 @@ def test_a_rollout_compiled_for_all_sizes_is_a_rollout(gradients, options):
     compiled = torch.compile(outcome, backend="aot_eager", dynamic=True)
     with torch.set_grad_enabled(gradients):
         for world_count, particle_count, eps0 in ((1, 20, 0.2), (2, 30, 0.2), (2, 30, 0.3)):
-            x, s = random_world(
-                world_count, particle_count, 2, 5, dtype=torch.float32, device="cpu"
-            )
+            shape = (world_count, particle_count, 2, 5)
+            x, s = random_world(*shape, dtype=torch.float32, device="cpu")
             s.requires_grad_(gradients)
             found, expected = compiled(x, s, eps0), outcome(x, s, eps0)
             torch.testing.assert_close(found, expected, rtol=1e-5, atol=1e-6)

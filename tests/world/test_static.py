@@ -29,13 +29,10 @@ def outcome(rule, x, s, *, rebuilt=False, steps=STEPS, **options):
     Rebuilt: cells, densities and neighbour lists are made in every step.
     """
     s = s.clone().requires_grad_()
-    generator = torch.Generator(x.device).manual_seed(3)
-    given = {"eps": 0.3, "generator": generator, "detach_positions": not rebuilt}
-    new_x, new_s, path = npa_envs.rollout(
-        rule, x, s, steps, return_path_length=True, **given, **options
-    )
-    gradients = torch.autograd.grad(new_s, [s, *rule.parameters()], cotangents([new_s]))
-    return [new_x, new_s, path, *gradients]
+    options |= {"generator": torch.Generator(x.device).manual_seed(3), "return_path_length": True}
+    after = npa_envs.rollout(rule, x, s, steps, eps=0.3, detach_positions=not rebuilt, **options)
+    inputs = [s, *rule.parameters()]
+    return [*after, *torch.autograd.grad(after[1], inputs, cotangents(after[1:2]))]
 
 
 def assert_equals_rebuilding(rule, x, s, bound=1e-12, *, exactly=False, **options):
@@ -70,19 +67,23 @@ def test_it_equals_rebuilding(world_count, space_dim, state_dim, box, update_pro
 
 
 @pytest.mark.parametrize(
-    "terms",
+    ("terms", "steps"),
     [
-        {"state_gradient": False},
-        {"moment_correction": False},
-        {"density_gradient": False},
-        {"moment_inverse": "smooth"},
+        ({"state_gradient": False}, STEPS),
+        ({"moment_correction": False}, STEPS),
+        ({"density_gradient": False}, STEPS),
+        ({"moment_inverse": "smooth"}, STEPS),
+        *(({}, steps) for steps in (1, FEWEST_STATIC - 1, FEWEST_STATIC)),
     ],
     ids=str,
 )
-def test_terms_are_those_of_the_rule(terms, device):
+@pytest.mark.parametrize("hooked", [False, True])
+def test_terms_and_a_hook_are_those_of_the_rule(terms, steps, hooked, device):
     rule = static_rule(device, torch.float64, state_dim=4, **terms)
+    if hooked:
+        rule.hidden.register_forward_hook(lambda module, args, output: 2.0 * output)
     x, s = random_world(2, 60, 2, 4, dtype=torch.float64, device=device)
-    assert_equals_rebuilding(rule, x, s)
+    assert_equals_rebuilding(rule, x, s, steps=steps)
 
 
 def test_hard_worlds_equal_rebuilding(dtype, space_dim, device):
@@ -118,25 +119,11 @@ def test_positions_are_returned_as_a_copy_and_pass_their_gradient(device):
     assert torch.equal(gradient, weights)
 
 
-@pytest.mark.parametrize("steps", [1, FEWEST_STATIC - 1, FEWEST_STATIC])
-def test_rollouts_of_few_steps_equal_rebuilding(steps, device):
-    rule = static_rule(device, torch.float64)
-    x, s = random_world(1, 40, 2, 5, dtype=torch.float64, device=device)
-    assert_equals_rebuilding(rule, x, s, steps=steps)
-
-
 def test_noise_moves_particles_of_static_rules(device):
     rule = static_rule(device, torch.float64)
     x, s = random_world(1, 40, 2, 5, dtype=torch.float64, device=device)
     after, _ = npa_envs.rollout(rule, x, s, STEPS, position_noise=0.01)
     assert 0.0 < float((after - x).abs().max()) < 0.2
-
-
-def test_a_module_in_the_rules_place_is_run(device):
-    rule = static_rule(device, torch.float64)
-    x, s = random_world(1, 40, 2, 5, dtype=torch.float64, device=device)
-    rule.hidden.register_forward_hook(lambda module, args, output: 2.0 * output)
-    assert_equals_rebuilding(rule, x, s)
 
 
 def test_a_compiled_rollout_equals_the_eager_one(device):

@@ -1,0 +1,16 @@
+"""What several tests of worlds start from."""
+
+import pytest
+import torch
+
+from npa_envs.world import recorded
+
+
+@pytest.fixture
+def nothing_recorded():
+    """No recordings before and after a test, where there is a CUDA device."""
+    for before in (True, False):
+        if torch.cuda.is_available():
+            recorded.release_recordings()
+        if before:
+            yield
