@@ -135,7 +135,7 @@ class Physics(NamedTuple):
 
     def scale(self) -> float:
         """Return c = eps / eps0."""
-        return constant(self.eps) / constant(self.eps0)
+        return constant(self.eps / self.eps0)
 
     def constants(self) -> Physics:
         """Return them with numbers that a compiler takes for constants."""
