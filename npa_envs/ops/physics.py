@@ -16,9 +16,8 @@ from npa_envs.checks import (
     checked_eps,
     checked_number,
     constant,
-    shown,
 )
-from npa_envs.errors import NPAError
+from npa_envs.errors import NPAError, shown
 
 Boundary = Literal["periodic", "reflecting"]
 """What the sides of a box do: they are one place with the opposite side, or walls."""
@@ -111,8 +110,10 @@ class Physics(NamedTuple):
         terms = Terms(bool(state_gradient), INVERSES[int(inverse)], bool(density_gradient))
         largest, update_prob, dt, noise, reflecting, *sides = rest
         box, walls = (None, tuple(sides)) if reflecting else (tuple(sides) or None, None)
-        numbers = largest, update_prob, dt, noise
-        return cls(0, 0, eps, eps0, box, terms, bool(moving), *numbers, NO_LIMITS, walls)
+        return cls(
+            *(0, 0, eps, eps0, box, terms, bool(moving)),
+            *(largest, update_prob, dt, noise, NO_LIMITS, walls),
+        )
 
     def numbers(self) -> list[float]:
         """Return what torch operators take in place of this: numbers, constants to compilers."""
