@@ -10,7 +10,7 @@ import functools
 import inspect
 from collections.abc import Callable, Iterator
 from types import NoneType
-from typing import Any, Generic, NoReturn, ParamSpec, TypeVar
+from typing import Any, Generic, ParamSpec, TypeVar
 
 import torch
 from torch import Tensor, nn
@@ -188,15 +188,11 @@ def once_differentiable(
         except RuntimeError as error:
             # A batch of cotangents has no memory that a kernel could read.
             if any(map(torch._C._functorch.is_legacy_batchedtensor, _tensors(args))):
-                _refuse_batches(error)
+                raise NPAError(
+                    "is_grads_batched must be False where particles are perceived, moved or drawn, "
+                    "and vectorize too, got several cotangents at once: run one backward pass for "
+                    f"each, {CURE}"
+                ) from error
             raise
 
     return guarded
-
-
-def _refuse_batches(error: RuntimeError) -> NoReturn:
-    raise NPAError(
-        "is_grads_batched must be False where particles are perceived, moved or drawn, and "
-        "vectorize too, got several cotangents at once: run one backward pass for each, "
-        f"{CURE}"
-    ) from error

@@ -352,8 +352,8 @@ def perceive_rows(
         static_rows: Rows of the active particles of static worlds, or None for all.
 
     Returns:
-        Rows of perception, dimensionless, shape [K, row_width], zero beyond the last active row,
-        and which particles they stand for.
+        Rows of perception, shape [K, row_width], zero beyond the last active row, and which
+        particles they stand for.
     """
     x, s, rows = x.contiguous(), s.contiguous(), static_rows
     masked = (mask if static is None else static_rows) is not None
@@ -412,12 +412,7 @@ def update_some_at_a_time(
 
 
 class NeighbourState:
-    """Sorted worlds with densities, ready for perception; `build_neighbours` makes them.
-
-    Args:
-        launch_of: Returns what to give to a launch that writes rows into a tensor, [B N, P].
-        shape: Shape of what is perceived, [B, N, P].
-    """
+    """Sorted worlds with densities, ready for perception; `build_neighbours` makes them."""
 
     def __init__(
         self, launch_of: Callable[[Tensor], tuple[Any, ...]], shape: tuple[int, ...], like: Tensor
@@ -431,10 +426,7 @@ class NeighbourState:
         """Return what every particle perceives, clipped, in the caller's order, shape [B, N, P].
 
         Later calls, after the tensors read have got other numbers, take less of the host's time.
-
-        Args:
-            out: Where to write it, contiguous; a new tensor otherwise. Where the worlds have places
-                in a larger batch it must be given, of that batch's shape.
+        Where the worlds have places in a larger batch, `out` must be given, of that batch's shape.
         """
         if out is None:
             out = self._like.new_empty(self._shape)

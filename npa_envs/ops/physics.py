@@ -160,17 +160,7 @@ def physics(
 ) -> Physics:
     """Return the constants of worlds of a dtype, checked.
 
-    Args:
-        dtype: Floating dtype of the worlds.
-        eps0: Radius of the training, itself checked; default: eps.
-        moving: Whether particles move.
-        alpha: Largest displacement in a unit of time, as a fraction of eps.
-        update_prob: Probability of an update.
-        dt: Time step.
-        position_noise: Standard deviation of the noise.
-
-    Raises:
-        NPAError: A number is out of its range, or too large or small for the dtype.
+    `eps0` is checked already, by default it is `eps`; α is a fraction of ε.
     """
     numbers = (eps, eps0, box, alpha, update_prob, dt, position_noise)
     # Numbers of other types may change, and tensors are no keys.

@@ -209,10 +209,8 @@ def static_rows(
 ) -> list[StaticRows]:
     """Give the active particles of each of some steps rows, all steps at once.
 
-    Args:
-        masks: Each step's active particles in the caller's order, uint8, shape [B, N].
-        row_capacity: Rows K on CUDA; active particles beyond them get none. On a CPU each step has
-            as many as it needs, at least one.
+    Masks are in the caller's order. There are `row_capacity` rows on CUDA, and active particles
+    beyond them get none; on a CPU each step has as many as it needs, at least one.
     """
     if not x.is_cuda:
         row_capacity = x.shape[0] * x.shape[1]
