@@ -177,11 +177,7 @@ TABLE: tuple[Implementation, ...] = (
     ),
     Implementation("density", "portable", "kernels/portable/density.py", "otherwise", _always),
     Implementation(
-        "perceive",
-        "cuda",
-        "kernels/cuda/perceive.py",
-        f"{_MODERN}: from neighbour lists",
-        _cuda,
+        "perceive", "cuda", "kernels/cuda/perceive.py", f"{_MODERN}: from neighbour lists", _cuda
     ),
     Implementation("perceive", "portable", "kernels/portable/perceive.py", "otherwise", _always),
     Implementation(

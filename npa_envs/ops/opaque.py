@@ -142,9 +142,7 @@ def opaque(name: str) -> Callable[[Callable[Arguments, Result]], Opaque[Argument
     return lambda function: Opaque(name, function)
 
 
-def without_autocast(
-    backward: Callable[Arguments, Result],
-) -> Callable[Arguments, Result]:
+def without_autocast(backward: Callable[Arguments, Result]) -> Callable[Arguments, Result]:
     """Return the backward pass of an autograd function, in its tensors' own dtypes.
 
     Forward passes are run without autocast; a backward pass may be asked for within it.
@@ -161,9 +159,7 @@ def without_autocast(
     return guarded
 
 
-def once_differentiable(
-    backward: Callable[Arguments, Result],
-) -> Callable[Arguments, Result]:
+def once_differentiable(backward: Callable[Arguments, Result]) -> Callable[Arguments, Result]:
     """Return the backward pass of an autograd function, made to refuse what it cannot derive.
 
     Torch's own `once_differentiable` says nothing where the cotangent needs no gradient, as that of

@@ -31,12 +31,7 @@ def _sharers(count: int) -> int:
 
 @opaque("npa::update_particles")
 def _update_particles(
-    update: Tensor,
-    x: Tensor,
-    s: Tensor,
-    path_length: Tensor,
-    row_of: Tensor,
-    physics: Physics,
+    update: Tensor, x: Tensor, s: Tensor, path_length: Tensor, row_of: Tensor, physics: Physics
 ) -> tuple[Tensor, Tensor, Tensor]:
     space_dim, state_dim = x.shape[2], s.shape[2]
     total = x.shape[0] * x.shape[1]
@@ -150,12 +145,7 @@ class _UpdateParticles(torch.autograd.Function):
 
 
 def update_particles(
-    update: Tensor,
-    x: Tensor,
-    s: Tensor,
-    path_length: Tensor,
-    rows: Rows,
-    physics: Physics,
+    update: Tensor, x: Tensor, s: Tensor, path_length: Tensor, rows: Rows, physics: Physics
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Return positions, states and path lengths after a rule's updates of the rows' particles.
 

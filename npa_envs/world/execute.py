@@ -23,13 +23,7 @@ from npa_envs.world.cuda_graph import draws_alone
 from npa_envs.world.divergence import DivergenceWatch
 from npa_envs.world.particles import Particles, combined
 from npa_envs.world.randomness import Randomness
-from npa_envs.world.recorded import (
-    LAUNCHED_FIRST,
-    CallKinds,
-    CudaGraph,
-    rule_form,
-    run_recorded,
-)
+from npa_envs.world.recorded import LAUNCHED_FIRST, CallKinds, CudaGraph, rule_form, run_recorded
 from npa_envs.world.steps import (
     DivisionStep,
     Draws,

@@ -676,11 +676,7 @@ class _Replayed(torch.autograd.Function):
 
     @staticmethod
     def forward(
-        ctx: Any,
-        recording: _Recording,
-        steps: int,
-        generator: Randomness | None,
-        *tensors: Tensor,
+        ctx: Any, recording: _Recording, steps: int, generator: Randomness | None, *tensors: Tensor
     ) -> tuple[Tensor, ...]:
         ctx.recording, ctx.steps = recording, steps
         ctx.set_materialize_grads(False)

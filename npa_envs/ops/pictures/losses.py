@@ -105,11 +105,6 @@ def picture_losses(
     window = checked_window(resolution, pixel_size, sigma, lo, hi)
     x, states, target, goal = (t.detach() for t in (x, states, target.to(x), goal.to(x)))
     losses = _picture_losses(
-        x.contiguous(),
-        states.contiguous(),
-        goal.contiguous(),
-        target,
-        shift,
-        *window[1:],
+        x.contiguous(), states.contiguous(), goal.contiguous(), target, shift, *window[1:]
     )
     return losses[:, 0], losses[:, 1]
