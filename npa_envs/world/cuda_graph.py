@@ -177,22 +177,9 @@ class GraphSequence:
             # Without this every replay would draw the numbers of the capture again.
             graph.register_generator_state(self._generator)
         self._graphs.append(graph)
-        own = torch.cuda.default_generators[torch.cuda.current_device()]
-        state = own.graphsafe_get_state() if self.alone else None
-        if state is not None:
-            # Torch registers its own generator with every graph, and until the capture ends other
-            # threads could not draw from it. So another one stands in.
-            stand_in = torch.Generator(own.device)
-            # What other threads draw meanwhile must not be the same each time.
-            stand_in.seed()
-            graph.register_generator_state(stand_in)
-            own.graphsafe_set_state(stand_in)
-        try:
+        with _stand_in(graph) if self.alone else contextlib.nullcontext():
             # A backward pass runs on a thread of its own, whose calls the strict mode would refuse.
             graph.capture_begin(pool=self._pool, capture_error_mode="thread_local")
-        finally:
-            if state is not None:
-                own.graphsafe_set_state(state)
 
     def end(self) -> None:
         """Record no more."""
@@ -209,6 +196,26 @@ class GraphSequence:
     def __del__(self) -> None:
         # Freed here, memory would be taken from captures of other threads.
         GraphSequence.abandoned += self._owns_pool and bool(self._graphs)
+
+
+@contextlib.contextmanager
+def _stand_in(graph: torch.cuda.CUDAGraph) -> Iterator[None]:
+    """Let a capture that begins inside register another generator than torch's own.
+
+    Torch registers its own one with every graph, and until the capture ends other threads could not
+    draw from it.
+    """
+    own = torch.cuda.default_generators[torch.cuda.current_device()]
+    stand_in = torch.Generator(own.device)
+    # What other threads draw meanwhile must not be the same each time.
+    stand_in.seed()
+    graph.register_generator_state(stand_in)
+    state = own.graphsafe_get_state()
+    own.graphsafe_set_state(stand_in)
+    try:
+        yield
+    finally:
+        own.graphsafe_set_state(state)
 
 
 _capturing: ContextVar[GraphSequence | None] = ContextVar("capturing", default=None)
