@@ -134,7 +134,7 @@ class Opaque(Generic[Arguments, Result]):
             flat = [value.numbers() if isinstance(value, Physics) else value for value in args]
             result: Result = self._operator(*flat)
             return result
-        return self._function(*args)  # type: ignore[call-arg]
+        return self._function(*args, **kwargs)
 
 
 def opaque(name: str) -> Callable[[Callable[Arguments, Result]], Opaque[Arguments, Result]]:

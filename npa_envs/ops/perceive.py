@@ -362,13 +362,14 @@ def perceive_rows(
         rows = all_rows(static, x) if rows is None else rows
     given = x, s, mask, static, rows, masked, row_capacity, row_width, physics
     if torch.is_grad_enabled() and (x.requires_grad or s.requires_grad):
-        perception, *found = _PerceiveRows.apply(*given)  # type: ignore[no-untyped-call]
+        perception, *places = _PerceiveRows.apply(*given)  # type: ignore[no-untyped-call]
     else:
         saved, row_source = _perceived(*given, for_adjoint=False)
-        perception, *found = saved.perception, saved.row_of, row_source, saved.starts
+        perception, places = saved.perception, [saved.row_of, row_source, saved.starts]
     if rows is not None:
-        found = [rows.row_of, rows.row_source, rows.starts]
-    return perception, Rows(*found, x.shape[0] * x.shape[1] if masked else 0)
+        places = [rows.row_of, rows.row_source, rows.starts]
+    row_of, row_source, starts = places
+    return perception, Rows(row_of, row_source, starts, x.shape[0] * x.shape[1] if masked else 0)
 
 
 ROWS_TOGETHER = 2**22
@@ -398,8 +399,8 @@ def update_some_at_a_time(
     updates = None
     for first in range(0, row_capacity, ROWS_TOGETHER):
         some = perception[: min(ROWS_TOGETHER, row_capacity - first)]
-        part = {"first_row": first, "row_count": len(some)}
-        launch(*perception_launch(plan, ordered, densities, some, **part))
+        given = plan, ordered, densities, some
+        launch(*perception_launch(*given, first_row=first, row_count=len(some)))
         mapped = network(some)
         if updates is None:
             updates = mapped.new_empty(row_capacity, mapped.shape[1])

@@ -68,8 +68,8 @@ def warmup(
             _warm_invariants(x, s)
             _warm_update(x, s)
             _warm_actions(x, s)
-            for worlds in _sizes(x, s):
-                build_neighbours(*worlds, _physics(x, s)).perceive()
+            for places, states in _sizes(x, s):
+                build_neighbours(places, states, _physics(x, s)).perceive()
             if space_dim == 2:
                 _warm_pictures(x)
             else:

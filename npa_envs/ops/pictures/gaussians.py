@@ -279,7 +279,7 @@ def _(
     dilation: float,
     pairs_per_particle: int,
 ) -> list[Tensor]:
-    means, *_, colours, motions, _ = tensors
+    means, colours, motions = tensors[0], tensors[3], tensors[4]
     views = (means.shape[0], motions.shape[-3])
     images = views[0] * views[1]
     seen = images * means.shape[1]
