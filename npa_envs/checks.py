@@ -52,7 +52,7 @@ def check_dense(name: str, tensor: Tensor) -> None:
         )
 
 
-def check_floating(name: str, tensor: Tensor, shape: str = "") -> None:
+def check_floating(name: str, tensor: Any, shape: str = "") -> None:
     """Check that something is a dense tensor of float32 or float64.
 
     Raises:

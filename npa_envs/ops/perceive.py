@@ -291,8 +291,9 @@ class _PerceiveRows(torch.autograd.Function):
             # Read once: unpacking recomputes what a checkpoint has left out.
             tensors = list(ctx.saved_tensors)
             count, shape = ctx.saved_count, ctx.shape
+            saved, listed = tensors[:count], tensors[count:]
             states_bar, positions_bar = perceive_rows_backward(
-                bar, tensors[:count], tensors[count:], *shape[1:], ctx.masked, ctx.physics
+                bar, saved, listed, shape[1], shape[2], ctx.masked, ctx.physics
             )
             states_bar = states_bar.view(shape)
             x_bar = positions_bar.view(*shape[:2], -1) if ctx.needs_input_grad[0] else None
