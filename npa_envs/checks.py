@@ -48,6 +48,25 @@ def check_dense(name: str, tensor: Tensor) -> None:
         )
 
 
+def check_floating(name: str, tensor: Any, shape: str = "") -> None:
+    """Check that something is a dense tensor of float32 or float64.
+
+    Raises:
+        NPAError: It is not; the message may say which shape it is to have.
+    """
+    if not isinstance(tensor, Tensor):
+        wanted = f" of shape {shape}" if shape else ""
+        raise NPAError(
+            f"{name} must be a torch tensor{wanted}, got {type(tensor).__name__}: "
+            f"convert it with torch.as_tensor"
+        )
+    if tensor.dtype not in DTYPES:
+        raise NPAError(
+            f"{name} must be float32 or float64, got {tensor.dtype}: convert it with .float()"
+        )
+    check_dense(name, tensor)
+
+
 def check_world(x: Tensor, s: Tensor) -> None:
     """Check shapes, dtypes and devices of positions and states."""
     for name, tensor, last in (("x", x, "D"), ("s", s, "C")):

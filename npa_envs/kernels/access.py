@@ -51,9 +51,6 @@ def make_wide_load(value_type: type, scalar: type) -> Any:
 
     The array must be dense and its memory aligned to an entry, or to 16 bytes; the index must not
     be negative. Warp's own indexing, which knows neither, takes several instructions more.
-
-    Args:
-        value_type: A scalar, vector or matrix type.
     """
 
     @native.func_native()
@@ -83,10 +80,7 @@ def make_wide_store(value_type: type, scalar: type) -> Any:
 def make_read_at(value_type: type, scalar: type, alignment: int) -> Any:
     """Return a Warp function that reads a vector from a place of an array of scalars.
 
-    Args:
-        value_type: A vector type of a multiple of `alignment` bytes.
-        alignment: Bytes that the place is a multiple of in memory, and that a load takes: 4, 8
-            or 16.
+    The place is a multiple of `alignment` bytes in memory, 4, 8 or 16, which a load takes.
     """
 
     @native.func_native(value_type, alignment)
@@ -97,11 +91,7 @@ def make_read_at(value_type: type, scalar: type, alignment: int) -> Any:
 
 @made_once()
 def make_read_channels(value_type: type, scalar: type) -> Any:
-    """Return a Warp function that reads adjacent channels of a particle, zeros beyond its last one.
-
-    Args:
-        value_type: A vector type.
-    """
+    """Return a Warp function that reads adjacent channels of a particle, zeros beyond the last."""
     count = value_type._length_
     alignment = min(wp.types.type_size_in_bytes(value_type), 16)
     read_at = make_read_at(value_type, scalar, alignment)
@@ -131,8 +121,7 @@ def make_read_channels(value_type: type, scalar: type) -> Any:
 def make_write_at(value_type: type, scalar: type) -> Any:
     """Return a Warp function that writes a vector to a place of an array of scalars.
 
-    Args:
-        value_type: A vector type of a multiple of 16 bytes; the place is one, too, in memory.
+    Place and size of the vector are multiples of 16 bytes.
     """
 
     @native.func_native()
@@ -156,11 +145,8 @@ def make_lane_sum(
 ) -> Any:
     """Return a Warp function that adds a value over the lanes of a particle; each gets the sum.
 
-    Args:
-        value_type: A scalar, vector or matrix type.
-        lanes: Lanes of a particle, 1 on the CPU.
-        whole_warps: All threads of a warp call it together, which takes fewer instructions.
-        stride: Every so-manyth lane is added, a power of two.
+    There is one lane on the CPU. With `whole_warps` all threads of a warp call it together, which
+    takes fewer instructions; every so-manyth lane is added, as `stride` says, a power of two.
     """
 
     @native.func_native(scalar, lanes, whole_warps, stride)
@@ -173,12 +159,8 @@ def make_lane_sum(
 def make_lane_collect(value_type: type, scalar: type, lanes: int) -> Any:
     """Return a Warp function that adds over the lanes; each gets its share of the columns.
 
-    Of the shares in a lane's value the k-th is that of lane `lane ^ k`, its own one the first: so
-    no lane has to look for what it gives.
-
-    Args:
-        value_type: A matrix [D, W] type; W is a multiple of `lanes`.
-        lanes: Lanes of a particle, 1 on the CPU.
+    Of the shares in a lane's value, a matrix [D, W], the k-th is that of lane `lane ^ k`, its own
+    one the first: so no lane has to look for what it gives.
     """
     rows, width = value_type._shape_
     share = share_type(value_type, scalar, lanes)
@@ -207,9 +189,6 @@ def make_warp_sum(value_type: type) -> Any:
     """Return a Warp function that adds a value over the 32 threads of a warp; each gets the sum.
 
     All 32 must call it. On the CPU it returns its argument.
-
-    Args:
-        value_type: `wp.float64` or a vector of it.
     """
 
     @native.func_native()
@@ -220,11 +199,7 @@ def make_warp_sum(value_type: type) -> Any:
 
 @made_once()
 def make_shuffle(scalar: type) -> wp.Function:
-    """Return a Warp function for a value that a thread of the warp has; on the CPU, the argument.
-
-    Args:
-        scalar: `wp.int32` or `wp.float32`.
-    """
+    """Return a Warp function for a value of a thread of the warp; on the CPU, the argument."""
 
     @native.func_native()
     def shuffle(value: scalar, thread: wp.int32) -> scalar: ...
@@ -304,3 +279,16 @@ def as_number(word: wp.float32) -> wp.int32:
 @native.func_native()
 def as_word(number: wp.int32) -> wp.float32:
     """An integer packed into a word."""
+
+
+@made_once()
+def make_add_scaled(group: type, scalar: type) -> Any:
+    """Return a Warp function for total + factor * value, rounded after each operation on the CPU.
+
+    It uses vector registers of the CPU, where its compiler finds none by itself.
+    """
+
+    @native.func_native()
+    def add_scaled(total: group, factor: scalar, value: group) -> group: ...
+
+    return add_scaled

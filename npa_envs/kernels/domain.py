@@ -179,19 +179,9 @@ def domain_types(space_dim: int, scalar: type) -> SimpleNamespace:
             result[d] = entry[d]
         return result
 
-    return SimpleNamespace(
-        vector=vector,
-        particle=particle,
-        Domain=Domain,
-        cell_of=cell_of,
-        cell_index=cell_index,
-        cell_place=cell_place,
-        segment_count=segment_count,
-        segment_cells=segment_cells,
-        minimum_image=minimum_image,
-        periodic_image=periodic_image,
-        position_of=position_of,
-    )
+    functions = [cell_of, cell_index, cell_place, segment_count]
+    functions += [segment_cells, minimum_image, periodic_image, position_of]
+    return native.named(*functions, vector=vector, particle=particle, Domain=Domain)
 
 
 @functools.lru_cache(maxsize=256)
@@ -226,13 +216,7 @@ def make_domain(
     particle_count: int,
     cell_reach: int = 2,
 ) -> Any:
-    """Return the `Domain` of worlds of `particle_count` particles.
-
-    Args:
-        scalar: `wp.float32` or `wp.float64`.
-        cell_reach: Cells on each side of a cell in which its neighbours lie; a cell is
-            eps / cell_reach wide.
-    """
+    """Return the `Domain` of worlds of so many particles, with cells of eps / cell_reach."""
     types = domain_types(space_dim, scalar)
     domain = types.Domain()
     domain.inverse_eps = 1.0 / eps

@@ -177,10 +177,7 @@ def make_smooth_inverse(space_dim: int, scalar: type) -> wp.Function:
 def make_corrected(space_dim: int, scalar: type, width: int, moment_inverse: str | None) -> Any:
     """Return a Warp function that multiplies state gradients [D, width] by an inverse of M.
 
-    Args:
-        scalar: `wp.float32` or `wp.float64`.
-        width: Channels.
-        moment_inverse: "smooth", or "threshold": gradients stay as they are where M is singular.
+    It is "smooth", or "threshold": gradients stay as they are where M is singular.
     """
     square = wp.types.matrix((space_dim, space_dim), scalar)
     gradient_type = wp.types.matrix((space_dim, width), scalar)
@@ -203,11 +200,7 @@ def make_corrected(space_dim: int, scalar: type, width: int, moment_inverse: str
 
 @made_once()
 def make_fast_exp2(scalar: type) -> Any:
-    """Return a Warp function for powers of two, in float32 on CUDA right to about 2e-7.
-
-    Args:
-        scalar: `wp.float32` or `wp.float64`.
-    """
+    """Return a Warp function for powers of two, in float32 on CUDA right to about 2e-7."""
 
     @native.func_native()
     def fast_exp2(value: scalar) -> scalar: ...

@@ -15,8 +15,8 @@ from typing import Literal, NamedTuple
 
 import torch
 
+from npa_envs.kernels.cuda.density import SMALLEST_SIDE
 from npa_envs.kernels.cuda.equivariance import fits_block
-from npa_envs.kernels.cuda.tiles import SMALLEST_SIDE
 
 Operator = Literal["sort", "density", "perceive", "adjoint", "vectors", "network", "update"]
 
@@ -119,10 +119,6 @@ def _tiles(request: KernelRequest) -> bool:
     )
 
 
-def _world(request: KernelRequest) -> bool:
-    return request.device.type == "cpu" and request.particle_count <= LARGEST_THREAD_WORLD
-
-
 def _fused(request: KernelRequest) -> bool:
     widths = request.row_width, request.update_width
     return (
@@ -133,14 +129,6 @@ def _fused(request: KernelRequest) -> bool:
         and request.update_width <= LARGEST_UPDATE
         and request.hidden_dim <= LARGEST_HIDDEN
     )
-
-
-def _warps(request: KernelRequest) -> bool:
-    return request.vectors is not None and _cuda(request) and fits_block(*request.vectors)
-
-
-def _has_vectors(request: KernelRequest) -> bool:
-    return request.vectors is not None
 
 
 def _always(request: KernelRequest) -> bool:
@@ -166,13 +154,15 @@ TABLE: tuple[Implementation, ...] = (
         "world",
         "kernels/portable/sort.py",
         f"a CPU, worlds of at most {LARGEST_THREAD_WORLD} particles: a thread sorts a world",
-        _world,
+        lambda request: (
+            request.device.type == "cpu" and request.particle_count <= LARGEST_THREAD_WORLD
+        ),
     ),
     Implementation("sort", "portable", "kernels/portable/sort.py", "otherwise", _always),
     Implementation(
         "density",
         "tiles",
-        "kernels/cuda/tiles.py",
+        "kernels/cuda/density.py",
         f"{_MODERN}, 2D, worlds of at most {SHARED_WORLD} particles, boxes of at least "
         f"{SMALLEST_SIDE} cells along each side; environments only above {SMALL_WORLD}: neighbours "
         "are listed on the way, by a warp for eight particles",
@@ -187,11 +177,7 @@ TABLE: tuple[Implementation, ...] = (
     ),
     Implementation("density", "portable", "kernels/portable/density.py", "otherwise", _always),
     Implementation(
-        "perceive",
-        "cuda",
-        "kernels/cuda/perceive.py",
-        f"{_MODERN}: from neighbour lists",
-        _cuda,
+        "perceive", "cuda", "kernels/cuda/perceive.py", f"{_MODERN}: from neighbour lists", _cuda
     ),
     Implementation("perceive", "portable", "kernels/portable/perceive.py", "otherwise", _always),
     Implementation(
@@ -207,10 +193,16 @@ TABLE: tuple[Implementation, ...] = (
         "cuda",
         "kernels/cuda/equivariance.py",
         f"{_MODERN}, rows that a block has room for: a warp has a few rows of an equivariant rule",
-        _warps,
+        lambda request: (
+            request.vectors is not None and _cuda(request) and fits_block(*request.vectors)
+        ),
     ),
     Implementation(
-        "vectors", "portable", "kernels/portable/equivariance.py", "otherwise", _has_vectors
+        "vectors",
+        "portable",
+        "kernels/portable/equivariance.py",
+        "otherwise",
+        lambda request: request.vectors is not None,
     ),
     Implementation(
         "network",
@@ -258,7 +250,7 @@ class Listing(NamedTuple):
     teams: int
     """Teams of lanes of a row in the perception pass."""
     tiled: bool = False
-    """Whether the density pass is that of `kernels/cuda/tiles.py`."""
+    """Whether the density pass is that of `kernels/cuda/density.py`."""
 
     def shape(self, row_count: int) -> tuple[int, int, int]:
         """Return the shape of so many lists: 32 of them together, or, of tiles, list after list."""
@@ -280,13 +272,7 @@ DENSITY_LANES = 4
 
 
 def rollout_listing(request: KernelRequest, mean_neighbours: float = 0.0) -> Listing:
-    """Return how rollouts list neighbours: few worlds shall fill a GPU.
-
-    Args:
-        request: What is known of the call.
-        mean_neighbours: Neighbours of particles that are spread evenly over a periodic box; 0 in
-            open space.
-    """
+    """Return how rollouts list neighbours, by `mean_neighbours`: few worlds shall fill a GPU."""
     if request.particle_count <= SHARED_WORLD:
         crowded = int(mean_neighbours) in CROWD
         capacity = CROWDED_CAPACITY if crowded else LARGE_CAPACITY

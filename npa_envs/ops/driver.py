@@ -101,12 +101,7 @@ def _follows_kernel(stream: int) -> bool:
 
 
 class DriverLaunch:
-    """A launch of a kernel, made again and again.
-
-    Args:
-        launch: What `wp.launch` returns with `record_cmd=True`, on CUDA.
-        addresses: Addresses of the kernel's parameters.
-    """
+    """A launch of a kernel, recorded by Warp on CUDA, made again and again."""
 
     def __init__(self, launch: Any, device: torch.device, addresses: Any) -> None:
         capability = launch.device.get_cuda_compile_arch() or 0
@@ -136,12 +131,7 @@ class DriverLaunch:
         self._place = ctypes.byref(self._config)
 
     def run(self, thread_count: int, stream: int) -> bool:
-        """Launch on the current stream; return whether that was done: otherwise Warp launches.
-
-        Args:
-            thread_count: Number of threads.
-            stream: The stream's handle.
-        """
+        """Launch on the current stream; return whether that was done: otherwise Warp launches."""
         if self._launch is None or thread_count > MOST_THREADS:
             return False
         if torch.cuda.current_device() != self._device.index:

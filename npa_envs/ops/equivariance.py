@@ -76,13 +76,8 @@ class VectorForm(NamedTuple):
 def invariants(perception: Tensor, mixing: Tensor, form: VectorForm) -> tuple[Tensor, Tensor]:
     """Return mixed vectors, and the numbers that stay the same in a turned world.
 
-    Args:
-        perception: Perception vectors, dimensionless, shape [..., P].
-        mixing: Weights of the mixtures, shape [perceived, mixed].
-        form: What is where.
-
-    Returns:
-        Mixed vectors u, shape [..., mixed, D], and scalars and products, shape [..., input_dim].
+    These are u, shape [..., mixed, D], and scalars and products, shape [..., input_dim]; the
+    weights of the mixtures have shape [perceived, mixed].
     """
     shape = (*perception.shape[:-1], form.perceived, form.space_dim)
     vectors = perception[..., form.scalars :].reshape(shape)
@@ -98,11 +93,8 @@ def invariants(perception: Tensor, mixing: Tensor, form: VectorForm) -> tuple[Te
 def steered(output: Tensor, mixed: Tensor, steering: Tensor, form: VectorForm) -> Tensor:
     """Return raw updates [δ (D) ; Δs] of gates and state changes: δ = Σ relu(g_a) steering_a u_a.
 
-    Args:
-        output: Gates and then state changes, dimensionless, shape [..., gate_count + C].
-        mixed: Mixed vectors u, shape [..., mixed, D].
-        steering: How far a gate of 1 moves along its vector, dimensionless, shape [gate_count].
-        form: What is where.
+    The output has gates and then state changes, shape [..., gate_count + C]; `steering` is how far
+    a gate of 1 moves along its vector, shape [gate_count].
     """
     gates = torch.relu(output[..., : form.gate_count]) * steering
     along = torch.cat((mixed, _turned(mixed)), dim=-2) if form.chiral else mixed
@@ -129,11 +121,6 @@ BLOCKS_PER_PROCESSOR = 5
 """Blocks of a multiprocessor that pull back to rows, where there are many rows."""
 
 
-def _block_count(row_count: int, rows: int, warps: int) -> int:
-    """Return how many blocks of so many warps, each with so many rows, have all of them."""
-    return -(-row_count // (rows * warps))
-
-
 def _launch_blocks(kernel: Any, blocks: int, warps: int, *tensors: Tensor) -> None:
     """Launch a kernel of CUDA in so many blocks of so many warps."""
     block = warps * WARP
@@ -149,7 +136,7 @@ def _read_rows(
     inputs = rows.new_empty(len(rows), width)
     device, form = rows.device, (space_dim, scalars, perceived, count, chiral)
     if _is_for_warps(rows, form):
-        blocks = _block_count(len(rows), rows_of_warp(count), READ_WARPS)
+        blocks = -(-len(rows) // (rows_of_warp(count) * READ_WARPS))
         kernel = row_kernels(*form).read_rows
         _launch_blocks(kernel, blocks, READ_WARPS, rows, mixing, mixed, inputs)
         return mixed, inputs
@@ -192,7 +179,7 @@ def _read_rows_backward(
     device, form = rows.device, (space_dim, scalars, len(mixing), count, chiral)
     rows_bar = torch.empty_like(rows)
     if _is_for_warps(rows, form):
-        blocks = _block_count(row_count, rows_of_warp(count), PULL_WARPS)
+        blocks = -(-row_count // (rows_of_warp(count) * PULL_WARPS))
         blocks = min(blocks, BLOCKS_PER_PROCESSOR * processor_count(device))
         partial_sums, mixing_bar = rows.new_empty(blocks, mixing.numel()), torch.empty_like(mixing)
         kernel = row_kernels(*form).pull_back_rows
@@ -251,7 +238,7 @@ def _steer_rows(output: Tensor, mixed: Tensor, signs: Tensor, width: int) -> Ten
     update = output.new_empty(len(output), width)
     form = _steers_by_warps(mixed, len(signs))
     if form is not None:
-        blocks = _block_count(len(output), STEERED_ROWS, STEER_WARPS)
+        blocks = -(-len(output) // (STEERED_ROWS * STEER_WARPS))
         kernel = steering_kernels(*form).steer
         _launch_blocks(kernel, blocks, STEER_WARPS, output, mixed, signs, update)
         return update
@@ -273,7 +260,7 @@ def _steer_rows_backward(
     tensors = output, mixed, signs, update_bar, output_bar, mixed_bar
     form = _steers_by_warps(mixed, len(signs))
     if form is not None:
-        blocks = _block_count(len(output), STEERED_ROWS, STEER_WARPS)
+        blocks = -(-len(output) // (STEERED_ROWS * STEER_WARPS))
         _launch_blocks(steering_kernels(*form).pull_back_steering, blocks, STEER_WARPS, *tensors)
         return output_bar, mixed_bar
     kernel = _kernels(output, mixed.shape[2]).pull_back_steering
@@ -336,16 +323,9 @@ class _SteerRows(torch.autograd.Function):
 
 
 def read_rows(rows: Tensor, mixing: Tensor, form: VectorForm, width: int) -> tuple[Tensor, Tensor]:
-    """Return what `invariants` does of rows, followed by the rows' own one and by zeros.
+    """Return what `invariants` does of rows [z | 1 | 0], followed by their own one and by zeros.
 
-    Args:
-        rows: Rows of perception [z | 1 | 0], shape [K, row_width].
-        mixing: Weights of the mixtures, shape [perceived, mixed].
-        form: What is where.
-        width: Columns of the result, more than `form.input_dim`.
-
-    Returns:
-        Mixed vectors, shape [K, mixed, D], and [scalars | products | 1 | 0], shape [K, width].
+    These are mixed vectors, shape [K, mixed, D], and [scalars | products | 1 | 0], [K, width].
     """
     tensors = rows.contiguous(), mixing.contiguous()
     if not (torch.is_grad_enabled() and any(tensor.requires_grad for tensor in tensors)):
@@ -360,13 +340,6 @@ def signed_gates(weight: Tensor, steering: Tensor) -> tuple[Tensor, Tensor]:
     relu(g) steering = sign(steering) relu(|steering| g): the products of rows with these weights
     take in all of `steering` but its signs, so its gradient follows from theirs, without a sum over
     rows. Where it is 0 a gate is as good as closed, but not quite: so it still learns.
-
-    Args:
-        weight: Weights of gates and then state changes, shape [gate_count + C, H].
-        steering: How far a gate of 1 moves along its vector, dimensionless, shape [gate_count].
-
-    Returns:
-        Weights of the same shape, and signs, without gradient, of the shape of `steering`.
     """
     steering = torch.where(steering == 0.0, steering + LEAST_STEERING, steering)
     factors = torch.nn.functional.pad(steering.abs(), (0, len(weight) - len(steering)), value=1.0)
@@ -374,17 +347,7 @@ def signed_gates(weight: Tensor, steering: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def steer_rows(output: Tensor, mixed: Tensor, signs: Tensor, width: int) -> Tensor:
-    """Return what `steered` does, of gates by `signed_gates`, followed by zeros.
-
-    Args:
-        output: Gates and state changes [g | Δs | 0], dimensionless, shape [K, any].
-        mixed: Mixed vectors, shape [K, mixed, D].
-        signs: Whether a gate moves along its vector or against it, shape [gate_count].
-        width: Columns of the result.
-
-    Returns:
-        Raw updates [δ | Δs | 0], dimensionless, shape [K, width].
-    """
+    """Return what `steered` does of [g | Δs | 0], with gates by `signed_gates`: [δ | Δs | 0]."""
     output = output.contiguous()
     if not (torch.is_grad_enabled() and (output.requires_grad or mixed.requires_grad)):
         return _steer_rows(output, mixed, signs, width)

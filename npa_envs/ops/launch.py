@@ -22,7 +22,7 @@ from torch import Tensor
 
 from npa_envs.errors import NPAError
 from npa_envs.kernels.access import CUDA_BLOCK
-from npa_envs.kernels.cpu import SMALLEST_RANGES
+from npa_envs.kernels.native import SMALLEST_RANGES
 from npa_envs.once import alone, made_once
 from npa_envs.ops.driver import DriverLaunch
 from npa_envs.runtime import in_turn, quiet_warp, start_warp
@@ -67,12 +67,7 @@ NEVER = (-1, -1)
 
 
 class _ArrayArgument:
-    """The description of a tensor within a kernel's arguments, changed in place.
-
-    Args:
-        place: The description, in the memory of the arguments.
-        array_type: What the kernel reads.
-    """
+    """The description of a tensor within a kernel's arguments, changed in place."""
 
     def __init__(self, place: Any, array_type: Any) -> None:
         self._place = place
@@ -111,11 +106,7 @@ class _ArrayArgument:
 
 
 def _null(tensor: Tensor) -> int:
-    """Return 0, the address of an empty tensor.
-
-    Raises:
-        NPAError: The tensor has numbers, but no memory of its own.
-    """
+    """Return 0, the address of an empty tensor; others must have memory of their own."""
     if tensor.numel():
         raise NPAError(
             "tensors must have memory of their own, got a tensor subclass that wraps others "
@@ -159,11 +150,6 @@ class _Arguments:
     """A kernel on a device with memory for its arguments, in which each launch changes some.
 
     Warp's own launch makes all of them anew, which takes the host ten times longer.
-
-    Args:
-        size: Number of threads along each dimension.
-        block_dim: Threads of a CUDA block.
-        arguments: Its arguments, with `range_start` where the kernel has it.
     """
 
     def __init__(
@@ -349,16 +335,11 @@ def launch(
     *arguments: Any,
     block_dim: int = CUDA_BLOCK,
 ) -> None:
-    """Launch a kernel on torch's current stream of a device.
+    """Launch a kernel, with so many threads along each dimension, on torch's current stream.
 
-    Args:
-        kernel: A Warp kernel; its own signature says how each tensor is read. An array of one
-            dimension is all of a contiguous tensor, whatever the tensor's shape.
-        size: Number of threads along each dimension.
-        device: Device of every tensor among the arguments.
-        arguments: Kernel arguments in order: tensors (None for an absent one), structs and numbers;
-            without `range_start`, where the kernel has it.
-        block_dim: Threads of a CUDA block.
+    Arguments are tensors of the device (None for an absent one), structs and numbers, in the
+    kernel's order, without `range_start`. The kernel's own signature says how each tensor is read:
+    an array of one dimension is all of a contiguous tensor, whatever the tensor's shape.
     """
     size = (size,) if isinstance(size, int) else size
     if 0 in size:
@@ -433,10 +414,10 @@ class Tape:
 
     def places(self, tensor: Tensor) -> list[tuple[_Arguments, int]]:
         """Return where a tensor is an argument; the caller keeps it from now on."""
-        places = []
+        places, address = [], tensor.data_ptr()
         for (made, _), arguments in zip(self._launches, self._given, strict=True):
             for k, value in enumerate(arguments):
-                if isinstance(value, Tensor) and value.data_ptr() == tensor.data_ptr():
+                if isinstance(value, Tensor) and value.data_ptr() == address:
                     arguments[k] = None
                     places.append((made, k))
         return places
@@ -527,11 +508,7 @@ def even_ranges(count: int, smallest: int) -> list[range]:
 
 
 def run_together(calls: Sequence[Callable[[], object]]) -> None:
-    """Run calls that release the GIL, side by side; each thread takes the next one in turn.
-
-    Raises:
-        BaseException: The first error of a call; the other calls have been run.
-    """
+    """Run calls that release the GIL, side by side; the first error is raised after all ran."""
     pending = iter(calls)
     errors: list[BaseException] = []
 
@@ -544,17 +521,14 @@ def run_together(calls: Sequence[Callable[[], object]]) -> None:
 
     team = None if _forked else _team()
     if team is None:
-        _run_in_pool(run_pending, min(torch.get_num_threads(), len(calls)))
+        # In this thread and, at the same time, in others of a pool of Python's.
+        threads = min(torch.get_num_threads(), len(calls))
+        helpers = [_pool().submit(run_pending) for _ in range(threads - 1)]
+        run_pending()
+        # One that has not begun by now would find nothing left to do.
+        wait([helper for helper in helpers if not helper.cancel()])
     else:
         # Of all threads: OpenMP would end those that a smaller team leaves out.
         team(_Task(run_pending), None, torch.get_num_threads(), 0)
     if errors:
         raise errors[0]
-
-
-def _run_in_pool(run: Callable[[], None], threads: int) -> None:
-    """Run the same in this thread and, at the same time, in others of a pool of Python's."""
-    helpers = [_pool().submit(run) for _ in range(threads - 1)]
-    run()
-    # One that has not begun by now would find nothing left to do.
-    wait([helper for helper in helpers if not helper.cancel()])

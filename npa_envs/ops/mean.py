@@ -7,7 +7,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from npa_envs.checks import DTYPES, check_dense
+from npa_envs.checks import check_floating
 from npa_envs.errors import NPAError
 from npa_envs.kernels.portable.mean import CHUNK, MEAN_LANES, mean_kernels
 from npa_envs.ops.launch import launch, scalar_type
@@ -15,15 +15,7 @@ from npa_envs.ops.opaque import check_derivatives, opaque
 
 
 def average_sums(partial_sums: Tensor, value_count: int, like: Tensor) -> Tensor:
-    """Return means from partial sums, in an order that depends on their number alone.
-
-    Args:
-        partial_sums: Float64, shape [B, L, K].
-        value_count: How many values they sum.
-
-    Returns:
-        The means, shape [B, K].
-    """
+    """Return means [B, K] from partial sums [B, L, K], in an order that L alone decides."""
     world_count, _, width = partial_sums.shape
     lanes = _lanes(like.device)
     kernels = mean_kernels(scalar_type(like.dtype), lanes)
@@ -93,21 +85,12 @@ def world_mean(values: Tensor) -> Tensor:
     Raises:
         NPAError: A wrong shape or dtype, or nothing to average.
     """
-    if not isinstance(values, Tensor):
-        raise NPAError(
-            f"values must be a torch tensor, got {type(values).__name__}: "
-            f"convert it with torch.as_tensor"
-        )
+    check_floating("values", values)
     if values.ndim != 3 or 0 in values.shape:
         raise NPAError(
             f"values must have shape [B, M, K] with at least one of each, "
             f"got {tuple(values.shape)}: reshape it"
         )
-    if values.dtype not in DTYPES:
-        raise NPAError(
-            f"values must be float32 or float64, got {values.dtype}: convert it with .float()"
-        )
-    check_dense("values", values)
     check_derivatives(values=values)
     means: Tensor = _WorldMean.apply(values)  # type: ignore[no-untyped-call]
     return means

@@ -31,24 +31,6 @@ class ArrangedWeights(NamedTuple):
     """The same of both transposed, then fragments of both, bfloat16; empty without gradients."""
 
 
-def fits_network(hidden_weight: Tensor, output_weight: Tensor) -> bool:
-    """Return whether the backend table gives a rule's folded weights to the fused kernels.
-
-    Args:
-        hidden_weight: Weights of the hidden units, shape [H, row_width].
-        output_weight: Weights of the updates, shape [A', H].
-    """
-    hidden, width = hidden_weight.shape
-    request = KernelRequest(
-        hidden_weight.device,
-        hidden_weight.dtype,
-        row_width=width,
-        update_width=output_weight.shape[0],
-        hidden_dim=hidden,
-    )
-    return choose("network", request).name == "cuda"
-
-
 def _arrange_layers(first: Tensor, second: Tensor) -> list[Tensor]:
     """Lay out two layers' weights, [H, width] and [width', H]: fragments and output scales."""
     hidden, width = first.shape
@@ -57,39 +39,11 @@ def _arrange_layers(first: Tensor, second: Tensor) -> list[Tensor]:
     fragments = half(hidden * steps * 32), half(hidden * tiles * 16)
     unit_unscale, output_unscale = first.new_empty(hidden), first.new_empty(8 * tiles)
     kernels = arrangement_kernels()
-    launch(
-        kernels.arrange_hidden,
-        (hidden // 8, steps, WARP),
-        first.device,
-        first,
-        unit_unscale,
-        fragments[0],
-    )
-    launch(
-        kernels.arrange_output,
-        (hidden // UNIT_GROUP, tiles, WARP),
-        first.device,
-        second,
-        unit_unscale,
-        output_unscale,
-        fragments[1],
-    )
+    device, threads = first.device, (hidden // 8, steps, WARP)
+    launch(kernels.arrange_hidden, threads, device, first, unit_unscale, fragments[0])
+    threads, scales = (hidden // UNIT_GROUP, tiles, WARP), (unit_unscale, output_unscale)
+    launch(kernels.arrange_output, threads, device, second, *scales, fragments[1])
     return [*fragments, output_unscale]
-
-
-def _arrange_left(weight: Tensor) -> Tensor:
-    """Lay out weights [H, width] as the left operand of a product."""
-    hidden, width = weight.shape
-    steps = -(-width // 16)
-    fragments = torch.empty(hidden * steps * 32, dtype=torch.bfloat16, device=weight.device)
-    launch(
-        arrangement_kernels().arrange_left,
-        (hidden // UNIT_GROUP, steps, WARP),
-        weight.device,
-        weight,
-        fragments,
-    )
-    return fragments
 
 
 @opaque("npa::arrange_weights")
@@ -99,7 +53,13 @@ def _arrange_weights(
     arranged = _arrange_layers(hidden_weight, output_weight)
     if with_backward:
         arranged += _arrange_layers(output_weight.T, hidden_weight.T)
-        arranged += [_arrange_left(hidden_weight), _arrange_left(output_weight.T)]
+        # Left operands of products.
+        for weight in (hidden_weight, output_weight.T):
+            steps = -(-weight.shape[1] // 16)
+            size, device = weight.shape[0] * steps * 32, weight.device
+            arranged.append(torch.empty(size, dtype=torch.bfloat16, device=device))
+            threads = weight.shape[0] // UNIT_GROUP, steps, WARP
+            launch(arrangement_kernels().arrange_left, threads, device, weight, arranged[-1])
     return arranged
 
 
@@ -136,12 +96,16 @@ def arrange_weights(hidden_weight: Tensor, output_weight: Tensor) -> ArrangedWei
 
     Where gradients are enabled they are laid out for the backward pass too, even of weights that
     need none: once here, instead of at every step whose rows need one.
-
-    Args:
-        hidden_weight: Weights of the hidden units, shape [H, row_width].
-        output_weight: Weights of the updates, shape [A', H].
     """
-    if not fits_network(hidden_weight, output_weight):
+    hidden, width = hidden_weight.shape
+    request = KernelRequest(
+        hidden_weight.device,
+        hidden_weight.dtype,
+        row_width=width,
+        update_width=output_weight.shape[0],
+        hidden_dim=hidden,
+    )
+    if choose("network", request).name != "cuda":
         return None
     return arrange(hidden_weight, output_weight, with_backward=torch.is_grad_enabled())
 
@@ -162,16 +126,18 @@ SIGN_UNITS = 128
 """Hidden units whose signs are one word for each of the four lanes that share a row."""
 
 
-def _map_rows(
+@opaque("npa::run_network")
+def _run_network(
     rows: Tensor,
     arranged: list[Tensor],
     out_width: int,
     unit_count: int,
-    signs: Tensor | None,
     mode: str,
-) -> Tensor:
-    """Run two layers on rows [K, width], as `two_layer_kernel` says; returns [K, out_width]."""
+    noted: Tensor | None,
+) -> tuple[Tensor, Tensor]:
+    """Run two layers on rows [K, width], as `two_layer_kernel` says; "note" returns signs too."""
     steps, tiles = -(-rows.shape[1] // 16), -(-out_width // 8)
+    signs = _empty_signs(rows, unit_count, mode)
     output = rows.new_empty(rows.shape[0], out_width)
     warps = -(-rows.shape[0] // ROW_GROUP)
     launch(
@@ -181,49 +147,29 @@ def _map_rows(
         unit_count,
         aligned(rows),
         *arranged[:3],
-        signs,
+        signs if noted is None else noted,
         output,
         block_dim=LAYER_BLOCK,
     )
-    return output
-
-
-@opaque("npa::run_network")
-def _run_network(
-    rows: Tensor, arranged: list[Tensor], out_width: int, unit_count: int, noting: bool
-) -> tuple[Tensor, Tensor]:
-    words = _sign_words(unit_count) if noting else 0
-    signs = rows.new_empty(rows.shape[0], words, dtype=torch.int32)
-    mode = "note" if noting else "rectify"
-    return _map_rows(rows, arranged, out_width, unit_count, signs, mode), signs
+    return output, signs
 
 
 @_run_network.register_fake
 def _(
-    rows: Tensor, arranged: list[Tensor], out_width: int, unit_count: int, noting: bool
+    rows: Tensor,
+    arranged: list[Tensor],
+    out_width: int,
+    unit_count: int,
+    mode: str,
+    noted: Tensor | None,
 ) -> tuple[Tensor, Tensor]:
-    words = _sign_words(unit_count) if noting else 0
-    signs = rows.new_empty(rows.shape[0], words, dtype=torch.int32)
-    return rows.new_empty(rows.shape[0], out_width), signs
+    return rows.new_empty(rows.shape[0], out_width), _empty_signs(rows, unit_count, mode)
 
 
-def _sign_words(unit_count: int) -> int:
-    """Return how many words hold the signs of a row's hidden units."""
-    return 4 * -(-unit_count // SIGN_UNITS)
-
-
-@opaque("npa::run_network_backward")
-def _run_network_backward(
-    update_bar: Tensor, arranged: list[Tensor], signs: Tensor, width: int, unit_count: int
-) -> Tensor:
-    return _map_rows(update_bar, arranged, width, unit_count, signs, "mask")
-
-
-@_run_network_backward.register_fake
-def _(
-    update_bar: Tensor, arranged: list[Tensor], signs: Tensor, width: int, unit_count: int
-) -> Tensor:
-    return update_bar.new_empty(update_bar.shape[0], width)
+def _empty_signs(rows: Tensor, unit_count: int, mode: str) -> Tensor:
+    """Return words for the signs of hidden units, if these are noted."""
+    words = 4 * -(-unit_count // SIGN_UNITS) if mode == "note" else 0
+    return rows.new_empty(rows.shape[0], words, dtype=torch.int32)
 
 
 @opaque("npa::network_weight_gradients")
@@ -288,7 +234,7 @@ class _Network(torch.autograd.Function):
         arranged: ArrangedWeights,
     ) -> Tensor:
         update: Tensor
-        update, signs = _run_network(rows, arranged.forward, out_width, unit_count, True)
+        update, signs = _run_network(rows, arranged.forward, out_width, unit_count, "note", None)
         ctx.save_for_backward(rows, signs, *arranged.backward)
         ctx.unit_count = unit_count
         return update
@@ -300,7 +246,7 @@ class _Network(torch.autograd.Function):
         unit_count, width = ctx.unit_count, rows.shape[1]
         rows_bar = weights_bar = None
         if ctx.needs_input_grad[0]:
-            rows_bar = _run_network_backward(update_bar, arranged, signs, width, unit_count)
+            rows_bar, _ = _run_network(update_bar, arranged, width, unit_count, "mask", signs)
         if ctx.needs_input_grad[1]:
             weights_bar = _weight_gradients(rows, update_bar, signs, arranged, unit_count)
         return rows_bar, weights_bar, None, None, None
@@ -314,14 +260,9 @@ def run_network(
     A row's result depends on nothing but that row and the weights.
 
     Args:
-        rows: Rows of perception, dimensionless, shape [K, row_width].
         weights: W1 [H, row_width] and W2 [A', H], one after the other, shape [H (row_width + A')].
-        output_shape: Shape (A', H) of W2.
         arranged: The same weights as `arrange_weights` laid them out; again where gradients were
             not enabled then and are now.
-
-    Returns:
-        Raw updates, dimensionless, shape [K, A'].
     """
     out_width, unit_count = output_shape
     noting = torch.is_grad_enabled() and (rows.requires_grad or weights.requires_grad)
@@ -331,7 +272,7 @@ def run_network(
         output_weight = weights[end:].view(out_width, unit_count)
         arranged = arrange(hidden_weight, output_weight, with_backward=True)
     if not noting:
-        return _run_network(rows, arranged.forward, out_width, unit_count, False)[0]
+        return _run_network(rows, arranged.forward, out_width, unit_count, "rectify", None)[0]
     update: Tensor = _Network.apply(  # type: ignore[no-untyped-call]
         rows, weights, out_width, unit_count, arranged
     )

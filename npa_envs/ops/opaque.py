@@ -10,7 +10,7 @@ import functools
 import inspect
 from collections.abc import Callable, Iterator
 from types import NoneType
-from typing import Any, Generic, NoReturn, ParamSpec, TypeVar
+from typing import Any, Generic, ParamSpec, TypeVar
 
 import torch
 from torch import Tensor, nn
@@ -134,7 +134,7 @@ class Opaque(Generic[Arguments, Result]):
             flat = [value.numbers() if isinstance(value, Physics) else value for value in args]
             result: Result = self._operator(*flat)
             return result
-        return self._function(*args)  # type: ignore[call-arg]
+        return self._function(*args, **kwargs)
 
 
 def opaque(name: str) -> Callable[[Callable[Arguments, Result]], Opaque[Arguments, Result]]:
@@ -142,9 +142,7 @@ def opaque(name: str) -> Callable[[Callable[Arguments, Result]], Opaque[Argument
     return lambda function: Opaque(name, function)
 
 
-def without_autocast(
-    backward: Callable[Arguments, Result],
-) -> Callable[Arguments, Result]:
+def without_autocast(backward: Callable[Arguments, Result]) -> Callable[Arguments, Result]:
     """Return the backward pass of an autograd function, in its tensors' own dtypes.
 
     Forward passes are run without autocast; a backward pass may be asked for within it.
@@ -161,9 +159,7 @@ def without_autocast(
     return guarded
 
 
-def once_differentiable(
-    backward: Callable[Arguments, Result],
-) -> Callable[Arguments, Result]:
+def once_differentiable(backward: Callable[Arguments, Result]) -> Callable[Arguments, Result]:
     """Return the backward pass of an autograd function, made to refuse what it cannot derive.
 
     Torch's own `once_differentiable` says nothing where the cotangent needs no gradient, as that of
@@ -188,15 +184,11 @@ def once_differentiable(
         except RuntimeError as error:
             # A batch of cotangents has no memory that a kernel could read.
             if any(map(torch._C._functorch.is_legacy_batchedtensor, _tensors(args))):
-                _refuse_batches(error)
+                raise NPAError(
+                    "is_grads_batched must be False where particles are perceived, moved or drawn, "
+                    "and vectorize too, got several cotangents at once: run one backward pass for "
+                    f"each, {CURE}"
+                ) from error
             raise
 
     return guarded
-
-
-def _refuse_batches(error: RuntimeError) -> NoReturn:
-    raise NPAError(
-        "is_grads_batched must be False where particles are perceived, moved or drawn, and "
-        "vectorize too, got several cotangents at once: run one backward pass for each, "
-        f"{CURE}"
-    ) from error

@@ -11,9 +11,8 @@ from npa_envs.errors import NPAError
 from npa_envs.kernels.access import CUDA_LANES, WARP
 from npa_envs.kernels.cuda.adjoint import SHARE, listed_adjoint
 from npa_envs.kernels.cuda.adjoint import TILE as ADJOINT_TILE
-from npa_envs.kernels.cuda.density import LIST_BLOCK, listed_density
+from npa_envs.kernels.cuda.density import LIST_BLOCK, TILE, listed_density, tiled_density
 from npa_envs.kernels.cuda.perceive import listed_perception
-from npa_envs.kernels.cuda.tiles import TILE, tiled_density
 from npa_envs.kernels.portable.adjoint import adjoint_kernels
 from npa_envs.kernels.portable.density import density_kernels
 from npa_envs.kernels.portable.perceive import perception_kernels
@@ -90,10 +89,8 @@ def compute_densities(
 ) -> Densities:
     """Compute densities, and neighbour lists or the rows' density gradients for perception.
 
-    Args:
-        listing: How to list neighbours, where the plan says so; default: as in rollouts.
-        state_place: Where the states of sorted particles are, int32, shape [B N]; None: in order.
-        with_particles: Also leave `particles` where neighbours are listed: the adjoint reads them.
+    Neighbours are listed where the plan says so, by default as in rollouts, with their states'
+    places (by default in order); `with_particles`: also leave what the adjoint reads.
     """
     if not plan.lists_neighbours:
         return compute_density_gradients(plan, ordered)
@@ -178,13 +175,11 @@ def perception_launch(
     """Return what to give to `launch` so that it writes the perception of each row, or of some.
 
     Args:
-        out: Rows to write, shape [K, row_width].
         states: States in the caller's order, where `ordered` has none.
         destination: Row of `out` for each row, int32, shape [K]; default: its own.
         limit: Entries are clipped to plus and minus this; 0: they are not.
         row_kernel_sum: Where to write the rows' sums of v K, shape [K, D], for the adjoint.
         first_row: What is written into the first row of `out`, a multiple of `LISTS_TOGETHER`.
-        row_count: Rows to write, where they are not all.
     """
     some = row_count is not None
     row_count = plan.row_capacity if row_count is None else row_count

@@ -291,8 +291,9 @@ class _PerceiveRows(torch.autograd.Function):
             # Read once: unpacking recomputes what a checkpoint has left out.
             tensors = list(ctx.saved_tensors)
             count, shape = ctx.saved_count, ctx.shape
+            saved, listed = tensors[:count], tensors[count:]
             states_bar, positions_bar = perceive_rows_backward(
-                bar, tensors[:count], tensors[count:], *shape[1:], ctx.masked, ctx.physics
+                bar, saved, listed, shape[1], shape[2], ctx.masked, ctx.physics
             )
             states_bar = states_bar.view(shape)
             x_bar = positions_bar.view(*shape[:2], -1) if ctx.needs_input_grad[0] else None
@@ -352,8 +353,8 @@ def perceive_rows(
         static_rows: Rows of the active particles of static worlds, or None for all.
 
     Returns:
-        Rows of perception, dimensionless, shape [K, row_width], zero beyond the last active row,
-        and which particles they stand for.
+        Rows of perception, shape [K, row_width], zero beyond the last active row, and which
+        particles they stand for.
     """
     x, s, rows = x.contiguous(), s.contiguous(), static_rows
     masked = (mask if static is None else static_rows) is not None
@@ -362,13 +363,14 @@ def perceive_rows(
         rows = all_rows(static, x) if rows is None else rows
     given = x, s, mask, static, rows, masked, row_capacity, row_width, physics
     if torch.is_grad_enabled() and (x.requires_grad or s.requires_grad):
-        perception, *found = _PerceiveRows.apply(*given)  # type: ignore[no-untyped-call]
+        perception, *places = _PerceiveRows.apply(*given)  # type: ignore[no-untyped-call]
     else:
         saved, row_source = _perceived(*given, for_adjoint=False)
-        perception, *found = saved.perception, saved.row_of, row_source, saved.starts
+        perception, places = saved.perception, [saved.row_of, row_source, saved.starts]
     if rows is not None:
-        found = [rows.row_of, rows.row_source, rows.starts]
-    return perception, Rows(*found, x.shape[0] * x.shape[1] if masked else 0)
+        places = [rows.row_of, rows.row_source, rows.starts]
+    row_of, row_source, starts = places
+    return perception, Rows(row_of, row_source, starts, x.shape[0] * x.shape[1] if masked else 0)
 
 
 ROWS_TOGETHER = 2**22
@@ -398,8 +400,8 @@ def update_some_at_a_time(
     updates = None
     for first in range(0, row_capacity, ROWS_TOGETHER):
         some = perception[: min(ROWS_TOGETHER, row_capacity - first)]
-        part = {"first_row": first, "row_count": len(some)}
-        launch(*perception_launch(plan, ordered, densities, some, **part))
+        given = plan, ordered, densities, some
+        launch(*perception_launch(*given, first_row=first, row_count=len(some)))
         mapped = network(some)
         if updates is None:
             updates = mapped.new_empty(row_capacity, mapped.shape[1])
@@ -412,12 +414,7 @@ def update_some_at_a_time(
 
 
 class NeighbourState:
-    """Sorted worlds with densities, ready for perception; `build_neighbours` makes them.
-
-    Args:
-        launch_of: Returns what to give to a launch that writes rows into a tensor, [B N, P].
-        shape: Shape of what is perceived, [B, N, P].
-    """
+    """Sorted worlds with densities, ready for perception; `build_neighbours` makes them."""
 
     def __init__(
         self, launch_of: Callable[[Tensor], tuple[Any, ...]], shape: tuple[int, ...], like: Tensor
@@ -431,10 +428,7 @@ class NeighbourState:
         """Return what every particle perceives, clipped, in the caller's order, shape [B, N, P].
 
         Later calls, after the tensors read have got other numbers, take less of the host's time.
-
-        Args:
-            out: Where to write it, contiguous; a new tensor otherwise. Where the worlds have places
-                in a larger batch it must be given, of that batch's shape.
+        Where the worlds have places in a larger batch, `out` must be given, of that batch's shape.
         """
         if out is None:
             out = self._like.new_empty(self._shape)

@@ -182,17 +182,7 @@ def physics(
 ) -> Physics:
     """Return the constants of worlds of a dtype, checked.
 
-    Args:
-        dtype: Floating dtype of the worlds.
-        eps0: Radius of the training, itself checked; default: eps.
-        moving: Whether particles move.
-        alpha: Largest displacement in a unit of time, as a fraction of eps.
-        update_prob: Probability of an update.
-        dt: Time step.
-        position_noise: Standard deviation of the noise.
-
-    Raises:
-        NPAError: A number is out of its range, or too large or small for the dtype.
+    `eps0` is checked already, by default it is `eps`; α is a fraction of ε.
     """
     if boundary not in get_args(Boundary):
         raise NPAError(f"boundary must be 'periodic' or 'reflecting', got {shown(boundary)}")

@@ -201,7 +201,7 @@ def mean_neighbours(particle_count: int, eps: float, box: Sequence[float] | None
 
 def sorts_at_once(world_count: int, particle_count: int) -> bool:
     """Return whether a CPU sorts small worlds in one launch, whatever the mask."""
-    return _earlier(world_count, world_count * particle_count) <= LARGEST_THREAD_MASK
+    return world_count * world_count * particle_count <= LARGEST_THREAD_MASK
 
 
 def sort_worlds(
@@ -211,7 +211,8 @@ def sort_worlds(
 
     What is left out is empty: states without `s`, everything about rows without `with_rows`.
     """
-    earlier = _earlier(plan.world_count, plan.total) if plan.masked else 0
+    # Entries of masks that are read where each world counts the rows before it.
+    earlier = plan.world_count * plan.total if plan.masked else 0
     capacity = 0 if earlier > LARGEST_MASK else block_capacity(plan.request, x, s, mask)
     if capacity:
         return _sort_by_blocks(plan, capacity, x, s, mask, with_rows)
@@ -302,11 +303,6 @@ def slice_count(device: torch.device, world_count: int, particle_count: int) -> 
     """Return into how many slices worlds are cut that would leave processors idle."""
     idle = processor_count(device) // world_count
     return max(min(idle, particle_count // SMALLEST_SLICE), 1)
-
-
-def _earlier(world_count: int, total: int) -> int:
-    """Return how many entries of masks are read where each world counts the rows before it."""
-    return world_count * total
 
 
 def _sort_by_threads(

@@ -39,15 +39,7 @@ class SpeciesFields(NamedTuple):
 
 
 def checked_counts(counts: Sequence[int], particle_count: int) -> tuple[int, ...]:
-    """Return how many particles each species has, as a tuple of ints.
-
-    Args:
-        counts: Particles of each species, in the order in which they lie in a world.
-        particle_count: Particles in each world N, which they must sum to.
-
-    Raises:
-        NPAError: They are no integers of at least 1, too many, or do not sum to N.
-    """
+    """Return how many particles each species has, integers of at least 1 that sum to N."""
     given = entries(counts)
     if given is None:
         raise NPAError(

@@ -15,20 +15,9 @@ from npa_envs.kernels.portable.density import density_kernels
 from npa_envs.kernels.portable.sort import give_rows
 from npa_envs.ops.launch import launch, scalar_type
 from npa_envs.ops.opaque import opaque
-from npa_envs.ops.passes import (
-    Densities,
-    ListedNeighbours,
-    NeighbourLists,
-    compute_densities,
-)
+from npa_envs.ops.passes import Densities, ListedNeighbours, NeighbourLists, compute_densities
 from npa_envs.ops.physics import Physics
-from npa_envs.ops.sort import (
-    KernelPlan,
-    SortedWorlds,
-    grouped_states,
-    make_plan,
-    sort_worlds,
-)
+from npa_envs.ops.sort import KernelPlan, SortedWorlds, grouped_states, make_plan, sort_worlds
 
 LARGEST_LISTS = 2**31
 """Bytes of all lists on a CPU, at most: where there would be more, each step searches anew."""
@@ -123,11 +112,7 @@ def _(x: Tensor, state_dim: int, physics: Physics) -> list[Tensor]:
     on_cuda = plan.lists_neighbours
     if on_cuda:
         shape = plan.listing.shape(total)
-        lists = [
-            x.new_empty(shape, dtype=torch.int16),
-            integers(total),
-            x.new_empty(total, 4),
-        ]
+        lists = [x.new_empty(shape, dtype=torch.int16), integers(total), x.new_empty(total, 4)]
     elif plan.on_cpu:
         lists = [integers(torch.library.get_ctx().new_dynamic_size()), integers(total)]
     return StaticWorlds(
@@ -209,10 +194,8 @@ def static_rows(
 ) -> list[StaticRows]:
     """Give the active particles of each of some steps rows, all steps at once.
 
-    Args:
-        masks: Each step's active particles in the caller's order, uint8, shape [B, N].
-        row_capacity: Rows K on CUDA; active particles beyond them get none. On a CPU each step has
-            as many as it needs, at least one.
+    Masks are in the caller's order. There are `row_capacity` rows on CUDA, and active particles
+    beyond them get none; on a CPU each step has as many as it needs, at least one.
     """
     if not x.is_cuda:
         row_capacity = x.shape[0] * x.shape[1]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Any
 
 import torch
@@ -24,7 +23,7 @@ from npa_envs.kernels.portable.update import (
 from npa_envs.ops.launch import Tape, launch, scalar_type
 from npa_envs.ops.opaque import check_derivatives, once_differentiable, opaque
 from npa_envs.ops.perceive import Rows
-from npa_envs.ops.physics import Limits, Physics
+from npa_envs.ops.physics import Physics
 from npa_envs.ops.sort import LARGEST_INDEX
 
 
@@ -176,17 +175,11 @@ def _facing(
 
 
 def update_particles(
-    update: Tensor,
-    x: Tensor,
-    s: Tensor,
-    path_length: Tensor,
-    rows: Rows,
-    physics: Physics,
+    update: Tensor, x: Tensor, s: Tensor, path_length: Tensor, rows: Rows, physics: Physics
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Return positions, states and path lengths after a rule's updates of the rows' particles.
 
-    `update` is [δ (D) ; Δs (C)], dimensionless, shape [K, A] or wider; the columns beyond A are
-    not read.
+    `update` is [δ (D) ; Δs (C)], shape [K, A] or wider; the columns beyond A are not read.
     """
     x, s = x.contiguous(), s.contiguous()
     tensors = (update, x, s, path_length)
@@ -225,16 +218,10 @@ def apply_actions(
     action: Tensor,
     x: Tensor,
     s: Tensor,
+    physics: Physics,
     *,
     mask: Tensor | None,
     noise: Tensor | None,
-    max_displacement: float,
-    dt: float,
-    state_scale: float,
-    moving: bool,
-    box: Sequence[float] | None,
-    position_limit: float,
-    state_limit: float,
     enabled: Tensor | None,
     diverged: Tensor,
 ) -> None:
@@ -245,40 +232,12 @@ def apply_actions(
     that is not a number becomes 0 and one beyond its limit is moved to it; both mark the world as
     diverged.
 
-    Args:
-        action: Actions [a_x (D) ; a_s (C)], dimensionless, shape [B, N, A]; a_s alone where
-            particles do not move.
-        x: Positions [length units], finite, shape [B, N, D]; changed.
-        s: States, dimensionless, finite, shape [B, N, C]; changed.
-        mask: Which particles act, uint8, shape [B, N]; None: all of them.
-        noise: What is added to every position first [length units], shape [B, N, D], or None.
-        max_displacement: Largest displacement alpha eps in a unit of time [length units].
-        dt: Time step, dimensionless.
-        state_scale: Largest change of a state in a unit of time, dimensionless.
-        moving: Actions begin with a_x; otherwise there is none and only noise moves particles.
-        box: Sides of the periodic box, into which positions are wrapped, or None.
-        position_limit: Largest coordinate's size [length units].
-        state_limit: Largest state's size, dimensionless.
-        enabled: Whether anything happens at all, uint8, shape [1]; None: it does.
-        diverged: Set to 1 where a world diverged and left as it is elsewhere, uint8, shape [B].
-
-    Raises:
-        NPAError: A shape, dtype or device does not fit, or a tensor to be changed or read is not
-            contiguous.
+    Actions are [a_x (D) ; a_s (C)], shape [B, N, A], or a_s alone where particles do not move.
+    The mask (uint8, [B, N]) says which act, by default all; the noise (shape [B, N, D]) is added to
+    every position first; nothing happens where `enabled` (uint8, [1]) is 0. `diverged` (uint8, [B])
+    is set to 1 where a world diverged and left as it is elsewhere.
     """
-    _check_worlds(action, x, s, mask, noise, enabled, diverged, moving)
-    physics = Physics(
-        x.shape[2],
-        s.shape[2],
-        # Actions do not read the radius.
-        eps=1.0,
-        eps0=1.0,
-        box=None if box is None else tuple(box),
-        moving=moving,
-        max_displacement=max_displacement,
-        dt=dt,
-        limits=Limits(state_scale, position=position_limit, state=state_limit),
-    )
+    _check_worlds(action, x, s, physics, mask, noise, enabled, diverged)
     aligned = s.data_ptr() % 16 == 0 and action.data_ptr() % 16 == 0
     launch(*_launch_of(action, x, s, physics, mask, noise, enabled, diverged, aligned=aligned))
 
@@ -306,7 +265,7 @@ class PreparedActions:
         self._physics = physics
         self._step = (mask, noise, enabled, diverged)
         self._tape: Tape | None = None
-        _check_worlds(self._buffer, x, s, mask, noise, enabled, diverged, physics.moving)
+        _check_worlds(self._buffer, x, s, physics, *self._step)
 
     def __getstate__(self) -> dict[str, Any]:
         """Leave out what cannot be pickled."""
@@ -403,19 +362,18 @@ def _check_worlds(
     action: Tensor,
     x: Tensor,
     s: Tensor,
+    physics: Physics,
     mask: Tensor | None,
     noise: Tensor | None,
     enabled: Tensor | None,
     diverged: Tensor,
-    moving: bool,
 ) -> None:
     check_world(x, s)
     check_derivatives(action=action, x=x, s=s, noise=noise)
     world_count, particle_count, space_dim = x.shape
-    state_dim = s.shape[2]
-    action_dim = state_dim + (space_dim if moving else 0)
+    action_dim = s.shape[2] + (space_dim if physics.moving else 0)
     worlds = (world_count, particle_count)
-    for name, tensor, shape, dtype in (
+    for name, tensor, size, dtype in (
         ("x", x, x.shape, x.dtype),
         ("s", s, s.shape, x.dtype),
         ("action", action, (*worlds, action_dim), x.dtype),
@@ -424,25 +382,21 @@ def _check_worlds(
         ("enabled", enabled, (1,), torch.uint8),
         ("diverged", diverged, (world_count,), torch.uint8),
     ):
-        if tensor is not None:
-            _check_fit(name, tensor, tuple(shape), dtype, x.device)
+        if tensor is None:
+            continue
+        shape = tuple(size)
+        if tuple(tensor.shape) != shape or tensor.dtype != dtype or tensor.device != x.device:
+            raise NPAError(
+                f"{name} must be {dtype} of shape {shape} on {x.device}, got {tensor.dtype} of "
+                f"shape {tuple(tensor.shape)} on {tensor.device}: convert or reshape it"
+            )
+        if not tensor.is_contiguous():
+            raise NPAError(
+                f"{name} must be contiguous, got strides {tensor.stride()}: "
+                f"make it so with {name}.contiguous()"
+            )
     if action.numel() >= LARGEST_INDEX:
         raise NPAError(
             f"actions must stay below {LARGEST_INDEX} numbers in one batch, got {action.numel()}: "
             f"split the batch"
-        )
-
-
-def _check_fit(
-    name: str, tensor: Tensor, shape: tuple[int, ...], dtype: torch.dtype, device: torch.device
-) -> None:
-    if tuple(tensor.shape) != shape or tensor.dtype != dtype or tensor.device != device:
-        raise NPAError(
-            f"{name} must be {dtype} of shape {shape} on {device}, got {tensor.dtype} of shape "
-            f"{tuple(tensor.shape)} on {tensor.device}: convert or reshape it"
-        )
-    if not tensor.is_contiguous():
-        raise NPAError(
-            f"{name} must be contiguous, got strides {tensor.stride()}: "
-            f"make it so with {name}.contiguous()"
         )

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+import itertools
+from collections.abc import Iterable, Iterator
 from typing import Any
 
 import torch
@@ -11,7 +12,7 @@ from npa_envs.checks import DTYPES, entries
 from npa_envs.devices import check_device
 from npa_envs.errors import NPAError, shown
 from npa_envs.ops.backend import SHARED_WORLD
-from npa_envs.ops.draws import bernoulli_draw, integer_draw, normal_draw, uniform_draw
+from npa_envs.ops.draws import draw
 from npa_envs.ops.episodes import EpisodeRules, PreparedJudgement
 from npa_envs.ops.equivariance import MIXED_VECTORS, VectorForm, read_rows, steer_rows
 from npa_envs.ops.mean import world_mean
@@ -50,24 +51,25 @@ def warmup(
     dtypes = _chosen("dtypes", dtypes, DTYPES)
     keys = torch.zeros(1, dtype=torch.int64, device=device)
     counts = torch.zeros(1, dtype=torch.int32, device=device)
-    bernoulli_draw(keys, counts, counts, 0, 1, 0.5)
-    integer_draw(keys, counts, counts, 0, 1, 2)
+    streams = keys, counts, counts, 0
+    draw(*streams, "bernoulli", 1, torch.uint8, 1)
+    draw(*streams, "integers", 1, torch.int64, 2)
     _warm_judgement(counts)
     for dtype in dtypes:
-        uniform_draw(keys, counts, counts, 0, 1, dtype)
-        normal_draw(keys, counts, counts, 0, 1, dtype)
+        draw(*streams, "uniform", 1, dtype, 0)
+        draw(*streams, "normal", 1, dtype, 0)
         world_mean(torch.zeros(1, 1, 1, dtype=dtype, device=device))
         for space_dim in space_dims:
             x = torch.zeros(1, 2, space_dim, dtype=dtype, device=device, requires_grad=True)
             s = torch.zeros(1, 2, state_dim, dtype=dtype, device=device, requires_grad=True)
             _pull_back(perceive(x, s, 0.1, detach_positions=False))
             _warm_rows(x, s)
-            _warm_static(x, s)
             _warm_network(x, s)
             _warm_invariants(x, s)
             _warm_update(x, s)
             _warm_actions(x, s)
-            _warm_observation(x, s)
+            for places, states in _sizes(x, s):
+                build_neighbours(places, states, _physics(x, s)).perceive()
             if space_dim == 2:
                 _warm_pictures(x)
             else:
@@ -104,42 +106,29 @@ def _physics(x: torch.Tensor, s: torch.Tensor) -> Physics:
     )
 
 
+def _sizes(x: torch.Tensor, *others: torch.Tensor) -> Iterator[list[torch.Tensor]]:
+    """Yield worlds of all sizes: small, middling and large ones have kernels of their own."""
+    for count in (x.shape[1], SHARED_WORLD, SHARED_WORLD + 1):
+        yield [value.detach()[:, :1].expand(-1, count, -1) for value in (x, *others)]
+
+
 def _warm_rows(x: torch.Tensor, s: torch.Tensor) -> None:
-    """Perception in rollouts: small and large worlds, all particles and some, gradients or none."""
-    for particle_count in (x.shape[1], SHARED_WORLD, SHARED_WORLD + 1):
-        places = x.detach()[:, :1].expand(-1, particle_count, -1)
-        mask = torch.ones(1, particle_count, dtype=torch.uint8, device=x.device)
-        for chosen in (None, mask):
-            for gradients in (False, True):
-                states = s.detach()[:, :1].expand(-1, particle_count, -1).clone()
-                rows, _ = perceive_rows(
-                    places,
-                    states.requires_grad_(gradients),
-                    _physics(x, s),
-                    mask=chosen,
-                    row_capacity=particle_count,
-                    row_width=_physics(x, s).perception_dim + 1,
-                )
-                if gradients:
-                    _pull_back(rows)
-
-
-def _warm_static(x: torch.Tensor, s: torch.Tensor) -> None:
-    """Perception of particles that never move, with all of them active and with some."""
-    static = prepare_static(x, _physics(x, s))
+    """Perception in rollouts: moving and static worlds, all particles and some."""
+    physics = _physics(x, s)
+    width = physics.perception_dim + 1
+    for places, states in _sizes(x, s):
+        count = places.shape[1]
+        mask = torch.ones(1, count, dtype=torch.uint8, device=x.device)
+        for chosen, gradients in itertools.product((None, mask), (False, True)):
+            given = places, states.clone().requires_grad_(gradients), physics
+            rows, _ = perceive_rows(*given, mask=chosen, row_capacity=count, row_width=width)
+            if gradients:
+                _pull_back(rows)
+    static = prepare_static(x, physics)
     mask = torch.ones(x.shape[:2], dtype=torch.uint8, device=x.device)
-    (active,) = static_rows(static, x.detach(), [mask], x.shape[1])
-    for chosen in (None, active):
-        rows, _ = perceive_rows(
-            x,
-            s,
-            _physics(x, s),
-            mask=None,
-            row_capacity=x.shape[1],
-            row_width=_physics(x, s).perception_dim + 1,
-            static=static,
-            static_rows=chosen,
-        )
+    for active in (None, *static_rows(static, x.detach(), [mask], x.shape[1])):
+        size = {"row_capacity": x.shape[1], "row_width": width}
+        rows, _ = perceive_rows(x, s, physics, mask=None, static=static, static_rows=active, **size)
         _pull_back(rows)
 
 
@@ -148,22 +137,16 @@ def _warm_network(x: torch.Tensor, s: torch.Tensor) -> None:
     space_dim, state_dim = x.shape[2], s.shape[2]
     width = Terms().perception_dim(space_dim, state_dim) + 1
     for out in (space_dim + state_dim, state_dim):
-        _warm_products(x, width + -width % 4, out + -out % 4)
-
-
-def _warm_products(x: torch.Tensor, width: int, out: int) -> None:
-    rows, hidden, update = (
-        torch.zeros(*shape, dtype=x.dtype, device=x.device, requires_grad=True)
-        for shape in ((1, width), (128, width), (out, 128))
-    )
-    for gradients in (False, True):
-        with torch.set_grad_enabled(gradients):
-            arranged = arrange_weights(hidden, update)
-            if arranged is not None:
-                weights = torch.cat((hidden.flatten(), update.flatten()))
-                updates = run_network(rows, weights, update.shape, arranged)
-    if arranged is not None:
-        _pull_back(updates)
+        shapes = (1, width + -width % 4), (128, width + -width % 4), (out + -out % 4, 128)
+        rows, hidden, update = (x.new_zeros(shape).requires_grad_() for shape in shapes)
+        for gradients in (False, True):
+            with torch.set_grad_enabled(gradients):
+                arranged = arrange_weights(hidden, update)
+                if arranged is not None:
+                    weights = torch.cat((hidden.flatten(), update.flatten()))
+                    updates = run_network(rows, weights, update.shape, arranged)
+        if arranged is not None:
+            _pull_back(updates)
 
 
 def _warm_invariants(x: torch.Tensor, s: torch.Tensor) -> None:
@@ -183,10 +166,7 @@ def _warm_pictures(x: torch.Tensor) -> None:
     picture = splat(x, colours, resolution=8, pixel_size=0.1)
     _pull_back(picture)
     target, middle = picture.detach()[0], x.new_zeros(2)
-    # Small, middling and large worlds have kernels of their own.
-    for particle_count in (x.shape[1], 4096, 4097):
-        places = x.detach()[:, :1].expand(-1, particle_count, -1)
-        states = colours[:, :1].expand(-1, particle_count, -1)
+    for places, states in _sizes(x, colours):
         picture_losses(places, states, target, goal=middle, shift=0.0, pixel_size=0.1)
 
 
@@ -207,14 +187,6 @@ def _warm_views(x: torch.Tensor) -> None:
         width=1,
         height=1,
     )
-
-
-def _warm_observation(x: torch.Tensor, s: torch.Tensor) -> None:
-    """Small, middling and large worlds have kernels of their own."""
-    for particle_count in (x.shape[1], 4096, 4097):
-        places = x.detach()[:, :1].expand(-1, particle_count, -1)
-        states = s.detach()[:, :1].expand(-1, particle_count, -1)
-        build_neighbours(places, states, _physics(x, s)).perceive()
 
 
 def _warm_update(x: torch.Tensor, s: torch.Tensor) -> None:

@@ -54,15 +54,14 @@ def perceive_each_species(x: Tensor, counts: Sequence[int], physics: Physics) ->
     return perceive_by_species(x, tuple(counts), physics).clamp(-limit, limit)
 
 
-class Actions:
+class Actions(PreparedActions):
     """What actions do to some worlds, in place, with the masks and the noise of `rollout`.
 
-    Args:
-        random: Where masks and noise come from; advanced by one step in each `draw`.
-        enabled: Whether actions are applied, uint8, shape [1]: set to 0 where one is not finite,
-            and no world changes; the caller sets it to 1 again.
-        diverged: Set to 1 for worlds in which a number left its bounds or is not finite, to 0 for
-            the others, uint8, shape [B]; such numbers are moved back to the bounds, NaN to 0.
+    Displacements are fractions of α ε (D, norm clipped to 1), state steps fractions of
+    `state_scale` (C, clipped to [-1, 1]). `enabled` (uint8, [1]) is set to 0 where an action is not
+    finite, and no world changes; the caller sets it to 1 again. `diverged` (uint8, [B]) is set to 1
+    for worlds in which a number left its bounds or is not finite, to 0 for the others; such numbers
+    are moved back to the bounds, NaN to 0.
     """
 
     def __init__(
@@ -75,51 +74,31 @@ class Actions:
         enabled: Tensor,
         diverged: Tensor,
     ) -> None:
-        self._x = x
-        self._physics = physics
         self._random = random
-        self._diverged = diverged
-        self._mask = self._noise = None
         self._everyone = torch.ones((), dtype=torch.bool, device=x.device).expand(x.shape[:2])
+        mask = noise = None
         if physics.update_prob < 1.0:
-            self._mask = torch.zeros(x.shape[:2], dtype=torch.uint8, device=x.device)
+            mask = torch.zeros(x.shape[:2], dtype=torch.uint8, device=x.device)
         if physics.position_noise > 0.0:
-            self._noise = torch.zeros_like(x)
-        self._apply = PreparedActions(
-            x, s, physics, mask=self._mask, noise=self._noise, enabled=enabled, diverged=diverged
-        )
+            noise = torch.zeros_like(x)
+        super().__init__(x, s, physics, mask=mask, noise=noise, enabled=enabled, diverged=diverged)
+
+    apply = PreparedActions.__call__
 
     @torch.no_grad()
     def draw(self) -> None:
         """Draw the next step's masks and noise; may be captured in a CUDA graph."""
-        self._diverged.zero_()
-        drawn = draw_step(self._x, self._physics, self._random)
-        for own, new in ((self._mask, drawn.mask), (self._noise, drawn.noise)):
+        *held, _, diverged = self._step
+        diverged.zero_()
+        drawn = draw_step(self._worlds[0], self._physics, self._random)
+        for own, new in zip(held, drawn[:2], strict=True):
             if own is not None and new is not None:
                 own.copy_(new)
 
     def updated(self) -> Tensor:
         """Return which particles the last draw updates, bool, shape [B, N]."""
-        if self._mask is None:
-            return self._everyone
-        return self._mask.bool()
-
-    def apply(self, action: Tensor) -> None:
-        """Apply actions with what was drawn last.
-
-        Args:
-            action: Displacement as a fraction of α ε (D, norm clipped to 1), then state step as a
-                fraction of `state_scale` (C, clipped to [-1, 1]); shape [B, N, A], any device.
-        """
-        self._apply(action)
-
-    def hold(self, action: Tensor) -> None:
-        """Copy actions, as `apply` takes them, to where `apply_held` reads them."""
-        self._apply.hold(action)
-
-    def apply_held(self) -> None:
-        """Apply the actions held last with what was drawn last; may be captured in a CUDA graph."""
-        self._apply.apply_held()
+        mask = self._step[0]
+        return self._everyone if mask is None else mask.bool()
 
 
 def marginal_gains(
@@ -136,12 +115,8 @@ def marginal_gains(
     the mean over the particles is what the loss fell; for others it is so up to third order. What a
     task holds constant in its gradients stays constant.
 
-    Args:
-        losses: The named parts of each world's loss, shape [B] each, of positions and states.
-        after: The same after it.
-
-    Returns:
-        The gains, or None where no gradient leads from the losses to positions or states.
+    `losses` gives the named parts of each world's loss, shape [B] each, of positions and states.
+    None is returned where no gradient leads from them to positions or states.
     """
     moved = wrapped(after[0] - before[0], box)
     changed = after[1] - before[1]

@@ -42,12 +42,7 @@ def offsets_from(x: Tensor, centre: Tensor, box: Sides = None) -> Tensor:
 
 
 def nearest_image(way: Tensor, box: Sides) -> Tensor:
-    """Return ways, or places, as their images nearest to the origin have them, [..., D].
-
-    Args:
-        way: From one place to another [length units], shape [..., D].
-        box: Sides of the periodic box [length units]; None: they are as they are.
-    """
+    """Return ways, or places, as their images nearest to the origin have them, [..., D]."""
     if box is None:
         return way
     # Side by side: a tensor of the sides would be a copy to the device.
@@ -98,11 +93,12 @@ def removed(x: Tensor, s: Tensor, *, gone: Tensor) -> tuple[Tensor, Tensor]:
         NPAError: A wrong shape or dtype, or worlds would not keep equally many particles.
     """
     check_world(x, s)
-    wanted = f"gone must be a bool tensor of shape [B, N] = {list(x.shape[:2])}"
-    if not isinstance(gone, Tensor):
-        raise NPAError(f"{wanted}, got {shown(gone)}: take inside_ball")
-    if gone.shape != x.shape[:2] or gone.dtype != torch.bool:
-        raise NPAError(f"{wanted}, got {gone.dtype} {list(gone.shape)}: take inside_ball")
+    if not isinstance(gone, Tensor) or gone.shape != x.shape[:2] or gone.dtype != torch.bool:
+        got = f"{gone.dtype} {list(gone.shape)}" if isinstance(gone, Tensor) else shown(gone)
+        raise NPAError(
+            f"gone must be a bool tensor of shape [B, N] = {list(x.shape[:2])}, got {got}: take "
+            "inside_ball"
+        )
     counts = gone.sum(dim=1).tolist()
     if len(set(counts)) > 1:
         raise NPAError(
@@ -169,17 +165,7 @@ def inject(
         NPAError: A wrong shape or dtype, or a number out of its range.
     """
     check_world(x, s)
-    if not isinstance(state, Tensor):
-        raise NPAError(
-            f"state must be a tensor of shape [B, C] = {(s.shape[0], s.shape[2])}, got "
-            f"{shown(state)}: give one state for each world"
-        )
-    if state.shape != (s.shape[0], s.shape[2]):
-        raise NPAError(
-            f"state must have shape [B, C] = {(s.shape[0], s.shape[2])}, got {tuple(state.shape)}: "
-            "give one state for each world"
-        )
-    _check_alike("state", state, s, "s")
+    _check_each("state", state, s, "s", "C")
     share = _per_world("strength", strength, x, highest=1.0)
     return s + share * softness(x, centre=centre, radius=radius, box=box) * (state[:, None] - s)
 
@@ -336,21 +322,22 @@ def _per_world(name: str, value: float | Tensor, x: Tensor, *, highest: float = 
 def _check_vector(name: str, vector: Tensor, x: Tensor) -> None:
     if x.ndim != 3:
         raise NPAError(f"x must have shape [B, N, D], got {tuple(x.shape)}: add a world, x[None]")
-    wanted = (x.shape[0], x.shape[2])
-    if not isinstance(vector, Tensor):
-        raise NPAError(
-            f"{name} must be a tensor of shape [B, D] = {wanted}, got {shown(vector)}: "
-            f"give one vector for each world, for example torch.zeros{wanted}"
-        )
-    if vector.shape != wanted:
-        raise NPAError(
-            f"{name} must have shape [B, D] = {wanted}, got {tuple(vector.shape)}: "
-            f"give one vector for each world, for example {name}.expand{wanted}"
-        )
-    _check_alike(name, vector, x, "x")
+    _check_each(name, vector, x, "x", "D")
 
 
-def _check_alike(name: str, value: Tensor, other: Tensor, other_name: str) -> None:
+def _check_each(name: str, value: Tensor, other: Tensor, other_name: str, letter: str) -> None:
+    """Check that there is a vector for each world, of the last size of other tensors."""
+    wanted = (other.shape[0], other.shape[2])
+    shape = f"shape [B, {letter}] = {wanted}"
+    cure = "give one vector for each world, for example"
+    if not isinstance(value, Tensor):
+        raise NPAError(
+            f"{name} must be a tensor of {shape}, got {shown(value)}: {cure} torch.zeros{wanted}"
+        )
+    if value.shape != wanted:
+        raise NPAError(
+            f"{name} must have {shape}, got {tuple(value.shape)}: {cure} {name}.expand{wanted}"
+        )
     if value.device != other.device or value.dtype != other.dtype:
         raise NPAError(
             f"{name} must be {other.dtype} on {other.device} like {other_name}, got {value.dtype} "

@@ -24,9 +24,7 @@ from npa_envs.ops.driver import new_stream
 def to_device_async(values: NDArray[Any], device: torch.device) -> Tensor:
     """Return an array as a tensor on a device; the host does not wait for what the device does.
 
-    Args:
-        values: An array; on a CPU the tensor shares its memory.
-        device: Where it is to go.
+    On a CPU the tensor shares the array's memory.
     """
     tensor = torch.from_numpy(values)
     # Unpinned memory would be copied once the stream is idle, and the host would wait for that.
@@ -136,12 +134,7 @@ def _capture_stream(device_index: int) -> torch.cuda.Stream:
 
 
 def prepare_capture(function: Callable[[], object], device: torch.device) -> None:
-    """Run a function on the stream that is captured: loads kernels, allocates workspaces.
-
-    Args:
-        function: Launches kernels.
-        device: A CUDA device, where it works.
-    """
+    """Run a function on the stream that is captured: loads kernels, allocates workspaces."""
     with recording_lock, torch.cuda.device(device), plain_tensors():
         stream = _capture_stream(torch.cuda.current_device())
         stream.wait_stream(torch.cuda.current_stream())
@@ -154,21 +147,14 @@ def prepare_capture(function: Callable[[], object], device: torch.device) -> Non
 class GraphSequence:
     """Work that was recorded: CUDA graphs, one after the other, and what is done between them.
 
-    Args:
-        pool: Memory that the graphs share; None is a pool of their own.
-        generator: A generator that draws anew in each replay.
-        alone: Nothing is drawn from torch's own generator.
+    `generator` draws anew in each replay; `alone`: nothing is drawn from torch's own generator.
     """
 
     abandoned = 0
     """Pools of graphs that are gone since memory was given back."""
 
     def __init__(
-        self,
-        pool: Any = None,
-        generator: torch.Generator | None = None,
-        *,
-        alone: bool = False,
+        self, pool: Any = None, generator: torch.Generator | None = None, *, alone: bool = False
     ) -> None:
         self._owns_pool = pool is None
         self._pool = pool
@@ -239,8 +225,7 @@ _capturing: ContextVar[GraphSequence | None] = ContextVar("capturing", default=N
 def host_call(work: Callable[[], object]) -> None:
     """Do what cannot be part of a graph: at once, or in a capture between two graphs, each replay.
 
-    Args:
-        work: Reads and writes tensors that stay where they are; what launches it keeps them.
+    The work reads and writes tensors that stay where they are; what launches it keeps them.
     """
     captured = _capturing.get()
     if captured is None:
@@ -266,28 +251,16 @@ def capture(
 ) -> GraphSequence:
     """Record what a function launches as CUDA graphs, without running it.
 
-    It is one graph, unless the function calls `host_call`.
+    It is one graph, unless the function calls `host_call`. The function launches kernels that are
+    loaded already (by `warm_up`, on the stream that is captured), and never waits for the device.
+    A `pool` is shared with graphs that never run at the same time. Each replay draws anew from a
+    CUDA `generator`; if `alone`, a draw from torch's own one is an error, and other threads may
+    draw from that meanwhile. After an error of the function the device can be used as before.
 
     Without a warm-up the host waits for nothing. `torch.cuda.graph` waits for the device, frees the
     allocator's cache and may collect garbage at each capture, which can take longer than the
     capture itself. That makes room, as a graph's pool has no use for memory in that cache. Here
     room is made after the warm-up, which leaves most of it, and where a capture has not enough.
-
-    Args:
-        function: Launches kernels that are loaded already, and never waits for the device.
-        device: A CUDA device, where it works.
-        pool: Memory (`torch.cuda.graph_pool_handle()`) to share with graphs that never run at the
-            same time as this one; None is a new pool.
-        generator: A CUDA generator that the function draws from: each replay draws anew.
-        warm_up: Run first, on the stream that is captured: loads kernels, allocates workspaces.
-        alone: The function draws from the generator alone, and other threads may draw from torch's
-            own one meanwhile; a draw from that within the function is an error.
-
-    Returns:
-        What was recorded, to be replayed on any stream.
-
-    Raises:
-        Exception: Whatever the function raises; the device can be used as before.
     """
     with recording_lock, torch.cuda.device(device), plain_tensors():
         stream = _capture_stream(torch.cuda.current_device())
@@ -298,13 +271,13 @@ def capture(
         if warm_up is not None:
             prepare_capture(warm_up, device)
         with contextlib.suppress(torch.OutOfMemoryError):
-            return _recorded(function, stream, GraphSequence(pool, generator, alone=alone))
+            return _captured(function, stream, GraphSequence(pool, generator, alone=alone))
         # Only here: the error that is gone by now held the memory of the first attempt.
         torch.cuda.empty_cache()
-        return _recorded(function, stream, GraphSequence(pool, generator, alone=alone))
+        return _captured(function, stream, GraphSequence(pool, generator, alone=alone))
 
 
-def _recorded(
+def _captured(
     function: Callable[[], object], stream: torch.cuda.Stream, captured: GraphSequence
 ) -> GraphSequence:
     """Capture a stream while the function runs."""
@@ -314,7 +287,18 @@ def _recorded(
     stream.wait_stream(current)
     try:
         with torch.cuda.stream(stream), no_garbage_collection():
-            _record(function, captured)
+            captured.begin()
+            before = _capturing.set(captured)
+            try:
+                function()
+            except BaseException:
+                # What broke the capture says more than the complaint that it is broken.
+                with contextlib.suppress(RuntimeError):
+                    captured.end()
+                raise
+            finally:
+                _capturing.reset(before)
+            captured.end()
     except BaseException:
         with contextlib.suppress(RuntimeError):
             current.wait_stream(stream)
@@ -323,29 +307,10 @@ def _recorded(
     return captured
 
 
-def _record(function: Callable[[], object], captured: GraphSequence) -> None:
-    """Capture the current stream while the function runs."""
-    captured.begin()
-    before = _capturing.set(captured)
-    try:
-        function()
-    except BaseException:
-        # What broke the capture says more than the complaint that it is broken.
-        with contextlib.suppress(RuntimeError):
-            captured.end()
-        raise
-    finally:
-        _capturing.reset(before)
-    captured.end()
-
-
 def may_be_disturbed(attempts: int) -> bool:
     """Return whether a capture that failed is worth another attempt.
 
     A thread that waits for the whole device (`torch.cuda.synchronize`) ends all captures.
-
-    Args:
-        attempts: Attempts so far.
     """
     return threading.active_count() > 1 and attempts < CAPTURE_ATTEMPTS
 
@@ -355,9 +320,6 @@ class WeakFunction:
 
     An object that keeps its own method is freed only when garbage is collected, and with it graphs
     and their memory. What this returns is of no use once its object is gone.
-
-    Args:
-        function: The function, or the method of an object that others keep.
     """
 
     def __init__(self, function: Callable[..., Any]) -> None:
@@ -368,11 +330,7 @@ class WeakFunction:
         return WeakFunction, (self(),)
 
     def __call__(self) -> Callable[..., Any]:
-        """Return the function.
-
-        Raises:
-            ReferenceError: Its object is gone.
-        """
+        """Return the function, whose object must be there."""
         function = self._get()
         if function is None:
             raise ReferenceError("the object of this method is gone: keep it as long as the method")
@@ -383,17 +341,11 @@ class GraphedCallable:
     """A function without arguments that is run as it is on a CPU, and as a CUDA graph on CUDA.
 
     Launches of many short kernels would otherwise take longer than the kernels do. The first call
-    runs the function kernel by kernel, which loads them; the second captures it.
-
-    Args:
-        function: Reads and writes the same tensors in every call, and never waits for the device. A
-            method's object has to be kept by others (`WeakFunction`).
-        device: Where these are.
-        generator: The generator on the device that the function draws from, if any; the numbers
-            are the same whether it is captured or not.
-        recorded: False: run it as it is on CUDA too.
-        pool: Memory (`torch.cuda.graph_pool_handle()`) to share with functions that never run at
-            the same time, and of whose work nothing is needed that lies there; None: its own.
+    runs the function kernel by kernel, which loads them; the second captures it. The function reads
+    and writes the same tensors in every call, and never waits for the device; a method's object has
+    to be kept by others (`WeakFunction`). Numbers of its `generator` are the same either way. A
+    `pool` is shared with functions that never run at the same time, and of whose work nothing is
+    needed that lies there.
     """
 
     def __init__(
@@ -419,11 +371,7 @@ class GraphedCallable:
         return self.__dict__ | {"_warm": False, "_graph": None, "_attempts": 0}
 
     def __call__(self) -> None:
-        """Run the function.
-
-        Raises:
-            ReferenceError: It is a method, and its object is gone.
-        """
+        """Run the function."""
         function = self._function()
         if not self._recorded or not self._warm:
             function()
@@ -444,11 +392,7 @@ class GraphedCallable:
 
 
 class SideStream:
-    """A CUDA stream that overlaps the current one.
-
-    Args:
-        device: A CUDA device.
-    """
+    """A CUDA stream that overlaps the current one."""
 
     _free: ClassVar[dict[torch.device, collections.deque[torch.cuda.Stream]]] = {}
     """Streams whose objects are gone, by device."""
@@ -464,12 +408,7 @@ class SideStream:
     @staticmethod
     @functools.lru_cache(maxsize=64)
     def of_thread(device: torch.device, thread: int) -> SideStream:
-        """Return the one of a thread, for captures.
-
-        Args:
-            device: A CUDA device.
-            thread: The thread's identifier.
-        """
+        """Return the one of a thread, for captures."""
         return SideStream(device)
 
     def __del__(self) -> None:

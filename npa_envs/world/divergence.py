@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from typing import Literal, NamedTuple
 
 import torch
@@ -47,7 +46,9 @@ def divergence(x: Tensor, s: Tensor, *, limit: float = RUNAWAY) -> Divergence:
         NPAError: Shapes, dtypes or devices do not fit each other, or the limit is not positive.
     """
     check_world(x, s)
-    limit = _checked_limit(limit)
+    limit = checked_number("limit", limit)
+    if not limit > 0.0:
+        raise NPAError(f"limit must be positive, got {limit}")
     # A largest number is NaN where one of the numbers is.
     largest = torch.stack((x.abs().amax(dim=(1, 2)), s.abs().amax(dim=(1, 2)))).amax(dim=0)
     finite = largest.isfinite()
@@ -130,11 +131,7 @@ class DivergenceWatch:
         self._looks += 1
 
     def raise_diverged(self) -> None:
-        """Raise an error if a world has diverged; it waits for the device.
-
-        Raises:
-            DivergedError: The message says which worlds, at which step, and which number.
-        """
+        """Raise an error where worlds diverged, which says when and where; waits for the device."""
         first = self._first.tolist()
         worlds = sorted((step, world) for world, step in enumerate(first) if step >= 0)
         if not worlds:
@@ -158,11 +155,7 @@ class DivergenceWatch:
 
 
 def make_watch(on_divergence: str, x: Tensor, s: Tensor) -> DivergenceWatch | None:
-    """Return what watches over a rollout, or None where nothing does.
-
-    Raises:
-        NPAError: The word is unknown, or the rollout is being captured, which cannot wait.
-    """
+    """Return what watches over a rollout, or None where nothing does."""
     if on_divergence not in ("ignore", "raise"):
         raise NPAError(f"on_divergence must be 'ignore' or 'raise', got {shown(on_divergence)}")
     if on_divergence == "ignore":
@@ -173,10 +166,3 @@ def make_watch(on_divergence: str, x: Tensor, s: Tensor) -> DivergenceWatch | No
             "waits for the device: read npa_envs.divergence after a replay"
         )
     return DivergenceWatch(x, s)
-
-
-def _checked_limit(limit: float) -> float:
-    value = checked_number("limit", limit)
-    if math.isnan(value) or value <= 0.0:
-        raise NPAError(f"limit must be positive, got {limit}")
-    return value

@@ -42,11 +42,7 @@ def living(s: Tensor) -> Tensor:
 
 
 def parked(x: Tensor, alive: Tensor, eps: float) -> Tensor:
-    """Return positions with the dead far away from all others and from each other.
-
-    Args:
-        alive: Which slots hold a living particle, bool, shape [B, N].
-    """
+    """Return positions with the dead far away from all others and from each other."""
     count, space_dim = x.shape[1:]
     side = 1
     while side**space_dim < count:
@@ -122,12 +118,8 @@ def divided(
     children_x = (x + half_way).gather(1, source[..., None].expand_as(x))
     x = torch.where(born[..., None], children_x, x - half_way)
     alive = stays | born
-    return _dead_amidst(x, alive), s, torch.where(alive & ~born, path_length, 0.0)
-
-
-def _dead_amidst(x: Tensor, alive: Tensor) -> Tensor:
-    """Return positions with the dead at the mean of the living."""
+    # The dead are at the mean of the living. Where none lives, all are at the origin.
     share = alive[..., None].to(x.dtype)
-    # Where none lives, all are at the origin.
-    middle = world_mean(x * share) / world_mean(share).clamp_min(0.5 / x.shape[1])
-    return torch.where(alive[..., None], x, middle[:, None])
+    middle = world_mean(x * share) / world_mean(share).clamp_min(0.5 / count)
+    x = torch.where(alive[..., None], x, middle[:, None])
+    return x, s, torch.where(alive & ~born, path_length, 0.0)

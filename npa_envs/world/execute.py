@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import threading
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any, Literal, NamedTuple
@@ -22,13 +23,7 @@ from npa_envs.world.cuda_graph import draws_alone
 from npa_envs.world.divergence import DivergenceWatch
 from npa_envs.world.particles import Particles, combined
 from npa_envs.world.randomness import Randomness
-from npa_envs.world.recorded import (
-    LAUNCHED_FIRST,
-    CallKinds,
-    CudaGraph,
-    rule_form,
-    run_recorded,
-)
+from npa_envs.world.recorded import LAUNCHED_FIRST, CallKinds, CudaGraph, rule_form, run_recorded
 from npa_envs.world.steps import (
     DivisionStep,
     Draws,
@@ -91,10 +86,10 @@ class RolloutSpec(NamedTuple):
         physics = self.physics.constants()
         moving = physics.moving or physics.position_noise > 0.0 or not self.detach_positions
         if not moving and self.steps >= FEWEST_STATIC:
-            return StaticStep.of(rule, physics, particles.x)
+            return StaticStep(rule, physics, particles.x)
         # A rule without a network runs as the module that it is.
-        step = RuleStep(rule, rule.network(), physics, self.detach_positions)
-        return DivisionStep(step) if rule.divides else step
+        made = DivisionStep if rule.divides else RuleStep
+        return made(rule, rule.network(), physics, self.detach_positions)
 
     def run(
         self,
@@ -103,13 +98,58 @@ class RolloutSpec(NamedTuple):
         source: Randomness | None,
         watch: DivergenceWatch | None = None,
     ) -> Particles:
-        """Launch the rollout of checked worlds: from a tape on a CPU, in a loop otherwise."""
+        """Launch the rollout of checked worlds: from a tape on a CPU, in a loop otherwise.
+
+        Raises:
+            DivergedError: A world diverged under a watch.
+        """
         step = self.make_step(rules, particles)
-        if isinstance(step, RuleStep) and watch is None and may_tape(step, particles):
-            kept = run_taped(step, particles, source, self.steps, self.keep_every)
-            if kept is not None:
-                return kept
-        return run_steps(step, self, rules, particles, source, watch)
+        if type(step) is RuleStep and watch is None:
+            taped = run_taped(step, particles, source, self.steps, self.keep_every)
+            if taped is not None:
+                return taped
+        particles = step.enter(particles)
+        keep_every = self.keep_every
+        interval = STORED_INTERVAL[self.memory] if torch.is_grad_enabled() else 1
+        kept: list[Particles] = []
+        # While a graph is recorded, torch's state cannot be read, and its draws are the graph's.
+        recorded = particles.x.is_cuda and torch.cuda.is_current_stream_capturing()
+        with_modules = not all(rule.has_network() for rule in rules)
+        redraw = with_modules and not recorded
+        if with_modules and recorded and not draws_alone():
+            # Recomputed, a module that draws would draw otherwise.
+            interval = 1
+        again = None
+        # A compiled function reads copies.
+        if interval > 1 and not torch.compiler.is_compiling():
+            again = RecomputedSteps(step.advance, rules, {"x": particles.x, "s": particles.s})
+        # Worlds keep their dtype under autocast: the kernels read what the rules write.
+        with torch.autocast(particles.x.device.type, enabled=False):
+            for number, draws in enumerate(step.draw(particles.x, self.steps, source)):
+                if (self.steps - 1 - number) % interval > 0:
+                    particles = checkpoint(
+                        again or step.advance,
+                        particles,
+                        draws,
+                        use_reentrant=False,
+                        preserve_rng_state=redraw,
+                    )
+                else:
+                    particles = step.advance(particles, draws)
+                if watch is not None:
+                    after = step.leave(particles.map(Tensor.detach))
+                    watch.look(after.x, after.s)
+                if keep_every is not None and (number + 1) % keep_every == 0:
+                    kept.append(step.leave(particles))
+            if again is not None:
+                again.end_forward()
+            if self.steps == 0:
+                # What is returned is the caller's to write to.
+                particles = particles.map(torch.clone)
+            particles = step.leave(particles) if keep_every is None else combined(torch.stack, kept)
+        if watch is not None:
+            watch.raise_diverged()
+        return particles
 
 
 class RecomputedSteps:
@@ -117,10 +157,6 @@ class RecomputedSteps:
 
     These read the rule and the first worlds where they are. Gradients would silently be wrong if
     they had changed meanwhile, which is refused.
-
-    Args:
-        advance: Returns the worlds after one step.
-        rules: The rules that it runs.
     """
 
     def __init__(
@@ -137,7 +173,13 @@ class RecomputedSteps:
         """Run one step, forward or again."""
         if self._read is None:
             return self._advance(*arguments)
-        self._check(self._read)
+        for name, value in self._readings():
+            if name not in self._read or self._read[name][1] != _reading(value):
+                raise NPAError(
+                    f"{name} must stay as it is between a rollout that recomputes steps and its "
+                    "backward pass, got another: call backward() before it changes, or take "
+                    "memory='store'"
+                )
         try:
             return self._advance(*arguments)
         finally:
@@ -146,21 +188,12 @@ class RecomputedSteps:
 
     def end_forward(self) -> None:
         """Note what has been read."""
-        self._read = dict(self._readings())
-
-    def _check(self, before: dict[str, Any]) -> None:
-        for name, value in self._readings():
-            if name not in before or before[name] != value:
-                raise NPAError(
-                    f"{name} must stay as it is between a rollout that recomputes steps and its "
-                    "backward pass, got another: call backward() before it changes, or take "
-                    "memory='store'"
-                )
+        # Tensors are held, so that no other one gets the same memory.
+        self._read = {name: (value, _reading(value)) for name, value in self._readings()}
 
     def _readings(self) -> Iterator[tuple[str, Any]]:
-        """Yield what steps read, by name, as something that can be compared."""
-        for name, world in self._worlds.items():
-            yield name, _Reading(world)
+        """Yield what steps read, by name: tensors and other values."""
+        yield from self._worlds.items()
         for number, (rule, with_weights) in enumerate(self._rules):
             of_rule = "the rule" if len(self._rules) == 1 else f"rule {number}"
             for name, value in rule.hyper_parameters().items():
@@ -169,86 +202,15 @@ class RecomputedSteps:
                 place = f"{path}." if path else ""
                 own = {**vars(module), **module._parameters, **module._buffers}
                 for name, value in own.items():
-                    if isinstance(value, Tensor):
-                        yield f"{place}{name} of {of_rule}", _Reading(value)
-                    elif isinstance(value, bool | int | float | str):
+                    if isinstance(value, Tensor | bool | int | float | str):
                         yield f"{place}{name} of {of_rule}", value
 
 
-class _Reading:
-    """A tensor as it was read: equal to another reading if nothing was written in between."""
-
-    def __init__(self, tensor: Tensor) -> None:
-        # Held, so that no other tensor gets the same memory.
-        self._held = tensor.detach()
-        self._where = tensor.data_ptr()
-        self._version = None if tensor.is_inference() else tensor._version
-
-    def __eq__(self, other: object) -> bool:
-        return (
-            isinstance(other, _Reading)
-            and self._where == other._where
-            and self._version == other._version
-        )
-
-    __hash__ = None  # type: ignore[assignment]
-
-
-def run_steps(
-    step: Step,
-    spec: RolloutSpec,
-    rules: Sequence[NPARule],
-    particles: Particles,
-    source: Randomness | None,
-    watch: DivergenceWatch | None,
-) -> Particles:
-    """Repeat a step on checked worlds.
-
-    Raises:
-        DivergedError: A world diverged under a watch.
-    """
-    steps, keep_every = spec.steps, spec.keep_every
-    particles = step.enter(particles)
-    interval = STORED_INTERVAL[spec.memory] if torch.is_grad_enabled() else 1
-    kept: list[Particles] = []
-    # While a graph is recorded, torch's state cannot be read, and its draws are the graph's.
-    recorded = particles.x.is_cuda and torch.cuda.is_current_stream_capturing()
-    with_modules = not all(rule.has_network() for rule in rules)
-    redraw = with_modules and not recorded
-    if with_modules and recorded and not draws_alone():
-        # Recomputed, a module that draws would draw otherwise.
-        interval = 1
-    again = None
-    # A compiled function reads copies.
-    if interval > 1 and not torch.compiler.is_compiling():
-        again = RecomputedSteps(step.advance, rules, {"x": particles.x, "s": particles.s})
-    # Worlds keep their dtype under autocast: the kernels read what the rules write.
-    with torch.autocast(particles.x.device.type, enabled=False):
-        for number, draws in enumerate(step.draw(particles.x, steps, source)):
-            if (steps - 1 - number) % interval > 0:
-                particles = checkpoint(
-                    again or step.advance,
-                    particles,
-                    draws,
-                    use_reentrant=False,
-                    preserve_rng_state=redraw,
-                )
-            else:
-                particles = step.advance(particles, draws)
-            if watch is not None:
-                after = step.leave(particles.map(Tensor.detach))
-                watch.look(after.x, after.s)
-            if keep_every is not None and (number + 1) % keep_every == 0:
-                kept.append(step.leave(particles))
-        if again is not None:
-            again.end_forward()
-        if steps == 0:
-            # What is returned is the caller's to write to.
-            particles = particles.map(torch.clone)
-        particles = step.leave(particles) if keep_every is None else combined(torch.stack, kept)
-    if watch is not None:
-        watch.raise_diverged()
-    return particles
+def _reading(value: Any) -> Any:
+    """Return what changes with each write to a tensor; of other values, themselves."""
+    if not isinstance(value, Tensor):
+        return value
+    return value.data_ptr(), None if value.is_inference() else value._version
 
 
 def execute(
@@ -262,18 +224,23 @@ def execute(
 ) -> Particles:
     """Run a checked rollout, in the first of the ways that can be taken.
 
-    Args:
-        spec: The rollout.
-        graph: Whether to record on CUDA; True also records rules that are not plain.
-        watch: Checks the worlds after each step, which then are launched.
-
-    Raises:
-        NPAError: A position is not finite.
-        DivergedError: A world diverged under a watch.
+    A watch checks the worlds after each step, which then are launched.
     """
-    if watch is None and _may_rest(spec, rules, particles):
-        return _run_until_rest(spec, rules, particles, source, graph)
-    return run_all_steps(spec, rules, particles, source, graph=graph, watch=watch)
+    if watch is not None or not _may_rest(spec, rules, particles):
+        return run_all_steps(spec, rules, particles, source, graph=graph, watch=watch)
+    # In parts, to skip the steps after all worlds are at rest.
+    left, part = spec.steps, FIRST_PART[particles.x.device.type]
+    while left and not resting(rules, particles, spec.physics, graph).all():
+        own = spec._replace(steps=min(part, left))
+        particles = run_all_steps(own, rules, particles, source, graph=graph)
+        left, part = left - own.steps, 2 * part
+        if left and not particles.x.isfinite().all():
+            # A world has diverged, which the next call refuses, and not this one.
+            return spec._replace(steps=left).run(rules, particles, source)
+    # Whoever draws next gets what comes after all steps.
+    skip_draws(particles.x, spec.physics, left, source)
+    # What is returned is the caller's to write to.
+    return particles.map(torch.clone) if left == spec.steps else particles
 
 
 def run_all_steps(
@@ -320,33 +287,11 @@ def _may_rest(spec: RolloutSpec, rules: Sequence[NPARule], particles: Particles)
         and spec.steps >= FEWEST_RESTING
         and spec.keep_every is None
         and spec.physics.position_noise == 0.0
-        and not particles.measures_paths
+        and particles.path_length is None
         and not torch.is_grad_enabled()
         and not torch.compiler.is_compiling()
         and not (particles.x.is_cuda and torch.cuda.is_current_stream_capturing())
     )
-
-
-def _run_until_rest(
-    spec: RolloutSpec,
-    rules: Sequence[NPARule],
-    particles: Particles,
-    source: Randomness | None,
-    graph: CudaGraph,
-) -> Particles:
-    """Run a rollout in parts, and skip the steps after all worlds are at rest."""
-    left, part = spec.steps, FIRST_PART[particles.x.device.type]
-    while left and not resting(rules, particles, spec.physics, graph).all():
-        own = spec._replace(steps=min(part, left))
-        particles = run_all_steps(own, rules, particles, source, graph=graph)
-        left, part = left - own.steps, 2 * part
-        if left and not particles.x.isfinite().all():
-            # A world has diverged, which the next call refuses, and not this one.
-            return spec._replace(steps=left).run(rules, particles, source)
-    # Whoever draws next gets what comes after all steps.
-    skip_draws(particles.x, spec.physics, left, source)
-    # What is returned is the caller's to write to.
-    return particles.map(torch.clone) if left == spec.steps else particles
 
 
 # Small worlds on a CPU: a step is some 50 µs of work, and several times as much of Python, for
@@ -363,24 +308,18 @@ class _TapedStep:
         self.row_width = step.network.row_width
         self._update_width = step.network.update_width
         self.tape = Tape()
+        stand_in: Any = self
         with self.tape.recording():
-            self.after = step._replace(network=self).advance(particles, Draws(mask, None))
-        self._places = self.tape.places(self._updates)
+            step = dataclasses.replace(step, network=stand_in)
+            self.after = step.advance(particles, Draws(mask, None))
+        self.places = self.tape.places(self._updates)
 
     def __call__(self, rows: Tensor) -> Tensor:
         """Note what the network reads, [B N, row_width], and its place on the tape."""
         self.rows = rows
-        self._split = len(self.tape)
+        self.split = len(self.tape)
         self._updates = rows.new_zeros(len(rows), self._update_width)
         return self._updates
-
-    def run(self, network: Network, row_count: int) -> None:
-        """Step the worlds that lie where the recorded ones lay."""
-        self.tape.replay(0, self._split, last_count=row_count)
-        # Held until the launch has read it.
-        updates = network(self.rows[:row_count])
-        self.tape.move(self._places, updates)
-        self.tape.replay(self._split)
 
 
 class TapedSteps:
@@ -411,7 +350,11 @@ class TapedSteps:
             if self._mask is not None and mask is not None:
                 self._mask.copy_(mask)
                 count = max(int(mask.sum()), 1)
-            step.run(network, count)
+            step.tape.replay(0, step.split, last_count=count)
+            # Held until the launch has read it.
+            updates = network(step.rows[:count])
+            step.tape.move(step.places, updates)
+            step.tape.replay(step.split)
             if (number + 1) % every == 0:
                 kept.append(self._places[(number + 1) % 2].map(torch.clone))
         return kept
@@ -423,23 +366,6 @@ _lock = threading.Lock()
 """Held while the above changes."""
 
 
-def may_tape(step: RuleStep, particles: Particles) -> bool:
-    """Return whether steps of worlds may be on a tape: small, on a CPU, without gradients."""
-    x, s, *_ = particles
-    return (
-        not torch.compiler.is_compiling()
-        and not torch.is_grad_enabled()
-        and x.device.type == "cpu"
-        and x.shape[0] * x.shape[1] <= LARGEST_TOTAL
-        and step.network is not None
-        and step.physics.position_noise == 0.0
-        and sorts_at_once(*x.shape[:2])
-        and type(x) is Tensor
-        and type(s) is Tensor
-        and not is_in_torch_dispatch_mode()
-    )
-
-
 def run_taped(
     step: RuleStep,
     particles: Particles,
@@ -447,11 +373,25 @@ def run_taped(
     steps: int,
     keep_every: int | None,
 ) -> Particles | None:
-    """Run a rollout by taped steps; None where calls of this kind are too few so far."""
-    if steps == 0:
-        return None
-    assert step.network is not None
+    """Run a rollout by taped steps; None where calls of its kind are too few so far.
+
+    Only steps of small worlds on a CPU, without gradients, may be on a tape.
+    """
     x, s, *_ = particles
+    if (
+        torch.compiler.is_compiling()
+        or torch.is_grad_enabled()
+        or x.device.type != "cpu"
+        or x.shape[0] * x.shape[1] > LARGEST_TOTAL
+        or step.network is None
+        or step.physics.position_noise > 0.0
+        or steps == 0
+        or not sorts_at_once(*x.shape[:2])
+        or type(x) is not Tensor
+        or type(s) is not Tensor
+        or is_in_torch_dispatch_mode()
+    ):
+        return None
     key = (step.physics, rule_form(step.rule), x.shape, s.shape[2], x.dtype)
     with _lock:
         kind = _kinds.count(key, MOST_KINDS)

@@ -21,11 +21,6 @@ class Particles(NamedTuple):
     goal: Tensor | None = None
     """What a world is to become, int64, shape [B]."""
 
-    @property
-    def measures_paths(self) -> bool:
-        """Whether path lengths are there."""
-        return self.path_length is not None
-
     def tensors(self) -> list[Tensor]:
         """Return the fields that are there."""
         return [value for value in self if value is not None]

@@ -15,7 +15,7 @@ from torch import Tensor
 from npa_envs.checks import DTYPES, check_dense, checked_count, checked_number
 from npa_envs.devices import check_device
 from npa_envs.errors import NPAError, shown
-from npa_envs.ops.draws import bernoulli_draw, integer_draw, normal_draw, uniform_draw
+from npa_envs.ops.draws import WORD_COUNT, draw
 from npa_envs.ops.sort import LARGEST_INDEX
 
 
@@ -202,9 +202,7 @@ class WorldRandom:
             NPAError: A size is no integer of at least 0, or the dtype is another one.
         """
         _check_dtype(dtype)
-        count = _element_count(shape, self.world_count)
-        drawn: Tensor = uniform_draw(*self._next(), count, dtype)
-        return drawn.view(self.world_count, *shape)
+        return self._drawn("uniform", shape, dtype)
 
     def normal(self, *shape: int, dtype: torch.dtype = torch.float32) -> Tensor:
         """Return standard normal numbers, always finite, shape [B, *shape].
@@ -217,9 +215,7 @@ class WorldRandom:
             NPAError: A size is no integer of at least 0, or the dtype is another one.
         """
         _check_dtype(dtype)
-        count = _element_count(shape, self.world_count)
-        drawn: Tensor = normal_draw(*self._next(), count, dtype)
-        return drawn.view(self.world_count, *shape)
+        return self._drawn("normal", shape, dtype)
 
     def bernoulli(self, probability: float, *shape: int) -> Tensor:
         """Return ones with a probability and zeros otherwise, uint8, shape [B, *shape].
@@ -234,9 +230,7 @@ class WorldRandom:
         chance = checked_number("probability", probability)
         if not 0.0 <= chance <= 1.0:
             raise NPAError(f"probability must lie in [0, 1], got {probability}: try 0.5")
-        count = _element_count(shape, self.world_count)
-        drawn: Tensor = bernoulli_draw(*self._next(), count, chance)
-        return drawn.view(self.world_count, *shape)
+        return self._drawn("bernoulli", shape, torch.uint8, round(chance * WORD_COUNT))
 
     def integers(self, high: int, *shape: int) -> Tensor:
         """Return integers uniform in [0, high), int64, shape [B, *shape].
@@ -251,14 +245,23 @@ class WorldRandom:
         limit = checked_count("high", high)
         if not 1 <= limit < 2**63:
             raise NPAError(f"high must lie in [1, 2^63 - 1], got {high}: draw from [0, high)")
-        count = _element_count(shape, self.world_count)
-        drawn: Tensor = integer_draw(*self._next(), count, limit)
-        return drawn.view(self.world_count, *shape)
+        return self._drawn("integers", shape, torch.int64, limit)
 
-    def _next(self) -> tuple[Tensor, Tensor, Tensor, int]:
-        draw = self._draw_count
+    def _drawn(
+        self, kind: str, shape: tuple[int, ...], dtype: torch.dtype, bound: int = 0
+    ) -> Tensor:
+        count = math.prod(checked_count("a size", size) for size in shape)
+        if count * self.world_count > LARGEST_INDEX:
+            raise NPAError(
+                f"a draw must have at most {LARGEST_INDEX} numbers, got {count} for each of "
+                f"{self.world_count} worlds: draw several times"
+            )
+        number = self._draw_count
         self._draw_count += 1
-        return self.keys, self.episodes, self.steps, draw
+        drawn: Tensor = draw(
+            self.keys, self.episodes, self.steps, number, kind, count, dtype, bound
+        )
+        return drawn.view(self.world_count, *shape)
 
 
 Randomness = torch.Generator | WorldRandom
@@ -278,11 +281,7 @@ _reserving = threading.Lock()
 
 
 def reserve_draws(source: torch.Generator, count: int) -> int:
-    """Move a CUDA generator on by what is to be drawn, and return where it stood.
-
-    Args:
-        count: How far, as torch counts it (`get_offset`).
-    """
+    """Move a CUDA generator on by what is to be drawn, and return where it stood."""
     with _reserving:
         begin = source.get_offset()
         source.set_offset(begin + count)
@@ -297,15 +296,7 @@ def give_back_draws(source: torch.Generator, begin: int, count: int) -> None:
 
 
 def check_generator(generator: Randomness | None, device: torch.device, world_count: int) -> None:
-    """Check that a source of randomness is one, for these worlds, on the device where it is used.
-
-    Args:
-        device: Where the numbers are needed.
-        world_count: Worlds B.
-
-    Raises:
-        NPAError: It is no source of randomness, on another device, or for other worlds.
-    """
+    """Check that a source of randomness is one, for B worlds, on the device where it is used."""
     if generator is None:
         return
     if not isinstance(generator, Randomness):
@@ -331,12 +322,7 @@ def check_generator(generator: Randomness | None, device: torch.device, world_co
 
 
 def uniform_draws(generator: Randomness | None, shape: Sequence[int], like: Tensor) -> Tensor:
-    """Return uniform numbers in [0, 1) for worlds.
-
-    Args:
-        generator: Where they come from, checked; None is torch's own.
-        shape: Worlds, then what each of them draws.
-    """
+    """Return uniform numbers in [0, 1): worlds, then what each of them draws."""
     if isinstance(generator, WorldRandom):
         return generator.uniform(*shape[1:], dtype=like.dtype)
     return torch.rand(tuple(shape), generator=generator, device=like.device, dtype=like.dtype)
@@ -371,14 +357,3 @@ def _signed(number: int) -> int:
 def _check_dtype(dtype: torch.dtype) -> None:
     if dtype not in DTYPES:
         raise NPAError(f"dtype must be torch.float32 or torch.float64, got {dtype}")
-
-
-def _element_count(shape: tuple[int, ...], world_count: int) -> int:
-    """Return how many numbers each world draws."""
-    count = math.prod(checked_count("a size", size) for size in shape)
-    if count * world_count > LARGEST_INDEX:
-        raise NPAError(
-            f"a draw must have at most {LARGEST_INDEX} numbers, got {count} for each of "
-            f"{world_count} worlds: draw several times"
-        )
-    return count

@@ -116,23 +116,31 @@ def run_recorded(
         wanted = tuple(tensor.requires_grad for tensor in tensors)
         wanted = (*wanted[:2], False, *wanted[2:]) if any(wanted) else ()
     by_world = isinstance(generator, WorldRandom)
-    precision = _matmul_precision()
+    # Torch's own getter of old refuses a choice that was made in the new way.
+    precision = torch.backends.cuda.matmul.fp32_precision
     shape = (x.shape, s.shape[2], x.dtype, x.device)
     key = call._replace(steps=0), forms, shape, wanted, by_world, precision
     with _lock:
         kind = _kinds.count(key, MOST_KINDS)
     if kind.refused or kind.calls <= (1 if asked else LAUNCHED_FIRST):
         return None
-    if wanted and (_hooked() or call.steps > MOST_STEPS):
+    # Somebody may handle what is saved for backward passes, as checkpoints do.
+    hooks = getattr(torch._C._autograd, "_top_saved_tensors_default_hooks", None)
+    hooked = hooks is not None and hooks(True) is not None
+    if wanted and (hooked or call.steps > MOST_STEPS):
         return None
-    blocks = [call.steps] if wanted else _blocks(call)
+    # Without gradients graphs are replayed one after the other.
+    kept = call.keep_every or 1
+    block = call.steps if wanted else max(BLOCK_STEPS // kept, 1) * kept
+    rest = call.steps % block
+    blocks = [block] * (call.steps // block) + [rest] * (rest > 0)
     make = functools.partial(_Recording, call, rules, x, s, wanted, by_world)
     lease = _lease(kind, set(blocks), make, tensors, asked)
     if lease is None:
         return None
     if not all(plain) and not lease.recording.compared.issuperset(blocks):
         return _compared(call, rules, kind, lease, blocks, tensors, generator)
-    return _replay_blocks(call, lease, blocks, tensors, generator)
+    return lease.recording.replay(call, lease, blocks, tensors, generator)
 
 
 def recorded_memory(device: torch.device) -> int:
@@ -148,12 +156,6 @@ def release_recordings() -> None:
         for key in list(_kinds):
             _kinds.forget(key)
     torch.cuda.empty_cache()
-
-
-def _hooked() -> bool:
-    """Return whether somebody handles what is saved for backward passes, as checkpoints do."""
-    hooks = getattr(torch._C._autograd, "_top_saved_tensors_default_hooks", None)
-    return hooks is not None and hooks(True) is not None
 
 
 def rule_form(rule: NPARule) -> Hashable:
@@ -176,13 +178,6 @@ def _form(rule: NPARule, plain: bool) -> tuple[Hashable, list[Tensor]]:
 
 def _memory_form(tensor: Tensor) -> Hashable:
     return tensor.shape, tensor.dtype, tensor.device
-
-
-def _matmul_precision() -> str:
-    """Return how torch multiplies matrices of float32 on CUDA, in whichever way that was chosen."""
-    # Torch's own getter of old refuses a choice that was made in the new way.
-    precision: str = torch.backends.cuda.matmul.fp32_precision
-    return precision
 
 
 def _twin(rule: NPARule, like: Tensor) -> NPARule:
@@ -235,7 +230,8 @@ class CallKinds(collections.OrderedDict[Hashable, CallKind]):
     def forget(self, key: Hashable) -> None:
         """Forget a kind; recordings under way live until their backward pass has run."""
         for recording in self.pop(key).recordings:
-            recording.finish()
+            if recording.stream is not None:
+                recording.stream.synchronize()
 
 
 class _Lease:
@@ -290,12 +286,14 @@ class _Recording:
         self._rules = [_twin(rule, x) for rule in rules]
         self._own = [rule for rule in self._rules if not rule.has_network()]
         weights = [weight for rule in self._rules for weight in _form(rule, rule.has_network())[1]]
-        own = [
+        worlds = [
             torch.empty(value.shape, dtype=value.dtype, device=value.device)
             for value in (x, s, self.no_path)
         ]
-        self._inputs = [*own, *weights]
+        self._inputs = [*worlds, *weights]
         self._wanted = wanted or (False,) * len(self._inputs)
+        self.differentiable = any(self._wanted)
+        """Whether there are backward passes."""
         for tensor, flag in zip(self._inputs, self._wanted, strict=True):
             # Buffers of rules may hold integers.
             if tensor.requires_grad != flag:
@@ -307,22 +305,19 @@ class _Recording:
             self._streams = WorldRandom.from_keys(keys)
         self._bars: dict[int | None, list[Tensor]] = {}
         """Cotangents of the worlds that are kept, by their number."""
-        self._graphs: collections.OrderedDict[int, _Graphs] = collections.OrderedDict()
+        self.graphs: collections.OrderedDict[int, _Graphs] = collections.OrderedDict()
+        """By their numbers of steps, the least recently used first."""
         self.compared: set[int] = set()
         """Numbers of steps whose replay has given what a launched rollout gives."""
         self._draws_a_step = 0
         """How far a step moves a generator on."""
         self._pool = torch.cuda.graph_pool_handle()
-        self._stream: torch.cuda.Stream | None = None
+        self.stream: torch.cuda.Stream | None = None
         self.token = torch.empty(0, device=self.device)
-
-    def holds(self, steps: int) -> bool:
-        """Return whether a number of steps is recorded."""
-        return steps in self._graphs
 
     def record(self, steps: int, tensors: Sequence[Tensor]) -> None:
         """Record rollouts of a number of steps; kernels are warmed up with worlds and weights."""
-        if not self._graphs:
+        if not self.graphs:
             first = self._call._replace(steps=min(steps, WARM_UP_STEPS), keep_every=None)
             with torch.no_grad():
                 torch._foreach_copy_(self._inputs, list(tensors))
@@ -332,15 +327,21 @@ class _Recording:
             self._generator.set_offset(0)
             shared = torch_generator(None, self.device)
             place = shared.get_offset()
-            prepare_capture(functools.partial(self._warm_up, first), self.device)
+
+            def warm_up() -> None:
+                after = self._run(first, []).tensors()
+                if self.differentiable:
+                    self._pull_back(after, [torch.zeros_like(value) for value in after])
+
+            prepare_capture(warm_up, self.device)
             self._draws_a_step = self._generator.get_offset() // first.steps
             if self._own:
                 # What their networks have drawn was for nobody.
                 shared.set_offset(place)
-        elif len(self._graphs) >= MOST_GRAPHS:
-            self.compared.discard(self._graphs.popitem(last=False)[0])
+        elif len(self.graphs) >= MOST_GRAPHS:
+            self.compared.discard(self.graphs.popitem(last=False)[0])
         call = self._call._replace(steps=steps)
-        before = _reserved(self.device)
+        before = torch.cuda.memory_reserved(self.device)
         results: list[Tensor] = []
         kept: list[Tensor] = []
         gradients: list[Tensor] = []
@@ -368,35 +369,30 @@ class _Recording:
         if self.differentiable:
             self._bars_of(steps)
             backward_graph = capture(backward, self.device, pool=self._pool, alone=True)
-        self._check_settings(begin)
+        now = self._settings()
+        changed = {key[1] for key in begin.keys() | now.keys() if begin.get(key) != now.get(key)}
+        if changed:
+            raise NPAError(
+                "forward must not change a rule's attributes, but for the numbers of its tensors, "
+                f"got other {', '.join(sorted(changed))}"
+            )
         if versions != self._versions():
             raise NPAError("a rule's tensors must not change in its backward pass, but one does")
-        self._graphs[steps] = _Graphs(
+        self.graphs[steps] = _Graphs(
             forward_graph, _places(results), backward_graph, _places(gradients), written
         )
-        self.bytes += max(_reserved(self.device) - before, 0)
+        self.bytes += max(torch.cuda.memory_reserved(self.device) - before, 0)
 
     def _settings(self) -> dict[tuple[int, str], Hashable]:
         """Return what rules with a network of their own depend on besides their inputs."""
         settings: dict[tuple[int, str], Hashable] = {}
         for number, rule in enumerate(self._own):
             for name, setting in rule_settings(rule, self.device).items():
-                settings[number, name] = setting
+                # No setting is as good as absent.
+                settings[number, name] = (setting,)
             for tensor in rule_tensors(rule, self.device):
-                settings[id(tensor), "tensors"] = None
+                settings[id(tensor), "tensors"] = True
         return settings
-
-    def _check_settings(self, begin: dict[tuple[int, str], Hashable]) -> None:
-        """Check that nothing but inputs has changed."""
-        now = self._settings()
-        changed = {key[1] for key in begin.keys() | now.keys() if begin.get(key) != now.get(key)}
-        # Of tensors their presence alone is noted.
-        changed |= {key[1] for key in begin.keys() ^ now.keys()}
-        if changed:
-            raise NPAError(
-                "forward must not change a rule's attributes, but for the numbers of its tensors, "
-                f"got other {', '.join(sorted(changed))}"
-            )
 
     def _versions(self) -> list[int]:
         """Return what changes with each write to an input."""
@@ -411,11 +407,6 @@ class _Recording:
             worlds = self._inputs[:3]
             self._bars[count] = [tensor.new_zeros(*first, *tensor.shape) for tensor in worlds]
         return self._bars[count]
-
-    def _warm_up(self, call: RolloutSpec) -> None:
-        results = self._run(call, []).tensors()
-        if self.differentiable:
-            self._pull_back(results, [torch.zeros_like(result) for result in results])
 
     def _run(self, call: RolloutSpec, kept: list[Tensor]) -> Particles:
         """Launch a rollout; what its backward pass reads is kept."""
@@ -447,6 +438,57 @@ class _Recording:
         )
         return [gradient.contiguous() for gradient in gradients]
 
+    def replay(
+        self,
+        call: RolloutSpec,
+        lease: _Lease,
+        blocks: Sequence[int],
+        tensors: Sequence[Tensor],
+        generator: Randomness | None,
+    ) -> Particles:
+        """Replay graphs of a rollout one after the other; write what the network writes."""
+        x, s, *weights = tensors
+        given = [x, s, self.no_path, *weights]
+        self.ready.record(current_stream(x.device))
+        found: list[Particles] = []
+        for steps in blocks:
+            if self.differentiable:
+                # The lease stands for what is saved, so it ends when autograd drops that: after a
+                # backward pass, unless the graph is retained, or with the last result.
+                hooks = torch.autograd.graph.saved_tensors_hooks(
+                    lambda _: lease, lambda saved: saved.recording.token
+                )
+                with hooks:
+                    after = Particles(*_Replayed.apply(self, steps, generator, *given))  # type: ignore[no-untyped-call]
+            else:
+                after = Particles(*self.forward(steps, given, generator))
+            if not found:
+                # Only now, when the device has work: this takes the host as long as the rest.
+                try:
+                    FiniteCheck(x, self.ready).wait()
+                except NPAError:
+                    if self._streams is None:
+                        # The caller's source goes on where the rollout began.
+                        count = steps * self._draws_a_step
+                        source = torch_generator(generator, self.device)
+                        give_back_draws(source, self._generator.get_offset() - count, count)
+                    raise
+            if self._streams is not None:
+                assert isinstance(generator, WorldRandom)
+                generator.sync_with(self._streams, steps)
+            written = self.graphs[steps].written
+            if written:
+                with torch.no_grad():
+                    torch._foreach_copy_(
+                        [given[k] for k in written], [self._inputs[k] for k in written]
+                    )
+            found.append(after)
+            last = after if call.keep_every is None else after.map(lambda value: value[-1])
+            given[:3] = last.tensors()
+        if len(found) == 1:
+            return found[0]
+        return last if call.keep_every is None else combined(torch.cat, found)
+
     def forward(
         self, steps: int, tensors: Sequence[Tensor], generator: Randomness | None
     ) -> list[Tensor]:
@@ -455,8 +497,8 @@ class _Recording:
             self._take_turns()
             torch._foreach_copy_(self._inputs, list(tensors))
             self._load_draws(generator, steps)
-            graphs = self._graphs[steps]
-            self._graphs.move_to_end(steps)
+            graphs = self.graphs[steps]
+            self.graphs.move_to_end(steps)
             graphs.forward.replay()
             return _copies(graphs.worlds)
 
@@ -468,35 +510,12 @@ class _Recording:
             self._take_turns()
             for buffer, bar in zip(self._bars_of(steps), bars, strict=True):
                 buffer.zero_() if bar is None else buffer.copy_(bar)
-            graphs = self._graphs[steps]
+            graphs = self.graphs[steps]
             assert graphs.backward is not None, "it was recorded for gradients"
             graphs.backward.replay()
             gradients = iter(_copies(graphs.gradients))
             made = [next(gradients) if flag else None for flag in self._wanted]
             return [value if flag else None for value, flag in zip(made, wanted, strict=True)]
-
-    @property
-    def differentiable(self) -> bool:
-        """Whether there are backward passes."""
-        return any(self._wanted)
-
-    def finish(self) -> None:
-        """Wait until what was replayed is done."""
-        if self._stream is not None:
-            self._stream.synchronize()
-
-    def end_draws(self, generator: Randomness | None, steps: int) -> None:
-        """Let the caller's streams of draws go on where the rollout's ended."""
-        if self._streams is not None:
-            assert isinstance(generator, WorldRandom)
-            generator.sync_with(self._streams, steps)
-
-    def leave_draws(self, generator: Randomness | None, steps: int) -> None:
-        """Let the caller's source of draws go on where the rollout began."""
-        if self._streams is None:
-            count = steps * self._draws_a_step
-            source = torch_generator(generator, self.device)
-            give_back_draws(source, self._generator.get_offset() - count, count)
 
     def _load_draws(self, generator: Randomness | None, steps: int) -> None:
         if self._streams is not None:
@@ -508,15 +527,6 @@ class _Recording:
             begin = reserve_draws(source, steps * self._draws_a_step)
             self._generator.set_offset(begin)
 
-    def write_back(self, steps: int, tensors: Sequence[Tensor]) -> None:
-        """Write what the network has changed to the caller's tensors."""
-        written = self._graphs[steps].written
-        if written:
-            with torch.no_grad():
-                torch._foreach_copy_(
-                    [tensors[k] for k in written], [self._inputs[k] for k in written]
-                )
-
     def _placed(self) -> contextlib.AbstractContextManager[object]:
         """Return a context in which this device is the current one."""
         if torch.cuda.current_device() == self.device.index:
@@ -526,10 +536,10 @@ class _Recording:
     def _take_turns(self) -> None:
         """Let the current stream wait for the one on which this was used last."""
         stream = current_stream(self.device)
-        if self._stream is not stream:
-            if self._stream is not None:
-                stream.wait_stream(self._stream)
-            self._stream = stream
+        if self.stream is not stream:
+            if self.stream is not None:
+                stream.wait_stream(self.stream)
+            self.stream = stream
 
 
 class _Place:
@@ -555,46 +565,10 @@ def _copies(tensors: list[Tensor]) -> list[Tensor]:
     return copies
 
 
-def _reserved(device: torch.device) -> int:
-    return int(torch.cuda.memory_reserved(device))
-
-
 _kinds = CallKinds()
 
 _lock = recording_lock
 """Held while the above changes: with another lock, two threads could wait for each other."""
-
-
-def _replay_blocks(
-    call: RolloutSpec,
-    lease: _Lease,
-    blocks: Sequence[int],
-    tensors: Sequence[Tensor],
-    generator: Randomness | None,
-) -> Particles:
-    """Replay the graphs of a rollout one after the other; what the network writes is written."""
-    x, s, *weights = tensors
-    recording = lease.recording
-    given = [x, s, recording.no_path, *weights]
-    recording.ready.record(current_stream(x.device))
-    found: list[Particles] = []
-    for steps in blocks:
-        after = _replay(lease, steps, given, generator)
-        if not found:
-            # Only now, when the device has work: this takes the host as long as the rest.
-            try:
-                FiniteCheck(x, recording.ready).wait()
-            except NPAError:
-                recording.leave_draws(generator, steps)
-                raise
-        recording.end_draws(generator, steps)
-        recording.write_back(steps, given)
-        found.append(after)
-        last = after if call.keep_every is None else after.map(lambda value: value[-1])
-        given[:3] = last.tensors()
-    if len(found) == 1:
-        return found[0]
-    return last if call.keep_every is None else combined(torch.cat, found)
 
 
 def _compared(
@@ -625,18 +599,14 @@ def _compared(
     worlds = Particles(x.view_as(x), s.view_as(s), x.new_zeros(x.shape[:2]))
     launched = call.run(rules, worlds, generator)
     with torch.no_grad():
-        replayed = _replay_blocks(call, lease, blocks, [x, s, *own], source)
+        replayed = lease.recording.replay(call, lease, blocks, [x, s, *own], source)
         pairs = zip((*launched.tensors(), *weights), (*replayed.tensors(), *own), strict=True)
-        same = all(bool(_same(*pair)) for pair in pairs)
+        same = all(bool(((a == b) | (a.isnan() & b.isnan())).all()) for a, b in pairs)
     if same:
         lease.recording.compared.update(blocks)
     else:
         _refuse(kind, "a replay gives other numbers than forward, run by Python", asked=True)
     return launched
-
-
-def _same(one: Tensor, other: Tensor) -> Tensor:
-    return ((one == other) | (one.isnan() & other.isnan())).all()
 
 
 def _refuse(kind: CallKind, reason: object, *, asked: bool) -> None:
@@ -647,14 +617,6 @@ def _refuse(kind: CallKind, reason: object, *, asked: bool) -> None:
         kind.refused = True
         kind.recordings.clear()
         kind.free.clear()
-
-
-def _blocks(call: RolloutSpec) -> list[int]:
-    """Return the steps of the graphs that are replayed one after the other, without gradients."""
-    kept = call.keep_every or 1
-    block = max(BLOCK_STEPS // kept, 1) * kept
-    rest = call.steps % block
-    return [block] * (call.steps // block) + [rest] * (rest > 0)
 
 
 def _lease(
@@ -678,8 +640,16 @@ def _lease(
                 kind.recordings.append(recording)
                 lease = _Lease(recording, kind)
             recording = lease.recording
-            for missing in [number for number in steps if not recording.holds(number)]:
-                if not _make_room(recording.device):
+            device = recording.device
+            for missing in [number for number in steps if number not in recording.graphs]:
+                limit = MEMORY_SHARE * torch.cuda.get_device_properties(device).total_memory
+                # Kinds not in use are forgotten, but for the last one.
+                for key in list(_kinds)[:-1]:
+                    if recorded_memory(device) < limit:
+                        break
+                    if any(own.device == device for own in _kinds[key].recordings):
+                        _kinds.forget(key)
+                if recorded_memory(device) >= limit:
                     logger.debug(
                         "a rollout is launched: recordings have taken their share of memory"
                     )
@@ -701,44 +671,12 @@ def _lease(
         return lease
 
 
-def _make_room(device: torch.device) -> bool:
-    """Return whether recordings take less than their share, forgetting those not in use."""
-    limit = MEMORY_SHARE * torch.cuda.get_device_properties(device).total_memory
-
-    for key in list(_kinds)[:-1]:
-        if recorded_memory(device) < limit:
-            break
-        if any(own.device == device for own in _kinds[key].recordings):
-            _kinds.forget(key)
-    return recorded_memory(device) < limit
-
-
-def _replay(
-    lease: _Lease, steps: int, tensors: Sequence[Tensor], generator: Randomness | None
-) -> Particles:
-    """Replay a rollout from worlds, with weights; differentiable where that was recorded."""
-    recording = lease.recording
-    if not recording.differentiable:
-        return Particles(*recording.forward(steps, tensors, generator))
-    # The lease stands for what is saved, so it ends when autograd drops that: after a backward
-    # pass, unless the graph is retained, or with the last result.
-    hooks = torch.autograd.graph.saved_tensors_hooks(
-        lambda _: lease, lambda saved: saved.recording.token
-    )
-    with hooks:
-        return Particles(*_Replayed.apply(recording, steps, generator, *tensors))  # type: ignore[no-untyped-call]
-
-
 class _Replayed(torch.autograd.Function):
     """A recorded rollout."""
 
     @staticmethod
     def forward(
-        ctx: Any,
-        recording: _Recording,
-        steps: int,
-        generator: Randomness | None,
-        *tensors: Tensor,
+        ctx: Any, recording: _Recording, steps: int, generator: Randomness | None, *tensors: Tensor
     ) -> tuple[Tensor, ...]:
         ctx.recording, ctx.steps = recording, steps
         ctx.set_materialize_grads(False)

@@ -108,11 +108,7 @@ def result(
 
 
 def checked_keep_every(keep_every: int | None, steps: int) -> int | None:
-    """Return after how many steps worlds are kept, each time.
-
-    Raises:
-        NPAError: It is no divisor of the number of steps.
-    """
+    """Return after how many steps, a divisor of all, worlds are kept each time."""
     if keep_every is None:
         return None
     kept = checked_count("keep_every", keep_every)

@@ -24,7 +24,6 @@ from npa_envs.world.rollout import (
     checked_keep_every,
     checked_physics,
     result,
-    rollout,
 )
 from npa_envs.world.steps import SpeciesSpec
 
@@ -159,27 +158,8 @@ def rollout_species(
     probabilities = _checked_probabilities(update_prob, len(sizes))
     divisors = _checked_divisors(density_counts, sizes)
     check_memory(memory)
-    if perception == "shared" and divisors == (float(x.shape[1]),):
-        x_after, s_after, travelled = rollout(
-            species_rules[0],
-            x,
-            s,
-            steps,
-            eps=eps,
-            box=box,
-            boundary=boundary,
-            update_prob=probabilities[0],
-            dt=dt,
-            position_noise=position_noise,
-            detach_positions=detach_positions,
-            memory=memory,
-            generator=generator,
-            on_divergence=on_divergence,
-            keep_every=keep_every,
-            cuda_graph=cuda_graph,
-            return_path_length=True,
-        )
-        return (x_after, s_after, travelled) if return_path_length else (x_after, s_after)
+    # Of one species this is `rollout`.
+    alone = perception == "shared" and divisors == (float(x.shape[1]),)
     kept = checked_keep_every(keep_every, steps)
     check_cuda_graph(cuda_graph)
     own = [
@@ -200,10 +180,10 @@ def rollout_species(
         update_prob=max(each.update_prob for each in own),
         max_displacement=max(each.max_displacement for each in own),
     )
-    species = tuple(
+    species = [
         SpeciesSpec(size, each.update_prob, divisor)
         for size, each, divisor in zip(sizes, own, divisors, strict=True)
-    )
+    ]
     check_generator(generator, x.device, x.shape[0])
     spec = RolloutSpec(
         steps,
@@ -211,13 +191,13 @@ def rollout_species(
         checked_flag("detach_positions", detach_positions),
         memory,
         kept,
-        species,
+        () if alone else tuple(species),
         perception == "per_species",
     )
     after = execute(
         spec,
         species_rules,
-        Particles(x, s),
+        Particles(x, s, x.new_zeros(x.shape[:2]) if alone else None),
         generator,
         graph=cuda_graph,
         watch=make_watch(on_divergence, x, s),

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 import threading
 from collections.abc import Callable, Iterator, Sequence
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -48,10 +49,6 @@ def row_capacity(particle_total: int, update_prob: float) -> int:
 
     Bernstein's inequality bounds the number of active particles; a graph of kernels needs a shape
     that does not depend on the draw. On the CPU the exact number is used instead.
-
-    Args:
-        particle_total: Particles of all worlds, B N.
-        update_prob: Probability p with which each is active.
     """
     mean = particle_total * update_prob
     variance = mean * (1.0 - update_prob)
@@ -87,17 +84,14 @@ def draw_step(x: Tensor, physics: Physics, generator: Randomness | None) -> Draw
     mask = noise = None
     if isinstance(generator, WorldRandom):
         generator.advance()
-        if physics.update_prob < 1.0:
-            mask = generator.bernoulli(physics.update_prob, x.shape[1])
-        if physics.position_noise > 0.0:
-            noise = generator.normal(*x.shape[1:], dtype=x.dtype)
-            noise *= physics.position_noise
-        return Draws(mask, noise)
     if physics.update_prob < 1.0:
-        mask = torch.empty(x.shape[:2], dtype=torch.uint8, device=x.device)
-        mask.bernoulli_(physics.update_prob, generator=generator)
+        if isinstance(generator, WorldRandom):
+            mask = generator.bernoulli(physics.update_prob, x.shape[1])
+        else:
+            mask = torch.empty(x.shape[:2], dtype=torch.uint8, device=x.device)
+            mask.bernoulli_(physics.update_prob, generator=generator)
     if physics.position_noise > 0.0:
-        noise = torch.randn(x.shape, dtype=x.dtype, device=x.device, generator=generator)
+        noise = normal_draws(generator, x.shape, x)
         noise *= physics.position_noise
     return Draws(mask, noise)
 
@@ -106,9 +100,6 @@ def iterate_draws(draw: Callable[[], Draws], like: Tensor, steps: int) -> Iterat
     """Yield each step's random draws, in the same order on every device.
 
     In a CUDA graph some steps' draws are made while the steps before them run.
-
-    Args:
-        draw: Returns the next step's draws.
     """
     # Asked in this order: a compiler cannot trace what a stream does.
     recording = not torch.compiler.is_compiling() and like.is_cuda
@@ -146,23 +137,30 @@ def skip_draws(x: Tensor, physics: Physics, steps: int, generator: Randomness | 
             draw_step(x, physics, generator)
 
 
-class Step(Protocol):
+class Step:
     """What a rollout repeats: draws, and an advance that follows from them alone."""
+
+    physics: Physics
 
     def enter(self, particles: Particles) -> Particles:
         """Return worlds as the steps take them, such as in sorted order."""
+        return particles
 
     def draw(self, like: Tensor, steps: int, source: Randomness | None) -> Iterator[Draws]:
         """Yield each step's draws, for positions like these."""
+        return iterate_draws(lambda: draw_step(like, self.physics, source), like, steps)
 
     def advance(self, particles: Particles, draws: Draws) -> Particles:
         """Return the worlds after one step with these draws."""
+        raise NotImplementedError
 
     def leave(self, particles: Particles) -> Particles:
         """Return worlds of the rollout in the caller's order."""
+        return particles
 
 
-class RuleStep(NamedTuple):
+@dataclasses.dataclass
+class RuleStep(Step):
     """The step of one rule: perceive the active particles, run the network, update."""
 
     rule: NPARule
@@ -171,15 +169,7 @@ class RuleStep(NamedTuple):
     physics: Physics
     detach_positions: bool = True
     static: StaticWorlds | None = None
-    """Sorted worlds whose particles never move; `StaticStep` prepares them."""
-
-    def enter(self, particles: Particles) -> Particles:
-        """Return the worlds."""
-        return particles
-
-    def draw(self, like: Tensor, steps: int, source: Randomness | None) -> Iterator[Draws]:
-        """Yield each step's update mask and position noise."""
-        return iterate_draws(lambda: draw_step(like, self.physics, source), like, steps)
+    """Sorted worlds whose particles never move."""
 
     def advance(self, particles: Particles, draws: Draws) -> Particles:
         """Return the worlds after one step with these draws."""
@@ -208,37 +198,26 @@ class RuleStep(NamedTuple):
         moved = x if noise is None else x + noise
         return Particles(*update_particles(update, moved, s, path_length, active, physics))
 
-    def leave(self, particles: Particles) -> Particles:
-        """Return the worlds."""
-        return particles
 
-
-class StaticStep(NamedTuple):
+class StaticStep(RuleStep):
     """The step of a rule whose particles never move: sorted and searched once."""
 
-    step: RuleStep
-    static: StaticWorlds
-    x: Tensor
-    """Positions, within the boundary."""
-
-    @classmethod
-    def of(cls, rule: NPARule, physics: Physics, x: Tensor) -> StaticStep:
-        """Return the step of worlds at these positions."""
+    def __init__(self, rule: NPARule, physics: Physics, x: Tensor) -> None:
         # Later parts of a rollout begin within the boundary, and so does the first.
-        x = bounded(x, physics)
+        self.x = bounded(x, physics)
         # First: compilers trace nothing across it.
-        static = prepare_static(x, physics)
-        return cls(RuleStep(rule, rule.network(), physics, True, static), static, x)
+        self.sorted = prepare_static(self.x, physics)
+        super().__init__(rule, rule.network(), physics, True, self.sorted)
 
     def enter(self, particles: Particles) -> Particles:
         """Return the worlds in sorted order."""
         _, s, path_length, goal = particles
-        return Particles(self.x, s, path_length, goal).gather(self.static.source)
+        return Particles(self.x, s, path_length, goal).gather(self.sorted.source)
 
     def draw(self, like: Tensor, steps: int, source: Randomness | None) -> Iterator[Draws]:
         """Yield each step's rows, which are given some steps at a time, in few launches."""
         total = like.shape[0] * like.shape[1]
-        physics = self.step.physics
+        physics = self.physics
         together = max(min(16, ROWS_TOGETHER // total), 1)
         for first in range(0, steps, together):
             count = min(together, steps - first)
@@ -246,24 +225,17 @@ class StaticStep(NamedTuple):
             masks = [draws.mask for draws in drawn if draws.mask is not None]
             if masks:
                 capacity = row_capacity(total, physics.update_prob)
-                rows = static_rows(self.static, like.detach(), masks, capacity)
+                rows = static_rows(self.sorted, like.detach(), masks, capacity)
                 drawn = [Draws(None, None, own) for own in rows]
             yield from drawn
 
-    def advance(self, particles: Particles, draws: Draws) -> Particles:
-        """Return the worlds after one step with these draws."""
-        return self.step.advance(particles, draws)
-
     def leave(self, particles: Particles) -> Particles:
         """Return the worlds in the caller's order."""
-        return particles.gather(self.static.place)
+        return particles.gather(self.sorted.place)
 
 
-class DivisionStep(NamedTuple):
+class DivisionStep(RuleStep):
     """The step of a rule whose particles divide: that of the living, and then their fates."""
-
-    step: RuleStep
-    """The step of the living."""
 
     def enter(self, particles: Particles) -> Particles:
         """Return the worlds with states of zero in dead slots."""
@@ -275,7 +247,7 @@ class DivisionStep(NamedTuple):
         """Yield each step's update mask, position noise, fates and directions of children."""
 
         def draw() -> Draws:
-            mask, noise, *_ = draw_step(like, self.step.physics, source)
+            mask, noise, *_ = draw_step(like, self.physics, source)
             chance = uniform_draws(source, like.shape[:2], like)
             births = Births(chance, normal_draws(source, like.shape, like))
             return Draws(mask, noise, None, births)
@@ -286,13 +258,13 @@ class DivisionStep(NamedTuple):
         """Return the worlds after one step with these draws."""
         assert draws.births is not None, "drawn above"
         x, s, path_length, _ = particles
-        eps = self.step.physics.eps
+        eps = self.physics.eps
         alive = living(s)
         updated = alive if draws.mask is None else alive & draws.mask.bool()
         life, rest = s[..., : LIFE + 1], s[..., LIFE + 1 :]
         # Life is no weight of what is perceived, so perception gives it no gradient.
         perceived = torch.cat((life.detach(), rest), dim=-1)
-        after = self.step.advance(
+        after = super().advance(
             Particles(parked(x, alive, eps), perceived, path_length),
             Draws(updated.byte(), draws.noise, draws.rows, draws.births),
         )
@@ -304,16 +276,12 @@ class DivisionStep(NamedTuple):
                 after.x,
                 new_s,
                 after.path_length,
-                division_probabilities=self.step.rule.division_probabilities(new_s),
+                division_probabilities=self.rule.division_probabilities(new_s),
                 updated=updated,
                 births=draws.births,
                 eps=eps,
             )
         )
-
-    def leave(self, particles: Particles) -> Particles:
-        """Return the worlds."""
-        return particles
 
 
 class SpeciesSpec(NamedTuple):
@@ -344,8 +312,13 @@ class Species(NamedTuple):
     count_ratio: float
     """Particles of a world over those by which this species divides densities."""
 
+    def capacity(self, world_count: int) -> int:
+        """Return how many rows hold its active particles of so many worlds."""
+        return row_capacity(world_count * (self.end - self.first), self.update_prob)
 
-class SpeciesStep(NamedTuple):
+
+@dataclasses.dataclass
+class SpeciesStep(Step):
     """The step of several rules in one world: a common perception pass, then rule by rule."""
 
     species: list[Species]
@@ -355,10 +328,6 @@ class SpeciesStep(NamedTuple):
     """Share of the updates so drawn that each particle keeps, shape [N]; None: all keep all."""
     by_species: bool
     """Rules perceive each species' density and density gradient."""
-
-    def enter(self, particles: Particles) -> Particles:
-        """Return the worlds."""
-        return particles
 
     def draw(self, like: Tensor, steps: int, source: Randomness | None) -> Iterator[Draws]:
         """Yield each step's update mask and position noise: as for one rule, thinned by species."""
@@ -385,25 +354,29 @@ class SpeciesStep(NamedTuple):
             shared_width = max(
                 own.network.row_width if own.network else shared_dim for own in species
             )
+        total = row_count(mask, x, physics.update_prob)
+        if mask is not None and mask.is_cuda:
+            every = x.shape[0] * x.shape[1]
+            total = min(every, sum(own.capacity(x.shape[0]) for own in species))
         perception, active = perceive_rows(
             x.detach() if self.detach_positions else x,
             s,
             physics,
             mask=mask,
-            row_capacity=_row_total(self, x, mask),
+            row_capacity=total,
             row_width=shared_width,
         )
         appended = None
         if self.by_species:
             counts = tuple(own.end - own.first for own in species)
             appended = perceive_by_species(x, counts, physics)
-        row_count = len(perception)
+        row_total = len(perception)
         outputs, places = [], []
         for own in species:
             place, particle = _rows_of_species(
-                active.row_of.view(x.shape[:2]), own, row_count, mask
+                active.row_of.view(x.shape[:2]), own, row_total, mask
             )
-            z = perception.index_select(0, place.clamp(max=row_count - 1))
+            z = perception.index_select(0, place.clamp(max=row_total - 1))
             if own.count_ratio != 1.0 and physics.terms.density_gradient:
                 begin, end = shared_dim - physics.space_dim, shared_dim
                 gradient = _recounted(z[:, begin:end], own.count_ratio)
@@ -416,17 +389,13 @@ class SpeciesStep(NamedTuple):
             outputs.append(_update_of(own, z))
             places.append(place)
         width = min(output.shape[1] for output in outputs)
-        update = perception.new_zeros(row_count + 1, width).index_copy(
+        update = perception.new_zeros(row_total + 1, width).index_copy(
             0, torch.cat(places), torch.cat([output[:, :width] for output in outputs])
         )
         moved = x if noise is None else x + noise
         return Particles(
-            *update_particles(update[:row_count], moved, s, path_length, active, physics)
+            *update_particles(update[:row_total], moved, s, path_length, active, physics)
         )
-
-    def leave(self, particles: Particles) -> Particles:
-        """Return the worlds."""
-        return particles
 
 
 def make_species_step(
@@ -443,43 +412,15 @@ def make_species_step(
     first = 0
     longest = max(rule.alpha for rule in rules)
     for rule, own in zip(rules, specs, strict=True):
-        species.append(
-            Species(
-                rule=rule,
-                network=rule.network(),
-                first=first,
-                end=first + own.size,
-                update_prob=constant(own.update_prob),
-                displacement_share=rule.alpha / longest,
-                count_ratio=x.shape[1] / own.density_count,
-            )
-        )
-        first += own.size
+        end, prob = first + own.size, constant(own.update_prob)
+        ratio = x.shape[1] / own.density_count
+        species.append(Species(rule, rule.network(), first, end, prob, rule.alpha / longest, ratio))
+        first = end
     update_share = None
     if min(own.update_prob for own in species) < physics.update_prob:
-        update_share = torch.cat(
-            [
-                torch.full(
-                    (own.end - own.first,), own.update_prob / physics.update_prob, device=x.device
-                )
-                for own in species
-            ]
-        )
+        shares = [(own.end - own.first, own.update_prob / physics.update_prob) for own in species]
+        update_share = torch.cat([torch.full((n,), q, device=x.device) for n, q in shares])
     return SpeciesStep(species, physics, detach_positions, update_share, by_species)
-
-
-def _row_total(community: SpeciesStep, x: Tensor, mask: Tensor | None) -> int:
-    """Return how many rows hold the active particles of all species."""
-    total = x.shape[0] * x.shape[1]
-    if mask is None:
-        return total
-    if not x.is_cuda:
-        return max(int(mask.sum()), 1)
-    return min(total, sum(_capacity(own, x.shape[0]) for own in community.species))
-
-
-def _capacity(own: Species, world_count: int) -> int:
-    return row_capacity(world_count * (own.end - own.first), own.update_prob)
 
 
 def _rows_of_species(
@@ -487,8 +428,8 @@ def _rows_of_species(
 ) -> tuple[Tensor, Tensor]:
     """Return the rows of a species' active particles, and which of its particles they stand for.
 
-    Both are int64, of one shape [R]; entries that stand for nobody have the row `row_count`. On
-    CUDA R does not depend on the draw, so that nothing waits for the device.
+    Both are int64, of one shape [R], on CUDA a fixed one, so that nothing waits for the device;
+    entries that stand for nobody have the row `row_count`.
     """
     row = row_of[:, own.first : own.end].reshape(-1).long()
     everyone = torch.arange(len(row), device=row.device)
@@ -496,7 +437,7 @@ def _rows_of_species(
         return row, everyone
     active = row >= 0
     if row.is_cuda:
-        capacity = _capacity(own, row_of.shape[0])
+        capacity = own.capacity(row_of.shape[0])
         place = active.cumsum(0) - 1
         place = torch.where(active & (place < capacity), place, capacity)
         particle = everyone.new_zeros(capacity + 1).scatter(0, place, everyone)[:capacity]

@@ -9,7 +9,7 @@ import warp as wp
 
 from npa_envs.kernels import native
 from npa_envs.kernels.cuda.adjoint import listed_adjoint
-from npa_envs.kernels.cuda.density import listed_density
+from npa_envs.kernels.cuda.density import listed_density, tiled_density
 from npa_envs.kernels.cuda.equivariance import mixing_sum, row_kernels, steering_kernels
 from npa_envs.kernels.cuda.network import (
     arrangement_kernels,
@@ -19,7 +19,6 @@ from npa_envs.kernels.cuda.network import (
 from npa_envs.kernels.cuda.perceive import listed_perception
 from npa_envs.kernels.cuda.sort import BLOCKS, order_particles, sort_small_worlds
 from npa_envs.kernels.cuda.splat import sort_small_splats
-from npa_envs.kernels.cuda.tiles import tiled_density
 from npa_envs.kernels.pictures.blending import block_kernels
 from npa_envs.kernels.pictures.errors import gather_errors
 from npa_envs.kernels.portable.episodes import judge_worlds

@@ -15,14 +15,13 @@ from npa_envs.ops.update import PreparedActions, update_particles
 B, N, C = 3, 77, 5
 REACH, DT, STATE_SCALE = 0.07, 0.8, 0.6
 RULES = {
-    "max_displacement": REACH,
-    "dt": DT,
-    "state_scale": STATE_SCALE,
     "moving": True,
     "box": None,
+    "state_scale": STATE_SCALE,
+    "position_limit": 50.0,
+    "state_limit": 20.0,
 }
-LIMITS = {"position_limit": 50.0, "state_limit": 20.0}
-GIVEN = {"mask": None, "noise": None, "enabled": None, **RULES, **LIMITS}
+GIVEN = {"mask": None, "noise": None, "enabled": None}
 ERRORS = {torch.float32: 1e-6, torch.float64: 3e-15}
 """Largest difference from the formula in float64, for values of size about 3 (worst seen 2.2e-7
 and 2.2e-16: one rounding)."""
@@ -42,9 +41,16 @@ def applied(action, x, s, **options):
     """Return new positions and states, and which worlds diverged; x and s are left alone."""
     x, s = x.clone(), s.clone()
     diverged = torch.zeros(x.shape[0], dtype=torch.uint8, device=x.device)
+    rules = {name: options.pop(name, value) for name, value in RULES.items()}
     given = {**GIVEN, "diverged": diverged, **options}
-    apply_actions(action, x, s, **given)
+    apply_actions(action, x, s, physics_of(x, **rules), **given)
     return x, s, given["diverged"]
+
+
+def physics_of(x, *, moving, box, state_scale, position_limit, state_limit):
+    limits = Limits(state_scale, position=position_limit, state=state_limit)
+    form = {"box": box, "moving": moving, "max_displacement": REACH, "dt": DT}
+    return Physics(x.shape[2], C, 1.0, 1.0, **form, limits=limits)
 
 
 def formula(action, x, s, mask=None, noise=None, moving=True, box=None):
@@ -213,7 +219,7 @@ def test_tensors_that_do_not_fit_are_clear_errors(change, message):
         "diverged": torch.zeros(2, dtype=torch.uint8),
     }
     with pytest.raises(NPAError, match=message):
-        apply_actions(**GIVEN | given | change)
+        apply_actions(physics=physics_of(given["x"], **RULES), **GIVEN | given | change)
 
 
 def test_a_direction_with_a_hole_takes_no_particle_far(device):
@@ -228,8 +234,7 @@ def prepared(x, s, **options):
     """Return the actions on copies of a world, with these copies, and what switches them off."""
     x, s = x.clone(), s.clone()
     enabled = torch.ones(1, dtype=torch.uint8, device=x.device)
-    limits = Limits(STATE_SCALE, position=50.0, state=20.0)
-    physics = Physics(x.shape[2], C, 1.0, 1.0, max_displacement=REACH, dt=DT, limits=limits)
+    physics = physics_of(x, **RULES)
     given = {
         "mask": None,
         "noise": None,

@@ -2,7 +2,7 @@
 
 import torch
 
-from npa_envs.ops.draws import uniform_draw
+from npa_envs.ops.draws import draw
 
 WORLDS = 12
 SELECTIONS = (
@@ -21,7 +21,7 @@ def test_tensors_with_and_without_strides_take_turns(device):
     episodes = torch.arange(WORLDS, dtype=torch.int32, device=device)
 
     def drawn(*arguments):
-        return uniform_draw(*arguments, 0, 5, torch.float32)
+        return draw(*arguments, 0, "uniform", 5, torch.float32, 0)
 
     expected = drawn(keys, episodes, episodes)
     assert len(expected.unique()) == expected.numel()

@@ -70,9 +70,7 @@ store_channels = make_wide_store(CHANNELS, wp.float32)
 def make_sum_listed(space_dim: int, width: int, kinds: int, periodic: bool) -> wp.Function:
     """Return a Warp function that adds weighted channels of listed rows for a warp's particles.
 
-    Args:
-        width: Channels of a group, W, at most 16.
-        kinds: Weights of a pair: 1 for the smoothing kernel, 1 + D with the spiky gradient kernel.
+    A pair has a weight of the smoothing kernel, and D more with the spiky gradient kernel.
     """
     vector = wp.types.vector(space_dim, wp.float32)
 
@@ -99,11 +97,7 @@ def row_list_address() -> wp.uint32:
 
 @made_once()
 def make_read_columns(count: int) -> wp.Function:
-    """Return a Warp function that reads some adjacent columns of a row, 0 from a last one on.
-
-    Args:
-        count: Columns to read, a multiple of 4.
-    """
+    """Return a Warp function that reads some adjacent columns of a row, 0 from a last one on."""
     result_type = wp.types.vector(count, wp.float32)
 
     @native.func_native(count)

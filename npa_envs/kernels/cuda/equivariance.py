@@ -48,12 +48,6 @@ def row_kernels(
 
     Rows are [scalars | perceived vectors | 1 | 0], inputs [scalars | products | 1 | 0]; mixed
     vectors [K, mixed, D] and mixing weights [perceived, mixed] are flat.
-
-    Args:
-        scalars: Entries of a row before the first vector.
-        perceived: Vectors of a row.
-        mixed: Mixed vectors.
-        chiral: Whether there are cross products.
     """
     form = space_dim, scalars, perceived, mixed, chiral
     module = native.module(f"npa_envs.kernels.vector_rows_{'_'.join(str(int(k)) for k in form)}")
@@ -136,10 +130,6 @@ def steering_kernels(space_dim: int, mixed: int, chiral: bool) -> SimpleNamespac
     """Return the kernels between outputs and updates; a warp has `STEERED_ROWS` rows.
 
     Outputs are [gates | state changes | 0], updates [displacement | state changes | 0].
-
-    Args:
-        mixed: Mixed vectors.
-        chiral: Whether there is a second gate for each mixed vector.
     """
     form = space_dim, mixed, chiral
     module = native.module(f"npa_envs.kernels.steering_{'_'.join(str(int(k)) for k in form)}")

@@ -41,11 +41,8 @@ WIDE, WIDE_REGISTERS = range(81, 97), 128
 def two_layer_kernel(steps: int, tiles: int, mode: str) -> wp.Kernel:
     """Return the kernel of two products, row by row, for 16 rows a warp.
 
-    Args:
-        steps: Groups of 16 input columns.
-        tiles: Groups of 8 output columns.
-        mode: Between the products, "rectify" hidden units, "note" which are positive too, or
-            "mask" by what was noted.
+    There are `steps` groups of 16 input columns and `tiles` of 8 output columns. Between the
+    products, "rectify" hidden units, "note" which are positive too, or "mask" by what was noted.
 
     The kernel takes a number of hidden units H, a multiple of 16; rows [K, width] of at most 16
     `steps` columns; both layers' fragments, as `arrange_hidden` and `arrange_output` leave them;
@@ -93,18 +90,10 @@ def weight_gradient_kernels(
 ) -> SimpleNamespace:
     """Return the kernels of the weights' gradients: sums over shares of the rows, and their sum.
 
-    A block sums a share of the rows, each warp of it for some hidden units: it computes their
-    values and cotangents again, transposed, so that they are the left operands of the gradients'
-    products. Numbers are pairs of bfloat16, which need no scaling: the rows' scales differ, and
-    sums run over rows.
-
-    Args:
-        steps: Groups of 16 columns of a row.
-        tiles: Groups of 8 columns of a row.
-        out_tiles: Groups of 8 columns of an update.
-        warps: Warps of a block, each for `WARP_UNITS` hidden units.
-        unit_blocks: Blocks that serve the hidden units of one share of rows.
-        words: Words of a row's signs.
+    A block sums a share of the rows, each warp of it for `WARP_UNITS` hidden units: it computes
+    their values and cotangents again, transposed, so that they are the left operands of the
+    gradients' products. Numbers are pairs of bfloat16, which need no scaling: the rows' scales
+    differ, and sums run over rows. A row has groups of 16 columns (`steps`) or of 8 (`tiles`).
     """
     variant = f"{steps}_{tiles}_{out_tiles}_{warps}_{unit_blocks}_{words}"
     module = native.module(f"npa_envs.kernels.network_gradients_{variant}")
@@ -266,6 +255,4 @@ def arrangement_kernels() -> SimpleNamespace:
             fragments[first + i] = high
             fragments[first + 8 * wp.static(WARP) + i] = wp.bfloat16(value - wp.float32(high))
 
-    return SimpleNamespace(
-        arrange_hidden=arrange_hidden, arrange_output=arrange_output, arrange_left=arrange_left
-    )
+    return native.named(arrange_hidden, arrange_output, arrange_left)

@@ -76,13 +76,8 @@ def listed_perception(
     """Return the perception kernel of one variant.
 
     Args:
-        width: Channels of a group.
         lanes: Lanes of a team, which share the channels of a group.
-        state_gradient: Whether the state gradient is perceived.
-        moment_inverse: How it is corrected by the moment matrix; None: not at all.
         grouped: Whether channels come in several groups.
-        capacity: Neighbours that lists have room for.
-        for_adjoint: Whether what the adjoint reads is written, too.
         teams: Teams that share a particle where few particles fill the device: each runs through
             its own part of the list, all channels of it.
         by_place: Whether there is a list for each sorted particle, not for each row.
@@ -620,11 +615,7 @@ def listed_perception(
 
 @made_once()
 def make_stage(value_type: type) -> wp.Function:
-    """Return a Warp function that puts a value into a slot, a number of words from its beginning.
-
-    Args:
-        value_type: A vector or matrix type of float32.
-    """
+    """Return a Warp function that puts a value into a slot, some words from its beginning."""
 
     @native.func_native()
     def stage(slot: wp.uint32, word: wp.int32, value: value_type): ...

@@ -93,17 +93,9 @@ def block_functions(capacity: int) -> SimpleNamespace:
     def member_at(address: wp.uint64, place: wp.int32) -> wp.int32:
         """Number of the particle at a provisional place."""
 
-    return SimpleNamespace(
-        block_memory=block_memory,
-        clear_counts=clear_counts,
-        arrive=arrive,
-        add_up_counts=add_up_counts,
-        start_of=start_of,
-        place_arrived=place_arrived,
-        span_of_slice=span_of_slice,
-        ranked_at=ranked_at,
-        member_at=member_at,
-    )
+    functions = [block_memory, clear_counts, arrive, add_up_counts]
+    functions += [start_of, place_arrived, span_of_slice, ranked_at, member_at]
+    return native.named(*functions)
 
 
 @made_once()
@@ -276,11 +268,7 @@ def sort_small_worlds(space_dim: int, capacity: int) -> wp.Kernel:
 
 @made_once()
 def order_particles(space_dim: int, width: int) -> wp.Kernel:
-    """Return the last kernel of sorting large worlds, which moves states a warp at a time.
-
-    Args:
-        width: Channels of a group: 4, 8 or 16.
-    """
+    """Return the last kernel of sorting large worlds, which moves states a warp at a time."""
     scalar = wp.float32
     vector = domain_types(space_dim, scalar).vector
     share_width = width // CUDA_LANES

@@ -27,9 +27,9 @@ from npa_envs.kernels.access import (
     make_wide_load,
     meet_block,
 )
-from npa_envs.kernels.cpu import TILES, in_ranges
 from npa_envs.kernels.domain import scalar_name
 from npa_envs.kernels.mathematics import make_fast_exp2
+from npa_envs.kernels.native import TILES, in_ranges, named
 from npa_envs.kernels.pictures.gaussians import (
     CHANNELS,
     PULLS,
@@ -131,14 +131,7 @@ def blending_functions(scalar: type) -> SimpleNamespace:
         """Place of the middle of a row's or a column's pixels."""
         return scalar(pixel) + scalar(0.5)
 
-    return SimpleNamespace(
-        strength=strength,
-        colours_of=colours_of,
-        pull=pull,
-        channels_at=channels_at,
-        pixel_of=pixel_of,
-        middle_of=middle_of,
-    )
+    return named(strength, colours_of, pull, channels_at, pixel_of, middle_of)
 
 
 @made_once()

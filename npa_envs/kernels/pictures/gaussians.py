@@ -17,8 +17,8 @@ import warp as wp
 
 from npa_envs.kernels import native
 from npa_envs.kernels.access import make_wide_load, make_wide_store
-from npa_envs.kernels.cpu import PAIRS, in_ranges
 from npa_envs.kernels.domain import scalar_name
+from npa_envs.kernels.native import PAIRS, in_ranges, named
 from npa_envs.once import made_once
 
 TILE = 16
@@ -87,14 +87,7 @@ def make_frame(
     near: float,
     dilation: float,
 ) -> Any:
-    """Return the `Frame` of a batch of pictures.
-
-    Args:
-        scalar: `wp.float32` or `wp.float64`.
-        sizes: Pixels across and down.
-        near: Nothing nearer is seen [length units].
-        dilation: Added to both variances on the picture [pixels squared].
-    """
+    """Return the `Frame` of a batch of pictures."""
     frame = gaussian_types(scalar).Frame()
     frame.particle_count, frame.view_count, frame.channels = shape
     frame.width, frame.height = sizes
@@ -516,8 +509,4 @@ def gaussian_kernels(scalar: type) -> SimpleNamespace:
                 for c in range(3):
                     colours_bar[i, 3 * k + c] = harmonics_bar[k, c]
 
-    return SimpleNamespace(
-        project_gaussians=project_gaussians,
-        list_pairs=list_pairs,
-        pull_back_gaussians=pull_back_gaussians,
-    )
+    return named(project_gaussians, list_pairs, pull_back_gaussians)

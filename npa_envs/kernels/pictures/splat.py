@@ -28,9 +28,9 @@ from npa_envs.kernels.access import (
     make_wide_load,
     make_wide_store,
 )
-from npa_envs.kernels.cpu import PAIRS, WORLDS, in_ranges
 from npa_envs.kernels.domain import scalar_name
 from npa_envs.kernels.mathematics import make_fast_exp2
+from npa_envs.kernels.native import PAIRS, WORLDS, in_ranges, named
 from npa_envs.once import made_once
 
 CHANNELS = 4
@@ -96,16 +96,7 @@ def splat_types(scalar: type) -> SimpleNamespace:
 def make_lens(
     scalar: type, resolution: int, pixel_size: float, sigma: float, low: float, high: float
 ) -> Any:
-    """Return the `Lens`: the sizes that follow from a picture's resolution, window and Gaussian.
-
-    Args:
-        scalar: `wp.float32` or `wp.float64`.
-        resolution: Pixels R along each side.
-        pixel_size: Side of a pixel of the target [length units].
-        sigma: Standard deviation of the Gaussian in target pixels, dimensionless.
-        low: Lower edge of the window in both directions [length units].
-        high: Upper edge of the window in both directions [length units].
-    """
+    """Return the `Lens`: the sizes that follow from a picture's resolution, window and Gaussian."""
     pixels = resolution * pixel_size / (high - low)
     lens = splat_types(scalar).Lens()
     lens.resolution = resolution
@@ -222,15 +213,9 @@ def splat_functions(scalar: type) -> SimpleNamespace:
     def footprint_colours(footprint: footprint_type):
         return colour_type(footprint[4], footprint[5], footprint[6], footprint[7])
 
-    return SimpleNamespace(
-        patch_weight=patch_weight,
-        pixel_place=pixel_place,
-        patch_centre=patch_centre,
-        visible=visible,
-        cell_of_centre=cell_of_centre,
-        footprint_of=footprint_of,
-        footprint_colours=footprint_colours,
-    )
+    functions = [patch_weight, pixel_place, patch_centre]
+    functions += [visible, cell_of_centre, footprint_of, footprint_colours]
+    return named(*functions)
 
 
 @made_once()
@@ -590,11 +575,6 @@ def splat_kernels(scalar: type, lanes: int) -> SimpleNamespace:
             for c in range(3):
                 colours_bar[i, c] = colour_bar[c]
 
-    return SimpleNamespace(
-        count_splats=count_splats,
-        place_splats=place_splats,
-        order_splats=order_splats,
-        gather_splats=gather_splats,
-        scatter_splats=scatter_splats,
-        pull_back_splats=pull_back_splats,
+    return named(
+        count_splats, place_splats, order_splats, gather_splats, scatter_splats, pull_back_splats
     )

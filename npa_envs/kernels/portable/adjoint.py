@@ -15,8 +15,7 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from npa_envs.kernels.access import make_wide_load
-from npa_envs.kernels.cpu import PAIRS, in_ranges, make_add_scaled
+from npa_envs.kernels.access import make_add_scaled, make_wide_load
 from npa_envs.kernels.domain import domain_types, kernel_module
 from npa_envs.kernels.mathematics import (
     log_scale_adjoint,
@@ -25,6 +24,7 @@ from npa_envs.kernels.mathematics import (
     spiky_factor,
     spiky_radial_slope,
 )
+from npa_envs.kernels.native import PAIRS, in_ranges, named
 from npa_envs.kernels.portable.search import make_search
 from npa_envs.once import made_once
 
@@ -365,9 +365,6 @@ def adjoint_kernels(
                     pull -= pair_pull(domain, -offset, squared, as_centre, centre_kernel)
         positions_bar[source[k]] = pull
 
-    return SimpleNamespace(
-        unscale_cotangents=unscale_cotangents,
-        gather_state_cotangents=gather_state_cotangents,
-        gather_density_cotangents=gather_density_cotangents,
-        gather_position_cotangents=gather_position_cotangents,
-    )
+    functions = [unscale_cotangents, gather_state_cotangents]
+    functions += [gather_density_cotangents, gather_position_cotangents]
+    return named(*functions)

@@ -9,9 +9,9 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from npa_envs.kernels.cpu import PAIRS, in_ranges
 from npa_envs.kernels.domain import domain_types, kernel_module
 from npa_envs.kernels.mathematics import smoothing, spiky_factor_wide
+from npa_envs.kernels.native import PAIRS, in_ranges, named
 from npa_envs.kernels.portable.search import make_search
 from npa_envs.once import made_once
 
@@ -174,8 +174,4 @@ def density_kernels(space_dim: int, scalar: type, on_cpu: bool) -> SimpleNamespa
             begin = ends[k - 1]
         list_around(domain, particle_count, starts, particles, k, begin, neighbours)
 
-    return SimpleNamespace(
-        compute_density=compute_density,
-        count_neighbours=count_neighbours,
-        list_neighbours=list_neighbours,
-    )
+    return named(compute_density, count_neighbours, list_neighbours)

@@ -7,8 +7,8 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from npa_envs.kernels.cpu import ELEMENTS, in_ranges
 from npa_envs.kernels.domain import domain_types, kernel_module
+from npa_envs.kernels.native import ELEMENTS, in_ranges, named
 from npa_envs.once import made_once
 
 
@@ -233,11 +233,6 @@ def equivariance_kernels(space_dim: int, scalar: type) -> SimpleNamespace:
                 value = update_bar[row, place]
         output_bar[row, column] = value
 
-    return SimpleNamespace(
-        mix_vectors=mix_vectors,
-        write_inputs=write_inputs,
-        pull_back_products=pull_back_products,
-        pull_back_rows=pull_back_rows,
-        steer=steer,
-        pull_back_steering=pull_back_steering,
+    return named(
+        mix_vectors, write_inputs, pull_back_products, pull_back_rows, steer, pull_back_steering
     )

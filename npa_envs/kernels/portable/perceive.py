@@ -10,8 +10,7 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from npa_envs.kernels.access import make_wide_load
-from npa_envs.kernels.cpu import PAIRS, in_ranges, make_add_scaled
+from npa_envs.kernels.access import make_add_scaled, make_wide_load
 from npa_envs.kernels.domain import domain_types, kernel_module
 from npa_envs.kernels.mathematics import (
     log_scaled,
@@ -19,6 +18,7 @@ from npa_envs.kernels.mathematics import (
     smoothing,
     spiky_factor,
 )
+from npa_envs.kernels.native import PAIRS, in_ranges
 from npa_envs.kernels.portable.search import make_search
 from npa_envs.once import made_once
 
@@ -39,15 +39,7 @@ def perception_kernels(
     """Return the kernels of one variant.
 
     A variant without `state_gradient`, or without a correction of it by a `moment_inverse`, neither
-    sums nor holds what only that needs.
-
-    Args:
-        scalar: `wp.float32` or `wp.float64`.
-        width: Channels of a group.
-        on_cpu: Whether candidates are sifted.
-        state_gradient: Whether the state gradient is perceived.
-        moment_inverse: How it is corrected by the moment matrix; None: not at all.
-        listed: Whether neighbours were listed before.
+    sums nor holds what only that needs. On a CPU candidates are sifted.
     """
     moment_correction = moment_inverse is not None
     smooth = moment_inverse == "smooth"

@@ -20,7 +20,7 @@ SIFTED = 32
 def make_search(
     space_dim: int, scalar: type, entry_type: type, on_cpu: bool, listed: bool = False
 ) -> SimpleNamespace:
-    """Return the Warp functions of a search among sorted entries.
+    """Return the Warp functions of a search among sorted vectors that begin with a position.
 
     They are used as
 
@@ -29,11 +29,7 @@ def make_search(
             for first in range(begin, end, stride):
                 near, count = sift(domain, entries, neighbours, position, first, end)
 
-    Args:
-        scalar: `wp.float32` or `wp.float64`.
-        entry_type: Vector type of what is searched, which begins with a position.
-        on_cpu: Whether a sift takes several candidates.
-        listed: Whether `neighbours` holds the neighbours of each particle, up to its `ends`.
+    `listed`: `neighbours` holds the neighbours of each particle, up to its `ends`.
     """
     types = domain_types(space_dim, scalar)
     vector, Domain, minimum_image = types.vector, types.Domain, types.minimum_image

@@ -17,8 +17,8 @@ from npa_envs.kernels.access import (
     make_read_channels,
     make_wide_store,
 )
-from npa_envs.kernels.cpu import PARTICLES, WORLDS, in_ranges
 from npa_envs.kernels.domain import domain_types, kernel_module
+from npa_envs.kernels.native import PARTICLES, WORLDS, in_ranges, named
 from npa_envs.once import made_once
 
 store_pair = make_wide_store(wp.vec2i, wp.int32)
@@ -26,12 +26,7 @@ store_pair = make_wide_store(wp.vec2i, wp.int32)
 
 @made_once()
 def sort_kernels(space_dim: int, scalar: type, width: int) -> SimpleNamespace:
-    """Return the kernels of one variant.
-
-    Args:
-        scalar: `wp.float32` or `wp.float64`.
-        width: Channels of a group: 4, 8 or 16.
-    """
+    """Return the kernels of one variant."""
     types = domain_types(space_dim, scalar)
     vector, Domain = types.vector, types.Domain
     cell_of, cell_index = types.cell_of, types.cell_index
@@ -238,21 +233,12 @@ def sort_kernels(space_dim: int, scalar: type, width: int) -> SimpleNamespace:
         if masked != 0:
             starts[active_offset + first_cell] = first_row
 
-    return SimpleNamespace(
-        count_cells=count_cells,
-        place_by_arrival=place_by_arrival,
-        order_particles=order_particles,
-        sort_worlds=sort_worlds,
-    )
+    return named(count_cells, place_by_arrival, order_particles, sort_worlds)
 
 
 @made_once()
 def give_rows(space_dim: int, scalar: type) -> wp.Kernel:
-    """Return the kernel that gives active particles of worlds that are sorted already their rows.
-
-    Args:
-        scalar: `wp.float32` or `wp.float64`.
-    """
+    """Return the kernel that gives active particles of sorted worlds their rows."""
     vector = wp.types.vector(space_dim, scalar)
 
     @wp.kernel(enable_backward=False, module=kernel_module("rows", space_dim, scalar))

@@ -9,20 +9,15 @@ Sources: kernels of arXiv 2601.16096, section 3, summed over the particles of on
 
 import warp as wp
 
-from npa_envs.kernels.cpu import PAIRS, in_ranges
 from npa_envs.kernels.domain import domain_types, kernel_module
 from npa_envs.kernels.mathematics import log_scaled, smoothing, spiky_factor
+from npa_envs.kernels.native import PAIRS, in_ranges
 from npa_envs.once import made_once
 
 
 @made_once()
 def species_kernel(space_dim: int, scalar: type, species_count: int) -> wp.Kernel:
-    """Return the kernel of one variant.
-
-    Args:
-        scalar: `wp.float32` or `wp.float64`.
-        species_count: Species K.
-    """
+    """Return the kernel of one variant."""
     types = domain_types(space_dim, scalar)
     vector, Domain = types.vector, types.Domain
     cell_of, segment_count, segment_cells = (

@@ -18,8 +18,8 @@ from npa_envs.kernels.access import (
     make_wide_load,
     make_write_at,
 )
-from npa_envs.kernels.cpu import ELEMENTS, in_ranges
 from npa_envs.kernels.domain import domain_types, kernel_module, scalar_name
+from npa_envs.kernels.native import ELEMENTS, in_ranges, named
 from npa_envs.once import made_once
 
 CHANNEL_SHARE = 4
@@ -342,9 +342,7 @@ def update_kernels(space_dim: int, scalar: type) -> SimpleNamespace:
         if held_back != 0:
             diverged[i / particle_count] = wp.uint8(1)
 
-    return SimpleNamespace(
-        apply_update=apply_update, pull_back_update=pull_back_update, apply_actions=apply_actions
-    )
+    return named(apply_update, pull_back_update, apply_actions)
 
 
 QUAD = 4

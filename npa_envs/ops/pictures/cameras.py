@@ -19,6 +19,7 @@ from npa_envs.checks import (
     DTYPES,
     LARGEST_SIDE,
     check_dense,
+    check_floating,
     checked_count,
     checked_finite,
     checked_number,
@@ -67,12 +68,10 @@ class Cameras:
         if not (math.isfinite(near) and near > 0.0):
             raise NPAError(
                 f"near must be positive and finite [length units], got {shown(near)}: what is "
-                "nearer has "
-                f"no place on the picture"
+                "nearer has no place on the picture"
             )
         if self.world_to_camera.device.type == "cpu":
-            self._check_motions()
-            self._check_intrinsics()
+            self._check_numbers()
 
     @property
     def count(self) -> int:
@@ -85,17 +84,9 @@ class Cameras:
         return self.world_to_camera.shape[0] if self.world_to_camera.ndim == 4 else None
 
     def to(self, like: Tensor | torch.device | torch.dtype | str) -> Cameras:
-        """Return the cameras on another device or in another dtype.
-
-        Args:
-            like: What `torch.Tensor.to` takes: a device, a dtype or a tensor.
-        """
-        moved = self.world_to_camera.to(like)
-        return dataclasses.replace(
-            self,
-            world_to_camera=moved,
-            intrinsics=self.intrinsics.to(like),
-        )
+        """Return the cameras on another device or in another dtype."""
+        motions, intrinsics = self.world_to_camera.to(like), self.intrinsics.to(like)
+        return dataclasses.replace(self, world_to_camera=motions, intrinsics=intrinsics)
 
     def _check_shapes(self) -> None:
         motions, intrinsics = self.world_to_camera, self.intrinsics
@@ -129,7 +120,7 @@ class Cameras:
                 f"convert one with .to(other)"
             )
 
-    def _check_motions(self) -> None:
+    def _check_numbers(self) -> None:
         motions = self.world_to_camera.detach().flatten(0, -3).double()
         last = motions.new_tensor([0.0, 0.0, 0.0, 1.0])
         rotations = motions[:, :3, :3]
@@ -143,8 +134,6 @@ class Cameras:
                 f"singular nor scaled nor mirrored), got {motions[k].tolist()} as camera {k}: "
                 f"make it with look_at, orbit or cameras_of_poses"
             )
-
-    def _check_intrinsics(self) -> None:
         intrinsics = self.intrinsics.detach().view(-1, 4)
         fits = intrinsics.isfinite().all(-1) & (intrinsics[:, :2] > 0.0).all(-1)
         if not bool(fits.all()):
@@ -295,12 +284,7 @@ def cameras_of_poses(
     if not isinstance(camera_to_world, Tensor) or camera_to_world.shape[-2:] != (4, 4):
         got = getattr(camera_to_world, "shape", type(camera_to_world).__name__)
         raise NPAError(f"camera_to_world must have shape [V, 4, 4] or [B, V, 4, 4], got {got}")
-    if camera_to_world.dtype not in DTYPES:
-        raise NPAError(
-            f"camera_to_world must be float32 or float64, got {camera_to_world.dtype}: "
-            f"convert it with .float()"
-        )
-    check_dense("camera_to_world", camera_to_world)
+    check_floating("camera_to_world", camera_to_world)
     # Of a rigid motion: R and t become Rᵀ and -Rᵀ t. What is not rigid is refused by `Cameras`.
     flip = camera_to_world.new_tensor([1.0, -1.0, -1.0])
     back = (camera_to_world[..., :3, :3] * flip).mT

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from npa_envs.checks import DTYPES, check_dense, checked_count, checked_number
+from npa_envs.checks import check_floating, checked_count, checked_number
 from npa_envs.errors import NPAError, shown
 from npa_envs.kernels.pictures.blending import TILE_PIXELS, block_kernels, tile_kernels
 from npa_envs.kernels.pictures.gaussians import (
@@ -29,11 +29,7 @@ from npa_envs.ops.sort import LARGEST_INDEX
 def check_gaussians(
     means: Tensor, scales: Tensor, quaternions: Tensor, opacities: Tensor, colours: Tensor
 ) -> None:
-    """Check shapes, dtypes and devices of Gaussians; on the CPU also the scales' signs.
-
-    Raises:
-        NPAError: They do not fit.
-    """
+    """Check shapes, dtypes and devices of Gaussians; on the CPU also the scales' signs."""
     _check_tensor("means", means, means, "[B, N, 3]")
     lead = tuple(means.shape[:2])
     if means.ndim != 3 or means.shape[2] != 3 or 0 in lead:
@@ -60,13 +56,8 @@ def check_gaussians(
                 f"{name} must have shape {shape} with [B, N] = {list(lead)} as means has, "
                 f"got {tuple(tensor.shape)}"
             )
-    check_derivatives(
-        means=means,
-        scales=scales,
-        quaternions=quaternions,
-        opacities=opacities,
-        colours=colours,
-    )
+    given = {"means": means} | {name: tensor for name, tensor, *_ in shapes}
+    check_derivatives(**given)
     if scales.device.type == "cpu" and not torch.compiler.is_compiling():
         negative = scales.detach() < 0.0
         if bool(negative.any()):
@@ -79,16 +70,7 @@ def check_gaussians(
 
 
 def _check_tensor(name: str, tensor: Tensor, means: Tensor, shape: str) -> None:
-    if not isinstance(tensor, Tensor):
-        raise NPAError(
-            f"{name} must be a torch tensor of shape {shape}, got {type(tensor).__name__}: "
-            f"convert it with torch.as_tensor"
-        )
-    if tensor.dtype not in DTYPES:
-        raise NPAError(
-            f"{name} must be float32 or float64, got {tensor.dtype}: convert it with .float()"
-        )
-    check_dense(name, tensor)
+    check_floating(name, tensor, shape)
     if tensor.dtype != means.dtype or tensor.device != means.device:
         raise NPAError(
             f"{name} and means must share dtype and device, got {tensor.dtype} on {tensor.device} "
@@ -99,11 +81,7 @@ def _check_tensor(name: str, tensor: Tensor, means: Tensor, shape: str) -> None:
 def check_cameras(
     cameras: Cameras, means: Tensor, background: Tensor | None, channels: int
 ) -> None:
-    """Check that cameras and a background fit the worlds.
-
-    Raises:
-        NPAError: They do not.
-    """
+    """Check that cameras and a background fit the worlds."""
     if not isinstance(cameras, Cameras):
         raise NPAError(
             f"cameras must be Cameras, got {type(cameras).__name__}: "
@@ -301,7 +279,7 @@ def _(
     dilation: float,
     pairs_per_particle: int,
 ) -> list[Tensor]:
-    means, *_, colours, motions, _ = tensors
+    means, colours, motions = tensors[0], tensors[3], tensors[4]
     views = (means.shape[0], motions.shape[-3])
     images = views[0] * views[1]
     seen = images * means.shape[1]
@@ -328,10 +306,8 @@ def _gaussians_backward(
     picture_bar: Tensor, passing_bar: Tensor, saved: list[Tensor], near: float, dilation: float
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
     """Return the cotangents of means, scales, quaternions, opacities and colours."""
-    scene = Gaussians(*saved[: len(Gaussians._fields)])
-    passing, stops, footprints, counts, slots, starts, owners, places = saved[
-        len(Gaussians._fields) :
-    ]
+    scene = Gaussians(*saved[:6])
+    passing, stops, footprints, counts, slots, starts, owners, places = saved[6:]
     device, scalar = footprints.device, scalar_type(footprints.dtype)
     frame = scene.frame(int(passing.shape[3]), int(passing.shape[2]), near, dilation)
     picture_bar = picture_bar.contiguous().view(-1, frame.channels)

@@ -89,20 +89,11 @@ def picture_losses(
     Each world's mean position is moved to `goal` and drawn as by `splat`; colours are the last
     three states plus `shift`. With d the difference from the target and e = |d| + d^2, a pixel's
     density error is that of the densities, its colour error is the mean of e over the colours times
-    exp(-(density error)).
-
-    Args:
-        x: Particle positions [length units], shape [B, N, 2].
-        target: Picture to compare with, dimensionless, shape [R, R, 4].
-        goal: Where each world's mean is moved to [length units], shape [2].
-        shift: What is added to states to give colours, dimensionless.
+    exp(-(density error)). The target has shape [R, R, 4], the goal [2].
 
     Returns:
         Means over the pixels of the density error and of the colour error, shape [B] each. World
         k's are the same, bit for bit, in every batch.
-
-    Raises:
-        NPAError: A shape does not fit or a number is out of its range.
     """
     check_particles(x, states, None)
     resolution = target.shape[0] if target.ndim else 0
@@ -114,11 +105,6 @@ def picture_losses(
     window = checked_window(resolution, pixel_size, sigma, lo, hi)
     x, states, target, goal = (t.detach() for t in (x, states, target.to(x), goal.to(x)))
     losses = _picture_losses(
-        x.contiguous(),
-        states.contiguous(),
-        goal.contiguous(),
-        target,
-        shift,
-        *window[1:],
+        x.contiguous(), states.contiguous(), goal.contiguous(), target, shift, *window[1:]
     )
     return losses[:, 0], losses[:, 1]

@@ -297,11 +297,7 @@ def check_particles(x: Tensor, colour: Tensor, width: int | None) -> None:
 def checked_window(
     resolution: int, pixel_size: float, sigma: float, low: float, high: float
 ) -> tuple[int, float, float, float, float]:
-    """Return what pictures are drawn by, in this order, as Python's own numbers.
-
-    Raises:
-        NPAError: One is no number or out of its range, or spots have no moderate size in pixels.
-    """
+    """Return what pictures are drawn by, in this order, checked, as Python's own numbers."""
     if checked_count("resolution", resolution) < 2:
         raise NPAError(f"resolution must be at least 2 pixels, got {resolution}")
     side = checked_side("resolution", resolution)
@@ -342,23 +338,8 @@ def periodic_splat(
     batch.
 
     Worlds are drawn on a canvas that is wider by a patch on each side, by the kernels of `splat`.
-    What lies in a margin is then added where it belongs, on the other side.
-
-    Args:
-        x: Particle positions [length units], shape [B, N, 2].
-        colour: Particle colours, dimensionless, shape [B, N, 3].
-        resolution: Pixels R along each side, 2 or more.
-        pixel_size: Side h of a pixel of the target [length units].
-        sigma: Standard deviation of the Gaussian in target pixels, dimensionless.
-        lo: Lower edge of the box in both directions [length units].
-        hi: Upper edge of the box in both directions [length units].
-
-    Returns:
-        Pictures, dimensionless, shape [B, R, R, 4]: sums of colour times weight and, last, of the
-        weights, which sum to (R h / (hi - lo))^2 for each particle; y points to higher rows.
-
-    Raises:
-        NPAError: A shape does not fit or a number is out of its range.
+    What lies in a margin is then added where it belongs, on the other side. Arguments, results and
+    errors are those of `splat`; `lo` and `hi` are the edges of the box in both directions.
     """
     check_particles(x, colour, 3)
     resolution, pixel_size, sigma, lo, hi = checked_window(resolution, pixel_size, sigma, lo, hi)

@@ -29,11 +29,6 @@ def nearest_triangles(
         colours: Of the corners, shape [K, 3].
         faces: Corners of each triangle, from 0 to K − 1, shape [F, 3].
         seen: Whether a camera sees a triangle, shape [V, F].
-        width: Pixels across, W.
-        height: Pixels down, H.
-
-    Returns:
-        Shape [V, H, W, 4].
     """
     count = len(place)
     nearest = place.new_zeros(count, height * width)
