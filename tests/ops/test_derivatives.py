@@ -14,6 +14,7 @@ from worlds import lively_rule as made_rule
 import npa_envs
 from npa_envs import reference
 from npa_envs.ops.pictures.losses import picture_losses
+from npa_envs.world.brushes import push
 
 TANGENT = r" must carry no tangent of forward-mode derivatives .*reference"
 TRANSFORM = r" must not be given within a function of torch.func .*reference"
@@ -173,6 +174,7 @@ def test_the_reference_that_the_errors_name_has_them_all():
         torch.func.jacrev(perceived)(s),
     ):
         torch.testing.assert_close(found, expected, rtol=1e-9, atol=1e-11)
+    assert torch.func.hessian(lambda s: perceived(s).sum())(s).any()
 
 
 class Rollout(torch.nn.Module):
@@ -231,8 +233,6 @@ def test_a_tangent_that_an_own_network_makes_is_refused(device):
 
 
 def test_brushes_have_forward_derivatives():
-    from npa_envs.world.brushes import push
-
     x, _ = world("cpu")
     with forward_ad.dual_level():
         dual = forward_ad.make_dual(x, torch.ones_like(x))

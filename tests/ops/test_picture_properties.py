@@ -170,14 +170,9 @@ def scenes(draw, device):
         torch.rand(lead, generator=generator, dtype=torch.float64),
         normal(*lead, *channels),
     )
-    cameras = orbit(
-        views,
-        draw(st.integers(-80, 80)),
-        draw(st.sampled_from((0.5, 3.0, 20.0))),
-        draw(st.sampled_from((20.0, 45.0, 120.0))),
-        width=width,
-        height=height,
-    )
+    elevation, radius = draw(st.integers(-80, 80)), draw(st.sampled_from((0.5, 3.0, 20.0)))
+    fov = draw(st.sampled_from((20.0, 45.0, 120.0)))
+    cameras = orbit(views, elevation, radius, fov, width=width, height=height)
     cotangent = normal(lead[0], views, height, width, channels[-1])
     made = tuple(tensor.to(device, dtype) for tensor in gaussians)
     return Scene(made, cameras.to(device), cotangent.to(device, dtype))

@@ -1,6 +1,7 @@
 """Threads: launches on the CPU in ranges, the first calls of several threads, forks."""
 
 import contextlib
+import functools
 import multiprocessing
 import os
 import subprocess
@@ -15,7 +16,6 @@ from worlds import assert_same, random_mask, random_world, rows_of, with_gradien
 
 import npa_envs
 from npa_envs.once import alone, made_once
-from npa_envs.ops import launch as bridge
 from npa_envs.ops import launch as threads
 from npa_envs.ops import orbit, render_gaussians
 from npa_envs.ops.launch import even_ranges, run_together
@@ -46,8 +46,8 @@ def cuts(monkeypatch):
         counts.append(len(calls))
         run_together(calls)
 
-    monkeypatch.setattr(bridge, "even_ranges", lambda count, _: even_ranges(count, SMALL_RANGE))
-    monkeypatch.setattr(bridge, "run_together", counted)
+    monkeypatch.setattr(threads, "even_ranges", lambda count, _: even_ranges(count, SMALL_RANGE))
+    monkeypatch.setattr(threads, "run_together", counted)
     return counts
 
 
@@ -61,9 +61,8 @@ def stepped(x, s):
     mask = random_mask(x)
 
     def moved(x, s):
-        perception, rows = rows_of(
-            x, s, mask, width=Terms().perception_dim(x.shape[2], STATE_DIM) + 1
-        )
+        width = Terms().perception_dim(x.shape[2], STATE_DIM) + 1
+        perception, rows = rows_of(x, s, mask, width=width)
         # No product: torch's own may depend on its number of threads.
         update = perception[:, : x.shape[2] + STATE_DIM]
         path = x.new_zeros(x.shape[:2])
@@ -97,9 +96,8 @@ def acted(x, s):
 def drawn(x, s):
     """Return pictures, their cotangents, and losses."""
     x = x[..., :2].contiguous()
-    found = with_gradients(
-        lambda x, colour: splat(x, colour, resolution=24, pixel_size=0.05), x, s[..., -3:]
-    )
+    picture = functools.partial(splat, resolution=24, pixel_size=0.05)
+    found = with_gradients(picture, x, s[..., -3:])
     losses = picture_losses(x, s, found[0][0], goal=x.new_zeros(2), shift=0.5, pixel_size=0.05)
     return [*found, *losses]
 
@@ -118,9 +116,8 @@ def rendered(x, s):
 def test_results_are_the_same_bits_for_every_number_of_threads(
     run, world_count, particle_count, space_dim, set_threads, cuts
 ):
-    x, s = random_world(
-        world_count, particle_count, space_dim, STATE_DIM, dtype=torch.float32, device="cpu"
-    )
+    sizes = (world_count, particle_count, space_dim, STATE_DIM)
+    x, s = random_world(*sizes, dtype=torch.float32, device="cpu")
     set_threads(1)
     expected = run(x, s)
     assert not cuts
@@ -135,7 +132,7 @@ def test_results_are_the_same_bits_for_every_number_of_threads(
 def test_launches_over_large_worlds_alone_are_cut(
     particle_count, ranges, set_threads, cuts, monkeypatch
 ):
-    monkeypatch.setattr(bridge, "even_ranges", even_ranges)
+    monkeypatch.setattr(threads, "even_ranges", even_ranges)
     x, s = random_world(1, particle_count, 2, STATE_DIM, dtype=torch.float32, device="cpu")
     set_threads(2)
     npa_envs.perceive(x, s, 0.1)
@@ -264,15 +261,9 @@ with multiprocessing.get_context("fork").Pool(2) as pool:
 
 def printed(program, threads):
     """Return the lines that a program prints in a process of its own."""
-    done = subprocess.run(
-        [sys.executable, "-c", ROLLOUT + program],
-        env={**os.environ, "OMP_NUM_THREADS": str(threads)},
-        capture_output=True,
-        text=True,
-        timeout=60,
-        check=False,
-        encoding="utf-8",
-    )
+    command, env = [sys.executable, "-c", ROLLOUT + program], {"OMP_NUM_THREADS": str(threads)}
+    options = {"capture_output": True, "encoding": "utf-8", "timeout": 60, "check": False}
+    done = subprocess.run(command, env={**os.environ, **env}, **options)
     assert done.returncode == 0, done.stderr
     return done.stdout.split("\n")[:-1]
 

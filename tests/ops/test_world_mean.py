@@ -3,7 +3,6 @@
 import pytest
 import torch
 
-from npa_envs.errors import NPAError
 from npa_envs.ops import world_mean
 
 ERRORS = {torch.float32: 3e-7, torch.float64: 2e-15}
@@ -26,6 +25,7 @@ def test_the_mean_is_right_and_the_same_in_every_batch(count, width, dtype, devi
     for world in range(7):
         assert torch.equal(world_mean(values[world : world + 1]), means[world : world + 1])
     assert torch.equal(world_mean(values[2:5]), means[2:5])
+    assert torch.equal(world_mean(values.mT.contiguous().mT), means)
 
 
 def test_float32_values_are_added_in_float64(device):
@@ -34,42 +34,16 @@ def test_float32_values_are_added_in_float64(device):
     assert world_mean(values).tolist() == [[torch.tensor((2.0**26 + 1e4) / 10_001).item()]] * 2
 
 
-def test_values_may_be_strided(dtype, device):
-    values = numbers(5, 101, 3, dtype=dtype, device=device).transpose(0, 1)
-    assert torch.equal(world_mean(values), world_mean(values.contiguous()))
-
-
 def test_gradients_are_right_to_the_second_order(device):
     values = numbers(2, 5, 3, dtype=torch.float64, device=device).requires_grad_()
     assert torch.autograd.gradcheck(world_mean, values)
     assert torch.autograd.gradgradcheck(lambda v: world_mean(v) ** 2, values)
 
 
-def test_the_gradient_is_one_share_of_the_means(dtype, device):
-    values = numbers(3, 8, 2, dtype=dtype, device=device).requires_grad_()
-    cotangent = numbers(3, 2, dtype=dtype, device=device)
-    world_mean(values).backward(cotangent)
-    assert torch.equal(values.grad, (cotangent / 8)[:, None].expand(3, 8, 2))
-
-
 def test_it_can_be_compiled(device):
     values = numbers(3, 33, 2, dtype=torch.float32, device=device)
     compiled = torch.compile(lambda v: world_mean(v) * 2.0, backend="aot_eager", fullgraph=True)
     assert torch.equal(compiled(values), world_mean(values) * 2.0)
-
-
-@pytest.mark.parametrize(
-    ("values", "message"),
-    [
-        (torch.zeros(4, 3), r"values must have shape \[B, M, K\] .*, got \(4, 3\)"),
-        (torch.zeros(4, 0, 3), r"got \(4, 0, 3\)"),
-        (torch.zeros(4, 2, 3, dtype=torch.float16), "float32 or float64, got torch.float16"),
-        (torch.zeros(4, 2, 3, dtype=torch.int64), r"convert it with \.float\(\)"),
-    ],
-)
-def test_wrong_values_are_clear_errors(values, message):
-    with pytest.raises(NPAError, match=message):
-        world_mean(values)
 
 
 def test_means_of_a_batch_are_right_after_a_single_world_of_any_stride(device):

@@ -11,8 +11,6 @@ import npa_envs
 from npa_envs import NPAError, NPARule
 from npa_envs import reference as oracle
 from npa_envs.agents import RulePolicy
-from npa_envs.rule.authors import save_demo_json
-from npa_envs.rule.files import rule_metadata
 from npa_envs.training import load_config
 from npa_envs.training.trainer import initial_rule
 from npa_envs.world import execute
@@ -115,16 +113,6 @@ def test_species_have_zones_of_their_own(device):
     assert still[30:].double().mean() < 0.5
 
 
-def test_a_file_says_the_zone(tmp_path):
-    npa_envs.save_rule(NPARule(dead_zone=0.001), tmp_path / "rule.safetensors")
-    assert npa_envs.load_rule(tmp_path / "rule.safetensors").dead_zone == 0.001
-    npa_envs.save_rule(NPARule(), tmp_path / "plain.safetensors")
-    assert rule_metadata(tmp_path / "plain.safetensors")["dead_zone"] == "0.0"
-    assert npa_envs.load_rule("heart-first").dead_zone == 0.0
-    with pytest.raises(NPAError, match=r"dead_zone=0\.0 only, 'mine' has 0\.001"):
-        save_demo_json({"mine": NPARule(dead_zone=0.001)}, tmp_path / "models.json")
-
-
 @pytest.mark.parametrize("zone", [-1e-3, float("nan"), float("inf"), "wide"])
 def test_zones_that_are_none_are_refused(zone, tmp_path):
     with pytest.raises(NPAError, match="dead_zone must be a"):
@@ -146,12 +134,8 @@ def test_training_gives_its_rule_the_zone(tmp_path, begun):
     untrained = CircleTask().make_rule(torch.Generator())
     initial = NPARule(**untrained.hyper_parameters() | {"dead_zone": begun})
     npa_envs.save_rule(initial, tmp_path / "rule.safetensors")
-    config = circle_config(
-        tmp_path / "run",
-        iterations=2,
-        dead_zone=0.01,
-        initial_rule=str(tmp_path / "rule.safetensors"),
-    )
+    fields = {"dead_zone": 0.01, "initial_rule": str(tmp_path / "rule.safetensors")}
+    config = circle_config(tmp_path / "run", iterations=2, **fields)
     rule = initial_rule(config, untrained)
     assert rule.dead_zone == 0.01
     assert torch.equal(rule.hidden.weight, initial.hidden.weight)
@@ -250,33 +234,24 @@ class TestRest:
         after[0].zero_()
         assert x.any()
 
-    @pytest.mark.parametrize(
-        "options",
-        [
-            {"keep_every": 64},
-            {"return_path_length": True},
-            {"position_noise": 1e-3},
-            {"on_divergence": "raise"},
-        ],
-        ids=lambda options: next(iter(options)),
-    )
-    def test_what_needs_each_step_runs_each_step(self, rule, worlds, asked, options):
-        x, s = worlds
-        with torch.no_grad():
-            npa_envs.rollout(rule, x, s, 256, eps=0.3, **options)
-        assert asked == [256]
-
-    def test_so_do_gradients_and_rules_with_a_network_of_their_own(self, rule, worlds, asked):
+    def test_what_needs_each_step_runs_each_step(self, rule, worlds, asked):
         class Own(NPARule):
             def forward(self, perception):
                 return super().forward(perception)
 
         x, s = worlds
+        own = Own(**rule.hyper_parameters()).to(x.device)
         npa_envs.rollout(rule, x, s, 256, eps=0.3)
         with torch.no_grad():
-            own = Own(**rule.hyper_parameters()).to(x.device)
             npa_envs.rollout(own, x, s, 256, eps=0.3)
-        assert asked == [256, 256]
+            for name, value in {
+                "keep_every": 64,
+                "return_path_length": True,
+                "position_noise": 1e-3,
+                "on_divergence": "raise",
+            }.items():
+                npa_envs.rollout(rule, x, s, 256, eps=0.3, **{name: value})
+        assert asked == [256] * 6
 
     def test_worlds_that_diverge_are_returned_as_without_a_zone(self, rule, worlds, asked, device):
         with torch.no_grad():

@@ -19,13 +19,10 @@ from npa_envs.training.trainer import initial_rule
 
 
 def test_the_choice_is_saved_with_a_rule(tmp_path):
-    smooth, plain = npa_envs.NPARule(moment_inverse="smooth"), npa_envs.NPARule()
-    npa_envs.save_rule(smooth, tmp_path / "smooth.safetensors")
-    npa_envs.save_rule(plain, tmp_path / "plain.safetensors")
-    assert npa_envs.load_rule(tmp_path / "smooth.safetensors").moment_inverse == "smooth"
-    assert npa_envs.load_rule(tmp_path / "plain.safetensors").moment_inverse == "threshold"
     assert npa_envs.load_rule("gecko").moment_inverse == "threshold"
+    assert npa_envs.load_rule("heart-first").dead_zone == 0.0
     path = tmp_path / "smooth.safetensors"
+    npa_envs.save_rule(npa_envs.NPARule(moment_inverse="smooth"), path)
     path.write_bytes(path.read_bytes().replace(b'\\"smooth\\"', b'\\"smoosh\\"'))
     with pytest.raises(npa_envs.NPAError, match="got 'smoosh'"):
         npa_envs.load_rule(path)
@@ -79,9 +76,7 @@ def test_an_environment_observes_what_it_is_told(name, device):
 def test_a_rule_acts_only_where_its_choice_is_observed():
     rule = npa_envs.NPARule(moment_inverse="smooth")
     env = gymnasium.make("npa/Morphogenesis2D-v0", particle_count=32)
-    with pytest.raises(
-        npa_envs.NPAError, match="make the environment with moment_inverse='smooth'"
-    ):
+    with pytest.raises(npa_envs.NPAError, match="the environment with moment_inverse='smooth'"):
         RulePolicy(rule, env)
     env = gymnasium.make("npa/Morphogenesis2D-v0", particle_count=32, moment_inverse="smooth")
     observation, _ = env.reset(seed=0)

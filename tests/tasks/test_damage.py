@@ -1,17 +1,23 @@
+"""Damages: what they do to a world, to worlds of the pool, and particles that are thrown out."""
+
 import math
+from dataclasses import replace
 
 import pytest
 import torch
 
 from npa_envs.errors import NPAError
-from npa_envs.tasks.damage import random_particle
-from npa_envs.world.brushes import clump, cut, wipe_state
+from npa_envs.tasks import damage
+from npa_envs.tasks.damage import FARTHEST, NEAREST, SHARE, PoolDamage, damage_pool
+from npa_envs.tasks.morphogenesis2d import Morphogenesis2D, Morphogenesis2DConfig
+from npa_envs.tasks.seeds import uniform_ball
+from npa_envs.world.randomness import WorldRandom
 
 B, N, C = 3, 257, 5
 
 
 @pytest.fixture(params=[(2, torch.float32), (3, torch.float64)], ids=["2d", "3d"])
-def world(request, device) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+def world(request, device):
     space_dim, dtype = request.param
     g = torch.Generator().manual_seed(3)
     x = 2 * torch.rand(B, N, space_dim, generator=g, dtype=dtype) - 1
@@ -23,7 +29,7 @@ def world(request, device) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
 def test_states_inside_the_ball_are_zero_and_the_others_untouched(world):
     x, s, centre = world
     before = s.clone()
-    wiped = wipe_state(x, s, centre=centre, radius=0.4)
+    wiped = brushes.wipe_state(x, s, centre=centre, radius=0.4)
     counted = 0
     for b in range(B):
         for i in range(N):
@@ -36,7 +42,7 @@ def test_states_inside_the_ball_are_zero_and_the_others_untouched(world):
     assert torch.equal(s, before)
     # Each world may have a radius of its own.
     radius = torch.tensor([0.0, 0.4, 9.0], dtype=x.dtype, device=x.device)
-    by_world = wipe_state(x, s, centre=centre, radius=radius)
+    by_world = brushes.wipe_state(x, s, centre=centre, radius=radius)
     assert torch.equal(by_world[0], s[0])
     assert torch.equal(by_world[1], wiped[1])
     assert (by_world[2] == 0).all()
@@ -45,7 +51,7 @@ def test_states_inside_the_ball_are_zero_and_the_others_untouched(world):
 def test_cut_opens_a_slit_of_the_gap_and_leaves_the_rest_alone(world):
     x, s, centre = world
     normal = torch.randn(B, x.shape[-1], generator=torch.Generator().manual_seed(1)).to(x)
-    moved, states = cut(x, s, centre=centre, normal=normal, gap=0.2)
+    moved, states = brushes.cut(x, s, centre=centre, normal=normal, gap=0.2)
     unit = normal / normal.norm(dim=-1, keepdim=True)
     before = ((x - centre[:, None]) * unit[:, None]).sum(dim=-1)
     after = ((moved - centre[:, None]) * unit[:, None]).sum(dim=-1)
@@ -58,13 +64,13 @@ def test_cut_opens_a_slit_of_the_gap_and_leaves_the_rest_alone(world):
     across = (moved - x) - (after - before)[..., None] * unit[:, None]
     assert across.abs().max() < 1e-6
     assert states is s
-    moved, _ = cut(x, s, centre=centre, normal=torch.zeros_like(centre), gap=0.2)
+    moved, _ = brushes.cut(x, s, centre=centre, normal=torch.zeros_like(centre), gap=0.2)
     assert torch.equal(moved, x)
 
 
 def test_clump_shortens_the_distance_inside_and_moves_nothing_outside(world):
     x, s, centre = world
-    moved, states = clump(x, s, centre=centre, radius=0.5, factor=0.75)
+    moved, states = brushes.clump(x, s, centre=centre, radius=0.5, factor=0.75)
     distance = (x - centre[:, None]).norm(dim=-1)
     inside = distance <= 0.5
     assert 10 < inside.sum() < B * N
@@ -72,45 +78,177 @@ def test_clump_shortens_the_distance_inside_and_moves_nothing_outside(world):
     torch.testing.assert_close(shortened[inside], 0.25 * distance[inside])
     assert torch.equal(moved[~inside], x[~inside])
     assert states is s
-    collected, _ = clump(x, s, centre=centre, radius=9.0, factor=1.0)
+    collected, _ = brushes.clump(x, s, centre=centre, radius=9.0, factor=1.0)
     torch.testing.assert_close(collected, centre[:, None].expand_as(x))
-    same, _ = clump(x, s, centre=centre, radius=9.0, factor=0.0)
+    same, _ = brushes.clump(x, s, centre=centre, radius=9.0, factor=0.0)
     assert torch.equal(same, x)
 
 
 def test_random_particle_is_one_of_its_own_world(world):
     x, _, _ = world
-    chosen = random_particle(x, torch.Generator(x.device).manual_seed(0))
+    chosen = damage.random_particle(x, torch.Generator(x.device).manual_seed(0))
     for b in range(B):
         assert (x[b] == chosen[b]).all(dim=-1).any()
-
-
-def test_wrong_arguments_are_clear_errors():
-    x, s, centre = torch.zeros(2, 4, 2), torch.zeros(2, 4, 3), torch.zeros(2, 2)
-    with pytest.raises(NPAError, match=r"add a world dimension with x\[None\]"):
-        random_particle(x[0])
-    with pytest.raises(NPAError, match="at least one particle"):
-        random_particle(x[:, :0])
-    with pytest.raises(NPAError, match=r"x must be float32 or float64, got torch\.int64"):
-        random_particle(x.long())
-    with pytest.raises(NPAError, match="x and s must agree in worlds and particles"):
-        wipe_state(x, s[:, :3], centre=centre, radius=0.1)
-    with pytest.raises(NPAError, match=r"centre must have shape \[B, D\] = \(2, 2\), got \(2,\)"):
-        wipe_state(x, s, centre=centre[0], radius=0.1)
-    with pytest.raises(NPAError, match=r"centre must be torch\.float32"):
-        wipe_state(x, s, centre=centre.double(), radius=0.1)
-    with pytest.raises(NPAError, match=r"normal must have shape"):
-        cut(x, s, centre=centre, normal=torch.zeros(2, 3), gap=0.1)
-    with pytest.raises(NPAError, match=r"radius must be a number or a tensor of shape \[B\]"):
-        wipe_state(x, s, centre=centre, radius=torch.zeros(3))
-    for radius in (-0.1, math.nan, math.inf):
-        with pytest.raises(NPAError, match="radius must be finite and at least 0"):
-            clump(x, s, centre=centre, radius=radius, factor=0.5)
-    with pytest.raises(NPAError, match=r"factor must be in \[0, 1\], got 1\.5"):
-        clump(x, s, centre=centre, radius=0.1, factor=1.5)
 
 
 @pytest.mark.gpu
 def test_generator_of_another_device_is_a_clear_error():
     with pytest.raises(NPAError, match=r"generator must be on the worlds' device"):
-        random_particle(torch.zeros(1, 4, 2, device="cuda"), torch.Generator())
+        damage.random_particle(torch.zeros(1, 4, 2, device="cuda"), torch.Generator())
+
+
+def seeded(seed):
+    return torch.Generator().manual_seed(seed)
+
+
+def worlds(count, space_dim=2, particles=200):
+    x = uniform_ball(count, particles, space_dim, 0.8, generator=seeded(1))
+    return x, torch.ones(count, particles, 3)
+
+
+def changed(before, after):
+    return (before != after).flatten(1).any(dim=1)
+
+
+@pytest.mark.parametrize("space_dim", [2, 3])
+def test_a_ball_of_states_is_wiped_in_every_world(space_dim):
+    x, s = worlds(40, space_dim)
+    found, states = damage_pool(x, s, PoolDamage(damage_radius=0.3), generator=seeded(2))
+    assert found is x
+    for places, blank in zip(x, (states == 0.0).all(dim=-1), strict=True):
+        assert 0 < int(blank.sum()) < 150
+        assert float(torch.cdist(places[blank], places[blank]).max()) <= 0.6
+
+
+@pytest.mark.parametrize(
+    ("fields", "share"),
+    [
+        *(({name: 0.5}, SHARE) for name in ("clump_radius", "cut_gap", "flake_radius")),
+        ({"cut_gap": 0.5, "cut_share": 0.7}, 0.7),
+    ],
+)
+@pytest.mark.parametrize("space_dim", [2, 3])
+def test_as_many_worlds_are_hit_as_asked_for(fields, share, space_dim):
+    x, s = worlds(400, space_dim, 60)
+    found, states = damage_pool(x, s, PoolDamage(**fields), generator=seeded(2))
+    # Five standard deviations of a share of 400 worlds; some are hit where nobody is.
+    assert share - 0.13 < float(changed(x, found).float().mean()) < share + 0.11
+    assert torch.equal(states, s)
+
+
+def test_a_clump_is_one_point():
+    x, s = worlds(40)
+    found, _ = damage_pool(x, s, PoolDamage(clump_radius=0.3), generator=seeded(2))
+    hit = changed(x, found)
+    assert hit.any()
+    for before, after in zip(x[hit], found[hit], strict=True):
+        moved = (before != after).any(dim=1)
+        middle = after[moved].mean(dim=0)
+        at_one_point = (after - middle).norm(dim=1) < 1e-6
+        assert torch.equal(at_one_point, (before - middle).norm(dim=1) <= 0.3)
+        assert int(at_one_point.sum()) > 1
+
+
+@pytest.mark.parametrize("space_dim", [2, 3])
+def test_a_flake_leaves_as_it_is(space_dim):
+    x, _ = worlds(60, space_dim)
+    found = damage.tear_off(x, radius=0.3, chance=0.5, generator=torch.Generator().manual_seed(3))
+    hit = changed(x, found)
+    assert 15 <= int(hit.sum()) <= 45
+    sizes = []
+    for before, after in zip(x[hit], found[hit], strict=True):
+        torn = (before != after).any(dim=1)
+        shift = (after - before)[torn]
+        torch.testing.assert_close(shift, shift[:1].expand_as(shift), rtol=0.0, atol=1e-6)
+        distance = after[torn].norm(dim=1)
+        assert (distance > NEAREST - 0.3).all()
+        assert (distance < FARTHEST + 0.3).all()
+        sizes.append(int(torn.sum()))
+    # Some are single particles, some are not.
+    assert min(sizes) <= 3 < max(sizes)
+
+
+def test_each_world_suffers_what_it_would_suffer_alone(device):
+    every = PoolDamage(
+        damage_radius=0.1, clump_radius=0.3, cut_gap=0.2, flake_radius=0.3, escape_share=0.05
+    )
+    x, s = (tensor.to(device) for tensor in worlds(6))
+    together = damage_pool(x, s, every, generator=WorldRandom(range(6), device=device))
+    for k in range(6):
+        random = WorldRandom([k], device=device)
+        alone = damage_pool(x[k : k + 1], s[k : k + 1], every, generator=random)
+        torch.testing.assert_close(alone[0], together[0][k : k + 1], rtol=0.0, atol=2e-7)
+        assert torch.equal(alone[1], together[1][k : k + 1])
+
+
+def test_nothing_is_done_unless_asked_for():
+    x, s = worlds(3)
+    found = damage_pool(x, s, PoolDamage(), generator=torch.Generator())
+    assert found[0] is x
+    assert found[1] is s
+    assert Morphogenesis2DConfig().clump_radius == Morphogenesis2DConfig().flake_radius == 0.0
+
+
+TINY = {"state_dim": 6, "hidden_dim": 24, "eps": 0.3, "resolution": 24, "particle_count": 96}
+SMALL = Morphogenesis2DConfig(
+    target="ring", target_point_count=96, escape_share=0.1, escape_weight=1.0, **TINY
+)
+
+
+def generators(device):
+    return [torch.Generator(device).manual_seed(4), WorldRandom([4, 5], device=device)]
+
+
+@pytest.mark.parametrize("which", [0, 1])
+@pytest.mark.parametrize("space_dim", [2, 3])
+def test_as_many_are_thrown_out_as_was_said_and_on_all_sides(device, which, space_dim):
+    x = torch.zeros(2, 4000, space_dim, device=device)
+    found = damage.displace(x, share=0.25, generator=generators(device)[which])
+    distance = found.norm(dim=-1)
+    out = distance > 0.0
+    assert ((distance[out] >= NEAREST) & (distance[out] <= FARTHEST)).all()
+    # Five standard deviations of a share of 8000, and of the mean of vectors as long as 4.
+    assert float(out.float().mean()) == pytest.approx(0.25, abs=0.025)
+    assert found[out].mean(dim=0).abs().max() < 0.4
+    assert torch.equal(found[~out], x[~out])
+
+
+def test_only_the_paths_of_those_outside_count():
+    x = torch.tensor([[[0.5, 0.2], [1.5, 0.0], [0.0, -3.0]]])
+    path = torch.tensor([[7.0, 1.0, 2.0]], requires_grad=True)
+    motion = damage.escape_motion(x, path)
+    assert float(motion.detach()) == 1.5
+    motion.backward()
+    assert path.grad.tolist() == [[0.0, 0.5, 0.5]]
+    assert float(damage.escape_motion(x[:, :1], path[:, :1]).detach()) == 0.0
+
+
+def test_a_share_throws_particles_of_the_pool_out_and_a_weight_counts_their_paths():
+    task = Morphogenesis2D(SMALL)
+    generator = torch.Generator().manual_seed(1)
+    x, s, _ = task.seed(2, generator=generator)
+    hurt_x, *_ = task.damage(x, s, None, generator)
+    out = hurt_x.norm(dim=-1) > 1.0
+    assert 0 < int(out.sum()) < 60
+    path = torch.ones(2, 96)
+    total, parts = task.loss(hurt_x, s, path)
+    plain, without = Morphogenesis2D(replace(SMALL, escape_weight=0.0)).loss(hurt_x, s, path)
+    assert float(parts["stray"]) == 1.0
+    assert "stray" not in without
+    assert float(total) == pytest.approx(float(plain) + 1.0)
+
+
+def test_the_distance_of_the_centroid_from_where_worlds_begin_is_paid_for():
+    task = Morphogenesis2D(replace(SMALL, drift_weight=2.0), device="cpu")
+    x, s, _ = task.seed(1, generator=torch.Generator().manual_seed(0), device=torch.device("cpu"))
+    moved = (x + torch.tensor([0.3, -0.4])).requires_grad_()
+    still = x.new_zeros(x.shape[:2])
+    near, there = task.loss(x - x.mean(1, keepdim=True), s, still), task.loss(moved, s, still)
+    assert float(near[1]["drift"]) < 2e-6
+    assert float(there[1]["drift"].detach()) == pytest.approx(0.5, abs=0.05)
+    (pull,) = torch.autograd.grad(there[1]["drift"], moved)
+    # Every particle is pulled back along the way that the centroid has gone.
+    torch.testing.assert_close(
+        pull.sum(1), moved.mean(1) / moved.mean(1).norm(dim=-1), rtol=1e-5, atol=1e-6
+    )
+    assert "drift" not in Morphogenesis2D(SMALL, device="cpu").loss(x, s, still)[1]

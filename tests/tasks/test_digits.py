@@ -25,10 +25,13 @@ def folder(tmp_path_factory):
     return write_idx(tmp_path_factory.mktemp("idx"))
 
 
-def test_idx_files_are_read_as_they_were_written(folder):
+def test_idx_files_are_read_as_they_were_written(folder, monkeypatch):
+    # A tilde is the user's home.
+    monkeypatch.setenv("HOME", str(folder.parent))
+    monkeypatch.setenv("USERPROFILE", str(folder.parent))
     for seed, (split, part) in enumerate((("train", "train"), ("test", "t10k"))):
         images, label = pictures(COUNTS[part], seed)
-        read = load_pictures(str(folder), split)
+        read = load_pictures(f"~/{folder.name}", split)
         assert np.array_equal(np.round(read.ink * 255), images)
         assert np.array_equal(read.label, label)
         assert read.ink.dtype == np.float32
@@ -56,13 +59,9 @@ def test_a_damaged_idx_file_is_a_clear_error(tmp_path, content, message):
         read_idx(path)
 
 
-def test_data_that_are_not_there_are_clear_errors(tmp_path, folder):
-    with pytest.raises(NPAError, match="did you mean 'digits'"):
-        load_pictures("digit")
+def test_folders_without_data_are_clear_errors(tmp_path):
     with pytest.raises(NPAError, match="must hold train-images-idx3-ubyte or"):
         load_pictures(str(tmp_path))
-    with pytest.raises(NPAError, match="split must be"):
-        load_pictures(str(folder), "half")
     for name in ("train-images-idx3-ubyte", "train-labels-idx1-ubyte"):
         (tmp_path / name).write_bytes(idx(np.zeros((3, 2), np.uint8)))
     with pytest.raises(NPAError, match=r"must hold pictures \[M, H, W\].*got \[3, 2\]"):
@@ -148,14 +147,6 @@ def test_coverage_is_the_share_of_the_unit_square(tmp_path):
     images, _ = pictures(COUNTS["train"], 0)
     clouds = load_clouds(str(write_idx(tmp_path / "idx")), "train", 20, device=cpu)
     assert clouds.coverage == sample_ink((images / 255.0).astype(np.float32), 20)[1]
-
-
-def test_a_tilde_is_the_users_home(tmp_path, monkeypatch):
-    monkeypatch.setenv("HOME", str(tmp_path))
-    monkeypatch.setenv("USERPROFILE", str(tmp_path))
-    write_idx(tmp_path / "idx")
-    read = load_pictures("~/idx", "test")
-    assert np.array_equal(read.label, load_pictures(str(tmp_path / "idx"), "test").label)
 
 
 def test_points_are_spread_evenly():

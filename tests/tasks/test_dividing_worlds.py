@@ -3,8 +3,6 @@
 import pytest
 import torch
 
-import npa_envs
-from npa_envs.errors import NPAError
 from npa_envs.rule.rule import FIRST_FATES, LIFE
 from npa_envs.tasks.morphogenesis2d import Morphogenesis2D, Morphogenesis2DConfig
 from npa_envs.training import Trainer, optimiser, preset
@@ -37,9 +35,8 @@ def test_seeds_are_one_living_particle():
 
 def test_pictures_and_losses_are_those_of_the_living():
     task = make_task()
-    alone = Morphogenesis2D(
-        Morphogenesis2DConfig(**SMALL | {"particle_count": 32}), target=task.target
-    )
+    few = Morphogenesis2DConfig(**SMALL | {"particle_count": 32})
+    alone = Morphogenesis2D(few, target=task.target)
     x, s = half_alive(task)
     wanted = alone.picture(x[:, :32], s[:, :32])
     assert (task.picture(x, s) - wanted).abs().max() < 1e-5
@@ -76,38 +73,6 @@ def test_damage_takes_about_half_of_the_particles_and_never_the_last():
     assert torch.equal(task.damage(x, s, None, torch.Generator().manual_seed(0))[1], s)
 
 
-def test_division_refuses_what_it_does_not_go_with():
-    for field in ({"equivariant": True}, {"targets": ("ring", "heart")}):
-        with pytest.raises(NPAError, match="division goes neither with equivariant"):
-            make_task(**field)
-
-
-def test_a_run_trains_resumes_and_leaves_a_rule_that_divides(tmp_path):
-    fields = {
-        "division": True, "particle_count": 32, "target_point_count": 32, "iterations": 4,
-        "steps": (8, 9), "checkpoint_interval": 2, "picture_interval": 0, "tensorboard": False,
-    }  # fmt: skip
-    rules = []
-    for name, stops in (("whole", (4,)), ("resumed", (2, 4))):
-        config = preset("tiny", "morphogenesis2d", **fields, out=tmp_path / name)
-        for stop in stops:
-            trainer = Trainer(
-                Morphogenesis2D(config.task),
-                config,
-                task_name="morphogenesis2d",
-                resume=stop > stops[0],
-            )
-            while trainer.iteration < stop:
-                trainer.iterate()
-            trainer.save()
-        rules.append(npa_envs.load_rule(tmp_path / name / "rule.safetensors"))
-    first, second = rules
-    assert first.divides
-    assert first.hyper_parameters() == second.hyper_parameters()
-    assert all(map(torch.equal, first.state_dict().values(), second.state_dict().values()))
-    assert first.fate.weight.abs().max() > 0.0
-
-
 def trained(tmp_path, iterations=4, **fields):
     """The rule after a few iterations."""
     options = {
@@ -125,13 +90,10 @@ def trained(tmp_path, iterations=4, **fields):
 def test_rest_says_nothing_of_fates(tmp_path, monkeypatch):
     monkeypatch.setattr(optimiser, "FATE_RATE", 1.0)
     # Old worlds are to rest, but what is born in them is no unrest; pictures do not count.
-    rest = {
-        "stillness_weight": 1.0,
-        "max_age_range": (12, 48),
-        "stillness_min_age": 12,
-        "damage_share": 0.0,
-    }
+    rest = {"stillness_weight": 1.0, "max_age_range": (12, 48), "stillness_min_age": 12}
+    rest["damage_share"] = 0.0
     rule = trained(tmp_path, 8, splat_weight=0.0, drift_weight=0.0, **rest)
+    assert rule.divides
     assert rule.fate.bias.tolist() == list(FIRST_FATES)
     assert rule.output.weight.any()
 

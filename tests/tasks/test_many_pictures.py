@@ -16,7 +16,7 @@ from npa_envs.rule.codes import Codes
 from npa_envs.rule.files import load_rule
 from npa_envs.tasks.many_pictures import ManyPictures, named_targets
 from npa_envs.tasks.morphogenesis2d import Morphogenesis2D, Morphogenesis2DConfig
-from npa_envs.training import Trainer, preset, train
+from npa_envs.training import preset, train
 from npa_envs.training.trained_tasks import task_of_rule
 
 SMALL = {
@@ -38,16 +38,11 @@ def generator(seed=0, device="cpu"):
     return torch.Generator(device).manual_seed(seed)
 
 
-def square(path, colour):
-    Image.new("RGBA", (8, 8), colour).save(path)
-    return str(path)
-
-
 def test_a_folder_stands_for_its_pictures(tmp_path):
     folder = tmp_path / "pictures"
     folder.mkdir()
     for name in ("b.png", "a.webp"):
-        square(folder / name, "red")
+        Image.new("RGBA", (8, 8), "red").save(folder / name)
     (folder / "notes.txt").write_text("no picture", encoding="utf-8")
     named = named_targets(("heart", str(folder)))
     assert list(named) == ["heart", "a", "b"]
@@ -62,9 +57,8 @@ def test_a_folder_stands_for_its_pictures(tmp_path):
 
 def test_each_world_is_compared_with_its_own_target(device):
     task = task_of(device)
-    singles = [
-        Morphogenesis2D(config_of(target=name, targets=()), device=device) for name in TARGETS
-    ]
+    alone = [config_of(target=name, targets=()) for name in TARGETS]
+    singles = [Morphogenesis2D(config, device=device) for config in alone]
     goal = torch.tensor([2, 0, 1], device=device)
     aimed = task.toward(goal)
     worlds = [singles[k].target for k in goal.tolist()]
@@ -78,14 +72,6 @@ def test_each_world_is_compared_with_its_own_target(device):
         # The target itself has the density that it has alone, whatever its size.
         own, alone = aimed.target_picture[number], singles[int(goal[number])].target_picture
         assert float(own[..., 3].sum()) == pytest.approx(float(alone[..., 3].sum()), rel=0.1)
-
-
-@pytest.mark.parametrize("number", [-1, 3])
-def test_targets_that_do_not_exist_are_refused(number):
-    with pytest.raises(NPAError, match=f"goal must hold .* below 3, got .{number}, 0.: for"):
-        task_of("cpu").toward(torch.tensor([number, 0]))
-    with pytest.raises(NPAError, match=r"goal must be an int64 tensor of shape .*float32 \(3,\)"):
-        task_of("cpu").toward(torch.zeros(3))
 
 
 def test_gradients_of_the_loss_reach_the_worlds_codes_alone(device):
@@ -121,9 +107,8 @@ def test_switched_worlds_get_another_goal_and_its_code(device):
 @pytest.mark.parametrize("encoder", [False, True])
 def test_training_changes_codes_and_keeps_them_with_their_worlds(encoder):
     task = task_of(encoder=encoder)
-    config = preset(
-        "tiny", **SMALL, targets=TARGETS, encoder=encoder, steps=(2, 4), pool_size=6, seed=3
-    )
+    fields = {"targets": TARGETS, "encoder": encoder, "steps": (2, 4), "pool_size": 6, "seed": 3}
+    config = preset("tiny", **SMALL, **fields)
     cycle, rule = make_cycle(config, task)
     before = rule.codes.table.detach().clone()
     for iteration in range(3):
@@ -163,25 +148,6 @@ def test_an_encoder_reads_the_pictures_once_in_an_iteration(monkeypatch):
     assert len(read) == 1
 
 
-def test_a_resumed_run_is_the_same_run(tmp_path):
-    def trainer_of(name, **options):
-        config = preset("tiny", **SMALL, targets=TARGETS, iterations=6, out=tmp_path / name)
-        task = ManyPictures(config.task)
-        return Trainer(task, config, task_name="morphogenesis2d", **options)
-
-    straight = trainer_of("straight")
-    straight.run(progress=False)
-    stopped = trainer_of("stopped")
-    for _ in range(3):
-        stopped.iterate()
-    stopped.save()
-    resumed = trainer_of("stopped", resume=True)
-    resumed.run(progress=False)
-    assert torch.equal(resumed.rule.codes.table, straight.rule.codes.table)
-    assert torch.equal(resumed.rule.hidden.weight, straight.rule.hidden.weight)
-    assert torch.equal(resumed.pool.worlds.s, straight.pool.worlds.s)
-
-
 def test_the_command_trains_and_evaluates_by_name(tmp_path, capsys):
     out = str(tmp_path / "many")
     small = [f"--{name.replace('_', '-')}={value}" for name, value in SMALL.items()]
@@ -202,12 +168,8 @@ def test_the_command_trains_and_evaluates_by_name(tmp_path, capsys):
     assert first.target.name == "heart"
     options = ["--no-progress", "--seed-count=1", "--checkpoints", "4"]
     assert main(["evaluate", out, "--target=letter-a", *options, "--json", f"{out}/one.json"]) == 0
-    assert (
-        json.loads((tmp_path / "many" / "one.json").read_text(encoding="utf-8"))["growth"][0][
-            "step"
-        ]
-        == 4
-    )
+    one = json.loads((tmp_path / "many" / "one.json").read_text(encoding="utf-8"))
+    assert one["growth"][0]["step"] == 4
     assert main(["evaluate", out, *options, "--json", f"{out}/all.json"]) == 0
     rows = json.loads((tmp_path / "many" / "all.json").read_text(encoding="utf-8"))["pictures"]
     assert [row["target"] for row in rows] == [*TARGETS, "(median)"]
@@ -222,27 +184,11 @@ def test_rows_tell_the_right_code_from_another():
     rule = task_of().make_rule(generator())
     tasks = [Morphogenesis2D(config_of(target=t, targets=())).for_rule(rule) for t in TARGETS]
     rows = picture_rows(rule, tasks, checkpoints=(1, 2), seeds=(1, 2))
-    assert [(row.step, row.target) for row in rows] == [
-        (step, name) for step in (1, 2) for name in (*TARGETS, "(median)")
-    ]
+    names = [*TARGETS, "(median)"]
+    assert [(row.step, row.target) for row in rows] == [(k, name) for k in (1, 2) for name in names]
     assert rows[3].loss == sorted(row.loss for row in rows[:3])[1]
     # A rule that has learned nothing does not care: all worlds stay disks.
     x, s, _ = tasks[0].seed(2, generator=npa_envs.WorldRandom((1, 2)))
     assert rows[0].loss == pytest.approx(float(tasks[0].metric(x, s).mean()), rel=0.2)
     with pytest.raises(NPAError, match="two or more"):
         picture_rows(rule, tasks[:1], seeds=(1,))
-
-
-@pytest.mark.parametrize(
-    ("fields", "message"),
-    [
-        ({"targets": ["heart"]}, "targets must be a tuple"),
-        ({"code_dim": 0}, "code_dim must be a whole number of at least 1"),
-        ({"switch_share": 1.5}, "switch_share must be at most 1"),
-        ({"equivariant": True}, "targets need a rule that knows directions"),
-        ({"targets": ("heart", "hart")}, "unknown|emoji"),
-    ],
-)
-def test_what_cannot_be_is_refused(fields, message):
-    with pytest.raises(NPAError, match=message):
-        task_of(**fields)

@@ -46,8 +46,6 @@ def test_a_task_says_what_it_has_besides(task):
     assert 0.99 < float(distance.max()) <= 1.0
     rule = task.make_rule(torch.Generator().manual_seed(0))
     assert (rule.space_dim, rule.readout_dim, rule.alpha) == (3, OUTPUTS, 1.0)
-    with pytest.raises(NPAError, match="must read out 20 numbers of a state, or none"):
-        task.for_rule(NPARule(3, 16, 8, readout_dim=10, readout_hidden_dim=4))
 
 
 def test_outputs_of_zero_are_round_grey_particles():
@@ -104,10 +102,8 @@ def under_the_surface(count, depth):
 
 def test_particles_under_the_target_s_surface_look_like_it():
     """A world made by hand: held-out views by our Gaussians against those of the mesh."""
-    config = dataclasses.replace(
-        SMALL, particle_count=6000, resolution=48, sigma=0.02, opacity=0.7, training_views=1
-    )
-    task = Morphogenesis3D(config)
+    fields = {"particle_count": 6000, "resolution": 48, "sigma": 0.02, "opacity": 0.7}
+    task = Morphogenesis3D(dataclasses.replace(SMALL, training_views=1, **fields))
     # A pixel is 0.05 wide, and Gaussians reach beyond their middle.
     x, colours = under_the_surface(6000, depth=0.07)
     s = torch.zeros(1, 6000, 16)
@@ -195,13 +191,6 @@ def test_shares_average_to_the_loss_and_tell_what_opacity_changes(task):
     assert float(found[2] - found[1]) == pytest.approx(150 * (slopes[2] - slopes[1]), rel=1e-4)
 
 
-def test_what_does_not_fit_is_refused(target):
-    with pytest.raises(NPAError, match="views must have 32 x 32 pixels"):
-        Morphogenesis3D(dataclasses.replace(SMALL, resolution=32), target=target)
-    with pytest.raises(NPAError, match="at least 16 pixels for MS-SSIM"):
-        Morphogenesis3D(dataclasses.replace(SMALL, resolution=12, ssim_weight=0.2))
-
-
 def read_ply(path):
     """Return the columns of a binary PLY file, read by its own header."""
     header, _, body = path.read_bytes().partition(b"end_header\n")
@@ -234,9 +223,8 @@ def test_gaussians_are_written_as_others_read_them(cloud, tmp_path):
     x, look, colours = cloud
     write_gaussians(tmp_path / "a.ply", x, look)
     rows = read_ply(tmp_path / "a.ply")
-    assert np.allclose(
-        np.exp([rows[f"scale_{k}"] for k in range(3)]).T, look.scales[0].detach(), rtol=1e-5
-    )
+    scales = np.exp([rows[f"scale_{k}"] for k in range(3)]).T
+    assert np.allclose(scales, look.scales[0].detach(), rtol=1e-5)
     assert np.allclose(1 / (1 + np.exp(-rows["opacity"])), look.opacities[0].detach(), atol=1e-6)
     flat = np.stack([rows[f"f_dc_{k}"] for k in range(3)], axis=1)
     assert np.allclose((0.28209479 * flat + 0.5).clip(0, 1), colours, atol=1e-5)
@@ -244,10 +232,8 @@ def test_gaussians_are_written_as_others_read_them(cloud, tmp_path):
     first = np.stack([rows[f"f_rest_{k}"] for k in range(3)], axis=1)
     assert np.allclose(first, look.colours[0, :, 1:, 0].detach())
     turns = np.stack([rows[f"rot_{k}"] for k in range(4)], axis=1)
-    assert np.allclose(np.linalg.norm(turns, axis=1), 1.0, atol=1e-6)
-    assert np.allclose(
-        turns, torch.nn.functional.normalize(look.quaternions[0], dim=-1).detach(), atol=1e-6
-    )
+    expected = torch.nn.functional.normalize(look.quaternions[0], dim=-1).detach()
+    assert np.allclose(turns, expected, atol=1e-6)
     assert (rows["nx"] == 0.0).all()
 
 
@@ -284,8 +270,7 @@ def test_turntables_go_once_around(task):
     )
     pixel = DISTANCE * math.tan(math.radians(0.5 * ANGLE)) / 16.0
     columns = [float((np.nonzero(255 - f[..., 0])[1]).mean()) for f in frames]
-    assert columns[0] == pytest.approx(15.5 + 0.6 / pixel, abs=0.5)
-    assert columns[1] == pytest.approx(15.5, abs=0.5)
-    assert columns[2] == pytest.approx(15.5 - 0.6 / pixel, abs=0.5)
+    expected = [15.5 + 0.6 / pixel, 15.5, 15.5 - 0.6 / pixel]
+    assert columns[:3] == pytest.approx(expected, abs=0.5)
     assert frames[0].shape == (32, 32, 3)
     assert tuple(frames[0][0, 0]) == (255, 255, 255)

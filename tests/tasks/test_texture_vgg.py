@@ -48,16 +48,14 @@ def colours(name, resolution=32):
 
 def plain_vgg16(weights):
     """The network as torchvision builds it, with average pooling."""
-    layers, index, channels = [], 0, 3
+    layers = []
     for group in VGG_WIDTHS:
         for width in group:
-            layer = torch.nn.Conv2d(channels, width, 3, padding=1, padding_mode="circular")
-            layer.weight.data = weights[f"features.{index}.weight"]
-            layer.bias.data = weights[f"features.{index}.bias"]
+            weight = weights[f"features.{len(layers)}.weight"]
+            layer = torch.nn.Conv2d(weight.shape[1], width, 3, padding=1, padding_mode="circular")
+            layer.weight.data, layer.bias.data = weight, weights[f"features.{len(layers)}.bias"]
             layers += [layer, torch.nn.ReLU()]
-            index, channels = index + 2, width
         layers.append(torch.nn.AvgPool2d(2))
-        index += 1
     return layers
 
 
@@ -143,9 +141,8 @@ def test_densities_and_targets_that_do_not_tile_are_compared_too(options):
     density = load_texture("dots", resolution=32).picture.movedim(-1, 0)[3:]
     loss = make_texture_loss("vgg_ot", density, options)
     assert float(loss(density[None])) < 1e-4 < float(loss(torch.ones(1, 1, 32, 32)))
-    edged = make_texture_loss(
-        "vgg_ot", density, LossOptions(tiles=False, vgg_weights=options.vgg_weights)
-    )
+    edges = LossOptions(tiles=False, vgg_weights=options.vgg_weights)
+    edged = make_texture_loss("vgg_ot", density, edges)
     assert float(edged(density[None])) > 1e-3
 
 
@@ -167,11 +164,7 @@ def test_weights_are_looked_for_in_the_folder_of_downloads(tmp_path, monkeypatch
     assert torch.equal(load_vgg_weights()["features.0.bias"], torch.ones(64))
 
 
-def test_damaged_and_foreign_weights_and_wrong_targets_are_refused(tmp_path, weights, options):
-    with pytest.raises(NPAError, match="1 or 3 channels, got 2"):
-        make_texture_loss("vgg_ot", torch.rand(2, 32, 32), options)
-    with pytest.raises(NPAError, match="at least 32 pixels for vgg_ot, got 24"):
-        make_texture_loss("vgg_ot", torch.rand(3, 24, 24), options)
+def test_damaged_and_foreign_weights_are_refused(tmp_path, weights):
     path = tmp_path / "bad.pth"
     short = {name: weight for name, weight in weights.items() if name != "features.7.weight"}
     for content, message in (

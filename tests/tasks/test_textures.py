@@ -86,26 +86,6 @@ def test_transparency_is_the_density_and_colours_do_not_leak(tmp_path):
     assert float(target.picture[..., 1].max()) == 0.0
 
 
-@pytest.mark.parametrize(
-    ("source", "options", "message"),
-    [
-        ("cels", {}, "did you mean 'cells'.*known: bubbles, cells, dots, droplets, grid"),
-        ("", {}, "for example 'cells'"),
-        (3, {}, "must be a built-in texture"),
-        ("missing.png", {}, "does not exist"),
-        ("cells", {"resolution": 0}, "resolution must be an integer of at least 1"),
-        ("cells", {"resolution": 8.0}, "resolution must be an integer of at least 1"),
-    ],
-)
-def test_bad_sources_are_refused(source, options, message):
-    with pytest.raises(NPAError, match=message):
-        load_texture(source, **options)
-    with pytest.raises(NPAError, match="did you mean 'dots'"):
-        draw_pattern("dot", 8)
-    with pytest.raises(NPAError, match="at least 1 pixel"):
-        draw_pattern("dots", 0)
-
-
 def test_bad_pictures_are_refused(tmp_path):
     Image.new("RGBA", (8, 8), (0, 0, 0, 0)).save(tmp_path / "empty.png")
     Image.new("RGB", (1, 9)).save(tmp_path / "thin.png")

@@ -73,6 +73,24 @@ def is_recorded():
     return recorded.recorded_memory(DEVICE) > 0
 
 
+@pytest.mark.parametrize("gradients", [False, True])
+@pytest.mark.parametrize(
+    "options",
+    [
+        {},
+        {"update_prob": 1.0, "box": (1.4, 1.8)},
+        {"position_noise": 0.01, "dt": 0.5},
+        {"detach_positions": False},
+        {"memory": "recompute"},
+        {"memory": "minimal"},
+        {"keep_every": 7},
+        {"keep_every": 1},
+        {"by_world": True, "position_noise": 0.01},
+        {"steps": 1},
+        {"steps": 150},
+    ],
+    ids=str,
+)
 def test_a_recorded_rollout_is_the_launched_one(options, gradients):
     rule = make_rule()
     as_launched(rule, 2, gradients=gradients, **options)

@@ -74,12 +74,9 @@ def test_a_rule_of_the_authors_grows_its_picture(device, aubergine, reference):
         s = x.new_zeros(1, x.shape[1], 16)
         with torch.no_grad():
             x, s = npa_envs.rollout(rule, x, s, int(data["steps"]), generator=generator)
-            picture = splat(
-                x - x.mean(dim=1, keepdim=True),
-                rule.colour(s),
-                resolution=int(data["resolution"]),
-                pixel_size=float(data["pixel_size"]),
-            )[0].cpu()
+            size = {"resolution": int(data["resolution"]), "pixel_size": float(data["pixel_size"])}
+            centred = x - x.mean(dim=1, keepdim=True)
+            picture = splat(centred, rule.colour(s), **size)[0].cpu()
         psnr = -10.0 * torch.log10((picture - expected).square().mean())
         assert psnr >= 24.0, f"seed {seed}: {psnr:.1f} dB"
 
