@@ -107,7 +107,7 @@ def resolved_sections(env_class: type) -> dict[str, str]:
     for heading in order:
         said = own.get(heading) or first.get(heading)
         if heading == "Observation space" and first and said and "| Columns |" not in said:
-            # What a row begins with is said on the first page; here is what follows it.
+            # The first page says what a row begins with.
             said = f"{first[heading]}\n\n{said}"
         parts = said, shared.get(heading)
         found[heading] = "\n\n".join(part for part in parts if part)

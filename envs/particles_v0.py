@@ -6,7 +6,7 @@ newer).
 
 from __future__ import annotations
 
-from typing import Any, ClassVar
+from typing import Any
 
 from npa_envs.envs.core.config import plain
 from npa_envs.envs.multi.parallel import CrowdEnv, in_turns, register
@@ -102,7 +102,7 @@ class ParticlesEnv(CrowdEnv):
         NPAError: A name is unknown, a value wrong, or there are more than 512 particles.
     """
 
-    metadata: ClassVar[dict[str, Any]] = CrowdEnv.metadata | {"name": "npa_particles_v0"}
+    metadata: Any = CrowdEnv.metadata | {"name": "npa_particles_v0"}
 
     def __init__(self, task: str = "mixing", **config: Any) -> None:
         count = sum(task_type(task).config_type.from_keywords(config).counts)

@@ -104,7 +104,10 @@ class PointClassificationTask(TargetEnvTask[PointClassificationEnvConfig]):
         super().__init__(config, device)
         self.goal = PointClassification(config.goal, device=device, split=config.split)
         if config.rule:
-            self.goal = self.goal.for_rule(_read_out_rule(config, device))
+            given = load_read_out("rule", config.rule, config.state_dim, device)
+            rule = _WorldByWorld(**given.hyper_parameters()).to(device)
+            rule.load_state_dict(given.state_dict())
+            self.goal = self.goal.for_rule(rule.requires_grad_(False))
         self._coverage = self.goal.clouds.coverage
 
     def fresh(self, random: WorldRandom) -> Start:
@@ -157,13 +160,6 @@ class PointClassificationTask(TargetEnvTask[PointClassificationEnvConfig]):
 
 MAGNIFICATION = 2.0 / (1.0 + 2.0 * PICTURE_MARGIN)
 """Of pictures, which span two length units."""
-
-
-def _read_out_rule(config: PointClassificationEnvConfig, device: torch.device) -> NPARule:
-    given = load_read_out("rule", config.rule, config.state_dim, device)
-    rule = _WorldByWorld(**given.hyper_parameters()).to(device)
-    rule.load_state_dict(given.state_dict())
-    return rule.requires_grad_(False)
 
 
 class PointClassificationEnv(NPAEnv):

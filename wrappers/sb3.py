@@ -228,13 +228,15 @@ class _EpisodeRows(RowVecEnv):
         """Return the infos of all rows, after a step in which the episodes of some worlds ended."""
         if not len(worlds):
             return [self.nothing] * self.num_envs
-        count, final, last, cut_off = self.row_count, infos["final_info"], None, None
+        count, final = self.row_count, infos["final_info"]
+        last: Any = None
+        cut_off: Any = None
         success = final.get("is_success", final.get("success"))
         if success is not None:
             success = on_host(success)[0][worlds].repeat(count).tolist()
         if self.bootstrap:
-            last, cut_off = self._last(infos["final_obs"], worlds), cut[worlds].repeat(count)
-            cut_off = cut_off.tolist()
+            last = self._last(infos["final_obs"], worlds)
+            cut_off = cut[worlds].repeat(count).tolist()
         rows = (worlds[:, None] * count + np.arange(count)).reshape(-1)
         names = ("is_success", "TimeLimit.truncated", "terminal_observation")
         return self.infos(rows, dict(zip(names, (success, cut_off, last), strict=True)))

@@ -179,7 +179,7 @@ class WorldsEnv(ShownEnv):
         """Start episodes in some worlds, int64, [M]; return what is observed in all, [B, ...]."""
         with self.worlds.device_context():
             self.worlds.start(worlds, keys)
-            observation = self.worlds.perceive(out)
+            observation: Tensor = self.worlds.perceive(out)
         self._started = True
         self._show()
         return observation
@@ -190,7 +190,7 @@ class WorldsEnv(ShownEnv):
         start = self.worlds.checked_particles(x, s, len(worlds), count)
         with self.worlds.device_context():
             self.worlds.place(worlds, start)
-            observation = self.worlds.perceive(out)
+            observation: Tensor = self.worlds.perceive(out)
         self._show()
         return observation
 

@@ -178,7 +178,8 @@ class NPAVectorEnv(WorldsEnv, VectorEnv[Any, Any, Any]):
         numbers, flags, infos = self._report(stepped, copy=self.copies or final)
         if final:
             which = self._mask(ended)
-            final_infos = self._ending_infos(infos, endings, which)
+            final_infos = {n: which if n.startswith("_") else v for n, v in infos.items()}
+            final_infos |= {"reason": REASONS[endings], "_reason": which}
             final_observation = observation
             if self.copies and ended.all():
                 observation = torch.empty_like(observation)
@@ -255,13 +256,6 @@ class NPAVectorEnv(WorldsEnv, VectorEnv[Any, Any, Any]):
     def _extras(self, when: str, which: Any, *, copy: bool = True) -> dict[str, Any]:
         extras = self.worlds.extras(when).items()
         return masked({n: self._out(v.clone() if copy else v) for n, v in extras}, which)
-
-    def _ending_infos(
-        self, infos: dict[str, Any], endings: NDArray[np.uint8], which: Any
-    ) -> dict[str, Any]:
-        """Return the last infos of the worlds whose episodes are over, with the reasons."""
-        final = {name: which if name.startswith("_") else value for name, value in infos.items()}
-        return final | {"reason": REASONS[endings], "_reason": which}
 
     def _numbers(self, report: StepReport) -> list[Any]:
         """Return a report's numbers as handed out: arrays are float64, as Gymnasium's own are."""

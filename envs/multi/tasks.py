@@ -17,8 +17,7 @@ from torch import Tensor
 from npa_envs import perceive, world_mean
 from npa_envs.envs.multi.task import Population, SpeciesConfig, SpeciesTask
 from npa_envs.errors import NPAError, shown, suggest
-from npa_envs.registration import SPECIES as ENVIRONMENTS
-from npa_envs.registration import SPECIES_SIZES
+from npa_envs.registration import SPECIES, SPECIES_SIZES
 from npa_envs.tasks.morphogenesis2d import Morphogenesis2D, Morphogenesis2DConfig
 from npa_envs.world.randomness import StreamId, WorldRandom
 
@@ -337,6 +336,10 @@ TASKS: dict[str, type[SpeciesTask]] = {
     "symbiosis": SymbiosisTask,
 }
 """Tasks by the names that environments take."""
+
+
+ENVIRONMENTS = SPECIES
+"""Tasks by the ids that `pettingzoo.make` takes."""
 
 
 def task_settings(name: str) -> tuple[str, dict[str, Any]]:

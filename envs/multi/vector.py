@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from functools import cached_property
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 import torch
@@ -39,7 +39,7 @@ BatchOutcome = tuple[ByAgent, ByAgent, ByAgent, ByAgent, Infos]
 class AgentsEnv(ShownEnv):
     """What environments of agents are made of, be it one world or many."""
 
-    metadata: ClassVar[dict[str, Any]] = {
+    metadata: Any = {  # noqa: RUF012 (nobody writes to it)
         "name": "npa_multispecies_v0",
         "render_modes": ["rgb_array", "human"],
         "render_fps": 25,
@@ -71,8 +71,8 @@ class AgentsEnv(ShownEnv):
         # Position, state, present.
         limits, physics = worlds.physics.limits, worlds.physics
         high = [limits.position] * physics.space_dim + [limits.state] * physics.state_dim
-        rows = np.tile(np.float32([*high, 1.0]), (worlds.particle_count, 1))
-        self._state_space = Box(rows * np.float32([-1.0] * len(high) + [0.0]), rows)
+        rows = np.tile(np.array([*high, 1.0], np.float32), (worlds.particle_count, 1))
+        self._state_space = Box(rows * np.array([-1.0] * len(high) + [0.0], np.float32), rows)
         self.np_random: np.random.Generator | None = None
 
     def close(self) -> None:

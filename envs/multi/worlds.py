@@ -315,8 +315,8 @@ class SpeciesWorlds(WorldState):
         """
         (cohort,) = self.cohorts
         there = cohort.population
-        one = (number_tensor(name, value)[None] for name, value in (("x", x), ("s", s)))
-        placed = self.checked_particles(*one, 1, there.x.shape[1])
+        x, s = number_tensor("x", x)[None], number_tensor("s", s)[None]
+        placed = self.checked_particles(x, s, 1, there.x.shape[1])
         there.x.copy_(placed.x)
         there.s.copy_(placed.s)
         return self._carry_over()
