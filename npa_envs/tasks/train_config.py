@@ -246,8 +246,9 @@ class TrainConfig(Generic[TaskConfigT]):
             (
                 "pool_size",
                 not are_ages or not self.ages or self.pool_size % self.world_count == 0,
-                f"be a multiple of world_count={self.world_count} where max_age_range is set",
-                f"set pool_size={self.pool_size // self.world_count * self.world_count}",
+                "be a multiple of world_count where max_age_range is set",
+                f"with world_count={self.world_count} set "
+                f"pool_size={self.pool_size // self.world_count * self.world_count}",
             ),
             (
                 "vary_eps",
