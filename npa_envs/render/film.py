@@ -237,16 +237,17 @@ def checked_frames(frames: Iterable[Frame]) -> list[Frame]:
         )
     first = pictures[0].shape
     for k, picture in enumerate(pictures):
-        if picture.dtype != np.uint8 or picture.ndim != 3 or picture.shape[-1] != 3:
+        is_picture = picture.ndim == 3 and picture.shape[-1] == 3 and picture.size > 0
+        if picture.dtype != np.uint8 or not is_picture:
             name = "frame" if len(pictures) == 1 else f"frame {k}"
             raise NPAError(
-                f"{name} must be uint8 of shape [H, W, 3], got {picture.dtype} {picture.shape}: "
-                "make frames with npa_envs.render.to_uint8"
+                f"{name} must be uint8 of shape [H, W, 3] and a size that is not zero, got "
+                f"{picture.dtype} {picture.shape}: make frames with npa_envs.render.to_uint8"
             )
-        if picture.shape != first or 0 in first:
+        if picture.shape != first:
             raise NPAError(
-                f"frames must all have one size that is not zero, got {first} and frame {k} of "
-                f"{picture.shape}: render them at one resolution"
+                f"frames must all have one size, got {first} and frame {k} of {picture.shape}: "
+                "render them at one resolution"
             )
     return pictures
 

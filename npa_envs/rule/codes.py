@@ -99,8 +99,8 @@ def carrying(states: Tensor, code: Tensor) -> Tensor:
 
 def check_names(names: object) -> None:
     """Check that what codes are to be called is several texts."""
-    several = isinstance(names, Collection) and not isinstance(names, str)
-    if not several or not all(isinstance(name, str) for name in names):
+    given = names if isinstance(names, Collection) and not isinstance(names, str) else None
+    if given is None or not all(isinstance(name, str) for name in given):
         raise NPAError(
             f"code_names must be a list of names, got {shown(names)}: for example ['gecko', "
             "'heart'], or () for a rule without codes"

@@ -168,13 +168,13 @@ def save_rule(
             "metadata={'trained by': 'me'}"
         )
     for name, text in (metadata or {}).items():
-        fault, cure = "", ""
+        came = f"got {shown(name)}: {shown(text)}"
         if not isinstance(name, str) or not isinstance(text, str):
-            fault, cure = "map text to text", "use str()"
-        elif any("\ud800" <= letter <= "\udfff" for letter in name + text):
-            fault, cure = "be text that UTF-8 can write", "leave single surrogates out"
-        if fault:
-            raise NPAError(f"metadata must {fault}, got {shown(name)}: {shown(text)}: {cure}")
+            raise NPAError(f"metadata must map text to text, {came}: use str()")
+        if any("\ud800" <= letter <= "\udfff" for letter in name + text):
+            raise NPAError(
+                f"metadata must be text that UTF-8 can write, {came}: leave single surrogates out"
+            )
         if name in _RESERVED:
             raise NPAError(
                 f"metadata must not use the name {shown(name)}: the format holds it itself"

@@ -294,9 +294,10 @@ class ViewSchedule:
         backgrounds = random.random(self.backgrounds.shape, dtype=np.float32)
         left = max(0.0, 1.0 - iteration / config.blur_iterations)
         sigma = np.array(config.blur_sigma * left, dtype=np.float32)
-        written = (self.index, index.astype(np.int64)), (self.backgrounds, backgrounds)
-        for tensor, values in (*written, (self.sigma, sigma)):
-            tensor.copy_(to_device_async(values, tensor.device))
+        device = self.sigma.device
+        self.index.copy_(to_device_async(index.astype(np.int64), device))
+        self.backgrounds.copy_(to_device_async(backgrounds, device))
+        self.sigma.copy_(to_device_async(sigma, device))
 
 
 def blurred(pictures: Tensor, sigma: Tensor) -> Tensor:

@@ -185,9 +185,8 @@ class TrainConfig(Generic[TaskConfigT]):
         check_positive(self, int, "picture_interval", at_least=0)
         check_positive(self, float, "learning_rate", "stillness_power")
         check_non_negative(self, "weight_decay", "stillness_weight", "dead_zone")
-        check_non_negative(
-            self, "fresh_share", "damage_share", "damage_and_keep_share", at_most=1.0
-        )
+        check_non_negative(self, "damage_and_keep_share")
+        check_non_negative(self, "fresh_share", "damage_share", at_most=1.0)
         check_seed(self, "seed")
         check_flag(self, "cuda_graph", "tensorboard")
         choices = {"optimiser": OptimiserName, "schedule": Schedule, "memory": Memory}
@@ -247,8 +246,9 @@ class TrainConfig(Generic[TaskConfigT]):
             (
                 "pool_size",
                 not are_ages or not self.ages or self.pool_size % self.world_count == 0,
-                f"be a multiple of world_count={self.world_count} where max_age_range is set",
-                f"set pool_size={self.pool_size // self.world_count * self.world_count}",
+                "be a multiple of world_count where max_age_range is set",
+                f"with world_count={self.world_count} set "
+                f"pool_size={self.pool_size // self.world_count * self.world_count}",
             ),
             (
                 "vary_eps",

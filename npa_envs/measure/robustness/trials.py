@@ -179,18 +179,18 @@ class PicturesInTurn(ParticleTask[Morphogenesis2DConfig]):
 
     def resized(self, particle_count: int) -> Self:
         """Return the same pictures for another number of particles."""
-        return type(self)([task.resized(particle_count) for task in self._tasks], self._goal)
+        return type(self)([task.resized(particle_count) for task in self._tasks], self.goal)
 
     def for_rule(self, rule: NPARule) -> Self:
         """Return the task for the worlds of a rule."""
-        return type(self)([task.for_rule(rule) for task in self._tasks], self._goal)
+        return type(self)([task.for_rule(rule) for task in self._tasks], self.goal)
 
     def seed(
         self, world_count: int, *, generator: Randomness, device: str | torch.device = "cpu"
     ) -> Worlds:
         """Return fresh worlds with the codes of their pictures, and which ones these are."""
         x, s, _ = self._tasks[0].seed(world_count, generator=generator, device=device)
-        return x, self.coded(s), self._goal
+        return x, self.coded(s), self.goal
 
     def toward(self, goal: Tensor | None) -> Self:
         """Return the task for worlds of other pictures, int64, shape [B]."""
@@ -211,8 +211,8 @@ class PicturesInTurn(ParticleTask[Morphogenesis2DConfig]):
         return losses
 
     def _worlds(self) -> Iterator[tuple[Morphogenesis2D, Tensor]]:
-        for number in sorted(set(self._goal.tolist())):
-            yield self._tasks[number], (self._goal == number).nonzero()[:, 0]
+        for number in sorted(set(self.goal.tolist())):
+            yield self._tasks[number], (self.goal == number).nonzero()[:, 0]
 
 
 class RuleTrial:
