@@ -344,10 +344,10 @@ class InteractionRecord(Record[InteractionRow]):
 
     def parse(self, held: dict[str, Any]) -> list[InteractionRow]:
         """Return the rows; JSON has no infinite numbers."""
-        return [
-            InteractionRow(**{k: math.inf if v is None else v for k, v in row.items()})
-            for row in held["rows"]
+        rows: list[dict[str, Any]] = [
+            {k: math.inf if v is None else v for k, v in row.items()} for row in held["rows"]
         ]
+        return [InteractionRow(**row) for row in rows]
 
 
 def _by_setting(

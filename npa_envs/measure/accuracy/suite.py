@@ -76,13 +76,17 @@ class CheckSession:
         return torch.Generator(self.device).manual_seed(1000 * self.seed + number)
 
 
+Run = Callable[..., CheckResult]
+"""Measures something in a session; a rule or a space dimension may come before that."""
+
+
 @dataclass(frozen=True)
 class Check:
     """A hard case GROUP/CASE, its expectation in a sentence, and the function that measures it."""
 
     name: str
     expected: str
-    run: Callable[[CheckSession], CheckResult]
+    run: Run
     rule: str = ""
     """What `load_rule` takes, of a check of a rule."""
 
@@ -90,9 +94,6 @@ class Check:
 def group_of(name: str) -> str:
     """Return the group of a check's name."""
     return name.partition("/")[0]
-
-
-Run = Callable[..., CheckResult]
 
 
 def check(checks: list[Check], name: str, *space_dims: int) -> Callable[[Run], Run]:
