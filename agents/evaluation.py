@@ -167,7 +167,6 @@ def _ending(info: Mapping[str, Any]) -> str:
 
 
 def _step_limit(env: Any) -> int | None:
-    """Return Gymnasium's limit on episodes of single environments, or None."""
     inner, spec = env.unwrapped, None
     if isinstance(inner, SyncVectorEnv | AsyncVectorEnv):
         spec = inner.get_attr("spec")[0]

@@ -350,7 +350,6 @@ def _result(record: RunRecord | None) -> str:
 
 
 def _frame(record: RunRecord | None, folder: Path) -> NDArray[np.uint8]:
-    """Return a run's picture, or an empty one where it has none."""
     path = None if record is None else folder / record.job.folder / PICTURE
     if path is None or not path.exists():
         return np.full((SIZE, SIZE, 3), 255, np.uint8)

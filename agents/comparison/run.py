@@ -285,7 +285,6 @@ class _Process(Child):
 
 
 def _tell(process: subprocess.Popen[bytes], line: str) -> None:
-    """Write a line to the input of a process."""
     assert process.stdin is not None, "opened at its start"
     # The next look finds that a process has died, and records it.
     with contextlib.suppress(BrokenPipeError):

@@ -59,7 +59,6 @@ def _of_one(
 
 
 def _evaluated(progress: Progress, policy: PolicyT) -> PolicyT:
-    """Return a policy after its only evaluation."""
     check_no_start(progress)
     progress.start(policy)
     return policy

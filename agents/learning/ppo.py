@@ -252,7 +252,6 @@ class PPOLearner:
 
     @torch.no_grad()
     def _draw_actions(self) -> None:
-        """Draw actions for the present observations."""
         restart(self.random)
         action, log_prob = self.actor.sample(self._now, self.random)
         self._action.copy_(action)
@@ -269,7 +268,6 @@ class PPOLearner:
 
     @torch.no_grad()
     def _find_advantages(self) -> None:
-        """Find advantages and targets from rewards and values."""
         memory, values = self.memory, self.memory.values[:-1]
         advantages = generalised_advantages(
             memory.rewards,
@@ -395,7 +393,6 @@ class PPOLearner:
         return rows
 
     def _gain_weights(self, acted: Tensor) -> Tensor:
-        """Return the weights of the ratios of rows."""
         return acted.amax(dim=1, keepdim=True) if self.options.ratio == "world" else acted
 
     def _gain(self, part: list[Round]) -> Tensor:

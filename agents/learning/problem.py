@@ -441,7 +441,6 @@ class ConcatenatedSpeciesEnv:
         return torch.cat([rows[agent] for agent in self.spans], dim=1)
 
     def _stacked(self, infos: Mapping[str, Mapping[str, Any]], name: str) -> Tensor:
-        """Return an info of each species, shape [B, K]."""
         return torch.stack([infos[agent][name] for agent in self.spans], dim=1)
 
     def _by_particle(self, values: Tensor) -> Tensor:
@@ -451,7 +450,6 @@ class ConcatenatedSpeciesEnv:
 
 
 def _concatenated_space(spaces: Mapping[str, Any]) -> Box:
-    """Return the space of all species' particles, one after the other."""
     low, high = (
         np.concatenate([getattr(space, bound) for space in spaces.values()])
         for bound in ("low", "high")

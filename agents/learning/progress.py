@@ -311,7 +311,6 @@ class Progress:
         self._since = time.perf_counter()
 
     def _agree_on_time(self) -> None:
-        """Take the time of the first process."""
         self._elapsed = self.ranks.broadcast(self.seconds)
 
     def _check_started(self, caller: str) -> None:
@@ -375,7 +374,6 @@ class Progress:
             )
 
     def _go_on(self, learner: Learner, content: dict[str, Any]) -> None:
-        """Go on from what a checkpoint holds."""
         assert self._kept.folder is not None, "it holds the checkpoint"
         path, like = self._kept.folder.checkpoint, learner_state(learner)
         like |= {"iteration": 0, "part": 0, "particle_steps": 0, "seconds": 0.0}

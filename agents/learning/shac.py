@@ -32,6 +32,7 @@ from npa_envs.agents.learning.rules import RuleSet
 from npa_envs.checks import check_fraction, check_non_negative, check_positive
 from npa_envs.training.optimiser import normalise_gradients
 from npa_envs.training.ranks import ALONE, Ranks, restart
+from npa_envs.world.particles import Particles
 from npa_envs.world.randomness import WorldRandom
 from npa_envs.world.rollout import Memory
 
@@ -160,9 +161,8 @@ class SHACLearner:
         self._begin()
 
     def _begin(self) -> None:
-        """Begin the episodes of all worlds."""
         restart(self.random)
-        self.x, self.s, self.goal = self._fresh(list(range(len(self._places))))
+        self.worlds = self._fresh(list(range(len(self._places))))
         self.windows_left = [1 + place % self.window_count for place in self._places]
         """Windows left of each world's episode: at first all numbers, so that every part of an
         episode is in a batch."""
@@ -185,7 +185,7 @@ class SHACLearner:
     def play(self) -> StepWindow:
         """Run the rules for a window, differentiably, and begin episodes anew where one is over."""
         task, steps = self.task, self.window
-        x0, s0 = self.x, self.s
+        x0, s0, _, goal = self.worlds
         restart(self.random)
         x, s, _ = task.rollout(
             self.rules,
@@ -198,16 +198,17 @@ class SHACLearner:
             cuda_graph=True,
         )
         x, s = torch.cat((x0[None], x)), torch.cat((s0[None], s))
-        goals = None if self.goal is None else self.goal.repeat(steps + 1)
+        goals = None if goal is None else goal.repeat(steps + 1)
         losses = task.toward(goals).world_losses(x.flatten(0, 1), s.flatten(0, 1))
         losses = losses.view(steps + 1, -1)
         level = losses[..., None, None].expand(*s.shape[:-1], 1)
         features = torch.cat((x - x.mean(dim=-2, keepdim=True), s, level), dim=-1)
         # Worlds that run away are held at the limits of the environment until they begin anew.
-        self.x, self.s = (
-            torch.nan_to_num(last.detach()).clamp(-limit, limit)
-            for last, limit in ((x[-1], self._limits[0]), (s[-1], self._limits[1]))
+        x, s = (
+            torch.nan_to_num(each[-1].detach()).clamp(-limit, limit)
+            for each, limit in zip((x, s), self._limits, strict=True)
         )
+        self.worlds = Particles(x, s, goal=goal)
         self._restart()
         return StepWindow(features, losses)
 
@@ -218,20 +219,16 @@ class SHACLearner:
         over = [k for k, left in enumerate(self.windows_left) if left == 0]
         if not over:
             return
-        x, s, goal = self._fresh(over)
-        index = torch.tensor(over, device=self.device)
-        self.x, self.s = self.x.index_copy(0, index, x), self.s.index_copy(0, index, s)
-        if self.goal is not None and goal is not None:
-            self.goal = self.goal.index_copy(0, index, goal)
+        self.worlds.put_(torch.tensor(over, device=self.device), self._fresh(over))
         for world in over:
             self.windows_left[world] = self.window_count
 
-    def _fresh(self, worlds: list[int]) -> tuple[Tensor, Tensor, Tensor | None]:
-        """Return worlds as their episodes begin."""
+    def _fresh(self, worlds: list[int]) -> Particles:
         random = self.random
         if isinstance(random, WorldRandom):
             random = random.take(torch.tensor(worlds, device=self.device))
-        return self.task.seed(len(worlds), generator=random, device=self.device)
+        x, s, goal = self.task.seed(len(worlds), generator=random, device=self.device)
+        return Particles(x, s, goal=goal)
 
     def gain(self, window: StepWindow) -> Tensor:
         """Return the mean discounted reward of a window and value after it."""

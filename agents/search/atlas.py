@@ -113,7 +113,6 @@ def _cell(search: Search, elite: Elite | None, pictures: Pictures) -> str:
 
 
 def _span(axis: Axis, cell: int) -> str:
-    """Return the beginning and the end of a cell of an axis."""
     width = (axis.highest - axis.lowest) / axis.cells
     begin = axis.lowest + cell * width
     return f"{begin:.3g} to {begin + width:.3g}"

@@ -269,7 +269,6 @@ class TrainingCycle:
 
     @torch.no_grad()
     def _keep_worlds(self) -> None:
-        """Put the batch back into the pool."""
         age = self._age + self._steps if self._config.ages else None
         lost = self.pool.write(self._index, self.batch.end, self._fresh_worlds, age)
         self._lost += lost.sum()

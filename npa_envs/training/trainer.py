@@ -302,7 +302,6 @@ class Trainer:
             self._finish_record()
 
     def _finish_record(self) -> None:
-        """Write the record that was begun, if there is one."""
         begun, self._record_begun = self._record_begun, None
         if begun is None:
             return

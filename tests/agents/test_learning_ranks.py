@@ -46,9 +46,8 @@ def learner_of(form):
         made.critic.observe(made.memory.seen[-1], made.ranks)
         return made
     fresh = made._fresh
-    made._fresh = lambda worlds: tuple(
-        part.double() if part is not None and part.is_floating_point() else part
-        for part in fresh(worlds)
+    made._fresh = lambda worlds: fresh(worlds).map(
+        lambda part: part.double() if part.is_floating_point() else part
     )
     made._begin()
     return made

@@ -11,6 +11,7 @@ from npa_envs.tasks import damage
 from npa_envs.tasks.damage import FARTHEST, NEAREST, SHARE, PoolDamage, damage_pool
 from npa_envs.tasks.morphogenesis2d import Morphogenesis2D, Morphogenesis2DConfig
 from npa_envs.tasks.seeds import uniform_ball
+from npa_envs.world import brushes
 from npa_envs.world.randomness import WorldRandom
 
 B, N, C = 3, 257, 5

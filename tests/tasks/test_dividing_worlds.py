@@ -3,6 +3,7 @@
 import pytest
 import torch
 
+import npa_envs
 from npa_envs.rule.rule import FIRST_FATES, LIFE
 from npa_envs.tasks.morphogenesis2d import Morphogenesis2D, Morphogenesis2DConfig
 from npa_envs.training import Trainer, optimiser, preset
