@@ -11,19 +11,7 @@ from PIL import Image, ImageDraw
 
 from npa_envs.cli import main
 from npa_envs.errors import NPAError
-from npa_envs.measure.interaction import (
-    FRAME_SHARES,
-    MIXED,
-    Encounters,
-    InteractionRow,
-    InteractionSettings,
-    RuleUnderTest,
-    heat_map,
-    mixing_index,
-    phase_diagram,
-    ratio_interval,
-    verdict,
-)
+from npa_envs.measure import interaction
 from npa_envs.rule.files import save_rule
 from npa_envs.rule.rule import NPARule
 from npa_envs.tasks.morphogenesis2d import Morphogenesis2D, Morphogenesis2DConfig
@@ -55,12 +43,12 @@ def make_rule(seed=0, scale=0.3, eps0=0.15):
 
 
 def organism(name="a", update_prob=0.5, **options):
-    return RuleUnderTest(name, make_rule(**options), task_of, update_prob)
+    return interaction.RuleUnderTest(name, make_rule(**options), task_of, update_prob)
 
 
 def settings(**options):
     usual = {"particle_count": COUNT, "distances": (0.0,), "steps": 12, "seeds": (1, 2, 3)}
-    return InteractionSettings(**usual | options)
+    return interaction.InteractionSettings(**usual | options)
 
 
 @pytest.mark.parametrize(
@@ -69,37 +57,41 @@ def settings(**options):
         (0.79, 0.0, 0.2, "cooperates"),
         (0.81, 0.0, 0.2, "undisturbed"),
         (0.81, 0.0, 0.1, "cooperates"),
-        (1.19, MIXED - 1e-9, 0.2, "undisturbed"),
+        (1.19, interaction.MIXED - 1e-9, 0.2, "undisturbed"),
         (1.19, 0.0, 0.1, "disrupted"),
-        (1.21, MIXED, 0.2, "disrupted, mixes"),
+        (1.21, interaction.MIXED, 0.2, "disrupted, mixes"),
         (0.5, 1.0, 0.2, "cooperates, mixes"),
         (math.inf, 0.0, 0.2, "disrupted"),
         (math.nan, 0.0, 0.2, "disrupted"),
     ],
 )
 def test_a_verdict_follows_from_the_change_and_the_mixing(change, mixing, margin, expected):
-    assert verdict(change, mixing, margin) == expected
+    assert interaction.verdict(change, mixing, margin) == expected
 
 
 def test_the_mixing_index_of_known_worlds():
     pair = torch.zeros(1, 2, 2)
-    assert mixing_index(pair, [1, 1], eps=0.1).item() == pytest.approx(1.0)
+    assert interaction.mixing_index(pair, [1, 1], eps=0.1).item() == pytest.approx(1.0)
     apart = torch.tensor([[[0.0, 0.0], [5.0, 0.0]]])
-    assert mixing_index(apart, [1, 1], eps=0.1).item() == 0.0
+    assert interaction.mixing_index(apart, [1, 1], eps=0.1).item() == 0.0
     # Three of one species and one of another at one place: the entropy of 3/4 and 1/4.
     heap = torch.zeros(1, 4, 2)
     entropy = -(0.75 * math.log(0.75) + 0.25 * math.log(0.25)) / math.log(2.0)
-    assert mixing_index(heap, [3, 1], eps=0.1).item() == pytest.approx(entropy, rel=1e-6)
+    assert interaction.mixing_index(heap, [3, 1], eps=0.1).item() == pytest.approx(
+        entropy, rel=1e-6
+    )
     # Of three species one is far away: two mix, the third does not.
     three = torch.tensor([[[0.0, 0.0], [0.0, 0.0], [5.0, 0.0]]])
     expected = 2.0 / 3.0 * math.log(2.0) / math.log(3.0)
-    assert mixing_index(three, [1, 1, 1], eps=0.1).item() == pytest.approx(expected, rel=1e-6)
+    assert interaction.mixing_index(three, [1, 1, 1], eps=0.1).item() == pytest.approx(
+        expected, rel=1e-6
+    )
     with pytest.raises(NPAError, match="at least two species"):
-        mixing_index(pair, [2], eps=0.1)
+        interaction.mixing_index(pair, [2], eps=0.1)
 
 
 def test_a_rule_within_reach_is_measured_by_its_own_particles():
-    encounters = Encounters(settings(distances=(0.0, 0.3)), device=CPU)
+    encounters = interaction.Encounters(settings(distances=(0.0, 0.3)), device=CPU)
     rows, _ = encounters.meet(organism(), organism("b", seed=1))
     alone = {found.alone for found in rows}
     assert len(alone) == 1
@@ -108,12 +100,12 @@ def test_a_rule_within_reach_is_measured_by_its_own_particles():
         assert found.together != found.alone
         assert found.change == pytest.approx(found.together / found.alone, rel=1e-12)
         assert found.displacement > 1e-3
-        assert found.verdict == verdict(found.change, found.mixing)
+        assert found.verdict == interaction.verdict(found.change, found.mixing)
 
 
 def test_still_rules_leave_their_seeds_and_the_metric_is_the_tasks():
     still = [organism(name, scale=0.0) for name in "ab"]
-    rows, _ = Encounters(settings(distances=(0.2,)), device=CPU).meet(*still)
+    rows, _ = interaction.Encounters(settings(distances=(0.2,)), device=CPU).meet(*still)
     (found,) = rows
     assert found.change == 1.0
     assert found.displacement == 0.0
@@ -121,18 +113,18 @@ def test_still_rules_leave_their_seeds_and_the_metric_is_the_tasks():
     x, s, _ = task.seed(3, generator=WorldRandom([1, 2, 3]))
     assert found.alone == pytest.approx(task.metric(x, s).mean().item(), rel=1e-6)
     # A rule beside itself has seeds of its own: else every particle would see both alike.
-    rows, _ = Encounters(settings(), device=CPU).meet(still[0], still[0])
+    rows, _ = interaction.Encounters(settings(), device=CPU).meet(still[0], still[0])
     assert 0.5 < rows[0].mixing < 0.99
 
 
 def test_pictures_are_taken_along_the_way_and_steps_are_counted():
     done = []
     given = settings(steps=40, distances=(0.0, 1.0))
-    encounters = Encounters(given, device=CPU, progress=done.append)
+    encounters = interaction.Encounters(given, device=CPU, progress=done.append)
     _, scenes = encounters.meet(organism(), organism("b", seed=1))
     # What is grown alone is grown once.
     assert sum(done) == 40 + 2 * 40
-    steps = [round(40 * share) for share in FRAME_SHARES]
+    steps = [round(40 * share) for share in interaction.FRAME_SHARES]
     expected = [f"d {d}, r 0.5, step {step}" for d in (0, 1) for step in steps]
     assert scenes.captions == expected
     assert len(scenes.frames) == len(expected)
@@ -144,7 +136,7 @@ def test_pictures_are_taken_along_the_way_and_steps_are_counted():
 def test_a_world_that_blows_up_is_disrupted_and_the_study_goes_on():
     bomb = organism("b", seed=1)
     bomb.rule.output.weight.mul_(1e38)
-    rows, _ = Encounters(settings(), device=CPU).meet(organism(), bomb)
+    rows, _ = interaction.Encounters(settings(), device=CPU).meet(organism(), bomb)
     assert rows[0].together == math.inf
     assert rows[0].verdict.startswith("disrupted")
     assert math.isfinite(rows[0].alone)
@@ -152,22 +144,22 @@ def test_a_world_that_blows_up_is_disrupted_and_the_study_goes_on():
 
 def test_the_interval_of_a_ratio_is_that_of_its_worlds():
     ones = torch.ones(4)
-    assert ratio_interval(2.0 * ones, ones) == (2.0, 2.0)
+    assert interaction.ratio_interval(2.0 * ones, ones) == (2.0, 2.0)
     # Both numbers of a world are drawn together.
-    assert ratio_interval(torch.arange(1.0, 5.0), torch.arange(1.0, 5.0)) == (1.0, 1.0)
+    assert interaction.ratio_interval(torch.arange(1.0, 5.0), torch.arange(1.0, 5.0)) == (1.0, 1.0)
     above = torch.randn(200, generator=torch.Generator().manual_seed(0)) + 3.0
-    low, high = ratio_interval(above, torch.ones(200))
+    low, high = interaction.ratio_interval(above, torch.ones(200))
     half = 1.96 * above.std().item() / math.sqrt(200)
     assert low == pytest.approx(above.mean().item() - half, abs=0.2 * half)
     assert high == pytest.approx(above.mean().item() + half, abs=0.2 * half)
-    low, high = ratio_interval(torch.tensor([1.0, 1.0, 1.0, math.inf]), ones)
+    low, high = interaction.ratio_interval(torch.tensor([1.0, 1.0, 1.0, math.inf]), ones)
     assert (low, high) == (1.0, math.inf)
-    assert ratio_interval(ones, torch.zeros(4)) == (math.inf, math.inf)
+    assert interaction.ratio_interval(ones, torch.zeros(4)) == (math.inf, math.inf)
 
 
 def test_a_larger_radius_mixes_more_and_figures_lie_in_their_intervals():
     one, twice = (
-        Encounters(settings(eps_factors=(factor,), distances=(0.2,)), device=CPU)
+        interaction.Encounters(settings(eps_factors=(factor,), distances=(0.2,)), device=CPU)
         for factor in (1.0, 2.0)
     )
     pair = organism(), organism("b", seed=1)
@@ -182,18 +174,18 @@ def test_a_larger_radius_mixes_more_and_figures_lie_in_their_intervals():
 
 def test_pictures_are_drawn_of_rows_with_gaps_and_infinities():
     pytest.importorskip("matplotlib")
-    row = InteractionRow("a", "b", 0.0, 0.5, 0.1, 0.2, 2.0, 0.1, 0.0, "disrupted")
+    row = interaction.InteractionRow("a", "b", 0.0, 0.5, 0.1, 0.2, 2.0, 0.1, 0.0, "disrupted")
     infinite = {"ratio": 0.25, "change": math.inf, "change_high": math.inf}
     for draw, *others in (
-        (phase_diagram, infinite, {"eps_factor": 2.0}),
-        (heat_map, {"rule": "b", "beside": "a", "change": math.inf}, {"distance": 1.0}),
+        (interaction.phase_diagram, infinite, {"eps_factor": 2.0}),
+        (interaction.heat_map, {"rule": "b", "beside": "a", "change": math.inf}, {"distance": 1.0}),
     ):
         rows = [row, *(dataclasses.replace(row, **changed) for changed in others)]
         assert draw(rows).startswith(b"\x89PNG")
 
 
 def test_rules_that_cannot_share_a_world_are_named():
-    encounters = Encounters(settings(), device=CPU)
+    encounters = interaction.Encounters(settings(), device=CPU)
     with pytest.raises(NPAError, match=r"a and b cannot share a world: .*eps0, got 0\.15 .* 0\.2"):
         encounters.check([organism(), organism("b", eps0=0.2)])
 
@@ -291,7 +283,7 @@ class TestCommand:
     ):
         whole, parts = tmp_path / "whole", tmp_path / "parts"
         assert main(self.words(rules, whole)) == 0
-        meet, met = Encounters.meet, []
+        meet, met = interaction.Encounters.meet, []
 
         def stopped(self, first, second):
             met.append((first.name, second.name))
@@ -299,7 +291,7 @@ class TestCommand:
                 raise KeyboardInterrupt
             return meet(self, first, second)
 
-        monkeypatch.setattr(Encounters, "meet", stopped)
+        monkeypatch.setattr(interaction.Encounters, "meet", stopped)
         assert main(self.words(rules, parts)) == 130
         assert (
             len(json.loads((parts / "interactions.json").read_text(encoding="utf-8"))["rows"]) == 4
