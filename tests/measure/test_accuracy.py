@@ -355,9 +355,8 @@ def test_checks_of_a_rule_that_was_trained_anew_are_run_again(tmp_path, capsys):
 
     def verdict():
         main(words)
-        (entry,) = json.loads((tmp_path / "stress_cpu_quick.json").read_text(encoding="utf-8"))[
-            "checks"
-        ]
+        held = json.loads((tmp_path / "stress_cpu_quick.json").read_text(encoding="utf-8"))
+        (entry,) = held["checks"]
         return entry["weights"], entry["verdict"]
 
     assert verdict() == (rule_digest(rule), "pass")

@@ -32,12 +32,8 @@ from npa_envs.world.randomness import WorldRandom
 
 SIDE = 2.0
 COUNT = 501
-TINY = TrialPlan(
-    grow_steps=8,
-    heal_steps=(0, 4, 8),
-    chunk=4,
-    values={"eps": (1.0, 2.0), "particles": (1.0, 2.0), "update_prob": (0.25, 0.5)},
-)
+VALUES = {"eps": (1.0, 2.0), "particles": (1.0, 2.0), "update_prob": (0.25, 0.5)}
+TINY = TrialPlan(grow_steps=8, heal_steps=(0, 4, 8), chunk=4, values=VALUES)
 
 
 def ground(

@@ -3,8 +3,10 @@
 import contextlib
 import importlib
 import importlib.util
+import math
 import re
 import sys
+import time
 from pathlib import Path
 from types import ModuleType
 from typing import NamedTuple
@@ -16,7 +18,8 @@ import torch
 from crowds import TASKS, still
 from crowds import small as small_crowd
 from gymnasium.utils.env_checker import check_env
-from small_envs import assert_batch_of_singles, make
+from PIL import Image
+from small_envs import make
 
 import npa_envs
 from npa_envs.agents.learning import Budget, train
@@ -84,20 +87,6 @@ def anchors(path: Path) -> set[str]:
 # Pages that scripts make.
 
 
-@pytest.fixture(scope="module")
-def bench():
-    """The script that makes the tables of NPA-Bench."""
-    pytest.importorskip("jsonschema")
-    pytest.importorskip("scipy")
-    return script("build_npa_bench_page")
-
-
-@pytest.mark.parametrize("name", ["environment_pages", "gallery_page"])
-def test_made_pages_are_current(name, capsys):
-    status = script(f"build_{name}").main(["--check"])
-    assert status == 0, capsys.readouterr().err
-
-
 def test_check_finds_pages_that_are_changed_missing_or_nobodys(tmp_path, capsys):
     builder = script("build_environment_pages")
     for name, text in builder.pages().items():
@@ -113,31 +102,13 @@ def test_check_finds_pages_that_are_changed_missing_or_nobodys(tmp_path, capsys)
     assert "not current: Forgotten.md, Morphogenesis2D.md, README.md: run python docs/" in printed
 
 
-def test_tables_and_curves_of_the_benchmark_show_all_rows(bench):
-    from npa_envs.agents.comparison.npa_bench import SUITES, BenchRow, BenchRun
-
-    assert bench.main(["--check"]) == 0
-    suite = SUITES["npa-bench-v0"]
-    first, second = list(suite.groups["gardens"])[:2]
-
-    def row(method, *means):
-        curve = ((0.0, 0.0), (9.0, means[-1])) if method == "other" else ((0.0, means[-1]),)
-        runs = [BenchRun(first, seed, 9.0, mean, curve) for seed, mean in enumerate(means)]
-        return BenchRow(suite, method, tuple(runs), f"it is {method}")
-
-    rows = {name: row(name, *means) for name, means in {
-        "other": (1.0, 2.0), "zero": (0.0, 0.0), "gradient": (4.0, 4.0), "sac": (3.0, 3.0),
-    }.items()}  # fmt: skip
-    text = bench.results(suite, rows)
-    assert "| `other` | 0.38 [0.25, 0.50] | 0.38 [0.25, 0.50] |" in text
-    assert text.index("| `sac` | it is sac | 2 |") < text.index("| `other` | it is other | 2 |")
-    assert second not in text
-    assert "](images/npa_bench_v0.png)" in text
-    assert text in bench.page(text_of("npa_bench"), dict.fromkeys(SUITES, rows))
-    assert bench.curves(suite, rows).startswith(b"\x89PNG")
-    del rows["gradient"]
-    assert "Scores need the rows" in bench.results(suite, rows)
-    assert bench.results(suite, {}) == bench.NO_ROWS
+@pytest.mark.parametrize("name", ["environment_pages", "gallery_page", "npa_bench_page"])
+def test_made_pages_are_current(name, capsys):
+    if name == "npa_bench_page":
+        pytest.importorskip("jsonschema")
+        pytest.importorskip("scipy")
+    status = script(f"build_{name}").main(["--check"])
+    assert status == 0, capsys.readouterr().err
 
 
 def test_the_gallery_shows_every_rule_by_a_small_film():
@@ -346,15 +317,6 @@ def test_the_own_environment_passes_the_check_of_gymnasium(ring, monkeypatch, re
     assert [str(warning.message) for warning in recwarn] == []
 
 
-def test_a_batch_of_the_own_environment_equals_single_ones(ring):
-    keywords = {"particle_count": 61, "position_noise": 0.01}
-    envs = gym.make_vec("my/Ring-v0", num_envs=3, max_episode_steps=5, **keywords)
-    singles = [gym.make("my/Ring-v0", max_episode_steps=5, **keywords) for _ in range(3)]
-    actions = np.random.default_rng(0).uniform(-1, 1, (8, *envs.action_space.shape))
-    reasons, _ = assert_batch_of_singles(envs, singles, actions.astype(np.float32))
-    assert reasons == {None, "time limit"}
-
-
 def test_the_own_environment_measures_the_distance_from_the_ring(ring):
     env = gym.make("my/Ring-v0", particle_count=60, ring_radius=0.25).unwrapped
     env.reset(seed=0)
@@ -452,6 +414,64 @@ def test_the_code_of_a_page_runs(page, tmp_path, monkeypatch, capsys):
     names = run_code(page, *changes, blocks=blocks)
     names |= {"printed": capsys.readouterr().out, "folder": tmp_path, "text_of": text_of}
     assert [check for check in checks if not eval(check, names)] == []
+
+
+# The tutorials.
+
+
+ROUNDS = r"model\.learn\(100 \* 16"
+
+
+def printed_returns(text: str) -> dict[str, tuple[float, float]]:
+    """Return mean returns and their standard errors, by policy, of what a program prints."""
+    rows = re.findall(r"^(\w+): (-?[\d.]+) ± ([\d.]+)$", text, re.MULTILINE)
+    return {name: (float(mean), float(error)) for name, mean, error in rows}
+
+
+def test_the_tutorial_runs_and_gives_the_returns_that_need_no_training(
+    tmp_path, monkeypatch, capsys
+):
+    pytest.importorskip("stable_baselines3")
+    monkeypatch.chdir(tmp_path)
+    run_code("tutorial", (ROUNDS, "model.learn(16"), blocks=slice(-1, None))
+    returns, on_page = (
+        printed_returns(capsys.readouterr().out),
+        printed_returns(text_of("tutorial")),
+    )
+    assert returns.keys() == on_page.keys()
+    for name in ("RandomPolicy", "ZeroPolicy", "RulePolicy"):
+        assert returns[name][0] == pytest.approx(on_page[name][0], abs=0.02)
+    with Image.open(tmp_path / "ppo.png") as picture:
+        assert picture.width >= 5 * 256
+
+
+@pytest.mark.slow
+def test_ppo_beats_random_actions_by_three_standard_errors_in_five_minutes(
+    tmp_path, monkeypatch, capsys
+):
+    pytest.importorskip("stable_baselines3")
+    monkeypatch.chdir(tmp_path)
+    start = time.process_time()
+    run_code("tutorial", blocks=slice(-1, None))
+    assert time.process_time() - start < 300.0
+    returns = printed_returns(capsys.readouterr().out)
+    (mean, error), (random_mean, random_error) = returns["RowPolicy"], returns["RandomPolicy"]
+    assert mean - random_mean > 3.0 * math.hypot(error, random_error)
+    # Not by doing nothing, either.
+    assert mean > 3.0 * error
+    assert mean == pytest.approx(printed_returns(text_of("tutorial"))["RowPolicy"][0], abs=0.2)
+
+
+def test_the_program_for_a_graphics_card_runs_on_any_device(tmp_path, monkeypatch, capsys):
+    pytest.importorskip("stable_baselines3")
+    monkeypatch.chdir(tmp_path)
+    smaller = ("[13]0_000_000", "500"), ("episode_steps=48", "episode_steps=2")
+    fewer = ("particle_count=512", "particle_count=16"), ("num_envs=32", "num_envs=2")
+    run_code("gpu", *smaller, *fewer, blocks=slice(-1, None))
+    told = re.findall(r"^([\w, ']+): -?[\d.]+", capsys.readouterr().out, re.MULTILINE)
+    assert told == ["zero", "ppo", "gradient", "ppo, begun with the gradient's rule"]
+    for method in ("ppo", "gradient"):
+        assert (tmp_path / "runs" / method / "rule-0.safetensors").is_file()
 
 
 @pytest.mark.slow

@@ -88,9 +88,7 @@ def assert_same_curve(folder, other):
 
 
 @pytest.mark.parametrize(
-    "fields",
-    [{}, LIVELY, SEEDED, STRAYING],
-    ids=["plain", "lively", "seeded", "straying"],
+    "fields", [{}, LIVELY, SEEDED, STRAYING], ids=["plain", "lively", "seeded", "straying"]
 )
 def test_two_processes_have_the_curve_of_one(tmp_path, fields):
     for count in (1, 2):

@@ -216,25 +216,6 @@ def test_a_configuration_survives_being_written_as_json(name, task, fields):
     assert override(preset("paper", task), **plain) == config
 
 
-@pytest.mark.parametrize("name", TASKS["co_morphogenesis2d"].presets)
-def test_presets_of_two_species_have_the_schedule_of_one_but_what_came_with_muon(name):
-    came = {"optimiser", "learning_rate", "seed_interval", "max_age_range", "damage_and_keep_share"}
-    came |= {"damage_share", "stillness_weight", "stillness_min_age", "stillness_power"}
-    came |= {"weight_decay", "dead_zone"}
-    alone, together = preset(name), preset(name, "co_morphogenesis2d")
-    assert together.task.counts == (alone.task.particle_count,) * 2
-    own = together.task.species[0]
-    # Several species were measured with as wide rules, and as many cuts, as one had before Muon.
-    then = {"best": {"cut_share": 0.25}, "fast": {"hidden_dim": 64}}.get(name, {})
-    assert own == dataclasses.replace(alone.task, **then)
-    assert together.task.distance == 0.8
-    for field in dataclasses.fields(TrainConfig):
-        known = alone.optimiser == "adamw" or field.name not in came
-        if known and field.name not in ("task", "out", "initial_rule"):
-            assert getattr(together, field.name) == getattr(alone, field.name)
-    assert (together.optimiser, together.weight_decay) == ("adamw", 0.0)
-
-
 @pytest.mark.parametrize("task", TASKS)
 def test_what_presets_begin_with_is_there_and_fits(task):
     for config in TASKS[task].presets.values():

@@ -15,12 +15,7 @@ from npa_envs.rule.rule import NPARule, fate_parameters
 from npa_envs.training.checkpoint import load_checkpoint, save_checkpoint
 from npa_envs.training.iteration import EagerIteration, power_mean
 from npa_envs.training.meter import Interval, LossMeter
-from npa_envs.training.optimiser import (
-    FATE_RATE,
-    RuleOptimiser,
-    layer_weights,
-    normalise_gradients,
-)
+from npa_envs.training.optimiser import FATE_RATE, RuleOptimiser, layer_weights, normalise_gradients
 from npa_envs.training.pool import WorldPool
 from npa_envs.training.randomness import RunRandomness
 from npa_envs.training.run_folder import JsonlLog
@@ -176,7 +171,7 @@ def test_iteration_leaves_the_worlds_the_terms_and_the_gradients(tmp_path):
     generator = torch.Generator().manual_seed(3)
     x, s, path_length = plain_rollout(
         rule, iteration.x0, iteration.s0, 5, eps=task.eps, box=None, update_prob=0.5,
-        memory="store", generator=generator, return_path_length=True,
+        memory="store", generator=generator, return_path_length=True
     )  # fmt: skip
     total, parts = task.loss(x, s, path_length)
     rule.zero_grad()
@@ -243,7 +238,7 @@ def test_a_parameter_outside_the_loss_gets_a_zero_gradient(tmp_path):
     rule.unused = nn.Parameter(torch.ones(2))
     iteration = EagerIteration(
         task, rule, circle_config(tmp_path), iteration.x, iteration.s, torch.Generator(),
-        plain_rollout,
+        plain_rollout
     )  # fmt: skip
     rule.unused.grad.fill_(5.0)
     iteration.run(2)

@@ -282,20 +282,22 @@ def test_worlds_whose_time_is_over_are_damaged_then_and_live_again(tmp_path, sha
 def test_an_iteration_follows_a_share_of_the_schedule(tmp_path):
     config = circle_config(tmp_path, schedule="cosine", log_interval=1)
     trainer = trainer_of(config)
-    first = next(trainer.rule.parameters()).detach().clone()
+    parameter = next(trainer.rule.parameters())
+    first = parameter.detach().clone()
     trainer.iterate(share=1.0)
     # AdamW's first step is as long as the rate.
-    change = next(trainer.rule.parameters()).detach() - first
     rate = 0.01 * config.learning_rate
-    assert change.abs().max().item() == pytest.approx(rate, rel=1e-3)
+    assert (parameter.detach() - first).abs().max().item() == pytest.approx(rate, rel=1e-3)
     trainer._begin_record()
     assert log_of(tmp_path)[-1]["learning_rate"] == pytest.approx(rate)
     with pytest.raises(NPAError, match=r"share must lie in \[0, 1\], got 1.5"):
         trainer.iterate(share=1.5)
 
 
-def test_run_leaves_rule_configuration_and_pictures(tmp_path):
-    config = circle_config(tmp_path, picture_interval=3)
+def test_run_leaves_rule_configuration_pictures_and_a_board_with_the_logs_numbers(tmp_path):
+    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+    config = circle_config(tmp_path, picture_interval=3, tensorboard=True)
     result = train(config)
     rule = load_rule(tmp_path / "rule.safetensors")
     assert_same(list(rule.parameters()), list(result.rule.parameters()))
@@ -309,23 +311,16 @@ def test_run_leaves_rule_configuration_and_pictures(tmp_path):
     assert (pixels[:, :256] == 255).all()
     assert (worlds[::32] == worlds[31::32]).all()
     assert worlds.min() < worlds.max()
-
-
-def test_tensorboard_gets_the_same_numbers_as_the_log(tmp_path):
-    train(circle_config(tmp_path, tensorboard=True, picture_interval=6))
-    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
-
     events = EventAccumulator(str(tmp_path / "tensorboard"))
     events.Reload()
     losses = [(event.step, event.value) for event in events.Scalars("loss")]
     expected = [(record["iteration"], record["loss"]) for record in log_of(tmp_path)]
     assert losses == [(k, pytest.approx(loss, rel=1e-6)) for k, loss in expected]
-    (picture,) = events.Images("batch")
-    assert (picture.step, picture.width, picture.height) == (6, 4 * 256 + 3 * 8, 256)
-    written = np.asarray(Image.open(tmp_path / "pictures" / "000006.png")).astype(float)
-    shown = np.asarray(Image.open(io.BytesIO(picture.encoded_image_string)))
+    first, last = events.Images("batch")
+    assert (first.step, last.step, last.width, last.height) == (3, 6, 4 * 256 + 3 * 8, 256)
+    shown = np.asarray(Image.open(io.BytesIO(last.encoded_image_string)))
     # A JPEG of few pixels: seen 5.6 of 255.
-    assert np.abs(shown - written).mean() < 12
+    assert np.abs(shown - pixels.astype(float)).mean() < 12
 
 
 class BrokenTask(CircleTask):
@@ -468,24 +463,21 @@ def test_checkpoint_of_another_task_or_configuration_is_refused(tmp_path):
 
 
 def test_folders_that_do_not_do_are_named_before_training(tmp_path, monkeypatch):
-    with pytest.raises(NPAError, match="there is no checkpoint to resume from"):
-        trainer_of(circle_config(tmp_path / "none"), resume=True)
+    def refuse(folder, message, **options):
+        with pytest.raises(NPAError, match=message):
+            trainer_of(circle_config(tmp_path / folder), **options)
+
+    refuse("none", "there is no checkpoint to resume from", resume=True)
     assert not (tmp_path / "none").exists()
     (tmp_path / "file").write_text("", encoding="utf-8")
-    with pytest.raises(NPAError, match=r"out must be a folder that can be created .*file/run"):
-        trainer_of(circle_config(tmp_path / "file" / "run"))
+    refuse("file/run", r"out must be a folder that can be created .*file/run")
     usage = type("Usage", (), {"free": 100})
     monkeypatch.setattr("npa_envs.training.run_folder.shutil.disk_usage", lambda path: usage)
-    with pytest.raises(NPAError, match="must have room for two checkpoints"):
-        trainer_of(circle_config(tmp_path / "full"))
+    refuse("full", "must have room for two checkpoints")
     assert not (tmp_path / "full" / "checkpoint.pt").exists()
-
-
-@pytest.mark.skipif(os.geteuid() == 0, reason="root may write everywhere")
-def test_folder_without_write_permission_is_named_before_training(tmp_path):
-    tmp_path.chmod(0o555)
-    with pytest.raises(NPAError, match="permission"):
-        trainer_of(circle_config(tmp_path))
+    if os.geteuid() != 0:  # Root may write everywhere.
+        tmp_path.chmod(0o555)
+        refuse("new", "permission")
 
 
 def test_disk_that_fills_up_leaves_the_last_checkpoint(tmp_path):
