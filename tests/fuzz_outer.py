@@ -143,15 +143,7 @@ def read_damaged(kind: str, content: Any) -> None:
 
 
 def config_files(draw: random.Random) -> dict[str, Any]:
-    texts = (
-        "iterations: 5",
-        "{}",
-        "[1]",
-        "iterations = nan",
-        '{"steps": [1, "a"]}',
-        "\x00",
-        "a: [",
-    )
+    texts = ("iterations: 5", "{}", "[1]", "iterations = nan", '{"steps": [1, "a"]}', "\0", "a: [")
     return {"text": draw.choice(texts), "suffix": draw.choice((".yaml", ".toml", ".json", ".txt"))}
 
 
@@ -220,17 +212,13 @@ def acted(draw: random.Random) -> dict[str, Any]:
 
 
 def crowd_fields(draw: random.Random) -> dict[str, Any]:
-    task = draw.choice(small_species_tasks())
+    task = draw.choice(tuple(multispecies_v0.ENVIRONMENTS.values()))
     known = sorted(species_config(task).__dataclass_fields__)
     fields = draw.sample([*known, "seed"], draw.choice((1, 1, 2)))
     made = {f: getattr(species_config(task), f, None) for f in fields if f != "species_count"}
     fixed = {"particle_count": 12, "eps": 0.3, "max_cycles": 3, "render_size": 24}
     maker = draw.choice(("parallel_env", "particles", "batched", "env"))
     return {"maker": maker, "task": task, "species_count": 2, **(made | fixed)}
-
-
-def small_species_tasks() -> tuple[str, ...]:
-    return tuple(multispecies_v0.ENVIRONMENTS.values())
 
 
 @functools.cache
@@ -240,13 +228,9 @@ def species_config(task: str) -> type:
 
 def run_species(maker: str, **keywords: Any) -> None:
     """Make an environment of several species and act in it once."""
-    makers = {
-        "parallel_env": multispecies_v0.parallel_env,
-        "particles": particles_v0.parallel_env,
-        "batched": multispecies_v0.batched,
-        "env": multispecies_v0.env,
-    }
-    env = makers[maker](**keywords)
+    particles = maker == "particles"
+    make = particles_v0.parallel_env if particles else getattr(multispecies_v0, maker)
+    env = make(**keywords)
     env.reset(seed=0)
     if maker in ("parallel_env", "particles"):
         env.step({agent: env.action_space(agent).sample() for agent in env.agents})

@@ -21,10 +21,7 @@ def heart(episode_steps=8, num_envs=3, **keywords):
 def digits(episode_steps=8, **keywords):
     given = WORLD | {"state_dim": 12, "eps": 0.15, "eps0": 0.15, **keywords}
     return Problem(
-        env_id="npa/PointClassification-v0",
-        keywords=given,
-        episode_steps=episode_steps,
-        num_envs=3,
+        env_id="npa/PointClassification-v0", keywords=given, episode_steps=episode_steps, num_envs=3
     )
 
 

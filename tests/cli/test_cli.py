@@ -35,13 +35,19 @@ def trained(tmp_path_factory):
     return folder
 
 
-def error_of(capsys, words):
-    """Run a command that must be refused, and return its message."""
-    assert main(words) == 2
-    captured = capsys.readouterr()
-    assert captured.err.count("\n") == 1
-    assert captured.err.startswith("npa-envs: error: ")
-    return captured.err
+def error_of(capsys, words, lines=1):
+    """Run a command that must be refused, and return its message of so many lines."""
+    try:
+        code = main(words)
+    except SystemExit as end:
+        assert lines is None, "the parser has refused it"
+        code = end.code
+    error = capsys.readouterr().err
+    assert code == 2
+    if lines:
+        assert error.count("\n") == lines
+        assert error.startswith("npa-envs: error: ")
+    return error
 
 
 def raising(error):
@@ -56,44 +62,28 @@ def rule(trained):
     return str(trained / "rule.safetensors")
 
 
-def test_help_names_every_command(capsys):
-    assert main(["--help"]) == 0
-    text = capsys.readouterr().out
-    assert [name for name in COMMANDS if f"\n  {name} " not in text] == []
-
-
-@pytest.mark.parametrize("name", COMMANDS)
-def test_every_command_explains_itself(name, capsys):
+def help_of(capsys, *words):
+    """Ask for help, and return it without colours."""
     try:
-        code: object = main([name, "--help"])
+        code: object = main([*words])
     except SystemExit as end:
         code = end.code
     assert code == 0
-    assert f"usage: npa-envs {name}" in capsys.readouterr().out
+    return re.sub(r"\x1b\[[0-9;]*m", "", capsys.readouterr().out)
 
 
-@pytest.mark.parametrize("name", EXAMPLES)
-def test_the_help_of_a_command_shows_examples_of_options_that_it_has(name, capsys):
-    with pytest.raises(SystemExit):
-        main([*name.split(), "--help"])
-    text = capsys.readouterr().out
+@pytest.mark.parametrize("name", [*COMMANDS, *(name for name in EXAMPLES if " " in name)])
+def test_every_command_explains_itself_and_shows_examples_of_its_options(name, capsys):
+    assert f"\n  {name.split()[0]} " in help_of(capsys, "--help")
+    text = help_of(capsys, *name.split(), "--help")
+    assert f"usage: npa-envs {name}" in text
     assert "{None}" not in text
-    for example in EXAMPLES[name]:
+    for example in EXAMPLES.get(name, ()):
         assert f"  npa-envs {example}\n" in text
         assert example.startswith(name)
         for option in re.findall("--[a-z-]+", example):
             # Once more, among the options.
             assert len(re.findall(rf"{option}[ ,\n]", text.split(EXAMPLES[name][-1])[1])) > 0
-
-
-def test_the_help_of_train_begins_with_the_most_common_options(capsys):
-    with pytest.raises(SystemExit):
-        main(["train", "texture", "--help"])
-    common, _, others = capsys.readouterr().out.partition("training options")
-    for option in ("preset", "target", "iterations", "device", "out", "config", "resume"):
-        assert f"--{option}" in common
-        assert f" --{option} " not in others
-    assert "default: dots" in common
 
 
 def test_the_help_of_train_shows_the_most_used_options_and_help_all_all_of_them(
@@ -102,14 +92,17 @@ def test_the_help_of_train_shows_the_most_used_options_and_help_all_all_of_them(
     monkeypatch.setenv("COLUMNS", "80")
     counts = []
     for word in ("--help", "--help-all"):
-        with pytest.raises(SystemExit):
-            main(["train", "morphogenesis2d", word])
-        text = re.sub(r"\x1b\[[0-9;]*m", "", capsys.readouterr().out)
+        text = help_of(capsys, "train", "morphogenesis2d", word)
         # Their explanations stand further to the right.
         counts.append(len(set(re.findall(r"^[ │|]{1,3}(--[a-z][a-z-]+)", text, re.MULTILINE))))
         assert ("--splat-weight" in text) == (word == "--help-all")
     assert "--help-all" not in text.partition("Examples")[0]
     assert counts == [25, 76]
+    common, _, others = help_of(capsys, "train", "texture", "--help").partition("training options")
+    for option in ("preset", "target", "iterations", "device", "out", "config", "resume"):
+        assert f"--{option}" in common
+        assert f" --{option} " not in others
+    assert "default: dots" in common
 
 
 def test_no_command_is_a_usage_error_and_the_version_is_that_of_the_package(capsys):
@@ -143,6 +136,10 @@ def test_doctor_reports_what_there_is_and_goes_on_where_a_check_breaks(capsys, m
     text = capsys.readouterr().out
     assert re.search(r"^! warp devices +OSError: no driver$", text, re.MULTILINE)
     assert "ffmpeg" in text
+    done = run_alone(WITHOUT_EXTRAS)
+    assert done.returncode == 1, done.stderr
+    assert re.search(rf"^  tyro +{re.escape(metadata.version('tyro'))}$", done.stdout, re.MULTILINE)
+    assert re.search(r"^! ffmpeg +not found", done.stdout, re.MULTILINE)
 
 
 WITHOUT_EXTRAS = """
@@ -152,13 +149,6 @@ for name in ("tyro", "tqdm", "torch", "warp", "imageio_ffmpeg", "PIL"):
 from npa_envs.cli import main
 sys.exit(main(["doctor"]))
 """
-
-
-def test_doctor_reports_where_packages_cannot_be_imported():
-    done = run_alone(WITHOUT_EXTRAS)
-    assert done.returncode == 1, done.stderr
-    assert re.search(rf"^  tyro +{re.escape(metadata.version('tyro'))}$", done.stdout, re.MULTILINE)
-    assert re.search(r"^! ffmpeg +not found", done.stdout, re.MULTILINE)
 
 
 def test_the_command_line_works_without_utf8(tmp_path):
@@ -203,23 +193,13 @@ def test_doctor_tells_what_is_broken_from_what_is_slow_or_missing(capsys, monkey
 
 
 def test_doctor_finds_packages_that_are_missing_or_old(monkeypatch):
-    lines = [
-        "torch>=999",
-        "numpy>=1.26",
-        "nosuchpackage>=1.0",
-        'pettingzoo>=1.25; extra == "envs"',
-        'nosuchpackage[server]>=1.0; extra == "view"',
-        'npa-envs[envs,view]; extra == "all"',
-    ]
+    lines = ["torch>=999", "numpy>=1.26", "nosuchpackage>=1.0"]
+    lines += ['pettingzoo>=1.25; extra == "envs"', 'npa-envs[envs,view]; extra == "all"']
+    lines += ['nosuchpackage[server]>=1.0; extra == "view"']
     monkeypatch.setattr(doctor.importlib.metadata, "requires", lambda _: lines)
     found = {row.subject: row for row in (*doctor._packages(), *doctor._extras())}
-    assert {name: row.mark for name, row in found.items() if name != "[envs]"} == {
-        "npa-envs": " ",
-        "torch": "!",
-        "numpy": " ",
-        "nosuchpackage": "!",
-        "[view]": "-",
-    }
+    marks = {"npa-envs": " ", "torch": "!", "numpy": " ", "nosuchpackage": "!", "[view]": "-"}
+    assert {name: row.mark for name, row in found.items() if name != "[envs]"} == marks
     assert found["torch"].text.endswith("is older than 999")
     assert found["nosuchpackage"].cure == "pip install -U 'nosuchpackage>=1.0'"
     assert found["[view]"].cure == "pip install 'npa-envs[view]'"
@@ -237,9 +217,8 @@ def test_doctor_finds_packages_that_are_missing_or_old(monkeypatch):
 )
 def test_doctor_says_why_no_card_is_used(built, cards, hidden, mark, cure, monkeypatch, tmp_path):
     program = tmp_path / "nvidia-smi"
-    program.write_text(
-        f"#!/bin/sh\necho '{cards}'\n" if cards else "#!/bin/sh\nexit 9\n", encoding="utf-8"
-    )
+    says = f"echo '{cards}'" if cards else "exit 9"
+    program.write_text(f"#!/bin/sh\n{says}\n", encoding="utf-8")
     program.chmod(0o755)
     monkeypatch.setenv("PATH", f"{tmp_path}{os.pathsep}{os.environ['PATH']}")
     monkeypatch.delenv("CUDA_VISIBLE_DEVICES", raising=False)
@@ -278,10 +257,9 @@ def test_doctor_names_old_cards_idle_cores_cold_caches_and_what_is_not_there(mon
     assert "ssh -L" in doctor._browser()[0].cure
 
 
-@pytest.mark.parametrize(("name", "expected"), [("fast", 1), ("paper", 3)])
-def test_small_batches_train_on_one_thread(name, expected):
+def test_small_batches_train_on_one_thread():
     with torch_threads(3):
-        assert thread_count(preset(name)) == expected
+        assert [thread_count(preset(name)) for name in ("fast", "paper")] == [1, 3]
 
 
 def test_train_says_what_it_learns_and_writes_a_rule_that_loads(tmp_path, capsys):
@@ -323,11 +301,10 @@ def test_a_configuration_file_goes_over_the_preset_and_options_over_the_file(tmp
     ("words", "name"),
     [
         ("morphogenesis2d", "fast"),
-        *((f"{task} --device cuda", "best") for task in ("morphogenesis2d", "texture")),
-        *(
-            (f"{task} --device cuda:1", "best")
-            for task in ("co_morphogenesis2d", "morphogenesis3d")
-        ),
+        ("morphogenesis2d --device cuda", "best"),
+        ("texture --device cuda", "best"),
+        ("co_morphogenesis2d --device cuda:1", "best"),
+        ("morphogenesis3d --device cuda:1", "best"),
         ("point_classification --device cuda", "fast"),
         ("morphogenesis2d --device cuda --preset fast", "fast"),
     ],
@@ -356,20 +333,19 @@ def test_train_refuses_before_it_says_where_it_writes(trained, tmp_path, capsys)
     before = (trained / "rule.safetensors").read_bytes()
     words = ["train", *TINY, "--milestones", "--out"]
     for given, message in (
-        ([str(trained)], r"holds one: resume it \(--resume\), .*overwrite it \(--overwrite\)"),
-        ([str(trained), "--resume", "--overwrite"], "resume and overwrite exclude each other"),
-        ([str(tmp_path / "out"), "--target", "/nowhere.png"], r"nowhere\.png"),
+        ([*words, str(trained)], r"holds one: resume it \(--resume\), .*it \(--overwrite\)"),
+        ([*words, str(trained), "--resume", "--overwrite"], "resume and overwrite exclude"),
+        ([*words, str(tmp_path / "out"), "--target", "/nowhere.png"], r"nowhere\.png"),
+        (
+            ["train", "texture", "--resume", "--out", str(trained)],
+            "is of task 'morphogenesis2d', not of 'texture'",
+        ),
     ):
-        assert main([*words, *given]) == 2
-        told = capsys.readouterr()
-        assert told.out == ""
-        assert re.search(message, told.err)
+        assert main(given) == 2
+        said = capsys.readouterr()
+        assert said.out == ""
+        assert re.search(message, said.err)
     assert (trained / "rule.safetensors").read_bytes() == before
-
-
-def test_a_run_of_another_task_is_not_resumed_but_named(trained, capsys):
-    message = error_of(capsys, ["train", "texture", "--resume", "--out", str(trained)])
-    assert "is of task 'morphogenesis2d', not of 'texture'" in message
 
 
 @pytest.mark.parametrize("command", ["rollout", "evaluate"])
@@ -394,76 +370,67 @@ def test_a_quick_encounter_is_of_two_rules(tmp_path, capsys, monkeypatch):
     assert len(held["rows"]) == 2 * 2 * 2
 
 
+MISTAKES = [
+    ("demoo", "unknown command 'demoo': did you mean 'demo'?"),
+    ("warmup --space-dims 4", "2, 3 or both"),
+    ("warmup --device cuda:99", "device must"),
+    ("train", "needs a task first"),
+    ("train --preset tiny", "needs a task first"),
+    ("train morphogenesis", "unknown task 'morphogenesis': did you mean 'morphogenesis"),
+    ("train morphogenesis2d --preset papr", "unknown preset 'papr'"),
+    ("train morphogenesis2d --preset", "expected one argument"),
+    ("train morphogenesis2d --resume --out /nowhere", "no checkpoint to resume from"),
+    ("train morphogenesis2d --config /nowhere.yaml", "cannot read the configuration file"),
+    ("train TINY --out OUT --max-seconds -1", "max_seconds must be positive"),
+    ("train TINY --out OUT --iterations 0", "iterations must be a whole number"),
+    ("rollout nosuchrule --out OUT", "unknown rule 'nosuchrule'"),
+    ("rollout RULE --out OUT --damage 5:burn", "unknown damage 'burn'"),
+    ("rollout RULE --out OUT --damage 5", "STEP:KIND"),
+    ("rollout RULE --out OUT --damage 5:cut:-1", "positive size"),
+    ("rollout RULE --out OUT --steps 20 --damage 20:cut", "before the last of 20 steps"),
+    ("rollout RULE --out OUT --target nosuchtarget", "nosuchtarget"),
+    ("rollout RULE --out OUT --eps -1", "eps must be"),
+    ("rollout RULE --out OUT --device cuda:99", "device must be"),
+    ("rollout RULE --out FILE/inside", "out must be a folder"),
+    ("rollout 3D --out OUT", "got space_dim=3"),
+    ("evaluate UNTOLD --no-progress", "give --target"),
+    ("robustness hart", "unknown rule 'hart': did you mean 'heart'"),
+    ("robustness --seed-count 0", "seed_count must be at least 1, got 0"),
+    ("robustness --max-seconds 0", "max_seconds must be positive, got 0"),
+    ("stress --only tim", "unknown check 'tim'"),
+    ("stress --max-seconds 0", "max_seconds must be positive, got 0"),
+    ("stress --threads 0", "threads must be at least 1, got 0"),
+    ("train JOINT --targets ring", "targets must be two or more, got 1"),
+    ("rollout digits --style points", "for clouds that never move"),
+]
+WRONG_OPTIONS = [
+    ("train TINY --repeats 0", "repeats must be a whole number"),
+    ("train TINY --iters 3", "--iters"),
+    ("rollout gecko --fps 51", "fps must be in [0.1, 50], got 51"),
+    ("rollout gecko --fps nan", "fps must be in"),
+    ("rollout gecko --background mauvish", "background must be"),
+    ("rollout gecko --seed -1", "seed must be in [0, 2^63), got -1"),
+    ("rollout gecko --seed 9223372036854775808", "seed must be in"),
+]
+"""What tyro refuses, in a box of lines."""
+
+
 @pytest.mark.parametrize(
-    ("words", "message"),
-    [
-        ("demoo", "unknown command 'demoo': did you mean 'demo'?"),
-        ("warmup --space-dims 4", "2, 3 or both"),
-        ("warmup --device cuda:99", "device must"),
-        ("train", "needs a task first"),
-        ("train --preset tiny", "needs a task first"),
-        ("train morphogenesis", "unknown task 'morphogenesis': did you mean 'morphogenesis"),
-        ("train morphogenesis2d --preset papr", "unknown preset 'papr'"),
-        ("train morphogenesis2d --preset", "expected one argument"),
-        ("train morphogenesis2d --resume --out /nowhere", "no checkpoint to resume from"),
-        ("train morphogenesis2d --config /nowhere.yaml", "cannot read the configuration file"),
-        ("train TINY --out OUT --max-seconds -1", "max_seconds must be positive"),
-        ("train TINY --out OUT --iterations 0", "iterations must be a whole number"),
-        ("rollout nosuchrule --out OUT", "unknown rule 'nosuchrule'"),
-        ("rollout RULE --out OUT --damage 5:burn", "unknown damage 'burn'"),
-        ("rollout RULE --out OUT --damage 5", "STEP:KIND"),
-        ("rollout RULE --out OUT --damage 5:cut:-1", "positive size"),
-        ("rollout RULE --out OUT --steps 20 --damage 20:cut", "before the last of 20 steps"),
-        ("rollout RULE --out OUT --target nosuchtarget", "nosuchtarget"),
-        ("rollout RULE --out OUT --eps -1", "eps must be"),
-        ("rollout RULE --out OUT --device cuda:99", "device must be"),
-        ("rollout RULE --out FILE/inside", "out must be a folder"),
-        ("rollout 3D --out OUT", "got space_dim=3"),
-        ("evaluate UNTOLD --no-progress", "give --target"),
-        ("robustness hart", "unknown rule 'hart': did you mean 'heart'"),
-        ("robustness --seed-count 0", "seed_count must be at least 1, got 0"),
-        ("robustness --max-seconds 0", "max_seconds must be positive, got 0"),
-        ("stress --only tim", "unknown check 'tim'"),
-        ("stress --max-seconds 0", "max_seconds must be positive, got 0"),
-        ("stress --threads 0", "threads must be at least 1, got 0"),
-    ],
+    ("words", "message", "lines"),
+    [(*row, 1) for row in MISTAKES] + [(*row, None) for row in WRONG_OPTIONS],
 )
-def test_a_mistake_is_refused_in_one_line_and_nothing_is_written(
-    words, message, rule, tmp_path, capsys
-):
+def test_a_mistake_is_refused_and_nothing_is_written(words, message, lines, rule, tmp_path, capsys):
     names = {"OUT": tmp_path / "out", "FILE/inside": tmp_path / "file/a", "RULE": rule}
     names |= {"3D": tmp_path / "3d.safetensors", "UNTOLD": tmp_path / "untold.safetensors"}
     (tmp_path / "file").touch()
     save_rule(NPARule(3, 8, 16), names["3D"])
     save_rule(NPARule(2, 8, 16, eps0=0.2), names["UNTOLD"])
+    options = " ".join([*TINY[1:], "--milestones"])
+    words = words.replace("TINY", f"{TINY[0]} {options}")
+    words = words.replace("JOINT", f"co_morphogenesis2d {options}")
     given = [str(names.get(word, word)) for word in words.split()]
-    given = [
-        part for word in given for part in ([*TINY, "--milestones"] if word == "TINY" else [word])
-    ]
-    assert message in error_of(capsys, given)
+    assert message in error_of(capsys, given, lines)
     assert not list(tmp_path.rglob("growth.gif"))
-
-
-@pytest.mark.parametrize(
-    ("words", "message"),
-    [
-        (["train", *TINY, "--repeats", "0"], "repeats must be a whole number"),
-        (["train", *TINY, "--iters", "3"], "--iters"),
-        (["rollout", "gecko", "--fps", "51"], "fps must be in [0.1, 50], got 51"),
-        (["rollout", "gecko", "--fps", "nan"], "fps must be in"),
-        (["rollout", "gecko", "--background", "mauvish"], "background must be"),
-        (["rollout", "gecko", "--seed", "-1"], "seed must be in [0, 2^63), got -1"),
-        (["rollout", "gecko", "--seed", str(2**63)], "seed must be in"),
-        (["rollout", "digits", "--style", "points"], "for clouds that never move"),
-    ],
-)
-def test_a_wrong_option_is_refused(words, message, capsys):
-    try:
-        code = main(words)
-    except SystemExit as end:  # Newer versions of tyro take what checks of the options raise.
-        code = end.code
-    assert code == 2
-    assert message in capsys.readouterr().err
 
 
 def test_ctrl_c_leaves_a_checkpoint_and_says_how_to_go_on(tmp_path, monkeypatch, capsys):
@@ -501,14 +468,17 @@ def test_rollout_writes_films_that_open(tmp_path, rule, capsys):
         assert f"wrote {out / name}" in text
 
 
-def test_rollout_repeats_itself(tmp_path, rule):
-    words = ["rollout", rule, "--steps", "12", "--resolution", "16", "--no-progress"]
-    for name in ("a", "b"):
-        assert main([*words, "--damage", "6:wipe", "--out", str(tmp_path / name)]) == 0
-    assert main([*words, "--seed", "1", "--out", str(tmp_path / "c")]) == 0
-    films = [(tmp_path / name / "growth.gif").read_bytes() for name in "abc"]
-    assert films[0] == films[1]
-    assert films[0] != films[2]
+def test_rollout_repeats_itself_and_makes_about_150_frames(tmp_path, rule):
+    words = ["rollout", rule, "--resolution", "16", "--no-progress", "--damage", "6:wipe"]
+    films = []
+    for steps, seed in ((12, 0), (12, 0), (12, 1), (299, 0)):
+        given = [*words, "--steps", str(steps), "--seed", str(seed)]
+        assert main([*given, "--out", str(tmp_path)]) == 0
+        films.append((tmp_path / "growth.gif").read_bytes())
+    assert films[0] == films[1] != films[2]
+    with Image.open(tmp_path / "growth.gif") as film:
+        # One every second step, the last one, and one after the damage.
+        assert (film.size, film.n_frames) == ((16, 16), 152)
 
 
 def test_rollout_runs_a_rule_whose_file_names_no_task(tmp_path, capsys):
@@ -529,8 +499,9 @@ def test_rollout_notices_before_the_first_step_that_it_cannot_write(
     refuse = raising(PermissionError(13, "Permission denied"))
     monkeypatch.setattr("npa_envs.cli.common.tempfile.TemporaryFile", refuse)
     monkeypatch.setattr("npa_envs.cli.film.run_worlds", lambda *_, **__: pytest.fail("a step ran"))
-    words = ["rollout", rule, "--steps", "9", "--out", str(tmp_path)]
-    assert "out must be a folder that can be written to" in error_of(capsys, words)
+    assert "out must be a folder that can be written to" in error_of(
+        capsys, ["rollout", rule, "--steps", "9", "--out", str(tmp_path)]
+    )
 
 
 def test_a_film_to_share_has_the_style_and_the_background_that_were_asked_for(
@@ -559,13 +530,6 @@ def test_a_film_to_share_has_the_style_and_the_background_that_were_asked_for(
     assert (~bare["points"]).mean() < 0.7 * (~bare["large"]).mean()
     with Image.open(tmp_path / "points" / "growth-filmstrip.png") as strip:
         assert strip.getpixel((0, 0)) == (16, 32, 48)
-
-
-def test_rollout_makes_about_150_frames(tmp_path, rule):
-    words = ["rollout", rule, "--steps", "299", "--no-progress"]
-    assert main([*words, "--resolution", "16", "--out", str(tmp_path)]) == 0
-    with Image.open(tmp_path / "growth.gif") as film:
-        assert (film.size, film.n_frames) == ((16, 16), 151)
 
 
 @pytest.mark.parametrize(

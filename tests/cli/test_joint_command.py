@@ -110,8 +110,3 @@ def test_what_cannot_be_started_from_is_refused(fields, message, tmp_path):
     config = preset("paper", "co_morphogenesis2d", **fields, out=tmp_path, pool_size=8)
     with pytest.raises(NPAError, match=message):
         train(config, "co_morphogenesis2d", progress=False)
-
-
-def test_one_target_is_refused(capsys):
-    assert main(["train", *TINY, "--targets", "ring"]) == 2
-    assert "targets must be two or more, got 1" in capsys.readouterr().err

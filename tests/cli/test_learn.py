@@ -22,12 +22,18 @@ WORDS += ["--options", "steps=4"]
 ROUND = 4 * 2 * 64
 
 
+def points(out):
+    """The lines of the curve."""
+    log = out / "log.jsonl"
+    text = log.read_text(encoding="utf-8") if log.exists() else ""
+    return [json.loads(line) for line in text.splitlines()]
+
+
 def learned(out, rounds, *words):
-    """The exit code, and the particle-steps of the curve's points."""
+    """The exit code, and the rounds of the curve's points."""
     budget = ["--particle-steps", str(rounds * ROUND), "--out", str(out)]
     code = main([*WORDS, *budget, *words])
-    lines = (out / "log.jsonl").read_text(encoding="utf-8").splitlines()
-    return code, [json.loads(line)["particle_steps"] // ROUND for line in lines]
+    return code, [point["particle_steps"] // ROUND for point in points(out)]
 
 
 def test_a_run_begins_and_goes_on_with_the_same_words(tmp_path, capsys):
@@ -50,17 +56,13 @@ def test_a_killed_process_ends_a_run_and_a_signal_stops_it(tmp_path):
     words = [*WORDS, "--particle-steps", "1e9", "--seconds", "60", "--entries", "60"]
     words += ["--out", str(tmp_path), "--processes", "2", "--resume", "auto"]
 
-    def begun(points):
+    def begun(count):
         run = subprocess.Popen(
             [sys.executable, "-m", "npa_envs", *words],
-            stdout=subprocess.PIPE,
-            stderr=subprocess.STDOUT,
-            text=True,
-            encoding="utf-8",
-        )
+            stdout=subprocess.PIPE, stderr=subprocess.STDOUT, encoding="utf-8",
+        )  # fmt: skip
         end = time.monotonic() + 60
-        log = tmp_path / "log.jsonl"
-        while not log.exists() or len(log.read_text(encoding="utf-8").splitlines()) < points:
+        while len(points(tmp_path)) < count:
             assert run.poll() is None, run.stdout.read()
             assert time.monotonic() < end
             time.sleep(0.05)
@@ -73,7 +75,7 @@ def test_a_killed_process_ends_a_run_and_a_signal_stops_it(tmp_path):
     assert run.returncode == 2
     assert "process 1 of 2 was ended by SIGKILL" in said
     done = load_checkpoint(tmp_path / "checkpoint.pt")["iteration"]
-    run = begun(len((tmp_path / "log.jsonl").read_text(encoding="utf-8").splitlines()) + 1)
+    run = begun(len(points(tmp_path)) + 1)
     run.terminate()
     said, _ = run.communicate(timeout=60)
     assert run.returncode == 130
@@ -117,10 +119,7 @@ def test_worlds_are_those_of_shac_where_they_are_told(tmp_path):
     words += ["--entries", "1", "--episode-steps", "2", "--no-progress", "--out"]
     for name, worlds, count in (("told", ["--worlds", "3"], 3), ("default", [], 8)):
         assert main([*words, str(tmp_path / name), *worlds]) == 0
-        last = json.loads(
-            (tmp_path / name / "log.jsonl").read_text(encoding="utf-8").splitlines()[-1]
-        )
-        assert last["particle_steps"] == count * 2 * 64
+        assert points(tmp_path / name)[-1]["particle_steps"] == count * 2 * 64
 
 
 def test_what_is_written_takes_no_time_and_what_is_over_has_finished(tmp_path, monkeypatch):
@@ -134,8 +133,6 @@ def test_what_is_written_takes_no_time_and_what_is_over_has_finished(tmp_path, m
     monkeypatch.setattr(Run, "keep", slow)
     words = [*WORDS, "--seconds", "0.5", "--no-progress", "--out", str(tmp_path)]
     assert main(words) == 0
-    seconds = [
-        json.loads(line)["seconds"] for line in (tmp_path / "log.jsonl").open(encoding="utf-8")
-    ]
+    seconds = [point["seconds"] for point in points(tmp_path)]
     assert 0.5 <= seconds[-1] < 1.0
     assert len(seconds) > 2

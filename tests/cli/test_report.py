@@ -75,10 +75,8 @@ def test_the_figures_of_a_report_are_those_of_the_command_that_it_names(tmp_path
     held = json.loads((tmp_path / "run" / "report" / "rule.json").read_text("utf-8"))
     _, *command = held["command"].split()
     assert main([*command, "--no-progress", "--json", str(tmp_path / "again.json")]) == 0
-    assert (
-        json.loads((tmp_path / "again.json").read_text(encoding="utf-8"))["growth"]
-        == held["growth"]
-    )
+    again = json.loads((tmp_path / "again.json").read_text("utf-8"))
+    assert again["growth"] == held["growth"]
     folder = str(tmp_path / "run")  # stands for its rule
     rule = load_rule(folder)
     task = task_of_rule(folder, rule, report.torch.device("cpu"))
@@ -88,9 +86,15 @@ def test_the_figures_of_a_report_are_those_of_the_command_that_it_names(tmp_path
     capsys.readouterr()
 
 
-def test_a_run_writes_no_report_where_none_is_wanted_or_no_iteration_was_done(tmp_path, capsys):
+def test_a_run_writes_no_report_where_none_is_wanted_or_no_iteration_was_done(
+    tmp_path, capsys, monkeypatch
+):
+    # Nor does it name a viewer that is not installed.
+    monkeypatch.setattr(importlib.import_module("npa_envs.cli.train"), "VIEWER", ("no_such_thing",))
     words = words_of("morphogenesis2d", tmp_path)
     assert main([*words, "--no-report"]) == 0
+    live = f"npa-envs rollout {words[-1]} (live: pip install 'npa-envs[view]')"
+    assert re.search(rf"look at it .*{re.escape(live)}", capsys.readouterr().out)
     assert main([*words, "--overwrite", "--max-seconds", "1e-9"]) == 0
     assert not (tmp_path / "run" / "report").exists()
     assert main([*words, "--resume"]) == 0
@@ -107,9 +111,8 @@ def test_a_report_without_ffmpeg_has_all_but_the_film_that_needs_it(tmp_path, ca
 
     monkeypatch.setattr(film, "write_mp4", refuse)
     assert main(words_of("morphogenesis2d", tmp_path)) == 0
-    assert re.search(
-        r"report .*rule\.md: .*; not all films: an MP4 file needs", capsys.readouterr().out
-    )
+    said = r"report .*rule\.md: .*; not all films: an MP4 file needs"
+    assert re.search(said, capsys.readouterr().out)
     files = {path.name for path in (tmp_path / "run" / "report").iterdir()}
     assert files == {"rule.md", "rule.json", "rule.gif", "rule-filmstrip.png"}
 
@@ -127,14 +130,6 @@ def test_a_report_says_where_worlds_do_not_hold(factor, holds, tmp_path, capsys,
     assert main(words_of("morphogenesis2d", tmp_path)) == 0
     said = "; worlds do not hold: at step 128 their loss is many times the least"
     assert (said in capsys.readouterr().out) is not holds
-
-
-def test_a_run_names_what_shows_it_where_the_viewer_is_not_installed(tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr(importlib.import_module("npa_envs.cli.train"), "VIEWER", ("no_such_thing",))
-    words = words_of("morphogenesis2d", tmp_path)
-    assert main([*words, "--no-report"]) == 0
-    (line,) = (line for line in capsys.readouterr().out.splitlines() if "look at it" in line)
-    assert f"npa-envs rollout {words[-1]} (live: pip install 'npa-envs[view]')" in line
 
 
 def test_a_rule_that_cannot_be_measured_is_kept_and_said_to_have_no_report(

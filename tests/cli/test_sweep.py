@@ -39,12 +39,8 @@ def call(tmp_path, *words):
 
 def test_every_combination_is_a_run_with_its_own_words():
     runs = combinations(["seed=0,1", "target=a,b/c.png"], ["texture", "--preset", "tiny"])
-    assert [dict(run.values) for run in runs] == [
-        {"seed": "0", "target": "a"},
-        {"seed": "0", "target": "b/c.png"},
-        {"seed": "1", "target": "a"},
-        {"seed": "1", "target": "b/c.png"},
-    ]
+    values = [(run.values["seed"], run.values["target"]) for run in runs]
+    assert values == [(seed, target) for seed in "01" for target in ("a", "b/c.png")]
     assert " ".join(runs[1].words) == "texture --preset tiny --seed 0 --target b/c.png"
     assert runs[1].name == "seed=0,target=b_c.png"
 
@@ -99,12 +95,9 @@ def test_a_run_that_fails_is_tried_again_and_those_that_are_over_are_left(tmp_pa
     assert "seed=1,target=a failed: out of luck" in told
     assert call(tmp_path) == 0
     assert capsys.readouterr().out.count("| done |") == 4
-    begun = {
-        path.parent.name: path.read_text(encoding="utf-8") for path in tmp_path.glob("*/begun")
-    }
-    assert begun == {
-        f"seed={seed},target={target}": "x" * (seed + 1) for seed in (0, 1) for target in "ab"
-    }
+    begun = {path.parent.name: path.read_text("utf-8") for path in tmp_path.glob("*/begun")}
+    names = {f"seed={seed},target={target}": seed for seed in (0, 1) for target in "ab"}
+    assert begun == {name: "x" * (seed + 1) for name, seed in names.items()}
     words = json.loads((tmp_path / "seed=0,target=b" / "words").read_text(encoding="utf-8"))
     assert words[words.index("--device") + 1] == "cpu"
     assert words[words.index("--resume") + 1] == "auto"
@@ -123,10 +116,8 @@ def test_parts_and_time_limits_leave_runs_to_other_calls(tmp_path, child, capsys
     assert call(tmp_path, "--max-seconds", "1e-9") == 0
     assert "4 runs are left" in capsys.readouterr().out
     assert call(tmp_path, "--part", "1/2") == 1
-    assert {path.parent.name for path in tmp_path.glob("*/begun")} == {
-        "seed=0,target=a",
-        "seed=1,target=a",
-    }
+    begun = {path.parent.name for path in tmp_path.glob("*/begun")}
+    assert begun == {"seed=0,target=a", "seed=1,target=a"}
     with pytest.raises(SystemExit):
         main(["sweep", "--out", str(tmp_path)])
     assert main(["sweep", "--over", "seed=0", "--part", "3/2", "--", "texture"]) == 2
@@ -177,12 +168,8 @@ def in_a_terminal(tmp_path, words, program=()):
     given = ["sweep", "--over", "seed=0,1,2", "--out", str(tmp_path), "--no-progress"]
     return subprocess.Popen(
         [sys.executable, "-c", SWEEP.format(program=program), *given, "--jobs", "2", "--", *words],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.STDOUT,
-        text=True,
-        start_new_session=True,
-        encoding="utf-8",
-    )
+        stdout=subprocess.PIPE, stderr=subprocess.STDOUT, start_new_session=True, encoding="utf-8",
+    )  # fmt: skip
 
 
 def wait_for(process, condition):

@@ -13,23 +13,17 @@ from npa_envs.cli import main
 from npa_envs.cli.common import named_rules
 from npa_envs.errors import NPAError
 from npa_envs.measure import accuracy
-from npa_envs.measure.accuracy import all_checks, endurance, hard_cases, numerics
+from npa_envs.measure.accuracy import all_checks, endurance, hard_cases, numerics, suite
 from npa_envs.measure.accuracy import scenes as places
 from npa_envs.measure.accuracy.endurance import habitat
 from npa_envs.measure.accuracy.scenes import EPS, scenes, threshold_scenes
 from npa_envs.measure.accuracy.suite import (
     GROUPS,
     Check,
-    CheckEntry,
     CheckResult,
     CheckSession,
     Skipped,
-    StressRecord,
-    chosen_checks,
     group_of,
-    heat_maps,
-    run_check,
-    run_checks,
 )
 from npa_envs.rule.files import load_rule, rule_digest, rule_file, rule_metadata, save_rule
 from npa_envs.rule.rule import NPARule
@@ -61,15 +55,15 @@ def test_every_check_has_a_name_of_its_own_a_group_and_an_expectation():
 
 def test_checks_are_chosen_by_group_by_name_and_by_how_names_begin():
     checks = list(CHECKS.values())
-    groups = {group_of(check.name) for check in chosen_checks(checks, ["time", "values"])}
+    groups = {group_of(check.name) for check in suite.chosen_checks(checks, ["time", "values"])}
     assert groups == {"time", "values"}
-    assert [c.name for c in chosen_checks(checks, ["time/gecko"])] == ["time/gecko"]
-    clumps = chosen_checks(checks, ["geometry/clump"])
+    assert [c.name for c in suite.chosen_checks(checks, ["time/gecko"])] == ["time/gecko"]
+    clumps = suite.chosen_checks(checks, ["geometry/clump"])
     where = ["2d/open", "2d/periodic", "3d/open", "3d/periodic"]
     assert [c.name.removeprefix("geometry/clump/") for c in clumps] == where
-    assert chosen_checks(checks, []) == checks
+    assert suite.chosen_checks(checks, []) == checks
     with pytest.raises(NPAError, match="unknown check 'geometri': did you mean 'geometry'"):
-        chosen_checks(checks, ["geometri"])
+        suite.chosen_checks(checks, ["geometri"])
 
 
 # Verdicts
@@ -92,13 +86,13 @@ def test_a_figure_above_its_limit_not_a_number_or_missing_fails(figures, holds, 
 
 
 def test_the_worst_figure_is_named():
-    entry = CheckEntry.of(
+    entry = suite.CheckEntry.of(
         told("a/b"), CheckResult({"x": 1.0, "y": 3.0}, {"x": 10.0, "y": 4.0, "z": 1.0}), 0.0
     )
     assert entry.worst() == "z nan (at most 1)"
     assert entry.share("y") == 0.75
-    assert CheckEntry("a/b", "", "fail", {"x": 1.0}, {"x": 0.0}).share("x") == math.inf
-    assert CheckEntry("a/b", "", "pass", {"x": 0.0}, {"x": 0.0}).share("x") == 0.0
+    assert suite.CheckEntry("a/b", "", "fail", {"x": 1.0}, {"x": 0.0}).share("x") == math.inf
+    assert suite.CheckEntry("a/b", "", "pass", {"x": 0.0}, {"x": 0.0}).share("x") == 0.0
 
 
 def test_what_raises_has_failed_and_the_others_go_on():
@@ -108,9 +102,9 @@ def test_what_raises_has_failed_and_the_others_go_on():
 
         return Check(f"values/{type(error).__name__}", "no error", run)
 
-    record = StressRecord(FACTS)
+    record = suite.StressRecord(FACTS)
     errors = (ZeroDivisionError("by\nzero"), Skipped("no device"), torch.OutOfMemoryError("much"))
-    run_checks([*map(raising, errors), told("values/last")], session(), record)
+    suite.run_checks([*map(raising, errors), told("values/last")], session(), record)
     found = {entry.name: (entry.verdict, entry.note) for entry in record.rows}
     assert found == {
         "values/ZeroDivisionError": ("fail", "ZeroDivisionError: by zero"),
@@ -127,14 +121,14 @@ def test_what_raises_has_failed_and_the_others_go_on():
 
 def test_a_record_comes_back_as_it_was_written(tmp_path: Path):
     path = tmp_path / "record.json"
-    assert StressRecord(FACTS, path).read().rows == []
+    assert suite.StressRecord(FACTS, path).read().rows == []
     figures = {"a": 1.5, "b": math.inf, "c": math.nan}
-    record = StressRecord(FACTS, path)
-    record.put(CheckEntry("x/y", "s", "fail", figures, {"a": 1.0}, "", "n"))
+    record = suite.StressRecord(FACTS, path)
+    record.put(suite.CheckEntry("x/y", "s", "fail", figures, {"a": 1.0}, "", "n"))
     held = json.loads(path.read_text(encoding="utf-8"))
     assert held["counts"] == {"pass": 0, "range": 0, "fail": 1, "skipped": 0}
     assert held["checks"][0]["figures"] == {"a": 1.5, "b": "inf", "c": "nan"}
-    assert repr(StressRecord(FACTS, path).read().rows) == repr(record.rows)
+    assert repr(suite.StressRecord(FACTS, path).read().rows) == repr(record.rows)
 
 
 def test_a_run_goes_on_where_it_was_and_repeats_what_did_not_pass():
@@ -149,19 +143,19 @@ def test_a_run_goes_on_where_it_was_and_repeats_what_did_not_pass():
 
     failing = {"figures": {"x": 2.0}, "limits": {"x": 1.0}}
     checks = [counted("a/1"), counted("a/2", **failing), counted("a/3", holds="all")]
-    record, sizes = StressRecord(FACTS), []
+    record, sizes = suite.StressRecord(FACTS), []
     record.write = lambda: sizes.append(len(record.rows))
-    run_checks(checks, session(), record)
+    suite.run_checks(checks, session(), record)
     assert sizes == [1, 2, 3]
-    run_checks(checks, session(), record)
+    suite.run_checks(checks, session(), record)
     assert ran == ["a/1", "a/2", "a/3", "a/2"]
-    late = StressRecord(FACTS, names=["a/3", "a/1"])
-    run_checks(checks, session(), late, max_seconds=0.0)
+    late = suite.StressRecord(FACTS, names=["a/3", "a/1"])
+    suite.run_checks(checks, session(), late, max_seconds=0.0)
     assert {entry.verdict for entry in late.rows} == {"skipped"}
-    run_checks(checks, session(), late)
+    suite.run_checks(checks, session(), late)
     assert [entry.verdict for entry in late.rows] == ["range", "pass", "fail"]
     # No time is no reason to forget that something failed.
-    run_checks(checks, session(), late, max_seconds=0.0)
+    suite.run_checks(checks, session(), late, max_seconds=0.0)
     assert [entry.verdict for entry in late.rows] == ["range", "pass", "fail"]
     assert [entry.name for entry in late.rows] == ["a/3", "a/1", "a/2"]
 
@@ -180,7 +174,7 @@ AS_EXPECTED = """
 
 @pytest.mark.parametrize("name", AS_EXPECTED.split())
 def test_the_library_is_as_expected(name, device):
-    entry = run_check(CHECKS[name], session(device))
+    entry = suite.run_check(CHECKS[name], session(device))
     assert entry.verdict in ("pass", "range"), (entry.worst(), entry.note)
 
 
@@ -193,8 +187,8 @@ def test_a_wrong_operator_is_found_out(factor, monkeypatch):
         right = module.perceive
         monkeypatch.setattr(module, "perceive", wrong)
     for name in ("geometry/clump/2d/open", "geometry/threshold/2d", "geometry/outside/3d"):
-        assert run_check(CHECKS[name], session()).verdict == "fail"
-    difference = run_check(CHECKS["gradients/finite_differences/2d/open"], session())
+        assert suite.run_check(CHECKS[name], session()).verdict == "fail"
+    difference = suite.run_check(CHECKS["gradients/finite_differences/2d/open"], session())
     # A wrong factor is differentiated rightly; what is not a number is not.
     assert difference.verdict == ("fail" if math.isnan(factor) else "pass")
 
@@ -212,7 +206,7 @@ def test_jumps_and_results_that_change_from_call_to_call_are_found_out(module, n
         return right(*arguments, **options) * (1.0 + 1e-6 * next(calls))
 
     monkeypatch.setattr(module, "perceive", wrong)
-    assert run_check(CHECKS[name], session()).verdict == "fail"
+    assert suite.run_check(CHECKS[name], session()).verdict == "fail"
 
 
 def test_no_limit_is_more_than_a_scene_asks_for():
@@ -254,7 +248,7 @@ def test_a_rule_that_blows_up_is_found_out(factor, count, verdict, device, monke
         return dataclasses.replace(home, rule=rule, x=home.x[:, :count], s=home.s[:, :count])
 
     monkeypatch.setattr(endurance, "habitat", tampered)
-    entry = run_check(CHECKS["time/heart" if count == 1 else "time/dots"], session(device))
+    entry = suite.run_check(CHECKS["time/heart" if count == 1 else "time/dots"], session(device))
     if count == 1:
         # A world that extends nowhere is measured all the same.
         assert (entry.figures["extent"], entry.figures["drift"] >= 0.0) == (0.0, True)
@@ -302,7 +296,7 @@ def test_rules_of_every_kind_in_files_are_checked_by_themselves(fields, tmp_path
         "gradients/norm/mine",
         "gradients/float32/mine",
     ]
-    entries = {check.name: run_check(check, session(device)) for check in checks}
+    entries = {check.name: suite.run_check(check, session(device)) for check in checks}
     assert all(entry.figures or entry.verdict == "skipped" for entry in entries.values())
     assert entries["gradients/norm/mine"].verdict == "pass"
     alike = entries["gradients/float32/mine"]
@@ -338,9 +332,8 @@ def test_checks_of_a_rule_that_was_trained_anew_are_run_again(tmp_path, capsys):
 
     def verdict():
         main(words)
-        (entry,) = json.loads((tmp_path / "stress_cpu_quick.json").read_text(encoding="utf-8"))[
-            "checks"
-        ]
+        held = json.loads((tmp_path / "stress_cpu_quick.json").read_text(encoding="utf-8"))
+        (entry,) = held["checks"]
         return entry["weights"], entry["verdict"]
 
     assert verdict() == (rule_digest(rule), "pass")
@@ -382,20 +375,22 @@ def test_the_command_lists_its_checks(capsys):
 
 def test_heat_maps_are_drawn_of_what_has_limits():
     entries = [
-        CheckEntry("geometry/one/2d/open", "", "fail", {"z": math.nan, "s": 0.5}, {"z": 1.0}),
-        CheckEntry("geometry/nearest/2d", "", "range", {"z": 2.0}, {"z": 1.0, "s": 1.0}, "near"),
-        CheckEntry("gradients/growth/heart", "", "range", {"norm": 1.0}, {}, "512 steps"),
-        CheckEntry("values/nan_state", "", "skipped"),
+        suite.CheckEntry("geometry/one/2d/open", "", "fail", {"z": math.nan, "s": 0.5}, {"z": 1.0}),
+        suite.CheckEntry(
+            "geometry/nearest/2d", "", "range", {"z": 2.0}, {"z": 1.0, "s": 1.0}, "near"
+        ),
+        suite.CheckEntry("gradients/growth/heart", "", "range", {"norm": 1.0}, {}, "512 steps"),
+        suite.CheckEntry("values/nan_state", "", "skipped"),
     ]
-    record = StressRecord(FACTS)
+    record = suite.StressRecord(FACTS)
     record.rows = entries
-    pictures = heat_maps(record)
+    pictures = suite.heat_maps(record)
     assert set(pictures) == {"geometry"}
     assert pictures["geometry"].startswith(b"\x89PNG")
 
 
 @pytest.mark.slow
 def test_everything_quick_is_as_expected(device):
-    record = StressRecord(FACTS)
-    run_checks(list(CHECKS.values()), session(device), record)
+    record = suite.StressRecord(FACTS)
+    suite.run_checks(list(CHECKS.values()), session(device), record)
     assert [entry.name for entry in record.failed()] == []

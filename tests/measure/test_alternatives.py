@@ -8,21 +8,6 @@ from pathlib import Path
 import alternatives
 import pytest
 import torch
-from alternatives import (
-    PEERS,
-    Alternatives,
-    Point,
-    RolloutRow,
-    composed_step,
-    draw_fronts,
-    drawn_mask,
-    front,
-    gecko,
-    mask_source,
-    peer_rows,
-    perception_rows,
-    rollout_rows,
-)
 from precisions import PRECISIONS
 from strategies import NEIGHBOUR_CAP, STRATEGIES, nearest
 
@@ -37,8 +22,8 @@ FORWARD = 1e-5
 """Relative error that float32 may have in one perception; the worst measured is 3.2e-7."""
 
 
-def session(**options) -> Alternatives:
-    return Alternatives(torch.device("cpu"), repeats=1, small=True, **options)
+def session(**options) -> alternatives.Alternatives:
+    return alternatives.Alternatives(torch.device("cpu"), repeats=1, small=True, **options)
 
 
 def timing(median: float) -> Timing:
@@ -75,20 +60,20 @@ def test_the_neighbour_cap_leaves_out_all_but_the_nearest():
 
 
 def test_steps_composed_in_torch_are_those_of_the_library_with_the_same_masks():
-    start = gecko(1, 300, torch.device("cpu")).grown(3)
+    start = alternatives.gecko(1, 300, torch.device("cpu")).grown(3)
     rule, x, s = start.rule.double(), start.x.double(), start.s.double()
-    own = rollout(rule, x, s, 3, update_prob=0.5, generator=mask_source(x))
-    generator = mask_source(x)
+    own = rollout(rule, x, s, 3, update_prob=0.5, generator=alternatives.mask_source(x))
+    generator = alternatives.mask_source(x)
     assert not torch.equal(own[0], x)
     for _ in range(3):
-        mask = drawn_mask(x, 0.5, generator)
-        x, s = composed_step(STRATEGIES["dense"], rule, x, s, mask)
+        mask = alternatives.drawn_mask(x, 0.5, generator)
+        x, s = alternatives.composed_step(STRATEGIES["dense"], rule, x, s, mask)
     for value, expected in zip((x, s), own, strict=True):
         torch.testing.assert_close(value, expected, rtol=1e-10, atol=1e-10)
 
 
 def test_a_precision_keeps_weights_and_rounds_what_it_says():
-    rule = gecko(1, 64, torch.device("cpu")).rule
+    rule = alternatives.gecko(1, 64, torch.device("cpu")).rule
     generator = torch.Generator().manual_seed(0)
     z = torch.randn(40, rule.perception_dim, generator=generator)
     s = torch.randn(2, 3, 4, generator=generator)
@@ -115,7 +100,7 @@ def test_a_precision_keeps_weights_and_rounds_what_it_says():
 
 def test_perception_in_float32_errs_little_and_the_reference_not_at_all():
     here = session()
-    rows = perception_rows(here, TINY)
+    rows = alternatives.perception_rows(here, TINY)
     exact = [row for row in rows if (row.strategy, row.precision) == ("library", "float64")]
     assert [row.perception for row in exact] == [0.0]
     summed = [row for row in rows if row.strategy != "neighbour_cap"]
@@ -136,7 +121,7 @@ def test_perception_in_float32_errs_little_and_the_reference_not_at_all():
 def test_rollouts_err_more_in_shorter_precisions():
     chosen = [PRECISIONS[name] for name in ("float64", "float32", "bf16_storage", "mixed")]
     here = session(strategies=[STRATEGIES["library"], STRATEGIES["dense"]], precisions=chosen)
-    exact, single, storage, mixed = rollout_rows(here, 200)
+    exact, single, storage, mixed = alternatives.rollout_rows(here, 200)
     assert (exact.x_1, exact.s_64, exact.weights) == (0.0, 0.0, 0.0)
     assert 0.0 < single.x_1 < FORWARD
     assert single.s_1 < FORWARD
@@ -152,36 +137,40 @@ def test_peers_that_are_there_are_right_and_others_are_left_out_with_a_reason(mo
     def missing(*_):
         raise ModuleNotFoundError("No module named 'absent'")
 
-    monkeypatch.setitem(PEERS, "absent", missing)
+    monkeypatch.setitem(alternatives.PEERS, "absent", missing)
     here = session()
-    rows = peer_rows(here, Workload(3, 1, 120, 1, eps=0.2))
+    rows = alternatives.peer_rows(here, Workload(3, 1, 120, 1, eps=0.2))
     assert {"npa-envs", "wp.HashGrid", "dense torch"} <= {row.peer for row in rows}
     assert max(row.error for row in rows) < FORWARD
     assert LeftOut("absent", "ModuleNotFoundError: No module named 'absent'") in here.left_out
     measured = {row.peer for row in rows} | {entry.what for entry in here.left_out}
-    assert measured == set(PEERS)
+    assert measured == set(alternatives.PEERS)
 
 
 def test_the_front_holds_what_nothing_beats():
-    points = [Point(1e-7, 5.0, "a", ""), Point(1e-3, 2.0, "b", ""), Point(1e-2, 3.0, "c", "")]
-    points.append(Point(1e-7, 6.0, "d", ""))
-    assert [point.strategy for point in front(points)] == ["a", "b"]
+    points = [
+        alternatives.Point(1e-7, 5.0, "a", ""),
+        alternatives.Point(1e-3, 2.0, "b", ""),
+        alternatives.Point(1e-2, 3.0, "c", ""),
+    ]
+    points.append(alternatives.Point(1e-7, 6.0, "d", ""))
+    assert [point.strategy for point in alternatives.front(points)] == ["a", "b"]
 
 
-def rollout_row(**values) -> RolloutRow:
+def rollout_row(**values) -> alternatives.RolloutRow:
     numbers = dict.fromkeys(("x_1", "s_1", "x_8", "s_8", "x_64", "s_64"), 1e-6)
     usual = {"strategy": "library", "precision": "float32", "particles": 10, **numbers}
     usual |= {"step_us": timing(3.0), "training_us": None, "peak_mib": None}
-    return RolloutRow(**usual | {"weights": None, "psnr_512": math.nan} | values)
+    return alternatives.RolloutRow(**usual | {"weights": None, "psnr_512": math.nan} | values)
 
 
 def test_pictures_are_drawn_of_what_was_measured():
     pytest.importorskip("matplotlib")
     tables = {
-        "perceptions": perception_rows(session(), Workload(2, 1, 60, 1)),
+        "perceptions": alternatives.perception_rows(session(), Workload(2, 1, 60, 1)),
         "rollouts": [rollout_row(), rollout_row(precision="mixed", s_8=1e-3)],
     }
-    assert png(draw_fronts(**tables)).startswith(b"\x89PNG")
+    assert png(alternatives.draw_fronts(**tables)).startswith(b"\x89PNG")
 
 
 def stored(tmp_path: Path, **values: float) -> Path:
@@ -211,7 +200,9 @@ def test_the_script_prints_tables_writes_what_it_says_and_checks_ratios(
     tmp_path, monkeypatch, capsys
 ):
     monkeypatch.setattr(
-        alternatives, "accuracy", lambda here: {"perception": perception_rows(here, TINY)}
+        alternatives,
+        "accuracy",
+        lambda here: {"perception": alternatives.perception_rows(here, TINY)},
     )
     monkeypatch.setattr(alternatives, "WORKLOAD", Workload(2, 1, 100, 1, hidden_dim=16))
 

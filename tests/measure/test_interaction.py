@@ -11,19 +11,7 @@ from PIL import Image, ImageDraw
 
 from npa_envs.cli import main
 from npa_envs.errors import NPAError
-from npa_envs.measure.interaction import (
-    FRAME_SHARES,
-    MIXED,
-    Encounters,
-    InteractionRow,
-    InteractionSettings,
-    RuleUnderTest,
-    heat_map,
-    mixing_index,
-    phase_diagram,
-    ratio_interval,
-    verdict,
-)
+from npa_envs.measure import interaction
 from npa_envs.rule.files import save_rule
 from npa_envs.rule.rule import NPARule
 from npa_envs.tasks.morphogenesis2d import Morphogenesis2D, Morphogenesis2DConfig
@@ -31,19 +19,13 @@ from npa_envs.world.randomness import WorldRandom
 
 CPU = torch.device("cpu")
 COUNT = 40
+SMALL = {"state_dim": 4, "eps": 0.15, "resolution": 24}
 
 
 @functools.cache
 def task_of(count):
-    config = Morphogenesis2DConfig(
-        target="ring",
-        particle_count=count,
-        target_point_count=count,
-        state_dim=4,
-        eps=0.15,
-        resolution=24,
-    )
-    return Morphogenesis2D(config)
+    config = {"particle_count": count, "target_point_count": count, **SMALL}
+    return Morphogenesis2D(Morphogenesis2DConfig(target="ring", **config))
 
 
 def make_rule(seed=0, scale=0.3, eps0=0.15):
@@ -55,12 +37,12 @@ def make_rule(seed=0, scale=0.3, eps0=0.15):
 
 
 def organism(name="a", update_prob=0.5, **options):
-    return RuleUnderTest(name, make_rule(**options), task_of, update_prob)
+    return interaction.RuleUnderTest(name, make_rule(**options), task_of, update_prob)
 
 
 def settings(**options):
     usual = {"particle_count": COUNT, "distances": (0.0,), "steps": 12, "seeds": (1, 2, 3)}
-    return InteractionSettings(**usual | options)
+    return interaction.InteractionSettings(**usual | options)
 
 
 @pytest.mark.parametrize(
@@ -69,37 +51,41 @@ def settings(**options):
         (0.79, 0.0, 0.2, "cooperates"),
         (0.81, 0.0, 0.2, "undisturbed"),
         (0.81, 0.0, 0.1, "cooperates"),
-        (1.19, MIXED - 1e-9, 0.2, "undisturbed"),
+        (1.19, interaction.MIXED - 1e-9, 0.2, "undisturbed"),
         (1.19, 0.0, 0.1, "disrupted"),
-        (1.21, MIXED, 0.2, "disrupted, mixes"),
+        (1.21, interaction.MIXED, 0.2, "disrupted, mixes"),
         (0.5, 1.0, 0.2, "cooperates, mixes"),
         (math.inf, 0.0, 0.2, "disrupted"),
         (math.nan, 0.0, 0.2, "disrupted"),
     ],
 )
 def test_a_verdict_follows_from_the_change_and_the_mixing(change, mixing, margin, expected):
-    assert verdict(change, mixing, margin) == expected
+    assert interaction.verdict(change, mixing, margin) == expected
 
 
 def test_the_mixing_index_of_known_worlds():
     pair = torch.zeros(1, 2, 2)
-    assert mixing_index(pair, [1, 1], eps=0.1).item() == pytest.approx(1.0)
+    assert interaction.mixing_index(pair, [1, 1], eps=0.1).item() == pytest.approx(1.0)
     apart = torch.tensor([[[0.0, 0.0], [5.0, 0.0]]])
-    assert mixing_index(apart, [1, 1], eps=0.1).item() == 0.0
+    assert interaction.mixing_index(apart, [1, 1], eps=0.1).item() == 0.0
     # Three of one species and one of another at one place: the entropy of 3/4 and 1/4.
     heap = torch.zeros(1, 4, 2)
     entropy = -(0.75 * math.log(0.75) + 0.25 * math.log(0.25)) / math.log(2.0)
-    assert mixing_index(heap, [3, 1], eps=0.1).item() == pytest.approx(entropy, rel=1e-6)
+    assert interaction.mixing_index(heap, [3, 1], eps=0.1).item() == pytest.approx(
+        entropy, rel=1e-6
+    )
     # Of three species one is far away: two mix, the third does not.
     three = torch.tensor([[[0.0, 0.0], [0.0, 0.0], [5.0, 0.0]]])
     expected = 2.0 / 3.0 * math.log(2.0) / math.log(3.0)
-    assert mixing_index(three, [1, 1, 1], eps=0.1).item() == pytest.approx(expected, rel=1e-6)
+    assert interaction.mixing_index(three, [1, 1, 1], eps=0.1).item() == pytest.approx(
+        expected, rel=1e-6
+    )
     with pytest.raises(NPAError, match="at least two species"):
-        mixing_index(pair, [2], eps=0.1)
+        interaction.mixing_index(pair, [2], eps=0.1)
 
 
 def test_a_rule_within_reach_is_measured_by_its_own_particles():
-    encounters = Encounters(settings(distances=(0.0, 0.3)), device=CPU)
+    encounters = interaction.Encounters(settings(distances=(0.0, 0.3)), device=CPU)
     rows, _ = encounters.meet(organism(), organism("b", seed=1))
     alone = {found.alone for found in rows}
     assert len(alone) == 1
@@ -108,12 +94,12 @@ def test_a_rule_within_reach_is_measured_by_its_own_particles():
         assert found.together != found.alone
         assert found.change == pytest.approx(found.together / found.alone, rel=1e-12)
         assert found.displacement > 1e-3
-        assert found.verdict == verdict(found.change, found.mixing)
+        assert found.verdict == interaction.verdict(found.change, found.mixing)
 
 
 def test_still_rules_leave_their_seeds_and_the_metric_is_the_tasks():
     still = [organism(name, scale=0.0) for name in "ab"]
-    rows, _ = Encounters(settings(distances=(0.2,)), device=CPU).meet(*still)
+    rows, _ = interaction.Encounters(settings(distances=(0.2,)), device=CPU).meet(*still)
     (found,) = rows
     assert found.change == 1.0
     assert found.displacement == 0.0
@@ -121,18 +107,18 @@ def test_still_rules_leave_their_seeds_and_the_metric_is_the_tasks():
     x, s, _ = task.seed(3, generator=WorldRandom([1, 2, 3]))
     assert found.alone == pytest.approx(task.metric(x, s).mean().item(), rel=1e-6)
     # A rule beside itself has seeds of its own: else every particle would see both alike.
-    rows, _ = Encounters(settings(), device=CPU).meet(still[0], still[0])
+    rows, _ = interaction.Encounters(settings(), device=CPU).meet(still[0], still[0])
     assert 0.5 < rows[0].mixing < 0.99
 
 
 def test_pictures_are_taken_along_the_way_and_steps_are_counted():
     done = []
     given = settings(steps=40, distances=(0.0, 1.0))
-    encounters = Encounters(given, device=CPU, progress=done.append)
+    encounters = interaction.Encounters(given, device=CPU, progress=done.append)
     _, scenes = encounters.meet(organism(), organism("b", seed=1))
     # What is grown alone is grown once.
     assert sum(done) == 40 + 2 * 40
-    steps = [round(40 * share) for share in FRAME_SHARES]
+    steps = [round(40 * share) for share in interaction.FRAME_SHARES]
     expected = [f"d {d}, r 0.5, step {step}" for d in (0, 1) for step in steps]
     assert scenes.captions == expected
     assert len(scenes.frames) == len(expected)
@@ -144,7 +130,7 @@ def test_pictures_are_taken_along_the_way_and_steps_are_counted():
 def test_a_world_that_blows_up_is_disrupted_and_the_study_goes_on():
     bomb = organism("b", seed=1)
     bomb.rule.output.weight.mul_(1e38)
-    rows, _ = Encounters(settings(), device=CPU).meet(organism(), bomb)
+    rows, _ = interaction.Encounters(settings(), device=CPU).meet(organism(), bomb)
     assert rows[0].together == math.inf
     assert rows[0].verdict.startswith("disrupted")
     assert math.isfinite(rows[0].alone)
@@ -152,28 +138,25 @@ def test_a_world_that_blows_up_is_disrupted_and_the_study_goes_on():
 
 def test_the_interval_of_a_ratio_is_that_of_its_worlds():
     ones = torch.ones(4)
-    assert ratio_interval(2.0 * ones, ones) == (2.0, 2.0)
+    assert interaction.ratio_interval(2.0 * ones, ones) == (2.0, 2.0)
     # Both numbers of a world are drawn together.
-    assert ratio_interval(torch.arange(1.0, 5.0), torch.arange(1.0, 5.0)) == (1.0, 1.0)
+    assert interaction.ratio_interval(torch.arange(1.0, 5.0), torch.arange(1.0, 5.0)) == (1.0, 1.0)
     above = torch.randn(200, generator=torch.Generator().manual_seed(0)) + 3.0
-    low, high = ratio_interval(above, torch.ones(200))
+    low, high = interaction.ratio_interval(above, torch.ones(200))
     half = 1.96 * above.std().item() / math.sqrt(200)
     assert low == pytest.approx(above.mean().item() - half, abs=0.2 * half)
     assert high == pytest.approx(above.mean().item() + half, abs=0.2 * half)
-    low, high = ratio_interval(torch.tensor([1.0, 1.0, 1.0, math.inf]), ones)
+    low, high = interaction.ratio_interval(torch.tensor([1.0, 1.0, 1.0, math.inf]), ones)
     assert (low, high) == (1.0, math.inf)
-    assert ratio_interval(ones, torch.zeros(4)) == (math.inf, math.inf)
+    assert interaction.ratio_interval(ones, torch.zeros(4)) == (math.inf, math.inf)
 
 
 def test_a_larger_radius_mixes_more_and_figures_lie_in_their_intervals():
-    one, twice = (
-        Encounters(settings(eps_factors=(factor,), distances=(0.2,)), device=CPU)
-        for factor in (1.0, 2.0)
-    )
+    given = settings(eps_factors=(1.0, 2.0), distances=(0.2,))
     pair = organism(), organism("b", seed=1)
-    (usual,), _ = one.meet(*pair)
-    (wide,), _ = twice.meet(*pair)
-    assert wide.eps_factor == 2.0
+    rows, _ = interaction.Encounters(given, device=CPU).meet(*pair)
+    usual, wide = rows
+    assert (usual.eps_factor, wide.eps_factor) == (1.0, 2.0)
     assert wide.alone != usual.alone
     assert wide.mixing > usual.mixing
     assert usual.mixing_low <= usual.mixing <= usual.mixing_high
@@ -182,18 +165,20 @@ def test_a_larger_radius_mixes_more_and_figures_lie_in_their_intervals():
 
 def test_pictures_are_drawn_of_rows_with_gaps_and_infinities():
     pytest.importorskip("matplotlib")
-    row = InteractionRow("a", "b", 0.0, 0.5, 0.1, 0.2, 2.0, 0.1, 0.0, "disrupted")
+    row = interaction.InteractionRow("a", "b", 0.0, 0.5, 0.1, 0.2, 2.0, 0.1, 0.0, "disrupted")
     infinite = {"ratio": 0.25, "change": math.inf, "change_high": math.inf}
     for draw, *others in (
-        (phase_diagram, infinite, {"eps_factor": 2.0}),
-        (heat_map, {"rule": "b", "beside": "a", "change": math.inf}, {"distance": 1.0}),
+        (interaction.phase_diagram, infinite, {"eps_factor": 2.0}),
+        (interaction.heat_map, {"rule": "b", "beside": "a", "change": math.inf}, {"distance": 1.0}),
     ):
         rows = [row, *(dataclasses.replace(row, **changed) for changed in others)]
         assert draw(rows).startswith(b"\x89PNG")
 
 
-def test_rules_that_cannot_share_a_world_are_named():
-    encounters = Encounters(settings(), device=CPU)
+def test_rules_that_cannot_share_a_world_are_named_and_a_share_leaves_a_particle():
+    shares = (0.5, 0.001, 0.999)
+    assert [settings().counts(share) for share in shares] == [(20, 20), (1, 39), (39, 1)]
+    encounters = interaction.Encounters(settings(), device=CPU)
     with pytest.raises(NPAError, match=r"a and b cannot share a world: .*eps0, got 0\.15 .* 0\.2"):
         encounters.check([organism(), organism("b", eps0=0.2)])
 
@@ -216,16 +201,23 @@ def test_wrong_settings_are_clear_errors(options, message):
         settings(**options)
 
 
-def test_a_share_leaves_a_particle_for_either_species():
-    shares = (0.5, 0.001, 0.999)
-    assert [settings().counts(share) for share in shares] == [(20, 20), (1, 39), (39, 1)]
-
-
 def rules_metadata(folder):
     """What rules that grow the picture in `folder` say in their files."""
     config = {"target": str(folder / "disk.png"), "particle_count": COUNT, "hidden_dim": 16}
-    config |= {"state_dim": 4, "eps": 0.15, "resolution": 24}
+    config |= SMALL
     return {"task": "morphogenesis2d", "config": json.dumps(config)}
+
+
+def saved(folder, rules, *names, first=0):
+    """Write rules that grow the picture in `rules`, and return their files."""
+    paths = [folder / f"{name}.safetensors" for name in names]
+    for number, path in enumerate(paths, start=first):
+        save_rule(make_rule(number), path, metadata=rules_metadata(rules))
+    return [str(path) for path in paths]
+
+
+def held_in(folder):
+    return json.loads((folder / "interactions.json").read_text(encoding="utf-8"))
 
 
 class TestCommand:
@@ -235,9 +227,7 @@ class TestCommand:
         picture = Image.new("RGBA", (16, 16))
         ImageDraw.Draw(picture).ellipse((3, 3, 12, 12), fill="#30a050")
         picture.save(folder / "disk.png")
-        for number, name in enumerate(("one", "two")):
-            path = folder / f"{name}.safetensors"
-            save_rule(make_rule(number), path, metadata=rules_metadata(folder))
+        saved(folder, folder, "one", "two")
         return folder
 
     @staticmethod
@@ -248,15 +238,14 @@ class TestCommand:
 
     def test_every_pair_is_measured_written_and_drawn(self, rules, tmp_path, capsys):
         assert main(self.words(rules, tmp_path)) == 0
-        held = json.loads((tmp_path / "interactions.json").read_text(encoding="utf-8"))
+        held = held_in(tmp_path)
         pairs = [(found["rule"], found["beside"]) for found in held["rows"]]
         names = ["one", "two"]
         assert pairs == [(a, b) for a in names for b in names for _ in range(2)]
         assert [(m["ratio"], m["distance"]) for m in held["matrices"]] == [(0.5, 0.0), (0.5, 2.0)]
         for matrix in held["matrices"]:
-            changes = [
-                found["change"] for found in held["rows"] if found["distance"] == matrix["distance"]
-            ]
+            rows = [row for row in held["rows"] if row["distance"] == matrix["distance"]]
+            changes = [row["change"] for row in rows]
             assert matrix["change"] == [changes[:2], changes[2:]]
         assert held["settings"]["particle_count"] == COUNT
         for a, b in {*pairs}:
@@ -266,32 +255,38 @@ class TestCommand:
         assert printed.count("\n") >= 9
         assert "undisturbed" in printed
 
-    def test_several_radii_make_phase_diagrams_of_each_pair(self, rules, tmp_path, capsys):
+    def test_several_radii_make_phase_diagrams_of_each_pair(self, rules, tmp_path):
         pytest.importorskip("matplotlib")
         more = ("--eps-factors", "1", "1.5", "--no-itself")
         assert main(self.words(rules, tmp_path, *more)) == 0
-        rows = json.loads((tmp_path / "interactions.json").read_text(encoding="utf-8"))["rows"]
-        told = [(row["rule"], row["eps_factor"], row["distance"]) for row in rows]
+        told = [
+            (row["rule"], row["eps_factor"], row["distance"]) for row in held_in(tmp_path)["rows"]
+        ]
         settings = [(factor, distance) for factor in (1.0, 1.5) for distance in (0.0, 2.0)]
         assert told == [(name, *each) for name in ("one", "two") for each in settings]
         for name in ("one-two", "two-one"):
             with Image.open(tmp_path / f"phases-{name}.png") as drawn:
                 assert drawn.width > drawn.height
 
-    def test_a_rule_alone_that_is_not_to_meet_itself_is_refused(self, rules, tmp_path, capsys):
-        path, out = str(rules / "one.safetensors"), tmp_path / "out"
-        assert main(["interact", path, "--no-itself", "--out", str(out)]) == 2
-        assert "rules must be two or more without itself, got one" in capsys.readouterr().err
-        assert main(self.words(rules, out, "--particle-count", "0")) == 2
-        assert "particle_count must be at least 2, got 0" in capsys.readouterr().err
-        assert not out.exists()
+    def test_mistakes_are_refused_and_nothing_is_written(self, rules, tmp_path, capsys):
+        out, unknown = tmp_path / "out", tmp_path / "unknown.safetensors"
+        save_rule(make_rule(), unknown)
+        one = str(rules / "one.safetensors")
+        for words, message in (
+            (["interact", one, "--no-itself", "--out", str(out)], "more without itself, got one"),
+            (self.words(rules, out, "--particle-count", "0"), "must be at least 2, got 0"),
+            (["interact", str(unknown), "--out", str(out)], "does not say what it grows: leave it"),
+        ):
+            assert main(words) == 2
+            assert message in capsys.readouterr().err
+            assert not out.exists()
 
     def test_a_stopped_run_goes_on_and_ends_as_one_that_was_not(
         self, rules, tmp_path, capsys, monkeypatch
     ):
         whole, parts = tmp_path / "whole", tmp_path / "parts"
         assert main(self.words(rules, whole)) == 0
-        meet, met = Encounters.meet, []
+        meet, met = interaction.Encounters.meet, []
 
         def stopped(self, first, second):
             met.append((first.name, second.name))
@@ -299,42 +294,25 @@ class TestCommand:
                 raise KeyboardInterrupt
             return meet(self, first, second)
 
-        monkeypatch.setattr(Encounters, "meet", stopped)
+        monkeypatch.setattr(interaction.Encounters, "meet", stopped)
         assert main(self.words(rules, parts)) == 130
-        assert (
-            len(json.loads((parts / "interactions.json").read_text(encoding="utf-8"))["rows"]) == 4
-        )
+        assert len(held_in(parts)["rows"]) == 4
         capsys.readouterr()
         assert main(self.words(rules, parts)) == 0
         assert "2 of 4 pairs were measured before" in capsys.readouterr().out
         assert met[3:] == [("two", "one"), ("two", "two")]
-        texts = [
-            (folder / "interactions.json").read_text(encoding="utf-8") for folder in (whole, parts)
-        ]
-        assert texts[0] == texts[1]
-
-    def test_results_of_other_settings_are_not_mixed_with_these(self, rules, tmp_path, capsys):
-        assert main(self.words(rules, tmp_path)) == 0
-        assert main(self.words(rules, tmp_path, "--update-prob", "0.9")) == 2
+        assert held_in(whole) == held_in(parts)
+        # Results of other settings are not mixed with these.
+        assert main(self.words(rules, parts, "--update-prob", "0.9")) == 2
         error = capsys.readouterr().err
         assert "update_prob was None, now 0.9: remove it, or choose another folder with" in error
-        save_rule(make_rule(5), rules / "two.safetensors", metadata=rules_metadata(rules))
-        assert main(self.words(rules, tmp_path)) == 2
+        saved(rules, rules, "two", first=5)
+        assert main(self.words(rules, parts)) == 2
         assert "holds figures of other settings: rules was" in capsys.readouterr().err
 
-    def test_rules_of_other_tasks_and_of_none_are_refused(self, rules, tmp_path, capsys):
-        unknown = tmp_path / "unknown.safetensors"
-        save_rule(make_rule(), unknown)
-        assert main(["interact", str(unknown), "--out", str(tmp_path / "out")]) == 2
-        assert "does not say what it grows: leave it out" in capsys.readouterr().err
-        assert not (tmp_path / "out").exists()
-
-    def test_pairs_whose_names_look_alike_have_files_of_their_own(self, rules, tmp_path, capsys):
+    def test_pairs_whose_names_look_alike_have_files_of_their_own(self, rules, tmp_path):
         pytest.importorskip("matplotlib")
-        for number, name in enumerate(("p", "p-q", "q-r", "r")):
-            path = tmp_path / f"{name}.safetensors"
-            save_rule(make_rule(number), path, metadata=rules_metadata(rules))
-        paths = [str(tmp_path / f"{name}.safetensors") for name in ("p", "p-q", "q-r", "r")]
+        paths = saved(tmp_path, rules, "p", "p-q", "q-r", "r")
         words = ["--seed-count", "1", "--steps", "2", "--distances", "0", "--no-itself"]
         words += ["--eps-factors", "1", "1.5", "--out", str(tmp_path / "out"), "--no-progress"]
         assert main(["interact", *paths, *words]) == 0
@@ -345,12 +323,12 @@ class TestCommand:
         assert {"p-q-r.png", "p-q-r-2.png"} < pairs
         assert {f"phases-{name}" for name in pairs} < names
 
-    def test_quick_leaves_what_was_said(self, rules, tmp_path, capsys):
+    def test_quick_leaves_what_was_said(self, rules, tmp_path):
         paths = [str(rules / f"{name}.safetensors") for name in ("one", "two")]
         words = ["--quick", "--steps", "3", "--seed-count", "1", "--distances", "0", "0.5", "1"]
         words += ["--out", str(tmp_path), "--no-progress"]
         assert main(["interact", *paths, *words]) == 0
-        told = json.loads((tmp_path / "interactions.json").read_text(encoding="utf-8"))["settings"]
+        told = held_in(tmp_path)["settings"]
         # The last is the default, and was said all the same.
         assert (told["steps"], told["seeds"], told["distances"]) == (3, [1_000_000], [0, 0.5, 1])
         assert told["particle_count"] == 512

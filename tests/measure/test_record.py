@@ -10,37 +10,24 @@ import torch
 from scripts import script_facts, script_parser
 
 from npa_envs.errors import NPAError
+from npa_envs.measure import record
 from npa_envs.measure.plots import mark_decades, write_plots
-from npa_envs.measure.record import (
-    UNMEASURED,
-    csv_text,
-    current_commit,
-    markdown_table,
-    mean_with_error,
-    measured_facts,
-    number,
-    read_record,
-    table_text,
-    time_limit,
-    without_folders,
-    write_record,
-)
 
 RESULTS = Path(__file__).resolve().parents[2] / "benchmarks" / "results"
 FACTS = {"commit": "0", "seeds": (1, 2)}
 
 
 def read(path: Path, facts=FACTS, **options):
-    return read_record(path, facts, lambda held: held["rows"], command="x", **options)
+    return record.read_record(path, facts, lambda held: held["rows"], command="x", **options)
 
 
 def test_a_record_comes_back_with_null_for_what_is_not_finite(tmp_path):
     path = tmp_path / "record.json"
     assert read(path) is None
-    write_record(path, {"facts": FACTS, "rows": [1.5, math.inf, math.nan]})
+    record.write_record(path, {"facts": FACTS, "rows": [1.5, math.inf, math.nan]})
     assert read(path) == [1.5, None, None]
-    assert math.isnan(number(None))
-    assert number(3) == 3.0
+    assert math.isnan(record.number(None))
+    assert record.number(3) == 3.0
 
 
 @pytest.mark.parametrize(
@@ -63,24 +50,24 @@ def test_other_settings_and_other_files_are_refused(content, facts, message, tmp
 
 
 def test_facts_name_the_machine_the_commit_and_the_versions():
-    facts = measured_facts(torch.device("cpu"), None, seed=3)
+    facts = record.measured_facts(torch.device("cpu"), None, seed=3)
     assert list(facts) == ["device", "machine", "seed", "commit", "versions"]
     assert facts["machine"].startswith("CPU (")
-    assert facts["commit"] == current_commit()
+    assert facts["commit"] == record.current_commit()
     assert torch.__version__.startswith(facts["versions"]["torch"])
-    assert measured_facts(torch.device("cpu"), "abc")["commit"] == "abc"
+    assert record.measured_facts(torch.device("cpu"), "abc")["commit"] == "abc"
 
 
 def test_a_commands_folders_are_not_told():
     words = ["heart", "--out", "a/b", "--output=c", "--seed", "a/b"]
     told = ["heart", "--out", "OUT", "--output=OUTPUT", "--seed", "a/b"]
-    assert without_folders(words, "--out", "--output") == told
+    assert record.without_folders(words, "--out", "--output") == told
 
 
 def test_a_time_limit_passes_once_and_never_without_one():
-    assert not time_limit(None)()
-    assert not time_limit(60.0)()
-    assert time_limit(0.0)()
+    assert not record.time_limit(None)()
+    assert not record.time_limit(60.0)()
+    assert record.time_limit(0.0)()
 
 
 def test_stored_records_can_be_read():
@@ -103,18 +90,18 @@ class Row:
 
 def test_tables_as_text_markdown_and_comma_separated_values():
     rows = [Row(64, 31.41592), Row(128, None)]
-    assert table_text(rows, missing=UNMEASURED).splitlines() == [
+    assert record.table_text(rows, missing=record.UNMEASURED).splitlines() == [
         "step  mean loss",
         "  64      31.42",
         " 128          -",
     ]
-    assert table_text(rows[1:], missing=UNMEASURED).splitlines() == ["step", " 128"]
-    assert table_text(rows[1:]).splitlines() == ["step  mean loss", " 128      never"]
-    assert table_text([]) == ""
-    assert markdown_table(["a", "b"], [["1", "2"]]) == "| a | b |\n| --- | --- |\n| 1 | 2 |"
-    assert csv_text(["a", "b"], [["x", 125.0], [1, math.nan]]) == "a,b\nx,125\n1,nan\n"
+    assert record.table_text(rows[1:], missing=record.UNMEASURED).splitlines() == ["step", " 128"]
+    assert record.table_text(rows[1:]).splitlines() == ["step  mean loss", " 128      never"]
+    assert record.table_text([]) == ""
+    assert record.markdown_table(["a", "b"], [["1", "2"]]) == "| a | b |\n| --- | --- |\n| 1 | 2 |"
+    assert record.csv_text(["a", "b"], [["x", 125.0], [1, math.nan]]) == "a,b\nx,125\n1,nan\n"
     estimates = [(1.0, 0.25), (2.0, math.nan), (math.nan, math.nan)]
-    assert [mean_with_error(*one) for one in estimates] == ["1.000 ± 0.250", "2.000", "–"]
+    assert [record.mean_with_error(*one) for one in estimates] == ["1.000 ± 0.250", "2.000", "–"]
 
 
 def test_plots_without_matplotlib_name_the_extra(tmp_path, monkeypatch):

@@ -10,45 +10,21 @@ import torch
 
 from npa_envs.cli import main
 from npa_envs.measure.accuracy.endurance import rule_names, task_name
-from npa_envs.measure.robustness import study
-from npa_envs.measure.robustness.study import (
-    Response,
-    RuleRecord,
-    grow,
-    pictures,
-    recovered_share,
-    responses,
-    tables,
-    where_it_works,
-    working_range,
-)
+from npa_envs.measure.robustness import study, trials
 from npa_envs.measure.robustness.trials import (
     BLOB_DISTANCE,
     CONDITIONS,
-    CONTROL,
-    DAMAGES,
     PLANS,
     SHAPES,
     SIZE_FACTOR,
-    STATE_NOISE,
-    LossCurve,
     RuleTrial,
     TrialPlan,
     disk,
-    healing,
     loss_curves,
     quick_plan,
-    recovery_step,
     trained_value,
 )
-from npa_envs.rule.files import (
-    load_rule,
-    rule_digest,
-    rule_file,
-    rule_metadata,
-    save_rule,
-    shipped_rules,
-)
+from npa_envs.rule import files
 from npa_envs.tasks.damage import random_particle
 from npa_envs.training.trained_tasks import task_of_rule, trained_config
 from npa_envs.world.brushes import nearest_image
@@ -56,12 +32,8 @@ from npa_envs.world.randomness import WorldRandom
 
 SIDE = 2.0
 COUNT = 501
-TINY = TrialPlan(
-    grow_steps=8,
-    heal_steps=(0, 4, 8),
-    chunk=4,
-    values={"eps": (1.0, 2.0), "particles": (1.0, 2.0), "update_prob": (0.25, 0.5)},
-)
+VALUES = {"eps": (1.0, 2.0), "particles": (1.0, 2.0), "update_prob": (0.25, 0.5)}
+TINY = TrialPlan(grow_steps=8, heal_steps=(0, 4, 8), chunk=4, values=VALUES)
 
 
 def ground(
@@ -72,7 +44,7 @@ def ground(
 
 def damaged(name: str, x: torch.Tensor, s: torch.Tensor, box=None, seeds=(1, 2, 3)):
     before = x.clone(), s.clone()
-    found = DAMAGES[name].apply(x, s, WorldRandom(list(seeds), device=x.device), box)
+    found = trials.DAMAGES[name].apply(x, s, WorldRandom(list(seeds), device=x.device), box)
     assert torch.equal(x, before[0])
     assert torch.equal(s, before[1])
     return found
@@ -93,7 +65,7 @@ def worlds(request, device):
 def plainly(name, x, s, random, box):
     """What a damage leaves of worlds, by its formula."""
     if name == "noise":
-        return x, s + STATE_NOISE * random.normal(*s.shape[1:])
+        return x, s + trials.STATE_NOISE * random.normal(*s.shape[1:])
     if name in ("half", "side"):
         key = random.uniform(COUNT) if name == "half" else x @ random.normal(x.shape[2])[..., None]
         key = key.view(3, COUNT)
@@ -115,7 +87,7 @@ def plainly(name, x, s, random, box):
     return x + shift * normal.mT, s
 
 
-@pytest.mark.parametrize("name", DAMAGES)
+@pytest.mark.parametrize("name", trials.DAMAGES)
 def test_a_damage_does_to_each_world_what_it_says(worlds, name):
     x, s, box = worlds
     found_x, found_s = damaged(name, x, s, box)
@@ -177,29 +149,29 @@ def test_seeds_of_other_shapes_are_where_they_should_be(space_dim, device):
     ],
 )
 def test_recovery_is_the_first_step_within_a_tenth_of_the_twin(losses, twins, step):
-    assert recovery_step((0, 16, 32, 64), losses, twins) == step
+    assert trials.recovery_step((0, 16, 32, 64), losses, twins) == step
 
 
 def test_a_course_counts_its_seeds():
     twins = ((1.0, 1.0, 1.0),) * 4
     losses = ((3.0, 1.0, 1.0), (3.0, 2.0, 1.0), (3.0, 1.05, 2.0), (3.0, 2.0, 2.0))
-    course = LossCurve("wipe", (0, 16, 32), losses, twins)
+    course = trials.LossCurve("wipe", (0, 16, 32), losses, twins)
     assert course.recovery_steps() == [16, 32, 16, None]
     assert (course.recovered(), course.median_step(), course.within_at_end()) == (3, 16, 2)
     assert course.ratios(-1) == [1.0, 1.0, 2.0, 2.0]
-    others = [dataclasses.replace(course, damage=name) for name in (CONTROL, "side")]
-    assert recovered_share([record(course, *others)], ["wipe", "cut"]) == (3, 2, 4)
-    assert recovered_share([record(course, *others)], DAMAGES) == (6, 4, 8)
+    others = [dataclasses.replace(course, damage=name) for name in (trials.CONTROL, "side")]
+    assert study.recovered_share([record(course, *others)], ["wipe", "cut"]) == (3, 2, 4)
+    assert study.recovered_share([record(course, *others)], trials.DAMAGES) == (6, 4, 8)
 
 
-def record(*found: LossCurve, **changed) -> RuleRecord:
+def record(*found: trials.LossCurve, **changed) -> study.RuleRecord:
     values = [("eps", 1.0), ("eps", 2.0), ("particles", 1.0), ("update_prob", 0.5)]
-    told = tuple(Response(name, value, 8, (0.5, value)) for name, value in values)
-    lost = Response("eps", 4.0, 8, (0.5, math.nan))
-    left_out = Response("particles", 2.0, 0, (), note="256 particles in all")
+    told = tuple(study.Response(name, value, 8, (0.5, value)) for name, value in values)
+    lost = study.Response("eps", 4.0, 8, (0.5, math.nan))
+    left_out = study.Response("particles", 2.0, 0, (), note="256 particles in all")
     fields = {"rule": "heart", "task": "morphogenesis2d", "metric": "loss", "update_prob": 0.5}
     fields |= {"curves": found, "responses": (*told, lost, left_out)}
-    return RuleRecord({"a": 1}, **fields | changed)
+    return study.RuleRecord({"a": 1}, **fields | changed)
 
 
 # Where rules work
@@ -215,13 +187,13 @@ def record(*found: LossCurve, **changed) -> RuleRecord:
     ],
 )
 def test_a_rule_works_where_its_loss_at_most_doubles(ratios, text):
-    assert working_range((0.1, 0.2, 0.5, 0.8, 1.0), ratios, trained=0.5) == text
+    assert study.working_range((0.1, 0.2, 0.5, 0.8, 1.0), ratios, trained=0.5) == text
 
 
-def responding(condition: str, *losses_by_value) -> RuleRecord:
+def responding(condition: str, *losses_by_value) -> study.RuleRecord:
     """A record of one condition beside the loss as trained, which is 1 unless it says so."""
-    told = [Response(condition, value, 8, losses) for value, losses in losses_by_value]
-    trained = () if condition == "eps" else (Response("eps", 1.0, 8, (0.5, 1.5)),)
+    told = [study.Response(condition, value, 8, losses) for value, losses in losses_by_value]
+    trained = () if condition == "eps" else (study.Response("eps", 1.0, 8, (0.5, 1.5)),)
     return record(responses=(*trained, *told))
 
 
@@ -251,7 +223,7 @@ def responding(condition: str, *losses_by_value) -> RuleRecord:
 def test_where_a_rule_works_follows_from_the_mean_loss_of_its_seeds(
     condition, losses_by_value, text
 ):
-    assert where_it_works(responding(condition, *losses_by_value), condition) == text
+    assert study.where_it_works(responding(condition, *losses_by_value), condition) == text
 
 
 # Measuring
@@ -260,17 +232,20 @@ def test_where_a_rule_works_follows_from_the_mean_loss_of_its_seeds(
 @pytest.mark.parametrize("name", ["heart", "dots", "digits"])
 def test_damaged_worlds_go_beside_twins_with_the_same_masks(name, device):
     place = ground(name, device)
-    home, trained = grow(place)
-    found = {course.damage: course for course in healing(place, home)}
+    home, trained = study.grow(place)
+    found = {course.damage: course for course in trials.healing(place, home)}
     static = name == "digits"
-    assert set(found) == {CONTROL, *(n for n, d in DAMAGES.items() if d.static or not static)}
+    assert set(found) == {
+        trials.CONTROL,
+        *(n for n, d in trials.DAMAGES.items() if d.static or not static),
+    }
     twins = found["wipe"].twins
-    assert twins == found[CONTROL].twins == found["noise"].twins
+    assert twins == found[trials.CONTROL].twins == found["noise"].twins
     assert tuple(curve[0] for curve in twins) == pytest.approx(trained.losses, rel=1e-6)
     # At first the control is its twin; then masks are others.
-    assert found[CONTROL].ratios(0) == [1.0, 1.0]
+    assert found[trials.CONTROL].ratios(0) == [1.0, 1.0]
     if not static:
-        assert found[CONTROL].losses != twins
+        assert found[trials.CONTROL].losses != twins
         assert all(value != 1.0 for value in found["noise"].ratios(0))
     assert found["half"].twins == found["side"].twins != twins
     # What twins do is what the worlds do that go on alone.
@@ -281,8 +256,8 @@ def test_damaged_worlds_go_beside_twins_with_the_same_masks(name, device):
 
 def test_conditions_are_grown_for_as_many_updates_and_left_out_where_too_large(device):
     place = ground("heart", device)
-    _, trained = grow(place)
-    found = list(responses(place, trained, most_particles=300))
+    _, trained = study.grow(place)
+    found = list(study.responses(place, trained, most_particles=300))
     assert [(r.condition, r.value, r.steps) for r in found] == [
         ("eps", 1.0, 8),
         ("eps", 2.0, 8),
@@ -328,13 +303,13 @@ def test_seeds_of_a_rule_of_many_pictures_grow_them_in_turn(device):
     one = RuleTrial("seven-pictures", device, TINY, range(8, 9), 128).home(share=0.5)
     assert torch.equal(one.s, place.home(share=0.5).s[3:])
     # What takes codes away gives them back.
-    loss_curves = healing(place, grow(place)[0])
+    loss_curves = trials.healing(place, study.grow(place)[0])
     assert all(len(course.losses) == 4 for course in loss_curves)
 
 
 def test_a_world_that_is_lost_stays_lost_and_leaves_the_others_as_they_are(device):
     place = ground("heart", device)
-    home, _ = grow(place)
+    home, _ = study.grow(place)
     whole = loss_curves(home, place.run(home, place.random(9)), (0, 4, 8))
     run = place.run(home, place.random(9))
     run.s[0, :, 0] = math.nan
@@ -345,8 +320,8 @@ def test_a_world_that_is_lost_stays_lost_and_leaves_the_others_as_they_are(devic
 
 def test_plans_are_whole_chunks_and_hold_what_was_trained():
     assert task_name("seven-pictures") == "morphogenesis2d"
-    for name, path in shipped_rules().items():
-        update_prob = trained_config(path, rule_metadata(path)).task.update_prob
+    for name, path in files.shipped_rules().items():
+        update_prob = trained_config(path, files.rule_metadata(path)).task.update_prob
         for plan in (PLANS[task_name(name)], quick_plan(task_name(name))):
             assert plan.heal_steps[0] == 0
             assert all(step % plan.chunk == 0 for step in (*plan.heal_steps, plan.grow_steps))
@@ -363,15 +338,15 @@ def test_stored_records_give_the_stored_tables():
     folder = Path(__file__).resolve().parents[2] / "benchmarks" / "results" / "robustness_h200"
     places = [folder / f"robustness_{name}.json" for name in rule_names()]
     held = {path: json.loads(path.read_text("utf-8")) for path in places if path.exists()}
-    records = [RuleRecord(content["facts"], path).read() for path, content in held.items()]
+    records = [study.RuleRecord(content["facts"], path).read() for path, content in held.items()]
     assert len(records) == len(list(folder.glob("*.json"))) == 15
     assert all(record.done for record in records)
-    assert tables(records) == (folder / "robustness.md").read_text("utf-8")
+    assert study.tables(records) == (folder / "robustness.md").read_text("utf-8")
 
 
 def test_tables_say_what_was_not_measured_and_what_is_not_finite():
-    course = LossCurve("wipe", (0, 16), ((2.0, 1.0), (2.0, 3.0)), ((1.0, 1.0), (1.0, 1.0)))
-    text = tables([record(course), record(rule="dots")])
+    course = trials.LossCurve("wipe", (0, 16), ((2.0, 1.0), (2.0, 3.0)), ((1.0, 1.0), (1.0, 1.0)))
+    text = study.tables([record(course), record(rule="dots")])
     ranges = "1 … 2 | 1 alone (not measured: 2) | 0.5 alone | – | – | – |"
     assert f"| heart | {ranges}\n| dots | {ranges}" in text
     for line in ("| heart | 1/2, 16 |", "| heart | 2 → 2 (1/2) |", "| dots | – |"):
@@ -380,7 +355,9 @@ def test_tables_say_what_was_not_measured_and_what_is_not_finite():
 
 
 def test_records_come_back_as_they_were_written_and_curves_are_drawn_by_task(tmp_path):
-    course = LossCurve("wipe", (0, 16), ((2.0, 1.0), (2.0, math.nan)), ((1.0, 1.0), (1.0, 1.0)))
+    course = trials.LossCurve(
+        "wipe", (0, 16), ((2.0, 1.0), (2.0, math.nan)), ((1.0, 1.0), (1.0, 1.0))
+    )
     records = [record(course), record(course, task="texture", rule="dots")]
     path = tmp_path / "robustness_heart.json"
     records[0].path = path
@@ -389,11 +366,11 @@ def test_records_come_back_as_they_were_written_and_curves_are_drawn_by_task(tmp
         16,
         None,
     ]
-    found = RuleRecord({"a": 1}, path).read()
+    found = study.RuleRecord({"a": 1}, path).read()
     assert repr((found.rows, found.curves)) == repr((records[0].rows, records[0].curves))
     assert found.about == records[0].about
     pytest.importorskip("matplotlib")
-    drawn = pictures(records)
+    drawn = study.pictures(records)
     assert set(drawn) == {"morphogenesis2d", "texture"}
     assert all(picture.startswith(b"\x89PNG") for picture in drawn.values())
 
@@ -435,11 +412,14 @@ def test_the_command_measures_writes_and_goes_on(tmp_path, capsys, monkeypatch):
 
 
 def test_a_record_of_a_rule_that_was_trained_anew_is_refused(tmp_path, capsys, monkeypatch):
-    rule = load_rule("heart")
-    metadata = {"task": "morphogenesis2d", "config": rule_metadata(rule_file("heart"))["config"]}
+    rule = files.load_rule("heart")
+    metadata = {
+        "task": "morphogenesis2d",
+        "config": files.rule_metadata(files.rule_file("heart"))["config"],
+    }
     (tmp_path / "mine").mkdir()
     path = tmp_path / "mine" / "rule.safetensors"
-    save_rule(rule, path, metadata=metadata)
+    files.save_rule(rule, path, metadata=metadata)
     words = ["robustness", str(path.parent), "--quick", "--no-progress", "--commit", "0"]
     words += ["--max-seconds", "1e-9", f"--out={tmp_path / 'out'}"]
     monkeypatch.setattr(
@@ -447,10 +427,24 @@ def test_a_record_of_a_rule_that_was_trained_anew_is_refused(tmp_path, capsys, m
     )
     assert main(words) == 0
     held = json.loads((tmp_path / "out" / "robustness_mine.json").read_text(encoding="utf-8"))
-    assert held["facts"]["weights"] == rule_digest(rule)
+    assert held["facts"]["weights"] == files.rule_digest(rule)
     assert str(tmp_path / "out") not in held["command"]
     with torch.no_grad():
         rule.output.weight.mul_(1.01)
-    save_rule(rule, path, metadata=metadata)
+    files.save_rule(rule, path, metadata=metadata)
     assert main(words) == 2
     assert "holds figures of other settings: weights was" in capsys.readouterr().err
+
+
+def test_a_run_of_several_radii_is_taken_and_a_rule_of_no_task_refused(tmp_path, capsys):
+    out = str(tmp_path / "run")
+    words = ["train", "morphogenesis2d", "--preset", "tiny", "--iterations", "2", "--no-report"]
+    words += ["--milestones", "1", "--vary-eps", "0.5", "2"]
+    assert main([*words, "--no-progress", "--out", out]) == 0
+    capsys.readouterr()
+    assert main(["robustness", out, "--quick", "--no-progress", "--out", str(tmp_path / "r")]) == 0
+    assert "| run |" in capsys.readouterr().out
+    assert json.loads((tmp_path / "r" / "robustness_run.json").read_text(encoding="utf-8"))["done"]
+    files.save_rule(files.load_rule("heart"), tmp_path / "own.safetensors")
+    assert main(["robustness", str(tmp_path / "own.safetensors"), "--quick"]) == 2
+    assert "must say on which task it was trained" in capsys.readouterr().err

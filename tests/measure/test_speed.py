@@ -9,21 +9,10 @@ from functools import partial
 import pytest
 import torch
 from clock import Clock
-from drift import DriftRow, drift_rows
 
 from npa_envs.cli import main
 from npa_envs.measure.speed import suites
 from npa_envs.measure.speed.explain import explain
-from npa_envs.measure.speed.suites import (
-    PAPER,
-    BenchReport,
-    roll_one_species,
-    scaling_rows,
-    skip_rows,
-    slope_rows,
-    throughput_rows,
-    varied,
-)
 from npa_envs.measure.speed.timing import LeftOut, Timing, TimingSession, Workload, compare
 from npa_envs.ops import perceive
 from npa_envs.ops.launch import noted_launches
@@ -56,12 +45,16 @@ def test_the_time_of_a_call_is_a_median_within_its_range():
 
 
 def test_workloads_have_the_neighbours_they_claim():
-    for workload in (Workload(2, 1, 2000, 1), Workload(3, 1, 2000, 1), varied("neighbours", 32)):
+    for workload in (
+        Workload(2, 1, 2000, 1),
+        Workload(3, 1, 2000, 1),
+        suites.varied("neighbours", 32),
+    ):
         (x,), _ = workload.worlds(torch.device("cpu"))
         inner = (x.abs() < workload.half_width - workload.eps).all(1)
         counted = (torch.cdist(x[inner], x) < workload.eps).sum(1).double().mean()
         assert float(counted) == pytest.approx(workload.neighbour_count, rel=0.1)
-    flat = [workload for workload in PAPER if workload.space_dim == 2]
+    flat = [workload for workload in suites.PAPER if workload.space_dim == 2]
     assert {round(workload.neighbour_count, 6) for workload in flat} == {66.652875}
     state = torch.get_rng_state()
     one, other = (TINY.rule(torch.device("cpu")) for _ in range(2))
@@ -73,7 +66,7 @@ def test_workloads_have_the_neighbours_they_claim():
 
 
 def test_float32_drifts_little_from_float64_over_a_rollout(device):
-    rows = drift_rows(
+    rows = suites.drift_rows(
         TimingSession(device, repeats=1), [Workload(2, 2, 300, 8), Workload(3, 1, 300, 8)]
     )
     assert [row.workload for row in rows] == ["2D (2, 300, 8)", "3D (1, 300, 8)"]
@@ -87,7 +80,7 @@ def test_float32_drifts_little_from_float64_over_a_rollout(device):
 
 
 def test_throughput_stores_and_recomputes():
-    store, recompute = throughput_rows(session(), [TINY])
+    store, recompute = suites.throughput_rows(session(), [TINY])
     assert (store.memory, recompute.memory) == ("store", "recompute")
     assert store.workload == "2D (2, 150, 2)"
     assert store.worlds_mib == pytest.approx(2 * 150 * (2 + 16) * 4 / 2**20)
@@ -96,7 +89,7 @@ def test_throughput_stores_and_recomputes():
 
 
 def test_scaling_varies_one_number_at_a_time_and_slopes_are_those_of_logarithms():
-    rows = scaling_rows(session())
+    rows = suites.scaling_rows(session())
     assert [row.value for row in rows] == [256, 1024, 16, 64, 1, 2, 4, 16]
     assert [round(row.neighbours) for row in rows] == [67, 67, 16, 64, 67, 67, 67, 67]
     assert [row.channels for row in rows] == [16] * 6 + [4, 16]
@@ -105,7 +98,7 @@ def test_scaling_varies_one_number_at_a_time_and_slopes_are_those_of_logarithms(
         for row in rows[::2]
         for n in (16, 64, 256, 1024)
     ]
-    slopes = slope_rows(grown)
+    slopes = suites.slope_rows(grown)
     assert [slope.axis for slope in slopes] == list(suites.AXES)
     for slope in slopes:
         assert (slope.infer_slope, slope.train_slope) == pytest.approx((1.0, 2.0))
@@ -127,7 +120,7 @@ def test_what_does_not_fit_into_memory_or_the_time_is_left_out():
 
 def test_each_skip_is_measured_with_and_without():
     here = session()
-    rows = skip_rows(here)
+    rows = suites.skip_rows(here)
     assert here.left_out == []
     assert len({row.condition for row in rows}) == len(rows) == 10
     assert all(row.done_us.median > 0 and row.skipped_us.median > 0 for row in rows)
@@ -182,7 +175,7 @@ def test_one_species_is_compared_with_the_rollout_that_it_is():
     rule = TINY.rule(here.device)
     outcomes = [
         roll(rule, x, s, 2, update_prob=0.5, generator=torch.Generator().manual_seed(1))
-        for roll in (rollout, roll_one_species)
+        for roll in (rollout, suites.roll_one_species)
     ]
     assert all(map(torch.equal, *outcomes))
 
@@ -195,14 +188,14 @@ class TimeRow:
     step_us: Timing
 
 
-def report_of(tables, **options) -> BenchReport:
-    return BenchReport(
+def report_of(tables, **options) -> suites.BenchReport:
+    return suites.BenchReport(
         "quick", "npa-envs bench", "abc", torch.device("cpu"), 1, tables, (), **options
     )
 
 
 def test_a_report_is_json_without_numbers_that_json_has_not():
-    row = DriftRow("tiny", 1e-6, math.nan, 1e-6, 1e-6, 1e-6)
+    row = suites.DriftRow("tiny", 1e-6, math.nan, 1e-6, 1e-6, 1e-6)
     loaded = json.loads(report_of({"drift": [row], "times": [TimeRow(timing(3.0))]}).json())
     assert {"suite", "command", "commit", "date", "device", "machine", "versions"} <= set(loaded)
     assert torch.__version__.startswith(loaded["versions"]["torch"])
@@ -246,7 +239,7 @@ def test_noted_launches_are_those_of_the_block():
 
 def test_the_command_prints_tables_and_writes_what_it_says(tmp_path, monkeypatch, capsys):
     monkeypatch.setitem(
-        suites.SUITES, "quick", lambda here: {"throughput": throughput_rows(here, [TINY])}
+        suites.SUITES, "quick", lambda here: {"throughput": suites.throughput_rows(here, [TINY])}
     )
     monkeypatch.chdir(tmp_path)
     folder = tmp_path / "results"

@@ -6,7 +6,16 @@ import pytest
 import torch
 
 import npa_envs
-from npa_envs import NPAError, NPARule, perceive, perception_fields, rollout
+from npa_envs import (
+    NPAError,
+    NPARule,
+    perceive,
+    perception_fields,
+    rollout,
+    rollout_species,
+    save_rule,
+    species_fields,
+)
 from npa_envs.agents.learning import Budget, Problem
 from npa_envs.agents.learning import train as learn
 from npa_envs.envs import multispecies_v0
@@ -21,12 +30,8 @@ from npa_envs.web.export import export_web
 from npa_envs.world.brushes import inject, wipe_state
 from npa_envs.wrappers import RowPolicy, TorchNormalizeReward
 
-
-def world(**options):
-    return torch.zeros(1, 4, 2, **options), torch.zeros(1, 4, 16, **options)
-
-
-X, S = world()
+X, X3, S = torch.zeros(1, 4, 2), torch.zeros(1, 4, 3), torch.zeros(1, 4, 16)
+ONE_STEP = Budget(particle_steps=1)
 NAN, INF = float("nan"), float("inf")
 HOLED = X.clone()
 HOLED[0, 2, 1] = NAN
@@ -72,7 +77,7 @@ def test_numbers_of_other_libraries_are_numbers(function, box):
 def test_numbers_of_other_libraries_run_worlds_and_survive_in_a_rule(tmp_path):
     rule = NPARule(alpha=np.float32(0.5))
     assert all(torch.isfinite(t).all() for t in rollout(rule, X, S, np.int64(2)))
-    npa_envs.save_rule(rule, tmp_path / "rule.safetensors")
+    save_rule(rule, tmp_path / "rule.safetensors")
     assert npa_envs.load_rule(tmp_path / "rule.safetensors").alpha == 0.5
 
 
@@ -89,6 +94,8 @@ def test_numbers_of_other_libraries_run_worlds_and_survive_in_a_rule(tmp_path):
         ({"dt": "fast"}, "dt must be a number"),
         ({"generator": 3}, "generator must be a torch.Generator or a WorldRandom, got int"),
         ({"memory": "forget"}, "memory must be 'store', 'recompute' or 'minimal'"),
+        ({"memory": []}, "memory must be 'store'"),
+        ({"cuda_graph": np.array([1, 2])}, "cuda_graph must be 'auto', True or False"),
         *(({"steps": steps}, "steps must be an integer") for steps in (-1, 2.0, True, "3")),
         ({"s": S[..., :8]}, "the rule's 2 coordinates and 16 channels"),
         ({"x": X.double(), "s": S.double()}, "share dtype and device"),
@@ -100,77 +107,62 @@ def test_rollouts_name_what_they_refuse(options, message):
         rollout(NPARule(), **{"x": X, "s": S, "steps": 1} | options)
 
 
-def splatted(**options):
-    given = {"resolution": 8, "pixel_size": 0.2} | options
-    return splat(torch.zeros(1, 4, 2), torch.zeros(1, 4, 3), **given)
+def made(function, *given, **usual):
+    """A function that makes calls of a function with some arguments, changed by keywords."""
+    return lambda **options: lambda: function(*given, **usual | options)
 
 
+rule = made(NPARule)
+splatted = made(splat, X, S[..., :3], resolution=8, pixel_size=0.2)
+camera = made(orbit, 1, width=4, height=4)
+small = made(gymnasium.make, "npa/Texture-v0", particle_count=16)
+damaged = made(damage_worlds, X, S, kind="wipe")
+crowd = multispecies_v0.parallel_env
 PROBLEM = Problem(env_id="npa/Morphogenesis2DSmall-v0", episode_steps=4)
-SPARSE = torch.zeros(1, 4, 2).to_sparse()
-META = torch.zeros(1, 4, 2, device="meta")
+SPARSE, META = X.to_sparse(), X.to("meta")
+WIDE = NPARule(state_dim=2)
 
 
 @pytest.mark.parametrize(
     ("call", "message"),
     [
-        (lambda: rollout(3, *world(), 1), "rule must be an NPARule, got int"),
-        (lambda: rollout(NPARule(), *world(), 1, memory=[]), "memory must be 'store'"),
+        (lambda: rollout(3, X, S, 1), "rule must be an NPARule, got int"),
         (lambda: warmup(space_dims=2), r"space_dims must be some of \(2, 3\), got 2"),
         (lambda: warmup(dtypes=[torch.float16]), "dtypes must be some of"),
         (lambda: warmup("tpu"), "device must"),
-        (
-            lambda: rollout(NPARule(), *world(), 1, cuda_graph=np.array([1, 2])),
-            "cuda_graph must be 'auto', True or False",
-        ),
         (lambda: perceive(SPARSE, SPARSE, 0.1), "x must be a dense tensor"),
         (lambda: perceive(META, META, 0.1), "x must be a dense tensor on 'cpu' or 'cuda'"),
-        (
-            lambda: perceive(*world(), 0.1, detach_positions=torch.ones(2)),
-            "detach_positions must be True or False",
-        ),
-        (
-            lambda: npa_envs.species_fields(world()[0], torch.tensor(4), eps=0.1),
-            "counts must hold one number",
-        ),
-        (lambda: npa_envs.rollout_species(np.array(1.0), *world(), 1, counts=[4]), "rules must"),
+        (lambda: perceive(X, S, 0.1, detach_positions=X), "detach_positions must be True or False"),
         (lambda: perceive(X, S, 1e7, 1e-7), "eps / eps0 must be a moderate"),
-        (
-            lambda: perceive(X.double(), S.double(), 1e60, 1e-60),
-            "eps / eps0 must be a moderate",
-        ),
-        (
-            lambda: perceive(torch.zeros(1, 4, 3), S, 1e-7),
-            r"eps must lie in \[1e-06, 1e\+06\] length units for torch\.float32 in 3D",
-        ),
+        (lambda: perceive(X.double(), S.double(), 1e60, 1e-60), "eps / eps0 must be a moderate"),
+        (lambda: perceive(X3, S, 1e-7), r"eps .* \[1e-06, 1e\+06\] .* for torch\.float32 in 3D"),
         (lambda: perceive(X, S, 0.1, box=1e39), "box sides must be at most 3.40282e\\+32"),
         (lambda: perceive(X, S, 0.1, 0.0), "eps0 must be positive"),
-        (lambda: NPARule(space_dim=4), "space_dim must be 2 or 3"),
-        (lambda: NPARule(state_dim=0), "state_dim must be at least 1"),
-        (lambda: NPARule(hidden_dim=0), "hidden_dim"),
-        (lambda: NPARule(eps0=0.0), "eps0"),
-        (lambda: NPARule(alpha=INF), "alpha"),
-        (lambda: NPARule(readout_dim=3), "readout_hidden_dim"),
-        (lambda: NPARule(space_dim=2.0), "space_dim must be an integer, got 2.0"),
-        (lambda: NPARule(hidden_dim=True), "hidden_dim must be an integer, got True"),
-        (
-            lambda: NPARule(2, 16, 64, species_count="2"),
-            "species_count must be an integer, got '2'",
-        ),
-        (lambda: NPARule(state_dim=2).colour(S[..., :2]), "the last three outputs .* got 2"),
+        (lambda: species_fields(X, torch.tensor(4), eps=0.1), "counts must hold one number"),
+        (lambda: rollout_species(np.array(1.0), X, S, 1, counts=[4]), "rules must"),
+        (rule(space_dim=4), "space_dim must be 2 or 3"),
+        (rule(state_dim=0), "state_dim must be at least 1"),
+        (rule(hidden_dim=0), "hidden_dim"),
+        (rule(eps0=0.0), "eps0"),
+        (rule(alpha=INF), "alpha"),
+        (rule(alpha=[]), "alpha must be a number"),
+        (rule(readout_dim=3), "readout_hidden_dim"),
+        (rule(space_dim=2.0), "space_dim must be an integer, got 2.0"),
+        (rule(hidden_dim=True), "hidden_dim must be an integer, got True"),
+        (rule(hidden_dim=2**31), "at most 65536"),
+        (rule(species_count="2"), "species_count must be an integer, got '2'"),
+        (lambda: WIDE.colour(S[..., :2]), "the last three outputs .* got 2"),
         (lambda: train("fast"), "config must be a TrainConfig, got 'fast'"),
         (lambda: train(preset("tiny"), "texture"), "config must be one of the task 'texture'"),
         (lambda: train(preset("tiny"), max_seconds="3"), "max_seconds must be a number"),
-        (
-            lambda: learn("gradient", "npa/Mixing-v0", Budget(particle_steps=1), 0),
-            "problem must be a Problem, got 'npa/Mixing-v0'",
-        ),
+        (lambda: learn("gradient", "npa/X-v0", ONE_STEP, 0), "a Problem, got 'npa/X-v0'"),
         (lambda: learn("gradient", PROBLEM, 1000, 0), "budget must be a Budget, got 1000"),
         (lambda: export_web("gecko", "p.html"), "sources must be a list of rules, got 'gecko'"),
         (lambda: export_web([NPARule()], "p.html"), "names or files of rules, got a NPARule"),
         (lambda: export_web(["gecko"], "p.html", title=3), "title must be text"),
         (lambda: wipe_state(X, S, centre=(0.0, 0.0), radius=0.2), "centre must be a tensor"),
         (
-            lambda: inject(X, S, centre=torch.zeros(1, 2), radius=0.2, state=0.5, strength=1.0),
+            lambda: inject(X, S, centre=X[:, 0], radius=0.2, state=0.5, strength=1.0),
             "state must be a tensor",
         ),
         (lambda: RowPolicy("model.zip"), "model must be one of Stable-Baselines3"),
@@ -178,55 +170,39 @@ META = torch.zeros(1, 4, 2, device="meta")
             lambda: multispecies_v0.batched("npa/MixingSmall-v0", num_envs=2),
             "'num_envs': many worlds at once .* world_count=8",
         ),
-        (
-            lambda: multispecies_v0.parallel_env("npa/MixingSmal-v0"),
-            "did you mean 'npa/MixingSmall-v0'",
-        ),
-        (lambda: NPARule(alpha=[]), "alpha must be a number"),
-        (lambda: NPARule(hidden_dim=2**31), "at most 65536"),
-        (lambda: npa_envs.save_rule(3, "a.safetensors"), "rule must be an NPARule"),
-        (lambda: npa_envs.save_rule(NPARule(), {}), "a path must be text"),
-        (
-            lambda: npa_envs.save_rule(NPARule(), "a.safetensors", metadata=[1]),
-            "metadata must map text to text",
-        ),
+        (lambda: crowd("npa/MixingSmal-v0"), "did you mean 'npa/MixingSmall-v0'"),
+        (lambda: save_rule(3, "a.safetensors"), "rule must be an NPARule"),
+        (lambda: save_rule(WIDE, {}), "a path must be text"),
+        (lambda: save_rule(WIDE, "a.safetensors", metadata=[1]), "metadata must map text to text"),
         (lambda: npa_envs.shipped_rules(np.zeros(2)), "task must be the name of one"),
         (lambda: npa_envs.world_mean(3.0), "values must be a torch tensor"),
         (lambda: npa_envs.WorldRandom(0, device=2**31), "device must be text"),
         (lambda: npa_envs.WorldRandom(0).uniform(2**64), "a draw must have at most"),
         (lambda: scores(["a"]), "unknown rule"),
-        (lambda: splatted(resolution="8"), "resolution must be an integer"),
-        (lambda: splatted(resolution=2**31), r"resolution must lie in \[1, 16384\]"),
-        (lambda: splatted(hi=[1.0]), "hi must be a number"),
-        (lambda: splatted(hi=1e300), "must have a size in"),
+        (splatted(resolution="8"), "resolution must be an integer"),
+        (splatted(resolution=2**31), r"resolution must lie in \[1, 16384\]"),
+        (splatted(hi=[1.0]), "hi must be a number"),
+        (splatted(hi=1e300), "must have a size in"),
         (
-            lambda: periodic_splat(
-                torch.zeros(1, 4, 2), torch.zeros(1, 4, 3), resolution=8, pixel_size=0.2, sigma=1e5
-            ),
+            lambda: periodic_splat(X, S[..., :3], resolution=8, pixel_size=0.2, sigma=1e5),
             "stay within 16384 pixels",
         ),
-        (lambda: orbit(1, centre=1.0, width=4, height=4), "centre must be 3 numbers"),
-        (lambda: orbit(1, fov=[1], width=4, height=4), "fov must be a number"),
-        (lambda: orbit(1, width=(4,), height=4), "width must be an integer"),
+        (camera(centre=1.0), "centre must be 3 numbers"),
+        (camera(fov=[1]), "fov must be a number"),
+        (camera(width=(4,)), "width must be an integer"),
         (lambda: uniform_ball(2, None, 2, 0.1), "particle_count must be an integer"),
         (lambda: uniform_ball(2, 2**31, 2, 0.1), "coordinates must be at most"),
         (lambda: uniform_box(2, 3, 1.0), "box must hold a side"),
         (lambda: parse_damage(3), "damage must be text"),
-        (lambda: damage_worlds(*world(), kind="wipe", size={}), "size must be a number"),
-        (lambda: damage_worlds(*world(), kind="wipe", size=1e300), "at least 0"),
+        (damaged(size={}), "size must be a number"),
+        (damaged(size=1e300), "at least 0"),
         (lambda: preset("tiny", 3), "unknown task 3"),
         (lambda: preset("tiny", weight_decay=10**400), "weight_decay must be of type float"),
         (lambda: TextureConfig(eps=10**400), "eps must be a finite number"),
         (lambda: to_uint8(torch.zeros(2, 2, 4), background=2.0), "background must be red"),
         (lambda: write_gif("a.gif", 3), "frames must be a sequence"),
-        (
-            lambda: gymnasium.make("npa/Texture-v0", particle_count=16, eps=5e-324),
-            "eps must be at least 1e-09",
-        ),
-        (
-            lambda: gymnasium.make("npa/Texture-v0", particle_count=16, success_loss=2**64),
-            "success_loss must be at most",
-        ),
+        (small(eps=5e-324), "eps must be at least 1e-09"),
+        (small(success_loss=2**64), "success_loss must be at most"),
         (lambda: TorchNormalizeReward(()), "needs a vector environment, got tuple"),
     ],
 )

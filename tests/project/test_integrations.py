@@ -11,7 +11,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from npa_envs import wrappers
 from npa_envs.errors import MissingDependencyError
 
-PAGE = Path(__file__).resolve().parents[2] / "docs" / "integrations.md"
+TEXT = (Path(__file__).resolve().parents[2] / "docs/integrations.md").read_text("utf-8")
 RANDOM, RANDOM_ERROR = 0.143, 0.018
 """Return of random actions in the worlds of the tutorial, by its table."""
 
@@ -29,28 +29,20 @@ def in_a_folder_of_its_own(tmp_path, monkeypatch):
 
 def program(mark: str) -> str:
     """Return the page's one program that holds a piece of text."""
-    blocks = re.findall(
-        r"^```python\n(.*?)^```", PAGE.read_text(encoding="utf-8"), re.MULTILINE | re.DOTALL
-    )
+    blocks = re.findall(r"^```python\n(.*?)^```", TEXT, re.MULTILINE | re.DOTALL)
     (block,) = (block for block in blocks if mark in block)
     return block
 
 
-def run(code: str, *, rounds: int = 60) -> dict:
+def run(code: str, *, rounds: int = 60) -> None:
     """Run a program, with another number of rounds than the page's."""
-    names: dict = {}
-    exec(
-        compile(
-            re.sub(r"^rounds(.*) = 60", rf"rounds\1 = {rounds}", code, flags=re.M), "x", "exec"
-        ),
-        names,
-    )
-    return names
+    code = re.sub(r"^rounds(.*) = 60", rf"rounds\1 = {rounds}", code, flags=re.M)
+    exec(compile(code, "integrations.md", "exec"), {})
 
 
 def told(library: str) -> float:
     """Return the return that the page prints of a library."""
-    (mean,) = re.findall(rf"^{library}: ([\d.]+) ± [\d.]+$", PAGE.read_text(encoding="utf-8"), re.M)
+    (mean,) = re.findall(rf"^{library}: ([\d.]+) ± [\d.]+$", TEXT, re.M)
     return float(mean)
 
 
@@ -80,12 +72,8 @@ def test_callbacks_logs_and_films_of_stable_baselines3(tmp_path):
     log = EventAccumulator(str(runs / "PPO_1")).Reload()
     assert [event.step for event in log.Scalars("eval/mean_reward")] == [8192, 16384]
     assert [event.value for event in log.Scalars("eval/mean_ep_length")] == [16.0, 16.0]
-    assert [event.step for event in log.Scalars("rollout/ep_rew_mean")] == [
-        4096,
-        8192,
-        12288,
-        16384,
-    ]
+    rewards = log.Scalars("rollout/ep_rew_mean")
+    assert [event.step for event in rewards] == [4096, 8192, 12288, 16384]
     (film,) = runs.glob("*.mp4")
     frames = imageio.imread(film)
     assert len(frames) in (17, 18)
@@ -126,9 +114,8 @@ def test_weights_and_biases_follows_the_logs(tmp_path, monkeypatch):
 def test_particles_learn_to_act_for_their_world(library, module, mark, rounds, capsys):
     pytest.importorskip(module)
     run(program(mark), rounds=rounds)
-    ((mean, error),) = re.findall(
-        rf"^{library}: (-?[\d.]+) ± ([\d.]+)$", capsys.readouterr().out, re.M
-    )
+    printed = capsys.readouterr().out
+    ((mean, error),) = re.findall(rf"^{library}: (-?[\d.]+) ± ([\d.]+)$", printed, re.M)
     assert float(error) < 0.05
     if rounds == 60:
         assert float(mean) > RANDOM + 10.0 * (RANDOM_ERROR + float(error))

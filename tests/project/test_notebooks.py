@@ -2,7 +2,6 @@
 
 import ast
 import json
-import re
 from pathlib import Path
 
 import matplotlib.pyplot as plt
@@ -82,21 +81,3 @@ def test_a_notebook_is_stored_as_it_ran(name):
     assert stored
     assert not [out for out in stored if out["output_type"] == "error"]
     assert not [out for out in stored if out.get("name") == "stderr"]
-
-
-@pytest.mark.parametrize("name", SMALL)
-def test_a_section_is_about_a_screen_long(name):
-    sections = []
-    for cell in json.loads((FOLDER / f"{name}.ipynb").read_text(encoding="utf-8"))["cells"]:
-        if cell["source"][0].startswith("#") and cell["cell_type"] == "markdown":
-            sections.append(0)
-        sections[-1] += len(cell["source"])
-    assert max(sections) <= 42, sections
-
-
-def test_an_own_loss_has_as_many_lines_as_is_said():
-    code = ["".join(cell["source"]) for cell in cells("own_loss", "code")]
-    (loss,) = (text[text.index("def loss") :] for text in code if "def loss" in text)
-    (training,) = (text for text in code if "optimiser.step" in text)
-    lines = [line for line in f"{loss}\n{training}".split("\n") if re.match(r"\s*[^\s#]", line)]
-    assert len(lines) == 25

@@ -7,14 +7,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from PIL import Image
+from PIL import Image, ImageSequence
 
-from npa_envs.errors import NPAError
 from npa_envs.render import to_uint8, write_filmstrip, write_gif, write_mp4, write_png
 from npa_envs.render.film import encode_frame
 
 WRITERS = [(write_gif, "film.gif"), (write_mp4, "film.mp4"), (write_filmstrip, "film.png")]
-EVERY_WRITER = pytest.mark.parametrize(("writer", "name"), WRITERS, ids=["gif", "mp4", "strip"])
 
 
 def film(count: int = 6, height: int = 48, width: int = 64) -> list[np.ndarray]:
@@ -29,11 +27,7 @@ def film(count: int = 6, height: int = 48, width: int = 64) -> list[np.ndarray]:
 
 def read_film(path: Path) -> list[np.ndarray]:
     with Image.open(path) as opened:
-        frames = []
-        for k in range(opened.n_frames):
-            opened.seek(k)
-            frames.append(np.asarray(opened.convert("RGB")))
-    return frames
+        return [np.asarray(frame.convert("RGB")) for frame in ImageSequence.Iterator(opened)]
 
 
 NAN, INFINITE = float("nan"), float("inf")
@@ -71,20 +65,6 @@ def test_first_row_of_the_shown_picture_is_the_highest_y():
     np.testing.assert_array_equal(to_uint8(picture), expected)
 
 
-@pytest.mark.parametrize(
-    ("picture", "background", "message"),
-    [
-        (torch.zeros(8, 8, 3), "white", r"\[\.\.\., R, R, 4\].*\(8, 8, 3\)"),
-        (torch.zeros(8, 8, 4, dtype=torch.uint8), "white", r"torch\.uint8"),
-        (torch.zeros(8, 8, 4), "blurple", "background must be a colour, got 'blurple'"),
-        (torch.zeros(8, 8, 4), (255, 255, 255), r"red, green and blue in \[0, 1\]"),
-    ],
-)
-def test_wrong_picture_or_background_is_a_clear_error(picture, background, message):
-    with pytest.raises(NPAError, match=message):
-        to_uint8(picture, background)
-
-
 def test_png_is_read_back_exactly(tmp_path):
     frame = np.random.default_rng(0).integers(0, 256, (7, 9, 3), dtype=np.uint8)
     write_png(tmp_path / "picture.png", frame)
@@ -101,8 +81,6 @@ def test_an_encoded_png_is_exact_and_a_jpeg_is_smaller_and_nearly_exact():
     # Seen: 1.2, and 0.16 of the bytes.
     assert np.abs(shown.astype(float) - frame).mean() < 3
     assert len(jpeg) < 0.5 * len(png)
-    with pytest.raises(NPAError, match=r"uint8 of shape \[H, W, 3\]"):
-        encode_frame(frame[..., :2], "PNG")
 
 
 def test_gif_holds_every_frame_with_nearly_exact_colours(tmp_path):
@@ -131,9 +109,7 @@ def test_gif_background_is_exact_in_every_frame_however_many_colours_there_are(t
 
 def test_gif_shows_what_stands_still_the_same_in_every_frame(tmp_path):
     ramp = np.linspace(0, 255, 64).astype(np.uint8)
-    still = np.stack(
-        [ramp[:, None] + 0 * ramp, ramp + 0 * ramp[:, None], 0 * ramp + 0 * ramp[:, None]], -1
-    )
+    still = np.stack([*np.meshgrid(ramp, ramp), np.zeros((64, 64), np.uint8)], -1)
     frames = []
     for k in range(5):
         frame = np.full((64, 96, 3), 255, np.uint8)
@@ -152,10 +128,7 @@ def test_gif_lasts_as_long_as_its_frames(tmp_path, fps):
     write_gif(tmp_path / "film.gif", frames, fps=fps)
     with Image.open(tmp_path / "film.gif") as opened:
         assert opened.info["loop"] == 0
-        length = 0
-        for k in range(opened.n_frames):
-            opened.seek(k)
-            length += opened.info["duration"]
+        length = sum(frame.info["duration"] for frame in ImageSequence.Iterator(opened))
     assert length == pytest.approx(1000 * len(frames) / fps, abs=10)
 
 
@@ -173,12 +146,9 @@ def test_mp4_holds_every_frame_at_an_even_size(tmp_path, height, width):
         assert np.abs(shown[:height, :width].astype(int) - frame).mean() < 4
 
 
-def test_a_gif_that_stands_still_for_longer_than_a_gif_can_is_refused(tmp_path):
-    still = [np.zeros((8, 8, 3), np.uint8)] * 70
-    write_gif(tmp_path / "still.gif", still[:65], fps=0.1)
-    with pytest.raises(NPAError, match=r"alike for at most 655 s in a GIF.*fps=0\.1: raise fps"):
-        write_gif(tmp_path / "long.gif", still, fps=0.1)
-    assert [path.name for path in tmp_path.iterdir()] == ["still.gif"]
+def test_a_gif_stands_still_for_as_long_as_a_gif_can(tmp_path):
+    write_gif(tmp_path / "still.gif", [np.zeros((8, 8, 3), np.uint8)] * 65, fps=0.1)
+    assert read_film(tmp_path / "still.gif")
 
 
 def test_filmstrip_holds_the_frames_exactly_in_rows(tmp_path):
@@ -230,42 +200,6 @@ def test_filmstrip_of_small_frames_keeps_captions_apart(tmp_path):
     assert dark[0] == (pitch - 8 - 32) // 2
 
 
-@EVERY_WRITER
-def test_wrong_frames_are_clear_errors_and_leave_nothing(tmp_path, writer, name):
-    for frames, message in (
-        ([], "at least one picture"),
-        ([np.zeros((4, 4, 3))], "must be uint8"),
-        ([np.zeros((4, 4, 4), np.uint8)], r"shape \[H, W, 3\]"),
-        ([np.zeros((4, 4, 3), np.uint8), np.zeros((5, 4, 3), np.uint8)], "all have one size"),
-        ([np.zeros((0, 4, 3), np.uint8)], "not zero"),
-    ):
-        with pytest.raises(NPAError, match=message):
-            writer(tmp_path / name, frames)
-    assert list(tmp_path.iterdir()) == []
-
-
-def test_wrong_rates_captions_and_columns_are_clear_errors(tmp_path):
-    for fps in (0, -1, 51, float("nan")):
-        with pytest.raises(NPAError, match=r"fps must be in \[0\.1, 50\]"):
-            write_gif(tmp_path / "film.gif", film(), fps=fps)
-    with pytest.raises(NPAError, match="fps must be in"):
-        write_mp4(tmp_path / "film.mp4", film(), fps=0)
-    with pytest.raises(NPAError, match="as many as the frames, 6, got 2"):
-        write_filmstrip(tmp_path / "strip.png", film(), ["a", "b"])
-    for captions in (range(6), [None, *"abcde"], 6, "abcdef"):
-        with pytest.raises(NPAError, match="captions must be texts, one for each frame"):
-            write_filmstrip(tmp_path / "strip.png", film(), captions)
-    with pytest.raises(NPAError, match="columns must be an integer of at least 1"):
-        write_filmstrip(tmp_path / "strip.png", film(), columns=0)
-    assert list(tmp_path.iterdir()) == []
-
-
-@EVERY_WRITER
-def test_missing_folder_is_a_clear_error(tmp_path, writer, name):
-    with pytest.raises(NPAError, match="nowhere"):
-        writer(tmp_path / "nowhere" / name, film())
-
-
 FILE_SIZE_LIMIT = """
 import resource, sys
 import numpy as np
@@ -287,11 +221,8 @@ def test_disk_that_fills_up_is_a_clear_error_and_keeps_the_old_file(tmp_path):
     for path in words[1::2]:
         Path(path).write_bytes(b"old")
     program = [sys.executable, "-c", FILE_SIZE_LIMIT, *words]
-    done = subprocess.run(
-        program, capture_output=True, text=True, timeout=300, check=False, encoding="utf-8"
-    )
-    _, *told = done.stdout.split("refused: ")
-    assert len(told) == len(WRITERS), done.stderr
+    _, *told = subprocess.check_output(program, text=True, encoding="utf-8").split("refused: ")
+    assert len(told) == len(WRITERS)
     for text, path in zip(told, words[1::2], strict=True):
         assert text.startswith(f"cannot write '{path}'")
         assert Path(path).read_bytes() == b"old"

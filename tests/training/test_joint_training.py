@@ -11,14 +11,10 @@ from npa_envs.tasks.train_config import tiny_run
 from npa_envs.training import train_together
 
 
-def small(target, particle_count=48, **fields):
+def small(target, count=48, **fields):
     usual = {"hidden_dim": 24, "eps": 0.3, "resolution": 24, "state_dim": 6}
-    return Morphogenesis2DConfig(
-        target=target,
-        particle_count=particle_count,
-        target_point_count=particle_count,
-        **usual | fields,
-    )
+    usual |= {"particle_count": count, "target_point_count": count}
+    return Morphogenesis2DConfig(target=target, **usual | fields)
 
 
 def pair(**fields):
@@ -122,14 +118,19 @@ class TestRun:
         assert [rule.dead_zone for rule in kept] == [0.0, 0.5]
         assert load_rule(tmp_path / "run" / "rule-1.safetensors").dead_zone == 0.5
 
-    def test_rules_that_do_not_fit_are_refused(self, tmp_path):
-        rules = CoMorphogenesis2D(pair()).make_rules(torch.Generator())
-        with pytest.raises(NPAError, match="one for each of 2 species, got 1"):
-            train_together(run_config(tmp_path / "a"), rules[:1], progress=False)
-        other = CoMorphogenesis2D(
-            pair(species=(small("ring"), small("heart", 32, hidden_dim=8)))
-        ).make_rules(torch.Generator())
-        with pytest.raises(NPAError, match=r"rule 1 differs in hidden_dim: .* of species 1"):
-            train_together(run_config(tmp_path / "b"), other, progress=False)
-        with pytest.raises(NPAError, match="initial_rule is for one rule, got 'gecko'"):
-            train_together(run_config(tmp_path / "c", initial_rule="gecko"), progress=False)
+    @pytest.mark.parametrize(
+        ("species", "kept", "fields", "message"),
+        [
+            (("heart", {}), 1, {}, "one for each of 2 species, got 1"),
+            (("heart", {"hidden_dim": 8}), 2, {}, r"rule 1 differs in hidden_dim: .* of species 1"),
+            (None, 0, {"initial_rule": "gecko"}, "initial_rule is for one rule, got 'gecko'"),
+        ],
+    )
+    def test_rules_that_do_not_fit_are_refused(self, tmp_path, species, kept, fields, message):
+        rules = None
+        if species is not None:
+            target, own = species
+            given = pair(species=(small("ring"), small(target, 32, **own)))
+            rules = CoMorphogenesis2D(given).make_rules(torch.Generator())[:kept]
+        with pytest.raises(NPAError, match=message):
+            train_together(run_config(tmp_path, **fields), rules, progress=False)

@@ -2,6 +2,7 @@
 
 import os
 import signal
+import threading
 import time
 
 import pytest
@@ -14,32 +15,17 @@ from worlds import assert_same
 from npa_envs.errors import NPAError
 from npa_envs.rule.files import load_rule
 from npa_envs.tasks.morphogenesis2d import Morphogenesis2D
-from npa_envs.training import TASKS, Trainer, override, preset, train
+from npa_envs.training import TASKS, Trainer, override, preset, ranks, train
 from npa_envs.training.checkpoint import load_checkpoint
 from npa_envs.training.cycle import TrainingCycle
-from npa_envs.training.ranks import Ranks, joined_ranks
+from npa_envs.training.ranks import LOST_CODE, Heartbeat, Ranks, joined_ranks
 
-PLAIN = {}
-"""The preset as it is."""
-
-LIVELY = {
-    "max_age_range": (4, 400),
-    "stillness_weight": 1.0,
-    "stillness_min_age": 4,
-    "damage_share": 0.5,
-    "world_count": 4,
-    "pool_size": 16,
-    "picture_interval": 2,
-}
+LIVELY = {"max_age_range": (4, 400), "stillness_weight": 1.0, "stillness_min_age": 4}
+LIVELY |= {"damage_share": 0.5, "world_count": 4, "pool_size": 16, "picture_interval": 2}
 """Worlds that age, are to rest or are damaged in some places, and are replaced."""
 
-SEEDED = {
-    "seed_interval": 3,
-    "fresh_share": 0.7,
-    "world_count": 4,
-    "pool_size": 8,
-    "damage_share": 0.5,
-}
+SEEDED = {"seed_interval": 3, "fresh_share": 0.7, "damage_share": 0.5}
+SEEDED |= {"world_count": 4, "pool_size": 8}
 """Batches with several fresh seeds; worlds of some places are damaged."""
 
 STRAYING = {"escape_share": 0.1, "escape_weight": 10.0, "world_count": 4, "pool_size": 8}
@@ -51,10 +37,36 @@ def tiny(out, **fields):
     return preset("tiny", out=out, particle_count=64, resolution=16, **fields)
 
 
+def trainer_of(config, **options):
+    return Trainer(Morphogenesis2D(config.task), config, task_name="morphogenesis2d", **options)
+
+
 def trained(config, **options):
     """What a process of a run does; the log is the first one's."""
-    trainer = Trainer(Morphogenesis2D(config.task), config, task_name="morphogenesis2d", **options)
-    return trainer.run(progress=False).interrupted
+    return trainer_of(config, **options).run(progress=False).interrupted
+
+
+def disturbed(config, iteration, disturb, *, first=False):
+    """A trainer of which one process does something else before an iteration."""
+    trainer = trainer_of(config)
+    iterate = trainer.iterate
+
+    def disturbing():
+        if trainer.iteration == iteration and Ranks.current().first == first:
+            disturb()
+        iterate()
+
+    trainer.iterate = disturbing
+    return trainer
+
+
+def make_cycle(config):
+    """Worlds of a rule that moves nothing, which draw by themselves."""
+    task = Morphogenesis2D(config.task)
+    rule = task.make_rule(torch.Generator().manual_seed(0)).double()
+    torch.nn.init.zeros_(rule.output.weight)
+    cpu = torch.device("cpu")
+    return TrainingCycle(task, rule, config, cpu, torch.Generator(), by_world=True)
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -62,15 +74,7 @@ def loaded_kernels(tmp_path_factory):
     """Load once what each forked process would have to load by itself."""
     folder = tmp_path_factory.mktemp("loaded")
     assert not trained(tiny(folder / "alone", **LIVELY))
-    config = tiny(folder / "grouped", iterations=1, milestones=[1], **LIVELY)
-    TrainingCycle(
-        Morphogenesis2D(config.task),
-        Morphogenesis2D(config.task).make_rule(torch.Generator()).double(),
-        config,
-        torch.device("cpu"),
-        torch.Generator(),
-        by_world=True,
-    ).run(0)
+    make_cycle(tiny(folder / "grouped", iterations=1, milestones=[1], **LIVELY)).run(0)
 
 
 def assert_same_curve(folder, other):
@@ -84,9 +88,7 @@ def assert_same_curve(folder, other):
 
 
 @pytest.mark.parametrize(
-    "fields",
-    [PLAIN, LIVELY, SEEDED, STRAYING],
-    ids=["plain", "lively", "seeded", "straying"],
+    "fields", [{}, LIVELY, SEEDED, STRAYING], ids=["plain", "lively", "seeded", "straying"]
 )
 def test_two_processes_have_the_curve_of_one(tmp_path, fields):
     for count in (1, 2):
@@ -110,13 +112,9 @@ def test_processes_take_muons_steps_together(tmp_path):
 
 @pytest.mark.parametrize("fresh_share", [0.0, 0.25, 0.5, 0.75])
 def test_seeds_come_into_the_part_of_the_pool_of_every_world(tmp_path, fresh_share):
-    # A rule that moves nothing: only worlds that began anew are others than at the beginning.
+    # Where nothing moves, only worlds that began anew are others than at the beginning.
     fields = {"world_count": 4, "pool_size": 8, "seed_interval": 1, "fresh_share": fresh_share}
-    config = tiny(tmp_path, **fields, damage_share=0.0, learning_rate=1e-30)
-    task = Morphogenesis2D(config.task)
-    rule = task.make_rule(torch.Generator().manual_seed(0)).double()
-    torch.nn.init.zeros_(rule.output.weight)
-    cycle = TrainingCycle(task, rule, config, torch.device("cpu"), torch.Generator(), by_world=True)
+    cycle = make_cycle(tiny(tmp_path, **fields, damage_share=0.0, learning_rate=1e-30))
     before = cycle.pool.worlds.x.clone()
     for iteration in range(4):
         cycle.run(iteration)
@@ -149,7 +147,7 @@ def test_a_run_goes_on_with_another_number_of_processes(tmp_path):
     first = override(parts, iterations=5, checkpoint_interval=2)
 
     def until_the_fourth():
-        trainer = Trainer(Morphogenesis2D(first.task), first, task_name="morphogenesis2d")
+        trainer = trainer_of(first)
         for _ in range(3):
             trainer.iterate()
         trainer.save()
@@ -175,7 +173,7 @@ def test_parameters_that_differ_are_refused_and_the_checkpoint_stays(tmp_path):
     config = tiny(tmp_path / "run")
 
     def drift():
-        trainer = Trainer(Morphogenesis2D(config.task), config, task_name="morphogenesis2d")
+        trainer = trainer_of(config)
         if not Ranks.current().first:
             with torch.no_grad():
                 next(trainer.rule.parameters())[0, 0] += 0.5
@@ -191,19 +189,10 @@ def test_parameters_that_differ_are_refused_and_the_checkpoint_stays(tmp_path):
 def test_a_lost_process_ends_the_others_and_the_run_goes_on_from_its_checkpoint(tmp_path):
     config = tiny(tmp_path / "run", iterations=30, checkpoint_interval=2)
 
-    def lost():
-        trainer = Trainer(Morphogenesis2D(config.task), config, task_name="morphogenesis2d")
-        iterate = trainer.iterate
+    def dying():
+        disturbed(config, 5, lambda: os.kill(os.getpid(), signal.SIGKILL)).run(progress=False)
 
-        def dying():
-            if trainer.iteration == 5 and not Ranks.current().first:
-                os.kill(os.getpid(), signal.SIGKILL)
-            iterate()
-
-        trainer.iterate = dying
-        trainer.run(progress=False)
-
-    said, code = on_ranks(2, lost, tmp_path)
+    said, code = on_ranks(2, dying, tmp_path)
     assert "process 0 of 2 has lost another one" in said
     assert code == -signal.SIGKILL
     assert load_checkpoint(tmp_path / "run" / "checkpoint.pt")["iteration"] == 4
@@ -214,19 +203,11 @@ def test_a_lost_process_ends_the_others_and_the_run_goes_on_from_its_checkpoint(
 def test_a_full_disk_ends_all_processes_and_leaves_the_checkpoint(tmp_path):
     resource = pytest.importorskip("resource")
     config = tiny(tmp_path / "run", iterations=30, checkpoint_interval=2)
+    # The log has room for its line, a checkpoint has not.
+    room = resource.RLIMIT_FSIZE, (10_000, resource.RLIM_INFINITY)
 
     def filling():
-        trainer = Trainer(Morphogenesis2D(config.task), config, task_name="morphogenesis2d")
-        iterate = trainer.iterate
-
-        def full():
-            if trainer.iteration == 3 and Ranks.current().first:
-                # The log has room for its line, a checkpoint has not.
-                resource.setrlimit(resource.RLIMIT_FSIZE, (10_000, resource.RLIM_INFINITY))
-            iterate()
-
-        trainer.iterate = full
-        trainer.run(progress=False)
+        disturbed(config, 3, lambda: resource.setrlimit(*room), first=True).run(progress=False)
 
     first, other = on_ranks(2, filling, tmp_path)
     assert "cannot write" in first
@@ -252,18 +233,13 @@ def test_processes_whose_iterations_take_long_ask_each_other_in_every_one(tmp_pa
 def test_all_processes_stop_after_the_same_iteration_where_one_is_asked_to(tmp_path):
     config = tiny(tmp_path / "run", iterations=60)
 
+    def stop():
+        # Twice: torchrun passes on what a terminal has sent already.
+        os.kill(os.getpid(), signal.SIGTERM)
+        os.kill(os.getpid(), signal.SIGTERM)
+
     def asked():
-        trainer = Trainer(Morphogenesis2D(config.task), config, task_name="morphogenesis2d")
-        iterate = trainer.iterate
-
-        def stopping():
-            if trainer.iteration == 3 and not Ranks.current().first:
-                # Twice: torchrun passes on what a terminal has sent already.
-                os.kill(os.getpid(), signal.SIGTERM)
-                os.kill(os.getpid(), signal.SIGTERM)
-            iterate()
-
-        trainer.iterate = stopping
+        trainer = disturbed(config, 3, stop)
         return trainer.run(progress=False).interrupted, trainer.iteration
 
     one, other = on_ranks(2, asked, tmp_path)
@@ -286,11 +262,8 @@ def test_processes_meet_through_nccl_only_where_each_has_a_gpu(gpus, backend, mo
     monkeypatch.setattr(dist, "is_nccl_available", lambda: True)
     monkeypatch.setattr(dist, "init_process_group", join)
     monkeypatch.setattr(torch.cuda, "device_count", lambda: gpus)
-    for name, value in (
-        ("LOCAL_RANK", "0"),
-        ("LOCAL_WORLD_SIZE", "2"),
-        ("CUDA_VISIBLE_DEVICES", "0,1"),
-    ):
+    places = {"LOCAL_RANK": "0", "LOCAL_WORLD_SIZE": "2", "CUDA_VISIBLE_DEVICES": "0,1"}
+    for name, value in places.items():
         monkeypatch.setenv(name, value)
     with pytest.raises(NPAError, match="must reach each other"), joined_ranks():
         pass
@@ -301,7 +274,7 @@ def test_worlds_of_all_processes_are_diagnosed_when_the_loss_is_not_finite(tmp_p
     config = tiny(tmp_path / "run", world_count=4, pool_size=8)
 
     def diverge():
-        trainer = Trainer(Morphogenesis2D(config.task), config, task_name="morphogenesis2d")
+        trainer = trainer_of(config)
         if not Ranks.current().first:
             trainer.pool.worlds.s[:] = 1e200
         trainer.run(progress=False)
@@ -317,12 +290,12 @@ def test_what_cannot_be_shared_out_is_refused():
     assert Ranks(1, 4).places(16, 2).tolist() == [2, 3, 10, 11]
     parts = [Ranks(rank, 4).own(torch.arange(16), 2) for rank in range(4)]
     assert sorted(torch.cat(parts).tolist()) == list(range(16))
-    with pytest.raises(NPAError, match=r"multiple of the number of processes, got 6 and 4: .*=4"):
-        Ranks(0, 4).check(tiny("x", world_count=6, pool_size=12))
-    with pytest.raises(
-        NPAError, match=r"pool_size must be a multiple .* 10 and 4: set pool_size=8"
+    for worlds, pool, said in (
+        (6, 12, "multiple of the number of processes, got 6 and 4: .*=4"),
+        (4, 10, "pool_size must be a multiple .* 10 and 4: set pool_size=8"),
     ):
-        Ranks(0, 4).check(tiny("x", world_count=4, pool_size=10))
+        with pytest.raises(NPAError, match=said):
+            Ranks(0, 4).check(tiny("x", world_count=worlds, pool_size=pool))
     # Alone, nothing is touched.
     numbers = torch.ones(2)
     alone = Ranks.current()
@@ -331,3 +304,65 @@ def test_what_cannot_be_shared_out_is_refused():
     assert not alone.together
     assert alone.collected(numbers, 1) is numbers
     assert_same(numbers, torch.ones(2))
+
+
+# Signs of life.
+
+
+@pytest.fixture
+def codes(monkeypatch):
+    """Exit codes with which a process would have ended; its pauses are short."""
+    ended = []
+    monkeypatch.setattr(ranks, "BEAT_SECONDS", 0.05)
+    monkeypatch.setattr(ranks.os, "_exit", ended.append)
+    return ended
+
+
+def test_nobody_is_missed_who_lives_or_has_left(codes, monkeypatch):
+    # No load gives a thread sixty pauses and another one none.
+    monkeypatch.setattr(ranks, "BEAT_SECONDS", 0.02)
+    monkeypatch.setattr(ranks, "SILENT_BEATS", 60)
+    store = dist.HashStore()
+    first, second = (Heartbeat(store, rank, 2) for rank in (0, 1))
+    time.sleep(2.0)
+    second.end(left=True)
+    time.sleep(2.0)
+    first.end(left=True)
+    assert codes == []
+
+
+class Store:
+    """A store that fails, or that does not answer until it is thawed."""
+
+    def __init__(self, gone):
+        self.gone, self.thawed = gone, threading.Event()
+
+    def add(self, _, __):
+        if self.gone:
+            raise RuntimeError("connection reset")
+        self.thawed.wait()
+        return 1
+
+
+@pytest.mark.parametrize(
+    ("make", "said"),
+    [
+        (dist.HashStore, "process 0 of 3 has heard nothing from process 2 for"),
+        (lambda: Store(gone=True), "s, as the store that processes meet in is gone"),
+        (lambda: Store(gone=False), "has heard nothing from process 1"),
+    ],
+)
+def test_a_process_or_store_that_falls_silent_is_missed(codes, capfd, make, said):
+    store = make()
+    own = isinstance(store, Store)
+    first, *others = (Heartbeat(store, rank, 3) for rank in range(1 if own else 3))
+    for other, left in zip(others, (True, False), strict=not own):
+        other.end(left=left)
+    end = time.monotonic() + 60.0
+    while not codes and time.monotonic() < end:
+        time.sleep(0.01)
+    assert set(codes) == {LOST_CODE}
+    if own:
+        store.thawed.set()
+    first.end(left=True)
+    assert said in capfd.readouterr().err

@@ -148,13 +148,12 @@ DAMAGES = {
 
 def made(word, present):
     """What stands in a checkpoint instead of a tensor."""
-    changes = {
-        "negative": lambda: present - 1.0,
-        "nan": lambda: present * float("nan"),
-        "sparse": present.to_sparse,
-        "meta": lambda: present.to("meta"),
-    }
-    return changes[word]()
+    match word:
+        case "sparse":
+            return present.to_sparse()
+        case "meta":
+            return present.to("meta")
+    return present - 1.0 if word == "negative" else present * float("nan")
 
 
 @pytest.fixture(scope="module")
@@ -164,28 +163,44 @@ def finished(tmp_path_factory):
     return folder
 
 
+@pytest.fixture
+def resumed(finished, monkeypatch):
+    """A function that resumes the finished run from another content of its checkpoint."""
+
+    def resume(content, message):
+        monkeypatch.setattr("npa_envs.training.run.load_checkpoint", lambda _: content)
+        before = {path: path.read_bytes() for path in finished.iterdir() if path.is_file()}
+        with pytest.raises(NPAError, match=message):
+            trainer_of(circle_config(finished, log_interval=2), resume=True)
+        del before[finished / ".lock"]
+        assert all(path.read_bytes() == data for path, data in before.items())
+
+    return resume
+
+
 @pytest.mark.parametrize("place", DAMAGES)
-def test_a_checkpoint_with_something_wrong_in_it_is_refused_by_name(finished, place, monkeypatch):
-    config = circle_config(finished)
-    path = finished / "checkpoint.pt"
+def test_a_checkpoint_with_something_wrong_in_it_is_refused_by_name(finished, resumed, place):
     for value in DAMAGES[place]:
-        content = load_checkpoint(path)
+        content = load_checkpoint(finished / "checkpoint.pt")
         *outer, last = place.split("/")
         there = content
         for name in outer:
             there = there[int(name) if name.isdigit() else name]
         if last == "weight":
             last = next(name for name, weight in there.items() if weight.ndim == 2)
-        there[last] = (
-            made(value, there[last]) if value in ("negative", "nan", "sparse", "meta") else value
-        )
-        monkeypatch.setattr("npa_envs.training.run.load_checkpoint", lambda _, c=content: c)
-        before = {file: file.read_bytes() for file in finished.iterdir() if file.is_file()}
-        with pytest.raises(NPAError, match=rf"checkpoint\.pt' .*{place.split('/')[0]}.*: start a"):
-            trainer_of(override(config, log_interval=2), resume=True)
-        assert all(
-            file.read_bytes() == data for file, data in before.items() if file.name != ".lock"
-        )
+        words = ("negative", "nan", "sparse", "meta")
+        there[last] = made(value, there[last]) if value in words else value
+        resumed(content, rf"checkpoint\.pt' .*{place.split('/')[0]}.*: start a")
+
+
+def test_a_checkpoint_must_hold_all_that_is_read(finished, resumed):
+    whole = load_checkpoint(finished / "checkpoint.pt")
+    names = "task_name config iteration seconds rule optimiser pool meter random_states"
+    for name in names.split():
+        for content in ({key: whole[key] for key in whole if key != name}, whole | {name: None}):
+            resumed(content, rf"checkpoint\.pt' .*lacks {name} or")
+    del whole["config"]["task"]
+    resumed(whole, r"lacks config\.task or")
 
 
 @pytest.mark.parametrize(
@@ -211,9 +226,8 @@ def test_a_damaged_line_of_the_log_is_named_and_the_log_left_alone(tmp_path, lin
     lines = log.read_text(encoding="utf-8").splitlines()
     log.write_text("\n".join([lines[0], line, *lines[2:]]) + "\n", encoding="utf-8")
     before = log.read_text(encoding="utf-8")
-    with pytest.raises(
-        NPAError, match=r"log\.jsonl' must hold .* but line 2 is .*move the file"
-    ) as e:
+    said = r"log\.jsonl' must hold .* but line 2 is .*move the file"
+    with pytest.raises(NPAError, match=said) as e:
         trainer_of(config, resume=True)
     assert len(str(e.value)) < 500 + len(str(tmp_path))
     assert log.read_text(encoding="utf-8") == before

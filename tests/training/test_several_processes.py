@@ -23,43 +23,27 @@ pytestmark = [
 ]
 
 
-def started(out, *options):
-    """A run on two processes that would go on for hours, if need be from its checkpoint."""
-    command = [sys.executable, "-m", "npa_envs", "train", "morphogenesis2d", "--preset", "tiny"]
-    command += ["--processes", "2", "--resume", "auto", "--out", str(out)]
-    command += ["--iterations", "1000000", "--checkpoint-interval", str(INTERVAL), "--no-progress"]
+def popen(*words, **variables):
+    """A run that would go on for hours, if need be from its checkpoint."""
+    task = ["train", "morphogenesis2d", "--preset", "tiny", "--resume", "auto", "--no-progress"]
+    task += ["--iterations", "1000000", "--checkpoint-interval", str(INTERVAL)]
+    launcher, options = words[: words.index("npa_envs") + 1], words[words.index("npa_envs") + 1 :]
     return subprocess.Popen(
-        [*command, *options],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.STDOUT,
-        text=True,
-        encoding="utf-8",
-    )
+        [sys.executable, "-m", *launcher, *task, *options], env=os.environ | variables,
+        stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, encoding="utf-8",
+    )  # fmt: skip
+
+
+def started(out, *options):
+    """A run on two processes."""
+    return popen("npa_envs", "--processes", "2", "--out", str(out), *options)
 
 
 def started_node(number, port, out):
-    """A machine of two that share such a run, each with one process."""
-    command = [sys.executable, "-m", "torch.distributed.run", "--nnodes=2", "--nproc-per-node=1"]
-    command += [f"--node-rank={number}", "--master-addr=127.0.0.1", f"--master-port={port}"]
-    command += [
-        "-m",
-        "npa_envs",
-        "train",
-        "morphogenesis2d",
-        "--preset",
-        "tiny",
-        "--resume",
-        "auto",
-    ]
-    command += ["--out", str(out), "--iterations", "1000000", "--no-progress"]
-    return subprocess.Popen(
-        [*command, "--checkpoint-interval", str(INTERVAL)],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.STDOUT,
-        text=True,
-        env=os.environ | {"GLOO_SOCKET_IFNAME": "lo", "OMP_NUM_THREADS": "1"},
-        encoding="utf-8",
-    )
+    """A machine of two that share a run, each with one process."""
+    words = ["torch.distributed.run", "--nnodes=2", "--nproc-per-node=1", f"--node-rank={number}"]
+    words += ["--master-addr=127.0.0.1", f"--master-port={port}", "-m", "npa_envs"]
+    return popen(*words, "--out", str(out), GLOO_SOCKET_IFNAME="lo", OMP_NUM_THREADS="1")
 
 
 def children(pid):
@@ -204,13 +188,8 @@ def test_a_small_batch_is_shared_unasked(tmp_path, monkeypatch):
     monkeypatch.setenv("OMP_NUM_THREADS", "2")
     command = [sys.executable, "-m", "npa_envs", "train", "morphogenesis2d", "--max-seconds", "1"]
     command += ["--target", "ring", "--no-report", "--out", str(tmp_path / "run")]
-    told = subprocess.run(
-        command, capture_output=True, text=True, timeout=120, check=True, encoding="utf-8"
-    )
-    assert "on 2 processes (cpu)" in told.stdout
-    assert "--resume --processes 2" in told.stdout
-    again = [*command, "--resume"]
-    told = subprocess.run(
-        again, capture_output=True, text=True, timeout=120, check=True, encoding="utf-8"
-    )
-    assert "learns ring (goes on)" in told.stdout
+    options = {"text": True, "timeout": 120, "encoding": "utf-8"}
+    said = subprocess.check_output(command, **options)
+    assert "on 2 processes (cpu)" in said
+    assert "--resume --processes 2" in said
+    assert "learns ring (goes on)" in subprocess.check_output([*command, "--resume"], **options)

@@ -8,9 +8,10 @@ from training_runs import Recording, make_cycle
 from worlds import assert_same
 
 import npa_envs
+from npa_envs.errors import NPAError
 from npa_envs.tasks.morphogenesis2d import Morphogenesis2D
 from npa_envs.tasks.point_classification import PointClassification
-from npa_envs.training import preset
+from npa_envs.training import preset, train
 from npa_envs.training.iteration import EagerIteration, GraphedIteration
 from npa_envs.world.particles import Particles
 
@@ -141,3 +142,33 @@ def test_recorded_iterations_take_means_over_processes_where_eager_ones_do(tmp_p
     for eager, graphed in zip(found[:3], found[3:], strict=True):
         for one, other in zip(eager, graphed, strict=True):
             torch.testing.assert_close(one, other, rtol=1e-4, atol=1e-6)
+
+
+# Worlds of several radii.
+
+
+def test_seeds_are_as_large_as_eps_makes_them(tmp_path):
+    def sizes(*vary_eps):
+        cycle, _ = tiny_cycle(tmp_path, vary_eps=vary_eps, pool_size=64)
+        radius = preset("tiny").task.seed_radius
+        return cycle.pool.worlds.x.norm(dim=-1).amax(dim=1) / radius
+
+    plain, varied, nearly = sizes(1.0, 1.0), sizes(0.5, 2.0), sizes(1.999, 2.0)
+    assert 0.8 < float(plain.min()) <= float(plain.max()) <= 1.0
+    assert 0.4 < float(varied.min()) < 0.7
+    assert 1.5 < float(varied.max()) <= 2.0
+    torch.testing.assert_close(nearly, sizes(2.0, 2.0), rtol=2e-3, atol=0.0)
+
+
+@pytest.mark.parametrize(
+    ("task", "fields", "message"),
+    [
+        ("texture", {}, "vary_eps needs particles that move in open space"),
+        ("morphogenesis2d", {"division": True}, "vary_eps needs seeds of more than one particle"),
+        ("co_morphogenesis2d", {}, "vary_eps is for runs of one rule"),
+    ],
+)
+def test_eps_is_varied_only_where_it_can_be(tmp_path, task, fields, message):
+    config = preset("tiny", task, out=tmp_path, vary_eps=(0.5, 2.0), **fields)
+    with pytest.raises(NPAError, match=message):
+        train(config, task, progress=False)

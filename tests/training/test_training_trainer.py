@@ -1,7 +1,7 @@
 """The trainer as a whole: it learns, it leaves files behind, it can be killed and resumed."""
 
+import contextlib
 import io
-import itertools
 import math
 import os
 import signal
@@ -21,15 +21,16 @@ from npa_envs.rule.files import load_rule, rule_metadata, save_rule
 from npa_envs.rule.rule import NPARule
 from npa_envs.training import DivergedError, JsonlLog, load_config, override
 from npa_envs.training.checkpoint import load_checkpoint
+from npa_envs.training.run import ONE_REQUEST, stop_flag
 
 
 def test_training_starts_from_an_initial_rule_of_its_shape(tmp_path):
     first = train(circle_config(tmp_path / "first", iterations=3))
     path = tmp_path / "first" / "rule.safetensors"
-    config = circle_config(tmp_path / "second", iterations=3, initial_rule=str(path))
-    assert_same(trainer_of(config).rule.state_dict(), first.rule.state_dict())
-    config = circle_config(tmp_path / "third", initial_rule=str(path.parent))  # the run's folder
-    assert_same(trainer_of(config).rule.state_dict(), first.rule.state_dict())
+    # Named by its file, or by the run's folder.
+    for name, given in (("second", path), ("third", path.parent)):
+        config = circle_config(tmp_path / name, initial_rule=str(given))
+        assert_same(trainer_of(config).rule.state_dict(), first.rule.state_dict())
     save_rule(NPARule(2, 5, 7), tmp_path / "other.safetensors")
     config = circle_config(tmp_path / "run", initial_rule=str(tmp_path / "other.safetensors"))
     with pytest.raises(NPAError, match=r"shape, but .* differs in .*hidden_dim \(7, here "):
@@ -78,6 +79,7 @@ def test_a_loss_that_is_not_finite_is_told_where_its_worlds_cannot_be_written(tm
         (5, {"max_age_range": (3, 40), "pool_size": 9, "schedule": "cosine"}),
         (5, {"dtype": "float64", "damage_share": 0.0}),
         (5, {"optimiser": "muon", "weight_decay": 0.1}),
+        (5, {"vary_eps": (0.5, 2.0)}),
     ],
 )
 def test_killed_and_resumed_run_has_the_same_log_bit_for_bit(tmp_path, iteration, fields):
@@ -128,11 +130,10 @@ def test_a_trainer_that_runs_again_goes_on_with_its_time(tmp_path, monkeypatch):
     assert seconds[-1] <= saved < seconds[-1] + 1.0
 
 
-def test_two_runs_with_one_seed_are_equal_and_with_two_seeds_differ(tmp_path):
-    for name, seed in (("a", 1), ("b", 1), ("c", 2)):
-        train(circle_config(tmp_path / name, seed=seed))
-    assert log_of(tmp_path / "a") == log_of(tmp_path / "b")
-    assert log_of(tmp_path / "a") != log_of(tmp_path / "c")
+def test_runs_with_two_seeds_differ(tmp_path):
+    for seed in (1, 2):
+        train(circle_config(tmp_path / str(seed), seed=seed))
+    assert log_of(tmp_path / "1") != log_of(tmp_path / "2")
 
 
 def test_log_has_terms_rate_steps_and_time(tmp_path):
@@ -150,52 +151,56 @@ def test_log_has_terms_rate_steps_and_time(tmp_path):
         assert record["loss"] == pytest.approx(whole, rel=1e-5)
 
 
-class WatchedTask(CircleTask):
-    """Counts the batches whose first world is a seed: only a seed's states are all 0."""
+def watching(note):
+    """A rollout that first notes the worlds and steps that it is given."""
 
-    def __init__(self):
-        super().__init__()
-        self.fresh = []
+    def rollout(rule, x, s, steps, **options):
+        note(x, s, steps)
+        return plain_rollout(rule, x, s, steps, **options)
+
+    return rollout
+
+
+class WatchedTask(CircleTask):
+    """Its seeds' states are all 0.125, which no other world's are."""
 
     def seed(self, world_count, *, generator, device):
         x, s, goal = super().seed(world_count, generator=generator, device=device)
         return x, s + 0.125, goal
 
-    def make_rollout(self):
-        def rollout(rule, x, s, steps, **options):
-            self.fresh.append((s == 0.125).flatten(1).all(1).tolist())
-            return plain_rollout(rule, x, s, steps, **options)
 
-        return rollout
+def fresh(s):
+    """Tell which worlds of a batch are seeds."""
+    return (s == 0.125).flatten(1).all(1).tolist()
+
+
+def run_watched(config, note):
+    trainer = trainer_of(config, WatchedTask(), rollout=watching(note))
+    trainer.run(progress=False)
 
 
 def test_every_fourth_batch_starts_with_a_fresh_seed(tmp_path):
-    task = WatchedTask()
+    found = []
     # Once every world of the pool has been trained on, a seed can only be a fresh one.
     config = circle_config(tmp_path, iterations=40, world_count=2, pool_size=2, milestones=[])
-    trainer_of(config, task, rollout=task.make_rollout()).run(progress=False)
-    assert [first for first, _ in task.fresh[4:]] == [k % 4 == 0 for k in range(4, 40)]
-    assert not any(second for _, second in task.fresh[4:])
+    run_watched(config, lambda x, s, steps: found.append(fresh(s)))
+    assert [first for first, _ in found[4:]] == [k % 4 == 0 for k in range(4, 40)]
+    assert not any(second for _, second in found[4:])
 
 
 def test_worlds_that_have_lived_are_replaced_by_seeds_and_all_others_grow_older(tmp_path):
-    task, steps = WatchedTask(), []
-
-    def rollout(rule, x, s, count, **options):
-        steps.append(count)
-        return task.make_rollout()(rule, x, s, count, **options)
-
+    found = []
     fields = {"iterations": 60, "world_count": 2, "pool_size": 2, "milestones": []}
     fields |= {"max_age_range": (1, 40), "steps": (4, 8), "damage_share": 0.0}
     config = circle_config(tmp_path, **fields)
-    trainer_of(config, task, rollout=rollout).run(progress=False)
-    ages = [0, 0]
-    for count, (first, second) in zip(steps, task.fresh, strict=True):
+    run_watched(config, lambda x, s, steps: found.append((steps, *fresh(s))))
+    age = 0
+    for steps, first, second in found:
         # The first world never lives longer than a rollout.
         assert first
-        assert second == (ages[1] == 0 or ages[1] >= 40)
-        ages[1] = (0 if second else ages[1]) + count
-    assert 5 < sum(second for _, second in task.fresh) < 12
+        assert second == (age == 0 or age >= 40)
+        age = (0 if second else age) + steps
+    assert 5 < sum(second for *_, second in found) < 12
 
 
 @pytest.mark.parametrize("damage", [True, False])
@@ -219,13 +224,8 @@ def test_worlds_that_are_old_and_never_damaged_count_as_grown(tmp_path, damage):
 @pytest.mark.parametrize("damage", [True, False])
 def test_worlds_from_the_pool_are_damaged_where_asked_and_fresh_seeds_are_not(tmp_path, damage):
     blank = []
-
-    def rollout(rule, x, s, steps, **options):
-        blank.append((s == 0).all(-1).sum(1).tolist())
-        return plain_rollout(rule, x, s, steps, **options)
-
     config = circle_config(tmp_path, iterations=12, damage_share=float(damage), milestones=[])
-    trainer_of(config, WatchedTask(), rollout=rollout).run(progress=False)
+    run_watched(config, lambda x, s, steps: blank.append((s == 0).all(-1).sum(1).tolist()))
     # Each particle is blanked with probability 0.2; only damage makes states exactly 0.
     total = sum(sum(counts) for counts in blank)
     assert (50 < total < 130) if damage else total == 0
@@ -233,20 +233,18 @@ def test_worlds_from_the_pool_are_damaged_where_asked_and_fresh_seeds_are_not(tm
 
 
 def test_worlds_in_the_first_places_are_damaged_and_the_others_never(tmp_path):
-    task, blank = WatchedTask(), []
+    hurt = {place: [] for place in range(8)}
 
-    def rollout(rule, x, s, steps, **options):
-        blank.append([*zip(chosen(), (s == 0).all(-1).any(1).tolist(), strict=True)])
-        return plain_rollout(rule, x, s, steps, **options)
+    def note(x, s, steps):
+        damaged = (s == 0).all(-1).any(1).tolist()
+        for place, one in zip(trainer._cycle._index.tolist(), damaged, strict=True):
+            if trainer.iteration > 0:
+                hurt[place].append(one)
 
     fields = {"iterations": 60, "pool_size": 8, "damage_share": 0.25, "milestones": []}
     config = circle_config(tmp_path, seed_interval=100, **fields)
-    trainer = trainer_of(config, task, rollout=rollout)
-    chosen = trainer._cycle._index.tolist
+    trainer = trainer_of(config, WatchedTask(), rollout=watching(note))
     trainer.run(progress=False)
-    hurt = {place: [] for place in range(8)}
-    for place, damaged in itertools.chain.from_iterable(blank[1:]):
-        hurt[place].append(damaged)
     shares = [sum(hurt[place]) / len(hurt[place]) for place in range(8)]
     # 12 particles, each blanked with probability 0.2: 7 % of the damaged worlds have none.
     assert [share > 0.7 for share in shares] == [True] * 2 + [False] * 6
@@ -255,34 +253,25 @@ def test_worlds_in_the_first_places_are_damaged_and_the_others_never(tmp_path):
 
 @pytest.mark.parametrize("share", [0.0, 0.5, 0.9])
 def test_worlds_whose_time_is_over_are_damaged_then_and_live_again(tmp_path, share):
-    drawn = []
+    seen, begun = set(), []
 
-    def rollout(rule, x, s, steps, **options):
+    def note(x, s, steps):
         cycle = trainer._cycle
         places, ages = cycle._index.tolist(), cycle._age.tolist()
-        same = zip(x, cycle.pool.worlds.x[places], s, cycle.pool.worlds.s[places], strict=True)
-        changed = [(torch.equal(a, b), not torch.equal(c, d)) for a, b, c, d in same]
-        kept, hurt = zip(*changed, strict=True)
-        drawn.extend(zip(places, ages, kept, hurt, strict=True))
-        return plain_rollout(rule, x, s, steps, **options)
+        before = cycle.pool.worlds.x[places], cycle.pool.worlds.s[places]
+        for k, (place, age) in enumerate(zip(places, ages, strict=True)):
+            hurt = not torch.equal(s[k], before[1][k])
+            if age == 0 and place in seen:
+                begun.append((torch.equal(x[k], before[0][k]), hurt))
+            elif place > 0:  # the first place is damaged each time
+                assert not hurt
+            seen.add(place)
 
     fields = {"iterations": 150, "pool_size": 16, "world_count": 4, "max_age_range": (8, 32)}
-    fields |= {
-        "damage_share": 1e-6,
-        "milestones": [],
-        "steps": (4, 5),
-        "damage_and_keep_share": share,
-    }
-    config = circle_config(tmp_path, **fields)
-    trainer = trainer_of(config, WatchedTask(), rollout=rollout)
+    fields |= {"milestones": [], "steps": (4, 5), "damage_and_keep_share": share}
+    config = circle_config(tmp_path, damage_share=1e-6, **fields)
+    trainer = trainer_of(config, WatchedTask(), rollout=watching(note))
     trainer.run(progress=False)
-    seen, begun = set(), []
-    for place, age, kept, hurt in drawn:
-        if age == 0 and place in seen:
-            begun.append((kept, hurt))
-        elif place > 0:  # the first place is damaged each time
-            assert not hurt
-        seen.add(place)
     again = [hurt for kept, hurt in begun if kept]
     assert len(begun) > 80
     assert len(again) == pytest.approx(share * len(begun), abs=0.15 * len(begun) * (share > 0))
@@ -293,24 +282,25 @@ def test_worlds_whose_time_is_over_are_damaged_then_and_live_again(tmp_path, sha
 def test_an_iteration_follows_a_share_of_the_schedule(tmp_path):
     config = circle_config(tmp_path, schedule="cosine", log_interval=1)
     trainer = trainer_of(config)
-    first = next(trainer.rule.parameters()).detach().clone()
+    parameter = next(trainer.rule.parameters())
+    first = parameter.detach().clone()
     trainer.iterate(share=1.0)
     # AdamW's first step is as long as the rate.
-    change = next(trainer.rule.parameters()).detach() - first
     rate = 0.01 * config.learning_rate
-    assert change.abs().max().item() == pytest.approx(rate, rel=1e-3)
+    assert (parameter.detach() - first).abs().max().item() == pytest.approx(rate, rel=1e-3)
     trainer._begin_record()
     assert log_of(tmp_path)[-1]["learning_rate"] == pytest.approx(rate)
     with pytest.raises(NPAError, match=r"share must lie in \[0, 1\], got 1.5"):
         trainer.iterate(share=1.5)
 
 
-def test_run_leaves_rule_configuration_and_pictures(tmp_path):
-    config = circle_config(tmp_path, picture_interval=3)
+def test_run_leaves_rule_configuration_pictures_and_a_board_with_the_logs_numbers(tmp_path):
+    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+    config = circle_config(tmp_path, picture_interval=3, tensorboard=True)
     result = train(config)
     rule = load_rule(tmp_path / "rule.safetensors")
-    for ours, theirs in zip(rule.parameters(), result.rule.parameters(), strict=True):
-        assert torch.equal(ours, theirs)
+    assert_same(list(rule.parameters()), list(result.rule.parameters()))
     assert rule_metadata(tmp_path / "rule.safetensors")["iteration"] == "6"
     assert load_config(tmp_path / "config.json", circle_config("x")) == config
     assert sorted(p.name for p in tmp_path.glob("pictures/*")) == ["000003.png", "000006.png"]
@@ -321,23 +311,16 @@ def test_run_leaves_rule_configuration_and_pictures(tmp_path):
     assert (pixels[:, :256] == 255).all()
     assert (worlds[::32] == worlds[31::32]).all()
     assert worlds.min() < worlds.max()
-
-
-def test_tensorboard_gets_the_same_numbers_as_the_log(tmp_path):
-    train(circle_config(tmp_path, tensorboard=True, picture_interval=6))
-    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
-
     events = EventAccumulator(str(tmp_path / "tensorboard"))
     events.Reload()
     losses = [(event.step, event.value) for event in events.Scalars("loss")]
     expected = [(record["iteration"], record["loss"]) for record in log_of(tmp_path)]
     assert losses == [(k, pytest.approx(loss, rel=1e-6)) for k, loss in expected]
-    (picture,) = events.Images("batch")
-    assert (picture.step, picture.width, picture.height) == (6, 4 * 256 + 3 * 8, 256)
-    written = np.asarray(Image.open(tmp_path / "pictures" / "000006.png")).astype(float)
-    shown = np.asarray(Image.open(io.BytesIO(picture.encoded_image_string)))
+    first, last = events.Images("batch")
+    assert (first.step, last.step, last.width, last.height) == (3, 6, 4 * 256 + 3 * 8, 256)
+    shown = np.asarray(Image.open(io.BytesIO(last.encoded_image_string)))
     # A JPEG of few pixels: seen 5.6 of 255.
-    assert np.abs(shown - written).mean() < 12
+    assert np.abs(shown - pixels.astype(float)).mean() < 12
 
 
 class BrokenTask(CircleTask):
@@ -452,12 +435,12 @@ def test_second_run_in_a_folder_is_refused_unless_it_overwrites(tmp_path):
     config = circle_config(tmp_path, picture_interval=1)
     train(config)
     (tmp_path / "notes.txt").write_text("mine", encoding="utf-8")
-    with pytest.raises(
-        NPAError, match=r"holds one: resume it .*, choose another folder .*, or overwrite"
+    for options, said in (
+        ({}, r"holds one: resume it .*, choose another folder .*, or overwrite"),
+        ({"resume": True, "overwrite": True}, "resume and overwrite exclude each other"),
     ):
-        trainer_of(config)
-    with pytest.raises(NPAError, match="resume and overwrite exclude each other"):
-        train(config, resume=True, overwrite=True)
+        with pytest.raises(NPAError, match=said):
+            trainer_of(config, **options)
     assert [record["iteration"] for record in log_of(tmp_path)][-1] == config.iterations
     result = train(override(config, iterations=2), overwrite=True)
     assert result.iteration == 2
@@ -468,39 +451,33 @@ def test_second_run_in_a_folder_is_refused_unless_it_overwrites(tmp_path):
 
 def test_checkpoint_of_another_task_or_configuration_is_refused(tmp_path):
     config = circle_config(tmp_path)
-    train(config)
-    before = (tmp_path / "checkpoint.pt").read_bytes()
-    with pytest.raises(NPAError, match="is of task 'circle', not of 'square'"):
-        trainer_of(config, task_name="square", resume=True)
-    with pytest.raises(NPAError, match=r"learning_rate: 0.01 there, 0.5 here.*initial_rule="):
-        trainer_of(override(config, learning_rate=0.5), resume=True)
-    with pytest.raises(NPAError, match=r"task.target: 'gecko' there, 'heart' here"):
-        trainer_of(override(config, target="heart"), resume=True)
-    train(override(config, repeats=2), resume=True)
-    with pytest.raises(NPAError, match="at iteration 12, beyond the 6 of this run: raise repeats"):
-        trainer_of(config, resume=True)
-    assert (tmp_path / "checkpoint.pt").read_bytes() != before
+    train(override(config, repeats=2))
+    for changes, options, said in (
+        ({}, {"task_name": "square"}, "is of task 'circle', not of 'square'"),
+        ({"learning_rate": 0.5}, {}, r"learning_rate: 0.01 there, 0.5 here.*initial_rule="),
+        ({"target": "heart"}, {}, r"task.target: 'gecko' there, 'heart' here"),
+        ({}, {}, "at iteration 12, beyond the 6 of this run: raise repeats"),
+    ):
+        with pytest.raises(NPAError, match=said):
+            trainer_of(override(config, **changes), resume=True, **options)
 
 
 def test_folders_that_do_not_do_are_named_before_training(tmp_path, monkeypatch):
-    with pytest.raises(NPAError, match="there is no checkpoint to resume from"):
-        trainer_of(circle_config(tmp_path / "none"), resume=True)
+    def refuse(folder, message, **options):
+        with pytest.raises(NPAError, match=message):
+            trainer_of(circle_config(tmp_path / folder), **options)
+
+    refuse("none", "there is no checkpoint to resume from", resume=True)
     assert not (tmp_path / "none").exists()
     (tmp_path / "file").write_text("", encoding="utf-8")
-    with pytest.raises(NPAError, match=r"out must be a folder that can be created .*file/run"):
-        trainer_of(circle_config(tmp_path / "file" / "run"))
+    refuse("file/run", r"out must be a folder that can be created .*file/run")
     usage = type("Usage", (), {"free": 100})
     monkeypatch.setattr("npa_envs.training.run.shutil.disk_usage", lambda path: usage)
-    with pytest.raises(NPAError, match="must have room for two checkpoints"):
-        trainer_of(circle_config(tmp_path / "full"))
+    refuse("full", "must have room for two checkpoints")
     assert not (tmp_path / "full" / "checkpoint.pt").exists()
-
-
-@pytest.mark.skipif(os.geteuid() == 0, reason="root may write everywhere")
-def test_folder_without_write_permission_is_named_before_training(tmp_path):
-    tmp_path.chmod(0o555)
-    with pytest.raises(NPAError, match="permission"):
-        trainer_of(circle_config(tmp_path))
+    if os.geteuid() != 0:  # Root may write everywhere.
+        tmp_path.chmod(0o555)
+        refuse("new", "permission")
 
 
 def test_disk_that_fills_up_leaves_the_last_checkpoint(tmp_path):
@@ -519,3 +496,25 @@ def test_disk_that_fills_up_leaves_the_last_checkpoint(tmp_path):
     assert (tmp_path / "checkpoint.pt").read_bytes() == before
     assert not list(tmp_path.glob(".*tmp*"))
     assert train(config, resume=True).finished
+
+
+# Signals.
+
+
+@pytest.mark.parametrize("patient", [False, True])
+def test_signals_of_one_moment_are_one_request_and_a_later_one_ends_the_impatient(
+    patient, monkeypatch, capfd
+):
+    clock, usual = Clock(), signal.getsignal(signal.SIGINT)
+    monkeypatch.setattr("npa_envs.training.run.time", clock)
+    with stop_flag(patient=patient) as stop:
+        assert not stop.is_set()
+        # A launcher passes on what its scheduler has sent to all processes.
+        for number in (signal.SIGTERM, signal.SIGTERM, signal.SIGINT):
+            signal.raise_signal(number)
+            assert stop.is_set()
+        clock.sleep(2 * ONE_REQUEST)
+        with contextlib.nullcontext() if patient else pytest.raises(KeyboardInterrupt):
+            signal.raise_signal(signal.SIGINT)
+    assert signal.getsignal(signal.SIGINT) is usual
+    assert patient or capfd.readouterr().err.count("once more to stop at once") == 1

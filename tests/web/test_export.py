@@ -4,19 +4,15 @@ from __future__ import annotations
 
 import json
 import re
-import shutil
 import subprocess
 import threading
-from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
 
 import pytest
 import torch
 from page_worlds import (
     TOLERANCE,
     WORLDS,
-    Box,
     described,
     grown,
     lively,
@@ -33,14 +29,7 @@ from npa_envs.errors import NPAError
 from npa_envs.rule.files import load_rule, save_rule
 from npa_envs.rule.rule import NPARule
 from npa_envs.tasks.point_classification import class_colours
-from npa_envs.web.export import (
-    PAGE,
-    check_browser_rule,
-    export_web,
-    joined_modules,
-    page_rule,
-    page_text,
-)
+from npa_envs.web.export import check_browser_rule, export_web, joined_modules, page_rule, page_text
 from npa_envs.web.live import ColouredWorld, Colouring
 from npa_envs.world import brushes
 from npa_envs.world.rollout import rollout
@@ -48,26 +37,15 @@ from npa_envs.world.species import rollout_species
 
 NODE_SECONDS = 60
 
-Run = Callable[..., Any]
-
 
 @pytest.fixture(scope="module")
-def run(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Run]:
+def run(modules):
     """Run an act of run_engine.mjs on the page's modules; one Node.js serves all tests."""
-    node = shutil.which("node")
-    if node is None:
-        pytest.skip("needs Node.js, which runs the page's modules without a browser")
-    folder = tmp_path_factory.mktemp("page")
-    for module in PAGE.glob("*.js"):
-        shutil.copy(module, folder)
-    (folder / "package.json").write_text('{"type": "module"}', encoding="utf-8")
-    command = [node, str(Path(__file__).with_name("run_engine.mjs")), str(folder)]
+    command = ["node", str(Path(__file__).with_name("run_engine.mjs")), str(modules)]
     pipe = subprocess.PIPE
     with subprocess.Popen(command, stdin=pipe, stdout=pipe, text=True, encoding="utf-8") as process:
-        assert process.stdin is not None
-        assert process.stdout is not None
 
-        def act(name: str, **told: Any) -> Any:
+        def act(name, **told):
             limit = threading.Timer(NODE_SECONDS, process.kill)
             limit.start()
             process.stdin.write(json.dumps({"act": name, **told}) + "\n")
@@ -83,8 +61,13 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Run]:
         process.kill()
 
 
+def assert_worlds(got, x, s, bound=TOLERANCE):
+    for name, want in (("x", x), ("s", s)):
+        assert float((unpacked(got[name], want.shape) - want).abs().max()) < bound
+
+
 @pytest.mark.parametrize("kind", WORLDS)
-def test_a_step_with_a_given_mask_is_that_of_python(run: Run, kind: str) -> None:
+def test_a_step_with_a_given_mask_is_that_of_python(run, kind):
     (rule,), x, s, eps, box = world_of(kind)
     count = x.shape[1]
     mask = (torch.rand(1, count, generator=torch.Generator().manual_seed(9)) < 0.5).double()
@@ -94,56 +77,51 @@ def test_a_step_with_a_given_mask_is_that_of_python(run: Run, kind: str) -> None
     for kernels, name in (("plain", "JavaScript"), ("simd", "WebAssembly")):
         got = run(
             "step", rules=[described(rule)], kernels=kernels, x=packed(x), s=packed(s),
-            species=[0] * count, mask=mask[0].int().tolist(), eps=eps, box=box,
+            species=[0] * count, mask=mask[0].int().tolist(), eps=eps, box=box
         )  # fmt: skip
         assert got["kernels"] == name
-        assert float((unpacked(got["x"], x.shape) - want_x).abs().max()) < TOLERANCE
-        assert float((unpacked(got["s"], s.shape) - want_s).abs().max()) < TOLERANCE
+        assert_worlds(got, want_x, want_s)
         assert torch.equal(unpacked(got["s"], s.shape)[mask == 0], s[mask == 0])
 
 
 @pytest.mark.parametrize(
     "left_out", ["moment_correction", "state_gradient", "density_gradient", "nothing"]
 )
-def test_a_step_has_the_time_the_noise_and_the_groups_of_perception_of_a_rollout(
-    run: Run, left_out: str
-) -> None:
+def test_a_step_has_the_time_the_noise_and_the_groups_of_perception_of_a_rollout(run, left_out):
     groups = {} if left_out == "nothing" else {left_out: False}
     rule = lively(NPARule(2, 6, 5, alpha=0.8, **groups))
     x, s = scattered(200, 2, 6, None)
     got = run(
         "step", rules=[described(rule)], kernels="simd", x=packed(x), s=packed(s),
-        species=[0] * 200, eps=0.1, box=None, dt=0.5, noise=packed(torch.full_like(x, 0.25)),
+        species=[0] * 200, eps=0.1, box=None, dt=0.5, noise=packed(torch.full_like(x, 0.25))
     )  # fmt: skip
     with torch.no_grad():
         want_x, want_s = rollout(
             rule.double(), x.double(), s.double(), 1, eps=0.1, update_prob=1.0, dt=0.5
         )
-    assert float((unpacked(got["x"], x.shape) - want_x - 0.25).abs().max()) < TOLERANCE
-    assert float((unpacked(got["s"], s.shape) - want_s).abs().max()) < TOLERANCE
+    assert_worlds(got, want_x + 0.25, want_s)
 
 
 @pytest.mark.parametrize("density_counts", [None, (200, 100)])
-def test_two_species_step_as_in_python(run: Run, density_counts: tuple[int, int] | None) -> None:
+def test_two_species_step_as_in_python(run, density_counts):
     rules = [load_rule("gecko"), lively(NPARule(2, 16, 24, alpha=0.3))]
     x, s = grown("gecko", 300, None)
     got = run(
         "step", rules=[described(rule) for rule in rules], kernels="simd", x=packed(x),
         s=packed(s), species=[0] * 200 + [1] * 100, eps=0.1, box=None,
-        density_counts=density_counts,
+        density_counts=density_counts
     )  # fmt: skip
     with torch.no_grad():
         want_x, want_s = rollout_species(
             [rule.double() for rule in rules], x.double(), s.double(), 1, counts=(200, 100),
-            update_prob=1.0, density_counts=density_counts,
+            update_prob=1.0, density_counts=density_counts
         )  # fmt: skip
-    assert float((unpacked(got["x"], x.shape) - want_x).abs().max()) < TOLERANCE
-    assert float((unpacked(got["s"], s.shape) - want_s).abs().max()) < TOLERANCE
+    assert_worlds(got, want_x, want_s)
 
 
 @pytest.mark.parametrize(("dimension", "box"), [(2, None), (2, (0.6, 0.5)), (3, None)])
 @pytest.mark.parametrize("name", ["wipe", "push", "clump", "cut", "cut for ever", "inject"])
-def test_brushes_are_those_of_python(run: Run, name: str, dimension: int, box: Box) -> None:
+def test_brushes_are_those_of_python(run, name, dimension, box):
     x, s = scattered(200, dimension, 4, box)
     at, move = x.new_full((1, dimension), 0.2), x.new_tensor([[0.05, -0.1, 0.2][:dimension]])
     along = None if name == "cut for ever" else 0.5 * move
@@ -167,37 +145,38 @@ def test_brushes_are_those_of_python(run: Run, name: str, dimension: int, box: B
     got = run(
         "brush", tool=name.split()[0], dimension=dimension, x=packed(x), s=packed(s), box=box,
         at=at[0].tolist(), move=move[0].tolist(), radius=0.15, strength=0.7,
-        normal=move.flip(1)[0].tolist(), along=None if along is None else along[0].tolist(),
+        normal=move.flip(1)[0].tolist(), along=None if along is None else along[0].tolist()
     )  # fmt: skip
-    assert float((unpacked(got["x"], x.shape) - want_x).abs().max()) < 1e-6
-    assert float((unpacked(got["s"], s.shape) - want_s).abs().max()) < 1e-6
+    assert_worlds(got, want_x, want_s, bound=1e-6)
     assert not (torch.equal(want_x, x) and torch.equal(want_s, s))
     inside = brushes.inside_ball(want_x, **told)[0]
     assert got["inside"] == inside.nonzero()[:, 0].tolist()
 
 
 @pytest.fixture(scope="module")
-def settings() -> dict[str, Any]:
+def settings():
     """What the page hands to its engine: two rules that may live together, and a static one."""
-    rules = [page_rule(name, particle_count=300) for name in ("gecko", "heart")]
-    text = page_text([*rules, page_rule("dots", particle_count=200)], title="mine")
-    return json.loads(re.search(r'id="rules">(.*?)</script>', text)[1])  # type: ignore[index]
+    counts = {"gecko": 300, "heart": 300, "dots": 200}
+    return settings_of(*(page_rule(name, particle_count=n) for name, n in counts.items()))
 
 
-def live(run: Run, settings: dict[str, Any], *script: dict[str, Any]) -> Any:
+def settings_of(*rules):
+    text = page_text(rules, title="mine")
+    return json.loads(re.search(r'id="rules">(.*?)</script>', text)[1])
+
+
+def live(run, settings, *script):
     return run("live", settings=settings, script=list(script))
 
 
 ADVANCE = {"type": "advance"}
 
 
-def last(told: Any, kind: str) -> Any:
+def last(told, kind):
     return next(event for event in reversed(told["events"]) if event["type"] == kind)
 
 
-def test_a_live_world_moves_and_the_same_seed_gives_the_same_world(
-    run: Run, settings: dict[str, Any]
-) -> None:
+def test_a_live_world_moves_and_the_same_seed_gives_the_same_world(run, settings):
     first, second = (live(run, settings, ADVANCE, ADVANCE) for _ in range(2))
     assert first["x"] == second["x"]
     frame, world = last(first, "frame"), last(first, "world")
@@ -207,9 +186,7 @@ def test_a_live_world_moves_and_the_same_seed_gives_the_same_world(
     assert live(run, settings, {"type": "reset", "seed": 0}, ADVANCE, ADVANCE)["x"] == first["x"]
 
 
-def test_the_rubber_takes_particles_away_and_the_others_go_on(
-    run: Run, settings: dict[str, Any]
-) -> None:
+def test_the_rubber_takes_particles_away_and_the_others_go_on(run, settings):
     rubber = {"type": "brush", "tool": "remove", "at": [0.1, 0], "radius": 0.08, "strength": 1}
     before = live(run, settings)
     after = live(run, settings, {"type": "play", "on": False}, rubber)
@@ -222,7 +199,7 @@ def test_the_rubber_takes_particles_away_and_the_others_go_on(
     assert last(live(run, settings, everything, ADVANCE, ADVANCE), "frame")["colours"] == []
 
 
-def test_a_state_is_injected_where_the_pointer_is(run: Run, settings: dict[str, Any]) -> None:
+def test_a_state_is_injected_where_the_pointer_is(run, settings):
     pause = {"type": "play", "on": False}
     told = {"type": "brush", "tool": "inject", "at": [0.1, 0], "radius": 0.08, "strength": 1}
     before = live(run, settings, *[ADVANCE] * 9, pause)
@@ -240,9 +217,7 @@ def test_a_state_is_injected_where_the_pointer_is(run: Run, settings: dict[str, 
     assert nobody["errors"] == after["errors"] == []
 
 
-def test_species_are_grafted_and_added_where_rules_agree(
-    run: Run, settings: dict[str, Any]
-) -> None:
+def test_species_are_grafted_and_added_where_rules_agree(run, settings):
     where = {"type": "brush", "at": [0.1, 0], "radius": 0.1, "strength": 0.5, "rule": "heart"}
     grafted = live(run, settings, {**where, "tool": "graft"}, ADVANCE)
     assert 0 < sum(grafted["species"]) < 300
@@ -261,10 +236,8 @@ def test_species_are_grafted_and_added_where_rules_agree(
     assert sum(wrong["species"]) == 0
 
 
-def test_settings_reach_the_world_and_wrong_messages_are_told(
-    run: Run, settings: dict[str, Any]
-) -> None:
-    def set_to(name: str, value: Any) -> dict[str, Any]:
+def test_settings_reach_the_world_and_wrong_messages_are_told(run, settings):
+    def set_to(name, value):
         return {"type": "set", "name": name, "value": value}
 
     told = live(run, settings, set_to("eps", 0.15), set_to("speed", 4), ADVANCE)
@@ -279,11 +252,11 @@ def test_settings_reach_the_world_and_wrong_messages_are_told(
     assert float(unpacked(texture["x"], (200, 2)).abs().max()) <= 1.0
     wrong = live(
         run, settings, set_to("eps", 9), set_to("rule", "nobody"), set_to("show", "nothing"),
-        {"type": "damage", "name": "luck"}, {"type": "fly"},
+        {"type": "damage", "name": "luck"}, {"type": "fly"}
     )  # fmt: skip
     assert wrong["errors"] == [
         "eps must lie in [0.04, 0.25], got 9", "no rule is called nobody",
-        "nothing to show is called nothing", "no damage is called luck", "no message is called fly",
+        "nothing to show is called nothing", "no damage is called luck", "no message is called fly"
     ]  # fmt: skip
     for name in ("wipe", "cut", "clump", "noise"):
         hurt = live(run, settings, *[ADVANCE] * 3, {"type": "damage", "name": name})
@@ -294,19 +267,17 @@ def test_settings_reach_the_world_and_wrong_messages_are_told(
 @pytest.mark.parametrize(
     "show", ["colours", "density", "components", "species", "speed", "mask", "state 3"]
 )
-def test_particles_have_the_colours_of_the_viewer(
-    run: Run, settings: dict[str, Any], show: str
-) -> None:
+def test_particles_have_the_colours_of_the_viewer(run, settings, show):
     told = live(
         run, settings, *[ADVANCE] * 8, {"type": "play", "on": False},
-        {"type": "set", "name": "show", "value": show}, ADVANCE,
+        {"type": "set", "name": "show", "value": show}, ADVANCE
     )  # fmt: skip
     frame = last(told, "frame")
     x, s = unpacked(told["x"], (1, 300, 2)), unpacked(told["s"], (1, 300, 16))
     rule = load_rule("gecko")
     seen = ColouredWorld(
         x, s, rule.colour, 0.1, None, [300], 300, unpacked(told["travelled"], (1, 300)),
-        torch.tensor([told["updated"]]).bool(),
+        torch.tensor([told["updated"]]).bool()
     )  # fmt: skip
     want = torch.from_numpy(Colouring()(show, seen)).int()
     got = torch.tensor(frame["colours"]).view(300, 3).int()
@@ -318,7 +289,7 @@ def test_particles_have_the_colours_of_the_viewer(
     assert len(want.unique(dim=0)) > (0 if show == "species" else 1)
 
 
-def test_particles_that_are_no_number_leave_the_components_of_the_others_alone(run: Run) -> None:
+def test_particles_that_are_no_number_leave_the_components_of_the_others_alone(run):
     s = torch.randn(40, 4, generator=torch.Generator().manual_seed(2))
     broken = torch.cat((s, s[:2]))
     broken[40, 1], broken[41, 0] = float("nan"), float("inf")
@@ -330,13 +301,11 @@ def test_particles_that_are_no_number_leave_the_components_of_the_others_alone(r
 
 
 @pytest.mark.parametrize("name", ["duck", pytest.param("digits", marks=pytest.mark.slow)])
-def test_read_outs_have_the_colours_of_the_viewer(run: Run, name: str) -> None:
+def test_read_outs_have_the_colours_of_the_viewer(run, name):
     if name == "digits":
         pytest.importorskip("sklearn")
     rule = page_rule(name) if name == "digits" else page_rule(name, particle_count=300)
-    text = page_text([rule], title="mine")
-    settings = json.loads(re.search(r'id="rules">(.*?)</script>', text)[1])  # type: ignore[index]
-    told = live(run, settings, *[ADVANCE] * 6)
+    told = live(run, settings_of(rule), *[ADVANCE] * 6)
     count = len(told["species"])
     s = unpacked(told["s"], (1, count, -1))
     loaded = load_rule(name)
@@ -348,7 +317,7 @@ def test_read_outs_have_the_colours_of_the_viewer(run: Run, name: str) -> None:
 
 
 @pytest.mark.slow
-def test_each_class_of_digits_begins_as_a_cloud_of_its_own(run: Run) -> None:
+def test_each_class_of_digits_begins_as_a_cloud_of_its_own(run):
     pytest.importorskip("sklearn")
     world = page_rule("digits")["world"]
     clouds = world["seed"]["clouds"]
@@ -359,9 +328,10 @@ def test_each_class_of_digits_begins_as_a_cloud_of_its_own(run: Run) -> None:
 # The file.
 
 
-def test_a_page_is_one_small_file_that_asks_for_nothing(tmp_path: Path) -> None:
-    export_web(["gecko"], tmp_path / "page.html")
-    text = (tmp_path / "page.html").read_text(encoding="utf-8")
+def test_a_page_is_one_small_file_that_asks_for_nothing(tmp_path):
+    page = tmp_path / "page.html"
+    export_web(["gecko"], page)
+    text = page.read_text(encoding="utf-8")
     assert len(text) < 300_000
     assert "default-src 'none'" in text
     # What a page could load: no element of it names anything but data.
@@ -369,32 +339,24 @@ def test_a_page_is_one_small_file_that_asks_for_nothing(tmp_path: Path) -> None:
     assert [address for address in loads if not address.startswith(("data:", "#"))] == []
     assert not re.search(r"\bimport\b *[({'\"*]|\bfetch\(|WebSocket|XMLHttpRequest", text)
     assert "<title>gecko</title>" in text
+    export_web(["gecko"], page, title="</title><script>alert(1)</script>")
+    assert "<script>alert(1)" not in page.read_text(encoding="utf-8")
 
 
-def test_a_title_cannot_leave_its_element(tmp_path: Path) -> None:
-    export_web(["gecko"], tmp_path / "page.html", title="</title><script>alert(1)</script>")
-    text = (tmp_path / "page.html").read_text(encoding="utf-8")
-    assert "<script>alert(1)" not in text
+def test_modules_are_joined_in_the_order_of_their_imports(tmp_path):
+    def joined(b):
+        a = 'import { two } from "./b.js";\nexport const four = two + two;\n'
+        for name, text in (("a", a), ("b", b)):
+            (tmp_path / f"{name}.js").write_text(text, encoding="utf-8")
+        return joined_modules(["a.js"], tmp_path)
 
-
-def test_modules_are_joined_in_the_order_of_their_imports(tmp_path: Path) -> None:
-    (tmp_path / "a.js").write_text(
-        'import { two } from "./b.js";\nexport const four = two + two;\n', encoding="utf-8"
-    )
-    (tmp_path / "b.js").write_text(
-        "const one = 1;\nexport const two = one + one;\n", encoding="utf-8"
-    )
-    text = joined_modules(["a.js"], tmp_path)
+    text = joined("const one = 1;\nexport const two = one + one;\n")
     assert text.index("const b =") < text.index("const a =")
     assert "const { two } = b;" in text
-    (tmp_path / "b.js").write_text(
-        'import { four } from "./a.js";\nexport const two = four;\n', encoding="utf-8"
-    )
     with pytest.raises(ValueError, match=r"a\.js -> b\.js -> a\.js"):
-        joined_modules(["a.js"], tmp_path)
-    (tmp_path / "b.js").write_text("export default 2;\n", encoding="utf-8")
+        joined('import { four } from "./a.js";\nexport const two = four;\n')
     with pytest.raises(ValueError, match="export default 2;"):
-        joined_modules(["a.js"], tmp_path)
+        joined("export default 2;\n")
 
 
 class OwnNetwork(NPARule):
@@ -411,12 +373,12 @@ class OwnNetwork(NPARule):
         (NPARule(hidden_dim=13000), "at most 1048576 weights, 'mine' has 1105000"),
     ],
 )
-def test_rules_that_a_browser_cannot_run_are_refused(rule: NPARule, message: str) -> None:
+def test_rules_that_a_browser_cannot_run_are_refused(rule, message):
     with pytest.raises(NPAError, match=message):
         check_browser_rule(rule, "mine")
 
 
-def test_rules_are_named_by_paths_as_well(tmp_path: Path) -> None:
+def test_rules_are_named_by_paths_as_well(tmp_path):
     save_rule(load_rule("gecko"), tmp_path / "mine.safetensors")
     export_web(
         [tmp_path / "mine.safetensors"], tmp_path / "page.html", particle_count=64, previews=True
@@ -424,21 +386,23 @@ def test_rules_are_named_by_paths_as_well(tmp_path: Path) -> None:
     assert '"name":"mine"' in (tmp_path / "page.html").read_text(encoding="utf-8")
 
 
-def test_bad_pages_are_refused(tmp_path: Path) -> None:
+def test_bad_pages_are_refused_before_any_work(tmp_path, monkeypatch):
+    monkeypatch.setattr("npa_envs.web.export.page_rule", lambda *_, **__: pytest.fail("worked"))
     for sources, path, message in (
         (["gecko"], "page.htm", r"must end in \.html"),
+        (["gecko"], "nowhere/page.html", "does not exist"),
         ([], "page.html", "rules of different names"),
         (["gecko", "gecko"], "page.html", "rules of different names"),
-        (["geko"], "page.html", "did you mean 'gecko'"),
     ):
         with pytest.raises(NPAError, match=message):
             export_web(sources, tmp_path / path)
+    monkeypatch.undo()
+    with pytest.raises(NPAError, match="did you mean 'gecko'"):
+        export_web(["geko"], tmp_path / "page.html")
     assert not any(tmp_path.iterdir())
 
 
-def test_the_command_writes_pages_and_collections(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_command_writes_pages_and_collections(tmp_path, capsys):
     page, collection = tmp_path / "page.html", tmp_path / "models.json"
     (tmp_path / "run").mkdir()
     save_rule(NPARule(), tmp_path / "run" / "rule.safetensors")
@@ -466,11 +430,3 @@ def test_the_command_writes_pages_and_collections(
     ):
         assert main(["export-web", *words, "-o", str(collection)]) == 2
         assert error in capsys.readouterr().err
-
-
-def test_a_place_that_cannot_be_written_to_is_told_before_any_work(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("npa_envs.web.export.page_rule", lambda *_, **__: pytest.fail("worked"))
-    with pytest.raises(NPAError, match="does not exist"):
-        export_web(["gecko"], tmp_path / "nowhere" / "page.html")

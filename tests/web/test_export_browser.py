@@ -4,12 +4,10 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Callable, Iterator
-from pathlib import Path
 
 import pytest
 import torch
-from browser import DESK, PHONE, Page, browser
+from browser import DESK, PHONE, browser
 from page_worlds import TOLERANCE, WORLDS, described, lively, packed, stepped, world_of
 
 from npa_envs.rule.rule import NPARule
@@ -17,15 +15,30 @@ from npa_envs.web.export import export_web, joined_modules
 from npa_envs.world.species import rollout_species
 
 
-@pytest.fixture(scope="module")
-def new_page(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Callable[[], Page]]:
-    with browser(tmp_path_factory.mktemp("profile")) as opened:
-        yield opened
+@pytest.fixture
+def exported(new_page, tmp_path):
+    """A function that exports rules and opens them, once some steps are done.
 
+    A page must load nothing and complain of nothing until the end of the test.
+    """
+    opened = []
 
-def export(folder: Path, *rules: str, count: int = 1024, previews: bool = False) -> str:
-    export_web(rules, folder / "page.html", particle_count=count, previews=previews)
-    return (folder / "page.html").as_uri()
+    def show(*rules, size=DESK, steps=1, make=new_page, query="", **options):
+        options = {"particle_count": 1024, "previews": False} | options
+        path = tmp_path / f"page-{len(opened)}.html"
+        export_web(rules, path, **options)
+        opened.append(page := make())
+        page.open(path.as_uri() + query, size)
+        if steps:
+            page.wait(f"{STEP} >= {steps}")
+        return page
+
+    yield show
+    for page in opened:
+        names = "performance.getEntriesByType('resource').map((entry) => entry.name)"
+        assert [n for n in page.run(names) if not n.startswith(("data:", "blob:"))] == []
+        assert page.complaints == []
+        page.open("about:blank")
 
 
 STEP = "document.page.frame.step"
@@ -40,19 +53,8 @@ BLANK = """(() => {
 """Particles of state zero, whose colour is grey."""
 
 
-def alone(page: Page) -> None:
-    """Check that the page has loaded nothing and complained of nothing."""
-    loaded = page.run("performance.getEntriesByType('resource').map((entry) => entry.name)")
-    assert [name for name in loaded if not name.startswith(("data:", "blob:"))] == []
-    assert page.complaints == []
-
-
-def test_an_exported_page_lives_and_is_touched(
-    tmp_path: Path, new_page: Callable[[], Page]
-) -> None:
-    page = new_page()
-    page.open(export(tmp_path, "gecko", count=512))
-    page.wait(f"{STEP} >= 3")
+def test_an_exported_page_lives_and_is_touched(exported):
+    page = exported("gecko", particle_count=512, steps=3)
     # The middle of the canvas, where the seed is.
     x, y = page.run(
         "(({ left, top, width, height }) => [left + width / 2, top + height / 2])"
@@ -72,17 +74,12 @@ def test_an_exported_page_lives_and_is_touched(
     )
     assert not waits
     page.wait(f"{STEP} > {before} + 2")
-    alone(page)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("size", [DESK, PHONE])
-def test_an_exported_page_heals(
-    tmp_path: Path, new_page: Callable[[], Page], size: tuple[int, int]
-) -> None:
-    page = new_page()
-    page.open(export(tmp_path, "gecko", "heart"), size)
-    page.wait(f"{STEP} >= 100", 120)
+def test_an_exported_page_heals(exported, size):
+    page = exported("gecko", "heart", size=size, steps=100)
     page.run("document.page.play(false)")
     assert page.run(BLANK) < 10
     page.run("document.page.send({ type: 'damage', name: 'wipe' })")
@@ -92,14 +89,11 @@ def test_an_exported_page_heals(
     page.run("document.page.send({ type: 'set', name: 'rule', value: 'heart' })")
     page.wait("document.page.world.rule === 'heart'")
     page.wait(f"{STEP} >= 5")
-    alone(page)
 
 
 @pytest.mark.slow
-def test_a_page_records_a_film_and_a_picture(tmp_path: Path, new_page: Callable[[], Page]) -> None:
-    page = new_page()
-    page.open(export(tmp_path, "gecko", count=256))
-    page.wait(f"{STEP} >= 2")
+def test_a_page_records_a_film_and_a_picture(exported):
+    page = exported("gecko", particle_count=256, steps=2)
     page.run("document.getElementById('record').click()")
     page.wait(f"{STEP} >= 30")
     page.run("document.getElementById('record').click()")
@@ -117,14 +111,11 @@ def test_a_page_records_a_film_and_a_picture(tmp_path: Path, new_page: Callable[
         })"""
     )
     assert width == page.run("document.getElementById('world').width")
-    alone(page)
 
 
 @pytest.mark.slow
-def test_a_page_may_not_reach_the_network(tmp_path: Path, new_page: Callable[[], Page]) -> None:
-    page = new_page()
-    page.open(export(tmp_path, "gecko", count=64))
-    page.wait(f"{STEP} >= 1")
+def test_a_page_may_not_reach_the_network(exported):
+    page = exported("gecko", particle_count=64)
     refused = page.run(
         """new Promise((told) => {
           addEventListener("securitypolicyviolation", (event) => told(event.effectiveDirective));
@@ -132,13 +123,13 @@ def test_a_page_may_not_reach_the_network(tmp_path: Path, new_page: Callable[[],
         })"""
     )
     assert refused == "connect-src"
+    # The browser has complained of it.
+    page.complaints.clear()
 
 
 @pytest.mark.slow
-def test_a_gallery_opens_a_rule_and_goes_back(tmp_path: Path, new_page: Callable[[], Page]) -> None:
-    address = export(tmp_path, "gecko", "dots", count=256, previews=True)
-    page = new_page()
-    page.open(address, PHONE)
+def test_a_gallery_opens_a_rule_and_goes_back(exported):
+    page = exported("gecko", "dots", particle_count=256, previews=True, size=PHONE, steps=0)
     shown = "[...document.querySelectorAll('#gallery img')].filter((image) => image.naturalWidth)"
     page.wait(f"{shown}.length === 2")
     page.run("document.querySelector('#gallery li:nth-child(2) a').click()")
@@ -148,32 +139,21 @@ def test_a_gallery_opens_a_rule_and_goes_back(tmp_path: Path, new_page: Callable
     page.run("location.hash = 'gecko'")
     page.wait(f"document.page.world.rule === 'gecko' && {STEP} >= 2")
     assert page.run("document.page.world.playing")
-    alone(page)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["duck", "digits"])
-def test_solid_and_still_worlds_live_in_a_page(
-    tmp_path: Path, new_page: Callable[[], Page], name: str
-) -> None:
+def test_solid_and_still_worlds_live_in_a_page(exported, name):
     if name == "digits":
         pytest.importorskip("sklearn")
-    page = new_page()
-    export_web([name], tmp_path / "page.html")
-    page.open((tmp_path / "page.html").as_uri())
-    page.wait(f"{STEP} >= 3", 120)
+    page = exported(name, particle_count=None, previews=True, steps=3)
     count = {"duck": 8192, "digits": 512}[name]
     told = page.run("document.getElementById('step').textContent")
     assert re.fullmatch(rf"step \d+ · {count} particles", told)
-    alone(page)
 
 
 # A graphics card in software: slow, but the shaders are those that any card runs.
-CARD = (
-    "--enable-unsafe-webgpu",
-    "--use-webgpu-adapter=swiftshader",
-    "--enable-features=Vulkan",
-)
+CARD = ("--enable-unsafe-webgpu", "--use-webgpu-adapter=swiftshader", "--enable-features=Vulkan")
 
 CARD_STEP = """(async ({ rules, x, s, species, mask, eps, box, densityCounts }) => {
   const floats = (text) =>
@@ -195,16 +175,14 @@ CARD_STEP = """(async ({ rules, x, s, species, mask, eps, box, densityCounts }) 
 
 
 @pytest.fixture(scope="module")
-def card_page(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Callable[[], Page]]:
+def card_page(tmp_path_factory):
     with browser(tmp_path_factory.mktemp("card"), *CARD) as opened:
         yield opened
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", [*WORLDS, "two species"])
-def test_a_step_on_a_graphics_card_is_that_of_python(
-    tmp_path: Path, card_page: Callable[[], Page], kind: str
-) -> None:
+def test_a_step_on_a_graphics_card_is_that_of_python(tmp_path, card_page, kind):
     script = joined_modules(["physics_gpu.js"])
     shown = "Object.assign(window, { physics, physics_gpu });"
     text = f"<!doctype html><script>{script}\n{shown}</script>"
@@ -222,14 +200,14 @@ def test_a_step_on_a_graphics_card_is_that_of_python(
         with torch.no_grad():
             want_x, want_s = rollout_species(
                 [rule.double() for rule in rules], x.double(), s.double(), 1, counts=counts,
-                update_prob=1.0, density_counts=counts,
+                update_prob=1.0, density_counts=counts
             )  # fmt: skip
     else:
         want_x, want_s = stepped(rules[0], x, s, mask, eps=eps, box=box)
     told = {
         "rules": [described(rule) for rule in rules], "x": packed(x), "s": packed(s),
         "species": [0] * count if counts is None else [0] * counts[0] + [1] * counts[1],
-        "mask": mask[0].int().tolist(), "eps": eps, "box": box, "densityCounts": counts,
+        "mask": mask[0].int().tolist(), "eps": eps, "box": box, "densityCounts": counts
     }  # fmt: skip
     got = page.run(f"{CARD_STEP}({json.dumps(told)})")
     assert float((torch.tensor(got["x"]).view_as(want_x) - want_x).abs().max()) < TOLERANCE
@@ -238,12 +216,10 @@ def test_a_step_on_a_graphics_card_is_that_of_python(
 
 
 @pytest.mark.slow
-def test_a_page_lives_on_a_graphics_card(tmp_path: Path, card_page: Callable[[], Page]) -> None:
-    address = export(tmp_path, "gecko", "heart", count=256)
+def test_a_page_lives_on_a_graphics_card(exported, card_page):
     for engine, name in (("gpu", "WebGPU"), ("auto", ""), ("processor", "WebAssembly")):
-        page = card_page()
-        page.open(f"{address}?engine={engine}")
-        page.wait(f"{STEP} >= 8", 60)
+        kind = {"make": card_page, "query": f"?engine={engine}"}
+        page = exported("gecko", "heart", particle_count=256, steps=8, **kind)
         page.run(
             "document.page.send({ type: 'brush', tool: 'graft', rule: 'heart', "
             "at: [0.1, 0], move: [0, 0], radius: 0.1, strength: 1 })"
@@ -251,4 +227,3 @@ def test_a_page_lives_on_a_graphics_card(tmp_path: Path, card_page: Callable[[],
         page.wait("document.page.world.species.length === 2")
         assert page.run("document.page.frame.engine") == name or not name
         page.wait(f"{STEP} >= {page.run(STEP)} + 8", 60)
-        alone(page)

@@ -42,6 +42,18 @@ def brush(tool, **told):
     return {"type": "brush", "tool": tool, "at": [0.0, 0.0], "radius": 0.1} | told
 
 
+def put(world, **settings):
+    """Change settings; return what the world says of the last one."""
+    for name, value in settings.items():
+        done = world.handle({"type": "set", "name": name, "value": value})
+    return done
+
+
+def advance(world, count):
+    for _ in range(count):
+        world.advance()
+
+
 def world_of(rule: NPARule, path: Path, device: torch.device, **options) -> RuleWorld:
     """A world of a rule that was trained by the preset `paper` with some options."""
     config = config_to_dict(preset("paper", **options))
@@ -57,13 +69,12 @@ def world(gecko) -> RuleWorld:
 
 
 def test_a_live_world_is_the_rollout_of_its_rule(world):
-    world.handle({"type": "set", "name": "speed", "value": 3})
+    put(world, speed=3)
     device = world.x.device
     rule = load_rule("gecko", device=device).float()
     generator = torch.Generator(device).manual_seed(0)
     x, s, _ = world.task.seed(1, generator=generator, device=device)
-    for _ in range(2):
-        world.advance()
+    advance(world, 2)
     with torch.no_grad():
         x, s = rollout(
             rule, x, s, 6, eps=world.task.eps, update_prob=world.task.update_prob,
@@ -80,9 +91,9 @@ def test_a_live_world_is_the_rollout_of_its_rule(world):
 def test_what_is_shown_does_not_change_the_world(gecko):
     plain, watched = gecko(), gecko()
     for show in ("mask", "speed", "density", "components", "species", "state 3"):
-        watched.handle({"type": "set", "name": "show", "value": show})
+        put(watched, show=show)
         for world in (plain, watched):
-            world.handle({"type": "set", "name": "speed", "value": 2})
+            put(world, speed=2)
             world.advance()
         assert watched.frame().colours.shape == (COUNT, 3)
         assert torch.equal(plain.x, watched.x)
@@ -91,10 +102,8 @@ def test_what_is_shown_does_not_change_the_world(gecko):
 
 def test_the_mask_shows_about_as_many_as_are_updated(device):
     world = RuleWorld("gecko", device=device, particle_count=1024)
-    world.handle({"type": "set", "name": "update_prob", "value": 0.25})
-    world.handle({"type": "set", "name": "show", "value": "mask"})
-    for _ in range(3):
-        world.advance()
+    put(world, update_prob=0.25, show="mask")
+    advance(world, 3)
     bright = (world.frame().colours[:, 0] > 200).mean()
     # Four standard deviations of a share of 1024 draws.
     assert abs(bright - 0.25) < 0.06
@@ -102,7 +111,7 @@ def test_the_mask_shows_about_as_many_as_are_updated(device):
 
 @pytest.mark.parametrize("show", ["mask", "speed"])
 def test_before_the_first_step_nothing_was_updated_or_has_moved(world, show):
-    world.handle({"type": "set", "name": "show", "value": show})
+    put(world, show=show)
     assert len(np.unique(world.frame().colours, axis=0)) == 1
 
 
@@ -141,8 +150,7 @@ def test_remove_takes_particles_and_the_others_feel_it_nearby_only(world, gecko)
     assert far.sum() > 3
     for live in (world, other):
         # All are updated, so that both draw nothing.
-        live.handle({"type": "set", "name": "update_prob", "value": 1.0})
-        live.handle({"type": "set", "name": "eps", "value": 0.05})
+        put(live, update_prob=1.0, eps=0.05)
         live.advance()
     apart = (world.x[0][:, None] - other.x[0]).norm(dim=-1).min(dim=0).values
     assert float(apart[far].max()) < 1e-6
@@ -171,18 +179,16 @@ def test_a_world_at_rest_is_not_stepped_until_something_changes_it(tmp_path, dev
         return rollout(*args, **options)
 
     monkeypatch.setattr(rule_world, "rollout", noted)
-    world.handle({"type": "set", "name": "speed", "value": 16})
-    for _ in range(8):
-        world.advance()
+    put(world, speed=16)
+    advance(world, 8)
     assert asked == [16] * 3
     assert world.step == 128
     world.s[0, 3] = 1e4
     world.advance()
     assert asked == [16] * 4
     world.handle({"type": "reset"})
-    world.handle({"type": "set", "name": "noise", "value": 0.002})
-    for _ in range(8):
-        world.advance()
+    put(world, noise=0.002)
+    advance(world, 8)
     assert asked == [16] * 12
 
 
@@ -191,9 +197,9 @@ def test_a_world_that_divides_shows_its_living_particles(tmp_path, device):
     world = world_of(rule, path, device, division=True, particle_count=64)
     assert len(world.frame().positions) == 1
     assert not {"inject", "graft", "add"} & set(world.describe()["tools"])
-    world.handle({"type": "set", "name": "speed", "value": 8})
+    put(world, speed=8)
     for show in ("colours", "mask", "speed", "density", "components", "species", "state 3"):
-        world.handle({"type": "set", "name": "show", "value": show})
+        put(world, show=show)
         world.advance()
         alive = living(world.s)[0]
         frame = world.frame()
@@ -219,16 +225,13 @@ def test_what_is_added_to_a_world_of_a_rule_with_codes_carries_one(device):
     assert torch.equal(world.s[0, :, :8], code.expand(world.s.shape[1], 8))
 
 
-def test_push_carries_particles_along(world):
+def test_push_carries_particles_along_and_clump_and_cut_move_them(world):
     before = world.x.clone()
     world.handle(brush("push", move=[0.05, 0.0], radius=0.2, strength=1.0))
     moved = world.x - before
     assert float(moved[..., 0].max()) > 0.03
     assert float(moved[..., 0].min()) >= 0.0
     assert float(moved[..., 1].abs().max()) == 0.0
-
-
-def test_clump_and_cut_move_particles(world):
     before = world.x.clone()
     world.handle(brush("clump", radius=0.3, strength=1.0))
     assert world.x.norm(dim=-1).mean() < before.norm(dim=-1).mean()
@@ -265,7 +268,7 @@ def test_grafts_follow_the_other_rule(world):
     # The page's tracers must know.
     assert world.news() == [{"type": "reordered"}]
     world.advance()
-    world.handle({"type": "set", "name": "show", "value": "species"})
+    put(world, show="species")
     np.testing.assert_array_equal(
         world.frame().colours, species_colours(2).repeat(world.counts, axis=0)
     )
@@ -274,12 +277,11 @@ def test_grafts_follow_the_other_rule(world):
 
 
 def test_a_seed_that_is_added_grows_as_it_would_alone(world):
-    world.handle({"type": "set", "name": "update_prob", "value": 1.0})
+    put(world, update_prob=1.0)
     world.handle(brush("add", rule="heart", at=[30.0, 0.0], radius=0.2, strength=1.0))
     assert world.counts == [COUNT, COUNT // 2]
     heart = world.x[:, COUNT:].clone(), world.s[:, COUNT:].clone()
-    for _ in range(2):
-        world.advance()
+    advance(world, 2)
     rule = load_rule("heart", device=world.x.device).float()
     with torch.no_grad():
         x, s = rollout(rule, *heart, 2, update_prob=1.0)
@@ -289,8 +291,7 @@ def test_a_seed_that_is_added_grows_as_it_would_alone(world):
 
 @pytest.mark.parametrize("name", DAMAGE_SIZES)
 def test_damage_changes_the_world(world, name):
-    for _ in range(3):
-        world.advance()
+    advance(world, 3)
     x, s = world.x.clone(), world.s.clone()
     world.handle({"type": "damage", "name": name})
     assert not (torch.equal(x, world.x) and torch.equal(s, world.s))
@@ -302,7 +303,7 @@ def test_settings_are_taken_and_told(world):
         assert world.describe()["settings"][name]["value"] == value
     world.advance()
     assert world.step == 4
-    world.handle({"type": "set", "name": "count", "value": 64})
+    put(world, count=64)
     assert len(world.frame().positions) == 64
     assert world.describe()["settings"]["eps"]["value"] == 0.12
 
@@ -310,8 +311,8 @@ def test_settings_are_taken_and_told(world):
 def test_noise_moves_particles_that_the_rule_leaves(world, gecko):
     still = gecko()
     for live in (world, still):
-        live.handle({"type": "set", "name": "update_prob", "value": 0.05})
-    world.handle({"type": "set", "name": "noise", "value": 0.02})
+        put(live, update_prob=0.05)
+    put(world, noise=0.02)
     before = world.x.clone()
     for live in (world, still):
         live.advance()
@@ -320,8 +321,8 @@ def test_noise_moves_particles_that_the_rule_leaves(world, gecko):
 
 
 def test_another_rule_is_another_world(world):
-    world.handle({"type": "set", "name": "show", "value": "state 15"})
-    assert world.handle({"type": "set", "name": "rule", "value": "dots"})
+    put(world, show="state 15")
+    assert put(world, rule="dots")
     told = world.describe()
     assert told["rule"] == "dots"
     assert told["box"] == [2.0, 2.0]
@@ -334,7 +335,7 @@ def test_another_rule_is_another_world(world):
 
 def test_the_loss_is_computed_only_where_it_is_wanted(world):
     assert world.frame().loss is None
-    world.handle({"type": "set", "name": "loss", "value": True})
+    put(world, loss=True)
     world.advance()
     loss = world.frame().loss
     assert loss == pytest.approx(float(world.task.metric(world.x, world.s)))
@@ -376,24 +377,19 @@ def test_the_loss_is_computed_only_where_it_is_wanted(world):
         (brush("graft", rule="duck"), "duck cannot live in a world of gecko"),
     ],
 )
-def test_a_wrong_message_is_refused_and_changes_nothing(message, error):
-    world = shared_world()
-    x, s, told = world.x, world.s, world.describe()
+def test_a_wrong_message_is_refused_and_changes_nothing(shared, message, error):
+    x, s, told = shared.x, shared.s, shared.describe()
     with pytest.raises(NPAError, match=error):
-        world.handle(message)
-    assert world.x is x
-    assert world.s is s
-    assert world.describe() == told
+        shared.handle(message)
+    assert shared.x is x
+    assert shared.s is s
+    assert shared.describe() == told
 
 
-_shared: list[RuleWorld] = []
-
-
-def shared_world() -> RuleWorld:
+@pytest.fixture(scope="module")
+def shared():
     """One world for all messages that must leave it as it is."""
-    if not _shared:
-        _shared.append(RuleWorld("gecko", device=CPU, particle_count=COUNT))
-    return _shared[0]
+    return RuleWorld("gecko", device=CPU, particle_count=COUNT)
 
 
 @pytest.mark.slow
@@ -403,7 +399,7 @@ def test_every_shipped_rule_can_be_viewed(name, device):
     told = world.describe()
     assert name in told["others"]
     for show in (*told["shows"][:6], "state 0"):
-        world.handle({"type": "set", "name": "show", "value": show})
+        put(world, show=show)
         world.advance()
         frame = world.frame()
         assert frame.positions.shape == (world.full, told["dimension"])
@@ -411,7 +407,7 @@ def test_every_shipped_rule_can_be_viewed(name, device):
         middle = np.array(told["centre"])
         inside = np.abs(frame.positions - middle).max(axis=1) <= 1.1 * told["half_width"]
         assert inside.mean() > 0.95
-    world.handle({"type": "set", "name": "loss", "value": True})
+    put(world, loss=True)
     assert np.isfinite(world.frame().loss)
 
 
@@ -544,21 +540,17 @@ def followed(tmp_path) -> RunWorld:
     return RunWorld(tmp_path, device=CPU, particle_count=COUNT)
 
 
-def test_a_run_is_followed(tmp_path):
-    folder = tmp_path / "mine"
-    write_run(folder)
-    world = RunWorld(folder, device=CPU, particle_count=COUNT)
+def test_a_run_is_followed(tmp_path, followed):
+    world = followed
     curve, told = world.news()
-    assert curve["points"] == [[k, 1.0 / (k + 1)] for k in range(10)]
-    assert not curve["append"]
-    assert told["note"] == "a training run, iteration 9"
-    assert told["title"] == "mine"
+    assert (curve["points"], curve["append"]) == ([[k, 1.0 / (k + 1)] for k in range(10)], False)
+    assert (told["note"], told["title"]) == ("a training run, iteration 9", tmp_path.name)
     assert world.news() == []
     world.advance()
     x = world.x
     newer = trained_on("gecko")
-    write_run(folder, rule=newer)
-    log(folder, 10, 12)
+    write_run(tmp_path, rule=newer)
+    log(tmp_path, 10, 12)
     curve, told = (event for event in news(world) if event["type"] != "error")
     assert (curve["points"], curve["append"]) == ([[10, 1.0 / 11], [11, 1.0 / 12]], True)
     assert told["note"] == "a training run, iteration 11"
@@ -604,26 +596,21 @@ def test_a_run_of_several_rules_is_one_world_of_them(tmp_path):
 def test_another_run_in_the_folder_is_another_world(tmp_path, followed):
     world = followed
     world.news()
+    advance(world, 1)
+    # With another picture of the same sizes, and then in a box.
+    write_run(tmp_path, "heart")
+    assert news(world)[-1]["type"] == "world"
+    assert (world.task.config.target, world.step) == ("heart", 0)
+    advance(world, 1)
+    write_run(tmp_path, "heart", trained_on("heart"))
+    news(world)
+    assert world.step == 1
     write_run(tmp_path, "dots")
     reordered, told = news(world)
     assert reordered == {"type": "reordered"}
     assert told["box"] == [2.0, 2.0]
-    world.advance()
+    advance(world, 1)
     assert world.frame().step == 1
-
-
-def test_another_run_with_another_picture_is_another_world(tmp_path, followed):
-    world = followed
-    world.advance()
-    # Of the same sizes.
-    write_run(tmp_path, "heart")
-    assert news(world)[-1]["type"] == "world"
-    assert world.task.config.target == "heart"
-    assert world.step == 0
-    world.advance()
-    write_run(tmp_path, "heart", trained_on("heart"))
-    news(world)
-    assert world.step == 1
 
 
 def test_particles_carry_the_codes_of_the_newest_rule(tmp_path):
@@ -643,9 +630,7 @@ def test_particles_carry_the_codes_of_the_newest_rule(tmp_path):
 
 
 def test_of_a_log_only_what_is_new_is_read(tmp_path, followed, monkeypatch):
-    world = followed
-    path = tmp_path / "log.jsonl"
-
+    world, path = followed, tmp_path / "log.jsonl"
     assert len(points(world)[0][1]) == 10
     opened = []
     monkeypatch.setattr(
@@ -662,9 +647,7 @@ def test_of_a_log_only_what_is_new_is_read(tmp_path, followed, monkeypatch):
 
 
 def test_a_log_that_begins_anew_or_goes_back_is_told_from_its_start(tmp_path, followed):
-    world = followed
-    path = tmp_path / "log.jsonl"
-
+    world, path = followed, tmp_path / "log.jsonl"
     points(world)
     # A resumed run drops the lines after its checkpoint.
     JsonlLog(path).truncate(4)
@@ -683,16 +666,14 @@ def test_a_log_that_begins_anew_or_goes_back_is_told_from_its_start(tmp_path, fo
     assert points(world) == [(False, [[0, 1.0]])]
 
 
-def test_a_line_that_is_being_written_waits(tmp_path):
-    write_run(tmp_path)
+def test_a_line_that_is_being_written_waits(tmp_path, followed):
+    followed.news()
     with (tmp_path / "log.jsonl").open("a", encoding="utf-8") as file:
         file.write('{"iteration": 10, "lo')
-    world = RunWorld(tmp_path, device=CPU, particle_count=COUNT)
-    curve = world.news()[0]
-    assert curve["points"][-1] == [9, 0.1]
-    with (tmp_path / "log.jsonl").open("a", encoding="utf-8") as file:
+        file.flush()
+        assert points(followed) == []
         file.write('ss": 0.25}\n')
-    assert news(world)[0]["points"] == [[10, 0.25]]
+    assert points(followed) == [(True, [[10, 0.25]])]
 
 
 def test_a_rule_that_is_damaged_meanwhile_is_told_and_the_world_lives_on(tmp_path, followed):
@@ -708,30 +689,34 @@ def test_a_rule_that_is_damaged_meanwhile_is_told_and_the_world_lives_on(tmp_pat
 
 
 def test_an_unfinished_run_is_refused_in_words(tmp_path):
-    with pytest.raises(NPAError, match=r"must hold the rule\.safetensors of a run"):
-        RunWorld(tmp_path, device=CPU)
-    (tmp_path / "config.json").write_text("{}", encoding="utf-8")
-    with pytest.raises(NPAError, match="has not written its rules yet: wait for its first"):
-        RunWorld(tmp_path, device=CPU)
-    with pytest.raises(NPAError, match="a run must be a folder"):
-        RunWorld(tmp_path / "none", device=CPU)
+    for content, folder, message in (
+        (None, tmp_path, r"must hold the rule\.safetensors of a run"),
+        ("{}", tmp_path, "has not written its rules yet: wait for its first"),
+        ("{}", tmp_path / "none", "a run must be a folder"),
+    ):
+        if content is not None:
+            (tmp_path / "config.json").write_text(content, encoding="utf-8")
+        with pytest.raises(NPAError, match=message):
+            RunWorld(folder, device=CPU)
 
 
 # Environments.
 
 
+def made(name, **keywords):
+    small = {"particle_count": 64, "resolution": 16, "disable_env_checker": True}
+    return gymnasium.make(name, **small, **keywords)
+
+
 def test_the_speed_of_a_step_across_an_edge_of_the_box_is_that_of_the_step():
-    env = gymnasium.make(
-        "npa/Texture-v0", particle_count=64, resolution=16, target="dots",
-        disable_env_checker=True,
-    )  # fmt: skip
+    env = made("npa/Texture-v0", target="dots")
     action = np.zeros(env.action_space.shape, np.float32)
     action[:, 0] = 1.0
     world = EnvironmentWorld(env, lambda seen: action)
     x, s = world._inner.particles()
     x[:, 0] = 1.0 - 1e-4
     world._place(x[None], s[None])
-    world.handle({"type": "set", "name": "show", "value": "speed"})
+    put(world, show="speed")
     world.advance()
     after = world._inner.particles()[0]
     assert int((after[:, 0] < 0).sum()) > 10
@@ -741,10 +726,7 @@ def test_the_speed_of_a_step_across_an_edge_of_the_box_is_that_of_the_step():
 
 @pytest.fixture
 def episodes():
-    env = gymnasium.make(
-        "npa/Morphogenesis2D-v0", particle_count=64, resolution=16, max_episode_steps=3,
-        disable_env_checker=True,
-    )  # fmt: skip
+    env = made("npa/Morphogenesis2D-v0", max_episode_steps=3)
     world = EnvironmentWorld(env, ZeroPolicy(env))
     yield world
     world.close()
@@ -781,7 +763,7 @@ def test_hands_reach_into_environments(episodes):
     assert not torch.equal(episodes._inner.particles()[1], states)
     with pytest.raises(NPAError, match="keeps its particles, so that the brush 'remove'"):
         episodes.handle(brush("remove"))
-    episodes.handle({"type": "set", "name": "loss", "value": True})
+    put(episodes, loss=True)
     assert episodes.frame().loss == pytest.approx(episodes._info["loss"])
 
 
@@ -789,14 +771,16 @@ def test_environments_are_made_with_a_policy():
     env, policy = make_environment("npa/Morphogenesis2D-v0", "gecko", particle_count=64)
     world = EnvironmentWorld(env, policy)
     before = world.frame().positions.copy()
-    world.handle({"type": "set", "name": "show", "value": "speed"})
+    put(world, show="speed")
     world.advance()
     assert not np.array_equal(world.frame().positions, before)
     world.close()
-    with pytest.raises(NPAError, match="unknown environment 'npa/Nothing-v0'"):
-        make_environment("npa/Nothing-v0")
-    with pytest.raises(NPAError, match="updates of particles can be viewed, got 'npa/Gardener2DSm"):
-        make_environment("npa/Gardener2DSmall-v0")
+    for name, message in (
+        ("npa/Nothing-v0", "unknown environment 'npa/Nothing-v0'"),
+        ("npa/Gardener2DSmall-v0", "updates of particles can be viewed, got 'npa/Gardener2DSm"),
+    ):
+        with pytest.raises(NPAError, match=message):
+            make_environment(name)
     make_environment("npa/Morphogenesis2DSmall-v0")[0].close()
     with pytest.raises(NPAError, match="env must be an environment of npa_envs"):
         EnvironmentWorld(gymnasium.make("CartPole-v1"), lambda seen: 0)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import io
 import json
 import queue
@@ -92,9 +93,22 @@ def client_of(world, films, **options):
     return testclient.TestClient(server.make_app(site), base_url=HERE)
 
 
-def meet(client, **options):
+@contextlib.contextmanager
+def meet(client):
     """Open the socket, and take the first event."""
-    return client.websocket_connect(SOCKET, **options)
+    with client.websocket_connect(SOCKET) as reader:
+        assert reader.receive_json() == {"type": "world", "title": "counter", "playing": True}
+        yield reader
+
+
+def refuse(client, address, **headers):
+    """Check that a socket is not opened."""
+    with (
+        pytest.raises(WebSocketDisconnect) as refusal,
+        client.websocket_connect(address, headers=headers),
+    ):
+        pass
+    assert refusal.value.code == 1008
 
 
 def next_error(reader) -> str:
@@ -142,8 +156,7 @@ def test_other_names_are_refused(client, host):
     answer = client.get("/", headers={"host": host})
     assert answer.status_code == 403
     assert "refused" in answer.text
-    with pytest.raises(WebSocketDisconnect), meet(client, headers={"host": host}):
-        pass
+    refuse(client, SOCKET, host=host)
 
 
 @pytest.mark.parametrize("host", ["localhost:8765", "127.0.0.1", "[::1]:8765"])
@@ -155,37 +168,23 @@ def test_names_of_this_computer_are_known(client, host):
     "origin", ["http://evil.example", "null", "http://127.0.0.1:9999", "http://localhost:8765"]
 )
 def test_sockets_of_foreign_pages_are_refused(client, worlds, origin):
-    with pytest.raises(WebSocketDisconnect) as refusal, meet(client, headers={"origin": origin}):
-        pass
-    assert refusal.value.code == 1008
+    refuse(client, SOCKET, origin=origin)
     assert worlds == []
-
-
-def test_the_own_page_may_open_a_socket(client):
-    with meet(client, headers={"origin": HERE}) as reader:
-        assert reader.receive_json() == {"type": "world", "title": "counter", "playing": True}
+    with client.websocket_connect(SOCKET, headers={"origin": HERE}) as reader:
+        assert reader.receive_json()["title"] == "counter"
 
 
 def test_a_server_that_others_reach_asks_for_a_token(tmp_path):
-    site = server.make_site(Counter, films=tmp_path, host="0.0.0.0")
+    site, other = (server.make_site(Counter, films=tmp_path, host="0.0.0.0") for _ in range(2))
     assert len(site.token) >= 24
-    other = server.make_site(Counter, films=tmp_path, host="0.0.0.0")
     assert site.token != other.token
     client = testclient.TestClient(server.make_app(site), base_url="http://lab.example:8765")
-    assert client.get("/").status_code == 403
-    assert client.get("/?token=wrong").status_code == 403
-    assert client.get("/films/film.mp4?token=é").status_code == 403
+    for path in ("/", "/?token=wrong", "/films/film.mp4?token=é"):
+        assert client.get(path).status_code == 403
     assert client.get(f"/?token={site.token}").status_code == 200
-    for path in (THERE, f"{THERE}?token=", f"{THERE}?token=wrong"):
-        with pytest.raises(WebSocketDisconnect) as refusal, client.websocket_connect(path):
-            pass
-        assert refusal.value.code == 1008
-    foreign = {"origin": "http://evil.example"}
-    with (
-        pytest.raises(WebSocketDisconnect),
-        client.websocket_connect(f"{THERE}?token={site.token}", headers=foreign),
-    ):
-        pass
+    for address in (THERE, f"{THERE}?token=", f"{THERE}?token=wrong"):
+        refuse(client, address)
+    refuse(client, f"{THERE}?token={site.token}", origin="http://evil.example")
     with client.websocket_connect(f"{THERE}?token={site.token}") as reader:
         assert reader.receive_json()["title"] == "counter"
 
@@ -204,7 +203,6 @@ def test_loopback_addresses_are_told_from_others(tmp_path, host, loopback):
 
 def test_frames_travel_as_they_are(client):
     with meet(client) as reader:
-        reader.receive_json()
         first, second = reader.receive_bytes(), reader.receive_bytes()
     kind, step, count, dimension, milliseconds, loss = struct.unpack("<IIIIff", second[:24])
     assert (kind, step, count, dimension, milliseconds, loss) == (1, 2, 2, 2, 1.5, 0.125)
@@ -217,7 +215,6 @@ def test_frames_travel_as_they_are(client):
 
 def test_the_world_waits_for_a_page_that_does_not_draw(client, worlds):
     with meet(client) as reader:
-        reader.receive_json()
         for _ in range(server.FRAMES_AHEAD):
             reader.receive_bytes()
         time.sleep(0.3)
@@ -234,7 +231,6 @@ def test_the_world_waits_for_a_page_that_does_not_draw(client, worlds):
 
 def test_a_world_that_is_paused_is_shown_after_each_message(client, worlds):
     with meet(client) as reader:
-        reader.receive_json()
         reader.send_json({"type": "play", "on": False})
         while "text" not in (message := reader.receive()):
             reader.send_json({"type": "drawn"})
@@ -261,7 +257,6 @@ def test_a_world_that_is_paused_is_shown_after_each_message(client, worlds):
 )
 def test_bad_messages_are_told_and_the_world_goes_on(client, text, error):
     with meet(client) as reader:
-        reader.receive_json()
         reader.send_text(text)
         assert error in next_error(reader)
         reader.send_json({"type": "drawn"})
@@ -282,8 +277,7 @@ def test_a_world_that_cannot_be_made_says_why(tmp_path):
     def make_world():
         raise NPAError("no such rule")
 
-    client = client_of(make_world, tmp_path)
-    with meet(client) as reader:
+    with client_of(make_world, tmp_path).websocket_connect(SOCKET) as reader:
         assert next_error(reader) == "no such rule"
 
 
@@ -293,9 +287,7 @@ def test_a_world_that_breaks_says_so(tmp_path):
         def advance(self):
             raise RuntimeError("out of memory")
 
-    client = client_of(Broken, tmp_path)
-    with meet(client) as reader:
-        reader.receive_json()
+    with meet(client_of(Broken, tmp_path)) as reader:
         assert next_error(reader) == "the world has ended: out of memory"
 
 
@@ -309,9 +301,7 @@ def test_a_page_that_says_it_has_drawn_more_gets_no_more_ahead(tmp_path):
                 assert told.wait(60)
             super().advance()
 
-    client = client_of(Held, tmp_path)
-    with meet(client) as reader:
-        reader.receive_json()
+    with meet(client_of(Held, tmp_path)) as reader:
         reader.send_json({"type": "drawn"})
         assert begun.wait(60)
         for _ in range(50):
@@ -332,17 +322,16 @@ def test_a_page_that_says_it_has_drawn_more_gets_no_more_ahead(tmp_path):
 
 
 def test_each_reader_has_a_world_and_there_is_room_for_some(client, worlds):
-    readers = [meet(client) for _ in range(server.MOST_SESSIONS)]
-    for reader in readers:
-        reader.__enter__().receive_json()
-    assert len(worlds) == server.MOST_SESSIONS
-    with meet(client) as late, pytest.raises(WebSocketDisconnect, match=r".*"):
-        late.receive_json()
-    for reader in readers:
-        reader.__exit__(None, None, None)
+    with contextlib.ExitStack() as readers:
+        for _ in range(server.MOST_SESSIONS):
+            readers.enter_context(meet(client))
+        assert len(worlds) == server.MOST_SESSIONS
+        late = readers.enter_context(client.websocket_connect(SOCKET))
+        with pytest.raises(WebSocketDisconnect, match=r".*"):
+            late.receive_json()
     assert all(world.closed.wait(60) for world in worlds)
-    with meet(client) as reader:
-        assert reader.receive_json()["title"] == "counter"
+    with meet(client):
+        pass
 
 
 def test_worlds_that_take_turns_are_never_at_work_together(tmp_path):
@@ -375,20 +364,8 @@ def jpeg(size=(32, 24), colour=(200, 30, 40)) -> bytes:
 
 
 def test_a_recording_is_a_film(client, site):
-    with meet(client) as reader:
-        reader.receive_json()
-        reader.send_json({"type": "play", "on": False})
-        reader.send_json({"type": "film", "action": "start"})
-        for k in range(5):
-            reader.send_bytes(jpeg(colour=(40 * k, 30, 40)))
-        reader.send_json({"type": "film", "action": "stop"})
-        files = []
-        while len(files) < 2:
-            message = reader.receive()
-            if "text" in message:
-                event = json.loads(message["text"])
-                assert event["type"] != "error", event
-                files += [event] if event["type"] == "file" else []
+    with recording(client, [jpeg(colour=(40 * k, 30, 40)) for k in range(5)]) as reader:
+        files = [next_event(reader, "file", "error") for _ in range(2)]
     assert {path.suffix for path in site.films.iterdir()} == {".gif", ".mp4"}
     for event in files:
         film = client.get("/" + event["url"])
@@ -403,7 +380,6 @@ def test_a_recording_is_a_film(client, site):
 def test_a_film_that_is_long_enough_ends_by_itself(client, site, monkeypatch):
     monkeypatch.setattr(server, "MOST_PICTURES", 3)
     with meet(client) as reader:
-        reader.receive_json()
         reader.send_json({"type": "film", "action": "start"})
         for _ in range(5):
             reader.send_bytes(jpeg())
@@ -416,16 +392,24 @@ def test_a_film_that_is_long_enough_ends_by_itself(client, site, monkeypatch):
         assert frames.info["duration"] * getattr(frames, "n_frames", 1) <= 120
 
 
-def film_of(colour) -> server.PageFilm:
-    film = server.PageFilm()
-    film.add(jpeg(colour=colour))
-    return film
+@contextlib.contextmanager
+def recording(client, pictures):
+    """Send pictures of a film, and end it."""
+    with meet(client) as reader:
+        reader.send_json({"type": "play", "on": False})
+        reader.send_json({"type": "film", "action": "start"})
+        for picture in pictures:
+            reader.send_bytes(picture)
+        reader.send_json({"type": "film", "action": "stop"})
+        yield reader
 
 
 def test_films_of_one_moment_are_files_of_their_own(tmp_path, monkeypatch):
     monkeypatch.setattr(server.time, "strftime", lambda pattern: "film-20260101-120000")
     for colour in ((0, 0, 0), (255, 255, 255)):
-        *_, name = (path.name for path in film_of(colour).write(tmp_path))
+        film = server.PageFilm()
+        film.add(jpeg(colour=colour))
+        *_, name = (path.name for path in film.write(tmp_path))
         assert name.startswith("film-20260101-120000-")
     seen = set()
     for gif in tmp_path.glob("*.gif"):
@@ -440,10 +424,7 @@ def test_without_ffmpeg_there_is_a_gif(client, site, monkeypatch):
         raise MissingDependencyError("an MP4 file needs imageio with ffmpeg")
 
     monkeypatch.setattr(server, "write_mp4", refuse)
-    with meet(client) as reader:
-        reader.send_json({"type": "film", "action": "start"})
-        reader.send_bytes(jpeg())
-        reader.send_json({"type": "film", "action": "stop"})
+    with recording(client, [jpeg()]) as reader:
         file, error = (next_event(reader, "file", "error") for _ in range(2))
     assert error["message"] == "an MP4 file needs imageio with ffmpeg"
     (gif,) = site.films.iterdir()
@@ -461,12 +442,7 @@ def test_without_ffmpeg_there_is_a_gif(client, site, monkeypatch):
     ],
 )
 def test_wrong_pictures_of_a_film_are_told(client, pictures, error):
-    with meet(client) as reader:
-        reader.receive_json()
-        reader.send_json({"type": "film", "action": "start"})
-        for picture in pictures:
-            reader.send_bytes(picture)
-        reader.send_json({"type": "film", "action": "stop"})
+    with recording(client, pictures) as reader:
         assert error in next_error(reader)
 
 
@@ -496,13 +472,13 @@ def test_wrong_addresses_are_named(host, port, error):
         server.open_port(host, port)
 
 
-def test_links_open_the_page(tmp_path):
-    for host, link in (("127.0.0.1", "http://127.0.0.1:"), ("0.0.0.0", "http://127.0.0.1:")):
-        site = server.make_site(Counter, films=tmp_path, host=host)
-        with server.open_port(host, 0) as listener:
-            address = server.address_of(site, listener)
-        assert address.startswith(link)
-        assert ("?token=" in address) == (host == "0.0.0.0")
+@pytest.mark.parametrize("host", ["127.0.0.1", "0.0.0.0"])
+def test_links_open_the_page(tmp_path, host):
+    site = server.make_site(Counter, films=tmp_path, host=host)
+    with server.open_port(host, 0) as listener:
+        address = server.address_of(site, listener)
+    assert address.startswith("http://127.0.0.1:")
+    assert ("?token=" in address) == (host == "0.0.0.0")
 
 
 def test_more_messages_than_there_is_room_for_are_refused(site):

@@ -1,0 +1,131 @@
+"""What pictures, films and windows refuse, and what they say."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from npa_envs.errors import NPAError
+from npa_envs.render import (
+    Window,
+    draw_worlds,
+    show,
+    show_worlds,
+    to_uint8,
+    write_filmstrip,
+    write_gif,
+    write_mp4,
+    write_webp,
+)
+from npa_envs.render.film import encode_frame
+
+FRAME = np.zeros((4, 4, 3), np.uint8)
+FILM = [FRAME] * 6
+X, S = torch.zeros(3, 8, 2), torch.zeros(3, 8, 8)
+NO_PICTURES = [
+    ([], "at least one picture"),
+    ([np.zeros((4, 4, 3))], "must be uint8"),
+    ([np.zeros((4, 4, 4), np.uint8)], r"shape \[H, W, 3\]"),
+    ([FRAME, np.zeros((5, 4, 3), np.uint8)], "all have one size"),
+    ([np.zeros((0, 4, 3), np.uint8)], "not zero"),
+]
+WRITERS = [(write_gif, "film.gif"), (write_mp4, "film.mp4"), (write_filmstrip, "film.png")]
+
+
+def picture(*shape, background="white", dtype=torch.float32):
+    return lambda _: to_uint8(torch.zeros(*shape, dtype=dtype), background)
+
+
+def drawn(x=X, s=S, **options):
+    return lambda _: draw_worlds(x, s, **{"resolution": 32, "pixel_size": 0.1} | options)
+
+
+def strip(*given, **options):
+    return lambda folder: write_filmstrip(folder / "strip.png", FILM, *given, **options)
+
+
+def window(*given, **options):
+    def make(_):
+        pytest.importorskip("pygame")
+        return Window("a world", *given, **options)
+
+    return make
+
+
+def shown_by_window(frame):
+    def make(_):
+        with window(32)(_) as made:
+            made.show(frame)
+
+    return make
+
+
+REFUSED = [
+    (picture(8, 8, 3), r"\[\.\.\., R, R, 4\].*\(8, 8, 3\)"),
+    (picture(8, 8, 4, dtype=torch.uint8), r"torch\.uint8"),
+    (picture(8, 8, 4, background="blurple"), "background must be a colour, got 'blurple'"),
+    (picture(8, 8, 4, background=(255, 255, 255)), r"red, green and blue in \[0, 1\]"),
+    (lambda _: encode_frame(FRAME[..., :2], "PNG"), r"uint8 of shape \[H, W, 3\]"),
+    *(
+        (lambda folder, w=writer, n=name, f=frames: w(folder / n, f), message)
+        for writer, name in WRITERS
+        for frames, message in NO_PICTURES
+    ),
+    *(
+        (lambda folder, w=writer, n=name: w(folder / "nowhere" / n, FILM), "nowhere")
+        for writer, name in WRITERS
+    ),
+    *(
+        (lambda folder, f=fps: write_gif(folder / "a.gif", FILM, fps=f), r"fps .* in \[0\.1, 50\]")
+        for fps in (0, -1, 51, math.nan)
+    ),
+    (
+        lambda folder: write_gif(folder / "long.gif", [FRAME] * 70, fps=0.1),
+        r"alike for at most 655 s in a GIF.*fps=0\.1: raise fps",
+    ),
+    (lambda folder: write_mp4(folder / "film.mp4", FILM, fps=0), "fps must be in"),
+    (lambda folder: write_webp(folder / "a.webp", FILM, quality=101), "quality must be in"),
+    (strip(["a", "b"]), "as many as the frames, 6, got 2"),
+    (strip(range(6)), "captions must be texts, one for each frame"),
+    (strip([None, *"abcde"]), "captions must be texts, one for each frame"),
+    (strip(6), "captions must be texts, one for each frame"),
+    (strip("abcdef"), "captions must be texts, one for each frame"),
+    (strip(columns=0), "columns must be an integer of at least 1"),
+    (drawn(style="densty"), "did you mean 'density'"),
+    (drawn(half_width=0.0), "half_width must be positive"),
+    (drawn(pixel_size=math.nan), "pixel_size must be positive"),
+    (drawn(sigma=-1.0), "sigma must be positive"),
+    (drawn(azimuth=math.inf), "azimuth must be finite"),
+    (drawn(centre=(0.0, 0.0, 0.0)), r"centre must have shape \[2\] or \[3, 2\]"),
+    (drawn(background="no colour"), "background must be a colour"),
+    (drawn(resolution=1), "resolution must be at least 2"),
+    (drawn(torch.zeros(3, 8, 3), periodic=True), "periodic pictures are of 2D worlds"),
+    (drawn(s=S[..., :2]), "at least 3 channels, got 2"),
+    (lambda _: show_worlds(X, S[0]), "give what rollout returns"),
+    (lambda _: show_worlds(X[:, :0], S[:, :0]), "at least one particle"),
+    (
+        lambda _: show_worlds(torch.stack([X] * 3), torch.stack([S] * 2)),
+        r"as many steps, got 3 and 2: give what rollout returns",
+    ),
+    (lambda _: show_worlds(X, S, fps=0), "fps must be in"),
+    (lambda _: show(np.zeros((4, 4, 3))), "must be uint8"),
+    (lambda _: show([]), "at least one picture"),
+    *(
+        (shown_by_window(frame), "frame must be uint8")
+        for frame in (FRAME[..., 0], FRAME.astype(np.float32), FRAME[..., :2], FRAME[:0])
+    ),
+    *(
+        (window(size), "must be")
+        for size in (0, (3, -1), 12.5, "a", (1, 2, 3), (), None, True, (4.0, 4))
+    ),
+    (window(32, fps=0.0), "must be"),
+]
+
+
+@pytest.mark.parametrize(("call", "message"), REFUSED)
+def test_what_is_refused_is_named_and_nothing_is_written(call, message, tmp_path, monkeypatch):
+    monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
+    with pytest.raises(NPAError, match=message):
+        call(tmp_path)
+    assert list(tmp_path.iterdir()) == []
