@@ -136,7 +136,7 @@ class ProgressCallback(BaseCallback):
     def _on_training_start(self) -> None:
         policy: Any = self.model.policy
         self.actor: GaussianRules = policy.actor
-        self.rules = self.actor.rules
+        self.rules: RuleSet = self.actor.rules
         self._learned = [p for p in self.actor.parameters() if p.requires_grad]
         self.progress.start(self.rules)
 
