@@ -45,7 +45,7 @@ def write_table(
         )
     facts = {"command": command, **asdict(plan), "left_out": sorted(map(list, plan.left_out))}
     write_text(folder / TABLE, f"`{command}`\n\n{shown}")
-    Record(facts, table, folder / FIGURES).write()
+    Record(facts, folder / FIGURES, table).write()
     write_text(folder / CURVES, curves(records))
     return shown
 

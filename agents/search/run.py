@@ -192,6 +192,31 @@ Batch = dict[str, Any]
 weights, and "found", quality and descriptors of each, or None where nothing is alive."""
 
 
+class SearchRecord(Record[Batch]):
+    """The batches of a search, and how its archive grew."""
+
+    command = "search"
+
+    def __init__(self, facts: Mapping[str, Any], path: Path | None = None) -> None:
+        super().__init__(facts, path)
+        self.growth: list[Growth] = []
+        """The archive after each batch."""
+
+    def content(self) -> Mapping[str, Any]:
+        """Return the growth and the batches."""
+        return {"growth": self.growth, "batches": self.rows}
+
+    def parse(self, held: dict[str, Any]) -> list[Batch]:
+        """Return the batches of the file's JSON object."""
+        return [
+            {
+                "fingerprint": int(batch["fingerprint"]),
+                "found": [one and list(map(float, one)) for one in batch["found"]],
+            }
+            for batch in held["batches"]
+        ]
+
+
 class Search:
     """A search for rules that differ, in worlds of one kind.
 
@@ -233,8 +258,6 @@ class Search:
         self.axes: tuple[Axis, ...] = world.axes()
         """The descriptors."""
         self.candidates = Candidates(world, device=device)
-        self.growth: list[Growth] = []
-        """The archive after each batch."""
         self.facts: dict[str, Any] = {
             **asdict(world),
             "method": method,
@@ -244,9 +267,8 @@ class Search:
             "axes": [list(axis) for axis in self.axes],
             "versions": {name: installed_version(name) for name in LIBRARIES},
         }
-        self._record = Record[Batch](
-            self.facts, path=path, content=lambda rows: {"growth": self.growth, "batches": rows}
-        )
+        self._record = SearchRecord(self.facts, path)
+        self.growth = self._record.growth
         self.archive = make_archive(self.candidates.weight_count, self.axes, seed)
         """The elites, a `ribs.archives.GridArchive`."""
         self._proposals = METHODS[method](self.archive, batch_size, seed)
@@ -309,18 +331,7 @@ class Search:
 
     def _replay(self) -> None:
         """Propose again the candidates of the record, if there is one, and tell their results."""
-
-        def read(held: dict[str, Any]) -> list[Batch]:
-            return [
-                {
-                    "fingerprint": int(batch["fingerprint"]),
-                    "found": [one and list(map(float, one)) for one in batch["found"]],
-                }
-                for batch in held["batches"]
-            ]
-
-        held = self._record.resume(read, command="search").rows
-        self._record.rows = []
+        held, self._record.rows = self._record.read().rows, []
         for number, batch in enumerate(held):
             asked = self._proposals.ask()
             if _fingerprint(asked) != batch["fingerprint"] or len(asked) != len(batch["found"]):
