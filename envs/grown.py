@@ -123,7 +123,7 @@ def run_rule(
 
     Changes are other arguments of `rollout`.
     """
-    names = ("eps", "box", "update_prob", "dt", "position_noise")
+    names = ("eps", "box", "boundary", "update_prob", "dt", "position_noise")
     constants = {name: getattr(config, name) for name in names} | changes
     stepped: tuple[Tensor, Tensor] = rollout(rule, x, s, steps, generator=random, **constants)
     return stepped

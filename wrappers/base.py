@@ -164,7 +164,7 @@ def check_row_actions(actions: Any, *wanted: int) -> None:
         )
 
 
-class Rows:
+class ParticleRowsBase:
     """The part of adapters in which row w N + i is particle i of world w of a vector environment.
 
     A row is paid its own reward where there is one, else its world's.

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from npa_envs.wrappers.base import (
     AnyVectorEnv,
-    Rows,
+    ParticleRowsBase,
     autoreset_mode,
     check_autoreset,
     row_space,
@@ -21,7 +21,7 @@ from npa_envs.wrappers.base import (
 )
 
 
-class ParticleRows(Rows, AnyVectorEnv):
+class ParticleRows(ParticleRowsBase, AnyVectorEnv):
     """The particles of a vector environment as the rows of another one, arrays on the host.
 
     Row w N + i is particle i of world w: it observes that particle's perception, shape [P], gives

@@ -10,7 +10,7 @@ from torch import Tensor
 from npa_envs.errors import MissingDependencyError, NPAError
 from npa_envs.wrappers.base import (
     AnyVectorEnv,
-    Rows,
+    ParticleRowsBase,
     autoreset_mode,
     check_same_step,
     torch_env,
@@ -25,7 +25,7 @@ except ImportError as error:
     ) from error
 
 
-class RslRlParticleEnv(Rows, VecEnv):  # type: ignore[misc]
+class RslRlParticleEnv(ParticleRowsBase, VecEnv):  # type: ignore[misc]
     """The particles of a vector environment as the rows of RSL-RL's `VecEnv`.
 
     Row w N + i is particle i of world w. It observes that particle's perception, shape [P], in the

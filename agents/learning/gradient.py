@@ -220,12 +220,13 @@ class EnvironmentTask(ParticleTask[Any]):
         clamped = self._clamped[1]
         options = {
             "eps": self.eps,
-            "box": self.box,
             "update_prob": self.update_prob,
             "dt": physics.dt,
             "position_noise": physics.position_noise,
             "return_path_length": True,
             **options,
+            "box": physics.box or physics.walls,
+            "boundary": config.boundary,
         }
         rollout: Any = npa_envs.rollout
         rule: Any = clamped[0]

@@ -20,9 +20,8 @@ from npa_envs.checks import (
 from npa_envs.devices import check_device
 from npa_envs.errors import NPAError, UnknownKeywordError, shown, suggest
 from npa_envs.render import STYLES
-from npa_envs.world.actions import Limits, MomentInverse, Physics, Terms
+from npa_envs.world.actions import Boundary, Limits, MomentInverse, Physics, Terms
 
-Boundary = Literal["open", "periodic"]
 Reward = Literal["dense", "sparse", "particle", "marginal"]
 Output = Literal["numpy", "torch"]
 OnDivergence = Literal["terminate", "reset", "raise", "ignore"]
@@ -92,10 +91,11 @@ class WorldConfig:
     neighbours come to lie on a line; or "smooth", for rules that are trained with it."""
 
     boundary: Boundary = "open"
-    """"open" space, or a "periodic" box into which positions are wrapped."""
+    """"open" space, a "periodic" box into which positions are wrapped, or one whose "reflecting"
+    walls mirror them."""
 
     box_size: float = 2.0
-    """Side of the periodic box around the origin [length units]."""
+    """Side of the box around the origin, unless space is open [length units]."""
 
     observation_limit: float = 64.0
     """Observations and states are clipped to ± this; a particle held there has diverged
@@ -139,7 +139,7 @@ class WorldConfig:
                 f"box_size must be at least 2 eps = {2.0 * self.eps:g}, got {self.box_size}: "
                 "enlarge the box or perceive at a smaller eps"
             )
-        if self.boundary == "periodic" and self.position_limit < 0.5 * self.box_size:
+        if self.boundary != "open" and self.position_limit < 0.5 * self.box_size:
             raise NPAError(
                 f"position_limit must be at least half of box_size = {self.box_size:g}, got "
                 f"{self.position_limit}: particles would be out of bounds inside the box"
@@ -163,17 +163,25 @@ class WorldConfig:
 
     @property
     def box(self) -> float | None:
-        """Side of the periodic box [length units], or None in open space."""
+        """Side of the box [length units], or None in open space."""
+        return None if self.boundary == "open" else self.box_size
+
+    @property
+    def periodic_box(self) -> float | None:
+        """Side of the box that particles are perceived across [length units], or None."""
         return self.box_size if self.boundary == "periodic" else None
 
     def physics(self, space_dim: int, *, static: bool) -> Physics:
         """Return the constants by which worlds act and perceive."""
+        sides = None if self.box is None else (self.box,) * space_dim
+        periodic = self.boundary == "periodic"
         return Physics(
             space_dim=space_dim,
             state_dim=self.state_dim,
             eps=self.eps,
             eps0=self.eps0,
-            box=None if self.box is None else (self.box,) * space_dim,
+            box=sides if periodic else None,
+            walls=None if periodic else sides,
             terms=Terms(moment_inverse=self.moment_inverse),
             moving=not static,
             max_displacement=self.alpha * self.eps,

@@ -104,7 +104,7 @@ class WorldTask(Generic[AnyConfig]):
             pixel_size=self.pixel_size,
             sigma=SHARPNESS,
             half_width=self.half_width,
-            periodic=self.space_dim == 2 and (self.config.box or 0.0) >= 2.0,
+            periodic=self.space_dim == 2 and (self.config.periodic_box or 0.0) >= 2.0,
             azimuth=azimuth,
         )
 
@@ -206,7 +206,7 @@ class EnvTask(WorldTask[Config]):
         Raises:
             NPAError: The losses have no gradient.
         """
-        box = self.config.box
+        box = self.config.periodic_box
         sides = None if box is None else (box,) * self.space_dim
         gains = marginal_gains(self.losses, before, after, sides)
         if gains is None:

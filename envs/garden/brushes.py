@@ -173,7 +173,7 @@ def grid_places(config: GardenConfig, device: torch.device | None = None) -> Ten
 def offsets(x: Tensor, places: Tensor, config: GardenConfig) -> Tensor:
     """Return the way from each place to each particle [length units], shape [B, K, N, 2]."""
     spread = x[:, None].expand(-1, places.shape[1], -1, -1)
-    box = None if config.box is None else (config.box,) * 2
+    box = None if config.periodic_box is None else (config.periodic_box,) * 2
     return offsets_from(spread.flatten(0, 1), places.flatten(0, 1), box).view(spread.shape)
 
 

@@ -44,7 +44,7 @@ class MixingTask(SpeciesTask):
         return {"separation": 1.0 - self._entropy(population)}
 
     def _entropy(self, population: Population) -> Tensor:
-        return local_entropy(population, eps=self.config.eps, box=self.config.box)
+        return local_entropy(population, eps=self.config.eps, box=self.config.periodic_box)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -264,7 +264,7 @@ class SpeciesWorlds(WorldState):
         if self._side_stream is not None:
             self._side_stream.mark()
         live = to_device_async(acted, self.device)
-        rewards = self.account.pay(self._measured(stepped=True), live, left & live)
+        rewards = self.account.pay(self.measured(stepped=True), live, left & live)
         numbers = self.account.step_numbers()
         observation = self.perceived(stepped=True)
         # The device goes on while the host learns who left.
@@ -296,7 +296,7 @@ class SpeciesWorlds(WorldState):
             seen[cohort.places] = cohort.perceived(stepped=stepped)
         return seen
 
-    def _measured(self, *, stepped: bool = False) -> dict[str, Tensor]:
+    def measured(self, *, stepped: bool = False) -> dict[str, Tensor]:
         """Return the parts of every agent's loss, float32, shape [B, A]; 0 of those that ended."""
         found: dict[str, Tensor] = {}
         for cohort in self.cohorts:
@@ -322,7 +322,7 @@ class SpeciesWorlds(WorldState):
         return self._carry_over()
 
     def _carry_over(self) -> Tensor:
-        self.account.carry_over(self._measured())
+        self.account.carry_over(self.measured())
         seen: Tensor = self.perceived()
         return seen
 
@@ -522,7 +522,7 @@ class Cohort:
         x, s, physics = self.population.x, self.population.s, self._physics
         inside = (s.abs() < physics.limits.state).all(dim=-1)
         # In a box nobody gets to the bound but by wrapping onto an edge that may lie there.
-        if physics.box is None:
+        if (physics.box or physics.walls) is None:
             inside &= (x.abs() < physics.limits.position).all(dim=-1)
         # Sums of ones are exact in any order.
         count = torch.zeros(len(inside), self._agent_count, device=inside.device)

@@ -19,8 +19,8 @@ from npa_envs.checks import (
 )
 from npa_envs.errors import NPAError, shown
 
-Boundary = Literal["periodic", "reflecting"]
-"""What the sides of a box do: they are one place with the opposite side, or walls."""
+Boundary = Literal["open", "periodic", "reflecting"]
+"""No box; a box whose opposite sides are one place; or a box of walls."""
 
 
 class Terms(NamedTuple):
@@ -185,7 +185,11 @@ def physics(
     `eps0` is checked already, by default it is `eps`; α is a fraction of ε.
     """
     if boundary not in get_args(Boundary):
-        raise NPAError(f"boundary must be 'periodic' or 'reflecting', got {shown(boundary)}")
+        raise NPAError(
+            f"boundary must be 'open', 'periodic' or 'reflecting', got {shown(boundary)}"
+        )
+    if boundary == "open" and box is not None:
+        raise NPAError(f"box must be None where boundary is 'open', got {shown(box)}: leave it out")
     if boundary == "reflecting" and box is None:
         raise NPAError("box must be given where boundary is 'reflecting', got None: give its sides")
     numbers = (eps, eps0, box, alpha, update_prob, dt, position_noise)
@@ -223,7 +227,7 @@ def _checked(
         raise NPAError(f"dt must be positive and finite, got {dt}")
     if not (math.isfinite(position_noise) and position_noise >= 0.0):
         raise NPAError(f"position_noise must be finite and not negative, got {position_noise}")
-    periodic = boundary == "periodic"
+    periodic = boundary != "reflecting"
     sides = checked_box(box, space_dim, radius if periodic else None, dtype)
     return Physics(
         space_dim,

@@ -22,7 +22,7 @@ from npa_envs.ops.episodes import (
 )
 from npa_envs.ops.mean import world_mean
 from npa_envs.ops.perceive import NeighbourState, build_neighbours
-from npa_envs.ops.physics import Limits, Physics, Terms
+from npa_envs.ops.physics import Boundary, Limits, Physics, Terms
 from npa_envs.ops.species import perceive_by_species
 from npa_envs.ops.update import PreparedActions, wrapped
 from npa_envs.world.randomness import WorldRandom
@@ -34,6 +34,7 @@ __all__ = [
     "SUCCESS",
     "TIME_LIMIT",
     "Actions",
+    "Boundary",
     "EpisodeRules",
     "Limits",
     "MomentInverse",

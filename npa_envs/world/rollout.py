@@ -271,7 +271,7 @@ def rollout(
         box: Sides of a box centred on the origin [length units], or None for open space.
         boundary: What the sides of the box do. "periodic": particles perceive nearest images, and
             positions are wrapped. "reflecting": particles perceive as in open space, and positions
-            beyond a wall are mirrored at it, as often as they meet one.
+            beyond a wall are mirrored at it, as often as they meet one. "open": there is no box.
         update_prob: Probability p of each particle's update in a step, in (0, 1].
         dt: Time step, dimensionless.
         position_noise: Standard deviation of the noise added to every position in each step

@@ -115,9 +115,9 @@ REFUSED = {
         ({"rule": {"code_dim": 2, "code_names": ["ring"]}}, "code_dim=2"),
     ],
     lambda kind, name=None, **given: kind(make(**({"name": name} if name else {})), **given): [
-        ({"kind": RandomPolicy, "seed": -1}, "a seed"),
+        ({"kind": RandomPolicy, "seed": -1}, "seed must be an integer of at least 0"),
         ({"kind": PaintPolicy, "colour": (0.5,)}, "colour must have three numbers"),
-        ({"kind": MendPolicy, "blank": "x"}, "blank must be a finite number, got 'x'"),
+        ({"kind": MendPolicy, "blank": "x"}, "blank must be a number, got 'x'"),
         ({"kind": PaintPolicy, "name": POINTS}, "colour must be given where env has no target"),
         ({"kind": ZeroPolicy, "name": SHAPESHIFTER}, "acts by rows of particles"),
         ({"kind": RandomPolicy, "name": SHAPESHIFTER}, "acts by rows of particles"),

@@ -81,12 +81,12 @@ OF_ONE = {
         ({"boundary": "periodic"}, "boundary must be 'open' for"),
         ({"split": "half"}, "split must be 'train' or 'test'"),
         ({"state_dim": 9}, "state_dim must be a whole number of at"),
-        ({"rule": "gecko"}, "rule must have a read-out of state_dim"),
+        ({"rule": "gecko"}, "rule must be a rule with a read-out of state_dim"),
         ({"class_count": 9}, "class_count must be more than the"),
     ],
     functools.partial(make, SOLID): [
         ({"target": "rocke"}, "did you mean 'rocket'"),
-        ({"readout": "gecko"}, "reads out states of 16 channels"),
+        ({"readout": "gecko"}, "read-out of state_dim = 16 channels, but .gecko. has 16"),
         ({"readout": 3}, "for example readout='mushroom'"),
         ({"opacity": 1.0}, "opacity must lie below 1"),
         ({"seed_radius": 5.0}, "seed_radius must be below"),
@@ -206,7 +206,7 @@ def test_an_unknown_keyword_is_a_type_error_in_pythons_words(name):
     "keywords", [{"particle_count": 10**5}, {"resolution": 4096}, {"seed_pool": 10**6}]
 )
 def test_worlds_beyond_memory_are_refused_before_they_are_made(keywords, monkeypatch):
-    monkeypatch.setattr("npa_envs.envs.core.memory.free_bytes", lambda device: 10**8)
+    monkeypatch.setattr("npa_envs.envs.core.state.free_bytes", lambda device: 10**8)
     make(IDS[0])
     refused("particle_count must fit into memory: 1 world", make, IDS[0], **keywords)
 

@@ -15,7 +15,7 @@ import npa_envs
 from npa_envs.agents.gardening import ScriptedGardener
 from npa_envs.agents.shapeshifting import RecognisingShapeshifter
 from npa_envs.envs import gardeners_v0
-from npa_envs.envs.garden.brush_layout import BrushLayout, brushed, grid_places
+from npa_envs.envs.garden.brushes import BrushLayout, brushed, grid_places
 from npa_envs.envs.gardener2d import Gardener2DEnv
 from npa_envs.registration import GARDENS
 

@@ -60,7 +60,7 @@ def world_fields(draw: random.Random) -> dict[str, Any]:
         "position_noise": draw.choice((0.0, 0.05)),
         "moment_inverse": draw.choice(("threshold", "smooth")),
         "observation_limit": draw.choice((64.0, 3.0)),
-        "boundary": draw.choice(("open", "open", "periodic")),
+        "boundary": draw.choice(("open", "open", "periodic", "reflecting")),
         "output": draw.choice(("numpy", "torch")),
         "render_mode": draw.choice((None, "rgb_array")),
         "render_size": 8,

@@ -9,6 +9,7 @@ from functools import partial
 import pytest
 import torch
 from clock import Clock
+from drift import DriftRow, drift_rows
 
 from npa_envs.cli import main
 from npa_envs.measure.speed import suites
@@ -66,7 +67,7 @@ def test_workloads_have_the_neighbours_they_claim():
 
 
 def test_float32_drifts_little_from_float64_over_a_rollout(device):
-    rows = suites.drift_rows(
+    rows = drift_rows(
         TimingSession(device, repeats=1), [Workload(2, 2, 300, 8), Workload(3, 1, 300, 8)]
     )
     assert [row.workload for row in rows] == ["2D (2, 300, 8)", "3D (1, 300, 8)"]
@@ -195,7 +196,7 @@ def report_of(tables, **options) -> suites.BenchReport:
 
 
 def test_a_report_is_json_without_numbers_that_json_has_not():
-    row = suites.DriftRow("tiny", 1e-6, math.nan, 1e-6, 1e-6, 1e-6)
+    row = DriftRow("tiny", 1e-6, math.nan, 1e-6, 1e-6, 1e-6)
     loaded = json.loads(report_of({"drift": [row], "times": [TimeRow(timing(3.0))]}).json())
     assert {"suite", "command", "commit", "date", "device", "machine", "versions"} <= set(loaded)
     assert torch.__version__.startswith(loaded["versions"]["torch"])

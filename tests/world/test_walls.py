@@ -109,7 +109,8 @@ def test_worlds_beyond_the_walls_are_not_at_rest():
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"boundary": "closed", "box": 2.0}, "boundary must be 'periodic' or 'reflecting'"),
+        ({"boundary": "closed", "box": 2.0}, "boundary must be 'open', 'periodic' or 'reflecting'"),
+        ({"boundary": "open", "box": 2.0}, "box must be None where boundary is 'open'"),
         ({"boundary": "reflecting"}, "box must be given where boundary is 'reflecting'"),
         ({"boundary": "reflecting", "box": 0.0}, "box sides must be finite and positive"),
         ({"boundary": "reflecting", "box": (1.0, 1.0, 1.0)}, "box must have 2 sides"),

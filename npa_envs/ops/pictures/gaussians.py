@@ -140,7 +140,7 @@ def sort_pairs(
 ) -> Pairs:
     """Sort the pairs of pictures, whose depths and counts of tiles have shape [B V, N].
 
-    Both sorts are stable: Gaussians of the same depth stay in the order of their indices.
+    Both sorts are stable: GaussianScene of the same depth stay in the order of their indices.
     """
     device, images = depths.device, depths.shape[0]
     order = torch.sort(depths, dim=1, stable=True).indices
@@ -208,7 +208,7 @@ class GaussianPictures(NamedTuple):
     """Pictures without room for all pairs, whose farthest Gaussians are missing: bool, [B, V]."""
 
 
-class Gaussians(NamedTuple):
+class GaussianScene(NamedTuple):
     """Gaussians, but for opacities, and cameras: tensors of worlds, and of views."""
 
     means: Tensor
@@ -244,7 +244,7 @@ def _gaussians(
     pairs_per_particle: int,
 ) -> list[Tensor]:
     """Return pictures, whether pairs found no room, and what the adjoint reads."""
-    scene = Gaussians(*tensors)
+    scene = GaussianScene(*tensors)
     means, frame = scene.means, scene.frame(width, height, near, dilation)
     worlds, views = means.shape[0], frame.view_count
     images, particles = worlds * views, means.shape[1]
@@ -306,7 +306,7 @@ def _gaussians_backward(
     picture_bar: Tensor, passing_bar: Tensor, saved: list[Tensor], near: float, dilation: float
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
     """Return the cotangents of means, scales, quaternions, opacities and colours."""
-    scene = Gaussians(*saved[:6])
+    scene = GaussianScene(*saved[:6])
     passing, stops, footprints, counts, slots, starts, owners, places = saved[6:]
     device, scalar = footprints.device, scalar_type(footprints.dtype)
     frame = scene.frame(int(passing.shape[3]), int(passing.shape[2]), near, dilation)
