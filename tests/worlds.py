@@ -35,8 +35,11 @@ def relative_error(value, expected):
 def random_world(world_count, particle_count, space_dim, state_dim, *, dtype, device, seed=0):
     """Return worlds with about twenty neighbours at eps 0.3, positions in [-0.7, 0.7]^D."""
     generator = torch.Generator().manual_seed(seed)
-    x = torch.rand(world_count, particle_count, space_dim, generator=generator) * 1.4 - 0.7
-    s = torch.randn(world_count, particle_count, state_dim, generator=generator)
+    x = (
+        torch.rand(world_count, particle_count, space_dim, generator=generator, device="cpu") * 1.4
+        - 0.7
+    )
+    s = torch.randn(world_count, particle_count, state_dim, generator=generator, device="cpu")
     return x.to(device, dtype), s.to(device, dtype)
 
 

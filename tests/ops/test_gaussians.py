@@ -13,7 +13,7 @@ from npa_envs.kernels.pictures.blending import TILE_PIXELS, block_kernels
 from npa_envs.ops import render_gaussians
 from npa_envs.ops.launch import launch, scalar_type
 from npa_envs.ops.pictures.cameras import Cameras, look_at, orbit
-from npa_envs.ops.pictures.gaussians import Gaussians, _gaussians
+from npa_envs.ops.pictures.gaussians import GaussianScene, _gaussians
 
 # Worst error measured over all scenes, then the bound.
 PICTURE_BOUND = {torch.float32: 1e-5, torch.float64: 1e-13}  # 2e-6, 3e-15
