@@ -144,7 +144,9 @@ def test_blocks_and_tiles_draw_the_same(name, device):
     gaussians, cameras = SCENES[name].of(torch.float32, device)
     size = (cameras.width, cameras.height)
     means, scales, turns, opacities, colours = [t.detach() for t in gaussians]
-    scene = Gaussians(means, scales, turns, colours, cameras.world_to_camera, cameras.intrinsics)
+    scene = GaussianScene(
+        means, scales, turns, colours, cameras.world_to_camera, cameras.intrinsics
+    )
     picture, _, passing, stops, footprints, *lists = _gaussians(
         opacities, list(scene), *size, cameras.near, 0.3, 0
     )
