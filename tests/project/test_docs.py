@@ -34,8 +34,6 @@ ROOT = Path(__file__).resolve().parents[2]
 DOCS = ROOT / "docs"
 OWN = DOCS / "own_environment.md"
 TEXTS = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted(DOCS.rglob("*.md"))]
-FOLDERS = "npa_envs|envs|wrappers|agents|tests|benchmarks|docs"
-"""Folders by which a path in a text is known for one."""
 
 every_text = pytest.mark.parametrize("path", TEXTS, ids=lambda p: p.relative_to(ROOT).as_posix())
 every_environment = pytest.mark.parametrize("name", [row.name for row in ENVIRONMENTS])
@@ -196,36 +194,6 @@ def test_links_lead_somewhere(path):
         there = (path.parent / name).resolve() if name else path
         assert there.exists(), f"{target} is not there"
         assert not anchor or anchor in anchors(there), f"{there.name} has no heading {anchor}"
-
-
-def in_package(name: str) -> Path:
-    """Return where a path lies that may leave out `npa_envs/`."""
-    return ROOT / name if (ROOT / name).exists() else ROOT / "npa_envs" / name
-
-
-@every_text
-def test_paths_in_code_exist(path):
-    text = path.read_text(encoding="utf-8")
-    named = re.findall(rf"`((?:{FOLDERS})/[\w./]*|\w+/[\w/]*\.(?:py|cuh))`", text)
-    assert [name for name in named if "NAME" not in name and not in_package(name).exists()] == []
-
-
-def test_the_map_names_what_is_there():
-    """Of the drawings' lines, of the way of `eps`, and of "`name` in `file`"."""
-    text = text_of("architecture")
-    trail = re.findall(r"((?:npa_envs|envs)/[\w/]+\.py): ([\w.]+)", text)
-    assert len(trail) == 8
-    drawn = re.findall(r"((?:world|ops|rule|envs/core)/\w+\.py) +([A-Za-z_]\w*(?:\.\w+)?) ", text)
-    assert len(drawn) > 10
-    told = [pair[::-1] for pair in re.findall(r"`([\w.]+)` (?:in|of) `([\w/]+\.py)`", text)]
-    for file, names in re.findall(r"`([\w/]+\.py)` \((`[\w`, ]+)\)", text):
-        told += [(file, name) for name in re.findall(r"\w+", names)]
-    assert len(told) > 20
-    for file, name in [*trail, *drawn, *told]:
-        for part in name.split("."):
-            defined = rf"^ *(?:def|class) {part}\b|^ *{part}\b(?:: .*)? = |^    {part}:"
-            there = re.search(defined, in_package(file).read_text(encoding="utf-8"), re.MULTILINE)
-            assert there, f"{file} has no {name}"
 
 
 # Pages of environments.
