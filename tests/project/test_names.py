@@ -145,7 +145,7 @@ def leads_somewhere(parts: list[str]) -> bool:
 def missing(name: str) -> bool:
     """Return whether a dotted name has a word of no program, or a member that its class has not."""
     parts = name.split(".")
-    if parts[0] == "npa_envs" and len(parts) > 1:
+    if parts[0] == "npa_envs":
         return not leads_somewhere(parts[1:])
     owned = [(members(owner), member) for owner, member in itertools.pairwise(parts)]
     if any(inside and member not in inside for inside, member in owned):
