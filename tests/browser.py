@@ -20,19 +20,11 @@ from typing import Any
 
 import pytest
 
+DISABLED = ("gpu", "quic", "dev-shm-usage", "background-networking", "component-update", "sync")
 FLAGS = (
-    "--headless",
-    "--no-sandbox",
-    "--disable-gpu",
-    "--enable-unsafe-swiftshader",
-    "--disable-quic",
-    "--disable-dev-shm-usage",
-    "--no-first-run",
-    "--disable-background-networking",
-    "--disable-component-update",
-    "--disable-sync",
-    "--hide-scrollbars",
-    "--remote-debugging-port=0",
+    *("--headless", "--no-sandbox", "--enable-unsafe-swiftshader", "--no-first-run"),
+    *(f"--disable-{name}" for name in DISABLED),
+    *("--hide-scrollbars", "--remote-debugging-port=0"),
 )
 DESK, PHONE = (1280, 800), (390, 844)
 
@@ -117,16 +109,11 @@ class Page:
 
     def drag(self, places: list[tuple[float, float]]) -> None:
         """Press the mouse at the first place on the page [pixels], move on, and let go."""
-        for k, (x, y) in enumerate(places):
-            kind = "mousePressed" if k == 0 else "mouseMoved"
-            self._mouse(kind, x, y)
+        given = {"button": "left", "buttons": 1, "clickCount": 1}
+        kinds = ["mousePressed", *["mouseMoved"] * (len(places) - 1), "mouseReleased"]
+        for kind, (x, y) in zip(kinds, [*places, places[-1]], strict=True):
+            self.call("Input.dispatchMouseEvent", type=kind, x=x, y=y, **given)
             time.sleep(0.03)
-        self._mouse("mouseReleased", *places[-1])
-
-    def _mouse(self, kind: str, x: float, y: float) -> None:
-        self.call(
-            "Input.dispatchMouseEvent", type=kind, x=x, y=y, button="left", buttons=1, clickCount=1
-        )
 
     def touch(self, places: list[tuple[float, float]]) -> None:
         """Touch the first place on the page [pixels], move on, and let go."""

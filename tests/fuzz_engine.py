@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from fuzz_values import Target
+from fuzz_values import Target, read_file
 from torch import Tensor
 
 import npa_envs
@@ -101,11 +101,7 @@ def saved(draw: random.Random) -> dict[str, Any]:
 
 
 def load_bytes(data: Any, suffix: Any) -> None:
-    """Read a rule from a file of these bytes."""
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / f"rule{suffix}"
-        path.write_bytes(data)
-        npa_envs.load_rule(path)
+    read_file(npa_envs.load_rule, f"rule{suffix}", data)
 
 
 @functools.cache

@@ -8,7 +8,6 @@ import io
 import json
 import random
 import re
-import tempfile
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -16,7 +15,7 @@ from typing import Any
 import gymnasium
 import small_envs
 import torch
-from fuzz_values import Target, wrong
+from fuzz_values import Target, read_file, wrong
 from PIL import Image
 
 import npa_envs
@@ -51,11 +50,8 @@ def reconfigure(name: Any, task: Any, field: str, value: Any) -> None:
             dataclasses.replace(part, **{field: value})
 
 
-def read_config(text: Any, suffix: Any) -> None:
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / f"config{suffix}"
-        path.write_text(str(text), encoding="utf-8")
-        load_config(path, preset("tiny"))
+def configure_by(path: Path) -> Any:
+    return load_config(path, preset("tiny"))
 
 
 FILES: dict[str, tuple[str, Callable[[Path], Any]]] = {
@@ -66,9 +62,9 @@ FILES: dict[str, tuple[str, Callable[[Path], Any]]] = {
     },
     ".safetensors": ("rule", npa_envs.load_rule),
     ".pth": ("state dict", npa_envs.load_rule),
-    ".json": ("configuration", lambda path: load_config(path, preset("tiny"))),
-    ".yaml": ("configuration", lambda path: load_config(path, preset("tiny"))),
-    ".toml": ("TOML", lambda path: load_config(path, preset("tiny"))),
+    ".json": ("configuration", configure_by),
+    ".yaml": ("configuration", configure_by),
+    ".toml": ("TOML", configure_by),
     ".idx": ("IDX", read_idx),
     ".gz": ("IDX", read_idx),
     ".obj": ("mesh", lambda path: load_views(path, resolution=8, training_count=1)),
@@ -135,16 +131,14 @@ def damaged_files(draw: random.Random) -> dict[str, Any]:
     return {"kind": suffix, "content": bytes(content)}
 
 
-def read_damaged(kind: str, content: Any) -> None:
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / f"file{kind}"
-        path.write_bytes(content if isinstance(content, bytes) else str(content).encode())
-        FILES[kind][1](path)
+def read_damaged(kind: str, content: bytes) -> None:
+    read_file(FILES[kind][1], f"file{kind}", content)
 
 
 def config_files(draw: random.Random) -> dict[str, Any]:
     texts = ("iterations: 5", "{}", "[1]", "iterations = nan", '{"steps": [1, "a"]}', "\0", "a: [")
-    return {"text": draw.choice(texts), "suffix": draw.choice((".yaml", ".toml", ".json", ".txt"))}
+    content = draw.choice(texts).encode()
+    return {"content": content, "name": "config" + draw.choice((".yaml", ".toml", ".json", ".txt"))}
 
 
 def env_fields(draw: random.Random) -> dict[str, Any]:
@@ -310,7 +304,7 @@ def run_command(words: Any) -> None:
 OUTER: dict[str, Target] = {
     "preset": Target(configure, configured, 4),
     "TrainConfig": Target(reconfigure, configured, 4),
-    "load_config": Target(read_config, config_files),
+    "load_config": Target(functools.partial(read_file, configure_by), config_files),
     "damaged files": Target(read_damaged, damaged_files, 6),
     "gymnasium.make": Target(run_env, env_fields, 5, (gymnasium.error.Error,)),
     "reset, place_particles and step": Target(act, acted, 5, (gymnasium.error.Error,)),

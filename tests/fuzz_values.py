@@ -3,6 +3,7 @@
 import dataclasses
 import math
 import random
+import tempfile
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -43,6 +44,14 @@ class Target:
     """How often it is called."""
     documented: tuple[type[BaseException], ...] = ()
     """What its documentation names besides `NPAError`."""
+
+
+def read_file(read: Callable[[Path], Any], name: str, content: bytes) -> None:
+    """Read a file of this name and content."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / name
+        path.write_bytes(content)
+        read(path)
 
 
 def wrong(draw: random.Random, name: str, legal: Any) -> Any:

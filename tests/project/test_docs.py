@@ -34,8 +34,6 @@ ROOT = Path(__file__).resolve().parents[2]
 DOCS = ROOT / "docs"
 OWN = DOCS / "own_environment.md"
 TEXTS = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted(DOCS.rglob("*.md"))]
-FOLDERS = "npa_envs|envs|wrappers|agents|tests|benchmarks|docs"
-"""Folders by which a path in a text is known for one."""
 
 every_text = pytest.mark.parametrize("path", TEXTS, ids=lambda p: p.relative_to(ROOT).as_posix())
 every_environment = pytest.mark.parametrize("name", [row.name for row in ENVIRONMENTS])
@@ -119,6 +117,59 @@ def test_the_gallery_shows_every_rule_by_a_small_film():
     assert all((DOCS / "images" / film).stat().st_size < 300_000 for film in films)
 
 
+# Measured tables.
+
+tables = script("build_tables")
+SPEC = """[times]
+record: tests/project/*.json
+rows: r.times.rows
+Case | {name}
+Time [ms] | {us * 1e-3:.1f}
+Error | {relative:.0e}
+caption: no
+"""
+PAGE = "<!-- table: times -->\n<!-- /table -->\n"
+
+
+def test_tables_are_current(capsys):
+    status = tables.main(["--check"])
+    assert status == 0, capsys.readouterr().err
+
+
+def test_a_table_is_made_of_a_record(tmp_path, monkeypatch):
+    folder = tmp_path / "tests" / "project"
+    folder.mkdir(parents=True)
+    monkeypatch.setattr(tables, "ROOT", tmp_path)
+    row = '{"name": "one | world", "us": 1260, "relative": 3.6e-07}'
+    (folder / "times.json").write_text(f'{{"rows": [{row}]}}', encoding="utf-8")
+    (folder / "other.json").write_text("{}", encoding="utf-8")
+    pages = {"docs/page.md": f"{PAGE}It takes long."}
+    made = tables.rebuilt(pages, tables.specs(SPEC))
+    assert "\n| one \\| world | 1.3 | 4e-7 |\n<!-- /table -->\nIt takes" in made["docs/page.md"]
+    assert tables.rebuilt(made, tables.specs(SPEC)) == made
+    with pytest.raises(SystemExit, match="table times: NameError: name 'us_' is not defined"):
+        tables.rebuilt(pages, tables.specs(SPEC.replace("{us *", "{us_ *")))
+    for texts in ({"docs/page.md": "nothing"}, {"a.md": PAGE, "b.md": PAGE}):
+        with pytest.raises(SystemExit, match="described once and shown once, not times"):
+            tables.rebuilt(texts, tables.specs(SPEC))
+    with pytest.raises(SystemExit, match="a table is described twice"):
+        tables.specs(SPEC + SPEC)
+
+
+def test_a_measurement_outside_of_made_text_is_found():
+    for loose in ("It takes 48 µs.", "32.1 dB", "as 1.0 ± 0.2", "is 3 times as fast", "9 % of it"):
+        assert tables.loose_figures(f"# Page\n\n{loose}\n") == [loose]
+    fine = "`dt=0.1 ms`, [8, 4096], three times, `5 %`\n\n```sh\nwait 5 ms\n```\n"
+    assert tables.loose_figures(PAGE.replace("\n", "\n5 ms\n", 1) + fine) == []
+
+
+@every_text
+def test_a_page_has_no_measurement_that_is_not_made(path):
+    # The gallery is made as a whole.
+    made = path.stem == "gallery" or path.parent != DOCS
+    assert made or tables.loose_figures(path.read_text(encoding="utf-8")) == []
+
+
 # Names that pages list.
 
 
@@ -196,36 +247,6 @@ def test_links_lead_somewhere(path):
         there = (path.parent / name).resolve() if name else path
         assert there.exists(), f"{target} is not there"
         assert not anchor or anchor in anchors(there), f"{there.name} has no heading {anchor}"
-
-
-def in_package(name: str) -> Path:
-    """Return where a path lies that may leave out `npa_envs/`."""
-    return ROOT / name if (ROOT / name).exists() else ROOT / "npa_envs" / name
-
-
-@every_text
-def test_paths_in_code_exist(path):
-    text = path.read_text(encoding="utf-8")
-    named = re.findall(rf"`((?:{FOLDERS})/[\w./]*|\w+/[\w/]*\.(?:py|cuh))`", text)
-    assert [name for name in named if "NAME" not in name and not in_package(name).exists()] == []
-
-
-def test_the_map_names_what_is_there():
-    """Of the drawings' lines, of the way of `eps`, and of "`name` in `file`"."""
-    text = text_of("architecture")
-    trail = re.findall(r"((?:npa_envs|envs)/[\w/]+\.py): ([\w.]+)", text)
-    assert len(trail) == 8
-    drawn = re.findall(r"((?:world|ops|rule|envs/core)/\w+\.py) +([A-Za-z_]\w*(?:\.\w+)?) ", text)
-    assert len(drawn) > 10
-    told = [pair[::-1] for pair in re.findall(r"`([\w.]+)` (?:in|of) `([\w/]+\.py)`", text)]
-    for file, names in re.findall(r"`([\w/]+\.py)` \((`[\w`, ]+)\)", text):
-        told += [(file, name) for name in re.findall(r"\w+", names)]
-    assert len(told) > 20
-    for file, name in [*trail, *drawn, *told]:
-        for part in name.split("."):
-            defined = rf"^ *(?:def|class) {part}\b|^ *{part}\b(?:: .*)? = |^    {part}:"
-            there = re.search(defined, in_package(file).read_text(encoding="utf-8"), re.MULTILINE)
-            assert there, f"{file} has no {name}"
 
 
 # Pages of environments.

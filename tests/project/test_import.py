@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from learning_problems import heart
 
+from npa_envs import wrappers
 from npa_envs.agents.learning import Budget, train
 from npa_envs.errors import MissingDependencyError
 from npa_envs.render import Window, write_mp4
@@ -118,6 +119,13 @@ FRAME, ONE_STEP = np.zeros((4, 4, 3), np.uint8), Budget(particle_steps=1)
 EXTRA = r"pip install 'npa-envs\[{}\]'"
 
 
+def wrapper(module, name):
+    """Import a wrapper as a first user does."""
+    sys.modules.pop(f"npa_envs.wrappers.{module}", None)
+    vars(wrappers).pop(module, None)
+    return getattr(wrappers, name)
+
+
 @pytest.mark.parametrize(
     ("library", "cure", "call"),
     [
@@ -125,6 +133,8 @@ EXTRA = r"pip install 'npa-envs\[{}\]'"
         ("sklearn.datasets", EXTRA.format("points"), lambda _: load_pictures("digits")),
         ("torchvision.datasets", "pip install torchvision", lambda _: load_pictures("mnist")),
         ("trimesh", EXTRA.format("meshes"), load_mesh),
+        ("torchrl.data", EXTRA.format("torchrl"), lambda _: wrapper("torchrl", "NPATorchRLEnv")),
+        ("rsl_rl.env", EXTRA.format("rslrl"), lambda _: wrapper("rsl_rl", "RslRlParticleEnv")),
         ("pygame", EXTRA.format("human"), lambda _: Window("a world", 32)),
         ("imageio_ffmpeg", r"pip install 'imageio\[ffmpeg\]'", lambda p: write_mp4(p, [FRAME])),
     ],

@@ -1,15 +1,11 @@
 """The programs of docs/integrations.md: each runs as it stands there, and learns."""
 
 import re
-import sys
 from pathlib import Path
 
 import imageio.v3 as imageio
 import pytest
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
-
-from npa_envs import wrappers
-from npa_envs.errors import MissingDependencyError
 
 TEXT = (Path(__file__).resolve().parents[2] / "docs/integrations.md").read_text("utf-8")
 RANDOM, RANDOM_ERROR = 0.143, 0.018
@@ -44,21 +40,6 @@ def told(library: str) -> float:
     """Return the return that the page prints of a library."""
     (mean,) = re.findall(rf"^{library}: ([\d.]+) ± [\d.]+$", TEXT, re.M)
     return float(mean)
-
-
-@pytest.mark.parametrize(
-    ("name", "module", "library", "extra"),
-    [
-        ("NPATorchRLEnv", "torchrl", "torchrl.data", "torchrl"),
-        ("RslRlParticleEnv", "rsl_rl", "rsl_rl.env", "rslrl"),
-    ],
-)
-def test_a_missing_library_is_named_with_its_extra(name, module, library, extra, monkeypatch):
-    monkeypatch.delitem(sys.modules, f"npa_envs.wrappers.{module}", raising=False)
-    monkeypatch.delattr(wrappers, module, raising=False)
-    monkeypatch.setitem(sys.modules, library, None)
-    with pytest.raises(MissingDependencyError, match=rf"pip install 'npa-envs\[{extra}\]'"):
-        getattr(wrappers, name)
 
 
 def test_callbacks_logs_and_films_of_stable_baselines3(tmp_path):

@@ -1,4 +1,4 @@
-"""The import ladder: each module imports only what stands on a lower rung, and few libraries.
+"""The layers: each module imports only modules of lower layers, and few libraries.
 
 The table below is the whole rule. A new module needs a row (or lies in a folder that has one); the
 libraries named are the only ones outside Python's own that its files may import, at any depth.
@@ -16,79 +16,79 @@ MAPPED = ("envs", "wrappers", "agents")
 
 
 @dataclass(frozen=True)
-class Rung:
-    """Where a module stands and which libraries it may use."""
+class Layer:
+    """The height of a module and the libraries that it may use."""
 
     level: int
     libraries: frozenset[str]
     never: tuple[str, ...] = ()
-    """Modules of ours that it must not import although they stand lower."""
+    """Modules of lower layers that it must not import."""
 
 
-def rung(level: int, libraries: str = "", never: tuple[str, ...] = ()) -> Rung:
-    return Rung(level, frozenset(libraries.split()), never)
+def layer(level: int, libraries: str = "", never: tuple[str, ...] = ()) -> Layer:
+    return Layer(level, frozenset(libraries.split()), never)
 
 
 COMPUTED_NAME = "<imported by a computed name>"
 INSIDES = ("npa_envs.kernels", "npa_envs.ops", "npa_envs.reference")
-"""For who uses worlds and operators through `npa_envs.world` and the public names alone."""
+"""Not for users of worlds and operators, who take `npa_envs.world` and the public names."""
 ORACLES = ("npa_envs.kernels", "npa_envs.reference")
-LADDER = {
-    "npa_envs._module_search": Rung(0, frozenset({COMPUTED_NAME})),
-    "npa_envs.errors": rung(0),
-    "npa_envs.registration": rung(0, "gymnasium"),
-    "npa_envs.checks": rung(1, "torch"),
-    "npa_envs.devices": rung(1, "torch"),
-    "npa_envs.files": rung(1),
-    "npa_envs.once": rung(0),
-    "npa_envs.processes": rung(1),
-    "npa_envs.runtime": rung(1, "warp"),
-    "npa_envs.reference": rung(1, "torch"),
-    "npa_envs.reference_gaussians": rung(1, "torch"),
-    "npa_envs.kernels": rung(1, "warp"),
-    "npa_envs.world.cuda_graph": rung(3, "torch numpy", never=ORACLES),
-    "npa_envs.ops": rung(2, "warp torch", never=("npa_envs.reference",)),
-    "npa_envs.world.randomness": rung(3, "torch numpy", never=ORACLES),
-    "npa_envs.world.divergence": rung(3, "torch", never=ORACLES),
-    "npa_envs.rule.codes": rung(2, "torch"),
-    "npa_envs.rule.network": rung(3, "torch"),
-    "npa_envs.rule.rule": rung(4, "torch"),
-    "npa_envs.rule": rung(5, "torch safetensors", never=INSIDES),
-    "npa_envs.world": rung(6, "torch", never=ORACLES),
-    "npa_envs.tasks": rung(7, "torch numpy PIL sklearn torchvision trimesh", never=ORACLES),
-    "npa_envs.render": rung(8, "torch numpy PIL imageio imageio_ffmpeg pygame", never=ORACLES),
-    "npa_envs.training": rung(9, "torch numpy tqdm yaml tensorboard", never=ORACLES),
-    "npa_envs": Rung(10, frozenset({COMPUTED_NAME}), never=ORACLES),
-    "npa_envs.measure.record": rung(3, "torch", never=INSIDES),
-    "npa_envs.measure.plots": rung(2, "matplotlib"),
-    "npa_envs.measure.judge": rung(10, "torch", never=INSIDES),
-    "npa_envs.measure.quality": rung(11, "torch numpy tqdm", never=INSIDES),
-    "npa_envs.measure.interaction": rung(11, "torch numpy matplotlib", never=ORACLES),
-    "npa_envs.measure.speed": rung(13, "torch numpy matplotlib", never=("npa_envs.kernels",)),
-    "npa_envs.measure.accuracy": rung(14, "torch matplotlib", never=("npa_envs.kernels",)),
-    "npa_envs.measure.robustness": rung(15, "torch", never=ORACLES),
-    "npa_envs.measure": rung(16),
-    "npa_envs.envs": rung(17, "torch numpy gymnasium pettingzoo", never=INSIDES),
-    "npa_envs.wrappers": rung(
+LAYERS = {
+    "npa_envs._module_search": Layer(0, frozenset({COMPUTED_NAME})),
+    "npa_envs.errors": layer(0),
+    "npa_envs.registration": layer(0, "gymnasium"),
+    "npa_envs.checks": layer(1, "torch"),
+    "npa_envs.devices": layer(1, "torch"),
+    "npa_envs.files": layer(1),
+    "npa_envs.once": layer(0),
+    "npa_envs.processes": layer(1),
+    "npa_envs.runtime": layer(1, "warp"),
+    "npa_envs.reference": layer(1, "torch"),
+    "npa_envs.reference_gaussians": layer(1, "torch"),
+    "npa_envs.kernels": layer(1, "warp"),
+    "npa_envs.world.cuda_graph": layer(3, "torch numpy", never=ORACLES),
+    "npa_envs.ops": layer(2, "warp torch", never=("npa_envs.reference",)),
+    "npa_envs.world.randomness": layer(3, "torch numpy", never=ORACLES),
+    "npa_envs.world.divergence": layer(3, "torch", never=ORACLES),
+    "npa_envs.rule.codes": layer(2, "torch"),
+    "npa_envs.rule.network": layer(3, "torch"),
+    "npa_envs.rule.rule": layer(4, "torch"),
+    "npa_envs.rule": layer(5, "torch safetensors", never=INSIDES),
+    "npa_envs.world": layer(6, "torch", never=ORACLES),
+    "npa_envs.tasks": layer(7, "torch numpy PIL sklearn torchvision trimesh", never=ORACLES),
+    "npa_envs.render": layer(8, "torch numpy PIL imageio imageio_ffmpeg pygame", never=ORACLES),
+    "npa_envs.training": layer(9, "torch numpy tqdm yaml tensorboard", never=ORACLES),
+    "npa_envs": Layer(10, frozenset({COMPUTED_NAME}), never=ORACLES),
+    "npa_envs.measure.record": layer(3, "torch", never=INSIDES),
+    "npa_envs.measure.plots": layer(2, "matplotlib"),
+    "npa_envs.measure.judge": layer(10, "torch", never=INSIDES),
+    "npa_envs.measure.quality": layer(11, "torch numpy tqdm", never=INSIDES),
+    "npa_envs.measure.interaction": layer(11, "torch numpy matplotlib", never=ORACLES),
+    "npa_envs.measure.speed": layer(13, "torch numpy matplotlib", never=("npa_envs.kernels",)),
+    "npa_envs.measure.accuracy": layer(14, "torch matplotlib", never=("npa_envs.kernels",)),
+    "npa_envs.measure.robustness": layer(15, "torch", never=ORACLES),
+    "npa_envs.measure": layer(16),
+    "npa_envs.envs": layer(17, "torch numpy gymnasium pettingzoo", never=INSIDES),
+    "npa_envs.wrappers": layer(
         18,
         "torch numpy gymnasium pettingzoo stable_baselines3 ray torchrl tensordict rsl_rl minari "
         "h5py",
         never=INSIDES,
     ),
-    "npa_envs.agents": rung(
+    "npa_envs.agents": layer(
         19, "torch numpy tqdm gymnasium pettingzoo stable_baselines3 cma", never=INSIDES
     ),
-    "npa_envs.agents.comparison": rung(
+    "npa_envs.agents.comparison": layer(
         20, "torch numpy PIL scipy matplotlib jsonschema", never=INSIDES
     ),
-    "npa_envs.agents.search": rung(20, "torch numpy cma ribs", never=INSIDES),
-    "npa_envs.web": rung(21, "torch numpy gymnasium PIL starlette uvicorn", never=ORACLES),
-    "npa_envs.cli": Rung(
+    "npa_envs.agents.search": layer(20, "torch numpy cma ribs", never=INSIDES),
+    "npa_envs.web": layer(21, "torch numpy gymnasium PIL starlette uvicorn", never=ORACLES),
+    "npa_envs.cli": Layer(
         22,
         frozenset({COMPUTED_NAME, "torch", "numpy", "tqdm", "tyro", "imageio_ffmpeg"}),
         never=ORACLES,
     ),
-    "npa_envs.__main__": rung(23),
+    "npa_envs.__main__": layer(23),
 }
 WARP_AND_TORCH = {"npa_envs.ops"}
 
@@ -108,11 +108,11 @@ MODULES = {module_name(path) for path in source_files()}
 
 
 def row_of(module: str) -> str | None:
-    """The longest row of the ladder that holds `module`; a submodule needs a row of its own."""
+    """The longest row that contains `module`; a submodule needs its own row."""
     name = module
-    while name not in LADDER and "." in name:
+    while name not in LAYERS and "." in name:
         name = name.rpartition(".")[0]
-    if name not in LADDER or (name == "npa_envs" and module != "npa_envs"):
+    if name not in LAYERS or (name == "npa_envs" and module != "npa_envs"):
         return None
     return name
 
@@ -131,7 +131,7 @@ def imported_modules(module: str, source: str, *, is_package: bool) -> set[str]:
                 base = ".".join([*kept, *([node.module] if node.module else [])])
             for alias in node.names:
                 inner = f"{base}.{alias.name}"
-                found.add(inner if inner in MODULES or inner in LADDER else base)
+                found.add(inner if inner in MODULES or inner in LAYERS else base)
         elif isinstance(node, ast.Call):
             called = ast.unparse(node.func)
             if called in {"__import__", "import_module", "importlib.import_module"}:
@@ -142,11 +142,11 @@ def imported_modules(module: str, source: str, *, is_package: bool) -> set[str]:
 
 
 def violations(module: str, source: str, *, is_package: bool = False) -> list[str]:
-    """What `source`, standing in `module`, imports against the ladder."""
+    """What the `source` of a `module` imports against the layers."""
     row = row_of(module)
     if row is None:
-        return [f"{module} has no row in the ladder"]
-    here = LADDER[row]
+        return [f"{module} has no row in the table of layers"]
+    here = LAYERS[row]
     wrong = []
     for name in sorted(imported_modules(module, source, is_package=is_package)):
         top = name.split(".")[0]
@@ -156,24 +156,24 @@ def violations(module: str, source: str, *, is_package: bool = False) -> list[st
             continue
         other = row_of(name)
         if other is None:
-            wrong.append(f"{module} imports {name}, which has no row in the ladder")
-        elif other != row and LADDER[other].level >= here.level:
-            wrong.append(f"{module} imports {name}, which stands no lower")
-        # By how it begins: who must not know one oracle must not know any.
+            wrong.append(f"{module} imports {name}, which has no row in the table of layers")
+        elif other != row and LAYERS[other].level >= here.level:
+            wrong.append(f"{module} imports {name}, which is in no lower layer")
+        # By how it begins: one oracle or all.
         elif other.startswith(here.never):
             wrong.append(f"{module} imports {name}, which it must not know")
     return wrong
 
 
 @pytest.mark.parametrize("path", source_files(), ids=lambda p: p.relative_to(ROOT).as_posix())
-def test_every_source_file_keeps_to_the_ladder(path: Path) -> None:
+def test_every_source_file_keeps_to_the_layers(path: Path) -> None:
     is_package = path.name == "__init__.py"
     source = path.read_text(encoding="utf-8")
     assert violations(module_name(path), source, is_package=is_package) == []
 
 
 def test_only_the_operators_and_the_benchmarked_hash_grid_know_both_warp_and_torch() -> None:
-    both = {name for name, here in LADDER.items() if {"warp", "torch"} <= here.libraries}
+    both = {name for name, here in LAYERS.items() if {"warp", "torch"} <= here.libraries}
     assert both == WARP_AND_TORCH
 
 
