@@ -145,7 +145,7 @@ def grow(
     return grown_x, grown_s
 
 
-def check_living(config: Any) -> None:
+def check_rule_driven(config: Any) -> None:
     """Check what configurations of living worlds share."""
     if config.resolution % config.picture_size:
         raise NPAError(

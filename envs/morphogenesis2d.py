@@ -13,7 +13,7 @@ from npa_envs.checks import check_positive
 from npa_envs.envs.core.config import EnvConfig
 from npa_envs.envs.core.single import NPAEnv
 from npa_envs.envs.core.task import TargetEnvTask
-from npa_envs.envs.core.vector import batched
+from npa_envs.envs.core.vector import vector_class
 from npa_envs.tasks.morphogenesis2d import Morphogenesis2D, Morphogenesis2DConfig
 from npa_envs.tasks.targets.images import LARGEST_POINT_COUNT
 
@@ -166,4 +166,4 @@ class Morphogenesis2DEnv(NPAEnv):
     task_type = PictureEnvTask
 
 
-Morphogenesis2DVectorEnv = batched(Morphogenesis2DEnv)
+Morphogenesis2DVectorEnv = vector_class(Morphogenesis2DEnv)

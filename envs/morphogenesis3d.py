@@ -16,7 +16,7 @@ from npa_envs.checks import check_positive
 from npa_envs.envs.core.config import EnvConfig
 from npa_envs.envs.core.single import NPAEnv
 from npa_envs.envs.core.task import TURN, TargetEnvTask
-from npa_envs.envs.core.vector import batched
+from npa_envs.envs.core.vector import vector_class
 from npa_envs.envs.grown import load_read_out
 from npa_envs.errors import NPAError, shown
 from npa_envs.render import turntable_frames
@@ -25,7 +25,7 @@ from npa_envs.tasks.morphogenesis3d import Morphogenesis3D, Morphogenesis3DConfi
 PIXEL_BYTES = 200
 """About what comparing one pixel of a view needs [bytes]."""
 
-SEEN_BYTES = 700
+PARTICLE_BYTES = 700
 """About what one particle in one view needs [bytes]."""
 
 
@@ -94,7 +94,7 @@ class SolidTask(TargetEnvTask[Morphogenesis3DEnvConfig]):
     @classmethod
     def extra_bytes(cls, config: Any, world_count: int) -> int:
         """Return about how much memory pool and views need [bytes]."""
-        view = PIXEL_BYTES * config.resolution**2 + SEEN_BYTES * config.particle_count
+        view = PIXEL_BYTES * config.resolution**2 + PARTICLE_BYTES * config.particle_count
         copies = 2 if config.per_particle_reward else 1
         views = copies * world_count * config.view_count * view
         return super().extra_bytes(config, world_count) + int(views)
@@ -206,4 +206,4 @@ class Morphogenesis3DEnv(NPAEnv):
     task_type = SolidTask
 
 
-Morphogenesis3DVectorEnv = batched(Morphogenesis3DEnv)
+Morphogenesis3DVectorEnv = vector_class(Morphogenesis3DEnv)

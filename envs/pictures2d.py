@@ -14,7 +14,7 @@ from npa_envs.envs.core.config import EnvConfig
 from npa_envs.envs.core.single import NPAEnv
 from npa_envs.envs.core.state import OBSERVATION_COPIES
 from npa_envs.envs.core.task import Start
-from npa_envs.envs.core.vector import batched
+from npa_envs.envs.core.vector import vector_class
 from npa_envs.envs.morphogenesis2d import PictureConfig, PictureEnvTask
 from npa_envs.errors import NPAError, shown
 from npa_envs.tasks.many_pictures import ManyPictures, named_targets
@@ -119,9 +119,9 @@ class PicturesTask(PictureEnvTask[Pictures2DEnvConfig]):
 
     def toward(self, goal: Tensor) -> Self:
         """Return the task with losses for worlds of these pictures."""
-        aimed = super().toward(goal)
-        aimed._number = goal
-        return aimed
+        goal_task = super().toward(goal)
+        goal_task._number = goal
+        return goal_task
 
     def extra_info(self, s: Tensor) -> dict[str, Tensor]:
         """Return the number of each world's picture, int64, shape [B]."""
@@ -176,4 +176,4 @@ class Pictures2DEnv(NPAEnv):
     task_type = PicturesTask
 
 
-Pictures2DVectorEnv = batched(Pictures2DEnv)
+Pictures2DVectorEnv = vector_class(Pictures2DEnv)

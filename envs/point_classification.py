@@ -16,7 +16,7 @@ from npa_envs.checks import check_positive
 from npa_envs.envs.core.config import EnvConfig
 from npa_envs.envs.core.single import NPAEnv
 from npa_envs.envs.core.task import Start, TargetEnvTask
-from npa_envs.envs.core.vector import batched
+from npa_envs.envs.core.vector import vector_class
 from npa_envs.envs.grown import load_read_out
 from npa_envs.errors import NPAError, shown
 from npa_envs.rule.rule import COLOUR_OFFSET, NPARule
@@ -236,4 +236,4 @@ class PointClassificationEnv(NPAEnv):
     task_type = PointClassificationTask
 
 
-PointClassificationVectorEnv = batched(PointClassificationEnv)
+PointClassificationVectorEnv = vector_class(PointClassificationEnv)

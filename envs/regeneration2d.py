@@ -8,10 +8,10 @@ import torch
 from torch import Tensor
 
 from npa_envs.checks import check_flag, check_fraction, check_positive
-from npa_envs.envs.core.referee import total
+from npa_envs.envs.core.rewards import total
 from npa_envs.envs.core.single import NPAEnv
 from npa_envs.envs.core.task import Start
-from npa_envs.envs.core.vector import batched
+from npa_envs.envs.core.vector import vector_class
 from npa_envs.envs.grown import GrownConfig, GrownTask
 from npa_envs.envs.morphogenesis2d import PictureEnvTask
 from npa_envs.errors import NPAError, shown, suggest
@@ -186,4 +186,4 @@ class Regeneration2DEnv(NPAEnv):
     task_type = RegenerationTask
 
 
-Regeneration2DVectorEnv = batched(Regeneration2DEnv)
+Regeneration2DVectorEnv = vector_class(Regeneration2DEnv)

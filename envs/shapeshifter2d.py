@@ -17,10 +17,10 @@ from npa_envs.envs.core.base import ParticleSpaces, batch_tensor
 from npa_envs.envs.core.config import EnvConfig
 from npa_envs.envs.core.single import NPAEnv
 from npa_envs.envs.core.task import Start
-from npa_envs.envs.core.vector import batched
+from npa_envs.envs.core.vector import vector_class
 from npa_envs.envs.garden.brushes import GardenReward
-from npa_envs.envs.garden.task import Living
-from npa_envs.envs.grown import check_living, check_runs, grow, run_rule
+from npa_envs.envs.garden.task import RuleDriven
+from npa_envs.envs.grown import check_rule_driven, check_runs, grow, run_rule
 from npa_envs.envs.morphogenesis2d import PictureConfig, PictureEnvTask
 from npa_envs.errors import NPAError
 from npa_envs.rule.codes import Codes
@@ -32,7 +32,7 @@ from npa_envs.training.trained_tasks import sources_of_codes
 from npa_envs.world.actions import Physics
 from npa_envs.world.randomness import WorldRandom
 
-SEEN_LIMIT = 8.0
+OBSERVATION_LIMIT = 8.0
 """What is seen is clipped to plus and minus this (dimensionless)."""
 
 GOAL_COUNT = 8
@@ -88,7 +88,7 @@ class Shapeshifter2DEnvConfig(PictureConfig):
         """Check every field."""
         super().__post_init__()
         check_positive(self, int, "rule_steps", "hold_steps", "grow_steps", "picture_size")
-        check_living(self)
+        check_rule_driven(self)
 
 
 def rule_of(config: Shapeshifter2DEnvConfig, device: torch.device) -> tuple[NPARule, Codes]:
@@ -122,7 +122,8 @@ class CodeForm(ParticleSpaces):
         self._output = config.output
         count, dim = self._table.shape
         seen = (8 * config.picture_size**2,)
-        self.observation_space: Space[Any] = Box(-SEEN_LIMIT, SEEN_LIMIT, seen, np.float32)
+        limit = OBSERVATION_LIMIT
+        self.observation_space: Space[Any] = Box(-limit, limit, seen, np.float32)
         self.action_space: Space[Any] = (
             Discrete(count) if self._chosen else Box(-1.0, 1.0, (dim,), np.float32)
         )
@@ -149,7 +150,7 @@ class CodeForm(ParticleSpaces):
         return self._table / self._limit
 
 
-class ShapeshifterTask(Living, PictureEnvTask[Shapeshifter2DEnvConfig]):
+class ShapeshifterTask(RuleDriven, PictureEnvTask[Shapeshifter2DEnvConfig]):
     """A picture that becomes others; what worlds keep are their goals, the present one first."""
 
     config_type = Shapeshifter2DEnvConfig
@@ -193,8 +194,8 @@ class ShapeshifterTask(Living, PictureEnvTask[Shapeshifter2DEnvConfig]):
         x = torch.full((len(goals), 1, 2), 1e3, device=self.device)
         s = x.new_zeros(len(goals), 1, self.config.state_dim)
         # Where nothing lies in the picture, colours do not count; the mean is not moved.
-        aimed = self.goal.toward(goals)
-        difference = aimed.picture(x, s, centred=False) - aimed.target_picture
+        goal_task = self.goal.toward(goals)
+        difference = goal_task.picture(x, s, centred=False) - goal_task.target_picture
         error = difference[..., 3].square() + difference[..., 3].abs()
         return error.flatten(1).mean(dim=1)
 
@@ -253,11 +254,11 @@ class ShapeshifterTask(Living, PictureEnvTask[Shapeshifter2DEnvConfig]):
 
     def observe(self, x: Tensor, s: Tensor, loss: Tensor, context: Tensor) -> Tensor:
         """Return coarse pictures of worlds and of their goals, shape [B, 8 G²]."""
-        aimed = self.goal.toward(context[:, 0].long())
-        both = torch.cat((aimed.picture(x, s), aimed.target_picture), dim=-1)
+        goal_task = self.goal.toward(context[:, 0].long())
+        both = torch.cat((goal_task.picture(x, s), goal_task.target_picture), dim=-1)
         pixels = self.config.resolution // self.config.picture_size
         seen = F.avg_pool2d(both.permute(0, 3, 1, 2), pixels).flatten(1)
-        return seen.clamp(-SEEN_LIMIT, SEEN_LIMIT)
+        return seen.clamp(-OBSERVATION_LIMIT, OBSERVATION_LIMIT)
 
 
 class Shapeshifter2DEnv(NPAEnv):
@@ -328,4 +329,4 @@ class Shapeshifter2DEnv(NPAEnv):
     task_type = ShapeshifterTask
 
 
-Shapeshifter2DVectorEnv = batched(Shapeshifter2DEnv)
+Shapeshifter2DVectorEnv = vector_class(Shapeshifter2DEnv)

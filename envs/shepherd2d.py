@@ -17,8 +17,8 @@ from npa_envs.checks import check_non_negative, check_positive
 from npa_envs.envs.core.base import to_output
 from npa_envs.envs.core.task import Start
 from npa_envs.envs.core.vector import NPAVectorEnv
-from npa_envs.envs.garden.brushes import SEEN_LIMIT, BrushSpaces, GardenConfig, GardenReward
-from npa_envs.envs.garden.task import GardenEnv, GardenTask, lost_share, marks_of_whole
+from npa_envs.envs.garden.brushes import OBSERVATION_LIMIT, BrushSpaces, GardenConfig, GardenReward
+from npa_envs.envs.garden.task import GardenEnv, GardenTask, intact_context, lost_fraction
 from npa_envs.errors import NPAError
 from npa_envs.tasks.seeds import uniform_ball
 from npa_envs.world.actions import Physics
@@ -77,13 +77,13 @@ class GoalBrushes(BrushSpaces):
         super().__init__(physics, config)
         seen = self.observation_space
         assert seen.shape is not None, "a box has a shape"
-        goal = Box(-SEEN_LIMIT, SEEN_LIMIT, (3,), np.float32)
+        goal = Box(-OBSERVATION_LIMIT, OBSERVATION_LIMIT, (3,), np.float32)
         self._seen_count = seen.shape[0]
         self.observation_space = Dict(
             {"observation": seen, "achieved_goal": goal, "desired_goal": goal}
         )
 
-    def seen(self, observation: Tensor) -> Any:
+    def returned(self, observation: Tensor) -> Any:
         """Return observations of worlds, or of one, as they are handed out."""
         count = self._seen_count
         parts = torch.split(observation, [count, 3, 3], dim=-1)
@@ -93,9 +93,9 @@ class GoalBrushes(BrushSpaces):
             for name, part in zip(names, parts, strict=True)
         }
 
-    def last_seen(self, observation: Tensor, ended: NDArray[np.bool_]) -> Any:
+    def returned_final(self, observation: Tensor, ended: NDArray[np.bool_]) -> Any:
         """Return the last observations as Gymnasium has them: an array of dictionaries, or None."""
-        batched = self.seen(observation)
+        batched = self.returned(observation)
         if self._output == "torch":
             return batched
         last = np.full(len(ended), None, dtype=object)
@@ -111,7 +111,7 @@ class ShepherdTask(GardenTask[Shepherd2DEnvConfig]):
     form_type = GoalBrushes
     # What it is when whole, the goal, then how it lay at the start: mean and second moments.
     context_count = 2 + 2 + 5
-    pays_each_step = True
+    rewards_each_step = True
 
     def episode_context(self, start: Start, loss: Tensor, random: WorldRandom) -> Tensor:
         """Return what is whole, the goal, and how the creature lies at its start."""
@@ -125,7 +125,7 @@ class ShepherdTask(GardenTask[Shepherd2DEnvConfig]):
             goal = direction(drawn[:, :1])
         else:
             goal = 1.0 + drawn
-        return torch.cat((marks_of_whole(self, start, loss), goal, lies), dim=1)
+        return torch.cat((intact_context(self, start, loss), goal, lies), dim=1)
 
     def achieved(self, x: Tensor, s: Tensor, context: Tensor) -> Tensor:
         """Return what worlds have come to and what share of them is lost, shape [B, 3]."""
@@ -140,7 +140,7 @@ class ShepherdTask(GardenTask[Shepherd2DEnvConfig]):
             middle = now[:, None, :2]
             undone = middle + (x - middle) / got[:, None]
         loss = sum(self.losses(undone, s).values(), torch.zeros_like(got[:, 0]))
-        return torch.cat((got, lost_share(loss, context)[:, None]), dim=1)
+        return torch.cat((got, lost_fraction(loss, context)[:, None]), dim=1)
 
     def desired(self, context: Tensor) -> Tensor:
         """Return what worlds are to come to, and the share that may be lost, shape [B, 3]."""
@@ -148,7 +148,7 @@ class ShepherdTask(GardenTask[Shepherd2DEnvConfig]):
             (context[:, 2:4], torch.full_like(context[:, :1], self.config.lost_limit)), 1
         )
 
-    def paid(self, achieved: Tensor, desired: Tensor) -> Tensor:
+    def goal_reward(self, achieved: Tensor, desired: Tensor) -> Tensor:
         """Return rewards, shape [...], of what was achieved and desired, [..., 3]."""
         away = (achieved[..., :2] - desired[..., :2]).square().sum(dim=-1).sqrt()
         excess = achieved[..., 2] - desired[..., 2]
@@ -160,7 +160,9 @@ class ShepherdTask(GardenTask[Shepherd2DEnvConfig]):
 
     def reward(self, x: Tensor, s: Tensor, loss: Tensor, context: Tensor) -> Tensor:
         """Return what worlds are worth, shape [B]."""
-        return self.paid(self.achieved(x, s, context), self.desired(context)).to(torch.float32)
+        return self.goal_reward(self.achieved(x, s, context), self.desired(context)).to(
+            torch.float32
+        )
 
     def context_info(self, x: Tensor, s: Tensor, context: Tensor) -> dict[str, Tensor]:
         """Return whether worlds are at their goals and whole, and what share is lost."""
@@ -173,7 +175,7 @@ class ShepherdTask(GardenTask[Shepherd2DEnvConfig]):
         """Return what is seen, then what is achieved, then what is desired, [B, O + 6]."""
         seen = super().observe(x, s, loss, context)
         goals = torch.cat((self.achieved(x, s, context), self.desired(context)), dim=1)
-        return torch.cat((seen, goals.clamp(-SEEN_LIMIT, SEEN_LIMIT)), dim=1)
+        return torch.cat((seen, goals.clamp(-OBSERVATION_LIMIT, OBSERVATION_LIMIT)), dim=1)
 
 
 def lie_of(x: Tensor) -> Tensor:
@@ -232,7 +234,7 @@ class _GoalReward:
         # By torch, as episodes are paid: NumPy's roots are rounded otherwise on some processors.
         achieved = torch.tensor(np.asarray(achieved_goal))
         desired = torch.tensor(np.asarray(desired_goal))
-        paid: NDArray[Any] = self.task.paid(achieved, desired).numpy()
+        paid: NDArray[Any] = self.task.goal_reward(achieved, desired).numpy()
         return paid
 
 

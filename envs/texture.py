@@ -12,7 +12,7 @@ from torch import Tensor
 from npa_envs.envs.core.config import Boundary, EnvConfig
 from npa_envs.envs.core.single import NPAEnv
 from npa_envs.envs.core.task import TargetEnvTask
-from npa_envs.envs.core.vector import batched
+from npa_envs.envs.core.vector import vector_class
 from npa_envs.errors import NPAError, shown
 from npa_envs.tasks.texture import Texture, TextureConfig
 
@@ -139,4 +139,4 @@ class TextureEnv(NPAEnv):
     task_type = TextureTask
 
 
-TextureVectorEnv = batched(TextureEnv)
+TextureVectorEnv = vector_class(TextureEnv)

@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from npa_envs.wrappers.damage import DamageEvents, VectorDamageEvents
+    from npa_envs.wrappers.numeric_infos import NumericInfos as NumericInfos
     from npa_envs.wrappers.particle_rows import ParticleRows
-    from npa_envs.wrappers.pettingzoo import NumericInfos as NumericInfos
     from npa_envs.wrappers.rsl_rl import RslRlParticleEnv as RslRlParticleEnv
     from npa_envs.wrappers.sb3 import ParticleVecEnv as ParticleVecEnv
     from npa_envs.wrappers.sb3 import RowPolicy as RowPolicy
@@ -42,7 +42,7 @@ __all__ = [
 # A star imports all of them, and must need none of the libraries that are optional.
 ON_REQUEST = {
     "NPATorchRLEnv": "torchrl",
-    "NumericInfos": "pettingzoo",
+    "NumericInfos": "numeric_infos",
     "ParticleVecEnv": "sb3",
     "RowPolicy": "sb3",
     "RslRlParticleEnv": "rsl_rl",

@@ -172,7 +172,7 @@ class ParticleRowsBase:
 
     num_envs: int
 
-    def hold(self, env: Any, base: NPAVectorEnv) -> None:
+    def set_env(self, env: Any, base: NPAVectorEnv) -> None:
         """Keep the environment whose particles are rows, and count them."""
         self.vector_env = env
         """The environment whose particles these are."""
@@ -254,7 +254,7 @@ class Observations(AnyWrapper):
     def observations(self, observations: Any) -> Any:
         """Return an observation, shape [N, P], changed."""
 
-    def new_ones(self, observations: Any) -> Any:
+    def new_observations(self, observations: Any) -> Any:
         """Return what the world gave; as that of `VectorObservations`."""
         return observations
 
@@ -319,7 +319,7 @@ class VectorObservations(EpisodeWrapper):
     def observation_space(self, space: Space[Any]) -> None:
         self._observation_space = space
 
-    def new_ones(self, observations: Any) -> Any:
+    def new_observations(self, observations: Any) -> Any:
         """Return, of all observations [B, N, P], those of worlds that gave new ones, [M, N, P]."""
         observed = self.clock.observed
         if observed.all():
@@ -352,7 +352,7 @@ class VectorObservations(EpisodeWrapper):
         return observations, rewards, terminations, truncations, infos
 
 
-class Twin(RecordConstructorArgs):
+class WrapperBase(RecordConstructorArgs):
     """The common part of a wrapper of one world and its form for many, before their other base."""
 
     def __init__(self, env: Any, **recorded: Any) -> None:

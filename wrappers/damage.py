@@ -18,8 +18,8 @@ from npa_envs.world.randomness import StreamId
 from npa_envs.wrappers.base import (
     AnyWrapper,
     EpisodeWrapper,
-    Twin,
     VectorStep,
+    WrapperBase,
     check_untouched,
     world_indices,
 )
@@ -28,7 +28,7 @@ Event = str | DamageEvent
 """What an event is given as: "STEP:KIND", "STEP:KIND:SIZE", or a `DamageEvent`."""
 
 
-class _DamagesWorlds(Twin):
+class _DamagesWorlds(WrapperBase):
     """The events and the damage that they do, for one world or many."""
 
     def __init__(

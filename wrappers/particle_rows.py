@@ -47,7 +47,7 @@ class ParticleRows(ParticleRowsBase, AnyVectorEnv):
         check_autoreset(
             autoreset_mode(env), "next-step", "restart worlds in the step after the last one"
         )
-        self.hold(env, base)
+        self.set_env(env, base)
         self.metadata = env.metadata
         self.render_mode = env.render_mode
         self.single_observation_space = row_space(env.single_observation_space)

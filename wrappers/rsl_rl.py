@@ -54,7 +54,7 @@ class RslRlParticleEnv(ParticleRowsBase, VecEnv):  # type: ignore[misc]
     ) -> None:
         base = torch_env(env, type(self).__name__)
         check_same_step(autoreset_mode(env))
-        self.hold(env, base)
+        self.set_env(env, base)
         self.bootstrap = bootstrap
         """Whether rows cut off by the step limit say so."""
         self.num_actions = base.worlds.physics.action_dim

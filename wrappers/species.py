@@ -16,8 +16,8 @@ from npa_envs.errors import NPAError, shown, suggest
 from npa_envs.world.randomness import StreamId
 from npa_envs.wrappers.base import (
     Observations,
-    Twin,
     VectorObservations,
+    WrapperBase,
     world_indices,
 )
 
@@ -32,7 +32,7 @@ def tagged(observation: Any, tags: Any) -> Any:
     return np.concatenate((observation, tags), axis=-1)
 
 
-class _TagsSpecies(Twin):
+class _TagsSpecies(WrapperBase):
     """The species of all particles, and their tags, for one world or many."""
 
     def __init__(

@@ -25,9 +25,9 @@ from npa_envs.wrappers.base import (
     AnyVectorEnv,
     EpisodeWrapper,
     Observations,
-    Twin,
     VectorObservations,
     VectorStep,
+    WrapperBase,
     as_tensor,
     autoreset_mode,
     check_vector_env,
@@ -142,12 +142,12 @@ class PerceptionStatistics:
         return torch.cat((statistics[:centred], gradients))
 
 
-class _NormalizesPerception(Twin):
+class _NormalizesPerception(WrapperBase):
     """Statistics of perception and normalisation by them, for one world or many."""
 
     statistics: PerceptionStatistics
     training: bool
-    new_ones: Callable[[Any], Any]
+    new_observations: Callable[[Any], Any]
 
     def __init__(
         self,
@@ -190,7 +190,7 @@ class _NormalizesPerception(Twin):
     def observations(self, observations: Any) -> Any:
         """Return observations normalised, and count them while training."""
         if self.training:
-            self.statistics.update(self.new_ones(observations))
+            self.statistics.update(self.new_observations(observations))
         return self.statistics.normalize(observations)
 
     def final_observations(self, observations: Any) -> Any:
@@ -348,7 +348,7 @@ class TorchNormalizeObservation(VectorObservations):
         """Return observations normalised, and count them unless frozen."""
         check_tensor(observations, type(self).__name__)
         if self.update_running_mean:
-            seen = self.new_ones(observations)
+            seen = self.new_observations(observations)
             var, mean = torch.var_mean(seen, dim=0, correction=0)
             self.obs_rms.update(mean, var, len(seen))
         return self.final_observations(observations)

@@ -77,9 +77,9 @@ class CrowdEnv(AgentsEnv, KnownAgents):
         There are no options.
         """
         observation = self._start(np.arange(1), seed, seed)
-        self._count_agents()
-        infos = self._infos(self.worlds.account.numbers())
-        return self._handed_out(observation), infos
+        self._update_agents()
+        infos = self._infos(self.worlds.agent_returns.numbers())
+        return self._by_agent(observation), infos
 
     def step(self, actions: Mapping[str, Any]) -> Outcome:
         """Apply the actions of all live agents, take those that ended out of the world, perceive.
@@ -107,17 +107,17 @@ class CrowdEnv(AgentsEnv, KnownAgents):
         shapes = [self.action_spaces[agent].shape for agent in acted]
         action = joined_actions(actions, acted, shapes, worlds.device)
         with worlds.device_context():
-            outcome = worlds.step(self._everyones(action))
+            outcome = worlds.step(self._with_zeros(action))
         ended, late = outcome.endings[0] > 0, bool(outcome.late[0])
         infos = self._infos(outcome.numbers)
         for k, agent in zip(live, acted, strict=True):
             if ended[k] or late:
                 infos[agent]["reason"] = outcome.reasons[0, k]
-        observations = self._handed_out(outcome.observation)
+        observations = self._by_agent(outcome.observation)
         paid = outcome.rewards[0].tolist()
         rewards = {agent: paid[k] for k, agent in zip(live, acted, strict=True)}
         terminations = {agent: bool(ended[k]) for k, agent in zip(live, acted, strict=True)}
-        self._count_agents()
+        self._update_agents()
         self._show()
         return observations, rewards, terminations, dict.fromkeys(acted, late), infos
 
@@ -145,15 +145,15 @@ class CrowdEnv(AgentsEnv, KnownAgents):
         with self.worlds.device_context():
             observation = self.worlds.place(x, s)
         self._show()
-        return self._handed_out(observation)
+        return self._by_agent(observation)
 
-    def _count_agents(self) -> None:
+    def _update_agents(self) -> None:
         """Take down who is to act next."""
         played = len(self.possible_agents)
         self._live = np.flatnonzero(self.worlds.live[0, :played]).tolist()
         self.agents = [self.possible_agents[k] for k in self._live]
 
-    def _everyones(self, action: Tensor) -> Tensor:
+    def _with_zeros(self, action: Tensor) -> Tensor:
         """Return actions of live agents, [N now, A], with zeros for all others, [1, N, A]."""
         count = self.worlds.particle_count
         if len(action) == count:
@@ -173,7 +173,7 @@ class CrowdEnv(AgentsEnv, KnownAgents):
             for k, agent in zip(self._live, self.agents, strict=True)
         }
 
-    def _handed_out(self, observation: Tensor) -> dict[str, Any]:
+    def _by_agent(self, observation: Tensor) -> dict[str, Any]:
         """Return the rows of what all particles perceive, [1, N, P], that are of `agents`."""
         rows, spans = self._out(observation[0]), self.worlds.spans
         return {

@@ -23,9 +23,9 @@ from npa_envs.rule.rule import COLOUR_OFFSET
 from npa_envs.tasks.seeds import uniform_ball
 from npa_envs.world.randomness import WorldRandom
 
-Reward = Literal["individual", "team"]
+SpeciesReward = Literal["individual", "team"]
 Perception = Literal["shared", "per_species"]
-OnDivergence = Literal["terminate", "raise", "ignore"]
+SpeciesOnDivergence = Literal["terminate", "raise", "ignore"]
 
 SPECIES_STYLE = "species"
 """Style of pictures in which each species has one colour."""
@@ -40,8 +40,8 @@ class SpeciesConfig(WorldConfig):
 
     words = WorldConfig.words | {
         "perception": get_args(Perception),
-        "reward": get_args(Reward),
-        "on_divergence": get_args(OnDivergence),
+        "reward": get_args(SpeciesReward),
+        "on_divergence": get_args(SpeciesOnDivergence),
         "render_style": (SPECIES_STYLE, *STYLES),
     }
 
@@ -62,7 +62,7 @@ class SpeciesConfig(WorldConfig):
     """"shared": particles perceive each other whatever their species; "per_species": they also
     perceive the density and the density gradient of each species."""
 
-    on_divergence: OnDivergence = "terminate"
+    on_divergence: SpeciesOnDivergence = "terminate"
     """What happens to an agent once all of its particles have diverged: "terminate" takes it out of
     the world; "raise" is an error that names it; "ignore" lets it go on, held at the limits."""
 
@@ -75,7 +75,7 @@ class SpeciesConfig(WorldConfig):
     deaths: tuple[tuple[int, int], ...] = ()
     """Pairs (species, step): the species is removed at the end of that step."""
 
-    reward: Reward = "individual"
+    reward: SpeciesReward = "individual"
     """"individual": each agent is paid for its own improvement; "team": each gets the mean of
     all."""
 

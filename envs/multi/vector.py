@@ -196,7 +196,7 @@ class MultiSpeciesVectorEnv(AgentsEnv):
             raise NPAError("reset_mask needs worlds to leave alone: reset all of them first")
         first = int(seed) if isinstance(seed, int | np.integer) else None
         observation, worlds = self._start(chosen, seed, first), self.worlds
-        return self._rows(observation), self._infos(worlds.account.numbers(), worlds.live)
+        return self._rows(observation), self._infos(worlds.agent_returns.numbers(), worlds.live)
 
     def step(self, actions: Mapping[str, Any]) -> BatchOutcome:
         """Apply every species' actions in all worlds, and perceive.

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from npa_envs import world_mean
 from npa_envs.checks import number_tensor
-from npa_envs.envs.core.referee import total
+from npa_envs.envs.core.rewards import total
 from npa_envs.envs.core.state import OBSERVATION_COPIES, WorldState
 from npa_envs.envs.multi.task import Population, SpeciesTask
 from npa_envs.envs.multi.tasks import task_type
@@ -108,7 +108,7 @@ class AgentReturns:
         self._carried = self._carried + (loss - self.loss)
         self.loss = loss
 
-    def pay(self, parts: Parts, live: Tensor, fled: Tensor) -> Tensor:
+    def step_rewards(self, parts: Parts, live: Tensor, escaped: Tensor) -> Tensor:
         """Take down the losses after a step, and return rewards, 0 for those that did not act.
 
         Returns:
@@ -119,7 +119,7 @@ class AgentReturns:
         # Leaving the world must not pay, even where an empty picture is better than the start, nor
         # give back what a death added at no charge.
         least = self._at_start + self._carried.clamp_min(0.0)
-        loss = torch.where(fled, torch.maximum(loss, least), loss)
+        loss = torch.where(escaped, torch.maximum(loss, least), loss)
         earned = torch.where(live, self.loss - loss, 0.0)
         if self._team:
             share = live.shape[1] / live.sum(dim=1).clamp_min(1)
@@ -199,7 +199,7 @@ class SpeciesWorlds(WorldState):
         """Steps since the start of each episode, shape [B]."""
         device, team = self.device, config.reward == "team"
         kinds = to_device_async(self.agent_species, device)
-        self.account = AgentReturns(self.task, kinds, world_count, team=team)
+        self.agent_returns = AgentReturns(self.task, kinds, world_count, team=team)
         """The agents' losses."""
         self._owner = to_device_async(self.owner, device)
         deaths = dict(config.deaths)
@@ -238,7 +238,7 @@ class SpeciesWorlds(WorldState):
         self.elapsed[worlds] = 0
         population = self._whole.population._replace(x=x.contiguous(), s=s)
         parts, seen = self._whole.measured(population), self._whole.perceived(population)
-        self.account.open(parts, index)
+        self.agent_returns.open(parts, index)
         return seen
 
     @torch.no_grad()
@@ -264,20 +264,20 @@ class SpeciesWorlds(WorldState):
         if self._side_stream is not None:
             self._side_stream.mark()
         live = to_device_async(acted, self.device)
-        rewards = self.account.pay(self.measured(stepped=True), live, left & live)
-        numbers = self.account.step_numbers()
+        rewards = self.agent_returns.step_rewards(self.measured(stepped=True), live, left & live)
+        numbers = self.agent_returns.step_numbers()
         observation = self.perceived(stepped=True)
         # The device goes on while the host learns who left.
         if self._side_stream is not None:
             self._side_stream.wait()
-        fled = self._host_left.numpy() & acted
-        if self.config.on_divergence == "raise" and fled.any():
-            raise DivergedError(self._report(fled))
-        endings = self._endings(fled)
+        escaped = self._host_left.numpy() & acted
+        if self.config.on_divergence == "raise" and escaped.any():
+            raise DivergedError(self._report(escaped))
+        endings = self._endings(escaped)
         late = self.open & (self.elapsed >= self.config.max_cycles)
         self.live &= endings == 0
         if endings.any():
-            observation = self._taken_out(endings, observation)
+            observation = self._without_ended(endings, observation)
         self.live[late] = False
         self._close_deserted()
         return AgentOutcome(observation, rewards, numbers, acted, endings, late)
@@ -322,7 +322,7 @@ class SpeciesWorlds(WorldState):
         return self._carry_over()
 
     def _carry_over(self) -> Tensor:
-        self.account.carry_over(self.measured())
+        self.agent_returns.carry_over(self.measured())
         seen: Tensor = self.perceived()
         return seen
 
@@ -368,10 +368,10 @@ class SpeciesWorlds(WorldState):
                 endings[world, staying[world]] = ALONE
         return endings
 
-    def _report(self, fled: NDArray[np.bool_]) -> str:
+    def _report(self, escaped: NDArray[np.bool_]) -> str:
         """Return an error's message about agents that are out of bounds, shape [B, A]."""
         limits, word = self.physics.limits, "particle" if self.by_particle else "species"
-        places = np.argwhere(fled)
+        places = np.argwhere(escaped)
         names = [f"{word}_{agent} of world {world}" for world, agent in places[:LARGEST_REPORT]]
         more = f" and {len(places) - len(names)} more" if len(places) > len(names) else ""
         return (
@@ -381,7 +381,7 @@ class SpeciesWorlds(WorldState):
             "limits, or choose on_divergence='terminate'"
         )
 
-    def _taken_out(self, endings: NDArray[np.uint8], observation: Tensor) -> Tensor:
+    def _without_ended(self, endings: NDArray[np.uint8], observation: Tensor) -> Tensor:
         """Take out particles of agents that ended; return what is perceived without them."""
         self._close_deserted()
         self._disband()
@@ -468,7 +468,7 @@ class Cohort:
         self.gone = torch.zeros(len(worlds), self._agent_count, dtype=torch.bool, device=device)
         """Which agents have no particle within bounds after the last step, shape [M, A]."""
         self._owners = to_device_async(owner[columns], device)
-        self._surveyed: NeighbourState | None = None
+        self._neighbours: NeighbourState | None = None
         self._actions = Actions(
             x,
             s,
@@ -478,18 +478,18 @@ class Cohort:
             diverged=torch.zeros(len(worlds), dtype=torch.uint8, device=device),
         )
         self._draw = GraphedCallable(self._actions.draw, device)
-        self._look = GraphedCallable(self._look_around, device)
+        self._evaluate_graph = GraphedCallable(self._evaluate, device)
 
     def __getstate__(self) -> dict[str, Any]:
         """Leave out what only the next perception needs, and which cannot be pickled."""
-        return self.__dict__ | {"_surveyed": None}
+        return self.__dict__ | {"_neighbours": None}
 
     def act(self, action: Tensor) -> None:
         """Apply finite actions, shape [M, N now, A], and see what came of them without waiting."""
         action = self._task.played(action, self.population, self.random)
         self._draw()
         self._actions.apply(action)
-        self._look()
+        self._evaluate_graph()
 
     def measured(self, population: Population | None = None) -> dict[str, Tensor]:
         """Return the parts of every agent's loss, float32, shape [M, A]; 0 of those that are gone.
@@ -512,13 +512,13 @@ class Cohort:
         after the last step are not sorted again.
         """
         x, s, counts, _ = population or self.population
-        surveyed = self._surveyed if stepped else None
-        seen = (surveyed or build_neighbours(x, s, self._physics)).perceive()
+        neighbours = self._neighbours if stepped else None
+        seen = (neighbours or build_neighbours(x, s, self._physics)).perceive()
         if self._task.config.perception == "per_species":
             seen = torch.cat((seen, perceive_each_species(x, counts, self._physics)), dim=-1)
         return seen
 
-    def _look_around(self) -> None:
+    def _evaluate(self) -> None:
         x, s, physics = self.population.x, self.population.s, self._physics
         inside = (s.abs() < physics.limits.state).all(dim=-1)
         # In a box nobody gets to the bound but by wrapping onto an edge that may lie there.
@@ -528,7 +528,7 @@ class Cohort:
         count = torch.zeros(len(inside), self._agent_count, device=inside.device)
         self.gone = count.index_add_(1, self._owners, inside.float()) == 0.0
         self.parts = self.measured()
-        self._surveyed = build_neighbours(x, s, physics)
+        self._neighbours = build_neighbours(x, s, physics)
 
 
 def population_of(x: Tensor, s: Tensor, kind: NDArray[np.int64], species_count: int) -> Population:
