@@ -1,4 +1,4 @@
-"""`npa/Morphogenesis3D-v0`: a ball of blank particles grows into a thing seen from all sides."""
+"""`npa/Morphogenesis3D-v0`: a ball of blank particles grows into a 3D object."""
 
 from __future__ import annotations
 
@@ -23,15 +23,15 @@ from npa_envs.render import turntable_frames
 from npa_envs.tasks.morphogenesis3d import Morphogenesis3D, Morphogenesis3DConfig
 
 PIXEL_BYTES = 200
-"""About what comparing one pixel of a view needs [bytes]."""
+"""Memory for comparing one pixel of a view, about [bytes]."""
 
 PARTICLE_BYTES = 700
-"""About what one particle in one view needs [bytes]."""
+"""Memory for drawing one particle in one view, about [bytes]."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Morphogenesis3DEnvConfig(EnvConfig):
-    """Adds the target, the seed and the views of `Morphogenesis3DConfig`, which explains most."""
+    """Adds target, seed and views of `Morphogenesis3DConfig`, which documents most fields."""
 
     task_config_type = Morphogenesis3DConfig
 
@@ -44,11 +44,11 @@ class Morphogenesis3DEnvConfig(EnvConfig):
     seed_radius: float = 0.6
 
     readout: str = ""
-    """Rule whose read-out says how particles look: a shipped one's name or a file; empty: the last
-    three channels are the colour, and particles are round."""
+    """Name or file of the rule whose read-out gives the particles' shapes and colours; empty: the
+    last three channels are the colour, and particles are round."""
 
     view_count: int = 6
-    """Views from all sides that the loss compares, at most."""
+    """Largest number of views from all sides that the loss compares."""
 
     opacity: float = 0.5
     """Opacity of a particle, in (0, 1); with a read-out, its opacity where the read-out is 0."""
@@ -67,7 +67,7 @@ class Morphogenesis3DEnvConfig(EnvConfig):
 
     @property
     def goal(self) -> Morphogenesis3DConfig:
-        """Configuration of the task itself; the views compared are held out."""
+        """Configuration of the training task; the compared views are the held-out ones."""
         return self.task_config(
             Morphogenesis3DConfig,
             training_views=1,
@@ -77,7 +77,7 @@ class Morphogenesis3DEnvConfig(EnvConfig):
 
 
 class SolidTask(TargetEnvTask[Morphogenesis3DEnvConfig]):
-    """A thing to grow, compared view by view as `npa_envs.tasks.morphogenesis3d` does."""
+    """An object to grow, compared view by view by `npa_envs.tasks.morphogenesis3d`."""
 
     config_type = Morphogenesis3DEnvConfig
     goal: Morphogenesis3D

@@ -155,6 +155,7 @@ def test_a_step_after_divergence_rewards_particles_by_their_losses_and_the_world
     assert before["diverged"]
     _, reward, _, _, after = env.step(-0.1 * wild)
     parts = [sum(v for k, v in info.items() if k.startswith("loss_")) for info in (before, after)]
+    assert before["loss"] > parts[0]
     assert reward == pytest.approx(before["loss"] - after["loss"], abs=1e-6)
     assert after["particle_reward"].mean() == pytest.approx(parts[0] - parts[1], abs=1e-5)
 
