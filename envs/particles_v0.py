@@ -47,11 +47,11 @@ class ParticlesEnv(CrowdEnv):
 
     ## Observation space
 
-    `Box(-64, 64, (P,), float32)` with P = 4C + 2: one row of what a species would observe.
+    `Box(-64, 64, (P,), float32)` with P = 4C + 2: a particle's row of its species' observation.
 
     ## Action space
 
-    `Box(-1, 1, (A,), float32)` with A = 2 + C: one row of what a species would do.
+    `Box(-1, 1, (A,), float32)` with A = 2 + C: a particle's row of its species' action.
 
     ## Reward
 

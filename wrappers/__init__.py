@@ -1,8 +1,7 @@
-"""Wrappers, and adapters to the libraries that train on environments, as `npa_envs.wrappers`.
+"""Gymnasium wrappers, and adapters to training libraries, imported as `npa_envs.wrappers`.
 
-Holds Gymnasium wrappers, and adapters to Stable-Baselines3, TorchRL, RSL-RL and RLlib. They use the
-public API only. Names are imported when they are first used, so that none of these libraries is
-needed for the others.
+The adapters are for Stable-Baselines3, TorchRL, RSL-RL, RLlib and Minari. Names are imported at
+their first use, so that none of these libraries is needed for the others.
 """
 
 import pkgutil
@@ -39,7 +38,7 @@ __all__ = [
     "VectorNormalizePerception",
     "VectorSpeciesTags",
 ]
-# A star imports all of them, and must need none of the libraries that are optional.
+# Not in `__all__`, as a star import must not need optional libraries.
 ON_REQUEST = {
     "NPATorchRLEnv": "torchrl",
     "NumericInfos": "numeric_infos",

@@ -63,7 +63,7 @@ class SegregationTask(MixingTask):
 def local_entropy(population: Population, *, eps: float, box: float | None) -> Tensor:
     """Return the entropy of species around each particle, in [0, 1], shape [B, N].
 
-    The fraction of species k around a particle is f_k = b_k / Σ b, where b are the SPH-smoothed tags
+    The fraction of species k around a particle is f_k = b_k / Σ b, where b are SPH-smoothed tags
     (1 for a particle of species k, else 0). The entropy is −Σ f_k ln f_k / ln K: 0 with one species
     in the neighbourhood, 1 with equal parts of all K.
     """
