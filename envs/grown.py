@@ -59,8 +59,8 @@ class GrownConfig(Morphogenesis2DEnvConfig):
         check_positive(self, int, "seed_pool", at_least=0, at_most=FIRST_TEST_SEED)
         if self.split == "test" and self.seed_pool == 0:
             raise NPAError(
-                "split must be 'train' where seed_pool=0 grows each episode's world anew: evaluate "
-                "with other seeds of reset, or give seed_pool=4"
+                "split must be 'train' where seed_pool=0 grows a new world for each episode: "
+                "evaluate with other seeds of reset, or give seed_pool=4"
             )
 
 

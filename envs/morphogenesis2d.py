@@ -91,7 +91,7 @@ class Morphogenesis2DEnv(NPAEnv):
 
     ## Description
 
-    A world holds N particles in the plane. Each has a position and a state of C numbers. The last
+    A world has N particles in the plane. Each has a position and a state of C numbers. The last
     three numbers, plus 0.5, are its colour: red, green and blue. In every step the policy moves
     each particle and changes its state. An episode begins with a small disk of grey particles. At
     its end they should look like the target picture.

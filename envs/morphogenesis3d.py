@@ -93,7 +93,7 @@ class SolidTask(TargetEnvTask[Morphogenesis3DEnvConfig]):
 
     @classmethod
     def extra_bytes(cls, config: Any, world_count: int) -> int:
-        """Return about how much memory pool and views need [bytes]."""
+        """Return an estimate of the memory of pool and views [bytes]."""
         view = PIXEL_BYTES * config.resolution**2 + PARTICLE_BYTES * config.particle_count
         copies = 2 if config.per_particle_reward else 1
         views = copies * world_count * config.view_count * view
@@ -104,14 +104,14 @@ class SolidTask(TargetEnvTask[Morphogenesis3DEnvConfig]):
         return {"views": self.goal.metric(x, s)}
 
     def draw(self, x: Tensor, s: Tensor, steps: NDArray[np.int64]) -> NDArray[np.uint8]:
-        """Return a picture of each world; with a read-out, of the Gaussians that it says."""
+        """Return a picture of each world; with a read-out, of its Gaussians."""
         if self._rule is None or self.config.render_style != "particles":
             return super().draw(x, s, steps)
         frames = []
         for k, step in enumerate(steps):
-            seen = partial(self.goal.views, x[k : k + 1], s[k : k + 1])
+            views = partial(self.goal.views, x[k : k + 1], s[k : k + 1])
             frames += turntable_frames(
-                seen,
+                views,
                 frame_count=1,
                 resolution=self.config.render_size,
                 azimuth=TURN * float(step),
@@ -121,26 +121,26 @@ class SolidTask(TargetEnvTask[Morphogenesis3DEnvConfig]):
 
 
 class Morphogenesis3DEnv(NPAEnv):
-    """Grow a thing that is seen from all sides from a ball of blank particles.
+    """Grow a 3D object from a ball of blank particles.
 
     ## Description
 
-    A world holds N particles in open 3D space. Each has a position and a state of C numbers. The
+    A world has N particles in open 3D space. Each has a position and a state of C numbers. The
     last three numbers, plus 0.5, are its colour. An episode begins with grey particles all over a
     ball. At its end they should look like the target: a mushroom, a duck, a rocket, a doughnut, any
     mesh, or a scene given by pictures. Particles are drawn as 3D Gaussians.
 
-    No particle sees the whole or knows where it is. As in `npa/Morphogenesis2D-v0` it perceives its
-    neighbourhood within the radius ε. The usual policy is one small network that is applied to
+    As in `npa/Morphogenesis2D-v0` a particle perceives its neighbourhood within the radius ε, and
+    not its position. The usual policy is one small network that is applied to
     every row of the observation. Rules are trained by gradient with `npa-envs train
     morphogenesis3d`; `npa_envs.agents.RulePolicy(npa_envs.load_rule("rule.safetensors"), env)`
-    makes a policy of one. Such a rule also has a network that reads from the states how particles
-    look, so give it as `readout` too. Shipped rules need the worlds that they were trained in:
-    `particle_count=16384`, `state_dim=24`, `eps` and `eps0` 0.1, `alpha=1.0`, `seed_radius` 0.7
+    makes a policy of one. Such a rule also has a network that maps states to the particles' shapes
+    and colours, so give it as `readout` too. Shipped rules need the worlds that they were trained
+    in: `particle_count=16384`, `state_dim=24`, `eps` and `eps0` 0.1, `alpha=1.0`, `seed_radius` 0.7
     (the mushroom's 0.5), `sigma=0.02`, `opacity=0.15`. The duck needs `particle_count=8192`,
     `eps` and `eps0` 0.126, `sigma=0.014`, `opacity=0.6`, and views of `resolution=192`: its finer
     particles are worse than those of the rule `duck-v0` in views of 48 pixels. `duck-v0` needs
-    what the others need.
+    the same values as the other rules.
 
     ## Observation space
 
@@ -171,12 +171,11 @@ class Morphogenesis3DEnv(NPAEnv):
 
     ## Reward
 
-    `view_count` cameras, spread over a sphere, see the particles in front of grey. The loss L is
-    the mean absolute difference from what they should see, over red, green, blue and alpha. 0 is
-    the target. Formulas: [3D morphogenesis](../mathematics.md#3d-morphogenesis).
+    The particles are rendered in front of grey by `view_count` cameras, spread over a sphere. The
+    loss L is the mean absolute difference from the target's views, over red, green, blue and alpha.
+    0 is the target. Formulas: [3D morphogenesis](../mathematics.md#3d-morphogenesis).
 
-    A particle's own reward says how much its opacity makes the views better or worse, to first
-    order.
+    A particle's own loss is what its opacity adds to the difference of the views, to first order.
 
     ## Starting state
 
@@ -190,13 +189,13 @@ class Morphogenesis3DEnv(NPAEnv):
 
     | Key | In | Value |
     |---|---|---|
-    | `loss_views` | reset, step | L too, as its one part |
+    | `loss_views` | reset, step | equal to L, its only part |
     | `reward_views` | step | how much it improved in this step |
 
     ## Rendering
 
-    The camera goes round by two degrees a step. With a `readout` the style `"particles"` draws its
-    Gaussians.
+    The camera turns around the world by two degrees a step. With a `readout` the style
+    `"particles"` draws its Gaussians.
 
     ## References
 

@@ -18,7 +18,7 @@ class MultiSpeciesEnv(CrowdEnv):
 
     ## Description
 
-    A world holds particles of K species in the plane, species after species. Each particle has a
+    A world has particles of K species in the plane, sorted by species. Each particle has a
     position and a state of C numbers. The last three numbers, plus 0.5, are its colour. In every
     step each agent moves all of its particles and changes their states.
 
@@ -148,7 +148,7 @@ class MultiSpeciesEnv(CrowdEnv):
 
     ## Arguments
 
-    `task` and `species_count` come first, and all else is given by keyword. This holds for
+    `task` and `species_count` are positional, all others are keywords. This applies to
     `parallel_env`, `env`, `raw_env` and `pettingzoo.make`. An unknown name, or a value out of
     range, raises an `NPAError` that says which values are valid.
 

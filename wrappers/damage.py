@@ -40,7 +40,7 @@ class _DamagesWorlds(WrapperBase):
             several = [events]
         given = list(several)
         if not given:
-            raise NPAError("events must hold at least one event, got none: for example '100:cut'")
+            raise NPAError("events must have at least one event, got none: for example '100:cut'")
         if every is not None and not (is_whole(every) and 1 <= every < 2**63):
             raise NPAError(
                 f"every must be a whole number of at least 1 and below 2^63, got {shown(every)}"

@@ -65,7 +65,7 @@ def record_episodes(
     check_same_step(autoreset_mode(env))
     given = list(seeds)
     if not given:
-        raise NPAError("seeds must hold at least one seed, got none: give seeds=range(8)")
+        raise NPAError("seeds must have at least one seed, got none: give seeds=range(8)")
     for first in range(0, len(given), env.num_envs):
         batch = given[first : first + env.num_envs]
         # Worlds beyond the last seed repeat it, and are dropped.
@@ -77,7 +77,7 @@ def record_episodes(
 def _recorded(env: Any, policy: Callable[[Any], Any], seeds: list[int]) -> list[EpisodeBuffer]:
     """Return the first episode of each world after a reset with its seed."""
     observation, infos = env.reset(seed=seeds)
-    seen, losses = [_host(observation)], [_host(infos["loss"])]
+    observations, losses = [_host(observation)], [_host(infos["loss"])]
     done: list[dict[str, Any]] = []
     lengths = np.zeros(len(seeds), np.int64)
     last: list[Any] = [None] * len(seeds)
@@ -95,15 +95,15 @@ def _recorded(env: Any, policy: Callable[[Any], Any], seeds: list[int]) -> list[
             for k in np.flatnonzero(over).tolist():
                 last[k] = _of_world(final, k)
                 lengths[k] = len(done)
-        seen.append(_host(observation))
+        observations.append(_host(observation))
         losses.append(loss)
     episodes = []
     for k, length in enumerate(map(int, lengths)):
         steps = {name: np.stack([step[name][k] for step in done[:length]]) for name in done[0]}
-        shown_to = [*(_of_world(one, k) for one in seen[:length]), last[k]]
+        of_world = [*(_of_world(one, k) for one in observations[:length]), last[k]]
         infos_of_world = {"loss": np.array([loss[k] for loss in losses[: length + 1]], np.float64)}
         buffer: Any = EpisodeBuffer(
-            seed=seeds[k], observations=_stacked(shown_to), infos=infos_of_world, **steps
+            seed=seeds[k], observations=_stacked(of_world), infos=infos_of_world, **steps
         )
         episodes.append(buffer)
     return episodes
@@ -130,10 +130,11 @@ def _of_world(observation: Any, k: int) -> Any:
     return observation[k]
 
 
-def _stacked(seen: list[Any]) -> Any:
-    if isinstance(seen[0], dict):
-        return {name: _stacked([one[name] for one in seen]) for name in seen[0]}
-    return np.stack(seen)
+def _stacked(observations: list[Any]) -> Any:
+    if isinstance(observations[0], dict):
+        first = observations[0]
+        return {name: _stacked([one[name] for one in observations]) for name in first}
+    return np.stack(observations)
 
 
 def write_dataset(
@@ -239,14 +240,14 @@ def read_pairs(dataset_id: str) -> tuple[Tensor, Tensor]:
             f"there is no dataset {shown(dataset_id)} in {shown(str(get_dataset_path()))}: record "
             "one with npa-envs record, or set MINARI_DATASETS_PATH"
         ) from error
-    seen, done = [], []
+    observations, actions = [], []
     for episode in dataset.iterate_episodes():
         if not isinstance(episode.observations, np.ndarray):
             raise NPAError(
-                f"dataset {shown(dataset_id)} must hold arrays, got observations of "
+                f"dataset {shown(dataset_id)} must have arrays, got observations of "
                 f"{type(episode.observations).__name__}"
             )
         # The last observation of an episode has no action.
-        seen.append(as_tensor(episode.observations[:-1]))
-        done.append(as_tensor(episode.actions))
-    return torch.cat(seen).float(), torch.cat(done).float()
+        observations.append(as_tensor(episode.observations[:-1]))
+        actions.append(as_tensor(episode.actions))
+    return torch.cat(observations).float(), torch.cat(actions).float()

@@ -333,7 +333,7 @@ class WorldVecEnv(_EpisodeRows):
         ]
         if None in spaces:
             raise NPAError(
-                f"env must hold many worlds, got {env}: make it with "
+                f"env must be a vector environment, got {env}: make it with "
                 "gym.make_vec(..., vectorization_mode='vector_entry_point')"
             )
         check_same_step(autoreset_mode(env))
@@ -417,7 +417,7 @@ class SpeciesVecEnv(RowVecEnv):
         for name, policy in self.others.items():
             if not callable(policy):
                 raise NPAError(
-                    f"others must hold functions of observations, got {type(policy).__name__} for "
+                    f"others must be functions of observations, got {type(policy).__name__} for "
                     f"{shown(name)}: RowPolicy(model) makes one of a model"
                 )
             if name not in env.possible_agents:
@@ -454,11 +454,11 @@ class SpeciesVecEnv(RowVecEnv):
         own = np.split(self.taken_actions(), np.cumsum(self._counts)[:-1], axis=1)
         actions: dict[str, Any] = dict(zip(self.rows_of, own, strict=True))
         actions |= {name: policy(self._seen[name]) for name, policy in self.others.items()}
-        seen, rewards, terminations, truncations, infos = self.vector_env.step(actions)
-        self._seen = seen
+        observed, rewards, terminations, truncations, infos = self.vector_env.step(actions)
+        self._seen = observed
         live = {name: as_tensor(infos[name]["live"]) for name in self.rows_of}
-        shown, paid, ended, cut = on_host(
-            torch.where(self._repeated(live)[..., None], self._rows(seen), 0.0),
+        of_rows, of_rewards, ended, cut = on_host(
+            torch.where(self._repeated(live)[..., None], self._rows(observed), 0.0),
             self._repeated(rewards),
             self._repeated(terminations),
             self._repeated(truncations),
@@ -470,13 +470,14 @@ class SpeciesVecEnv(RowVecEnv):
             over |= restarted[:, None]
         rows, final = np.flatnonzero(over), None
         if len(rows):
-            last = {name: infos[name].get("final_obs", seen[name]) for name in self.rows_of}
+            last = {name: infos[name].get("final_obs", observed[name]) for name in self.rows_of}
             final = on_host(self._rows(last))[0].reshape(self.num_envs, -1)[rows]
         cut_off = (cut & ~ended).reshape(-1)[rows].tolist()
         row_infos = self.infos(
             rows, {"TimeLimit.truncated": cut_off, "terminal_observation": final}
         )
-        return shown.reshape(self.num_envs, -1), paid.reshape(-1), over.reshape(-1), row_infos
+        rows_observed = of_rows.reshape(self.num_envs, -1)
+        return rows_observed, of_rewards.reshape(-1), over.reshape(-1), row_infos
 
     def policy(self, model: Any, species: str, *, deterministic: bool = False) -> RowPolicy:
         """Return a model that was trained on these rows as the policy of one species.

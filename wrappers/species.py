@@ -135,10 +135,10 @@ class SpeciesTags(_TagsSpecies, Observations):
     Args:
         env: An environment of this package.
         species_count: Species K.
-        fractions: Share of each species, of any sum; None: equal shares.
+        fractions: Relative size of each species, with any sum; None: equal sizes.
         assignment: "blocks": the first particles are species 0, the next species 1, and so on, in
-            every episode; "random": drawn anew for each episode from the world's own seed, in the
-            same numbers.
+            every episode; "random": drawn for each episode from the world's own seed, with the
+            same sizes.
 
     Raises:
         NPAError: An argument is wrong, or a species would have no particle.

@@ -339,7 +339,7 @@ class TorchNormalizeObservation(VectorObservations):
         self.obs_rms = RunningMoments(*shape)
         """Running mean and variance of each entry."""
         self.update_running_mean = True
-        """Whether the statistics follow what is seen."""
+        """Whether new observations update the statistics."""
 
     def observations(self, observations: Any) -> Any:
         """Return observations normalised, and count them unless frozen."""
@@ -381,7 +381,7 @@ class TorchNormalizeReward(EpisodeWrapper):
         self.accumulated_reward: Tensor | None = None
         """Discounted return of each running episode, float64, shape [B]."""
         self.update_running_mean = True
-        """Whether the statistics follow what is seen."""
+        """Whether new rewards update the statistics."""
         self._same_step = autoreset_mode(env) is AutoresetMode.SAME_STEP
 
     def after_reset(self, observations: Any, infos: dict[str, Any]) -> tuple[Any, dict[str, Any]]:

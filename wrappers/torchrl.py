@@ -60,11 +60,11 @@ class NPATorchRLEnv(EnvBase):  # type: ignore[misc]
         self.particle_count = count
         """Particles N of a world."""
         self._first_seed: int | None = None
-        seen, acted = (
+        observed, acted = (
             _bounded(space, worlds, self.device)
             for space in (env.single_observation_space, env.single_action_space)
         )
-        self.observation_spec = Composite(observation=seen, shape=batch, device=self.device)
+        self.observation_spec = Composite(observation=observed, shape=batch, device=self.device)
         self.action_spec = acted
         self.reward_spec = Unbounded(shape=(*batch, 1), device=self.device)
         flag = Categorical(2, shape=(*batch, 1), dtype=torch.bool, device=self.device)

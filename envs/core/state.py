@@ -43,7 +43,7 @@ def needed_bytes(
 
 
 def free_bytes(device: torch.device) -> int | None:
-    """Return the free memory of a device [bytes], or None if the system does not tell."""
+    """Return the free memory of a device [bytes], or None if it is unknown."""
     if device.type == "cuda":
         free, _ = torch.cuda.mem_get_info(device)
         cached = torch.cuda.memory_reserved(device) - torch.cuda.memory_allocated(device)

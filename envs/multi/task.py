@@ -209,7 +209,7 @@ class SpeciesTask(WorldTask[Any]):
         if config.species_count < self.least_species:
             raise NPAError(
                 f"species_count must be at least {self.least_species} in this task, got "
-                f"{config.species_count}: with one species there is nobody to meet"
+                f"{config.species_count}: one species alone has no task here"
             )
         super().__init__(config, device)
         middle = 0.5 * (config.species_count - 1)

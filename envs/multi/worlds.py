@@ -506,10 +506,10 @@ class Cohort:
         """
         x, s, counts, _ = population or self.population
         neighbours = self._neighbours if stepped else None
-        seen = (neighbours or build_neighbours(x, s, self._physics)).perceive()
+        rows = (neighbours or build_neighbours(x, s, self._physics)).perceive()
         if self._task.config.perception == "per_species":
-            seen = torch.cat((seen, perceive_each_species(x, counts, self._physics)), dim=-1)
-        return seen
+            rows = torch.cat((rows, perceive_each_species(x, counts, self._physics)), dim=-1)
+        return rows
 
     def _evaluate(self) -> None:
         x, s, physics = self.population.x, self.population.s, self._physics

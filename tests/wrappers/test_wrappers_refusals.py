@@ -127,7 +127,7 @@ SB3_REFUSALS = [
     (lambda w: w.ParticleVecEnv(batched(**DISABLED)), SAME_STEP),
     (lambda w: w.SpeciesVecEnv(species(**DISABLED)), SAME_STEP),
     (lambda w: w.ParticleVecEnv(single()), "vector_entry_point"),
-    (lambda w: w.WorldVecEnv(single()), "env must hold many worlds"),
+    (lambda w: w.WorldVecEnv(single()), "env must be a vector environment"),
     (
         lambda w: started(w.WorldVecEnv, batched(2)).step(np.zeros((2, 63, ACTIONS), np.float32)),
         r"got \(2, 63, 18\)",
