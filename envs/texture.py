@@ -9,12 +9,13 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from npa_envs.envs.core.config import Boundary, EnvConfig
+from npa_envs.envs.core.config import EnvConfig
 from npa_envs.envs.core.single import NPAEnv
 from npa_envs.envs.core.task import TargetEnvTask
 from npa_envs.envs.core.vector import vector_class
 from npa_envs.errors import NPAError, shown
 from npa_envs.tasks.texture import Texture, TextureConfig
+from npa_envs.world.actions import Boundary
 
 LOSS_BYTES = 4000
 """About what comparing one pixel of a picture needs [bytes]."""

@@ -165,7 +165,7 @@ class TargetDeficit:
 class RuleDriven:
     """Mixin of tasks whose worlds a rule steps while an agent acts on them."""
 
-    worlds_type = RuleDrivenWorlds
+    worlds_type: ClassVar[type[BatchedWorlds] | None] = RuleDrivenWorlds
 
     context_count: ClassVar[int]
     """Values in an episode's context, M."""
