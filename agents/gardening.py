@@ -32,7 +32,7 @@ class BrushPolicy:
                 f"env must be a garden with actions='grid' or 'free', got "
                 f"{type(self.task).__name__}: make it with gymnasium.make('npa/Gardener2D-v0')"
             )
-        self._seen = inner.form.seen_dim
+        self._seen = inner.form.observation_ndim
         self.config = self.task.config
         self.columns = BrushLayout.of(self.config)
         self.shape = inner.form.rows_shape
@@ -94,7 +94,7 @@ class ScriptedGardener(BrushPolicy):
         if "push" not in self.config.tools:
             raise NPAError(f"env must have brushes that push, got tools={self.config.tools}")
         self._gain = checked_positive("gain", gain)
-        self._lacking = self.task.lacking
+        self._lacking = self.task.deficit
         if self.config.actions == "free":
             fine = replace(self.config, place_count=FREE_PLACES)
             places = grid_places(fine, self.task.device)
@@ -142,7 +142,7 @@ class ScriptedShepherd(BrushPolicy):
                 f"{type(self.task).__name__} with tools={self.config.tools}"
             )
         self._gain = checked_positive("gain", gain)
-        self._places = self.task.lacking.places
+        self._places = self.task.deficit.places
         ring = checked_positive("ring", ring)
         if self.config.actions == "free":
             count = self.config.brush_count

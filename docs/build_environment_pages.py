@@ -37,7 +37,7 @@ from npa_envs.envs.core.base import ParticleSpaces
 from npa_envs.envs.core.config import EnvConfig
 from npa_envs.envs.core.single import NPAEnv
 from npa_envs.envs.core.vector import NPAVectorEnv
-from npa_envs.envs.garden.task import GardenEnv, LivingWorlds
+from npa_envs.envs.garden.task import GardenEnv, RuleDrivenWorlds
 from npa_envs.registration import CODED, ENVIRONMENTS, GARDENS, SIZES, SMALL, Registration
 
 DOCS = Path(__file__).resolve().parent
@@ -83,7 +83,7 @@ def resolved_sections(env_class: type) -> dict[str, str]:
     first = sections(environment_class(FIRST))
     shared = sections(NPAEnv)
     order = [name for name in (first | shared) if name]
-    if env_class.task_type.worlds_type is LivingWorlds:
+    if env_class.task_type.worlds_type is RuleDrivenWorlds:
         # They pay and tell otherwise; all else that they do not say is said of all environments.
         del shared["Reward"], shared["Info"]
         first = {}
@@ -207,7 +207,7 @@ def page(registration: Registration) -> str:
     spaces = {"Observation space": form.observation_space, "Action space": form.action_space}
     letters = {"C": config.state_dim, "D": task.space_dim, "N": count}
     text = resolved_sections(env_class)
-    if task.worlds_type is not LivingWorlds:
+    if task.worlds_type is not RuleDrivenWorlds:
         for heading, space in spaces.items():
             text[heading] = numbered_columns(text[heading], letters, space.shape[1])
     text["Arguments"] += "\n\n" + argument_tables(task.config_type)

@@ -1,4 +1,4 @@
-"""`npa/Gardener2D-v0`: a gardener keeps a living picture whole in bad weather."""
+"""`npa/Gardener2D-v0`: an agent with brushes keeps a picture intact against disturbances."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ from torch import Tensor
 
 from npa_envs.checks import check_fraction, check_non_negative, check_positive
 from npa_envs.envs.core.task import Start
-from npa_envs.envs.core.vector import batched
+from npa_envs.envs.core.vector import vector_class
 from npa_envs.envs.garden.brushes import GardenConfig
-from npa_envs.envs.garden.task import GardenEnv, GardenTask, lost_share, marks_of_whole
+from npa_envs.envs.garden.task import GardenEnv, GardenTask, intact_context, lost_fraction
 from npa_envs.tasks.damage import random_particle
 from npa_envs.world.brushes import push, wipe_state
 from npa_envs.world.randomness import StreamId, WorldRandom
@@ -20,7 +20,7 @@ from npa_envs.world.randomness import StreamId, WorldRandom
 
 @dataclass(frozen=True, kw_only=True)
 class Gardener2DEnvConfig(GardenConfig):
-    """What befalls the picture."""
+    """Adds the disturbances: gusts, which move particles, and blights, which wipe states."""
 
     episode_steps: int = 32
 
@@ -29,20 +29,21 @@ class Gardener2DEnvConfig(GardenConfig):
     [length units]."""
 
     gust_chance: float = 1.0
-    """Probability of a gust in a step: particles around a random one are carried along in a random
+    """Probability of a gust in a step: particles around a random one are moved in a random
     direction (dimensionless)."""
 
     gust_radius: float = 0.4
-    """Radius within which a gust carries particles along, softly [length units]."""
+    """Radius of a gust, whose effect falls to 0 at its edge [length units]."""
 
     gust_length: float = 0.4
-    """How far it carries those in its middle [length units]."""
+    """Displacement at the centre of a gust [length units]."""
 
     blight_chance: float = 0.5
-    """Probability that states around a random particle are wiped in a step (dimensionless)."""
+    """Probability of a blight in a step: states around a random particle become zero
+    (dimensionless)."""
 
     blight_radius: float = 0.3
-    """Radius within which they are wiped [length units]."""
+    """Radius of a blight [length units]."""
 
     def __post_init__(self) -> None:
         """Check every field."""
@@ -55,13 +56,13 @@ class Gardener2DEnvConfig(GardenConfig):
 
 
 class GardenerTask(GardenTask[Gardener2DEnvConfig]):
-    """A picture in bad weather."""
+    """A picture with gusts and blights."""
 
     config_type = Gardener2DEnvConfig
     context_count = 2
 
     def disturb(self, x: Tensor, s: Tensor, random: WorldRandom) -> tuple[Tensor, Tensor]:
-        """Return worlds after a gust and a blight, by draws apart from the rule's."""
+        """Return worlds after a gust and a blight; their random stream is not the rule's."""
         config, draws = self.config, random.substream(StreamId.DAMAGE)
         chance, angle = draws.uniform(2), 2.0 * math.pi * draws.uniform(1)
         centre = random_particle(x, draws)
@@ -69,56 +70,57 @@ class GardenerTask(GardenTask[Gardener2DEnvConfig]):
         move = config.gust_length * happens * torch.cat((angle.cos(), angle.sin()), dim=1)
         box = None if config.periodic_box is None else (config.periodic_box,) * 2
         x = push(x, centre=centre, move=move, radius=config.gust_radius, box=box)
-        # A ball outside of the world wipes nothing.
+        # A negative radius wipes nothing.
         centre = random_particle(x, draws)
         happens = chance[:, 1] < config.blight_chance
         radius = torch.where(happens, config.blight_radius, -1.0)
         return x, wipe_state(x, s, centre=centre, radius=radius, box=box)
 
     def episode_context(self, start: Start, loss: Tensor, random: WorldRandom) -> Tensor:
-        """Return the loss of the whole picture, and how much it rises if all of it turns grey."""
-        return marks_of_whole(self, start, loss)
+        """Return the loss of the intact picture, and its rise if all of it turns grey."""
+        return intact_context(self, start, loss)
 
     def reward(self, x: Tensor, s: Tensor, loss: Tensor, context: Tensor) -> Tensor:
-        """Return how good worlds are: 1 as at their start, 0 as bad as grey, shape [B]."""
-        return (1.0 - lost_share(loss, context)).clamp_min(-1.0)
+        """Return 1 for worlds as at their start, 0 for worlds as bad as grey, shape [B]."""
+        return (1.0 - lost_fraction(loss, context)).clamp_min(-1.0)
 
 
 class Gardener2DEnv(GardenEnv):
-    """Keep a living picture whole in bad weather.
+    """Keep a picture that a rule has grown intact against disturbances.
 
     ## Description
 
-    A trained rule has grown a picture from N particles and goes on running them. Again and again a
-    gust carries some of them away, a blight wipes the states of others, and noise shakes them all.
-    The rule heals a part of it, too slowly. The agent helps from outside, as a gardener does: it
-    has brushes on a grid, which push particles; with other `tools` they wipe or change states or
-    let particles live slower or faster. It sees what lacks at each place of the grid.
+    A trained rule has grown a picture from N particles and keeps stepping them. Gusts move some
+    particles away, blights wipe the states of others, and noise moves all of them. The rule heals
+    a part of this, too slowly. The agent helps from outside, as a gardener: it has brushes on a
+    grid, which push particles; with other `tools` they wipe or change states, or slow down or speed
+    up the rule. It observes the difference to the target at each place of the grid.
 
-    `npa_envs.agents.gardening` has gardeners to compare with: `StillGardener` does nothing,
-    `ScriptedGardener` pushes particles to where the picture lacks some, linearly in what it sees,
-    and `GradientGardener` plans by the gradient of the reward through brushes, rule and picture.
+    `npa_envs.agents.gardening` has policies to compare with: `StillGardener` does nothing,
+    `ScriptedGardener` pushes particles to where the picture has too few, linearly in what it
+    observes, and `GradientGardener` plans by the gradient of the reward through brushes, rule and
+    picture.
 
     ## Reward
 
     Worlds are compared with the target as in `npa/Morphogenesis2D-v0`, by a loss L. The reward is
     1 − (L − L₀) / (L₁ − L₀), and at least -1. L₀ is the loss at the episode's start, of the picture
-    that the rule has grown. L₁ is what it would be if all states were wiped, grey, and at least
-    1.1 L₀. So 1 is a picture as good as the rule's, 0 one as bad as a grey one; a picture nearer to
-    the target than the rule's is worth more than 1.
+    that the rule has grown. L₁ is the loss of the same picture with all states wiped, grey, and at
+    least 1.1 L₀. So 1 is a picture as good as the rule's, and 0 one as bad as a grey one; a picture
+    nearer to the target than the rule's has a reward above 1.
 
     ## Starting state
 
-    The rule has grown a world for `grow_steps` steps from a disk of blank particles; it is whole.
-    With the default `seed_pool=16` there are sixteen grown worlds, made at the first reset, which
-    takes some seconds on a CPU. The weather is drawn anew for each episode.
+    The rule has grown an intact picture in `grow_steps` steps from a disk of blank particles. With
+    the default `seed_pool=16` there are sixteen grown worlds, made at the first reset, which takes
+    some seconds on a CPU. Disturbances differ between episodes.
 
     ## Episode end
 
-    `success_loss` is None by default: a gardener's work has no end.
+    `success_loss` is None by default: the picture has to be kept for the whole episode.
     """
 
     task_type = GardenerTask
 
 
-Gardener2DVectorEnv = batched(Gardener2DEnv)
+Gardener2DVectorEnv = vector_class(Gardener2DEnv)

@@ -1,4 +1,4 @@
-"""Two gardeners with opposed aims, the way PettingZoo has it: `parallel_env`, `env`, `raw_env`.
+"""Two gardeners with opposed aims, as PettingZoo's functions: `parallel_env`, `env`, `raw_env`.
 
 Importing this module registers `npa/Gardeners-v0` with PettingZoo (1.27 or newer).
 """
@@ -25,10 +25,10 @@ AGENTS = ("keeper_0", "raider_0")
 
 
 class _BothHands(BrushSpaces):
-    """Brushes of both gardeners, used at once; what is seen is the same for both."""
+    """Spaces of one gardener, and conversion of both gardeners' actions to rows of brushes."""
 
     def action(self, action: Any, world_count: int | None) -> Tensor:
-        """Return the rows of all brushes, shape [B, 2 K, W], of both gardeners' actions."""
+        """Return the rows of both gardeners' brushes, shape [B, 2 K, W]."""
         both = [super(_BothHands, self).action(action[agent], world_count) for agent in AGENTS]
         return torch.cat(both, dim=1)
 
@@ -42,14 +42,14 @@ class _SharedGarden(Gardener2DEnv):
 
 
 class GardenersEnv(KnownAgents):
-    """Two gardeners at one living picture: the keeper keeps it whole, the raider spoils it.
+    """Two gardeners at one picture: the keeper keeps it intact, the raider spoils it.
 
     ## Description
 
     The world is that of [`npa/Gardener2D-v0`](Gardener2D.md): a trained rule has grown a picture
-    from N particles and goes on running them. There is no weather; the raider is the weather. Both
-    agents have the same brushes and see the same. All brushes are used at once, and what a particle
-    feels of them adds up.
+    from N particles and keeps stepping them. There are no gusts and blights; the raider takes their
+    place. Both agents have the same brushes and the same observation. All brushes act at once, and
+    their effects add up.
 
     In `parallel_env` both act at once. In `env` and `raw_env` they act in turn, by PettingZoo's own
     conversion, and the world moves on after the raider. `env` also clips actions into their space.
@@ -57,7 +57,7 @@ class GardenersEnv(KnownAgents):
     `npa_envs.envs.gardeners_v0` is imported.
 
     `garden` is the world as a Gymnasium environment. Policies of `npa_envs.agents.gardening` take
-    it, and what they do is an action of either agent: `ScriptedGardener(env.garden)`.
+    it, and their actions fit either agent: `ScriptedGardener(env.garden)`.
 
     ## Observation space
 
@@ -66,12 +66,12 @@ class GardenersEnv(KnownAgents):
     ## Action space
 
     As that of `npa/Gardener2D-v0`, for each agent. Every agent has to give an action. One that is
-    missing, of another shape or not finite raises `NPAError` and leaves the world as it was.
+    missing, of another shape or not finite raises `NPAError` and does not change the world.
 
     ## Reward
 
-    The keeper is paid what a gardener is: 1 for a picture as good as at the start, 0 for one as bad
-    as a grey one, and at least −1. The raider is paid minus that, so rewards sum to zero.
+    The keeper gets a gardener's reward: 1 for a picture as good as at the start, 0 for one as bad
+    as a grey one, and at least −1. The raider gets minus that, so rewards sum to zero.
 
     ## Starting state
 
@@ -113,7 +113,7 @@ class GardenersEnv(KnownAgents):
     def __init__(self, max_cycles: int = 32, **config: Any) -> None:
         calm = {"gust_chance": 0.0, "blight_chance": 0.0}
         self.garden = _SharedGarden(**(calm | config))
-        """The world as a Gymnasium environment, whose actions are those of both."""
+        """The world as a Gymnasium environment, whose actions are dicts with both agents'."""
         self.max_cycles = checked_count("max_cycles", max_cycles)
         """Steps of an episode."""
         self._episodes = TimeLimit(self.garden, self.max_cycles)
@@ -126,13 +126,13 @@ class GardenersEnv(KnownAgents):
     def reset(
         self, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, Any], dict[str, dict[str, Any]]]:
-        """Start an episode, as `npa/Gardener2D-v0`; return what both see, and the loss."""
-        seen, info = self._episodes.reset(seed=seed)
+        """Start an episode; return both agents' observations and infos."""
+        observation, info = self._episodes.reset(seed=seed)
         self.agents = list(AGENTS)
-        return _for_both(seen), {agent: dict(info) for agent in AGENTS}
+        return _for_both(observation), {agent: dict(info) for agent in AGENTS}
 
     def step(self, actions: Mapping[str, Any]) -> Outcome:
-        """Use all brushes by the actions of both agents, let the rule run, and judge."""
+        """Apply both agents' actions, and make the rule's steps."""
         if not self.agents and not actions:
             return {}, {}, {}, {}, {}
         if not self.agents or set(actions) != set(self.agents):
@@ -140,19 +140,19 @@ class GardenersEnv(KnownAgents):
                 f"actions must be given for the agents {self.agents}, got some for "
                 f"{shown(list(actions))}: call reset where there are none"
             )
-        seen, earned, ended, late, info = self._episodes.step(actions)
-        if ended or late:
+        observation, reward, terminated, truncated, info = self._episodes.step(actions)
+        if terminated or truncated:
             self.agents = []
         return (
-            _for_both(seen),
-            {"keeper_0": float(earned), "raider_0": -float(earned)},
-            dict.fromkeys(AGENTS, ended),
-            dict.fromkeys(AGENTS, late),
+            _for_both(observation),
+            {"keeper_0": float(reward), "raider_0": -float(reward)},
+            dict.fromkeys(AGENTS, terminated),
+            dict.fromkeys(AGENTS, truncated),
             {agent: dict(info) for agent in AGENTS},
         )
 
     def render(self) -> NDArray[np.uint8] | None:
-        """Return the world's picture, shape [R, R, 3], in the mode "rgb_array"."""
+        """Return the world's picture, shape [R, R, 3], with the render mode "rgb_array"."""
         return self.garden.render()
 
     def close(self) -> None:
@@ -160,9 +160,9 @@ class GardenersEnv(KnownAgents):
         self.garden.close()
 
 
-def _for_both(seen: Any) -> dict[str, Any]:
-    # Each its own: what one agent does to what it sees is nothing to the other.
-    copied = seen.clone if isinstance(seen, Tensor) else seen.copy
+def _for_both(observation: Any) -> dict[str, Any]:
+    # Copies, so that one agent's changes do not reach the other's.
+    copied = observation.clone if isinstance(observation, Tensor) else observation.copy
     return {agent: copied() for agent in AGENTS}
 
 
@@ -177,7 +177,7 @@ def raw_env(max_cycles: int = 32, **config: Any) -> Any:
 
 
 def env(max_cycles: int = 32, **config: Any) -> Any:
-    """Return `raw_env` with actions that are numbers clipped into their spaces."""
+    """Return `raw_env`, with actions clipped into their spaces if these are boxes."""
     both = parallel_env(max_cycles, **config)
     return in_turns(both, clips=isinstance(both.action_space("keeper_0"), Box))
 

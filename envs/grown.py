@@ -1,4 +1,4 @@
-"""Worlds that a trained rule has grown: what healing, gardening and shepherding begin with."""
+"""Worlds that a trained rule has grown, from which other environments start."""
 
 from __future__ import annotations
 
@@ -21,31 +21,31 @@ from npa_envs.world.randomness import StreamId, WorldRandom
 from npa_envs.world.rollout import rollout
 
 FIRST_RULES = {"gecko": "gecko-v0", "heart": "heart-first"}
-"""Rules that grow these targets where no rule is given; other targets are grown by the shipped rule
-of their name. A rule that is trained anew does not replace one of these."""
+"""Default rules for these targets; other targets are grown by the shipped rule of their name.
+Newer shipped rules do not replace these, so that environments stay the same."""
 
 FIRST_TEST_SEED = 1_000_000
-"""Pools have no more worlds than this."""
+"""Seed of the first world of the "test" pool, and the largest size of a pool."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class GrownConfig(Morphogenesis2DEnvConfig):
-    """Adds what grows the worlds, and which there are."""
+    """Adds the rule that grows the worlds, and the pool of grown worlds."""
 
     without_rule: ClassVar[str] = ""
-    """What else than a rule can be given, as the end of an error's message."""
+    """Alternative to a rule, as the end of an error's message."""
 
     seed_pool: int = 4
-    """Episodes start from one of so many grown worlds, each made once; 0: from a new one each time,
-    which takes `grow_steps` steps of the rule."""
+    """Number of grown worlds, each made once, that episodes start from; 0: each start grows a new
+    one in `grow_steps` steps of the rule."""
 
     rule: str | None = None
-    """What grows the worlds: a rule of the package or a rule's file; None: `heart-first` for the
-    target "heart", `gecko-v0` for "gecko", and the shipped rule of its name for another one."""
+    """Name or file of the rule that grows the worlds; None: `heart-first` for the target "heart",
+    `gecko-v0` for "gecko", and the shipped rule of its name for another target."""
 
     split: Split = "train"
-    """Which grown worlds the pool holds: "train", or "test" for others that evaluate what was
-    learned. It needs a `seed_pool`: fresh worlds differ by the seeds of `reset`."""
+    """Which grown worlds are in the pool: "train", or "test" for others, to evaluate. "test" needs
+    a `seed_pool`, as without one worlds differ by the seeds of `reset`."""
 
     grow_steps: int = 256
     """Steps of the rule from the seed to the grown world, of time step 1 and without noise."""
@@ -59,8 +59,8 @@ class GrownConfig(Morphogenesis2DEnvConfig):
         check_positive(self, int, "seed_pool", at_least=0, at_most=FIRST_TEST_SEED)
         if self.split == "test" and self.seed_pool == 0:
             raise NPAError(
-                "split must be 'train' where seed_pool=0 grows each episode's world anew: evaluate "
-                "with other seeds of reset, or give seed_pool=4"
+                "split must be 'train' where seed_pool=0 grows a new world for each episode: "
+                "evaluate with other seeds of reset, or give seed_pool=4"
             )
 
 
@@ -78,7 +78,7 @@ class GrownTask(PictureEnvTask[Config]):
 
     @cached_property
     def rule(self) -> NPARule:
-        """What grows them."""
+        """The rule that grows them."""
         return _load_rule(self.config, self.device)
 
     @property
@@ -88,20 +88,20 @@ class GrownTask(PictureEnvTask[Config]):
 
     @property
     def start_is_short(self) -> bool:
-        """Whether a start takes few operations: not where it grows a world."""
+        """Whether a start takes few operations: not if it grows a world."""
         return self.config.seed_pool > 0
 
-    def pooled(self, numbers: Tensor) -> Start:
+    def pooled(self, indices: Tensor) -> Start:
         """Return worlds of the pool; on a CPU each is grown when an episode first starts from it.
 
-        On CUDA the host would have to wait for the numbers.
+        On CUDA this would synchronise.
         """
         if self.device.type != "cpu":
-            return super().pooled(numbers)
-        wanted = numbers.tolist()
-        for number in set(wanted) - self._grown.keys():
-            self._grown[number] = self.made_for_pool([number])
-        worlds = [self._grown[number] for number in wanted]
+            return super().pooled(indices)
+        wanted = indices.tolist()
+        for index in set(wanted) - self._grown.keys():
+            self._grown[index] = self.made_for_pool([index])
+        worlds = [self._grown[index] for index in wanted]
         return Start(torch.cat([world.x for world in worlds]), torch.cat([w.s for w in worlds]))
 
     def seed(self, random: WorldRandom) -> tuple[Tensor, Tensor]:
@@ -119,9 +119,9 @@ def run_rule(
     random: WorldRandom,
     **changes: Any,
 ) -> tuple[Tensor, Tensor]:
-    """Return worlds after some steps of a rule, with the constants of an environment's worlds.
+    """Return worlds after steps of a rule with an environment's constants.
 
-    Changes are other arguments of `rollout`.
+    `changes` replace arguments of `rollout`.
     """
     names = ("eps", "box", "boundary", "update_prob", "dt", "position_noise")
     constants = {name: getattr(config, name) for name in names} | changes
@@ -134,7 +134,7 @@ def grow(
 ) -> tuple[Tensor, Tensor]:
     """Return worlds after `grow_steps` steps of a rule; arguments are those of `run_rule`.
 
-    Each is grown by itself: a rule's products change in the last bit with the number of worlds.
+    One after the other: a rule's matrix products depend in the last bit on the number of worlds.
     """
     worlds = []
     for k in range(len(x)):
@@ -145,8 +145,8 @@ def grow(
     return grown_x, grown_s
 
 
-def check_living(config: Any) -> None:
-    """Check what configurations of living worlds share."""
+def check_rule_driven(config: Any) -> None:
+    """Check the fields that configurations of rule-driven worlds share."""
     if config.resolution % config.picture_size:
         raise NPAError(
             f"picture_size must divide resolution = {config.resolution}, got "
@@ -157,18 +157,18 @@ def check_living(config: Any) -> None:
 
 
 def check_runs(rule: NPARule, **wanted: Any) -> None:
-    """Check that constants of worlds are those of the rule that runs them."""
+    """Check that the worlds' constants are those of the rule that steps them."""
     for name, given in wanted.items():
-        own = getattr(rule, name)
-        if own != given:
+        value = getattr(rule, name)
+        if value != given:
             raise NPAError(
-                f"{name} must be the rule's, {own!r}, got {given!r}: give {name}={own!r}, or "
+                f"{name} must be the rule's, {value!r}, got {given!r}: give {name}={value!r}, or "
                 "another rule"
             )
 
 
 def load_read_out(field: str, name: str, state_dim: int, device: torch.device) -> NPARule:
-    """Return the rule that a field of a configuration names, whose read-out reads the states."""
+    """Return the rule with a read-out that a field of a configuration names, checked."""
     rule = load_rule(name, device=device).float().requires_grad_(False)
     if rule.readout is None or rule.state_dim != state_dim:
         raise NPAError(
@@ -180,7 +180,7 @@ def load_read_out(field: str, name: str, state_dim: int, device: torch.device) -
 
 
 def growing_rule(config: GrownConfig) -> str:
-    """Return the name or the file of the rule that grows the worlds of a configuration."""
+    """Return the name or file of the rule that grows a configuration's worlds."""
     return config.rule or FIRST_RULES.get(config.target, config.target)
 
 

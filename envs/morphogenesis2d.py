@@ -13,14 +13,14 @@ from npa_envs.checks import check_positive
 from npa_envs.envs.core.config import EnvConfig
 from npa_envs.envs.core.single import NPAEnv
 from npa_envs.envs.core.task import TargetEnvTask
-from npa_envs.envs.core.vector import batched
+from npa_envs.envs.core.vector import vector_class
 from npa_envs.tasks.morphogenesis2d import Morphogenesis2D, Morphogenesis2DConfig
 from npa_envs.tasks.targets.images import LARGEST_POINT_COUNT
 
 
 @dataclass(frozen=True, kw_only=True)
 class PictureConfig(EnvConfig):
-    """Adds the seed and the loss of `Morphogenesis2DConfig`, which explains them."""
+    """Adds the seed and the loss of `Morphogenesis2DConfig`, which documents the fields."""
 
     task_config_type = Morphogenesis2DConfig
 
@@ -32,14 +32,14 @@ class PictureConfig(EnvConfig):
     def __post_init__(self) -> None:
         """Check every field."""
         super().__post_init__()
-        # By its own name: the target has as many points.
+        # The target has as many points as particles.
         check_positive(self, int, "particle_count", at_most=LARGEST_POINT_COUNT)
         _ = self.goal
         self.check_start_radius(self.seed_radius)
 
     @property
     def goal(self) -> Morphogenesis2DConfig:
-        """Configuration of the task itself."""
+        """Configuration of the training task."""
         return self.task_config(Morphogenesis2DConfig, target_point_count=self.particle_count)
 
 
@@ -59,7 +59,7 @@ class PictureEnvTask(TargetEnvTask[Config]):
     config_type: ClassVar[type[PictureConfig]] = Morphogenesis2DEnvConfig
     goal: Morphogenesis2D
     goal_type: ClassVar[type[Morphogenesis2D]] = Morphogenesis2D
-    """The task as training sees it."""
+    """Class of the training task."""
 
     def __init__(self, config: Config, device: torch.device) -> None:
         super().__init__(config, device)
@@ -70,7 +70,7 @@ class PictureEnvTask(TargetEnvTask[Config]):
 
     @classmethod
     def extra_bytes(cls, config: Any, world_count: int) -> int:
-        """Return about how much memory pool and pictures need [bytes]."""
+        """Return an estimate of the memory of pool and pictures [bytes]."""
         copies = 4 if config.per_particle_reward else 1
         pictures = 16 * copies * world_count * config.resolution**2
         return super().extra_bytes(config, world_count) + int(pictures)
@@ -82,7 +82,7 @@ class PictureEnvTask(TargetEnvTask[Config]):
 
     @property
     def pixel_size(self) -> float:
-        """Size of a particle in pictures: the distance of the target's points."""
+        """Size of a particle in pictures: the spacing of the target's points."""
         return self.goal.target.pixel_size
 
 
@@ -91,15 +91,15 @@ class Morphogenesis2DEnv(NPAEnv):
 
     ## Description
 
-    A world holds N particles in the plane. Each has a position and a state of C numbers. The last
-    three numbers, plus 0.5, are its colour: red, green and blue. In every step the policy tells
-    each particle where to move and how to change its state. An episode begins with a small disk of
-    grey particles. At its end they should look like the target picture.
+    A world has N particles in the plane. Each has a position and a state of C numbers. The last
+    three numbers, plus 0.5, are its colour: red, green and blue. In every step the policy moves
+    each particle and changes its state. An episode begins with a small disk of grey particles. At
+    its end they should look like the target picture.
 
-    No particle sees the whole. A row of the observation holds what one particle perceives within
-    the radius ε around it, as averages that smoothed particle hydrodynamics (SPH) defines. It does
-    not tell where the particle is, which one it is, or how many steps have passed. So a policy is
-    usually one small network that is applied to every row.
+    A row of the observation is what one particle perceives within the radius ε around it, as
+    averages that smoothed particle hydrodynamics (SPH) defines. It does not depend on where the
+    particle is, which one it is, or how many steps have passed. So a policy is usually one small
+    network that is applied to every row.
 
     The task can be solved: update rules trained by gradient do it, and some are shipped.
     `npa_envs.agents.RulePolicy(npa_envs.load_rule("gecko"), env)` makes a policy of one. The task
@@ -133,18 +133,18 @@ class Morphogenesis2DEnv(NPAEnv):
 
     In every step each particle is updated with probability `update_prob`, independently of the
     others. The rows of particles that are not updated are ignored in this step. A displacement
-    longer than 1 is shortened to length 1, and state entries are clipped to [-1, 1]. A number that
-    is not finite raises `NPAError` and leaves the world as it was. An update rule's output [δ; Δs]
+    longer than 1 is shortened to length 1, and state entries are clipped to [-1, 1]. An action that
+    is not finite raises `NPAError` and does not change the world. An update rule's output [δ; Δs]
     is the action [δ / (1 + |δ|); Δs / `state_scale`]; see [one step](../mathematics.md#one-step). A
     policy that explores does better with `state_scale=0.1`: see [training](../training.md).
 
     ## Reward
 
     The particles' picture is compared with the target's on `resolution` × `resolution` pixels. The
-    loss L is the sum of a density error (is there something where there should be?) and
+    loss L is the sum of a density error (are there particles where there should be?) and
     `colour_weight` times a colour error; 0 is a perfect picture. The picture's middle is moved onto
-    the target's first, so where the whole thing lies does not count. Formula:
-    [pictures](../mathematics.md#pictures). A particle's own reward comes from the errors of the
+    the target's first, so its position does not count. Formula:
+    [pictures](../mathematics.md#pictures). A particle's own loss comes from the errors of the
     pixels that it covers.
 
     ## Starting state
@@ -166,4 +166,4 @@ class Morphogenesis2DEnv(NPAEnv):
     task_type = PictureEnvTask
 
 
-Morphogenesis2DVectorEnv = batched(Morphogenesis2DEnv)
+Morphogenesis2DVectorEnv = vector_class(Morphogenesis2DEnv)

@@ -1,4 +1,4 @@
-"""`npa/Morphogenesis3D-v0`: a ball of blank particles grows into a thing seen from all sides."""
+"""`npa/Morphogenesis3D-v0`: a ball of blank particles grows into a 3D object."""
 
 from __future__ import annotations
 
@@ -16,22 +16,22 @@ from npa_envs.checks import check_positive
 from npa_envs.envs.core.config import EnvConfig
 from npa_envs.envs.core.single import NPAEnv
 from npa_envs.envs.core.task import TURN, TargetEnvTask
-from npa_envs.envs.core.vector import batched
+from npa_envs.envs.core.vector import vector_class
 from npa_envs.envs.grown import load_read_out
 from npa_envs.errors import NPAError, shown
 from npa_envs.render import turntable_frames
 from npa_envs.tasks.morphogenesis3d import Morphogenesis3D, Morphogenesis3DConfig
 
 PIXEL_BYTES = 200
-"""About what comparing one pixel of a view needs [bytes]."""
+"""Memory for comparing one pixel of a view, about [bytes]."""
 
-SEEN_BYTES = 700
-"""About what one particle in one view needs [bytes]."""
+PARTICLE_BYTES = 700
+"""Memory for drawing one particle in one view, about [bytes]."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Morphogenesis3DEnvConfig(EnvConfig):
-    """Adds the target, the seed and the views of `Morphogenesis3DConfig`, which explains most."""
+    """Adds target, seed and views of `Morphogenesis3DConfig`, which documents most fields."""
 
     task_config_type = Morphogenesis3DConfig
 
@@ -44,11 +44,11 @@ class Morphogenesis3DEnvConfig(EnvConfig):
     seed_radius: float = 0.6
 
     readout: str = ""
-    """Rule whose read-out says how particles look: a shipped one's name or a file; empty: the last
-    three channels are the colour, and particles are round."""
+    """Name or file of the rule whose read-out gives the particles' shapes and colours; empty: the
+    last three channels are the colour, and particles are round."""
 
     view_count: int = 6
-    """Views from all sides that the loss compares, at most."""
+    """Largest number of views from all sides that the loss compares."""
 
     opacity: float = 0.5
     """Opacity of a particle, in (0, 1); with a read-out, its opacity where the read-out is 0."""
@@ -67,7 +67,7 @@ class Morphogenesis3DEnvConfig(EnvConfig):
 
     @property
     def goal(self) -> Morphogenesis3DConfig:
-        """Configuration of the task itself; the views compared are held out."""
+        """Configuration of the training task; the compared views are the held-out ones."""
         return self.task_config(
             Morphogenesis3DConfig,
             training_views=1,
@@ -77,7 +77,7 @@ class Morphogenesis3DEnvConfig(EnvConfig):
 
 
 class SolidTask(TargetEnvTask[Morphogenesis3DEnvConfig]):
-    """A thing to grow, compared view by view as `npa_envs.tasks.morphogenesis3d` does."""
+    """An object to grow, compared view by view by `npa_envs.tasks.morphogenesis3d`."""
 
     config_type = Morphogenesis3DEnvConfig
     goal: Morphogenesis3D
@@ -93,8 +93,8 @@ class SolidTask(TargetEnvTask[Morphogenesis3DEnvConfig]):
 
     @classmethod
     def extra_bytes(cls, config: Any, world_count: int) -> int:
-        """Return about how much memory pool and views need [bytes]."""
-        view = PIXEL_BYTES * config.resolution**2 + SEEN_BYTES * config.particle_count
+        """Return an estimate of the memory of pool and views [bytes]."""
+        view = PIXEL_BYTES * config.resolution**2 + PARTICLE_BYTES * config.particle_count
         copies = 2 if config.per_particle_reward else 1
         views = copies * world_count * config.view_count * view
         return super().extra_bytes(config, world_count) + int(views)
@@ -104,14 +104,14 @@ class SolidTask(TargetEnvTask[Morphogenesis3DEnvConfig]):
         return {"views": self.goal.metric(x, s)}
 
     def draw(self, x: Tensor, s: Tensor, steps: NDArray[np.int64]) -> NDArray[np.uint8]:
-        """Return a picture of each world; with a read-out, of the Gaussians that it says."""
+        """Return a picture of each world; with a read-out, of its Gaussians."""
         if self._rule is None or self.config.render_style != "particles":
             return super().draw(x, s, steps)
         frames = []
         for k, step in enumerate(steps):
-            seen = partial(self.goal.views, x[k : k + 1], s[k : k + 1])
+            views = partial(self.goal.views, x[k : k + 1], s[k : k + 1])
             frames += turntable_frames(
-                seen,
+                views,
                 frame_count=1,
                 resolution=self.config.render_size,
                 azimuth=TURN * float(step),
@@ -121,26 +121,26 @@ class SolidTask(TargetEnvTask[Morphogenesis3DEnvConfig]):
 
 
 class Morphogenesis3DEnv(NPAEnv):
-    """Grow a thing that is seen from all sides from a ball of blank particles.
+    """Grow a 3D object from a ball of blank particles.
 
     ## Description
 
-    A world holds N particles in open 3D space. Each has a position and a state of C numbers. The
+    A world has N particles in open 3D space. Each has a position and a state of C numbers. The
     last three numbers, plus 0.5, are its colour. An episode begins with grey particles all over a
     ball. At its end they should look like the target: a mushroom, a duck, a rocket, a doughnut, any
     mesh, or a scene given by pictures. Particles are drawn as 3D Gaussians.
 
-    No particle sees the whole or knows where it is. As in `npa/Morphogenesis2D-v0` it perceives its
-    neighbourhood within the radius ε. The usual policy is one small network that is applied to
+    As in `npa/Morphogenesis2D-v0` a particle perceives its neighbourhood within the radius ε, and
+    not its position. The usual policy is one small network that is applied to
     every row of the observation. Rules are trained by gradient with `npa-envs train
     morphogenesis3d`; `npa_envs.agents.RulePolicy(npa_envs.load_rule("rule.safetensors"), env)`
-    makes a policy of one. Such a rule also has a network that reads from the states how particles
-    look, so give it as `readout` too. Shipped rules need the worlds that they were trained in:
-    `particle_count=16384`, `state_dim=24`, `eps` and `eps0` 0.1, `alpha=1.0`, `seed_radius` 0.7
+    makes a policy of one. Such a rule also has a network that maps states to the particles' shapes
+    and colours, so give it as `readout` too. Shipped rules need the worlds that they were trained
+    in: `particle_count=16384`, `state_dim=24`, `eps` and `eps0` 0.1, `alpha=1.0`, `seed_radius` 0.7
     (the mushroom's 0.5), `sigma=0.02`, `opacity=0.15`. The duck needs `particle_count=8192`,
     `eps` and `eps0` 0.126, `sigma=0.014`, `opacity=0.6`, and views of `resolution=192`: its finer
     particles are worse than those of the rule `duck-v0` in views of 48 pixels. `duck-v0` needs
-    what the others need.
+    the same values as the other rules.
 
     ## Observation space
 
@@ -171,12 +171,11 @@ class Morphogenesis3DEnv(NPAEnv):
 
     ## Reward
 
-    `view_count` cameras, spread over a sphere, see the particles in front of grey. The loss L is
-    the mean absolute difference from what they should see, over red, green, blue and alpha. 0 is
-    the target. Formulas: [3D morphogenesis](../mathematics.md#3d-morphogenesis).
+    The particles are rendered in front of grey by `view_count` cameras, spread over a sphere. The
+    loss L is the mean absolute difference from the target's views, over red, green, blue and alpha.
+    0 is the target. Formulas: [3D morphogenesis](../mathematics.md#3d-morphogenesis).
 
-    A particle's own reward says how much its opacity makes the views better or worse, to first
-    order.
+    A particle's own loss is what its opacity adds to the difference of the views, to first order.
 
     ## Starting state
 
@@ -190,13 +189,13 @@ class Morphogenesis3DEnv(NPAEnv):
 
     | Key | In | Value |
     |---|---|---|
-    | `loss_views` | reset, step | L too, as its one part |
+    | `loss_views` | reset, step | equal to L, its only part |
     | `reward_views` | step | how much it improved in this step |
 
     ## Rendering
 
-    The camera goes round by two degrees a step. With a `readout` the style `"particles"` draws its
-    Gaussians.
+    The camera turns around the world by two degrees a step. With a `readout` the style
+    `"particles"` draws its Gaussians.
 
     ## References
 
@@ -206,4 +205,4 @@ class Morphogenesis3DEnv(NPAEnv):
     task_type = SolidTask
 
 
-Morphogenesis3DVectorEnv = batched(Morphogenesis3DEnv)
+Morphogenesis3DVectorEnv = vector_class(Morphogenesis3DEnv)

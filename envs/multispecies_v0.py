@@ -1,4 +1,4 @@
-"""Species as agents, the way PettingZoo has it: `parallel_env`, `env` and `raw_env`; and `batched`.
+"""Species as agents, as PettingZoo's functions (`parallel_env`, `env`, `raw_env`) and `batched`.
 
 Importing this module registers `npa/Mixing-v0` and its like with PettingZoo (1.27 or newer).
 """
@@ -18,25 +18,25 @@ class MultiSpeciesEnv(CrowdEnv):
 
     ## Description
 
-    A world holds particles of K species in the plane, species after species. Each particle has a
+    A world has particles of K species in the plane, sorted by species. Each particle has a
     position and a state of C numbers. The last three numbers, plus 0.5, are its colour. In every
-    step each agent tells all of its particles where to move and how to change their states.
+    step each agent moves all of its particles and changes their states.
 
-    As in the paper, particles perceive each other whatever their species. Species influence each
-    other only by what others perceive of them, and are recognised only by their particles' states.
+    As in the paper, particles perceive particles of all species alike. Species influence each
+    other only by perception, and can be told apart only by their particles' states.
 
     | `task` | Id | What it is about |
     |---|---|---|
-    | `"mixing"` | `npa/Mixing-v0` | species that start side by side are to mix |
-    | `"segregation"` | `npa/Segregation-v0` | species that start all mixed are to part |
-    | `"co_morphogenesis"` | `npa/CoMorphogenesis-v0` | each grows a picture of its own |
-    | `"invasion"` | `npa/Invasion-v0` | species 0 grows a picture, the others keep it from it |
-    | `"symbiosis"` | `npa/Symbiosis-v0` | all grow one picture that takes all particles |
+    | `"mixing"` | `npa/Mixing-v0` | species that start side by side have to mix |
+    | `"segregation"` | `npa/Segregation-v0` | species that start mixed have to separate |
+    | `"co_morphogenesis"` | `npa/CoMorphogenesis-v0` | each species grows its own picture |
+    | `"invasion"` | `npa/Invasion-v0` | species 0 grows a picture, the others disturb it |
+    | `"symbiosis"` | `npa/Symbiosis-v0` | all species grow one picture together |
 
     `npa/MixingSmall-v0` and the like have 64 particles and episodes of 32 steps;
     `npa/InvasionSmall-v0` has 64 particles of species 0 and 32 invaders that the environment plays.
     `npa/MixingLarge-v0` and the like have 4096 particles and episodes of 256 steps, for a GPU.
-    `npa_envs.registration.SPECIES_SIZES` holds their keywords. All functions take ids for tasks.
+    `npa_envs.registration.SPECIES_SIZES` has their keywords. All functions take ids for tasks.
 
     With `opponent="random"` the environment plays the invaders, by actions uniform in [-1, 1], and
     `species_0` is the only agent. The invaders are perceived and drawn, and are in `state()`.
@@ -57,8 +57,7 @@ class MultiSpeciesEnv(CrowdEnv):
 
     `Box(-64, 64, (N_k, P), float32)` with P = 4C + 2, for species k: a row for each of its
     particles, always in the same order. The columns are those of
-    [`npa/Morphogenesis2D-v0`](Morphogenesis2D.md#observation-space). Nothing tells a particle's
-    species.
+    [`npa/Morphogenesis2D-v0`](Morphogenesis2D.md#observation-space). They do not include species.
 
     With `perception="per_species"` K (1 + D) more columns follow: the density c² ρ_k / N of each
     species k = 0, 1, ..., and then, species after species, its density gradient, scaled like that
@@ -70,7 +69,7 @@ class MultiSpeciesEnv(CrowdEnv):
     `Box(-1, 1, (N_k, A), float32)` with A = 2 + C, for species k. The columns, and what they do,
     are those of [`npa/Morphogenesis2D-v0`](Morphogenesis2D.md#action-space). Every live agent has
     to give an action, and no other agent may: see `agents`. An action that is missing, superfluous,
-    of another shape or not finite raises `NPAError` and leaves the world as it was.
+    of another shape or not finite raises `NPAError` and does not change the world.
 
     ## Reward
 
@@ -78,17 +77,17 @@ class MultiSpeciesEnv(CrowdEnv):
 
     | Task | L_k | Parts |
     |---|---|---|
-    | mixing | 1 less the mean entropy around its particles | `separation` |
+    | mixing | 1 minus the mean entropy around its particles | `separation` |
     | segregation | the mean entropy around its particles | `mixture` |
     | co_morphogenesis | its particles' splat loss against `targets[k]` | `density`, `colour` |
     | invasion | L_0: the splat loss of species 0; L_k: -L_0 / (K - 1) | `density`, `colour` |
     | symbiosis | for all: the splat loss of all particles | `density`, `colour` |
 
-    The entropy around a particle is -Σ f_k ln f_k / ln K, where f_k is the share of species k among
-    the SPH-weighted neighbours within ε, itself included. It is 0 if the particle sees only its own
-    species, and 1 if it sees all species in equal parts. K is the number of species at the start.
-    The splat loss is that of [`npa/Morphogenesis2D-v0`](Morphogenesis2D.md#reward). It moves a
-    picture's middle onto the target's, so it does not count where the picture lies.
+    The entropy around a particle is -Σ f_k ln f_k / ln K, where f_k is the fraction of species k
+    among the SPH-weighted neighbours within ε, itself included. It is 0 with one species within ε,
+    and 1 with equal parts of all. K is the number of species at the start. The splat loss is that
+    of [`npa/Morphogenesis2D-v0`](Morphogenesis2D.md#reward). It moves a picture's middle onto the
+    target's, so the picture's position does not count.
 
     There is one reward for each species. Rewards of single particles (`reward="particle"` and
     `"marginal"`), and `tell_updated`, are for environments of one species, and are refused.
@@ -99,8 +98,8 @@ class MultiSpeciesEnv(CrowdEnv):
 
     Rewards telescope, except at deaths: taking particles out changes the losses of others, and this
     change is not rewarded. In the step in which a species leaves the world, L_k counts as at least
-    its value at the start plus what deaths added to it. So leaving never pays. The parts in `info`
-    are not changed by this.
+    its value at the start plus what deaths added to it, so that leaving is never rewarded. The
+    parts in `info` are not changed by this.
 
     ## Starting state
 
@@ -117,11 +116,11 @@ class MultiSpeciesEnv(CrowdEnv):
     | one side of an invasion is gone | all | terminated | `"no opponent"` |
     | `max_cycles` steps are done | all | truncated | `"time limit"` |
 
-    A particle is out of bounds if a coordinate is held at ±`position_limit` or a state at
+    A particle is out of bounds if a coordinate is clipped to ±`position_limit` or a state to
     ±`observation_limit`. As long as others of its species are within bounds, it stays and may come
-    back. A species that ends is taken out of `agents` and, except for the survivors of an invasion,
-    out of the world. The observations that the others get in that step no longer show it; its own
-    last observation still does. No species comes back before `reset`.
+    back. A species that ends is removed from `agents` and, except for the survivors of an invasion,
+    from the world. The others' observations of that step no longer include it; its own last
+    observation still does. No species comes back before `reset`.
 
     ## Info
 
@@ -130,7 +129,7 @@ class MultiSpeciesEnv(CrowdEnv):
     | Key | In | Value |
     |---|---|---|
     | `species` | reset, step | the agent's species, from 0 on |
-    | `loss` | reset, step | L_k as it is now |
+    | `loss` | reset, step | the current loss L_k |
     | `loss_separation`, ... | reset, step | its parts, by their names above |
     | `reward_separation`, ... | step | how much each part fell in this step |
     | `reason` | last step | why the agent's episode ended, see above |
@@ -149,9 +148,9 @@ class MultiSpeciesEnv(CrowdEnv):
 
     ## Arguments
 
-    `task` and `species_count` come first, and all else is given by keyword. This holds for
+    `task` and `species_count` are positional, all others are keywords. This applies to
     `parallel_env`, `env`, `raw_env` and `pettingzoo.make`. An unknown name, or a value out of
-    range, raises an `NPAError` that says what would be right.
+    range, raises an `NPAError` that says which values are valid.
 
     ## Version history
 
@@ -224,12 +223,12 @@ def env(task: str = "mixing", species_count: int | None = None, **config: Any) -
 
 
 def settings(task: str, species_count: int | None, config: dict[str, Any]) -> dict[str, Any]:
-    """Return all keywords of an environment; those that are given go before those of an id.
+    """Return all keywords of an environment; given ones replace those of an id.
 
     Args:
         task: A task's name, or an id.
-        species_count: Species K, or None for those of the id, which are 2 unless it says more.
-        config: What else is given.
+        species_count: Species K; None: those of the id, by default 2.
+        config: The other given keywords.
     """
     name, keywords = task_settings(task)
     if species_count is not None:

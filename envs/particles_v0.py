@@ -1,4 +1,4 @@
-"""Particles as agents, the way PettingZoo has it: `parallel_env`, `env` and `raw_env`.
+"""Particles as agents, as PettingZoo's functions: `parallel_env`, `env` and `raw_env`.
 
 Importing this module registers `npa/MixingParticles-v0` and its like with PettingZoo (1.27 or
 newer).
@@ -18,10 +18,10 @@ ENVIRONMENTS = {name.replace("-v0", "Particles-v0"): task for name, task in OF_S
 """Tasks by the ids that `pettingzoo.make` takes."""
 
 PARTICLE_COUNT = 64
-"""Particles by default."""
+"""Default number of particles."""
 
 LARGEST_CROWD = 512
-"""No more agents than this: each costs a place in five dicts a step."""
+"""Largest number of agents: each has an entry in five dicts a step."""
 
 
 class ParticlesEnv(CrowdEnv):
@@ -31,8 +31,8 @@ class ParticlesEnv(CrowdEnv):
 
     These are the worlds and tasks of [several species](MultiSpecies.md), with the same seeds and
     the same physics. But every particle is an agent: `particle_0`, `particle_1`, ... in the order
-    of their species. `info["species"]` tells its species. Each agent needs places in five dicts a
-    step, so there are at most 512. For more particles, let species be the agents.
+    of their species. `info["species"]` is a particle's species. Each agent has an entry in five
+    dicts a step, so there are at most 512. For more particles, let species be the agents.
 
     | `task` | Id |
     |---|---|
@@ -47,19 +47,19 @@ class ParticlesEnv(CrowdEnv):
 
     ## Observation space
 
-    `Box(-64, 64, (P,), float32)` with P = 4C + 2: one row of what a species would observe.
+    `Box(-64, 64, (P,), float32)` with P = 4C + 2: a particle's row of its species' observation.
 
     ## Action space
 
-    `Box(-1, 1, (A,), float32)` with A = 2 + C: one row of what a species would do.
+    `Box(-1, 1, (A,), float32)` with A = 2 + C: a particle's row of its species' action.
 
     ## Reward
 
-    Each particle has a loss of its own, and its reward is how much it fell in the step.
+    Each particle has its own loss, and its reward is the fall of this loss in the step.
 
     | Task | Loss of a particle | Part |
     |---|---|---|
-    | mixing | 1 less the entropy around it | `separation` |
+    | mixing | 1 minus the entropy around it | `separation` |
     | segregation | the entropy around it | `mixture` |
     | co_morphogenesis | its share of its species' splat loss | `picture` |
     | invasion | species 0: its share of the splat loss; others: -Σ / their number | `picture` |
@@ -73,16 +73,16 @@ class ParticlesEnv(CrowdEnv):
     ## Episode end
 
     As for [several species](MultiSpecies.md#episode-end), particle by particle: one that is out of
-    bounds leaves the world alone, and all those of a species that `deaths` names end together.
+    bounds leaves the world by itself; all those of a species that `deaths` names end together.
 
     ## Info
 
     | Key | In | Value |
     |---|---|---|
     | `species` | reset, step | the particle's species, from 0 on |
-    | `loss` | reset, step | its loss as it is now |
+    | `loss` | reset, step | its current loss |
     | `loss_separation`, ... | reset, step | the same by the name of its part, see above |
-    | `reward_separation`, ... | step | how much that fell in this step |
+    | `reward_separation`, ... | step | how much it fell in this step |
     | `reason` | last step | why the particle's episode ended |
 
     ## Arguments
@@ -119,7 +119,7 @@ def parallel_env(task: str = "mixing", species_count: int = 2, **config: Any) ->
 
     Args:
         task: "mixing", "segregation", "co_morphogenesis", "invasion" or "symbiosis".
-        species_count: Species K; `info["species"]` tells each particle's.
+        species_count: Species K; `info["species"]` is each particle's.
         config: Fields of the task's configuration; `particle_count` is 64 unless given, and 512 at
             most.
 

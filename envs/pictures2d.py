@@ -1,4 +1,4 @@
-"""`npa/Pictures2D-v0`: each episode asks for one of several pictures."""
+"""`npa/Pictures2D-v0`: each episode has one of several target pictures."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from npa_envs.envs.core.config import EnvConfig
 from npa_envs.envs.core.single import NPAEnv
 from npa_envs.envs.core.state import OBSERVATION_COPIES
 from npa_envs.envs.core.task import Start
-from npa_envs.envs.core.vector import batched
+from npa_envs.envs.core.vector import vector_class
 from npa_envs.envs.morphogenesis2d import PictureConfig, PictureEnvTask
 from npa_envs.errors import NPAError, shown
 from npa_envs.tasks.many_pictures import ManyPictures, named_targets
@@ -23,12 +23,12 @@ from npa_envs.tasks.targets.clouds import Split
 from npa_envs.world.randomness import WorldRandom
 
 CHANNELS = 4
-"""Red, green and blue of a pixel, and how many particles lie there."""
+"""Channels of a pixel: red, green, blue and density."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Pictures2DEnvConfig(PictureConfig):
-    """Adds the pictures, and whether observations show them."""
+    """Adds the targets, and whether observations show them."""
 
     words = EnvConfig.words | {"split": get_args(Split)}
 
@@ -39,13 +39,13 @@ class Pictures2DEnvConfig(PictureConfig):
     """Pictures of the split "test", not among `targets`."""
 
     split: Split = "train"
-    """Which pictures episodes ask for: "train", or "test" to evaluate with others."""
+    """Which pictures are targets: "train", or "test" to evaluate with others."""
 
     observe_target: bool = False
-    """Each row of the observation ends with a small picture of the target."""
+    """Whether each row of the observation ends with a small picture of the target."""
 
     picture_size: int = 4
-    """Pixels on each side of the picture that is seen; it divides `resolution`."""
+    """Pixels on each side of the observed picture; a divisor of `resolution`."""
 
     def __post_init__(self) -> None:
         """Check every field."""
@@ -62,7 +62,7 @@ class Pictures2DEnvConfig(PictureConfig):
                 "targets and test_targets must name a picture each, got "
                 f"{shown(self.targets)} and {shown(self.test_targets)}: for example ('heart',)"
             )
-        # Checks names, also of the split that is not asked for.
+        # Checks the names of both splits.
         _ = self._goal_of(self.targets), self._goal_of(self.test_targets)
         both = named_targets(self.targets).keys() & named_targets(self.test_targets).keys()
         if both:
@@ -73,12 +73,12 @@ class Pictures2DEnvConfig(PictureConfig):
 
     @property
     def goal(self) -> Morphogenesis2DConfig:
-        """Configuration of the task itself."""
+        """Configuration of the training task."""
         return self._goal_of(self.targets if self.split == "train" else self.test_targets)
 
     @property
     def target_dim(self) -> int:
-        """Numbers that a row tells of the target, T; 0: none."""
+        """Columns of the target after those of perception in an observation's row, T."""
         return CHANNELS * self.picture_size**2 if self.observe_target else 0
 
     def _goal_of(self, targets: tuple[str, ...]) -> Morphogenesis2DConfig:
@@ -87,7 +87,7 @@ class Pictures2DEnvConfig(PictureConfig):
 
 
 class PicturesTask(PictureEnvTask[Pictures2DEnvConfig]):
-    """Several pictures to grow, one asked for in each world."""
+    """Several pictures to grow, one target in each world."""
 
     config_type = Pictures2DEnvConfig
     goal: ManyPictures
@@ -96,7 +96,7 @@ class PicturesTask(PictureEnvTask[Pictures2DEnvConfig]):
     def __init__(self, config: Pictures2DEnvConfig, device: torch.device) -> None:
         super().__init__(config, device)
         self.names = self.goal.names
-        """Names of the pictures of the split, by their numbers."""
+        """Names of the pictures of the split, by their indices."""
         everyone = torch.arange(len(self.names), device=device)
         pictures = self.goal.toward(everyone).target_picture.permute(0, 3, 1, 2)
         small = F.avg_pool2d(pictures, config.resolution // config.picture_size)
@@ -107,52 +107,52 @@ class PicturesTask(PictureEnvTask[Pictures2DEnvConfig]):
 
     @classmethod
     def extra_bytes(cls, config: Any, world_count: int) -> int:
-        """Return about how much memory pool, pictures and what rows tell of them need [bytes]."""
+        """Return an estimate of the memory of pool, pictures and columns of targets [bytes]."""
         numbers = OBSERVATION_COPIES * world_count * config.particle_count * config.target_dim
         return super().extra_bytes(config, world_count) + int(4 * numbers)
 
     def fresh(self, random: WorldRandom) -> Start:
-        """Return worlds as training begins with them, and the numbers of their pictures."""
+        """Return the training task's initial worlds, and the indices of their pictures."""
         x, s, number = self.goal.seed(random.world_count, generator=random, device=self.device)
-        # No rule of codes acts on these worlds.
+        # Drops the channels of codes, which only rules of many pictures use.
         return Start(x, s[..., -self.config.state_dim :].contiguous(), goal=number)
 
     def toward(self, goal: Tensor) -> Self:
-        """Return the task with losses for worlds of these pictures."""
-        aimed = super().toward(goal)
-        aimed._number = goal
-        return aimed
+        """Return a task whose losses are for worlds of these pictures."""
+        goal_task = super().toward(goal)
+        goal_task._number = goal
+        return goal_task
 
     def extra_info(self, s: Tensor) -> dict[str, Tensor]:
-        """Return the number of each world's picture, int64, shape [B]."""
+        """Return the index of each world's picture, int64, shape [B]."""
         return {"target": self._number.clone()}
 
 
 class Pictures2DEnv(NPAEnv):
-    """Grow the picture that is asked for from a disk of blank particles.
+    """Grow the episode's target picture from a disk of blank particles.
 
     ## Description
 
-    As in `npa/Morphogenesis2D-v0` a disk of grey particles is to become a picture, but each episode
-    draws which one. With `observe_target=True` every particle is told: its row of the observation
-    ends with a small picture of the target. Without, nothing in the observation tells the pictures
-    apart; `info["target"]` does.
+    As in `npa/Morphogenesis2D-v0` a disk of grey particles has to become a picture, but each
+    episode draws its target. With `observe_target=True` each row of the observation ends with a
+    small picture of the target. Without it the observation does not depend on the target;
+    `info["target"]` has its index.
 
-    Learn with the pictures of the split "train", and evaluate with those of `split="test"`, which
-    are others. A policy that observes targets can try new ones; another can only find what serves
-    all of them.
+    Learn with the pictures of the split "train", and evaluate with the other pictures of
+    `split="test"`. A policy that observes targets can be tried on new ones; any other policy can
+    only find a compromise between them.
 
     Particles of all pictures are drawn equally large, and pictures are scaled so that each one's
     density is about 1. Action space and reward are those of `Morphogenesis2DEnv`.
 
     ## Observation space
 
-    With `observe_target=True` T = 4 G² columns more tell of the target, the same in all rows: means
-    over squares of pixels, G × G of red, then of green, of blue, and of density, rows from the
-    bottom up (dimensionless); G is `picture_size`. Policies of `npa_envs.agents` leave them out,
-    and `npa_envs.agents.learning.Problem` refuses `observe_target`, as rules read no target: so
-    none of its methods takes these columns. Learners that read whole observations do, such as
-    Stable-Baselines3's through [`ParticleVecEnv`](../integrations.md).
+    With `observe_target=True` there are T = 4 G² more columns, the target's small picture, equal in
+    all rows: means over squares of pixels, G × G of red, then of green, of blue, and of density,
+    rows from the bottom up (dimensionless); G is `picture_size`. Rules do not use these columns:
+    policies of `npa_envs.agents` drop them, and `npa_envs.agents.learning.Problem` refuses
+    `observe_target`. Learners that use whole observations use them, such as Stable-Baselines3's
+    through [`ParticleVecEnv`](../integrations.md).
 
     ## Starting state
 
@@ -170,10 +170,10 @@ class Pictures2DEnv(NPAEnv):
     |---|---|---|
     | `loss_density`, `loss_colour` | reset, step | the parts of the loss |
     | `reward_density`, `reward_colour` | step | how much each part improved in this step |
-    | `target` | reset, step | number of the picture; `env.unwrapped.task.names` has its name |
+    | `target` | reset, step | index of the picture; `env.unwrapped.task.names` has its name |
     """
 
     task_type = PicturesTask
 
 
-Pictures2DVectorEnv = batched(Pictures2DEnv)
+Pictures2DVectorEnv = vector_class(Pictures2DEnv)

@@ -1,4 +1,4 @@
-"""`npa/PointClassification-v0`: particles that stay where they are agree on what they form."""
+"""`npa/PointClassification-v0`: particles that do not move agree on the digit that they form."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from npa_envs.checks import check_positive
 from npa_envs.envs.core.config import EnvConfig
 from npa_envs.envs.core.single import NPAEnv
 from npa_envs.envs.core.task import Start, TargetEnvTask
-from npa_envs.envs.core.vector import batched
+from npa_envs.envs.core.vector import vector_class
 from npa_envs.envs.grown import load_read_out
 from npa_envs.errors import NPAError, shown
 from npa_envs.rule.rule import COLOUR_OFFSET, NPARule
@@ -34,7 +34,7 @@ Score = Literal["error", "cross_entropy", "accuracy"]
 
 @dataclass(frozen=True, kw_only=True)
 class PointClassificationEnvConfig(EnvConfig):
-    """Adds the clouds and the loss of `PointClassificationConfig`, which explains them."""
+    """Adds the clouds and the loss of `PointClassificationConfig`, which documents the fields."""
 
     task_config_type = PointClassificationConfig
 
@@ -50,19 +50,19 @@ class PointClassificationEnvConfig(EnvConfig):
     overflow_weight: float = PointClassificationConfig.overflow_weight
 
     split: Split = "train"
-    """Which pictures: "train" or "test", which are never varied."""
+    """Split of the data: "train", or "test", whose clouds are not augmented."""
 
     score: Score = "error"
-    """What the loss is, overflow aside: "error", the mean squared error of what particles say;
-    "cross_entropy" of the probabilities softmax(`sharpness` × what they say); or "accuracy", the
-    share of particles that say another class most loudly."""
+    """First part of the loss: "error", the mean squared error of particles' outputs;
+    "cross_entropy" of softmax(`sharpness` × outputs); or "accuracy", the fraction of particles
+    whose largest output is of another class."""
 
     sharpness: float = 4.0
-    """How surely outputs are taken as probabilities, where score is "cross_entropy"."""
+    """Factor of outputs in the softmax of "cross_entropy" (dimensionless)."""
 
     rule: str = ""
-    """File of the rule whose read-out tells classes from states; empty: the last channels are the
-    classes."""
+    """File of the rule whose read-out maps states to outputs; empty: the last channels are the
+    outputs."""
 
     def __post_init__(self) -> None:
         """Check every field."""
@@ -82,19 +82,19 @@ class PointClassificationEnvConfig(EnvConfig):
 
     @property
     def goal(self) -> PointClassificationConfig:
-        """Configuration of the task itself."""
+        """Configuration of the training task."""
         return self.task_config(PointClassificationConfig)
 
 
 class _WorldByWorld(NPARule):
-    """A rule whose read-out rounds alike in every batch."""
+    """A rule whose read-out does not depend on the batch in its last bits."""
 
     def read_out(self, states: Tensor) -> Tensor:
         return torch.stack([super(_WorldByWorld, self).read_out(world) for world in states])
 
 
 class PointClassificationTask(TargetEnvTask[PointClassificationEnvConfig]):
-    """Clouds of digits, and the error of what their particles say of them."""
+    """Clouds of digits, and the error of their particles' outputs."""
 
     config_type = PointClassificationEnvConfig
     goal: PointClassification
@@ -116,7 +116,7 @@ class PointClassificationTask(TargetEnvTask[PointClassificationEnvConfig]):
         return Start(x, s, goal=label)
 
     def losses(self, x: Tensor, s: Tensor) -> Mapping[str, Tensor]:
-        """Return each world's loss of what it says of its class, and its weighted overflow."""
+        """Return each world's loss of its outputs, and its weighted overflow."""
         score = self.config.score
         overflow = self.config.overflow_weight * self.goal.overflow(s)
         if score == "error":
@@ -128,11 +128,11 @@ class PointClassificationTask(TargetEnvTask[PointClassificationEnvConfig]):
         return self._scores(s) + self.config.overflow_weight * self.goal.overflows(s)
 
     def particle_gains(self, before: tuple[Tensor, Tensor], after: tuple[Tensor, Tensor]) -> Tensor:
-        """Return how much each particle's own loss fell: nobody else's action changes it."""
+        """Return the fall of each particle's loss, which no other particle's action changes."""
         return self.particle_losses(*before) - self.particle_losses(*after)
 
     def accuracy(self, s: Tensor) -> Tensor:
-        """Return the share of each world's particles that say its class most loudly, [B]."""
+        """Return the fraction of particles whose largest output is of the world's class, [B]."""
         return 1.0 - world_mean(self.goal.mistakes(s)[..., None])[:, 0]
 
     def extra_info(self, s: Tensor) -> dict[str, Tensor]:
@@ -140,13 +140,13 @@ class PointClassificationTask(TargetEnvTask[PointClassificationEnvConfig]):
         return {"label": self.goal.goal.clone(), "accuracy": self.accuracy(s)}
 
     def _scores(self, s: Tensor) -> Tensor:
-        """Return the loss of what each particle says, [B, N]."""
+        """Return the loss of each particle's outputs, [B, N]."""
         if self.config.score == "cross_entropy":
             return self.goal.cross_entropies(s, self.config.sharpness)
         return self.goal.mistakes(s) if self.config.score == "accuracy" else self.goal.errors(s)
 
     def draw(self, x: Tensor, s: Tensor, steps: NDArray[np.int64]) -> NDArray[np.uint8]:
-        """Return pictures of the unit square, with a margin, in colours of what particles say."""
+        """Return pictures of the unit square with a margin, in the colours of predicted classes."""
         colours = class_colours(self.goal.outputs(s)) - COLOUR_OFFSET
         return super().draw(
             MAGNIFICATION * (x - 0.5), torch.cat((s[..., :-3], colours), dim=-1), steps
@@ -159,7 +159,7 @@ class PointClassificationTask(TargetEnvTask[PointClassificationEnvConfig]):
 
 
 MAGNIFICATION = 2.0 / (1.0 + 2.0 * PICTURE_MARGIN)
-"""Of pictures, which span two length units."""
+"""Scale of pictures, which span two length units."""
 
 
 class PointClassificationEnv(NPAEnv):
@@ -167,16 +167,15 @@ class PointClassificationEnv(NPAEnv):
 
     ## Description
 
-    A world holds N particles that lie evenly spread on the ink of a digit and stay where they are.
-    Each has a state of C numbers, zero at first. Step by step the particles have to find out which
-    digit they form, and each of them has to say it. The last `class_count` channels of a state are
-    the particle's answer for class 0, 1, ...: they should be 1 for the digit's own class and 0 for
-    all others.
+    A world has N particles, spread evenly over the ink of a digit, which never move. Each has a
+    state of C numbers, zero at first. The particles have to find out which digit they form, and
+    each of them has to output it. The last `class_count` channels of a state are the particle's
+    outputs for class 0, 1, ...: they should be 1 for the digit's own class and 0 for all others.
 
-    No particle sees more than its neighbourhood within the radius ε, and the digit is ten times as
-    large. So news has to travel. As in `npa/Morphogenesis2D-v0` the usual policy is one small
+    A particle perceives its neighbourhood within the radius ε, and the digit is ten times as large,
+    so information has to travel. As in `npa/Morphogenesis2D-v0` the usual policy is one small
     network that is applied to every row of the observation. Rules are trained by gradient with
-    `npa-envs train point_classification`. They give their answers through a read-out network. So to
+    `npa-envs train point_classification`. Their outputs come from a read-out network. So to
     run one as a policy, give its file to the environment as well: `gym.make(id,
     rule="rule.safetensors")` with
     `npa_envs.agents.RulePolicy(npa_envs.load_rule("rule.safetensors"), env)`. The task is that of
@@ -199,18 +198,18 @@ class PointClassificationEnv(NPAEnv):
 
     ## Reward
 
-    The loss L is the mean squared difference of what all particles say and what they should say,
-    plus `overflow_weight` times the mean of |s − clip(s, −1, 1)|. Blank states have
+    The loss L is the mean squared difference of all particles' outputs and the right ones, plus
+    `overflow_weight` times the mean of |s − clip(s, −1, 1)|. Blank states have
     L = 1 / `class_count`. With `score="cross_entropy"` or `"accuracy"` the first part is the mean
-    cross-entropy of softmax(`sharpness` × what particles say), or the share of particles that say
-    another class most loudly; ties go to the first class.
+    cross-entropy of softmax(`sharpness` × outputs), or the fraction of particles whose largest
+    output is of another class; ties go to the first class.
 
-    A particle's own reward is how much its own loss fell.
+    A particle's reward is the fall of its own loss.
 
     ## Starting state
 
-    A random cloud of the `split`, which is turned, stretched and shaken as `rotation`, `stretch`
-    and `jitter` say. All states are zero. After `place_particles` a world keeps its class.
+    A random cloud of the `split`, rotated, stretched and jittered by `rotation`, `stretch` and
+    `jitter`. All states are zero. After `place_particles` a world keeps its class.
 
     ## Episode end
 
@@ -223,17 +222,17 @@ class PointClassificationEnv(NPAEnv):
     | `loss_error`, `loss_overflow` | reset, step | the parts of the loss |
     | `reward_error`, `reward_overflow` | step | how much each part improved in this step |
     | `label` | reset, step | the digit's class, a whole number |
-    | `accuracy` | reset, step | the share of particles that say it most loudly |
+    | `accuracy` | reset, step | fraction of particles whose largest output is of this class |
 
-    With another `score` than "error" the first part is called so.
+    With another `score` than "error" the first part has its name.
 
     ## Rendering
 
-    A particle has the colour of the class that it says, and is greyer the less sure it is. The
-    picture shows [0, 1] × [0, 1] with a little room around it, instead of the square named below.
+    A particle has the colour of its predicted class, greyer for less certain outputs. The picture
+    shows [0, 1] × [0, 1] with a margin, instead of the square named below.
     """
 
     task_type = PointClassificationTask
 
 
-PointClassificationVectorEnv = batched(PointClassificationEnv)
+PointClassificationVectorEnv = vector_class(PointClassificationEnv)

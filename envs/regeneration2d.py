@@ -1,4 +1,4 @@
-"""`npa/Regeneration2D-v0`: a grown picture is damaged, and is to heal."""
+"""`npa/Regeneration2D-v0`: a grown picture is damaged and has to heal."""
 
 from __future__ import annotations
 
@@ -8,10 +8,10 @@ import torch
 from torch import Tensor
 
 from npa_envs.checks import check_flag, check_fraction, check_positive
-from npa_envs.envs.core.referee import total
+from npa_envs.envs.core.rewards import total
 from npa_envs.envs.core.single import NPAEnv
 from npa_envs.envs.core.task import Start
-from npa_envs.envs.core.vector import batched
+from npa_envs.envs.core.vector import vector_class
 from npa_envs.envs.grown import GrownConfig, GrownTask
 from npa_envs.envs.morphogenesis2d import PictureEnvTask
 from npa_envs.errors import NPAError, shown, suggest
@@ -20,19 +20,19 @@ from npa_envs.tasks.damage import damage_worlds
 from npa_envs.world.randomness import StreamId, WorldRandom
 
 RANDOM_DAMAGE = "random"
-"""Each episode draws its kind of damage."""
+"""Value of `damage` with which each episode draws its kind."""
 
 RANDOM_KINDS = ("wipe", "cut", "clump")
-"""Kinds that it draws from."""
+"""Kinds that "random" draws from."""
 
 SIZES = {"wipe": 0.3, "cut": 0.1, "clump": 0.2, "noise": 0.05}
-"""Radius, width, radius and standard deviation where no size is given [length units]."""
+"""Default radius, width, radius and standard deviation [length units]."""
 
 LEAST_RISE = 0.02
-"""Damage that raises the loss by a smaller share than this cannot be healed: no success."""
+"""Damage that raises the loss by a smaller fraction than this has no success threshold."""
 
 PICTURE = "picture"
-"""Worlds start as the target's own points."""
+"""Value of `rule` with which worlds start as the target's own points."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -45,8 +45,7 @@ class Regeneration2DEnvConfig(GrownConfig):
     """As elsewhere; it equals the registered `max_episode_steps`."""
 
     damage: str = RANDOM_DAMAGE
-    """What is done to the worlds: "wipe", "cut", "clump", "noise", or "random" for one of the
-    first three."""
+    """Kind of damage: "wipe", "cut", "clump", "noise", or "random" for one of the first three."""
 
     damage_size: float | None = None
     """Radius of the wiped or clumped disk, width of the cut, or standard deviation of the noise
@@ -58,16 +57,14 @@ class Regeneration2DEnvConfig(GrownConfig):
     "picture" starts from the target's own points instead, with blank hidden states."""
 
     seed_pool: int = 256
-    """As elsewhere: episodes start from one of so many grown worlds, each made once; 0: from a new
-    one each time."""
+    """Number of grown worlds, each made once, that episodes start from; 0: each grows a new one."""
 
     split_damage: bool = True
-    """Damage of split="test" is drawn apart from that of "train", also where `reset` is given the
-    same seeds."""
+    """Whether split="test" draws other damage than "train", also with the same seeds of `reset`."""
 
     healed_share: float = 0.8
-    """The episode ends in success once this share of what the damage added to the loss is gone,
-    unless `success_loss` is given (dimensionless, in (0, 1])."""
+    """Fraction of the damage's addition to the loss that must be gone for success, unless
+    `success_loss` is given (dimensionless, in (0, 1])."""
 
     def __post_init__(self) -> None:
         """Check every field."""
@@ -83,7 +80,7 @@ class Regeneration2DEnvConfig(GrownConfig):
 
 
 class RegenerationTask(GrownTask[Regeneration2DEnvConfig]):
-    """A grown picture, damaged."""
+    """A grown picture with damage."""
 
     config_type = Regeneration2DEnvConfig
 
@@ -94,16 +91,16 @@ class RegenerationTask(GrownTask[Regeneration2DEnvConfig]):
             _ = self.rule
 
     def seed(self, random: WorldRandom) -> tuple[Tensor, Tensor]:
-        """Return grown worlds, not damaged yet."""
+        """Return grown worlds without damage."""
         return self._picture_worlds(random) if self._drawn else super().seed(random)
 
     @property
     def start_is_short(self) -> bool:
-        """Whether a start takes few operations: not where it grows a world."""
+        """Whether a start takes few operations: not if it grows a world."""
         return self._drawn or super().start_is_short
 
     def start(self, random: WorldRandom) -> Start:
-        """Return damaged worlds; they are healed once their loss is near the undamaged one."""
+        """Return damaged worlds, with the loss at which each counts as healed."""
         x, s, threshold, _ = super().start(random)
         if self.config.split_damage and self.config.split == "test":
             random = random.substream(StreamId.TEST)
@@ -113,7 +110,7 @@ class RegenerationTask(GrownTask[Regeneration2DEnvConfig]):
         for k, kind in enumerate(kinds):
             size = SIZES[kind] if self.config.damage_size is None else self.config.damage_size
             new_x, new_s = damage_worlds(x, s, kind=kind, size=size, generator=random)
-            # A damage leaves either positions or states as they are.
+            # Each kind changes either positions or states.
             if new_x is not x:
                 hurt_x = torch.where(chosen == k, new_x, hurt_x)
             if new_s is not s:
@@ -131,7 +128,7 @@ class RegenerationTask(GrownTask[Regeneration2DEnvConfig]):
     def _picture_worlds(self, random: WorldRandom) -> tuple[Tensor, Tensor]:
         x, s = PictureEnvTask.seed(self, random)
         points, colours = self.goal.target.points, self.goal.target.colours
-        # The target's points are about as many as the particles: some stand twice, or are left out.
+        # The numbers of points and particles differ a little: some points repeat or are skipped.
         chosen = torch.linspace(0, len(points) - 1, x.shape[1], device=x.device).round().long()
         s[..., -3:] = colours[chosen] - COLOUR_OFFSET
         return points[chosen].expand_as(x).clone(), s
@@ -142,10 +139,10 @@ class Regeneration2DEnv(NPAEnv):
 
     ## Description
 
-    A picture was grown from N particles and then damaged: a disk lost its state, a knife went
-    through it, or a disk was drawn together. The policy tells each particle where to move and how
-    to change its state, so that the picture becomes whole again. As in `npa/Morphogenesis2D-v0`, a
-    particle perceives only its neighbourhood. Nobody tells it that there was damage.
+    A picture was grown from N particles and then damaged: the states in a disk were wiped, a line
+    was cut through it, or a disk was drawn together. The policy moves each particle and changes its
+    state, so that the picture becomes intact again. As in `npa/Morphogenesis2D-v0`, a particle
+    perceives only its neighbourhood. Observations do not say that there was damage.
 
     Update rules that grow pictures can also heal them. The rule `gecko-v0` has grown these worlds,
     so their hidden states mean something to it:
@@ -157,13 +154,12 @@ class Regeneration2DEnv(NPAEnv):
     ## Starting state
 
     The rule grows a world for `grow_steps` steps from a disk of blank particles. Then one kind of
-    damage is done to it. The worlds are made once: with the default `seed_pool=256` there are 256.
-    On a CPU each is grown when an episode first starts from it, which takes 0.4 s of CPU time with
-    1024 particles; on CUDA the first reset grows all of them. The damage is drawn anew for each
-    episode.
+    damage is applied. The worlds are made once: with the default `seed_pool=256` there are 256. On
+    a CPU each is grown when an episode first starts from it, which takes 0.4 s of CPU time with
+    1024 particles; on CUDA the first reset grows all of them. Each episode draws its damage.
 
-    `split="test"` has grown worlds of its own, as many, and damage of its own: learn with "train",
-    evaluate with "test".
+    `split="test"` has other grown worlds, as many, and other damage: learn with "train", evaluate
+    with "test".
 
     | `damage` | What is done |
     |---|---|
@@ -186,4 +182,4 @@ class Regeneration2DEnv(NPAEnv):
     task_type = RegenerationTask
 
 
-Regeneration2DVectorEnv = batched(Regeneration2DEnv)
+Regeneration2DVectorEnv = vector_class(Regeneration2DEnv)

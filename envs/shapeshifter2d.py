@@ -17,10 +17,10 @@ from npa_envs.envs.core.base import ParticleSpaces, batch_tensor
 from npa_envs.envs.core.config import EnvConfig
 from npa_envs.envs.core.single import NPAEnv
 from npa_envs.envs.core.task import Start
-from npa_envs.envs.core.vector import batched
+from npa_envs.envs.core.vector import vector_class
 from npa_envs.envs.garden.brushes import GardenReward
-from npa_envs.envs.garden.task import Living
-from npa_envs.envs.grown import check_living, check_runs, grow, run_rule
+from npa_envs.envs.garden.task import RuleDriven
+from npa_envs.envs.grown import check_rule_driven, check_runs, grow, run_rule
 from npa_envs.envs.morphogenesis2d import PictureConfig, PictureEnvTask
 from npa_envs.errors import NPAError
 from npa_envs.rule.codes import Codes
@@ -32,11 +32,11 @@ from npa_envs.training.trained_tasks import sources_of_codes
 from npa_envs.world.actions import Physics
 from npa_envs.world.randomness import WorldRandom
 
-SEEN_LIMIT = 8.0
-"""What is seen is clipped to plus and minus this (dimensionless)."""
+OBSERVATION_LIMIT = 8.0
+"""Observations are clipped to plus and minus this (dimensionless)."""
 
 GOAL_COUNT = 8
-"""Goals of an episode, one after the other; longer ones begin again with the first."""
+"""Goals of an episode; after the last one follows the first."""
 
 Actions = Literal["code", "choice"]
 
@@ -48,8 +48,7 @@ class Shapeshifter2DEnvConfig(PictureConfig):
     words = EnvConfig.words | {"reward": get_args(GardenReward), "actions": get_args(Actions)}
 
     reward: GardenReward = "dense"
-    """"dense": how near the world is to the goal, in each step; "sparse": the same, in the last
-    step alone."""
+    """"dense": the closeness to the goal in each step; "sparse": that of the last step only."""
 
     episode_steps: int = 64
     particle_count: int = 256
@@ -61,7 +60,7 @@ class Shapeshifter2DEnvConfig(PictureConfig):
     """A rule of many pictures, by name or file; its pictures are the goals."""
 
     actions: Actions = "code"
-    """Form of actions: "code", the numbers of a code; "choice", which of the rule's codes."""
+    """Form of actions: "code", the vector of a code; "choice", the index of one of the rule's."""
 
     rule_steps: int = 8
     """Steps of the rule in one step of the environment."""
@@ -70,17 +69,17 @@ class Shapeshifter2DEnvConfig(PictureConfig):
     """Steps of the environment after which the goal becomes another picture."""
 
     grow_steps: int = 64
-    """Steps of the rule from the seed to the world that an episode begins with."""
+    """Steps of the rule from the seed to the start of an episode."""
 
     seed_pool: int = 16
-    """Episodes start from one of so many grown worlds, made once; 0: from a new one each time,
-    which takes `grow_steps` steps of the rule."""
+    """Number of grown worlds, made once, that episodes start from; 0: each start grows a new one in
+    `grow_steps` steps of the rule."""
 
     resolution: int = 32
     """Pixels on each side of the picture that the loss compares, R."""
 
     picture_size: int = 8
-    """Pixels on each side of the pictures that are seen, G; it divides `resolution`."""
+    """Pixels on each side of the observed pictures, G; a divisor of `resolution`."""
 
     seed_radius: float = 0.4
 
@@ -88,7 +87,7 @@ class Shapeshifter2DEnvConfig(PictureConfig):
         """Check every field."""
         super().__post_init__()
         check_positive(self, int, "rule_steps", "hold_steps", "grow_steps", "picture_size")
-        check_living(self)
+        check_rule_driven(self)
 
 
 def rule_of(config: Shapeshifter2DEnvConfig, device: torch.device) -> tuple[NPARule, Codes]:
@@ -112,7 +111,7 @@ def rule_of(config: Shapeshifter2DEnvConfig, device: torch.device) -> tuple[NPAR
 
 
 class CodeForm(ParticleSpaces):
-    """Coarse pictures are seen; an action is a code, or the number of one."""
+    """Spaces: observe a coarse picture and the goal's; act by a code or by the index of one."""
 
     def __init__(self, physics: Physics, config: Shapeshifter2DEnvConfig) -> None:
         _, codes = rule_of(config, torch.device("cpu"))
@@ -121,14 +120,15 @@ class CodeForm(ParticleSpaces):
         self._chosen = config.actions == "choice"
         self._output = config.output
         count, dim = self._table.shape
-        seen = (8 * config.picture_size**2,)
-        self.observation_space: Space[Any] = Box(-SEEN_LIMIT, SEEN_LIMIT, seen, np.float32)
+        shape = (8 * config.picture_size**2,)
+        limit = OBSERVATION_LIMIT
+        self.observation_space: Space[Any] = Box(-limit, limit, shape, np.float32)
         self.action_space: Space[Any] = (
             Discrete(count) if self._chosen else Box(-1.0, 1.0, (dim,), np.float32)
         )
 
     def action(self, action: Any, world_count: int | None) -> Tensor:
-        """Return the codes that actions mean, float32, shape [B, 1, K]."""
+        """Return the codes for checked actions, float32, shape [B, 1, K]."""
         count, dim = self._table.shape
         if not self._chosen:
             code = batch_tensor(action, world_count, (dim,), "K")
@@ -145,12 +145,12 @@ class CodeForm(ParticleSpaces):
         return self._table.to(chosen.device)[chosen.long().view(-1, 1)]
 
     def actions_of_codes(self) -> Tensor:
-        """Return the action of the form "code" that says each of the rule's codes, [T, K]."""
+        """Return the action of the form "code" for each of the rule's codes, [T, K]."""
         return self._table / self._limit
 
 
-class ShapeshifterTask(Living, PictureEnvTask[Shapeshifter2DEnvConfig]):
-    """A picture that becomes others; what worlds keep are their goals, the present one first."""
+class ShapeshifterTask(RuleDriven, PictureEnvTask[Shapeshifter2DEnvConfig]):
+    """A picture that has to become others; contexts are the goals, the current one first."""
 
     config_type = Shapeshifter2DEnvConfig
     form_type = CodeForm
@@ -172,13 +172,13 @@ class ShapeshifterTask(Living, PictureEnvTask[Shapeshifter2DEnvConfig]):
 
     @classmethod
     def extra_bytes(cls, config: Any, world_count: int) -> int:
-        """Return about how much memory pool and pictures need [bytes]."""
+        """Return an estimate of the memory of pool and pictures [bytes]."""
         pictures = 32 * world_count * config.resolution**2
         return super().extra_bytes(config, world_count) + int(pictures)
 
     @property
     def start_is_short(self) -> bool:
-        """Whether a start takes few operations: not where it grows a world."""
+        """Whether a start takes few operations: not if it grows a world."""
         return self.config.seed_pool > 0
 
     @property
@@ -192,9 +192,9 @@ class ShapeshifterTask(Living, PictureEnvTask[Shapeshifter2DEnvConfig]):
         goals = torch.arange(len(self.codes), device=self.device)
         x = torch.full((len(goals), 1, 2), 1e3, device=self.device)
         s = x.new_zeros(len(goals), 1, self.config.state_dim)
-        # Where nothing lies in the picture, colours do not count; the mean is not moved.
-        aimed = self.goal.toward(goals)
-        difference = aimed.picture(x, s, centred=False) - aimed.target_picture
+        # Without particles in the picture colours do not count, and nothing is centred.
+        goal_task = self.goal.toward(goals)
+        difference = goal_task.picture(x, s, centred=False) - goal_task.target_picture
         error = difference[..., 3].square() + difference[..., 3].abs()
         return error.flatten(1).mean(dim=1)
 
@@ -207,12 +207,12 @@ class ShapeshifterTask(Living, PictureEnvTask[Shapeshifter2DEnvConfig]):
         return Start(x, s, goal=self._another(grown, random))
 
     def _another(self, goal: Tensor, random: WorldRandom) -> Tensor:
-        """Return goals other than those given, int64, shape [B]."""
+        """Return random goals that differ from the given ones, int64, shape [B]."""
         count = len(self.codes)
         return (goal + 1 + random.integers(count - 1, 1)[:, 0]) % count
 
     def episode_context(self, start: Start, loss: Tensor, random: WorldRandom) -> Tensor:
-        """Return the goals of an episode: the present one, then all of them in turn, [B, 1 + G]."""
+        """Return an episode's current goal, then all of its goals in turn, [B, 1 + G]."""
         assert start.goal is not None, "made with goals"
         goals = [start.goal]
         while len(goals) < GOAL_COUNT:
@@ -224,61 +224,53 @@ class ShapeshifterTask(Living, PictureEnvTask[Shapeshifter2DEnvConfig]):
     def step(
         self, x: Tensor, s: Tensor, action: Tensor, random: WorldRandom
     ) -> tuple[Tensor, Tensor]:
-        """Return worlds whose particles carry the code that was chosen, after the rule's steps.
-
-        Args:
-            x: Positions [length units], shape [B, N, 2].
-            s: States, dimensionless, shape [B, N, C].
-            action: Codes, dimensionless, shape [B, 1, K].
-            random: One stream a world; advanced by `rule_steps`.
-        """
+        """Give all particles the codes of an action, [B, 1, K]; return worlds after the rule."""
         config = self.config
         coded = self.rule.with_code(s, action)
         return run_rule(self.rule, config, x, coded, config.rule_steps, random)
 
     def reward(self, x: Tensor, s: Tensor, loss: Tensor, context: Tensor) -> Tensor:
-        """Return how near worlds are to their goals: 1 there, 0 as a blank picture; shape [B]."""
+        """Return 1 at the goal, 0 for a loss as of an empty picture, shape [B]."""
         blank = self.blank_losses.index_select(0, context[:, 0].long())
         return (1.0 - loss / blank).clamp_min(-1.0)
 
     def next_goals(self, elapsed: Tensor, context: Tensor, goal: Tensor) -> None:
-        """Change the worlds' goals every `hold_steps` steps, in place, once these are paid."""
+        """Change the worlds' goals in place every `hold_steps` steps."""
         turn = (elapsed.long() // self.config.hold_steps) % GOAL_COUNT
         context[:, :1] = context.gather(1, 1 + turn[:, None])
         goal.copy_(context[:, 0].long())
 
     def context_info(self, x: Tensor, s: Tensor, context: Tensor) -> dict[str, Tensor]:
-        """Return the number of each world's goal, shape [B]."""
+        """Return the index of each world's goal, shape [B]."""
         return {"goal": context[:, 0].long()}
 
     def observe(self, x: Tensor, s: Tensor, loss: Tensor, context: Tensor) -> Tensor:
         """Return coarse pictures of worlds and of their goals, shape [B, 8 G²]."""
-        aimed = self.goal.toward(context[:, 0].long())
-        both = torch.cat((aimed.picture(x, s), aimed.target_picture), dim=-1)
+        goal_task = self.goal.toward(context[:, 0].long())
+        both = torch.cat((goal_task.picture(x, s), goal_task.target_picture), dim=-1)
         pixels = self.config.resolution // self.config.picture_size
-        seen = F.avg_pool2d(both.permute(0, 3, 1, 2), pixels).flatten(1)
-        return seen.clamp(-SEEN_LIMIT, SEEN_LIMIT)
+        coarse = F.avg_pool2d(both.permute(0, 3, 1, 2), pixels).flatten(1)
+        return coarse.clamp(-OBSERVATION_LIMIT, OBSERVATION_LIMIT)
 
 
 class Shapeshifter2DEnv(NPAEnv):
-    """Let a living picture become others, by the code that its particles carry.
+    """Change a grown picture into others, by the code that its particles have.
 
     ## Description
 
-    A rule of many pictures runs N particles: a code of K numbers, which all of them carry and
-    perceive, tells them what to grow ([one rule, many pictures](../beyond.md)). The agent says the
-    code. It sees what the world looks like and what it should look like, both as coarse pictures,
-    and after `hold_steps` steps the goal becomes another picture. Nobody tells the agent which code
-    grows which picture, and particles need time to arrange themselves anew.
+    A rule of many pictures steps N particles. A code of K numbers, part of each particle's state,
+    determines the picture that they grow ([one rule, many pictures](../beyond.md)). The agent
+    chooses the code. It observes the current picture and the goal's, both coarse, and after
+    `hold_steps` steps the goal becomes another picture. Observations do not say which code grows
+    which picture, and particles need time to rearrange.
 
-    With `actions="choice"` the agent chooses among the codes that the rule has learned: it has to
-    recognise the goal. With `actions="code"` it has to find the numbers, and may say others than
-    the rule has learned.
+    With `actions="choice"` the agent chooses among the rule's trained codes: it has to recognise
+    the goal. With `actions="code"` it gives the vector itself, which need not be a trained one.
 
-    The default rule, `seven-pictures`, has learned the package's seven drawings in small worlds on
-    a CPU. It recolours a grown picture at once, but reshapes it hardly.
-    `npa_envs.agents.shapeshifting.RecognisingShapeshifter` says the goal's code and earns −0.03 a
-    step, actions at random earn −0.37 (means of 8 episodes). Others: `npa-envs train
+    The default rule, `seven-pictures`, was trained on the package's seven drawings in small worlds
+    on a CPU. It recolours a grown picture at once, but hardly changes its shape.
+    `npa_envs.agents.shapeshifting.RecognisingShapeshifter` gives the goal's code and gets −0.03 a
+    step, random actions get −0.37 (means of 8 episodes). For other rules: `npa-envs train
     morphogenesis2d --targets ...`, then `rule="PATH"` with the rule's own `state_dim`, `eps` and
     `eps0`, and `particle_count` as it was trained.
 
@@ -286,22 +278,23 @@ class Shapeshifter2DEnv(NPAEnv):
 
     `Box(-8, 8, (8 G²,), float32)` with G = `picture_size`: red, green, blue and density of the
     world's picture, then of the goal's, each row by row from the bottom up. Colours are sums over
-    particles, as the density is, which is about 1 where a goal is. The world's picture goes along
-    with its particles' mean.
+    particles, as is the density, which is about 1 inside a goal. The world's picture is centred on
+    its particles' mean.
 
     ## Action space
 
-    With `actions="code"`, `Box(-1, 1, (K,), float32)`: the code, in units of the largest number in
-    the rule's codes, and at least 1. With `actions="choice"`, `Discrete(T)`: the number of one of
-    the rule's T codes. All particles carry it from then on, and the rule runs for `rule_steps`
-    steps. A number that is not finite raises `NPAError` and leaves the world as it was.
+    With `actions="code"`, `Box(-1, 1, (K,), float32)`: the code, in units of the largest absolute
+    value in the rule's codes, or of 1 if that is larger. With `actions="choice"`, `Discrete(T)`:
+    the index of one of the rule's T codes. All particles get this code, and the rule makes
+    `rule_steps` steps. An action that is not finite raises `NPAError` and does not change the
+    world.
 
     ## Reward
 
     Worlds are compared with the goal as in `npa/Morphogenesis2D-v0`, by a loss L. The reward is
     1 − L / L₁, and at least -1; L₁ is the loss of an empty picture. So 1 is the goal itself.
 
-    A step is paid by the goal that was seen before it.
+    The reward of a step is for the goal that was observed before it.
 
     ## Starting state
 
@@ -317,15 +310,15 @@ class Shapeshifter2DEnv(NPAEnv):
 
     | Key | In | Value |
     |---|---|---|
-    | `goal` | reset, step | number of the goal's code |
-    | `loss` | reset, step | L as it is now; of a step, to the goal that was seen before it |
+    | `goal` | reset, step | index of the goal's code |
+    | `loss` | reset, step | current loss L; of a step, for the goal observed before it |
     | `loss_density`, `loss_colour` | reset, step | the parts of the loss |
     | `reward_density`, `reward_colour` | step | how much each part fell, whatever the goals were |
-    | `success`, `diverged` | step | whether it did so in this step, bool |
+    | `success`, `diverged` | step | whether the world succeeded or diverged in it, bool |
     | `reason` | last step | why the episode ended, see above; None for worlds that go on |
     """
 
     task_type = ShapeshifterTask
 
 
-Shapeshifter2DVectorEnv = batched(Shapeshifter2DEnv)
+Shapeshifter2DVectorEnv = vector_class(Shapeshifter2DEnv)

@@ -9,12 +9,13 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from npa_envs.envs.core.config import Boundary, EnvConfig
+from npa_envs.envs.core.config import EnvConfig
 from npa_envs.envs.core.single import NPAEnv
 from npa_envs.envs.core.task import TargetEnvTask
-from npa_envs.envs.core.vector import batched
+from npa_envs.envs.core.vector import vector_class
 from npa_envs.errors import NPAError, shown
 from npa_envs.tasks.texture import Texture, TextureConfig
+from npa_envs.world.actions import Boundary
 
 LOSS_BYTES = 4000
 """About what comparing one pixel of a picture needs [bytes]."""
@@ -52,7 +53,7 @@ class TextureEnvConfig(EnvConfig):
 
     @property
     def goal(self) -> TextureConfig:
-        """Configuration of the task itself."""
+        """Configuration of the training task."""
         return self.task_config(TextureConfig)
 
 
@@ -68,7 +69,7 @@ class TextureTask(TargetEnvTask[TextureEnvConfig]):
 
     @classmethod
     def extra_bytes(cls, config: Any, world_count: int) -> int:
-        """Return about how much memory pool and loss need [bytes]."""
+        """Return an estimate of the memory of pool and loss [bytes]."""
         copies = 4 if config.per_particle_reward else 1
         pictures = LOSS_BYTES * copies * world_count * config.resolution**2
         return super().extra_bytes(config, world_count) + int(pictures)
@@ -81,7 +82,7 @@ class TextureTask(TargetEnvTask[TextureEnvConfig]):
 
     @property
     def pixel_size(self) -> float:
-        """Size of a particle in pictures: all together have the target's mean density."""
+        """Size of a particle in pictures, at which the mean density is the target's."""
         return self.goal.pixel_size
 
 
@@ -90,14 +91,14 @@ class TextureEnv(NPAEnv):
 
     ## Description
 
-    A world holds N particles in a periodic box: a particle that leaves it on one side comes in on
-    the other. Each has a position and a state of C numbers. The last three numbers, plus 0.5, are
+    A world has N particles in a periodic box: a particle that leaves it on one side enters on the
+    other. Each has a position and a state of C numbers. The last three numbers, plus 0.5, are
     its colour. An episode begins with grey particles scattered over the box. At its end they should
     look like the target. It does not matter where the parts of the pattern lie. For dots, bubbles
     and meshes particles gather and leave places empty; cells and stripes are made of colours alone.
 
-    No particle sees the whole or knows where it is. As in `npa/Morphogenesis2D-v0` it perceives its
-    neighbourhood within the radius ε. The usual policy is one small network that is applied to
+    As in `npa/Morphogenesis2D-v0` a particle perceives its neighbourhood within the radius ε, and
+    not its position. The usual policy is one small network that is applied to
     every row of the observation. Rules for textures are trained by gradient with `npa-envs train
     texture`; `npa_envs.agents.RulePolicy(npa_envs.load_rule("rule.safetensors"), env)` makes a
     policy of one. Spaces are those of `Morphogenesis2DEnv`.
@@ -105,15 +106,14 @@ class TextureEnv(NPAEnv):
     ## Reward
 
     The particles' picture, which has no seam, is compared with the target on `resolution` ×
-    `resolution` pixels. The texture loss ignores where things lie. It compares how patches of
-    several sizes (`"patch_swd"`), answers of random filters (`"filter_swd"`), or features of VGG16
-    (`"vgg_ot"`) are distributed. The loss L is `colour_weight` times the loss of the colour image
+    `resolution` pixels. The texture loss ignores positions. It compares the distributions of
+    patches of several sizes (`"patch_swd"`), responses of random filters (`"filter_swd"`), or
+    features of VGG16 (`"vgg_ot"`). The loss L is `colour_weight` times the loss of the colour image
     plus `density_weight` times the loss of the density image. 0 is the same texture. Joint losses
     such as `"patch_ot"` see both images at once. Their part of the density is 0. Formulas:
     [textures](../mathematics.md#textures).
 
-    A particle's own reward says how much its part of the picture makes the texture better or worse,
-    to first order.
+    A particle's own loss is what its part of the picture adds to the texture loss, to first order.
 
     ## Starting state
 
@@ -132,11 +132,11 @@ class TextureEnv(NPAEnv):
 
     ## Vectorized environment
 
-    With `reward="particle"` and `loss="vgg_ot"` or a joint loss but `"joint_swd"`, particles' own
-    rewards may depend in their last bits on the number of worlds. Nothing else does.
+    With `reward="particle"` and `loss="vgg_ot"` or a joint loss other than `"joint_swd"`,
+    particles' rewards may depend in their last bits on the number of worlds. Nothing else does.
     """
 
     task_type = TextureTask
 
 
-TextureVectorEnv = batched(TextureEnv)
+TextureVectorEnv = vector_class(TextureEnv)

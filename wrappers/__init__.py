@@ -1,8 +1,7 @@
-"""Wrappers, and adapters to the libraries that train on environments, as `npa_envs.wrappers`.
+"""Gymnasium wrappers, and adapters to training libraries, imported as `npa_envs.wrappers`.
 
-Holds Gymnasium wrappers, and adapters to Stable-Baselines3, TorchRL, RSL-RL and RLlib. They use the
-public API only. Names are imported when they are first used, so that none of these libraries is
-needed for the others.
+The adapters are for Stable-Baselines3, TorchRL, RSL-RL, RLlib and Minari. Names are imported at
+their first use, so that none of these libraries is needed for the others.
 """
 
 import pkgutil
@@ -10,8 +9,8 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from npa_envs.wrappers.damage import DamageEvents, VectorDamageEvents
+    from npa_envs.wrappers.numeric_infos import NumericInfos as NumericInfos
     from npa_envs.wrappers.particle_rows import ParticleRows
-    from npa_envs.wrappers.pettingzoo import NumericInfos as NumericInfos
     from npa_envs.wrappers.rsl_rl import RslRlParticleEnv as RslRlParticleEnv
     from npa_envs.wrappers.sb3 import ParticleVecEnv as ParticleVecEnv
     from npa_envs.wrappers.sb3 import RowPolicy as RowPolicy
@@ -39,10 +38,10 @@ __all__ = [
     "VectorNormalizePerception",
     "VectorSpeciesTags",
 ]
-# A star imports all of them, and must need none of the libraries that are optional.
+# Not in `__all__`, as a star import must not need optional libraries.
 ON_REQUEST = {
     "NPATorchRLEnv": "torchrl",
-    "NumericInfos": "pettingzoo",
+    "NumericInfos": "numeric_infos",
     "ParticleVecEnv": "sb3",
     "RowPolicy": "sb3",
     "RslRlParticleEnv": "rsl_rl",

@@ -1,4 +1,4 @@
-"""Parts of wrappers and adapters: checks of environments, rows, clocks, changed observations."""
+"""Base classes and functions of wrappers and adapters."""
 
 from __future__ import annotations
 
@@ -29,14 +29,14 @@ else:
 
 
 MAKE_VECTOR = "make it with gym.make_vec(..., vectorization_mode='vector_entry_point')"
-"""How an environment of many worlds is made, for errors."""
+"""How to make a vector environment, for error messages."""
 
 VectorStep = tuple[Any, Any, Any, Any, dict[str, Any]]
 """Observations, rewards, terminations, truncations and infos of a step of many worlds."""
 
 
 def single_env(env: Any, wrapper: str) -> NPAEnv:
-    """Return this package's environment under wrappers, for a wrapper of that name."""
+    """Return this package's environment below wrappers; `wrapper` is named in errors."""
     base = getattr(env, "unwrapped", None)
     if isinstance(base, NPAEnv):
         return base
@@ -47,7 +47,7 @@ def single_env(env: Any, wrapper: str) -> NPAEnv:
 
 
 def vector_env(env: Any, wrapper: str) -> NPAVectorEnv:
-    """Return the vector environment that lies under wrappers, likewise."""
+    """Return this package's vector environment below wrappers; `wrapper` is named in errors."""
     base = getattr(env, "unwrapped", None)
     if isinstance(base, NPAVectorEnv):
         return base
@@ -60,7 +60,7 @@ def vector_env(env: Any, wrapper: str) -> NPAVectorEnv:
 
 
 def torch_env(env: Any, adapter: str) -> NPAVectorEnv:
-    """Return the vector environment under wrappers, for an adapter that keeps its tensors."""
+    """Return this package's vector environment with tensors that an adapter can keep."""
     base = vector_env(env, adapter)
     if base.config.output != "torch":
         raise NPAError(
@@ -76,7 +76,7 @@ def torch_env(env: Any, adapter: str) -> NPAVectorEnv:
 
 
 def check_vector_env(env: Any, wrapper: str) -> None:
-    """Check that what a wrapper was given is a vector environment of Gymnasium's."""
+    """Check that a wrapper's argument is a Gymnasium vector environment."""
     if not isinstance(env, VectorEnv):
         raise NPAError(
             f"{wrapper} needs a vector environment, got {type(env).__name__}: {MAKE_VECTOR}"
@@ -84,7 +84,7 @@ def check_vector_env(env: Any, wrapper: str) -> None:
 
 
 def check_untouched(env: Any, wrapper: str) -> None:
-    """Check that the wrappers beneath leave observations as the environment gives them."""
+    """Check that the wrappers below do not change the observation space."""
     name = "single_observation_space" if isinstance(env, VectorEnv) else "observation_space"
     own, given = getattr(env, name), getattr(env.unwrapped, name)
     if own != given:
@@ -95,18 +95,18 @@ def check_untouched(env: Any, wrapper: str) -> None:
 
 
 def autoreset_mode(env: AnyVectorEnv) -> AutoresetMode:
-    """Return what a vector environment does with worlds whose episodes are over."""
+    """Return a vector environment's autoreset mode."""
     return AutoresetMode(env.metadata.get("autoreset_mode", AutoresetMode.NEXT_STEP))
 
 
 def check_autoreset(mode: AutoresetMode, word: str, rule: str) -> None:
-    """Check that an environment restarts worlds as an adapter needs it: by a mode, in words."""
+    """Check that an environment has the autoreset mode of this name; `rule` explains it."""
     if mode is not AUTORESET_MODES[word]:
         raise NPAError(f"env must {rule}, got {mode}: make it with autoreset_mode={shown(word)}")
 
 
 def check_same_step(mode: AutoresetMode) -> None:
-    """Check that worlds restart by themselves, as rows have to."""
+    """Check that worlds restart in the step that ends their episodes."""
     check_autoreset(mode, "same-step", "restart worlds in the step that ends their episodes")
 
 
@@ -116,36 +116,35 @@ def as_tensor(values: Any) -> Tensor:
 
 
 def like(result: Tensor, values: Any) -> Any:
-    """Return a tensor as what `values` is: an array or a tensor."""
+    """Return a tensor in the type of `values`: array or tensor."""
     return result if isinstance(values, Tensor) else result.numpy()
 
 
 def to_host(values: Any) -> NDArray[Any]:
-    """Return an array or tensor as an array; a tensor on a device is waited for."""
+    """Return an array or tensor as an array; synchronises with the device."""
     return values.cpu().numpy() if isinstance(values, Tensor) else np.asarray(values)
 
 
 def world_indices(mask: NDArray[np.bool_], device: torch.device) -> Tensor:
-    """Return the numbers of the worlds where a mask of shape [B] is True, int64, shape [M]."""
+    """Return the indices at which a mask, [B], is True, int64, shape [M]."""
     return torch.from_numpy(np.flatnonzero(mask)).to(device)
 
 
 def own_rewards(infos: dict[str, Any]) -> Any:
-    """Return each particle's reward of the last step, shape [B, N], or None where there is none.
+    """Return each particle's reward of the last step, shape [B, N]; None without such rewards.
 
-    With same-step autoreset worlds that restarted say in their final infos what their last step
-    was worth.
+    With same-step autoreset the rewards of worlds that restarted are in their final infos.
     """
-    own = infos.get("particle_reward")
+    rewards = infos.get("particle_reward")
     last = infos.get("final_info", {}).get("particle_reward")
-    if own is None or last is None:
-        return own
+    if rewards is None or last is None:
+        return rewards
     which = as_tensor(infos["_final_info"])[:, None]
-    return torch.where(which, as_tensor(last), as_tensor(own))
+    return torch.where(which, as_tensor(last), as_tensor(rewards))
 
 
 def row_space(space: Any) -> Box:
-    """Return the space of one particle of a world's, a box of shape [N, ...]."""
+    """Return the space of one particle, from a world's box of shape [N, ...]."""
     if not isinstance(space, Box) or len(space.shape) < 2:
         raise NPAError(
             "rows need an environment that gives and takes one for each particle, got the space "
@@ -156,7 +155,7 @@ def row_space(space: Any) -> Box:
 
 
 def check_row_actions(actions: Any, *wanted: int) -> None:
-    """Check the shape of actions, which could else be read as those of other rows."""
+    """Check the shape of actions; a wrong one could be read as actions of other rows."""
     if tuple(np.shape(actions)) != wanted:
         raise NPAError(
             f"actions must have shape [rows, A] = {wanted}, got {tuple(np.shape(actions))}: "
@@ -165,15 +164,15 @@ def check_row_actions(actions: Any, *wanted: int) -> None:
 
 
 class ParticleRowsBase:
-    """The part of adapters in which row w N + i is particle i of world w of a vector environment.
+    """Base class of adapters whose row w N + i is particle i of world w of a vector environment.
 
-    A row is paid its own reward where there is one, else its world's.
+    A row's reward is its particle's if there is one, else its world's.
     """
 
     num_envs: int
 
-    def hold(self, env: Any, base: NPAVectorEnv) -> None:
-        """Keep the environment whose particles are rows, and count them."""
+    def set_env(self, env: Any, base: NPAVectorEnv) -> None:
+        """Set the environment whose particles are rows; `base` is the one below its wrappers."""
         self.vector_env = env
         """The environment whose particles these are."""
         self.world_count = base.num_envs
@@ -183,26 +182,26 @@ class ParticleRowsBase:
         self.num_envs = self.world_count * self.particle_count
 
     def step_worlds(self, actions: Any) -> VectorStep:
-        """Step all worlds by actions of rows, [B N, A]; return what all rows get, [B N, ...]."""
+        """Step all worlds by actions of rows, [B N, A]; return the rows' outcome, [B N, ...]."""
         check_row_actions(actions, self.num_envs, *self.vector_env.single_action_space.shape[1:])
         by_world = actions.reshape(self.world_count, self.particle_count, -1)
         observations, rewards, ended, cut, infos = self.vector_env.step(by_world)
-        own = own_rewards(infos)
-        paid = self.spread(rewards) if own is None else own.reshape(-1)
+        by_particle = own_rewards(infos)
+        rewards = self.spread(rewards) if by_particle is None else by_particle.reshape(-1)
         rows = observations.reshape(self.num_envs, -1)
-        return rows, paid, self.spread(ended), self.spread(cut), infos
+        return rows, rewards, self.spread(ended), self.spread(cut), infos
 
     def spread(self, values: Any) -> Any:
-        """Return what worlds have, [B], for each of their rows, shape [B N]."""
+        """Repeat values of worlds, [B], for each of their rows, shape [B N]."""
         if isinstance(values, Tensor):
             return values.repeat_interleave(self.particle_count, output_size=self.num_envs)
         return np.repeat(values, self.particle_count)
 
 
 class EpisodeClock:
-    """Where each world of a vector environment stands in its episode, kept on the host.
+    """Step counts and restarts of each world of a vector environment, on the host.
 
-    With `AutoresetMode.SAME_STEP` the device is waited for only in steps in which episodes end.
+    With `AutoresetMode.SAME_STEP` it synchronises only in steps in which episodes end.
     """
 
     def __init__(self, env: AnyVectorEnv) -> None:
@@ -210,16 +209,16 @@ class EpisodeClock:
         self.elapsed = np.zeros(env.num_envs, dtype=np.int64)
         """Steps since the start of the running episode, shape [B]."""
         self.lengths = np.zeros_like(self.elapsed)
-        """Steps of the episode that the last step belonged to, shape [B]."""
+        """Steps, after the last one, of the episode that it belonged to, shape [B]."""
         self.ended = np.zeros(env.num_envs, dtype=bool)
         """Whether the last step ended an episode, shape [B]."""
         self.restarted = np.zeros_like(self.ended)
         """Whether the last observation is the first of an episode, shape [B]."""
         self.observed = np.ones_like(self.ended)
-        """Whether it is a new one, shape [B]: a reset of some worlds gives the others' old ones."""
+        """Whether the last observation is new, shape [B]; not if a reset was of other worlds."""
 
     def reset(self, options: dict[str, Any] | None) -> None:
-        """Follow a reset; `reset_mask` among its options says of which worlds."""
+        """Update for a reset, of the worlds of `reset_mask` among its options, or of all."""
         mask = None if options is None else options.get("reset_mask")
         self.restarted = np.ones_like(self.ended) if mask is None else to_host(mask).copy()
         self.observed = self.restarted
@@ -228,7 +227,7 @@ class EpisodeClock:
         self.ended = self.ended & ~self.restarted
 
     def step(self, terminations: Any, truncations: Any, infos: dict[str, Any]) -> None:
-        """Follow a step, by what the environment returned: arrays or tensors, shape [B]."""
+        """Update for a step with these results, arrays or tensors, shape [B]."""
         self.observed = np.ones_like(self.ended)
         next_step = self._mode is AutoresetMode.NEXT_STEP
         self.restarted = self.ended if next_step else np.zeros_like(self.ended)
@@ -245,7 +244,7 @@ class EpisodeClock:
 
 
 class Observations(AnyWrapper):
-    """A wrapper of environments of one world that changes observations."""
+    """Base class of wrappers that change the observations of one world."""
 
     restarted = False
     """Whether the last observation is the first of an episode."""
@@ -254,8 +253,8 @@ class Observations(AnyWrapper):
     def observations(self, observations: Any) -> Any:
         """Return an observation, shape [N, P], changed."""
 
-    def new_ones(self, observations: Any) -> Any:
-        """Return what the world gave; as that of `VectorObservations`."""
+    def new_observations(self, observations: Any) -> Any:
+        """Return the observation, which is always new."""
         return observations
 
     def reset(
@@ -274,18 +273,18 @@ class Observations(AnyWrapper):
 
 
 class EpisodeWrapper(AnyVectorWrapper):
-    """A wrapper of vector environments that follows the worlds' episodes."""
+    """Base class of wrappers of vector environments with an `EpisodeClock`."""
 
     def __init__(self, env: AnyVectorEnv) -> None:
         super().__init__(env)
         self.clock = EpisodeClock(env)
-        """Where each world stands in its episode."""
+        """Step counts and restarts of the worlds."""
 
     def reset(
         self, *, seed: Any = None, options: dict[str, Any] | None = None
     ) -> tuple[Any, dict[str, Any]]:
         """Start episodes; as for the environment itself."""
-        # A copy: wrappers of Gymnasium take the mask out of what they are given.
+        # A copy, as wrappers of Gymnasium remove the mask from the dict.
         observations, infos = self.env.reset(seed=seed, options=options and dict(options))
         self.clock.reset(options)
         return self.after_reset(observations, infos)
@@ -298,19 +297,19 @@ class EpisodeWrapper(AnyVectorWrapper):
 
     @abstractmethod
     def after_reset(self, observations: Any, infos: dict[str, Any]) -> tuple[Any, dict[str, Any]]:
-        """Return what a reset gives, once the clock knows of it."""
+        """Return the results of a reset, after the clock's update."""
 
     @abstractmethod
     def after_step(self, outcome: VectorStep) -> VectorStep:
-        """Return what a step gives, once the clock knows of it."""
+        """Return the results of a step, after the clock's update."""
 
 
 class VectorObservations(EpisodeWrapper):
-    """A wrapper of vector environments that changes observations, the final ones included."""
+    """Base class of wrappers that change observations of many worlds, final ones included."""
 
     @property
     def observation_space(self) -> Space[Any]:
-        """Observations of all worlds; made when asked for, as it is large."""
+        """Space of all worlds' observations; large, so made at the first use."""
         if self._observation_space is None:
             self._observation_space = batch_space(self.single_observation_space, self.num_envs)
         return self._observation_space
@@ -319,8 +318,8 @@ class VectorObservations(EpisodeWrapper):
     def observation_space(self, space: Space[Any]) -> None:
         self._observation_space = space
 
-    def new_ones(self, observations: Any) -> Any:
-        """Return, of all observations [B, N, P], those of worlds that gave new ones, [M, N, P]."""
+    def new_observations(self, observations: Any) -> Any:
+        """Return the rows of observations, [B, N, P], that are new, [M, N, P]."""
         observed = self.clock.observed
         if observed.all():
             return observations
@@ -334,10 +333,7 @@ class VectorObservations(EpisodeWrapper):
 
     @abstractmethod
     def final_observations(self, observations: Any) -> Any:
-        """Return observations changed, [B, N, P], after `observations` of the same step.
-
-        Those of ended episodes are the last ones.
-        """
+        """Return the final observations, [B, N, P], changed; called after `observations`."""
 
     def after_reset(self, observations: Any, infos: dict[str, Any]) -> tuple[Any, dict[str, Any]]:
         """Return changed observations and infos."""
@@ -352,21 +348,21 @@ class VectorObservations(EpisodeWrapper):
         return observations, rewards, terminations, truncations, infos
 
 
-class Twin(RecordConstructorArgs):
-    """The common part of a wrapper of one world and its form for many, before their other base."""
+class WrapperBase(RecordConstructorArgs):
+    """Mixin of a wrapper of one world and of its vector form; their first base class."""
 
     def __init__(self, env: Any, **recorded: Any) -> None:
         self.many = isinstance(self, EpisodeWrapper)
         """Whether there are many worlds."""
         self._base = self.base_of(env)
         RecordConstructorArgs.__init__(self, **recorded)
-        # The base that follows in the order of methods is Gymnasium's wrapper.
+        # The next class in the method resolution order is Gymnasium's wrapper.
         super(RecordConstructorArgs, self).__init__(env)  # type: ignore[call-arg]
         self.space_name = "single_observation_space" if self.many else "observation_space"
         """Name of the space of one world's observations."""
 
     def base_of(self, env: Any) -> Any:
-        """Return the environment of this package under wrappers, of one world or many."""
+        """Return this package's environment below wrappers, single or vector."""
         find = vector_env if isinstance(self, EpisodeWrapper) else single_env
         return find(env, type(self).__name__)
 

@@ -1,4 +1,4 @@
-"""Damage on a schedule: worlds are hurt in the midst of their episodes, and are to heal."""
+"""Wrappers that damage worlds at chosen steps of their episodes."""
 
 from __future__ import annotations
 
@@ -18,18 +18,18 @@ from npa_envs.world.randomness import StreamId
 from npa_envs.wrappers.base import (
     AnyWrapper,
     EpisodeWrapper,
-    Twin,
     VectorStep,
+    WrapperBase,
     check_untouched,
     world_indices,
 )
 
 Event = str | DamageEvent
-"""What an event is given as: "STEP:KIND", "STEP:KIND:SIZE", or a `DamageEvent`."""
+"""An event: "STEP:KIND", "STEP:KIND:SIZE", or a `DamageEvent`."""
 
 
-class _DamagesWorlds(Twin):
-    """The events and the damage that they do, for one world or many."""
+class _DamagesWorlds(WrapperBase):
+    """Mixin with the events and their damage, for one world or many."""
 
     def __init__(
         self, env: Any, events: Event | Sequence[Event], *, every: int | None = None
@@ -40,7 +40,7 @@ class _DamagesWorlds(Twin):
             several = [events]
         given = list(several)
         if not given:
-            raise NPAError("events must hold at least one event, got none: for example '100:cut'")
+            raise NPAError("events must have at least one event, got none: for example '100:cut'")
         if every is not None and not (is_whole(every) and 1 <= every < 2**63):
             raise NPAError(
                 f"every must be a whole number of at least 1 and below 2^63, got {shown(every)}"
@@ -52,12 +52,12 @@ class _DamagesWorlds(Twin):
                     "for example '100:cut'"
                 )
         self.events = tuple(parse_damage(e) if isinstance(e, str) else e for e in given)
-        """The events, in the order in which those of one step are applied."""
+        """The events; those of one step are applied in this order."""
         self.every = every
-        """Steps after which each event comes again."""
+        """Steps after which each event repeats."""
         super().__init__(env, events=[str(event) for event in self.events], every=every)
         check_untouched(env, type(self).__name__)
-        # Events of a stack of wrappers are numbered through, so that no two draw the same place.
+        # Events of nested wrappers have different numbers, so that they draw different places.
         self._first = 0
         while hasattr(env, "env"):
             if isinstance(env, _DamagesWorlds):
@@ -66,8 +66,8 @@ class _DamagesWorlds(Twin):
 
     def _due(self, elapsed: NDArray[np.int64]) -> NDArray[np.bool_]:
         """Return which events are due in which worlds, [E, B], by steps of their episodes, [B]."""
-        late = elapsed - np.array([[event.step] for event in self.events])
-        due = late == 0 if self.every is None else (late >= 0) & (late % self.every == 0)
+        since = elapsed - np.array([[event.step] for event in self.events])
+        due = since == 0 if self.every is None else (since >= 0) & (since % self.every == 0)
         return np.asarray(due, dtype=bool)
 
     def _particles(self, due: NDArray[np.bool_]) -> tuple[Tensor, Tensor]:
@@ -87,20 +87,20 @@ class _DamagesWorlds(Twin):
 class DamageEvents(_DamagesWorlds, AnyWrapper):
     """Damage the world after certain steps of each episode.
 
-    An event comes after the step whose number it has: the observation of that step shows the
-    damage, its reward does not know of it. A step of 0 damages the world that an episode starts
-    from. Places and angles come from the world's own seed, and are the same in a vector environment
-    (`VectorDamageEvents`). An episode that is over is left alone, so put the wrapper around what
-    `gym.make` returns, whose step limit it then sees.
+    An event happens after its step: the observation of that step shows the damage, its reward does
+    not include it. Step 0 damages the initial world. Places and angles come from the world's seed,
+    and are the same in a vector environment (`VectorDamageEvents`). A world whose episode is over
+    is not damaged, so put the wrapper around the result of `gym.make`, which includes the step
+    limit.
 
-    On such steps `info` holds `loss_damage`, by how much the loss rose; `info["loss"]`, its parts
-    and all else that `info` tells of a world are those of the damaged one. A stack of these
-    wrappers damages as one with all their events, the innermost first.
+    On such steps `info["loss_damage"]` is the rise of the loss; `info["loss"]`, its parts and
+    further entries are those of the damaged world. Nested wrappers act as one with all their
+    events, the innermost first.
 
     Args:
-        env: An environment of this package, under no wrapper that changes observations.
+        env: An environment of this package, without wrappers that change observations.
         events: "STEP:KIND", "STEP:KIND:SIZE" or `DamageEvent`; one or several.
-        every: Each event comes again after so many steps, and again; None: it comes once.
+        every: Each event repeats every `every` steps; None: it happens once.
 
     Raises:
         NPAError: An event or the environment is wrong.
@@ -138,23 +138,23 @@ class DamageEvents(_DamagesWorlds, AnyWrapper):
 
 
 class VectorDamageEvents(_DamagesWorlds, EpisodeWrapper):
-    """`DamageEvents` for vector environments: each world by the steps of its own episode.
+    """`DamageEvents` for vector environments, by the steps of each world's own episode.
 
     World k is damaged as the single environment with the same seed, bit for bit. Arguments and
-    errors are those of `DamageEvents`, but for `env`, a vector environment of this package.
+    errors are those of `DamageEvents`, except `env`, a vector environment of this package.
     """
 
     def after_reset(self, observations: Any, infos: dict[str, Any]) -> tuple[Any, dict[str, Any]]:
-        """Damage the worlds whose episodes start from damaged ones."""
+        """Damage the restarted worlds that have an event at step 0."""
         due = self._due(self.clock.elapsed) & self.clock.restarted
         return self._damaged(due, observations, infos) if due.any() else (observations, infos)
 
     def after_step(self, outcome: VectorStep) -> VectorStep:
-        """Damage the worlds in whose episodes an event is due."""
+        """Damage the worlds with an event at this step of their episodes."""
         observations, rewards, terminations, truncations, infos = outcome
         due = self._due(self.clock.elapsed) & (self.clock.restarted | ~self.clock.ended)
         if due.any():
-            # With copy=False these are the buffers that placing particles writes to.
+            # With copy=False `place_particles` overwrites these buffers.
             rewards, terminations, truncations = map(_copy, (rewards, terminations, truncations))
             observations, infos = self._damaged(due, observations, infos)
         return observations, rewards, terminations, truncations, infos
@@ -165,16 +165,16 @@ class VectorDamageEvents(_DamagesWorlds, EpisodeWrapper):
         base, worlds = self._base, self._base.worlds
         infos = {name: _copy(value) for name, value in infos.items()}
         before = worlds.loss.clone()
-        hurt = np.asarray(due.any(axis=0))
-        chosen = world_indices(hurt, base.task.device)
+        damaged = np.asarray(due.any(axis=0))
+        chosen = world_indices(damaged, base.task.device)
         x, s = self._particles(due)
         observations = base.place_particles(x[chosen], s[chosen], chosen)
         output = base.config.output
-        # Arrays are float64, as those of environments are, and differences as of single ones.
+        # Arrays are float64, as in environments, and differences equal those of single ones.
         dtype = torch.float64 if output == "numpy" else torch.float32
         now = base.losses_of(worlds.report.numbers.to(dtype, copy=True))
         now["loss_damage"] = now["loss"] - before.to(dtype)
-        now["_loss_damage"] = torch.from_numpy(hurt).to(base.task.device)
+        now["_loss_damage"] = torch.from_numpy(damaged).to(base.task.device)
         changed = {name: to_output(value, output) for name, value in now.items()}
         if "loss_damage" in infos:
             changed["loss_damage"] = changed["loss_damage"] + infos["loss_damage"]

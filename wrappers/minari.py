@@ -1,7 +1,7 @@
-"""Episodes as datasets of Minari: written from any policy, read as tensors to learn from.
+"""Minari datasets of episodes: recording any policy, and reading steps as tensors.
 
-Minari keeps datasets below the folder that the variable `MINARI_DATASETS_PATH` names, by default
-`~/.minari/datasets`.
+Minari stores datasets below the folder in the environment variable `MINARI_DATASETS_PATH`, by
+default `~/.minari/datasets`.
 """
 
 from __future__ import annotations
@@ -38,23 +38,23 @@ except ImportError as error:
     ) from error
 
 ROOT = "MINARI_DATASETS_PATH"
-"""Variable that names the folder of all datasets."""
+"""Environment variable with the folder of all datasets."""
 
 _DATASET_ID = re.compile(r"([-\w][-\w/]*[-\w]/)?[-\w]+-v\d+")
-"""Minari's ids with a version, without which it writes none."""
+"""Minari's ids with a version, which it needs to write a dataset."""
 
 
 def record_episodes(
     env: Any, policy: Callable[[Any], Any], seeds: Sequence[int]
 ) -> Iterator[EpisodeBuffer]:
-    """Run one episode from each seed, and yield each as Minari takes it.
+    """Run one episode from each seed, and yield each as a Minari buffer.
 
     An episode is the first one after a reset with its seed. It has T + 1 observations, T actions,
     rewards, terminations and truncations, and the info `loss`, of T + 1 numbers.
 
     Args:
-        env: A vector environment of this package with same-step autoreset, which ends its episodes;
-            as many episodes run at a time as it has worlds.
+        env: A vector environment of this package with same-step autoreset and a step limit; each of
+            its worlds runs an episode at a time.
         policy: Maps observations, [B, ...], to actions, [B, ...].
         seeds: One for each episode.
 
@@ -65,10 +65,10 @@ def record_episodes(
     check_same_step(autoreset_mode(env))
     given = list(seeds)
     if not given:
-        raise NPAError("seeds must hold at least one seed, got none: give seeds=range(8)")
+        raise NPAError("seeds must have at least one seed, got none: give seeds=range(8)")
     for first in range(0, len(given), env.num_envs):
         batch = given[first : first + env.num_envs]
-        # All worlds take part; what those beyond the last seed do is not kept.
+        # Worlds beyond the last seed repeat it, and are dropped.
         yield from _recorded(env, policy, [*batch, *batch[-1:] * (env.num_envs - len(batch))])[
             : len(batch)
         ]
@@ -77,7 +77,7 @@ def record_episodes(
 def _recorded(env: Any, policy: Callable[[Any], Any], seeds: list[int]) -> list[EpisodeBuffer]:
     """Return the first episode of each world after a reset with its seed."""
     observation, infos = env.reset(seed=seeds)
-    seen, losses = [_host(observation)], [_host(infos["loss"])]
+    observations, losses = [_host(observation)], [_host(infos["loss"])]
     done: list[dict[str, Any]] = []
     lengths = np.zeros(len(seeds), np.int64)
     last: list[Any] = [None] * len(seeds)
@@ -95,45 +95,46 @@ def _recorded(env: Any, policy: Callable[[Any], Any], seeds: list[int]) -> list[
             for k in np.flatnonzero(over).tolist():
                 last[k] = _of_world(final, k)
                 lengths[k] = len(done)
-        seen.append(_host(observation))
+        observations.append(_host(observation))
         losses.append(loss)
     episodes = []
     for k, length in enumerate(map(int, lengths)):
         steps = {name: np.stack([step[name][k] for step in done[:length]]) for name in done[0]}
-        shown_to = [*(_of_world(one, k) for one in seen[:length]), last[k]]
+        of_world = [*(_of_world(one, k) for one in observations[:length]), last[k]]
         infos_of_world = {"loss": np.array([loss[k] for loss in losses[: length + 1]], np.float64)}
         buffer: Any = EpisodeBuffer(
-            seed=seeds[k], observations=_stacked(shown_to), infos=infos_of_world, **steps
+            seed=seeds[k], observations=_stacked(of_world), infos=infos_of_world, **steps
         )
         episodes.append(buffer)
     return episodes
 
 
 def _clipped(env: Any, action: Any) -> Any:
-    """Return actions within the space, as environments take them anyway."""
+    """Return actions clipped to the space, as environments do."""
     if isinstance(env.single_action_space, gymnasium.spaces.Box):
         return action.clip(-1.0, 1.0)
     return action
 
 
 def _host(value: Any) -> Any:
-    """Return what tensors and arrays hold as new arrays; of dictionaries likewise."""
+    """Return a tensor or array as a new array; dictionaries entry by entry."""
     if isinstance(value, dict):
         return {name: _host(part) for name, part in value.items()}
     return value.cpu().numpy().copy() if isinstance(value, Tensor) else np.array(value)
 
 
 def _of_world(observation: Any, k: int) -> Any:
-    """Return what is seen of one world."""
+    """Return the observation of world k."""
     if isinstance(observation, dict):
         return {name: part[k] for name, part in observation.items()}
     return observation[k]
 
 
-def _stacked(seen: list[Any]) -> Any:
-    if isinstance(seen[0], dict):
-        return {name: _stacked([one[name] for one in seen]) for name in seen[0]}
-    return np.stack(seen)
+def _stacked(observations: list[Any]) -> Any:
+    if isinstance(observations[0], dict):
+        first = observations[0]
+        return {name: _stacked([one[name] for one in observations]) for name in first}
+    return np.stack(observations)
 
 
 def write_dataset(
@@ -147,14 +148,14 @@ def write_dataset(
     """Write episodes as a dataset, whole or not at all, and return its folder.
 
     Args:
-        dataset_id: What `minari.load_dataset` takes, "NAMESPACE/NAME-v0".
-        spec: Of the single environment: `dataset.recover_environment()` makes it anew.
+        dataset_id: Id for `minari.load_dataset`, "NAMESPACE/NAME-v0".
+        spec: Spec of the single environment, for `dataset.recover_environment()`.
         episodes: From `record_episodes`.
-        algorithm: What acted.
-        description: What the dataset is.
+        algorithm: Name of the policy's algorithm.
+        description: Description of the dataset.
 
     Raises:
-        NPAError: There is such a dataset, the id is none, or files cannot be written.
+        NPAError: The dataset exists, the id is invalid, or files cannot be written.
     """
     if not _DATASET_ID.fullmatch(dataset_id):
         raise NPAError(
@@ -172,7 +173,7 @@ def write_dataset(
     try:
         part.mkdir()
         with _datasets_in(part), warnings.catch_warnings():
-            # It asks for authors, an address and a place of code.
+            # Minari warns about missing authors, addresses and links to code.
             warnings.simplefilter("ignore", UserWarning)
             made = minari.create_dataset_from_buffers(
                 dataset_id,
@@ -188,7 +189,7 @@ def write_dataset(
             create_namespace(namespace)
         os.replace(part / dataset_id, target)
     except NPAError:
-        # That of an episode, which says itself what is wrong.
+        # Errors of `episodes` need no other message.
         raise
     except (OSError, ValueError) as error:
         raise NPAError(
@@ -202,7 +203,7 @@ def write_dataset(
 
 @contextlib.contextmanager
 def _datasets_in(folder: Path) -> Iterator[None]:
-    """A block in which Minari's datasets lie in a folder."""
+    """Set the folder of Minari's datasets within a block."""
     before = os.environ.get(ROOT)
     os.environ[ROOT] = str(folder)
     try:
@@ -215,7 +216,7 @@ def _datasets_in(folder: Path) -> Iterator[None]:
 
 
 def spec_of(env_id: str, keywords: dict[str, Any], episode_steps: int) -> EnvSpec:
-    """Return what Gymnasium makes an environment of, with keywords and a limit of its steps."""
+    """Return the spec of a single environment with keywords and a step limit."""
     spec = deepcopy(gymnasium.spec(env_id))
     spec.kwargs = {**spec.kwargs, **keywords}
     spec.max_episode_steps = episode_steps
@@ -224,13 +225,13 @@ def spec_of(env_id: str, keywords: dict[str, Any], episode_steps: int) -> EnvSpe
 
 
 def read_pairs(dataset_id: str) -> tuple[Tensor, Tensor]:
-    """Return all observations of a dataset with what was done then, on the CPU.
+    """Return all observations of a dataset with the actions taken there, on the CPU.
 
     Returns:
         Observations, float32, shape [W, ...], and actions, shape [W, ...], of W steps.
 
     Raises:
-        NPAError: There is no such dataset, or observations are no arrays.
+        NPAError: There is no such dataset, or observations are not arrays.
     """
     try:
         dataset = minari.load_dataset(dataset_id)
@@ -239,14 +240,14 @@ def read_pairs(dataset_id: str) -> tuple[Tensor, Tensor]:
             f"there is no dataset {shown(dataset_id)} in {shown(str(get_dataset_path()))}: record "
             "one with npa-envs record, or set MINARI_DATASETS_PATH"
         ) from error
-    seen, done = [], []
+    observations, actions = [], []
     for episode in dataset.iterate_episodes():
         if not isinstance(episode.observations, np.ndarray):
             raise NPAError(
-                f"dataset {shown(dataset_id)} must hold arrays, got observations of "
+                f"dataset {shown(dataset_id)} must have arrays, got observations of "
                 f"{type(episode.observations).__name__}"
             )
-        # The last observation is one that nobody acted on.
-        seen.append(as_tensor(episode.observations[:-1]))
-        done.append(as_tensor(episode.actions))
-    return torch.cat(seen).float(), torch.cat(done).float()
+        # The last observation of an episode has no action.
+        observations.append(as_tensor(episode.observations[:-1]))
+        actions.append(as_tensor(episode.actions))
+    return torch.cat(observations).float(), torch.cat(actions).float()

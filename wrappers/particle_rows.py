@@ -1,4 +1,4 @@
-"""Particles as the rows of another vector environment of Gymnasium's, for RLlib and its like."""
+"""Particles as the rows of another Gymnasium vector environment, as RLlib needs it."""
 
 from __future__ import annotations
 
@@ -22,24 +22,24 @@ from npa_envs.wrappers.base import (
 
 
 class ParticleRows(ParticleRowsBase, AnyVectorEnv):
-    """The particles of a vector environment as the rows of another one, arrays on the host.
+    """The particles of a vector environment as the rows of another one, with NumPy arrays.
 
     Row w N + i is particle i of world w: it observes that particle's perception, shape [P], gives
     its action, shape [A], and gets its own reward where the environment was made with
     `reward="particle"`, else its world's. The particles of a world begin and end their episodes
     together, and a new one begins in the step after (next-step autoreset).
 
-    For libraries that train one policy on the rows of any vector environment of Gymnasium's.
-    Infos are empty, as few of them could read those of many rows.
+    For libraries that train one policy on the rows of any Gymnasium vector environment. Infos are
+    empty.
 
     Args:
         env: A vector environment of this package, wrapped or not, with next-step autoreset.
 
     Raises:
-        NPAError: The environment is none of this package, or has another autoreset mode.
+        NPAError: The environment is not of this package, or has another autoreset mode.
     """
 
-    # Gymnasium closes what is deleted, also what was refused below: that has nothing to close.
+    # Gymnasium closes deleted objects, also if the constructor failed and nothing is open.
     closed = True
 
     def __init__(self, env: AnyVectorEnv) -> None:
@@ -47,7 +47,7 @@ class ParticleRows(ParticleRowsBase, AnyVectorEnv):
         check_autoreset(
             autoreset_mode(env), "next-step", "restart worlds in the step after the last one"
         )
-        self.hold(env, base)
+        self.set_env(env, base)
         self.metadata = env.metadata
         self.render_mode = env.render_mode
         self.single_observation_space = row_space(env.single_observation_space)
@@ -56,12 +56,12 @@ class ParticleRows(ParticleRowsBase, AnyVectorEnv):
 
     @cached_property
     def observation_space(self) -> Space[Any]:  # type: ignore[override]
-        """Observations of all rows, shape [B N, P]; made when asked for, as it is large."""
+        """Space of all rows' observations, [B N, P]; large, so made at the first use."""
         return batch_space(self.single_observation_space, self.num_envs)
 
     @cached_property
     def action_space(self) -> Space[Any]:  # type: ignore[override]
-        """Actions of all rows, shape [B N, A]; made when asked for, as it is large."""
+        """Space of all rows' actions, [B N, A]; large, so made at the first use."""
         return batch_space(self.single_action_space, self.num_envs)
 
     def reset(
@@ -70,8 +70,8 @@ class ParticleRows(ParticleRowsBase, AnyVectorEnv):
         """Start episodes in all worlds.
 
         Args:
-            seed: World w begins the episodes of seed + w; None: the sequences go on.
-            options: Not used: rows cannot restart without the others of their world.
+            seed: World w begins the sequence of seed + w; None: each world's next episode.
+            options: Not used, as rows cannot restart without the others of their world.
 
         Returns:
             Observations of the rows, shape [B N, P], and an empty info.
@@ -91,21 +91,20 @@ class ParticleRows(ParticleRowsBase, AnyVectorEnv):
         """Step all worlds.
 
         Args:
-            actions: Of each row, shape [B N, A].
+            actions: Shape [B N, A].
 
         Returns:
-            Of each row: observation [B N, P], reward, termination and truncation [B N]; and an
-            empty info.
+            Observations [B N, P], rewards, terminations and truncations [B N], and an empty info.
 
         Raises:
-            NPAError: The actions have another shape; the worlds are then as they were.
-            DivergedError: An action is not finite; the worlds are then as they were.
+            NPAError: The actions have another shape; the worlds are not changed.
+            DivergedError: An action is not finite; the worlds are not changed.
         """
-        rows, paid, ended, cut, _ = self.step_worlds(actions)
-        return to_host(rows), to_host(paid).astype(np.float64), to_host(ended), to_host(cut), {}
+        rows, rewards, ended, cut, _ = self.step_worlds(actions)
+        return to_host(rows), to_host(rewards).astype(np.float64), to_host(ended), to_host(cut), {}
 
     def render(self) -> Any:
-        """Return what the environment shows: a picture of each world."""
+        """Return the environment's pictures of the worlds."""
         return self.vector_env.render()
 
     def close_extras(self, **kwargs: Any) -> None:

@@ -33,7 +33,7 @@ except ImportError as error:
     ) from error
 
 EVERYONE = "everyone"
-"""Name of the policy that all species share, where they do."""
+"""Name of the policy that all species share with `shared=True`."""
 
 MAKERS = {
     name: (module.parallel_env, task)
@@ -46,11 +46,11 @@ ROW_IDS = tuple(row.id for row in ALL)
 """Ids of Gymnasium's registry."""
 
 WHOLE_IDS = frozenset((*GARDEN_IDS, *(row.id for row in CODED)))
-"""Those where an action is of a whole world."""
+"""Ids of environments whose actions are for a whole world."""
 
 
 def _agents(name: str, keywords: dict[str, Any]) -> ParallelPettingZooEnv:
-    """Return the environment of an id and keywords, as RLlib asks for it."""
+    """Make the environment of an id and keywords, as a creator for RLlib."""
     make, task = MAKERS[name]
     return ParallelPettingZooEnv(make(task, **dict(keywords)))
 
@@ -60,8 +60,8 @@ def _policy_of(policies: dict[str, str], agent: str, *_: Any, **__: Any) -> str:
 
 
 def _rows(name: str, keywords: dict[str, Any]) -> AnyVectorEnv:
-    """Return worlds of an id, as many as give so many rows, as RLlib asks for them."""
-    # In a process of RLlib's this module may be all that was imported.
+    """Make the worlds of an id for `num_envs` rows, as a creator for RLlib."""
+    # A process of RLlib may have imported this module only.
     register_environments()
     fields = dict(keywords)
     count = fields.pop("num_envs")
@@ -80,7 +80,7 @@ def _worlds(name: str, count: int, fields: dict[str, Any]) -> AnyVectorEnv:
 
 
 def _flat(worlds: AnyVectorEnv) -> AnyVectorEnv:
-    """Return worlds whose observations and actions have one dimension, as RLlib's networks do."""
+    """Return worlds with flattened observations and actions, as RLlib's networks need."""
     space, flat = worlds.single_action_space, FlattenObservation(worlds)
     if not isinstance(space, Box):
         return flat
@@ -94,10 +94,10 @@ def _flat(worlds: AnyVectorEnv) -> AnyVectorEnv:
 def rllib_config(name: str, *, shared: bool = False, **keywords: Any) -> PPOConfig:
     """Register an environment with RLlib, and return a configuration of PPO for it.
 
-    Every species has a policy of its own, `species_0` and so on, which all of its particles share
-    where these are the agents, as in `npa/MixingParticles-v0`. Where species are, observations have
-    two dimensions, for which RLlib has no network: bring one along. Everything else is RLlib's
-    default, to be changed as always: `rllib_config(...).training(...)`.
+    Every species has its own policy, `species_0` and so on, which all of its particles share if
+    particles are the agents, as in `npa/MixingParticles-v0`. If species are the agents,
+    observations have two dimensions, for which RLlib has no network: give one yourself. Everything
+    else is RLlib's default, which you can change: `rllib_config(...).training(...)`.
 
     Args:
         name: An id of PettingZoo's registry.
@@ -129,13 +129,13 @@ def rllib_config(name: str, *, shared: bool = False, **keywords: Any) -> PPOConf
 def rllib_rows_config(
     name: str, *, particle_count: int | None = None, world_count: int = 4, **keywords: Any
 ) -> PPOConfig:
-    """Register an environment of Gymnasium's with RLlib, and return a configuration of PPO for it.
+    """Register a Gymnasium environment with RLlib, and return a configuration of PPO for it.
 
-    Particles are the rows of a vector environment, and one policy is shared by all of them. In
-    gardens, and where an action is a code, the rows are worlds instead, observations and actions
-    flattened. Each environment runner steps `world_count` worlds as one batch. Everything else is
-    RLlib's default, to be changed as always: `rllib_rows_config(...).training(...)`. RLlib keeps an
-    object of its own for each row, so hundreds of rows suit it better than many thousands.
+    Particles are the rows of a vector environment, and share one policy. In environments whose
+    actions are brushes or codes the rows are worlds instead, with flattened observations and
+    actions. Each environment runner steps `world_count` worlds as one batch. Everything else is
+    RLlib's default, which you can change: `rllib_rows_config(...).training(...)`. RLlib has an
+    object for each row, so hundreds of rows suit it better than many thousands.
 
     Args:
         name: An id of Gymnasium's registry, of any size.
@@ -170,7 +170,7 @@ def rllib_rows_config(
 
 
 def _check_id(name: str, known: Collection[str], others: Collection[str], cure: str) -> None:
-    """Check that an id is known to one of the two functions."""
+    """Check that an id is among the known ones; `cure` is the function for the others."""
     if name not in known:
         hint = f"take {cure} for it; " if name in others else ""
         raise NPAError(f"name must be a known id, got {shown(name)}: {hint}{suggest(name, known)}")

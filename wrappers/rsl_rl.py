@@ -30,22 +30,22 @@ class RslRlParticleEnv(ParticleRowsBase, VecEnv):  # type: ignore[misc]
 
     Row w N + i is particle i of world w. It observes that particle's perception, shape [P], in the
     observation group "policy", gives its action, shape [A], and gets its own reward where the
-    environment was made with `reward="particle"`, else its world's. One policy is so shared by all
-    particles. Observations, rewards and flags stay on the environment's device.
+    environment was made with `reward="particle"`, else its world's. So all particles share one
+    policy. Observations, rewards and flags stay on the environment's device.
 
     At the ends of episodes the means of the last losses and of success are logged, as
     `Episode/loss` and `Episode/success`.
 
     Args:
         env: A vector environment of this package, wrapped or not, made with `output="torch"`, with
-            same-step autoreset and `copy=True` (the default): RSL-RL keeps what it gets.
-        seed: World w begins with the episode of seed + w; None: any.
-        bootstrap: Whether rows cut off by the step limit say so, from which RSL-RL estimates what
-            they would still have got; False: such an end counts as any other.
+            same-step autoreset and `copy=True` (the default), as RSL-RL stores the tensors.
+        seed: World w begins with the episode of seed + w; None: a drawn one.
+        bootstrap: Whether extras mark truncation by the step limit, so that RSL-RL bootstraps the
+            value there; False: truncation counts as termination.
 
     Raises:
-        NPAError: The environment is none of this package, hands out arrays or the same tensors
-            in each step, or has another autoreset mode.
+        NPAError: The environment is not of this package, returns arrays or the same tensors in each
+            step, or has another autoreset mode.
         MissingDependencyError: RSL-RL is not installed (on import).
     """
 
@@ -54,9 +54,9 @@ class RslRlParticleEnv(ParticleRowsBase, VecEnv):  # type: ignore[misc]
     ) -> None:
         base = torch_env(env, type(self).__name__)
         check_same_step(autoreset_mode(env))
-        self.hold(env, base)
+        self.set_env(env, base)
         self.bootstrap = bootstrap
-        """Whether rows cut off by the step limit say so."""
+        """Whether extras mark truncation by the step limit."""
         self.num_actions = base.worlds.physics.action_dim
         self.max_episode_length = base.worlds.episode_steps or 2**31 - 1
         self.device = base.worlds.x.device
@@ -72,7 +72,7 @@ class RslRlParticleEnv(ParticleRowsBase, VecEnv):  # type: ignore[misc]
     @episode_length_buf.setter
     def episode_length_buf(self, _: Tensor) -> NoReturn:
         raise NPAError(
-            "episode_length_buf cannot be set, the worlds keep their own time: "
+            "episode_length_buf cannot be set, the worlds count their own steps: "
             "call learn with init_at_random_ep_len=False"
         )
 
@@ -85,19 +85,19 @@ class RslRlParticleEnv(ParticleRowsBase, VecEnv):  # type: ignore[misc]
         """Step all worlds.
 
         Args:
-            actions: Of each row, shape [B N, A].
+            actions: Shape [B N, A].
 
         Returns:
-            Of each row: observations, reward [B N], whether its episode is over, int64, [B N]; and
-            extras, with `time_outs` [B N], and `log` where episodes ended.
+            Observations, rewards [B N], done flags, int64, [B N], and extras, with `time_outs`
+            [B N], and `log` where episodes ended.
 
         Raises:
-            NPAError: The actions have another shape; the worlds are then as they were.
-            DivergedError: An action is not finite; the worlds are then as they were.
+            NPAError: The actions have another shape; the worlds are not changed.
+            DivergedError: An action is not finite; the worlds are not changed.
         """
-        # RSL-RL collects in inference mode, whose tensors nobody else could write to afterwards.
+        # RSL-RL collects in inference mode, whose tensors later steps could not write to.
         with torch.inference_mode(False), torch.no_grad():
-            self._seen, paid, ended, cut, infos = self.step_worlds(actions.clone())
+            self._seen, rewards, ended, cut, infos = self.step_worlds(actions.clone())
             over = ended | cut
             self._elapsed = torch.where(over, 0, self._elapsed + 1)
             extras: dict[str, Any] = {}
@@ -105,11 +105,11 @@ class RslRlParticleEnv(ParticleRowsBase, VecEnv):  # type: ignore[misc]
                 extras["time_outs"] = cut & ~ended
             if "final_info" in infos:
                 extras["log"] = _episode_log(infos)
-            return self.get_observations(), paid, over.long(), extras
+            return self.get_observations(), rewards, over.long(), extras
 
 
 def _episode_log(infos: dict[str, Any]) -> dict[str, Tensor]:
-    """Return means over the worlds whose episodes are over, without waiting for the device."""
+    """Return means over the worlds whose episodes are over, without synchronising."""
     final, which = infos["final_info"], infos["_final_info"]
     return {
         f"Episode/{name}": torch.where(which, final[name].float(), 0.0).sum() / which.sum()

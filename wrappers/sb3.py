@@ -38,11 +38,11 @@ RowSteps = tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.bool_], li
 
 
 class SharedInfo(dict[str, Any]):
-    """The empty info that all rows in the midst of their episodes share, so it stays empty."""
+    """The read-only empty info that all rows share whose episodes go on."""
 
     def _refuse(self, *_: Any, **__: Any) -> NoReturn:
         raise NPAError(
-            "info of a row in the midst of its episode is shared by all such rows: "
+            "info of a row whose episode goes on is shared by all such rows: "
             "put a copy into the list, infos[row] = dict(infos[row])"
         )
 
@@ -50,7 +50,7 @@ class SharedInfo(dict[str, Any]):
 
 
 class RowVecEnv(VecEnv):
-    """Rows of a batch of worlds, as many of each; subclasses say what a row sees, does and gets."""
+    """Base class: a `VecEnv` with equally many rows for each world; subclasses define rows."""
 
     def __init__(
         self,
@@ -61,21 +61,21 @@ class RowVecEnv(VecEnv):
         action_space: Space[Any],
     ) -> None:
         self.vector_env = env
-        """The environment whose particles these are."""
+        """The vector environment."""
         self.world_count = world_count
         """Worlds B."""
         self.row_count = row_count
         """Rows of a world, R."""
         self.spec = getattr(env, "spec", None)
-        """What Gymnasium knows of the environment."""
+        """Gymnasium's spec of the environment."""
         self.nothing: dict[str, Any] = SharedInfo()
-        """The info of all rows in the midst of their episodes."""
+        """The info of all rows whose episodes go on."""
         self._seed: int | None = None
         self._actions: NDArray[np.float32] | None = None
         super().__init__(world_count * row_count, observation_space, action_space)
 
     def begin(self) -> tuple[Any, Any]:
-        """Reset the environment with what `seed` and `set_options` left for it."""
+        """Reset the environment with the arguments of `seed` and `set_options`."""
         outcome: tuple[Any, Any] = self.vector_env.reset(
             seed=self._seed, options=self._options[0] or None
         )
@@ -85,26 +85,26 @@ class RowVecEnv(VecEnv):
         return outcome
 
     def step_async(self, actions: NDArray[Any]) -> None:
-        """Keep the actions of all rows, shape [B R, A], for `step_wait`."""
+        """Store the actions of all rows, shape [B R, A], for `step_wait`."""
         check_row_actions(actions, self.num_envs, *(self.action_space.shape or ()))
         self._actions = actions.reshape(self.world_count, self.row_count, -1)
 
     def taken_actions(self) -> NDArray[np.float32]:
-        """Return the actions that were kept, shape [B, R, A]; they are taken once."""
+        """Return the stored actions, shape [B, R, A], and delete them."""
         if self._actions is None:
             raise NPAError("step_wait needs actions: call step_async, or step")
         actions, self._actions = self._actions, None
         return actions
 
     def infos(self, rows: NDArray[np.int64], entries: Mapping[str, Any]) -> list[dict[str, Any]]:
-        """Return an info of its own for some rows, [M], and the shared empty one for the others.
+        """Return infos of all rows: `entries` for some, [M], and the shared empty one for others.
 
-        Entries hold something for each of these rows; None: nothing.
+        Entries have a value for each of the M rows; those that are None are left out.
         """
         infos: list[dict[str, Any]] = [self.nothing] * self.num_envs
-        told = {name: values for name, values in entries.items() if values is not None}
+        given = {name: values for name, values in entries.items() if values is not None}
         for k, row in enumerate(rows.tolist()):
-            infos[row] = {name: values[k] for name, values in told.items()}
+            infos[row] = {name: values[k] for name, values in given.items()}
         return infos
 
     def close(self) -> None:
@@ -112,9 +112,9 @@ class RowVecEnv(VecEnv):
         self.vector_env.close()
 
     def seed(self, seed: int | None = None) -> list[int | None]:
-        """Let the next reset begin the sequences of episodes of seed, seed + 1, ..., one a world.
+        """Set the seed of the next reset, seed + k for world k; return that of each row's world.
 
-        Without a number it is any. Returned is the seed of each row's world.
+        None draws a seed.
         """
         if seed is None:
             seed = int(np.random.default_rng().integers(2**32))
@@ -123,16 +123,16 @@ class RowVecEnv(VecEnv):
         return [self._seed + world for world in worlds.tolist()]
 
     def get_images(self) -> list[NDArray[np.uint8] | None]:
-        """Return a picture of each world, shape [R, R, 3], or nothing without a render mode."""
+        """Return a picture of each world, shape [R, R, 3]; an empty list without a render mode."""
         pictures: Any = self.vector_env.render()
         return list(pictures or ())
 
     def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
-        """Return an attribute of the environment, once for each row; wrappers are asked first."""
+        """Return an attribute of the environment or its wrappers, once for each row."""
         return [getattr(self._holder(attr_name), attr_name)] * len(self._chosen(indices))
 
     def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
-        """Set an attribute of the environment where it is found, else of the innermost one."""
+        """Set an attribute on the wrapper or environment that has it, else on the innermost."""
         if len(set(self._chosen(indices))) != self.num_envs:
             raise NPAError("indices must be all rows, which share one environment: give None")
         try:
@@ -171,11 +171,11 @@ class RowVecEnv(VecEnv):
 
 
 def on_host(*given: Any) -> list[NDArray[Any]]:
-    """Return new arrays with what arrays or tensors hold, after one wait for the device."""
+    """Return copies of arrays or tensors as arrays, synchronising once."""
     copies = []
     for values in given:
         tensor = as_tensor(values)
-        # Pinned memory comes from torch's cache and goes back to it with the array.
+        # Pinned memory comes from torch's cache and returns to it with the array.
         copy = torch.empty(
             tensor.shape, dtype=tensor.dtype, device="cpu", pin_memory=tensor.is_cuda
         )
@@ -186,35 +186,41 @@ def on_host(*given: Any) -> list[NDArray[Any]]:
 
 
 class _EpisodeRows(RowVecEnv):
-    """Rows whose episodes are those of their worlds; subclasses say what a row is."""
+    """Base class of rows whose episodes are those of their worlds."""
 
     bootstrap = True
-    """Whether rows cut off by the step limit say so."""
+    """Whether infos mark truncation by the step limit."""
 
     per_particle_reward = True
-    """Whether rows are paid what their particles are, where that is known."""
+    """Whether rows get their particles' rewards, if there are any."""
 
     def reset(self) -> Any:
         """Start episodes in all worlds and return the rows' observations, shape [B R, ...]."""
         observations, _ = self.begin()
-        return self._shown(observations)
+        return self._row_observations(observations)
 
     def step_wait(self) -> RowSteps:
-        """Step all worlds; return of each row observation, reward, whether it is over, info."""
+        """Step all worlds; return the rows' observations, rewards, done flags and infos."""
         shape = self.vector_env.single_action_space.shape
         actions = self.taken_actions().reshape(self.world_count, *shape)
         observations, rewards, terminations, truncations, infos = self.vector_env.step(actions)
-        own = own_rewards(infos) if self.per_particle_reward else None
-        paid, ended, cut = on_host(rewards if own is None else own, terminations, truncations)
-        if own is None:
-            paid = np.repeat(paid, self.row_count)
+        by_particle = own_rewards(infos) if self.per_particle_reward else None
+        given = rewards if by_particle is None else by_particle
+        rewards, ended, cut = on_host(given, terminations, truncations)
+        if by_particle is None:
+            rewards = np.repeat(rewards, self.row_count)
         done = ended | cut
-        row_infos = self._ends(np.flatnonzero(done), cut & ~ended, infos)
-        paid = paid.reshape(self.num_envs).astype(np.float32, copy=False)
-        return self._shown(observations), paid, np.repeat(done, self.row_count), row_infos
+        row_infos = self._end_infos(np.flatnonzero(done), cut & ~ended, infos)
+        rewards = rewards.reshape(self.num_envs).astype(np.float32, copy=False)
+        return (
+            self._row_observations(observations),
+            rewards,
+            np.repeat(done, self.row_count),
+            row_infos,
+        )
 
-    def _shown(self, observations: Any) -> Any:
-        """Return observations of all worlds, or of some, as those of their rows."""
+    def _row_observations(self, observations: Any) -> Any:
+        """Return the rows' observations for those of all or some worlds."""
         if isinstance(observations, Mapping):
             return dict(zip(observations, on_host(*observations.values()), strict=True))
         return self._as_rows(on_host(observations)[0])
@@ -222,7 +228,7 @@ class _EpisodeRows(RowVecEnv):
     def _as_rows(self, values: NDArray[Any]) -> NDArray[Any]:
         return values.reshape(-1, *(self.observation_space.shape or ()))
 
-    def _ends(
+    def _end_infos(
         self, worlds: NDArray[np.int64], cut: NDArray[np.bool_], infos: dict[str, Any]
     ) -> list[dict[str, Any]]:
         """Return the infos of all rows, after a step in which the episodes of some worlds ended."""
@@ -244,13 +250,13 @@ class _EpisodeRows(RowVecEnv):
     def _last(self, final: Any, worlds: NDArray[np.int64]) -> Any:
         """Return the last observations of worlds that are over, one for each of their rows."""
         if isinstance(final, Mapping):
-            shown = {name: values[worlds] for name, values in self._shown(final).items()}
-            return [{name: rows[k] for name, rows in shown.items()} for k in range(len(worlds))]
+            last = {n: values[worlds] for n, values in self._row_observations(final).items()}
+            return [{name: rows[k] for name, rows in last.items()} for k in range(len(worlds))]
         if not isinstance(final, Tensor) and final.dtype == object:
             return list(final[worlds])
-        # Of the worlds that are over alone, as all are much to copy.
+        # Only ended worlds are copied.
         rows = as_tensor(final)
-        return self._shown(rows[torch.from_numpy(worlds).to(rows.device)])
+        return self._row_observations(rows[torch.from_numpy(worlds).to(rows.device)])
 
 
 class ParticleVecEnv(_EpisodeRows):
@@ -258,26 +264,25 @@ class ParticleVecEnv(_EpisodeRows):
 
     Row w N + i is particle i of world w: it observes that particle's perception, shape [P], gives
     its action, shape [A], and gets its own reward where the environment was made with
-    `reward="particle"`; with any other reward each row gets its world's. So a policy of any
-    algorithm is shared by all particles, and sees what a rule sees. A step stays one batched step,
-    and costs one copy of the observations to the host (on CUDA make the environment with
-    `output="torch"`: the copy is then pinned).
+    `reward="particle"`; with any other reward each row gets its world's. So all particles share one
+    policy, with the observation of a rule. A step is one batched step, and copies the observations
+    to the host once (on CUDA make the environment with `output="torch"`: the copy is then pinned).
 
-    Rows of a finished world have an info of their own, with `terminal_observation`,
-    `TimeLimit.truncated` and `is_success`; the others share an empty one, which cannot be written
-    to. Attributes and methods belong to the whole environment: each row gives the same.
+    Rows of a finished world have their own infos, with `terminal_observation`,
+    `TimeLimit.truncated` and `is_success`; the others share a read-only empty one. Attributes and
+    methods are those of the whole environment, the same for each row.
 
     Stable-Baselines3 counts rows: 8 worlds of 1024 particles are 8192 steps at once. Its defaults
     are made for a few rows; with PPO set for example `n_steps=32, batch_size=4096`.
 
     Args:
         env: A vector environment of this package, wrapped or not, with same-step autoreset.
-        bootstrap: Whether rows cut off by the step limit say so, from which Stable-Baselines3
-            estimates what they would still have got. On-policy algorithms do that row by row, which
-            for many thousand rows takes seconds; False: such an end counts as any other.
+        bootstrap: Whether infos mark truncation by the step limit, so that Stable-Baselines3
+            bootstraps the value there. On-policy algorithms do that row by row, which takes seconds
+            for many thousand rows; False: truncation counts as termination.
 
     Raises:
-        NPAError: The environment is none of this package, or has another autoreset mode.
+        NPAError: The environment is not of this package, or has another autoreset mode.
         MissingDependencyError: Stable-Baselines3 is not installed (on import).
     """
 
@@ -285,7 +290,7 @@ class ParticleVecEnv(_EpisodeRows):
         base = vector_env(env, type(self).__name__)
         check_same_step(autoreset_mode(env))
         self.bootstrap = bootstrap
-        """Whether rows cut off by the step limit say so."""
+        """Whether infos mark truncation by the step limit."""
         self.particle_count = base.config.particle_count
         """Particles N of a world."""
         super().__init__(
@@ -300,16 +305,16 @@ class ParticleVecEnv(_EpisodeRows):
 class WorldVecEnv(_EpisodeRows):
     """The worlds of a vector environment as the rows of a Stable-Baselines3 `VecEnv`.
 
-    A row is a world. Of a living world, such as `npa/Gardener2D-v0`, it observes and gives few
-    numbers, and Stable-Baselines3's own policies learn; dictionaries are kept.
+    A row is a world. Rule-driven worlds, such as `npa/Gardener2D-v0`, have small observations and
+    actions, which suit Stable-Baselines3's own policies; dictionary observations stay dictionaries.
 
-    Where actions belong to particles a row observes what all of them perceive, shape [N, P], and
-    gives all their actions, [N, A]. Stable-Baselines3's own policies draw those from one Gaussian
-    of N A columns, which cannot learn: after the smallest update the ratio of two likelihoods is
-    near zero or beyond all bounds. Take a policy that means over particles instead of summing, such
-    as `npa_envs.agents.learning.sb3.WorldRulePolicy`.
+    Where actions belong to particles, a row's observation is the perception of all of them, shape
+    [N, P], and its action all their actions, [N, A]. Stable-Baselines3's own policies draw those
+    from one Gaussian of N A dimensions, which cannot learn: after a small update the ratio of two
+    likelihoods is near zero or overflows. Take a policy that averages log-likelihoods over
+    particles, such as `npa_envs.agents.learning.sb3.WorldRulePolicy`.
 
-    Rows of a finished world have an info of their own, with `terminal_observation`,
+    Rows of a finished world have their own infos, with `terminal_observation`,
     `TimeLimit.truncated` and, where there is one, `is_success`; the others share an empty one.
 
     Args:
@@ -328,7 +333,7 @@ class WorldVecEnv(_EpisodeRows):
         ]
         if None in spaces:
             raise NPAError(
-                f"env must hold many worlds, got {env}: make it with "
+                f"env must be a vector environment, got {env}: make it with "
                 "gym.make_vec(..., vectorization_mode='vector_entry_point')"
             )
         check_same_step(autoreset_mode(env))
@@ -343,12 +348,12 @@ class RowPolicy:
     """A Stable-Baselines3 model that was trained on rows, as the policy of a species or a world.
 
     Args:
-        model: The model; the policy follows when it is trained on.
+        model: The model; training it further changes the policy.
         deterministic: Whether it acts by its mean instead of a draw.
-        tag: Columns with the species behind each row, shape [K]; None: nothing.
+        tag: One-hot species to append to each row, shape [K]; None: nothing.
 
     Raises:
-        NPAError: The model is none.
+        NPAError: `model` has no method `predict`.
     """
 
     def __init__(
@@ -365,33 +370,33 @@ class RowPolicy:
 
     def __call__(self, observations: Any) -> NDArray[np.float32]:
         """Return actions, shape [B, N, A]."""
-        (seen,) = on_host(observations)
-        rows = seen.reshape(-1, seen.shape[-1])
+        (observed,) = on_host(observations)
+        rows = observed.reshape(-1, observed.shape[-1])
         if self.tag is not None:
             rows = np.hstack((rows, np.broadcast_to(self.tag, (len(rows), len(self.tag)))))
         actions, _ = self.model.predict(rows, deterministic=self.deterministic)
-        return np.asarray(actions, np.float32).reshape(*seen.shape[:-1], -1)
+        return np.asarray(actions, np.float32).reshape(*observed.shape[:-1], -1)
 
 
 class SpeciesVecEnv(RowVecEnv):
     """Particles of several species as the rows of a Stable-Baselines3 `VecEnv`.
 
-    Without `others` all particles of all species are rows and share one policy; a one-hot tag of
-    its species follows what each perceives. With `others` the particles of those species are played
-    by the policies given, and the remaining species' particles are the rows, without tags: for
-    policies of their own, train them in turn.
+    Without `others` all particles of all species are rows and share one policy; each observation
+    ends with a one-hot tag of the species. With `others` those species act by the given policies,
+    and the particles of the remaining species are the rows, without tags: so species can be trained
+    in turn.
 
-    A world's rows follow each other, species after species. Each row is paid what its species is.
-    Where a species ends, its rows end; until the world's next episode they see zeros,
-    are paid nothing, and their actions are not read. With the world they end once more.
+    A world's rows are sorted by species. Each row gets its species' reward. Rows of a species that
+    ended are done; until the world's next episode their observations and rewards are zeros, and
+    their actions are ignored. When the world ends they are done again.
 
     Args:
-        env: What `multispecies_v0.batched` returns, with same-step autoreset.
-        others: Policies of species that are not to be rows, by name.
+        env: From `multispecies_v0.batched`, with same-step autoreset.
+        others: Policies of the species that are no rows, by name.
 
     Raises:
-        NPAError: `env` is another environment, or does not restart worlds by itself, or there is no
-            species of a name, or none left to be rows, or a policy is no function.
+        NPAError: `env` is another environment or has another autoreset mode, a name in `others` is
+            unknown, a policy is no function, or no species remains.
         MissingDependencyError: Stable-Baselines3 is not installed (on import).
     """
 
@@ -412,7 +417,7 @@ class SpeciesVecEnv(RowVecEnv):
         for name, policy in self.others.items():
             if not callable(policy):
                 raise NPAError(
-                    f"others must hold functions of observations, got {type(policy).__name__} for "
+                    f"others must be functions of observations, got {type(policy).__name__} for "
                     f"{shown(name)}: RowPolicy(model) makes one of a model"
                 )
             if name not in env.possible_agents:
@@ -423,7 +428,7 @@ class SpeciesVecEnv(RowVecEnv):
         self.rows_of = [name for name in env.possible_agents if name not in self.others]
         """Species whose particles are rows, in order."""
         if not self.rows_of:
-            raise NPAError("others must leave at least one species to be rows, got all of them")
+            raise NPAError("others must not name all species: at least one has to be rows")
         spaces = env.single_observation_spaces
         self._counts = np.array([spaces[name].shape[0] for name in self.rows_of])
         observed = row_space(spaces[self.rows_of[0]])
@@ -449,11 +454,11 @@ class SpeciesVecEnv(RowVecEnv):
         own = np.split(self.taken_actions(), np.cumsum(self._counts)[:-1], axis=1)
         actions: dict[str, Any] = dict(zip(self.rows_of, own, strict=True))
         actions |= {name: policy(self._seen[name]) for name, policy in self.others.items()}
-        seen, rewards, terminations, truncations, infos = self.vector_env.step(actions)
-        self._seen = seen
+        observed, rewards, terminations, truncations, infos = self.vector_env.step(actions)
+        self._seen = observed
         live = {name: as_tensor(infos[name]["live"]) for name in self.rows_of}
-        shown, paid, ended, cut = on_host(
-            torch.where(self._repeated(live)[..., None], self._rows(seen), 0.0),
+        of_rows, of_rewards, ended, cut = on_host(
+            torch.where(self._repeated(live)[..., None], self._rows(observed), 0.0),
             self._repeated(rewards),
             self._repeated(terminations),
             self._repeated(truncations),
@@ -465,20 +470,21 @@ class SpeciesVecEnv(RowVecEnv):
             over |= restarted[:, None]
         rows, final = np.flatnonzero(over), None
         if len(rows):
-            last = {name: infos[name].get("final_obs", seen[name]) for name in self.rows_of}
+            last = {name: infos[name].get("final_obs", observed[name]) for name in self.rows_of}
             final = on_host(self._rows(last))[0].reshape(self.num_envs, -1)[rows]
         cut_off = (cut & ~ended).reshape(-1)[rows].tolist()
         row_infos = self.infos(
             rows, {"TimeLimit.truncated": cut_off, "terminal_observation": final}
         )
-        return shown.reshape(self.num_envs, -1), paid.reshape(-1), over.reshape(-1), row_infos
+        rows_observed = of_rows.reshape(self.num_envs, -1)
+        return rows_observed, of_rewards.reshape(-1), over.reshape(-1), row_infos
 
     def policy(self, model: Any, species: str, *, deterministic: bool = False) -> RowPolicy:
         """Return a model that was trained on these rows as the policy of one species.
 
         Args:
             model: The model.
-            species: Its name, one of `rows_of`.
+            species: Name of the species, one of `rows_of`.
             deterministic: Whether it acts by its mean instead of a draw.
         """
         if species not in self.rows_of:
@@ -492,14 +498,14 @@ class SpeciesVecEnv(RowVecEnv):
         return RowPolicy(model, deterministic=deterministic, tag=tag)
 
     def _rows(self, by_species: Mapping[str, Any]) -> Tensor:
-        """Return what rows observe, with tags where all species are rows, shape [B, R, P]."""
+        """Return the rows' observations, with tags if all species are rows, shape [B, R, P]."""
         rows = torch.cat([as_tensor(by_species[name]) for name in self.rows_of], dim=1)
         if self._tags is None:
             return rows
         return torch.cat((rows, self._tags.to(rows.device).expand(len(rows), -1, -1)), dim=2)
 
     def _repeated(self, by_species: Mapping[str, Any]) -> Tensor:
-        """Return what species have in each world, [B], for each of their rows, shape [B, R]."""
+        """Repeat values of species, [B] each, for each of their rows, shape [B, R]."""
         values = [as_tensor(by_species[name]) for name in self.rows_of]
         return torch.cat(
             [value[:, None].expand(-1, n) for value, n in zip(values, self._counts, strict=True)],

@@ -16,24 +16,24 @@ from npa_envs.errors import NPAError, shown, suggest
 from npa_envs.world.randomness import StreamId
 from npa_envs.wrappers.base import (
     Observations,
-    Twin,
     VectorObservations,
+    WrapperBase,
     world_indices,
 )
 
 ASSIGNMENTS = ("blocks", "random")
-"""How particles come by their species."""
+"""Ways to assign species to particles."""
 
 
 def tagged(observation: Any, tags: Any) -> Any:
-    """Return observations with tags behind them, arrays or tensors."""
+    """Return observations with tags as their last columns, arrays or tensors."""
     if isinstance(observation, Tensor):
         return torch.cat((observation, tags), dim=-1)
     return np.concatenate((observation, tags), axis=-1)
 
 
-class _TagsSpecies(Twin):
-    """The species of all particles, and their tags, for one world or many."""
+class _TagsSpecies(WrapperBase):
+    """Mixin with the species of all particles and their tags, for one world or many."""
 
     def __init__(
         self,
@@ -76,7 +76,7 @@ class _TagsSpecies(Twin):
             )
         self._species_count, self._random = species_count, assignment == "random"
         blocks = torch.arange(species_count).repeat_interleave(torch.from_numpy(sizes))
-        # Species of particles 0 to N - 1 where they stand in blocks.
+        # Species of particles 0 to N - 1 with assignment="blocks".
         self._blocks = blocks.to(self._base.task.device)
         setattr(self, self.space_name, self._tagged_space(getattr(env, self.space_name)))
         everyone = torch.arange(self._worlds.world_count, device=self._base.task.device)
@@ -116,7 +116,7 @@ class _TagsSpecies(Twin):
         self._tags = to_output(tags if self.many else tags[0], self._output)
 
     def observations(self, observations: Any) -> Any:
-        """Return observations with tags; worlds in a new episode get new ones."""
+        """Return observations with tags, which restarted worlds draw again if they are random."""
         restarted = self.restarted_worlds
         self._last_tags = self._tags
         if self._random and restarted.any():
@@ -125,7 +125,7 @@ class _TagsSpecies(Twin):
         return tagged(observations, self._tags)
 
     def final_observations(self, observations: Any) -> Any:
-        """Return observations with the tags that particles had in the step before."""
+        """Return observations with the tags of the previous step."""
         return tagged(observations, self._last_tags)
 
 
@@ -135,10 +135,10 @@ class SpeciesTags(_TagsSpecies, Observations):
     Args:
         env: An environment of this package.
         species_count: Species K.
-        fractions: Share of each species, of any sum; None: equal shares.
+        fractions: Relative size of each species, with any sum; None: equal sizes.
         assignment: "blocks": the first particles are species 0, the next species 1, and so on, in
-            every episode; "random": drawn anew for each episode from the world's own seed, in the
-            same numbers.
+            every episode; "random": drawn for each episode from the world's own seed, with the
+            same sizes.
 
     Raises:
         NPAError: An argument is wrong, or a species would have no particle.

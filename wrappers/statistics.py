@@ -1,7 +1,7 @@
-"""Wrappers with running statistics: of perception, of observations, rewards and episodes.
+"""Wrappers with running statistics of perception, observations, rewards and episodes.
 
-The wrappers named "Torch..." are those of `gymnasium.wrappers.vector` for tensors: they stay on the
-device, and know all three autoreset modes.
+"Torch..." wrappers are those of `gymnasium.wrappers.vector` for tensors on a device, with all three
+autoreset modes.
 """
 
 from __future__ import annotations
@@ -25,9 +25,9 @@ from npa_envs.wrappers.base import (
     AnyVectorEnv,
     EpisodeWrapper,
     Observations,
-    Twin,
     VectorObservations,
     VectorStep,
+    WrapperBase,
     as_tensor,
     autoreset_mode,
     check_vector_env,
@@ -36,11 +36,11 @@ from npa_envs.wrappers.base import (
 )
 
 PRIOR_COUNT = 1e-4
-"""Samples that the initial mean 0 and variance 1 count for, as in Gymnasium."""
+"""Weight, in samples, of the initial mean 0 and variance 1, as in Gymnasium."""
 
 
 class RunningMoments:
-    """Mean and variance of all samples so far, float64, without waiting for the device."""
+    """Mean and variance of all samples so far, float64, without synchronising."""
 
     def __init__(self, *shape: int) -> None:
         self.mean = torch.zeros(shape, dtype=torch.float64)
@@ -48,10 +48,7 @@ class RunningMoments:
         self.count = PRIOR_COUNT
 
     def update(self, mean: Tensor, var: Tensor, count: int) -> None:
-        """Take in a batch of samples; from then on the moments are on its device.
-
-        Its variance is divided by `count`, not by one less.
-        """
+        """Add a batch of samples by its mean, biased variance and count; takes its device."""
         old_mean, old_var = self.mean.to(mean.device), self.var.to(mean.device)
         total = self.count + count
         delta = mean.double() - old_mean
@@ -66,7 +63,7 @@ class RunningMoments:
         return {"mean": self.mean.cpu().clone(), "var": self.var.cpu().clone(), "count": count}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Take over what `state_dict` returned."""
+        """Set the state that `state_dict` returned."""
         wanted = {"mean": self.mean.shape, "var": self.var.shape, "count": torch.Size()}
         for name in state.keys() ^ wanted.keys():
             fault = "unknown" if name in state else "missing"
@@ -119,14 +116,14 @@ class PerceptionStatistics:
         )
 
     def normalize(self, observation: Any) -> Any:
-        """Return perception, shape [..., P], on one scale, clipped, as new float32 numbers."""
+        """Return perception, shape [..., P], normalised and clipped, as new float32 values."""
         z = as_tensor(observation)
         mean = self._spread(self.moments.mean).to(z)
         scale = self._spread((self.moments.var + self.epsilon).rsqrt()).to(z)
         return like(((z - mean) * scale).clamp_(-self.clip, self.clip), observation)
 
     def space(self, space: Any) -> Box:
-        """Return the space of normalised observations, by that of the observations as they are."""
+        """Return the space of normalised observations for a space of observations."""
         shape = (*(space.shape or ()),)
         if len(shape) != 2 or shape[1] != self.perception_dim:
             raise NPAError(
@@ -136,18 +133,18 @@ class PerceptionStatistics:
         return Box(-self.clip, self.clip, shape, np.float32)
 
     def _spread(self, statistics: Tensor) -> Tensor:
-        """Return the number of each entry of a perception vector, shape [P]."""
+        """Expand statistics to the entries of a perception vector, shape [P]."""
         centred = 2 * self.state_dim
         gradients = statistics[centred:].repeat_interleave(self.space_dim)
         return torch.cat((statistics[:centred], gradients))
 
 
-class _NormalizesPerception(Twin):
-    """Statistics of perception and normalisation by them, for one world or many."""
+class _NormalizesPerception(WrapperBase):
+    """Mixin that normalises perception by its statistics, for one world or many."""
 
     statistics: PerceptionStatistics
     training: bool
-    new_ones: Callable[[Any], Any]
+    new_observations: Callable[[Any], Any]
 
     def __init__(
         self,
@@ -184,13 +181,13 @@ class _NormalizesPerception(Twin):
         return self.statistics.moments.state_dict()
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Take over the statistics that another wrapper's `state_dict` returned."""
+        """Set the statistics that another wrapper's `state_dict` returned."""
         self.statistics.moments.load_state_dict(state)
 
     def observations(self, observations: Any) -> Any:
-        """Return observations normalised, and count them while training."""
+        """Return observations normalised; while training, first add new ones to the statistics."""
         if self.training:
-            self.statistics.update(self.new_ones(observations))
+            self.statistics.update(self.new_observations(observations))
         return self.statistics.normalize(observations)
 
     def final_observations(self, observations: Any) -> Any:
@@ -199,24 +196,24 @@ class _NormalizesPerception(Twin):
 
 
 class NormalizePerception(_NormalizesPerception, Observations):
-    """Bring perception to one scale, by running statistics.
+    """Normalise perception by running statistics that all particles share.
 
-    The environment's spec holds how, and not the statistics: save those with `state_dict`.
+    The environment's spec has the arguments, not the statistics: save those with `state_dict`.
 
     Args:
         env: An environment of this package.
-        clip: What is normalised is clipped to plus and minus this (dimensionless); None: to 10, or
-            as `statistics` has it.
-        epsilon: Added to variances (dimensionless); None: 1e-8, or as `statistics` has it.
-        training: Whether the statistics follow what is seen.
-        statistics: Those of another wrapper, to share; None makes new ones.
+        clip: Normalised values are clipped to plus and minus this (dimensionless); None: 10, or
+            that of `statistics`.
+        epsilon: Added to variances (dimensionless); None: 1e-8, or that of `statistics`.
+        training: Whether new observations update the statistics.
+        statistics: Those of another wrapper, to share; None: new ones.
 
     Raises:
         NPAError: The environment or a number is wrong, or `clip` or `epsilon` is given although
             `statistics` has its own.
 
     Attributes:
-        training: Whether the statistics follow what is seen; set it to False to freeze them.
+        training: Whether new observations update the statistics; set it to False to freeze them.
         statistics: The running statistics.
     """
 
@@ -224,9 +221,9 @@ class NormalizePerception(_NormalizesPerception, Observations):
 class VectorNormalizePerception(_NormalizesPerception, VectorObservations):
     """`NormalizePerception` for vector environments, of NumPy arrays or tensors on a device.
 
-    Final observations are normalised and not counted, nor are those of worlds that a reset leaves
-    alone. Nothing waits for the device. Arguments, errors and attributes are those of
-    `NormalizePerception`, but for `env`, a vector environment of this package.
+    Final observations are normalised and not counted, nor are repeated ones after a reset of some
+    worlds. Nothing synchronises. Arguments, errors and attributes are those of
+    `NormalizePerception`, except `env`, a vector environment of this package.
     """
 
 
@@ -239,7 +236,7 @@ class TorchRecordEpisodeStatistics(EpisodeWrapper):
 
     Args:
         env: A vector environment with torch tensors.
-        buffer_length: Episodes that the queues hold.
+        buffer_length: Episodes in the queues.
         stats_key: The key in `infos`.
 
     Raises:
@@ -266,25 +263,25 @@ class TorchRecordEpisodeStatistics(EpisodeWrapper):
         self.time_queue: deque[float] = deque(maxlen=buffer_length)
         """Times that the last episodes took [s]."""
         self._returns: deque[float] = deque(maxlen=buffer_length)
-        # Left on the device until somebody asks: each entry has one episode at least.
+        # On the device until they are read; each entry has at least one episode.
         self._unread: deque[Tensor] = deque(maxlen=buffer_length)
         self._began = np.full(env.num_envs, time.perf_counter())
 
     @property
     def return_queue(self) -> deque[float]:
-        """Returns of the last episodes; reading it waits for the device."""
+        """Returns of the last episodes; reading it synchronises."""
         if self._unread:
             self._returns.extend(torch.cat(tuple(self._unread)).tolist())
             self._unread.clear()
         return self._returns
 
     def after_reset(self, observations: Any, infos: dict[str, Any]) -> tuple[Any, dict[str, Any]]:
-        """Begin to sum the rewards of new episodes."""
+        """Set the sums of new episodes to zero."""
         self._restart(self.clock.restarted)
         return observations, infos
 
     def after_step(self, outcome: VectorStep) -> VectorStep:
-        """Sum the rewards, and tell of the episodes that ended."""
+        """Sum the rewards, and report the episodes that ended."""
         observations, rewards, terminations, truncations, infos = outcome
         check_tensor(rewards, type(self).__name__)
         returns = rewards.double()
@@ -293,7 +290,7 @@ class TorchRecordEpisodeStatistics(EpisodeWrapper):
         self.episode_returns = returns
         if self.clock.ended.any():
             infos = infos | self._ended(returns, rewards.device)
-        # Where the next step begins an episode, that step is none of the episode's own.
+        # With next-step autoreset the step that restarts belongs to no episode.
         self._restart(self.clock.restarted)
         return observations, rewards, terminations, truncations, infos
 
@@ -320,9 +317,9 @@ class TorchRecordEpisodeStatistics(EpisodeWrapper):
 class TorchNormalizeObservation(VectorObservations):
     """Centre each entry of the observations and scale it to unit variance, by running statistics.
 
-    As in Gymnasium each particle has statistics of its own; `VectorNormalizePerception` has one for
-    all. Final observations are normalised and not counted, nor are those of worlds that a reset
-    leaves alone.
+    As in Gymnasium each particle has its own statistics; `VectorNormalizePerception` shares them.
+    Final observations are normalised and not counted, nor are repeated ones after a reset of some
+    worlds.
 
     Args:
         env: A vector environment with torch tensors.
@@ -342,15 +339,15 @@ class TorchNormalizeObservation(VectorObservations):
         self.obs_rms = RunningMoments(*shape)
         """Running mean and variance of each entry."""
         self.update_running_mean = True
-        """Whether the statistics follow what is seen."""
+        """Whether new observations update the statistics."""
 
     def observations(self, observations: Any) -> Any:
         """Return observations normalised, and count them unless frozen."""
         check_tensor(observations, type(self).__name__)
         if self.update_running_mean:
-            seen = self.new_ones(observations)
-            var, mean = torch.var_mean(seen, dim=0, correction=0)
-            self.obs_rms.update(mean, var, len(seen))
+            new = self.new_observations(observations)
+            var, mean = torch.var_mean(new, dim=0, correction=0)
+            self.obs_rms.update(mean, var, len(new))
         return self.final_observations(observations)
 
     def final_observations(self, observations: Any) -> Any:
@@ -362,7 +359,7 @@ class TorchNormalizeObservation(VectorObservations):
 class TorchNormalizeReward(EpisodeWrapper):
     """Divide rewards by the running standard deviation of the discounted return.
 
-    The return begins anew with each episode, however the one before it ended.
+    The return restarts at zero with each episode.
 
     Args:
         env: A vector environment with torch tensors.
@@ -370,7 +367,7 @@ class TorchNormalizeReward(EpisodeWrapper):
         epsilon: Added to the variance (dimensionless).
 
     Raises:
-        NPAError: `gamma` lies elsewhere, or `epsilon` is not finite or not positive.
+        NPAError: `gamma` is not in [0, 1], or `epsilon` is not finite or not positive.
     """
 
     def __init__(self, env: AnyVectorEnv, gamma: float = 0.99, epsilon: float = 1e-8) -> None:
@@ -384,16 +381,16 @@ class TorchNormalizeReward(EpisodeWrapper):
         self.accumulated_reward: Tensor | None = None
         """Discounted return of each running episode, float64, shape [B]."""
         self.update_running_mean = True
-        """Whether the statistics follow what is seen."""
+        """Whether new rewards update the statistics."""
         self._same_step = autoreset_mode(env) is AutoresetMode.SAME_STEP
 
     def after_reset(self, observations: Any, infos: dict[str, Any]) -> tuple[Any, dict[str, Any]]:
-        """Forget the returns of the episodes before."""
+        """Set the returns of new episodes to zero."""
         self.accumulated_reward = forgotten(self.accumulated_reward, self.clock.restarted)
         return observations, infos
 
     def after_step(self, outcome: VectorStep) -> VectorStep:
-        """Return rewards on the scale of the discounted return."""
+        """Return rewards divided by the standard deviation of the discounted return."""
         observations, rewards, terminations, truncations, infos = outcome
         check_tensor(rewards, type(self).__name__)
         clock = self.clock
@@ -401,7 +398,7 @@ class TorchNormalizeReward(EpisodeWrapper):
         returns = rewards.double() if before is None else before * self.gamma + rewards.double()
         counted = returns
         if not self._same_step and clock.restarted.any():
-            # The step that begins an episode is none of its steps.
+            # With next-step autoreset the step that restarts belongs to no episode.
             counted = returns[world_indices(~clock.restarted, returns.device)]
         if self.update_running_mean and len(counted):
             var, mean = torch.var_mean(counted, dim=0, correction=0)
@@ -412,14 +409,14 @@ class TorchNormalizeReward(EpisodeWrapper):
 
 
 def forgotten(sums: Tensor | None, worlds: NDArray[np.bool_]) -> Tensor | None:
-    """Return sums of each world, shape [B], that begin anew at 0 in some of them."""
+    """Return sums of each world, shape [B], set to 0 in some of them."""
     if sums is None or not worlds.any():
         return sums
     return sums.index_fill(0, world_indices(worlds, sums.device), 0.0)
 
 
 def check_tensor(values: Any, wrapper: str) -> None:
-    """Check that what an environment handed out to a wrapper is a tensor."""
+    """Check that an environment returned a tensor to a wrapper."""
     if not isinstance(values, Tensor):
         raise NPAError(
             f"{wrapper} needs torch tensors, got {type(values).__name__}: make the environment "
@@ -428,7 +425,7 @@ def check_tensor(values: Any, wrapper: str) -> None:
 
 
 def above_zero(name: str, value: float) -> float:
-    """Return a number that must be finite and greater than 0, by its name."""
+    """Return the argument of this name, checked: finite and greater than 0."""
     if not is_real(value) or value <= 0:
         raise NPAError(f"{name} must be a finite number greater than 0, got {shown(value)}")
     return float(value)

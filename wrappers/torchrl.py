@@ -28,22 +28,22 @@ class NPATorchRLEnv(EnvBase):  # type: ignore[misc]
     `truncated`, [B, 1] each. TorchRL restarts worlds itself, each when its own episode is over.
     World k, seeded with s, has the episodes of the single environment seeded with s + k.
 
-    With `rows=True` every particle is an environment of its own: all of TorchRL's losses for one
-    agent then train one small policy that all particles share. `observation` and `action` stay as
-    they are, the others become [B, N, 1]; a particle is paid its own reward where the environment
-    was made with `reward="particle"`, else its world's. Frames are then counted in rows. The
-    particles of a world begin and end their episodes together.
+    With `rows=True` every particle is an element of the batch, so TorchRL's losses for one agent
+    train one small policy that all particles share. `observation` and `action` keep their shapes,
+    the others become [B, N, 1]; a particle gets its own reward where the environment was made with
+    `reward="particle"`, else its world's. Frames are then counted in rows. The particles of a world
+    begin and end their episodes together.
 
-    Observations, rewards and flags are the tensors that the environment hands out, on its device.
+    Observations, rewards and flags are the environment's own tensors, on its device.
 
     Args:
         env: A vector environment of this package, wrapped or not, made with `output="torch"`,
-            `autoreset_mode="disabled"`, and `copy=True` (the default): TorchRL keeps what it gets.
-        rows: Whether particles are environments of their own.
+            `autoreset_mode="disabled"`, and `copy=True` (the default), as TorchRL stores tensors.
+        rows: Whether particles are elements of the batch.
 
     Raises:
-        NPAError: The environment is none of this package, hands out arrays or the same tensors
-            in each step, or restarts worlds by itself.
+        NPAError: The environment is not of this package, returns arrays or the same tensors in each
+            step, or has another autoreset mode.
         MissingDependencyError: TorchRL is not installed (on import).
     """
 
@@ -54,17 +54,17 @@ class NPATorchRLEnv(EnvBase):  # type: ignore[misc]
         batch = (worlds, count) if rows else (worlds,)
         super().__init__(device=base.worlds.x.device, batch_size=torch.Size(batch))
         self.vector_env = env
-        """The environment whose worlds these are."""
+        """The vector environment."""
         self.rows = rows
-        """Whether particles are environments of their own."""
+        """Whether particles are elements of the batch."""
         self.particle_count = count
         """Particles N of a world."""
         self._first_seed: int | None = None
-        seen, acted = (
+        observed, acted = (
             _bounded(space, worlds, self.device)
             for space in (env.single_observation_space, env.single_action_space)
         )
-        self.observation_spec = Composite(observation=seen, shape=batch, device=self.device)
+        self.observation_spec = Composite(observation=observed, shape=batch, device=self.device)
         self.action_spec = acted
         self.reward_spec = Unbounded(shape=(*batch, 1), device=self.device)
         flag = Categorical(2, shape=(*batch, 1), dtype=torch.bool, device=self.device)
@@ -73,7 +73,7 @@ class NPATorchRLEnv(EnvBase):  # type: ignore[misc]
         self.done_spec = Composite(flags, shape=batch, device=self.device)
 
     def _reset(self, tensordict: TensorDictBase | None, **_: Any) -> TensorDictBase:
-        """Start episodes where `_reset` says so, or everywhere."""
+        """Start episodes in the worlds of the mask `_reset`, or in all."""
         mask = None if tensordict is None else tensordict.get("_reset", None)
         chosen = None if mask is None else self._chosen(mask)
         if chosen is None or bool(chosen.all()):
@@ -89,28 +89,28 @@ class NPATorchRLEnv(EnvBase):  # type: ignore[misc]
         outcome = self.vector_env.step(tensordict["action"])
         observation, reward, terminated, truncated, infos = outcome
         if self.rows and "particle_reward" in infos:
-            paid = infos["particle_reward"][..., None]
+            reward = infos["particle_reward"][..., None]
         else:
-            paid = self._spread(reward)
+            reward = self._spread(reward)
         return self._entries(
             observation,
-            reward=paid,
+            reward=reward,
             done=self._spread(terminated | truncated),
             terminated=self._spread(terminated),
             truncated=self._spread(truncated),
         )
 
     def _set_seed(self, seed: int | None) -> None:
-        """Let the next reset of all worlds begin the episodes of seed, seed + 1, ..., one each."""
+        """Set the seed of the next reset of all worlds, seed + k for world k."""
         self._first_seed = seed
 
     def close(self, *, raise_if_closed: bool = True) -> None:
-        """Close the environment; twice is an error if wanted, as for any of TorchRL's."""
+        """Close the environment; `raise_if_closed` refuses a second call."""
         super().close(raise_if_closed=raise_if_closed)
         self.vector_env.close()
 
     def _chosen(self, mask: Tensor) -> Tensor:
-        """Return which worlds a mask of TorchRL's chooses, bool, shape [B], on the host."""
+        """Return the mask of worlds for TorchRL's mask, bool, shape [B], on the host."""
         by_world = mask.reshape(self.batch_size[0], -1).cpu()
         chosen = by_world.any(dim=1)
         if not torch.equal(chosen, by_world.all(dim=1)):
@@ -121,20 +121,20 @@ class NPATorchRLEnv(EnvBase):  # type: ignore[misc]
         return chosen
 
     def _spread(self, values: Tensor) -> Tensor:
-        """Return what worlds have, [B], in the shape of the entries: [B, 1] or [B, N, 1]."""
+        """Return values of worlds, [B], in the shape of entries: [B, 1] or [B, N, 1]."""
         if not self.rows:
             return values[:, None]
         return values[:, None, None].expand(-1, self.particle_count, -1).clone()
 
     def _entries(self, observation: Tensor, **entries: Tensor) -> TensorDictBase:
-        """Return what TorchRL is given after a reset or a step."""
+        """Return the results of a reset or a step as a TensorDict."""
         entries["observation"] = observation
         made: TensorDictBase = TensorDict(entries, batch_size=self.batch_size, device=self.device)
         return made
 
 
 def _bounded(space: Any, world_count: int, device: torch.device | None) -> Bounded:
-    """Return the spec of what all worlds have, by the space of what one has."""
+    """Return TorchRL's spec of B worlds for the space of one."""
     assert isinstance(space, Box), "environments of this package have boxes"
     low, high = (
         torch.as_tensor(limit, device=device).expand(world_count, *space.shape).clone()

@@ -1,6 +1,6 @@
-"""What environments are made of: spaces, arrays in and out, pictures and the window of them.
+"""Base classes of environments: spaces, conversion of actions and observations, rendering.
 
-Arrays are of NumPy or torch outside, float32 tensors inside.
+Users give and get NumPy arrays or torch tensors; worlds take float32 tensors.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from npa_envs.envs.core.config import EnvConfig
+from npa_envs.envs.core.rewards import FIRST_PART, LOSS
 from npa_envs.envs.core.task import EnvTask
 from npa_envs.envs.core.worlds import BatchedWorlds
 from npa_envs.errors import NPAError
@@ -25,44 +26,44 @@ from npa_envs.world.actions import Physics
 from npa_envs.world.cuda_graph import to_device_async
 
 SHOWN_ACROSS = 4
-"""A window shows at most so many worlds side by side."""
+"""Worlds in a row of the window, at most; it shows at most as many rows."""
 
 
 class ParticleSpaces:
-    """How most worlds are seen and acted upon: one row for each particle."""
+    """Spaces and conversions of observations and actions that have a row for each particle."""
 
     def __init__(self, physics: Physics, config: EnvConfig) -> None:
         count, limit = config.particle_count, physics.limits.perception
         columns = physics.perception_dim + config.target_dim
         self.observation_space: Space[Any] = Box(-limit, limit, (count, columns), np.float32)
-        """Of a world."""
+        """Space of one world's observations."""
         self._shape = (count, physics.action_dim)
         self.action_space: Space[Any] = Box(-1.0, 1.0, self._shape, np.float32)
-        """Of a world."""
+        """Space of one world's actions."""
         self._output = config.output
 
     def action(self, action: Any, world_count: int | None) -> Tensor:
-        """Return actions as worlds take them, float32, [B, N, A]; B is None for a single world."""
+        """Return checked actions, float32, shape [B, N, A]; `world_count` is None for one world."""
         return batch_tensor(action, world_count, self._shape, "N, A")
 
-    def seen(self, observation: Tensor) -> Any:
-        """Return observations of worlds, or of one, as they are handed out."""
+    def returned(self, observation: Tensor) -> Any:
+        """Return observations of worlds, or of one, in the type that the user chose."""
         return to_output(observation, self._output)
 
-    def last_seen(self, observation: Tensor, ended: NDArray[np.bool_]) -> Any:
-        """Return worlds' last observations, [B, ...], where some, bool, [B], have ended."""
-        return self.seen(observation)
+    def returned_final(self, observation: Tensor, ended: NDArray[np.bool_]) -> Any:
+        """Return `final_obs`, shape [B, ...], after a step in which some worlds, [B], ended."""
+        return self.returned(observation)
 
 
 def to_output(tensor: Tensor, output: str) -> Any:
-    """Return a tensor as it is handed out: as it is for "torch", as an array for "numpy"."""
+    """Return a tensor itself for the output "torch", as an array for "numpy"."""
     return tensor if output == "torch" else tensor.cpu().numpy()
 
 
 def batch_tensor(
     action: Any, world_count: int | None, shape: tuple[int, ...], letters: str
 ) -> Tensor:
-    """Return actions of B worlds, or of one where B is None, float32, shape [B, ...]."""
+    """Return checked actions of B worlds, or of one (None), float32, shape [B, *shape]."""
     batch, first = ((), "") if world_count is None else ((world_count,), "B, ")
     wanted, letters = (*batch, *shape), f"[{first}{letters}] = "
     checked = action_tensor("action", action, wanted, "env.action_space", letters)
@@ -72,14 +73,14 @@ def batch_tensor(
 def action_tensor(
     name: str, action: Any, wanted: tuple[int, ...], space: str, letters: str = ""
 ) -> Tensor:
-    """Return an action as a float32 tensor, on the device where it came from."""
+    """Return a checked action as a float32 tensor on its own device."""
     came = ""
     if not isinstance(action, Tensor):
         try:
             given = np.asanyarray(action)
             if given.dtype.kind not in "biufO" or np.ma.is_masked(given):
                 raise TypeError("no real numbers, or some that are masked")
-            # Torch cannot read what may not be written.
+            # Torch needs writable arrays.
             action = torch.from_numpy(np.require(given, np.float32, ("C", "W")))
         except (TypeError, ValueError, OverflowError):
             came = type(action).__name__
@@ -97,12 +98,12 @@ def action_tensor(
 
 
 class ShownEnv:
-    """The common part of environments of all kinds: pictures, and the type of returned arrays."""
+    """Base class of all environments: rendering, and the type of returned arrays."""
 
     config: Any
     """The environment's configuration."""
     worlds: Any
-    """The worlds, with a method `pictures`."""
+    """The batch of worlds."""
     metadata: Any
     _started = False
     _window: Window | None = None
@@ -114,14 +115,14 @@ class ShownEnv:
                 "render() draws nothing without a render_mode: make the environment with "
                 "render_mode='rgb_array' or 'human'"
             )
-        # A window already shows the worlds as they are.
+        # A window is updated by reset and step.
         if self.config.render_mode != "rgb_array":
             return None
         pictures: NDArray[np.uint8] = self.worlds.pictures(self.worlds.world_count)
         return pictures
 
     def _repr_mimebundle_(self, include: Any = None, exclude: Any = None) -> dict[str, Any]:
-        """Return what Jupyter shows: the worlds as they are, or some, from the first reset on."""
+        """Return what Jupyter displays: pictures of the first worlds, once there was a reset."""
         text = {"text/plain": str(self)}
         if not self._started:
             return text
@@ -129,7 +130,7 @@ class ShownEnv:
         return show(side_by_side(self.worlds.pictures(count)))._repr_mimebundle_() | text
 
     def _show_in_window(self, title: str) -> None:
-        """Show the worlds as they are, the first ones where they are many; only if "human"."""
+        """Show the first worlds in the window, with the render mode "human"."""
         if self.config.render_mode != "human":
             return
         count, size = self.worlds.world_count, self.config.render_size
@@ -151,22 +152,22 @@ class ShownEnv:
         return to_output(tensor, self.config.output)
 
     def _sent(self, values: NDArray[Any]) -> Any:
-        """Return a new array as it is handed out."""
+        """Return an array of the host in the type that the user chose."""
         if self.config.output == "numpy":
             return values
         return to_device_async(values, self.config.torch_device)
 
 
 class WorldsEnv(ShownEnv):
-    """The common part of environments of one species; subclasses name the task."""
+    """Base class of environments of one species; subclasses set `task_type`."""
 
     task_type: ClassVar[type[EnvTask[Any]]]
-    """The task: starts and losses."""
+    """Class of the task."""
 
     spec: Any
 
     def _make_worlds(self, keywords: dict[str, Any], world_count: int, steps: int | None) -> None:
-        """Make configuration, worlds, spaces and screen."""
+        """Make the configuration, the worlds and the spaces."""
         self.config = self.task_type.config_type.from_keywords(keywords)
         self.render_mode = self.config.render_mode
         worlds_type = self.task_type.worlds_type or BatchedWorlds
@@ -176,7 +177,7 @@ class WorldsEnv(ShownEnv):
         self.form: ParticleSpaces = form_type(self.worlds.physics, self.config)
 
     def _begin(self, worlds: Tensor, keys: Tensor | None, out: Tensor | None = None) -> Tensor:
-        """Start episodes in some worlds, int64, [M]; return what is observed in all, [B, ...]."""
+        """Start episodes in some worlds, int64, [M]; return all worlds' observations, [B, ...]."""
         with self.worlds.device_context():
             self.worlds.start(worlds, keys)
             observation: Tensor = self.worlds.perceive(out)
@@ -185,7 +186,7 @@ class WorldsEnv(ShownEnv):
         return observation
 
     def _place(self, x: Any, s: Any, worlds: Tensor, out: Tensor | None = None) -> Tensor:
-        """Put particles into some worlds, int64, [M]; return what is observed in all, likewise."""
+        """Replace particles of some worlds, [M]; return all worlds' observations, [B, ...]."""
         count = self.config.particle_count
         start = self.worlds.checked_particles(x, s, len(worlds), count)
         with self.worlds.device_context():
@@ -195,13 +196,15 @@ class WorldsEnv(ShownEnv):
         return observation
 
     def losses_of(self, numbers: Any) -> dict[str, Any]:
-        """Return the loss and its parts by their names in infos, from a report's numbers."""
-        parts = {f"loss_{n}": numbers[2 + k] for k, n in enumerate(self.worlds.part_names)}
-        return {"loss": numbers[1]} | parts
+        """Return the loss and its parts by their names in infos, from the rows of a report."""
+        names = self.worlds.part_names
+        parts = {f"loss_{name}": numbers[FIRST_PART + k] for k, name in enumerate(names)}
+        return {"loss": numbers[LOSS]} | parts
 
     def _improvements(self, numbers: Any) -> dict[str, Any]:
         names = self.worlds.part_names
-        return {f"reward_{name}": numbers[2 + len(names) + k] for k, name in enumerate(names)}
+        first = FIRST_PART + len(names)
+        return {f"reward_{name}": numbers[first + k] for k, name in enumerate(names)}
 
     def _show(self) -> None:
         self._show_in_window(self.spec.id if self.spec is not None else type(self).__name__)

@@ -1,4 +1,4 @@
-"""Configurations of environments: flat keywords of `gym.make`, checked before all else."""
+"""Configurations of environments: the keywords of `gym.make`, with their checks."""
 
 from __future__ import annotations
 
@@ -27,17 +27,17 @@ Output = Literal["numpy", "torch"]
 OnDivergence = Literal["terminate", "reset", "raise", "ignore"]
 
 LARGEST = 1e9
-"""No number of a configuration is larger: products of them stay finite in float32."""
+"""Largest value of a field, so that products of fields are finite in float32."""
 
 LARGEST_RATIO = 1e7
-"""Perception is not scaled by more: its fourth power is a number of float32."""
+"""Largest ratio of eps to eps0, and its inverse; its fourth power is finite in float32."""
 
 TaskConfig = TypeVar("TaskConfig")
 
 
 @dataclass(frozen=True, kw_only=True)
 class WorldConfig:
-    """The fields that all environments have, whether one species lives in a world or several.
+    """Fields of all environments, of one species or several.
 
     Lengths are in length units: pictures show [-1, 1] x [-1, 1].
     """
@@ -48,37 +48,37 @@ class WorldConfig:
         "output": get_args(Output),
         "render_mode": (None, "rgb_array", "human"),
     }
-    """Fields that take one of a few words."""
+    """Fields that take one of a few values, with these values."""
 
     elsewhere: ClassVar[dict[str, str]] = {"seed": "give it to reset(seed=...)"}
-    """Names that belong to something else, and where they are said."""
+    """Keywords that are no fields, with hints for the error message."""
 
     taken_by_make: ClassVar[tuple[str, ...]] = ()
-    """Keywords that are no fields, as Gymnasium itself takes them."""
+    """Keywords that Gymnasium itself takes, for suggestions in error messages."""
 
     task_config_type: ClassVar[type | None] = None
-    """Configuration of a task in `npa_envs.tasks` that explains the fields without a docstring."""
+    """Training task's configuration, which documents the fields without a docstring."""
 
     particle_count: int = 1024
     """Particles in a world, N."""
 
     state_dim: int = 16
-    """State channels of a particle, C; the last three are its colour (less 0.5)."""
+    """State channels of a particle, C; the last three plus 0.5 are its colour."""
 
     eps: float = 0.1
     """Perception radius ε [length units]."""
 
     eps0: float = 0.1
-    """Radius ε0 that perception is scaled to: that of the rules [length units]."""
+    """Radius ε0 that perception is scaled to: the one that rules are trained at [length units]."""
 
     alpha: float = 0.5
     """Largest displacement in one step, as a fraction of ε (dimensionless)."""
 
     state_scale: float = 1.0
-    """State step of an action of 1 (dimensionless)."""
+    """Change of a state channel by an action of 1 (dimensionless)."""
 
     update_prob: float = 0.5
-    """Probability p that a particle's action takes effect in a step (dimensionless)."""
+    """Probability p that a particle is updated, so that its action counts (dimensionless)."""
 
     dt: float = 1.0
     """Time step (dimensionless)."""
@@ -87,8 +87,8 @@ class WorldConfig:
     """Standard deviation of the noise added to every position in a step [length units]."""
 
     moment_inverse: MomentInverse = "threshold"
-    """How observed state gradients are corrected: "threshold", the paper's, which jumps where
-    neighbours come to lie on a line; or "smooth", for rules that are trained with it."""
+    """Correction of observed state gradients: "threshold", the paper's, which jumps when neighbours
+    become collinear; or "smooth", for rules that are trained with it."""
 
     boundary: Boundary = "open"
     """"open" space, a "periodic" box into which positions are wrapped, or one whose "reflecting"
@@ -98,14 +98,14 @@ class WorldConfig:
     """Side of the box around the origin, unless space is open [length units]."""
 
     observation_limit: float = 64.0
-    """Observations and states are clipped to ± this; a particle held there has diverged
+    """Observations and states are clipped to ± this; a particle with a clipped state has diverged
     (dimensionless)."""
 
     position_limit: float = 4.0
-    """Coordinates are clipped to ± this; a particle held there has diverged [length units]."""
+    """Coordinates are clipped to ± this; a clipped particle has diverged [length units]."""
 
     device: str = "cpu"
-    """Where the worlds live: "cpu", "cuda" or "cuda:1"."""
+    """Device of the worlds: "cpu", "cuda" or "cuda:1"."""
 
     output: Output = "numpy"
     """Type of the returned arrays: "numpy", or "torch" tensors on the device."""
@@ -168,11 +168,11 @@ class WorldConfig:
 
     @property
     def periodic_box(self) -> float | None:
-        """Side of the box that particles are perceived across [length units], or None."""
+        """Side of the box [length units] if it is periodic, else None."""
         return self.box_size if self.boundary == "periodic" else None
 
     def physics(self, space_dim: int, *, static: bool) -> Physics:
-        """Return the constants by which worlds act and perceive."""
+        """Return the constants of motion and perception."""
         sides = None if self.box is None else (self.box,) * space_dim
         periodic = self.boundary == "periodic"
         return Physics(
@@ -203,10 +203,7 @@ class WorldConfig:
 
     @classmethod
     def from_keywords(cls, keywords: dict[str, Any]) -> Self:
-        """Return the configuration with some fields changed.
-
-        Numbers of NumPy are taken for Python's, lists for tuples.
-        """
+        """Return the configuration with these fields; NumPy numbers and lists are converted."""
         known = [field.name for field in fields(cls)]
         for name in keywords:
             if name not in known:
@@ -215,16 +212,13 @@ class WorldConfig:
         return cls(**{name: plain(value) for name, value in keywords.items()})
 
     def task_config(self, config_type: type[TaskConfig], **changes: Any) -> TaskConfig:
-        """Return a task's own configuration, with all fields that the environment has as well.
-
-        It checks them: so each field is explained, and checked, once.
-        """
+        """Return a training task's configuration, which takes and checks the shared fields."""
         names = [field.name for field in fields(config_type)]  # type: ignore[arg-type]
         shared = {name: getattr(self, name) for name in names if hasattr(self, name)}
         return config_type(**(shared | changes))
 
     def check_start_radius(self, radius: float) -> None:
-        """Check that particles that start within a radius are not out of bounds at once."""
+        """Check that particles that start within a radius are within `position_limit`."""
         if radius >= self.position_limit:
             raise NPAError(
                 f"seed_radius must be below position_limit = {self.position_limit:g}, got "
@@ -234,7 +228,7 @@ class WorldConfig:
 
 @dataclass(frozen=True, kw_only=True)
 class EnvConfig(WorldConfig):
-    """The fields that all environments of one species have; a task adds its own."""
+    """Fields of all environments of one species; a task adds its own."""
 
     words = WorldConfig.words | {
         "reward": get_args(Reward),
@@ -251,25 +245,24 @@ class EnvConfig(WorldConfig):
     taken_by_make = ("max_episode_steps",)
 
     on_divergence: OnDivergence = "terminate"
-    """What happens to a world that diverges, besides `info["diverged"]`: "terminate" ends its
-    episode; "reset" starts it anew within the episode; "raise" is an error that names the particle;
-    "ignore" goes on with its numbers held at the limits."""
+    """What happens to a world that diverges: "terminate" ends its episode; "reset" restarts its
+    particles within the episode; "raise" raises an error that names the particle; "ignore"
+    continues with values clipped to the limits. `info["diverged"]` is True in each case."""
 
     reward: Reward = "dense"
     """"dense": each step's improvement of the loss; "sparse": minus the loss at the episode's end;
-    "particle" and "marginal": as dense, with each particle's own reward in
-    `info["particle_reward"]`: how much its share of the loss fell, or what the world would have
-    lost without its action."""
+    "particle" and "marginal": as dense, with each particle's reward in `info["particle_reward"]`:
+    the fall of its own loss, or the contribution of its action to the fall of the world's loss."""
 
     tell_updated: bool = False
-    """Tell in `info["updated"]` which particles the step updated; the others ignored their action,
-    so that learners can leave their likelihoods out."""
+    """Report in `info["updated"]` which particles the step updated. The others ignored their
+    action, so learners can mask their likelihoods."""
 
     episode_steps: int = 256
     """Length of an episode where reward is "sparse" and there is no `max_episode_steps`."""
 
     success_loss: float | None = None
-    """The episode ends in success once the loss is at most this; None: the task's own choice."""
+    """The episode ends in success once the loss is at most this; None: as the task decides."""
 
     seed_pool: int = 0
     """Number of worlds, made once, that episodes start from; 0: each episode starts from a fresh
@@ -286,12 +279,12 @@ class EnvConfig(WorldConfig):
 
     @property
     def target_dim(self) -> int:
-        """Columns of an observation's rows behind perception, T; by default none."""
+        """Columns of the target after those of perception in an observation's row, T."""
         return 0
 
     @property
     def per_particle_reward(self) -> bool:
-        """Whether each particle has a reward of its own."""
+        """Whether `info` has a reward for each particle."""
         return self.reward in ("particle", "marginal")
 
     @classmethod
@@ -307,7 +300,7 @@ class EnvConfig(WorldConfig):
 
 
 def plain(value: Any) -> Any:
-    """Return a value as fields have it: NumPy's numbers as Python's, lists and arrays as tuples."""
+    """Return a field's value with NumPy numbers as Python's, lists and arrays as tuples."""
     if isinstance(value, np.generic | np.ndarray | Tensor):
         value = value.tolist()
     if isinstance(value, Sequence) and not isinstance(value, str):

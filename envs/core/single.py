@@ -15,18 +15,18 @@ from torch import Tensor
 
 from npa_envs.checks import number_tensor
 from npa_envs.envs.core.base import WorldsEnv
-from npa_envs.envs.core.referee import reason
+from npa_envs.envs.core.rewards import REWARD, reason
 from npa_envs.envs.core.vector import check_options, plain_seed, rng_keys
 from npa_envs.errors import NPAError
 from npa_envs.world.actions import DIVERGED, SUCCESS, TIME_LIMIT
 
 
 class NPAEnv(WorldsEnv, gymnasium.Env[Any, Any]):
-    """One world of a task as a Gymnasium environment; subclasses name the task.
+    """One world of a task as a Gymnasium environment; subclasses set `task_type`.
 
     Keywords are the fields of the task's configuration. An unknown or wrong one, or a world that
-    does not fit into memory, raises `NPAError`. The sections below belong to the docstring of every
-    subclass, after its own sections of the same name.
+    does not fit into memory, raises `NPAError`. The page of each subclass ends with the sections
+    below, each after the subclass's own section of the same name.
 
     ## Reward
 
@@ -34,19 +34,19 @@ class NPAEnv(WorldsEnv, gymnasium.Env[Any, Any]):
     |---|---|
     | `"dense"` | L before the step minus L after it |
     | `"sparse"` | 0, and minus L in the last step, also where that is a time limit |
-    | `"particle"` | as dense; besides, `info["particle_reward"]` has each particle's own |
-    | `"marginal"` | likewise, of what the world would have lost without its action |
+    | `"particle"` | as dense; `info["particle_reward"]` is the fall of each particle's loss |
+    | `"marginal"` | as dense; `info["particle_reward"]` is each action's contribution |
 
     Dense rewards telescope: their sum over an episode is L at its start minus L at its end. The
-    mean of all particles' own rewards is the dense reward, up to rounding. In a step that diverges,
-    L counts as at least its value at the start, so diverging never pays; the parts in `info` are
-    left as they are.
+    mean of all particles' rewards is the dense reward, up to rounding, as long as the episode
+    lasts. In a step that diverges, L counts as at least its value at the start, so that diverging
+    is never rewarded; the parts in `info` are not changed by this.
 
-    With `"marginal"` a particle's own reward is N times its change in the step, times minus the
-    slope of L in the middle of the step: to second order its marginal contribution, averaged over
-    being the first and the last to act. What these rewards miss of the dense reward is shared
-    equally. So it pays a particle for its own action alone, `"particle"` also for what the actions
-    of others do to its pixels.
+    With `"marginal"` a particle's reward is −N times its change in the step, times the gradient of
+    L in the middle of the step: to second order, N times what its action contributed to the fall
+    of L, averaged over being the first and the last to act. The remainder of the dense reward is
+    spread equally. So a particle is rewarded for its own action alone; with `"particle"` it is also
+    rewarded for what the actions of others do to its pixels.
 
     ## Starting state
 
@@ -62,18 +62,18 @@ class NPAEnv(WorldsEnv, gymnasium.Env[Any, Any]):
     | `max_episode_steps` steps are done | truncated | `"time limit"` |
 
     A particle has left the world if a coordinate is beyond ±`position_limit`. Its state has run
-    away if a number is beyond ±`observation_limit`. Where another library limits the steps,
+    away if a channel is beyond ±`observation_limit`. Where another library limits the steps,
     `reward="sparse"` needs their number as `episode_steps`.
 
     ## Info
 
     | Key | In | Value |
     |---|---|---|
-    | `loss` | reset, step | L as it is now |
-    | `success`, `diverged` | step | whether it did so in this step, bool |
+    | `loss` | reset, step | the current loss L |
+    | `success`, `diverged` | step | whether the world succeeded or diverged in it, bool |
     | `reason` | last step | why the episode ended, see above; None for worlds that go on |
-    | `particle_reward` | step, where particles are paid | each particle's own reward, shape [N] |
-    | `updated` | step, where `tell_updated=True` | which particles it updated, bool, shape [N] |
+    | `particle_reward` | step, with two `reward`s | each particle's reward, shape [N] |
+    | `updated` | step, with `tell_updated=True` | which particles it updated, bool, shape [N] |
 
     ## Rendering
 
@@ -85,7 +85,7 @@ class NPAEnv(WorldsEnv, gymnasium.Env[Any, Any]):
     ## Arguments
 
     All are keywords of `gym.make` and `gym.make_vec`. An unknown name, or a value out of range,
-    raises an `NPAError` that says what would be right.
+    raises an `NPAError` that says which values are valid.
 
     ## Vectorized environment
 
@@ -94,16 +94,16 @@ class NPAEnv(WorldsEnv, gymnasium.Env[Any, Any]):
     flags [B]. World k after `reset(seed=s)` is the single environment after `reset(seed=s + k)`,
     bit for bit, for every B.
 
-    - With `output="torch"` results are tensors on the device, and actions may be. Only the ends of
-      episodes are copied to the host.
+    - With `output="torch"` results are tensors on the device, and actions may be too. Only the
+      flags of episode ends are copied to the host.
     - Infos are arrays of shape [B] with masks, as Gymnasium's vector environments have them.
     - With `autoreset_mode="same-step"`, the default, a world whose episode is over starts the next
       one at once: the last observation is in `infos["final_obs"]`, the last infos in
       `infos["final_info"]`.
-    - `reset(options={"reset_mask": mask})` resets some worlds and leaves the others alone.
+    - `reset(options={"reset_mask": mask})` resets some worlds and does not change the others.
 
     `env.unwrapped.particles()` returns positions and states, and `place_particles(x, s)` replaces
-    them, at no reward; single environments have both as well.
+    them, without a reward; single environments have both methods as well.
 
     ## References
 
@@ -126,7 +126,7 @@ class NPAEnv(WorldsEnv, gymnasium.Env[Any, Any]):
         self.action_space = self.form.action_space
         self._world = torch.zeros(1, dtype=torch.int64, device=self.task.device)
         self._keyed_from: np.random.Generator | None = None
-        self._unpaid_steps = 0
+        self._unrewarded_steps = 0
         self._warned = False
 
     def reset(
@@ -135,13 +135,13 @@ class NPAEnv(WorldsEnv, gymnasium.Env[Any, Any]):
         """Start an episode.
 
         Args:
-            seed: Begin the sequence of episodes that belongs to this number; without it the
-                sequence goes on.
-            options: None or empty: a single environment has none.
+            seed: Begin the sequence of episodes of this seed; None: the next episode of the
+                current sequence.
+            options: None or empty, as there are no options.
 
         Raises:
             gymnasium.error.Error: The seed is no integer of at least 0.
-            NPAError: There is an option.
+            NPAError: An option is given.
 
         Returns:
             The observation, shape [N, P], and the loss with its parts.
@@ -149,31 +149,30 @@ class NPAEnv(WorldsEnv, gymnasium.Env[Any, Any]):
         seed = plain_seed(seed)
         check_options(options, ())
         super().reset(seed=seed)
-        self._warn_of_unpaid_rewards()
+        self._warn_of_missing_rewards()
         self.worlds.limit_steps(_step_limit(self))
-        # A generator that is not the one of the last episode means a new sequence, be it by `seed`
-        # or because the caller put another one into `np_random`.
+        # A new generator, by `seed` or because the caller set `np_random`, begins a new sequence.
         keys = None
         if seed is not None or self.np_random is not self._keyed_from:
             self._keyed_from = self.np_random
             keys = rng_keys(None, 1, self.np_random)
         observation = self._begin(self._world, keys)
         info = self.losses_of(self.worlds.report.numbers[:, 0].tolist()) | self._extras("reset")
-        return self.form.seen(observation[0]), info
+        return self.form.returned(observation[0]), info
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
-        """Apply an action and perceive.
+        """Apply an action.
 
         Args:
             action: Shape [N, A], in [-1, 1].
 
         Returns:
-            Observation, reward, whether the episode ended by itself, whether the step limit of
-            `gymnasium.make` ended it, and what the docstring of the environment lists.
+            Observation, reward, terminated, truncated (by the step limit of `gymnasium.make`), and
+            the info that the docstring of the environment lists.
 
         Raises:
-            NPAError: The action has another shape; the world is then as it was.
-            DivergedError: The action is not finite, and the world is as it was; or the world
+            NPAError: The action has another shape; the world is not changed.
+            DivergedError: The action is not finite, and the world is not changed; or the world
                 diverged, and `on_divergence` is "raise".
         """
         if not self._started:
@@ -184,24 +183,25 @@ class NPAEnv(WorldsEnv, gymnasium.Env[Any, Any]):
             endings, observation = worlds.step(checked)
             diverged = bool(endings[0] & DIVERGED)
             ending = int(worlds.guarded(endings, observation)[0])
-        ended, late = ending & (SUCCESS | DIVERGED) != 0, ending & TIME_LIMIT != 0
+        terminated, truncated = ending & (SUCCESS | DIVERGED) != 0, ending & TIME_LIMIT != 0
         numbers = worlds.host_numbers.numpy()[:, 0].tolist()
         info = self.losses_of(numbers) | self._improvements(numbers)
         info |= {"success": bool(ending & SUCCESS), "diverged": diverged}
-        if ended or late:
+        if terminated or truncated:
             info["reason"] = reason(ending)
         if worlds.particle_reward is not None:
             info["particle_reward"] = self._out(worlds.particle_reward[0].clone())
         info |= self._extras("reset", "step")
-        if worlds.pays_last_step_alone:
-            paid = ended or late or int(worlds.elapsed[0]) == config.episode_steps
-            self._unpaid_steps = 0 if paid else self._unpaid_steps + 1
+        if worlds.rewards_last_step_only:
+            last = int(worlds.elapsed[0]) == config.episode_steps
+            rewarded = terminated or truncated or last
+            self._unrewarded_steps = 0 if rewarded else self._unrewarded_steps + 1
         self._show()
-        seen = self.form.seen(worlds.host_observation(observation)[0])
-        return seen, numbers[0], ended, late, info
+        returned = self.form.returned(worlds.host_observation(observation)[0])
+        return returned, numbers[REWARD], terminated, truncated, info
 
     def render(self) -> NDArray[np.uint8] | None:
-        """Return the world's picture, shape [R, R, 3], in the mode "rgb_array"."""
+        """Return the world's picture, shape [R, R, 3], with the render mode "rgb_array"."""
         pictures = self._pictures()
         return None if pictures is None else pictures[0]
 
@@ -214,19 +214,19 @@ class NPAEnv(WorldsEnv, gymnasium.Env[Any, Any]):
         return self.worlds.x[0].clone(), self.worlds.s[0].clone()
 
     def place_particles(self, x: Any, s: Any) -> Any:
-        """Replace the particles, at no reward, and return the new observation, shape [N, P].
+        """Replace the particles, without a reward, and return the new observation, shape [N, P].
 
         Args:
             x: Positions [length units], shape [N, D].
             s: States, dimensionless, shape [N, C].
 
         Raises:
-            NPAError: A shape is another one, or a number is not finite or beyond its limit.
+            NPAError: A shape is wrong, or a value is not finite or beyond its limit.
         """
         if not self._started:
             raise NPAError("particles need a world: call reset first")
         x, s = (number_tensor(name, value)[None] for name, value in (("x", x), ("s", s)))
-        return self.form.seen(self._place(x, s, self._world)[0])
+        return self.form.returned(self._place(x, s, self._world)[0])
 
     def _extras(self, *when: str) -> dict[str, Any]:
         values = {name: value for own in when for name, value in self.worlds.extras(own).items()}
@@ -235,26 +235,26 @@ class NPAEnv(WorldsEnv, gymnasium.Env[Any, Any]):
             for name, value in values.items()
         }
 
-    def _warn_of_unpaid_rewards(self) -> None:
-        """Warn once where an episode ended by a limit that the environment does not know of."""
-        if self._unpaid_steps > 0 and not self._warned:
+    def _warn_of_missing_rewards(self) -> None:
+        """Warn once if an episode was ended by a limit that the environment does not know of."""
+        if self._unrewarded_steps > 0 and not self._warned:
             self._warned = True
             warnings.warn(
-                f"an episode ended {self._unpaid_steps} steps after the last sparse reward, which "
-                f"comes at step episode_steps={self.config.episode_steps}: give the number of "
-                "steps as max_episode_steps to gymnasium.make, or as episode_steps as well",
+                f"an episode ended {self._unrewarded_steps} steps after the last sparse reward, "
+                f"which comes at step episode_steps={self.config.episode_steps}: give the number "
+                "of steps as max_episode_steps to gymnasium.make, or as episode_steps as well",
                 stacklevel=3,
             )
-        self._unpaid_steps = 0
+        self._unrewarded_steps = 0
 
 
 def _step_limit(env: NPAEnv) -> int | None:
-    """Return the step limit that Gymnasium put around an environment, None where there is none.
+    """Return the limit of the `TimeLimit` wrappers around an environment, or None.
 
-    Wrappers that count its steps are reset with it, so they are among its callers. Limits around
-    other wrappers, which may take several steps at once, do not count.
+    They are found among the callers of `reset`. Limits around other wrappers, which may take
+    several steps at once, do not count.
     """
-    # A registered wrapper could say it, but Gymnasium refuses those next to a vector entry point.
+    # Gymnasium refuses registered wrappers, which would know the limit, with a vector entry point.
     limits, frame = [], sys._getframe(1).f_back
     inner: gymnasium.Env[Any, Any] = env
     while frame is not None:

@@ -1,4 +1,4 @@
-"""Particles of worlds on a device: the memory that they need, compared with what is free."""
+"""Particles of worlds on a device, and the check that they fit into its memory."""
 
 from __future__ import annotations
 
@@ -18,32 +18,32 @@ from npa_envs.world.actions import Physics
 from npa_envs.world.randomness import WorldRandom
 
 OBSERVATION_COPIES = 4
-"""Observations alive at once: the rows, the arrays handed out, the last ones, one to spare."""
+"""Observations in memory at once: the rows, the returned arrays, the final ones, and one spare."""
 
 LARGEST_INDEX = 2**31 - 1
 """Kernels index the particles' states with 32 bits."""
 
 LISTED_BYTES = 320
-"""What CUDA keeps of a particle's neighbours, at most: a list of 128, and what is sorted."""
+"""Bytes on CUDA for a particle's neighbours, at most: a list of 128, and sorted copies."""
 
 RECORDED_STARTS = 4 / 3
-"""Particles of all recorded restarts together, which have lists of their own, to those of a batch:
+"""Particles of all recorded restarts, which have their own lists, as a multiple of a batch:
 1 + 1/4 + 1/16 + ..."""
 
 
 def needed_bytes(
     world_count: int, particle_count: int, physics: Physics, device: torch.device
 ) -> int:
-    """Return about how much memory worlds take while they are stepped [bytes]."""
+    """Return an estimate of the memory that worlds take while they are stepped [bytes]."""
     particles = world_count * particle_count
     worlds = 6 * (physics.space_dim + physics.state_dim)
-    numbers = OBSERVATION_COPIES * physics.perception_dim + 2 * physics.action_dim + worlds + 16
+    floats = OBSERVATION_COPIES * physics.perception_dim + 2 * physics.action_dim + worlds + 16
     listed = LISTED_BYTES * (1.0 + RECORDED_STARTS) if device.type == "cuda" else 0.0
-    return int(particles * (4 * numbers + listed))
+    return int(particles * (4 * floats + listed))
 
 
 def free_bytes(device: torch.device) -> int | None:
-    """Return the memory that is free on a device [bytes], or None where nobody says."""
+    """Return the free memory of a device [bytes], or None if it is unknown."""
     if device.type == "cuda":
         free, _ = torch.cuda.mem_get_info(device)
         cached = torch.cuda.memory_reserved(device) - torch.cuda.memory_allocated(device)
@@ -82,7 +82,7 @@ def check_memory(
 
 
 def check_default_dtype() -> None:
-    """Check that what tasks make by default is float32, as the worlds are."""
+    """Check that torch's default dtype is float32, the worlds' own."""
     dtype = torch.get_default_dtype()
     if dtype != torch.float32:
         raise NPAError(
@@ -92,7 +92,7 @@ def check_default_dtype() -> None:
 
 
 class WorldState:
-    """Particles of B worlds on a device, a stream of randomness for each world."""
+    """Particles of B worlds on a device, and a random stream for each world."""
 
     def __init__(
         self,
@@ -107,7 +107,7 @@ class WorldState:
         self.world_count = world_count
         self.particle_count = particle_count
         self.physics = physics = config.physics(task_type.space_dim, static=task_type.static)
-        """The worlds' constants."""
+        """Constants of perception and motion."""
         check_memory(world_count, particle_count, physics, device, extra_bytes)
         self.x = torch.zeros(world_count, particle_count, physics.space_dim, device=device)
         """Positions [length units], shape [B, N, D]."""
@@ -115,13 +115,12 @@ class WorldState:
         """States, dimensionless, shape [B, N, C]."""
         keys = torch.zeros(world_count, dtype=torch.int64, device=device)
         self.random = WorldRandom.from_keys(keys)
-        """One stream of randomness for each world."""
+        """One random stream for each world."""
 
     def next_streams(self, worlds: Tensor, keys: Tensor | None) -> WorldRandom:
-        """Return the streams of randomness that some worlds', [M], next episodes begin with.
+        """Return the random streams for the next episodes of some worlds, [M].
 
-        Those with keys, int64, shape [M], are new and begin with their first episode; without, each
-        world goes on to its next one.
+        Keys, int64, shape [M], start new sequences of episodes; None: each world's next episode.
         """
         if keys is not None:
             return WorldRandom.from_keys(keys.to(self.device))
@@ -130,7 +129,7 @@ class WorldState:
         return random
 
     def checked_particles(self, x: Any, s: Any, world_count: int, particle_count: int) -> Start:
-        """Return particles to be put into M worlds of N, float32 on the device."""
+        """Return given particles of M worlds, checked, as float32 on the device."""
         given, physics = [], self.physics
         for name, value, width, limit, limit_name in (
             ("x", x, physics.space_dim, physics.limits.position, "position_limit"),
@@ -160,7 +159,7 @@ class WorldState:
 
 
 def not_finite(action: Tensor) -> DivergedError:
-    """Return the error about actions, shape [B, K, W], with a number that is not finite."""
+    """Return the error for actions, shape [B, K, W], with a value that is not finite."""
     bad = ~torch.isfinite(action)
     world, particle, entry = (int(k) for k in bad.nonzero()[0])
     return DivergedError(

@@ -1,11 +1,11 @@
-"""Tasks as environments see them: where worlds start, and how far they are from the goal."""
+"""Tasks of environments: where worlds start, their losses, and checks of what tasks return."""
 
 from __future__ import annotations
 
 import copy
 import random
 from collections.abc import Mapping, Sequence
-from typing import Any, ClassVar, Generic, NamedTuple, Self, TypeVar
+from typing import TYPE_CHECKING, Any, ClassVar, Generic, NamedTuple, Self, TypeVar
 
 import numpy as np
 import torch
@@ -19,11 +19,15 @@ from npa_envs.world.actions import marginal_gains
 from npa_envs.world.cuda_graph import recording_lock
 from npa_envs.world.randomness import StreamId, WorldRandom
 
+if TYPE_CHECKING:
+    from npa_envs.envs.core.base import ParticleSpaces
+    from npa_envs.envs.core.worlds import BatchedWorlds
+
 AnyConfig = TypeVar("AnyConfig", bound=WorldConfig)
 Config = TypeVar("Config", bound=EnvConfig)
 
 SHARPNESS = 0.7
-"""Standard deviation of a particle's spot in pictures, in distances between particles."""
+"""Standard deviation of a particle's Gaussian in pictures, in distances between particles."""
 
 TURN = 2.0
 """Degrees by which the camera turns around a 3D world in one step."""
@@ -42,15 +46,15 @@ class Start(NamedTuple):
     """Loss at which each world's episode ends in success, shape [B]; None: never."""
 
     goal: Tensor | None = None
-    """What each world is to come to, int64, shape [B], where worlds differ in that."""
+    """Index of each world's goal, such as its target picture, int64, shape [B]; None: one goal."""
 
 
 class WorldTask(Generic[AnyConfig]):
-    """What tasks of one species and of several have in common: constants and pictures.
+    """Base class of tasks of one species and of several: constants and pictures.
 
     Args:
         config: The environment's configuration.
-        device: Where the worlds live.
+        device: The worlds' device.
     """
 
     config_type: ClassVar[type[WorldConfig]] = WorldConfig
@@ -60,13 +64,7 @@ class WorldTask(Generic[AnyConfig]):
     """Space dimension D."""
 
     static: ClassVar[bool] = False
-    """Whether particles stay where they are; actions are then state steps alone."""
-
-    worlds_type: ClassVar[Any] = None
-    """How worlds are acted on, observed and judged; None: particles act and perceive."""
-
-    form_type: ClassVar[Any] = None
-    """The spaces of observations and actions; None: a row for each particle."""
+    """Whether particles never move; actions then only change states."""
 
     def __init__(self, config: AnyConfig, device: torch.device) -> None:
         self.config = config
@@ -79,12 +77,12 @@ class WorldTask(Generic[AnyConfig]):
 
     @property
     def open_half_width(self) -> float:
-        """From the middle of a picture to its edge in open space; 1 at least [length units]."""
+        """Half of a picture's side in open space [length units]; smaller values count as 1."""
         return 1.0
 
     @property
     def half_width(self) -> float:
-        """From the middle of a picture to its edge [length units]."""
+        """Half of a picture's side [length units]."""
         box = self.config.box
         return max(1.0, self.open_half_width if box is None else 0.5 * box)
 
@@ -93,8 +91,8 @@ class WorldTask(Generic[AnyConfig]):
     ) -> NDArray[np.uint8]:
         """Return a picture of each world in one of `STYLES`, shape [B, R, R, 3].
 
-        Positions are x [length units], [B, N, D], and states s, [B, N, C]. The camera of 3D worlds
-        stands at an azimuth [degrees].
+        Positions are x [length units], [B, N, D], states s, [B, N, C]; `azimuth` [degrees] is that
+        of the camera of 3D worlds.
         """
         return draw_worlds(
             x,
@@ -110,29 +108,36 @@ class WorldTask(Generic[AnyConfig]):
 
 
 class EnvTask(WorldTask[Config]):
-    """One task as environments see it; subclass it, and name the subclass in an `NPAEnv`.
+    """The task of an environment; subclass it, and set `task_type` of an `NPAEnv` to the subclass.
 
-    `seed` and `losses` are all that a task must have. None of the methods may wait for the device
-    (no `.item()`, no branch on a tensor's value), and the result for one world must not depend on
-    the others: take means over particles or pixels with `npa_envs.world_mean`. Everywhere x are
-    positions [length units], shape [B, N, D], and s states, dimensionless, shape [B, N, C].
+    A task must define `seed` and `losses`. No method may synchronise with the device (no `.item()`,
+    no branch on a tensor's value), and the result for one world must not depend on the others: take
+    means over particles or pixels with `npa_envs.world_mean`. In all methods x are positions
+    [length units], shape [B, N, D], and s states, dimensionless, shape [B, N, C].
 
     Args:
         config: The environment's configuration.
-        device: Where the worlds live.
+        device: The worlds' device.
     """
 
     config_type: ClassVar[type[EnvConfig]] = EnvConfig
+
+    worlds_type: ClassVar[type[BatchedWorlds] | None] = None
+    """Class that steps and observes the worlds; None: `BatchedWorlds`, particles act and perceive.
+    Tasks whose particles a rule moves take `RuleDrivenWorlds`."""
+
+    form_type: ClassVar[type[ParticleSpaces] | None] = None
+    """Class of the spaces; None: `ParticleSpaces`, a row for each particle."""
 
     def __init__(self, config: Config, device: torch.device) -> None:
         super().__init__(config, device)
         self._pool: Start | None = None
         self.target_rows: Tensor | None = None
-        """What rows of observations hold of each goal behind perception, [K, T]; None: nothing."""
+        """Columns that follow perception in each row, by the world's goal, [K, T]; None: none."""
 
     @classmethod
     def extra_bytes(cls, config: Any, world_count: int) -> int:
-        """Return about how much memory the task needs besides the worlds [bytes]: their pool.
+        """Return an estimate of the memory that the task needs beyond the worlds [bytes].
 
         Args:
             config: The environment's configuration.
@@ -145,20 +150,16 @@ class EnvTask(WorldTask[Config]):
         """Return fresh worlds: positions [B, N, D] and states [B, N, C].
 
         Args:
-            random: Where they come from, one stream a world; B is `random.world_count`.
+            random: One stream of random numbers for each world; B is `random.world_count`.
         """
         raise NotImplementedError
 
     def fresh(self, random: WorldRandom) -> Start:
-        """Return fresh worlds, with their goals where the task has such: by default `seed`'s.
-
-        Args:
-            random: As for `seed`.
-        """
+        """Return fresh worlds, with goals if the task has several; by default those of `seed`."""
         return self._as_start("seed", self.seed(random))
 
     def _as_start(self, method: str, made: Any) -> Start:
-        """Return what one of the task's methods made, positions and states first, as a `Start`."""
+        """Return the tuple that a method of the task returned as a `Start`."""
         if not isinstance(made, tuple | list) or not 2 <= len(made) <= len(Start._fields):
             raise NPAError(
                 f"{type(self).__name__}.{method} must return positions and states, got a "
@@ -167,10 +168,10 @@ class EnvTask(WorldTask[Config]):
         return Start(*made)
 
     def toward(self, goal: Tensor) -> Self:
-        """Return the task with losses for worlds of these goals; by default there are none.
+        """Return a task whose losses are for worlds of these goals; by default the task itself.
 
         Args:
-            goal: The worlds' goals, int64, shape [B]; read anew at each call of `losses`.
+            goal: The worlds' goals, int64, shape [B]; each call of `losses` reads their values.
         """
         return self
 
@@ -179,14 +180,14 @@ class EnvTask(WorldTask[Config]):
         raise NotImplementedError
 
     def extra_info(self, s: Tensor) -> dict[str, Tensor]:
-        """Return what infos tell of worlds besides, shape [B, ...] each; by default nothing."""
+        """Return further entries of infos, shape [B, ...] each; by default none."""
         return {}
 
     def particle_losses(self, x: Tensor, s: Tensor) -> Tensor:
-        """Return each particle's share of its world's loss, shape [B, N]; their mean is the loss.
+        """Return a loss for each particle, shape [B, N], whose mean is the world's loss.
 
         Raises:
-            NPAError: The task has none.
+            NPAError: The task does not define it.
         """
         raise NPAError(
             f"{type(self).__name__} has no losses of single particles: choose reward='dense' or "
@@ -194,14 +195,13 @@ class EnvTask(WorldTask[Config]):
         )
 
     def particle_gains(self, before: tuple[Tensor, Tensor], after: tuple[Tensor, Tensor]) -> Tensor:
-        """Return what each world would have lost without a particle's action, times N; [B, N].
+        """Return N times what each particle's action contributed to the fall of the loss, [B, N].
 
-        By default from the gradient of `losses`, as `marginal_gains` says; a task whose particles
-        have losses of their own can be exact.
+        The default estimates it from the gradient of `losses` by `marginal_gains`.
 
         Args:
             before: Positions and states before a step.
-            after: The same after it.
+            after: Positions and states after it.
 
         Raises:
             NPAError: The losses have no gradient.
@@ -219,14 +219,14 @@ class EnvTask(WorldTask[Config]):
 
     @property
     def start_is_short(self) -> bool:
-        """Whether `start` takes few operations, so that restarts are recorded on CUDA."""
+        """Whether `start` takes few operations, so that on CUDA it is recorded as a graph."""
         return True
 
     def start(self, random: WorldRandom) -> Start:
         """Return worlds at the beginning of their episodes: fresh ones, or some from the pool.
 
         Args:
-            random: Where they come from, one stream a world.
+            random: One stream of random numbers for each world.
         """
         if self.config.seed_pool == 0:
             start = self._as_start("fresh", self.fresh(random))
@@ -239,77 +239,76 @@ class EnvTask(WorldTask[Config]):
 
     @property
     def first_pool_seed(self) -> int:
-        """Seed of the first world of the pool; each of the others has one more."""
+        """Seed of world 0 of the pool; world k has this seed plus k."""
         return 0
 
-    def pooled(self, numbers: Tensor) -> Start:
-        """Return worlds of the pool, which is made when first asked for.
+    def pooled(self, indices: Tensor) -> Start:
+        """Return worlds of the pool, which the first call makes.
 
         Args:
-            numbers: Which ones, below `seed_pool`, int64, shape [B].
+            indices: Positions in the pool, below `seed_pool`, int64, shape [B].
         """
         if self._pool is None:
             self._pool = self.made_for_pool(range(self.config.seed_pool))
         x, s, _, goal = self._pool
-        return Start(x[numbers], s[numbers], goal=None if goal is None else goal[numbers])
+        return Start(x[indices], s[indices], goal=None if goal is None else goal[indices])
 
-    def made_for_pool(self, numbers: Sequence[int]) -> Start:
-        """Make worlds of the pool, each from a seed of its own."""
-        seeds = [self.first_pool_seed + number for number in numbers]
-        # Not the streams that episodes with these seeds go on with.
+    def made_for_pool(self, indices: Sequence[int]) -> Start:
+        """Make the worlds at some positions in the pool, each from its own seed."""
+        seeds = [self.first_pool_seed + index for index in indices]
+        # Other streams than those of episodes with these seeds.
         random = WorldRandom(seeds, device=self.device).substream(StreamId.GROWTH)
         return self._as_start("fresh", self.fresh(random))
 
     def draw(self, x: Tensor, s: Tensor, steps: NDArray[np.int64]) -> NDArray[np.uint8]:
-        """Return a picture of each world, shape [B, R, R, 3], so many steps after its start, [B].
+        """Return a picture of each world, shape [B, R, R, 3].
 
-        A camera turns around 3D worlds.
+        The camera of 3D worlds turns with `steps`, the steps since each world's start, [B].
         """
         style = self.config.render_style
         if self.space_dim == 2:
             return self.draw_particles(x, s, style)
-        # Each is seen from an angle of its own.
         angles = TURN * steps.astype(float)
-        seen = [
+        pictures = [
             self.draw_particles(x[k : k + 1], s[k : k + 1], style, a) for k, a in enumerate(angles)
         ]
-        return np.concatenate(seen)
+        return np.concatenate(pictures)
 
     @property
     def pixel_size(self) -> float:
-        """Size of a particle in pictures: their distance where N fill the unit disk or ball."""
+        """Size of a particle in pictures: the spacing of N that fill the unit disk or ball."""
         volume = np.pi if self.space_dim == 2 else 4.0 * np.pi / 3.0
         return float((volume / self.config.particle_count) ** (1.0 / self.space_dim))
 
 
 class TargetEnvTask(EnvTask[Config]):
-    """A task that rules are trained on, too: `npa_envs.tasks` has its targets and losses."""
+    """A task with the targets and losses of a training task of `npa_envs.tasks`."""
 
     goal: Any
-    """The task as training sees it."""
+    """The training task."""
 
     def seed(self, random: WorldRandom) -> tuple[Tensor, Tensor]:
-        """Return worlds as training begins with them, all states zero."""
+        """Return the training task's initial worlds, all states zero."""
         x, s, _ = self.goal.seed(random.world_count, generator=random, device=self.device)
         return x, s
 
     def toward(self, goal: Tensor) -> Self:
-        """Return the task with losses for worlds of these goals, where training has such too."""
-        aimed = copy.copy(self)
-        aimed.goal = self.goal.toward(goal)
-        return aimed
+        """Return a task whose losses are for worlds of these goals."""
+        goal_task = copy.copy(self)
+        goal_task.goal = self.goal.toward(goal)
+        return goal_task
 
     def particle_losses(self, x: Tensor, s: Tensor) -> Tensor:
-        """Return each particle's share of the task's loss."""
+        """Return the training task's loss of each particle."""
         shares: Tensor = self.goal.particle_shares(x, s)
         return shares
 
 
-# What tasks return, checked: a mistake of an own task would be a wrong reward without a word.
+# Checks of what tasks return: a mistake in a custom task would silently give wrong rewards.
 
 
-def starter(task: EnvTask[Any]) -> str:
-    """Return the name of the method that a task says with where worlds start."""
+def start_method(task: EnvTask[Any]) -> str:
+    """Return the name of the method by which a task defines where worlds start, for errors."""
     own = (
         name for name in ("start", "fresh") if getattr(type(task), name) != getattr(EnvTask, name)
     )
@@ -317,8 +316,8 @@ def starter(task: EnvTask[Any]) -> str:
 
 
 def check_start(task: EnvTask[Any], start: Start, world_count: int, shapes: Any) -> None:
-    """Check the starts of some worlds, whose shapes are of more, without waiting for the device."""
-    name = starter(task)
+    """Check M starts without synchronising; `shapes` are those of x and s of all worlds."""
+    name = start_method(task)
     if not isinstance(start, Start):
         raise NPAError(
             f"{type(task).__name__}.{name} must return a Start, got a {type(start).__name__}: "
@@ -337,7 +336,7 @@ def check_start(task: EnvTask[Any], start: Start, world_count: int, shapes: Any)
 def checked_losses(
     task: EnvTask[Any], losses: Any, world_count: int, names: tuple[str, ...]
 ) -> list[Tensor]:
-    """Return the parts of worlds' losses, shape [B] each, without waiting for the device."""
+    """Return the checked parts of worlds' losses, shape [B] each, without synchronising."""
     name = f"{type(task).__name__}.losses"
     if not isinstance(losses, Mapping) or not losses or not all(type(n) is str for n in losses):
         came = list(losses) if isinstance(losses, Mapping) else type(losses).__name__
@@ -364,7 +363,7 @@ def checked_tensor(
     shape: tuple[int, ...],
     dtype: torch.dtype = torch.float32,
 ) -> Tensor:
-    """Return what a method of a task returned, a tensor of this shape and type."""
+    """Return a tensor that a method of a task returned, if it has this shape and type."""
     device = task.device
     if not isinstance(value, Tensor):
         came = f"a {type(value).__name__}"
@@ -379,7 +378,7 @@ def checked_tensor(
 
 
 def check_finite(task: EnvTask[Any], method: str, parts: Mapping[str, Tensor]) -> None:
-    """Check that numbers of worlds are finite; waits for the device."""
+    """Check that tensors with one row for each world are finite; synchronises."""
     for part, value in parts.items():
         bad = ~torch.isfinite(value.flatten(1) if value.ndim > 1 else value[:, None]).all(dim=1)
         if bool(bad.any()):
@@ -392,14 +391,14 @@ def check_finite(task: EnvTask[Any], method: str, parts: Mapping[str, Tensor]) -
 
 
 class GlobalDraws:
-    """The states of the global generators of random numbers: a task must not draw from them."""
+    """States of the global random number generators, from which a task must not draw."""
 
     def __init__(self, task: EnvTask[Any]) -> None:
         self._task = task
         self._before = self._states()
 
     def check(self, method: str) -> None:
-        """Check that none of them has moved since, by the method of the task."""
+        """Raise an error if a method of the task has drawn from one since this was made."""
         now = self._states()
         moved = [name for name, state in self._before.items() if state != now[name]]
         if moved:
@@ -417,7 +416,7 @@ class GlobalDraws:
             "Python's": random.getstate(),
         }
         if self._task.device.type == "cuda":
-            # A capture of another thread puts another generator in its place for a moment.
+            # A capture in another thread replaces this generator for a moment.
             with recording_lock:
                 state = torch.cuda.get_rng_state(self._task.device)
             states["torch's on CUDA"] = state.numpy().tobytes()

@@ -1,4 +1,4 @@
-"""Many worlds as one Gymnasium vector environment, batched on the device."""
+"""Many worlds as one Gymnasium vector environment, and checks of its arguments."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from torch import Tensor
 
 from npa_envs.checks import is_whole, number_tensor
 from npa_envs.envs.core.base import WorldsEnv
-from npa_envs.envs.core.referee import FLAGS, StepReport, reason
+from npa_envs.envs.core.rewards import FLAGS, REWARD, StepReport, reason
 from npa_envs.errors import NPAError, shown, suggest
 from npa_envs.world.actions import TIME_LIMIT
 from npa_envs.world.cuda_graph import to_device_async
@@ -28,24 +28,25 @@ AUTORESET_MODES = {
     "next-step": AutoresetMode.NEXT_STEP,
     "disabled": AutoresetMode.DISABLED,
 }
-"""What happens to worlds whose episodes are over."""
+"""Gymnasium's modes by the names that `autoreset_mode` takes."""
 
 REASONS = np.array([reason(ending) for ending in range(2 * TIME_LIMIT)], dtype=object)
-"""Why an episode ended, in words, for each combination of endings."""
+"""`info["reason"]` for each combination of the flags of an ending."""
 
 
 class NPAVectorEnv(WorldsEnv, VectorEnv[Any, Any, Any]):
-    """B worlds of a task, stepped together; subclasses name the task.
+    """B worlds of a task, stepped together; subclasses set `task_type`.
 
     World k, reset with `seed`, is the single environment reset with `seed + k`, bit for bit.
 
     Args:
         num_envs: Worlds B.
         max_episode_steps: Steps after which an episode is truncated; None or -1: never.
-        autoreset_mode: "same-step": the step that ends an episode returns the next one's first
-            observation, the last one is in `infos["final_obs"]`; "next-step": the next step does,
-            whatever its action; "disabled": `reset(options={"reset_mask": ...})` does.
-        copy: Hand out new arrays; False: the same ones in each step, overwritten by the next.
+        autoreset_mode: When a world whose episode is over starts the next one. "same-step": in the
+            step that ends the episode, whose last observation is in `infos["final_obs"]`;
+            "next-step": in the step after, which ignores its action; "disabled": when
+            `reset(options={"reset_mask": ...})` is called.
+        copy: Return new arrays; False: the same ones in each step, overwritten by the next.
         keywords: Fields of the task's configuration.
 
     Raises:
@@ -68,7 +69,7 @@ class NPAVectorEnv(WorldsEnv, VectorEnv[Any, Any, Any]):
         **keywords: Any,
     ) -> None:
         num_envs = checked_count("num_envs", num_envs)
-        # Gymnasium's word for "never" is -1.
+        # Gymnasium takes -1 for no limit.
         if max_episode_steps is not None and max_episode_steps != -1:
             episode_steps = checked_count("max_episode_steps", max_episode_steps)
         else:
@@ -80,19 +81,19 @@ class NPAVectorEnv(WorldsEnv, VectorEnv[Any, Any, Any]):
         self.single_observation_space = self.form.observation_space
         self.single_action_space = self.form.action_space
         self.copies = copy
-        """Whether what is handed out stays as it is after the next step."""
+        """Whether returned arrays are new, and not overwritten by the next step."""
         self._buffer: Tensor | None = None
         self._shared: NDArray[np.float64] | None = None
         self._ended = np.zeros(num_envs, dtype=bool)
 
     @cached_property
     def observation_space(self) -> Space[Any]:  # type: ignore[override]
-        """Observations of all worlds, shape [B, N, P]; made when asked for, as it is large."""
+        """Space of all worlds' observations, [B, N, P]; large, so made at the first use."""
         return batch_space(self.single_observation_space, self.num_envs)
 
     @cached_property
     def action_space(self) -> Space[Any]:  # type: ignore[override]
-        """Actions of all worlds, shape [B, N, A]; made when asked for, as it is large."""
+        """Space of all worlds' actions, [B, N, A]; large, so made at the first use."""
         return batch_space(self.single_action_space, self.num_envs)
 
     def reset(
@@ -104,10 +105,10 @@ class NPAVectorEnv(WorldsEnv, VectorEnv[Any, Any, Any]):
         """Start episodes.
 
         Args:
-            seed: Begin the sequences of episodes of seed, seed + 1, ..., or of the seeds in a list;
-                without it the sequences go on.
+            seed: World k begins the sequence of episodes of seed + k, or of the k-th seed of a
+                list; None: each world starts the next episode of its sequence.
             options: `{"reset_mask": mask}` resets only the worlds where the mask, bool, shape [B],
-                is True; the others are left as they are, bit for bit.
+                is True; the others do not change.
 
         Returns:
             Observations of all worlds, shape [B, N, P], and the losses with their parts.
@@ -119,7 +120,7 @@ class NPAVectorEnv(WorldsEnv, VectorEnv[Any, Any, Any]):
         super().reset(seed=seed if isinstance(seed, int) else None)
         chosen = worlds_to_reset(options, self.num_envs)
         if not self._started and len(chosen) < self.num_envs:
-            raise NPAError("reset_mask needs worlds to leave alone: reset all of them first")
+            raise NPAError("reset_mask needs worlds that have started: reset all of them first")
         keys = None
         if seed is not None or not self._started:
             keys = rng_keys(seed, self.num_envs, self.np_random)[chosen]
@@ -130,12 +131,12 @@ class NPAVectorEnv(WorldsEnv, VectorEnv[Any, Any, Any]):
         self._ended[chosen] = False
         which = np.zeros(self.num_envs, dtype=bool)
         which[chosen] = True
-        losses = self.losses_of(self._numbers(self.worlds.report.copy()))
+        losses = self.losses_of(self._report_rows(self.worlds.report.copy()))
         infos = masked(losses, self._mask(which)) | self._extras("reset", self._mask(which))
-        return self.form.seen(observation), infos
+        return self.form.returned(observation), infos
 
     def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
-        """Apply an action to each world and perceive.
+        """Apply an action to each world.
 
         Args:
             actions: Shape [B, N, A], in [-1, 1].
@@ -144,8 +145,8 @@ class NPAVectorEnv(WorldsEnv, VectorEnv[Any, Any, Any]):
             Observations [B, N, P], rewards [B], terminations [B], truncations [B], and infos.
 
         Raises:
-            NPAError: The actions have another shape; the worlds are then as they were.
-            DivergedError: An action is not finite, and the worlds are as they were; or a world
+            NPAError: The actions have another shape; the worlds are not changed.
+            DivergedError: An action is not finite, and the worlds are not changed; or a world
                 diverged, and `on_divergence` is "raise".
         """
         if not self._started:
@@ -174,8 +175,8 @@ class NPAVectorEnv(WorldsEnv, VectorEnv[Any, Any, Any]):
             self.worlds.restart(np.flatnonzero(over), observation)
         ended = endings != 0
         final = self.autoreset_mode is AutoresetMode.SAME_STEP and bool(ended.any())
-        # What a restart overwrites is copied first, whatever the caller wants of the rest.
-        numbers, flags, infos = self._report(stepped, copy=self.copies or final)
+        # A restart overwrites the report, so it is copied first.
+        rows, flags, infos = self._report(stepped, copy=self.copies or final)
         if final:
             which = self._mask(ended)
             final_infos = {n: which if n.startswith("_") else v for n, v in infos.items()}
@@ -188,7 +189,7 @@ class NPAVectorEnv(WorldsEnv, VectorEnv[Any, Any, Any]):
             self.worlds.restart(np.flatnonzero(ended), observation)
             _, _, infos = self._report(~ended, copy=self.copies)
             infos |= {
-                "final_obs": self.form.last_seen(final_observation, ended),
+                "final_obs": self.form.returned_final(final_observation, ended),
                 "_final_obs": which,
             }
             infos |= {"final_info": final_infos, "_final_info": self._mask(ended)}
@@ -197,10 +198,10 @@ class NPAVectorEnv(WorldsEnv, VectorEnv[Any, Any, Any]):
             if ended.any():
                 infos |= {"reason": REASONS[endings], "_reason": self._mask(ended)}
         self._show()
-        return self.form.seen(observation), numbers[0], flags[0], flags[1], infos
+        return self.form.returned(observation), rows[REWARD], flags[0], flags[1], infos
 
     def render(self) -> tuple[NDArray[np.uint8], ...] | None:
-        """Return a picture of each world, shape [R, R, 3], in the mode "rgb_array"."""
+        """Return a picture of each world, shape [R, R, 3], with the render mode "rgb_array"."""
         if not self._started:
             raise NPAError("render needs worlds: call reset first")
         pictures = self._pictures()
@@ -215,16 +216,16 @@ class NPAVectorEnv(WorldsEnv, VectorEnv[Any, Any, Any]):
         return self.worlds.x.clone(), self.worlds.s.clone()
 
     def place_particles(self, x: Any, s: Any, worlds: Any = None) -> Any:
-        """Replace particles, at no reward, and return the new observations of all worlds.
+        """Replace particles, without a reward, and return the new observations of all worlds.
 
         Args:
             x: Positions [length units], shape [M, N, D].
             s: States, dimensionless, shape [M, N, C].
-            worlds: Which worlds, indices, each once, shape [M]; None: all of them.
+            worlds: Indices of the worlds, without repetition, shape [M]; None: all of them.
 
         Raises:
-            NPAError: A shape is another one, a number is not finite or beyond its limit, or worlds
-                are no such indices.
+            NPAError: A shape is wrong, a value is not finite or beyond its limit, or `worlds` are
+                no such indices.
         """
         if not self._started:
             raise NPAError("particles need worlds: call reset first")
@@ -232,72 +233,71 @@ class NPAVectorEnv(WorldsEnv, VectorEnv[Any, Any, Any]):
             chosen = torch.arange(self.num_envs)
         else:
             chosen = world_numbers(worlds, self.num_envs)
-        return self.form.seen(self._place(x, s, chosen.to(self.task.device), self._buffer))
+        return self.form.returned(self._place(x, s, chosen.to(self.task.device), self._buffer))
 
     def _report(
         self, stepped: NDArray[np.bool_] | None, *, copy: bool
     ) -> tuple[list[Any], list[Any], dict[str, Any]]:
-        """Return numbers, flags and infos as they are, as they are handed out."""
+        """Return the current report's rows and flags, and infos; `stepped`: worlds that acted."""
         worlds = self.worlds
         report = worlds.report.copy() if copy else worlds.report
-        # One view for each quantity, made at once.
-        numbers, flags = self._numbers(report), list(self._out(report.endings))
+        rows, flags = self._report_rows(report), list(self._out(report.endings))
         everyone = self._out(report.everyone if copy else report.everyone.clone())
         which = everyone if stepped is None else self._mask(stepped)
-        infos = masked(self.losses_of(numbers), everyone)
+        infos = masked(self.losses_of(rows), everyone)
         infos |= self._extras("reset", everyone, copy=copy)
-        own = self._improvements(numbers) | dict(zip(FLAGS, flags[2:], strict=True))
+        of_step = self._improvements(rows) | dict(zip(FLAGS, flags[2:], strict=True))
         if worlds.particle_reward is not None:
-            shares = worlds.particle_reward
-            own["particle_reward"] = self._out(shares.clone() if copy else shares)
-        infos |= masked(own, which) | self._extras("step", which, copy=copy)
-        return numbers, flags, infos
+            rewards = worlds.particle_reward
+            of_step["particle_reward"] = self._out(rewards.clone() if copy else rewards)
+        infos |= masked(of_step, which) | self._extras("step", which, copy=copy)
+        return rows, flags, infos
 
     def _extras(self, when: str, which: Any, *, copy: bool = True) -> dict[str, Any]:
         extras = self.worlds.extras(when).items()
         return masked({n: self._out(v.clone() if copy else v) for n, v in extras}, which)
 
-    def _numbers(self, report: StepReport) -> list[Any]:
-        """Return a report's numbers as handed out: arrays are float64, as Gymnasium's own are."""
-        numbers = self._out(report.numbers)
-        if isinstance(numbers, Tensor):
-            return list(numbers)
+    def _report_rows(self, report: StepReport) -> list[Any]:
+        """Return the rows of a report's numbers: tensors, or arrays of float64 as Gymnasium's."""
+        rows = self._out(report.numbers)
+        if isinstance(rows, Tensor):
+            return list(rows)
         if report is not self.worlds.report:
-            return list(numbers.astype(np.float64))
+            return list(rows.astype(np.float64))
         if self._shared is None:
-            self._shared = np.empty(numbers.shape)
-        self._shared[:] = numbers
+            self._shared = np.empty(rows.shape)
+        self._shared[:] = rows
         return list(self._shared)
 
     def _mask(self, mask: NDArray[np.bool_]) -> Any:
-        """Return a mask of worlds as a new array to hand out."""
+        """Return a copy of a mask of worlds in the type that the user chose."""
         return self._sent(mask.copy())
 
 
 def masked(values: dict[str, Any], which: Any) -> dict[str, Any]:
-    """Return values of worlds, and which worlds have them, as Gymnasium's infos hold them."""
+    """Return values by name, and as `_name` the mask of the worlds that have them."""
     infos = {}
     for name, value in values.items():
         infos[name], infos[f"_{name}"] = value, which
     return infos
 
 
-def batched(env_type: type[WorldsEnv]) -> type[NPAVectorEnv]:
-    """Return the class of many worlds of the task of an environment of one."""
+def vector_class(env_type: type[WorldsEnv]) -> type[NPAVectorEnv]:
+    """Return the vector environment's class for the class of a single environment."""
     name = env_type.__name__
-    own = {
+    attributes = {
         "__doc__": f"Worlds of `{name}`, batched on one device; its docstring describes both.",
         "__module__": env_type.__module__,
         "task_type": env_type.task_type,
     }
-    return type(name.replace("Env", "VectorEnv"), (NPAVectorEnv,), own)
+    return type(name.replace("Env", "VectorEnv"), (NPAVectorEnv,), attributes)
 
 
-# Arguments of environments that are no fields of a configuration, checked.
+# Checks of arguments that are no fields of a configuration.
 
 
 def checked_count(name: str, value: Any) -> int:
-    """Return what the caller calls so, a whole number of at least 1."""
+    """Return the argument of this name, checked: a whole number of at least 1."""
     if isinstance(value, np.integer):
         value = int(value)
     if not is_whole(value) or value < 1:
@@ -308,7 +308,7 @@ def checked_count(name: str, value: Any) -> int:
 
 
 def checked_mode(given: str | AutoresetMode) -> AutoresetMode:
-    """Return Gymnasium's mode for a word or for itself."""
+    """Return Gymnasium's mode for a name or a mode."""
     if isinstance(given, AutoresetMode):
         return given
     by_name = AUTORESET_MODES | {mode.value: mode for mode in AutoresetMode}
@@ -321,12 +321,12 @@ def checked_mode(given: str | AutoresetMode) -> AutoresetMode:
 
 
 def plain_seed(seed: Any) -> Any:
-    """Return a seed as Gymnasium takes it: NumPy's whole number as Python's, all else as it is."""
+    """Return a NumPy integer as Python's, which Gymnasium needs, and anything else unchanged."""
     return int(seed) if isinstance(seed, np.integer) else seed
 
 
 def check_options(options: Any, known: tuple[str, ...]) -> None:
-    """Check the options of `reset` by their names."""
+    """Check that the options of `reset` are a dict with known names only."""
     if not isinstance(options, Mapping | None):
         raise NPAError(
             f"options must be a dict or None, got {type(options).__name__}: "
@@ -339,7 +339,7 @@ def check_options(options: Any, known: tuple[str, ...]) -> None:
 
 
 def worlds_to_reset(options: dict[str, Any] | None, world_count: int) -> NDArray[np.int64]:
-    """Return which of B worlds the options of `reset` ask for: those of the mask, or all."""
+    """Return the indices of the worlds that `reset_mask` chooses, all without a mask."""
     check_options(options, ("reset_mask",))
     mask = (options or {}).get("reset_mask")
     if mask is None:
@@ -356,14 +356,14 @@ def worlds_to_reset(options: dict[str, Any] | None, world_count: int) -> NDArray
 
 
 def world_numbers(worlds: Any, world_count: int) -> Tensor:
-    """Return indices of worlds, each once, checked; on the CPU, int64, shape [M]."""
+    """Return checked indices of worlds, without repetition, on the CPU, int64, shape [M]."""
     given = number_tensor("worlds", worlds).cpu()
-    # A mask would else be taken for the indices 0 and 1.
+    # A mask is refused: it would be read as the indices 0 and 1.
     whole = not given.is_floating_point() and given.dtype != torch.bool
     if given.ndim == 1 and whole:
         chosen = given.long()
-        there = bool(((chosen >= 0) & (chosen < world_count)).all())
-        if there and len(set(chosen.tolist())) == len(chosen):
+        exist = bool(((chosen >= 0) & (chosen < world_count)).all())
+        if exist and len(set(chosen.tolist())) == len(chosen):
             return chosen
     raise NPAError(
         f"worlds must be indices below {world_count}, each once, got {shown(given.tolist())}: "
@@ -374,10 +374,10 @@ def world_numbers(worlds: Any, world_count: int) -> Tensor:
 def rng_keys(
     seed: int | Sequence[int] | None, world_count: int, np_random: np.random.Generator
 ) -> Tensor:
-    """Return the key of each world's randomness, int64, shape [B].
+    """Return the key of each world's random stream, int64, shape [B].
 
-    The seed is that of the first world, each of the others has one more; or there is one for each;
-    without any, keys are drawn from the generator.
+    World k has the key of seed + k, or of the k-th seed of a sequence; None draws keys from the
+    generator.
     """
     if seed is None:
         drawn = np_random.integers(2**64, size=world_count, dtype=np.uint64)

@@ -1,7 +1,6 @@
-"""The batch of worlds behind every environment: actions, observations, restarts.
+"""The batch of worlds of an environment: actions, observations, restarts.
 
-Gymnasium is not known in this module. A single environment is a batch of one; world k of a batch
-is, bit for bit, that world alone.
+A single environment is a batch of one. World k of a batch is the same as alone, bit for bit.
 """
 
 from __future__ import annotations
@@ -16,7 +15,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from npa_envs.envs.core.config import EnvConfig
-from npa_envs.envs.core.referee import JudgedWorlds
+from npa_envs.envs.core.rewards import RewardedWorlds
 from npa_envs.envs.core.state import check_default_dtype, not_finite
 from npa_envs.envs.core.task import (
     EnvTask,
@@ -24,7 +23,7 @@ from npa_envs.envs.core.task import (
     Start,
     check_finite,
     check_start,
-    starter,
+    start_method,
 )
 from npa_envs.errors import DivergedError, NPAError
 from npa_envs.world.actions import (
@@ -45,15 +44,15 @@ from npa_envs.world.cuda_graph import (
 from npa_envs.world.divergence import LARGEST_REPORT, term_name
 
 FEW_PARTICLES = 8192
-"""Particles of all worlds up to which a step on CUDA is one graph: larger ones hide launches."""
+"""Particles of all worlds up to which a step on CUDA is one graph; larger steps hide launches."""
 
 
-class BatchedWorlds(JudgedWorlds):
-    """B worlds of one task, stepped together; arguments and errors are those of `JudgedWorlds`.
+class BatchedWorlds(RewardedWorlds):
+    """B worlds of one task, stepped together; arguments and errors are those of `RewardedWorlds`.
 
     Each particle moves and changes its state by its row of an action, and observes what it
-    perceives, then the task's `target_rows` for the world's goal. All tensors stay where they are
-    between steps.
+    perceives, then the task's `target_rows` for the world's goal. All tensors keep their memory
+    between steps, as CUDA graphs need.
     """
 
     @makes_plain_tensors
@@ -67,11 +66,11 @@ class BatchedWorlds(JudgedWorlds):
         super().__init__(task_type, config, world_count, episode_steps)
         self._target: Tensor | None = self.task.target_rows
         self._perceived: Tensor | None = None
-        """What is perceived, [B, N, P], where a step is one graph."""
+        """Perception, shape [B, N, P], that the graph of a step writes; None without one."""
         self._host_perceived: Tensor | None = None
-        """The same of a single world that is returned as arrays, in pinned memory."""
+        """Its copy in pinned memory, for a single world with NumPy output."""
         self._host_is_current = False
-        """Whether that is of the last step, after which no world began anew."""
+        """Whether the copy belongs to the last step, and no world restarted since."""
         self._neighbours: NeighbourState | None = None
         self._prepare_actions()
         self._make_graphs()
@@ -92,43 +91,40 @@ class BatchedWorlds(JudgedWorlds):
         self._draw = GraphedCallable(self._actions.draw, self.device)
 
     def _make_graphs(self) -> None:
-        self._look = GraphedCallable(self._judge_and_sort, self.device)
-        self._act = GraphedCallable(self._act_and_look, self.device)
+        self._evaluate_graph = GraphedCallable(self._evaluate_and_sort, self.device)
+        self._step_graph = GraphedCallable(self._act_and_evaluate, self.device)
 
     def __getstate__(self) -> dict[str, Any]:
-        """Leave out what only the next step needs, and which cannot be pickled."""
+        """Return the state without what the next step makes again."""
         none = dict.fromkeys(("_neighbours", "_perceived", "_host_perceived"))
         return super().__getstate__() | none | {"_host_is_current": False}
 
     def limit_steps(self, episode_steps: int | None) -> None:
-        """Cut episodes off after so many steps from now on, or never."""
+        """Set the steps after which episodes are truncated; None: never."""
         if episode_steps != self.episode_steps:
-            self.episode_steps, self._judgement = episode_steps, None
+            self.episode_steps, self._evaluation = episode_steps, None
             self._make_graphs()
 
     @property
     def target_dim(self) -> int:
-        """Columns of an observation's rows behind perception, T."""
+        """Columns of the target after those of perception in an observation's row, T."""
         return 0 if self._target is None else int(self._target.shape[1])
 
     @torch.no_grad()
     @makes_plain_tensors
     def start(self, worlds: Tensor, keys: Tensor | None = None) -> Start:
-        """Start episodes in some worlds, int64, shape [M], and return their particles.
-
-        Keys are those of `next_streams`.
-        """
+        """Start episodes in some worlds, int64, [M], and return them; keys as in `next_streams`."""
         random = self.next_streams(worlds, keys)
         check_default_dtype()
-        # The first start is not recorded: the host may look.
+        # The first start is not recorded as a graph, so that it can synchronise for checks.
         task, first = self.task, not self.part_names
         draws, check = GlobalDraws(task) if first else None, first or not self.x.is_cuda
         start: Start = task.start(random)
         check_start(task, start, len(worlds), (self.x.shape, self.s.shape))
         if draws is not None:
-            draws.check(starter(task))
+            draws.check(start_method(task))
         if check:
-            check_finite(task, starter(task), {"positions": start.x, "states": start.s})
+            check_finite(task, start_method(task), {"positions": start.x, "states": start.s})
         self.random.put(worlds, random)
         self.begin(worlds, start, check=check)
         if draws is not None:
@@ -140,7 +136,7 @@ class BatchedWorlds(JudgedWorlds):
         return build_neighbours(start.x, start.s, self.physics, places=worlds)
 
     def restart(self, worlds: NDArray[np.int64], observation: Tensor) -> None:
-        """Start the next episodes of some worlds, [M], and write what is observed there."""
+        """Start the next episodes of some worlds, [M], and write their rows of the observation."""
         if self._target is None:
             self._resets(worlds, observation)
             return
@@ -152,7 +148,7 @@ class BatchedWorlds(JudgedWorlds):
     @torch.no_grad()
     @makes_plain_tensors
     def perceive(self, out: Tensor | None = None) -> Tensor:
-        """Return what is observed in all worlds as they are, shape [B, ...], written to `out`."""
+        """Return all worlds' current observations, shape [B, ...], in `out` if it is given."""
         return self._observed(build_neighbours(self.x, self.s, self.physics), out)
 
     def _observed(self, neighbours: NeighbourState, out: Tensor | None) -> Tensor:
@@ -170,29 +166,28 @@ class BatchedWorlds(JudgedWorlds):
     @torch.no_grad()
     @makes_plain_tensors
     def reseed(self, worlds: NDArray[np.int64], observation: Tensor) -> None:
-        """Start some worlds, [M], anew within their episodes; the last step's pay and flags stay.
+        """Restart the particles of some worlds, [M], within their episodes.
 
-        What is observed in them is written into the observation of all, shape [B, ...].
+        Rewards and flags of the last step stay. Their rows of the observation, [B, ...], are
+        overwritten.
         """
         self._host_is_current = False
-        restore = self.restore_pay(to_device_async(worlds, self.x.device))
+        restore = self.reward_restorer(to_device_async(worlds, self.x.device))
         self.restart(worlds, observation)
         restore()
 
     def step(self, action: Tensor, out: Tensor | None = None) -> tuple[NDArray[np.uint8], Tensor]:
-        """Apply actions to all worlds; return their endings, [B], and what is observed, [B, ...].
+        """Apply actions to all worlds; return their endings, [B], and observations, [B, ...].
 
-        The endings, one byte a world, and of a single world its numbers are all that the host
-        reads. On CUDA the worlds are judged and sorted side by side, and the device perceives while
-        the host reads.
+        The host reads the endings, one byte a world, and the report of a single world. On CUDA
+        evaluation and neighbour search overlap, and the device perceives while the host reads.
 
         Args:
             action: Float32, shape [B, ...], on any device.
-            out: Where to write what is observed; a new tensor otherwise.
+            out: Where to write the observations; None: a new tensor.
 
         Raises:
-            DivergedError: An action is not finite; the worlds, and what is reported of them, are
-                then as they were.
+            DivergedError: An action is not finite; worlds and report are not changed.
             NPAError: The task's losses are not finite.
         """
         observation = self.queue(action, out)
@@ -206,21 +201,21 @@ class BatchedWorlds(JudgedWorlds):
         if (endings & NOT_FINITE).any():
             self.check_losses(torch.arange(self.world_count, device=self.device))
             raise NPAError(
-                f"losses of {type(self.task).__name__} must be finite before a step as well as "
-                "after it: mend them, then reset"
+                f"losses of {type(self.task).__name__} must be finite before and after a step: "
+                "mend them, then reset"
             )
         return endings, observation
 
     @torch.no_grad()
     @makes_plain_tensors
     def queue(self, action: Tensor, out: Tensor | None = None) -> Tensor:
-        """Do what `step` does but wait for the device, and return what is observed there then."""
+        """Apply actions as `step` does, without synchronising; return observations, [B, ...]."""
         if self.x.is_cuda and self.x.shape[:2].numel() <= FEW_PARTICLES:
-            # To copy actions takes less than to launch what one graph then does.
+            # Copying actions costs less than the launches that the graph replaces.
             self._actions.hold(action)
-            self._act()
-            assert self._side_stream is not None, "it was CUDA just now"
-            assert self._perceived is not None, "it was perceived just now"
+            self._step_graph()
+            assert self._side_stream is not None, "CUDA has a side stream"
+            assert self._perceived is not None, "the graph writes it"
             self._side_stream.mark()
             if self._target is not None:
                 rows = self._with_target(self._perceived, self.goal)
@@ -231,18 +226,18 @@ class BatchedWorlds(JudgedWorlds):
             return self._perceived if self._host_is_current else self._perceived.clone()
         self._draw()
         self._actions.apply(action)
-        self._look()
+        self._evaluate_graph()
         if self._side_stream is not None:
-            # The host learns the endings while the device perceives.
+            # The host reads the endings while the device perceives.
             self._side_stream.mark()
-        assert self._neighbours is not None, "the worlds were sorted just now"
+        assert self._neighbours is not None, "the evaluation builds them"
         return self._observed(self._neighbours, out)
 
-    def _act_and_look(self) -> None:
-        """Apply the actions that are held; judge the worlds and, next to that, perceive."""
+    def _act_and_evaluate(self) -> None:
+        """Apply the stored actions, then evaluate and perceive at the same time."""
         self._actions.draw()
         self._actions.apply_held()
-        with self._judging_on_side():
+        with self._evaluating_on_side():
             if self._perceived is None:
                 self._perceived = self.x.new_empty(*self.x.shape[:2], self.physics.perception_dim)
                 returns_arrays = self.world_count == 1 and self.task.config.output == "numpy"
@@ -252,44 +247,39 @@ class BatchedWorlds(JudgedWorlds):
             if self._host_perceived is not None:
                 self._host_perceived.copy_(self._perceived, non_blocking=True)
 
-    def _judge_and_sort(self) -> None:
-        """Judge the worlds and, next to that, sort them."""
-        with self._judging_on_side():
+    def _evaluate_and_sort(self) -> None:
+        """Evaluate the worlds and, at the same time, search neighbours."""
+        with self._evaluating_on_side():
             self._neighbours = build_neighbours(self.x, self.s, self.physics)
 
     @contextlib.contextmanager
-    def _judging_on_side(self) -> Iterator[None]:
-        """Judge the worlds, on CUDA overlapped with what is launched inside."""
+    def _evaluating_on_side(self) -> Iterator[None]:
+        """Evaluate the worlds, on CUDA overlapped with what the block launches."""
         with contextlib.nullcontext() if self._side_stream is None else self._side_stream.overlap():
-            self.judge()
+            self.evaluate()
         yield
         if self._side_stream is not None:
             self._side_stream.join()
 
     def extras(self, when: str) -> dict[str, Tensor]:
-        """Return what infos hold besides, shape [B, ...] each: since a "reset", or of a "step"."""
+        """Return further entries of infos, [B, ...] each: of every call ("reset"), or of a step."""
         if when == "reset":
             return self.extra_info()
         return {"updated": self._actions.updated()} if self.task.config.tell_updated else {}
 
     def host_observation(self, observation: Tensor) -> Tensor:
-        """Return the observation of a single world after a step, on the host if it is there.
-
-        A world that is returned as arrays is there by the end of the step.
-        """
+        """Return a single world's observation, from the host's copy if that is current."""
         if not self._host_is_current or self._host_perceived is None:
             return observation
-        # The next step writes over it. NumPy copies it in this thread: torch would wait for others
-        # to wake, which can take milliseconds.
+        # The next step overwrites it. NumPy copies in this thread; torch would wake others, which
+        # can take milliseconds.
         return torch.from_numpy(self._host_perceived.numpy().copy())
 
     def guarded(self, endings: NDArray[np.uint8], observation: Tensor) -> NDArray[np.uint8]:
-        """Do what `on_divergence` says about worlds that diverged; return what ends episodes.
-
-        Nothing is read from the device, and nothing run, where none did.
+        """Apply `on_divergence` to worlds that diverged; costs nothing if none did.
 
         Returns:
-            Endings, shape [B], without divergence where that ends no episode.
+            Endings, shape [B], without the flag of divergences that end no episode.
         """
         way = self.task.config.on_divergence
         diverged = endings & DIVERGED != 0
@@ -298,10 +288,10 @@ class BatchedWorlds(JudgedWorlds):
         if way == "raise":
             raise DivergedError(self._divergence_message(np.flatnonzero(diverged)))
         if way == "reset":
-            # Where the time is up, the next episode comes anyway.
-            going_on = np.flatnonzero(endings == DIVERGED)
-            if len(going_on):
-                self.reseed(going_on, observation)
+            # Worlds that are also truncated start their next episode anyway.
+            only_diverged = np.flatnonzero(endings == DIVERGED)
+            if len(only_diverged):
+                self.reseed(only_diverged, observation)
         return endings & ~np.uint8(DIVERGED)
 
     def pictures(self, count: int) -> NDArray[np.uint8]:
@@ -311,19 +301,19 @@ class BatchedWorlds(JudgedWorlds):
         return pictures
 
     def _divergence_message(self, diverged: NDArray[np.int64]) -> str:
-        """Return an error's message about worlds that diverged."""
+        """Return the message of the error for `on_divergence="raise"`."""
         physics, lines = self.physics, []
         for world in diverged[:LARGEST_REPORT].tolist():
             numbers = torch.cat((self.x[world], self.s[world]), dim=1)
             outside = self.x[world].abs() >= physics.limits.position
-            held = torch.cat((outside, self.s[world].abs() >= physics.limits.state), dim=1)
+            outside = torch.cat((outside, self.s[world].abs() >= physics.limits.state), dim=1)
             line = f"world {world} in step {int(self.elapsed[world])}"
-            if bool(held.any()):
-                particle, entry = held.nonzero()[0].tolist()
+            if bool(outside.any()):
+                particle, entry = outside.nonzero()[0].tolist()
                 line += (
                     f": {term_name(entry, physics.space_dim)} of particle {particle} got to "
                     f"{numbers[particle, entry].item():g} "
-                    f"({int(held.any(dim=1).sum())} such particles)"
+                    f"({int(outside.any(dim=1).sum())} such particles)"
                 )
             lines.append(line)
         if len(diverged) > LARGEST_REPORT:
@@ -336,15 +326,14 @@ class BatchedWorlds(JudgedWorlds):
 
 
 GROWTH = 4
-"""Each recorded size is so many times the one before it."""
+"""Factor between the numbers of worlds that recorded restarts serve."""
 
 
 class GraphedResets:
-    """Starts of next episodes, on CUDA as one graph and one launch instead of some hundred.
+    """Starts of next episodes, on CUDA as one graph launch instead of some hundred launches.
 
-    A recorded start serves a fixed number of worlds. Fewer are filled up by repeating the last one:
-    it is then started twice in the same way, which is the same as once. `start` is a method of an
-    object that others keep.
+    A graph serves a fixed number of worlds. If fewer restart, the last index is repeated, and that
+    world is started in the same way several times. `start`, a bound method, is referred to weakly.
     """
 
     def __init__(
@@ -362,12 +351,12 @@ class GraphedResets:
         self._chunks: dict[int, _GraphedReset] = {}
 
     def __getstate__(self) -> dict[str, Any]:
-        """Leave out recorded starts, which cannot be pickled."""
+        """Return the state without graphs, which cannot be pickled."""
         return self.__dict__ | {"_chunks": {}}
 
     @makes_plain_tensors
     def __call__(self, worlds: NDArray[np.int64], observation: Tensor) -> None:
-        """Start the next episodes of some worlds, [M], and write what is perceived, [B, N, P]."""
+        """Start the next episodes of some worlds, [M], and write what they perceive, [B, N, P]."""
         if not self._recorded:
             self._start()(to_device_async(worlds, self._device)).perceive(observation)
             return
@@ -382,7 +371,7 @@ class GraphedResets:
 
 
 class _GraphedReset:
-    """The recorded start of a fixed number of worlds."""
+    """The graph of a start of a fixed number of worlds."""
 
     def __init__(self, start: WeakFunction, size: int, device: torch.device) -> None:
         self._start = start
@@ -390,10 +379,10 @@ class _GraphedReset:
         self._replayed = GraphedCallable(self._run, device)
 
     def restart(self, worlds: Tensor, observation: Tensor) -> None:
-        """Start the next episodes of as many worlds as the chunk is for."""
+        """Start the next episodes of worlds, as many as the graph serves."""
         self._index.copy_(worlds)
         self._replayed()
-        self._surveyed.perceive(observation)
+        self._neighbours.perceive(observation)
 
     def _run(self) -> None:
-        self._surveyed: NeighbourState = self._start()(self._index)
+        self._neighbours: NeighbourState = self._start()(self._index)

@@ -1,1 +1,1 @@
-"""Living worlds: a trained rule runs the particles, and an agent acts from outside."""
+"""Rule-driven worlds: a trained rule moves the particles, and an agent acts on them by brushes."""

@@ -1,4 +1,4 @@
-"""Brushes on living worlds: their configuration, what they do, and the spaces of both."""
+"""Brushes of agents on rule-driven worlds: configuration, effects, and spaces."""
 
 from __future__ import annotations
 
@@ -14,28 +14,28 @@ from npa_envs import world_mean
 from npa_envs.checks import check_flag, check_positive, is_whole, number_tensor
 from npa_envs.envs.core.base import ParticleSpaces, batch_tensor
 from npa_envs.envs.core.config import EnvConfig
-from npa_envs.envs.grown import GrownConfig, check_living
+from npa_envs.envs.grown import GrownConfig, check_rule_driven
 from npa_envs.errors import NPAError, shown, suggest
 from npa_envs.world.actions import Physics
 from npa_envs.world.brushes import offsets_from, softness
 
-SEEN_LIMIT = 8.0
-"""What is seen is clipped to plus and minus this (dimensionless, or length units)."""
+OBSERVATION_LIMIT = 8.0
+"""Observations are clipped to plus and minus this (dimensionless, or length units)."""
 
-SEEN_AT_A_PLACE = 6
-"""Numbers that are seen at a place of the grid."""
+VALUES_PER_PLACE = 6
+"""Observed values at a place of the grid: count, x, y, red, green, blue."""
 
 Actions = Literal["grid", "free", "discrete"]
 Observe = Literal["grid", "picture", "moments"]
 GardenReward = Literal["dense", "sparse"]
 
 TOOLS = ("push", "wipe", "inject", "rate")
-"""What a brush can do."""
+"""Effects that a brush can have."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class GardenConfig(GrownConfig):
-    """Adds brushes and what is observed of living worlds."""
+    """Adds the brushes and the form of observations."""
 
     words = EnvConfig.words | {
         "reward": get_args(GardenReward),
@@ -44,61 +44,60 @@ class GardenConfig(GrownConfig):
     }
 
     reward: GardenReward = "dense"
-    """"dense": how good the world is, in each step; "sparse": the same, in the last step alone."""
+    """"dense": the world's score in each step; "sparse": its score in the last step only."""
 
     target: str = "heart"
     particle_count: int = 512
 
     resolution: int = 32
-    """Pixels on each side of the picture that the loss compares, R."""
+    """Pixels on each side of the pictures that the loss compares, R."""
 
     seed_pool: int = 16
 
     state_scale: float = 0.5
-    """What an injection of 1 adds to a channel in the middle of a brush (dimensionless)."""
+    """Change of a channel by an injection of 1 at the centre of a brush (dimensionless)."""
 
     rule_steps: int = 8
     """Steps of the rule in one step of the environment."""
 
     brush_radius: float = 0.6
-    """Radius of a brush, which is soft: full strength in its middle, none at its edge
-    [length units]."""
+    """Radius of a brush: full strength at its centre, falling to 0 at its edge [length units]."""
 
     tools: tuple[str, ...] = ("push",)
-    """What brushes can do: some of "push", "wipe", "inject" and "rate", in this order."""
+    """Effects of the brushes: some of "push", "wipe", "inject" and "rate", in this order."""
 
     push_length: float = 0.15
-    """How far a push of 1 moves a particle in the middle of a brush [length units]."""
+    """Displacement by a push of 1 at the centre of a brush [length units]."""
 
     inject_channels: tuple[int, ...] = (-3, -2, -1)
     """State channels that brushes inject; the last three are the colour."""
 
     actions: Actions = "grid"
-    """Form of actions: "grid", a brush at each place of a grid; "free", brushes whose places are
-    numbers too; or "discrete", a place of the grid, a tool and a strength for each brush, as
+    """Form of actions: "grid", a brush at each place of a grid; "free", brushes whose positions are
+    part of the action; or "discrete", a place of the grid, a tool and a strength for each brush, as
     Gymnasium's MultiDiscrete."""
 
     place_count: int = 4
     """Places on each side of the grid."""
 
     place_reach: float = 0.75
-    """How far the outermost places of the grid are from its middle along x and y [length units]."""
+    """Half of the grid's extent along x and y [length units]."""
 
     brush_count: int = 1
     """Brushes K where actions are "free" or "discrete"; all of them are used in each step."""
 
     strength_count: int = 3
-    """Strengths from which to choose, where actions are "discrete"."""
+    """Number of strengths, where actions are "discrete"."""
 
     observe: Observe = "grid"
-    """What is seen: "grid", what lacks at each place of the grid; "picture", a coarse one; or
-    "moments", of positions and states."""
+    """Form of observations: "grid", the deficit to the target at each place of the grid; "picture",
+    a coarse one; or "moments", of positions and states."""
 
     picture_size: int = 16
-    """Pixels on each side of the picture that is seen; it divides `resolution`."""
+    """Pixels on each side of the observed picture; a divisor of `resolution`."""
 
     observe_error: bool = False
-    """The picture that is seen has, besides, what it lacks to the target's."""
+    """Whether the observed picture also has the target's picture minus its own."""
 
     def __post_init__(self) -> None:
         """Check every field."""
@@ -106,7 +105,7 @@ class GardenConfig(GrownConfig):
         check_positive(self, int, "rule_steps", "brush_count", "strength_count", "picture_size")
         check_positive(self, int, "place_count", at_least=2)
         check_positive(self, float, "brush_radius", "push_length", "place_reach")
-        check_living(self)
+        check_rule_driven(self)
         self._check_tools()
         check_flag(self, "observe_error")
 
@@ -137,11 +136,11 @@ class GardenConfig(GrownConfig):
 
 
 DIRECTIONS = ((1, 0), (1, 1), (0, 1), (-1, 1), (-1, 0), (-1, -1), (0, -1), (1, -1))
-"""Ways in which a brush of the "discrete" form pushes."""
+"""Directions of pushes of the "discrete" form."""
 
 
 class BrushLayout(NamedTuple):
-    """Where the numbers of each tool are in a brush's row; empty for what it lacks."""
+    """Columns of each tool in a brush's row of an action; empty for tools that are not used."""
 
     place: slice
     push: slice
@@ -152,7 +151,7 @@ class BrushLayout(NamedTuple):
 
     @classmethod
     def of(cls, config: GardenConfig) -> BrushLayout:
-        """Return the columns of a configuration's brushes; those of a grid stay where they are."""
+        """Return the layout for a configuration; only brushes off the grid have place columns."""
         widths = {"place": 0 if config.actions == "grid" else 2}
         widths |= {"push": 2, "wipe": 1, "inject": len(config.inject_channels), "rate": 1}
         first, found = 0, {}
@@ -164,63 +163,61 @@ class BrushLayout(NamedTuple):
 
 def grid_places(config: GardenConfig, device: torch.device | None = None) -> Tensor:
     """Return the places of the grid [length units], row by row from the bottom up, shape [P, 2]."""
-    share = torch.arange(config.place_count, device=device) / (config.place_count - 1)
-    steps = config.place_reach * (2.0 * share - 1.0)
+    fraction = torch.arange(config.place_count, device=device) / (config.place_count - 1)
+    steps = config.place_reach * (2.0 * fraction - 1.0)
     up, across = torch.meshgrid(steps, steps, indexing="ij")
     return torch.stack((across.flatten(), up.flatten()), dim=-1)
 
 
 def offsets(x: Tensor, places: Tensor, config: GardenConfig) -> Tensor:
-    """Return the way from each place to each particle [length units], shape [B, K, N, 2]."""
+    """Return the vector from each place to each particle [length units], shape [B, K, N, 2]."""
     spread = x[:, None].expand(-1, places.shape[1], -1, -1)
     box = None if config.periodic_box is None else (config.periodic_box,) * 2
     return offsets_from(spread.flatten(0, 1), places.flatten(0, 1), box).view(spread.shape)
 
 
-def holds(away: Tensor, config: GardenConfig) -> Tensor:
-    """Return how much soft brushes hold of each particle, dimensionless, shape [B, K, N]."""
+def brush_weights(away: Tensor, config: GardenConfig) -> Tensor:
+    """Return each brush's weight in [0, 1] at offsets of particles, shape [B, K, N]."""
     origin = away.new_zeros(away.shape[0] * away.shape[1], 2)
-    held = softness(away.flatten(0, 1), centre=origin, radius=config.brush_radius)
-    return held.view(away.shape[:3])
+    weights = softness(away.flatten(0, 1), centre=origin, radius=config.brush_radius)
+    return weights.view(away.shape[:3])
 
 
-def brushed(
+def apply_brushes(
     x: Tensor, s: Tensor, action: Tensor, middle: Tensor, config: GardenConfig
 ) -> tuple[Tensor, Tensor, Tensor | None]:
-    """Return worlds after their brushes have been used; differentiable in all of them.
-
-    All brushes are used at once: what a particle feels of them adds up.
+    """Apply all brushes at once, adding up their effects; differentiable.
 
     Returns:
-        Positions, states, and each particle's rate, the share of its rule's steps that it makes,
-        dimensionless, shape [B, N, 1]; None where no tool sets it.
+        Positions, states, and each particle's rate, the factor of its rule's steps, dimensionless,
+        shape [B, N, 1]; None without the tool "rate".
     """
     columns, action = BrushLayout.of(config), action.clamp(-1.0, 1.0)
     places = action[..., columns.place]
     if config.actions == "grid":
         places = grid_places(config, x.device).to(x)
-        # Several hands, each with a brush at every place.
+        # Several agents may each have a brush at every place.
         places = places.repeat(action.shape[1] // len(places), 1)
-    held = holds(offsets(x, middle[:, None] + places, config), config)
-    doses = held[..., None] * action[:, :, None]
+    weights = brush_weights(offsets(x, middle[:, None] + places, config), config)
+    doses = weights[..., None] * action[:, :, None]
     # Torch's own sums may change in the last bit with the number of worlds.
-    felt = len(doses[0]) * world_mean(doses.flatten(2)).view(*x.shape[:2], columns.width)
+    total = len(doses[0]) * world_mean(doses.flatten(2)).view(*x.shape[:2], columns.width)
     if "push" in config.tools:
-        x = x + config.push_length * felt[..., columns.push]
+        x = x + config.push_length * total[..., columns.push]
     if "wipe" in config.tools:
-        s = s * (1.0 - felt[..., columns.wipe].clamp(0.0, 1.0))
+        s = s * (1.0 - total[..., columns.wipe].clamp(0.0, 1.0))
     if "inject" in config.tools:
         channels = [channel % config.state_dim for channel in config.inject_channels]
         index = torch.tensor(channels, device=s.device)
-        s = s.index_add(2, index, config.state_scale * felt[..., columns.inject])
-    rate = (1.0 + felt[..., columns.rate]).clamp(0.0, 2.0) if "rate" in config.tools else None
+        s = s.index_add(2, index, config.state_scale * total[..., columns.inject])
+    rate = (1.0 + total[..., columns.rate]).clamp(0.0, 2.0) if "rate" in config.tools else None
     return x, s, rate
 
 
 def tool_table(config: GardenConfig) -> Tensor:
-    """Return what a brush of the "discrete" form can do at full strength, shape [M, W - 2].
+    """Return the M choices of a "discrete" brush at full strength, as rows of tools, [M, W - 2].
 
-    Nothing; pushes in eight directions; wipe; inject each channel, up and down; stop, quicken.
+    Nothing; pushes in eight directions; wipe; each channel up and down; rates of 0 and of 2.
     """
     columns = BrushLayout.of(config)
     rows = [torch.zeros(columns.width)]
@@ -248,24 +245,24 @@ def tool_table(config: GardenConfig) -> Tensor:
 
 
 class BrushSpaces(ParticleSpaces):
-    """A coarse picture or moments are seen; actions say what each brush does."""
+    """Spaces and conversions of observations of a whole world and of actions of brushes."""
 
     def __init__(self, physics: Physics, config: GardenConfig) -> None:
         self._config = config
         self._output = config.output
         counts = {
-            "grid": SEEN_AT_A_PLACE * config.place_count**2,
+            "grid": VALUES_PER_PLACE * config.place_count**2,
             "picture": (8 if config.observe_error else 4) * config.picture_size**2,
             "moments": 5 + 3 * config.state_dim,
         }
-        space = Box(-SEEN_LIMIT, SEEN_LIMIT, (counts[config.observe],), np.float32)
+        space = Box(-OBSERVATION_LIMIT, OBSERVATION_LIMIT, (counts[config.observe],), np.float32)
         self.observation_space: Space[Any] = space
-        self.seen_dim = len(space.shape)
-        """Dimensions of what is seen of one world."""
+        self.observation_ndim = len(space.shape)
+        """Dimensions of one world's observation."""
         on_grid = config.actions == "grid"
         count = config.place_count**2 if on_grid else config.brush_count
         self.rows_shape = (count, BrushLayout.of(config).width)
-        """Of the rows of a world's brushes, (K, W)."""
+        """Shape (K, W) of a world's rows of brushes."""
         self._tools = tool_table(config)
         self._choices = [config.place_count] * 2 + [len(self._tools), config.strength_count]
         self.action_space: Space[Any] = Box(-1.0, 1.0, self.rows_shape, np.float32)
@@ -273,7 +270,7 @@ class BrushSpaces(ParticleSpaces):
             self.action_space = MultiDiscrete(self._choices * config.brush_count)
 
     def action(self, action: Any, world_count: int | None) -> Tensor:
-        """Return actions as worlds take them, rows of brushes, float32, shape [B, K, W]."""
+        """Return checked actions as rows of brushes, float32, shape [B, K, W]."""
         if self._config.actions != "discrete":
             return batch_tensor(action, world_count, self.rows_shape, "K, W")
         batch, letters = ((), "") if world_count is None else ((world_count,), "B, ")
@@ -295,7 +292,7 @@ class BrushSpaces(ParticleSpaces):
         return self._rows(chosen)
 
     def _rows(self, chosen: Tensor) -> Tensor:
-        """Return the rows of brushes that choices mean, shape [B, K, W]."""
+        """Return the rows of brushes for discrete choices, shape [B, K, W]."""
         config, tools = self._config, self._tools.to(chosen.device)
         across, up = chosen[..., 0], chosen[..., 1]
         places = grid_places(config, chosen.device)[up * config.place_count + across]

@@ -1,4 +1,4 @@
-"""One world as a PettingZoo environment: agents own particles, and all act at once."""
+"""One world as a PettingZoo parallel environment, whose agents own particles."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ Outcome = tuple[dict[str, Any], dict[str, float], Flags, Flags, Infos]
 
 
 class KnownAgents(pettingzoo.ParallelEnv):  # type: ignore[misc]
-    """An environment of PettingZoo with spaces by the names of its agents, checked."""
+    """A PettingZoo environment that checks the names of agents."""
 
     def observation_space(self, agent: str) -> Any:
         """Return the space of an agent's observations, the same object each time."""
@@ -48,12 +48,12 @@ class KnownAgents(pettingzoo.ParallelEnv):  # type: ignore[misc]
 
 
 class CrowdEnv(AgentsEnv, KnownAgents):
-    """A world whose particles belong to agents; subclasses say to which.
+    """One world whose agents are species or particles.
 
     Args:
         task: A name from `npa_envs.envs.multi.TASKS`.
         keywords: Fields of the task's configuration.
-        by_particle: Whether every particle is an agent, and not every species.
+        by_particle: Whether agents are particles; False: species.
 
     Raises:
         NPAError: There is no such task, a keyword is unknown or wrong, or the world does not fit
@@ -73,29 +73,29 @@ class CrowdEnv(AgentsEnv, KnownAgents):
     ) -> tuple[dict[str, Any], Infos]:
         """Start an episode with all agents; return observations, and losses with their parts.
 
-        A seed begins the sequence of episodes that belongs to it; without one the sequence goes on.
-        There are no options.
+        A seed begins its sequence of episodes; None starts the next episode of the current
+        sequence. There are no options.
         """
         observation = self._start(np.arange(1), seed, seed)
-        self._count_agents()
-        infos = self._infos(self.worlds.account.numbers())
-        return self._handed_out(observation), infos
+        self._update_agents()
+        infos = self._infos(self.worlds.agent_returns.numbers())
+        return self._by_agent(observation), infos
 
     def step(self, actions: Mapping[str, Any]) -> Outcome:
-        """Apply the actions of all live agents, take those that ended out of the world, perceive.
+        """Apply the actions of all live agents, and remove those that ended from the world.
 
         Args:
-            actions: One for each live agent, as its action space says; none where none is live.
+            actions: One for each live agent, in its action space.
 
         Returns:
-            Observations, rewards, whether an agent's episode ended by itself, whether it was cut
-            off, and infos: of all agents that acted.
+            Observations, rewards, terminations, truncations and infos, by the names of the agents
+            that acted.
 
         Raises:
-            NPAError: There is no world yet, or an action is missing, not wanted, or of another
-                shape; the world is then as it was.
-            DivergedError: An action is not finite, and the world is as it was; or an agent is out
-                of bounds, and `on_divergence` is "raise".
+            NPAError: There is no world yet, or an action is missing, superfluous, or of another
+                shape; the world is not changed.
+            DivergedError: An action is not finite, and the world is not changed; or an agent is
+                out of bounds, and `on_divergence` is "raise".
         """
         if not self._started:
             raise NPAError("step needs a world: call reset first")
@@ -107,26 +107,26 @@ class CrowdEnv(AgentsEnv, KnownAgents):
         shapes = [self.action_spaces[agent].shape for agent in acted]
         action = joined_actions(actions, acted, shapes, worlds.device)
         with worlds.device_context():
-            outcome = worlds.step(self._everyones(action))
-        ended, late = outcome.endings[0] > 0, bool(outcome.late[0])
+            outcome = worlds.step(self._with_zeros(action))
+        ended, truncated = outcome.endings[0] > 0, bool(outcome.truncated[0])
         infos = self._infos(outcome.numbers)
         for k, agent in zip(live, acted, strict=True):
-            if ended[k] or late:
+            if ended[k] or truncated:
                 infos[agent]["reason"] = outcome.reasons[0, k]
-        observations = self._handed_out(outcome.observation)
-        paid = outcome.rewards[0].tolist()
-        rewards = {agent: paid[k] for k, agent in zip(live, acted, strict=True)}
+        observations = self._by_agent(outcome.observation)
+        all_rewards = outcome.rewards[0].tolist()
+        rewards = {agent: all_rewards[k] for k, agent in zip(live, acted, strict=True)}
         terminations = {agent: bool(ended[k]) for k, agent in zip(live, acted, strict=True)}
-        self._count_agents()
+        self._update_agents()
         self._show()
-        return observations, rewards, terminations, dict.fromkeys(acted, late), infos
+        return observations, rewards, terminations, dict.fromkeys(acted, truncated), infos
 
     def state(self) -> Any:
-        """Return what there is to know of the world, for central critics; see `state_space`."""
+        """Return the full state of the world, for central critics; see `state_space`."""
         return self._out(self._state()[0])
 
     def render(self) -> NDArray[np.uint8] | None:
-        """Return the world's picture, shape [R, R, 3], in the mode "rgb_array"."""
+        """Return the world's picture, shape [R, R, 3], with the render mode "rgb_array"."""
         pictures = self._pictures()
         return None if pictures is None else pictures[0]
 
@@ -136,7 +136,7 @@ class CrowdEnv(AgentsEnv, KnownAgents):
         return there.x[0], there.s[0]
 
     def place_particles(self, x: Any, s: Any) -> dict[str, Any]:
-        """Replace the particles of all live agents, at no reward, and return the observations.
+        """Replace the particles of all live agents, without a reward; return the observations.
 
         Positions have shape [N now, 2], states [N now, C].
         """
@@ -145,15 +145,15 @@ class CrowdEnv(AgentsEnv, KnownAgents):
         with self.worlds.device_context():
             observation = self.worlds.place(x, s)
         self._show()
-        return self._handed_out(observation)
+        return self._by_agent(observation)
 
-    def _count_agents(self) -> None:
-        """Take down who is to act next."""
+    def _update_agents(self) -> None:
+        """Set `agents` to those that act next."""
         played = len(self.possible_agents)
         self._live = np.flatnonzero(self.worlds.live[0, :played]).tolist()
         self.agents = [self.possible_agents[k] for k in self._live]
 
-    def _everyones(self, action: Tensor) -> Tensor:
+    def _with_zeros(self, action: Tensor) -> Tensor:
         """Return actions of live agents, [N now, A], with zeros for all others, [1, N, A]."""
         count = self.worlds.particle_count
         if len(action) == count:
@@ -164,7 +164,7 @@ class CrowdEnv(AgentsEnv, KnownAgents):
         return everyone
 
     def _infos(self, numbers: dict[str, Tensor]) -> Infos:
-        """Return what `info` says of live agents' losses."""
+        """Return the infos of live agents: species and losses."""
         rows = torch.stack(list(numbers.values()))[:, 0].tolist()
         columns = dict(zip(numbers, rows, strict=True))
         species = self.worlds.agent_species
@@ -173,8 +173,8 @@ class CrowdEnv(AgentsEnv, KnownAgents):
             for k, agent in zip(self._live, self.agents, strict=True)
         }
 
-    def _handed_out(self, observation: Tensor) -> dict[str, Any]:
-        """Return the rows of what all particles perceive, [1, N, P], that are of `agents`."""
+    def _by_agent(self, observation: Tensor) -> dict[str, Any]:
+        """Return the observation of each of `agents`, from all particles' perception, [1, N, P]."""
         rows, spans = self._out(observation[0]), self.worlds.spans
         return {
             agent: rows[spans[k].start] if self.worlds.by_particle else rows[spans[k]]
@@ -183,13 +183,13 @@ class CrowdEnv(AgentsEnv, KnownAgents):
 
 
 def in_turns(parallel: Any, *, clips: bool = False) -> Any:
-    """Return an environment in which agents act in turn, in an order that PettingZoo checks."""
+    """Return a parallel environment as one whose agents act in turn, in a checked order."""
     turns = parallel_to_aec(parallel)
     return OrderEnforcingWrapper(ClipOutOfBoundsWrapper(turns)) if clips else turns
 
 
 def register(name: str, module: str, keywords: dict[str, Any]) -> None:
-    """Put both kinds of an environment into PettingZoo's registries, unless they are there."""
+    """Register both kinds of an environment with PettingZoo, unless they are registered."""
     for kind, function in (("parallel", "parallel_env"), ("aec", "env")):
         # PettingZoo before 1.27 has no registries.
         if name not in getattr(pettingzoo, f"{kind}_registry", {name}):

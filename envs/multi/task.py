@@ -23,25 +23,25 @@ from npa_envs.rule.rule import COLOUR_OFFSET
 from npa_envs.tasks.seeds import uniform_ball
 from npa_envs.world.randomness import WorldRandom
 
-Reward = Literal["individual", "team"]
+SpeciesReward = Literal["individual", "team"]
 Perception = Literal["shared", "per_species"]
-OnDivergence = Literal["terminate", "raise", "ignore"]
+SpeciesOnDivergence = Literal["terminate", "raise", "ignore"]
 
 SPECIES_STYLE = "species"
-"""Style of pictures in which each species has one colour."""
+"""Style of pictures that draws each species in its own colour."""
 
 LARGEST_COUNT = 64
-"""No more species than this: their tags are smoothed as states."""
+"""Largest number of species."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class SpeciesConfig(WorldConfig):
-    """The fields that all tasks of several species have; a task adds its own."""
+    """Fields of all tasks of several species; a task adds its own."""
 
     words = WorldConfig.words | {
         "perception": get_args(Perception),
-        "reward": get_args(Reward),
-        "on_divergence": get_args(OnDivergence),
+        "reward": get_args(SpeciesReward),
+        "on_divergence": get_args(SpeciesOnDivergence),
         "render_style": (SPECIES_STYLE, *STYLES),
     }
 
@@ -53,18 +53,19 @@ class SpeciesConfig(WorldConfig):
     """Species K."""
 
     particle_count: int = 1024
-    """Particles of all species together, N; they are shared out evenly."""
+    """Particles of all species together, N, divided evenly."""
 
     particle_counts: tuple[int, ...] = ()
-    """Particles of each species, where these differ; empty: equal shares of `particle_count`."""
+    """Particles of each species; empty: `particle_count`, divided evenly."""
 
     perception: Perception = "shared"
     """"shared": particles perceive each other whatever their species; "per_species": they also
     perceive the density and the density gradient of each species."""
 
-    on_divergence: OnDivergence = "terminate"
-    """What happens to an agent once all of its particles have diverged: "terminate" takes it out of
-    the world; "raise" is an error that names it; "ignore" lets it go on, held at the limits."""
+    on_divergence: SpeciesOnDivergence = "terminate"
+    """What happens to an agent once all of its particles have diverged: "terminate" removes it from
+    the world; "raise" raises an error that names it; "ignore" continues with values clipped to the
+    limits."""
 
     seed_radius: float = 0.2
     """Radius of the disk that each species starts in [length units]."""
@@ -75,12 +76,11 @@ class SpeciesConfig(WorldConfig):
     deaths: tuple[tuple[int, int], ...] = ()
     """Pairs (species, step): the species is removed at the end of that step."""
 
-    reward: Reward = "individual"
-    """"individual": each agent is paid for its own improvement; "team": each gets the mean of
-    all."""
+    reward: SpeciesReward = "individual"
+    """"individual": each agent is rewarded for its own improvement; "team": each gets the mean."""
 
     max_cycles: int = 256
-    """Steps after which the episode is cut off for all."""
+    """Steps after which the episode is truncated for all agents."""
 
     render_style: str = SPECIES_STYLE
     """What pictures show: "species" (a colour each), "particles" (their own colours), "density" or
@@ -112,17 +112,17 @@ class SpeciesConfig(WorldConfig):
 
     @property
     def played_counts(self) -> tuple[int, ...]:
-        """Particles of each species that is an agent; the environment plays those after them."""
+        """Particles of each species that is an agent; the environment plays the other species."""
         return self.counts
 
     @property
     def seed_span(self) -> float:
-        """How far from the origin particles start at most [length units]."""
+        """Largest distance from the origin at which particles start [length units]."""
         return self.seed_radius + 0.5 * (self.species_count - 1) * self.seed_distance
 
     @classmethod
     def from_keywords(cls, keywords: dict[str, Any]) -> Self:
-        """As `WorldConfig.from_keywords`; particles are counted in one way."""
+        """As `WorldConfig.from_keywords`; only one of the two counts of particles may be given."""
         if "particle_count" in keywords and plain(keywords.get("particle_counts")):
             raise NPAError(
                 "particle_count and particle_counts exclude each other: "
@@ -161,10 +161,7 @@ class SpeciesConfig(WorldConfig):
 
 
 class Population(NamedTuple):
-    """The particles of worlds that have the same ones, those of each species one after the other.
-
-    N counts the particles that are left.
-    """
+    """Particles of worlds with the same N remaining ones, sorted by species."""
 
     x: Tensor
     """Positions [length units], shape [B, N, 2]."""
@@ -173,14 +170,14 @@ class Population(NamedTuple):
     """States, dimensionless, shape [B, N, C]."""
 
     counts: tuple[int, ...]
-    """Particles of each species in each world; 0 where it is gone. Known to the host."""
+    """Remaining particles of each species in each world, on the host."""
 
     species: Tensor
     """Species of each particle, int64, shape [N]."""
 
     @property
     def spans(self) -> list[slice]:
-        """Where each species' particles stand."""
+        """Slice of each species' particles."""
         ends = list(accumulate(self.counts))
         return [slice(end - count, end) for end, count in zip(ends, self.counts, strict=True)]
 
@@ -191,13 +188,13 @@ class Population(NamedTuple):
 
 
 class SpeciesTask(WorldTask[Any]):
-    """One task of several species; a loss for each, and one for each particle.
+    """A task of several species, with a loss for each species and each particle.
 
-    An agent's reward is how much its loss falls in a step, so losses go down where it does well.
+    An agent's reward is the fall of its loss in a step.
 
     Args:
         config: The environment's configuration.
-        device: Where the world lives.
+        device: The worlds' device.
 
     Raises:
         NPAError: There are too few species.
@@ -206,18 +203,18 @@ class SpeciesTask(WorldTask[Any]):
     config_type: ClassVar[type[SpeciesConfig]] = SpeciesConfig
 
     least_species: ClassVar[int] = 2
-    """The task makes no sense with fewer."""
+    """Smallest number of species."""
 
     def __init__(self, config: Any, device: torch.device) -> None:
         if config.species_count < self.least_species:
             raise NPAError(
                 f"species_count must be at least {self.least_species} in this task, got "
-                f"{config.species_count}: with one species there is nobody to meet"
+                f"{config.species_count}: one species alone has no task here"
             )
         super().__init__(config, device)
         middle = 0.5 * (config.species_count - 1)
         places = [config.seed_distance * (k - middle) for k in range(config.species_count)]
-        # Sent once: worlds that restart would wait for it.
+        # Copied to the device once, as a copy in each restart would synchronise.
         self._shift = torch.tensor(places).repeat_interleave(torch.tensor(config.counts)).to(device)
 
     def start(self, random: WorldRandom) -> tuple[Tensor, Tensor]:
@@ -235,10 +232,10 @@ class SpeciesTask(WorldTask[Any]):
     def losses(self, population: Population) -> Mapping[str, Tensor]:
         """Return the named parts of each species' loss, shape [B, K] each; their sum is its loss.
 
-        World k's are the same, bit for bit, in every batch, and nothing may wait for the device.
+        The losses of a world must not depend on the others, and nothing may synchronise.
 
         Args:
-            population: At least one particle; the loss of a species that is gone is never read.
+            population: At least one particle; losses of removed species are not read.
         """
         raise NotImplementedError
 
@@ -251,35 +248,35 @@ class SpeciesTask(WorldTask[Any]):
         raise NotImplementedError
 
     def played(self, action: Tensor, population: Population, random: WorldRandom) -> Tensor:
-        """Return what all particles do; by default agents play all species."""
+        """Return the actions of all particles, those of the environment's opponent included."""
         return action
 
     def settle(self, rewards: Tensor, live: Tensor, species: Tensor) -> Tensor:
-        """Return what agents are paid; by default what each has earned."""
+        """Return the agents' final rewards, [B, A]; by default unchanged."""
         return rewards
 
     def is_over(self, counts: tuple[int, ...]) -> bool:
-        """Return whether the episode ends for all where species are gone; by default never."""
+        """Return whether the episode ends for all at these counts of each species' live agents."""
         return False
 
     @property
     def pixel_size(self) -> float:
-        """Size of a particle in pictures: their distance where all fill the unit disk."""
+        """Size of a particle in pictures: the spacing of all that fill the unit disk."""
         return math.sqrt(math.pi / sum(self.config.counts))
 
     @property
     def open_half_width(self) -> float:
-        """From the middle of a picture to its edge in open space; 1 at least [length units]."""
+        """Half of a picture's side in open space [length units]; smaller values count as 1."""
         return 1.25 * float(self.config.seed_span)
 
     def draw(self, population: Population) -> NDArray[np.uint8]:
-        """Return a picture of each world, shape [B, R, R, 3]; white where nobody is left."""
+        """Return a picture of each world, shape [B, R, R, 3]; white without particles."""
         config, x, s = self.config, population.x, population.s
         if x.shape[1] == 0:
             return np.full((len(x), config.render_size, config.render_size, 3), 255, np.uint8)
         if config.render_style != SPECIES_STYLE:
             return self.draw_particles(x, s, config.render_style)
-        # A colour for each species, evenly around the wheel.
+        # Hues of the species are evenly spaced.
         hues = [k / config.species_count for k in range(config.species_count)]
         colours = torch.tensor([colorsys.hsv_to_rgb(hue, 0.85, 0.8) for hue in hues]).to(s)
         own = (colours[population.species] - COLOUR_OFFSET).expand(len(x), -1, -1)

@@ -1,8 +1,4 @@
-"""Tasks of several species, with the table of their names and of their ids.
-
-Species that start apart mix, or mixed ones part; or they grow pictures: one each, one together, or
-one that the others prevent.
-"""
+"""The tasks of several species, and the tables of their names and ids."""
 
 from __future__ import annotations
 
@@ -23,10 +19,10 @@ from npa_envs.world.randomness import StreamId, WorldRandom
 
 
 class MixingTask(SpeciesTask):
-    """Every particle is to see all species in equal parts: its loss is 1 less the local entropy."""
+    """Mix the species: a particle's loss is 1 minus the entropy of species around it."""
 
     def losses(self, population: Population) -> Mapping[str, Tensor]:
-        """Return the mean of each species' particle losses."""
+        """Return the mean of the particle losses of each species."""
         return {
             name: by_species(
                 [
@@ -40,7 +36,7 @@ class MixingTask(SpeciesTask):
         }
 
     def particle_losses(self, population: Population) -> Mapping[str, Tensor]:
-        """Return 1 less the entropy of species around each particle."""
+        """Return 1 minus the entropy of species around each particle."""
         return {"separation": 1.0 - self._entropy(population)}
 
     def _entropy(self, population: Population) -> Tensor:
@@ -49,13 +45,13 @@ class MixingTask(SpeciesTask):
 
 @dataclass(frozen=True, kw_only=True)
 class SegregationConfig(SpeciesConfig):
-    """As elsewhere, but species start in one disk."""
+    """`SpeciesConfig` with all species in one disk at the start."""
 
     seed_distance: float = 0.0
 
 
 class SegregationTask(MixingTask):
-    """Every particle is to see its own species alone: its loss is the local entropy."""
+    """Separate the species: a particle's loss is the entropy of species around it."""
 
     config_type = SegregationConfig
 
@@ -67,14 +63,14 @@ class SegregationTask(MixingTask):
 def local_entropy(population: Population, *, eps: float, box: float | None) -> Tensor:
     """Return the entropy of species around each particle, in [0, 1], shape [B, N].
 
-    The share of species k around particle i is f_k = b_k / Σ b, where b are the SPH-smoothed tags
-    (1 for a particle of species k, else 0). The entropy is −Σ f_k ln f_k / ln K: 0 where a particle
-    sees its own species alone, 1 where all K are there in equal parts.
+    The fraction of species k around a particle is f_k = b_k / Σ b, where b are SPH-smoothed tags
+    (1 for a particle of species k, else 0). The entropy is −Σ f_k ln f_k / ln K: 0 with one species
+    in the neighbourhood, 1 with equal parts of all K.
     """
     species_count = len(population.counts)
     kinds = torch.arange(species_count, device=population.x.device)
     tags = (population.species[:, None] == kinds).to(population.x)
-    seen = perceive(
+    perceived = perceive(
         population.x,
         tags.expand(len(population.x), -1, -1).contiguous(),
         eps,
@@ -84,22 +80,22 @@ def local_entropy(population: Population, *, eps: float, box: float | None) -> T
         moment_correction=False,
         density_gradient=False,
     )
-    blur = seen[..., species_count:]
-    shares = blur / blur.sum(dim=2, keepdim=True)
-    # At a share of exactly 0 the entropy has no finite derivative, and NaN would come of it.
-    there = shares > 0.0
-    terms = torch.where(there, torch.special.entr(torch.where(there, shares, 1.0)), 0.0)
+    smoothed = perceived[..., species_count:]
+    fractions = smoothed / smoothed.sum(dim=2, keepdim=True)
+    # At 0 the entropy has no finite derivative, which would give NaN gradients.
+    there = fractions > 0.0
+    terms = torch.where(there, torch.special.entr(torch.where(there, fractions, 1.0)), 0.0)
     entropy: Tensor = terms.sum(dim=2)
     return entropy / math.log(species_count)
 
 
 USUAL = ("gecko", "heart", "butterfly", "flower", "octopus", "ring")
-"""What species grow by default, in turn."""
+"""Default targets of species 0, 1, ..., repeated."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class PictureLossConfig(SpeciesConfig):
-    """Adds the loss of `Morphogenesis2DConfig`, which explains it."""
+    """Adds the loss of `Morphogenesis2DConfig`, which documents the fields."""
 
     task_config_type = Morphogenesis2DConfig
 
@@ -116,7 +112,7 @@ class PictureLossConfig(SpeciesConfig):
     def goal(
         self, target: str = Morphogenesis2DConfig.target, particle_count: int = 1
     ) -> Morphogenesis2DConfig:
-        """Return what the task of growing a target with so many particles is told."""
+        """Return the training task's configuration for a target and a number of particles."""
         return self.task_config(
             Morphogenesis2DConfig,
             target=target,
@@ -127,7 +123,7 @@ class PictureLossConfig(SpeciesConfig):
 
 @dataclass(frozen=True, kw_only=True)
 class OnePictureConfig(PictureLossConfig):
-    """Adds the picture of tasks that have but one."""
+    """Adds the target of tasks with one picture."""
 
     target: str = Morphogenesis2DConfig.target
 
@@ -143,9 +139,9 @@ class PictureLossTask(SpeciesTask):
     def __init__(self, config: Any, device: torch.device, *pictures: tuple[str, int]) -> None:
         super().__init__(config, device)
         self.goals = [Morphogenesis2D(config.goal(*picture), device=device) for picture in pictures]
-        """The tasks of growing each picture, with targets and losses."""
+        """Training tasks, with target and loss, of each picture."""
         self.goal = self.goals[0]
-        """The first of them, whose target's colour scripted policies take."""
+        """The first of them, whose target scripted policies use."""
 
     def picture_parts(self, k: int, x: Tensor, s: Tensor) -> dict[str, Tensor]:
         """Return density error and weighted colour error against picture k, shape [B] each."""
@@ -154,22 +150,22 @@ class PictureLossTask(SpeciesTask):
 
     @property
     def pixel_size(self) -> float:
-        """Size of a particle in pictures: the distance of the first target's points."""
+        """Size of a particle in pictures: the spacing of the first target's points."""
         return self.goal.target.pixel_size
 
     @property
     def open_half_width(self) -> float:
-        """Half of a picture [length units] in which a target fits where each seed was."""
+        """Half of a picture's side [length units], which shows a target around each seed."""
         return float(1.0 + 0.5 * (self.config.species_count - 1) * self.config.seed_distance)
 
 
 @dataclass(frozen=True, kw_only=True)
 class CoMorphogenesisConfig(PictureLossConfig):
-    """Adds a picture for each species, and how far apart they grow."""
+    """Adds a target for each species, and the distance between them."""
 
     targets: tuple[str, ...] = ()
-    """What each species grows: built-in names (`npa-envs list`), emoji, or paths of pictures;
-    empty: built-in ones."""
+    """Target of each species: built-in names (`npa-envs list`), emoji, or paths of pictures; empty:
+    built-in ones."""
 
     seed_distance: float = 1.0
     """Distance between the centres of neighbouring disks [length units]; 0 grows pictures through
@@ -189,7 +185,7 @@ class CoMorphogenesisConfig(PictureLossConfig):
 
     @property
     def goals(self) -> tuple[str, ...]:
-        """What each species grows."""
+        """Target of each species."""
         return self.targets or self._usual
 
     @property
@@ -212,20 +208,20 @@ class CoMorphogenesisTask(PictureLossTask):
         return {name: by_species([part[name] for part in parts], population) for name in parts[0]}
 
     def particle_losses(self, population: Population) -> Mapping[str, Tensor]:
-        """Return each particle's share of its species' splat loss."""
-        shares = [self.goals[k].particle_shares(*population.of(k)) for k in _present(population)]
-        return {"picture": torch.cat(shares, dim=1)}
+        """Return each particle's part of its species' splat loss."""
+        losses = [self.goals[k].particle_shares(*population.of(k)) for k in _present(population)]
+        return {"picture": torch.cat(losses, dim=1)}
 
 
 @dataclass(frozen=True, kw_only=True)
 class InvasionConfig(OnePictureConfig):
-    """As other pictures, but rewards cannot be shared, and invaders need not be agents."""
+    """Adds the opponent; rewards cannot be those of a team."""
 
     words = OnePictureConfig.words | {"opponent": (None, "random")}
 
     opponent: str | None = None
-    """Who plays the invaders: None, agents; "random", the environment, with actions uniform in
-    [-1, 1], drawn anew for each particle in each step."""
+    """Who plays the invaders: None: agents; "random": the environment, with actions uniform in
+    [-1, 1] for each particle and step."""
 
     @property
     def played_counts(self) -> tuple[int, ...]:
@@ -243,7 +239,7 @@ class InvasionConfig(OnePictureConfig):
 
 
 class InvasionTask(PictureLossTask):
-    """The splat loss of species 0; what it gains, the others lose together."""
+    """Splat loss of species 0; the rewards of the other species are minus its own, in sum."""
 
     config_type = InvasionConfig
 
@@ -260,40 +256,40 @@ class InvasionTask(PictureLossTask):
         }
 
     def particle_losses(self, population: Population) -> Mapping[str, Tensor]:
-        """Return shares of species 0's splat loss, and minus an equal share for each other one."""
+        """Return parts of species 0's splat loss, and minus an equal part for each invader."""
         own = self.goal.particle_shares(*population.of(0))
         own_count, other_count = own.shape[1], sum(population.counts[1:])
-        share = world_mean(own[..., None])[:, 0] * (-own_count / max(other_count, 1))
-        return {"picture": torch.cat((own, share[:, None].expand(-1, other_count)), dim=1)}
+        part = world_mean(own[..., None])[:, 0] * (-own_count / max(other_count, 1))
+        return {"picture": torch.cat((own, part[:, None].expand(-1, other_count)), dim=1)}
 
     def played(self, action: Tensor, population: Population, random: WorldRandom) -> Tensor:
-        """Return what all particles do: an opponent's, at random."""
+        """Return the actions of all particles, random ones for an opponent's."""
         if self.config.opponent is None:
             return action
         drawn = 2.0 * random.substream(StreamId.OPPONENT).uniform(*action.shape[1:]) - 1.0
         return torch.where((population.species > 0)[:, None], drawn, action)
 
     def settle(self, rewards: Tensor, live: Tensor, species: Tensor) -> Tensor:
-        """Return rewards that sum to zero: invaders pay in equal parts for species 0."""
+        """Return rewards that sum to zero: invaders lose what species 0 gains, in equal parts."""
         invading = species > 0
         gained = torch.where(invading, 0.0, rewards).sum(dim=1, keepdim=True)
         payers = live & invading
         return torch.where(payers, -gained / payers.sum(dim=1, keepdim=True).clamp_min(1), rewards)
 
     def is_over(self, counts: tuple[int, ...]) -> bool:
-        """Return whether one side is gone."""
+        """Return whether species 0 or all others are gone."""
         return counts[0] == 0 or sum(counts[1:]) == 0
 
 
 @dataclass(frozen=True, kw_only=True)
 class SymbiosisConfig(OnePictureConfig):
-    """As other pictures, but all species start in one disk."""
+    """`OnePictureConfig` with all species in one disk at the start."""
 
     seed_distance: float = 0.0
 
 
 class SymbiosisTask(PictureLossTask):
-    """The splat loss of all particles' picture, against a target of as many points."""
+    """Splat loss of the picture of all particles."""
 
     config_type = SymbiosisConfig
     least_species = 1
@@ -308,10 +304,10 @@ class SymbiosisTask(PictureLossTask):
         return {name: loss[:, None].expand(-1, count) for name, loss in parts.items()}
 
     def particle_losses(self, population: Population) -> Mapping[str, Tensor]:
-        """Return each particle's share of the splat loss."""
+        """Return each particle's part of the splat loss."""
         return {"picture": self.goal.particle_shares(population.x, population.s)}
 
-    # One picture in the middle, however far from it species begin.
+    # There is one picture, in the middle.
     open_half_width = SpeciesTask.open_half_width
 
 
@@ -321,7 +317,7 @@ def _present(population: Population) -> list[int]:
 
 
 def by_species(losses: list[Tensor], population: Population) -> Tensor:
-    """Return losses of the species that are there as one tensor, shape [B, K], 0 for the others."""
+    """Return losses of the present species as one tensor, shape [B, K], 0 for the others."""
     remaining = iter(losses)
     nothing = population.x.new_zeros(len(population.x))
     found = [next(remaining) if count else nothing for count in population.counts]
@@ -343,7 +339,7 @@ ENVIRONMENTS = SPECIES
 
 
 def task_settings(name: str) -> tuple[str, dict[str, Any]]:
-    """Return the task that an id means, and its keywords; a task's name means itself."""
+    """Return the task's name and the keywords of an id; names of tasks are returned unchanged."""
     for size in SPECIES_SIZES:
         if name == size.id:
             return size.task, dict(size.keywords)

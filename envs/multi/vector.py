@@ -1,4 +1,4 @@
-"""Agents that own particles of shared worlds: names, spaces, actions; and many worlds, batched."""
+"""Base class of environments of agents, and many worlds of several species as one batch."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ BatchOutcome = tuple[ByAgent, ByAgent, ByAgent, ByAgent, Infos]
 
 
 class AgentsEnv(ShownEnv):
-    """What environments of agents are made of, be it one world or many."""
+    """Base class of environments of agents, of one world or many: names, spaces, start, state."""
 
     metadata: Any = {  # noqa: RUF012 (nobody writes to it)
         "name": "npa_multispecies_v0",
@@ -50,12 +50,12 @@ class AgentsEnv(ShownEnv):
         self, task: str, keywords: dict[str, Any], world_count: int, *, by_particle: bool
     ) -> None:
         self.worlds = worlds = SpeciesWorlds(task, keywords, world_count, by_particle=by_particle)
-        """The particles."""
+        """The batch of worlds."""
         self._task_name = task
         self.config = worlds.config
         self.render_mode = self.config.render_mode
         self.max_cycles = self.config.max_cycles
-        """Steps after which an episode is cut off for all."""
+        """Steps after which an episode is truncated for all agents."""
         played = self.config.played_counts
         word, count = ("particle", sum(played)) if by_particle else ("species", len(played))
         self.possible_agents = [f"{word}_{k}" for k in range(count)]
@@ -64,15 +64,15 @@ class AgentsEnv(ShownEnv):
         self._observation_spaces: dict[str, Box] = {}
         self._action_spaces: dict[str, Box] = {}
         for agent, span in zip(self.possible_agents, worlds.spans[:count], strict=True):
-            ahead = () if by_particle else (span.stop - span.start,)
-            seen, done = (*ahead, worlds.perception_dim), (*ahead, worlds.physics.action_dim)
-            self._observation_spaces[agent] = Box(-limit, limit, seen, np.float32)
-            self._action_spaces[agent] = Box(-1.0, 1.0, done, np.float32)
+            rows = () if by_particle else (span.stop - span.start,)
+            observed, acted = (*rows, worlds.perception_dim), (*rows, worlds.physics.action_dim)
+            self._observation_spaces[agent] = Box(-limit, limit, observed, np.float32)
+            self._action_spaces[agent] = Box(-1.0, 1.0, acted, np.float32)
         # Position, state, present.
         limits, physics = worlds.physics.limits, worlds.physics
         high = [limits.position] * physics.space_dim + [limits.state] * physics.state_dim
-        rows = np.tile(np.array([*high, 1.0], np.float32), (worlds.particle_count, 1))
-        self._state_space = Box(rows * np.array([-1.0] * len(high) + [0.0], np.float32), rows)
+        upper = np.tile(np.array([*high, 1.0], np.float32), (worlds.particle_count, 1))
+        self._state_space = Box(upper * np.array([-1.0] * len(high) + [0.0], np.float32), upper)
         self.np_random: np.random.Generator | None = None
 
     def close(self) -> None:
@@ -80,12 +80,12 @@ class AgentsEnv(ShownEnv):
         self._close_window()
 
     def _start(self, worlds: NDArray[np.int64], seed: Any, first: Any) -> Tensor:
-        """Start episodes in some worlds, [M]; return what is perceived in all, [B, N, P].
+        """Start episodes in some worlds, [M]; return all worlds' perception, [B, N, P].
 
-        The seed is what `reset` was given; the generator of later keys begins with the first one.
+        `seed` is that of `reset`; `first` seeds the generator of later keys.
         """
         keys, batch = None, self.worlds
-        # After a first reset that was refused there are no worlds to go on with.
+        # The first reset may have failed, so that there are no sequences of episodes yet.
         if seed is not None or not self._started:
             self.np_random, _ = seeding.np_random(plain_seed(first))
             keys = rng_keys(seed, batch.world_count, self.np_random)[worlds]
@@ -115,25 +115,24 @@ class AgentsEnv(ShownEnv):
 class MultiSpeciesVectorEnv(AgentsEnv):
     """B worlds of several species, stepped together: `MultiSpeciesEnv`, batched on the device.
 
-    World k, reset with `seed`, is the single environment reset with `seed + k`, bit for bit,
-    whatever becomes of the others. Dicts have an entry for every species at all times, with the
-    world first: observations [B, N_k, P], actions [B, N_k, A], rewards, terminations and
-    truncations [B].
+    World k, reset with `seed`, is the single environment reset with `seed + k`, bit for bit. Dicts
+    always have an entry for every species, whose first dimension is the world: observations
+    [B, N_k, P], actions [B, N_k, A], rewards, terminations and truncations [B].
 
-    A species that ends in one world is terminated there, and nowhere else. From then on, until the
-    world's next episode, its observations and rewards there are zeros, its actions are not read
-    (but must be finite), and `infos[species]["live"]` is False. A world's episode is over once none
-    of its species is left, or `max_cycles` steps are done.
+    A species that ends in one world is terminated only there. Until that world's next episode its
+    observations and rewards there are zeros, its actions are ignored (but must be finite), and
+    `infos[species]["live"]` is False. A world's episode is over once none of its species is left,
+    or after `max_cycles` steps.
 
-    | Key of `infos[species]` | In | Value, shape [B] but where said |
+    | Key of `infos[species]` | In | Value, of shape [B] unless given |
     |---|---|---|
-    | `species` | reset, step | its number |
-    | `live` | reset, step | whether it is to act next |
-    | `acted` | step | whether it was alive in this step: what to leave out when training |
+    | `species` | reset, step | its index |
+    | `live` | reset, step | whether it acts in the next step |
+    | `acted` | step | whether it acted in this step; mask the others when training |
     | `loss`, `loss_...`, `reward_...` | as single | after the step, before a restart; else 0 |
-    | `reason` | a step in which it ended in a world | why, None where it did not |
+    | `reason` | a step in which it ended in a world | why, None for the other worlds |
     | `final_obs` | a step in which a world restarted | the last observations, [B, N_k, P] |
-    | `_final_obs` | likewise | which worlds restarted |
+    | `_final_obs` | a step in which a world restarted | whether each world restarted |
 
     Args:
         task: A name from `npa_envs.envs.multi.TASKS`.
@@ -165,7 +164,7 @@ class MultiSpeciesVectorEnv(AgentsEnv):
             )
         super().__init__(task, config, self.world_count, by_particle=False)
         self.agents = self.possible_agents
-        """The same: every species gets and gives arrays at all times."""
+        """All agents, as every species always has arrays."""
         self.single_observation_spaces = self._observation_spaces
         self.single_action_spaces = self._action_spaces
         self.single_state_space = self._state_space
@@ -173,13 +172,13 @@ class MultiSpeciesVectorEnv(AgentsEnv):
 
     @cached_property
     def observation_spaces(self) -> dict[str, Space[Any]]:
-        """Each species' observations in all worlds, [B, N_k, P]; large, so made when asked for."""
+        """Spaces of all worlds' observations, [B, N_k, P]; large, so made at the first use."""
         spaces = self.single_observation_spaces
         return {agent: batch_space(space, self.world_count) for agent, space in spaces.items()}
 
     @cached_property
     def action_spaces(self) -> dict[str, Space[Any]]:
-        """Each species' actions in all worlds, [B, N_k, A]; large, so made when asked for."""
+        """Spaces of all worlds' actions, [B, N_k, A]; large, so made at the first use."""
         spaces = self.single_action_spaces
         return {agent: batch_space(space, self.world_count) for agent, space in spaces.items()}
 
@@ -189,29 +188,28 @@ class MultiSpeciesVectorEnv(AgentsEnv):
         """Start episodes with all species; arguments are those of `NPAVectorEnv.reset`.
 
         Returns:
-            Observations of all worlds, and infos: losses with their parts, and who is live.
+            Observations of all worlds, and infos: losses with their parts, and live flags.
         """
         chosen = worlds_to_reset(options, self.world_count)
         if not self._started and len(chosen) < self.world_count:
-            raise NPAError("reset_mask needs worlds to leave alone: reset all of them first")
+            raise NPAError("reset_mask needs worlds that have started: reset all of them first")
         first = int(seed) if isinstance(seed, int | np.integer) else None
         observation, worlds = self._start(chosen, seed, first), self.worlds
-        return self._rows(observation), self._infos(worlds.account.numbers(), worlds.live)
+        return self._rows(observation), self._infos(worlds.agent_returns.numbers(), worlds.live)
 
     def step(self, actions: Mapping[str, Any]) -> BatchOutcome:
-        """Apply every species' actions in all worlds, and perceive.
+        """Apply every species' actions in all worlds.
 
         Args:
             actions: For each species, shape [B, N_k, A], in [-1, 1].
 
         Returns:
-            Observations, rewards (float32), whether a species' episode ended by itself in this
-            step, whether it was cut off, and infos.
+            Observations, rewards (float32), terminations, truncations and infos.
 
         Raises:
-            NPAError: An action is missing, not wanted or of another shape, or the episode of a
-                world that is not reset by itself is over; the worlds are then as they were.
-            DivergedError: An action is not finite, and the worlds are as they were; or an agent is
+            NPAError: An action is missing, superfluous or of another shape, or with
+                autoreset_mode="disabled" a world's episode is over; the worlds are not changed.
+            DivergedError: An action is not finite, and the worlds are not changed; or an agent is
                 out of bounds, and `on_divergence` is "raise".
         """
         if not self._started:
@@ -231,31 +229,31 @@ class MultiSpeciesVectorEnv(AgentsEnv):
             over = np.flatnonzero(~worlds.open)
             if len(over) and self.autoreset_mode is AutoresetMode.SAME_STEP:
                 final = self._rows(observation), over
-                seen = worlds.start(over)
-                observation = observation.index_copy(0, to_device_async(over, worlds.device), seen)
+                first, index = worlds.start(over), to_device_async(over, worlds.device)
+                observation = observation.index_copy(0, index, first)
         self._show()
         return (
             self._rows(observation),
             self._columns(outcome.rewards.float()),
             self._columns(outcome.endings > 0),
-            self._columns(outcome.acted & outcome.late[:, None]),
+            self._columns(outcome.acted & outcome.truncated[:, None]),
             self._step_infos(outcome, final),
         )
 
     def state(self) -> Any:
-        """Return what there is to know of the worlds, for central critics, [B, N, 2 + C + 1]."""
+        """Return the full state of the worlds, for central critics, [B, N, 2 + C + 1]."""
         return self._out(self._state())
 
     def render(self) -> tuple[NDArray[np.uint8], ...] | None:
-        """Return a picture of each world, shape [R, R, 3], in the mode "rgb_array"."""
+        """Return a picture of each world, shape [R, R, 3], with the render mode "rgb_array"."""
         pictures = self._pictures()
         return None if pictures is None else tuple(pictures)
 
     def _infos(self, numbers: dict[str, Tensor], acted: NDArray[np.bool_]) -> Infos:
-        """Return numbers of species that acted, 0 of the others, and who is live now."""
-        own = to_device_async(acted, self.worlds.device)
+        """Return infos of all species, with zeros in worlds where they did not act."""
+        mask = to_device_async(acted, self.worlds.device)
         everyone = torch.stack(list(numbers.values())).float()
-        rows = self._out(torch.where(own, everyone, 0.0).movedim(2, 0).contiguous())
+        rows = self._out(torch.where(mask, everyone, 0.0).movedim(2, 0).contiguous())
         live = self._columns(self.worlds.live)
         return {
             agent: {"species": k, "live": live[agent]} | dict(zip(numbers, rows[k], strict=True))
@@ -281,21 +279,21 @@ class MultiSpeciesVectorEnv(AgentsEnv):
         return infos
 
     def _rows(self, observation: Tensor) -> ByAgent:
-        """Return what particles perceive, [B, N, P], agent by agent."""
+        """Split what particles perceive, [B, N, P], by agent."""
         rows, spans = self._out(observation), self.worlds.spans
         return {agent: rows[:, spans[k]] for k, agent in enumerate(self.possible_agents)}
 
     def _columns(self, values: Any) -> ByAgent:
-        """Return values, [B, K], agent by agent, shape [B] each."""
-        sent = isinstance(values, Tensor)
-        columns = self._out(values.T.contiguous()) if sent else self._sent(values.T.copy())
+        """Split values, [B, K], by agent, shape [B] each."""
+        on_device = isinstance(values, Tensor)
+        columns = self._out(values.T.contiguous()) if on_device else self._sent(values.T.copy())
         return {agent: columns[k] for k, agent in enumerate(self.possible_agents)}
 
 
 def joined_actions(
     actions: Any, agents: Sequence[str], shapes: Sequence[tuple[int, ...]], device: torch.device
 ) -> Tensor:
-    """Return the actions of all live agents as rows, float32, shape [N, A] or [B, N, A]."""
+    """Return the checked actions of all live agents as rows, float32, [N, A] or [B, N, A]."""
     if not isinstance(actions, Mapping):
         raise NPAError(
             f"actions must be a dict with an action for each live agent, got "
@@ -320,7 +318,7 @@ def joined_actions(
         )
         for agent, shape in zip(agents, shapes, strict=True)
     ]
-    # What has one row only has no dimension for it.
+    # The action of a single particle has no dimension of rows.
     blocks = [row if row.ndim > 1 else row[None] for row in rows]
     joined = torch.cat([block.to(device) for block in blocks], dim=-2)
     if not bool(torch.isfinite(joined).all()):
@@ -328,8 +326,7 @@ def joined_actions(
         wrong = rows[bad][~torch.isfinite(rows[bad])]
         raise DivergedError(
             f"actions[{shown(agents[bad])}] must be finite, got {wrong[0].item()} ({wrong.numel()} "
-            "such "
-            "numbers): check the policy; the world is as it was"
+            "such numbers): check the policy; the world is not changed"
         )
     return joined
 

@@ -1,6 +1,6 @@
-"""Worlds that several species share: episodes, pay, and particles that come and go.
+"""Worlds of several species: episodes, rewards, and removal of agents' particles.
 
-A single world is a batch of one; world k of a batch is, bit for bit, that world alone.
+A single world is a batch of one. World k of a batch is the same as alone, bit for bit.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from torch import Tensor
 
 from npa_envs import world_mean
 from npa_envs.checks import number_tensor
-from npa_envs.envs.core.referee import total
+from npa_envs.envs.core.rewards import total
 from npa_envs.envs.core.state import OBSERVATION_COPIES, WorldState
 from npa_envs.envs.multi.task import Population, SpeciesTask
 from npa_envs.envs.multi.tasks import task_type
@@ -39,48 +39,48 @@ Parts = dict[str, Tensor]
 """Named parts of every agent's loss, shape [B, A] each."""
 
 REMOVED, LEFT, ALONE = 1, 2, 3
-"""Why an agent's episode ends by itself; 0 where it does not."""
+"""Causes that terminate an agent's episode; 0: none."""
 REASONS = np.array([None, "removed", "left the world", "no opponent", "time limit"], dtype=object)
-"""The same in words, as `info["reason"]` has them; the last one is for worlds that are cut off."""
+"""`info["reason"]` for each cause; the last one is for truncated worlds."""
 
 
 class AgentOutcome(NamedTuple):
-    """What a step brought all agents of all worlds."""
+    """Results of a step for all agents of all worlds."""
 
     observation: Tensor
-    """What particles perceive, shape [B, N, P]; the last perception of agents that ended."""
+    """Perception of all particles, [B, N, P]; the last one of agents that ended."""
 
     rewards: Tensor
-    """Rewards, 0 of those that did not act, float64, shape [B, A]."""
+    """Rewards, 0 for agents that did not act, float64, shape [B, A]."""
 
     numbers: dict[str, Tensor]
-    """Losses, their parts, and how much these fell, float64, shape [B, A] each."""
+    """Losses, their parts, and the fall of each part, float64, shape [B, A] each."""
 
     acted: NDArray[np.bool_]
-    """Which agents were alive in this step, shape [B, A]."""
+    """Whether each agent acted in this step, shape [B, A]."""
 
     endings: NDArray[np.uint8]
-    """Why agents' episodes ended by themselves, 0 where they did not, shape [B, A]."""
+    """Cause that terminated each agent's episode, 0 for none, shape [B, A]."""
 
-    late: NDArray[np.bool_]
-    """Worlds that are cut off, shape [B]."""
+    truncated: NDArray[np.bool_]
+    """Whether each world is truncated, shape [B]."""
 
     @property
     def reasons(self) -> NDArray[Any]:
-        """Why agents' episodes ended, in words, None where they go on or went before, [B, A]."""
-        late = np.where(self.acted & self.late[:, None], len(REASONS) - 1, 0)
-        return REASONS[np.where(self.endings > 0, self.endings, late)]
+        """`info["reason"]` of agents whose episodes ended in this step, else None, [B, A]."""
+        truncated = np.where(self.acted & self.truncated[:, None], len(REASONS) - 1, 0)
+        return REASONS[np.where(self.endings > 0, self.endings, truncated)]
 
 
 class AgentReturns:
-    """The losses of all agents in B worlds, now and before, and rewards for what fell."""
+    """Losses of all agents in B worlds, and their rewards: the fall of the losses in each step."""
 
     def __init__(self, task: SpeciesTask, species: Tensor, world_count: int, *, team: bool) -> None:
         self._task = task
         self._species = species
         self._team = team
         self.part_names: tuple[str, ...] = ()
-        """Names of the parts, known once an episode was opened."""
+        """Names of the parts of the loss; empty before the first episode."""
         shape = world_count, len(species)
         zeros = torch.zeros(shape, dtype=torch.float64, device=species.device)
         self.loss = zeros
@@ -102,44 +102,40 @@ class AgentReturns:
         self._carried = self._carried.index_fill(0, worlds, 0.0)
 
     def carry_over(self, parts: Parts) -> None:
-        """Count from other losses on, at no reward; of agents that ended nobody asks."""
+        """Replace the losses without a reward; those of agents that ended are not used again."""
         self._parts = self._before = _stacked(parts)
         loss = total(self._parts)
         self._carried = self._carried + (loss - self.loss)
         self.loss = loss
 
-    def pay(self, parts: Parts, live: Tensor, fled: Tensor) -> Tensor:
-        """Take down the losses after a step, and return rewards, 0 for those that did not act.
-
-        Returns:
-            Rewards, float64, shape [B, A].
-        """
+    def step_rewards(self, parts: Parts, live: Tensor, escaped: Tensor) -> Tensor:
+        """Store the losses after a step; return rewards, 0 if not live, float64, [B, A]."""
         now = _stacked(parts)
         loss = total(now)
-        # Leaving the world must not pay, even where an empty picture is better than the start, nor
-        # give back what a death added at no charge.
+        # Leaving the world must not be rewarded, even if an empty picture is better than the start;
+        # nor may it undo what a death added without a reward.
         least = self._at_start + self._carried.clamp_min(0.0)
-        loss = torch.where(fled, torch.maximum(loss, least), loss)
-        earned = torch.where(live, self.loss - loss, 0.0)
+        loss = torch.where(escaped, torch.maximum(loss, least), loss)
+        rewards = torch.where(live, self.loss - loss, 0.0)
         if self._team:
-            share = live.shape[1] / live.sum(dim=1).clamp_min(1)
-            mean = world_mean(earned[..., None])[:, 0] * share
-            earned = torch.where(live, mean[:, None], 0.0)
+            agents_per_live = live.shape[1] / live.sum(dim=1).clamp_min(1)
+            mean = world_mean(rewards[..., None])[:, 0] * agents_per_live
+            rewards = torch.where(live, mean[:, None], 0.0)
         self._parts, self._before, self.loss = now, self._parts, loss
-        return self._task.settle(earned, live, self._species)
+        return self._task.settle(rewards, live, self._species)
 
     def numbers(self) -> dict[str, Tensor]:
-        """Return what `info` says of losses, float64, shape [B, A] each."""
+        """Return the entries of `info` about losses, float64, shape [B, A] each."""
         parts = {
             f"loss_{name}": part for name, part in zip(self.part_names, self._parts, strict=True)
         }
         return {"loss": self.loss} | parts
 
     def step_numbers(self) -> dict[str, Tensor]:
-        """Return what `info` says of losses, and how much each part fell in the step, likewise."""
-        fallen = self._before - self._parts
-        own = {f"reward_{name}": part for name, part in zip(self.part_names, fallen, strict=True)}
-        return self.numbers() | own
+        """Return the entries of `numbers`, and the fall of each part in the step."""
+        falls = self._before - self._parts
+        named = {f"reward_{name}": fall for name, fall in zip(self.part_names, falls, strict=True)}
+        return self.numbers() | named
 
 
 def _stacked(parts: Parts) -> Tensor:
@@ -147,16 +143,16 @@ def _stacked(parts: Parts) -> Tensor:
 
 
 class SpeciesWorlds(WorldState):
-    """B worlds of a task with their agents; particles of each species lie one after the other.
+    """B worlds of a task with their agents; particles are sorted by species.
 
-    A world that lost particles is computed without them. Worlds that have the same ones are
-    computed together, as a cohort: all of the batch as long as nobody is gone.
+    Removed particles are not computed. Worlds with the same remaining particles are stepped
+    together, as a `Cohort`: the whole batch as long as no agent has been removed.
 
     Args:
         task: A name from `npa_envs.envs.multi.TASKS`.
         keywords: Fields of the task's configuration.
         world_count: Worlds B.
-        by_particle: Whether every particle is an agent, and not every species.
+        by_particle: Whether agents are particles; False: species.
 
     Raises:
         NPAError: There is no such task, a keyword is unknown or wrong, or the worlds do not fit
@@ -171,36 +167,36 @@ class SpeciesWorlds(WorldState):
         self.config = config = found.config_type.from_keywords(keywords)
         count, appended = sum(config.counts), 0
         if config.perception == "per_species":
-            # Numbers that a particle perceives of species one by one.
+            # Density and density gradient of each species.
             appended = config.species_count * (1 + found.space_dim)
         by_species = 4 * OBSERVATION_COPIES * world_count * count * appended
         super().__init__(config, found, world_count, count, by_species)
         self.perception_dim = self.physics.perception_dim + appended
-        """Numbers that a particle perceives: P, and K (1 + D) more with per-species perception."""
+        """Columns of perception: P, and K (1 + D) more with per-species perception."""
         self.task = found(config, self.device)
         self.by_particle = by_particle
         self.species = np.repeat(np.arange(config.species_count), config.counts)
-        """Species of each particle that an episode starts with, int64, shape [N]."""
+        """Species of each particle at the start of an episode, int64, shape [N]."""
         self.owner = np.arange(count) if by_particle else self.species
-        """Number of the agent that owns each of them, never falling, int64, shape [N]."""
+        """Index of the agent that owns each particle, non-decreasing, int64, shape [N]."""
         sizes = np.bincount(self.owner)
         ends = np.cumsum(sizes)
         self.spans = [slice(int(e - n), int(e)) for e, n in zip(ends, sizes, strict=True)]
-        """Where each agent's particles stand."""
+        """Slice of each agent's particles."""
         self.agent_species = self.species[ends - 1]
         """Species of each agent, int64, shape [A]."""
         self.live = np.zeros((world_count, len(sizes)), dtype=bool)
-        """Which agents are to act next, shape [B, A]."""
+        """Whether each agent acts in the next step, shape [B, A]."""
         self.there = np.zeros_like(self.live)
         """Whether each agent's particles are in its world, shape [B, A]."""
         self.open = np.zeros(world_count, dtype=bool)
-        """Whether each world goes on; the others stay as they are, shape [B]."""
+        """Whether each world's episode goes on; the others are not stepped, shape [B]."""
         self.elapsed = np.zeros(world_count, dtype=np.int64)
         """Steps since the start of each episode, shape [B]."""
         device, team = self.device, config.reward == "team"
         kinds = to_device_async(self.agent_species, device)
-        self.account = AgentReturns(self.task, kinds, world_count, team=team)
-        """The agents' losses."""
+        self.agent_returns = AgentReturns(self.task, kinds, world_count, team=team)
+        """The agents' losses and rewards."""
         self._owner = to_device_async(self.owner, device)
         deaths = dict(config.deaths)
         self._last_step = np.array([deaths.get(int(k), 0) for k in self.agent_species])
@@ -209,13 +205,13 @@ class SpeciesWorlds(WorldState):
             self.live.shape, dtype=torch.bool, device="cpu", pin_memory=device.type == "cuda"
         )
         everyone, worlds = np.arange(count), np.arange(world_count)
-        # Its work is recorded on CUDA, and worlds come back to it when their next episodes start.
+        # Its graphs are kept on CUDA: worlds return to it when their next episodes start.
         parts = self.task, self.physics, self.owner, by_particle
         self._whole = Cohort(*parts, worlds, everyone, self.x, self.s, self.random)
         self._cohorts: list[Cohort] | None = None
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        """Pin memory again that the device writes to."""
+        """Restore the state, and pin the host's memory again."""
         self.__dict__.update(state)
         if self._side_stream is not None:
             self._host_left = self._host_left.pin_memory()
@@ -223,7 +219,7 @@ class SpeciesWorlds(WorldState):
     @torch.no_grad()
     @makes_plain_tensors
     def start(self, worlds: NDArray[np.int64], keys: Tensor | None = None) -> Tensor:
-        """Start episodes in some worlds, [M], with all agents; return what is perceived, [M, N, P].
+        """Start episodes in some worlds, [M]; return their perception, [M, N, P].
 
         Keys are those of `next_streams`.
         """
@@ -237,19 +233,19 @@ class SpeciesWorlds(WorldState):
         self.live[worlds] = self.there[worlds] = self.open[worlds] = True
         self.elapsed[worlds] = 0
         population = self._whole.population._replace(x=x.contiguous(), s=s)
-        parts, seen = self._whole.measured(population), self._whole.perceived(population)
-        self.account.open(parts, index)
-        return seen
+        parts, perceived = self._whole.measured(population), self._whole.perceived(population)
+        self.agent_returns.open(parts, index)
+        return perceived
 
     @torch.no_grad()
     @makes_plain_tensors
     def step(self, action: Tensor) -> AgentOutcome:
-        """Apply actions, pay, and take agents that ended out of their worlds.
+        """Apply actions, compute rewards, and remove agents that ended from their worlds.
 
-        What the host reads is whether agents left their worlds, one byte for each agent.
+        The host reads whether each agent is out of bounds, one byte an agent.
 
         Args:
-            action: Finite, on the device, shape [B, N, A]; of agents that ended it is not read.
+            action: Finite, on the device, shape [B, N, A]; ignored for agents that ended.
 
         Raises:
             DivergedError: An agent is out of bounds, and `on_divergence` is "raise".
@@ -264,40 +260,40 @@ class SpeciesWorlds(WorldState):
         if self._side_stream is not None:
             self._side_stream.mark()
         live = to_device_async(acted, self.device)
-        rewards = self.account.pay(self.measured(stepped=True), live, left & live)
-        numbers = self.account.step_numbers()
+        rewards = self.agent_returns.step_rewards(self.measured(stepped=True), live, left & live)
+        numbers = self.agent_returns.step_numbers()
         observation = self.perceived(stepped=True)
-        # The device goes on while the host learns who left.
+        # The device continues while the host reads who left.
         if self._side_stream is not None:
             self._side_stream.wait()
-        fled = self._host_left.numpy() & acted
-        if self.config.on_divergence == "raise" and fled.any():
-            raise DivergedError(self._report(fled))
-        endings = self._endings(fled)
-        late = self.open & (self.elapsed >= self.config.max_cycles)
+        escaped = self._host_left.numpy() & acted
+        if self.config.on_divergence == "raise" and escaped.any():
+            raise DivergedError(self._report(escaped))
+        endings = self._endings(escaped)
+        truncated = self.open & (self.elapsed >= self.config.max_cycles)
         self.live &= endings == 0
         if endings.any():
-            observation = self._taken_out(endings, observation)
-        self.live[late] = False
+            observation = self._without_ended(endings, observation)
+        self.live[truncated] = False
         self._close_deserted()
-        return AgentOutcome(observation, rewards, numbers, acted, endings, late)
+        return AgentOutcome(observation, rewards, numbers, acted, endings, truncated)
 
     @torch.no_grad()
     @makes_plain_tensors
     def perceived(self, *, stepped: bool = False) -> Tensor:
         """Return what particles perceive, shape [B, N, P]; zeros where they or their world ended.
 
-        `stepped` says that nothing has changed since the cohorts acted.
+        `stepped`: the particles have not changed since the cohorts acted.
         """
         if self.cohorts == [self._whole]:
             return self._whole.perceived(stepped=stepped)
-        seen = self.x.new_zeros(self.world_count, self.particle_count, self.perception_dim)
+        perceived = self.x.new_zeros(self.world_count, self.particle_count, self.perception_dim)
         for cohort in self.cohorts:
-            seen[cohort.places] = cohort.perceived(stepped=stepped)
-        return seen
+            perceived[cohort.places] = cohort.perceived(stepped=stepped)
+        return perceived
 
     def measured(self, *, stepped: bool = False) -> dict[str, Tensor]:
-        """Return the parts of every agent's loss, float32, shape [B, A]; 0 of those that ended."""
+        """Return the parts of every agent's loss, float32, [B, A] each; 0 for agents that ended."""
         found: dict[str, Tensor] = {}
         for cohort in self.cohorts:
             for name, part in (cohort.parts if stepped else cohort.measured()).items():
@@ -309,10 +305,7 @@ class SpeciesWorlds(WorldState):
     @torch.no_grad()
     @makes_plain_tensors
     def place(self, x: Any, s: Any) -> Tensor:
-        """Replace the particles that are in a single world; return what is perceived, [1, N, P].
-
-        Losses count from now on, at no reward.
-        """
+        """Replace a single world's particles without a reward; return perception, [1, N, P]."""
         (cohort,) = self.cohorts
         there = cohort.population
         x, s = number_tensor("x", x)[None], number_tensor("s", s)[None]
@@ -322,9 +315,10 @@ class SpeciesWorlds(WorldState):
         return self._carry_over()
 
     def _carry_over(self) -> Tensor:
-        self.account.carry_over(self.measured())
-        seen: Tensor = self.perceived()
-        return seen
+        """Measure the losses again without a reward, and return what particles perceive."""
+        self.agent_returns.carry_over(self.measured())
+        perceived: Tensor = self.perceived()
+        return perceived
 
     def population(self, world: int) -> Population:
         """Return the particles that are in a world."""
@@ -337,7 +331,7 @@ class SpeciesWorlds(WorldState):
     @torch.no_grad()
     @makes_plain_tensors
     def state(self) -> Tensor:
-        """Return position, state and 1 of each particle, 0s of those gone, [B, N, 2 + C + 1]."""
+        """Return [position; state; 1] of each particle, zeros if removed, [B, N, 2 + C + 1]."""
         self._collect()
         there = to_device_async(self.there[:, self.owner], self.device)[..., None]
         rows = torch.cat((self.x, self.s, there.float()), dim=-1)
@@ -348,14 +342,14 @@ class SpeciesWorlds(WorldState):
         return np.concatenate([self.task.draw(self.population(k)) for k in range(count)])
 
     def _close_deserted(self) -> None:
-        """Let worlds in which no agent is to act stay as they are until they start again."""
+        """Stop stepping worlds without live agents until they start again."""
         deserted = self.open & ~self.live.any(axis=1)
         if deserted.any():
             self._disband()
             self.open &= ~deserted
 
     def _endings(self, left: NDArray[np.bool_]) -> NDArray[np.uint8]:
-        """Return why agents' episodes end by themselves in this step, shape [B, A]."""
+        """Return the cause that terminates each agent's episode in this step, 0: none, [B, A]."""
         live = self.live
         endings = np.zeros(live.shape, dtype=np.uint8)
         endings[live & (self._last_step == self.elapsed[:, None])] = REMOVED
@@ -368,10 +362,10 @@ class SpeciesWorlds(WorldState):
                 endings[world, staying[world]] = ALONE
         return endings
 
-    def _report(self, fled: NDArray[np.bool_]) -> str:
-        """Return an error's message about agents that are out of bounds, shape [B, A]."""
+    def _report(self, escaped: NDArray[np.bool_]) -> str:
+        """Return the message of the error for agents out of bounds, shape [B, A]."""
         limits, word = self.physics.limits, "particle" if self.by_particle else "species"
-        places = np.argwhere(fled)
+        places = np.argwhere(escaped)
         names = [f"{word}_{agent} of world {world}" for world, agent in places[:LARGEST_REPORT]]
         more = f" and {len(places) - len(names)} more" if len(places) > len(names) else ""
         return (
@@ -381,22 +375,22 @@ class SpeciesWorlds(WorldState):
             "limits, or choose on_divergence='terminate'"
         )
 
-    def _taken_out(self, endings: NDArray[np.uint8], observation: Tensor) -> Tensor:
-        """Take out particles of agents that ended; return what is perceived without them."""
+    def _without_ended(self, endings: NDArray[np.uint8], observation: Tensor) -> Tensor:
+        """Remove particles of agents that ended; return what the others perceive then."""
         self._close_deserted()
         self._disband()
         self.there &= (endings != REMOVED) & (endings != LEFT)
         if not self.open.any():
             return observation
-        # What others lose or gain by a death is nobody's merit: the next step counts from now.
-        seen = self._carry_over()
+        # A death changes the losses of others; this is not rewarded.
+        perceived = self._carry_over()
         stays = (endings == 0) & self.open[:, None]
         where = to_device_async(stays, self.device)[:, self._owner, None]
-        return torch.where(where, seen, observation)
+        return torch.where(where, perceived, observation)
 
     @property
     def cohorts(self) -> list[Cohort]:
-        """The worlds that go on, those together that have the same particles."""
+        """The worlds whose episodes go on, grouped by their remaining particles."""
         if self._cohorts is None:
             if self.open.all() and self.there.all():
                 self._cohorts = [self._whole]
@@ -409,11 +403,11 @@ class SpeciesWorlds(WorldState):
         going_on = np.flatnonzero(self.open & self.there.any(axis=1))
         if not len(going_on):
             return []
-        kinds, number = np.unique(self.there[going_on], axis=0, return_inverse=True)
+        groups, group_of = np.unique(self.there[going_on], axis=0, return_inverse=True)
         cohorts, parts = [], (self.task, self.physics, self.owner, self.by_particle)
-        for k, kind in enumerate(kinds):
-            worlds = going_on[number.reshape(-1) == k]
-            columns = np.flatnonzero(kind[self.owner])
+        for k, there in enumerate(groups):
+            worlds = going_on[group_of.reshape(-1) == k]
+            columns = np.flatnonzero(there[self.owner])
             index = to_device_async(worlds, self.device)
             places = index[:, None], to_device_async(columns, self.device)
             x, s, random = self.x[places], self.s[places], self.random.take(index)
@@ -421,12 +415,12 @@ class SpeciesWorlds(WorldState):
         return cohorts
 
     def _disband(self) -> None:
-        """Let cohorts be gathered anew when they are needed."""
+        """Copy the cohorts' particles to the batch; the next use groups the worlds again."""
         self._collect()
         self._cohorts = None
 
     def _collect(self) -> None:
-        """Copy the cohorts' particles to their places in the batch."""
+        """Copy the cohorts' particles to the batch."""
         for cohort in self._cohorts or ():
             if cohort is not self._whole:
                 self.x[cohort.places] = cohort.population.x
@@ -435,9 +429,9 @@ class SpeciesWorlds(WorldState):
 
 
 class Cohort:
-    """Some worlds of a batch with the same particles, stepped together.
+    """Worlds of a batch with the same remaining particles, stepped together.
 
-    On CUDA what a step computes is recorded at the second one, so it pays where many follow.
+    On CUDA the second step is captured as a graph, which only later steps make up for.
     """
 
     def __init__(
@@ -458,17 +452,17 @@ class Cohort:
         self.worlds = to_device_async(worlds, device)
         self._columns = to_device_async(columns, device)
         self.places = self.worlds[:, None], self._columns
-        """Where the batch has the particles, as an index of two dimensions."""
+        """Index of the particles in tensors of the batch, [B, N, ...]."""
         kind = np.repeat(np.arange(config.species_count), config.counts)[columns]
         self.population = population_of(x, s, kind, config.species_count)
         """The particles."""
         self.parts: dict[str, Tensor] = {}
-        """Parts of every agent's loss after the last step, shape [M, A]."""
+        """Parts of every agent's loss after the last step, shape [M, A] each."""
         self._agent_count = int(owner[-1]) + 1
         self.gone = torch.zeros(len(worlds), self._agent_count, dtype=torch.bool, device=device)
         """Which agents have no particle within bounds after the last step, shape [M, A]."""
         self._owners = to_device_async(owner[columns], device)
-        self._surveyed: NeighbourState | None = None
+        self._neighbours: NeighbourState | None = None
         self._actions = Actions(
             x,
             s,
@@ -478,23 +472,23 @@ class Cohort:
             diverged=torch.zeros(len(worlds), dtype=torch.uint8, device=device),
         )
         self._draw = GraphedCallable(self._actions.draw, device)
-        self._look = GraphedCallable(self._look_around, device)
+        self._evaluate_graph = GraphedCallable(self._evaluate, device)
 
     def __getstate__(self) -> dict[str, Any]:
-        """Leave out what only the next perception needs, and which cannot be pickled."""
-        return self.__dict__ | {"_surveyed": None}
+        """Return the state without neighbours, which cannot be pickled."""
+        return self.__dict__ | {"_neighbours": None}
 
     def act(self, action: Tensor) -> None:
-        """Apply finite actions, shape [M, N now, A], and see what came of them without waiting."""
+        """Apply finite actions, shape [M, N now, A], and evaluate, without synchronising."""
         action = self._task.played(action, self.population, self.random)
         self._draw()
         self._actions.apply(action)
-        self._look()
+        self._evaluate_graph()
 
     def measured(self, population: Population | None = None) -> dict[str, Tensor]:
-        """Return the parts of every agent's loss, float32, shape [M, A]; 0 of those that are gone.
+        """Return the parts of every agent's loss, float32, [M, A] each; 0 for removed agents.
 
-        They are of the worlds as they are, or of a population with the same particles.
+        `population`: other positions and states of the same particles; None: the current ones.
         """
         population = population or self.population
         if not self._by_particle:
@@ -506,32 +500,31 @@ class Cohort:
         return found
 
     def perceived(self, population: Population | None = None, *, stepped: bool = False) -> Tensor:
-        """Return what particles perceive, by one pass for all species, shape [M, N now, P].
+        """Return what particles perceive, shape [M, N now, P].
 
-        Telling species apart takes another one, again for all of them. Worlds that were sorted
-        after the last step are not sorted again.
+        `stepped`: the neighbours of the last step are still right, and used again.
         """
         x, s, counts, _ = population or self.population
-        surveyed = self._surveyed if stepped else None
-        seen = (surveyed or build_neighbours(x, s, self._physics)).perceive()
+        neighbours = self._neighbours if stepped else None
+        rows = (neighbours or build_neighbours(x, s, self._physics)).perceive()
         if self._task.config.perception == "per_species":
-            seen = torch.cat((seen, perceive_each_species(x, counts, self._physics)), dim=-1)
-        return seen
+            rows = torch.cat((rows, perceive_each_species(x, counts, self._physics)), dim=-1)
+        return rows
 
-    def _look_around(self) -> None:
+    def _evaluate(self) -> None:
         x, s, physics = self.population.x, self.population.s, self._physics
         inside = (s.abs() < physics.limits.state).all(dim=-1)
-        # In a box nobody gets to the bound but by wrapping onto an edge that may lie there.
+        # In a box positions reach the limit only by wrapping onto an edge that lies there.
         if (physics.box or physics.walls) is None:
             inside &= (x.abs() < physics.limits.position).all(dim=-1)
         # Sums of ones are exact in any order.
         count = torch.zeros(len(inside), self._agent_count, device=inside.device)
         self.gone = count.index_add_(1, self._owners, inside.float()) == 0.0
         self.parts = self.measured()
-        self._surveyed = build_neighbours(x, s, physics)
+        self._neighbours = build_neighbours(x, s, physics)
 
 
 def population_of(x: Tensor, s: Tensor, kind: NDArray[np.int64], species_count: int) -> Population:
-    """Return particles of these species, [N], as a population."""
+    """Return particles whose species are `kind`, [N], as a population."""
     counts = np.bincount(kind, minlength=species_count).tolist()
     return Population(x, s, tuple(counts), to_device_async(kind, x.device))

@@ -143,6 +143,23 @@ def test_an_episode_that_ends_says_why_and_divergence_does_not_pay(name, limits,
     assert np.isfinite(info["loss"])
 
 
+def test_a_step_after_divergence_rewards_particles_by_their_losses_and_the_world_by_its_own():
+    """The loss that a diverged episode ends with may exceed the sum of its parts."""
+    env = begun(make(IDS[0], reward="particle", observation_limit=0.5, state_scale=1.0))
+    still = np.zeros(env.action_space.shape, np.float32)
+    grown, s = env.unwrapped.particles()
+    env.unwrapped.place_particles(0.9 * grown, s + 0.4)
+    wild = still.copy()
+    wild[:, -1] = 1.0
+    *_, before = env.step(wild)
+    assert before["diverged"]
+    _, reward, _, _, after = env.step(-0.1 * wild)
+    parts = [sum(v for k, v in info.items() if k.startswith("loss_")) for info in (before, after)]
+    assert before["loss"] > parts[0]
+    assert reward == pytest.approx(before["loss"] - after["loss"], abs=1e-6)
+    assert after["particle_reward"].mean() == pytest.approx(parts[0] - parts[1], abs=1e-5)
+
+
 @every_id
 def test_zero_actions_leave_the_world_as_it_is_up_to_the_registered_limit(name):
     env = make(name, success_loss=0.0)

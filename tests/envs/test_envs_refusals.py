@@ -325,7 +325,7 @@ SPECIES = [
 NO_BATCH = [
     (lambda env: env.step({}), "step needs worlds: call reset first"),
     (lambda env: env.state(), "state needs a world"),
-    (masked(True, False, True), "reset_mask needs worlds to leave alone"),
+    (masked(True, False, True), "reset_mask needs worlds that have started"),
 ]
 BATCH = [
     (lambda env: env.step({"species_1": np.zeros((3, 20, 18))}), "got none for species_0"),

@@ -15,7 +15,7 @@ import npa_envs
 from npa_envs.agents.gardening import ScriptedGardener
 from npa_envs.agents.shapeshifting import RecognisingShapeshifter
 from npa_envs.envs import gardeners_v0
-from npa_envs.envs.garden.brushes import BrushLayout, brushed, grid_places
+from npa_envs.envs.garden.brushes import BrushLayout, apply_brushes, grid_places
 from npa_envs.envs.gardener2d import Gardener2DEnv
 from npa_envs.registration import GARDENS
 
@@ -45,19 +45,19 @@ def test_brushes_do_what_the_documentation_says():
     x = torch.tensor([[[0.0, 0.0], [0.15, 0.0], [0.5, 0.0]]])
     s, middle = torch.ones(1, 3, 16), torch.zeros(1, 2)
     held = torch.tensor([1.0, 0.5625, 0.0])
-    moved, same, rate = brushed(x, s, brush(config, push=(0.0, 0.5)), middle, config)
+    moved, same, rate = apply_brushes(x, s, brush(config, push=(0.0, 0.5)), middle, config)
     assert torch.allclose(moved - x, torch.stack((0.0 * held, 0.15 * held), dim=-1)[None])
     assert torch.equal(same, s)
     assert torch.equal(rate, torch.ones(1, 3, 1))
-    _, wiped, _ = brushed(x, s, brush(config, wipe=0.5), middle, config)
+    _, wiped, _ = apply_brushes(x, s, brush(config, wipe=0.5), middle, config)
     assert torch.allclose(wiped[0, :, 0], 1.0 - 0.5 * held)
-    _, kept, _ = brushed(x, s, brush(config, wipe=-1.0), middle, config)
+    _, kept, _ = apply_brushes(x, s, brush(config, wipe=-1.0), middle, config)
     assert torch.equal(kept, s)
-    _, dosed, _ = brushed(x, s, brush(config, inject=(1.0, 0.0, -0.5)), middle, config)
+    _, dosed, _ = apply_brushes(x, s, brush(config, inject=(1.0, 0.0, -0.5)), middle, config)
     assert torch.allclose(dosed[0, :, -3], 1.0 + 0.5 * held)
     assert torch.allclose(dosed[0, :, -1], 1.0 - 0.25 * held)
     assert torch.equal(dosed[..., :-3], s[..., :-3])
-    _, _, rate = brushed(x, s, brush(config, rate=-1.0), middle, config)
+    _, _, rate = apply_brushes(x, s, brush(config, rate=-1.0), middle, config)
     assert torch.allclose(rate[0, :, 0], 1.0 - held)
 
 
@@ -68,7 +68,7 @@ def test_brushes_stand_on_the_grid_and_what_they_do_adds_up():
     x, s = torch.tensor([[[1.0, 1.2], [1.25, 1.0]]]), torch.zeros(1, 2, 16)
     middle = torch.tensor([[1.0, 1.0]])
     everywhere = torch.tensor([0.4, -0.2]).expand(1, 9, 2)
-    moved, _, _ = brushed(x, s, everywhere, middle, config)
+    moved, _, _ = apply_brushes(x, s, everywhere, middle, config)
     square = (x[0][:, None] - middle - places).square().sum(dim=-1)
     held = (1.0 - square / 0.36).clamp_min(0.0).square().sum(dim=1)
     assert torch.allclose(moved - x, 0.15 * held[None, :, None] * everywhere[0, 0], atol=1e-6)
@@ -86,14 +86,14 @@ def test_what_lacks_is_seen_where_it_lacks():
     left, right = 5, 6
     near = (moved - places[left]).norm(dim=1) < 0.3
     moved[near] += places[right] - places[left]
-    lack = task.lacking(moved[None], grey[None], torch.zeros(1, 2))[0]
+    lack = task.deficit(moved[None], grey[None], torch.zeros(1, 2))[0]
     assert lack[left, 0] > 0.5
     assert lack[right, 0] < -0.5
     assert lack[left, 0] == pytest.approx(float(lack[:, 0].max()))
     # From the place beside it, they lack on the other side.
     assert lack[right, 1] < -0.1
     grey[:, -3:] = -0.5
-    lack = task.lacking(target.points[None], grey[None], torch.zeros(1, 2))[0]
+    lack = task.deficit(target.points[None], grey[None], torch.zeros(1, 2))[0]
     assert float(lack[:, :3].abs().max()) < 1e-3
     assert bool((lack[:, 3:] >= 0.0).all())
     assert float(lack[:, 3].max()) > 0.5
@@ -113,7 +113,7 @@ def test_brushes_reach_across_the_edges_of_a_box_and_may_be_too_small_to_hold_an
     # The last of the four places is across both edges.
     action = torch.zeros(1, 4, 2)
     action[0, 3, 0] = 1.0
-    moved, _, _ = brushed(x, s, action, middle, config)
+    moved, _, _ = apply_brushes(x, s, action, middle, config)
     held = (1.0 - (0.15**2 + 0.2**2) / 0.4**2) ** 2
     assert moved[0, 0].tolist() == pytest.approx([-0.95 + 0.15 * held, -0.9], abs=1e-6)
     assert moved[0, 1].tolist() == [0.0, 0.0]

@@ -134,10 +134,10 @@ def test_losses_keep_their_names(device):
             env.step(np.zeros(env.action_space.shape, np.float32))
 
 
-def test_shares_of_particles_are_checked(device):
+def test_losses_of_particles_are_checked(device):
     for change, message in (
-        (lambda a: a[:, :1], r"shares of MyTask\.particle_losses must .* got .*\(\d, 1\)"),
-        (lambda a: a / 0 * 0, r"shares of MyTask\.particle_losses must be finite"),
+        (lambda a: a[:, :1], r"losses of MyTask\.particle_losses must .* got .*\(\d, 1\)"),
+        (lambda a: a / 0 * 0, r"losses of MyTask\.particle_losses must be finite"),
     ):
         for env in environments(changed("particle_losses", change), device, reward="particle"):
             refused(message, env.reset, seed=0)

@@ -168,6 +168,8 @@ class OneSpecies(Played):
         """Steps of each world's episode."""
         self.loss = np.zeros(self.worlds, np.float32)
         self.over = np.zeros(self.worlds, bool)
+        self.was_lost = np.zeros(self.worlds, bool)
+        """Whether the last step ended the episode by divergence, and no reset followed."""
         if checked:
             # The checker of Gymnasium 1.4 fails itself after a first reset that was refused.
             self.settle()
@@ -201,7 +203,7 @@ class OneSpecies(Played):
         observation, info = found
         self.started = True
         self.check_observation(observation)
-        self.steps[chosen], self.over[chosen] = 0, False
+        self.steps[chosen], self.over[chosen], self.was_lost[chosen] = 0, False, False
         for k in np.flatnonzero(chosen):
             told = self.told(info, k)
             assert "reason" not in told
@@ -256,7 +258,7 @@ class OneSpecies(Played):
         if not (diverged and way == "reset"):
             self.check_reward(k, np.float32(reward), loss, told, diverged, terminated)
         self.loss[k] = loss
-        self.over[k] = ended
+        self.over[k], self.was_lost[k] = ended, lost and self.single
         if ended and self.mode is AutoresetMode.SAME_STEP:
             self.steps[k], self.over[k] = 0, False
             self.loss[k] = self.checked_loss(following)
@@ -273,7 +275,8 @@ class OneSpecies(Played):
         if not diverged:
             parts = [v for name, v in told.items() if name.startswith("loss_")]
             assert np.isclose(loss, sum(parts), rtol=1e-5, atol=1e-6)
-        if self.fields["reward"] in ("particle", "marginal"):
+        # Rewards of particles add up as long as the episode lasts.
+        if self.fields["reward"] in ("particle", "marginal") and not self.was_lost[k]:
             own = host(told["particle_reward"])
             assert own.shape == (self.fields["particle_count"],)
             size = max(abs(self.loss[k]), abs(loss), np.abs(own).max())
@@ -291,7 +294,7 @@ class OneSpecies(Played):
             name = draw.choice(("x", "s"))
             given[name] = wrong(draw, name, given[name])
         if self.refused(lambda: env.place_particles(**given)) is not None:
-            self.loss[:] = host(env.worlds.loss)
+            self.loss[:], self.was_lost[:] = host(env.worlds.loss), False
             assert np.isfinite(self.loss).all()
 
     @property

@@ -173,7 +173,9 @@ def test_rewards_of_an_agent_that_left_never_add_up_to_more_than_zero(carried):
         return {"loss": torch.tensor([values], dtype=torch.float64)}
 
     def pay(parts, fled):
-        return account.pay(parts, torch.tensor([[True, True]]), torch.tensor([[fled, False]]))[0]
+        return account.step_rewards(
+            parts, torch.tensor([[True, True]]), torch.tensor([[fled, False]])
+        )[0]
 
     account.open(losses(1.0, 1.0), torch.tensor([0]))
     paid = pay(losses(0.8, 1.0), False)

@@ -127,7 +127,7 @@ SB3_REFUSALS = [
     (lambda w: w.ParticleVecEnv(batched(**DISABLED)), SAME_STEP),
     (lambda w: w.SpeciesVecEnv(species(**DISABLED)), SAME_STEP),
     (lambda w: w.ParticleVecEnv(single()), "vector_entry_point"),
-    (lambda w: w.WorldVecEnv(single()), "env must hold many worlds"),
+    (lambda w: w.WorldVecEnv(single()), "env must be a vector environment"),
     (
         lambda w: started(w.WorldVecEnv, batched(2)).step(np.zeros((2, 63, ACTIONS), np.float32)),
         r"got \(2, 63, 18\)",
@@ -140,7 +140,7 @@ SB3_REFUSALS = [
     (lambda w: w.SpeciesVecEnv(species(), **OTHER).step(np.zeros((6, 18))), "call reset first"),
     (lambda w: w.SpeciesVecEnv(make_species()), "a batch of worlds .* got MultiSpeciesEnv"),
     (lambda w: w.SpeciesVecEnv(species(), others={"species_7": still}), "species, got 'species_7'"),
-    (lambda w: w.SpeciesVecEnv(species(), **ALL_OTHERS), "others must leave at least one species"),
+    (lambda w: w.SpeciesVecEnv(species(), **ALL_OTHERS), "others must not name all species"),
     (lambda w: w.SpeciesVecEnv(species(), **OTHER).policy(None, "species_1"), "must be one whose"),
     (
         lambda w: w.SpeciesVecEnv(species(), others={"species_0": object()}),

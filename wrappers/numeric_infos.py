@@ -1,4 +1,4 @@
-"""A wrapper of PettingZoo environments whose infos hold numbers alone."""
+"""A wrapper that makes the infos of PettingZoo environments numeric, for TorchRL."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ Infos = dict[str, dict[str, Any]]
 
 
 class NumericInfos(BaseParallelWrapper):  # type: ignore[misc]
-    """Infos that have the same entries at reset and in every step, numbers all of them.
+    """Keep only the infos that `reset` returns, which are numbers, in every step.
 
-    TorchRL's `PettingZooWrapper` takes the entries that there are at reset for all that there will
-    ever be, and makes a tensor of each. So losses and their parts stay, and what is known after a
-    step only (`reward_...`, `reason`) is left out.
+    TorchRL's `PettingZooWrapper` expects the entries of `reset` in every step, and makes a tensor
+    of each. Losses and their parts stay; entries of steps only (`reward_...`, `reason`) are
+    dropped.
 
     Args:
         env: A parallel environment of `npa_envs.envs.multispecies_v0` or `particles_v0`.
