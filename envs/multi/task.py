@@ -204,6 +204,7 @@ class SpeciesTask(WorldTask[Any]):
     """
 
     config_type: ClassVar[type[SpeciesConfig]] = SpeciesConfig
+    actor = "species"
 
     least_species: ClassVar[int] = 2
     """The task makes no sense with fewer."""
