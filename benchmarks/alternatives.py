@@ -3,11 +3,11 @@
     python benchmarks/alternatives.py --device cuda --output FILE --plot PNG
     python benchmarks/alternatives.py --quick --check benchmarks/results/ratios.json
 
-Errors of perception are against the library in float64 on the same device; `dense` in float64 is an
-independent implementation and shows how far that can be trusted. Worlds are chaotic: two that
-differ in the last bit drift apart, and after enough steps distances say how long they have run, not
-how well each was computed. The picture grown says that. `--check` ends with code 1 where the
-library is less than a third as many times faster than a stored ratio says.
+Errors of perception are relative to the library in float64 on the same device; `dense` in float64
+is an independent implementation, whose error shows how accurate that is. Worlds are chaotic: two
+that differ in the last bit diverge, so that long rollouts are compared by the picture grown, not by
+distances of particles. `--check` ends with code 1 if a ratio of times is less than a third of the
+stored one.
 """
 
 from __future__ import annotations

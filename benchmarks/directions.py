@@ -1,9 +1,8 @@
-"""Rules that know no direction, beside plain rules of the same recipe.
+"""Equivariant rules compared with plain rules of the same recipe.
 
-`train` trains on each target a plain rule and equivariant ones (KINDS), side by side on one device;
-`measure` runs the rules on seeds that training never saw: losses at the best angle over the steps,
-and what becomes of grown creatures that are turned by 90 degrees; `time` takes the time of a step.
-Each writes what it found to OUT as it goes.
+`train` trains a plain rule and equivariant ones (KINDS) on each target, in parallel on one device;
+`measure` runs the rules on unseen seeds: losses at the best angle over the steps, also after grown
+worlds are turned by 90 degrees; `time` measures the time of a step. Each writes its results to OUT.
 
     python benchmarks/directions.py train --device cuda --out OUT
     python benchmarks/directions.py measure --device cuda --out OUT

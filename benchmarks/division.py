@@ -1,9 +1,8 @@
-"""Rules whose particles divide, from one particle on, beside plain rules that begin with a disk.
+"""Rules with dividing particles, from one particle, compared with plain rules from a disk.
 
-`train` learns each target by the recipe of the preset `best`: once from a disk, as always, and once
-from one particle. `measure` runs rules on seeds that training never saw:
-losses and living particles over the steps, and then after half of the particles are taken away,
-each second one or those on one side.
+`train` trains on each target by the preset `best`: from a disk, and from one particle. `measure`
+runs rules on unseen seeds: losses and living particles over the steps, also after half of the
+particles are removed, every second one or those on one side.
 
     python benchmarks/division.py train --out OUT --device cuda
     python benchmarks/division.py measure OUT.json RULE [RULE ...] [--device cuda]

@@ -1,4 +1,4 @@
-"""Pictures that nobody chose: emoji drawn at random, some to develop on and as many to test."""
+"""Random sets of emoji for development and for tests."""
 
 from __future__ import annotations
 

@@ -1,14 +1,13 @@
-"""Speed of the batched environments: observations, rewards, resets and all; run with --help.
+"""Speed of the batched environments with observations, rewards and resets; run with --help.
 
-Actions are random, drawn beforehand. Every episode is 64 steps long, so resets fall into the
-timing: all of them in one step, or (staggered) some in every step. Worlds start from the seed, a
-dense disk (Morphogenesis2D), or as grown and damaged pictures (Regeneration2D). On CUDA
-observations stay on the device and the host reads one byte a world; on a CPU they are NumPy's.
+Actions are random and drawn in advance. Episodes have 64 steps, so that times include resets: of
+all worlds in one step, or (staggered) of some in every step. Worlds start from the seed, a dense
+disk (Morphogenesis2D), or as grown and damaged pictures (Regeneration2D). On CUDA observations stay
+on the device and the CPU reads one byte a world; on a CPU they are NumPy arrays.
 
-Where resets come together, `calm_step` is a step without any, and `queued` the same steps of the
-same worlds with the work queued on the device and nothing of Python's between: the difference is
-what Python costs. `device` is the sum of the kernels' times, `idle` the share of a step without
-any.
+If all worlds are reset together, `calm_step` is a step without resets, and `queued` the same steps
+with the work queued on the device without Python, so that the difference is Python's cost. `device`
+is the sum of the kernels' times, `idle` the fraction of a step without any kernel.
 
 With --plain only: plain loops of `env.step` without resets, of single environments and of batches.
 

@@ -1,7 +1,6 @@
-"""Perception over the neighbours that `wp.HashGrid` finds: two plain passes, no sorting of ours.
+"""Perception with `wp.HashGrid` in two plain passes: a simple baseline in Warp alone.
 
-What one would write first with Warp alone. The fast kernels are measured against it, and it shares
-with them only the kernel functions W and K.
+It shares only the kernel functions W and K with the library's kernels.
 """
 
 import contextlib

@@ -1,11 +1,11 @@
-"""Kills of one process of a run of several, at random moments: what each leaves behind.
+"""Kill one process of a distributed run at random times, and check what is left.
 
     python benchmarks/kills.py --out benchmarks/results/kills_cpu.jsonl
     python benchmarks/kills.py --device cuda --preset paper --interval 50 --kills 1
 
 A line is a JSON object: the last iteration in the log when the process was killed, that of the
 checkpoint, seconds from the kill to the launcher's end, its exit code, and processes left over.
-Each run goes on from the checkpoint of the one before, with `--resume auto`.
+Each run continues from the checkpoint of the one before, with `--resume auto`.
 """
 
 from __future__ import annotations

@@ -2,13 +2,13 @@
 
     python benchmarks/large_worlds.py --out results.json
 
-Worlds are as dense as those of `npa-envs bench` (66 neighbours), with 16 channels and an untrained
-rule of 128 hidden units. Memory is all that torch has held, worlds at the beginning included.
+Worlds have the density of `npa-envs bench` (66 neighbours), 16 channels and an untrained rule with
+128 hidden units. Memory is the peak allocated by torch, with the worlds.
 
-The last line is a check. Copies of a world of 2^20 particles, too far from each other to be seen,
-make one of 1e8: after one step of all particles and after two each copy must be what the one at
-the origin is, up to rounding. Far from it coordinates are rounded after the first step, and that
-can move a moment matrix over the threshold of its inverse: a few particles may differ by much.
+The last line is a check. A world of 1e8 particles consists of copies of one of 2^20 that do not
+perceive each other: after one and two steps of all particles each copy must equal the one at the
+origin, up to rounding. Far from the origin coordinates are rounded more, which can move a moment
+matrix over the threshold of its inverse, so that a few particles may differ by much.
 """
 
 from __future__ import annotations

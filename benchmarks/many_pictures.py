@@ -1,10 +1,10 @@
-"""One rule of many pictures, beside rules of one picture of the same recipe.
+"""Rules of many pictures compared with rules of one picture of the same recipe.
 
-`pictures` draws emoji that no other experiment uses, to train on and to hold out; `ways` trains the
-same pictures with three ways to tell a rule its code; `train` trains rules of many pictures (KINDS)
-and controls of one picture each, side by side; `measure` runs all of them on seeds that training
-never saw: losses with the right code, with that of another picture and after a switch, and PSNR of
-what an encoder grows from pictures that it never saw. Each writes what it found to OUT as it goes.
+`pictures` draws emoji that no other experiment uses, for training and held out; `ways` trains on the
+same pictures with three ways to give a rule its code; `train` trains rules of many pictures (KINDS)
+and controls of one picture each, in parallel; `measure` runs all of them on unseen seeds: losses
+with the right code, with another code and after a switch, and PSNR of the pictures that an encoder
+grows from unseen pictures. Each writes its results to OUT.
 
     python benchmarks/many_pictures.py pictures --out PICTURES
     python benchmarks/many_pictures.py ways --targets FOLDER --out OUT

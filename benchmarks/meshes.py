@@ -1,10 +1,10 @@
-"""Recipes of 3D morphogenesis compared, and meshes that none of them was developed on.
+"""Recipes of 3D morphogenesis compared on meshes that they were not developed on.
 
-An arm is a recipe with one choice changed. `run` trains arms on meshes, several side by side,
-and measures the rules as `npa-envs evaluate` does, on seeds that training never saw. Every finished
-run is a line of JSON with its rule and a picture: four held-out views of the target, and of one
-world after 128 steps and at the end. `draw` writes the unseen meshes as files, `particles` asks how
-well particles can draw a mesh without any rule, `report` prints the runs as a table.
+An arm is a recipe with one change. `run` trains arms on meshes, several in parallel, and evaluates
+the rules as `npa-envs evaluate` on unseen seeds. Every finished run is a line of JSON with its rule
+and a picture: four held-out views of the target, and of one world after 128 steps and at the end.
+`draw` writes the unseen meshes as files, `particles` fits particles to a mesh without a rule,
+`report` prints the runs as a table.
 
     python benchmarks/meshes.py draw --out MESHES
     python benchmarks/meshes.py run --out OUT --device cuda --targets rocket --arms recipe

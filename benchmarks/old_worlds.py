@@ -1,4 +1,4 @@
-"""Worlds that recipes.py has grown, when they are old: what their decay is, and their bounds."""
+"""Decay and bounds of worlds of recipes.py after many steps."""
 
 from __future__ import annotations
 

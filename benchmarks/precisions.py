@@ -2,7 +2,7 @@
 
     python benchmarks/precisions.py gecko dots digits --device cuda
 
-prints what the metric of rules at their horizon is in each precision, over that of float32.
+prints the metric of rules at their horizon in each precision, over that of float32.
 """
 
 from __future__ import annotations

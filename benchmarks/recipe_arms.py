@@ -1,4 +1,4 @@
-"""What is told to the runs that recipes.py compares: sizes of worlds, arms, seeds, one run."""
+"""Settings of the runs of recipes.py: sizes of worlds, arms, seeds."""
 
 from __future__ import annotations
 

@@ -86,8 +86,8 @@ SHAPES: dict[str, Shape] = {
 CONDITIONS = {
     "eps": "perception radius ε over the trained one",
     "particles": "particles N over the trained number",
-    "update_prob": "probability p of an update, with the same number of updates",
-    "dt": "time step, with the same total time",
+    "update_prob": "probability p of an update, for as many updates in all",
+    "dt": "time step, for as much time in all",
     "noise": "noise of every position in each step, over the perception radius",
     "shape": "shape of the seed",
 }
