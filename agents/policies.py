@@ -210,7 +210,7 @@ class Policy:
         return result
 
     def _spans(self, counts: Mapping[str, int]) -> dict[str, slice]:
-        """Return the slice of each agent's particles, of which `counts` has the numbers."""
+        """Return the slice of each agent's particles; counts: particles of each agent."""
         return dict(zip(counts, spans_of(counts.values()), strict=True))
 
     def _act_on(self, observation: Tensor) -> Tensor:

@@ -1,9 +1,9 @@
 """Rules of many pictures compared with rules of one picture of the same recipe.
 
-`pictures` draws emoji that no other experiment uses, for training and held out; `ways` trains on the
-same pictures with three ways to give a rule its code; `train` trains rules of many pictures (KINDS)
-and controls of one picture each, in parallel; `measure` runs all of them on unseen seeds: losses
-with the right code, with another code and after a switch, and PSNR of the pictures that an encoder
+`pictures` draws emoji that no other experiment uses, for training and held out; `ways` trains on
+the same pictures with three ways to give a rule its code; `train` trains rules of many pictures
+(KINDS) and controls of one picture each, in parallel; `measure` runs all of them on unseen seeds:
+losses with the right code, with another code and after a switch, and PSNR of the pictures that an encoder
 grows from unseen pictures. Each writes its results to OUT.
 
     python benchmarks/many_pictures.py pictures --out PICTURES

@@ -414,7 +414,7 @@ def _start(
 
 
 def _finish(plan: ComparisonPlan, one: _Process, folder: Path, command: str) -> RunRecord:
-    """Put the results of a run that is over into their place, and return its record."""
+    """Move the results of an ended run into its folder, and return its record."""
     if not one.lasts:
         one.process.communicate()
     request = RunRequest(one.job, plan.facts(one.job), command=command)

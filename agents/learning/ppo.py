@@ -469,7 +469,7 @@ class RoundMemory:
         self.terminated, self.ended = (zeros(*single, dtype=torch.bool) for _ in range(2))
         """Whether a particle's episode terminated in a step; whether it terminated or truncated."""
         self.values = zeros(steps + 1, worlds, particles)
-        """The critic's values of `seen`, shape [T + 1, B, N]."""
+        """The critic's values of `observations`, shape [T + 1, B, N]."""
         self.next_values = zeros(*single)
         """The critic's values of the states after each step, before any restart."""
         self.advantages = zeros(steps, worlds, particles if own_advantages else 1)

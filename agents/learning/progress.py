@@ -229,7 +229,7 @@ class Progress:
         def end(stopped: bool) -> None:
             if stopped:
                 self._on_stop()
-            # An evaluation takes its time, and who asked to stop may not wait.
+            # Save before the evaluation, as a stopped process may be killed soon.
             self._save(rules, learner)
             self.look(rules, force=True)
             self._save(rules, learner)

@@ -356,7 +356,7 @@ def tried_again(search: Search, seeds: Sequence[int], *, steps: int | None = Non
     Args:
         search: The search.
         seeds: Seeds of the worlds of each elite.
-        steps: Steps, of which the later half counts; default: those of the search.
+        steps: Steps; the later half counts. None: those of the search.
 
     Raises:
         NPAError: The number of steps is not a multiple of 16.

@@ -118,7 +118,7 @@ class Trials(NamedTuple):
 
 
 class RuleStack(NPARule):
-    """K rules of one architecture, each of which updates its own worlds of a batch.
+    """K rules of one architecture in one batch of worlds, where each updates its own worlds.
 
     Each rule must have the same number of worlds with the same masks, so that each has the same
     number of rows of perception. Weights [K, W] are in the order of `RuleWeights`.

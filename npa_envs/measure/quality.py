@@ -30,7 +30,7 @@ PROGRESS_STEPS = 32
 """Steps between two reports of progress."""
 
 CHECKPOINTS = (64, 128, 256, 512, 1024, 2048, 4096)
-"""Steps at which a rule is measured, unless others are asked for."""
+"""Default steps at which a rule is measured."""
 
 LOST = 10.0
 """A world is lost if its loss is more than this many times that before the damage."""

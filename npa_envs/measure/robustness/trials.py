@@ -91,7 +91,7 @@ CONDITIONS = {
     "noise": "noise of every position in each step, over the perception radius",
     "shape": "shape of the seed",
 }
-"""Conditions, of which one at a time is varied, with a summary."""
+"""Conditions, varied one at a time, with their summaries."""
 
 
 def trained_value(condition: str, update_prob: float) -> float | str:
