@@ -63,7 +63,7 @@ GROWN, AFTER = 512, 256
 
 
 def train(arguments: argparse.Namespace) -> None:
-    """Train all rules side by side."""
+    """Train all rules in parallel."""
     configs, names = [], []
     for target in arguments.targets:
         for kind in arguments.kinds:
@@ -144,7 +144,7 @@ def angles(turn: Tensor) -> list[float]:
 
 
 def measure(arguments: argparse.Namespace) -> None:
-    """Measure all rules that lie in the folder."""
+    """Measure all rules in the folder."""
     found = {}
     for path in sorted(arguments.out.glob("*.safetensors")):
         metadata = rule_metadata(path)
@@ -222,7 +222,7 @@ def seconds_of(rule: npa_envs.NPARule, x: Tensor, s: Tensor, steps: int, backwar
 
 
 def main() -> None:
-    """Do what the command line asks for."""
+    """Run the command line."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("command", choices=("train", "measure", "time"))
     parser.add_argument("--out", type=Path, required=True)

@@ -51,7 +51,7 @@ rollouts."""
 
 
 def train(arguments: argparse.Namespace) -> None:
-    """Train the rules of all targets side by side."""
+    """Train the rules of all targets in parallel."""
     # Few numbers of steps: few graphs.
     shared = {"steps": (62, 64)}
     changes = json.loads(arguments.fields)
@@ -88,7 +88,7 @@ def row(task: Task, x: Tensor, s: Tensor, divides: bool) -> dict[str, list[float
 
 @torch.no_grad()
 def measured(path: Path, device: torch.device) -> dict[str, Any]:
-    """Return what is found of one rule."""
+    """Return the measurements of one rule."""
     rule = npa_envs.load_rule(path, device=device).float()
     task = task_of_rule(str(path), rule, device).task
     random = WorldRandom(SEEDS, device=device)
@@ -140,7 +140,7 @@ def measure(arguments: argparse.Namespace) -> None:
 
 
 def main() -> None:
-    """Do what the command line asks for."""
+    """Run the command line."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )

@@ -61,7 +61,7 @@ CUDA = (
 CPU = (Case(1, 256), Case(1, 1024), Case(1, 4096), Case(8, 1024), Case(64, 256))
 QUICK = (Case(1, 64), Case(3, 64))
 BROKEN_DOWN = (Case(1024, 1024), Case(64, 4096))
-"""Cases of which the kernels are listed."""
+"""Cases whose kernels are listed."""
 
 STARTS: dict[str, tuple[str, dict[str, Any]]] = {
     "seed": ("npa_envs:npa/Morphogenesis2D-v0", {}),
@@ -118,7 +118,7 @@ class Prepared:
         sets = list(CALM * (2.0 * drawn - 1.0))
         cuda = device.type == "cuda"
         self.actions: list[Any] = sets if cuda else [actions.numpy() for actions in sets]
-        # The first episode compiles and captures; the second does what only follows a reset.
+        # The first episode compiles and captures; the second does all that only follows a reset.
         self.run(2 * EPISODE_STEPS)
 
     def run(self, steps: int, step: Callable[[Any], Any] | None = None) -> float:
@@ -147,7 +147,7 @@ class Prepared:
         """Return the times of a step [s] as it is, and where the host only queues the work.
 
         Both are medians over the same steps, from the same worlds, without resets; the second
-        neither reads endings nor makes infos. What the first takes longer is what Python costs.
+        neither reads endings nor makes infos. The difference is the cost of Python.
         """
         worlds = self.env.unwrapped.worlds
         changing = (worlds.x, worlds.s, worlds.random.steps, worlds.elapsed)
@@ -239,7 +239,7 @@ PLAIN_STEPS, PLAIN_WARM, PLAIN_READINGS = 48, 2, 5
 def measure_plain(
     start: str, count: int | None, particle_count: int, output: str, device: str, quick: bool
 ) -> dict[str, Any]:
-    """Return what a step of a plain loop takes, of a single environment where count is None."""
+    """Return the time of a step of a plain loop; count None: of a single environment."""
     name, keywords = STARTS[start]
     if start == "grown":
         keywords = keywords | {"seed_pool": min(count or 4, 4), "grow_steps": 4 if quick else 256}
@@ -305,7 +305,7 @@ SMALL_SECONDS = 0.3
 def measure_small(
     env_id: str, world_count: int, device: torch.device, quick: bool
 ) -> dict[str, Any]:
-    """Return the row of so many worlds of a small id."""
+    """Return the row of a small id with a number of worlds."""
     steps = SMALL_STEPS[env_id]
     envs: Any = Problem(env_id=env_id, episode_steps=steps).make_envs(world_count, device=device)
     generator = torch.Generator(device).manual_seed(0)

@@ -40,7 +40,7 @@ POLICIES = ("zero", "random", "scripted", "gradient")
 
 
 def measured(name: str, policy: str, device: str, count: int, steps: int | None) -> dict[str, Any]:
-    """Return what a policy earns in the first episodes of as many seeds."""
+    """Return the rewards of a policy in the first episode of each seed."""
     scripted = ScriptedShepherd if "Shepherd" in name else ScriptedGardener
     makes = (StillGardener, RandomGardener, scripted, GradientGardener)
     limit = steps or gymnasium.spec(name).max_episode_steps

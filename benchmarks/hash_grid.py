@@ -56,7 +56,7 @@ def grid_fields(x: Tensor, s: Tensor, eps: float) -> GridFields:
 
 @functools.cache
 def _grid(device: torch.device, scalar: Any, depth: int) -> Any:
-    """Return the hash grid of a kind, which every call fills anew."""
+    """Return the cached hash grid of a kind, which each call rebuilds."""
     make: Any = wp.HashGrid
     return make(GRID_CELLS, GRID_CELLS, depth, device=warp_device(device), dtype=scalar)
 

@@ -53,7 +53,7 @@ def main() -> None:
 def killed(
     folder: RunFolder, told: argparse.Namespace, chance: random.Random, before: int
 ) -> dict[str, float]:
-    """Start or resume the run, kill one of its processes, and return what that left."""
+    """Start or resume the run, kill one of its processes, and return the record of it."""
     words = ["train", "morphogenesis2d", "--preset", told.preset, "--out", str(folder.path)]
     words += ["--processes", str(told.processes), "--device", told.device, "--resume", "auto"]
     words += ["--iterations", "1000000", "--checkpoint-interval", str(told.interval)]

@@ -33,7 +33,7 @@ TRAINING = (2**22, 2**24)
 def measured(
     particle_count: int, steps: int, device: torch.device, *, train: bool
 ) -> dict[str, object]:
-    """Return what a rollout of a world takes."""
+    """Return time and memory of a rollout of a world."""
     workload = Workload(2, 1, particle_count, steps)
     torch.cuda.reset_peak_memory_stats(device)
     x, s = workload.worlds(device)
@@ -67,7 +67,7 @@ def checked(copies: int, particle_count: int, device: torch.device) -> dict[str,
     """Return how far copies within one world are from the one at the origin, after two steps."""
     workload = Workload(2, 1, particle_count, 2)
     x, s = workload.worlds(device)
-    # On a grid of 2^-14, places of copies are numbers of float32.
+    # On a grid of 2^-14, positions of copies are exact in float32.
     x = (x * 2.0**14).round() / 2.0**14
     rule = workload.rule(device)
     draws = torch.Generator(device).manual_seed(3)
