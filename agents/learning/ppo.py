@@ -179,8 +179,8 @@ class PPOLearner:
         self._action, self._log_prob = (
             part[0].clone() for part in (self.memory.actions, self.memory.log_probs)
         )
-        self._within_kl, self._rules_rate, self._all_acted = torch.ones(3, device=device)
         # `_within_kl` is 0 once the rules have moved farther than `target_kl` in a round.
+        self._within_kl, self._rules_rate, self._all_acted = torch.ones(3, device=device)
         # One group of rows for each species, or of worlds, for the rules; worlds for the critic.
         rows = (1,) if options.ratio == "world" else problem.counts
         self._minibatches = Minibatches(

@@ -218,19 +218,18 @@ class SearchRecord(Record[Batch]):
 
 
 class Search:
-    """A search for rules that differ, in worlds of one kind.
+    """A quality-diversity search for rules, with a record from which it can be resumed.
 
-    The same settings give the same elites. A record holds the results of all candidates, but not
-    their weights: a resumed search proposes the same candidates once more and does not try them.
+    The same settings give the same elites. The record has the results of all candidates, but not
+    their weights: a resumed search proposes the same candidates again without evaluating them.
 
     Args:
-        world: Where candidates live.
-        method: What proposes them, a name of `METHODS`.
-        seed: Of the proposals, at least 0. All candidates meet the same worlds.
-        batch_size: Candidates that are proposed together, at least 2.
-        device: Where worlds are computed.
-        path: The record, which is written after each batch, or None. Where it exists, the search
-            goes on from it.
+        world: Sizes of rules and worlds.
+        method: A name of `METHODS`.
+        seed: Seed of the proposals, at least 0. All candidates have the same worlds.
+        batch_size: Candidates in a batch, at least 2.
+        device: Device of the worlds.
+        path: File of the record, which is written after each batch; None: no record.
 
     Raises:
         NPAError: A setting is wrong, or the record is of other settings.

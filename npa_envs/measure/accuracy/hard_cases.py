@@ -71,8 +71,7 @@ def _run_scene(scene: Scene, session: CheckSession) -> CheckResult:
 
 @check(GEOMETRY, "geometry/threshold", 2, 3)
 def _run_threshold(space_dim: int, session: CheckSession) -> CheckResult:
-    """A moment matrix at the threshold of its inverse is inverted or is not, and nothing
-    between."""
+    """A moment matrix near the threshold of its inverse is either inverted or not inverted."""
     x, offsets = threshold_scenes(space_dim, reference.MOMENT_THRESHOLD)
     s = states_at(x)
     fields = reference.fields(x, s, EPS)
@@ -269,7 +268,7 @@ def _run_scale(space_dim: int, session: CheckSession) -> CheckResult:
 @check(VALUES, "values/infinite_channel", 2, 3)
 def _run_infinite_channel(space_dim: int, session: CheckSession) -> CheckResult:
     """A channel that is infinite at one particle changes no bit of other channels, of particles
-    that do not see it, and of other worlds."""
+    that do not perceive it, and of other worlds."""
     x, s = _worlds(session, space_dim, 16)
     clean = perceive(x, s, EPS)
     broken = s.clone()
@@ -293,8 +292,8 @@ def _run_infinite_channel(space_dim: int, session: CheckSession) -> CheckResult:
 @check(VALUES, "values/dead", 2, 3)
 @torch.no_grad()
 def _run_dead(space_dim: int, session: CheckSession) -> CheckResult:
-    """What lies in the slots of dead particles, NaN as well, changes no bit; one particle that
-    divides fills its world, whose numbers stay finite."""
+    """Numbers in the slots of dead particles, also NaN, change no bit of a rollout; one particle
+    that divides fills its world, whose numbers stay finite."""
     torch.manual_seed(session.seed)
     rule = NPARule(space_dim, STATE_DIM, eps0=EPS, divides=True).to(session.device)
     x, s = _worlds(session, space_dim, STATE_DIM)

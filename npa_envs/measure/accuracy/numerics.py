@@ -134,8 +134,8 @@ def _run_float32(name: str, session: CheckSession) -> CheckResult:
 
 @check(DIFFERENCES, "gradients/finite_differences", 2, 3)
 def _run_differences(space_dim: int, session: CheckSession, *, periodic: bool) -> CheckResult:
-    """In float64, derivatives along smooth motions and along random states are what finite
-    differences say, in every hard scene."""
+    """In float64, derivatives along smooth motions and along random states agree with finite
+    differences, in every hard scene."""
     figures = {}
     for scene in scenes(space_dim, periodic=periodic, seed=session.seed):
         for what in ("states", "positions"):
@@ -221,7 +221,7 @@ def _compared(pairs: Iterable[tuple[Scene, PerceptionOutcome, PerceptionOutcome]
 
 @check(PRECISION, "precision/order", 2, 3)
 def _run_order(space_dim: int, session: CheckSession) -> CheckResult:
-    """Particles in another order perceive the same but for rounding, in every hard scene."""
+    """Particles in another order perceive the same up to rounding, in every hard scene."""
 
     def pairs() -> Iterator[tuple[Scene, PerceptionOutcome, PerceptionOutcome]]:
         for scene in _every_scene(space_dim, session):
@@ -269,7 +269,7 @@ def _run_batch(space_dim: int, session: CheckSession) -> CheckResult:
 
 @check(PRECISION, "precision/devices")
 def _run_devices(session: CheckSession) -> CheckResult:
-    """A CUDA device perceives what the CPU does but for rounding, in every hard scene."""
+    """A CUDA device and the CPU perceive the same up to rounding, in every hard scene."""
     if not session.cuda:
         raise Skipped("there is one device only: run it with --device cuda")
 
