@@ -203,7 +203,7 @@ class PPOLearner:
             between_reductions(self._find_gradients) for _ in range(self._minibatches.count)
         ]
         self._current_part = 0
-        self._part_weights = self._within_kl.new_zeros(self._minibatches.count, 2)
+        self._part_weights: Tensor = self._within_kl.new_zeros(self._minibatches.count, 2)
         self._kl_sums = self._within_kl.new_zeros(2)
 
     def resume(self, iteration: int, part: int) -> None:
