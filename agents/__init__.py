@@ -1,7 +1,6 @@
-"""Policies and baselines, imported as `npa_envs.agents`.
+"""Policies of trained rules, scripted and random policies, and their evaluation.
 
-Holds policies made of gradient-trained rules, scripted and random ones, and their evaluation. They
-use the public API only.
+They are imported as `npa_envs.agents` and use the public API only.
 """
 
 from npa_envs.agents.evaluation import Episodes, evaluate_policy

@@ -17,7 +17,7 @@ from npa_envs.errors import NPAError, shown
 from npa_envs.world.randomness import WorldRandom
 
 TIME_LIMIT = "time limit"
-"""Why an episode ended that Gymnasium cut off."""
+"""Ending of an episode that was truncated."""
 
 _REASONS = {"reason", "diverged", "success"}
 
@@ -32,10 +32,10 @@ class Episodes(NamedTuple):
     final_losses: NDArray[np.float64]
     """Losses after the last step."""
     steps: NDArray[np.int64]
-    """Lengths."""
+    """Numbers of steps."""
     endings: tuple[str, ...]
-    """Why each was over: "success", "diverged" or "time limit"; of several species why the first
-    one ended by itself, and "left the world" where one diverged."""
+    """Why each ended: "success", "diverged" or "time limit"; with several species the reason of the
+    first one that terminated, or "left the world" if one diverged."""
 
     @property
     def mean_return(self) -> float:
@@ -50,30 +50,30 @@ class Episodes(NamedTuple):
 
 
 def evaluate_policy(env: Any, policy: Callable[[Any], Any], seeds: Iterable[int]) -> Episodes:
-    """Run one episode from each seed, as many at a time as the environment has worlds.
+    """Run one episode from each seed, in all worlds of the environment at a time.
 
-    Each is the first episode after a reset with its seed, so short episodes count no more than
-    long ones, and the environment's draws do not depend on the number of worlds.
+    Each is the first episode after a reset with its seed, so that results do not depend on the
+    number of worlds or on the lengths of episodes.
 
     Args:
         env: A single or a vector environment of `npa_envs`, or Gymnasium's `SyncVectorEnv` or
-            `AsyncVectorEnv` of single ones; wrapped or not, in any autoreset mode, with
+            `AsyncVectorEnv` of single ones, with or without wrappers, in any autoreset mode, with
             `max_episode_steps`.
         policy: Maps observations, [B, N, P], to actions, [B, N, A]; B is 1 where `env` is single.
-            One that looks at worlds instead has `made_for(env)`, which returns the policy of an
-            environment.
+            A policy that reads the worlds instead has `made_for(env)`, which returns the policy
+            for an environment.
         seeds: One for each episode, integers of at least 0.
 
     Raises:
-        NPAError: There are no seeds or wrong ones, or the environment is another one.
+        NPAError: Seeds are missing or wrong, or the environment is not of this library.
     """
-    # Environments in other processes are recognised by their infos.
+    # `_run` checks environments in other processes by their infos.
     elsewhere = isinstance(getattr(env, "unwrapped", None), AsyncVectorEnv)
     worlds = None if elsewhere else unwrapped(env).worlds
     if not (hasattr(env, "num_envs") or isinstance(env, gymnasium.Env)):
         raise NPAError(
-            f"env must be a single or a vector environment, got {type(env).__name__}: of several "
-            "species take Problem(...).make_envs() of npa_envs.agents.learning"
+            f"env must be a single or a vector environment, got {type(env).__name__}: for several "
+            "species use Problem(...).make_envs() of npa_envs.agents.learning"
         )
     limits = [getattr(holder, "episode_steps", None) for holder in (worlds, env)]
     if limits == [None, None] and _step_limit(env) is None:
@@ -91,21 +91,21 @@ def evaluate_policy(env: Any, policy: Callable[[Any], Any], seeds: Iterable[int]
 
 
 def checked_seeds(name: str, seeds: Iterable[int]) -> list[int]:
-    """Return the seeds of episodes, which the caller calls so."""
+    """Return seeds as a list; `name` is the argument in errors."""
     if not isinstance(seeds, Iterable):
         raise NPAError(
             f"{name} must be one for each episode, got {shown(seeds)}: give {name}=range(8)"
         )
     given = list(seeds)
     if not given:
-        raise NPAError(f"{name} must hold at least one seed, got none: give {name}=range(8)")
-    # Wrong seeds are errors now, not in the first episode.
+        raise NPAError(f"{name} must have at least one seed, got none: give {name}=range(8)")
+    # Raises on wrong seeds.
     WorldRandom(given)
     return given
 
 
 def policy_in(env: Any, policy: Callable[[Any], Any]) -> Callable[[Any], Any]:
-    """Return a policy for an environment: one that looks at worlds is made for those."""
+    """Return the policy, or if it reads the worlds, the one made for the environment."""
     make = getattr(policy, "made_for", None)
     return policy if make is None else make(env)
 
@@ -115,8 +115,8 @@ def _run(env: Any, policy: Callable[[Any], Any], seeds: list[int]) -> tuple[NDAr
     observation, infos = env.reset(seed=seeds)
     if "loss" not in infos:
         raise NPAError(
-            f"env must hold environments of npa_envs, got others in {type(env).__name__}: make it "
-            "with gymnasium.make_vec('npa/Morphogenesis2D-v0', num_envs=8)"
+            f"env must contain environments of npa_envs, got others in {type(env).__name__}: make "
+            "it with gymnasium.make_vec('npa/Morphogenesis2D-v0', num_envs=8)"
         )
     start_losses = _host(infos["loss"])
     returns, final_losses = np.zeros(len(seeds)), np.zeros(len(seeds))
@@ -144,16 +144,16 @@ def _run(env: Any, policy: Callable[[Any], Any], seeds: list[int]) -> tuple[NDAr
 def _run_single(
     env: Any, policy: Callable[[Any], Any], seeds: list[int]
 ) -> tuple[NDArray[Any], ...]:
-    """As `_run`, of one world."""
+    """As `_run`, for a single environment."""
     observation, info = env.reset(seed=seeds[0])
     start_loss, total, steps, over = info["loss"], 0.0, 0, False
     while not over:
-        one: Any = (
+        batch: Any = (
             {name: part[None] for name, part in observation.items()}
             if isinstance(observation, Mapping)
             else observation[None]
         )
-        action = policy(one)[0]
+        action = policy(batch)[0]
         observation, reward, terminated, truncated, info = env.step(action)
         total, steps, over = total + float(reward), steps + 1, terminated or truncated
     ending = np.array([_ending(info)], dtype=object)
@@ -177,6 +177,6 @@ def _step_limit(env: Any) -> int | None:
 
 
 def _host(value: Any) -> NDArray[Any]:
-    """Return numbers as an array, float64 unless they are truth values."""
+    """Return numbers as an array, float64 unless bool."""
     array = value.cpu().numpy() if isinstance(value, torch.Tensor) else np.asarray(value)
     return array if array.dtype == bool else array.astype(np.float64)

@@ -1,4 +1,4 @@
-"""Gardeners: policies that use brushes on living worlds, scripted and by the world's gradient."""
+"""Gardeners: policies that use brushes, scripted or planned by the gradient of the world."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ from npa_envs.errors import NPAError
 from npa_envs.world.randomness import StreamId, WorldRandom
 
 FREE_PLACES = 8
-"""Places on each side of the grid from which scripts choose where free brushes go."""
+"""Points on each side of the grid at which scripts place free brushes."""
 
 
 class BrushPolicy:
-    """A policy of a garden, single or vector, whose actions are numbers: "grid" or "free"."""
+    """A policy for a garden, single or vector, with actions="grid" or "free"."""
 
     def __init__(self, env: Any) -> None:
         inner = unwrapped(env)
@@ -32,7 +32,7 @@ class BrushPolicy:
                 f"env must be a garden with actions='grid' or 'free', got "
                 f"{type(self.task).__name__}: make it with gymnasium.make('npa/Gardener2D-v0')"
             )
-        self._seen = inner.form.observation_ndim
+        self._observation_dims = inner.form.observation_ndim
         self.config = self.task.config
         self.columns = BrushLayout.of(self.config)
         self.shape = inner.form.rows_shape
@@ -41,12 +41,12 @@ class BrushPolicy:
     def __call__(self, observation: Any) -> Any:
         """Return the brushes' actions, [K, W], or [B, K, W] for observations of B worlds.
 
-        Policies look at the worlds of their environment, not at the observation.
+        Only type and shape of the observation count: policies read their environment's worlds.
         """
-        seen = observation["observation"] if isinstance(observation, dict) else observation
+        array = observation["observation"] if isinstance(observation, dict) else observation
         action = self.act(self.worlds.world_count)
-        action = action if seen.ndim > self._seen else action[0]
-        return action if isinstance(seen, Tensor) else action.cpu().numpy()
+        action = action if array.ndim > self._observation_dims else action[0]
+        return action if isinstance(array, Tensor) else action.cpu().numpy()
 
     def act(self, world_count: int) -> Tensor:
         """Return the brushes' actions in the environment's worlds, float32, shape [B, K, W]."""
@@ -58,7 +58,7 @@ class BrushPolicy:
 
 
 class StillGardener(BrushPolicy):
-    """Leave the worlds to their rule."""
+    """Do nothing, so that only the rule acts."""
 
     def act(self, world_count: int) -> Tensor:
         """Return zeros."""
@@ -66,7 +66,7 @@ class StillGardener(BrushPolicy):
 
 
 class RandomGardener(BrushPolicy):
-    """Act at random, uniformly over the action space; each further world has one seed more."""
+    """Act at random, uniformly over the action space; world k has the seed `seed + k`."""
 
     def __init__(self, env: Any, seed: int = 0) -> None:
         super().__init__(env)
@@ -80,13 +80,13 @@ class RandomGardener(BrushPolicy):
 class ScriptedGardener(BrushPolicy):
     """Push particles towards places with too few of them.
 
-    On a grid actions are linear in observations. Free brushes go where the longest push is due and
-    no brush before them is.
+    On a grid actions are linear in observations. Free brushes go one by one to the place of the
+    longest push that has no brush yet.
 
     Args:
-        gain: Push for the deficit at a place (dimensionless).
-        share: Push towards neighbouring places for the deficit there (dimensionless).
-        width: Standard deviation of the distance of neighbours [length units].
+        gain: Push by the gradient of the deficit at a place (dimensionless).
+        share: Push towards each other place by the deficit there (dimensionless).
+        width: Standard deviation of the Gaussian weight of other places [length units].
     """
 
     def __init__(self, env: Any, gain: float = 0.5, share: float = 0.6, width: float = 0.4) -> None:
@@ -94,44 +94,43 @@ class ScriptedGardener(BrushPolicy):
         if "push" not in self.config.tools:
             raise NPAError(f"env must have brushes that push, got tools={self.config.tools}")
         self._gain = checked_positive("gain", gain)
-        self._lacking = self.task.deficit
+        self._deficit = self.task.deficit
         if self.config.actions == "free":
             fine = replace(self.config, place_count=FREE_PLACES)
             places = grid_places(fine, self.task.device)
-            self._lacking = TargetDeficit(places, self.task.goal.target, fine)
-        places = self._lacking.places
+            self._deficit = TargetDeficit(places, self.task.goal.target, fine)
+        places = self._deficit.places
         away = places[None] - places[:, None]
-        near = (-0.5 * away.square().sum(dim=-1) / checked_positive("width", width) ** 2).exp()
-        # In double precision: libraries add up one world in another order than several.
-        self._ways = (checked_positive("share", share) * near[..., None] * away).double()
+        weight = (-0.5 * away.square().sum(dim=-1) / checked_positive("width", width) ** 2).exp()
+        # In float64, as libraries sum one world in another order than several.
+        self._pulls = (checked_positive("share", share) * weight[..., None] * away).double()
 
     def act(self, world_count: int) -> Tensor:
         """Return the pushes for the deficits of the worlds."""
         worlds, action = self.worlds, self.still(world_count)
-        lack = self._lacking(worlds.x, worlds.s, self.task.middle(worlds.x))
-        ways = torch.einsum("bq,pqd->bpd", lack[..., 0].double(), self._ways).to(lack.dtype)
-        move = (self._gain * lack[..., 1:3] + ways).clamp(-1.0, 1.0)
+        deficit = self._deficit(worlds.x, worlds.s, self.task.middle(worlds.x))
+        pull = torch.einsum("bq,pqd->bpd", deficit[..., 0].double(), self._pulls).to(deficit.dtype)
+        move = (self._gain * deficit[..., 1:3] + pull).clamp(-1.0, 1.0)
         if self.config.actions == "grid":
             action[..., self.columns.push] = move
             return action
-        places, worth = self._lacking.places, move.norm(dim=-1)
-        everyone = torch.arange(world_count, device=lack.device)
+        places, length = self._deficit.places, move.norm(dim=-1)
+        every_world = torch.arange(world_count, device=deficit.device)
         for brush in range(len(action[0])):
-            place = worth.argmax(dim=1)
-            action[:, brush, self.columns.place] = places[place]
-            action[:, brush, self.columns.push] = move[everyone, place]
-            apart = (places - places[place][:, None]).norm(dim=-1) >= self.config.brush_radius
-            worth = worth * apart
+            longest = length.argmax(dim=1)
+            action[:, brush, self.columns.place] = places[longest]
+            action[:, brush, self.columns.push] = move[every_world, longest]
+            apart = (places - places[longest][:, None]).norm(dim=-1) >= self.config.brush_radius
+            length = length * apart
         return action
 
 
 class ScriptedShepherd(BrushPolicy):
-    """Push everywhere in the direction of the goal: to a place, around, or outwards.
+    """Push all particles towards the goal of "move", "reshape" or "turn".
 
     Args:
-        gain: Share of the way to the goal in a step (dimensionless).
-        ring: Distance from the middle of the picture at which brushes stand that can go anywhere
-            [length units].
+        gain: Fraction of the distance to the goal in a step (dimensionless).
+        ring: Radius of the circle on which free brushes are placed [length units].
     """
 
     def __init__(self, env: Any, gain: float = 1.0, ring: float = 0.4) -> None:
@@ -155,15 +154,15 @@ class ScriptedShepherd(BrushPolicy):
         achieved = self.task.achieved(worlds.x, worlds.s, worlds.context)
         missing = (self.task.desired(worlds.context) - achieved)[:, None, :2]
         if self.config.aim == "move":
-            way = missing.expand(-1, len(self._places), -1)
+            direction = missing.expand(-1, len(self._places), -1)
         elif self.config.aim == "reshape":
-            way = missing * self._places
+            direction = missing * self._places
         else:
             around = torch.stack((-self._places[:, 1], self._places[:, 0]), dim=1)
-            way = missing[..., 1:] * around
+            direction = missing[..., 1:] * around
         if self.config.actions == "free":
             action[..., self.columns.place] = self._places
-        push = self._gain * way / self.config.push_length
+        push = self._gain * direction / self.config.push_length
         action[..., self.columns.push] = push.clamp(-1.0, 1.0)
         return action
 
@@ -171,10 +170,9 @@ class ScriptedShepherd(BrushPolicy):
 class GradientGardener(BrushPolicy):
     """Plan by the gradient of rewards through brushes, rule and picture.
 
-    In each step it copies the worlds and improves a plan for the next `horizon` steps by Adam,
-    with draws of its own: it knows the state of the world, the rule and the target, and nothing of
-    the damage to come. It begins with the action of `ScriptedGardener` or `ScriptedShepherd`, and
-    takes the first step of the best plan found.
+    In each step it simulates the worlds for `horizon` steps, with random masks of its own and
+    without damage, and improves the actions by Adam, starting from those of `ScriptedGardener` or
+    `ScriptedShepherd`. It takes the first step of the best plan.
 
     Args:
         env: A garden whose brushes push, with dense rewards.
@@ -208,26 +206,26 @@ class GradientGardener(BrushPolicy):
         best = plan.detach().clone()
         highest = torch.full((world_count,), -torch.inf, device=self.task.device)
         for _ in range(self._iterations):
-            worth = self.worth(plan, draws)
+            rewards = self.planned_rewards(plan, draws)
             with torch.no_grad():
-                better = worth > highest
-                highest = torch.where(better, worth, highest)
+                better = rewards > highest
+                highest = torch.where(better, rewards, highest)
                 best = torch.where(better[:, None, None], plan, best)
-            (plan.grad,) = torch.autograd.grad(-worth.sum(), plan)
+            (plan.grad,) = torch.autograd.grad(-rewards.sum(), plan)
             optimizer.step()
             with torch.no_grad():
                 plan.clamp_(-1.0, 1.0)
         return best[0].detach()
 
     @torch.enable_grad()
-    def worth(self, plan: Tensor, draws: WorldRandom) -> Tensor:
-        """Return the worlds' rewards in the steps of a plan, [T, B, K, W], summed, [B]."""
+    def planned_rewards(self, plan: Tensor, draws: WorldRandom) -> Tensor:
+        """Return the sum of each world's rewards in the steps of a plan, [T, B, K, W], [B]."""
         worlds, task = self.worlds, self.task
         x, s = worlds.x.detach(), worlds.s.detach()
         random = draws.substream(StreamId.POLICY)
-        earned = torch.zeros(x.shape[0], device=x.device)
+        total = torch.zeros(x.shape[0], device=x.device)
         for action in plan:
             x, s = task.brush_and_roll(x, s, action, random)
             loss = sum(task.losses(x, s).values())
-            earned = earned + task.reward(x, s, loss, worlds.context)
-        return earned
+            total = total + task.reward(x, s, loss, worlds.context)
+        return total

@@ -24,36 +24,36 @@ Array = TypeVar("Array", NDArray[Any], Tensor)
 
 
 class Interface(NamedTuple):
-    """What observations and actions of an environment mean, column by column."""
+    """Meaning of the columns of an environment's observations and actions."""
 
     space_dim: int
     """Space dimension D."""
     state_dim: int
     """State channels C."""
     moving: bool
-    """Whether actions begin with a displacement."""
+    """Whether actions begin with a displacement, as particles move."""
     state_scale: float
     """State step of an action of 1, dimensionless."""
     species_count: int = 0
-    """Species whose densities and density gradients follow in an observation; 0: none."""
+    """Species whose densities and density gradients are at the end of a perception; 0: none."""
     target_dim: int = 0
-    """Columns of the world's target at the end of an observation; policies leave them out."""
+    """Columns of the world's target at the end of an observation; policies ignore them."""
 
     @classmethod
     def of(cls, physics: Physics, species_count: int = 0, target_dim: int = 0) -> Interface:
-        """Return that of worlds with such constants."""
+        """Return the interface of worlds with these physical constants."""
         scale = physics.limits.state_scale
         sizes = physics.space_dim, physics.state_dim, physics.moving
         return cls(*sizes, scale, species_count, target_dim)
 
     @property
     def shared_dim(self) -> int:
-        """Columns of an observation about all species together."""
+        """Columns of an observation before those of single species."""
         return self.state_dim * (2 + self.space_dim) + self.space_dim
 
     @property
     def perception_dim(self) -> int:
-        """Length P of an observed perception vector."""
+        """Length P of a perception vector."""
         return self.shared_dim + self.species_count * (1 + self.space_dim)
 
     @property
@@ -70,7 +70,7 @@ class Interface(NamedTuple):
         return observation[..., self.state_dim : 2 * self.state_dim]
 
     def density_gradient(self, observation: Tensor) -> Tensor:
-        """Return c^{1+D} ∇ρ / N, its logarithmic scale undone, shape [..., D]."""
+        """Return c^{1+D} ∇ρ / N on a linear scale, shape [..., D]."""
         scaled = observation[..., self.shared_dim - self.space_dim : self.shared_dim]
         size = scaled.norm(dim=-1, keepdim=True)
         return scaled * torch.where(size > 0.0, torch.expm1(size) / size, 1.0)
@@ -78,8 +78,8 @@ class Interface(NamedTuple):
     def action(self, displacement: Tensor, state_step: Tensor) -> Tensor:
         """Return the action of a displacement and a state step, within the action space.
 
-        Displacements, fractions of α ε, shape [..., D], are shortened to 1, and left out where
-        particles do not move; state steps, shape [..., C], are clipped to ± `state_scale`.
+        Displacements [..., D], fractions of α ε, are clipped to length 1 and left out if particles
+        do not move; state steps [..., C] are clipped to ± `state_scale`.
         """
         parts = [(state_step / self.state_scale).clamp(-1.0, 1.0)]
         if self.moving:
@@ -89,7 +89,7 @@ class Interface(NamedTuple):
 
 
 def unwrapped(env: Any) -> Any:
-    """Return the NPA environment within wrappers; of `SyncVectorEnv` the first."""
+    """Return the NPA environment inside wrappers; of a `SyncVectorEnv` its first one."""
     inner = getattr(env, "unwrapped", None)
     if isinstance(inner, SyncVectorEnv):
         inner = inner.envs[0].unwrapped
@@ -107,56 +107,56 @@ def unwrapped(env: Any) -> Any:
 
 
 def interface_of(env: Any) -> Interface:
-    """Return what observations and actions of an environment mean.
+    """Return the meaning of an environment's observations and actions.
 
     Args:
         env: A single or a vector environment of `npa_envs`, wrapped or not.
 
     Raises:
-        NPAError: It is none.
+        NPAError: `env` is not such an environment.
     """
     worlds = unwrapped(env).worlds
     physics = worlds.physics
-    # Worlds with perception by species perceive more than their physics says.
+    # Perception by species has columns that `physics` does not count.
     appended = getattr(worlds, "perception_dim", physics.perception_dim) - physics.perception_dim
     species = appended // (1 + physics.space_dim)
     return Interface.of(physics, species, getattr(worlds, "target_dim", 0))
 
 
 def acting_interface(env: Any) -> Interface:
-    """Return `interface_of` an environment; refuse actions that are no rows of its particles."""
+    """Return `interface_of` an environment, after a check that its actions are of particles."""
     interface = interface_of(env)
     space = getattr(env, "single_action_space", None) or getattr(env, "action_space", None)
-    # Parallel environments of PettingZoo have a method there: their agents are particles' species.
+    # In PettingZoo's environments, whose agents are species, `action_space` is a method.
     shape = getattr(space, "shape", None)
     if space is not None and not callable(space) and (shape is None or len(shape) != 2):
         raise NPAError(
-            f"this policy acts by rows of particles, but the environment takes {space}: draw from "
+            f"this policy acts by rows of particles, but the environment takes {space}: use "
             "env.action_space.sample(), or give another environment"
         )
     return interface
 
 
 def spans_of(counts: Iterable[int]) -> list[slice]:
-    """Return the places of groups of so many particles that stand one after the other."""
+    """Return the slices of consecutive groups of the given numbers of particles."""
     ends = [0, *accumulate(counts)]
     return [slice(*pair) for pair in pairwise(ends)]
 
 
 class Policy:
-    """A function from observations to actions; subclasses say what `act` does.
+    """A function from observations to actions; subclasses define `act`.
 
-    Called with observations of one world, [N, P], or of several, [B, N, P], it returns actions
-    [N, A] or [B, N, A], float32, within the action space: a NumPy array for an array, and a tensor
-    on the same device for a tensor. Called with a dict of agents' observations, as PettingZoo's
-    parallel environments return it, it returns a dict of their actions. No gradient is recorded.
+    It maps observations of one world, [N, P], or of several, [B, N, P], to actions [N, A] or
+    [B, N, A], float32, within the action space: arrays to arrays, and tensors to tensors on the
+    same device. It also maps a dict of agents' observations, as of PettingZoo's parallel
+    environments, to a dict of their actions. It has no gradients.
 
     Args:
-        interface: What observations and actions mean: `interface_of(env)`.
+        interface: `interface_of(env)`.
 
     Raises:
-        NPAError: When made with an `env` that is no environment of `npa_envs`; when called: the
-            observation has another shape.
+        NPAError: `env` is not an environment of `npa_envs`. When called: the observation has
+            another shape.
     """
 
     def __init__(self, interface: Interface) -> None:
@@ -174,12 +174,12 @@ class Policy:
 
     @torch.no_grad()
     def __call__(self, observation: Any) -> Any:
-        """Return the actions for observations, or for each agent's."""
+        """Return the actions for observations, or for a dict of them."""
         if isinstance(observation, Mapping):
             return self._act_by_agent(observation)
         if isinstance(observation, Tensor):
             return self._act_on(observation).to(observation.device)
-        # Torch refuses to share memory that may not be written to.
+        # `from_numpy` needs writable memory.
         writable = np.require(observation, np.float32, ("C", "W"))
         return self._act_on(torch.from_numpy(writable)).cpu().numpy()
 
@@ -187,30 +187,30 @@ class Policy:
         """Return the actions of agents that observe [P] or [N_k, P] or [B, N_k, P]."""
         if not observations:
             return {}
-        rows = {agent: torch.as_tensor(seen) for agent, seen in observations.items()}
-        rows = {agent: seen if seen.ndim > 1 else seen[None] for agent, seen in rows.items()}
-        places = self._places({agent: seen.shape[-2] for agent, seen in rows.items()})
+        rows = {agent: torch.as_tensor(own) for agent, own in observations.items()}
+        rows = {agent: own if own.ndim > 1 else own[None] for agent, own in rows.items()}
+        spans = self._spans({agent: own.shape[-2] for agent, own in rows.items()})
         first = next(iter(rows.values()))
-        count = max(place.stop for place in places.values())
-        together = first.new_zeros(*first.shape[:-2], count, first.shape[-1])
-        for agent, place in places.items():
-            if rows[agent].shape != together[..., place, :].shape:
+        count = max(span.stop for span in spans.values())
+        joined = first.new_zeros(*first.shape[:-2], count, first.shape[-1])
+        for agent, span in spans.items():
+            if rows[agent].shape != joined[..., span, :].shape:
                 raise NPAError(
                     f"observation[{agent!r}] must have shape "
-                    f"{tuple(together[..., place, :].shape)}, got {tuple(rows[agent].shape)}: "
+                    f"{tuple(joined[..., span, :].shape)}, got {tuple(rows[agent].shape)}: "
                     "use the policy with the environment that it was made for"
                 )
-            together[..., place, :] = rows[agent]
-        actions = self._act_on(together).to(together.device)
+            joined[..., span, :] = rows[agent]
+        actions = self._act_on(joined).to(joined.device)
         result: dict[str, Any] = {}
-        for agent, seen in observations.items():
-            own = actions[..., places[agent], :]
-            own = own if np.ndim(seen) > 1 else own[0]
-            result[agent] = own if isinstance(seen, Tensor) else own.cpu().numpy()
+        for agent, observed in observations.items():
+            own = actions[..., spans[agent], :]
+            own = own if np.ndim(observed) > 1 else own[0]
+            result[agent] = own if isinstance(observed, Tensor) else own.cpu().numpy()
         return result
 
-    def _places(self, counts: Mapping[str, int]) -> dict[str, slice]:
-        """Return the places of the particles of agents with such numbers of them."""
+    def _spans(self, counts: Mapping[str, int]) -> dict[str, slice]:
+        """Return the slice of each agent's particles; counts: particles of each agent."""
         return dict(zip(counts, spans_of(counts.values()), strict=True))
 
     def _act_on(self, observation: Tensor) -> Tensor:
@@ -228,14 +228,14 @@ class Policy:
 class RulePolicy(Policy):
     """An update rule as a policy: a_x = δ / (1 + |δ|) and a_s = Δs / state_scale.
 
-    With it an episode is `npa_envs.rollout` of the rule, up to rounding, as long as nothing that
-    the environment clips gets that far: state steps at `state_scale`, observations at
-    `observation_limit`. Actions are computed on the rule's device.
+    An episode is then `npa_envs.rollout` of the rule, up to rounding, unless the environment clips
+    state steps at `state_scale` or observations at `observation_limit`. Actions are computed on the
+    rule's device.
 
     Args:
-        rule: The rule; the policy follows when it is trained on.
-        env: The environment that it is to act in, checked to fit; None: trust the caller.
-        state_scale: The environment's, where `env` is not given (dimensionless).
+        rule: The rule, which is not copied.
+        env: The environment, which the rule is checked to fit; None: no check.
+        state_scale: The environment's, if `env` is None (dimensionless).
 
     Raises:
         NPAError: The rule perceives what no environment offers, has codes, divides, or does not fit
@@ -246,14 +246,13 @@ class RulePolicy(Policy):
         check_rule(rule)
         if rule.divides:
             raise NPAError(
-                "a policy acts on particles that stay as many as they are, got a rule with "
-                "divides=True: run it with npa_envs.rollout"
+                "a policy needs a constant number of particles, got a rule with divides=True: run "
+                "it with npa_envs.rollout"
             )
         if rule.code_dim:
             raise NPAError(
-                "a policy acts on particles that carry no code, got a rule with "
-                f"code_dim={rule.code_dim}: run it with npa_envs.rollout, or in "
-                "npa/Shapeshifter2D-v0"
+                f"a policy needs a rule without codes, got code_dim={rule.code_dim}: run it with "
+                "npa_envs.rollout, or in npa/Shapeshifter2D-v0"
             )
         state_scale = checked_positive("state_scale", state_scale)
         if env is None:
@@ -265,9 +264,8 @@ class RulePolicy(Policy):
             ]
             if spaces[0] != spaces[1]:
                 raise NPAError(
-                    "a rule must see observations as the environment makes them, and a wrapper "
-                    f"changes them from {spaces[1]} to {spaces[0]}: give RulePolicy the "
-                    "environment without it"
+                    "a rule needs the environment's own observations, but a wrapper changes them "
+                    f"from {spaces[1]} to {spaces[0]}: give RulePolicy the environment without it"
                 )
             check_rule_fits(rule, interface_of(env), unwrapped(env).config)
             state_scale = interface_of(env).state_scale
@@ -291,17 +289,17 @@ class ZeroPolicy(Policy):
 
 
 class PolicyDraws:
-    """Random numbers of a policy: a stream for each world, from `seed`, `seed + 1`, ..."""
+    """Random numbers of a policy: world k has the stream of `seed + k`."""
 
     def __init__(self, seed: Any) -> None:
         self._seed = checked_count("seed", seed)
         self._random: WorldRandom | None = None
 
     def next(self, world_count: int, device: torch.device) -> WorldRandom:
-        """Return the source of the next step; other numbers of worlds begin from the start."""
+        """Return the source for the next step; another number of worlds restarts the streams."""
         if self._random is None or self._random.world_count != world_count:
             seeds = range(self._seed, self._seed + world_count)
-            # A substream, as an environment with the same seed draws its masks from these streams.
+            # A substream, as an environment with the same seed uses these streams itself.
             self._random = WorldRandom(seeds, device=device).substream(StreamId.POLICY)
         self._random.advance()
         return self._random
@@ -310,15 +308,14 @@ class PolicyDraws:
 class RandomPolicy(Policy):
     """Act at random, uniformly over the action space.
 
-    The k-th of several worlds is acted upon as a policy with `seed + k` acts upon one.
+    World k of several gets the actions of a policy with `seed + k`.
 
     Args:
-        env: The environment that it is to act in.
-        seed: Of the sequence of actions, at least 0.
+        env: The environment.
+        seed: An integer of at least 0.
 
     Raises:
-        NPAError: The seed is no such integer, or the environment's actions are no rows of
-            particles.
+        NPAError: The seed is wrong, or the environment's actions are not rows of particles.
     """
 
     def __init__(self, env: Any, seed: int = 0) -> None:
@@ -333,14 +330,14 @@ class RandomPolicy(Policy):
 
 
 class SpreadPolicy(Policy):
-    """Move down the density gradient: particles repel each other and the worlds spread out.
+    """Move down the density gradient: particles repel each other and spread out.
 
     Args:
-        env: The environment that it is to act in.
-        gain: Displacement, as a fraction of α ε, at a perceived c^{1+D} ∇ρ / N of 1.
+        env: The environment.
+        gain: Displacement, as a fraction of α ε, for a density gradient c^{1+D} ∇ρ / N of 1.
 
     Raises:
-        NPAError: The gain is no finite number.
+        NPAError: The gain is not a finite number.
     """
 
     def __init__(self, env: Any, gain: float = 0.03) -> None:
@@ -364,15 +361,15 @@ def target_colour(env: Any) -> Tensor | None:
 
 
 class PaintPolicy(SpreadPolicy):
-    """Spread out in one colour: the picture's extent and its mean colour, without any detail.
+    """Spread out and take one colour.
 
     Args:
-        env: The environment that it is to act in.
+        env: The environment.
         colour: Red, green and blue in [0, 1]; None: the mean colour of the environment's target.
         gain: That of `SpreadPolicy`.
 
     Raises:
-        NPAError: `env` has no target's colour to take, or the colour does not have three numbers.
+        NPAError: Neither a colour nor a target is there, or the colour is not three numbers.
     """
 
     def __init__(
@@ -382,7 +379,7 @@ class PaintPolicy(SpreadPolicy):
         if colour is None:
             colour = target_colour(env)
             if colour is None:
-                raise NPAError("colour must be given where env has no target: colour=(0, 0.5, 0)")
+                raise NPAError("colour must be given if env has no target: colour=(0, 0.5, 0)")
         with contextlib.suppress(TypeError, ValueError, RuntimeError, OverflowError):
             self._colour = torch.as_tensor(colour, dtype=torch.float32)
         if getattr(self, "_colour", torch.zeros(0)).shape != (3,):
@@ -392,23 +389,23 @@ class PaintPolicy(SpreadPolicy):
             )
 
     def state_step(self, observation: Tensor) -> Tensor:
-        """Return the way to the colour in the last three channels."""
+        """Return the difference to the colour, in the last three channels."""
         step = torch.zeros_like(self.interface.states(observation))
-        wanted = self._colour.to(step.device) - COLOUR_OFFSET
-        step[..., -3:] = wanted - self.interface.states(observation)[..., -3:]
+        target = self._colour.to(step.device) - COLOUR_OFFSET
+        step[..., -3:] = target - self.interface.states(observation)[..., -3:]
         return step
 
 
 class MendPolicy(SpreadPolicy):
-    """Heal without a memory: blank particles take their neighbours' mean state, all spread out.
+    """Repair damage: blank particles take the mean state of their neighbours; all spread out.
 
     Args:
-        env: The environment that it is to act in.
-        blank: A particle is blank where the norm of its state is below this, dimensionless.
-        gain: That of `SpreadPolicy`, small so that what is whole stays nearly as it is.
+        env: The environment.
+        blank: Particles with a state of a smaller norm are blank (dimensionless).
+        gain: That of `SpreadPolicy`, small so that undamaged parts hardly change.
 
     Raises:
-        NPAError: One of the numbers is not finite.
+        NPAError: A number is not finite.
     """
 
     def __init__(self, env: Any, blank: float = 0.1, gain: float = 0.003) -> None:
@@ -416,14 +413,14 @@ class MendPolicy(SpreadPolicy):
         self._blank = checked_finite("blank", blank)
 
     def state_step(self, observation: Tensor) -> Tensor:
-        """Return the way to the neighbours' mean state where a particle is blank."""
+        """Return the difference to the neighbours' mean state for blank particles, else 0."""
         states = self.interface.states(observation)
         blank = states.norm(dim=-1, keepdim=True) < self._blank
         return torch.where(blank, self.interface.mean_states(observation) - states, 0.0)
 
 
 def rule_interface(rule: NPARule, state_scale: float) -> Interface:
-    """Return the meaning of observations and actions to a rule."""
+    """Return the interface that a rule needs."""
     moving = not rule.static
     return Interface(rule.space_dim, rule.state_dim, moving, state_scale, rule.species_count)
 
@@ -431,14 +428,14 @@ def rule_interface(rule: NPARule, state_scale: float) -> Interface:
 def bounded_update(rule: NPARule, observation: Tensor) -> tuple[Tensor, Tensor]:
     """Return a rule's bounded updates for observations [K, P], on its device; differentiable.
 
-    They are displacements δ / (1 + |δ|) as fractions of α ε, shape [K, D], or [K, 0] where
-    particles are static, and state steps Δs, dimensionless, not bounded, shape [K, C].
+    They are displacements δ / (1 + |δ|) as fractions of α ε, [K, D], or [K, 0] of a static rule,
+    and unbounded state steps Δs (dimensionless), [K, C].
     """
     weight = rule.hidden.weight
     rows = perceived(rule, observation.to(weight.device, weight.dtype))
     network = rule.network()
     if network is not None:
-        # The same products as in a rollout: a rule amplifies rounding from step to step.
+        # The same operations as in a rollout, as a rule amplifies rounding errors.
         padded = rows.new_zeros(len(rows), network.row_width)
         padded[:, : rule.perception_dim] = rows
         padded[:, rule.perception_dim] = 1.0
@@ -449,7 +446,7 @@ def bounded_update(rule: NPARule, observation: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def bounded(rule: NPARule, update: Tensor) -> tuple[Tensor, Tensor]:
-    """Return displacements and state steps of raw updates [K, A], as `bounded_update` does."""
+    """Split raw updates [K, A] into bounded displacements and state steps."""
     moved = 0 if rule.static else rule.space_dim
     delta, state_step = update[:, :moved], update[:, moved:]
     return delta / (1.0 + delta.norm(dim=1, keepdim=True)), state_step
@@ -471,7 +468,7 @@ def perceived(rule: NPARule, rows: Tensor) -> Tensor:
 
 
 def check_rule_fits(rule: NPARule, wanted: Interface, config: Any) -> None:
-    """Check that a rule can act in an environment as it does in a rollout."""
+    """Check that a rule can act in an environment with this interface and configuration."""
     _check_correction(rule)
     if rule.static == wanted.moving:
         kind, other = ("static", "moving") if rule.static else ("moving", "static")
@@ -481,10 +478,10 @@ def check_rule_fits(rule: NPARule, wanted: Interface, config: Any) -> None:
         )
     if rule.species_count != wanted.species_count:
         raise NPAError(
-            f"rule must tell as many species apart as the environment, {wanted.species_count}, got "
+            f"rule must distinguish {wanted.species_count} species as the environment does, got "
             f"{rule.species_count}: choose another rule, or another perception"
         )
-    theirs = {
+    required = {
         "space_dim": wanted.space_dim,
         "state_dim": wanted.state_dim,
         "moment_inverse": config.moment_inverse,
@@ -492,7 +489,7 @@ def check_rule_fits(rule: NPARule, wanted: Interface, config: Any) -> None:
         # Nothing moves in a static rule's worlds.
         "alpha": rule.alpha if rule.static else config.alpha,
     }
-    for name, value in theirs.items():
+    for name, value in required.items():
         own = getattr(rule, name)
         if math.isclose(own, value, rel_tol=1e-6) if isinstance(own, float) else own == value:
             continue
@@ -506,6 +503,6 @@ def check_rule_fits(rule: NPARule, wanted: Interface, config: Any) -> None:
 def _check_correction(rule: NPARule) -> None:
     if not rule.moment_correction:
         raise NPAError(
-            "rule must perceive gradients with moment_correction=True, as environments offer "
-            "them, got moment_correction=False: train it with the correction"
+            "rule must have moment_correction=True, as observations have corrected gradients, got "
+            "False: train it with the correction"
         )

@@ -1,4 +1,4 @@
-"""Scripted policies that choose codes of a rule of many pictures."""
+"""A scripted policy that chooses codes of a rule of many pictures."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ from npa_envs.errors import NPAError
 
 
 class RecognisingShapeshifter:
-    """Say the code of the picture that looks most like the goal; for arrays and tensors alike.
+    """Choose the code of the picture that is nearest to the goal; for arrays and tensors alike.
 
-    It knows which code grows which picture in `npa/Shapeshifter2D-v0`, single or vector, with
-    either form of actions, and looks at the observation alone.
+    It knows the picture of each code of `npa/Shapeshifter2D-v0`, single or vector, with either form
+    of actions, and otherwise reads the observation only.
     """
 
     def __init__(self, env: Any) -> None:
@@ -32,14 +32,14 @@ class RecognisingShapeshifter:
         goals = torch.arange(len(task.codes), device=task.device)
         x = torch.zeros(len(goals), 1, 2, device=task.device)
         s = x.new_zeros(len(goals), 1, task.config.state_dim)
-        # What would be seen with each goal; the second half is of the goal.
-        seen = task.observe(x, s, x[:, 0, 0], goals[:, None].to(x))
-        self._goals = seen.chunk(2, dim=1)[1].cpu()
+        # The second half of an observation is the goal's picture.
+        observation = task.observe(x, s, x[:, 0, 0], goals[:, None].to(x))
+        self._goals = observation.chunk(2, dim=1)[1].cpu()
 
     def __call__(self, observation: Any) -> Any:
-        """Return the action for what is seen, [8 G²], or those of B worlds, [B, 8 G²]."""
-        seen = torch.as_tensor(observation).cpu()
-        goal = seen.unflatten(-1, (2, -1))[..., 1, :]  # type: ignore[no-untyped-call]
+        """Return the action for an observation, [8 G²], or those of B worlds, [B, 8 G²]."""
+        array = torch.as_tensor(observation).cpu()
+        goal = array.unflatten(-1, (2, -1))[..., 1, :]  # type: ignore[no-untyped-call]
         away = (goal[..., None, :] - self._goals).square().sum(dim=-1)
         number = away.argmin(dim=-1)
         action = number if self._chosen else self._actions[number]

@@ -3,11 +3,11 @@
     python benchmarks/alternatives.py --device cuda --output FILE --plot PNG
     python benchmarks/alternatives.py --quick --check benchmarks/results/ratios.json
 
-Errors of perception are against the library in float64 on the same device; `dense` in float64 is an
-independent implementation and shows how far that can be trusted. Worlds are chaotic: two that
-differ in the last bit drift apart, and after enough steps distances say how long they have run, not
-how well each was computed. The picture grown says that. `--check` ends with code 1 where the
-library is less than a third as many times faster than a stored ratio says.
+Errors of perception are relative to the library in float64 on the same device; `dense` in float64
+is an independent implementation, whose error shows how accurate that is. Worlds are chaotic: two
+that differ in the last bit diverge, so that long rollouts are compared by the picture grown, not by
+distances of particles. `--check` ends with code 1 if a ratio of times is less than a third of the
+stored one.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ from npa_envs.world.rollout import rollout, step
 
 
 class Gecko(NamedTuple):
-    """The shipped rule, its task with as many target points as particles, and seeds."""
+    """The shipped rule `gecko`, its task with one target point a particle, and seeds."""
 
     rule: NPARule
     task: Morphogenesis2D
@@ -62,7 +62,7 @@ class Gecko(NamedTuple):
     s: Tensor
 
     def grown(self, steps: int) -> Gecko:
-        """Return the same with worlds that are so many float32 steps older."""
+        """Return a copy whose worlds are `steps` float32 steps older."""
         generator = torch.Generator(self.x.device).manual_seed(1)
         with torch.no_grad():
             x, s = rollout(
@@ -88,7 +88,7 @@ def gecko(world_count: int, particle_count: int, device: torch.device) -> Gecko:
 
 @dataclass
 class Alternatives(TimingSession):
-    """A session that knows what to compare."""
+    """A `TimingSession` with the methods to compare."""
 
     strategies: list[Strategy] = field(default_factory=lambda: list(STRATEGIES.values()))
     """Strategies to measure."""
@@ -186,7 +186,7 @@ def perception_rows(session: Alternatives, workload: Workload) -> list[Perceptio
 
 
 def perceived(strategy: Strategy, x: Tensor, s: Tensor, eps: float) -> Perceived:
-    """Return what a strategy makes of worlds x [B, N, D] and s [B, N, C]."""
+    """Return the perception of a strategy for worlds x [B, N, D] and s [B, N, C]."""
     z = strategy.perceive(x, s, eps)
     cotangent = None
     if strategy.differentiable:
@@ -257,7 +257,7 @@ GROWN_STEPS = 64
 """Age of the worlds that are compared: a gecko in the making."""
 
 TASK_STEPS = 512
-"""Age at which the gecko's picture is judged."""
+"""Step at which the gecko's picture is compared."""
 
 SLOW = ("dense", "neighbour_cap")
 """Strategies whose rollouts small sessions leave out."""
@@ -301,7 +301,7 @@ class Runner:
         self.task = start.task
         self.x = start.x.to(precision.dtype)
         self.s = precision.kept(start.s.to(precision.dtype))
-        # Drawn here: a graph of the functional holds no draws of its own.
+        # Drawn before the capture, so that the graph draws nothing.
         self._x_weights = drawn_like(self.x)
         self._s_weights = drawn_like(self.s)
 
@@ -348,7 +348,7 @@ class Runner:
         return torch.cat([gradient.flatten() for gradient in gradients])
 
     def costs(self, session: Alternatives) -> list[Cost]:
-        """Return what a timed rollout costs: inference, then training where it can be trained."""
+        """Return the costs of a rollout: inference and, if possible, training."""
         generator = mask_source(self.x)
 
         @torch.no_grad()
@@ -422,7 +422,7 @@ def mask_source(like: Tensor) -> torch.Generator:
 def _task_runner(
     session: Alternatives, strategy: Strategy, precision: Precision, seed: Gecko
 ) -> Runner | None:
-    """Return what grows the picture; a run of 512 steps is left out where it takes too long."""
+    """Return the run that grows the picture; 512 steps that take too long are left out."""
     particle_count = seed.x.shape[1]
     slow = strategy.name in SLOW and particle_count > LARGEST_SLOW
     if slow or (strategy.name != "library" and (session.small or not session.cuda)):
@@ -489,7 +489,7 @@ class PeerRow:
 
 @dataclass(frozen=True)
 class Call:
-    """A call that computes some operations; `capturable` where a CUDA graph can hold it."""
+    """A call that computes some operations; `capturable`: a CUDA graph can record it."""
 
     operation: str
     run: Callable[[], Fields]
@@ -574,7 +574,7 @@ def _scipy(x: Tensor, s: Tensor, eps: float) -> list[Call]:
 
 
 def _warp_sph_core(x: Tensor, s: Tensor, eps: float) -> list[Call]:
-    """warpSPHCore (fluids.dev): one call for each operation, each with a search of its own."""
+    """warpSPHCore (fluids.dev): one call for each operation, each with a neighbour search."""
     start_warp()
     sph = importlib.import_module("warpSPHCore")
     space_dim = x.shape[1]
@@ -619,7 +619,7 @@ PEERS = {
     "scipy cKDTree + index_add": _scipy,
     "warpSPHCore": _warp_sph_core,
 }
-"""Every peer, and what makes its calls from x [N, D], s [N, C] and eps."""
+"""Other libraries, with the functions that make their calls from x [N, D], s [N, C], eps."""
 
 
 # Plots: fronts of run time against error.
@@ -707,7 +707,7 @@ def _draw_front(axis: Any, points: Sequence[Point], across: str, up: str) -> Non
 
 
 def _add_legend(figure: Any, points: Sequence[Point]) -> None:
-    """Say which colours and shapes stand for what."""
+    """Draw the legend of colours and shapes."""
     from matplotlib.lines import Line2D
 
     strategies = dict.fromkeys(point.strategy for point in points)
@@ -726,7 +726,7 @@ def _add_legend(figure: Any, points: Sequence[Point]) -> None:
     figure.legend(handles=marks, loc="outside lower center", ncols=5, fontsize=8)
 
 
-# Ratios of times within one run, which hold on any machine of a kind, and their check.
+# Ratios of times within one run, which are similar on machines of a kind, and their check.
 
 WORKLOAD = Workload(2, 1, 1024, 1)
 """Small enough for dense torch."""
@@ -775,10 +775,10 @@ def ratios(session: Alternatives) -> dict[str, float]:
 
 
 def stored_ratios(path: Path, device: torch.device) -> dict[str, float]:
-    """Return the ratios that are to be held, of JSON {"cpu": {name: ratio}, "cuda": {...}}.
+    """Return the least ratios, of JSON {"cpu": {name: ratio}, "cuda": {...}}.
 
     Raises:
-        NPAError: The file cannot be read or holds nothing for this kind of device.
+        NPAError: The file cannot be read or has no ratios for this kind of device.
     """
     cure = "take `ratios` from the JSON of `benchmarks/alternatives.py --quick --output FILE`"
     try:
@@ -791,7 +791,7 @@ def stored_ratios(path: Path, device: torch.device) -> dict[str, float]:
 
 
 def missed_ratios(measured: Mapping[str, float], stored: Mapping[str, float]) -> list[str]:
-    """Return a line for each stored ratio that is missed; none where all are held."""
+    """Return a line for each stored ratio that is missed."""
     return [
         f"{name}: {measured.get(name, math.nan):.3g}, stored {value:.3g}, "
         f"at least {value / TOLERANCE:.3g} wanted"

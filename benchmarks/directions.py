@@ -1,9 +1,8 @@
-"""Rules that know no direction, beside plain rules of the same recipe.
+"""Equivariant rules compared with plain rules of the same recipe.
 
-`train` trains on each target a plain rule and equivariant ones (KINDS), side by side on one device;
-`measure` runs the rules on seeds that training never saw: losses at the best angle over the steps,
-and what becomes of grown creatures that are turned by 90 degrees; `time` takes the time of a step.
-Each writes what it found to OUT as it goes.
+`train` trains a plain rule and equivariant ones (KINDS) on each target, in parallel on one device;
+`measure` runs the rules on unseen seeds: losses at the best angle over the steps, also after grown
+worlds are turned by 90 degrees; `time` measures the time of a step. Each writes its results to OUT.
 
     python benchmarks/directions.py train --device cuda --out OUT
     python benchmarks/directions.py measure --device cuda --out OUT
@@ -64,7 +63,7 @@ GROWN, AFTER = 512, 256
 
 
 def train(arguments: argparse.Namespace) -> None:
-    """Train all rules side by side."""
+    """Train all rules in parallel."""
     configs, names = [], []
     for target in arguments.targets:
         for kind in arguments.kinds:
@@ -145,7 +144,7 @@ def angles(turn: Tensor) -> list[float]:
 
 
 def measure(arguments: argparse.Namespace) -> None:
-    """Measure all rules that lie in the folder."""
+    """Measure all rules in the folder."""
     found = {}
     for path in sorted(arguments.out.glob("*.safetensors")):
         metadata = rule_metadata(path)
@@ -223,7 +222,7 @@ def seconds_of(rule: npa_envs.NPARule, x: Tensor, s: Tensor, steps: int, backwar
 
 
 def main() -> None:
-    """Do what the command line asks for."""
+    """Run the command line."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("command", choices=("train", "measure", "time"))
     parser.add_argument("--out", type=Path, required=True)

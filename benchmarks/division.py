@@ -1,9 +1,8 @@
-"""Rules whose particles divide, from one particle on, beside plain rules that begin with a disk.
+"""Rules with dividing particles, from one particle, compared with plain rules from a disk.
 
-`train` learns each target by the recipe of the preset `best`: once from a disk, as always, and once
-from one particle. `measure` runs rules on seeds that training never saw:
-losses and living particles over the steps, and then after half of the particles are taken away,
-each second one or those on one side.
+`train` trains on each target by the preset `best`: from a disk, and from one particle. `measure`
+runs rules on unseen seeds: losses and living particles over the steps, also after half of the
+particles are removed, every second one or those on one side.
 
     python benchmarks/division.py train --out OUT --device cuda
     python benchmarks/division.py measure OUT.json RULE [RULE ...] [--device cuda]
@@ -52,7 +51,7 @@ rollouts."""
 
 
 def train(arguments: argparse.Namespace) -> None:
-    """Train the rules of all targets side by side."""
+    """Train the rules of all targets in parallel."""
     # Few numbers of steps: few graphs.
     shared = {"steps": (62, 64)}
     changes = json.loads(arguments.fields)
@@ -89,7 +88,7 @@ def row(task: Task, x: Tensor, s: Tensor, divides: bool) -> dict[str, list[float
 
 @torch.no_grad()
 def measured(path: Path, device: torch.device) -> dict[str, Any]:
-    """Return what is found of one rule."""
+    """Return the measurements of one rule."""
     rule = npa_envs.load_rule(path, device=device).float()
     task = task_of_rule(str(path), rule, device).task
     random = WorldRandom(SEEDS, device=device)
@@ -141,7 +140,7 @@ def measure(arguments: argparse.Namespace) -> None:
 
 
 def main() -> None:
-    """Do what the command line asks for."""
+    """Run the command line."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )

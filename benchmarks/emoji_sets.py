@@ -1,4 +1,4 @@
-"""Pictures that nobody chose: emoji drawn at random, some to develop on and as many to test."""
+"""Random sets of emoji for development and for tests."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ SKIN_TONES = (0x1F3FB, 0x1F3FF)
 """Those of them that change others."""
 
 DRAWN = 12
-"""Pictures to develop on, and as many to test."""
+"""Number of pictures for development, and for tests."""
 
 
 def single_emoji() -> dict[str, Image.Image]:

@@ -1,14 +1,13 @@
-"""Speed of the batched environments: observations, rewards, resets and all; run with --help.
+"""Speed of the batched environments with observations, rewards and resets; run with --help.
 
-Actions are random, drawn beforehand. Every episode is 64 steps long, so resets fall into the
-timing: all of them in one step, or (staggered) some in every step. Worlds start from the seed, a
-dense disk (Morphogenesis2D), or as grown and damaged pictures (Regeneration2D). On CUDA
-observations stay on the device and the host reads one byte a world; on a CPU they are NumPy's.
+Actions are random and drawn in advance. Episodes have 64 steps, so that times include resets: of
+all worlds in one step, or (staggered) of some in every step. Worlds start from the seed, a dense
+disk (Morphogenesis2D), or as grown and damaged pictures (Regeneration2D). On CUDA observations stay
+on the device and the CPU reads one byte a world; on a CPU they are NumPy arrays.
 
-Where resets come together, `calm_step` is a step without any, and `queued` the same steps of the
-same worlds with the work queued on the device and nothing of Python's between: the difference is
-what Python costs. `device` is the sum of the kernels' times, `idle` the share of a step without
-any.
+If all worlds are reset together, `calm_step` is a step without resets, and `queued` the same steps
+with the work queued on the device without Python, so that the difference is Python's cost. `device`
+is the sum of the kernels' times, `idle` the fraction of a step without any kernel.
 
 With --plain only: plain loops of `env.step` without resets, of single environments and of batches.
 
@@ -62,7 +61,7 @@ CUDA = (
 CPU = (Case(1, 256), Case(1, 1024), Case(1, 4096), Case(8, 1024), Case(64, 256))
 QUICK = (Case(1, 64), Case(3, 64))
 BROKEN_DOWN = (Case(1024, 1024), Case(64, 4096))
-"""Cases of which the kernels are listed."""
+"""Cases whose kernels are listed."""
 
 STARTS: dict[str, tuple[str, dict[str, Any]]] = {
     "seed": ("npa_envs:npa/Morphogenesis2D-v0", {}),
@@ -119,7 +118,7 @@ class Prepared:
         sets = list(CALM * (2.0 * drawn - 1.0))
         cuda = device.type == "cuda"
         self.actions: list[Any] = sets if cuda else [actions.numpy() for actions in sets]
-        # The first episode compiles and captures; the second does what only follows a reset.
+        # The first episode compiles and captures; the second does all that only follows a reset.
         self.run(2 * EPISODE_STEPS)
 
     def run(self, steps: int, step: Callable[[Any], Any] | None = None) -> float:
@@ -148,7 +147,7 @@ class Prepared:
         """Return the times of a step [s] as it is, and where the host only queues the work.
 
         Both are medians over the same steps, from the same worlds, without resets; the second
-        neither reads endings nor makes infos. What the first takes longer is what Python costs.
+        neither reads endings nor makes infos. The difference is the cost of Python.
         """
         worlds = self.env.unwrapped.worlds
         changing = (worlds.x, worlds.s, worlds.random.steps, worlds.elapsed)
@@ -240,7 +239,7 @@ PLAIN_STEPS, PLAIN_WARM, PLAIN_READINGS = 48, 2, 5
 def measure_plain(
     start: str, count: int | None, particle_count: int, output: str, device: str, quick: bool
 ) -> dict[str, Any]:
-    """Return what a step of a plain loop takes, of a single environment where count is None."""
+    """Return the time of a step of a plain loop; count None: of a single environment."""
     name, keywords = STARTS[start]
     if start == "grown":
         keywords = keywords | {"seed_pool": min(count or 4, 4), "grow_steps": 4 if quick else 256}
@@ -306,7 +305,7 @@ SMALL_SECONDS = 0.3
 def measure_small(
     env_id: str, world_count: int, device: torch.device, quick: bool
 ) -> dict[str, Any]:
-    """Return the row of so many worlds of a small id."""
+    """Return the row of a small id with a number of worlds."""
     steps = SMALL_STEPS[env_id]
     envs: Any = Problem(env_id=env_id, episode_steps=steps).make_envs(world_count, device=device)
     generator = torch.Generator(device).manual_seed(0)

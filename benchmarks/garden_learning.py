@@ -1,17 +1,16 @@
-"""How Stable-Baselines3's PPO and SAC learn to garden and to shepherd; run with --help.
+"""Learning curves of Stable-Baselines3's PPO and SAC in gardens; run with --help.
 
     python benchmarks/garden_learning.py npa/Gardener2DSmall-v0 ppo --steps 50000 --jobs 3
     python benchmarks/garden_learning.py npa/Gardener2DSmall-v0 ppo --worlds 256 --steps 1000000
 
-One process learns with each seed. As it learns, its policy without exploration is paid for the
-episodes of `npa_envs.agents.learning.problem.EVALUATION_SEEDS`: told are the mean reward of a step
-with its standard error over episodes and, of shepherds, how many creatures were at their goal and
-whole in the last step. Rows of a seed are written to the folder after each evaluation, with
-`--save` beside the policy.
+One process learns with each seed. During learning its policy is evaluated without exploration in
+the episodes of `npa_envs.agents.learning.problem.EVALUATION_SEEDS`: rows have the mean reward of a
+step with its standard error over episodes and, for shepherds, the success rate. The rows of a seed
+are written to the folder after each evaluation, with `--save` also the policy.
 
-With `--last-episodes 128` the policies that were learned last are paid for so many other episodes,
-and so are nobody, random actions and the script. What is told of the learned ones besides is how
-much more they earn than the script in the same episodes, with the standard error over episodes.
+`--last-episodes 128` evaluates the last policies, and the baselines zero, random and scripted, in
+128 other episodes. Rows of learned policies then have the difference to the script's reward in the
+same episodes, with its standard error.
 """
 
 from __future__ import annotations
@@ -56,7 +55,7 @@ METHODS: dict[str, tuple[type[Any], dict[str, Any], dict[str, Any]]] = {
         {"reward": "sparse"},
     ),
 }
-"""Algorithm, what of its defaults is changed, and keywords of the environment."""
+"""Algorithm, its options, and keywords of the environment."""
 
 MANY = {
     "ppo": {
@@ -66,28 +65,28 @@ MANY = {
         "policy_kwargs": {"log_std_init": -1.0},
     }
 }
-"""What is changed besides where many worlds are stepped together."""
+"""Further options with several worlds."""
 
 
 def make_envs(name: str, count: int, device: str, keywords: dict[str, Any]) -> Any:
-    """Return so many worlds to be paid in."""
+    """Return `count` worlds for evaluation."""
     return gymnasium.make_vec(
         name, count, vectorization_mode="vector_entry_point", device=device, **keywords
     )
 
 
-def paid(envs: Any, act: Callable[[Any], Any], seeds: range) -> dict[str, list[float]]:
+def episode_means(envs: Any, act: Callable[[Any], Any], seeds: range) -> dict[str, list[float]]:
     """Return the mean reward of a step, and the success of shepherds, for each episode."""
     limit = envs.spec.max_episode_steps
-    earned = np.zeros(len(seeds))
-    seen, _ = envs.reset(seed=list(seeds))
+    reward = np.zeros(len(seeds))
+    observation, _ = envs.reset(seed=list(seeds))
     for _ in range(limit):
-        seen, rewards, _, _, infos = envs.step(act(seen))
-        earned += rewards / limit
-    told = {"reward": earned.tolist()}
+        observation, rewards, _, _, infos = envs.step(act(observation))
+        reward += rewards / limit
+    means = {"reward": reward.tolist()}
     if "is_success" in infos["final_info"]:
-        told["success"] = np.asarray(infos["final_info"]["is_success"], dtype=float).tolist()
-    return told
+        means["success"] = np.asarray(infos["final_info"]["is_success"], dtype=float).tolist()
+    return means
 
 
 def mean_and_error(values: Any) -> tuple[float, float]:
@@ -95,17 +94,17 @@ def mean_and_error(values: Any) -> tuple[float, float]:
     return float(np.mean(values)), float(np.std(values, ddof=1) / math.sqrt(len(values)))
 
 
-def summary(told: dict[str, list[float]]) -> dict[str, float]:
-    """Return the means of what `paid` returns."""
-    mean, error = mean_and_error(told["reward"])
+def summary(means: dict[str, list[float]]) -> dict[str, float]:
+    """Return the means over the episodes of `episode_means`."""
+    mean, error = mean_and_error(means["reward"])
     row = {"reward": mean, "error": error}
-    if "success" in told:
-        row["success"] = float(np.mean(told["success"]))
+    if "success" in means:
+        row["success"] = float(np.mean(means["success"]))
     return row
 
 
 class Evaluation(BaseCallback):
-    """Evaluate every so many steps, write what came of it, and stop when the time is over."""
+    """Evaluate every `every` steps, write the rows, and stop at the time limit."""
 
     def __init__(self, envs: Any, every: int, seconds: float, path: Path, *, saves: bool) -> None:
         super().__init__()
@@ -121,15 +120,15 @@ class Evaluation(BaseCallback):
             self.evaluate()
         return time.perf_counter() < self._end
 
-    def act(self, seen: Any) -> Any:
-        """Return what the policy does without exploration."""
-        return self.model.predict(seen, deterministic=True)[0]
+    def act(self, observation: Any) -> Any:
+        """Return the policy's action without exploration."""
+        return self.model.predict(observation, deterministic=True)[0]
 
     def evaluate(self) -> None:
-        """Add a row about the policy as it is."""
+        """Evaluate the current policy and add a row."""
         learned = time.perf_counter() - self._begun
-        told = summary(paid(self._envs, self.act, EVALUATION_SEEDS))
-        row = {"steps": self.num_timesteps, "seconds": learned, **told}
+        means = summary(episode_means(self._envs, self.act, EVALUATION_SEEDS))
+        row = {"steps": self.num_timesteps, "seconds": learned, **means}
         self.rows.append(row)
         write_text(self._path, json.dumps(self.rows))
         if self._saves:
@@ -151,7 +150,7 @@ def learned(
     out: Path,
     saves: bool,
 ) -> tuple[list[dict[str, Any]], dict[str, list[float]]]:
-    """Return the evaluations of one seed, and what it is paid for the last episodes."""
+    """Learn with a seed; return its evaluations, and `episode_means` of the last episodes."""
     torch.set_num_threads(1)
     algorithm, settings, keywords = METHODS[method]
     policy = "MultiInputPolicy" if "Shepherd" in name else "MlpPolicy"
@@ -171,37 +170,38 @@ def learned(
         )
     model = algorithm(policy, env, seed=seed, device="cpu", **settings)
     envs = make_envs(name, len(EVALUATION_SEEDS), device, keywords)
-    told = Evaluation(envs, every, seconds, out / f"{method}_{seed}.json", saves=saves)
-    model.learn(steps, callback=told)
-    told.evaluate()
+    evaluation = Evaluation(envs, every, seconds, out / f"{method}_{seed}.json", saves=saves)
+    model.learn(steps, callback=evaluation)
+    evaluation.evaluate()
     if not last_episodes:
-        return told.rows, {}
+        return evaluation.rows, {}
     envs = make_envs(name, last_episodes, device, keywords)
-    return told.rows, paid(envs, told.act, last_seeds(last_episodes))
+    return evaluation.rows, episode_means(envs, evaluation.act, last_seeds(last_episodes))
 
 
 def last_seeds(count: int) -> range:
-    """Return the seeds of the last episodes, in which nothing is learned or chosen."""
+    """Return the seeds of the last episodes, which are not used for learning or evaluation."""
     return range(FIRST_TEST_SEED, FIRST_TEST_SEED + count)
 
 
 def unlearned(name: str, method: str, count: int, device: str) -> dict[str, dict[str, list[float]]]:
-    """Return what policies that learn nothing are paid for the last episodes."""
+    """Return `episode_means` of the baselines in the last episodes."""
     envs = make_envs(name, count, device, METHODS[method][2])
     scripted = ScriptedShepherd if "Shepherd" in name else ScriptedGardener
     makes = {"zero": StillGardener, "random": RandomGardener, "scripted": scripted}
-    return {policy: paid(envs, make(envs), last_seeds(count)) for policy, make in makes.items()}
+    seeds = last_seeds(count)
+    return {policy: episode_means(envs, make(envs), seeds) for policy, make in makes.items()}
 
 
 def compared(
     seeds: dict[int, dict[str, list[float]]], others: dict[str, dict[str, list[float]]]
 ) -> dict[str, Any]:
-    """Return what all earn in the last episodes, and by how much the learned exceed the script."""
-    rows: dict[str, Any] = {policy: summary(told) for policy, told in others.items()}
+    """Return rows of all policies in the last episodes, with differences to the script."""
+    rows: dict[str, Any] = {policy: summary(means) for policy, means in others.items()}
     script = np.array(others["scripted"]["reward"])
-    for seed, told in seeds.items():
-        more, error = mean_and_error(np.array(told["reward"]) - script)
-        rows[f"seed {seed}"] = {**summary(told), "more": more, "more_error": error}
+    for seed, means in seeds.items():
+        more, error = mean_and_error(np.array(means["reward"]) - script)
+        rows[f"seed {seed}"] = {**summary(means), "more": more, "more_error": error}
     return rows
 
 
@@ -210,15 +210,15 @@ def main(arguments: list[str] | None = None) -> None:
     parser = script_parser((__doc__ or "").split("\n")[0])
     parser.add_argument("id", choices=GARDEN_IDS)
     parser.add_argument("method", choices=METHODS)
-    parser.add_argument("--steps", type=int, default=50_000, help="of all worlds together")
-    parser.add_argument("--every", type=int, default=10_000, help="steps from one to the next row")
-    parser.add_argument("--worlds", type=int, default=1, help="stepped together; 1: a single one")
+    parser.add_argument("--steps", type=int, default=50_000, help="steps of all worlds together")
+    parser.add_argument("--every", type=int, default=10_000, help="steps between rows")
+    parser.add_argument("--worlds", type=int, default=1, help="worlds that are stepped together")
     parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2])
     parser.add_argument("--jobs", type=int, default=1, help="seeds that learn at the same time")
-    parser.add_argument("--folder", type=Path, default=Path("runs/gardens"), help="rows of seeds")
-    parser.add_argument("--seconds", type=float, default=math.inf, help="to learn for, at most")
-    parser.add_argument("--last-episodes", type=int, default=0, help="to compare all policies in")
-    parser.add_argument("--save", action="store_true", help="the policies too")
+    parser.add_argument("--folder", type=Path, default=Path("runs/gardens"), help="of the rows")
+    parser.add_argument("--seconds", type=float, default=math.inf, help="time limit of learning")
+    parser.add_argument("--last-episodes", type=int, default=0, help="to compare policies in")
+    parser.add_argument("--save", action="store_true", help="write the policies")
     given = parser.parse_args(arguments)
     given.folder.mkdir(parents=True, exist_ok=True)
     one = partial(
@@ -237,14 +237,14 @@ def main(arguments: list[str] | None = None) -> None:
     context = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(given.jobs, mp_context=context) as pool:
         found = dict(zip(given.seeds, pool.map(one, given.seeds), strict=True))
-    told: dict[str, Any] = {"seeds": {seed: rows for seed, (rows, _) in found.items()}}
+    results: dict[str, Any] = {"seeds": {seed: rows for seed, (rows, _) in found.items()}}
     if given.last_episodes:
         others = unlearned(given.id, given.method, given.last_episodes, given.device)
-        told["last"] = compared({seed: last for seed, (_, last) in found.items()}, others)
-        for policy, row in told["last"].items():
+        results["last"] = compared({seed: last for seed, (_, last) in found.items()}, others)
+        for policy, row in results["last"].items():
             print(policy, {name: round(value, 3) for name, value in row.items()})
     if given.output is not None:
-        write_record(given.output, {**script_facts(given), **told})
+        write_record(given.output, {**script_facts(given), **results})
 
 
 if __name__ == "__main__":

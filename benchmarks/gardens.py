@@ -1,15 +1,14 @@
-"""What gardeners and shepherds earn: nobody, at random, scripted, by the gradient; run with --help.
+"""Rewards in gardens of the policies zero, random, scripted and gradient; run with --help.
 
     python benchmarks/gardens.py [--ids npa/Gardener2D-v0 ...] [--device cuda] [--output FILE]
     python benchmarks/gardens.py --policies --worlds 1 1024        speed alone
 
-Episodes begin with the seeds of `npa_envs.agents.learning.problem.EVALUATION_SEEDS`, sixteen. Told
-are the mean reward of a step with its standard error over episodes and, of shepherds, how many
-creatures were at their goal and whole in the last step.
+Episodes have the sixteen seeds of `npa_envs.agents.learning.problem.EVALUATION_SEEDS`. Results are
+the mean reward of a step with its standard error over episodes and, for shepherds, the success
+rate.
 
-With `--worlds` the speed of so many worlds is told too: steps of all worlds a second over an
-episode that ends with a reset of all, the median of three. Actions are zero; on CUDA observations
-stay on the device.
+`--worlds` also measures speed: steps of all worlds a second over an episode that ends with a reset
+of all, the median of three. Actions are zero; on CUDA observations stay on the device.
 """
 
 from __future__ import annotations
@@ -41,7 +40,7 @@ POLICIES = ("zero", "random", "scripted", "gradient")
 
 
 def measured(name: str, policy: str, device: str, count: int, steps: int | None) -> dict[str, Any]:
-    """Return what a policy earns in the first episodes of as many seeds."""
+    """Return the rewards of a policy in the first episode of each seed."""
     scripted = ScriptedShepherd if "Shepherd" in name else ScriptedGardener
     makes = (StillGardener, RandomGardener, scripted, GradientGardener)
     limit = steps or gymnasium.spec(name).max_episode_steps

@@ -1,7 +1,6 @@
-"""Perception over the neighbours that `wp.HashGrid` finds: two plain passes, no sorting of ours.
+"""Perception with `wp.HashGrid` in two plain passes: a simple baseline in Warp alone.
 
-What one would write first with Warp alone. The fast kernels are measured against it, and it shares
-with them only the kernel functions W and K.
+It shares only the kernel functions W and K with the library's kernels.
 """
 
 import contextlib
@@ -57,7 +56,7 @@ def grid_fields(x: Tensor, s: Tensor, eps: float) -> GridFields:
 
 @functools.cache
 def _grid(device: torch.device, scalar: Any, depth: int) -> Any:
-    """Return the hash grid of a kind, which every call fills anew."""
+    """Return the cached hash grid of a kind, which each call rebuilds."""
     make: Any = wp.HashGrid
     return make(GRID_CELLS, GRID_CELLS, depth, device=warp_device(device), dtype=scalar)
 

@@ -1,11 +1,11 @@
-"""Kills of one process of a run of several, at random moments: what each leaves behind.
+"""Kill one process of a distributed run at random times, and check what is left.
 
     python benchmarks/kills.py --out benchmarks/results/kills_cpu.jsonl
     python benchmarks/kills.py --device cuda --preset paper --interval 50 --kills 1
 
 A line is a JSON object: the last iteration in the log when the process was killed, that of the
 checkpoint, seconds from the kill to the launcher's end, its exit code, and processes left over.
-Each run goes on from the checkpoint of the one before, with `--resume auto`.
+Each run continues from the checkpoint of the one before, with `--resume auto`.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ def main() -> None:
 def killed(
     folder: RunFolder, told: argparse.Namespace, chance: random.Random, before: int
 ) -> dict[str, float]:
-    """Start or resume the run, kill one of its processes, and return what that left."""
+    """Start or resume the run, kill one of its processes, and return the record of it."""
     words = ["train", "morphogenesis2d", "--preset", told.preset, "--out", str(folder.path)]
     words += ["--processes", str(told.processes), "--device", told.device, "--resume", "auto"]
     words += ["--iterations", "1000000", "--checkpoint-interval", str(told.interval)]

@@ -2,13 +2,13 @@
 
     python benchmarks/large_worlds.py --out results.json
 
-Worlds are as dense as those of `npa-envs bench` (66 neighbours), with 16 channels and an untrained
-rule of 128 hidden units. Memory is all that torch has held, worlds at the beginning included.
+Worlds have the density of `npa-envs bench` (66 neighbours), 16 channels and an untrained rule with
+128 hidden units. Memory is the peak allocated by torch, with the worlds.
 
-The last line is a check. Copies of a world of 2^20 particles, too far from each other to be seen,
-make one of 1e8: after one step of all particles and after two each copy must be what the one at
-the origin is, up to rounding. Far from it coordinates are rounded after the first step, and that
-can move a moment matrix over the threshold of its inverse: a few particles may differ by much.
+The last line is a check. A world of 1e8 particles consists of copies of one of 2^20 that do not
+perceive each other: after one and two steps of all particles each copy must equal the one at the
+origin, up to rounding. Far from the origin coordinates are rounded more, which can move a moment
+matrix over the threshold of its inverse, so that a few particles may differ by much.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ TRAINING = (2**22, 2**24)
 def measured(
     particle_count: int, steps: int, device: torch.device, *, train: bool
 ) -> dict[str, object]:
-    """Return what a rollout of a world takes."""
+    """Return time and memory of a rollout of a world."""
     workload = Workload(2, 1, particle_count, steps)
     torch.cuda.reset_peak_memory_stats(device)
     x, s = workload.worlds(device)
@@ -67,7 +67,7 @@ def checked(copies: int, particle_count: int, device: torch.device) -> dict[str,
     """Return how far copies within one world are from the one at the origin, after two steps."""
     workload = Workload(2, 1, particle_count, 2)
     x, s = workload.worlds(device)
-    # On a grid of 2^-14, places of copies are numbers of float32.
+    # On a grid of 2^-14, positions of copies are exact in float32.
     x = (x * 2.0**14).round() / 2.0**14
     rule = workload.rule(device)
     draws = torch.Generator(device).manual_seed(3)

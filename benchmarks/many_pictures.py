@@ -1,10 +1,10 @@
-"""One rule of many pictures, beside rules of one picture of the same recipe.
+"""Rules of many pictures compared with rules of one picture of the same recipe.
 
-`pictures` draws emoji that no other experiment uses, to train on and to hold out; `ways` trains the
-same pictures with three ways to tell a rule its code; `train` trains rules of many pictures (KINDS)
-and controls of one picture each, side by side; `measure` runs all of them on seeds that training
-never saw: losses with the right code, with that of another picture and after a switch, and PSNR of
-what an encoder grows from pictures that it never saw. Each writes what it found to OUT as it goes.
+`pictures` draws emoji that no other experiment uses, for training and held out; `ways` trains on
+the same pictures with three ways to give a rule its code; `train` trains rules of many pictures
+(KINDS) and controls of one picture each, in parallel; `measure` runs all of them on unseen seeds:
+losses with the right code, with another code and after a switch, and PSNR of pictures grown by
+codes of an encoder. Each writes its results to OUT.
 
     python benchmarks/many_pictures.py pictures --out PICTURES
     python benchmarks/many_pictures.py ways --targets FOLDER --out OUT
@@ -68,7 +68,7 @@ MANY_FIELDS = (
     "switch_share",
     "weight_decay",
 )
-"""What rules of many pictures may be told besides."""
+"""Further options of rules of many pictures."""
 
 SEEDS = tuple(range(1000, 1004))
 """Seeds of the worlds that rules are measured on."""
@@ -77,7 +77,7 @@ STEP = PICTURE_CHECKPOINTS[1]
 """Steps after which rules are compared with each other."""
 
 TRAINED, HELD_OUT = 60, 20
-"""Pictures that `pictures` draws, where `--count` does not ask for more to train on."""
+"""Default numbers of pictures for training, and held-out ones."""
 
 
 def draw_pictures(arguments: argparse.Namespace) -> None:
@@ -139,7 +139,7 @@ WAYS: Mapping[str, type[npa_envs.NPARule]] = {
     "film": Film,
     "hypernetwork": Hyper,
 }
-"""Ways to tell a rule its code: as further perceived channels alone, or besides as these do."""
+"""Ways to give a rule its code: only as further perceived channels, or also as these."""
 
 
 class WayTask(ManyPictures):
@@ -156,7 +156,7 @@ class WayTask(ManyPictures):
 
 
 def fields_of(arguments: argparse.Namespace) -> dict[str, Any]:
-    """Return what all runs of a call are told."""
+    """Return the settings of all runs of a call."""
     if arguments.size == "local":
         fields = dict(LOCAL)
     elif arguments.size == "fast":
@@ -183,7 +183,7 @@ def base_of(arguments: argparse.Namespace) -> str:
 
 
 def many_fields(arguments: argparse.Namespace) -> dict[str, Any]:
-    """Return what rules of many pictures are told besides."""
+    """Return the further settings of rules of many pictures."""
     fields: dict[str, Any] = {"targets": tuple(arguments.targets)}
     for name in MANY_FIELDS:
         value = getattr(arguments, name)
@@ -195,7 +195,7 @@ def many_fields(arguments: argparse.Namespace) -> dict[str, Any]:
 
 
 def ways(arguments: argparse.Namespace) -> None:
-    """Train the pictures by each way, and measure what came of it."""
+    """Train and measure rules of the pictures by each way."""
     found: dict[str, Any] = {}
     for name in arguments.kinds or WAYS:
         told = fields_of(arguments) | many_fields(arguments)
@@ -218,7 +218,7 @@ def ways(arguments: argparse.Namespace) -> None:
 
 
 def record(arguments: argparse.Namespace, found: Mapping[str, Any]) -> dict[str, Any]:
-    """Return what a record says."""
+    """Return the content of a record."""
     told = {
         name: [str(Path(one).name) for one in value] if name == "targets" else value
         for name, value in vars(arguments).items()
@@ -252,7 +252,7 @@ def median_losses(rows: Sequence[Mapping[str, Any]]) -> dict[int, str]:
 
 
 def train(arguments: argparse.Namespace) -> None:
-    """Train rules of many pictures, and then the controls side by side.
+    """Train rules of many pictures, and then the controls in parallel.
 
     With `--many-seconds` the rules of many pictures train for so long, and their cosines fall with
     the time. `--share K N` trains every Nth control from the Kth on.
@@ -281,7 +281,7 @@ def train(arguments: argparse.Namespace) -> None:
 
 @torch.no_grad()
 def measure(arguments: argparse.Namespace) -> None:
-    """Measure all rules that lie in the folder."""
+    """Measure all rules in the folder."""
     found: dict[str, Any] = {}
     device = arguments.device
     for path in sorted(arguments.out.glob("*.safetensors")):
@@ -343,7 +343,7 @@ def switched_rows(
 
 
 def control_rows(rule: npa_envs.NPARule, config: Any, device: str) -> list[dict[str, Any]]:
-    """Return what a rule of one picture grows."""
+    """Return the worlds of a rule of one picture."""
     task = Morphogenesis2D(config, device=device)
     rows = []
     worlds = grown(rule, [task], seeds=SEEDS, device=device)
@@ -357,7 +357,7 @@ def control_rows(rule: npa_envs.NPARule, config: Any, device: str) -> list[dict[
 def held_out_rows(
     rule: npa_envs.NPARule, config: Any, held_out: Sequence[str], device: str
 ) -> list[dict[str, Any]]:
-    """Return what a rule grows from pictures that only its encoder sees.
+    """Return the worlds of a rule for unseen pictures, by its encoder.
 
     Beside it the PSNR of a blank picture, and of the trained picture that comes closest.
     """
@@ -373,7 +373,7 @@ def held_out_rows(
 def floors(
     row: PictureRow, task: Morphogenesis2D, known: Sequence[Morphogenesis2D]
 ) -> dict[str, Any]:
-    """Return how close a blank picture and the closest trained picture come to a target [dB]."""
+    """Return the PSNR of a blank and of the closest trained picture to a target [dB]."""
     target = task.target_picture
     blank = psnr(torch.zeros_like(target)[None], target).item()
     nearest = max(known, key=lambda other: psnr(other.target_picture[None], target).item())
@@ -405,7 +405,7 @@ def ratios_of(found: Mapping[str, Any]) -> dict[str, float]:
 
 
 def main() -> None:
-    """Do what the command line asks for."""
+    """Run the command line."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )

@@ -1,10 +1,10 @@
-"""Recipes of 3D morphogenesis compared, and meshes that none of them was developed on.
+"""Recipes of 3D morphogenesis compared on meshes that they were not developed on.
 
-An arm is a recipe with one choice changed. `run` trains arms on meshes, several side by side,
-and measures the rules as `npa-envs evaluate` does, on seeds that training never saw. Every finished
-run is a line of JSON with its rule and a picture: four held-out views of the target, and of one
-world after 128 steps and at the end. `draw` writes the unseen meshes as files, `particles` asks how
-well particles can draw a mesh without any rule, `report` prints the runs as a table.
+An arm is a recipe with one change. `run` trains arms on meshes, several in parallel, and evaluates
+the rules as `npa-envs evaluate` on unseen seeds. Every finished run is a line of JSON with its rule
+and a picture: four held-out views of the target, and of one world after 128 steps and at the end.
+`draw` writes the unseen meshes as files, `particles` fits particles to a mesh without a rule,
+`report` prints the runs as a table.
 
     python benchmarks/meshes.py draw --out MESHES
     python benchmarks/meshes.py run --out OUT --device cuda --targets rocket --arms recipe
@@ -79,10 +79,10 @@ RECIPE: Fields = {
     "sigma": 0.012,
     "opacity": 0.4,
 }
-"""The candidate, laid over the preset `paper`: what 2D learned, and a rule that has grown."""
+"""The candidate as changes of the preset `paper`: findings of 2D, and an initial rule."""
 
 FEWER: Fields = {"particle_count": 8192, "eps": 0.126, "sigma": 0.014, "opacity": 0.6}
-"""Half of the particles, which see as many neighbours and cover as much."""
+"""Half of the particles, with the same number of neighbours and covered area."""
 
 FEWEST: Fields = {"particle_count": 4096, "eps": 0.159, "sigma": 0.016, "opacity": 0.8}
 """A quarter."""
@@ -162,7 +162,7 @@ FAST_NOW: Fields = {
     "stillness_min_age": 48,
     "stillness_weight": 0.5,
 }
-"""The preset `fast` of today, but for its iterations; seeds come by max_age_range."""
+"""The current preset `fast` with other iterations; seeds enter by max_age_range."""
 
 FAST_ARMS: Mapping[str, Fields] = {
     "fast": {},
@@ -296,7 +296,7 @@ def run(arguments: argparse.Namespace) -> None:
 
 
 def configuration(arguments: argparse.Namespace, arm: str, target: str) -> TrainConfig[Any]:
-    """Return what a run is told."""
+    """Return the settings of a run."""
     name = f"{arm.replace(',', '').replace(' ', '_')}-{Path(target).stem}{arguments.label}"
     fixed = {"tensorboard": False, "picture_interval": 0, "checkpoint_interval": 10**9}
     fixed |= {"target": target, "device": arguments.device, "out": arguments.runs / name}
@@ -325,7 +325,7 @@ def rule_for(source: str, eps: float, folder: Path) -> str:
 
 
 def own_changes(arguments: argparse.Namespace, arm: str) -> dict[str, Any]:
-    """Return what a run changes of its preset."""
+    """Return the settings that a run changes in its preset."""
     fast = arguments.size == "fast"
     own = FAST_BEFORE | FAST_ARMS[arm] if fast else RECIPE | ARMS[arm]
     if arm == "best":
@@ -373,7 +373,7 @@ def measure(
     seconds: float,
     together: int,
 ) -> None:
-    """Measure what was trained, and write what became of it."""
+    """Measure a trained rule, and write the results."""
     out, config = arguments.out, trainer.config
     rule = trainer.kept_rule
     save_rule(rule, out / f"{config.out.name}.safetensors", metadata=context_info(trainer))
@@ -407,7 +407,7 @@ def measure(
 
 
 def context_info(trainer: Trainer) -> dict[str, str]:
-    """Return what a rule's file says of the task that it was trained on."""
+    """Return the task configuration in a rule's file."""
     told = config_to_dict(trainer.config)
     told = {name: told[name] for name in told if name not in ("out", "device", "initial_rule")}
     return {
@@ -418,7 +418,7 @@ def context_info(trainer: Trainer) -> dict[str, str]:
 
 
 def origin(arguments: argparse.Namespace) -> dict[str, str]:
-    """Return what a line says of where it was made."""
+    """Return the facts of a line: machine and commit."""
     commit = arguments.commit or current_commit()
     made_on = machine(torch.device(arguments.device))
     return {"commit": commit, "date": date.today().isoformat(), "machine": made_on}
@@ -481,7 +481,7 @@ def report(arguments: argparse.Namespace) -> None:
 
 
 def main() -> None:
-    """Read the arguments and do what they say."""
+    """Run the command line."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("what", choices=("draw", "run", "particles", "report"))
     parser.add_argument("--out", type=Path, required=True)
@@ -498,7 +498,7 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=len(SEEDS), help="worlds to measure")
     parser.add_argument("--longest", type=float, help="seconds of a run, at most")
     parser.add_argument("--clock", type=float, help="seconds of a cosine that follows the time")
-    parser.add_argument("--together", type=int, default=1, help="runs side by side")
+    parser.add_argument("--together", type=int, default=1, help="runs in parallel")
     parser.add_argument("--seconds", type=float, default=1e9, help="begin no run later")
     parser.add_argument("--commit", help="what the lines name, where files are no checkout")
     parser.add_argument("--device", default="cpu")

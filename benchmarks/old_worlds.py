@@ -1,4 +1,4 @@
-"""Worlds that recipes.py has grown, when they are old: what their decay is, and their bounds."""
+"""Decay and bounds of worlds of recipes.py after many steps."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ def least_loss(task: Morphogenesis2D, x: Tensor, s: Tensor, motion: str) -> floa
 
 
 def follow(arguments: argparse.Namespace) -> None:
-    """Print what of one world's loss, as it grows old, lies in motions of the whole."""
+    """Print the part of an old world's loss that is due to motion of the whole world."""
     rule = load_rule(arguments.rule)
     task = Morphogenesis2D(preset(arguments.preset, target=arguments.target).task)
     generator = torch.Generator().manual_seed(SEEDS[0])
@@ -140,7 +140,7 @@ def endurance(
 
 
 def grown_rules(arguments: argparse.Namespace) -> Iterator[tuple[str, NPARule, Morphogenesis2D]]:
-    """Yield the rules that `run` has left: name of the picture, rule, and what it should grow."""
+    """Yield the rules of `run`: name of the picture, rule, and task."""
     device = torch.device(arguments.device)
     for path in sorted(arguments.out.glob("rule-*.safetensors")):
         picture = next(p for p in arguments.pictures.glob("*.png") if f"-{p.stem}-" in path.name)

@@ -2,7 +2,7 @@
 
     python benchmarks/precisions.py gecko dots digits --device cuda
 
-prints what the metric of rules at their horizon is in each precision, over that of float32.
+prints the metric of rules at their horizon in each precision, over that of float32.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from npa_envs.training.trained_tasks import task_of_rule
 from npa_envs.world.rollout import rollout
 
 HORIZONS = {"morphogenesis3d": 128, "point_classification": 32}
-"""Steps after which rules of a task are judged; of others 512."""
+"""Steps after which rules of a task are measured; default 512."""
 
 
 class TorchRule(NPARule):

@@ -1,4 +1,4 @@
-"""What is told to the runs that recipes.py compares: sizes of worlds, arms, seeds, one run."""
+"""Settings of the runs of recipes.py: sizes of worlds, arms, seeds."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ SEEDS = tuple(range(1000, 1008))
 """Seeds of the worlds that rules are measured on."""
 
 QUARTERS = (0.2, 0.4, 0.6, 0.8)
-"""Milestones of the paper's schedule, as shares of its length."""
+"""Milestones of the paper's schedule, as fractions of its length."""
 
 Fields = Mapping[str, Any]
 
@@ -278,7 +278,7 @@ class Run:
 def configuration(
     run: Run, picture: Path, out: Path, device: str, changes: Fields
 ) -> Morphogenesis2DTrainConfig:
-    """Return what a run is told."""
+    """Return the settings of a run."""
     fields: dict[str, Any] = {"repeats": 1, "tensorboard": False, "picture_interval": 0}
     if run.size == "fast":
         fields |= FAST_BEFORE | FAST_ARMS[run.arm]

@@ -1,9 +1,9 @@
-"""Recipes of training compared: choices switched on and off, on pictures that nobody tuned for.
+"""Recipes of training compared: choices switched on and off, on random emoji.
 
 An arm is a recipe with one choice changed. `run` trains every arm on every picture of a folder and
 measures the rules as `npa-envs evaluate --healing` does, with seeds that training never saw; on a
 GPU several runs share the device, each on a stream of its own. Every finished run is a line of
-JSON, so that a stopped call goes on where it was. `pictures` draws the emoji; `warm-up` compiles
+JSON, so that a stopped call can continue. `pictures` draws the emoji; `warm-up` compiles
 all kernels and tests that runs side by side learn bit for bit what they learn alone; `merge` makes
 one record, one sheet of pictures and one archive of rules of what several processes left; `report`
 prints the tables and draws the figure; `sync_with` says what the decay of a rule's world is; `long`
@@ -67,7 +67,7 @@ SIDE_BY_SIDE = 6
 """Runs of which the first is compared with one that has the device for itself."""
 
 PACES: Mapping[str, Sequence[int]] = {"small": (1, 6), "full": (1, 3)}
-"""How many runs side by side are timed."""
+"""Numbers of parallel runs to time."""
 
 
 def train_side_by_side(
@@ -79,7 +79,7 @@ def train_side_by_side(
     """Train several rules, an iteration of each in turn; return the trainers and the seconds.
 
     Args:
-        configs: What they are told.
+        configs: Their settings.
         longest: Stop after this time [s], finished or not.
         kept: Folder that the rules are copied to every 512 iterations and at the end, by the names
             of the runs' folders.
@@ -144,7 +144,7 @@ def measured(trainer: Trainer, size: str, last_step: int = LAST) -> dict[str, An
 
 @torch.no_grad()
 def strip(trainer: Trainer, steps: Sequence[int]) -> np.ndarray[Any, Any]:
-    """Return pictures of the target and of one world as it grows, side by side."""
+    """Return a strip of pictures of the target and of one world as it grows."""
     task: Any = trainer.task
     rule = trainer.kept_rule
     device = torch.device(trainer.config.device)
@@ -161,7 +161,7 @@ def strip(trainer: Trainer, steps: Sequence[int]) -> np.ndarray[Any, Any]:
 
 
 def read_lines(folder: Path) -> list[dict[str, Any]]:
-    """Return the finished runs that lie in a folder."""
+    """Return the finished runs in a folder."""
     merged = folder / "recipes.json"
     lines: list[dict[str, Any]] = []
     if merged.exists():
@@ -248,7 +248,7 @@ def run_all(arguments: argparse.Namespace) -> None:
 
 
 def warm_up(arguments: argparse.Namespace) -> None:
-    """Compile kernels, and see whether runs side by side learn what they learn alone."""
+    """Compile kernels, and check that parallel runs learn the same as alone."""
     arguments.out.mkdir(parents=True, exist_ok=True)
     sizes = ["tiny"] if arguments.tiny else ["small", "full", "fast"]
     target = Path("gecko")
@@ -290,7 +290,7 @@ def warm_up(arguments: argparse.Namespace) -> None:
 
 
 def merge(arguments: argparse.Namespace) -> None:
-    """Make one record, one sheet and one archive of what several processes left in a folder."""
+    """Merge the results of several processes into one record, one sheet and one archive."""
     out: Path = arguments.out
     record = {"machine": machine(torch.device(arguments.device)), "runs": read_lines(out)}
     write_record(out / "recipes.json", record)
@@ -365,7 +365,7 @@ def _loss(run: Mapping[str, Any], step: int) -> float | None:
 
 
 def report(arguments: argparse.Namespace) -> None:
-    """Print the tables of a record, and draw its figure where asked."""
+    """Print the tables of a record, and draw its figure if requested."""
     runs = json.loads(arguments.record.read_text("utf-8"))["runs"]
     if arguments.figure:
         write_bytes(arguments.figure, draw(runs))
@@ -375,7 +375,7 @@ def report(arguments: argparse.Namespace) -> None:
 
 
 def main() -> None:
-    """Do what the command line says."""
+    """Run the command line."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )

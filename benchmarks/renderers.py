@@ -119,7 +119,7 @@ def compared(task: object, x: Tensor, s: Tensor, cameras: object) -> dict[str, o
 
 
 def main() -> None:
-    """Print what both renderers make of a seed and of a grown world."""
+    """Compare both renderers on a seed and on a grown world."""
     print(f"gsplat {gsplat.__version__}, torch {torch.__version__}, {torch.cuda.get_device_name()}")
     rule = npa_envs.load_rule("duck-v0", device=DEVICE).requires_grad_(False)
     task = task_of_rule("duck-v0", rule, DEVICE).task

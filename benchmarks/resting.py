@@ -27,7 +27,7 @@ STEPS, READINGS = 512, 3
 
 
 def measured(source: str, device: torch.device) -> dict[str, Any]:
-    """Return what a rollout of a rule's world takes at each age."""
+    """Return the time of a rollout of a rule's world at each age."""
     rule = load_rule(source, device=device).float()
     task = task_of_rule(source, rule, device).task
     generator = torch.Generator(device).manual_seed(0)
@@ -64,7 +64,7 @@ def measured(source: str, device: torch.device) -> dict[str, Any]:
 
 
 def main() -> None:
-    """Measure, print, and write a record where asked."""
+    """Measure, print, and write a record if requested."""
     parser = script_parser((__doc__ or "").split("\n")[0])
     parser.add_argument("rules", nargs="+", metavar="RULE", help="names or files of rules")
     given = parser.parse_args()

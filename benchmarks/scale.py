@@ -71,7 +71,7 @@ class Run:
     Args:
         sharing: The processes that train it.
         worlds: Worlds of the whole batch.
-        told: What was asked for.
+        told: The command's options.
         folder: Where the run is written to.
     """
 
@@ -151,7 +151,7 @@ class Run:
         }
 
     def line(self, told: argparse.Namespace) -> dict[str, object]:
-        """Return what was measured."""
+        """Return the measurements."""
         return {
             "processes": self._sharing.count if self._sharing.together else "alone",
             "worlds": self._worlds,

@@ -36,7 +36,7 @@ FRESH_SEEDS = (1_000_000, 1_000_001)
 """Worlds that no search saw."""
 
 GOOD = 0.05
-"""Elites of at least this quality are counted besides."""
+"""Elites of at least this quality are also counted separately."""
 
 CURVES = {"qd_score": "QD score", "coverage": "coverage", "best": "best quality"}
 
@@ -44,7 +44,7 @@ COLOURS = {"map-elites": "C0", "cma-me": "C1", "cma-es": "C2", "random": "C7"}
 
 
 def run(arguments: Any) -> None:
-    """Run all searches, one seed after the other, and write what they came to after each."""
+    """Run all searches, one seed after the other, and write the results after each."""
     world = SearchWorld(particle_count=arguments.particles)
     facts = {
         **script_facts(arguments),
@@ -113,7 +113,7 @@ def draw(arguments: Any) -> None:
 
 
 def figures_of(run: dict[str, Any]) -> dict[str, float]:
-    """Return what a search came to, by the table's headings."""
+    """Return the results of a search by the table's headings."""
     grown, fresh = Growth(*run["growth"][-1]), Growth(*run["fresh_worlds"])
     good = sum(quality >= GOOD for quality in run["qualities"])
     return {
@@ -127,7 +127,7 @@ def figures_of(run: dict[str, Any]) -> dict[str, float]:
 
 
 def main() -> None:
-    """Do what the command line asks for."""
+    """Run the command line."""
     parser = script_parser(__doc__)
     parser.add_argument("command", choices=("run", "draw"))
     parser.add_argument("--out", type=Path, default=Path("runs/searches"))

@@ -1,4 +1,4 @@
-"""Runs that share a device, each on a stream of its own: what other scripts train by."""
+"""Parallel runs on one device, each on a separate CUDA stream, for other scripts."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from npa_envs.training import Trainer
 
 
 def stream_of(device: str | torch.device) -> Any:
-    """Return a stream of one's own on a device; on a CPU what stands for one."""
+    """Return a context with a new CUDA stream of a device; on a CPU an empty one."""
     device = torch.device(device)
     return torch.cuda.Stream(device) if device.type == "cuda" else contextlib.nullcontext()
 

@@ -23,12 +23,12 @@ MOST_PAIRS = {
 """Pairs B N² that quadratic strategies are given; one takes dense torch about a kilobyte."""
 
 SEARCH_BLOCK = 1024
-"""Particles whose distances to all others are held at a time."""
+"""Particles whose distances to all others are in memory at a time."""
 
 
 @dataclass(frozen=True)
 class Strategy:
-    """One way to compute what every particle perceives, at eps0 = eps in open space."""
+    """One way to compute the perception of all particles, with eps0 = eps in open space."""
 
     name: str
     """What the command line calls it."""
@@ -39,7 +39,7 @@ class Strategy:
     differentiable: bool
     """Whether gradients flow from z to s."""
     capturable: bool
-    """Whether a CUDA graph can hold it."""
+    """Whether a CUDA graph can record it."""
 
     def obstacle(self, x: Tensor) -> str | None:
         """Return why it has nothing to measure on worlds like `x`; None where it has."""

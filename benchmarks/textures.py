@@ -38,13 +38,13 @@ from npa_envs.training.trained_tasks import task_of_rule
 from npa_envs.world.recorded import release_recordings
 
 SEEDS = tuple(range(1_000_000, 1_000_008))
-"""Seeds of the worlds that rules are judged on."""
+"""Seeds of the worlds for the judge."""
 
 
 def measured(
     rule: NPARule, task: Texture, steps: Sequence[int], device: str, seeds: Sequence[int]
 ) -> tuple[dict[str, list[dict[str, Any]]], np.ndarray[Any, Any]]:
-    """Return what `npa-envs evaluate --judge` says, and the target and a world side by side."""
+    """Return the rows of `npa-envs evaluate --judge`, and a picture of target and world."""
     judge = TextureJudge(task)
     judged: list[JudgeRow] = []
     frames = [task.target_picture[None].cpu()]
@@ -69,7 +69,7 @@ def told(tables: dict[str, list[dict[str, Any]]]) -> str:
 
 
 def run(arguments: argparse.Namespace) -> None:
-    """Train and judge, all runs side by side."""
+    """Train and judge all runs in parallel."""
     out: Path = arguments.out
     out.mkdir(parents=True, exist_ok=True)
     changes = json.loads(arguments.fields)
@@ -127,7 +127,7 @@ def run(arguments: argparse.Namespace) -> None:
 
 
 def particles(arguments: argparse.Namespace) -> None:
-    """Let positions and colours themselves follow each loss, and judge where they come to."""
+    """Optimise positions and colours without a rule by each loss, and judge the results."""
     out: Path = arguments.out
     out.mkdir(parents=True, exist_ok=True)
     device = torch.device(arguments.device)
@@ -183,7 +183,7 @@ def frames_of(strip: Path) -> list[np.ndarray[Any, Any]]:
 
 
 def figures(arguments: argparse.Namespace) -> None:
-    """Draw each target with what its rule has grown, or with what each loss has brought."""
+    """Draw each target with the worlds of its rule, or of each loss."""
     captions, frames = [], []
     for target in arguments.targets:
         found = [
@@ -217,7 +217,7 @@ def report(arguments: argparse.Namespace) -> None:
 
 
 def main() -> None:
-    """Read the arguments and do what they say."""
+    """Run the command line."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("what", choices=("run", "particles", "report", "figures"))
     parser.add_argument("--out", type=Path, required=True)

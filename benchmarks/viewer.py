@@ -47,7 +47,7 @@ def served(rule: str, folder: Path, device: str) -> Iterator[str]:
 
 
 def drawn(address: str, seconds: float, grown: int, folder: Path) -> str:
-    """Return what a browser draws of the world at an address."""
+    """Return the frame rate of a browser that draws the world at an address, as text."""
     with browser(folder / "profile") as new_page:
         page = new_page()
         page.open(address, DESK)
@@ -64,7 +64,7 @@ def drawn(address: str, seconds: float, grown: int, folder: Path) -> str:
 
 
 def taken(address: str, seconds: float, grown: int) -> str:
-    """Return what a reader that draws nothing gets of the world at an address."""
+    """Return the frame rate of a reader that draws nothing, as text."""
     site = address.partition("?")[0].rstrip("/")
     times, spent, count = [], [], 0
     with connect(site.replace("http", "ws", 1) + "/socket", origin=site, max_size=None) as socket:

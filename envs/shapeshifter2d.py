@@ -154,6 +154,7 @@ class ShapeshifterTask(RuleDriven, PictureEnvTask[Shapeshifter2DEnvConfig]):
 
     config_type = Shapeshifter2DEnvConfig
     form_type = CodeForm
+    actor = "codes"
     context_count = 1 + GOAL_COUNT
     goal: ManyPictures
 

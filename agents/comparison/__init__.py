@@ -1,5 +1,5 @@
 """Methods compared on the same tasks, from the same seeds, for the same budget.
 
-Behind `npa-envs compare`: `plan` says what is run, `run` spreads the runs over processes and is
-what each of them does and records, and `report` shows it.
+For `npa-envs compare`: `plan` lists the runs, `run` distributes them over processes and has the
+program of such a process, and `report` makes tables and pictures.
 """

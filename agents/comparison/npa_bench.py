@@ -1,9 +1,9 @@
 """NPA-Bench v0: frozen problems and budgets, rows of results as JSON files, and their scores.
 
-There are two suites by one protocol, one for a GPU and a small one for a laptop. A row holds the
-results of one method in a suite: for each problem the returns of at least `LEAST_SEEDS` runs. It is
-a file that follows `npa_bench_v0.schema.json`, whoever wrote it. Scores follow from the files
-alone: those of the methods `zero` and `gradient` are 0 and 1.
+There are two suites, one for a GPU and a small one for a laptop. A row contains the results of one
+method in a suite: for each problem the returns of at least `LEAST_SEEDS` runs. It is a JSON file by
+`npa_bench_v0.schema.json`. Scores are computed from rows only; the methods `zero` and `gradient`
+have the scores 0 and 1.
 """
 
 from __future__ import annotations
@@ -40,22 +40,22 @@ METHODS = {
     "random": "acts at random",
     "zero": "does nothing",
 }
-"""Methods in a sentence each; one that cannot learn a problem is left out there."""
+"""Descriptions of the methods; problems that a method cannot learn are left out."""
 
 EPISODES = 32
-"""Held-out episodes of a run at its end."""
+"""Held-out episodes after a run."""
 
 LEAST_SEEDS = 5
-"""Runs of a method on a problem, at least, from different seeds."""
+"""Least runs of a method on a problem, from different seeds."""
 
 EXCESS = 1.25
-"""A run may take so many times its budget, as the last iteration is not cut off."""
+"""Most particle-steps of a run over its budget, which the last iteration may exceed."""
 
 SCHEMA = Path(__file__).with_name("npa_bench_v0.schema.json")
 
 
 class BenchProblem(NamedTuple):
-    """A problem: episodes, worlds to learn in, the hidden layer of new rules, and the budget."""
+    """Fields of a `Problem`, and its budget."""
 
     episode_steps: int
     num_envs: int
@@ -64,7 +64,7 @@ class BenchProblem(NamedTuple):
 
 
 QUICK_SHARE = 1e-3
-"""Share of the budgets that quick runs have, which only show that all runs."""
+"""Factor on the budgets of quick runs, which only test that everything runs."""
 
 LEFT_OUT = frozenset({("npa/PointClassificationSmall-v0", "scripted")})
 """Pairs of a problem and a method that are not run: no scripted policy classifies."""
@@ -72,7 +72,7 @@ LEFT_OUT = frozenset({("npa/PointClassificationSmall-v0", "scripted")})
 
 @dataclass(frozen=True)
 class Suite:
-    """Problems by their ids with their budgets: frozen, as changed ones make another version."""
+    """Problems and budgets by ids, in groups; a change would make another version."""
 
     name: str
     groups: Mapping[str, Mapping[str, BenchProblem]]
@@ -84,17 +84,17 @@ class Suite:
 
     @property
     def tasks(self) -> dict[str, str]:
-        """Ids by the names of tasks."""
+        """Ids by task names."""
         return {task_name(env_id): env_id for env_id in self.entries}
 
     @property
     def methods(self) -> list[str]:
-        """Methods that learn one of the problems at least."""
+        """Methods that can learn at least one of the problems."""
         suited = [methods_for(self.problem_of(task)) for task in self.tasks]
         return [name for name in METHODS if any(name in table for table in suited)]
 
     def problem_of(self, task: str) -> Problem:
-        """Return the problem of a name of `tasks`."""
+        """Return the problem of a task name."""
         if task not in self.tasks:
             raise NPAError(
                 f"unknown task {shown(task)} of {self.name}: {suggest(task, self.tasks)}"
@@ -105,33 +105,33 @@ class Suite:
         return Problem(env_id=env_id, **fields)
 
     def leaves_out(self, task: str, method: str) -> bool:
-        """Return whether a method cannot learn a task; "module:function" is taken to learn all."""
+        """Return whether a method cannot learn a task; "module:function" can learn any."""
         if ":" in method:
             return False
         known = methods_for(self.problem_of(task))
         return method not in known or (self.tasks[task], method) in LEFT_OUT
 
     def budget_of(self, task: str, *, quick: bool = False) -> float:
-        """Return the particle-steps that a run may learn from."""
+        """Return the particle-steps of a run."""
         return self.entries[self.tasks[task]].particle_steps * (QUICK_SHARE if quick else 1.0)
 
 
 def task_name(env_id: str) -> str:
-    """Return the name of a problem's task: its id without "npa/"."""
+    """Return the task name of an id: without "npa/"."""
     return env_id.removeprefix("npa/")
 
 
 _PARTICLES = {
     "npa/Morphogenesis2DSmall-v0": BenchProblem(32, 16, 64, 5_000_000),
     "npa/Regeneration2DSmall-v0": BenchProblem(24, 16, 64, 5_000_000),
-    # Its loss takes most of the time.
+    # Less, as its loss is slow.
     "npa/TextureSmall-v0": BenchProblem(24, 16, 64, 1_000_000),
     "npa/PointClassificationSmall-v0": BenchProblem(16, 16, 64, 5_000_000),
     "npa/MixingSmall-v0": BenchProblem(32, 16, 64, 5_000_000),
 }
 
 _GARDENS = {
-    # 48 828 steps of worlds, of 8 steps of the rule each.
+    # 48 828 steps of an environment, of 8 steps of the rule each.
     "npa/Gardener2DSmall-v0": BenchProblem(32, 64, 64, 100_000_000),
     "npa/Shepherd2DSmall-v0": BenchProblem(32, 64, 64, 100_000_000),
 }
@@ -146,7 +146,7 @@ _SMALL = {
     "npa/CoMorphogenesisSmall-v0": BenchProblem(32, 16, 64, 500_000),
     "npa/SymbiosisSmall-v0": BenchProblem(32, 16, 64, 1_500_000),
 }
-"""As many particle-steps as a core makes in a minute or less."""
+"""Budgets of at most a minute on a CPU core."""
 
 SUITES: Mapping[str, Suite] = {
     suite.name: suite
@@ -155,8 +155,7 @@ SUITES: Mapping[str, Suite] = {
         Suite("npa-bench-small-v0", {"small": _SMALL}),
     )
 }
-"""Suites by their names. An action has a row for each particle; in gardens a rule runs the
-particles, and its steps count."""
+"""Suites by name. In gardens the particle-steps are those of the rule."""
 
 
 # Rows: results of methods
@@ -172,9 +171,9 @@ class BenchRun:
     mean_return: float
     """Mean return of the held-out episodes; NaN where it diverged."""
     curve: tuple[tuple[float, float], ...] = ()
-    """Particle-steps, and the mean return of other held-out episodes after them."""
+    """Pairs of particle-steps and the mean return of evaluation episodes."""
     machine: str = ""
-    """Its machine, in a row of several machines."""
+    """Machine of the run, in a row of several machines."""
 
 
 @dataclass(frozen=True)
@@ -186,10 +185,10 @@ class BenchRow:
     runs: tuple[BenchRun, ...]
     about: str = ""
     machine: str = ""
-    """Its machine, or several separated by semicolons."""
+    """Machines of the runs, separated by semicolons."""
 
     def returns(self, env_id: str) -> NDArray[np.float64]:
-        """Return the mean returns of its runs on a problem, in the order of their seeds."""
+        """Return the mean returns of the runs on a problem, in the order of their seeds."""
         found = sorted((run for run in self.runs if run.env_id == env_id), key=lambda r: r.seed)
         return np.array([run.mean_return for run in found])
 
@@ -197,10 +196,10 @@ class BenchRow:
 def write_rows(
     suite: Suite, plan: ComparisonPlan, records: Sequence[RunRecord], folder: Path, command: str
 ) -> list[Path]:
-    """Write a file for each method of a suite's plan, METHOD.json, and return the paths.
+    """Write METHOD.json for each method of a suite's plan, and return the paths.
 
-    A file keeps its runs of other problems and seeds. It then names the commands, commits, machines
-    and versions of all of its runs, separated by semicolons.
+    Runs of other problems and seeds in an existing file are kept. It then names the commands,
+    commits, machines and versions of all of its runs, separated by semicolons.
     """
     paths = []
     for method in dict.fromkeys(record.job.method for record in records):
@@ -235,7 +234,7 @@ def write_rows(
 
 
 def check_rows(suite: Suite, plan: ComparisonPlan, folder: Path) -> None:
-    """Check that runs of a plan can be added to the rows in a folder, before any of them is run."""
+    """Check that runs of a plan can be added to the rows in a folder."""
     for method in plan.methods:
         _held_row(suite, plan, method, folder)
 
@@ -243,7 +242,7 @@ def check_rows(suite: Suite, plan: ComparisonPlan, folder: Path) -> None:
 def _held_row(
     suite: Suite, plan: ComparisonPlan, method: str, folder: Path
 ) -> dict[str, Any] | None:
-    """Return a method's row in a folder, None where there is none."""
+    """Return a method's row in a folder as JSON, or None; raises if runs cannot be added."""
     path = folder / f"{method}.json"
     if not path.exists():
         return None
@@ -281,17 +280,17 @@ def _held_row(
 
 
 def _joined(suite: Suite, held: Mapping[str, Any], row: dict[str, Any]) -> dict[str, Any]:
-    """Return a row with those runs of an earlier one that it does not have."""
+    """Return a row with the other runs of an earlier row added."""
     new = {(run["id"], run["seed"]) for run in row["runs"]}
     kept = [dict(run) for run in held["runs"] if (run["id"], run["seed"]) not in new]
     if not kept:
         return row
     added = [dict(run) for run in row["runs"]]
-    for some, where in ((kept, held["machine"]), (added, row["machine"])):
-        # In a row of several machines each run has its own already.
-        if held["machine"] != row["machine"] and ";" not in where:
+    for some, machine in ((kept, held["machine"]), (added, row["machine"])):
+        # In a row of several machines each run names its machine already.
+        if held["machine"] != row["machine"] and ";" not in machine:
             for run in some:
-                run.setdefault("machine", where)
+                run.setdefault("machine", machine)
     order, runs = list(suite.entries), [*kept, *added]
     runs.sort(key=lambda run: (run["seed"], order.index(run["id"]) if run["id"] in order else -1))
     before, now = held.get("versions", {}), row["versions"]
@@ -305,7 +304,7 @@ def _joined(suite: Suite, held: Mapping[str, Any], row: dict[str, Any]) -> dict[
 
 
 def _both(first: str | None, second: str | None) -> str | None:
-    """Return two texts in one, each part once, separated by semicolons."""
+    """Join two lists that are separated by semicolons, without duplicates."""
     if first == second:
         return first
     parts = [part for text in (first, second) for part in str(text).split("; ")]
@@ -338,8 +337,8 @@ def _read_run(held: Mapping[str, Any]) -> BenchRun:
     returns = [number(value) for value in held["returns"]]
     mean = sum(returns) / len(returns) if returns else math.nan
     curve = tuple((at, value) for at, value in held["curve"] if value is not None)
-    where = held.get("machine", "")
-    return BenchRun(held["id"], held["seed"], held["particle_steps"], mean, curve, where)
+    machine = held.get("machine", "")
+    return BenchRun(held["id"], held["seed"], held["particle_steps"], mean, curve, machine)
 
 
 def _check_row(row: BenchRow, name: str) -> None:
@@ -373,7 +372,7 @@ def _check_row(row: BenchRow, name: str) -> None:
 
 
 def read_rows(suite: Suite, folder: Path) -> dict[str, BenchRow]:
-    """Return all rows of a suite's folder by their methods."""
+    """Return all rows of a suite's folder by method."""
     rows: dict[str, BenchRow] = {}
     for path in sorted(folder.glob("*.json")):
         row = read_row(path)
@@ -428,10 +427,10 @@ def interquartile_mean(*samples: NDArray[np.float64], axis: int = -1) -> Any:
 
 
 def score(samples: Sequence[NDArray[np.float64]], seed: int = 0) -> Score:
-    """Return the interquartile mean of the problems' scores, and its interval by bootstrap.
+    """Return the interquartile mean of the problems' scores, and its 95 % interval.
 
-    Seeds are drawn anew within each problem, 2000 times, and percentiles taken: stratified
-    bootstrap (Agarwal et al., arXiv 2108.13264).
+    The interval is by stratified bootstrap, which resamples the runs within each problem, 2000
+    times (Agarwal et al., arXiv 2108.13264).
     """
     try:
         from scipy.stats import bootstrap
@@ -451,7 +450,7 @@ def score(samples: Sequence[NDArray[np.float64]], seed: int = 0) -> Score:
 def scores_in(
     rows: Mapping[str, BenchRow], method: str, env_ids: Iterable[str]
 ) -> dict[str, NDArray[np.float64]]:
-    """Return the scores of a method on those of some problems that it has runs of."""
+    """Return the scores of a method's runs by problem, for the problems that it has runs of."""
     return {
         env_id: normalised(rows, method, env_id)
         for env_id in env_ids

@@ -1,9 +1,8 @@
-"""The plan of a comparison: tasks in sizes at which all methods have a chance, jobs and budgets.
+"""The plan of a comparison: tasks, jobs and budgets.
 
-Worlds are smaller and episodes shorter than the paper's, so that reinforcement learning and
-evolution see many of them within a minute; states have few channels and change in small steps,
-which leaves less to explore. The gradient, which sees through the physics, needs none of this: it
-is the yardstick.
+Tasks are small enough for all methods: worlds are smaller and episodes shorter than the paper's, so
+that reinforcement learning and evolution run many of them in a minute, and states have few channels
+and change in small steps, so that there is less to explore.
 """
 
 from __future__ import annotations
@@ -26,7 +25,7 @@ GROWTH = {
     "state_scale": 0.1,
     "colour_weight": 20.0,
 }
-"""Keywords of both tasks of growth: a heart, wide enough neighbourhoods, small steps."""
+"""Keywords of both tasks of growth: a heart, wide neighbourhoods, small steps."""
 
 PROBLEMS: Mapping[str, Mapping[str, Any]] = {
     "morphogenesis2d": {
@@ -71,16 +70,16 @@ QUICK_KEYWORDS: Mapping[str, Mapping[str, Any]] = {
     "point_classification": {},
     "mixing": WIDER,
 }
-"""Keywords of tiny forms, of 64 particles, for a test that everything runs."""
+"""Keywords of tiny tasks, with 64 particles, to test that everything runs."""
 
 LEFT_OUT = frozenset({("point_classification", "scripted")})
-"""Pairs (task, method) that are compared only when asked for: no scripted policy classifies."""
+"""Pairs (task, method) that do not run by default: no scripted policy classifies."""
 
 QUICK = {"episode_steps": 16, "num_envs": 4, "hidden_dim": 16}
 
 
 def make_problem(name: str, *, quick: bool = False) -> Problem:
-    """Return one of `PROBLEMS`, or its tiny form."""
+    """Return one of `PROBLEMS`; `quick`: a tiny one."""
     if name not in PROBLEMS:
         raise NPAError(f"unknown task {name!r}: {suggest(name, PROBLEMS)}")
     fields = {"num_envs": 32, **PROBLEMS[name]}
@@ -92,12 +91,11 @@ def make_problem(name: str, *, quick: bool = False) -> Problem:
 
 # Every method on every task, from every seed, within every budget.
 
-
 NOTHING, YARDSTICK = "zero", "gradient"
-"""Methods whose mean returns count as 0 and as 1."""
+"""Methods whose mean returns have the scores 0 and 1."""
 
 Axis = Literal["seconds", "particle-steps"]
-"""Budget that is equal for all methods: wall time, or particle-steps."""
+"""Kind of the budget: seconds of wall time, or particle-steps."""
 
 AXES: tuple[Axis, ...] = get_args(Axis)
 
@@ -110,11 +108,11 @@ class Job:
     task: str
     method: str
     seed: int
-    """Seed of the rule's first weights, of training's worlds and of all draws."""
+    """Seed of all random numbers of the run."""
 
     @property
     def folder(self) -> PurePosixPath:
-        """Folder of its results, below the comparison's."""
+        """Folder of its results, relative to the comparison's."""
         return PurePosixPath(self.axis, self.task, self.method, f"seed-{self.seed}")
 
     def __str__(self) -> str:
@@ -130,20 +128,20 @@ class ComparisonPlan:
     methods: Sequence[str]
     seeds: Sequence[int]
     budgets: Mapping[Axis, Mapping[str, float]]
-    """Seconds or particle-steps that each run may take, by axis and task."""
+    """Seconds or particle-steps of each run, by axis and task."""
     options: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
-    """Keyword options by method; others run with their defaults."""
+    """Options by method; other methods have their defaults."""
     own: Mapping[str, str] = field(default_factory=dict)
-    """Methods with names of one's own: a known method, or "module:function"."""
+    """Methods by names that the user gave them: a known method, or "module:function"."""
     left_out: Collection[tuple[str, str]] = ()
     """Pairs (task, method) that are not run."""
     episodes: int = 32
-    """Held-out episodes of each run at its end."""
+    """Held-out episodes after each run."""
     settings: Mapping[str, Any] = field(default_factory=dict)
-    """Other facts that figures depend on: device, machine, runs at once, commit, versions."""
+    """Other facts that results depend on: device, machine, runs at once, commit, versions."""
 
     def jobs(self) -> list[Job]:
-        """Return all runs, one seed after the other, so that a seed is whole for all methods."""
+        """Return all runs in the order of their seeds."""
         return [
             Job(axis, task, method, seed)
             for axis in self.budgets
@@ -153,15 +151,15 @@ class ComparisonPlan:
             if (task, method) not in self.left_out
         ]
 
-    def part(self, words: str | None) -> list[Job]:
-        """Return the runs of one of several machines, as `npa_envs.processes.part_of` says.
+    def part(self, part: str | None) -> list[Job]:
+        """Return the runs of one of several machines, as `npa_envs.processes.part_of`.
 
-        All methods on a task from a seed are on one machine: some begin with what others learned.
+        All methods on a task from a seed run on one machine, as some use rules that others learned.
         """
-        return part_of(self.jobs(), words, lambda job: (job.axis, job.seed, job.task))
+        return part_of(self.jobs(), part, lambda job: (job.axis, job.seed, job.task))
 
     def teacher(self, job: Job) -> Job | None:
-        """Return the run whose rules a run clones, if it does and its options name no teacher."""
+        """Return the run whose rules a run clones; None if it does not, or has another teacher."""
         if self.own.get(job.method, job.method) != "clone":
             return None
         if "teacher" in self.options.get(job.method, {}):
@@ -169,7 +167,7 @@ class ComparisonPlan:
         return replace(job, method="gradient")
 
     def facts(self, job: Job) -> dict[str, Any]:
-        """Return the facts that figures of one of `jobs()` depend on, of JSON's types."""
+        """Return the facts that the results of one of `jobs()` depend on, of JSON's types."""
         return {
             "problem": dict(self.tasks[job.task]),
             "budget": self.budgets[job.axis][job.task],

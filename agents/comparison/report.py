@@ -1,4 +1,4 @@
-"""The report of a comparison: tables of what each method reached, curves, pictures, files."""
+"""The report of a comparison: tables, learning curves and pictures, and their files."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from npa_envs.measure.record import NONE, Record, csv_text, markdown_table, mean
 from npa_envs.render import write_filmstrip
 
 LOST = ("diverged", "left the world")
-"""Endings of episodes that diverged: of worlds, and of species."""
+"""Endings of diverged episodes: of worlds, and of species."""
 
 HEADINGS: Mapping[Axis, str] = {
     "seconds": "Equal wall time",
@@ -40,8 +40,8 @@ def write_table(
     at_once = plan.settings.get("runs_at_once", 1)
     if "seconds" in plan.budgets and at_once > 1:
         shown += (
-            f"\nUp to {at_once} runs at once shared a device: the share of each in its wall time "
-            "is not controlled.\n"
+            f"\nUp to {at_once} runs at once shared a device: their fractions of its time are not "
+            "controlled.\n"
         )
     facts = {"command": command, **asdict(plan), "left_out": sorted(map(list, plan.left_out))}
     write_text(folder / TABLE, f"`{command}`\n\n{shown}")
@@ -51,7 +51,7 @@ def write_table(
 
 
 def write_pictures(records: Sequence[RunRecord], folder: Path) -> list[str]:
-    """Write filmstrips and, where matplotlib is installed, curves; return a line for each file."""
+    """Write filmstrips and, with matplotlib, curves; return a line of text for each file."""
     strips = [f"wrote {path}" for path in write_strips(records, folder)]
     return [*strips, *write_plots(lambda: pictures(records), folder / "curves_*.png", "curves")]
 
@@ -75,7 +75,7 @@ UNKNOWN = Estimate(math.nan, math.nan)
 
 
 def estimate(values: Iterable[float]) -> Estimate:
-    """Return the mean of the finite ones of values, one for each seed, and its standard error."""
+    """Return the mean of the finite values, one for each seed, with its standard error."""
     kept = [value for value in values if math.isfinite(value)]
     if not kept:
         return UNKNOWN
@@ -91,7 +91,7 @@ class ReportRow:
     """The results of a method on a task, over its seeds."""
 
     axis: Axis
-    """The budget that is equal for all methods."""
+    """Kind of the budget."""
     task: str
     method: str
     done: int
@@ -99,9 +99,9 @@ class ReportRow:
     """Runs whose numbers became infinite or NaN."""
     failed: int
     counted: int
-    """Runs whose return is finite: means are over these."""
+    """Runs with a finite return, over which means are taken."""
     episodes_diverged: float
-    """Share of the held-out episodes in which a world diverged; NaN without episodes."""
+    """Fraction of the held-out episodes that diverged; NaN without episodes."""
     final_return: Estimate
     final_loss: Estimate
     fraction: Estimate
@@ -111,19 +111,19 @@ class ReportRow:
 
     @property
     def runs(self) -> int:
-        """All runs."""
+        """Number of runs."""
         return self.done + self.diverged + self.failed
 
 
 def rows(records: Iterable[RunRecord]) -> list[ReportRow]:
-    """Return a row for each method on each task for each axis, in the order of the records."""
+    """Return a row for each axis, task and method, in the order of the records."""
     groups: dict[tuple[Axis, str, str], list[RunRecord]] = {}
     for record in records:
         job = record.job
         groups.setdefault((job.axis, job.task, job.method), []).append(record)
     returns = {key: estimate(r.mean_return for r in some) for key, some in groups.items()}
 
-    def share(key: tuple[Axis, str, str]) -> Estimate:
+    def fraction_of(key: tuple[Axis, str, str]) -> Estimate:
         nothing, yardstick = (
             returns.get((*key[:2], method), UNKNOWN) for method in (NOTHING, YARDSTICK)
         )
@@ -131,10 +131,10 @@ def rows(records: Iterable[RunRecord]) -> list[ReportRow]:
         known = key[2] == YARDSTICK and not math.isnan(found.mean)
         return Estimate(1.0, math.nan) if known else found
 
-    return [_row(some, returns[key], share(key)) for key, some in groups.items()]
+    return [_row(some, returns[key], fraction_of(key)) for key, some in groups.items()]
 
 
-def _row(records: Sequence[RunRecord], reached: Estimate, share: Estimate) -> ReportRow:
+def _row(records: Sequence[RunRecord], final_return: Estimate, of_yardstick: Estimate) -> ReportRow:
     job = records[0].job
     states = [record.status for record in records]
     lasts = [record.curve[-1] for record in records if record.curve]
@@ -150,33 +150,33 @@ def _row(records: Sequence[RunRecord], reached: Estimate, share: Estimate) -> Re
         failed=states.count("failed"),
         counted=sum(math.isfinite(record.mean_return) for record in records),
         episodes_diverged=lost / episodes if episodes else math.nan,
-        final_return=reached,
+        final_return=final_return,
         final_loss=estimate(record.mean_loss for record in records),
-        fraction=share,
+        fraction=of_yardstick,
         seconds=estimate(last.seconds for last in lasts).mean,
         particle_steps=estimate(last.particle_steps for last in lasts).mean,
     )
 
 
-def fraction(reached: Estimate, nothing: Estimate, yardstick: Estimate) -> Estimate:
-    """Return (R - R_nothing) / (R_yardstick - R_nothing) of mean returns R, with both R's error.
+def fraction(result: Estimate, nothing: Estimate, yardstick: Estimate) -> Estimate:
+    """Return (R - R_nothing) / (R_yardstick - R_nothing) of mean returns R, with its error.
 
-    It is not defined where the yardstick is no better than nothing. Errors are propagated to first
-    order; that of R_nothing, which is the same in both differences, is left out.
+    It is NaN if the yardstick is not better than nothing. The errors of R and R_yardstick are
+    propagated to first order; that of R_nothing, which is in both differences, is ignored.
     """
     gain = yardstick.mean - nothing.mean
-    if not gain > 0.0 or math.isnan(reached.mean):
+    if not gain > 0.0 or math.isnan(result.mean):
         return UNKNOWN
-    share = (reached.mean - nothing.mean) / gain
-    spread = math.hypot(reached.standard_error, share * yardstick.standard_error)
+    share = (result.mean - nothing.mean) / gain
+    spread = math.hypot(result.standard_error, share * yardstick.standard_error)
     return Estimate(share, spread / gain)
 
 
-# Rows in words
+# Rows as text
 
 
 def text(table: Sequence[ReportRow]) -> str:
-    """Return rows as tables in Markdown, one for each axis and task."""
+    """Return a table in Markdown for each axis and task."""
     parts = []
     for axis in AXES:
         found = [row for row in table if row.axis == axis]
@@ -222,10 +222,7 @@ def _table(table: Sequence[ReportRow]) -> str:
 
 
 def curves(records: Iterable[RunRecord]) -> str:
-    """Return all learning curves as comma-separated values, a line for each point.
-
-    The curve of a run that failed ends there.
-    """
+    """Return all learning curves as comma-separated values, a line for each point."""
     names = [field.name for field in fields(CurvePoint)]
     lines = [
         [r.job.axis, r.job.task, r.job.method, r.job.seed, r.status, *astuple(point)]
@@ -240,12 +237,12 @@ ACROSS: dict[str, Callable[[CurvePoint], float]] = {
     "particle-steps": lambda point: point.particle_steps,
 }
 
-PLACES = 64
-"""Places along a curve at which seeds are averaged."""
+CURVE_POINTS = 64
+"""Points of a mean curve."""
 
 
 class Curve(NamedTuple):
-    """A mean over seeds at K places: where, the mean, and its standard error, shape [K] each."""
+    """A mean over seeds at K points: abscissa, mean, and standard error, shape [K] each."""
 
     across: NDArray[np.float64]
     mean: NDArray[np.float64]
@@ -254,10 +251,10 @@ class Curve(NamedTuple):
 
 
 def curve(records: Sequence[RunRecord], across: Callable[[CurvePoint], float]) -> Curve | None:
-    """Return the mean of learning curves where they overlap; None where they do not.
+    """Return the mean of learning curves, interpolated linearly, where they overlap, or None.
 
-    Between its points a curve is straight. A method that does not learn has a single point. Runs
-    that broke off are left out, so that they do not cut off the others, unless all did.
+    A method that does not learn has a single point. Failed and diverged runs, whose curves are
+    short, count only if there are no others.
     """
     lines = []
     for record in [record for record in records if record.status == "done"] or records:
@@ -269,7 +266,7 @@ def curve(records: Sequence[RunRecord], across: Callable[[CurvePoint], float]) -
     first, last = max(line[0][0] for line in lines), min(line[0][-1] for line in lines)
     if first > last:
         return None
-    grid = np.linspace(first, last, PLACES if last > first else 1)
+    grid = np.linspace(first, last, CURVE_POINTS if last > first else 1)
     values = np.stack([np.interp(grid, *line) for line in lines])
     error = np.zeros(len(grid))
     if len(lines) > 1:
@@ -278,7 +275,7 @@ def curve(records: Sequence[RunRecord], across: Callable[[CurvePoint], float]) -
 
 
 def pictures(records: Sequence[RunRecord]) -> dict[str, bytes]:
-    """Return PNG files of the curves by their tasks' names. Needs matplotlib."""
+    """Return PNG files of the curves by task. Needs matplotlib."""
     tasks = dict.fromkeys(record.job.task for record in records)
     return {task: _picture([r for r in records if r.job.task == task]) for task in tasks}
 
@@ -308,7 +305,7 @@ def _draw(panel: Any, found: Curve | None, colour: str, name: str) -> None:
     if found is None:
         panel.plot([], [], color=colour, label=name)
     elif len(found.across) == 1:
-        # It does not learn.
+        # The method does not learn.
         (mean,), (error,) = found.mean, found.error
         panel.axhline(mean, color=colour, lw=1.0, ls="--", label=name)
         panel.axhspan(mean - error, mean + error, color=colour, alpha=0.2, lw=0)
@@ -323,7 +320,7 @@ def _draw(panel: Any, found: Curve | None, colour: str, name: str) -> None:
 def write_strips(records: Sequence[RunRecord], folder: Path) -> list[Path]:
     """Write a filmstrip for each task and axis: a column for each method, a row for each seed.
 
-    The pictures of the runs are read from below the comparison's folder.
+    The pictures of the runs are read from the comparison's folder.
     """
     written = []
     for axis in AXES:
@@ -332,11 +329,11 @@ def write_strips(records: Sequence[RunRecord], folder: Path) -> list[Path]:
             found = {(record.job.method, record.job.seed): record for record in some}
             methods = list(dict.fromkeys(method for method, _ in found))
             seeds = sorted({seed for _, seed in found})
-            places = [(method, seed) for seed in seeds for method in methods]
-            frames = [_frame(found.get(place), folder) for place in places]
+            cells = [(method, seed) for seed in seeds for method in methods]
+            frames = [_frame(found.get(cell), folder) for cell in cells]
             captions = [
                 f"{method}, seed {seed}: {_result(found.get((method, seed)))}"
-                for method, seed in places
+                for method, seed in cells
             ]
             written.append(folder / f"grown_{task}_{axis}.png")
             write_filmstrip(written[-1], frames, captions, columns=len(methods))

@@ -1,9 +1,9 @@
-"""Runs of a comparison: each learns, is tested on held-out episodes, leaves a record and a picture.
+"""Runs of a comparison: each learns, is tested on held-out episodes, writes a record and a picture.
 
-They are spread over cores or GPUs, and each may fail by itself: a run has a process,
-`python -m npa_envs.agents.comparison.run FOLDER`, which gets ready, waits for a line on its input
-that names a device, and does there what `request.json` in the folder asks for. Another folder, as
-JSON on a line, and another device are one more run. The process ends when its input does.
+Runs are processes, `python -m npa_envs.agents.comparison.run FOLDER`, on several cores or GPUs. A
+process loads its libraries, waits for a line on its standard input that names a device, and does
+the run of `request.json` in FOLDER. Two more lines, a folder as JSON and a device, start another
+run. The process ends with its input.
 """
 
 from __future__ import annotations
@@ -44,14 +44,14 @@ from npa_envs.render import write_png
 Status = Literal["done", "diverged", "failed"]
 
 RECORD, REQUEST, OUTPUT, PICTURE = "run.json", "request.json", "output.txt", "picture.png"
-"""Files in the folder of a run: its record, the request to its process, the output of that, the
-last picture of a held-out episode."""
+"""Files of a run: record, request to the process, output of the process, and the last picture of a
+held-out episode."""
 
 SIZE = 192
 """Pixels on each side of a picture."""
 
 FIRST_TEST_SEED = 2_000_000
-"""Seeds of the held-out episodes begin here; learning curves are measured on others."""
+"""First seed of the held-out episodes; learning curves use smaller ones."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -67,29 +67,29 @@ class RunRecord:
     returns: Sequence[float] = ()
     final_losses: Sequence[float] = ()
     endings: Mapping[str, int] | None = None
-    """How many of the same episodes ended for each reason."""
+    """Number of held-out episodes by the reason of their end."""
     seconds: float = 0.0
-    """How long it took with set-up and evaluation [s]."""
+    """Duration with set-up and evaluation [s]."""
     command: str = ""
     date: str = ""
 
     @property
     def mean_return(self) -> float:
-        """Mean return of the held-out episodes; NaN where there are none."""
+        """Mean return of the held-out episodes; NaN without any."""
         return _mean(self.returns)
 
     @property
     def mean_loss(self) -> float:
-        """Mean loss at the ends of the held-out episodes; NaN where there are none."""
+        """Mean loss at the ends of the held-out episodes; NaN without any."""
         return _mean(self.final_losses)
 
     def write(self, folder: Path) -> None:
-        """Write everything into the run's folder; numbers that are not finite become null."""
+        """Write the record into the run's folder; numbers that are not finite become null."""
         write_record(folder / RECORD, asdict(self))
 
     @classmethod
     def read(cls, folder: Path, facts: Mapping[str, Any]) -> RunRecord | None:
-        """Return the record that a run left in its folder, None where there is none."""
+        """Return the record in a run's folder, or None."""
 
         def made(held: dict[str, Any]) -> RunRecord:
             points: list[dict[str, Any]]
@@ -111,7 +111,7 @@ def _mean(values: Sequence[float]) -> float:
 
 @dataclass(frozen=True)
 class RunRequest:
-    """What a process is to do."""
+    """Request to a process: one run."""
 
     job: Job
     facts: dict[str, Any]
@@ -120,11 +120,11 @@ class RunRequest:
     teacher: str = ""
     """Folder of the run whose rules are cloned, if any."""
     lasts: bool = False
-    """Whether the process waits for another run afterwards."""
+    """Whether the process waits for another request afterwards."""
 
     @classmethod
     def read(cls, folder: Path) -> RunRequest:
-        """Return what a folder asks for."""
+        """Return the request in a folder."""
         held = json.loads((folder / REQUEST).read_text("utf-8"))
         return cls(**held | {"job": Job(**held["job"])})
 
@@ -142,9 +142,9 @@ class RunRequest:
 
 
 def run(folder: Path, device: str) -> None:
-    """Do what `request.json` in a folder asks for; leave the record, the rules and a picture there.
+    """Do the run of `request.json` in a folder; write record, rules and picture into the folder.
 
-    Errors are recorded, so that other runs can go on.
+    Errors are recorded, so that other runs can continue.
     """
     request = RunRequest.read(folder)
     torch.set_num_threads(request.threads)
@@ -154,7 +154,7 @@ def run(folder: Path, device: str) -> None:
     try:
         episodes = _learn(request, folder, device, curve.append)
     except Exception as error:
-        # The table reports what breaks in a method.
+        # The table reports errors.
         traceback.print_exc()
         status = "diverged" if isinstance(error, DivergedError) else "failed"
         found: dict[str, Any] = {"error": f"{type(error).__name__}: {' '.join(str(error).split())}"}
@@ -172,7 +172,7 @@ def run(folder: Path, device: str) -> None:
 def _learn(
     request: RunRequest, folder: Path, device: str, on_entry: Callable[[CurvePoint], None]
 ) -> Episodes:
-    """Learn, write what was learned, and return the held-out episodes."""
+    """Learn, write rules or policy and a picture, and return the held-out episodes."""
     job, facts = request.job, request.facts
     problem, amount = Problem(**facts["problem"]), facts["budget"]
     in_seconds = job.axis == "seconds"
@@ -183,7 +183,7 @@ def _learn(
     )
     trained.save(folder)
     seeds = range(FIRST_TEST_SEED, FIRST_TEST_SEED + facts["episodes"])
-    # New worlds: the method may have changed its own.
+    # New environments, as the method may have changed its own.
     envs = problem.make_envs(min(len(seeds), problem.num_envs), device=device)
     episodes = evaluate_policy(envs, trained.policy, seeds)
     picture = final_picture(problem, trained.policy, FIRST_TEST_SEED, device=device)
@@ -199,7 +199,7 @@ def final_picture(
     The policy maps observations, [1, N, P], to actions, [1, N, A].
     """
     keywords = {**problem.keywords, "render_mode": "rgb_array", "render_size": SIZE}
-    # One step more, as a world that is over shows the next episode's start.
+    # One more step, as an environment at the end of an episode shows the next start.
     longer = replace(problem, keywords=keywords, episode_steps=problem.episode_steps + 1)
     envs = longer.make_envs(1, device=device)
     policy = policy_in(envs, policy)
@@ -217,18 +217,18 @@ def final_picture(
 
 
 def main(folder: Path) -> None:
-    """Do what a folder asks for once a device is named, then so for others, while there are any."""
+    """Do the run of a folder on the device that standard input names, then those of others."""
     lines: SimpleQueue[str] = SimpleQueue()
 
     def listen() -> None:
         for line in sys.stdin:
             lines.put(line.strip())
-        # The pipe has no other end.
+        # The parent process has ended.
         os._exit(1)
 
     threading.Thread(target=listen, daemon=True).start()
     request = RunRequest.read(folder)
-    # Loads the method's libraries. What breaks now breaks in `run` as well, which records it.
+    # Loads the method's libraries. Errors are raised again, and recorded, by `run`.
     with contextlib.suppress(Exception):
         method_options(request.facts["method"])
     lasts = request.lasts
@@ -246,8 +246,8 @@ def main(folder: Path) -> None:
         torch.cuda.empty_cache()
 
 
-# All runs over cores or GPUs, each of which may fail by itself. What starts with a process, such as
-# libraries, a GPU's context and kernels, takes longer than many runs learn.
+# The parent process. The start of a process (libraries, a GPU's context, kernels) takes longer than
+# many runs, so that processes do several runs where possible.
 
 PROGRAM = (sys.executable, "-m", "npa_envs.agents.comparison.run")
 
@@ -255,7 +255,7 @@ MEASURED = ("done", "diverged")
 """Runs that a resumed comparison does not repeat."""
 
 LAST_OUTPUT = 2000
-"""Characters of a dead process' last output that are shown, at most."""
+"""Most characters of a dead process's output that are shown."""
 
 
 @dataclass
@@ -264,7 +264,7 @@ class _Process(Child):
     folder: Path
     process: subprocess.Popen[bytes]
     lasts: bool
-    """Whether the process does another run afterwards."""
+    """As `RunRequest.lasts`."""
     begin: float = 0.0
 
     @property
@@ -273,38 +273,38 @@ class _Process(Child):
         return self.process.poll() is not None or (self.lasts and (self.folder / RECORD).exists())
 
     def go(self, device: str) -> None:
-        """Let it begin on a device."""
+        """Start the run on a device."""
         self.begin = time.perf_counter()
-        _tell(self.process, device)
+        _send(self.process, device)
 
     def end(self) -> None:
-        """End it, and remove its folder."""
+        """Terminate the process, and remove the run's folder."""
         self.process.terminate()
         self.process.communicate()
         shutil.rmtree(self.folder, ignore_errors=True)
 
 
-def _tell(process: subprocess.Popen[bytes], line: str) -> None:
+def _send(process: subprocess.Popen[bytes], line: str) -> None:
     assert process.stdin is not None, "opened at its start"
-    # The next look finds that a process has died, and records it.
+    # The death of a process is found and recorded later.
     with contextlib.suppress(BrokenPipeError):
         process.stdin.write(f"{line}\n".encode())
         process.stdin.flush()
 
 
 def lasts(plan: ComparisonPlan, job: Job) -> bool:
-    """Return whether the process of a run does others before and afterwards.
+    """Return whether a process may do other runs before and after this one.
 
-    A run that is measured by time has a process of its own, so that all start alike, and so has a
-    function from outside this library, which may leave things in memory.
+    Runs with a time budget have separate processes, for equal conditions, and so do functions from
+    outside this library, which may leave objects in memory.
     """
     own = ":" in plan.own.get(job.method, job.method)
-    # Other systems move no folder while a process writes into it.
+    # Other systems cannot rename a folder in which a process has an open file.
     return os.name == "posix" and job.axis == "particle-steps" and not own
 
 
 def held_records(plan: ComparisonPlan, folder: Path) -> dict[Job, RunRecord]:
-    """Return the records of an earlier comparison in a folder without runs that failed."""
+    """Return the records in a folder of an earlier comparison, without failed runs."""
     found = {job: RunRecord.read(folder / job.folder, plan.facts(job)) for job in plan.jobs()}
     return {
         job: record
@@ -323,13 +323,12 @@ def run_jobs(
     max_seconds: float = math.inf,
     written: Callable[[RunRecord], None] = lambda record: None,
 ) -> None:
-    """Run jobs of a plan in processes; one that fails is recorded, and the others go on.
+    """Run jobs of a plan in processes; a failed run is recorded, and the others continue.
 
-    Runs that are measured by particle-steps follow each other in processes, as long as none fails;
-    all others have a process each, and on GPUs that of the next one is started early, and waits
-    until its turn comes. A run's results appear in its folder all at once, when it is over, and
-    `written` is called with them. No run begins after `max_seconds`. If this is interrupted, its
-    processes are ended and leave nothing.
+    A process does several runs with budgets of particle-steps, as long as none fails; other runs
+    have a process each, which on GPUs is started before its turn. A run's folder appears when the
+    run is over, and `written` is called with its record. No run starts after `max_seconds`. An
+    interrupt ends all processes and removes their unfinished folders.
     """
     for job in jobs:
         teacher = plan.teacher(job)
@@ -361,7 +360,7 @@ def run_jobs(
             one.process.communicate()
         written(record)
 
-    # Unfinished runs of a killed comparison.
+    # Remove unfinished runs of a killed comparison.
     for job in jobs:
         target = folder / job.folder
         for left in target.parent.glob(f".{target.name}.*"):
@@ -387,7 +386,7 @@ def _start(
     command: str,
     idle: list[subprocess.Popen[bytes]],
 ) -> _Process:
-    """Return the process of a run, which waits for its device: an idle one, or a new one."""
+    """Return the process of a run, an idle or a new one, which waits for its device."""
     target = folder / job.folder
     part = target.parent / f".{target.name}.{secrets.token_hex(4)}"
     part.mkdir(parents=True)
@@ -400,7 +399,7 @@ def _start(
         # The process opens this file itself, unless it dies before.
         (part / OUTPUT).touch()
         process = idle.pop()
-        _tell(process, json.dumps(str(part)))
+        _send(process, json.dumps(str(part)))
         return _Process(job, part, process, lasts=True)
     environment = os.environ | {"OMP_NUM_THREADS": str(places.threads)}
     with (part / OUTPUT).open("wb") as output:
@@ -415,7 +414,7 @@ def _start(
 
 
 def _finish(plan: ComparisonPlan, one: _Process, folder: Path, command: str) -> RunRecord:
-    """Put the results of a run that is over into their place, and return its record."""
+    """Move the results of an ended run into its folder, and return its record."""
     if not one.lasts:
         one.process.communicate()
     request = RunRequest(one.job, plan.facts(one.job), command=command)
@@ -429,7 +428,7 @@ def _finish(plan: ComparisonPlan, one: _Process, folder: Path, command: str) -> 
     (one.folder / REQUEST).unlink(missing_ok=True)
     target = folder / one.job.folder
     if target.exists():
-        # It holds a run that failed, or no record: others are not repeated.
+        # A failed run, or one without a record.
         shutil.rmtree(target)
     os.replace(one.folder, target)
     return record

@@ -1,8 +1,12 @@
 """Learners of policies behind one interface, imported as `npa_envs.agents.learning`.
 
 `train(method, problem, budget, seed)` runs any of `METHODS` on a `Problem`, an environment with its
-keywords, and returns rules and a learning curve. A method is a function in a module of its own; a
-method's libraries are imported when it is asked for.
+keywords, and returns rules and a learning curve. Each method is a function in its own module, which
+is imported with its libraries when it is used.
+
+To read a method, for example `ppo.py`: `problem.py` makes the worlds, `rule_set.py` has the rules
+as functions, `progress.py` the budget, the curve and checkpoints; `ppo_common.py` has the parts
+that the actor-critics `ppo.py`, `sb3.py` and `shac.py` share.
 """
 
 from __future__ import annotations
@@ -19,7 +23,7 @@ import torch
 
 from npa_envs.agents.learning.problem import EVALUATION_SEEDS, Problem, check_run_seed
 from npa_envs.agents.learning.progress import Budget, CurvePoint, Progress, check_finite
-from npa_envs.agents.learning.rules import RuleSet, RuleSetPolicy
+from npa_envs.agents.learning.rule_set import RuleSet, RuleSetPolicy
 from npa_envs.errors import MissingDependencyError, NPAError, shown, suggest
 from npa_envs.training.ranks import Ranks
 
@@ -51,12 +55,12 @@ METHODS: dict[str, str] = {
     "zero": "npa_envs.agents.learning.baselines:train_zero",
     "scripted": "npa_envs.agents.learning.baselines:train_scripted",
 }
-"""Methods: functions `f(progress, ...)` of a `Progress` that return a `RuleSet` or a policy. A
-method's options are keyword-only arguments, or the fields of a dataclass which is the default of an
-argument `options`. Others may be added."""
+"""Methods: functions `f(progress, ...)` of a `Progress` that return a `RuleSet` or a policy. Their
+options are keyword-only arguments, or fields of a dataclass that is the default of an argument
+`options`. You may add methods."""
 
 KEPT_METHODS = ("ppo", "shac")
-"""Methods whose runs can be kept in a folder, go on from there, and be shared by processes."""
+"""Methods whose runs can be written to a folder, resumed, and distributed over processes."""
 
 GARDEN_METHODS: dict[str, str] = {
     "gradient": "npa_envs.agents.learning.baselines:tend_gradient",
@@ -66,22 +70,22 @@ GARDEN_METHODS: dict[str, str] = {
     "zero": "npa_envs.agents.learning.baselines:train_zero",
     "scripted": "npa_envs.agents.learning.baselines:tend_scripted",
 }
-"""The same for gardens, where a rule runs the particles: those that learn return policies."""
+"""Methods for gardens, where a rule updates the particles and actions are of brushes."""
 
 
 class Trained(NamedTuple):
-    """What a run came to."""
+    """Result of a run."""
 
     rules: RuleSet | None
-    """The rules, on the run's device; None where a method has none."""
+    """The rules, on the run's device; None if the method returns a policy."""
     log: list[CurvePoint]
     """The learning curve."""
     policy: Callable[[Any], Any]
-    """Maps observations, [B, N, P], to actions, [B, N, A], and a dict of agents' observations, of
-    PettingZoo's parallel environments, to one of their actions: the rules' where there are some."""
+    """Maps observations, [B, N, P], to actions, [B, N, A], and a dict of agents' observations, as
+    of PettingZoo's parallel environments, to a dict of their actions."""
 
     def save(self, folder: str | Path) -> list[Path]:
-        """Write what was learned, if anything: rules' files, or the policy's own; return paths.
+        """Write the files of the rules or of the policy, if it has any; return their paths.
 
         Raises:
             NPAError: As for `RuleSet.save`.
@@ -109,30 +113,30 @@ def train(
 ) -> Trained:
     """Learn a problem by a method, within a budget.
 
-    Where torch has a default group of processes, they learn together, by `KEPT_METHODS` only: each
-    has a share of the worlds, and the first one writes.
+    With a default process group of torch, its processes learn together, by `KEPT_METHODS` only:
+    each has a part of the worlds, and rank 0 writes.
 
     Args:
         method: A name from `methods_for(problem)`, or your own function, "package.module:function".
-        problem: What is to be learned.
-        budget: What may be spent.
-        seed: Of everything that the method draws, from 0 to 99: runs with different seeds learn in
-            different worlds, and none in those of evaluations.
-        device: Where worlds, rules and evaluations are.
+        problem: The problem to learn.
+        budget: Time or particle-steps to learn for.
+        seed: Seed of all random numbers, from 0 to 99: runs with different seeds learn in different
+            worlds, and none in those of evaluations.
+        device: Device of worlds, rules and evaluations.
         start: Rules to begin with, `RuleSet.of(problem, "heart")`; copied. None: new ones.
-        evaluation_seeds: Of the episodes by which the learning curve is drawn.
-        entries: Points of the curve besides the first, at equal shares of the budget.
+        evaluation_seeds: Seeds of the episodes that measure the learning curve.
+        entries: Points of the curve after the first, at equal parts of the budget.
         on_entry: Called with each point as soon as it is known.
-        on_stop: Called where a run that is kept is asked to stop before its budget is spent.
-        out: Folder for checkpoint, rules and curve, by `KEPT_METHODS` only: there SIGTERM and
-            Ctrl-C let a run stop in order. None: nothing is written.
-        resume: Go on from the checkpoint in `out`, on any number of processes, with new episodes.
-        overwrite: Begin anew although `out` holds a run; its files are removed.
-        options: The method's own: `method_options` names them.
+        on_stop: Called when a signal stops a run with `out` before its budget is spent.
+        out: Folder for checkpoint, rules and curve, by `KEPT_METHODS` only; SIGTERM and Ctrl-C then
+            save before they stop the run. None: nothing is written.
+        resume: Continue from the checkpoint in `out`, on any number of processes.
+        overwrite: Start again although `out` contains a run; its files are removed.
+        options: Options of the method, as listed by `method_options`.
 
     Raises:
-        NPAError: There is no such method or option, the method cannot learn this problem, cannot be
-            shared or kept, or the rules to begin with do not fit it. Or as for `Progress`.
+        NPAError: The method or an option is unknown, the method cannot learn this problem, cannot
+            be resumed or distributed, or `start` does not fit. Or as for `Progress`.
         DivergedError: The rules' weights have become infinite or NaN.
         MissingDependencyError: The method needs a library that is not installed.
     """
@@ -143,9 +147,9 @@ def train(
             raise NPAError(
                 f"{name} must be a {kind.__name__}, got {shown(value)}: make it with {cure}"
             )
-    if problem.chooses_codes and method in GARDEN_METHODS | METHODS:
+    if problem.actor == "codes" and method in GARDEN_METHODS | METHODS:
         raise NPAError(
-            f"method {shown(method)} learns no codes, which are the actions in {problem.env_id}: "
+            f"method {shown(method)} cannot learn codes, the actions of {problem.env_id}: "
             "give a function of your own, 'package.module:function', or take another library"
         )
     function = _function(method, methods_for(problem))
@@ -185,28 +189,28 @@ def train(
     given = {"options": replace(declared, **options)} if declared is not None else options
     result = function(progress, **given)
     if isinstance(result, RuleSet):
-        # Unused gradients may keep the memory of recorded work.
+        # Gradients may keep the memory of CUDA graphs.
         result.zero_grad()
         return Trained(result, progress.log, result.policy())
     return Trained(None, progress.log, result)
 
 
 def methods_for(problem: Problem) -> dict[str, str]:
-    """Return the table of the methods that can learn a problem; it is empty where none can."""
-    if problem.chooses_codes:
+    """Return the methods that can learn a problem, as `METHODS`; none for codes."""
+    if problem.actor == "codes":
         return {}
-    return GARDEN_METHODS if problem.is_garden else METHODS
+    return GARDEN_METHODS if problem.actor == "brushes" else METHODS
 
 
 def method_options(method: str) -> dict[str, Any]:
     """Return the options of a method, with their defaults.
 
     Args:
-        method: A name from `METHODS`; one that is there for gardens alone, from `GARDEN_METHODS`;
-            or your own function, "package.module:function".
+        method: A name from `METHODS` or, if not there, `GARDEN_METHODS`; or your own function,
+            "package.module:function".
 
     Raises:
-        NPAError: There is no such method.
+        NPAError: The method is unknown.
         MissingDependencyError: It needs a library that is not installed.
     """
     return _options_of(_function(method, GARDEN_METHODS | METHODS))
@@ -242,7 +246,7 @@ def _function(method: str, table: dict[str, str]) -> Callable[..., Any]:
         raise
     except (ImportError, AttributeError, ValueError) as error:
         raise NPAError(
-            "a method of your own must be 'package.module:function' that Python finds, got "
-            f"{shown(method)} ({error}): run where the module lies, or install it"
+            "a method of your own must be 'package.module:function' that Python can import, got "
+            f"{shown(method)} ({error}): run in the module's folder, or install it"
         ) from error
     return function

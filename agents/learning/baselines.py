@@ -1,4 +1,4 @@
-"""Methods that learn nothing, for particles and gardens: what learning curves are compared with."""
+"""Baseline methods that learn nothing, for particles and gardens."""
 
 from __future__ import annotations
 
@@ -35,23 +35,23 @@ PolicyT = TypeVar("PolicyT", bound=Callable[[Any], Any])
 SCRIPTED: tuple[Callable[..., Policy], ...] = (PaintPolicy, SpreadPolicy, MendPolicy)
 
 GAINS = (0.001, 0.003, 0.01, 0.03, 0.1, 0.3, -0.01, -0.03, -0.1, -0.3)
-"""Displacements at a perceived c^{1+D} ∇ρ / N of 1, as fractions of α ε; below 0 they gather."""
+"""Gains of scripted policies, as for `SpreadPolicy`; below 0 particles attract each other."""
 
 
 def train_random(progress: Progress) -> Policy | Tending:
-    """Return what acts at random; nothing is spent."""
-    return _of_one(progress, RandomPolicy, RandomGardener, seed=progress.seed)
+    """Return the policy that acts at random; no particle-steps are used."""
+    return _baseline(progress, RandomPolicy, RandomGardener, seed=progress.seed)
 
 
 def train_zero(progress: Progress) -> Policy | Tending:
-    """Return what does nothing; nothing is spent."""
-    return _of_one(progress, ZeroPolicy, StillGardener)
+    """Return the policy that does nothing; no particle-steps are used."""
+    return _baseline(progress, ZeroPolicy, StillGardener)
 
 
-def _of_one(
+def _baseline(
     progress: Progress, policy: Callable[..., Policy], gardener: Any, **given: int
 ) -> Policy | Tending:
-    if progress.problem.is_garden:
+    if progress.problem.actor == "brushes":
         return _evaluated(progress, Tending(lambda env: gardener(env, **given)))
     return _evaluated(
         progress, policy(progress.problem.make_envs(1, device=progress.device), **given)
@@ -65,12 +65,10 @@ def _evaluated(progress: Progress, policy: PolicyT) -> PolicyT:
 
 
 def train_scripted(progress: Progress, *, gains: Sequence[float] = GAINS) -> Policy:
-    """Return the scripted policy that fits best.
+    """Return the best of: doing nothing, and the policies of `SCRIPTED` at each of the gains.
 
-    Doing nothing, and all of `SCRIPTED` that the problem's task allows at each gain (a fraction of
-    α ε; negative ones gather), play one episode in each of the problem's worlds, from seeds that
-    evaluations do not use, until all have done so or the budget is spent. The best one is taken,
-    which may be doing nothing.
+    Each plays one episode in each of the problem's worlds, from seeds that evaluations do not use,
+    until the budget is spent.
     """
     check_no_start(progress)
     if not isinstance(gains, list | tuple) or not all(map(is_real, gains)):
@@ -83,31 +81,31 @@ def train_scripted(progress: Progress, *, gains: Sequence[float] = GAINS) -> Pol
     best: Policy = ZeroPolicy(envs)
     progress.start(best)
 
-    def tried(policy: Policy) -> float:
+    def mean_return_of(policy: Policy) -> float:
         episodes = evaluate_policy(envs, policy, seeds)
-        # All worlds go on until the last episode is over.
+        # All worlds are stepped until the last episode is over.
         steps = int(episodes.steps.max())
         progress.advance(steps * problem.num_envs * problem.particle_count)
         return episodes.mean_return
 
-    most = tried(best)
+    highest = mean_return_of(best)
     makers = [
         make for make in SCRIPTED if make is not PaintPolicy or target_colour(envs) is not None
     ]
     for policy in (make(envs, gain=gain) for make in makers for gain in gains):
         if progress.over:
             break
-        mean_return = tried(policy)
-        if mean_return > most:
-            best, most = policy, mean_return
+        mean_return = mean_return_of(policy)
+        if mean_return > highest:
+            best, highest = policy, mean_return
     progress.look(best, force=True)
     return best
 
 
 def check_no_start(progress: Progress) -> None:
-    """Check that there are no rules to begin with."""
+    """Check that the run has no `start`."""
     if progress.initial is not None:
-        if progress.problem.is_garden:
+        if progress.problem.actor == "brushes":
             raise NPAError("start must be None in a garden, where the world's rule is not learned")
         raise NPAError(
             "start must be None for a method that learns nothing: choose 'gradient', 'ppo', "
@@ -120,23 +118,23 @@ def check_no_start(progress: Progress) -> None:
 
 @dataclass(frozen=True)
 class Tending:
-    """A gardener that looks at worlds, not at observations: it is made for each environment."""
+    """A policy that reads the worlds, not the observations: `made_for` makes it for worlds."""
 
     made_for: Callable[[Any], BrushPolicy]
 
     def __call__(self, observation: Any) -> Any:
-        """Refuse: observations do not say which worlds they are of."""
+        """Raise an NPAError: observations do not identify their worlds."""
         raise NPAError(
-            "this gardener looks at worlds: call made_for(env), and then what that returns"
+            "this gardener reads the worlds: call made_for(env), and then what that returns"
         )
 
 
 def tend_scripted(progress: Progress) -> Tending:
-    """Return the scripted gardener, or the scripted shepherd."""
+    """Return the scripted gardener, or in `npa/Shepherd2D-v0` the scripted shepherd."""
     shepherd = issubclass(progress.problem.env_type.task_type, ShepherdTask)
     return _evaluated(progress, Tending(ScriptedShepherd if shepherd else ScriptedGardener))
 
 
 def tend_gradient(progress: Progress) -> Tending:
-    """Return the gardener that plans by the world's gradient."""
+    """Return the gardener that plans by the gradient through the world's physics."""
     return _evaluated(progress, Tending(lambda env: GradientGardener(env, seed=progress.seed)))

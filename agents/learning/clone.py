@@ -1,4 +1,4 @@
-"""Behaviour cloning: rules that learn to do what other rules do."""
+"""Behaviour cloning: rules learn the actions of other rules, or those of a dataset."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from torch import Tensor
 
 from npa_envs.agents.learning.problem import Problem, world_seeds
 from npa_envs.agents.learning.progress import Progress, annealed
-from npa_envs.agents.learning.rules import RuleSet, Source
+from npa_envs.agents.learning.rule_set import RuleSet, Source
 from npa_envs.checks import check_fraction, check_positive, is_real
 from npa_envs.errors import NPAError, shown
 
@@ -23,25 +23,25 @@ class CloneOptions:
     """Options of `train`."""
 
     teacher: Source | Sequence[Source] | RuleSet | None = None
-    """A rule, a shipped rule's name or a file, for all species or one for each, or a set of rules;
-    it must be given, or a dataset."""
+    """A rule, a shipped rule's name or a file, for all species or one for each, or a set of rules.
+    Either it or a dataset is needed."""
     dataset: str | None = None
-    """A dataset of Minari, by its id, to learn from instead; the particle-steps that count are
-    those learned from."""
+    """Id of a Minari dataset to learn from instead; its steps count as particle-steps each time
+    that they are used."""
     student_share: float = 0.5
-    """Share of the worlds in which the student acts, in [0, 1]; 0: plain cloning."""
+    """Fraction of the worlds in which the student acts, in [0, 1]; 0: plain cloning."""
     collect_steps: int = 8
     """Steps of the worlds in an iteration."""
     kept_steps: int = 64
-    """Steps of all worlds that are learned from, at least `collect_steps`."""
+    """Last steps of all worlds that are learned from, at least `collect_steps`."""
     updates: int = 16
     """Optimiser's steps in an iteration."""
     batch_worlds: int = 4
-    """Worlds, with all of their particles, in each of them."""
+    """Worlds, with all of their particles, in an optimiser's step."""
     learning_rate: float = 3e-3
-    """Adam's, at the beginning."""
+    """Adam's, at first."""
     last_rate: float = 0.02
-    """Learning rate at the end, as a share of the first."""
+    """Learning rate at the end, as a fraction of the first."""
 
     def __post_init__(self) -> None:
         """Check every field but the teacher; raises NPAError."""
@@ -63,11 +63,11 @@ DEFAULTS = CloneOptions()
 
 
 def train(progress: Progress, options: CloneOptions = DEFAULTS) -> RuleSet:
-    """Learn a teacher's actions in the worlds that it comes to, and in those of the student.
+    """Learn a teacher's actions in worlds where the teacher acts, and where the student acts.
 
     The loss is the squared error of actions over the variance of the teacher's, column by column.
-    In some of the worlds the student acts, as its errors lead to worlds that the teacher's actions
-    do not, and the teacher's actions there are learned (dataset aggregation, Ross et al. 2011).
+    In a fraction of the worlds the student acts, so that it learns the teacher's actions also in
+    states that its own errors lead to (dataset aggregation, Ross et al. 2011).
     """
     problem, device, seed = progress.problem, progress.device, progress.seed
     rules = progress.first_rules()
@@ -76,9 +76,9 @@ def train(progress: Progress, options: CloneOptions = DEFAULTS) -> RuleSet:
         rules.parameters(), lr=options.learning_rate, fused=device.type == "cuda"
     )
     if options.dataset is None:
-        collect, some = _taught(problem, rules, seed, device, options)
+        collect, pairs = _taught(problem, rules, seed, device, options)
     else:
-        collect, some = None, _recorded(problem, device, options)
+        collect, pairs = None, _recorded(problem, device, options)
 
     def iteration() -> int:
         steps = options.updates * options.batch_worlds if collect is None else collect()
@@ -86,7 +86,7 @@ def train(progress: Progress, options: CloneOptions = DEFAULTS) -> RuleSet:
         for group in optimiser.param_groups:
             group["lr"] = rate
         for _ in range(options.updates):
-            loss = unexplained(rules, *some.draw(options.batch_worlds, generator))
+            loss = unexplained(rules, *pairs.draw(options.batch_worlds, generator))
             optimiser.zero_grad()
             loss.backward()  # type: ignore[no-untyped-call]
             optimiser.step()
@@ -98,7 +98,7 @@ def train(progress: Progress, options: CloneOptions = DEFAULTS) -> RuleSet:
 def _taught(
     problem: Problem, rules: RuleSet, seed: int, device: torch.device, options: CloneOptions
 ) -> tuple[Callable[[], int], Demonstrations]:
-    """Return a function that steps worlds and counts their steps, and its demonstrations."""
+    """Return a function that collects demonstrations and returns the steps, and these."""
     source = options.teacher
     if source is None:
         raise NPAError("teacher must be given to clone, or a dataset: for example teacher='heart'")
@@ -106,20 +106,20 @@ def _taught(
     teacher = RuleSet.of(problem, given).to(device).policy()
     student, envs = rules.policy(), problem.make_envs(device=device)
     observation, _ = envs.reset(seed=world_seeds(seed, problem.num_envs))
-    some = Demonstrations(options.kept_steps * problem.num_envs, observation, teacher(observation))
+    pairs = Demonstrations(options.kept_steps * problem.num_envs, observation, teacher(observation))
     taught = problem.num_envs - round(options.student_share * problem.num_envs)
 
     def collect() -> int:
         nonlocal observation
         for _ in range(options.collect_steps):
             action = teacher(observation)
-            some.add(observation, action)
+            pairs.add(observation, action)
             if taught < problem.num_envs:
                 action[taught:] = student(observation[taught:])
             observation, *_ = envs.step(action)
         return options.collect_steps * problem.num_envs
 
-    return collect, some
+    return collect, pairs
 
 
 def _recorded(problem: Problem, device: torch.device, options: CloneOptions) -> Demonstrations:
@@ -127,23 +127,25 @@ def _recorded(problem: Problem, device: torch.device, options: CloneOptions) -> 
     from npa_envs.wrappers.minari import read_pairs
 
     if options.teacher is not None:
-        raise NPAError("teacher must be None where a dataset is given: it holds what was done")
+        raise NPAError("teacher must be None with a dataset, which contains the actions")
     assert options.dataset is not None, "checked by the caller"
-    seen, done = read_pairs(options.dataset)
+    observations, actions = read_pairs(options.dataset)
     interface, count = problem.interface, problem.particle_count
     wanted = (count, interface.perception_dim), (count, interface.action_dim)
-    if (seen.shape[1:], done.shape[1:]) != wanted:
+    if (observations.shape[1:], actions.shape[1:]) != wanted:
         raise NPAError(
-            f"dataset must hold observations and actions of shapes {wanted}, got "
-            f"{tuple(seen.shape[1:])} and {tuple(done.shape[1:])}: record it in this problem"
+            f"dataset must have observations and actions of shapes {wanted}, got "
+            f"{tuple(observations.shape[1:])} and {tuple(actions.shape[1:])}: record it in this "
+            "problem"
         )
-    some = Demonstrations(len(seen), seen.to(device), done.to(device))
-    some.add(seen.to(device), done.to(device))
-    return some
+    observations, actions = observations.to(device), actions.to(device)
+    pairs = Demonstrations(len(observations), observations, actions)
+    pairs.add(observations, actions)
+    return pairs
 
 
 def unexplained(rules: RuleSet, observation: Tensor, action: Tensor) -> Tensor:
-    """Return the squared error of rules over the variance of the actions, a scalar.
+    """Return the squared error of rules over the variance of the actions: 1 - R², a scalar.
 
     Observations have shape [B, N, P], the teacher's actions [B, N, A].
     """
@@ -156,27 +158,27 @@ def unexplained(rules: RuleSet, observation: Tensor, action: Tensor) -> Tensor:
 
 
 class Demonstrations:
-    """The last W observations of worlds, and the teacher's actions, on the device.
+    """Ring buffer of the last `capacity` worlds' observations and of the teacher's actions.
 
-    At most `capacity` worlds are kept, of the shape and device of an observation and an action.
+    Shapes and device are those of the observation and action that it is made with.
     """
 
     def __init__(self, capacity: int, observation: Tensor, action: Tensor) -> None:
         self.observations = observation.new_zeros(capacity, *observation.shape[1:])
         self.actions = action.new_zeros(capacity, *action.shape[1:])
         self.count = 0
-        """Worlds that were added so far; the oldest are overwritten."""
+        """Worlds added so far."""
 
     def add(self, observation: Tensor, action: Tensor) -> None:
-        """Add some worlds, at most as many as are kept, shapes [B, N, P] and [B, N, A]."""
+        """Add B <= capacity worlds, [B, N, P] and [B, N, A], in place of the oldest."""
         capacity = len(self.observations)
-        place = torch.arange(self.count, self.count + len(observation), device=observation.device)
-        self.observations.index_copy_(0, place % capacity, observation)
-        self.actions.index_copy_(0, place % capacity, action)
+        index = torch.arange(self.count, self.count + len(observation), device=observation.device)
+        self.observations.index_copy_(0, index % capacity, observation)
+        self.actions.index_copy_(0, index % capacity, action)
         self.count += len(observation)
 
     def draw(self, world_count: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
-        """Return some worlds drawn with replacement: observations and the teacher's actions."""
+        """Return observations and actions of worlds drawn with replacement."""
         kept, device = min(self.count, len(self.observations)), self.observations.device
         chosen = torch.randint(kept, (world_count,), generator=generator, device=device)
         return self.observations[chosen], self.actions[chosen]

@@ -1,10 +1,9 @@
 """Evolution strategies over rules' weights: sep-CMA-ES, all candidates in one batch of worlds.
 
-The library `cma` (pycma) proposes candidates and learns from their fitness; it is asked for a
-diagonal covariance, as rules have thousands of weights (Ros and Hansen, A Simple Modification in
-CMA-ES Achieving Linear Time and Space Complexity, 2008). A candidate's fitness is the mean return
-of its worlds, which start from the same seeds for all candidates of a generation, and from new ones
-in the next: differences between candidates are theirs and not their luck's.
+The library `cma` (pycma) proposes candidates, with a diagonal covariance, as rules have thousands
+of weights (Ros and Hansen, A Simple Modification in CMA-ES Achieving Linear Time and Space
+Complexity, 2008). A candidate's fitness is the mean return of its worlds. All candidates of a
+generation have worlds of the same seeds; each generation has new ones.
 """
 
 from __future__ import annotations
@@ -21,7 +20,7 @@ from torch import Tensor, nn
 
 from npa_envs.agents.learning.problem import FIRST_EVALUATION_SEED
 from npa_envs.agents.learning.progress import Progress
-from npa_envs.agents.learning.rules import RuleSet
+from npa_envs.agents.learning.rule_set import RuleSet
 from npa_envs.agents.policies import bounded, perceived
 from npa_envs.checks import check_positive
 from npa_envs.errors import MissingDependencyError, NPAError
@@ -29,7 +28,7 @@ from npa_envs.rule.network import without_small
 from npa_envs.rule.rule import NPARule
 
 MOST_HIDDEN = 2**27
-"""Numbers of hidden layers that are held at once, at most: 512 MiB of float32."""
+"""Most numbers of hidden layers in memory at a time: 512 MiB of float32."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -39,10 +38,10 @@ class EvolutionOptions:
     population: int = 32
     """Candidates of a generation, at least 4."""
     worlds_per_candidate: int = 1
-    """Worlds that each is tried in."""
+    """Worlds in which each candidate is evaluated."""
     sigma: float = 0.1
-    """Step size to begin with, as a fraction of the size that a layer's weights are drawn with
-    (Xavier, gain 1; dimensionless)."""
+    """First step size, as a fraction of the standard deviation of a layer's random weights (Xavier,
+    gain 1; dimensionless)."""
 
     def __post_init__(self) -> None:
         """Check every field; raises NPAError."""
@@ -57,7 +56,7 @@ DEFAULTS = EvolutionOptions()
 def train(progress: Progress, options: EvolutionOptions = DEFAULTS) -> RuleSet:
     """Evolve rules until the budget is spent, and return the mean of the last generation.
 
-    Candidates are drawn on the host and tried on the device.
+    Candidates are drawn on the CPU and evaluated on the device.
     """
     problem, device = progress.problem, progress.device
     rules = progress.first_rules()
@@ -80,9 +79,9 @@ def train(progress: Progress, options: EvolutionOptions = DEFAULTS) -> RuleSet:
 
 
 class RuleWeights:
-    """Plain rules, changed in place, whose weights are one vector: W1, b1, W2, rule after rule.
+    """Reads and writes the weights of plain rules as one vector: W1, b1, W2, rule after rule.
 
-    Read-outs are not changed.
+    Read-outs do not change.
     """
 
     def __init__(self, rules: Iterable[NPARule]) -> None:
@@ -96,12 +95,12 @@ class RuleWeights:
                 )
 
     def vector(self) -> NDArray[np.float64]:
-        """Return the weights of the rules as they are, shape [W]."""
+        """Return the current weights of the rules, shape [W]."""
         with torch.no_grad():
             return nn.utils.parameters_to_vector(self._parts).double().cpu().numpy()
 
     def put(self, vector: NDArray[np.float64]) -> None:
-        """Give the rules these weights, shape [W]."""
+        """Set the weights of the rules in place from a vector, shape [W]."""
         first = self._parts[0]
         with torch.no_grad():
             nn.utils.vector_to_parameters(
@@ -109,7 +108,7 @@ class RuleWeights:
             )
 
     def scales(self) -> NDArray[np.float64]:
-        """Return the standard deviation of each weight by Xavier at a gain of 1; biases as W1."""
+        """Return each weight's standard deviation by Xavier, gain 1, shape [W]; biases as W1."""
         sizes = []
         for rule in self._each:
             hidden, bias, output = layers_of(rule)
@@ -125,24 +124,24 @@ def layers_of(rule: NPARule) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def updates_of(rule: NPARule, weights: Tensor, rows: Tensor) -> Tensor:
-    """Return raw updates, [K, R, A], of K candidates' weights for their own rows, [K, R, P]."""
+    """Return raw updates [K, R, A] of K candidates' weights [K, W] for their rows [K, R, P]."""
     shapes = [tuple(part.shape) for part in layers_of(rule)]
     sizes = [math.prod(shape) for shape in shapes]
     first, bias, second = (
         part.reshape(-1, *shape)
         for part, shape in zip(torch.split(weights, sizes, dim=1), shapes, strict=True)
     )
-    at_once = max(1, MOST_HIDDEN // (rows.shape[1] * rule.hidden_dim))
+    size = max(1, MOST_HIDDEN // (rows.shape[1] * rule.hidden_dim))
     updates = []
-    for k in range(0, len(weights), at_once):
-        some = slice(k, k + at_once)
-        hidden = torch.baddbmm(bias[some, None], rows[some], first[some].mT).relu_()
-        updates.append(torch.bmm(hidden, second[some].mT))
+    for k in range(0, len(weights), size):
+        part = slice(k, k + size)
+        hidden = torch.baddbmm(bias[part, None], rows[part], first[part].mT).relu_()
+        updates.append(torch.bmm(hidden, second[part].mT))
     return without_small(torch.cat(updates), rule.dead_zone)
 
 
 class RulePopulation(RuleWeights):
-    """Rules of one architecture; their weights are rows of a matrix, as `RuleWeights` has them."""
+    """Runs K candidates for a set of rules; a candidate's weights are a row of [K, W]."""
 
     def __init__(self, rules: RuleSet) -> None:
         super().__init__(rules)
@@ -150,30 +149,29 @@ class RulePopulation(RuleWeights):
 
     @torch.no_grad()
     def actions(self, weights: Tensor, observation: Tensor) -> Tensor:
-        """Return actions, [K * M, N, A], of K candidates, weights [K, W], in M worlds each.
+        """Return actions [K * M, N, A] of K candidates, weights [K, W], in M worlds each.
 
-        Observations, [K * M, N, P], stand candidate by candidate.
+        Observations [K * M, N, P] are ordered by candidate.
         """
         sizes = [sum(part.numel() for part in layers_of(rule)) for rule in self._rules]
         parts = []
         each = zip(self._rules, self._rules.spans, torch.split(weights, sizes, dim=1), strict=True)
         for rule, span, own in each:
-            seen = observation[:, span]
-            rows = perceived(rule, seen.flatten(0, 1))
+            observed = observation[:, span]
+            rows = perceived(rule, observed.flatten(0, 1))
             rows = rows.view(len(weights), -1, rows.shape[1])
             update = updates_of(rule, own, rows).flatten(0, 1)
             action = self._rules.interface.action(*bounded(rule, update))
-            parts.append(action.view(*seen.shape[:2], -1))
+            parts.append(action.view(*observed.shape[:2], -1))
         return torch.cat(parts, dim=1)
 
 
 def fitness(
     envs: Any, candidates: RulePopulation, weights: Tensor, seeds: list[int], episode_steps: int
 ) -> Tensor:
-    """Return the mean return of each candidate over worlds from the same seeds, shape [K].
+    """Return the mean return of each candidate over worlds of the same seeds, shape [K].
 
-    Of the K * M worlds, candidate k, whose weights are a row of [K, W], owns the M from k * M on,
-    one for each of the seeds.
+    `envs` has K * M worlds: M from k * M on for candidate k, one for each of the seeds.
     """
     observation, _ = envs.reset(seed=seeds * len(weights))
     returns = torch.zeros(envs.num_envs, device=weights.device)
@@ -181,7 +179,7 @@ def fitness(
     for _ in range(episode_steps):
         action = candidates.actions(weights, observation)
         observation, reward, terminated, truncated, _ = envs.step(action)
-        # A world that is over has begun another episode, which does not count.
+        # The next episode of a world that restarted does not count.
         returns += torch.where(running, reward, 0.0)
         running &= ~(terminated | truncated)
     return returns.view(len(weights), -1).mean(dim=1)
@@ -190,7 +188,7 @@ def fitness(
 def _strategy(
     candidates: RulePopulation, options: EvolutionOptions, draws: np.random.Generator
 ) -> Any:
-    """Return the strategy: it proposes by `ask`, learns by `tell`, and its mean is `mean`."""
+    """Return the strategy of `cma`, with `ask`, `tell` and `mean`."""
     try:
         import cma
     except ImportError as error:
@@ -202,15 +200,15 @@ def _strategy(
     def normal(*shape: int) -> NDArray[np.float64]:
         return draws.standard_normal(shape)
 
-    # The library takes no seed where `randn` is given.
-    words = {"popsize": options.population, "randn": normal, "seed": math.nan, "verbose": -9}
-    words |= {"CMA_diagonal": True, "CMA_stds": candidates.scales()}
-    return cma.CMAEvolutionStrategy(candidates.vector(), options.sigma, words)
+    # The library takes no seed with `randn`.
+    settings = {"popsize": options.population, "randn": normal, "seed": math.nan, "verbose": -9}
+    settings |= {"CMA_diagonal": True, "CMA_stds": candidates.scales()}
+    return cma.CMAEvolutionStrategy(candidates.vector(), options.sigma, settings)
 
 
-def costs(found: NDArray[np.float64]) -> list[float]:
-    """Return costs to minimise for mean returns [K]; those that are not finite are the worst."""
-    finite = np.isfinite(found)
-    worst = found[finite].min() - 1.0 if finite.any() else 0.0
-    minimised: list[float] = (-np.where(finite, found, worst)).tolist()
+def costs(returns: NDArray[np.float64]) -> list[float]:
+    """Return costs to minimise for mean returns [K]; not finite ones get the highest cost."""
+    finite = np.isfinite(returns)
+    worst = returns[finite].min() - 1.0 if finite.any() else 0.0
+    minimised: list[float] = (-np.where(finite, returns, worst)).tolist()
     return minimised

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import itertools
+import sys
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Self, cast
@@ -14,7 +15,7 @@ from torch import Tensor
 import npa_envs
 from npa_envs.agents.learning.problem import Problem
 from npa_envs.agents.learning.progress import Progress, annealed
-from npa_envs.agents.learning.rules import RuleSet, species_of
+from npa_envs.agents.learning.rule_set import RuleSet, species_of
 from npa_envs.checks import check_fraction
 from npa_envs.envs.core.task import EnvTask
 from npa_envs.envs.multi.task import Population, SpeciesConfig, SpeciesTask
@@ -28,41 +29,40 @@ from npa_envs.world.randomness import Randomness, WorldRandom
 from npa_envs.world.rollout import Memory
 
 LONGEST = 96
-"""Rollouts are no longer than this unless asked for: longer episodes go on in a pool."""
+"""Most steps of a rollout by default: longer episodes continue in a pool."""
 
 POOL_SIZE = 64
-"""Worlds in a pool, unless asked for."""
+"""Default number of worlds in a pool."""
 
 KEY_RANGE = -(2**63), 2**63 - 1
-"""Keys of worlds' streams are drawn from here."""
+"""Range of the keys of worlds' random streams."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class GradientOptions:
-    """Options of `train`; most are checked where the trainer's configuration is made of them."""
+    """Options of `train`; most are checked by the `TrainConfig` that they are passed to."""
 
     steps: tuple[int, int] | None = None
-    """Range [lo, hi) that the number of steps of each rollout is drawn from; None: whole episodes
-    of up to 96 steps, or 32 to 96 steps of longer ones."""
+    """Range [lo, hi) of the steps of a rollout; None: whole episodes of up to 96 steps, and 32 to
+    96 steps of longer ones."""
     world_count: int = 8
     """Worlds in a batch."""
     pool_size: int | None = None
-    """Worlds that live on between rollouts; 0: none, all rollouts begin where episodes do. None: 64
-    where rollouts are shorter than episodes, else 0."""
+    """Worlds of a pool, from which rollouts continue; 0: all rollouts start new episodes. None: 64
+    if rollouts are shorter than episodes, else 0."""
     fresh_share: float = 0.25
-    """Share of each batch from the pool that begins where episodes do, at least one world
+    """Fraction of each batch from the pool that starts new episodes, at least one world
     (dimensionless)."""
     learning_rate: float = 4e-3
-    """AdamW's, at the beginning."""
+    """AdamW's, at first."""
     last_rate: float = 0.05
-    """Learning rate at the end, as a share of the first."""
+    """Learning rate at the end, as a fraction of the first."""
     memory: Memory = "store"
     """What the backward pass reads: "store", "recompute" or "minimal", as in `rollout`."""
 
     def __post_init__(self) -> None:
-        """Check what the trainer's configuration does not hold; raises NPAError."""
+        """Check what `TrainConfig` does not check; raises NPAError."""
         check_fraction(self, "last_rate")
-        # The trainer's configuration asks what numbers they are.
         given: Any = self.steps
         if given is not None:
             if not isinstance(given, list | tuple) or len(given) != 2:
@@ -79,9 +79,8 @@ DEFAULTS = GradientOptions()
 def train(progress: Progress, options: GradientOptions = DEFAULTS) -> RuleSet:
     """Descend the loss at the end of rollouts, differentiated through all of their steps.
 
-    Rollouts begin where episodes do, or go on from where earlier ones ended, in a pool as in the
-    paper (arXiv 2601.16096). State steps are clamped to the action space, as environments clip
-    them. Observations are not clipped.
+    Rollouts start new episodes, or continue earlier ones from a pool as in the paper (arXiv
+    2601.16096). State steps are clamped as in environments. Observations are not clipped.
     """
     problem, device, seed = progress.problem, progress.device, progress.seed
     task, rules = EnvironmentTask(problem, device), progress.first_rules()
@@ -90,11 +89,11 @@ def train(progress: Progress, options: GradientOptions = DEFAULTS) -> RuleSet:
         steps = (length, length + 1) if length <= LONGEST else (LONGEST // 3, LONGEST + 1)
     if pool_size is None:
         pool_size = 0 if steps[0] >= length else max(POOL_SIZE, options.world_count)
-    config = _Schedule(
+    config = BudgetTrainConfig(
         task=problem.config,
         progress=progress,
-        # The budget ends the run.
-        iterations=2**40,
+        # A single repeat without an end: the budget ends the run.
+        iterations=sys.maxsize,
         repeats=1,
         world_count=options.world_count,
         pool_size=pool_size or options.world_count,
@@ -108,14 +107,13 @@ def train(progress: Progress, options: GradientOptions = DEFAULTS) -> RuleSet:
         seed=seed,
         device=str(device),
         memory=options.memory,
-        # Long starts are not recorded.
+        # A task whose starts are long rollouts is not recorded.
         cuda_graph=not isinstance(task.inner, EnvTask) or task.inner.start_is_short,
     )
     schedule = torch.Generator().manual_seed(seed)
-    # The cycle calls of the rules what one rule has.
-    rule = cast(NPARule, rules)
-    cycle = TrainingCycle(task, rule, config, device, schedule, task.rollout)
-    # On CUDA every number of steps is a recording of its own.
+    # A cycle uses parameters and `task.rollout` only, for which a RuleSet is as good as a rule.
+    cycle = TrainingCycle(task, cast(NPARule, rules), config, device, schedule, task.rollout)
+    # On CUDA there is one recording for each number of steps: make all before the clock starts.
     for number in range(*config.steps) if device.type == "cuda" else (config.steps[0],):
         cycle.batch.run(number)
     numbers = itertools.count()
@@ -127,23 +125,22 @@ def train(progress: Progress, options: GradientOptions = DEFAULTS) -> RuleSet:
 
 
 @dataclass(frozen=True, kw_only=True)
-class _Schedule(TrainConfig[Any]):
-    """A trainer's configuration whose learning rate follows the budget."""
+class BudgetTrainConfig(TrainConfig[Any]):
+    """A `TrainConfig` whose learning rate depends on the budget spent, not on the iteration."""
 
     progress: Progress
     last_rate: float
-    """Learning rate at the end, as a share of the first (dimensionless)."""
+    """Learning rate at the end, as a fraction of the first (dimensionless)."""
 
     def learning_rate_at(self, iteration: int, share: float = 0.0) -> float:
-        """Return the learning rate now: half a cosine over the budget, whatever the arguments."""
+        """Return the current learning rate, half a cosine over the budget; ignores arguments."""
         return annealed(self.learning_rate, self.last_rate, self.progress.share)
 
 
 class EnvironmentTask(ParticleTask[Any]):
-    """Worlds as a problem's episodes start, and their loss; worlds move by the problem's physics.
+    """A problem as a task of the trainer: its episodes' starts, loss and physics.
 
-    Episodes are damaged where they start, or not at all. Rules are made by the learner. All rules
-    must descend one loss, and no particle may leave a world.
+    All species must have one loss, and no particle may leave a world.
     """
 
     def __init__(self, problem: Problem, device: torch.device) -> None:
@@ -156,8 +153,8 @@ class EnvironmentTask(ParticleTask[Any]):
         if type(task).settle is not SpeciesTask.settle:
             raise NPAError(
                 "a method that follows gradients must have one loss to descend, but in "
-                f"{problem.env_id} species are paid at each other's expense: learn by 'ppo' with "
-                "what each particle is paid"
+                f"{problem.env_id} species gain rewards at each other's expense: learn by 'ppo' "
+                "with the reward of each particle"
             )
         if problem.keywords.get("deaths"):
             raise NPAError(
@@ -174,7 +171,7 @@ class EnvironmentTask(ParticleTask[Any]):
     def seed(
         self, world_count: int, *, generator: Randomness, device: str | torch.device = "cpu"
     ) -> Worlds:
-        """Return worlds as episodes begin, and their goals where they have such."""
+        """Return the first worlds of episodes, with their goals, if any."""
         if isinstance(generator, WorldRandom):
             keys = generator.integers(KEY_RANGE[1])
         else:
@@ -183,23 +180,23 @@ class EnvironmentTask(ParticleTask[Any]):
         return x, s, rest[1] if rest else None
 
     def toward(self, goal: Tensor | None) -> Self:
-        """Return the task with the loss of worlds that have these goals, shape [B]."""
+        """Return a copy of the task whose losses are for these goals, shape [B]."""
         if goal is None:
             return self
         assert isinstance(self.inner, EnvTask), "species have no goals"
-        aimed = copy.copy(self)
-        aimed.inner = self.inner.toward(goal)
-        return aimed
+        task = copy.copy(self)
+        task.inner = self.inner.toward(goal)
+        return task
 
     def loss(self, x: Tensor, s: Tensor, path_length: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
-        """Return the environment's loss, the mean over worlds and species, and its named parts."""
+        """Return the loss, averaged over worlds and species, and its parts by name."""
         parts = {name: part.mean() for name, part in self._losses(x, s).items()}
         total = torch.stack(list(parts.values())).sum()
         self._check_gradient(total, x, s)
         return total, parts
 
     def world_losses(self, x: Tensor, s: Tensor) -> Tensor:
-        """Return the environment's loss of each world, the mean over its species, shape [B]."""
+        """Return the loss of each world, averaged over its species, shape [B]."""
         total = torch.stack(list(self._losses(x, s).values())).sum(dim=0)
         total = total.flatten(1).mean(dim=1) if total.dim() > 1 else total
         self._check_gradient(total, x, s)
@@ -208,13 +205,10 @@ class EnvironmentTask(ParticleTask[Any]):
     def rollout(
         self, rules: Any, x: Tensor, s: Tensor, steps: int, /, **options: Any
     ) -> tuple[Tensor, Tensor, Tensor]:
-        """Run a `RuleSet` as the environment would, differentiably.
-
-        Options are those of `npa_envs.rollout`; the physics is the environment's.
-        """
+        """Run a `RuleSet` by the environment's physics; options are those of `npa_envs.rollout`."""
         physics, config = self.physics, self.config
         if self._clamped is None or self._clamped[0] is not rules:
-            # Made once: recorded rollouts know clamped rules by their identity.
+            # Made once, as recorded rollouts identify rules by `id`.
             limit = physics.limits.state_scale
             self._clamped = rules, [ClampedRule(rule, limit) for rule in rules]
         clamped = self._clamped[1]
@@ -237,14 +231,14 @@ class EnvironmentTask(ParticleTask[Any]):
         return last
 
     def _losses(self, x: Tensor, s: Tensor) -> Mapping[str, Tensor]:
-        """Return the parts of each world's loss, shape [B] or [B, K]."""
+        """Return the parts of each world's loss, shape [B], or [B, K] of K species."""
         if isinstance(self.inner, SpeciesTask):
             return self.inner.losses(Population(x, s, self.problem.counts, self._species))
         return self.inner.losses(x, s)
 
     def _check_gradient(self, total: Tensor, x: Tensor, s: Tensor) -> None:
-        asked = torch.is_grad_enabled() and (x.requires_grad or s.requires_grad)
-        if asked and not total.requires_grad:
+        needed = torch.is_grad_enabled() and (x.requires_grad or s.requires_grad)
+        if needed and not total.requires_grad:
             raise NPAError(
                 f"the losses of {type(self.inner).__name__} must be differentiable for "
                 "a method that follows gradients, but no gradient leads from them to positions or "
@@ -253,7 +247,7 @@ class EnvironmentTask(ParticleTask[Any]):
 
 
 class _ClampInward(torch.autograd.Function):
-    """Numbers clamped to ± a limit; gradients that lead back inside go on as they are."""
+    """The autograd function of `clamp_inward`."""
 
     @staticmethod
     def forward(ctx: Any, values: Tensor, limit: float) -> Tensor:
@@ -264,19 +258,19 @@ class _ClampInward(torch.autograd.Function):
     @staticmethod
     def backward(ctx: Any, bar: Tensor) -> tuple[Tensor, None]:
         (values,) = ctx.saved_tensors
-        # A loss falls against its gradient: beyond the limit only a fall towards it is let through.
+        # Descent moves values against their gradient.
         leads_out = torch.where(values > 0.0, bar < 0.0, bar > 0.0)
         return bar.masked_fill((values.abs() > ctx.limit) & leads_out, 0.0), None
 
 
 def clamp_inward(values: Tensor, limit: float) -> Tensor:
-    """Return values clipped to ± a limit, so that those beyond it can be learned to come back."""
+    """Clamp values to ± a limit; beyond it gradients pass only if descent leads back inside."""
     clamped: Tensor = _ClampInward.apply(values, limit)  # type: ignore[no-untyped-call]
     return clamped
 
 
 class ClampedWeights(FoldedRule):
-    """The weights of a rule, run with its state steps clamped to a limit."""
+    """Folded weights of a rule, whose state steps are clamped to a limit."""
 
     displacement_dim: int
     limit: float
@@ -289,13 +283,13 @@ class ClampedWeights(FoldedRule):
 
 
 class ClampedRule(NPARule):
-    """A rule that shares another one's weights, with state steps within ± `limit` (dimensionless).
+    """A rule with another rule's parameters and state steps clamped to ± `limit` (dimensionless).
 
-    In a rollout it does what the other does in an environment with that `state_scale`.
+    In a rollout it acts as the other rule does in an environment with `state_scale` = `limit`.
     """
 
     def __init__(self, rule: NPARule, limit: float) -> None:
-        # The very parameters: what changes one rule changes both.
+        # The same parameters, not copies.
         vars(self).update(vars(rule))
         self.limit = limit
         self.rule_is_plain = rule.is_plain()
@@ -309,15 +303,15 @@ class ClampedRule(NPARule):
         )
 
     def is_plain(self) -> bool:
-        """Return whether `folded` may stand in for the rule: where it may for the other one."""
+        """Return whether the other rule is plain, so that `folded` may replace `forward`."""
         return self.rule_is_plain
 
     def has_network(self) -> bool:
-        """Return False: weights alone do not make the rule, whose steps are clamped."""
+        """Return False: the network alone would not clamp its state steps."""
         return False
 
     def folded(self) -> FoldedRule:
-        """Return the weights as two plain products with clamped state steps."""
+        """Return the folded weights with clamped state steps."""
         clamped = ClampedWeights(*super().folded())
         clamped.displacement_dim = self.update_dim - self.state_dim
         clamped.limit = self.limit

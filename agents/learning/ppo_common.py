@@ -12,7 +12,7 @@ import torch
 from torch import Tensor, nn
 
 from npa_envs.agents.learning.problem import Problem
-from npa_envs.agents.learning.rules import RuleSet, species_of
+from npa_envs.agents.learning.rule_set import RuleSet, species_of
 from npa_envs.checks import check_fraction, check_non_negative, check_positive
 from npa_envs.errors import NPAError, shown, suggest
 from npa_envs.training.ranks import ALONE, Ranks, restart, world_streams
@@ -20,7 +20,7 @@ from npa_envs.world.randomness import Randomness, WorldRandom, normal_draws
 
 
 class Pace(NamedTuple):
-    """Those of `CommonOptions` whose defaults depend on whether a run begins with fresh rules."""
+    """Options of `CommonOptions` whose defaults depend on whether the run has a `start`."""
 
     learning_rate: float
     initial_std: float
@@ -29,52 +29,52 @@ class Pace(NamedTuple):
     target_kl: float
 
 
-FRESH = Pace(1e-3, 0.2, 0.25, 0, 0.2)
+FRESH = Pace(learning_rate=1e-3, initial_std=0.2, last_noise=0.25, critic_rounds=0, target_kl=0.2)
 
-WARM = Pace(1e-4, 0.05, 1.0, 4, 0.05)
-"""For rules to begin with: noise, haste and a raw critic would undo what they can do."""
+WARM = Pace(learning_rate=1e-4, initial_std=0.05, last_noise=1.0, critic_rounds=4, target_kl=0.05)
+"""With a `start`: much noise, large steps and an untrained critic would spoil those rules."""
 
 CriticKind = Literal["particle", "central"]
-"""Input of a value: a "particle" alone, or its whole world besides ("central")."""
+"""Input of a value: a "particle" alone, or also the mean over its world ("central")."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class CommonOptions:
-    """Options that the device's own PPO and Stable-Baselines3's share."""
+    """Options of both PPOs: `ppo.py` and Stable-Baselines3's. "None: A, or B with a `start`" is the
+    default for new rules, and for rules to begin with."""
 
     steps: int = 16
     """Steps of all worlds in a round, T."""
     epochs: int = 4
-    """Passes over a round; fewer where `target_kl` is passed."""
+    """Passes over a round; fewer where `target_kl` is exceeded."""
     learning_rate: float | None = None
-    """Adam's step at the start, from which it falls to zero over the budget; None: 0.001, or 0.0001
-    with a `start`."""
+    """Adam's learning rate at first; it falls to zero over the budget. None: 0.001, or 0.0001 with
+    a `start`."""
     minibatches: int = 4
-    """Parts that a round is shuffled into in each pass."""
+    """Minibatches of a pass, which is shuffled."""
     gamma: float = 0.5
     """Discount of a reward one step later (dimensionless)."""
     gae_lambda: float = 0.9
-    """Discount of what the critic did not foresee, besides `gamma` (dimensionless)."""
+    """λ of generalised advantage estimation (dimensionless)."""
     entropy_weight: float = 0.0
-    """Weight of the entropy of an action in what is maximised."""
+    """Weight of the entropy of an action in the objective."""
     max_gradient_norm: float = 0.5
-    """Gradients are shortened to this norm: those of rules and of the critic by themselves on the
-    device, taken together in Stable-Baselines3."""
+    """Gradients are clipped to this norm: separately for rules and critic in `ppo.py`, together in
+    Stable-Baselines3."""
     target_kl: float | None = None
-    """The rules stay as they are for the rest of a round once particles' actions are farther than
-    this from those that were played [nats]; None: 0.2, or 0.05 with a `start`."""
+    """The rules learn no more in a round once the KL divergence from the rules that played it is
+    larger [nats]. None: 0.2, or 0.05 with a `start`."""
     initial_std: float | None = None
-    """Standard deviation of every action column at first; None: 0.2, or 0.05 with a `start`."""
+    """Standard deviation of every action column at first. None: 0.2, or 0.05 with a `start`."""
     last_noise: float | None = None
-    """What is left of the standard deviations at the end of the budget (dimensionless); None: 0.25,
-    or 1 with a `start`."""
+    """Factor on the standard deviations at the end of the budget (dimensionless). None: 0.25, or 1
+    with a `start`."""
     noise_decay_share: float = 0.5
-    """Share of the budget, its last, in which standard deviations fall to that; 1: from the
-    start."""
+    """Fraction of the budget, at its end, in which standard deviations fall by `last_noise`."""
     critic_rounds: int | None = None
-    """Rounds in which the critic learns alone; None: 0, or 4 with a `start`."""
+    """Rounds at first in which only the critic learns. None: 0, or 4 with a `start`."""
     critic: CriticKind = "particle"
-    """A value follows from a particle's own perception, or from its whole world ("central")."""
+    """Input of the critic: a particle's own perception, or also its whole world ("central")."""
 
     def __post_init__(self) -> None:
         """Check every field; raises NPAError."""
@@ -89,36 +89,38 @@ class CommonOptions:
             check_fraction(self, "last_noise")
         if self.critic_rounds is not None:
             check_positive(self, int, "critic_rounds", at_least=0)
-        check_word("critic", self.critic, get_args(CriticKind))
+        check_choice("critic", self.critic, get_args(CriticKind))
 
     def pace(self, start: RuleSet | None) -> Pace:
-        """Return the options that depend on a start: those of `FRESH` or `WARM` where None."""
+        """Return the options that depend on `start`, with `FRESH` or `WARM` in place of None."""
         given = {name: getattr(self, name) for name in Pace._fields}
         given = {name: value for name, value in given.items() if value is not None}
         return (FRESH if start is None else WARM)._replace(**given)
 
 
-def noise_left(share_left: float, last_noise: float, decay_share: float) -> float:
-    """Return the share of the first noise that is left: 1 at first, then it falls exponentially.
+def noise_left(budget_left: float, last_noise: float, decay_share: float) -> float:
+    """Return the factor on the first noise: 1 until the last `decay_share` of the budget.
 
-    Rules learn what is best with noise, and are evaluated without. In the last `decay_share` of the
-    budget the two become the same.
+    There it falls exponentially to `last_noise`, as rules learn with noise, but are evaluated
+    without.
     """
-    return math.pow(last_noise, max(0.0, 1.0 - share_left / decay_share))
+    return math.pow(last_noise, max(0.0, 1.0 - budget_left / decay_share))
 
 
-def check_word(name: str, word: object, words: Sequence[str]) -> None:
-    """Check that an option is one of a few words."""
-    if word not in words:
-        raise NPAError(f"{name} must be a known word, got {shown(word)}: {suggest(word, words)}")
+def check_choice(name: str, value: object, choices: Sequence[str]) -> None:
+    """Check that an option is one of its choices."""
+    if value not in choices:
+        raise NPAError(
+            f"{name} must be a known word, got {shown(value)}: {suggest(value, choices)}"
+        )
 
 
 def find_gradients(optimizer: torch.optim.Optimizer, loss: Tensor) -> None:
-    """Write the gradients of a loss into those of an optimiser's parameters."""
-    # A read-out does not act, and layers may be frozen.
+    """Write the gradients of a loss into an optimiser's parameters."""
+    # Read-outs and frozen layers have no gradients.
     parameters = [p for p in optimizer.param_groups[0]["params"] if p.requires_grad]
-    # Not backward(): its accumulation nodes remember the stream they were first used on, which a
-    # capture on another stream must not touch.
+    # Not backward(): its accumulation nodes keep the stream of their first use, which a capture
+    # on another stream must not touch.
     gradients = torch.autograd.grad(loss, parameters, allow_unused=True)
     for parameter, gradient in zip(parameters, gradients, strict=True):
         if gradient is not None:
@@ -129,15 +131,14 @@ def find_gradients(optimizer: torch.optim.Optimizer, loss: Tensor) -> None:
 
 
 def gradients_of(optimizer: torch.optim.Optimizer) -> list[Tensor]:
-    """Return the gradients of those of an optimiser's parameters that have one."""
+    """Return the gradients of an optimiser's parameters, without those that have none."""
     return [p.grad for p in optimizer.param_groups[0]["params"] if p.grad is not None]
 
 
 def zero_output_rules(problem: Problem, seed: int, start: RuleSet | None) -> RuleSet:
-    """Return the rules that actor-critics begin with: those given, or fresh ones that do nothing.
+    """Return the rules that actor-critics begin with: `start`, or new rules that do nothing.
 
-    The steps of random output layers add up: in `npa/Regeneration2D-v0` they take apart whole
-    pictures. Output layers of zeros leave these alone, and learn just as well.
+    Their output layers are zero: random ones destroy the picture in `npa/Regeneration2D-v0`.
     """
     if start is not None:
         return start
@@ -157,11 +158,10 @@ def gaussian_log_prob(mean: Tensor, log_std: Tensor, action: Tensor) -> Tensor:
 
 
 class GaussianRules(nn.Module):
-    """Rules as the mean of Gaussian actions, whose standard deviations do not depend on the state.
+    """Gaussian actions: means by copies of the rules, one standard deviation a column and species.
 
-    Each particle has a likelihood of its own, summed over its action's columns. That of a world is
-    the mean over its particles, never the sum: with N A columns the ratio of two sums is far from
-    one after the smallest update. The rules given are copied.
+    A particle's log-probability is the sum over its action's columns. A world's is the mean over
+    its particles, not the sum, whose ratio would be far from 1 after the smallest update.
     """
 
     row_species: Tensor
@@ -172,7 +172,7 @@ class GaussianRules(nn.Module):
         widths = [rule.update_dim for rule in self.rules]
         start = torch.full((len(widths), widths[0]), math.log(initial_std))
         self.noise_left = 1.0
-        """Share of the first standard deviations that is left (dimensionless)."""
+        """Factor on the first standard deviations (dimensionless)."""
         self.log_std = nn.Parameter(start)
         """Logarithms of the standard deviations, a row for each species, shape [K, A]."""
         self.register_buffer("row_species", species_of(rules.counts), persistent=False)
@@ -180,11 +180,11 @@ class GaussianRules(nn.Module):
         self._each = tuple(RuleSet([rule], [1], self.rules.interface) for rule in self.rules)
 
     def get_extra_state(self) -> float:
-        """Return the share of the noise that is left, for `state_dict`."""
+        """Return `noise_left`, for `state_dict`."""
         return self.noise_left
 
     def set_extra_state(self, state: float) -> None:
-        """Set the share of the noise that is left."""
+        """Set `noise_left`."""
         self.noise_left = state
 
     def row_log_std(self) -> Tensor:
@@ -193,14 +193,14 @@ class GaussianRules(nn.Module):
 
     @torch.no_grad()
     def leave_noise(self, left: float) -> None:
-        """Scale standard deviations to a share of the first, on top of what was learned."""
+        """Set the factor on the first standard deviations, which are also learned."""
         self.log_std.add_(math.log(left / self.noise_left))
         self.noise_left = left
 
     def sample(
         self, observation: Tensor, generator: Randomness | None = None
     ) -> tuple[Tensor, Tensor]:
-        """Draw actions for observations [M, N, P], not clipped, with log-probabilities [M, N]."""
+        """Draw unclipped actions for observations [M, N, P], and log-probabilities [M, N]."""
         mean, log_std = self.rules.mean(observation), self.row_log_std()
         noise = normal_draws(generator, mean.shape, mean)
         action = mean + log_std.exp() * noise
@@ -211,7 +211,7 @@ class GaussianRules(nn.Module):
         return gaussian_log_prob(self.rules.mean(observation), self.row_log_std(), action)
 
     def row_log_prob(self, species: int, rows: Tensor, action: Tensor) -> Tensor:
-        """Return log-probabilities [K] of actions [K, A] of one species that perceives [K, P]."""
+        """Return log-probabilities [K] of actions [K, A] of one species that observes [K, P]."""
         mean = self._each[species].mean(rows[:, None])[:, 0]
         return gaussian_log_prob(mean, self.log_std[species], action)
 
@@ -220,18 +220,17 @@ class GaussianRules(nn.Module):
         return (self.row_log_std() + HALF_LOG_TAU + 0.5).sum(dim=-1).mean()
 
 
-SLOWEST = 0.01
-"""Share of the newest batch in the running moments, once they are no longer plain means."""
+LEAST_RATE = 0.01
+"""Least weight of a new batch in the running moments; the first batches are averaged plainly."""
 
-FARTHEST = 8.0
-"""Standardised inputs are clipped to plus and minus this."""
+INPUT_LIMIT = 8.0
+"""Standardised inputs are clipped to ± this."""
 
 
 class Critic(nn.Module):
-    """Values of particles, whose inputs and outputs are standardised by running moments.
+    """Network of particles' values, whose inputs and outputs are scaled by running moments.
 
-    A value of the kind "particle" is a function of the particle's own perception, "central" of that
-    and of features of all particles of its world, averaged.
+    Its input is a particle's perception; of the kind "central" also the mean features of its world.
     """
 
     mean: Tensor
@@ -263,10 +262,10 @@ class Critic(nn.Module):
         self.register_buffer("updates", torch.zeros(2))
 
     def forward(self, observation: Tensor) -> Tensor:
-        """Return values of particles that observe [M, N, P], in units of the rewards, [M, N]."""
+        """Return values [M, N] for observations [M, N, P], in units of the rewards."""
         spread = (self.square - self.mean.square()).clamp(min=1e-6).sqrt()
-        seen = ((observation - self.mean) / spread).clamp(-FARTHEST, FARTHEST)
-        features = torch.tanh(self.features(seen))
+        inputs = ((observation - self.mean) / spread).clamp(-INPUT_LIMIT, INPUT_LIMIT)
+        features = torch.tanh(self.features(inputs))
         mixed = self.own(features) + self.species(self.row_species)
         if self.pooled is not None:
             mixed = mixed + self.pooled(features.mean(dim=-2, keepdim=True))
@@ -275,7 +274,7 @@ class Critic(nn.Module):
 
     @torch.no_grad()
     def observe(self, observation: Tensor, ranks: Ranks = ALONE) -> None:
-        """Take observations [..., P] of all processes into the moments of inputs."""
+        """Update the moments of inputs by observations [..., P] of all processes."""
         rate = self._rate(0)
         rows = observation.flatten(0, -2)
         mean, square = rows.mean(dim=0), rows.square().mean(dim=0)
@@ -285,7 +284,7 @@ class Critic(nn.Module):
 
     @torch.no_grad()
     def rescale(self, targets: Tensor, ranks: Ranks = ALONE) -> None:
-        """Take targets into the scale of values; values stay the same."""
+        """Update the scale by targets; the network is changed so that values stay the same."""
         before = self.scale.clone()
         square = targets.square().mean()
         ranks.reduce([square])
@@ -295,13 +294,13 @@ class Critic(nn.Module):
             parameter.mul_(before / self.scale)
 
     def _rate(self, moment: int) -> Tensor:
-        """Return the share of the newest batch, on the device."""
+        """Count a batch, and return its weight in a running moment, on the device."""
         self.updates[moment] += 1.0
-        return (1.0 / self.updates[moment]).clamp(min=SLOWEST)
+        return (1.0 / self.updates[moment]).clamp(min=LEAST_RATE)
 
 
 def seeded_critic(problem: Problem, input_dim: int, options: Any, seed: int) -> Critic:
-    """Return the critic of a problem's particles; torch's own randomness is left as it is."""
+    """Return a new critic; torch's global random state does not change."""
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
         return Critic(input_dim, problem.counts, options.critic, options.critic_width)
@@ -310,21 +309,19 @@ def seeded_critic(problem: Problem, input_dim: int, options: Any, seed: int) -> 
 def learner_random(
     seed: int, total: int, places: Tensor, device: torch.device, ranks: Ranks
 ) -> Randomness:
-    """Return the source of a learner's draws: a stream a world where processes share them."""
+    """Return a learner's random source: with several processes one stream a world."""
     if ranks.together:
         return world_streams((seed,), total, places, device)
     return torch.Generator(device).manual_seed(seed)
 
 
 class Minibatches:
-    """Parts that the rows of a round are shuffled into, anew for each pass.
+    """Minibatches: the rows of a round, shuffled for each pass and split into `count` parts.
 
-    A process alone shuffles all rows. Where several share a run, the rows of each world are
-    shuffled by its own stream, and a part has as many of each world: so it is the same part of the
-    whole round for any number of processes.
-
-    Groups are shuffled by themselves; those of n `rows` a world and step stand as [T, B, n]. There
-    are `count` parts, or fewer where there are not as many rows.
+    There are several groups of rows, which are shuffled separately: one with n in `rows` has n rows
+    a world and step, in the order [T, B, n]. Few rows make fewer parts. One process shuffles all
+    rows; of several each shuffles the rows of each world by the world's own stream, and a part has
+    equally many of each world, so that parts do not depend on the number of processes.
     """
 
     def __init__(
@@ -336,14 +333,14 @@ class Minibatches:
         shared = worlds if isinstance(random, WorldRandom) else 1
         self.count = min(count, steps * worlds * min(rows) // shared)
         """Parts of a pass."""
-        # Recorded work reads them in place.
+        # CUDA graphs read them in place.
         self._orders = [
             torch.zeros(steps * worlds * n, dtype=torch.int64, device=random.device) for n in rows
         ]
         self.parts: list[tuple[Tensor, ...]] = []
-        """Rows of each part, int64, by group: views, which `shuffle` writes anew."""
+        """Row numbers of each part, int64, by group: views that `shuffle` overwrites."""
         for order in self._orders:
-            # As even as `tensor_split` makes them.
+            # Sizes as of `tensor_split`.
             sizes = [shared * ((len(order) // shared + k) // self.count) for k in range(self.count)]
             self.parts.append(torch.split(order, sizes[::-1]))
 
@@ -359,7 +356,7 @@ class Minibatches:
     def _by_world(self, random: WorldRandom, rows: int) -> Tensor:
         """Return all rows of a group, part by part, shape [T B n]."""
         steps, worlds = self._shape
-        places = random.uniform(steps * rows).argsort(dim=1, stable=True)
-        world = torch.arange(worlds, device=places.device)[:, None]
-        index = (places // rows * worlds + world) * rows + places % rows
+        order = random.uniform(steps * rows).argsort(dim=1, stable=True)
+        world = torch.arange(worlds, device=order.device)[:, None]
+        index = (order // rows * worlds + world) * rows + order % rows
         return torch.cat([part.flatten() for part in index.tensor_split(self.count, dim=1)])

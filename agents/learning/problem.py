@@ -1,6 +1,6 @@
 """Problems to learn: an environment with its keywords, its worlds, and the seeds of runs.
 
-Every run learns in worlds of its own, and none in those of evaluations.
+Each run has seeds of its own for its worlds; evaluations have others.
 """
 
 from __future__ import annotations
@@ -19,56 +19,54 @@ from gymnasium.vector import AutoresetMode
 from torch import Tensor
 
 from npa_envs.agents.evaluation import TIME_LIMIT
-from npa_envs.agents.learning.rules import RuleSet
+from npa_envs.agents.learning.rule_set import RuleSet
 from npa_envs.agents.policies import Interface, spans_of
 from npa_envs.checks import check_positive, is_whole
 from npa_envs.devices import check_device
 from npa_envs.envs.core.config import EnvConfig
-from npa_envs.envs.core.task import EnvTask
+from npa_envs.envs.core.task import Actor, EnvTask
 from npa_envs.envs.core.vector import NPAVectorEnv, worlds_to_reset
-from npa_envs.envs.garden.task import GardenTask
 from npa_envs.envs.multi.task import SpeciesConfig, SpeciesTask
 from npa_envs.envs.multi.tasks import ENVIRONMENTS as SPECIES_TASKS
 from npa_envs.envs.multi.tasks import task_settings
 from npa_envs.envs.multi.tasks import task_type as species_task_type
 from npa_envs.envs.multi.vector import MultiSpeciesVectorEnv
-from npa_envs.envs.shapeshifter2d import ShapeshifterTask
 from npa_envs.errors import NPAError, shown, suggest
 from npa_envs.registration import ALL, SPECIES_SIZES
 from npa_envs.world.actions import Physics
 from npa_envs.world.cuda_graph import to_device_async
 
 WORLDS_PER_SEED = 10_000
-"""Distance of the worlds' seeds of one run from those of the next."""
+"""Seeds of worlds that each run has: run k has those from k times this."""
 
 FIRST_EVALUATION_SEED = 1_000_000
-"""Seeds from here on are for evaluations."""
+"""Runs learn in worlds with smaller seeds."""
 
 RUNS = FIRST_EVALUATION_SEED // WORLDS_PER_SEED
-"""Runs that have worlds of their own: their seeds are below this."""
+"""Seeds of runs are below this."""
 
 EVALUATION_SEEDS = range(FIRST_EVALUATION_SEED, FIRST_EVALUATION_SEED + 16)
-"""Seeds of evaluations, far from those that learners begin their worlds with."""
+"""Seeds of the worlds of evaluations."""
 
 LEFT = "left the world"
 """Reason for the end of a species that diverged."""
 
 DEFAULT_STEPS = 256
-"""Steps of an episode where an id is registered without a limit."""
+"""Steps of an episode of an id that is registered without a limit."""
 
 SPECIES = (*SPECIES_TASKS, *(size.id for size in SPECIES_SIZES))
 """Ids of species tasks."""
 
 RowRewards = Literal["particle", "marginal"]
-"""Rewards of environments that pay each particle."""
+"""Kinds of rewards that each particle gets separately."""
 
 ROW_REWARDS = get_args(RowRewards)
 
 ELSEWHERE = {
     "num_envs": "it is a field of Problem",
-    "world_count": "the field num_envs of Problem says how many",
-    "max_episode_steps": "the field episode_steps of Problem says how many",
-    "max_cycles": "the field episode_steps of Problem says how many",
+    "world_count": "set the field num_envs of Problem",
+    "max_episode_steps": "set the field episode_steps of Problem",
+    "max_cycles": "set the field episode_steps of Problem",
     "episode_steps": "it is a field of Problem",
     "device": "it is given to train and make_envs",
     "output": "learners are given tensors",
@@ -82,20 +80,19 @@ ELSEWHERE = {
 
 @dataclass(frozen=True, kw_only=True)
 class Problem:
-    """An environment to learn in. It can be written as JSON, and read again, by `to_json`.
+    """An environment to learn in, with its keywords; `to_json` and `from_json` store it.
 
     Raises:
-        NPAError: There is no such environment, a keyword is unknown or wrong, or a number is out of
-            its range.
+        NPAError: The environment or a keyword is unknown, or a value is wrong.
     """
 
     env_id: str
-    """Of `npa_envs.registration`, or of a species task: "npa/Mixing-v0"; or of an environment of
-    one's own that is registered with Gymnasium."""
+    """Id of an environment of this library, "npa/Mixing-v0", or of your own that is registered with
+    Gymnasium."""
     keywords: Mapping[str, Any] = field(default_factory=dict)
-    """Further keywords of `gym.make` or `multispecies_v0.batched`, of JSON's types."""
+    """Keywords of `gym.make` or `multispecies_v0.batched`, of JSON's types."""
     episode_steps: int
-    """Steps after which an episode is cut off."""
+    """Steps after which an episode is truncated."""
     num_envs: int = 16
     """Worlds B in which learners act at the same time."""
     hidden_dim: int = 128
@@ -125,7 +122,7 @@ class Problem:
                 f"give numbers, text and lists ({error})"
             ) from error
         object.__setattr__(self, "keywords", plain)
-        # Unknown ids and wrong keywords are errors now, not in the middle of a comparison.
+        # Raises on unknown ids and wrong keywords.
         _ = self.config
 
     def __hash__(self) -> int:
@@ -133,23 +130,17 @@ class Problem:
         return hash(self.to_json())
 
     @property
-    def is_species(self) -> bool:
-        """Whether several species share a world."""
+    def actor(self) -> Actor:
+        """What acts: "particles", those of several "species", "brushes", or "codes" of a rule."""
+        return self.task_type.actor
+
+    @property
+    def _is_species(self) -> bool:
         return isinstance(self.env_id, str) and self.env_id in SPECIES
-
-    @property
-    def is_garden(self) -> bool:
-        """Whether a rule runs the particles, and actions are those of brushes."""
-        return not self.is_species and issubclass(self.env_type.task_type, GardenTask)
-
-    @property
-    def chooses_codes(self) -> bool:
-        """Whether a rule of many pictures runs the particles, and an action is a code."""
-        return not self.is_species and issubclass(self.env_type.task_type, ShapeshifterTask)
 
     @cached_property
     def env_type(self) -> type[NPAVectorEnv]:
-        """Class of the environment of many worlds, where one species is alone."""
+        """Class of the batched environment; not of species."""
         spec = gymnasium.registry.get(self.env_id) if isinstance(self.env_id, str) else None
         entry: Any = None if spec is None else spec.vector_entry_point
         if isinstance(entry, str):
@@ -165,14 +156,14 @@ class Problem:
     @property
     def task_type(self) -> type[EnvTask[Any]] | type[SpeciesTask]:
         """Class of the task."""
-        if self.is_species:
+        if self._is_species:
             return species_task_type(task_settings(self.env_id)[0])
         return self.env_type.task_type
 
     @property
     def settings(self) -> dict[str, Any]:
-        """Keywords that belong to the id."""
-        if self.is_species:
+        """Keywords that the id is registered with."""
+        if self._is_species:
             settings = task_settings(self.env_id)[1]
             settings.pop("max_cycles", None)
             return settings
@@ -183,7 +174,7 @@ class Problem:
         """The environment's configuration, on the CPU."""
         config_type = self.task_type.config_type
         given = self.settings | dict(self.keywords)
-        if self.is_species:
+        if self._is_species:
             given["max_cycles"] = self.episode_steps
         elif given.get("reward") == "sparse":
             given["episode_steps"] = self.episode_steps
@@ -191,12 +182,12 @@ class Problem:
 
     @property
     def physics(self) -> Physics:
-        """The worlds' constants."""
+        """Physical constants of the worlds."""
         return self.config.physics(self.task_type.space_dim, static=self.task_type.static)
 
     @property
     def interface(self) -> Interface:
-        """What observations and actions mean, column by column."""
+        """Meaning of the columns of observations and actions."""
         config = self.config
         if isinstance(config, SpeciesConfig) and config.perception == "per_species":
             return Interface.of(self.physics, config.species_count)
@@ -204,7 +195,7 @@ class Problem:
 
     @property
     def counts(self) -> tuple[int, ...]:
-        """Particles of each species that is an agent; of the only one where it is alone."""
+        """Particles of each species that is an agent; one number without species."""
         config = self.config
         if isinstance(config, SpeciesConfig):
             return config.played_counts
@@ -212,11 +203,11 @@ class Problem:
 
     @property
     def particle_count(self) -> int:
-        """Particles of a world that are acted upon, N."""
+        """Particles of a world that act, N."""
         return sum(self.counts)
 
     def make_task(self, device: str | torch.device = "cpu") -> EnvTask[Any] | SpeciesTask:
-        """Return the task by itself, starts and losses, for worlds on a device.
+        """Return the task, which has starts and losses, for worlds on a device.
 
         Raises:
             NPAError: Something that the task needs cannot be loaded.
@@ -233,7 +224,7 @@ class Problem:
         tell_updated: bool = False,
         copy: bool = True,
     ) -> NPAVectorEnv | ConcatenatedSpeciesEnv:
-        """Return worlds to act in, batched on a device; all that goes in and out are tensors there.
+        """Return batched worlds on a device; observations, actions and the rest are tensors there.
 
         `reset(seed=0)` returns observations, [B, N, P], and infos; `step(actions)`, of [B, N, A],
         returns observations, rewards, terminations and truncations, [B] each, and infos. Worlds
@@ -242,23 +233,22 @@ class Problem:
 
         Args:
             num_envs: Worlds B; None: the problem's.
-            device: Where they live.
-            row_rewards: Give `infos["particle_reward"]`, [B, N], the reward of each particle:
-                "particle", its own share of the improvement, or "marginal", the loss of its world
-                without its action. Of several species each particle always has the reward of its
-                species.
-            tell_updated: Give `infos["updated"]`, [B, N], whose actions took effect in each step;
-                not for several species.
-            copy: Hand out new tensors; False: where possible the same ones in each step,
-                overwritten by the next.
+            device: Device of the worlds.
+            row_rewards: Adds `infos["particle_reward"]`, [B, N]: "particle", each particle's own
+                part of the improvement, or "marginal", the difference that its action makes. With
+                several species it is always there: the reward of the particle's species.
+            tell_updated: Adds `infos["updated"]`, [B, N]: which actions took effect; not with
+                several species.
+            copy: Return new tensors; False: where possible the same ones, which the next step
+                overwrites.
 
         Raises:
-            NPAError: The worlds do not fit into memory, there is no such device, or `row_rewards`
+            NPAError: The worlds do not fit into memory, the device is unknown, or `row_rewards`
                 contradicts the problem's keywords.
         """
         count = self.num_envs if num_envs is None else num_envs
         place = str(check_device(device))
-        if self.is_species:
+        if self._is_species:
             return ConcatenatedSpeciesEnv(
                 task_settings(self.env_id)[0],
                 count,
@@ -291,7 +281,7 @@ class Problem:
         return made
 
     def new_rules(self, seed: int) -> RuleSet:
-        """Return untrained rules, one for each species; as `RuleSet.new`."""
+        """Return `RuleSet.new` of the problem: untrained rules, one for each species."""
         return RuleSet.new(self, seed)
 
     def to_json(self) -> str:
@@ -303,7 +293,7 @@ class Problem:
         """Return the problem that `to_json` wrote.
 
         Raises:
-            NPAError: The text is no problem in JSON.
+            NPAError: The text is not a problem in JSON.
         """
         try:
             return cls(**json.loads(text))
@@ -315,7 +305,7 @@ class Problem:
 
 
 def registered_steps(env_id: str) -> int:
-    """Return the steps after which episodes of an id are cut off; 256 where it has no limit."""
+    """Return the steps after which episodes of an id are truncated; 256 without a limit."""
     if env_id in SPECIES:
         steps = task_settings(env_id)[1].get("max_cycles")
     else:
@@ -324,7 +314,7 @@ def registered_steps(env_id: str) -> int:
 
 
 def check_run_seed(seed: Any) -> None:
-    """Check the seed of a run, which has worlds of its own: it is below `RUNS`."""
+    """Check that the seed of a run is a whole number below `RUNS`."""
     if not is_whole(seed) or not 0 <= seed < RUNS:
         raise NPAError(
             f"seed must be a whole number from 0 to {RUNS - 1}, as the worlds of later ones are "
@@ -333,9 +323,9 @@ def check_run_seed(seed: Any) -> None:
 
 
 def world_seeds(seed: int, count: int, part: int = 0) -> list[int]:
-    """Return the seeds of the worlds that a run learns in, which no other run has.
+    """Return the seeds of a run's worlds, which no other run has.
 
-    Each part of a run, from one stop to the next, has others, as long as there are enough.
+    part: how often the run was resumed; each part has other seeds until all are used.
     """
     check_run_seed(seed)
     if count > WORLDS_PER_SEED:
@@ -348,14 +338,13 @@ def world_seeds(seed: int, count: int, part: int = 0) -> list[int]:
 
 
 class ConcatenatedSpeciesEnv:
-    """Worlds of several species whose particles stand one after the other: [B, N, P], [B, N, A].
+    """Worlds of several species as one agent: species concatenated to [B, N, P] and [B, N, A].
 
-    It has the interface of `NPAVectorEnv` as far as learners need it. Reward and loss of a world
-    are the means over its species; a species that ended keeps the loss that it had then. A world
-    terminates where all of its species have ended by themselves. The reason is that of the first
-    species that ended by itself, or "left the world" where one did. Every step's infos also have
-    of each particle's species, in [B, N], its reward in `particle_reward`, whether it was alive in
-    `acted`, and whether it ended by itself now in `particle_terminated`.
+    It has what learners need of the interface of `NPAVectorEnv`. Reward and loss of a world are
+    means over its species; a species that ended keeps its last loss. A world terminates once all
+    of its species have; its reason is that of the first one, or "left the world" if any did.
+    Infos of a step have for each particle, [B, N], the `particle_reward` of its species, whether it
+    was alive, `acted`, and whether it terminated in this step, `particle_terminated`.
     """
 
     def __init__(
@@ -393,35 +382,34 @@ class ConcatenatedSpeciesEnv:
         rows, infos = self.species_env.reset(seed, options)
         chosen = worlds_to_reset(options, self.num_envs)
         self._reasons[chosen] = None
-        # Infos are silent about species that have ended in worlds that go on.
+        # In worlds that are not reset, infos have no loss of species that ended.
         losses, index = self._stacked(infos, "loss"), to_device_async(chosen, self._loss.device)
         self._loss = self._loss.index_copy(0, index, losses[index])
         return self._concatenated(rows), {"loss": self._loss.mean(dim=1)}
 
     def step(self, actions: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, dict[str, Any]]:
-        """Apply actions, [B, N, A], in [-1, 1], and perceive; wrong ones leave the worlds alone."""
+        """Apply actions, [B, N, A], in [-1, 1], and observe; an error changes no world."""
         by_species = {agent: actions[:, span] for agent, span in self.spans.items()}
         rows, rewards, terminations, truncations, infos = self.species_env.step(by_species)
-        paid, ended, cut = (
+        reward, ended, cut = (
             torch.stack(list(part.values()), dim=1) for part in (rewards, terminations, truncations)
         )
-        acted, late = self._stacked(infos, "acted"), cut.any(dim=1)
+        acted, truncated = self._stacked(infos, "acted"), cut.any(dim=1)
         self._loss = torch.where(acted, self._stacked(infos, "loss"), self._loss)
         found: dict[str, Any] = {
             "loss": self._loss.mean(dim=1),
-            "particle_reward": self._by_particle(paid),
+            "particle_reward": self._by_particle(reward),
             "acted": self._by_particle(acted),
             "particle_terminated": self._by_particle(ended),
         }
-        # Why the first species of each world ended, or that one left the world.
         for agent in self.spans:
             own = infos[agent].get("reason")
             if own is not None:
-                given = own != None  # noqa: E711
-                held = (self._reasons != None) & (self._reasons != TIME_LIMIT)  # noqa: E711
-                self._reasons = np.where((given & ~held) | (own == LEFT), own, self._reasons)
+                new = own != None  # noqa: E711
+                known = (self._reasons != None) & (self._reasons != TIME_LIMIT)  # noqa: E711
+                self._reasons = np.where((new & ~known) | (own == LEFT), own, self._reasons)
         first = infos[self.species_env.agents[0]]
-        over = first.get("_final_obs", torch.zeros_like(late))
+        over = first.get("_final_obs", torch.zeros_like(truncated))
         if "final_obs" in first:
             last = {agent: infos[agent]["final_obs"] for agent in self.spans}
             which = over.cpu().numpy()
@@ -431,7 +419,8 @@ class ConcatenatedSpeciesEnv:
             final = {"loss": found["loss"], "_loss": over, "reason": reasons}
             found |= {"final_obs": self._concatenated(last), "_final_obs": over}
             found |= {"final_info": final, "_final_info": over}
-        return self._concatenated(rows), paid.mean(dim=1), over & ~late, over & late, found
+        ended, cut = over & ~truncated, over & truncated
+        return self._concatenated(rows), reward.mean(dim=1), ended, cut, found
 
     def close(self) -> None:
         """Close the window, if there is one."""

@@ -1,4 +1,4 @@
-"""The account of a run: its budget, its learning curve, and its checkpoints."""
+"""Budget, learning curve and checkpoints of a run."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from torch import Tensor, nn
 
 from npa_envs.agents.evaluation import checked_seeds, evaluate_policy
 from npa_envs.agents.learning.problem import Problem
-from npa_envs.agents.learning.rules import RuleSet
+from npa_envs.agents.learning.rule_set import RuleSet
 from npa_envs.checks import check_count, check_positive, is_real
 from npa_envs.devices import check_device
 from npa_envs.errors import DivergedError, NPAError, shown
@@ -29,18 +29,17 @@ from npa_envs.world.randomness import Randomness, WorldRandom
 
 @dataclass(frozen=True, kw_only=True)
 class Budget:
-    """What a learner may spend: time, or particle-steps, or whichever is spent first.
+    """Limit of a run: seconds, particle-steps, or whichever of both is reached first.
 
     Raises:
         NPAError: Neither is given, or one is not positive.
     """
 
     seconds: float | None = None
-    """Wall-clock time of learning [s]. Set-up and evaluations come on top, and may take longer:
-    there are at most `entries` + 2 evaluations, of an episode for each of `evaluation_seeds`. By
-    default these are 22 of 16 episodes; `entries=1` makes at most 3."""
+    """Wall-clock time of learning [s]. Set-up and evaluations do not count, and may take longer:
+    there are at most `entries` + 2 evaluations, by default 22 of 16 episodes."""
     particle_steps: int | None = None
-    """Steps of an environment or a rollout, times the particles that took them."""
+    """Steps times particles that took them, of environments and rollouts together."""
 
     def __post_init__(self) -> None:
         """Check both; raises NPAError."""
@@ -54,7 +53,7 @@ class Budget:
             check_positive(self, int, "particle_steps")
 
     def share(self, seconds: float, particle_steps: int) -> float:
-        """Return the share of the budget that time [s] and particle-steps are; 1: it is spent."""
+        """Return the fraction of the budget that time [s] and particle-steps make; 1: all of it."""
         by_time = 0.0 if self.seconds is None else seconds / self.seconds
         by_steps = 0.0 if self.particle_steps is None else particle_steps / self.particle_steps
         return max(by_time, by_steps)
@@ -65,9 +64,9 @@ class CurvePoint:
     """One evaluation: a point of a learning curve."""
 
     seconds: float
-    """Time spent by then [s]."""
+    """Learning time before it [s]."""
     particle_steps: int
-    """Particle-steps spent by then."""
+    """Particle-steps before it."""
     mean_return: float
     """Mean return of the evaluation's episodes."""
     standard_error: float
@@ -77,65 +76,65 @@ class CurvePoint:
 
 
 class Learner(Protocol):
-    """A learner whose run can be stopped and resumed: what its checkpoints hold."""
+    """A learner whose run can be stopped and resumed, by the state that checkpoints contain."""
 
     random: Randomness
-    """What it draws from."""
+    """Its random source."""
 
     @property
     def modules(self) -> Mapping[str, nn.Module]:
-        """What learns, by name."""
+        """Modules that are trained, by name."""
 
     @property
     def optimisers(self) -> Mapping[str, torch.optim.Optimizer]:
-        """Their optimisers of Adam's kind, by name."""
+        """Their optimisers, Adam or AdamW, by name."""
 
-    def go_on(self, iteration: int, part: int) -> None:
-        """Go on after so many iterations, for the part-th time, from 1 on, with other worlds."""
+    def resume(self, iteration: int, part: int) -> None:
+        """Resume after `iteration` iterations, for the `part`-th time, in new worlds."""
 
 
 class Progress:
-    """Keeps a learner's account, and evaluates what it has learned every now and then.
+    """Counts what a learner spends, evaluates its rules at regular parts of the budget, saves them.
 
-    A learner makes its worlds, compiles what it needs, and then leaves the loop to `run`, which is
+    A learner makes its worlds, compiles what it needs, and then calls `run`, which is
 
     ```python
     progress.start(rules)
     while not progress.over:
-        progress.advance(iteration())  # learns, and returns the particle-steps that it took
+        progress.advance(iteration())  # learns, and returns the particle-steps done
         progress.look(rules)
     progress.look(rules, force=True)
     ```
 
-    Set-up before `start`, evaluations and checkpoints count as no time. On CUDA the host waits for
-    the device only there, and `advance` keeps it at most one iteration ahead, so that time is what
-    the device took.
+    Set-up before `start`, evaluations and checkpoints do not count as time. On CUDA only these
+    synchronise; `advance` keeps the CPU at most one iteration ahead of the device, so that the time
+    measured is the device's.
 
-    A run that is kept writes a checkpoint, the rules and the curve as `log.jsonl` with each entry
-    of the curve, and where SIGTERM or Ctrl-C stops it. A resumed run has the weights, the
-    optimisers and the account of the checkpoint, on any number of processes, and new episodes.
+    With `out`, a checkpoint, the rules and the curve (`log.jsonl`) are written after each entry of
+    the curve, and when SIGTERM or Ctrl-C stops the run. A resumed run continues from the weights,
+    optimisers and counts of the checkpoint, on any number of processes, with new episodes.
 
-    Where torch has a default group of processes, each has an account, and all go by the clock of
-    the first one. Each evaluates the same episodes. The first one reports and writes.
+    With a default process group of torch, all processes use the clock of rank 0, each evaluates the
+    same episodes, and rank 0 reports and writes.
 
     Args:
-        problem: What is learned.
-        budget: What may be spent.
-        seed: Of new rules and of all that the learner draws.
-        device: Where worlds, rules and evaluations are.
-        evaluation_seeds: Of the episodes, which no learner sees: one each.
-        entries: Evaluations besides the first, at equal shares of the budget.
-        on_entry: Called with each entry.
+        problem: The problem to learn.
+        budget: Time or particle-steps to learn for.
+        seed: Seed of new rules and of the learner's random numbers.
+        device: Device of worlds, rules and evaluations.
+        evaluation_seeds: Seeds of the evaluations' episodes, one each.
+        entries: Evaluations after the first, at equal parts of the budget.
+        on_entry: Called with each entry of the curve.
         initial: Rules to begin with, which are copied; None: new ones.
-        out: Folder of the run's checkpoint, rules and curve; None: it is not kept.
-        run: What the run is of, of JSON's types: a resumed run must be of the same.
-        resume: Go on from the checkpoint in `out`.
-        overwrite: Begin anew although `out` holds a run; its files are removed.
-        on_stop: Called where a kept run is asked to stop before its budget is spent.
+        out: Folder for checkpoint, rules and curve; None: nothing is written.
+        run: Settings of the run, of JSON's types, which must be equal when it is resumed.
+        resume: Continue from the checkpoint in `out`.
+        overwrite: Start again although `out` contains a run; its files are removed.
+        on_stop: Called when a signal stops the run before its budget is spent.
 
     Raises:
-        NPAError: There are no seeds or wrong ones, or the number of entries is not positive. Or as
-            for `npa_envs.training.run.Run`.
+        NPAError: Seeds are missing or wrong, or the number of entries is not positive. Or as for
+            `npa_envs.training.run.Run`.
     """
 
     def __init__(
@@ -194,7 +193,7 @@ class Progress:
             folder.prepare(0, pictures=False)
 
     def first_rules(self) -> RuleSet:
-        """Return the rules that a learner begins with and may change, on the device."""
+        """Return the rules that a learner begins with and trains in place, on the device."""
         if self.initial is not None:
             return self.initial
         return RuleSet.new(self.problem, self.seed).to(self.device)
@@ -205,8 +204,8 @@ class Progress:
         """Learn until the budget is spent, and return the rules.
 
         Args:
-            iteration: Lets the rules learn a little, and returns the particle-steps that it took.
-            learner: What checkpoints are made of, where the run is kept.
+            iteration: Trains the rules a little, and returns the particle-steps that it took.
+            learner: The learner that checkpoints save; needed with `out`.
 
         Raises:
             NPAError: A file of a run that is kept cannot be written or used, or another run writes
@@ -230,7 +229,7 @@ class Progress:
         def end(stopped: bool) -> None:
             if stopped:
                 self._on_stop()
-            # An evaluation takes its time, and who asked to stop may not wait.
+            # Save before the evaluation, as a stopped process may be killed soon.
             self._save(rules, learner)
             self.look(rules, force=True)
             self._save(rules, learner)
@@ -239,12 +238,12 @@ class Progress:
             content, kept.content = kept.content, None
             if content is not None:
                 assert learner is not None, "methods whose runs are kept are learners"
-                self._go_on(learner, content)
+                self._restore(learner, content)
             kept.go(step, begin=begin, over=lambda: self.over, end=end)
         return rules
 
     def start(self, actor: RuleSet | Callable[[Any], Any]) -> None:
-        """Evaluate the rules or the policy that the learner begins with, and begin to count.
+        """Evaluate the rules or the policy before any learning, and start the clock.
 
         A resumed run has this evaluation already.
         """
@@ -258,12 +257,12 @@ class Progress:
 
     @property
     def seconds(self) -> float:
-        """Time spent so far, as the host sees it [s]."""
+        """Learning time so far by this process's clock [s]."""
         return self._seconds + (0.0 if self._since is None else time.perf_counter() - self._since)
 
     @property
     def share(self) -> float:
-        """Share of the budget that is spent; above 1 by the last iteration's excess."""
+        """Fraction of the budget that is spent; the last iteration may take it above 1."""
         seconds = self._elapsed if self.ranks.together else self.seconds
         return self.budget.share(seconds, self.particle_steps)
 
@@ -286,9 +285,9 @@ class Progress:
             self._agree_on_time()
 
     def look(self, actor: RuleSet | Callable[[Any], Any], force: bool = False) -> None:
-        """Evaluate where the next share of the budget is spent, or, by `force`, in any case.
+        """Evaluate if the next entry of the curve is due, or with `force`.
 
-        Where nothing was done since the last evaluation, there is none.
+        Without particle-steps since the last evaluation there is none.
 
         Raises:
             DivergedError: A weight of the rules is not finite, or an action.
@@ -303,7 +302,7 @@ class Progress:
 
     @contextlib.contextmanager
     def _stopped_clock(self) -> Iterator[None]:
-        """Count no time while a block runs; all processes enter it."""
+        """Stop the clock while a block runs; all processes enter it."""
         self._wait()
         self._agree_on_time()
         self._seconds, self._since = self._elapsed, None
@@ -344,15 +343,15 @@ class Progress:
             torch.cuda.synchronize(self.device)
 
     def _save(self, rules: RuleSet, learner: Learner | None) -> None:
-        """Write a run that is kept, once all processes agree on what was learned."""
+        """Write checkpoint, rules and curve, after a check that all processes have the same."""
         folder = self._kept.folder
         if folder is None:
             return
         assert learner is not None, "methods whose runs are kept are learners"
         with self._stopped_clock():
             state = learner_state(learner)
-            learned = [value for held in state["modules"].values() for value in held.values()]
-            self.ranks.check_same([value for value in learned if isinstance(value, Tensor)])
+            values = [value for module in state["modules"].values() for value in module.values()]
+            self.ranks.check_same([value for value in values if isinstance(value, Tensor)])
             if not self.ranks.first:
                 return
             curve = [asdict(entry) for entry in self.log]
@@ -373,7 +372,7 @@ class Progress:
                 f"differs in {', '.join(names)}: learn what it is of, or choose another folder"
             )
 
-    def _go_on(self, learner: Learner, content: dict[str, Any]) -> None:
+    def _restore(self, learner: Learner, content: dict[str, Any]) -> None:
         assert self._kept.folder is not None, "it holds the checkpoint"
         path, like = self._kept.folder.checkpoint, learner_state(learner)
         like |= {"iteration": 0, "part": 0, "particle_steps": 0, "seconds": 0.0}
@@ -388,7 +387,8 @@ class Progress:
             }
         random, drawn = learner.random, content.get("random")
         if not isinstance(drawn, Tensor) or drawn.shape != like["random"].shape:
-            # Processes that share a run draw by world, and one alone does not: draws begin anew.
+            # The checkpoint is of one process and the run of several, or the reverse, so that the
+            # random sources differ in kind: this one starts from its seed.
             content["random"] = like["random"]
         check_content(content, like, path)
         try:
@@ -404,24 +404,24 @@ class Progress:
                 random.set_state(content["random"])
         except (TypeError, RuntimeError) as error:
             raise unusable_checkpoint(path, f"it cannot be used ({shown(error)})") from error
-        # The error of a single episode is infinite.
+        # A single episode has an infinite standard error.
         if not self.log or not all(is_real(value) or value == math.inf for value in numbers):
             raise unusable_checkpoint(path, "curve must hold the numbers of its entries")
         self._kept.iteration, self._part = content["iteration"], content["part"] + 1
         self.particle_steps = content["particle_steps"]
         self._seconds = self._elapsed = content["seconds"]
         self._looks = int(self.share * self._entries)
-        learner.go_on(self._kept.iteration, self._part)
+        learner.resume(self._kept.iteration, self._part)
 
 
 def annealed(rate: float, last_rate: float, share: float) -> float:
-    """Return a rate that falls along half a cosine, to `last_rate` of itself at share 1."""
+    """Return a rate that falls along half a cosine, to `rate * last_rate` at share 1."""
     wave = 0.5 * (1.0 + math.cos(math.pi * min(share, 1.0)))
     return rate * (last_rate + (1.0 - last_rate) * wave)
 
 
 def check_finite(rules: RuleSet, particle_steps: int) -> None:
-    """Check that rules have not diverged; waits for the device.
+    """Check that rules have not diverged; synchronises with the device.
 
     Raises:
         DivergedError: A weight is infinite or NaN.
@@ -440,7 +440,7 @@ def check_finite(rules: RuleSet, particle_steps: int) -> None:
 def learner_state(learner: Learner) -> dict[str, Any]:
     """Return the state of a learner without its worlds."""
     random = learner.random
-    # All worlds have drawn equally often.
+    # The counter of draws is the same in all worlds.
     drawn = random.episodes[:1] if isinstance(random, WorldRandom) else random.get_state()
     optimisers = learner.optimisers.items()
     return {

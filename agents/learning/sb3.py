@@ -1,8 +1,8 @@
 """Learners of Stable-Baselines3: PPO over whole worlds; PPO and SAC in gardens.
 
-PPO over worlds has a likelihood a world, the mean over its particles. It is the independent
-baseline of the device's own PPO: rollouts, advantages and updates are Stable-Baselines3's; only the
-policy, whose actor is rules, is ours.
+PPO over worlds has one likelihood a world, the mean over its particles. It is an independent
+baseline for `ppo.py`: rollouts, advantages and updates are Stable-Baselines3's; only the policy,
+whose actor is a set of rules, is this library's.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from npa_envs.agents.learning.ppo_common import (
 )
 from npa_envs.agents.learning.problem import world_seeds
 from npa_envs.agents.learning.progress import Progress
-from npa_envs.agents.learning.rules import RuleSet
+from npa_envs.agents.learning.rule_set import RuleSet
 from npa_envs.checks import check_fraction, check_positive
 from npa_envs.errors import MissingDependencyError, NPAError, shown
 from npa_envs.wrappers.sb3 import WorldVecEnv, on_host
@@ -43,19 +43,19 @@ except ImportError as error:
         "this method needs Stable-Baselines3: pip install 'npa-envs[sb3]'"
     ) from error
 
-EXCESS = 1.5
-"""Stable-Baselines3 goes on until the divergence is so many times `target_kl`."""
+KL_FACTOR = 1.5
+"""Stable-Baselines3 ends a round when its divergence exceeds this times `target_kl`."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class WorldOptions(CommonOptions):
-    """Options of `train`; the defaults are those of the device's own PPO where both have one."""
+    """Options of `train`; common ones have the defaults of `ppo.py`."""
 
     clip: float = 0.02
-    """Ratios of likelihoods count up to 1 plus or minus this (dimensionless); little, as their
-    logarithms are means over many particles."""
+    """Likelihood ratios are clipped to 1 ± this (dimensionless); it is small, as log-ratios are
+    means over many particles."""
     tensorboard_log: str | None = None
-    """Folder for Stable-Baselines3's own log; None: nowhere."""
+    """Folder for Stable-Baselines3's log; None: no log."""
 
     def __post_init__(self) -> None:
         """Check every field; raises NPAError."""
@@ -69,15 +69,16 @@ DEFAULTS = WorldOptions()
 def train(progress: Progress, options: WorldOptions = DEFAULTS) -> RuleSet:
     """Return the rules that Stable-Baselines3's PPO finds within a budget.
 
-    Stable-Baselines3 seeds torch and NumPy as a whole; what is seen goes through the host.
+    Stable-Baselines3 seeds the global random states of torch and NumPy. Observations are copied to
+    the CPU.
     """
     problem, seed, device = progress.problem, progress.seed, progress.device
     pace = options.pace(progress.initial)
-    seen = options.steps * problem.num_envs
-    batch_size = -(-seen // options.minibatches)
+    world_steps = options.steps * problem.num_envs
+    batch_size = -(-world_steps // options.minibatches)
     if batch_size < 2:
         raise NPAError(
-            f"minibatches must leave at least 2 of the {seen} steps of worlds of a round for each, "
+            f"minibatches must have at least 2 of a round's {world_steps} steps of worlds each, "
             f"got {options.minibatches}: give fewer, more steps, or more worlds"
         )
     env = WorldVecEnv(problem.make_envs(device=device))
@@ -85,7 +86,7 @@ def train(progress: Progress, options: WorldOptions = DEFAULTS) -> RuleSet:
     model = PPO(
         WorldRulePolicy,
         env,
-        learning_rate=lambda _: pace.learning_rate * callback.share_left,
+        learning_rate=lambda _: pace.learning_rate * callback.budget_left,
         n_steps=options.steps,
         batch_size=batch_size,
         n_epochs=options.epochs,
@@ -109,50 +110,50 @@ def train(progress: Progress, options: WorldOptions = DEFAULTS) -> RuleSet:
 
 
 def _learn(model: Any, env: WorldVecEnv, progress: Progress, callback: BaseCallback) -> None:
-    # Stable-Baselines3 would begin with worlds seed, seed + 1, and so on.
+    # Stable-Baselines3 would use the seeds seed, seed + 1, and so on.
     env.seed(world_seeds(progress.seed, progress.problem.num_envs)[0])
     model.learn(sys.maxsize, callback)
 
 
 def world_kl(particle_kl: float) -> float:
-    """Return the `target_kl` that ends a round when particles' actions have moved so far [nats].
+    """Return the `target_kl` of Stable-Baselines3 for a divergence of particles' actions [nats].
 
-    The mean log-ratio of many particles is close to minus their divergence k, of which
-    Stable-Baselines3's estimate, r - 1 - log r, makes k² / 2.
+    The mean log-ratio of many particles is close to minus their divergence k, so that
+    Stable-Baselines3's estimate, r - 1 - log r, is k² / 2.
     """
-    return 0.5 * particle_kl**2 / EXCESS
+    return 0.5 * particle_kl**2 / KL_FACTOR
 
 
 class ProgressCallback(BaseCallback):
-    """Keeps a learner's account while Stable-Baselines3 learns, and stops it in time."""
+    """Reports to `Progress` while Stable-Baselines3 learns; stops it at the end of the budget."""
 
     def __init__(self, progress: Progress, options: WorldOptions, pace: Pace) -> None:
         super().__init__()
         self.progress, self.options, self.pace = progress, options, pace
         self.rounds = 0
-        self.share_left = 1.0
-        """Share of the budget that was left when the round began."""
+        self.budget_left = 1.0
+        """Fraction of the budget that was left at the start of the round."""
 
     def _on_training_start(self) -> None:
         policy: Any = self.model.policy
         self.actor: GaussianRules = policy.actor
         self.rules: RuleSet = self.actor.rules
-        self._learned = [p for p in self.actor.parameters() if p.requires_grad]
+        self._trained = [p for p in self.actor.parameters() if p.requires_grad]
         self.progress.start(self.rules)
 
     def _on_rollout_start(self) -> None:
         self.progress.look(self.rules)
-        self.share_left = max(0.0, 1.0 - self.progress.share)
+        self.budget_left = max(0.0, 1.0 - self.progress.share)
         self.actor.leave_noise(
-            noise_left(self.share_left, self.pace.last_noise, self.options.noise_decay_share)
+            noise_left(self.budget_left, self.pace.last_noise, self.options.noise_decay_share)
         )
-        for parameter in self._learned:
+        for parameter in self._trained:
             parameter.requires_grad_(self.rounds >= self.pace.critic_rounds)
         self.rounds += 1
 
     def _on_step(self) -> bool:
-        """Return whether to go on; asked in every step, so a round that is none ends at once."""
-        return self.share_left > 0.0
+        """Return whether to continue; without budget a round ends at its first step."""
+        return self.budget_left > 0.0
 
     def _on_rollout_end(self) -> None:
         problem = self.progress.problem
@@ -163,7 +164,7 @@ class ProgressCallback(BaseCallback):
 
 
 class WorldRulePolicy(ActorCriticPolicy):
-    """A policy for rows of `WorldVecEnv`: all particles of a world act by their species' rule.
+    """Policy of Stable-Baselines3 for `WorldVecEnv`: particles act by their species' rule.
 
     Log-probability, entropy and value of a world are means over its particles. Rules are copied.
     """
@@ -180,9 +181,9 @@ class WorldRulePolicy(ActorCriticPolicy):
         **keywords: Any,
     ) -> None:
         super().__init__(observation_space, action_space, lr_schedule, net_arch=[], **keywords)
-        self._made_of = {"rules": rules, "initial_std": initial_std, "critic": critic}
+        self._arguments = {"rules": rules, "initial_std": initial_std, "critic": critic}
         self.actor = GaussianRules(rules, initial_std)
-        """Rules that explore: `actor.rules` acts without."""
+        """Rules with exploration noise; `actor.rules` acts without."""
         self.log_std = self.actor.log_std
         self.critic = Critic(rules.interface.perception_dim, rules.counts, critic)
         self.optimizer = self.optimizer_class(
@@ -202,7 +203,7 @@ class WorldRulePolicy(ActorCriticPolicy):
         return action, self.predict_values(obs), log_prob.mean(dim=1)
 
     def evaluate_actions(self, obs: Any, actions: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Return values [M, 1], log-probabilities [M] and entropies [M] of what was done."""
+        """Return values [M, 1], log-probabilities [M] and entropies [M] of actions."""
         log_prob = self.actor.log_prob(obs, actions.view(*obs.shape[:2], -1))
         entropy = self.actor.entropy().expand(len(obs))
         return self.predict_values(obs), log_prob.mean(dim=1), entropy
@@ -213,8 +214,8 @@ class WorldRulePolicy(ActorCriticPolicy):
         return values.mean(dim=1, keepdim=True)
 
     def get_distribution(self, obs: Any) -> Any:
-        """Refuse: actions are drawn by `forward`, and likelihoods found by `evaluate_actions`."""
-        raise NotImplementedError("rules draw their actions themselves: see forward")
+        """Raise: `forward` draws actions, and `evaluate_actions` computes their likelihoods."""
+        raise NotImplementedError("there is no distribution object: see forward")
 
     def _predict(self, observation: Any, deterministic: bool = False) -> Tensor:
         if deterministic:
@@ -222,28 +223,28 @@ class WorldRulePolicy(ActorCriticPolicy):
         return self.actor.sample(observation)[0]
 
     def _build(self, lr_schedule: Any) -> None:
-        """Make nothing: networks and optimiser are made once the rules are known."""
+        """Do nothing: `__init__` makes networks and optimiser."""
 
     def _get_constructor_parameters(self) -> dict[str, Any]:
         given = super()._get_constructor_parameters()
         del given["net_arch"]
-        return given | self._made_of
+        return given | self._arguments
 
 
-# Gardens: SAC and PPO as they come, a row for each world.
+# Gardens: unchanged SAC and PPO, one row for each world.
 
 ALGORITHMS: dict[str, type[SAC] | type[PPO]] = {"sac": SAC, "ppo": PPO}
-"""By the names of the files that `GardenPolicy.save` writes, without ".zip"."""
+"""Algorithms by the file names of `GardenPolicy.save`, without ".zip"."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class GardenOptions:
-    """Options of both algorithms; all else is as Stable-Baselines3 has it."""
+    """Options of both algorithms; all others are Stable-Baselines3's defaults."""
 
     gamma: float = 0.9
     """Discount of a reward one step later (dimensionless)."""
     learning_rate: float = 3e-4
-    """Adam's."""
+    """Adam's learning rate."""
 
     def __post_init__(self) -> None:
         """Check every field; raises NPAError."""
@@ -258,7 +259,7 @@ class SACOptions(GardenOptions):
     learning_starts: int = 1000
     """Steps of worlds before the first gradient step."""
     world_steps: int = 8
-    """Steps of worlds for each gradient step, as nearly as the number of worlds allows."""
+    """Steps of worlds for each gradient step, about: it depends on the number of worlds."""
 
     def __post_init__(self) -> None:
         """Check every field; raises NPAError."""
@@ -323,7 +324,7 @@ def _garden_policy(
 
 
 class GardenCallback(BaseCallback):
-    """Keeps a learner's account while Stable-Baselines3 learns to garden, and stops it in time."""
+    """As `ProgressCallback`, for gardens."""
 
     def __init__(self, progress: Progress, policy: GardenPolicy) -> None:
         super().__init__()
@@ -335,7 +336,7 @@ class GardenCallback(BaseCallback):
         self._progress.start(self._policy)
 
     def _on_step(self) -> bool:
-        """Count a step of all worlds, and return whether to go on."""
+        """Count a step of all worlds, and return whether budget is left."""
         self._progress.advance(self._step)
         self._progress.look(self._policy)
         return not self._progress.over
@@ -345,7 +346,7 @@ class GardenCallback(BaseCallback):
 
 
 class GardenPolicy:
-    """A model of Stable-Baselines3, without noise, as the policy of a garden, also as it learns."""
+    """A model of Stable-Baselines3 as the policy of a garden, without noise; it shares weights."""
 
     def __init__(self, model: Any) -> None:
         self.model = model
@@ -353,20 +354,20 @@ class GardenPolicy:
         self._shapes = _shapes(space.spaces if isinstance(space, Dict) else space)
 
     def __call__(self, observation: Any) -> NDArray[np.float32]:
-        """Return actions of worlds, shape [B, K, W], for what is seen of them, [B, ...]."""
+        """Return actions [B, K, W] for observations [B, ...]."""
         wanted = self._shapes
         found = {name: shape[1:] for name, shape in _shapes(observation).items()}
         if wanted != found:
             raise NPAError(
-                "observation must be of a garden like that which the policy has learned in, of "
-                f"shapes {wanted} by world, got {found}: take one that has learned in this garden"
+                f"observation must have the shapes {wanted} of the garden that the policy was "
+                f"trained in, got {found}: take a policy that was trained in this garden"
             )
-        seen: Any = observation
+        arrays: Any = observation
         if isinstance(observation, dict):
-            seen = dict(zip(observation, on_host(*observation.values()), strict=True))
+            arrays = dict(zip(observation, on_host(*observation.values()), strict=True))
         else:
-            (seen,) = on_host(observation)
-        action, _ = self.model.predict(seen, deterministic=True)
+            (arrays,) = on_host(observation)
+        action, _ = self.model.predict(arrays, deterministic=True)
         return np.asarray(action)
 
     def save(self, folder: str | Path) -> list[Path]:
@@ -381,8 +382,8 @@ class GardenPolicy:
         name = Path(path).stem
         if name not in ALGORITHMS:
             raise NPAError(
-                f"path must be of a file sac.zip or ppo.zip, got {shown(str(path))}: name the file "
-                "as the learner that wrote it, because its name says how to read it"
+                f"path must be of a file sac.zip or ppo.zip, got {shown(str(path))}: rename the "
+                "file by the algorithm that wrote it"
             )
         if not Path(path).is_file():
             raise NPAError(
@@ -392,7 +393,7 @@ class GardenPolicy:
         try:
             return cls(ALGORITHMS[name].load(path, device="cpu"))
         except Exception as error:
-            # What unpickling raises depends on what is in the file.
+            # Unpickling may raise anything.
             raise NPAError(
                 f"path must be of a file that {name}'s `save` wrote, got {shown(str(path))} "
                 f"({shown(error)}): save the policy again, or name another file"
@@ -400,6 +401,6 @@ class GardenPolicy:
 
 
 def _shapes(parts: Any) -> dict[str, tuple[int, ...]]:
-    """Return the shapes of the parts of an observation or a space, or of what has none."""
+    """Return the shapes of an observation or a space by the names of its parts, if it has some."""
     named = parts if isinstance(parts, dict) else {"observation": parts}
     return {name: tuple(part.shape) for name, part in named.items()}

@@ -1,8 +1,8 @@
 """Short-horizon actor-critic: gradients through a few steps, a critic for the rest.
 
-Source: Xu et al., arXiv 2204.07137. Worlds live on from window to window. Rules ascend the rewards
-of a window, differentiated through its steps, and the critic's value of the worlds at its end. The
-gradient never leads through a whole episode.
+Source: Xu et al., arXiv 2204.07137. An episode is cut into windows, and worlds go on from one to
+the next. Rules ascend the rewards of a window, differentiated through its steps, plus the critic's
+value of the worlds at its end.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from npa_envs.agents.learning.ppo_common import (
     Critic,
     CriticKind,
     Minibatches,
-    check_word,
+    check_choice,
     find_gradients,
     gradients_of,
     learner_random,
@@ -28,7 +28,7 @@ from npa_envs.agents.learning.ppo_common import (
 )
 from npa_envs.agents.learning.problem import Problem
 from npa_envs.agents.learning.progress import Progress, annealed
-from npa_envs.agents.learning.rules import RuleSet
+from npa_envs.agents.learning.rule_set import RuleSet
 from npa_envs.checks import check_fraction, check_non_negative, check_positive
 from npa_envs.training.optimiser import normalise_gradients
 from npa_envs.training.ranks import ALONE, Ranks, restart
@@ -42,35 +42,32 @@ class SHACOptions:
     """Options of `train`."""
 
     steps: int = 16
-    """Steps that a gradient leads through, h, at most: an episode is cut into windows of equal
-    length."""
+    """Most steps of a window, h; windows of an episode have equal lengths."""
     world_count: int = 8
-    """Worlds B; several processes share them out."""
+    """Worlds B of all processes."""
     gamma: float = 0.97
     """Discount of a reward one step later (dimensionless)."""
     value_weight: float = 0.25
-    """Weight of the critic's value in what rules ascend; 1 as in the source; 0: rules look no
-    farther than their window (dimensionless)."""
+    """Weight of the critic's value in the rules' objective (dimensionless); 1 in the source."""
     td_lambda: float = 0.95
-    """Weight of later rewards against the critic's values, in its targets (dimensionless)."""
+    """λ of the critic's TD(λ) targets (dimensionless)."""
     learning_rate: float = 4e-3
-    """AdamW's for the rules, at the beginning; gradients are normalised parameter by parameter."""
+    """AdamW's for the rules, at first; gradients are normalised parameter by parameter."""
     last_rate: float = 0.05
-    """Learning rate at the end, as a share of the first (dimensionless)."""
+    """Learning rate at the end, as a fraction of the first (dimensionless)."""
     critic_learning_rate: float = 1e-3
     """Adam's for the critic."""
     critic_epochs: int = 4
     """Passes of the critic over a window."""
     minibatches: int = 4
-    """Parts that a window is shuffled into in each pass."""
+    """Minibatches of a pass, which is shuffled."""
     critic: CriticKind = "central"
-    """A world's value is the mean over particles of a function of each, or of the whole world
-    ("central")."""
+    """Input of the critic: each particle, or also its whole world ("central"). A world's value is
+    the mean over its particles."""
     critic_width: int = 64
     """Units in a hidden layer of the critic."""
     target_rate: float = 0.2
-    """Share of the critic that its copy takes over after each window. Targets and gradients are
-    made with the copy (dimensionless)."""
+    """Rate at which the target critic follows the critic after each window (dimensionless)."""
     memory: Memory = "store"
     """What the backward pass reads: "store", "recompute" or "minimal", as in `rollout`."""
 
@@ -78,7 +75,7 @@ class SHACOptions:
         """Check every field; raises NPAError. `memory` is checked where rollouts begin."""
         check_positive(self, int, "steps", "world_count", "critic_epochs", "minibatches")
         check_positive(self, int, "critic_width")
-        check_word("critic", self.critic, get_args(CriticKind))
+        check_choice("critic", self.critic, get_args(CriticKind))
         check_positive(self, float, "learning_rate", "critic_learning_rate")
         check_fraction(self, "gamma", "td_lambda", "last_rate", "target_rate")
         check_non_negative(self, "value_weight")
@@ -90,8 +87,8 @@ DEFAULTS = SHACOptions()
 def train(progress: Progress, options: SHACOptions = DEFAULTS) -> RuleSet:
     """Return the rules that a short-horizon actor-critic finds within a budget.
 
-    Rewards are the falls of the environment's loss, as with `reward="dense"`. To the critic worlds
-    go on after an episode's end. State steps are clamped as by the gradient's learner.
+    Rewards are decreases of the environment's loss, as with `reward="dense"`. The critic values
+    worlds as if episodes had no end. State steps are clamped as in `gradient.train`.
     """
     problem, ranks = progress.problem, progress.ranks
     learner = SHACLearner(problem, options, progress.seed, progress.device, progress.initial, ranks)
@@ -104,24 +101,24 @@ def train(progress: Progress, options: SHACOptions = DEFAULTS) -> RuleSet:
 
 
 class StepWindow(NamedTuple):
-    """h steps of B worlds."""
+    """h steps of B worlds, differentiable."""
 
     features: Tensor
     """The critic's inputs before and after each step, shape [h + 1, B, N, F]."""
     losses: Tensor
-    """The worlds' losses then, shape [h + 1, B]."""
+    """The worlds' losses before and after each step, shape [h + 1, B]."""
 
     @property
     def rewards(self) -> Tensor:
-        """Falls of the loss in each step, shape [h, B]."""
+        """Decrease of the loss in each step, shape [h, B]."""
         return self.losses[:-1] - self.losses[1:]
 
 
 class SHACLearner:
-    """Rules, critic and worlds; the seed is that of all draws.
+    """Rules, critic and worlds.
 
-    Several processes each have a share of the worlds, draw for each of these by itself, and take
-    the means of gradients and moments.
+    With several processes (`ranks`) each has some of the worlds, which have random streams of their
+    own, and gradients and moments are averaged.
     """
 
     def __init__(
@@ -135,13 +132,13 @@ class SHACLearner:
     ) -> None:
         self.options, self.device, self.ranks = options, device, ranks
         ranks.check_dealt("world_count", options.world_count)
-        places = ranks.places(options.world_count)
+        indices = ranks.places(options.world_count)
         self.rules = zero_output_rules(problem, seed, start).to(device)
         count = -(-problem.episode_steps // options.steps)
         self.window = -(-problem.episode_steps // count)
         """Steps of a window, h."""
         self.task = EnvironmentTask(problem, device)
-        self.random = learner_random(seed, options.world_count, places, device, ranks)
+        self.random = learner_random(seed, options.world_count, indices, device, ranks)
         width = problem.physics.space_dim + problem.physics.state_dim + 1
         self.critic = seeded_critic(problem, width, options, seed).to(device)
         self.target = copy.deepcopy(self.critic).requires_grad_(False)
@@ -154,25 +151,25 @@ class SHACLearner:
         self.optimisers = {"rules": self._optimizer, "critic": self._critic_optimizer}
         self._limits = problem.physics.limits.position, problem.physics.limits.state
         self.window_count = count
-        self._places = places.tolist()
+        self._indices = indices.tolist()
         self._minibatches = Minibatches(
-            self.window, len(places), (1,), options.minibatches, self.random
+            self.window, len(indices), (1,), options.minibatches, self.random
         )
         self._begin()
 
     def _begin(self) -> None:
         restart(self.random)
-        self.worlds = self._fresh(list(range(len(self._places))))
-        self.windows_left = [1 + place % self.window_count for place in self._places]
-        """Windows left of each world's episode: at first all numbers, so that every part of an
-        episode is in a batch."""
+        self.worlds = self._fresh(list(range(len(self._indices))))
+        self.windows_left = [1 + k % self.window_count for k in self._indices]
+        """Windows left of each world's episode: at first different ones, so that a batch has all
+        parts of an episode."""
 
-    def go_on(self, iteration: int, part: int) -> None:
-        """Go on after so many windows, for the part-th time, from 1 on, with fresh worlds."""
+    def resume(self, iteration: int, part: int) -> None:
+        """Resume after `iteration` windows, for the `part`-th time, in new worlds."""
         self._begin()
 
     def learn(self, rate: float) -> None:
-        """Let worlds live for a window, and rules and critic learn from it once."""
+        """Run the worlds for a window, and train rules and critic on it."""
         window = self.play()
         find_gradients(self._optimizer, -self.gain(window))
         means = gradients_of(self._optimizer)
@@ -183,7 +180,7 @@ class SHACLearner:
         self.learn_values(StepWindow(*(part.detach() for part in window)))
 
     def play(self) -> StepWindow:
-        """Run the rules for a window, differentiably, and begin episodes anew where one is over."""
+        """Run the rules for a window, differentiably; restart worlds whose episode is over."""
         task, steps = self.task, self.window
         x0, s0, _, goal = self.worlds
         restart(self.random)
@@ -203,7 +200,7 @@ class SHACLearner:
         losses = losses.view(steps + 1, -1)
         level = losses[..., None, None].expand(*s.shape[:-1], 1)
         features = torch.cat((x - x.mean(dim=-2, keepdim=True), s, level), dim=-1)
-        # Worlds that run away are held at the limits of the environment until they begin anew.
+        # Worlds that run away are clamped to the environment's limits until their restart.
         x, s = (
             torch.nan_to_num(each[-1].detach()).clamp(-limit, limit)
             for each, limit in zip((x, s), self._limits, strict=True)
@@ -213,7 +210,7 @@ class SHACLearner:
         return StepWindow(features, losses)
 
     def _restart(self) -> None:
-        """Begin the next episodes of worlds whose last window this was."""
+        """Start new episodes in worlds whose last window this was."""
         restart(self.random)
         self.windows_left = [left - 1 for left in self.windows_left]
         over = [k for k, left in enumerate(self.windows_left) if left == 0]
@@ -231,20 +228,20 @@ class SHACLearner:
         return Particles(x, s, goal=goal)
 
     def gain(self, window: StepWindow) -> Tensor:
-        """Return the mean discounted reward of a window and value after it."""
+        """Return the rules' objective: discounted rewards plus the value at the end, averaged."""
         gamma, steps = self.options.gamma, self.window
         discounts = gamma ** torch.arange(steps, device=self.device, dtype=torch.float32)
-        paid = (discounts[:, None] * window.rewards).sum(dim=0)
-        foreseen = values(self.target, window.features[-1])
-        return (paid + self.options.value_weight * gamma**steps * foreseen).mean()
+        returns = (discounts[:, None] * window.rewards).sum(dim=0)
+        value = values(self.target, window.features[-1])
+        return (returns + self.options.value_weight * gamma**steps * value).mean()
 
     def learn_values(self, window: StepWindow) -> None:
-        """Let the critic learn the window's targets, and its copy follow."""
+        """Train the critic on a window's targets, and move the target critic towards it."""
         options = self.options
-        seen = window.features[:-1].flatten(0, 1)
+        features = window.features[:-1].flatten(0, 1)
         with torch.no_grad():
             for critic in (self.critic, self.target):
-                critic.observe(seen, self.ranks)
+                critic.observe(features, self.ranks)
             later = values(self.target, window.features[1:].flatten(0, 1))
             targets = td_lambda_targets(
                 window.rewards,
@@ -257,14 +254,14 @@ class SHACLearner:
         for _ in range(options.critic_epochs):
             self._minibatches.shuffle()
             for part in self._minibatches.parts[0]:
-                error = (values(self.critic, seen[part]) - targets[part]) / self.critic.scale
+                error = (values(self.critic, features[part]) - targets[part]) / self.critic.scale
                 find_gradients(self._critic_optimizer, 0.5 * error.square().mean())
                 self.ranks.reduce(gradients_of(self._critic_optimizer))
                 self._critic_optimizer.step()
         with torch.no_grad():
             pairs = zip(self.target.parameters(), self.critic.parameters(), strict=True)
-            for followed, learned in pairs:
-                followed.lerp_(learned, options.target_rate)
+            for target, parameter in pairs:
+                target.lerp_(parameter, options.target_rate)
 
 
 def values(critic: Critic, features: Tensor) -> Tensor:
@@ -276,11 +273,11 @@ def values(critic: Critic, features: Tensor) -> Tensor:
 def td_lambda_targets(
     rewards: Tensor, following: Tensor, *, gamma: float, td_lambda: float
 ) -> Tensor:
-    """Return a critic's targets before each step of a window, shape [h, ...].
+    """Return TD(λ) targets before each step of a window, shape [h, ...].
 
     They are discounted sums of later rewards, in which the critic's values after each step,
-    `following`, have weight 1 - `td_lambda`, and weight 1 after the last step. Source: arXiv
-    2204.07137, equation 7.
+    `following`, have the weight 1 - λ, and 1 after the last step. Source: arXiv 2204.07137,
+    equation 7.
     """
     targets = torch.empty_like(rewards)
     later = following[-1]

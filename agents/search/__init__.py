@@ -1,4 +1,4 @@
-"""Search for rules that nobody asked for: quality-diversity over rules."""
+"""Quality-diversity search: many different rules of high quality, without a task."""
 
 from npa_envs.agents.search.run import Elite, Growth, Search, tried_again
 from npa_envs.agents.search.worlds import Found, SearchWorld

@@ -1,4 +1,4 @@
-"""The atlas: elites as files that all commands open, and a page that lays them out."""
+"""The atlas of a search: elites as rule files, and an HTML page of their pictures."""
 
 from __future__ import annotations
 
@@ -20,30 +20,30 @@ from npa_envs.render.film import encode_frame
 from npa_envs.rule.files import save_rule
 
 ELITES, PAGE = "elites", "atlas.html"
-"""Names in the folder of a search."""
+"""Folder of the elites' rules and the page, in the folder of a search."""
 
 SIDE = 64
 """Pixels on each side of an elite's picture."""
 
 HALF_WIDTH = 0.6
-"""From a picture's middle, the centroid, to its edge [length units]."""
+"""Half the side of a picture, whose centre is the centroid [length units]."""
 
 Pictures = Mapping[tuple[int, ...], NDArray[np.uint8]]
 """Pictures by cell, uint8, [R, R, 3] each."""
 
 
 def write_elites(search: Search, folder: Path) -> Pictures:
-    """Write each elite's rule as `elites/CELL.safetensors`; return its first world's picture."""
+    """Write each elite's rule as `elites/CELL.safetensors`; return pictures of first worlds."""
     pictures: dict[tuple[int, ...], NDArray[np.uint8]] = {}
     count = search.world.particle_count
     for elite in search.elites():
-        place = folder / ELITES / f"{elite.name}.safetensors"
+        path = folder / ELITES / f"{elite.name}.safetensors"
         measures = zip(search.axes, elite.found.measures, strict=True)
         found = {"quality": elite.found.quality} | {axis.name: value for axis, value in measures}
         world = {"particle_count": count, "update_prob": UPDATE_PROB, "seed_radius": SEED_RADIUS}
         metadata = {"found": json.dumps(found), "world": json.dumps(world)}
-        with made_folder(place.parent):
-            save_rule(search.candidates.rule_of(elite.solution), place, metadata=metadata)
+        with made_folder(path.parent):
+            save_rule(search.candidates.rule_of(elite.solution), path, metadata=metadata)
         trials = search.candidates.try_all(elite.solution[None])
         x, s = trials.x[0, :1], trials.s[0, :1]
         (pictures[elite.cell],) = draw_worlds(
@@ -60,7 +60,7 @@ def write_elites(search: Search, folder: Path) -> Pictures:
 def page(search: Search, pictures: Pictures) -> str:
     """Return the atlas as one HTML page: a table for each cell of the last axis.
 
-    Columns are the first axis from left to right, rows the second one from below.
+    The first axis goes from left to right, the second one upwards.
     """
     across, up, last = search.axes
     elites = {elite.cell: elite for elite in search.elites()}

@@ -1,7 +1,7 @@
-"""A search that can be stopped: what it proposes, its record, its growth, and its elites.
+"""A search that can be stopped and resumed: methods, archive, record, and elites.
 
-The archive is the grid of MAP-Elites (Mouret and Clune, arXiv 1504.04909): a cell keeps the best
-candidate whose descriptors lie in it. Methods differ in what they propose next.
+The archive is the grid of MAP-Elites (Mouret and Clune, arXiv 1504.04909): each cell keeps the best
+candidate with descriptors in it. Methods differ in the candidates that they propose next.
 """
 
 from __future__ import annotations
@@ -21,24 +21,23 @@ from npa_envs.errors import MissingDependencyError, NPAError, shown, suggest
 from npa_envs.measure.record import Record, installed_version
 
 RESULTS = "search.json"
-"""The file that a stopped search goes on from."""
+"""The file of a search's record, from which a stopped search continues."""
 
 LIBRARIES = ("numpy", "ribs", "cma")
-"""Libraries whose other versions may propose other candidates."""
-
+"""Libraries whose versions affect the proposed candidates."""
 
 SMALLEST, LARGEST = 0.05, 0.8
-"""Sizes of weights that random candidates have, over those of Xavier."""
+"""Range of a random candidate's standard deviation of weights, in Xavier's."""
 
 MUTATION = 0.1
-"""Standard deviation of what a mutation adds to a weight, over its size by Xavier."""
+"""Standard deviation of mutations, in Xavier's standard deviations of the weights."""
 
 FIRST_STEP = 0.2
-"""Standard deviation that CMA-ES begins with, likewise."""
+"""First standard deviation of CMA-ES, in Xavier's standard deviations of the weights."""
 
 
 def import_ribs() -> Any:
-    """Return the library with its parts imported."""
+    """Return the library `ribs` with its modules imported."""
     try:
         import cma  # noqa: F401
         import ribs.archives
@@ -53,15 +52,15 @@ def import_ribs() -> Any:
 
 
 def make_archive(weight_count: int, axes: tuple[Axis, ...], seed: int = 0) -> Any:
-    """Return an empty `ribs.archives.GridArchive` of candidates with so many weights.
+    """Return an empty `ribs.archives.GridArchive` of candidates with `weight_count` weights.
 
-    Only qualities above 0 are kept: all others are dead, or blew up. Elites are drawn by the seed.
+    Only qualities above 0 are kept: other worlds are dead or blew up. Elites are drawn by the seed.
     """
     return import_ribs().archives.GridArchive(
         solution_dim=weight_count,
         dims=[axis.cells for axis in axes],
         ranges=[(axis.lowest, axis.highest) for axis in axes],
-        # With these two a cell's threshold is 0 at first, and then its best.
+        # With these two the threshold of a cell is 0 at first, then its best quality.
         learning_rate=1.0,
         threshold_min=0.0,
         seed=seed,
@@ -69,7 +68,7 @@ def make_archive(weight_count: int, axes: tuple[Axis, ...], seed: int = 0) -> An
 
 
 class RandomProposals:
-    """Random candidates, each with weights of a size of its own, spread evenly in the logarithm."""
+    """Random candidates, whose standard deviations of weights are log-uniform."""
 
     def __init__(self, archive: Any, batch_size: int, seed: int) -> None:
         self._archive = archive
@@ -83,7 +82,7 @@ class RandomProposals:
         return self._asked
 
     def tell(self, objective: Numbers, measures: Numbers) -> None:
-        """Put the candidates into the archive."""
+        """Add the last candidates to the archive."""
         self._archive.add(self._asked, objective, measures)
 
 
@@ -109,7 +108,8 @@ def _evolution(ranker: str, restart_rule: str) -> Callable[[Any, int, int], Any]
         ribs = import_ribs()
         from cma.sigma_adaptation import CMAAdaptSigmaCSA
 
-        # From 300 weights on cma would go by the order of candidates, and pyribs sorts them.
+        # For more than 300 weights cma's default depends on the order of candidates, which pyribs
+        # changes.
         options = {"CMA_diagonal": True, "AdaptSigma": CMAAdaptSigmaCSA}
         emitter = ribs.emitters.EvolutionStrategyEmitter(
             archive,
@@ -137,19 +137,19 @@ METHODS: Mapping[str, Callable[[Any, int, int], Any]] = {
     "cma-es": _evolution("obj", "basic"),
     "random": RandomProposals,
 }
-"""Makes what `ask` returns candidates of, shape [K, W], from an archive, the batch size and a seed;
-it takes qualities and descriptors by `tell`, as pyribs' schedulers do, and fills the archive.
+"""Functions that make a scheduler, as of pyribs, from an archive, a batch size and a seed: `ask`
+returns candidates [K, W], `tell` takes their qualities and descriptors and fills the archive.
 
-`map-elites` mutates elites drawn at random. `cma-me` (arXiv 1912.02400) is CMA-ES that is rewarded
-for new cells first and for better elites second. `cma-es` is rewarded for quality alone. Both adapt
-a diagonal covariance. `random` draws anew.
+`map-elites` mutates random elites. `cma-me` (arXiv 1912.02400) is CMA-ES that ranks new cells
+before better elites. `cma-es` ranks by quality only. Both adapt a diagonal covariance. `random`
+draws independent candidates.
 """
 
 
 def qualities_and_measures(
     found: list[Found | None], axes: tuple[Axis, ...]
 ) -> tuple[Numbers, Numbers]:
-    """Return qualities, shape [K], and descriptors, [K, M]; all are 0 where nothing was found."""
+    """Return qualities [K] and descriptors [K, M], which are 0 for candidates without a result."""
     nothing = Found(0.0, (0.0,) * len(axes))
     whole = [nothing if one is None else one for one in found]
     return np.array([one.quality for one in whole]), np.array([one.measures for one in whole])
@@ -159,23 +159,23 @@ def qualities_and_measures(
 
 
 class Growth(NamedTuple):
-    """An archive after some candidates."""
+    """Statistics of an archive."""
 
     evaluations: int
     """Candidates tried so far."""
     qd_score: float
     """Sum of the elites' qualities."""
     coverage: float
-    """Share of the cells that hold an elite."""
+    """Fraction of the cells with an elite."""
     best: float
-    """Quality of the best elite, 0 without any."""
+    """Quality of the best elite, 0 without elites."""
 
 
 class Elite(NamedTuple):
     """The best candidate of a cell."""
 
     cell: tuple[int, ...]
-    """Place on each axis, from 0."""
+    """Index on each axis."""
     found: Found
     """Its quality and descriptors."""
     solution: Numbers
@@ -218,19 +218,18 @@ class SearchRecord(Record[Batch]):
 
 
 class Search:
-    """A search for rules that differ, in worlds of one kind.
+    """A quality-diversity search for rules, with a record from which it can be resumed.
 
-    The same settings give the same elites. A record holds the results of all candidates, but not
-    their weights: a resumed search proposes the same candidates once more and does not try them.
+    The same settings give the same elites. The record has the results of all candidates, but not
+    their weights: a resumed search proposes the same candidates again without evaluating them.
 
     Args:
-        world: Where candidates live.
-        method: What proposes them, a name of `METHODS`.
-        seed: Of the proposals, at least 0. All candidates meet the same worlds.
-        batch_size: Candidates that are proposed together, at least 2.
-        device: Where worlds are computed.
-        path: The record, which is written after each batch, or None. Where it exists, the search
-            goes on from it.
+        world: Sizes of rules and worlds.
+        method: A name of `METHODS`.
+        seed: Seed of the proposals, at least 0. All candidates have the same worlds.
+        batch_size: Candidates in a batch, at least 2.
+        device: Device of the worlds.
+        path: File of the record, which is written after each batch; None: no record.
 
     Raises:
         NPAError: A setting is wrong, or the record is of other settings.
@@ -281,7 +280,7 @@ class Search:
 
     @property
     def particle_steps(self) -> int:
-        """Their cost: B N T each."""
+        """Particle-steps of all candidates, B N T each."""
         return self.evaluations * self.world.particle_steps
 
     def run(
@@ -291,11 +290,11 @@ class Search:
         enough: Callable[[], bool] = lambda: False,
         progress: Callable[[int], None] = lambda _: None,
     ) -> None:
-        """Try candidates until the next batch would cost more than the budget in all.
+        """Evaluate batches of candidates while the search stays within its budget.
 
         Args:
-            budget: Particle-steps of the whole search, what was done before included.
-            enough: Asked after each batch whether to stop early.
+            budget: Particle-steps of the whole search, with those before a resume.
+            enough: Called after each batch; True stops the search.
             progress: Called with the particle-steps of each batch.
         """
         batch_cost = int(self.facts["batch_size"]) * self.world.particle_steps
@@ -308,7 +307,7 @@ class Search:
             self._record.write()
 
     def elites(self) -> list[Elite]:
-        """Return the best candidate of each cell that has one, cell by cell."""
+        """Return the elites, sorted by cell."""
         held = self.archive.data(["index", "solution", "objective", "measures"])
         cells = self.archive.int_to_grid_index(held["index"])
         elites = [
@@ -330,36 +329,36 @@ class Search:
         self.growth.append(growth_of(self.archive, self.evaluations))
 
     def _replay(self) -> None:
-        """Propose again the candidates of the record, if there is one, and tell their results."""
+        """Repeat the proposals of the record, if there is one, with its results."""
         held, self._record.rows = self._record.read().rows, []
         for number, batch in enumerate(held):
             asked = self._proposals.ask()
             if _fingerprint(asked) != batch["fingerprint"] or len(asked) != len(batch["found"]):
                 raise NPAError(
-                    f"{str(self._record.path)!r} must hold the candidates that this search "
-                    f"proposes, but batch {number} is of others (another machine?): remove it, or "
+                    f"{str(self._record.path)!r} must have the candidates that this search "
+                    f"proposes, but batch {number} differs (another machine?): remove it, or "
                     "choose another folder with --out"
                 )
             self._tell(batch)
 
 
 def growth_of(archive: Any, evaluations: int) -> Growth:
-    """Return the growth of an archive."""
+    """Return the statistics of an archive after a number of evaluations."""
     stats = archive.stats
     best = 0.0 if stats.obj_max is None else float(stats.obj_max)
     return Growth(evaluations, float(stats.qd_score), float(stats.coverage), best)
 
 
 def tried_again(search: Search, seeds: Sequence[int], *, steps: int | None = None) -> Growth:
-    """Return the growth of an archive of the same elites, tried once more in other worlds.
+    """Evaluate the elites of a search again in other worlds, and return the archive's statistics.
 
     Args:
-        search: Of the elites.
-        seeds: The worlds' numbers; each elite meets all.
-        steps: Steps from the seed, of which the later half is judged; default: as searched.
+        search: The search.
+        seeds: Seeds of the worlds of each elite.
+        steps: Steps; the later half counts. None: those of the search.
 
     Raises:
-        NPAError: The number of steps is no multiple of 16.
+        NPAError: The number of steps is not a multiple of 16.
     """
     world = search.world if steps is None else replace(search.world, steps=steps)
     candidates = Candidates(world, device=search.candidates.device, seeds=seeds)

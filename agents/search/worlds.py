@@ -1,4 +1,4 @@
-"""Worlds of candidate rules: how alive each is, and where among all others it belongs."""
+"""Evaluation of candidate rules: their quality, how alive worlds are, and descriptors."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from npa_envs.errors import NPAError
 from npa_envs.tasks.seeds import uniform_ball
 
 SNAPSHOTS = 16
-"""Moments at which a world is looked at, evenly spread; the later half of them counts."""
+"""Times at which a world is measured, evenly spread; the later half counts."""
 
 UPDATE_PROB = 0.5
 """Probability of a particle's update in a step (dimensionless)."""
@@ -28,13 +28,13 @@ SEED_RADIUS = 0.2
 """Radius of the disk that particles start in [length units]."""
 
 LEAST_VARIANCE = 1e-12
-"""Colours that vary no more than this are one colour."""
+"""Variance of colours that counts as a single colour."""
 
 Numbers = NDArray[np.float64]
 
 
 class Axis(NamedTuple):
-    """A descriptor: a name, where its first cell begins, where its last one ends, and how many."""
+    """A descriptor: name, range and number of cells."""
 
     name: str
     lowest: float
@@ -44,14 +44,14 @@ class Axis(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class SearchWorld:
-    """The world that candidates live in."""
+    """Sizes of the candidates' rules and worlds."""
 
     particle_count: int = 128
     """Particles N."""
     steps: int = 128
     """Steps from the seed, a multiple of 16."""
     world_count: int = 1
-    """Worlds that each candidate is tried in, B; figures are their means."""
+    """Worlds of each candidate, B, over which figures are averaged."""
     state_dim: int = 4
     """State channels C, at least 3; the last three are the colour (less 0.5)."""
     hidden_dim: int = 8
@@ -77,19 +77,18 @@ class SearchWorld:
         return self.world_count * self.particle_count * self.steps
 
     def make_rule(self) -> NPARule:
-        """Return a rule of any weights, on the CPU."""
+        """Return a rule with arbitrary weights, on the CPU."""
         with torch.random.fork_rng(devices=()):
             return NPARule(2, self.state_dim, self.hidden_dim, eps0=self.eps).requires_grad_(False)
 
     def axes(self) -> tuple[Axis, ...]:
         """Return the descriptors.
 
-        `speed` is the mean path length of a step [ε], at most the rule's α times the probability
-        of an update. `crowding` is log(ρ / ρ₁) / log N of the mean density ρ at particles, where
-        ρ₁ is that of a particle alone: 0 where each is alone, 1 where all stand in one place.
-        `mixing` is 1 − r of the correlation r between particles' colours and those around them: 0
-        where neighbours look alike, 1 where they have nothing in common. All are dimensionless but
-        for the speed.
+        `speed` is the mean path length of a step [ε], at most α times the probability of an update.
+        `crowding` is log(ρ / ρ₁) / log N for the mean density ρ at particles and the density ρ₁ of
+        a single particle: 0 if each is alone, 1 if all coincide. `mixing` is 1 − r for the
+        correlation r between particles' colours and those around them: 0 if neighbours look alike,
+        1 if their colours are independent. Both are dimensionless.
         """
         fastest = self.make_rule().alpha * UPDATE_PROB
         return (
@@ -109,8 +108,8 @@ class Found(NamedTuple):
 
 
 class Trials(NamedTuple):
-    """Results of K candidates, None where numbers blew up or nothing changes any more; and their
-    worlds at the end, [K, B, N, D] and [K, B, N, C].
+    """Results of K candidates, None if worlds blew up or came to rest, and their last worlds,
+    [K, B, N, D] and [K, B, N, C].
     """
 
     found: list[Found | None]
@@ -119,10 +118,10 @@ class Trials(NamedTuple):
 
 
 class RuleStack(NPARule):
-    """K rules of one architecture, each of which updates its own worlds of a batch.
+    """K rules of one architecture in one batch of worlds, where each updates its own worlds.
 
-    Worlds must be as many for each rule, with the same masks for each, so that every rule has as
-    many rows of perception. Weights, shape [K, W], are in the order of `RuleWeights`.
+    Each rule must have the same number of worlds with the same masks, so that each has the same
+    number of rows of perception. Weights [K, W] are in the order of `RuleWeights`.
     """
 
     def __init__(self, rule: NPARule, weights: Tensor) -> None:
@@ -135,17 +134,17 @@ class RuleStack(NPARule):
         """Map rows of perception [K R, P] to raw updates [K R, A]."""
         count = len(self.weights)
         if len(perception) % count:
-            # Where no particle is updated there is one row, which is not read.
+            # If no particle is updated there is one row, which is not used.
             return perception.new_zeros(len(perception), self.update_dim)
         rows = perception.reshape(count, len(perception) // count, self.perception_dim)
         return updates_of(self, self.weights, rows).flatten(0, 1)
 
 
 class Candidates:
-    """Tries rules whose weights are given, all from the same seeds and with the same masks.
+    """Evaluates rules with given weights, all from the same seeds and with the same masks.
 
-    On a CPU candidates share a batch of worlds. On CUDA, where rows of perception are not counted,
-    they are tried one after the other. The seeds of the B worlds are 0 to B - 1 by default.
+    On a CPU candidates share a batch of worlds. On CUDA, where the number of rows of perception is
+    unknown, they run one after the other. The seeds of the B worlds are 0 to B - 1 by default.
     """
 
     def __init__(
@@ -156,7 +155,7 @@ class Candidates:
         self._seeds = tuple(range(world.world_count) if seeds is None else seeds)
         self._rule = world.make_rule()
         self.scales = RuleWeights([self._rule]).scales()
-        """Size of each weight as Xavier would draw it, shape [W]: solutions are in these units."""
+        """Standard deviation of each weight by Xavier, shape [W]: the units of solutions."""
         alone = torch.zeros(1, 1, 2), torch.zeros(1, 1, 1)
         self._alone = float(perception_fields(*alone, eps=world.eps).rho)
 
@@ -173,7 +172,7 @@ class Candidates:
 
     @torch.no_grad()
     def try_all(self, solutions: Numbers) -> Trials:
-        """Grow the worlds of candidates, whose weights are in units of `scales`, [K, W]."""
+        """Run the worlds of candidates; their weights [K, W] are in units of `scales`."""
         weights = torch.as_tensor(solutions * self.scales, dtype=torch.float32).to(self.device)
         together = len(weights) if self.device.type == "cpu" else 1
         parts = [self._try(some) for some in torch.split(weights, together)]
@@ -217,16 +216,16 @@ class Candidates:
 
 
 def _colours(s: Tensor) -> Tensor:
-    """Return the colours that can be seen, less 0.5, shape [..., 3]."""
+    """Return the visible colours minus 0.5, shape [..., 3]."""
     return s[..., -3:].clamp(-0.5, 0.5)
 
 
 def quality_of(xs: Tensor, ss: Tensor) -> Tensor:
-    """Return how alive worlds [T, B, N, ·] are within their bounds, in [0, 1], shape [].
+    """Return bounded * alive of worlds [T, B, N, ·], in [0, 1], shape [].
 
     bounded = 1 / (1 + mean |s − clip(s, −1, 1)| + mean |x − clip(x, −1, 1)|), with the terms that
-    training penalises. alive = twice the standard deviation over T moments of a particle's colour
-    channels, averaged: 1 where each flickers between 0 and 1. The quality is bounded times alive.
+    training penalises. alive = twice the standard deviation over the T times of a particle's colour
+    channels, averaged: 1 if each flickers between 0 and 1.
     """
     excess = [(values - values.clamp(-1.0, 1.0)).abs().mean() for values in (xs, ss)]
     alive = 2.0 * _colours(ss).std(dim=0, correction=0).mean()
@@ -236,7 +235,7 @@ def quality_of(xs: Tensor, ss: Tensor) -> Tensor:
 def correlation(first: Tensor, second: Tensor) -> Tensor:
     """Return the correlation of two fields [B, N, K] over particles and channels, shape [B].
 
-    Each channel counts from its mean. It is 1 where the first field is the same everywhere.
+    The mean of each channel is subtracted. The correlation is 1 if the first field is constant.
     """
     a, b = (field - field.mean(dim=1, keepdim=True) for field in (first, second))
     together = (a * b).sum(dim=(1, 2))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 import random
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any, ClassVar, Generic, NamedTuple, Self, TypeVar
+from typing import TYPE_CHECKING, Any, ClassVar, Generic, Literal, NamedTuple, Self, TypeVar
 
 import numpy as np
 import torch
@@ -25,6 +25,9 @@ if TYPE_CHECKING:
 
 AnyConfig = TypeVar("AnyConfig", bound=WorldConfig)
 Config = TypeVar("Config", bound=EnvConfig)
+
+Actor = Literal["particles", "species", "brushes", "codes"]
+"""What an environment's actions are of."""
 
 SHARPNESS = 0.7
 """Standard deviation of a particle's Gaussian in pictures, in distances between particles."""
@@ -59,6 +62,9 @@ class WorldTask(Generic[AnyConfig]):
 
     config_type: ClassVar[type[WorldConfig]] = WorldConfig
     """The configuration's class: its fields are the environment's keywords."""
+
+    actor: ClassVar[Actor] = "particles"
+    """What the actions are of."""
 
     space_dim: ClassVar[int] = 2
     """Space dimension D."""

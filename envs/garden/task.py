@@ -194,6 +194,7 @@ class GardenTask(RuleDriven, GrownTask[Config]):
 
     config_type: ClassVar[type[GardenConfig]] = GardenConfig
     form_type: ClassVar[Any] = BrushSpaces
+    actor = "brushes"
 
     def __init__(self, config: Config, device: torch.device) -> None:
         super().__init__(config, device)

@@ -201,6 +201,7 @@ class SpeciesTask(WorldTask[Any]):
     """
 
     config_type: ClassVar[type[SpeciesConfig]] = SpeciesConfig
+    actor = "species"
 
     least_species: ClassVar[int] = 2
     """Smallest number of species."""

@@ -94,7 +94,7 @@ def problem_of(options: RecordOptions) -> Problem:
         episode_steps=registered_steps(options.env),
         num_envs=worlds,
     )
-    if problem.is_species:
+    if problem.actor == "species":
         raise NPAError(
             f"env must be of one species, as Minari keeps one agent's episodes, got {options.env}"
         )
@@ -105,7 +105,7 @@ def policy_of(options: RecordOptions, problem: Problem) -> Callable[[Any], Any]:
     """Return the policy."""
     from npa_envs.agents.learning import Budget, RuleSet, train
 
-    known = (*LEARNS_NOTHING, "gradient") if problem.is_garden else LEARNS_NOTHING
+    known = (*LEARNS_NOTHING, "gradient") if problem.actor == "brushes" else LEARNS_NOTHING
     if options.policy in known:
         # What learns nothing is only chosen, by seeds that are not recorded.
         return train(
@@ -118,11 +118,11 @@ def policy_of(options: RecordOptions, problem: Problem) -> Callable[[Any], Any]:
             entries=1,
         ).policy
     source = options.policy
-    if source.endswith(".zip") and problem.is_garden:
+    if source.endswith(".zip") and problem.actor == "brushes":
         from npa_envs.agents.learning.sb3 import GardenPolicy
 
         return GardenPolicy.load(source)
-    if problem.is_garden:
+    if problem.actor == "brushes":
         raise NPAError(
             f"policy must be one of {known} or a file sac.zip or ppo.zip, got {source!r}"
         )

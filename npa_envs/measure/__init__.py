@@ -1,1 +1,1 @@
-"""What is measured, and what is kept of it: speed, accuracy, robustness, quality, interaction."""
+"""Measurements and their records: speed, accuracy, robustness, quality, interaction."""

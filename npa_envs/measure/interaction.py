@@ -1,7 +1,7 @@
-"""Interaction of trained rules that share a world (arXiv 2601.16096), in numbers.
+"""Interaction of two trained rules in one world (arXiv 2601.16096), in numbers.
 
-Whether one disrupts another is measured by the other's task, on its own particles, against the same
-seeds grown alone.
+The effect of a rule on another is measured by the task metric of the other's particles, compared
+with the same seeds grown alone.
 """
 
 from __future__ import annotations
@@ -28,32 +28,32 @@ from npa_envs.world.randomness import StreamId, WorldRandom
 from npa_envs.world.species import rollout_species
 
 MARGIN = 0.2
-"""A loss that changes by less than this share of itself counts as undisturbed."""
+"""A loss that changes by less than this fraction counts as undisturbed."""
 
 MIXED = 0.25
-"""Mixing index from which on two species mix (dimensionless)."""
+"""Least mixing index of species that mix (dimensionless)."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class InteractionSettings:
-    """How rules are brought together."""
+    """Settings of an interaction measurement."""
 
     particle_count: int
     """Particles of a world with two species, N."""
     distances: tuple[float, ...] = (0.0, 0.5, 1.0)
     """Distances between the centres of the two seeds [length units]."""
     ratios: tuple[float, ...] = (0.5,)
-    """Shares of the particles that are of the measured species, in (0, 1)."""
+    """Fractions of the particles that belong to the measured species, in (0, 1)."""
     eps_factors: tuple[float, ...] = (1.0,)
-    """Perception radii, over that of the rules (dimensionless)."""
+    """Factors on the rules' perception radius (dimensionless)."""
     steps: int = 512
     """Steps from the seeds."""
     seeds: tuple[int, ...] = tuple(range(8))
-    """One number for each world; the same numbers give the same table."""
+    """Seeds of the worlds, one each; the same seeds give the same table."""
     update_prob: float | None = None
-    """Probability of each particle's update in a step; None: of each species as trained."""
+    """Probability of each particle's update in a step; None: as each species was trained."""
     margin: float = MARGIN
-    """Share by which a loss must change to count as changed, in (0, 1)."""
+    """Least fraction by which a loss must change to count as changed, in (0, 1)."""
 
     def __post_init__(self) -> None:
         """Check every field; raises NPAError."""
@@ -79,19 +79,20 @@ class InteractionSettings:
             raise NPAError(f"update_prob must lie in (0, 1], got {self.update_prob}")
 
     def counts(self, ratio: float) -> tuple[int, int]:
-        """Return the particles of the measured species and of the other one."""
+        """Return the numbers of particles of the measured species and of the other one."""
         own = min(max(round(ratio * self.particle_count), 1), self.particle_count - 1)
         return own, self.particle_count - own
 
 
 @dataclass(frozen=True)
 class InteractionRow:
-    """One rule A, grown next to another one, B; figures are means of the worlds.
+    """One rule A (`rule`), grown together with rule B (`beside`); figures are means of the worlds.
 
     `alone` and `together` are A's task metric of its own particles, `change` is together / alone,
-    `mixing` the `mixing_index` at the end, `displacement` the distance of A's centroid from where
-    it ends alone [length units]. `distance` is between the centres of the seeds [length units],
-    `ratio` A's share of the particles. `low` and `high` are the ends of 95 % intervals.
+    `mixing` the `mixing_index` at the end, `displacement` the distance of A's centroid from its
+    position when grown alone [length units]. `distance` is between the centres of the seeds
+    [length units], `ratio` A's fraction of the particles. `..._low` and `..._high` are the ends of
+    95 % intervals.
     """
 
     rule: str
@@ -125,16 +126,15 @@ def verdict(change: float, mixing: float, margin: float = MARGIN) -> str:
 
 
 def ratio_interval(above: Tensor, below: Tensor) -> tuple[float, float]:
-    """Return the 95 % interval of mean(above) / mean(below), by bootstrap over worlds.
+    """Return the 95 % bootstrap interval, over worlds, of mean(above) / mean(below).
 
-    `above` [B] may be infinite, `below` [B] is finite and not negative; of a mean of 0 the ratio is
-    infinite.
+    `above` [B] may be infinite, `below` [B] is finite and not negative; the ratio to 0 is infinite.
     """
     count = len(above)
     draws = np.random.default_rng(0).integers(count, size=(2000, count))
     tops, bases = (values.double().cpu().numpy()[draws].mean(axis=1) for values in (above, below))
     ratios = np.divide(tops, bases, out=np.full_like(tops, np.inf), where=bases > 0.0)
-    # No interpolation: it makes no number of two infinite ones.
+    # Without interpolation, which between two infinite numbers is NaN.
     low, high = np.quantile(ratios, (0.025, 0.975), method="nearest")
     return float(low), float(high)
 
@@ -142,14 +142,14 @@ def ratio_interval(above: Tensor, below: Tensor) -> tuple[float, float]:
 def mixing_index(x: Tensor, counts: Sequence[int], *, eps: float) -> Tensor:
     """Return how much the K species of each world are mixed, in [0, 1], shape [B].
 
-    The mean over the particles of the entropy of the species' shares in the density there, in units
-    of log K. 0: no particle perceives another species; 1: all species are perceived alike.
+    It is the mean over particles of the entropy of the species' fractions of the density, over
+    log K. 0: no particle perceives another species; 1: all species are perceived equally.
     """
     rho = species_fields(x, counts, eps=eps).rho
     if rho.shape[2] < 2:
         raise NPAError("counts must name at least two species that can mix, got one")
-    shares = rho / rho.sum(dim=2, keepdim=True)
-    entropy: Tensor = torch.special.entr(shares).sum(dim=2)
+    fractions = rho / rho.sum(dim=2, keepdim=True)
+    entropy: Tensor = torch.special.entr(fractions).sum(dim=2)
     return entropy.mean(dim=1) / math.log(rho.shape[2])
 
 
@@ -157,12 +157,12 @@ PROGRESS_STEPS = 32
 """Steps between two reports of progress."""
 
 FRAME_SHARES = (0.0, 0.125, 0.25, 0.5, 1.0)
-"""When pictures are taken, as shares of the run."""
+"""Times of pictures, as fractions of the run."""
 
 
 @dataclass(frozen=True)
 class RuleUnderTest:
-    """A trained rule that grows in 2D, and its task with a number of particles."""
+    """A trained rule that grows in 2D; `task_of` makes its task for a number of particles."""
 
     name: str
     rule: NPARule
@@ -174,23 +174,23 @@ class RuleUnderTest:
 
 
 class Scenes(NamedTuple):
-    """Pictures of the first worlds, uint8, [R, R, 3]: `len(FRAME_SHARES)` of each encounter."""
+    """Pictures of the first worlds, uint8, [R, R, 3]: `len(FRAME_SHARES)` for each setting."""
 
     frames: list[NDArray[np.uint8]]
     captions: list[str]
 
 
 class _Solo(NamedTuple):
-    """A rule grown alone: its metric [B], infinite where lost, and where it ends [B, 2]."""
+    """A rule grown alone: its metric [B], infinite if blown up, and centroids [B, 2]."""
 
     losses: Tensor
     centroids: Tensor
 
 
 class Encounters:
-    """Grows rules alone and together from the same seeds; what was grown alone is kept.
+    """Grows rules alone and together from the same seeds; caches results of rules alone.
 
-    `progress` is called with the number of steps done since its last call.
+    `progress` is called with the steps done since its last call.
     """
 
     def __init__(
@@ -221,7 +221,7 @@ class Encounters:
     def meet(
         self, first: RuleUnderTest, second: RuleUnderTest
     ) -> tuple[list[InteractionRow], Scenes]:
-        """Grow one rule, which is measured, with another or itself: a row for each setting."""
+        """Grow and measure `first` together with `second`: return a row for each setting."""
         rows, scenes, given = [], Scenes([], []), self.settings
         for factor, ratio, distance in itertools.product(
             given.eps_factors, given.ratios, given.distances
@@ -230,9 +230,9 @@ class Encounters:
             solo = self._solo(first, counts[0], factor)
             radius = "" if factor == 1.0 else f"eps x {factor:g}, "
             caption = f"{radius}d {distance:g}, r {ratio:g}, step"
-            seen: list[tuple[Tensor, Tensor, int]] = []
-            x, s, lost = self._grow([first, second], counts, distance, factor, seen)
-            for then_x, then_s, step in seen:
+            snapshots: list[tuple[Tensor, Tensor, int]] = []
+            x, s, lost = self._grow([first, second], counts, distance, factor, snapshots)
+            for then_x, then_s, step in snapshots:
                 frame = draw_worlds(
                     then_x,
                     then_s,
@@ -250,14 +250,14 @@ class Encounters:
             mixings = mixing_index(x, counts, eps=factor * first.rule.eps0)
             mixing = mixings.mean().item()
             away = (own.mean(dim=1) - solo.centroids).norm(dim=-1).mean().item()
-            said = verdict(change, mixing, given.margin)
+            word = verdict(change, mixing, given.margin)
             setting, figures = (distance, ratio), (alone, together, change, mixing, away)
             intervals = (
                 *ratio_interval(losses, solo.losses),
                 *ratio_interval(mixings, torch.ones_like(mixings)),
             )
             names = first.name, second.name
-            rows.append(InteractionRow(*names, *setting, *figures, said, factor, *intervals))
+            rows.append(InteractionRow(*names, *setting, *figures, word, factor, *intervals))
         return rows, scenes
 
     def _solo(self, organism: RuleUnderTest, count: int, factor: float) -> _Solo:
@@ -274,12 +274,13 @@ class Encounters:
         counts: tuple[int, ...],
         distance: float,
         factor: float,
-        seen: list[tuple[Tensor, Tensor, int]] | None = None,
+        snapshots: list[tuple[Tensor, Tensor, int]] | None = None,
     ) -> tuple[Tensor, Tensor, Tensor]:
         """Return one or two species grown from their seeds, and which worlds blew up.
 
-        The first is seeded around the origin and draws what it draws alone; the second is seeded
-        `distance` from it along the first axis. `seen` gets the first world at `FRAME_SHARES`.
+        The first is seeded at the origin and has the same random stream as alone; the second is
+        seeded at `distance` along the first axis. `snapshots` gets the first world at
+        `FRAME_SHARES`.
         """
         settings = self.settings
         random = WorldRandom(settings.seeds, device=self._device)
@@ -290,8 +291,8 @@ class Encounters:
             )[:2]
             for organism, count, stream in zip(organisms, counts, streams, strict=False)
         ]
-        for number, (place, _) in enumerate(parts):
-            place[..., 0] += number * distance
+        for number, (x, _) in enumerate(parts):
+            x[..., 0] += number * distance
         like = organisms[0].rule.hidden.weight
         x, s = (torch.cat(of_all, dim=1).to(like) for of_all in zip(*parts, strict=True))
         lost = torch.zeros(len(x), dtype=torch.bool, device=x.device)
@@ -309,26 +310,26 @@ class Encounters:
                 generator=random,
                 density_counts=counts,
             )
-            # A world that blew up must not keep the others from being measured.
+            # Worlds that blew up stay as they were, so that the others can be measured.
             fine = new_x.isfinite().all(dim=(1, 2)) & new_s.isfinite().all(dim=(1, 2))
             x = torch.where(fine[:, None, None], new_x, x)
             s = torch.where(fine[:, None, None], new_s, s)
             lost |= ~fine
             self._progress(then - now)
-            if then in frames and seen is not None:
-                # The middle of the two seeds is the middle of the picture.
+            if then in frames and snapshots is not None:
+                # Centre the picture between the two seeds.
                 shift = x.new_zeros(x.shape[2])
                 shift[0] = 0.5 * distance
-                seen.append((x[:1] - shift, s[:1], then))
+                snapshots.append((x[:1] - shift, s[:1], then))
         return x, s, lost
 
 
 LARGEST_CHANGE = 4.0
-"""Colours end at this many times the loss alone, and at its inverse."""
+"""Range of the colour map of changes: this, and its inverse."""
 
 
 class InteractionRecord(Record[InteractionRow]):
-    """Rows of settings, and each number of them as matrices over the rules."""
+    """Rows, and their figures as matrices over the rules for each setting."""
 
     command, key = "interact", "settings"
 
@@ -343,7 +344,7 @@ class InteractionRecord(Record[InteractionRow]):
         return {**super().content(), "matrices": matrices}
 
     def parse(self, held: dict[str, Any]) -> list[InteractionRow]:
-        """Return the rows; JSON has no infinite numbers."""
+        """Return the rows; null stands for infinite numbers."""
         rows: list[dict[str, Any]] = [
             {k: math.inf if v is None else v for k, v in row.items()} for row in held["rows"]
         ]
@@ -353,7 +354,7 @@ class InteractionRecord(Record[InteractionRow]):
 def _by_setting(
     rows: Sequence[InteractionRow],
 ) -> dict[tuple[float, float, float], list[InteractionRow]]:
-    """Return the rows of each radius, ratio and distance."""
+    """Return the rows by radius factor, ratio and distance."""
     found: dict[tuple[float, float, float], list[InteractionRow]] = {}
     for row in rows:
         found.setdefault((row.eps_factor, row.ratio, row.distance), []).append(row)
@@ -361,15 +362,15 @@ def _by_setting(
 
 
 def _matrix(rows: Sequence[InteractionRow], names: Sequence[str], what: str) -> list[list[Any]]:
-    """Return one field of each pair of rules; None where it is missing."""
+    """Return a field of each pair of rules as a matrix; None for missing pairs."""
     found = {(row.rule, row.beside): getattr(row, what) for row in rows}
     return [[found.get((down, across)) for across in names] for down in names]
 
 
 def heat_map(rows: Sequence[InteractionRow]) -> bytes:
-    """Return a PNG: how each rule's loss changes next to each other one, and how much they mix.
+    """Return a PNG of two matrices for each setting: change of the loss, and mixing index.
 
-    Rows are the measured rules; there are two panels for each setting. Needs matplotlib.
+    Rows are the measured rules, columns the other ones. Needs matplotlib.
     """
     names = list(dict.fromkeys([row.rule for row in rows] + [row.beside for row in rows]))
     settings = _by_setting(rows)
@@ -389,7 +390,7 @@ def heat_map(rows: Sequence[InteractionRow]) -> bytes:
 def phase_diagram(rows: Sequence[InteractionRow]) -> bytes:
     """Return a PNG of one pair of rules over distance, ratio and radius. Needs matplotlib.
 
-    Above the change of the loss, below the mixing index, each with its interval.
+    The upper panels show the change of the loss, the lower ones the mixing index, with intervals.
     """
     factors, ratios, distances = (
         sorted(set(each)) for each in zip(*_by_setting(rows), strict=True)
@@ -418,7 +419,7 @@ def phase_diagram(rows: Sequence[InteractionRow]) -> bytes:
 
 def _interval(row: InteractionRow, what: str) -> str:
     ends = (getattr(row, f"{what}_{end}") for end in ("low", "high"))
-    # Small ends have many zeros: a cell has room for one digit more.
+    # A cell has room for one digit of small numbers.
     return " to ".join(f"{end:.2g}" if end >= 0.01 else f"{end:.1g}" for end in ends)
 
 
@@ -427,7 +428,7 @@ def _radius(factor: float) -> str:
 
 
 def _shades() -> tuple[tuple[str, str, str, Any, dict[str, Any]], ...]:
-    """Return for each drawn field its name, title, colours, their norm, and marks of their bar."""
+    """Return, for each drawn field, its name, title, colour map, norm and options of the bar."""
     from matplotlib.colors import LogNorm, Normalize
 
     ticks = {"ticks": [0.25, 0.5, 1.0, 2.0, 4.0], "format": "%g"}

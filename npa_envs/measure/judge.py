@@ -1,7 +1,7 @@
-"""The judge of textures, which no rule trains on: three distances from the target, as ratios.
+"""The judge of textures: three distances from the target that no training loss contains.
 
-Each is divided by the distance of another drawing of the target by particles, at least by 2 % of
-that of grey noise, whose ratio is so 50 or less.
+Each is divided by the distance of a drawing of the target by particles, or by 2 % of the distance
+of grey noise if that is larger.
 """
 
 from __future__ import annotations
@@ -17,30 +17,30 @@ from npa_envs.tasks.losses.pieces import quantiles
 from npa_envs.tasks.texture import Texture, colour_image
 
 REFERENCE = 128
-"""Pixels along each side of pictures to which the lengths in pixels apply; others scale them."""
+"""Resolution for which lengths are given in pixels; they are scaled for others."""
 PATCH = 24
-"""Pixels along each side of a patch; no loss compares patches of this size."""
+"""Side of a patch [pixels], which no training loss uses."""
 DIRECTIONS = 64
 """Random directions that patches are projected on."""
 BANDS = 7
-"""Bands of the wave number, each `BAND_RATIO` times the one before, up to half a wave a pixel."""
+"""Logarithmic bands of the wave number, `BAND_RATIO` wide, up to half a wave a pixel."""
 BAND_RATIO = math.sqrt(2.0)
 ORIENTATIONS = 8
 """Orientations of waves in half a turn."""
 DISTANCES = (1, 2, 4, 6, 9, 13, 19, 28)
-"""Pixels between two colours that are counted together."""
+"""Distances of the pairs of pixels whose colours are counted [pixels]."""
 AXES = ((0, 1), (1, 1), (1, 0), (1, -1))
-"""Directions in which they lie, rows and columns."""
+"""Directions of these pairs, rows and columns."""
 DRAWINGS = 4
-"""Drawings of the target by particles that the distances are divided by."""
+"""Drawings of the target by particles, whose mean distance is the unit."""
 
 
 @dataclass(frozen=True)
 class JudgeRow:
-    """Means over worlds of ratios; at 1 worlds differ from the target as drawings of it do.
+    """Distances from the target over those of drawings of the target, averaged over worlds.
 
-    `patches` is the ratio of sliced Wasserstein distances of patches, `spectra` that of oriented
-    power spectra, `colours` that of co-occurring colours, `ratio` the mean of the three.
+    `patches` are sliced Wasserstein distances of patches, `spectra` distances of oriented power
+    spectra, `colours` those of co-occurring colours; `ratio` is the mean of the three.
     """
 
     step: int
@@ -52,12 +52,12 @@ class JudgeRow:
 
 
 class TextureJudge:
-    """How far worlds of a texture task look from its target.
+    """Distance of pictures of a texture task from its target.
 
-    All is counted in float64 with directions drawn from one seed, so that a CPU and a GPU agree.
+    It is computed in float64 with directions from a fixed seed, so that CPU and GPU agree.
 
     Raises:
-        NPAError: The task is no texture.
+        NPAError: The task is not a texture.
     """
 
     def __init__(self, task: object) -> None:
@@ -98,7 +98,7 @@ class TextureJudge:
         self._units = torch.maximum(self._distances(_images(drawn)).mean(0), least)
 
     def __call__(self, pictures: Tensor) -> Tensor:
-        """Return ratios of patches, spectra and colours, float64, [B, 3], of `Texture.picture`."""
+        """Return ratios of patches, spectra and colours, float64, [B, 3], for [B, R, R, 4]."""
         if pictures.shape[1:] != self._task.target_picture.shape:
             raise NPAError(
                 f"pictures must have shape [B, R, R, 4] with R as the target's "
@@ -110,7 +110,7 @@ class TextureJudge:
             )
 
     def row(self, x: Tensor, s: Tensor, step: int) -> JudgeRow:
-        """Judge worlds as they are, some steps from the seed."""
+        """Measure worlds that are `step` steps after their seed."""
         ratios = self(self._task.picture(x, s))
         each = ratios.mean(1)
         patches, spectra, colours = ratios.mean(0).tolist()
@@ -128,12 +128,12 @@ class TextureJudge:
     def _projections(self, image: Tensor, wrap: bool) -> Tensor:
         """Return the quantiles of the patches' projections, [DIRECTIONS, R²]."""
         waves = torch.fft.rfft2(image)
-        seen = torch.fft.irfft2((waves * self._filters).sum(1), s=image.shape[-2:])
+        projected = torch.fft.irfft2((waves * self._filters).sum(1), s=image.shape[-2:])
         count = image.shape[-1] ** 2
         if not wrap:
             inside = image.shape[-1] - self._side + 1
-            seen = seen[:, :inside, :inside]
-        return quantiles(seen.flatten(1), count)
+            projected = projected[:, :inside, :inside]
+        return quantiles(projected.flatten(1), count)
 
     def _amplitudes(self, image: Tensor) -> Tensor:
         """Return the square root of each channel's power in each bin of waves, [4, bins]."""
@@ -143,10 +143,10 @@ class TextureJudge:
         return sums.sqrt()
 
     def _counts(self, image: Tensor, wrap: bool) -> Tensor:
-        """Return how often two codes lie at each distance and direction, shares, [D, K, K]."""
+        """Return how often two codes lie at each distance and direction, fractions, [D, K, K]."""
         away = (image[0].movedim(0, -1)[..., None, :] - self._codes).square().sum(-1)
         near = torch.exp(-0.5 * away / 0.15**2)
-        # Colours near no code count as one more.
+        # One more code for colours that are near no other.
         near = torch.cat((near, torch.full_like(near[..., :1], 0.05)), dim=-1)
         near = near / near.sum(-1, keepdim=True)
         result = []
@@ -166,9 +166,9 @@ class TextureJudge:
 
 
 def _images(pictures: Tensor) -> Tensor:
-    """Return colours and densities as they are compared, float64, shape [B, 4, R, R]."""
+    """Return the colours and densities to compare, float64, shape [B, 4, R, R]."""
     channels = pictures.double().movedim(-1, 1)
-    # No power of the density: how faint the last trace of an edge is does not decide.
+    # The plain density, no power of it, as the faintest parts of edges should count little.
     return torch.cat((colour_image(channels), channels[:, 3:]), dim=1)
 
 
@@ -179,7 +179,7 @@ def _wave_bins(resolution: int) -> Tensor:
     length = torch.hypot(down, across)
     longest = 0.5 * REFERENCE / resolution
     band = BANDS + torch.floor(torch.log(length / longest + 1e-300) / math.log(BAND_RATIO))
-    # The longest waves are one band, the shortest another, however many there are.
+    # The first and the last band take all longer and all shorter waves.
     band = band.clamp(0, BANDS - 1)
     turn = torch.atan2(down, across) % math.pi
     orientation = torch.floor(turn / math.pi * ORIENTATIONS + 0.5) % ORIENTATIONS
@@ -188,7 +188,7 @@ def _wave_bins(resolution: int) -> Tensor:
 
 
 def _codes(colours: Tensor, count: int) -> Tensor:
-    """Return codes of colours, [K, F]: k-means from the farthest ones."""
+    """Return k-means centres of colours, [K, F], that start from the farthest colours."""
     centres = colours.mean(0, keepdim=True)
     for _ in range(count - 1):
         away = torch.cdist(colours, centres).amin(1)

@@ -1,6 +1,6 @@
 """Plots of measurements: figures without a window, bands, matrices, logarithmic axes, PNG files.
 
-Needs matplotlib, which the extra `bench` brings; `write_plots` says so where it is missing.
+They need matplotlib, of the extra `bench`.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from npa_envs.files import write_bytes
 
 
 def check_matplotlib() -> None:
-    """Check that pictures can be drawn: that matplotlib is installed."""
+    """Check that matplotlib is installed."""
     try:
         import matplotlib  # noqa: F401
     except ImportError as error:
@@ -26,10 +26,9 @@ def check_matplotlib() -> None:
 
 
 def write_plots(draw: Callable[[], Mapping[str, bytes]], path: Path, what: str) -> list[str]:
-    """Write PNG files where matplotlib is installed, and return what was done, in sentences.
+    """Write PNG files, and return a line of text for each; without matplotlib say so instead.
 
-    `draw` returns them by name, for which "*" stands in `path`; `what` they are is said where there
-    are none.
+    `draw` returns the files by name, which replaces "*" in `path`; `what` names them in the text.
     """
     try:
         check_matplotlib()
@@ -59,7 +58,7 @@ def png(figure: Any, dpi: int = 90) -> bytes:
 
 
 def legend_of(figure: Any, panel: Any, place: str = "lower center", **options: Any) -> None:
-    """Give a figure the legend of one panel, outside of all panels."""
+    """Show the legend of one panel outside of all panels of a figure."""
     handles, labels = panel.get_legend_handles_labels()
     figure.legend(handles, labels, loc=f"outside {place}", **options)
 
@@ -72,7 +71,7 @@ def draw_band(
     label: str,
     **options: Any,
 ) -> None:
-    """Draw a curve and a band around it: the band's lower end, the curve, the upper end."""
+    """Draw a curve with a band; `lines` are the band's lower end, the curve, the upper end."""
     low, middle, high = lines
     panel.plot(across, middle, color=colour, label=label, **options)
     panel.fill_between(across, low, high, color=colour, alpha=0.2, lw=0)
@@ -88,10 +87,9 @@ def draw_matrix(
     norm: Any,
     notes: Sequence[Sequence[str]] | None = None,
 ) -> Any:
-    """Draw a matrix with its numbers, and return what `figure.colorbar` takes.
+    """Draw a matrix with its numbers, and return the argument of `figure.colorbar`.
 
-    `notes` stand below the numbers. NaN is black, None stays blank; `norm` maps numbers to [0, 1]
-    of a colour map, which ends there.
+    `notes` are below the numbers. NaN is black, None blank; `norm` maps numbers to [0, 1].
     """
     from matplotlib.cm import ScalarMappable
     from matplotlib.patches import Rectangle
@@ -124,10 +122,9 @@ def number_plainly(
     within: Sequence[float] = (1, 2, 5),
     text: Callable[[float], str] | None = None,
 ) -> None:
-    """Label a logarithmic axis at 1, 2, 5, 10 ... or at some values, without powers of ten.
+    """Label a logarithmic axis with plain numbers at `values`, or `within` each decade.
 
-    Without values there are those `within` each decade, as multiples of the power of ten. Without
-    `text` labels have k or M for thousands and millions.
+    Without `text`, labels have k or M for thousands and millions.
     """
     from matplotlib.ticker import FixedLocator, FuncFormatter, LogLocator, NullLocator
 
@@ -146,7 +143,7 @@ def _with_unit(value: float) -> str:
 
 
 def mark_decades(panel: Any) -> None:
-    """Mark 1, 2 and 5 of each decade of a logarithmic axis y; where they are many, the decades."""
+    """Label 1, 2 and 5 of each decade of a logarithmic y axis; of a long axis only decades."""
     low, high = panel.get_ylim()
     fine = high < 100.0 * low
     panel.minorticks_off()

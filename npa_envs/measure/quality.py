@@ -30,23 +30,23 @@ PROGRESS_STEPS = 32
 """Steps between two reports of progress."""
 
 CHECKPOINTS = (64, 128, 256, 512, 1024, 2048, 4096)
-"""Steps at which a rule is measured, unless others are asked for."""
+"""Default steps at which a rule is measured."""
 
 LOST = 10.0
-"""A world whose loss has risen to so many times its undamaged one has run away."""
+"""A world is lost if its loss is more than this many times that before the damage."""
 
 HEALED = 1.2
-"""A world is healed once its loss is at most this many times the undamaged one."""
+"""A world is healed once its loss is at most this many times that before the damage."""
 
 
 @dataclass(frozen=True)
 class EvaluationRow:
-    """Several worlds after a number of steps from the seed; means, and those of the worst world.
+    """Several worlds `step` steps after the seed: means over worlds, and `..._worst` of the worst.
 
-    `loss` is the task's metric. `psnr` is that of the picture against the target's, four channels
-    in [0, 1], in 3D of held-out views [dB]; None where a world does not match its target pixel by
-    pixel. `overflow` is mean |s - clip(s, -1, 1)|, `extent` the longest side of the bounding box
-    [length units].
+    `loss` is the task's metric. `psnr` compares the picture with the target's, four channels in
+    [0, 1], in 3D held-out views [dB]; None for tasks whose worlds need not match their target pixel
+    by pixel. `overflow` is mean |s - clip(s, -1, 1)|, `extent` the longest side of the bounding
+    box [length units].
     """
 
     step: int
@@ -59,18 +59,17 @@ class EvaluationRow:
 
     @property
     def figures(self) -> str:
-        """The loss and, where there is one, the PSNR, in words."""
+        """The loss and, if measured, the PSNR, as text."""
         psnr = "" if self.psnr is None else f", PSNR {self.psnr:5.2f} dB"
         return f"loss {self.loss:.4f}{psnr}"
 
 
 @dataclass(frozen=True)
 class HealingRow:
-    """Several worlds, grown and damaged: their mean loss before, right after and at the end.
+    """Several worlds, grown and damaged: mean loss `before` and right `after` damage, and at `end`.
 
-    `steps_to_heal` are those until the mean loss is at most `HEALED` times `before`, None where
-    that takes too long. `worlds_healed` counts the worlds for which this once holds of their own
-    losses, and which have not risen above `LOST` times at the end.
+    `steps_to_heal`: steps until the mean loss is at most `HEALED` times `before`, None if never.
+    `worlds_healed`: worlds that once heal by their own loss and are not lost (`LOST`) at the end.
     """
 
     damage: str
@@ -93,10 +92,10 @@ def evaluate(
     progress: Callable[[int], None] | None = None,
     watch: Callable[[Tensor, Tensor, int], None] | None = None,
 ) -> list[EvaluationRow]:
-    """Grow one world from every seed and measure them at `checkpoints`, steps that increase.
+    """Grow one world from every seed and measure them at `checkpoints`, increasing steps.
 
-    `progress` is called with the number of steps done since its last call, `watch` at each of
-    `checkpoints` with positions, states and the step. The same seeds give the same table.
+    `progress` is called with the steps done since its last call, `watch` at each checkpoint with
+    positions, states and the step. The same seeds give the same table.
     """
     check_steps("checkpoints", checkpoints)
     runner, x, s = _from_seeds(rule, task, seeds, device, progress)
@@ -109,7 +108,7 @@ def evaluate(
 
 
 def measure(task: Task, x: Tensor, s: Tensor, step: int) -> EvaluationRow:
-    """Measure worlds as they are, some steps from the seed."""
+    """Measure worlds that are `step` steps after their seed."""
     loss, ratio = task.metric(x, s), None
     if task.has_views:
         ratio = task.view_psnr(x, s)
@@ -131,7 +130,7 @@ def _overflow(s: Tensor) -> Tensor:
 
 
 def psnr(picture: Tensor, target: Tensor) -> Tensor:
-    """Return the PSNR of pictures [B, R, R, 4] against a target [R, R, 4], clipped [dB], [B]."""
+    """Return the PSNR [dB], shape [B], of pictures [B, R, R, 4] and a target [R, R, 4], clipped."""
     error = (picture.clamp(0.0, 1.0) - target.clamp(0.0, 1.0)).square().flatten(1).mean(1)
     return -10.0 * torch.log10(error)
 
@@ -152,12 +151,12 @@ def healing(
 ) -> list[HealingRow]:
     """Grow worlds, damage them, and measure how long they take to heal.
 
-    Two damages, each on the same grown worlds: a slit of width `cut_gap` through the middle at a
-    random angle, and a disk of `wipe_radius` around a random particle whose states are wiped
-    [length units]. Losses are taken `every` so many steps.
+    There are two damages, each to the same grown worlds: a slit of width `cut_gap` through the
+    middle at a random angle, and states set to zero within `wipe_radius` of a random particle
+    [length units]. Losses are computed every `every` steps.
     """
-    for what, count in (("grow_steps", grow_steps), ("heal_steps", heal_steps), ("every", every)):
-        check_steps(what, [count])
+    for name, count in (("grow_steps", grow_steps), ("heal_steps", heal_steps), ("every", every)):
+        check_steps(name, [count])
     runner, x, s = _from_seeds(rule, task, seeds, device, progress)
     x, s = runner.run(x, s, grow_steps)
     task = runner.task
@@ -177,16 +176,16 @@ def healing(
     rows = []
     for name, worlds in damaged.items():
         losses = torch.stack([task.metric(x, s) for _, x, s in runner.at(steps, *worlds)])
-        gone = ~(losses[-1] <= LOST * before)
-        mean_within = ((losses.mean(1) <= HEALED * before.mean()) & ~gone.all()).tolist()
-        healed = [step for step, within in zip(steps, mean_within, strict=True) if within]
+        lost = ~(losses[-1] <= LOST * before)
+        mean_healed = ((losses.mean(1) <= HEALED * before.mean()) & ~lost.all()).tolist()
+        healed = [step for step, is_healed in zip(steps, mean_healed, strict=True) if is_healed]
         rows.append(
             HealingRow(
                 damage=name,
                 before=before.mean().item(),
                 after=losses[0].mean().item(),
                 steps_to_heal=healed[0] if healed else None,
-                worlds_healed=int(((losses <= HEALED * before).any(0) & ~gone).sum()),
+                worlds_healed=int(((losses <= HEALED * before).any(0) & ~lost).sum()),
                 world_count=len(before),
                 end=losses[-1].mean().item(),
             )
@@ -197,22 +196,22 @@ def healing(
 # Rules that classify clouds
 
 CLOUD_CHECKPOINTS = (8, 16, 24, 32, 64, 128)
-"""Steps after which clouds are asked for their class, unless others are given."""
+"""Default steps at which the classes of clouds are read."""
 
 CUT_SHARE = 0.25
-"""Share of its particles that a cut cloud loses."""
+"""Fraction of its particles that a cut cloud loses."""
 
 BATCH = 256
-"""Clouds that are run at once."""
+"""Clouds in a batch."""
 
 
 @dataclass(frozen=True)
 class AccuracyRow:
-    """All clouds some steps after blank states, shares in [0, 1].
+    """All clouds `step` steps after blank states; fractions in [0, 1].
 
-    `majority`: clouds whose majority says the right class; `particle`: particles that say it;
-    `agreement`: particles that say what their cloud's majority says. `loss` is the mean squared
-    error to the class, `overflow` mean |s - clip(s, -1, 1)|.
+    `majority`: clouds whose majority vote is right; `particle`: particles whose vote is right;
+    `agreement`: particles that vote as their cloud's majority. `loss` is the mean squared error to
+    the class, `overflow` mean |s - clip(s, -1, 1)|.
     """
 
     step: int
@@ -225,10 +224,10 @@ class AccuracyRow:
 
 @dataclass(frozen=True)
 class ChangeRow:
-    """All clouds some steps after a change that left the particles' states as they were.
+    """All clouds `steps` steps after a change of positions, which kept the particles' states.
 
-    `majority` and `particle` are shares that say the class which clouds show after the change,
-    `majority_before` the clouds whose majority says the class from before.
+    `majority` and `particle` are fractions that vote for the class after the change,
+    `majority_before` the fraction of clouds whose majority votes for the class before it.
     """
 
     change: str
@@ -247,28 +246,28 @@ def accuracies(
     seed: int = 0,
     progress: Callable[[int], None] | None = None,
 ) -> list[AccuracyRow]:
-    """Let a rule classify all clouds of a task's split, and count right answers at `checkpoints`.
+    """Let a rule classify all clouds of a task's split; return its accuracy at `checkpoints`.
 
-    The rule is on the device of the task; `seed` is that of the updates.
+    The rule runs on the device of the task; `seed` is that of the update masks.
     """
     check_steps("checkpoints", checkpoints)
     runner = RuleRunner(rule, task, task.clouds.x.device, seed, progress)
-    places = task.clouds.x.to(runner.dtype)
+    positions = task.clouds.x.to(runner.dtype)
     sums = torch.zeros(len(checkpoints), 5, dtype=torch.float64)
     for index, label, blank in _batches(task):
-        aimed = runner.task.toward(label)
-        worlds = runner.at(checkpoints, places[index], blank.to(runner.dtype), still=True)
+        labelled = runner.task.toward(label)
+        worlds = runner.at(checkpoints, positions[index], blank.to(runner.dtype), still=True)
         for row, (_, x, s) in enumerate(worlds):
             outputs = runner.task.outputs(s)
-            says, most = particle_classes(outputs), majority(outputs)
+            votes, most = particle_classes(outputs), majority(outputs)
             sums[row] += _sums(
                 most == label,
-                (says == label[:, None]).double().mean(1),
-                (says == most[:, None]).double().mean(1),
-                aimed.metric(x, s),
+                (votes == label[:, None]).double().mean(1),
+                (votes == most[:, None]).double().mean(1),
+                labelled.metric(x, s),
                 _overflow(s).mean((1, 2)),
             )
-    means = (sums / len(places)).tolist()
+    means = (sums / len(positions)).tolist()
     return [AccuracyRow(step, *row) for step, row in zip(checkpoints, means, strict=True)]
 
 
@@ -282,21 +281,21 @@ def changes_of_mind(
     seed: int = 0,
     progress: Callable[[int], None] | None = None,
 ) -> list[ChangeRow]:
-    """Let clouds settle on a class, change them, and count the answers after some more steps.
+    """Classify clouds for `settle_steps`, change them, and return the accuracy after more `steps`.
 
-    A cut cloud loses a quarter of its particles, on a random side. A mutated one becomes a cloud of
-    another class, wholly or in its upper half: its particles move there and keep their states.
-    `seed` is that of the updates and of the cuts.
+    A cut cloud loses a quarter of its particles, on a random side. A mutated one gets the positions
+    of a cloud of another class, all or in its upper half, and keeps its states. `seed` is that of
+    the update masks and of the cuts.
     """
     check_steps("settle_steps", [settle_steps])
     check_steps("steps", steps, at_least=0)
     runner = RuleRunner(rule, task, task.clouds.x.device, seed, progress)
-    places, classes = task.clouds.x.to(runner.dtype), task.clouds.label
+    positions, classes = task.clouds.x.to(runner.dtype), task.clouds.label
     partner = _partners(classes)
     names = (f"{CUT_SHARE:.0%} cut off", "upper half mutated", "all mutated")
     sums = torch.zeros(len(names), len(steps), 3, dtype=torch.float64)
     for index, label, blank in _batches(task):
-        x, other_x, other = places[index], places[partner[index]], classes[partner[index]]
+        x, other_x, other = positions[index], positions[partner[index]], classes[partner[index]]
         _, s = runner.run(x, blank.to(runner.dtype), settle_steps)
         changed = (
             (*_cut(x, s, runner.generator), label),
@@ -309,7 +308,7 @@ def changes_of_mind(
                 most = majority(outputs)
                 right = (particle_classes(outputs) == goal[:, None]).double().mean(1)
                 sums[number, row] += _sums(most == goal, right, most == label)
-    means = (sums / len(places)).tolist()
+    means = (sums / len(positions)).tolist()
     return [
         ChangeRow(name, step, *row)
         for name, rows in zip(names, means, strict=True)
@@ -318,7 +317,7 @@ def changes_of_mind(
 
 
 def _cut(x: Tensor, s: Tensor, generator: torch.Generator) -> tuple[Tensor, Tensor]:
-    """Return clouds without the particles that lie farthest to one side, random for each."""
+    """Return clouds without the particles farthest in a direction, which is random for each."""
     normal = torch.randn(len(x), 2, generator=generator, device=x.device, dtype=x.dtype)
     order = (x * normal[:, None]).sum(-1).argsort(dim=1)
     kept = order[:, : max(1, round((1.0 - CUT_SHARE) * x.shape[1])), None]
@@ -326,7 +325,7 @@ def _cut(x: Tensor, s: Tensor, generator: torch.Generator) -> tuple[Tensor, Tens
 
 
 def _chimera(x: Tensor, s: Tensor, other_x: Tensor) -> tuple[Tensor, Tensor]:
-    """Return clouds of the lower half of one and the upper half of the other, lowest first."""
+    """Return the lower halves of clouds with the upper halves of others, in order of height."""
     order = x[..., 1].argsort(dim=1)[..., None]
     other_order = other_x[..., 1].argsort(dim=1)[..., None]
     half = x.shape[1] // 2
@@ -336,16 +335,16 @@ def _chimera(x: Tensor, s: Tensor, other_x: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _partners(label: Tensor) -> Tensor:
-    """Return for each cloud the index of one of another class, each cloud once; shape [M]."""
+    """Return a permutation that maps each cloud to one of another class, shape [M]."""
     largest = int(label.bincount().max())
     if 2 * largest > len(label):
         raise NPAError(
             f"no class may have more than half of the clouds, got {largest} of {len(label)}: "
-            "mutated digits need others to become"
+            "mutated clouds need clouds of other classes"
         )
     order = label.argsort(stable=True)
     partner = torch.empty_like(order)
-    # Classes lie side by side in this order, none of them longer than this.
+    # Sorted by class, and no class is longer than the shift.
     partner[order] = order.roll(-largest)
     return partner
 
@@ -361,10 +360,10 @@ def tables_of(
     progress: Callable[[int], None] | None = None,
     judge: TextureJudge | None = None,
 ) -> dict[str, Sequence[Any]]:
-    """Return the tables that are measured of a rule of any task, by name.
+    """Measure a rule of any task; return tables by name.
 
-    These are `growth` and, if `changed`, `healing`; of clouds `accuracy` and `changes`; and those
-    of a `judge`. Clouds run where their task is, and take the first seed for the updates.
+    They are `growth` and, if `changed`, `healing`; for clouds `accuracy` and, if `changed`,
+    `changes`; and `judge`, if given. Clouds run on their task's device, with the first seed.
     """
     if task.classifies:
         clouds = cast(PointClassification, task)
@@ -392,15 +391,15 @@ def run_worlds(
     generator: Randomness,
     **changed: Any,
 ) -> tuple[Tensor, Tensor]:
-    """Return worlds some steps later, as in the task but for options that are changed."""
+    """Run worlds with the options of their task, except those in `changed`."""
     options = {"eps": task.eps, "box": task.box, "update_prob": task.update_prob} | changed
     return rollout(rule, x, s, steps, generator=generator, **options)
 
 
 class RuleRunner:
-    """A copy of a rule that runs worlds of its task, in the rule's precision.
+    """Runs worlds of a task by a copy of a rule, in the rule's precision.
 
-    `progress` is called with the number of steps done since its last call.
+    `progress` is called with the steps done since its last call.
     """
 
     def __init__(
@@ -411,7 +410,7 @@ class RuleRunner:
         seed: int,
         progress: Callable[[int], None] | None,
     ) -> None:
-        # The caller's own rule stays on its device.
+        # The caller's rule must stay on its device.
         self._rule = copy.deepcopy(rule).to(device)
         self.dtype = next(rule.parameters()).dtype
         self.task = task.for_rule(self._rule)
@@ -419,18 +418,18 @@ class RuleRunner:
         self._progress = progress or (lambda _: None)
 
     def run(self, x: Tensor, s: Tensor, steps: int) -> tuple[Tensor, Tensor]:
-        """Return worlds some steps later."""
+        """Return worlds after `steps` steps."""
         while steps > 0:
-            some = min(steps, PROGRESS_STEPS)
-            x, s = run_worlds(self._rule, self.task, x, s, some, self.generator)
-            self._progress(some)
-            steps -= some
+            count = min(steps, PROGRESS_STEPS)
+            x, s = run_worlds(self._rule, self.task, x, s, count, self.generator)
+            self._progress(count)
+            steps -= count
         return x, s
 
     def at(
         self, steps: Sequence[int], x: Tensor, s: Tensor, *, still: bool = False
     ) -> Iterator[tuple[int, Tensor, Tensor]]:
-        """Yield worlds after each of increasing numbers of steps; `still` ones keep positions."""
+        """Yield the step and worlds at each of increasing `steps`; `still`: positions stay."""
         for step, before in zip(steps, (0, *steps), strict=False):
             new_x, s = self.run(x, s, step - before)
             x = x if still else new_x
@@ -446,7 +445,7 @@ def _from_seeds(
 ) -> tuple[RuleRunner, Tensor, Tensor]:
     """Return a runner and one world for each of the seeds."""
     if not seeds:
-        raise NPAError("seeds must hold at least one number, got none: for example seeds=(0, 1)")
+        raise NPAError("seeds must have at least one number, got none: for example seeds=(0, 1)")
     device = check_device(device)
     runner = RuleRunner(rule, task, device, seeds[0] + len(seeds), progress)
     worlds = [
@@ -465,12 +464,12 @@ def _batches(task: PointClassification) -> Iterator[tuple[Tensor, Tensor, Tensor
 
 
 def _sums(*figures: Tensor) -> Tensor:
-    """Return the sums over clouds of figures [B], float64, on the host."""
+    """Return the sums over clouds of several figures [B], float64, on the CPU."""
     return torch.stack([figure.double().sum() for figure in figures]).cpu()
 
 
 def check_steps(name: str, steps: Sequence[int], at_least: int = 1) -> None:
-    """Check that there are steps, that they increase, and are `at_least` so many."""
+    """Check that steps are not empty, increase, and are `at_least` or more."""
     ordered = all(a < b for a, b in itertools.pairwise(steps))
     if not steps or min(steps) < at_least or not ordered:
         raise NPAError(
@@ -479,23 +478,23 @@ def check_steps(name: str, steps: Sequence[int], at_least: int = 1) -> None:
         )
 
 
-# Rules of many pictures: loss and PSNR of each picture by its code, and by another code.
+# Rules of many pictures: loss and PSNR of each picture with its code, and loss with another code.
 
 WORLDS = 64
-"""Worlds that are run at once."""
+"""Worlds in a batch."""
 
 PICTURE_CHECKPOINTS = (64, 256, 1024)
-"""Steps from the seed after which pictures are compared, unless others are asked for."""
+"""Default steps from the seed at which pictures are compared."""
 
 MEDIAN = "(median)"
-"""What stands in place of a picture's name in rows of medians."""
+"""`target` of rows of medians."""
 
 
 @dataclass(frozen=True)
 class PictureRow:
-    """Worlds of one picture, or medians of all pictures: means of splat loss and PSNR [dB].
+    """Mean splat loss and PSNR [dB] of the worlds of one picture, or medians of all pictures.
 
-    `shuffled` is the loss with the code of the next picture of the list.
+    `shuffled` is the loss of worlds that have the code of the next picture.
     """
 
     step: int
@@ -517,14 +516,14 @@ def grown(
 ) -> list[tuple[Tensor, Tensor]]:
     """Return x [T, B, N, 2] and s [T, B, N, C] of T tasks at each of `checkpoints`.
 
-    All tasks have equal worlds, each its own code, and start from the same seeds; `progress` is
-    called with the number of steps done since its last call.
+    Tasks differ in their codes only, and start from the same seeds. `progress` is called with the
+    steps done since its last call.
     """
     check_steps("checkpoints", checkpoints)
-    together = max(1, WORLDS // len(seeds))
+    at_a_time = max(1, WORLDS // len(seeds))
     found: list[list[tuple[Tensor, Tensor]]] = [[] for _ in checkpoints]
-    for first in range(0, len(tasks), together):
-        some = tasks[first : first + together]
+    for first in range(0, len(tasks), at_a_time):
+        some = tasks[first : first + at_a_time]
         fresh = [
             task.seed(len(seeds), generator=WorldRandom(seeds, device=device), device=device)
             for task in some
@@ -554,9 +553,9 @@ def picture_rows(
     device: str | torch.device = "cpu",
     progress: Callable[[int], None] | None = None,
 ) -> list[PictureRow]:
-    """Return rows of each picture of `grown` at `checkpoints`, and one of their medians."""
+    """Return, at each of `checkpoints`, a row for each picture and one of their medians."""
     if len(tasks) < 2:
-        raise NPAError(f"pictures must be two or more, got {len(tasks)}: nothing to tell apart")
+        raise NPAError(f"pictures must be two or more, got {len(tasks)}: give another")
     given: dict[str, Any] = {"seeds": seeds, "device": device, "progress": progress}
     rows = []
     worlds = grown(rule, tasks, checkpoints=checkpoints, **given)
@@ -576,17 +575,17 @@ def picture_rows(
 # Scores of shipped rules: the tables of `npa-envs evaluate`, in a file next to each rule.
 
 SCORED_STEPS = (128, 256, 512, 1024, 4096)
-"""Steps from the seed that a line of scores names, where they were measured."""
+"""Steps that `score_line` shows, if measured."""
 
 CLOUD_STEP = 32
-"""Step at which clouds are asked what they are."""
+"""Step at which `score_line` shows the accuracy of clouds."""
 
 
 def scores(name: str) -> dict[str, Any]:
     """Return the scores of a shipped rule: command, commit, date, machine, metric, and tables.
 
-    Tables are lists of rows by column: `growth`, for some rules `healing`, for textures `judge`; of
-    a rule that classifies `accuracy` and `changes`.
+    Tables are lists of rows: `growth`, for some rules `healing`, for textures `judge`; for rules
+    that classify `accuracy` and `changes`.
     """
     rules = shipped_rules()
     if not isinstance(name, str) or name not in rules:
@@ -596,7 +595,7 @@ def scores(name: str) -> dict[str, Any]:
 
 
 def score_line(measured: Mapping[str, Any]) -> str:
-    """Return scores, as `scores` returns them, in a line."""
+    """Return the result of `scores` as one line of text."""
     if "accuracy" in measured:
         (row,) = (row for row in measured["accuracy"] if row["step"] == CLOUD_STEP)
         shares = f"{row['majority']:.1%} of clouds by majority, {row['particle']:.1%} of particles"
@@ -611,7 +610,7 @@ def score_line(measured: Mapping[str, Any]) -> str:
 
 
 def _at_steps(rows: Sequence[Mapping[str, Any]], column: str, form: str, unit: str) -> str:
-    # JSON has no numbers that are not finite.
+    # Numbers that are not finite are null in JSON.
     values = [
         "no finite number" if row[column] is None else format(row[column], form) + unit
         for row in rows

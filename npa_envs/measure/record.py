@@ -1,7 +1,7 @@
-"""Records and tables of measurements: JSON written whole, with facts that figures follow from.
+"""Records and tables of measurements: JSON files with rows and the facts that they depend on.
 
-A record is written after every entry, so that a run that was stopped goes on from it. Figures of
-other facts (device, machine, commit, versions, settings) are refused.
+A record is written after every entry, so that a stopped run can continue. Records with other facts
+(device, machine, commit, versions, settings) are refused.
 """
 
 from __future__ import annotations
@@ -32,12 +32,12 @@ Row = TypeVar("Row")
 
 
 class Record(Generic[Row]):
-    """Rows of a measurement, and the facts that they follow from, in a JSON file, if in any."""
+    """Rows of a measurement and the facts that they depend on; with `path` in a JSON file."""
 
     command: str
     """The command that writes such records, for errors."""
     key = "facts"
-    """What the file calls the facts."""
+    """Key of the facts in the file."""
 
     def __init__(
         self, facts: Mapping[str, Any], path: Path | None = None, rows: Iterable[Row] = ()
@@ -53,7 +53,7 @@ class Record(Generic[Row]):
         raise NotImplementedError
 
     def read(self) -> Self:
-        """Take over the rows of the file, if there is one, and return this record."""
+        """Read the rows of the file, if it exists, and return this record."""
         if self.path is not None:
             make, command = self.parse, self.command
             found = read_record(self.path, self.facts, make, command=command, key=self.key)
@@ -66,7 +66,7 @@ class Record(Generic[Row]):
         self.write()
 
     def write(self) -> None:
-        """Write the file, where there is to be one."""
+        """Write the file, if the record has a path."""
         if self.path is not None:
             write_record(self.path, {self.key: self.facts, **self.content()})
 
@@ -76,7 +76,7 @@ class Record(Generic[Row]):
 
 
 def write_record(path: Path, content: Any) -> None:
-    """Write JSON, whole or not at all; numbers that are not finite become null."""
+    """Write JSON atomically; numbers that are not finite become null."""
     write_text(path, json_text(content))
 
 
@@ -88,10 +88,9 @@ def read_record(
     command: str,
     key: str = "facts",
 ) -> Content | None:
-    """Return what `make` makes of the JSON that a stopped run left; None where there is none.
+    """Return `make` of the JSON object in a file; None if the file does not exist.
 
-    Facts that differ from those of the file, where `key` names them, are refused; errors name the
-    command that writes such records.
+    Raises an NPAError, which names `command`, if the file's facts under `key` differ from `facts`.
     """
     if not os.path.exists(path):
         return None
@@ -102,25 +101,25 @@ def read_record(
         record = make(held)
     except (OSError, ValueError, TypeError, KeyError, AttributeError) as error:
         raise NPAError(
-            f"{str(path)!r} must hold a record of npa-envs {command}, but cannot be read "
+            f"{str(path)!r} must be a record of npa-envs {command}, but cannot be read "
             f"({shown(error)}): {cure}"
         ) from error
     for name, value in plain_numbers(facts).items():
         if before.get(name) != value:
             raise NPAError(
-                f"{str(path)!r} holds figures of other settings: {name} was "
+                f"{str(path)!r} has figures of other settings: {name} was "
                 f"{shown(before.get(name))}, now {shown(value)}: {cure}"
             )
     return record
 
 
 def number(value: float | None) -> float:
-    """Return a number that was read from a record; null is NaN."""
+    """Return a number of a record; NaN for null."""
     return math.nan if value is None else float(value)
 
 
 def time_limit(max_seconds: float | None) -> Callable[[], bool]:
-    """Return a function that says whether so long [s] has passed; never for None."""
+    """Return a function that returns whether `max_seconds` have passed since now; None: never."""
     end = math.inf if max_seconds is None else time.monotonic() + max_seconds
     return lambda: time.monotonic() >= end
 
@@ -129,7 +128,7 @@ def time_limit(max_seconds: float | None) -> Callable[[], bool]:
 
 
 def measured_facts(device: torch.device, commit: str | None, **settings: Any) -> dict[str, Any]:
-    """Return what figures follow from; without a commit, that of the checkout is measured."""
+    """Return the facts of a measurement; `commit` defaults to the checkout's."""
     return {
         "device": device.type,
         "machine": machine(device),
@@ -139,21 +138,21 @@ def measured_facts(device: torch.device, commit: str | None, **settings: Any) ->
     }
 
 
-def without_folders(words: Sequence[str], *options: str) -> list[str]:
-    """Return a command's words without the paths of options: "--out", "OUT" or "--out=OUT".
+def without_folders(arguments: Sequence[str], *options: str) -> list[str]:
+    """Return a command's arguments with OUT in place of the path after "--out".
 
     Records do not name folders of the machine that they were written on.
     """
     plain: list[str] = []
     before = ""
-    for word in words:
-        name, mark, _ = word.partition("=")
+    for argument in arguments:
+        name, mark, _ = argument.partition("=")
         if before in options:
-            word = before.lstrip("-").upper()
+            argument = before.lstrip("-").upper()
         elif mark and name in options:
-            word = f"{name}={name.lstrip('-').upper()}"
-        plain.append(word)
-        before = word
+            argument = f"{name}={name.lstrip('-').upper()}"
+        plain.append(argument)
+        before = argument
     return plain
 
 
@@ -170,7 +169,7 @@ def machine(device: torch.device) -> str:
 
 
 def installed_version(name: str) -> str | None:
-    """Return the version of a distribution, None where it is not installed."""
+    """Return the version of a distribution, None if it is not installed."""
     try:
         return importlib.metadata.version(name)
     except importlib.metadata.PackageNotFoundError:
@@ -184,7 +183,7 @@ def versions() -> dict[str, str | None]:
 
 
 def current_commit() -> str:
-    """Return the short hash of the checkout that this file lies in, "unknown" without one."""
+    """Return the short hash of this file's git checkout, "unknown" without one."""
     command = ["git", "describe", "--always", "--dirty", "--exclude=*"]
     try:
         done = subprocess.run(
@@ -198,16 +197,16 @@ def current_commit() -> str:
 # Tables: plain text, Markdown, comma-separated values, JSON
 
 UNMEASURED = "-"
-"""What tables show where nothing was measured."""
+"""Cell of a plain text table without a value."""
 
 NONE = "–"
-"""What Markdown shows where nothing was measured."""
+"""Cell of a Markdown table without a value."""
 
 
 def table_text(rows: Sequence[Any], *, missing: str = "never") -> str:
-    """Return rows, instances of one dataclass, as a plain text table under a line of headings.
+    """Return instances of one dataclass as a plain text table with headings.
 
-    A None is shown as `missing`; if that is `UNMEASURED`, columns of it alone are left out.
+    None is shown as `missing`; if that is `UNMEASURED`, columns without values are left out.
     """
     if not rows:
         return ""
@@ -215,7 +214,7 @@ def table_text(rows: Sequence[Any], *, missing: str = "never") -> str:
 
 
 def aligned(lines: Sequence[Sequence[str]]) -> list[str]:
-    """Return lines of cells in columns, which end below each other."""
+    """Return lines of cells as text in right-aligned columns."""
     widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
     return [
         "  ".join(cell.rjust(width) for cell, width in zip(line, widths, strict=True))
@@ -245,7 +244,7 @@ def _cell(value: object, missing: str) -> str:
 
 
 def tables_json(tables: Mapping[str, Sequence[Any]], **facts: str) -> str:
-    """Return tables and facts as a JSON object; a number that is not finite becomes null."""
+    """Return tables and facts as a JSON object; numbers that are not finite become null."""
     return json_text({**facts, **{name: as_objects(rows) for name, rows in tables.items()}})
 
 
@@ -271,12 +270,12 @@ def csv_text(heads: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
 
 
 def short(value: float | str) -> str:
-    """Return a number with three digits, a word as it is."""
+    """Return a number with three digits; text stays as it is."""
     return value if isinstance(value, str) else f"{value:.3g}"
 
 
 def mean_with_error(mean: float, error: float, digits: int = 3) -> str:
-    """Return a mean with its standard error; either may be NaN, for not known."""
+    """Return a mean ± its standard error as text; NaN: not known."""
     if math.isnan(mean):
         return NONE
     return f"{mean:.{digits}f}" + ("" if math.isnan(error) else f" ± {error:.{digits}f}")

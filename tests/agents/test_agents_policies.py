@@ -309,7 +309,7 @@ def test_the_error_about_foreign_vector_environments_says_how_to_make_ours():
     assert interface_of(envs) == Interface(2, 16, True, 1.0)
     with (
         contextlib.closing(gymnasium.vector.AsyncVectorEnv([single])) as elsewhere,
-        pytest.raises(NPAError, match="must hold environments of npa_envs"),
+        pytest.raises(NPAError, match="must contain environments of npa_envs"),
     ):
         evaluate_policy(elsewhere, never, [0])
     with pytest.raises(NPAError, match=r"got CartPoleEnv.*gymnasium\.make\('npa"):

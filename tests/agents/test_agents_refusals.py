@@ -220,7 +220,7 @@ REFUSED = {
         ({"method": "shac", "steps": 0}, "steps must be"),
         ({"method": "shac", "gamma": 1.5}, "gamma must lie"),
         ({"method": "shac", "critic": "all"}, "critic must be"),
-        ({"method": "ppo", "problem": problem(env_id=SHAPESHIFTER)}, "'ppo' learns no codes"),
+        ({"method": "ppo", "problem": problem(env_id=SHAPESHIFTER)}, "'ppo' cannot learn codes"),
         ({"method": "gradient", "problem": INVASION}, "gradients .* each other's expense"),
         ({"method": "gradient", "problem": DYING}, "gradients must keep all particles"),
         ({"method": "evolution", "problem": problem(env_id=GARDEN)}, "known word, got 'evolution'"),

@@ -92,7 +92,7 @@ def test_a_plan_by_the_gradient_is_worth_more_than_the_script_that_it_begins_wit
         envs.step(np.zeros(envs.action_space.shape, np.float32))
     planner, script = GradientGardener(envs, horizon=1, iterations=8), ScriptedGardener(envs)
     planned, scripted = (
-        planner.worth(policy.act(2)[None], npa_envs.WorldRandom([7, 8])).detach()
+        planner.planned_rewards(policy.act(2)[None], npa_envs.WorldRandom([7, 8])).detach()
         for policy in (planner, script)
     )
     assert bool((planned > scripted).all())
@@ -194,4 +194,4 @@ def test_a_policy_of_another_garden_or_a_file_of_something_else_is_refused(tmp_p
 
 
 def test_a_policy_that_learned_nothing_looks_at_worlds():
-    refused("looks at worlds: call made_for", learned("zero", garden()).policy, None)
+    refused("reads the worlds: call made_for", learned("zero", garden()).policy, None)

@@ -43,7 +43,7 @@ def learner_of(form):
                     setattr(holder, name, value.double())
         # As at the beginning.
         made.critic.updates.zero_()
-        made.critic.observe(made.memory.seen[-1], made.ranks)
+        made.critic.observe(made.memory.observations[-1], made.ranks)
         return made
     fresh = made._fresh
     made._fresh = lambda worlds: fresh(worlds).map(

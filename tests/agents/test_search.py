@@ -214,7 +214,7 @@ def test_a_record_of_other_settings_or_candidates_is_refused(tmp_path):
     held = json.loads(path.read_text(encoding="utf-8"))
     held["batches"][1]["fingerprint"] += 1
     path.write_text(json.dumps(held), encoding="utf-8")
-    refused("batch 1 is of others", search, path=path)
+    refused("batch 1 differs", search, path=path)
 
 
 def test_the_command_leaves_elites_that_other_commands_open(tmp_path, capsys):

@@ -109,7 +109,7 @@ def test_a_record_that_cannot_be_read_is_told(tmp_path, child, capsys, text):
     (tmp_path / "seed=0,target=a").mkdir()
     (tmp_path / "seed=0,target=a" / "run.json").write_text(text, encoding="utf-8")
     assert call(tmp_path) == 2
-    assert "must hold a record of npa-envs sweep" in capsys.readouterr().err
+    assert "must be a record of npa-envs sweep" in capsys.readouterr().err
 
 
 def test_parts_and_time_limits_leave_runs_to_other_calls(tmp_path, child, capsys):

@@ -127,7 +127,7 @@ def test_wiped_disk_blanks_states_of_the_grown_world(monkeypatch):
             (evaluate, {"checkpoints": steps}, "checkpoints must be whole numbers of at least 1")
             for steps in ([], [5, 5], [0, 5])
         ),
-        (evaluate, {"seeds": []}, "seeds must hold at least one number"),
+        (evaluate, {"seeds": []}, "seeds must have at least one number"),
         *((healing, {name: 0}, name) for name in ("grow_steps", "heal_steps", "every")),
     ],
 )

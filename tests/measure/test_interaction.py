@@ -308,7 +308,7 @@ class TestCommand:
         assert "update_prob was None, now 0.9: remove it, or choose another folder with" in error
         saved(rules, rules, "two", first=5)
         assert main(self.words(rules, parts)) == 2
-        assert "holds figures of other settings: rules was" in capsys.readouterr().err
+        assert "has figures of other settings: rules was" in capsys.readouterr().err
 
     def test_pairs_whose_names_look_alike_have_files_of_their_own(self, rules, tmp_path):
         pytest.importorskip("matplotlib")

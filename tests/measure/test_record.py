@@ -35,10 +35,10 @@ def test_a_record_comes_back_with_null_for_what_is_not_finite(tmp_path):
     [
         ('{"facts": {"commit": "0"}, "rows": []}', {"commit": "1"}, "commit was '0', now '1'"),
         ('{"facts": {}, "rows": []}', {"commit": "1"}, "commit was None, now '1'"),
-        ('{"facts": {}}', {}, "must hold a record of npa-envs x, but cannot be read"),
-        ('{"facts": 3, "rows": []}', {}, "must hold a record"),
-        ("[]", {}, "must hold a record"),
-        ("{", {}, "must hold a record"),
+        ('{"facts": {}}', {}, "must be a record of npa-envs x, but cannot be read"),
+        ('{"facts": 3, "rows": []}', {}, "must be a record"),
+        ("[]", {}, "must be a record"),
+        ("{", {}, "must be a record"),
     ],
 )
 def test_other_settings_and_other_files_are_refused(content, facts, message, tmp_path):

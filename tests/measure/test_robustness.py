@@ -433,7 +433,7 @@ def test_a_record_of_a_rule_that_was_trained_anew_is_refused(tmp_path, capsys, m
         rule.output.weight.mul_(1.01)
     files.save_rule(rule, path, metadata=metadata)
     assert main(words) == 2
-    assert "holds figures of other settings: weights was" in capsys.readouterr().err
+    assert "has figures of other settings: weights was" in capsys.readouterr().err
 
 
 def test_a_run_of_several_radii_is_taken_and_a_rule_of_no_task_refused(tmp_path, capsys):
@@ -447,4 +447,4 @@ def test_a_run_of_several_radii_is_taken_and_a_rule_of_no_task_refused(tmp_path,
     assert json.loads((tmp_path / "r" / "robustness_run.json").read_text(encoding="utf-8"))["done"]
     files.save_rule(files.load_rule("heart"), tmp_path / "own.safetensors")
     assert main(["robustness", str(tmp_path / "own.safetensors"), "--quick"]) == 2
-    assert "must say on which task it was trained" in capsys.readouterr().err
+    assert "must name the task of its training" in capsys.readouterr().err

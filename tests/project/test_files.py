@@ -16,7 +16,7 @@ from typing import Any
 import pytest
 from PIL import Image
 
-from npa_envs.agents.learning.rules import RuleSet
+from npa_envs.agents.learning.rule_set import RuleSet
 from npa_envs.cli.common import writable_folder
 from npa_envs.errors import NPAError
 from npa_envs.files import atomic_path, made_folder, remove_unfinished, write_bytes, write_text

@@ -1,4 +1,4 @@
-"""What `npa-envs stress` checks: hard cases, what is expected of each, and where things break."""
+"""Checks of `npa-envs stress`: hard cases for accuracy and stability, each with an expectation."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ from npa_envs.measure.accuracy.suite import Check, by_dimension
 def all_checks(
     *, quick: bool = False, seed: int = 0, rules: Mapping[str, str] | None = None
 ) -> list[Check]:
-    """Return every check in its order; of `rules`, name -> source, the checks of a rule alone.
+    """Return every check in order; with `rules`, name -> source, only the checks of these rules.
 
-    When quick only some shipped rules are checked. Random places are drawn from the seed.
+    `quick` checks fewer shipped rules. The seed is that of random positions.
     """
     # One rule of each task.
     few = ("gecko", "dots") if quick else ("gecko", "dots", "digits", "duck")
@@ -33,7 +33,7 @@ def all_checks(
 
 
 def _of(checks: Iterable[Check], rules: Mapping[str, str] | Iterable[str]) -> list[Check]:
-    """Return checks NAME/RULE of rules, name -> source, or of shipped ones."""
+    """Return the checks for each rule, named NAME/RULE; rules: name -> source, or shipped ones."""
     sources = rules if isinstance(rules, Mapping) else {name: name for name in rules}
     return [
         Check(f"{one.name}/{name}", one.expected, partial(one.run, source), source)

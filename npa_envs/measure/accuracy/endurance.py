@@ -1,4 +1,4 @@
-"""Rules in the worlds that they were trained for, and for 100 000 steps in them."""
+"""Trained rules in worlds of their task, and checks of 100 000 steps."""
 
 from __future__ import annotations
 
@@ -22,16 +22,16 @@ from npa_envs.world.randomness import Randomness
 from npa_envs.world.rollout import rollout
 
 TASKS = ("morphogenesis2d", "morphogenesis3d", "texture", "point_classification")
-"""Tasks whose rules are measured."""
+"""Tasks whose rules can be checked."""
 
 QUICK_PARTICLES, QUICK_CLOUD = 1024, 128
-"""The most particles, and particles of a cloud, in a quick run."""
+"""Most particles of a world, and of a cloud, in a quick run."""
 
 SMALLEST_VIEWS: dict[str, Any] = {"resolution": 16, "training_views": 1, "held_out_views": 1}
-"""Fields of 3D tasks whose target is not looked at: it takes long to make."""
+"""Fields of 3D tasks whose target is not used, as large views take long to make."""
 
-SEEN_AT_ONCE = 1 << 17
-"""Particles of the worlds whose loss is taken at once; views of Gaussians take much memory."""
+LOSS_PARTICLES = 1 << 17
+"""Most particles of a batch of worlds for a loss, as views of Gaussians take much memory."""
 
 CHUNK = 50
 """Steps that are recorded in one CUDA graph."""
@@ -39,7 +39,7 @@ CHUNK = 50
 
 @dataclass(frozen=True)
 class TrialWorlds:
-    """A float32 rule in worlds of its task, with their goals, where the task has such."""
+    """A float32 rule, its task, and worlds of it with their goals, if any."""
 
     rule: NPARule
     task: Task
@@ -48,31 +48,31 @@ class TrialWorlds:
     goal: Tensor | None = None
 
     def options(self, **changed: Any) -> dict[str, Any]:
-        """Return options of `rollout` as in training, but for what is changed."""
+        """Return the options of `rollout` of training, except those in `changed`."""
         task = self.task
         return {"eps": task.eps, "box": task.box, "update_prob": task.update_prob} | changed
 
     def at_trained_size(self, x: Tensor, eps: float) -> Tensor:
-        """Return positions scaled to the radius of training.
+        """Return positions at the scale of training, from a run with radius `eps`.
 
-        Scaling positions and ε alike is a symmetry of the dynamics in open space. Boxes and static
-        particles keep their size.
+        In open space the dynamics do not change if positions and ε are scaled by one factor.
+        Positions in boxes and of static particles are not scaled.
         """
         free = self.task.box is None and not self.rule.static
         return x * (self.task.eps / eps) if free and eps != self.task.eps else x
 
     def with_worlds(self, x: Tensor, s: Tensor) -> TrialWorlds:
-        """Return the same with other particles of K copies of all worlds, [K B, N, ...]."""
+        """Return a copy with the particles of K copies of all worlds, [K B, N, ...]."""
         goal = None if self.goal is None else self.goal.repeat(len(x) // len(self.goal))
         return replace(self, x=x, s=s, goal=goal)
 
     @torch.no_grad()
     def losses(self, x: Tensor, s: Tensor) -> Tensor:
-        """Return the task's metric, [B]; of clouds, the share of particles that are wrong."""
-        some = max(1, SEEN_AT_ONCE // x.shape[1])
+        """Return the task's metric, [B]; of clouds the fraction of wrong particles."""
+        size = max(1, LOSS_PARTICLES // x.shape[1])
         found = []
-        for start in range(0, len(x), some):
-            worlds = slice(start, start + some)
+        for start in range(0, len(x), size):
+            worlds = slice(start, start + size)
             goal = None if self.goal is None else self.goal[worlds]
             found.append(self.task.toward(goal).trial_metric(x[worlds], s[worlds]))
         return torch.cat(found)
@@ -84,11 +84,11 @@ def rule_names() -> list[str]:
 
 
 def task_name(rule: str) -> str:
-    """Return the name of the task that a rule was trained on, as its file says."""
+    """Return the name of the task that a rule was trained on, from its file."""
     metadata = rule_metadata(rule_file(rule))
     if metadata.get("task") not in TASKS:
         raise NPAError(
-            f"the rule's file must say on which task it was trained, {rule!r} says "
+            f"the rule's file must name the task of its training, {rule!r} names "
             f"{metadata.get('task')!r}: give a rule that npa-envs train has saved"
         )
     return metadata["task"]
@@ -97,16 +97,16 @@ def task_name(rule: str) -> str:
 def habitat(
     session: CheckSession, name: str, *, world_count: int = 1, particles: float = 1.0
 ) -> TrialWorlds:
-    """Return a rule, shipped or of a file, with seeds of its task, whose target is not looked at.
+    """Return a rule, shipped or of a file, with fresh worlds of its task.
 
-    `particles` is over those it was trained with or, in a quick run, over the most there.
+    `particles` is a factor on the trained number, in a quick run on at most `QUICK_PARTICLES`.
     """
     if (name, particles) not in session.kept:
         rule = load_rule(name, device=session.device).float().requires_grad_(False)
         fields = {} if rule.space_dim == 2 else SMALLEST_VIEWS
         path = rule_file(name)
         count = int(trained_config(path, rule_metadata(path)).task.particle_count)
-        # Clouds are sampled farthest point by farthest point, which is slow.
+        # Farthest point sampling of clouds is slow.
         most = QUICK_CLOUD if task_name(name) == "point_classification" else QUICK_PARTICLES
         count = max(1, round(particles * (min(count, most) if session.quick else count)))
         found = task_of_rule(name, rule, session.device, particle_count=count, **fields)
@@ -119,7 +119,7 @@ def habitat(
 class LongRun:
     """Long rollouts without gradients; `options` are those of `rollout`.
 
-    On CUDA a chunk of steps is recorded as a graph: launches would take most of the time.
+    On CUDA a chunk of steps is recorded as a graph, as launches would take most of the time.
     """
 
     def __init__(
@@ -133,12 +133,12 @@ class LongRun:
         self._graph: GraphSequence | None = None
 
     def advance(self, steps: int) -> None:
-        """Run some steps more."""
+        """Run `steps` more steps."""
         own = self._random if isinstance(self._random, torch.Generator) else None
         chunk = partial(self._run, self._steps)
         while self.x.is_cuda and steps >= self._steps:
             if self._graph is None:
-                # The warm-up is a chunk of the run.
+                # The warm-up counts as a chunk.
                 self._graph = capture(chunk, self.x.device, generator=own, warm_up=chunk)
             else:
                 self._graph.replay()
@@ -153,7 +153,7 @@ class LongRun:
         self.s.copy_(s)
 
     def marks(self, marks: Sequence[int]) -> Iterator[tuple[int, Tensor, Tensor]]:
-        """Yield steps, positions and states after each of increasing numbers of steps."""
+        """Yield step, positions and states at each of increasing steps."""
         for mark, before in zip(marks, (0, *marks), strict=False):
             self.advance(mark - before)
             yield mark, self.x, self.s
@@ -180,12 +180,12 @@ BOUNDS = {
     "energy": 4.0,
     "drift": 1.0,
 }
-"""Bounds of figures, which are the largest after the world has settled.
+"""Bounds of figures, which are maxima over the steps after the world has settled.
 
 `extent`: longest side of the bounding box, over that of the settled world. `overflow`: mean
 |s − clip(s, −1, 1)|. `largest_state`: the largest |s|. `energy`: mean over particles of |Δx|²/ε² +
-mean Δs² of a step, over that of the settled world, each the mean of `ENERGY_STEPS`. `drift`: how
-far the centroid is from where it was, in extents of the settled world; where a rule moves its
+mean Δs² of a step, over that of the settled world, both averaged over `ENERGY_STEPS`. `drift`:
+distance of the centroid from the settled one, in extents of the settled world; only for moving
 particles in open space.
 """
 
@@ -196,7 +196,7 @@ ENDURANCE: list[Check] = []
 def measured(
     home: TrialWorlds, x: Tensor, s: Tensor, generator: torch.Generator
 ) -> dict[str, float]:
-    """Return the figures of worlds by themselves; the energy takes some more steps."""
+    """Return the absolute figures of worlds; the energy runs `ENERGY_STEPS` more steps."""
     with torch.no_grad():
         not_finite = (~x.isfinite()).sum() + (~s.isfinite()).sum()
         if int(not_finite):
@@ -245,7 +245,7 @@ def _run(name: str, session: CheckSession) -> CheckResult:
                 found["drift"] = float((x.mean(1) - centroid).norm(dim=-1).max())
             for key, unit in (("extent", "extent"), ("energy", "energy"), ("drift", "extent")):
                 if key in found:
-                    # A world that has come to rest: what it does then is rounding.
+                    # In a world at rest the rest is rounding.
                     found[key] /= max(first[unit], 1e-12)
         for key, value in found.items():
             figures[key] = max(value, figures.get(key, 0.0))

@@ -1,4 +1,4 @@
-"""Hard cases of perception: where particles lie, and what states hold."""
+"""Checks of perception in hard cases: positions (`geometry`) and states (`values`)."""
 
 from __future__ import annotations
 
@@ -37,15 +37,14 @@ from npa_envs.world.division import living
 from npa_envs.world.rollout import rollout
 
 NEAR_THRESHOLD = 1e-3
-"""Relative distances from the threshold of an inverse at which perception is to change no more."""
+"""Relative distance from the threshold within which perception must not change more than this."""
 
-
-PLACED: list[Check] = []
-"""Checks of the group `geometry` that are of no scene."""
+GEOMETRY: list[Check] = []
+"""Checks of the group `geometry` that have no `Scene`."""
 
 
 def geometry_checks(seed: int = 0) -> list[Check]:
-    """Return the checks of the group `geometry`; random places are drawn from the seed."""
+    """Return the checks of the group `geometry`; the seed is that of random positions."""
     hard = [
         Check(
             f"geometry/{scene.name}/{space_dim}d/{'periodic' if periodic else 'open'}",
@@ -56,7 +55,7 @@ def geometry_checks(seed: int = 0) -> list[Check]:
         for periodic in (False, True)
         for scene in scenes(space_dim, periodic=periodic, seed=seed)
     ]
-    return [*hard, *by_dimension(PLACED)]
+    return [*hard, *by_dimension(GEOMETRY)]
 
 
 def _run_scene(scene: Scene, session: CheckSession) -> CheckResult:
@@ -70,10 +69,9 @@ def _run_scene(scene: Scene, session: CheckSession) -> CheckResult:
     return CheckResult(figures, error_limits(scene.x, scene.s, scene.box, expected))
 
 
-@check(PLACED, "geometry/threshold", 2, 3)
+@check(GEOMETRY, "geometry/threshold", 2, 3)
 def _run_threshold(space_dim: int, session: CheckSession) -> CheckResult:
-    """A moment matrix at the threshold of its inverse is inverted or is not, and nothing
-    between."""
+    """A moment matrix near the threshold of its inverse is either inverted or not inverted."""
     x, offsets = threshold_scenes(space_dim, reference.MOMENT_THRESHOLD)
     s = states_at(x)
     fields = reference.fields(x, s, EPS)
@@ -87,7 +85,7 @@ def _run_threshold(space_dim: int, session: CheckSession) -> CheckResult:
     figures, limits = {}, {}
     for name, dtype in PRECISIONS.items():
         z = perceive(x.to(session.device, dtype), s.to(session.device, dtype), EPS).cpu().double()
-        # Only a determinant that rounding moves over the threshold may be taken for the other one.
+        # Either result is right for a determinant that rounding may move over the threshold.
         near = offsets.abs() <= 1e2 * torch.finfo(dtype).eps / reference.MOMENT_THRESHOLD
         errors, errors_of_other = (
             ((z - exact).norm(dim=-1) / exact.norm(dim=-1))[:, 0] for exact in (right, others)
@@ -95,17 +93,17 @@ def _run_threshold(space_dim: int, session: CheckSession) -> CheckResult:
         corner = torch.where(near, torch.minimum(errors, errors_of_other), errors)
         figures[f"z_{name}"] = float(corner.max())
         limits[f"z_{name}"] = LIMITS[f"z_{name}"]
-        # Positions in float32 moved some over the threshold.
+        # Rounding of positions to float32 moves some over the threshold.
         figures[f"other_side_{name}"] = float((errors_of_other < errors).sum())
     return CheckResult(figures, limits)
 
 
-@check(PLACED, "geometry/smooth_inverse", 2, 3)
+@check(GEOMETRY, "geometry/smooth_inverse", 2, 3)
 def _run_smooth_inverse(space_dim: int, session: CheckSession) -> CheckResult:
     """Perception with moment_inverse='smooth' is as the float64 reference has it, and does not
     jump where that by the threshold does."""
     x, offsets = threshold_scenes(space_dim, reference.MOMENT_THRESHOLD)
-    # All worlds have the same states: from one to the next only a determinant changes.
+    # The same states in all worlds, so that only the determinant differs.
     s = states_at(x)[:1].expand(len(x), -1, -1)
     exact = reference.perceive(x, s, EPS, EPS, moment_inverse="smooth")
     near = offsets.abs() <= NEAR_THRESHOLD
@@ -122,12 +120,12 @@ def _run_smooth_inverse(space_dim: int, session: CheckSession) -> CheckResult:
 
 
 def _largest_jump(z: Tensor) -> float:
-    """Return how far the first particle's z [B, N, P] changes at most from world to world."""
+    """Return the largest relative change of the first particle's z between successive worlds."""
     corner = z[:, 0].cpu().double()
     return float(corner.diff(dim=0).norm(dim=-1).max() / corner.norm(dim=-1).max())
 
 
-@check(PLACED, "geometry/crowd", 2, 3)
+@check(GEOMETRY, "geometry/crowd", 2, 3)
 def _run_crowd(space_dim: int, session: CheckSession) -> CheckResult:
     """Very many particles in one cell: densities as float64 has them, all is finite, and the
     smoothing's adjoint conserves what it spreads."""
@@ -145,7 +143,7 @@ def _run_crowd(space_dim: int, session: CheckSession) -> CheckResult:
     blur = weight @ (s.detach()[0].double() / rho.double()[:, None])
     # Σ_i of the smoothed states is Σ_j v_j s_j Σ_i W_ij = Σ_j s_j, so its gradient is 1 everywhere.
     finite = [tensor.isfinite().all() for tensor in (rho, z, by_states)]
-    # Terms of one sign: N roundings at most, √N of them where they are as often up as down.
+    # Sums of N terms of one sign have rounding errors of about √N roundings.
     limit = 4.0 * count**0.5 * 2.0**-24
     return CheckResult(
         {
@@ -159,7 +157,7 @@ def _run_crowd(space_dim: int, session: CheckSession) -> CheckResult:
     )
 
 
-@check(PLACED, "geometry/nearest", 2, 3)
+@check(GEOMETRY, "geometry/nearest", 2, 3)
 def _run_nearest(space_dim: int, session: CheckSession) -> CheckResult:
     """A pair is perceived as such from 1e-19 length units on (float32), below it counts as
     coincident; all is finite down to denormal distances."""
@@ -184,7 +182,7 @@ def _run_nearest(space_dim: int, session: CheckSession) -> CheckResult:
     return CheckResult(figures, limits, holds=f"float32: from 1e-{holds} on")
 
 
-@check(PLACED, "geometry/outside", 2, 3)
+@check(GEOMETRY, "geometry/outside", 2, 3)
 def _run_outside(space_dim: int, session: CheckSession) -> CheckResult:
     """Particles outside of a periodic box are perceived as their images: in float32 with the
     rounding of their coordinates; all is finite."""
@@ -214,23 +212,22 @@ def _run_outside(space_dim: int, session: CheckSession) -> CheckResult:
     )
 
 
-# The group `values`: what states hold; no fault may spread to another world.
+# The group `values`: unusual states, which must not affect other worlds.
 
 POWERS = range(-30, 31, 2)
 """Scales of states, as powers of ten, at which float32 is right."""
 
 WORLD, PARTICLE = 1, 7
-"""The particle that something is wrong with, and its world, of `WORLD_COUNT`."""
+"""Index of the broken particle, and of its world."""
 
 WORLD_COUNT, PARTICLE_COUNT, STEPS = 3, 150, 8
-
 
 VALUES: list[Check] = []
 """The checks of the group `values`."""
 
 
 def _worlds(session: CheckSession, space_dim: int, state_dim: int) -> tuple[Tensor, Tensor]:
-    """Return worlds with about 20 neighbours, whose halves do not perceive each other."""
+    """Return worlds with about 20 neighbours a particle, in two halves that are far apart."""
     generator = torch.Generator().manual_seed(session.seed)
     shape = (WORLD_COUNT, PARTICLE_COUNT)
     side = EPS * (3.0 if space_dim == 2 else 2.4)
@@ -241,7 +238,7 @@ def _worlds(session: CheckSession, space_dim: int, state_dim: int) -> tuple[Tens
 
 
 def differing(value: Tensor, expected: Tensor) -> float:
-    """Return how many numbers of two tensors differ; NaN equals NaN."""
+    """Return the number of elements in which two tensors differ; NaN equals NaN."""
     same = (value == expected) | (value.isnan() & expected.isnan())
     return float((~same).sum())
 
@@ -264,14 +261,14 @@ def _run_scale(space_dim: int, session: CheckSession) -> CheckResult:
     low = POWERS[0]
     figures["wrong"] = float(sum(power not in right for power in POWERS))
     largest = max((p for p in right if set(range(low, p, 2)) <= set(right)), default=low)
-    words = f"float32: states of 1e{low} to 1e{largest:+d}"
-    return CheckResult(figures, {"wrong": 0.0}, holds=words)
+    text = f"float32: states of 1e{low} to 1e{largest:+d}"
+    return CheckResult(figures, {"wrong": 0.0}, holds=text)
 
 
 @check(VALUES, "values/infinite_channel", 2, 3)
 def _run_infinite_channel(space_dim: int, session: CheckSession) -> CheckResult:
     """A channel that is infinite at one particle changes no bit of other channels, of particles
-    that do not see it, and of other worlds."""
+    that do not perceive it, and of other worlds."""
     x, s = _worlds(session, space_dim, 16)
     clean = perceive(x, s, EPS)
     broken = s.clone()
@@ -295,8 +292,8 @@ def _run_infinite_channel(space_dim: int, session: CheckSession) -> CheckResult:
 @check(VALUES, "values/dead", 2, 3)
 @torch.no_grad()
 def _run_dead(space_dim: int, session: CheckSession) -> CheckResult:
-    """What lies in the slots of dead particles, NaN as well, changes no bit; one particle that
-    divides fills its world, whose numbers stay finite."""
+    """Numbers in the slots of dead particles, also NaN, change no bit of a rollout; one particle
+    that divides fills its world, whose numbers stay finite."""
     torch.manual_seed(session.seed)
     rule = NPARule(space_dim, STATE_DIM, eps0=EPS, divides=True).to(session.device)
     x, s = _worlds(session, space_dim, STATE_DIM)
@@ -340,7 +337,7 @@ def _run_gradient(session: CheckSession) -> CheckResult:
 
 
 def _broken_rollout(session: CheckSession) -> tuple[tuple[Tensor, Tensor], tuple[Tensor, Tensor]]:
-    """Return worlds after some steps that began with NaN in a state, and without it."""
+    """Return worlds after a rollout from states with a NaN, and after one without."""
     rule = load_rule("gecko", device=session.device).float()
     x, s = _worlds(session, 2, rule.state_dim)
     broken = s.clone()
@@ -371,7 +368,7 @@ def _run_nan_state(session: CheckSession) -> CheckResult:
 
 
 def _unreported(calls: dict[str, Callable[[], Any]], named: str) -> CheckResult:
-    """Return which calls are not refused by an error with some words."""
+    """Check that each call raises an NPAError that contains the text `named`."""
     figures = {}
     for name, call in calls.items():
         try:

@@ -1,4 +1,4 @@
-"""Numerics: how far gradients can be trusted, and what order, batches and devices change."""
+"""Checks of gradients, and of the effect of order, batches and devices on results."""
 
 from __future__ import annotations
 
@@ -32,23 +32,22 @@ from npa_envs.world.cuda_graph import capture
 from npa_envs.world.randomness import WorldRandom
 from npa_envs.world.rollout import rollout
 
-# The group `gradients`: how they grow with the steps, finite differences, float32's errors.
+# The group `gradients`: growth with the steps, finite differences, errors of float32.
 
 STEPS, QUICK_STEPS = 512, 32
-"""The longest rollouts that are differentiated."""
-
+"""Steps of the longest differentiated rollouts."""
 
 GRADIENTS: list[Check] = []
-"""The checks of the group `gradients`, each of a rule."""
+"""Checks of the group `gradients` that run for each rule."""
 
 DIFFERENCES: list[Check] = []
-"""Those that are of none, in open space or a periodic box."""
+"""Checks of the group `gradients` without a rule, in open space or a periodic box."""
 
 
 class RolloutOutcome(NamedTuple):
     """Worlds after a rollout, and gradients of a random linear functional of them.
 
-    Gradients are by all weights, [1, W], and by the states at the start.
+    Gradients are by all weights, [1, W], and by the initial states.
     """
 
     x: Tensor
@@ -58,14 +57,14 @@ class RolloutOutcome(NamedTuple):
 
 
 def powers_of_two(most: int) -> list[int]:
-    """Return 1, 2, 4, ... up to a number."""
+    """Return 1, 2, 4, ... up to `most`."""
     return [2**k for k in range(int(math.log2(most)) + 1)]
 
 
 def outcome(
     home: TrialWorlds, session: CheckSession, steps: int, dtype: torch.dtype
 ) -> RolloutOutcome:
-    """Return a rollout from the seed and its gradients; the same masks in every dtype."""
+    """Run a rollout and return worlds and gradients; masks do not depend on the dtype."""
     rule = NPARule(**home.rule.hyper_parameters()).to(home.x.device)
     rule.load_state_dict(home.rule.state_dict())
     rule.to(dtype)
@@ -129,28 +128,28 @@ def _run_float32(name: str, session: CheckSession) -> CheckResult:
             if error <= 1e-2 and usable[what] in (0, steps // 2):
                 usable[what] = steps
     limits = {f"{what}_1": 1e-5 for what in RolloutOutcome._fields}
-    words = ", ".join(f"{what} {steps}" for what, steps in usable.items())
-    return CheckResult(figures, limits, holds=f"steps within 1e-2, of {counts[-1]}: {words}")
+    text = ", ".join(f"{what} {steps}" for what, steps in usable.items())
+    return CheckResult(figures, limits, holds=f"steps within 1e-2, of {counts[-1]}: {text}")
 
 
 @check(DIFFERENCES, "gradients/finite_differences", 2, 3)
 def _run_differences(space_dim: int, session: CheckSession, *, periodic: bool) -> CheckResult:
-    """In float64, derivatives along smooth motions and along random states are what finite
-    differences say, in every hard scene."""
+    """In float64, derivatives along smooth motions and along random states agree with finite
+    differences, in every hard scene."""
     figures = {}
     for scene in scenes(space_dim, periodic=periodic, seed=session.seed):
         for what in ("states", "positions"):
-            # Far away neighbouring numbers are too far apart.
+            # Far from 0 floating-point numbers are too sparse.
             if (scene.name, what) != ("far", "positions"):
                 figures[f"{scene.name}_{what}"] = _difference(scene, session, what)
     return CheckResult(figures, dict.fromkeys(figures, 1e-6))
 
 
 def _difference(scene: Scene, session: CheckSession, what: str) -> float:
-    """Return the relative distance of a directional derivative from a finite difference.
+    """Return the relative error of a directional derivative against a finite difference.
 
-    Positions move along a smooth periodic field that is 0 at the origin, so that particles in one
-    place stay together. The correction by the moment matrix, a stopped gradient, is left out.
+    Positions move along a smooth periodic field that is 0 at the origin, so that coincident
+    particles stay together. There is no moment correction, through which no gradient flows.
     """
     x, s = scene.x.to(session.device), scene.s.to(session.device)
     generator = torch.Generator().manual_seed(6)
@@ -170,22 +169,22 @@ def _difference(scene: Scene, session: CheckSession, what: str) -> float:
         moved = way * along
         return functional(x, s + moved) if what == "states" else functional(x + moved, s)
 
-    # Second derivatives jump at ε: an error in proportion, for pairs that lie there.
+    # Second derivatives jump at ε, which causes an error in proportion to `change`.
     change = 1e-7
     quotient = float(at(change) - at(-change)) / (2.0 * change)
     given = (s if what == "states" else x).clone().requires_grad_()
     value = functional(x, given) if what == "states" else functional(given, s)
     (gradient,) = torch.autograd.grad(value, given)
     slope = float((gradient * along).sum())
-    # The terms may cancel: then their size is what the difference is small against.
+    # The terms may cancel, so the error is relative to the sum of their absolute values.
     size = float((gradient * along).abs().sum())
     return abs(slope - quotient) / size if size > 0.0 else abs(quotient)
 
 
-# The group `precision`: what must matter little or not at all.
+# The group `precision`: changes that must have little or no effect.
 
 TWO_ERRORS = 2.0
-"""Two answers that are each as far off as the group `geometry` allows are this far apart."""
+"""Allowed distance of two results, in errors that the group `geometry` allows for one."""
 
 PRECISION: list[Check] = []
 """The checks of the group `precision`."""
@@ -202,14 +201,14 @@ def _on(scene: Scene, device: torch.device) -> tuple[Tensor, Tensor]:
 
 
 def _compared(pairs: Iterable[tuple[Scene, PerceptionOutcome, PerceptionOutcome]]) -> CheckResult:
-    """Return the largest distance of two perceptions over the error that one may have."""
+    """Return the largest distance of pairs of perceptions over the error allowed for one."""
     shares = {}
     for scene, found, other in pairs:
         exact = perceived(scene.x, scene.s, scene.box, by_reference=True)
         allowed = error_limits(scene.x, scene.s, scene.box, exact)
         errors = [error / allowed[name] for name, error in float32_errors(found, other).items()]
         name = f"{scene.name}/{'open' if scene.box is None else 'periodic'}"
-        # NaN must not be skipped.
+        # max() of a tensor never ignores NaN.
         shares[name] = float(torch.tensor(errors).max())
     largest = float(torch.tensor(list(shares.values())).max())
     wrong = [name for name, share in shares.items() if not share <= TWO_ERRORS]
@@ -222,7 +221,7 @@ def _compared(pairs: Iterable[tuple[Scene, PerceptionOutcome, PerceptionOutcome]
 
 @check(PRECISION, "precision/order", 2, 3)
 def _run_order(space_dim: int, session: CheckSession) -> CheckResult:
-    """Particles in another order perceive the same but for rounding, in every hard scene."""
+    """Particles in another order perceive the same up to rounding, in every hard scene."""
 
     def pairs() -> Iterator[tuple[Scene, PerceptionOutcome, PerceptionOutcome]]:
         for scene in _every_scene(space_dim, session):
@@ -257,7 +256,7 @@ def _run_batch(space_dim: int, session: CheckSession) -> CheckResult:
     for periodic in (False, True):
         every = scenes(space_dim, periodic=periodic, seed=session.seed)
         some = [scene for scene in every if scene.name != "tight_box"]
-        # Each scene over and over until the world is full.
+        # Repeat each scene's particles until all worlds have equally many.
         count = max(scene.x.shape[1] for scene in some)
         x = torch.cat([scene.x.repeat(1, count, 1)[:, :count] for scene in some])
         x, s = (tensor.to(session.device, torch.float32) for tensor in (x, states_at(x)))
@@ -270,7 +269,7 @@ def _run_batch(space_dim: int, session: CheckSession) -> CheckResult:
 
 @check(PRECISION, "precision/devices")
 def _run_devices(session: CheckSession) -> CheckResult:
-    """A CUDA device perceives what the CPU does but for rounding, in every hard scene."""
+    """A CUDA device and the CPU perceive the same up to rounding, in every hard scene."""
     if not session.cuda:
         raise Skipped("there is one device only: run it with --device cuda")
 

@@ -13,7 +13,7 @@ from npa_envs import reference
 from npa_envs.ops import perceive
 
 EPS = 0.125
-"""Perception radius of the scenes [length units], a power of two: borders are hit exactly."""
+"""Perception radius of the scenes [length units], a power of two, so that borders are exact."""
 
 SIDE = 1.0
 """Side of the periodic scenes' boxes [length units]."""
@@ -26,22 +26,22 @@ Box = tuple[float, ...] | None
 
 @dataclass(frozen=True)
 class Scene:
-    """Worlds that are hard to perceive; float32 holds their float64 positions exactly."""
+    """Worlds that are hard to perceive, in float64; float32 represents their positions exactly."""
 
     name: str
     summary: str
-    """Where its particles lie, for a sentence."""
+    """Positions of the particles in words."""
     x: Tensor
     box: Box
 
     @property
     def s(self) -> Tensor:
-        """The states of `states_at`."""
+        """The states, as `states_at` returns them."""
         return states_at(self.x)
 
 
 def states_at(x: Tensor) -> Tensor:
-    """Return states from a normal distribution, float64 that float32 holds exactly."""
+    """Return normally distributed states, float64 numbers that float32 represents exactly."""
     shape = (*x.shape[:2], STATE_DIM)
     return torch.randn(shape, generator=torch.Generator().manual_seed(5)).double()
 
@@ -49,15 +49,15 @@ def states_at(x: Tensor) -> Tensor:
 def scenes(space_dim: int, *, periodic: bool, seed: int = 0) -> list[Scene]:
     """Return every scene of open space or of a periodic box of side `SIDE`."""
     made: list[Scene] = []
-    for name, (summary, place) in PLACES.items():
+    for name, (summary, make_positions) in POSITIONS.items():
         generator = torch.Generator().manual_seed(1000 * seed + len(made))
         only_periodic = name in ("seam", "tight_box")
         if (only_periodic and not periodic) or (name == "far" and periodic):
             continue
         if name == "coplanar" and space_dim != 3:
             continue
-        # Rounded to float32 first, so that both precisions see the same particles.
-        x = place(space_dim, generator).float().double()
+        # Rounded to float32 first, so that both precisions have the same particles.
+        x = make_positions(space_dim, generator).float().double()
         side = 2.0 * EPS if name == "tight_box" else SIDE
         made.append(Scene(name, summary, x, (side,) * space_dim if periodic else None))
     return made
@@ -68,7 +68,7 @@ def _uniform(space_dim: int, generator: torch.Generator, count: int, side: float
 
 
 def _direction(space_dim: int) -> Tensor:
-    """Return a unit vector along no axis."""
+    """Return a unit vector that is not along an axis."""
     slanted = torch.tensor([0.48, 0.64, 0.6] if space_dim == 3 else [0.6, 0.8])
     return slanted.double()
 
@@ -114,21 +114,21 @@ def _seam(space_dim: int, generator: torch.Generator) -> Tensor:
 
 def _tight_box(space_dim: int, generator: torch.Generator) -> Tensor:
     x = _uniform(space_dim, generator, 40, 2.0 * EPS)
-    # A pair across the box: each sees the other at exactly ε, on two sides.
+    # A pair at exactly ε on both sides, through the box and across its seam.
     x[0, 0], x[0, 1] = 0.0, 0.0
     x[0, 1, 0] = EPS
     return x
 
 
 def _far(space_dim: int, generator: torch.Generator) -> Tensor:
-    """A crowd around the origin and one around each far place; the farthest overflows squared."""
+    """A crowd at the origin and at each far offset; the square of the farthest overflows."""
     x = _uniform(space_dim, generator, 80)
-    for place, offset in enumerate((1e3, 1e6, -1e30, 3e38)):
-        x[:, 20 * place : 20 * place + 10, 0] += offset
+    for k, offset in enumerate((1e3, 1e6, -1e30, 3e38)):
+        x[:, 20 * k : 20 * k + 10, 0] += offset
     return x
 
 
-PLACES: dict[str, tuple[str, Callable[[int, torch.Generator], Tensor]]] = {
+POSITIONS: dict[str, tuple[str, Callable[[int, torch.Generator], Tensor]]] = {
     "one": ("a single particle", lambda d, draws: _uniform(d, draws, 1)),
     "coincident": (
         "48 particles in one place",
@@ -154,14 +154,15 @@ PLACES: dict[str, tuple[str, Callable[[int, torch.Generator], Tensor]]] = {
     "seam": ("particles on both sides of the box's seam and on it", _seam),
     "tight_box": ("particles in a box of exactly 2 ε", _tight_box),
 }
-"""What each scene is, and where its particles lie."""
+"""Summary of each scene, and the function that makes its positions."""
 
 
 def threshold_scenes(space_dim: int, threshold: float) -> tuple[Tensor, Tensor]:
-    """Return worlds whose first particle's moment matrix has a determinant around a threshold.
+    """Return worlds whose first particle's moment matrix has a determinant near a threshold.
 
-    The particles are a corner, one on each other axis, and one whose height sets the determinant.
-    Positions [B, 1 + D, D] come with the determinants' relative distances from the threshold, [B].
+    The other particles are one on each axis but the last, and one whose height sets the
+    determinant. Returns positions [B, 1 + D, D] and the determinants' relative distances from the
+    threshold, [B].
     """
     offsets = torch.tensor([1e-1, 1e-3, 1e-5, 1e-7, 0.0, -1e-7, -1e-5, -1e-3, -1e-1]).double()
     worlds = torch.zeros(len(offsets), 1 + space_dim, space_dim, dtype=torch.float64)
@@ -169,7 +170,7 @@ def threshold_scenes(space_dim: int, threshold: float) -> tuple[Tensor, Tensor]:
     worlds[:, -1, 0] = 0.5 * EPS
     s = torch.zeros(*worlds.shape[:2], 1, dtype=torch.float64)
     wanted = threshold * (1.0 + offsets)
-    # The determinant grows with the height: bisection.
+    # Bisection, as the determinant grows with the height.
     low, high = torch.zeros_like(offsets), torch.full_like(offsets, 0.4 * EPS)
     for _ in range(50):
         worlds[:, -1, -1] = 0.5 * (low + high)
@@ -190,9 +191,9 @@ LIMITS = {
     "states_float64": 1e-14,
     "positions_float64": 2e-14,
 }
-"""Relative errors allowed: of z, and of a random functional's gradients by states and positions.
+"""Allowed relative errors of z, and of gradients of a random functional by states and positions.
 
-`error_limits` raises them by a scene's condition.
+`error_limits` raises them for ill-conditioned scenes.
 """
 
 PRECISIONS = {"float32": torch.float32, "float64": torch.float64}
@@ -208,12 +209,12 @@ class PerceptionOutcome(NamedTuple):
 
 
 def relative_error(value: Tensor, expected: Tensor) -> float:
-    """Return the largest error of a world [B, ...] relative to its norm, if not 0, in float64."""
+    """Return the largest error of the worlds [B, ...], relative to its norm, if not 0."""
     exact = expected.detach().cpu().double().flatten(1)
     away = (value.detach().cpu().double().flatten(1) - exact).norm(dim=1)
     size = exact.norm(dim=1)
     errors = away / torch.where(size > 0.0, size, 1.0)
-    # max() of a list may skip NaN; that of a tensor does not.
+    # Unlike that of a list, max() of a tensor never ignores NaN.
     return float(errors.max())
 
 
@@ -241,7 +242,7 @@ def perceived(
 ) -> PerceptionOutcome:
     """Return z and its gradients, by the library or the reference.
 
-    `weights` are by default `functional_weights`; `given` changes all inputs first.
+    `weights` are by default `functional_weights`; `given` is applied to all inputs first.
     """
     x, s = given(x.detach()).requires_grad_(), given(s.detach()).requires_grad_()
     if by_reference:
@@ -256,11 +257,11 @@ def perceived(
 def error_limits(
     x: Tensor, s: Tensor, box: tuple[float, ...] | None, expected: PerceptionOutcome
 ) -> dict[str, float]:
-    """Return the relative errors that float64 worlds allow, by the names of `LIMITS`.
+    """Return the relative errors allowed for a scene, by the names of `LIMITS`.
 
-    Where sums cancel, or answers grow with 1 / distance, the last bit of an input shows in many
-    digits of the answer: an error may be as large as the change by four roundings of every input.
-    Particles in one place stay together; far away in open space differences are rounded.
+    An error may be as large as the effect of rounding every input four times, which is large where
+    sums cancel or results grow with 1 / distance. Coincident particles are moved together. Far away
+    in open space only differences of positions are rounded.
     """
     generator = torch.Generator().manual_seed(4)
     change = 1e-11

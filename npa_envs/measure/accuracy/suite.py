@@ -1,4 +1,4 @@
-"""Checks of `npa-envs stress`: what each finds and may find, how they run, and their record."""
+"""Checks of `npa-envs stress`: results and limits, how checks run, and their record."""
 
 from __future__ import annotations
 
@@ -29,11 +29,11 @@ GROUPS = {
 """Every group of checks with its summary."""
 
 FAR = 1e3
-"""Colours of heat maps end at this many times a limit, and at its inverse."""
+"""Range of the colour map of heat maps: this times a limit, and its inverse."""
 
 
 class Skipped(Exception):
-    """A check has nothing to measure; the message is the reason."""
+    """Raised by a check that cannot be measured; the message is the reason."""
 
 
 @dataclass(frozen=True)
@@ -43,12 +43,12 @@ class CheckResult:
     figures: Mapping[str, float]
     limits: Mapping[str, float] = field(default_factory=dict)
     holds: str = ""
-    """For a range: where it holds, in words."""
+    """The range in which the library is right, as text, if the check measures one."""
     note: str = ""
 
     @property
     def verdict(self) -> Verdict:
-        """Whether it is as expected; a figure that is missing or NaN is above its limit."""
+        """ "fail" if a figure with a limit is above it, missing or NaN, else "range" or "pass"."""
         nan = float("nan")
         # Comparisons with NaN are false.
         if not all(self.figures.get(name, nan) <= limit for name, limit in self.limits.items()):
@@ -58,7 +58,7 @@ class CheckResult:
 
 @dataclass
 class CheckSession:
-    """One run of the command; when quick, with small worlds and few steps."""
+    """One run of the command; `quick`: small worlds and few steps."""
 
     device: torch.device
     quick: bool = False
@@ -72,23 +72,23 @@ class CheckSession:
         return self.device.type == "cuda"
 
     def generator(self, number: int = 0) -> torch.Generator:
-        """Return a source of randomness on the device; others for other numbers."""
+        """Return a random generator on the device, a different one for each number."""
         return torch.Generator(self.device).manual_seed(1000 * self.seed + number)
 
 
 Run = Callable[..., CheckResult]
-"""Measures something in a session; a rule or a space dimension may come before that."""
+"""Takes a rule or a space dimension, if the check has one, and a session."""
 
 
 @dataclass(frozen=True)
 class Check:
-    """A hard case GROUP/CASE, its expectation in a sentence, and the function that measures it."""
+    """A hard case named GROUP/CASE, the expected result in a sentence, and its function."""
 
     name: str
     expected: str
     run: Run
     rule: str = ""
-    """What `load_rule` takes, of a check of a rule."""
+    """Name or file of the rule, for a check of a rule."""
 
 
 def group_of(name: str) -> str:
@@ -97,9 +97,9 @@ def group_of(name: str) -> str:
 
 
 def check(checks: list[Check], name: str, *space_dims: int) -> Callable[[Run], Run]:
-    """Return a decorator that adds a check to a list, or one NAME/2d for each space dimension.
+    """Return a decorator that adds a check to a list, or one for each space dimension: NAME/2d.
 
-    The docstring of what it decorates says what is expected.
+    The decorated function's docstring is the expectation.
     """
 
     def add(run: Run) -> Run:
@@ -120,21 +120,21 @@ def by_dimension(checks: Iterable[Check]) -> list[Check]:
 
 
 def chosen_checks(checks: Sequence[Check], names: Sequence[str]) -> list[Check]:
-    """Return the checks that names stand for: groups, checks, beginnings of names up to a slash."""
+    """Return the checks that names select: groups, checks, or beginnings of names up to a slash."""
 
-    def stands_for(name: str, check: Check) -> bool:
+    def selects(name: str, check: Check) -> bool:
         return f"{check.name}/".startswith(f"{name.rstrip('/')}/")
 
     for name in names:
-        if not any(stands_for(name, check) for check in checks):
+        if not any(selects(name, check) for check in checks):
             known = [*GROUPS, *(check.name for check in checks)]
             raise NPAError(f"unknown check {name!r}: {suggest(name, known)}")
-    return [c for c in checks if not names or any(stands_for(name, c) for name in names)]
+    return [c for c in checks if not names or any(selects(name, c) for name in names)]
 
 
 @dataclass(frozen=True)
 class CheckEntry:
-    """A check, its figures and limits by name, and what came of it."""
+    """Result of a check in a record."""
 
     name: str
     expected: str
@@ -142,28 +142,28 @@ class CheckEntry:
     figures: Mapping[str, float] = field(default_factory=dict)
     limits: Mapping[str, float] = field(default_factory=dict)
     holds: str = ""
-    """For a range: where it holds."""
+    """As `CheckResult.holds`."""
     note: str = ""
-    """The reason to skip it, the message of its error, or what else there is to know."""
+    """Why it was skipped, its error, or a remark."""
     seconds: float = 0.0
-    """How long it took [s]."""
+    """Duration [s]."""
     weights: str = ""
     """The `rule_digest` of a check's rule."""
 
     @classmethod
     def of(cls, check: Check, found: CheckResult, seconds: float) -> CheckEntry:
-        """Return the entry of a check that ran to its end."""
+        """Return the entry of a check that ended without an error."""
         return cls(check.name, check.expected, found.verdict, **vars(found), seconds=seconds)
 
     @property
     def done(self) -> bool:
-        """Whether a resumed run does not repeat it."""
+        """Whether a resumed run need not repeat it."""
         return self.verdict in ("pass", "range")
 
     def share(self, name: str) -> float:
-        """Return a figure over its limit: above 1, or not a number, it is exceeded.
+        """Return a figure over its limit, which is exceeded if this is above 1 or NaN.
 
-        A limit of 0 allows nothing but 0.
+        With a limit of 0 it is 0 or infinite.
         """
         value, limit = self.figures.get(name, math.nan), self.limits[name]
         if limit == 0.0:
@@ -171,7 +171,7 @@ class CheckEntry:
         return value / limit
 
     def worst(self) -> str:
-        """Return the figure that is nearest to its limit, or furthest above it, in words."""
+        """Return the figure with the largest `share` of its limit, as text."""
         if not self.limits:
             return ""
         shares = {name: self.share(name) for name in self.limits}
@@ -181,7 +181,7 @@ class CheckEntry:
 
 
 class StressRecord(Record[CheckEntry]):
-    """All that a run found, in the order of names."""
+    """Entries of a run, in the order of `names`."""
 
     command = "stress"
 
@@ -189,11 +189,11 @@ class StressRecord(Record[CheckEntry]):
         self, facts: Mapping[str, Any], path: Path | None = None, names: Iterable[str] = ()
     ) -> None:
         super().__init__(facts, path)
-        self._order = {name: place for place, name in enumerate(names)}
+        self._order = {name: k for k, name in enumerate(names)}
 
     def content(self) -> dict[str, Any]:
-        """Return the entries; numbers that are not finite, which JSON has not, become words."""
-        return {"counts": self.counts(), "checks": _with_words(as_objects(self.rows))}
+        """Return the entries; numbers that are not finite become text, such as "nan"."""
+        return {"counts": self.counts(), "checks": _json_values(as_objects(self.rows))}
 
     def parse(self, held: dict[str, Any]) -> list[CheckEntry]:
         """Return the entries of a run that was stopped."""
@@ -203,17 +203,17 @@ class StressRecord(Record[CheckEntry]):
         return [CheckEntry(**fields) for fields in held["checks"]]
 
     def put(self, entry: CheckEntry) -> None:
-        """Add an entry, in the place of one of the same name, and write the file."""
+        """Add an entry or replace the one of its name, and write the file."""
         self.rows = [row for row in self.rows if row.name != entry.name] + [entry]
         self.rows.sort(key=lambda row: self._order.get(row.name, len(self._order)))
         self.write()
 
     def drop_other_rules(self, weights: Mapping[str, str]) -> None:
-        """Drop checks whose rule has other weights now: `rule_digest` by the checks' names."""
+        """Drop checks whose rule has changed; `weights`: `rule_digest` by names of checks."""
         self.rows = [row for row in self.rows if weights.get(row.name, row.weights) == row.weights]
 
     def counts(self) -> dict[str, int]:
-        """Return how many checks came to each verdict."""
+        """Return the number of checks with each verdict."""
         found = [entry.verdict for entry in self.rows]
         return {verdict: found.count(verdict) for verdict in ("pass", "range", "fail", "skipped")}
 
@@ -248,12 +248,12 @@ class StressRecord(Record[CheckEntry]):
         return "\n\n".join([*parts, counts])
 
 
-def _with_words(value: Any) -> Any:
-    """Return a tree of values in which numbers that are not finite are words."""
+def _json_values(value: Any) -> Any:
+    """Return nested dicts and lists with numbers that are not finite as text."""
     if isinstance(value, Mapping):
-        return {key: _with_words(inner) for key, inner in value.items()}
+        return {key: _json_values(inner) for key, inner in value.items()}
     if isinstance(value, list):
-        return [_with_words(inner) for inner in value]
+        return [_json_values(inner) for inner in value]
     return str(value) if isinstance(value, float) and not math.isfinite(value) else value
 
 
@@ -266,10 +266,10 @@ def run_checks(
     weights: Mapping[str, str] | None = None,
     progress: Callable[[int], None] = lambda done: None,
 ) -> None:
-    """Run checks that are not done, and put what came of them into the record.
+    """Run checks that are not done, and put their entries into the record.
 
-    No check begins after `max_seconds`; those that are left are skipped, unless an earlier run has
-    an entry. `weights` are those of `rule_weights`. After each check `progress` is called with 1.
+    No check starts after `max_seconds`; those without an entry are then skipped. `weights` is the
+    result of `rule_weights`. After each check `progress` is called with 1.
     """
     time_is_up = time_limit(max_seconds)
     for check in checks:
@@ -286,14 +286,14 @@ def run_checks(
 
 
 def rule_weights(checks: Iterable[Check]) -> dict[str, str]:
-    """Return the `rule_digest` of the rules of checks of one, by the checks' names."""
-    some = [check for check in checks if check.rule]
-    known = {rule: rule_digest(load_rule(rule)) for rule in {check.rule for check in some}}
-    return {check.name: known[check.rule] for check in some}
+    """Return the `rule_digest` of each check's rule by the check's name, for checks of a rule."""
+    rules = {check.name: check.rule for check in checks if check.rule}
+    digests = {rule: rule_digest(load_rule(rule)) for rule in set(rules.values())}
+    return {name: digests[rule] for name, rule in rules.items()}
 
 
 def run_check(check: Check, session: CheckSession) -> CheckEntry:
-    """Return what comes of a check: raising is a failure, lack of memory a reason to skip."""
+    """Run a check and return its entry; an error is a failure, lack of memory skips it."""
     begin = time.perf_counter()
     verdict: Verdict
     try:
@@ -303,14 +303,14 @@ def run_check(check: Check, session: CheckSession) -> CheckEntry:
     except torch.OutOfMemoryError:
         verdict, note = "skipped", "not enough memory"
     except Exception as error:
-        # Whatever breaks is what the command looks for.
+        # Any error is a finding.
         verdict, note = "fail", f"{type(error).__name__}: {' '.join(str(error).split())}"
     seconds = time.perf_counter() - begin
     return CheckEntry(check.name, check.expected, verdict, note=note, seconds=seconds)
 
 
 def heat_maps(record: StressRecord) -> dict[str, bytes]:
-    """Return PNG files by group: every figure over its limit, where there are such."""
+    """Return PNG files of figures over their limits, by group."""
     drawn = {}
     for group, entries in record.by_group().items():
         limited = [entry for entry in entries if entry.figures and entry.limits]

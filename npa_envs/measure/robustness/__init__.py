@@ -1,1 +1,1 @@
-"""What `npa-envs robustness` measures: how well rules bear other worlds, and heal damage."""
+"""Measurements of `npa-envs robustness`: losses under other conditions, and after damage."""

@@ -1,4 +1,4 @@
-"""Losses of rules under other conditions and after damage: a record of each, tables of many."""
+"""Losses of rules under other conditions and after damage: records, tables and pictures."""
 
 from __future__ import annotations
 
@@ -30,32 +30,32 @@ from npa_envs.measure.robustness.trials import (
 from npa_envs.world.randomness import StreamId
 
 WORKS = 2.0
-"""A rule works where its loss is at most this many times that as trained, and all is finite."""
+"""A rule works under a condition if its loss is at most this many times the trained one."""
 
 MOST_PARTICLES = {"cpu": 1 << 17, "cuda": 1 << 21}
-"""Particles of all worlds together; where there would be more, a value is left out."""
+"""Most particles of all worlds together; values that need more are left out."""
 
 
 @dataclass(frozen=True)
 class Response:
-    """The losses of all seeds under one condition."""
+    """The losses of all seeds at one value of a condition."""
 
     condition: str
     value: float | str
     steps: int
     """Steps from the seed."""
     losses: tuple[float, ...]
-    """Loss of each seed, NaN where a world is not finite; none where it was left out."""
+    """Loss of each seed, NaN if a world is not finite; empty if the value was left out."""
     note: str = ""
-    """Why it was left out."""
+    """Why the value was left out."""
 
     def mean(self) -> float:
-        """Return the mean loss of the seeds; NaN where one is not finite, or there are none."""
+        """Return the mean loss of the seeds; NaN if one is not finite, or there are none."""
         return math.fsum(self.losses) / len(self.losses) if self.losses else math.nan
 
 
 class RuleRecord(Record[Response]):
-    """What was measured of one rule: loss curves after damage, and responses to conditions."""
+    """Measurements of one rule: loss curves after damage, and responses to conditions."""
 
     command = "robustness"
 
@@ -70,9 +70,9 @@ class RuleRecord(Record[Response]):
     ) -> None:
         super().__init__(facts, path, responses)
         self.curves = list(curves)
-        """After each damage, the control first."""
+        """Loss curve after each damage, the control first."""
         self.about: dict[str, Any] = {"done": True, "seconds": 0.0, "command": "", "date": ""}
-        """`rule`, `task`, `metric`, `update_prob` as trained; whether all is `done`, `seconds`."""
+        """Other fields of the file: `rule`, `task`, `metric`, trained `update_prob`, `done`, ..."""
         self.about |= about
 
     @property
@@ -82,16 +82,16 @@ class RuleRecord(Record[Response]):
 
     @property
     def done(self) -> bool:
-        """Whether nothing is left to measure."""
+        """Whether everything is measured."""
         return bool(self.about["done"])
 
     def content(self) -> dict[str, Any]:
-        """Return what was measured."""
-        courses = [asdict(c) | {"recovery_steps": c.recovery_steps()} for c in self.curves]
-        return {**self.about, "courses": courses, "responses": as_objects(self.rows)}
+        """Return all fields of the file but the facts."""
+        curves = [asdict(c) | {"recovery_steps": c.recovery_steps()} for c in self.curves]
+        return {**self.about, "courses": curves, "responses": as_objects(self.rows)}
 
     def parse(self, held: dict[str, Any]) -> list[Response]:
-        """Take over the curves of a record, and return its responses."""
+        """Read all fields of a file but its responses, and return these."""
 
         def numbers(values: list[float | None]) -> tuple[float, ...]:
             return tuple(map(number, values))
@@ -111,7 +111,7 @@ class RuleRecord(Record[Response]):
         return [response for response in self.rows if response.condition == condition]
 
     def trained(self) -> Response:
-        """Return the response of worlds as trained."""
+        """Return the response under trained conditions."""
         return next(response for response in self.of("eps") if response.value == 1.0)
 
 
@@ -122,10 +122,10 @@ def measure_rule(
     *,
     enough: Callable[[], bool] = lambda: False,
 ) -> None:
-    """Measure what a rule's record lacks; it is written after the damages and after each value.
+    """Measure what is missing in a rule's record, and write it after damages and each value.
 
-    Conditions of more than `most_particles` are left out. Before each value `enough` says whether
-    to stop: then the record is not done.
+    Values that need more than `most_particles` are left out. If `enough` returns True before a
+    value, the measurement stops, and the record is not done.
     """
     begin = time.perf_counter() - record.about["seconds"]
     home, trained = grow(ground)
@@ -153,7 +153,7 @@ def measure_rule(
 def grow(
     ground: RuleTrial, condition: str = "", value: float | str = 1.0
 ) -> tuple[TrialWorlds, Response]:
-    """Return worlds grown from their seeds under a condition, none by default, and their losses."""
+    """Return worlds grown from their seeds, if given under a condition, and their losses."""
     home = ground.home(
         share=float(value) if condition == "particles" else 1.0,
         shape=str(value) if condition == "shape" else "trained",
@@ -162,12 +162,12 @@ def grow(
     pace = 1.0
     if condition in ("update_prob", "dt"):
         changed[condition] = value
-        # As many updates, or as much time, as in training.
+        # The same number of updates, or total time, as in training.
         pace = float(value) / (ground.task.update_prob if condition == "update_prob" else 1.0)
     elif condition in ("eps", "noise"):
         name = "eps" if condition == "eps" else "position_noise"
         changed[name] = float(value) * ground.task.eps
-    # In whole chunks: what is left over would refuse worlds that are not finite any more.
+    # Whole chunks: a partial one would run eagerly, and refuse worlds that are not finite.
     chunk = ground.plan.chunk
     steps = chunk * max(1, round(ground.plan.grow_steps / pace / chunk))
     run = ground.run(home, ground.random(StreamId.GROWTH), **changed)
@@ -179,7 +179,7 @@ def grow(
 def responses(
     ground: RuleTrial, trained: Response, most_particles: int, *, done: int = 0
 ) -> Iterator[Response]:
-    """Yield the response to each value of each condition but for the first `done`."""
+    """Yield the response to each value of each condition, without the first `done`."""
     every = [(name, value) for name, values in ground.plan.values.items() for value in values]
     for condition, value in every[done:]:
         if value == trained_value(condition, ground.task.update_prob):
@@ -196,18 +196,18 @@ def responses(
             yield Response(condition, value, 0, (), note=f"no memory for {total} particles")
 
 
-# Where rules work, in words
+# The values at which rules work, as text
 
 
 def where_it_works(record: RuleRecord, condition: str) -> str:
-    """Return the values of a condition at which a rule works, in words; "" where there are none.
+    """Return the values of a condition at which a rule works, as text; "" if none was measured.
 
-    It works where all seeds are finite and the mean loss is at most `WORKS` times that as trained.
+    It works if all seeds are finite and the mean loss is at most `WORKS` times the trained one.
     """
     found = record.of(condition)
     if not found:
         return ""
-    # A value that was left out has no mean, so a range ends before it.
+    # The ratio of a value that was left out is NaN, so a range ends before it.
     ratios = [ratio(response.mean(), record.trained().mean()) for response in found]
     trained = trained_value(condition, record.about["update_prob"])
     if isinstance(trained, str):
@@ -221,9 +221,9 @@ def where_it_works(record: RuleRecord, condition: str) -> str:
 
 
 def working_range(values: Sequence[float], ratios: Sequence[float], trained: float) -> str:
-    """Return the values around the trained one at which a rule works, in words.
+    """Return the range of values around the trained one at which a rule works, as text.
 
-    Values increase; ratios are the loss at each over that as trained, NaN where a seed is lost.
+    Values increase; ratios are the loss at each over the trained one, NaN if a seed is lost.
     """
     works = [value <= WORKS for value in ratios]
     low = high = min(range(len(values)), key=lambda k: abs(values[k] - trained))
@@ -246,13 +246,13 @@ SHARES = {
     "what rules are asked to heal": [d.name for d in DAMAGES.values() if not d.beyond],
     "what is beyond that": [d.name for d in DAMAGES.values() if d.beyond],
 }
-"""Damages whose recovered share is counted together, without the control."""
+"""Damages whose recovered seeds are counted together, without the control."""
 
 
 def recovered_share(
     records: Iterable[RuleRecord], damages: Collection[str]
 ) -> tuple[int, int, int]:
-    """Return how many seeds of all rules recovered of damages, are so at the end, and there are."""
+    """Return the seeds of all rules that recovered, that are recovered at the end, and all."""
     curves = [c for record in records for c in record.curves if c.damage in damages]
     recovered = sum(curve.recovered() for curve in curves)
     at_end = sum(curve.within_at_end() for curve in curves)
@@ -260,7 +260,7 @@ def recovered_share(
 
 
 def tables(records: Sequence[RuleRecord]) -> str:
-    """Return all tables in Markdown and, last, the shares that recovered."""
+    """Return all tables in Markdown and, last, the fractions of recovered seeds."""
     ranges = [[r.rule, *(where_it_works(r, name) or NONE for name in CONDITIONS)] for r in records]
     works = markdown_table(["rule", *CONDITIONS], ranges)
     parts = [
@@ -313,7 +313,7 @@ def _by_damage(records: Sequence[RuleRecord], cell: Callable[[LossCurve], str]) 
 
 
 def _by_value(records: Sequence[RuleRecord], condition: str) -> str:
-    """Return a table of mean losses over those as trained, which the second column has."""
+    """Return a table of mean losses over the trained ones, which are in the second column."""
     values = list(dict.fromkeys(r.value for record in records for r in record.of(condition)))
     rows = []
     for record in records:
@@ -333,13 +333,12 @@ def _change(record: RuleRecord, response: Response | None) -> str:
 
 # Curves with bands over the seeds: a picture for each task, a row for each of its rules.
 
-
 DRAWN = {
     "eps": "ε over the trained one",
     "particles": "N over the trained one",
     "update_prob": "p",
 }
-"""Conditions that are drawn, and what their axes are called."""
+"""Conditions that are drawn, and the labels of their axes."""
 
 
 def pictures(records: Sequence[RuleRecord]) -> dict[str, bytes]:
@@ -363,8 +362,8 @@ def _draw(records: Sequence[RuleRecord]) -> bytes:
 
 def _draw_curves(panel: Any, record: RuleRecord) -> None:
     """Draw losses over the twins' after each damage."""
-    for place, curve in enumerate(record.curves):
-        colour = "0.5" if curve.damage == CONTROL else f"C{place}"
+    for k, curve in enumerate(record.curves):
+        colour = "0.5" if curve.damage == CONTROL else f"C{k}"
         columns = [curve.ratios(k) for k in range(len(curve.steps))]
         _draw_seeds(panel, curve.steps, columns, colour, curve.damage)
     panel.axhline(RECOVERED, color="black", lw=0.7, ls=":")
@@ -395,11 +394,11 @@ def _draw_responses(panel: Any, record: RuleRecord, condition: str) -> None:
 def _draw_seeds(
     panel: Any, across: Sequence[float], columns: Sequence[Sequence[float]], colour: str, name: str
 ) -> None:
-    """Draw the median of the seeds, and a band from the least to the most; gaps at NaN."""
+    """Draw the median of the seeds and a band from least to most; NaN makes gaps."""
     lost = [any(map(math.isnan, column)) for column in columns]
-    # Of an even number the upper one in the middle.
+    # The upper median of an even number.
     low, middle, high = (
-        [math.nan if gone else sorted(c)[place] for c, gone in zip(columns, lost, strict=True)]
-        for place in (0, len(columns[0]) // 2, -1)
+        [math.nan if gone else sorted(c)[k] for c, gone in zip(columns, lost, strict=True)]
+        for k in (0, len(columns[0]) // 2, -1)
     )
     draw_band(panel, across, (low, middle, high), colour, name, marker=".", ms=3, lw=1)

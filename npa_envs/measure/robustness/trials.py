@@ -1,6 +1,6 @@
-"""Test worlds of a rule, from unseen seeds, a stream each; plans of what is measured in them.
+"""Test worlds of a rule from seeds unseen in training, conditions, damage, and recovery.
 
-Damaged worlds run next to undamaged twins with the same masks.
+The twin of a damaged world is the same world without the damage, run with the same masks.
 """
 
 from __future__ import annotations
@@ -28,16 +28,16 @@ from npa_envs.training.trained_tasks import task_of_rule, tasks_of_codes
 from npa_envs.world.brushes import clump, cut, nearest_image, offsets_from, wipe_state
 from npa_envs.world.randomness import Randomness, StreamId, WorldRandom
 
-# Seeds of other shapes than the trained one, as dense where their size allows it.
+# Seeds of other shapes; ring, square and two blobs have the trained density.
 
 SIZE_FACTOR = 1.5
-"""Ratio of a larger disk's radius, and its inverse that of a smaller one's."""
+"""Factor on the radius of the larger disk; its inverse is that of the smaller one."""
 
 BLOB_DISTANCE = 1.25
-"""From the origin to the centre of each of two blobs, in their radii (dimensionless)."""
+"""Distance of each blob's centre from the origin, in radii of a blob (dimensionless)."""
 
 Shape = Callable[[int, int, float, WorldRandom], Tensor]
-"""Makes positions [B, N, D] of N, D, the disk's radius and randomness."""
+"""Makes positions [B, N, D] from N, D, the disk's radius and a random source."""
 
 
 def disk(particle_count: int, space_dim: int, radius: float, random: WorldRandom) -> Tensor:
@@ -47,10 +47,10 @@ def disk(particle_count: int, space_dim: int, radius: float, random: WorldRandom
 
 
 def ring(particle_count: int, space_dim: int, radius: float, random: WorldRandom) -> Tensor:
-    """Return a ring around a disk of radius R, a hollow ball in 3D, of that disk's size."""
+    """Return a ring around a disk of radius R with the disk's area, in 3D a spherical shell."""
     x = disk(particle_count, space_dim, radius, random)
     distance: Tensor = torch.linalg.vector_norm(x, dim=-1, keepdim=True).clamp_min(1e-12)
-    # What area the disk has within a particle's distance, the ring has as well.
+    # Moves each particle so that the ring inside of it has the area that the disk had.
     outer = (distance**space_dim + radius**space_dim) ** (1.0 / space_dim)
     return x * (outer / distance)
 
@@ -63,7 +63,7 @@ def square(particle_count: int, space_dim: int, radius: float, random: WorldRand
 
 
 def two_blobs(particle_count: int, space_dim: int, radius: float, random: WorldRandom) -> Tensor:
-    """Return two disks side by side with the area of one, balls in 3D."""
+    """Return two disks side by side, in 3D balls, with the total size of one of radius R."""
     small = radius * 0.5 ** (1.0 / space_dim)
     x = disk(particle_count, space_dim, small, random)
     side = torch.arange(particle_count, device=x.device) % 2 * 2 - 1
@@ -79,7 +79,7 @@ SHAPES: dict[str, Shape] = {
     "larger": lambda n, d, radius, random: disk(n, d, SIZE_FACTOR * radius, random),
     "smaller": lambda n, d, radius, random: disk(n, d, radius / SIZE_FACTOR, random),
 }
-"""Every other shape by its name."""
+"""Shapes by name, without the trained one."""
 
 # Conditions and plans
 
@@ -91,22 +91,22 @@ CONDITIONS = {
     "noise": "noise of every position in each step, over the perception radius",
     "shape": "shape of the seed",
 }
-"""Conditions, varied one at a time, with a summary."""
+"""Conditions, varied one at a time, with their summaries."""
 
 
 def trained_value(condition: str, update_prob: float) -> float | str:
-    """Return the value of a condition at which a rule whose task has `update_prob` was trained."""
+    """Return the trained value of a condition; `update_prob` is that of the task."""
     others: dict[str, float | str] = {"update_prob": update_prob, "noise": 0.0, "shape": "trained"}
     return others.get(condition, 1.0)
 
 
 @dataclass(frozen=True, kw_only=True)
 class TrialPlan:
-    """Measurements of one rule: all steps are whole chunks, which CUDA records as a graph.
+    """Plan of the measurements of a rule; steps are multiples of `chunk`, one CUDA graph.
 
-    `grow_steps` lead from the seed to the damage, and to the loss under each condition;
-    `heal_steps` after the damage, from 0 on, losses are taken; `values` of each condition increase,
-    the trained one among them.
+    `grow_steps`: steps from the seed to the damage, or to the loss under a condition. `heal_steps`:
+    steps after the damage at which losses are measured, from 0 on. `values`: increasing values of
+    each condition, which include the trained one.
     """
 
     grow_steps: int
@@ -137,17 +137,17 @@ PLANS = {
         grow_steps=64,
         heal_steps=(0, 8, 16, 24, 32, 48, 64, 96, 128),
         chunk=8,
-        # Few clouds are wrong, and nearly all of their particles are.
+        # Many, as few clouds are wrong, but then nearly all of their particles.
         worlds_per_seed=128,
         # The shape of a cloud is its class.
         values={name: values for name, values in _VALUES.items() if name != "shape"},
     ),
 }
-"""What is measured of the rules of each task."""
+"""Plans by task."""
 
 
 def quick_plan(task_name: str) -> TrialPlan:
-    """Return a plan of a task of `PLANS` that takes seconds: few steps, few values."""
+    """Return a plan for a task of `PLANS` that takes seconds: few steps, few values."""
     values: dict[str, tuple[float | str, ...]] = {
         "eps": (0.7, 1.0, 1.4),
         "particles": (0.5, 1.0),
@@ -170,7 +170,7 @@ def quick_plan(task_name: str) -> TrialPlan:
 
 
 class PicturesInTurn(ParticleTask[Morphogenesis2DConfig]):
-    """Worlds of several pictures of one rule: a world's goal is the place of its task."""
+    """Task of a rule of many pictures: a world's goal is the index of its picture."""
 
     def __init__(self, tasks: Sequence[Morphogenesis2D], goal: Tensor) -> None:
         first = tasks[0]
@@ -178,33 +178,33 @@ class PicturesInTurn(ParticleTask[Morphogenesis2DConfig]):
         self.config, self.metric_name = first.config, first.metric_name
 
     def resized(self, particle_count: int) -> Self:
-        """Return the same pictures for another number of particles."""
+        """Return the task for another number of particles."""
         return type(self)([task.resized(particle_count) for task in self._tasks], self.goal)
 
     def for_rule(self, rule: NPARule) -> Self:
-        """Return the task for the worlds of a rule."""
+        """Return the task for a rule."""
         return type(self)([task.for_rule(rule) for task in self._tasks], self.goal)
 
     def seed(
         self, world_count: int, *, generator: Randomness, device: str | torch.device = "cpu"
     ) -> Worlds:
-        """Return fresh worlds with the codes of their pictures, and which ones these are."""
+        """Return fresh worlds with the codes of their pictures, and their goals."""
         x, s, _ = self._tasks[0].seed(world_count, generator=generator, device=device)
         return x, self.coded(s), self.goal
 
     def toward(self, goal: Tensor | None) -> Self:
-        """Return the task for worlds of other pictures, int64, shape [B]."""
+        """Return the task for worlds with these goals, int64, shape [B]."""
         return self if goal is None else type(self)(self._tasks, goal)
 
     def coded(self, s: Tensor) -> Tensor:
-        """Return states with the codes of their worlds' pictures."""
+        """Return states with the codes of their pictures."""
         s = s.clone()
         for task, worlds in self._worlds():
             s[worlds] = task.coded(s[worlds])
         return s
 
     def metric(self, x: Tensor, s: Tensor) -> Tensor:
-        """Return how far each world is from its picture, shape [B]."""
+        """Return the metric of each world for its picture, shape [B]."""
         losses = x.new_empty(len(x))
         for task, worlds in self._worlds():
             losses[worlds] = task.metric(x[worlds], s[worlds])
@@ -216,9 +216,9 @@ class PicturesInTurn(ParticleTask[Morphogenesis2DConfig]):
 
 
 class RuleTrial:
-    """A rule and its tasks, one for each number of particles, with seeds unseen in training.
+    """A rule with its task and worlds from seeds unseen in training.
 
-    Of a rule of many pictures, world k grows picture k, modulo their number.
+    With a rule of many pictures, world k grows picture k modulo their number.
     """
 
     def __init__(
@@ -234,7 +234,7 @@ class RuleTrial:
         self.plan, self.seeds, self._device = plan, seeds, device
         fields: dict[str, Any] = {"particle_count": particle_count}
         if self.rule.space_dim == 3:
-            # Losses are those of held-out views.
+            # Losses are of held-out views, so few training views are enough.
             fields["training_views"] = SMALLEST_VIEWS["training_views"]
         found = task_of_rule(name, self.rule, device, **fields)
         if found.doubt is not None:
@@ -249,7 +249,7 @@ class RuleTrial:
 
     @property
     def particle_count(self) -> int:
-        """Particles in a world as trained."""
+        """Trained number of particles in a world."""
         return int(self.task.config.particle_count)
 
     @property
@@ -258,21 +258,21 @@ class RuleTrial:
         return len(self.seeds) * self.plan.worlds_per_seed
 
     def random(self, purpose: int) -> WorldRandom:
-        """Return streams of all worlds for a purpose, at their beginning."""
+        """Return the streams of all worlds for a `StreamId`, at their start."""
         return WorldRandom(self._numbers, device=self._device).substream(purpose)
 
     @property
     def _numbers(self) -> list[int]:
-        """Number of each world."""
+        """Random seed of each world."""
         each = self.plan.worlds_per_seed
         return [seed * each + k for seed in self.seeds for k in range(each)]
 
     def particles(self, share: float) -> int:
-        """Return how many particles a share of the trained number is."""
+        """Return a fraction of the trained number of particles."""
         return max(2, round(share * self.particle_count))
 
     def home(self, share: float = 1.0, shape: str = "trained") -> TrialWorlds:
-        """Return fresh worlds: a share of the trained number of particles, a shape of `SHAPES`."""
+        """Return fresh worlds with a fraction of the trained particles, in a shape of `SHAPES`."""
         count = self.particles(share)
         if count not in self._tasks:
             self._tasks[count] = self.task.resized(count).for_rule(self.rule)
@@ -281,13 +281,13 @@ class RuleTrial:
         x, s, goal = task.seed(self.world_count, generator=random, device=self._device)
         if shape != "trained":
             box = self.task.box
-            # A box is full when trained.
+            # Trained worlds fill their box, so there is no trained radius.
             radius = self.task.config.seed_radius if box is None else 0.25 * min(box)
             x = SHAPES[shape](count, self.rule.space_dim, float(radius), random)
         return TrialWorlds(self.rule, task.toward(goal), x.float(), s.float(), goal)
 
     def run(self, home: TrialWorlds, random: WorldRandom, **changed: Any) -> LongRun:
-        """Return a run of worlds; `changed` are options of `rollout` that differ from training."""
+        """Return a run of worlds; `changed` overrides options of `rollout`."""
         return LongRun(home, random, home.options(**changed), chunk=self.plan.chunk)
 
     def by_seed(self, losses: Tensor) -> Tensor:
@@ -296,9 +296,9 @@ class RuleTrial:
 
 
 def loss_curves(home: TrialWorlds, run: LongRun, steps: tuple[int, ...]) -> Tensor:
-    """Run worlds and return their losses after numbers of steps, [len(steps), B].
+    """Run worlds and return their losses at the given steps, [len(steps), B].
 
-    A world that is not finite has the loss NaN from then on; the others are not disturbed.
+    A world that is not finite has the loss NaN from then on; it does not affect the others.
     """
     lost = torch.zeros(len(home.x), dtype=torch.bool, device=home.x.device)
     found = []
@@ -311,38 +311,38 @@ def loss_curves(home: TrialWorlds, run: LongRun, steps: tuple[int, ...]) -> Tens
     return torch.stack(found)
 
 
-# Damage, batched, around a random place of each world, across the seam of a box
+# Damage
 
 STATE_NOISE = 0.3
 """Standard deviation of the noise of states (dimensionless)."""
 
 Box = tuple[float, ...] | None
 Change = Callable[[Tensor, Tensor, WorldRandom, Box], tuple[Tensor, Tensor]]
-"""Makes damaged worlds of positions, states, randomness and sides of the box."""
+"""Makes damaged worlds from positions, states, a random source and sides of the box."""
 
 
 @dataclass(frozen=True)
 class Damage:
-    """Damage of worlds."""
+    """A kind of damage."""
 
     name: str
     apply: Change
     static: bool
-    """Worlds can have it whose particles do not move."""
+    """It also applies to particles that cannot move."""
     halves: bool = False
-    """It halves the number of particles."""
+    """It removes half of the particles."""
     beyond: bool = False
-    """It is beyond what rules are asked to heal."""
+    """Rules are not expected to heal it."""
 
 
 def wipe(x: Tensor, s: Tensor, random: WorldRandom, box: Box) -> tuple[Tensor, Tensor]:
-    """Set all states in a disk around a random particle to zero, a ball in 3D."""
+    """Set all states in a disk around a random particle to zero, in 3D a ball."""
     centre = random_particle(x, random)
     return x, wipe_state(x, s, centre=centre, radius=DAMAGE_SIZES["wipe"], box=box)
 
 
 def slit(x: Tensor, s: Tensor, random: WorldRandom, box: Box) -> tuple[Tensor, Tensor]:
-    """Open a slit at a random angle: through the middle, in a box through a random particle."""
+    """Open a slit at a random angle through the centroid, in a box through a random particle."""
     centre = world_mean(x) if box is None else random_particle(x, random)
     normal = random.normal(x.shape[2], dtype=x.dtype)
     change = partial(cut, normal=normal, gap=DAMAGE_SIZES["cut"])
@@ -350,7 +350,7 @@ def slit(x: Tensor, s: Tensor, random: WorldRandom, box: Box) -> tuple[Tensor, T
 
 
 def pull_together(x: Tensor, s: Tensor, random: WorldRandom, box: Box) -> tuple[Tensor, Tensor]:
-    """Pull all particles in a disk around a random one to its place."""
+    """Move all particles in a disk around a random particle to its position."""
     change = partial(clump, radius=DAMAGE_SIZES["clump"], factor=1.0)
     return _around(x, s, random_particle(x, random), box, change)
 
@@ -358,7 +358,7 @@ def pull_together(x: Tensor, s: Tensor, random: WorldRandom, box: Box) -> tuple[
 def _around(
     x: Tensor, s: Tensor, centre: Tensor, box: Box, change: Callable[..., tuple[Tensor, Tensor]]
 ) -> tuple[Tensor, Tensor]:
-    """Change worlds around a place of each, in a box those images that are nearest to it."""
+    """Apply a change relative to a centre in each world, in a box to the nearest images."""
     away, s = change(offsets_from(x, centre, box), s, centre=torch.zeros_like(centre))
     return nearest_image(away + centre[:, None], box), s
 
@@ -369,21 +369,18 @@ def add_state_noise(x: Tensor, s: Tensor, random: WorldRandom, box: Box) -> tupl
 
 
 def remove_half(x: Tensor, s: Tensor, random: WorldRandom, box: Box) -> tuple[Tensor, Tensor]:
-    """Leave N // 2 particles, chosen at random."""
+    """Keep N // 2 particles, chosen at random."""
     return _lowest_half(x, s, random.uniform(x.shape[1]))
 
 
 def remove_side(x: Tensor, s: Tensor, random: WorldRandom, box: Box) -> tuple[Tensor, Tensor]:
-    """Leave the N // 2 particles on one side of a line at a random angle, a plane in 3D.
-
-    In a box the line runs through its middle, up to rounding.
-    """
+    """Keep the N // 2 particles on one side of a line at a random angle, in 3D of a plane."""
     normal = random.normal(x.shape[2], dtype=x.dtype)
     return _lowest_half(x, s, (x * normal[:, None]).sum(-1))
 
 
 def _lowest_half(x: Tensor, s: Tensor, key: Tensor) -> tuple[Tensor, Tensor]:
-    """Leave the particles with the lower keys [B, N], in the order that they have."""
+    """Keep the N // 2 particles with the lowest keys [B, N], in their order."""
     kept = key.argsort(dim=1)[:, : x.shape[1] // 2].sort(dim=1).values[..., None]
     return x.take_along_dim(kept, dim=1), s.take_along_dim(kept, dim=1)
 
@@ -399,7 +396,7 @@ DAMAGES = {
         Damage("side", remove_side, static=True, halves=True, beyond=True),
     )
 }
-"""Every damage by its name."""
+"""Kinds of damage by name."""
 
 
 # Recovery
@@ -408,17 +405,17 @@ RECOVERED = 1.1
 """A world has recovered once its loss is at most this many times its twin's at the same step."""
 
 CONTROL = "nothing"
-"""Name of worlds that only draw other masks than their twins."""
+"""Name of the control: worlds without damage, with other masks than their twins."""
 
 AFTERWARDS, OTHERWISE = 1001, 1002
-"""Streams of the masks after the damage, and of those of the control."""
+"""Random streams of the masks after the damage, and of the control's masks."""
 
 
 @dataclass(frozen=True)
 class LossCurve:
-    """Losses of all seeds, and of their twins without the damage, at steps after one damage.
+    """Losses of all seeds at `steps` after a damage, and those of their twins without the damage.
 
-    A loss is NaN where a world is not finite.
+    The loss of a world that is not finite is NaN.
     """
 
     damage: str
@@ -427,31 +424,31 @@ class LossCurve:
     twins: tuple[tuple[float, ...], ...]
 
     def recovery_steps(self) -> list[int | None]:
-        """Return for each seed the first of `steps` at which it has recovered; None: at none."""
+        """Return for each seed the first of `steps` at which it has recovered, or None."""
         pairs = zip(self.losses, self.twins, strict=True)
         return [recovery_step(self.steps, loss, twin) for loss, twin in pairs]
 
     def recovered(self) -> int:
-        """Return how many seeds have recovered."""
+        """Return the number of seeds that have recovered."""
         return sum(step is not None for step in self.recovery_steps())
 
     def median_step(self) -> float | None:
-        """Return the median recovery time of those that recovered [steps]; None: none did."""
+        """Return the median recovery time of the seeds that recovered [steps], or None."""
         found = [step for step in self.recovery_steps() if step is not None]
         return median(found) if found else None
 
-    def ratios(self, place: int) -> list[float]:
-        """Return for each seed the loss over its twin's at a place of `steps`: -1 is the end."""
+    def ratios(self, index: int) -> list[float]:
+        """Return for each seed the loss over its twin's at an index of `steps`."""
         pairs = zip(self.losses, self.twins, strict=True)
-        return [ratio(loss[place], twin[place]) for loss, twin in pairs]
+        return [ratio(loss[index], twin[index]) for loss, twin in pairs]
 
     def within_at_end(self) -> int:
-        """Return how many seeds are within `RECOVERED` at the last of `steps`."""
+        """Return the number of seeds that are recovered at the last step."""
         return sum(value <= RECOVERED for value in self.ratios(-1))
 
 
 def ratio(loss: float, twin: float) -> float:
-    """Return a loss over a twin's; of two zeros it is 1."""
+    """Return a loss over a twin's; 1 if both are 0."""
     if twin == 0.0:
         return 1.0 if loss == 0.0 else math.nan if math.isnan(loss) else math.inf
     return loss / twin
@@ -468,9 +465,9 @@ def recovery_step(
 
 @torch.no_grad()
 def healing(ground: RuleTrial, home: TrialWorlds) -> list[LossCurve]:
-    """Damage grown worlds in every way: a curve for the control and for each damage.
+    """Damage grown worlds in every way; return a curve for the control and for each damage.
 
-    Where half of the particles are removed, twins are worlds that were grown from as many.
+    If half of the particles are removed, twins are worlds that were grown from half as many.
     """
     chosen = [d for d in DAMAGES.values() if d.static or not ground.rule.static]
     found = _with_twins(ground, home, home, [d for d in chosen if not d.halves], control=True)
@@ -489,7 +486,7 @@ def _with_twins(
     *,
     control: bool,
 ) -> list[LossCurve]:
-    """Run twins and damaged worlds as one batch."""
+    """Run twins and damaged worlds as one batch; return their curves, the control first."""
     steps = ground.plan.heal_steps
     copies = [(twins.x, twins.s)]
     keys = [ground.random(AFTERWARDS).keys]

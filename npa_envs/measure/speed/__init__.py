@@ -1,1 +1,1 @@
-"""Benchmarks: run time against error, the paper's table, scaling, and what a call launches."""
+"""Benchmarks of `npa-envs bench`: times, memory, scaling, and the kernels of a call."""

@@ -1,4 +1,4 @@
-"""The kernels of a step: their times in suite `kernels`, and what decides on them."""
+"""The kernels of a step: their times (suite `kernels`), and why they were chosen."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from npa_envs.world.steps import row_capacity
 
 @dataclass(frozen=True)
 class KernelRow:
-    """One kernel in one workload: its time [µs] and its launches in a step, all together.
+    """One kernel in one workload: its total time [µs] and number of launches in a step.
 
     Kernels that take less than 0.5 % of a step have no row.
     """
@@ -68,7 +68,7 @@ def kernel_rows(session: TimingSession, workloads: Sequence[Workload]) -> list[K
 
 
 Gradients = Literal["none", "weights", "positions"]
-"""What a step is differentiated by: nothing, weights and states, or positions as well."""
+"""Gradients of a step: none, by weights and states, or also by positions."""
 
 
 def explain(
@@ -79,7 +79,7 @@ def explain(
     periodic: bool = False,
     gradients: Gradients = "weights",
 ) -> str:
-    """Run a step, and return which kernels it launched and what decided on them."""
+    """Run a step, and return as text which kernels it launched and why they were chosen."""
     box = 2.0 * workload.half_width if periodic else None
     x, s = (tensor.to(dtype) for tensor in workload.worlds(device))
     rule = workload.rule(device).to(dtype)
@@ -116,7 +116,7 @@ def _listed(launches: list[Launch]) -> list[str]:
 def _reasons(
     workload: Workload, x: Tensor, rule: NPARule, box: float | None, gradients: Gradients
 ) -> list[str]:
-    """Return what decides on the kernels, a line each."""
+    """Return the reasons for the choice of kernels as lines of text."""
     prob, total, masked = workload.update_prob, x.shape[0] * x.shape[1], workload.update_prob < 1.0
     plan = make_plan(
         torch.empty(0, dtype=x.dtype, device=x.device),

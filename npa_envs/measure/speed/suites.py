@@ -54,9 +54,9 @@ SMALL = (Workload(2, 1, 1024, 8),)
 
 @dataclass(frozen=True)
 class ThroughputRow:
-    """A workload (worlds B, particles N, steps T) that stores or recomputes what training reads.
+    """Times of one step of a workload (B, N, T) [µs], with `memory` "store" or "recompute".
 
-    Times are those of one step [µs], peaks of memory are above the worlds [MiB].
+    Peaks of memory [MiB] do not include the worlds.
     """
 
     workload: str
@@ -69,7 +69,7 @@ class ThroughputRow:
 
 
 def throughput_rows(session: TimingSession, workloads: Sequence[Workload]) -> list[ThroughputRow]:
-    """Return two rows for each workload: storing and recomputing."""
+    """Return two rows for each workload: "store" and "recompute"."""
     calls = []
     for workload in workloads:
         train = workload != PAPER[-1]
@@ -85,7 +85,7 @@ def throughput_rows(session: TimingSession, workloads: Sequence[Workload]) -> li
 def throughput_row(
     session: TimingSession, workload: Workload, memory: Memory = "store", *, train: bool = True
 ) -> ThroughputRow:
-    """Return what a step of a workload costs."""
+    """Return time and memory of a step of a workload."""
     x, s = workload.worlds(session.device)
     roll, generator = rollout_call(workload, x, s)
     infer, training = session.cost(roll, generator=generator), None
@@ -105,10 +105,9 @@ def throughput_row(
 
 @dataclass(frozen=True)
 class PublicRow:
-    """Time of a step of `rollout` in a plain loop [µs]; each call is waited for.
+    """Time of a step of `rollout` in a plain loop that synchronises after each call [µs].
 
-    On CUDA the first numbers are of calls that replay a recording, the `launched` ones of calls
-    with `cuda_graph=False`.
+    The `launched` numbers are of calls with `cuda_graph=False`; the others replay a CUDA graph.
     """
 
     workload: str
@@ -131,7 +130,7 @@ def _public_row(session: TimingSession, workload: Workload) -> PublicRow:
     return PublicRow(workload.name, *found.values())
 
 
-# Suite `scaling`: N, neighbours, B and C, one of them at a time.
+# Suite `scaling`: N, neighbours, B and C, varied one at a time.
 
 AXES = {
     "particles": "particles N, same density",
@@ -139,12 +138,12 @@ AXES = {
     "worlds": "worlds B",
     "channels": "state channels C",
 }
-"""What is varied, and what plots call it."""
+"""Varied quantities, with their labels in plots."""
 
 
 @dataclass(frozen=True)
 class ScalingRow:
-    """One step of a 2D workload; the `neighbours` of a particle include itself."""
+    """Time and memory of one step of a 2D workload; `neighbours` include the particle itself."""
 
     axis: str
     value: float
@@ -186,7 +185,7 @@ def _values(session: TimingSession) -> tuple[Sequence[int], ...]:
 
 
 def varied(axis: str, value: int, *, small: bool = False) -> Workload:
-    """Return the workload in which the number of one of `AXES` has a value."""
+    """Return the usual workload with another value of one of `AXES`."""
     usual = Workload(2, 1, 512 if small else 4096, 4 if small else 8)
     if axis == "particles":
         return replace(usual, particle_count=value)
@@ -194,8 +193,8 @@ def varied(axis: str, value: int, *, small: bool = False) -> Workload:
         return replace(usual, world_count=value, particle_count=min(usual.particle_count, 1024))
     if axis == "channels":
         return replace(usual, state_dim=value)
-    share = (value - 1) / (usual.neighbour_count - 1)
-    return replace(usual, eps=usual.eps * math.sqrt(share))
+    factor = (value - 1) / (usual.neighbour_count - 1)
+    return replace(usual, eps=usual.eps * math.sqrt(factor))
 
 
 def _scaling_row(session: TimingSession, axis: str, value: int) -> ScalingRow:
@@ -206,7 +205,7 @@ def _scaling_row(session: TimingSession, axis: str, value: int) -> ScalingRow:
 
 
 def slope_rows(rows: Sequence[ScalingRow]) -> list[SlopeRow]:
-    """Return how the times of each axis grow."""
+    """Return the slope of the times along each axis."""
     slopes = []
     for axis in AXES:
         found = [row for row in rows if row.axis == axis]
@@ -227,7 +226,7 @@ SKIPPED = {
     "cpu": Workload(2, 1, 4096, 4),
     "small": Workload(2, 1, 256, 2),
 }
-"""Worlds to measure on, by kinds of sessions."""
+"""Workloads by `TimingSession.size`."""
 
 
 @dataclass(frozen=True)
@@ -242,14 +241,14 @@ class SkipRow:
 
 
 Skip = tuple[str, str, dict[str, Any], dict[str, Any]]
-"""What is left out, the condition, and options of `rollout_call` with and without it."""
+"""A computation, when it is left out, and options of `rollout_call` with and without it."""
 
 
 def skips(workload: Workload) -> list[Skip]:
     """Return all computations that rollouts leave out."""
     side = 2.0 * workload.half_width
     training: dict[str, Any] = {"train": True}
-    # Cells and densities are computed anew in each step if positions may get a gradient.
+    # Cells and densities are computed in each step if positions may have a gradient.
     rebuilt: dict[str, Any] = {"detach_positions": False}
     static: dict[str, Any] = {"rule": {"static": True}}
     stored = "what a backward pass reads: signs of hidden units, volumes, kernel sums"
@@ -287,7 +286,7 @@ def skips(workload: Workload) -> list[Skip]:
 
 
 def skip_rows(session: TimingSession) -> list[SkipRow]:
-    """Return what each omission saves, measured with and without it in one run."""
+    """Return what each omission saves, from times with and without it."""
     workload = SKIPPED[session.size]
     x, s = workload.worlds(session.device)
 
@@ -312,15 +311,15 @@ SPECIES = {
     "cpu": (Workload(2, 1, 4096, 4), Workload(2, 1, 256, 4)),
     "small": (Workload(2, 1, 256, 2),),
 }
-"""Worlds to measure on, by kinds of sessions; small ones show the cost of a call."""
+"""Workloads by `TimingSession.size`; small ones show the cost of a call."""
 
 
 @dataclass(frozen=True)
 class OneSpeciesRow:
-    """The same rule and worlds by `rollout` and by `rollout_species` with one species.
+    """Times of one step [µs] of `rollout`, and of `rollout_species` with one species.
 
-    Times are those of one step [µs]; `calls` are "graph" where CUDA replays a captured graph.
-    `ratio` is the median over pairs of readings in turn.
+    `calls` is "graph" for replays of a CUDA graph, else "eager". `ratio` is the median over pairs
+    of readings in turn.
     """
 
     workload: str
@@ -349,7 +348,7 @@ def _species_row(
 ) -> OneSpeciesRow:
     x, s = workload.worlds(session.device)
     make: Callable[..., Any] = partial(rollout_call, workload, x, s, train=train)
-    # Each draws the same masks, as often as the other one is called.
+    # Both draw the same masks.
     alone, species = make(), make(roll=roll_one_species)
     # A ratio of nearly 1 needs more readings than other tables.
     repeats = 3 * session.repeats
@@ -367,7 +366,7 @@ def _species_row(
 def roll_one_species(
     rule: NPARule, x: Tensor, s: Tensor, steps: int, **options: Any
 ) -> tuple[Tensor, Tensor]:
-    """Roll worlds out as those of one species, with the densities of `rollout`."""
+    """Run `rollout_species` with all particles as one species."""
     count = [x.shape[1]]
     worlds: tuple[Tensor, Tensor] = rollout_species(
         [rule], x, s, steps, counts=count, density_counts=count, **options
@@ -379,11 +378,11 @@ def roll_one_species(
 
 
 def paper(session: TimingSession) -> Tables:
-    """Return the paper's table, and times of the public call."""
+    """Return the tables `throughput`, as in the paper, and on CUDA `public`."""
     workloads = SMALL if session.small else PAPER if session.cuda else CPU
     tables: Tables = {"throughput": throughput_rows(session, workloads)}
     if session.cuda:
-        # On a CPU the throughput is that of the public call.
+        # On a CPU `throughput` measures the same calls.
         public = SMALL if session.small else (*PROFILED, Workload(2, 64, 256, 32))
         tables["public"] = session.rows((w.name, partial(_public_row, session, w)) for w in public)
     return tables
@@ -409,7 +408,7 @@ SUITES: dict[str, Callable[[TimingSession], Tables]] = {
     "species": lambda session: {"one_species": one_species_rows(session)},
     "kernels": lambda here: {"kernels": kernel_rows(here, SMALL if here.small else PROFILED)},
 }
-"""What makes the tables of each suite."""
+"""Functions that make the tables of each suite."""
 
 
 @dataclass(frozen=True)
@@ -460,7 +459,7 @@ class BenchReport:
 
 
 def pictures(tables: Tables) -> dict[str, bytes]:
-    """Return PNG files by their names, of tables that are there and whole. Needs matplotlib."""
+    """Return PNG files by name, if the table `scaling` has all axes. Needs matplotlib."""
     drawn = {}
     rows = tables.get("scaling", [])
     if {row.axis for row in rows} == set(AXES):
@@ -478,7 +477,7 @@ def _draw_scaling(table: Sequence[ScalingRow], what: str) -> Any:
         rows = [row for row in table if row.axis == name]
         for field, label in (("infer", "inference"), ("train", "training")):
             found = [getattr(row, f"{field}_{unit}") for row in rows]
-            # A cell that was not measured is a gap.
+            # Missing values make gaps.
             values = [cell.median if isinstance(cell, Timing) else cell for cell in found]
             panel.plot([row.value for row in rows], values, marker="o", ms=4, label=label)
         panel.set(xscale="log", yscale="log", xlabel=AXES[name])

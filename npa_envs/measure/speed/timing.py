@@ -1,4 +1,4 @@
-"""Worlds to measure on, time and memory of a call, and the session that suites measure in."""
+"""Workloads, time and memory of a call, and the session of a benchmark."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from npa_envs.rule.rule import NPARule
 from npa_envs.world.cuda_graph import capture
 from npa_envs.world.rollout import rollout
 
-# Worlds with as many neighbours everywhere
+# Workloads: uniformly scattered particles
 
 
 @dataclass(frozen=True)
@@ -50,7 +50,7 @@ class Workload:
     def half_width(self) -> float:
         """Half the side of the square or cube that the particles fill [length units].
 
-        Worlds of all sizes are as dense.
+        The density does not depend on the number of particles.
         """
         if self.space_dim == 2:
             return 0.7 * math.sqrt(self.particle_count / 4096)
@@ -72,8 +72,8 @@ class Workload:
         return x.mul_(2.0).sub_(1.0).mul_(self.half_width), s.mul_(0.1)
 
     def rule(self, device: torch.device, **options: Any) -> NPARule:
-        """Return a rule with the same fresh weights at every call, and options of `NPARule`."""
-        # Weights are drawn from torch's global generators, which must be left as they were.
+        """Return a new rule, always with the same weights, with options of `NPARule`."""
+        # Weights are drawn from torch's global generators, whose state must not change.
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(0)
             dims = (self.space_dim, self.state_dim, self.hidden_dim)
@@ -92,10 +92,10 @@ def rollout_call(
     roll: Callable[..., Any] = rollout,
     **options: Any,
 ) -> tuple[Callable[[], None], torch.Generator]:
-    """Return a call that rolls worlds out, and the source of its masks.
+    """Return a function that runs a rollout, and the generator of its masks.
 
-    `train` takes the gradient of a random linear functional by the rule's weights, `gradients`
-    only lets autograd store its inputs. `rule` are options of the rule, `options` those of `roll`.
+    `train` computes the gradient of a random linear functional by the rule's weights, `gradients`
+    only enables gradients. `rule` are options of the rule, `options` those of `roll`.
     """
     network = workload.rule(x.device, **(rule or {}))
     generator = torch.Generator(x.device).manual_seed(1)
@@ -122,7 +122,7 @@ Sampled = tuple[Callable[[], object], torch.Generator]
 """A call, and the generator that it draws from."""
 
 LEAST_SECONDS = {"cpu": 2e-3, "cuda": 1e-2}
-"""Short calls are made so many times in a row that one reading takes at least this long [s]."""
+"""Least duration of a reading, for which short calls are repeated [s]."""
 
 
 @dataclass(frozen=True)
@@ -134,7 +134,7 @@ class Timing:
     high: float
 
     def __str__(self) -> str:
-        """Return the median and how far the readings lie from it."""
+        """Return the median and the largest deviation of a reading, as text."""
         off = max(self.high - self.median, self.median - self.low) / self.median
         return f"{self.median:.4g} ±{off:.0%}"
 
@@ -145,7 +145,7 @@ class Timing:
 
 @dataclass(frozen=True)
 class Cost:
-    """The time of a call and the peak of memory that torch allocates [MiB], None on a CPU."""
+    """The time of a call, and its peak of memory allocated by torch [MiB], None on a CPU."""
 
     time: Timing
     peak_mib: float | None
@@ -153,7 +153,7 @@ class Cost:
 
 @dataclass(frozen=True)
 class Comparison:
-    """Times of two calls in turn, and the median over pairs of readings of second over first."""
+    """Times of two calls, read in turn, and the median of the ratios second / first."""
 
     first: Timing
     second: Timing
@@ -161,7 +161,7 @@ class Comparison:
 
 
 def synchronize(device: torch.device) -> None:
-    """Wait until a device has done all its work."""
+    """Wait for all work of a device, if it is CUDA."""
     if device.type == "cuda":
         torch.cuda.synchronize(device)
 
@@ -169,9 +169,9 @@ def synchronize(device: torch.device) -> None:
 def compare(
     first: Sampled, second: Sampled, device: torch.device, *, repeats: int, graph: bool = True
 ) -> Comparison:
-    """Return what two calls cost, timed in turn, so that both run on the same machine.
+    """Time two calls in `repeats` pairs, whose order alternates, under the same conditions.
 
-    The second is first in the next of the `repeats` pairs. On CUDA, `graph` times replays.
+    On CUDA, `graph` times replays of CUDA graphs.
     """
     runs: list[Callable[[], object]] = []
     for run, generator in (first, second):
@@ -192,7 +192,7 @@ def compare(
 def timed_calls(
     run: Callable[[], object], device: torch.device, *, warm: int, repeats: int
 ) -> Timing:
-    """Return the time of single calls, each waited for, after `warm` that are not timed."""
+    """Return the time of single synchronised calls, after `warm` calls that are not timed."""
     for _ in range(warm):
         run()
     return _summary([_reading(run, device, 1) * 1e6 for _ in range(repeats)])
@@ -205,7 +205,7 @@ def _summary(readings: Sequence[float]) -> Timing:
 def _timing(run: Callable[[], object], device: torch.device, repeats: int) -> Timing:
     calls = _calls(_reading(run, device, 1), device)
     readings = [_reading(run, device, calls) * 1e6]
-    # Those of slow calls end after a second, with three of them at least.
+    # Slow calls have fewer readings: those of a second, but at least three.
     while len(readings) < repeats and (len(readings) < 3 or sum(readings) * calls < 1e6):
         readings.append(_reading(run, device, calls) * 1e6)
     return _summary(readings)
@@ -216,7 +216,7 @@ def _calls(seconds: float, device: torch.device) -> int:
 
 
 def _reading(run: Callable[[], object], device: torch.device, calls: int) -> float:
-    """Return the mean time of so many calls in a row [s]."""
+    """Return the mean time of `calls` calls in a row [s]."""
     synchronize(device)
     start = time.perf_counter()
     for _ in range(calls):
@@ -235,14 +235,14 @@ Tables = dict[str, list[Any]]
 
 @dataclass(frozen=True)
 class LeftOut:
-    """Something that a suite did not measure, and the reason in a few words."""
+    """A measurement that was left out, and the reason."""
 
     what: str
     why: str
 
 
 NO_TIME = "no time was left"
-"""Why something is left out that had not begun at the end of the time."""
+"""Reason for measurements that had not started at the time limit."""
 
 
 @dataclass
@@ -258,7 +258,7 @@ class TimingSession:
     """Called with 1 after each row."""
     left_out: list[LeftOut] = field(default_factory=list)
     enough: Callable[[], bool] = lambda: False
-    """Says whether the time is over: rows that have not begun by then are left out."""
+    """Returns whether the time limit is reached: later rows are left out."""
 
     @property
     def cuda(self) -> bool:
@@ -267,7 +267,7 @@ class TimingSession:
 
     @property
     def size(self) -> str:
-        """Whose sizes are measured: "small", "cpu" or "cuda"."""
+        """Size of workloads: "small", "cpu" or "cuda"."""
         return "small" if self.small else self.device.type
 
     def cost(
@@ -277,7 +277,7 @@ class TimingSession:
         graph: bool = True,
         generator: torch.Generator | None = None,
     ) -> Cost:
-        """Return what a call costs once its kernels are compiled; on CUDA `graph` times replays."""
+        """Return time and memory of a call after a first one; on CUDA `graph` times replays."""
         device = self.device
         run()
         synchronize(device)
@@ -292,7 +292,7 @@ class TimingSession:
         return Cost(timing, (torch.cuda.max_memory_allocated(device) - before) / 2**20)
 
     def attempt(self, what: str, make: Callable[[], Row]) -> list[Row]:
-        """Return the row that a call makes; none without the memory or the time for it."""
+        """Return the row of a call in a list, which is empty without memory or time for it."""
         if self.enough():
             self.leave_out(what, NO_TIME)
             return []
@@ -305,11 +305,11 @@ class TimingSession:
             self.progress(1)
 
     def rows(self, calls: Iterable[tuple[str, Callable[[], Row]]]) -> list[Row]:
-        """Return the rows of `attempt` of calls with names."""
+        """Return the rows of several named calls, as `attempt`."""
         return [row for what, make in calls for row in self.attempt(what, make)]
 
     def leave_out(self, what: str, why: str) -> None:
-        """Note that something is not measured."""
+        """Record that something is not measured."""
         entry = LeftOut(what, why)
         if entry not in self.left_out:
             self.left_out.append(entry)

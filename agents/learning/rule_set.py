@@ -30,12 +30,12 @@ class RuleSet(nn.Module):
     Make one with `new`, `of` or `load`.
 
     Args:
-        rules: One for each species, which are not copied.
+        rules: One for each species; not copied.
         counts: Particles of each species.
         interface: `problem.interface`.
 
     Raises:
-        NPAError: There is not one rule for each species.
+        NPAError: The numbers of rules and species differ.
     """
 
     def __init__(
@@ -50,17 +50,17 @@ class RuleSet(nn.Module):
         self.rules = nn.ModuleList(rules)
         """The rules, in the order of the species."""
         self.spans = spans_of(counts)
-        """Places of each species' particles."""
+        """Slice of each species' particles."""
         self.counts = tuple(counts)
-        """How many these are."""
+        """Particles of each species."""
         self.interface = interface
 
     @classmethod
     def new(cls, problem: Problem, seed: int) -> RuleSet:
-        """Return untrained rules for a problem, on the CPU; torch's own randomness stays as it is.
+        """Return untrained rules for a problem, on the CPU; torch's random state does not change.
 
         Raises:
-            NPAError: The seed is no integer of at least 0.
+            NPAError: The seed is not an integer of at least 0.
         """
         seed, interface, config = checked_count("seed", seed), problem.interface, problem.config
         with torch.random.fork_rng(devices=()):
@@ -84,12 +84,12 @@ class RuleSet(nn.Module):
         """Return copies of existing rules for a problem that they fit, on the CPU.
 
         Args:
-            problem: Where they are to act.
+            problem: The problem that they are for.
             source: A rule, or what `npa_envs.load_rule` takes, for all species or one for each; or
                 a folder that `save` wrote.
 
         Raises:
-            NPAError: A rule cannot be loaded or does not fit, or there are too few or too many.
+            NPAError: A rule cannot be loaded or does not fit, or their number is wrong.
         """
         if isinstance(source, str | Path) and (Path(source) / _file_name(0)).is_file():
             return cls.load(source, problem)
@@ -108,7 +108,7 @@ class RuleSet(nn.Module):
         """Return the rules that `save` wrote, on the CPU, for a problem.
 
         Raises:
-            NPAError: A file is missing or holds no rule, or one that does not fit.
+            NPAError: A file is missing, is not a rule's, or its rule does not fit.
         """
         return cls.of(problem, [Path(folder) / _file_name(k) for k in range(len(problem.counts))])
 
@@ -141,14 +141,14 @@ class RuleSet(nn.Module):
     def mean(self, observation: Tensor) -> Tensor:
         """Return actions [B, N, A] for observations: a_x = δ / (1 + |δ|), a_s = Δs / state_scale.
 
-        They are those of `policy`, but state steps beyond the action space are not clipped, so that
-        gradients do not vanish. They are differentiable in the weights and in the observation.
+        They are differentiable. Unlike those of `policy`, state steps are not clipped to the action
+        space, so that gradients do not vanish.
         """
         scale = self.interface.state_scale
         return self.acted(observation, lambda delta, step: torch.cat((delta, step / scale), dim=-1))
 
     def acted(self, observation: Tensor, action: Callable[[Tensor, Tensor], Tensor]) -> Tensor:
-        """Return actions [B, N, A], made of each species' displacements and state steps."""
+        """Return actions [B, N, A] that `action` makes of displacements and state steps."""
         parts = []
         for rule, span in zip(self, self.spans, strict=True):
             rows = observation[:, span]
@@ -157,27 +157,27 @@ class RuleSet(nn.Module):
         return parts[0] if len(parts) == 1 else torch.cat(parts, dim=1)
 
     def policy(self) -> RuleSetPolicy:
-        """Return the rules as a policy, which follows when they are trained on."""
+        """Return the rules as a policy; it shares their weights."""
         return RuleSetPolicy(self)
 
 
 class RuleSetPolicy(Policy):
-    """A set of rules as a policy for all particles of its problem, on the rules' device."""
+    """A set of rules as a policy, on the rules' device."""
 
     def __init__(self, rules: RuleSet) -> None:
         super().__init__(rules.interface)
         self.rules = rules
 
     def act(self, observation: Tensor) -> Tensor:
-        """Return the rules' bounded updates of every particle."""
+        """Return the rules' bounded updates of all particles."""
         return self.rules.acted(observation, self.interface.action).float()
 
-    def _places(self, counts: Mapping[str, int]) -> dict[str, slice]:
-        # Agents that are dead are missing, so that names say which species, or particle, it is.
+    def _spans(self, counts: Mapping[str, int]) -> dict[str, slice]:
+        # Agents that ended are missing: names identify the others.
         spans = self.rules.spans
         particles = [slice(k, k + 1) for k in range(spans[-1].stop)]
         known = {f"species_{k}": span for k, span in enumerate(spans)}
-        known |= {f"particle_{k}": place for k, place in enumerate(particles)}
+        known |= {f"particle_{k}": span for k, span in enumerate(particles)}
         for agent in counts:
             if agent not in known:
                 raise NPAError(
@@ -189,7 +189,7 @@ class RuleSetPolicy(Policy):
 
 
 def species_of(counts: Sequence[int]) -> Tensor:
-    """Return the number of the species of each particle, int64, shape [N]."""
+    """Return the species number of each particle, int64, shape [N]."""
     return torch.arange(len(counts)).repeat_interleave(torch.tensor(tuple(counts)))
 
 
