@@ -60,7 +60,7 @@ def main(arguments: Sequence[str]) -> int:
     )
     if options.plots and options.out is None:
         raise NPAError("plots need a folder to be written to: give --out DIR as well")
-    device = options.place()
+    device = options.checked_device()
     (name,) = common.chosen_names("suite", [options.suite or "quick"], suites.SUITES)
     if options.explain:
         import torch

@@ -114,7 +114,7 @@ class DeviceOptions:
     device: str = "cpu"
     """Where to run: cpu, cuda, cuda:1."""
 
-    def place(self) -> torch.device:
+    def checked_device(self) -> torch.device:
         """Return the checked device."""
         from npa_envs.devices import check_device
 

@@ -55,7 +55,7 @@ def main(arguments: Sequence[str]) -> int:
     checkpoints = options.checkpoints or quality.CHECKPOINTS
     quality.check_steps("checkpoints", checkpoints)
     common.check_numbers(options, seed_count=1)
-    device = options.place()
+    device = options.checked_device()
     rule = load_rule(options.rule, device=device).float()
     seeds = range(options.first_seed, options.first_seed + options.seed_count)
     given: dict[str, Any] = {"seeds": seeds, "device": device}

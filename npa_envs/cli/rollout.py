@@ -70,7 +70,7 @@ def main(arguments: Sequence[str]) -> int:
     from npa_envs.training.run import stop_flag
     from npa_envs.training.trained_tasks import task_of_rule
 
-    device = options.place()
+    device = options.checked_device()
     damages = [parse_damage(text) for words in options.damage for text in words]
     late = [damage for damage in damages if damage.step >= options.steps]
     if late:

@@ -60,7 +60,7 @@ def main(arguments: Sequence[str]) -> int:
                 print(f"{group}: {summary}")
                 print("\n".join(f"  {check.name}: {check.expected}" for check in some))
         return 0
-    device = options.place()
+    device = options.checked_device()
     path = None
     if options.out is not None:
         name = f"stress_{device.type}{'_quick' * options.quick}.json"

@@ -63,7 +63,7 @@ def main(arguments: Sequence[str]) -> int:
     options = common.parse_options(ViewOptions, "view", arguments)
     if not 1 <= options.threads <= 256:
         raise NPAError(f"threads must be in [1, 256], got {options.threads}")
-    device = options.place()
+    device = options.checked_device()
     make_world = world_maker(options, device)
     with common.torch_threads(options.threads):
         # Made once before the server starts, so that errors come at once.

@@ -36,7 +36,7 @@ def main(arguments: Sequence[str]) -> int:
         )
     start = time.perf_counter()
     dtypes = [getattr(torch, name) for name in options.dtypes]
-    warmup(options.place(), space_dims=options.space_dims, dtypes=dtypes)
+    warmup(options.checked_device(), space_dims=options.space_dims, dtypes=dtypes)
     seconds = time.perf_counter() - start
     print(f"kernels for {options.device} are ready ({seconds:.1f} s), in {kernel_cache_folder()}")
     return 0
