@@ -1,4 +1,4 @@
-"""`npa-envs interact`: grows pairs of rules in one world and measures how each changes the other."""
+"""`npa-envs interact`: grows rules in one world and measures how each changes the other."""
 
 from __future__ import annotations
 

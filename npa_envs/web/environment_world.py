@@ -101,10 +101,12 @@ class EnvironmentWorld(LiveWorld):
             "box": None if box is None else list(box),
             "half_width": task.half_width if box is None else 0.5 * min(box),
             "spot": 0.7 * float(task.pixel_size),
-            "tools": [*(("push", "clump", "cut") if physics.moving else ()), "inject"],
             "damages": list(DAMAGE_SIZES) if physics.moving else ["wipe"],
             "capabilities": ["step", "reset", "film", "loss"],
         }
+
+    def _allowed(self) -> set[str]:
+        return {"moves", "states"} if self._inner.worlds.physics.moving else {"states"}
 
     def _shows(self) -> list[str]:
         return shows_of(self._inner.worlds.physics.state_dim, species=False)

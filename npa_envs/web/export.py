@@ -20,9 +20,11 @@ from npa_envs.errors import NPAError, shown
 from npa_envs.files import atomic_path, checked_path
 from npa_envs.rule.files import load_rule
 from npa_envs.rule.rule import NPARule, check_rule
+from npa_envs.tasks.damage import CLUMP_FACTOR, DAMAGE_SIZES
 from npa_envs.tasks.point_classification import PALETTE, UNDECIDED, PointClassification
-from npa_envs.web.live import checked_seed, colour_ramp
-from npa_envs.web.rule_world import RuleWorld, name_of
+from npa_envs.web.live import CLUMP_RATE, INJECT_RATE, checked_seed, colour_ramp
+from npa_envs.web.rule_world import LEAST_SEED, SEED_FRACTION, RuleWorld, name_of
+from npa_envs.world.species import AGREEMENTS
 
 PAGE = Path(__file__).resolve().parent / "page"
 """The folder of the page's own files."""
@@ -41,6 +43,17 @@ POLICY = (
     "worker-src blob:; img-src data: blob:; media-src blob:; base-uri 'none'; form-action 'none'"
 )
 """The page's content security policy: nothing is loaded."""
+
+CONSTANTS = {
+    "AGREEMENTS": AGREEMENTS,
+    "CLUMP_FACTOR": CLUMP_FACTOR,
+    "CLUMP_RATE": CLUMP_RATE,
+    "DAMAGE_SIZES": DAMAGE_SIZES,
+    "INJECT_RATE": INJECT_RATE,
+    "LEAST_SEED": LEAST_SEED,
+    "SEED_FRACTION": SEED_FRACTION,
+}
+"""Numbers and names of the Python worlds that live_world.js also needs."""
 
 _IMPORT = re.compile(r'^import \{ ([\w, ]+) \} from "\./(\w+\.js)";$', re.MULTILINE)
 _EXPORT = re.compile(r"^export (?=(?:async function|function|class|const) (\w+))", re.MULTILINE)
@@ -232,6 +245,7 @@ def page_text(rules: Sequence[Mapping[str, Any]], *, title: str, seed: int = 0) 
         "worker": "worker",
         "seed": seed,
         "ramp": base64.b64encode(colour_ramp().tobytes()).decode(),
+        "constants": CONSTANTS,
         "rules": rules,
     }
     # "<" would allow a rule's text to end the element that holds it.

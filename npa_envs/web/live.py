@@ -41,6 +41,42 @@ LARGEST_RADIUS = 10.0
 """Largest radius of a brush [length units]."""
 
 
+class Tool(NamedTuple):
+    """A brush of the page."""
+
+    name: str
+    """What messages call it."""
+    label: str
+    """Its tooltip."""
+    needs: str
+    """What a world must allow to offer it: "moves", "states", "removal", "species" or "growth"."""
+    takes: str
+    """Other content of its messages: "source", "rule", "line" (one message at the end of a stroke),
+    or ""."""
+    icon: str
+    """Path of its picture, in SVG, on a square of side 24."""
+
+
+TOOLS = (
+    Tool("remove", "Remove", "removal", "", "M4 15l8-9 7 6-7 8H8zM9 20h11"),
+    Tool("push", "Pull with the pointer", "moves", "",
+         "M12 20c-4 0-6-3-7-7 2-1 3 0 4 2V6a1.4 1.4 0 0 1 3 0v5a1.4 1.4 0 0 1 3 0v1a1.4 1.4 0 0 1 "
+         "3 0v3c0 3-2 5-6 5z"),
+    Tool("clump", "Clump", "moves", "",
+         "M4 4l5 5M20 4l-5 5M4 20l5-5M20 20l-5-5M9 6v3H6M15 6v3h3M9 18v-3H6M15 18v-3h3"),
+    Tool("cut", "Cut along a line", "moves", "line",
+         "M5 19L19 5M6 8a2 2 0 1 0 0-.1M16 18a2 2 0 1 0 0-.1M8 9l8 8"),
+    Tool("inject", "Inject: the state of where you press spreads to where you drag", "states",
+         "source",
+         "M4 20l3-1 8-8-2-2-8 8zM12 8l4 4M14 10l3-4a1.8 1.8 0 0 1 3 0 1.8 1.8 0 0 1-1 3l-4 2"),
+    Tool("graft", "Graft: particles take another rule", "species", "rule",
+         "M12 21v-9M12 12c0-5 3-7 8-7 0 5-3 7-8 7zM12 15c0-4-3-6-8-6 0 4 3 6 8 6z"),
+    Tool("add", "Add a seed of another rule", "growth", "rule",
+         "M12 4a8 8 0 1 0 .1 0M12 8v8M8 12h8"),
+)  # fmt: skip
+"""All brushes. `brushed`, `RuleWorld._brush` and `brush` of live_world.js apply them."""
+
+
 class WorldView(NamedTuple):
     """A frame of a world."""
 
@@ -101,6 +137,7 @@ class LiveWorld(ABC):
         """Return the event "world"."""
         return {
             "type": "world",
+            "tools": [tool._asdict() for tool in TOOLS if tool.needs in self._allowed()],
             "shows": self._shows(),
             "show": self.show,
             "settings": {k: r.to_dict(getattr(self, k)) for k, r in self._ranges().items()},
@@ -163,6 +200,10 @@ class LiveWorld(ABC):
     def _brush(self, message: Mapping[str, Any]) -> bool: ...
 
     @abstractmethod
+    def _allowed(self) -> set[str]:
+        """Return what brushes may do in this world, in the terms of `Tool.needs`."""
+
+    @abstractmethod
     def _shows(self) -> list[str]: ...
 
     def _set(self, name: str, value: Any) -> bool:
@@ -221,13 +262,13 @@ class Touch(NamedTuple):
     @classmethod
     def read(cls, message: Mapping[str, Any], x: Tensor) -> Touch:
         """Return the brush of a message, for a world at x [1, N, D]."""
-        tool = message.get("tool")
-        tools = ("remove", "push", "clump", "cut", "inject", "graft", "add")
-        if tool not in tools:
-            raise NPAError(f"unknown tool {shown(tool)}: {suggest(tool, tools)}")
+        name = message.get("tool")
+        names = [tool.name for tool in TOOLS]
+        if name not in names:
+            raise NPAError(f"unknown tool {shown(name)}: {suggest(name, names)}")
         at, view = message.get("at"), message.get("view")
         return cls(
-            str(tool),
+            str(name),
             _checked_vector("at", at, x),
             _checked_vector("move", message.get("move", [0.0] * x.shape[2]), x),
             Range(1e-4, LARGEST_RADIUS).checked("radius", message.get("radius")),

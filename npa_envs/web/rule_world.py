@@ -46,8 +46,9 @@ from npa_envs.world.species import AGREEMENTS, rollout_species
 MOST_PARTICLES = {"cpu": 16384, "cuda": 131072}
 """Most particles of a world, by the kind of device."""
 
-SEED_SHARE = 0.5
-"""Particles that the brush `add` of strength 1 adds, over those of a fresh world."""
+SEED_FRACTION, LEAST_SEED = 0.5, 16
+"""Particles that the brush `add` of strength 1 adds, over those of a fresh world; at least so many
+are added."""
 
 SMALL_VIEWS = {"resolution": 64, "training_views": 1, "held_out_views": 6}
 """Smaller views for the loss of 3D worlds, whose targets take many seconds to draw."""
@@ -169,10 +170,6 @@ class RuleWorld(LiveWorld):
         """Return the event "world"."""
         task, box = self.task, self.task.box
         centre, half_width = list(task.frame.centre), task.frame.half_width
-        tools = ["remove", "push", "clump", "cut"]
-        # A rule that divides lives alone and fills its world; its dead particles have no state.
-        if not self.main.rule.divides:
-            tools += ["inject", "graft"] if self.main.rule.static else ["inject", "graft", "add"]
         capabilities = ["step", "reset", "film"]
         return super().describe() | {
             "title": self.main.name,
@@ -186,10 +183,17 @@ class RuleWorld(LiveWorld):
             "rule": self.main.name,
             "others": [name for name in self._choices if self._may_join(name)],
             "species": [live_rule.name for live_rule in self.live_rules],
-            "tools": tools,
             "damages": list(DAMAGE_SIZES),
             "capabilities": [*capabilities, "loss"] if self._has_loss() else capabilities,
         }
+
+    def _allowed(self) -> set[str]:
+        allowed = {"moves", "removal"}
+        # A rule that divides lives alone and fills its world; its dead particles have no state.
+        if not self.main.rule.divides:
+            allowed |= {"states", "species"}
+            allowed |= set() if self.main.rule.static else {"growth"}
+        return allowed
 
     def _has_loss(self) -> bool:
         return self.trained.doubt is None
@@ -358,7 +362,7 @@ class RuleWorld(LiveWorld):
         self._arrange(self.x, s, torch.where(inside[0], number, self._species()))
 
     def _add(self, touch: Touch, live_rule: LiveRule) -> None:
-        count = max(16, round(touch.strength * SEED_SHARE * self.full))
+        count = max(LEAST_SEED, round(touch.strength * SEED_FRACTION * self.full))
         room = MOST_PARTICLES[self._device.type] - self.x.shape[1]
         if count > room:
             raise NPAError(f"the world has room for {max(room, 0)} particles more, got {count}")

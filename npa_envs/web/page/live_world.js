@@ -10,26 +10,12 @@ import { GpuPhysics, openDevice } from "./physics_gpu.js";
 // Frames that are on the way to the page at most: a page that is slow or hidden holds the world.
 const FRAMES_AHEAD = 2;
 
-// Numbers of npa_envs/web/live.py, npa_envs/web/rule_world.py and npa_envs/tasks/damage.py.
-const CLUMP_RATE = 0.25;
-const INJECT_RATE = 0.5;
-const CLUMP_FACTOR = 0.9;
-const SEED_SHARE = 0.5;
-const LEAST_SEED = 16;
-const DAMAGE_SIZES = { wipe: 0.2, cut: 0.1, clump: 0.2, noise: 0.05 };
-
 // A graphics card is tried for so many steps, whose results may differ so much from the processor's.
 const TRIAL_STEPS = 4;
 const TRIAL_TOLERANCE = 1e-3;
 
-// What rules must have in common to live in one world, as AGREEMENTS of npa_envs/world/species.py.
-const AGREEMENTS = [
-  "space_dim", "state_dim", "eps0", "static", "state_gradient", "moment_correction", "moment_inverse",
-  "density_gradient",
-];
-
 export class LiveWorld {
-  // settings: {rules: [...], seed, ramp} as npa_envs/web/export.py writes them; the first rule is shown
+  // settings: {rules, seed, ramp, constants} as npa_envs/web/export.py writes them; the first rule is shown
   // first. send(event, transferred) hands an event to the page; device: a graphics card, or null.
   // settings.engine: "auto" tries the card and keeps what is faster, "gpu" takes it untried.
   constructor(settings, send, device = null) {
@@ -37,6 +23,7 @@ export class LiveWorld {
     this.engine = settings.engine ?? "auto";
     this.rules = settings.rules.map(decoded);
     this.ramp = bytesOf(settings.ramp);
+    this.constants = settings.constants;
     this.send = send;
     this.playing = true;
     this.changed = false;
@@ -214,7 +201,7 @@ export class LiveWorld {
 
   // Applies a brush; page.js describes the message.
   brush({ tool, at, move, radius, strength, source, rule, view }) {
-    const { dimension, box } = this;
+    const { dimension, box, constants } = this;
     const { x, s, species } = this.world;
     if (tool === "remove") {
       const gone = new Set(insideBall(x, dimension, at, radius, box));
@@ -222,20 +209,21 @@ export class LiveWorld {
     } else if (tool === "push") {
       push(x, dimension, at, move, radius, Math.min(1, 0.5 + strength), box);
     } else if (tool === "clump") {
-      clump(x, dimension, at, radius, CLUMP_RATE * strength, box);
+      clump(x, dimension, at, radius, constants.CLUMP_RATE * strength, box);
     } else if (tool === "cut") {
       const half = move.map((part) => part / 2);
       const normal = dimension === 2 ? [-move[1], move[0]] : cross(view ?? [0, 0, 1], move);
       cut(x, dimension, at.map((part, d) => part + half[d]), normal, radius, half, box);
     } else if (tool === "inject") {
       const state = stateAround(x, s, dimension, source ?? at, radius, box);
-      if (state !== null) inject(x, s, dimension, at, radius, state, INJECT_RATE * strength, box);
+      if (state !== null) inject(x, s, dimension, at, radius, state, constants.INJECT_RATE * strength, box);
     } else if (tool === "graft") {
       const inside = insideBall(x, dimension, at, radius, box);
       const number = this.speciesOf(rule, this.full);
       for (const i of inside) species[i] = number;
     } else if (tool === "add") {
-      this.add(at, radius, Math.max(LEAST_SEED, Math.round(strength * SEED_SHARE * this.full)), rule);
+      const count = Math.round(strength * constants.SEED_FRACTION * this.full);
+      this.add(at, radius, Math.max(constants.LEAST_SEED, count), rule);
     } else throw Error(`no brush is called ${tool}`);
     if (box !== null) wrap(this.world.x, this.world.count, box);
   }
@@ -275,7 +263,7 @@ export class LiveWorld {
     const number = this.species.indexOf(rule);
     if (number >= 0) return number;
     if (!this.mayJoin(rule)) {
-      throw Error(`${name} cannot live in a world of ${this.rule.name}: rules of one world must agree in ${AGREEMENTS.join(", ")}`);
+      throw Error(`${name} cannot live in a world of ${this.rule.name}: rules of one world must agree in ${this.constants.AGREEMENTS.join(", ")}`);
     }
     this.species.push(rule);
     this.divisors.push(divisor);
@@ -285,20 +273,20 @@ export class LiveWorld {
   }
 
   mayJoin(rule) {
-    return AGREEMENTS.every((what) => rule[what] === this.rule[what]);
+    return this.constants.AGREEMENTS.every((what) => rule[what] === this.rule[what]);
   }
 
   // Damage at a random place, or through the middle at a random angle.
   damage(name) {
-    const { dimension, random } = this;
+    const { dimension, random, constants } = this;
     const { x, s, count } = this.world;
-    const size = DAMAGE_SIZES[name];
+    const size = constants.DAMAGE_SIZES[name];
     if (size === undefined) throw Error(`no damage is called ${name}`);
     if (count === 0) return;
     const particle = random.below(count);
     const centre = x.slice(particle * dimension, (particle + 1) * dimension);
     if (name === "wipe") wipeState(x, s, dimension, centre, size, null);
-    if (name === "clump") clump(x, dimension, centre, size, CLUMP_FACTOR, null);
+    if (name === "clump") clump(x, dimension, centre, size, constants.CLUMP_FACTOR, null);
     if (name === "cut") cut(x, dimension, meanOf(x, dimension), random.direction(dimension), size, null, null);
     if (name === "noise") random.normals(x.length, size).forEach((part, k) => (x[k] += part));
     if (this.box !== null) wrap(x, count, this.box);

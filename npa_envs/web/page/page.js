@@ -14,7 +14,7 @@
 //   {type: "set", name, value}         name: a key of the world's `settings`, or "rule", "show",
 //                                      "loss" (true while its plot is open: else it is not computed)
 //   {type: "brush", tool, at, move, radius, strength, source?, rule?, view?}
-//                                      tool: remove | push | clump | cut | inject | graft | add
+//                                      tool: the name of one of the world's `tools`
 //                                      at, move: [x, y] or [x, y, z] [length units]; push, clump and
 //                                      inject come again and again while the pointer is down, cut
 //                                      once, at its end: the line from `at` to `at + move`, of
@@ -36,6 +36,7 @@
 //       particle's spot [length units]; rules: names that `rule` may take; others: names that graft
 //       and add may take; species: names of the rules of the world's particles; settings: {name:
 //       {value, low, high, scale?: "log", whole?: true}} with names among eps, update_prob, noise, count, speed (steps a frame);
+//       tools: [{name, label, icon, takes}], the rows of TOOLS in npa_envs/web/live.py;
 //       capabilities: some of "step", "reset", "film", "loss".
 //       A key that an engine leaves out is as in `BLANK` below.
 //   {type: "frame", step, positions, colours, milliseconds, loss?}
@@ -63,15 +64,10 @@ const BLANK = {
   capabilities: [], playing: true, seed: 0,
 };
 
-const TOOLS = {
-  look: ["Look: drag to move, wheel or pinch to zoom, double click to see all", "M12 5v14M5 12h14M12 5l-2 2M12 5l2 2M12 19l-2-2M12 19l2-2M5 12l2-2M5 12l2 2M19 12l-2-2M19 12l-2 2"],
-  remove: ["Remove", "M4 15l8-9 7 6-7 8H8zM9 20h11"],
-  push: ["Pull with the pointer", "M12 20c-4 0-6-3-7-7 2-1 3 0 4 2V6a1.4 1.4 0 0 1 3 0v5a1.4 1.4 0 0 1 3 0v1a1.4 1.4 0 0 1 3 0v3c0 3-2 5-6 5z"],
-  clump: ["Clump", "M4 4l5 5M20 4l-5 5M4 20l5-5M20 20l-5-5M9 6v3H6M15 6v3h3M9 18v-3H6M15 18v-3h3"],
-  cut: ["Cut along a line", "M5 19L19 5M6 8a2 2 0 1 0 0-.1M16 18a2 2 0 1 0 0-.1M8 9l8 8"],
-  inject: ["Inject: the state of where you press spreads to where you drag", "M4 20l3-1 8-8-2-2-8 8zM12 8l4 4M14 10l3-4a1.8 1.8 0 0 1 3 0 1.8 1.8 0 0 1-1 3l-4 2"],
-  graft: ["Graft: particles take another rule", "M12 21v-9M12 12c0-5 3-7 8-7 0 5-3 7-8 7zM12 15c0-4-3-6-8-6 0 4 3 6 8 6z"],
-  add: ["Add a seed of another rule", "M12 4a8 8 0 1 0 .1 0M12 8v8M8 12h8"],
+// The page's own tool; a world says which brushes it offers.
+const LOOK = {
+  name: "look", takes: "", label: "Look: drag to move, wheel or pinch to zoom, double click to see all",
+  icon: "M12 5v14M5 12h14M12 5l-2 2M12 5l2 2M12 19l-2-2M12 19l2-2M5 12l2-2M5 12l2 2M19 12l-2-2M19 12l-2 2",
 };
 
 const ICONS = {
@@ -118,7 +114,8 @@ class Page {
     const wanted = new URLSearchParams(location.search).get("painter");
     this.painter = makePainter(this.canvas, wanted ?? "auto");
     this.tracers = new Tracers();
-    this.tool = "look";
+    this.tool = LOOK.name;
+    this.takes = LOOK.takes;
     this.pointers = new Map();
     this.recording = null;
     this.frameTimes = [];
@@ -160,8 +157,9 @@ class Page {
       this.frame = null;
       // Also the undrawn frames of the former world: the engine waits for each.
       this.tellDrawn();
-      const first = world.tools.includes("remove") && world.dimension === 2 ? "remove" : "look";
-      const keep = before.dimension === world.dimension && world.tools.includes(this.tool);
+      const has = (tool) => world.tools.some(({ name }) => name === tool);
+      const first = has("remove") && world.dimension === 2 ? "remove" : LOOK.name;
+      const keep = before.dimension === world.dimension && has(this.tool);
       this.choose(keep ? this.tool : first);
     }
     if (before.rule !== world.rule || before.seed !== world.seed) {
@@ -179,7 +177,7 @@ class Page {
     options($("other"), world.others, other);
     options($("show"), world.shows, world.show);
     $("rule-field").hidden = world.rules.length < 2;
-    $("other-field").hidden = !world.tools.some((tool) => tool === "graft" || tool === "add");
+    $("other-field").hidden = !world.tools.some(({ takes }) => takes === "rule");
     $("brush").hidden = !world.tools.length;
     $("one").disabled = !world.capabilities.includes("step");
     $("reset").disabled = !world.capabilities.includes("reset");
@@ -270,13 +268,13 @@ class Page {
   }
 
   showTools() {
-    const names = ["look", ...this.world.tools.filter((name) => name in TOOLS)];
-    if ($("tools").dataset.names === names.join()) return;
-    $("tools").dataset.names = names.join();
-    $("tools").replaceChildren(...names.map((name, k) => {
+    const tools = [LOOK, ...this.world.tools], names = tools.map(({ name }) => name).join();
+    if ($("tools").dataset.names === names) return;
+    $("tools").dataset.names = names;
+    $("tools").replaceChildren(...tools.map(({ name, label, icon: path }, k) => {
       const button = document.createElement("button");
-      button.innerHTML = icon(TOOLS[name][1]);
-      button.title = `${TOOLS[name][0]} (${k + 1})`;
+      button.innerHTML = icon(path);
+      button.title = `${label} (${k + 1})`;
       button.dataset.tool = name;
       button.setAttribute("role", "radio");
       button.setAttribute("aria-label", name);
@@ -288,6 +286,7 @@ class Page {
 
   choose(name) {
     this.tool = name;
+    this.takes = this.world.tools.find((tool) => tool.name === name)?.takes ?? "";
     for (const button of $("tools").children)
       button.setAttribute("aria-checked", String(button.dataset.tool === name));
     if (name === "look") $("cursor").hidden = true;
@@ -405,7 +404,7 @@ class Page {
     }
     const near = this.nearness(place);
     this.stroke = { near, from: place, at: place, sent: place };
-    if (this.tool !== "cut") this.brush(place, [0, 0]);
+    if (this.takes !== "line") this.brush(place, [0, 0]);
     this.showCursor(place);
   }
 
@@ -434,7 +433,7 @@ class Page {
   release(event) {
     const { stroke } = this;
     this.pointers.delete(event.pointerId);
-    if (stroke && this.tool === "cut" && event.type === "pointerup") {
+    if (stroke && this.takes === "line" && event.type === "pointerup") {
       const move = [stroke.at[0] - stroke.from[0], stroke.at[1] - stroke.from[1]];
       if (Math.hypot(...move) > 4) this.brush(stroke.from, move);
     }
@@ -471,15 +470,15 @@ class Page {
       type: "brush", tool: this.tool, at: wrapped, move,
       radius: this.radius(), strength: +$("strength").value,
     };
-    if (this.tool === "inject") message.source = stroke?.source ?? wrapped;
-    if (this.tool === "graft" || this.tool === "add") message.rule = $("other").value;
+    if (this.takes === "source") message.source = stroke?.source ?? wrapped;
+    if (this.takes === "rule") message.rule = $("other").value;
     if (dimension === 3) message.view = camera.axes[2];
     this.send(message);
   }
 
   // A cut is a line: of its radius only a part is the gap.
   radius() {
-    return +$("radius").value * (this.tool === "cut" ? 0.4 : 1);
+    return +$("radius").value * (this.takes === "line" ? 0.4 : 1);
   }
 
   showCursor([column, row]) {
@@ -490,7 +489,7 @@ class Page {
     cursor.style.width = cursor.style.height = `${size}px`;
     cursor.style.transform = `translate(${column - size / 2}px, ${row - size / 2}px)`;
     cursor.classList.toggle("pressed", Boolean(stroke));
-    knife.hidden = !(stroke && this.tool === "cut");
+    knife.hidden = !(stroke && this.takes === "line");
     if (!knife.hidden) {
       const across = column - stroke.from[0], down = row - stroke.from[1];
       knife.style.width = `${Math.hypot(across, down)}px`;
@@ -504,7 +503,7 @@ class Page {
   tick() {
     requestAnimationFrame(() => this.tick());
     const { stroke } = this;
-    if (stroke && !["cut", "graft", "add"].includes(this.tool)) {
+    if (stroke && !["line", "rule"].includes(this.takes)) {
       const move = [stroke.at[0] - stroke.sent[0], stroke.at[1] - stroke.sent[1]];
       if (this.tool !== "push" || Math.hypot(...move) > 0) this.brush(stroke.sent, move);
       stroke.sent = stroke.at;
