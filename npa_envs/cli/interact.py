@@ -87,11 +87,12 @@ def main(arguments: Sequence[str]) -> int:
     shipped = list(shipped_rules(TASK))[: 2 if options.quick else None]
     device = options.checked_device()
     rules = _rules(options.rules or shipped, device)
-    pairs = [
-        (first, second)
-        for first, second in itertools.product(rules, rules)
-        if options.itself or first is not second
-    ]
+    pairs: dict[str, tuple[RuleUnderTest, RuleUnderTest]] = {}
+    for first, second in itertools.product(rules, rules):
+        if options.itself or first is not second:
+            name = f"{first.name}-{second.name}"
+            # Different pairs can have the same name if those of rules contain hyphens.
+            pairs[f"{name}-2" if name in pairs else name] = first, second
     if not pairs:
         raise NPAError(
             f"rules must be two or more without itself, got {rules[0].name}: name another one, "
@@ -111,25 +112,30 @@ def main(arguments: Sequence[str]) -> int:
     path = folder / "interactions.json"
     record = interaction.InteractionRecord(facts, path).read()
     done = {(row.rule, row.beside) for row in record.rows}
-    missing = [(a, b) for a, b in pairs if (a.name, b.name) not in done]
+    missing = {n: (a, b) for n, (a, b) in pairs.items() if (a.name, b.name) not in done}
+    if done:
+        print(f"{len(pairs) - len(missing)} of {len(pairs)} pairs were measured before")
     # A rule is grown alone once for each ratio and radius.
-    runs = len(missing) * len(settings.distances) + len({first.name for first, _ in missing})
+    runs = len(missing) * len(settings.distances) + len(
+        {first.name for first, _ in missing.values()}
+    )
     total = runs * len(settings.ratios) * len(settings.eps_factors) * settings.steps
     with common.StepBar(total, show=options.progress) as bar:
         encounters = interaction.Encounters(settings, device=device, progress=bar.advance)
         encounters.check(rules)
-        for first, second in missing:
-            rows, scenes = encounters.meet(first, second)
-            strip = folder / f"{first.name}-{second.name}.png"
+        for name, pair in missing.items():
+            rows, scenes = encounters.meet(*pair)
             columns = len(scenes.frames) // len(rows)
-            write_filmstrip(strip, scenes.frames, scenes.captions, columns=columns)
+            write_filmstrip(folder / f"{name}.png", scenes.frames, scenes.captions, columns=columns)
             record.add(*rows)
 
     def phases() -> dict[str, bytes]:
-        by_pair: dict[tuple[str, str], list[interaction.InteractionRow]] = {}
-        for row in record.rows:
-            by_pair.setdefault((row.rule, row.beside), []).append(row)
-        return {"-".join(pair): interaction.phase_diagram(rows) for pair, rows in by_pair.items()}
+        return {
+            name: interaction.phase_diagram(
+                [row for row in record.rows if (row.rule, row.beside) == (a.name, b.name)]
+            )
+            for name, (a, b) in pairs.items()
+        }
 
     print(record.table())
     print(f"wrote {path} and a filmstrip of each pair")

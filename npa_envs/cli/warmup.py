@@ -1,4 +1,4 @@
-"""`npa-envs warmup`: compile the kernels before they are needed."""
+"""`npa-envs warmup`: compiles the kernels ahead of time."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from npa_envs.errors import NPAError
 
 @dataclass(frozen=True, kw_only=True)
 class WarmupOptions(common.DeviceOptions):
-    """Compile the kernels ahead of time, into Warp's cache (`npa-envs doctor` says where)."""
+    """Compile the kernels ahead of time, into Warp's cache (`npa-envs doctor` prints where)."""
 
     space_dims: tuple[int, ...] = (2,)
     """Space dimensions: 2, 3 or both."""
@@ -22,7 +22,7 @@ class WarmupOptions(common.DeviceOptions):
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Compile what the words after `npa-envs warmup` ask for; return 0."""
+    """Compile the kernels; return 0."""
     options = common.parse_options(WarmupOptions, "warmup", arguments)
     import torch
 
