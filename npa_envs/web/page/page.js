@@ -1,7 +1,5 @@
-// The page: one canvas, brushes, controls and plots over an engine that moves the particles.
-//
-// An engine is a function `connect`: that of `viewer.js` speaks to a server that runs the Python engine,
-// that of `exported.js` computes in the page. Nothing else knows which one runs.
+// The page: a canvas, brushes, controls and plots. An engine runs the world: its function `connect` is
+// that of `viewer.js`, for a server in Python, or of `exported.js`, for a worker in the page.
 //
 //   const engine = await connect(settings, listener);   // settings: those of `start`
 //   engine.send(message);                               // page -> engine, a JSON object
@@ -15,42 +13,41 @@
 //                                      "loss" (true while its plot is open: else it is not computed)
 //   {type: "brush", tool, at, move, radius, strength, source?, rule?, view?}
 //                                      tool: the name of one of the world's `tools`
-//                                      at, move: [x, y] or [x, y, z] [length units]; push, clump and
-//                                      inject come again and again while the pointer is down, cut
-//                                      once, at its end: the line from `at` to `at + move`, of
-//                                      half-width `radius`; strength in [0, 1]; source: of inject,
-//                                      where the state comes from; rule: of graft and add, a name of
-//                                      `rules`; view: in 3D the unit vector towards the viewer
+//                                      at, move: [x, y] or [x, y, z] [length units]; sent for each
+//                                      drawn frame while the pointer is down, by cut once, at the
+//                                      end: the line from `at` to `at + move`, of half-width
+//                                      `radius`; strength in [0, 1]; source (inject): where the
+//                                      state comes from; rule (graft, add): a name of `rules`;
+//                                      view (3D): the unit vector towards the viewer
 //   {type: "damage", name}             one of the world's `damages`, at a random place
-//   {type: "drawn"}                    the page has drawn a frame and is ready for another. An engine
-//                                      has at most two frames on the way: a page that is slow or
-//                                      hidden holds the world, it does not lag behind it.
-//   {type: "film", action}             where capabilities hold "film": "start", "stop"; between them
+//   {type: "drawn"}                    the page has drawn a frame. An engine sends at most two frames
+//                                      that are not drawn yet: it waits for a slow or hidden page.
+//   {type: "film", action}             "start" or "stop", if capabilities contain "film"; between them
 //                                      the page sends pictures as Blob objects by engine.send(blob)
 //
 // Events:
 //   {type: "world", title, note, dimension, box, centre, half_width, spot, rules, rule, others,
 //    species, shows, show, tools, damages, settings, capabilities, playing, seed}
-//       once, and after changes. note: a sentence for the reader, or ""; box: sides [length units] or
-//       null; centre, half_width: what the canvas shows at first; spot: standard deviation of a
-//       particle's spot [length units]; rules: names that `rule` may take; others: names that graft
-//       and add may take; species: names of the rules of the world's particles; settings: {name:
-//       {value, low, high, scale?: "log", whole?: true}} with names among eps, update_prob, noise, count, speed (steps a frame);
+//       once, and after changes. note: a sentence for the user, or ""; box: sides [length units] or
+//       null; centre, half_width: the first view; spot: standard deviation of a particle's spot
+//       [length units]; rules: choices of `rule`; others: choices of graft and add; species: names of
+//       the rules of the world's particles; settings: {name: {value, low, high, scale?: "log",
+//       whole?: true}}, names: eps, update_prob, noise, count, speed (steps a frame);
 //       tools: [{name, label, icon, takes}], the rows of TOOLS in npa_envs/web/live.py;
 //       capabilities: some of "step", "reset", "film", "loss".
-//       A key that an engine leaves out is as in `BLANK` below.
+//       `BLANK` below has the defaults of missing keys.
 //   {type: "frame", step, positions, colours, milliseconds, loss?}
 //       positions: Float32Array, count * dimension; colours: Uint8Array, count * 3 (red, green, blue);
-//       milliseconds: one step took so long; loss: where it was computed
-//   {type: "reordered"}                                            particles stand elsewhere in frames
+//       milliseconds: time of a step; loss: if it was computed
+//   {type: "reordered"}                                            particles have other indices
 //   {type: "curve", name, points: [[x, y], ...], append?}          a plot of a training run
-//   {type: "film", action: "stop"}                                 the film is as long as it may be
+//   {type: "film", action: "stop"}                                 the film has its greatest length
 //   {type: "file", name, url}                                      a file of a film is ready
 //   {type: "error", message}
 //
-// index.html loads viewer.js. For the exported page, exported.js and the modules that it imports are
-// joined into one file. For that, imports are single lines of names in braces, exports stand before
-// `function`, `class` or `const`, and top-level names differ between modules.
+// index.html loads viewer.js. npa_envs/web/export.py joins exported.js and its imports into one file.
+// For that, imports are single lines of names in braces, and exports stand before `function`, `class`
+// or `const`.
 //
 // `show`: "colours", "density", "species", "speed", "mask", "components" (the first three principal
 // components of the state as red, green and blue), "state 0", "state 1", ...
@@ -97,7 +94,7 @@ export async function start(connect, settings) {
     page.engine = await connect(settings, (event) => page.listen(event));
     for (const message of page.waiting.splice(0)) page.engine.send(message);
   } catch (error) {
-    page.complain(error.message);
+    page.showError(error.message);
   }
   return page;
 }
@@ -108,7 +105,7 @@ class Page {
     this.waiting = [];
     this.world = { ...BLANK };
     this.frame = null;
-    this.undrawn = 0; // frames that came since the last one was drawn
+    this.undrawn = 0; // frames received since the last drawing
     this.camera = new Camera(2, BLANK.half_width);
     this.canvas = $("world");
     const wanted = new URLSearchParams(location.search).get("painter");
@@ -125,9 +122,9 @@ class Page {
     };
     this.curves = {};
     this.dirty = true;
-    this.build();
-    this.watch();
-    requestAnimationFrame(() => this.tick());
+    this.buildControls();
+    this.watchPointers();
+    requestAnimationFrame(() => this.drawIfNeeded());
   }
 
   send(message) {
@@ -141,22 +138,22 @@ class Page {
     if (event.type === "frame") {
       this.frame = event;
       this.undrawn++;
-    } else if (event.type === "world") this.meet(event);
+    } else if (event.type === "world") this.readWorld(event);
     else if (event.type === "curve") this.curve(event);
     else if (event.type === "reordered") this.tracers.clear();
     else if (event.type === "film" && this.recording?.picture) this.showRecording((this.recording = null));
-    else if (event.type === "file") this.offer(event.name, event.url);
-    else if (event.type === "error") this.complain(event.message);
+    else if (event.type === "file") this.offerFile(event.name, event.url);
+    else if (event.type === "error") this.showError(event.message);
   }
 
-  meet(event) {
+  readWorld(event) {
     const before = this.world, world = { ...BLANK, ...event };
     this.world = world;
-    if (!this.met || before.dimension !== world.dimension || before.half_width !== world.half_width) {
+    if (!this.described || before.dimension !== world.dimension || before.half_width !== world.half_width) {
       this.camera = new Camera(world.dimension, world.half_width, world.centre);
       this.frame = null;
-      // Also the undrawn frames of the former world: the engine waits for each.
-      this.tellDrawn();
+      // Also for undrawn frames of the former world: the engine waits for each.
+      this.reportDrawn();
       const has = (tool) => world.tools.some(({ name }) => name === tool);
       const first = has("remove") && world.dimension === 2 ? "remove" : LOOK.name;
       const keep = before.dimension === world.dimension && has(this.tool);
@@ -166,7 +163,7 @@ class Page {
       this.tracers.clear();
       Object.values(this.plots).forEach((plot) => plot.clear());
     }
-    this.met = true;
+    this.described = true;
     document.title = `${world.title} · npa-envs`;
     $("title").textContent = world.title;
     $("note").textContent = world.note;
@@ -195,7 +192,7 @@ class Page {
     plot.draw();
   }
 
-  offer(name, url) {
+  offerFile(name, url) {
     const item = document.createElement("li"), link = document.createElement("a");
     Object.assign(link, { href: url, download: name, textContent: name });
     item.append(link);
@@ -204,7 +201,7 @@ class Page {
     return link;
   }
 
-  complain(message) {
+  showError(message) {
     $("message").textContent = message;
     $("message").hidden = false;
     clearTimeout(this.quiet);
@@ -213,7 +210,7 @@ class Page {
 
   // Controls.
 
-  build() {
+  buildControls() {
     $("one").innerHTML = icon(ICONS.one);
     $("reset").innerHTML = icon(ICONS.reset);
     $("fold").innerHTML = icon(ICONS.fold);
@@ -304,7 +301,7 @@ class Page {
     }));
   }
 
-  // Sliders are made once and kept, so that one that is being dragged stays under the finger.
+  // Sliders are made once and updated, so that a dragged one is not replaced.
   showSettings() {
     const { settings } = this.world;
     $("speed-field").hidden = !settings.speed;
@@ -344,7 +341,7 @@ class Page {
     input.oninput = () => {
       output.textContent = short(read());
       clearTimeout(this.settling);
-      // A world is made anew for another number of particles: only once the slider rests.
+      // Another number of particles restarts the world: sent only once the slider rests.
       const send = () => this.send({ type: "set", name, value: read() });
       if (name === "count") this.settling = setTimeout(send, 150);
       else send();
@@ -364,9 +361,9 @@ class Page {
     act();
   }
 
-  // Pointers: one works, two look.
+  // Pointers: one uses the tool, two move the camera.
 
-  watch() {
+  watchPointers() {
     const { canvas } = this;
     canvas.onpointerdown = (event) => this.press(event);
     canvas.onpointermove = (event) => this.move(event);
@@ -443,7 +440,7 @@ class Page {
     if (event.pointerType !== "mouse") $("cursor").hidden = true;
   }
 
-  // How near the surface under the pointer is: brushes of 3D worlds work there.
+  // Nearness of the surface under the pointer, where brushes of 3D worlds act.
   nearness([column, row]) {
     const { frame, camera, canvas } = this;
     if (!frame || this.world.dimension !== 3) return 0;
@@ -457,7 +454,7 @@ class Page {
     return Number.isFinite(nearest) ? nearest : 0;
   }
 
-  // The brush at a place on the canvas, moved so many pixels.
+  // Sends the brush at a place on the canvas, with its movement in pixels.
   brush(place, pixels) {
     const { camera, canvas, world, stroke } = this;
     const width = canvas.clientWidth, height = canvas.clientHeight, { dimension, box } = world;
@@ -476,7 +473,7 @@ class Page {
     this.send(message);
   }
 
-  // A cut is a line: of its radius only a part is the gap.
+  // The brush's radius [length units]; for a line the width of its gap.
   radius() {
     return +$("radius").value * (this.takes === "line" ? 0.4 : 1);
   }
@@ -500,8 +497,8 @@ class Page {
 
   // Each frame of the screen: the brush, and new frames of the world.
 
-  tick() {
-    requestAnimationFrame(() => this.tick());
+  drawIfNeeded() {
+    requestAnimationFrame(() => this.drawIfNeeded());
     const { stroke } = this;
     if (stroke && !["line", "rule"].includes(this.takes)) {
       const move = [stroke.at[0] - stroke.sent[0], stroke.at[1] - stroke.sent[1]];
@@ -512,18 +509,18 @@ class Page {
       this.brush(stroke.at, [0, 0]);
     }
     if (!this.undrawn && !this.dirty) return;
-    if (this.undrawn) this.take();
+    if (this.undrawn) this.readFrame();
     this.draw();
-    this.tellDrawn();
+    this.reportDrawn();
     this.dirty = false;
   }
 
-  // Also of frames that later ones have replaced: the engine waits for each.
-  tellDrawn() {
+  // Also for frames that later ones have replaced: the engine waits for each.
+  reportDrawn() {
     for (; this.undrawn > 0; this.undrawn--) this.send({ type: "drawn" });
   }
 
-  take() {
+  readFrame() {
     const { frame, world } = this, now = performance.now();
     if ($("tracers").checked) this.tracers.add(frame.positions, world.dimension);
     this.frameTimes.push(now);
@@ -543,12 +540,12 @@ class Page {
 
   draw({ still = false } = {}) {
     const { canvas, frame, world, camera } = this;
-    // More pixels are invisible, and slow where the processor draws.
+    // More pixels are invisible, and slow without a graphics card.
     const ratio = Math.min(devicePixelRatio || 1, 1600 / Math.max(canvas.clientWidth, canvas.clientHeight, 1), 2);
     const width = Math.round(canvas.clientWidth * ratio), height = Math.round(canvas.clientHeight * ratio);
     if (!width || !height) return;
     if (canvas.width !== width || canvas.height !== height) Object.assign(canvas, { width, height });
-    // What fills the canvas may lie under the bar as well.
+    // A box may also extend below the bar.
     camera.covered = world.box ? 0 : (canvas.clientHeight - $("bar").offsetTop) / canvas.clientHeight;
     this.painter.draw({
       positions: frame?.positions ?? new Float32Array(), colours: frame?.colours ?? new Uint8Array(),
@@ -566,11 +563,11 @@ class Page {
     this.draw({ still: true });
     this.canvas.toBlob((blob) => {
       const name = `${this.world.title}-${this.frame?.step ?? 0}.png`.replace(/[^\w.-]+/g, "-");
-      this.offer(name, URL.createObjectURL(blob)).click();
+      this.offerFile(name, URL.createObjectURL(blob)).click();
     }, "image/png");
   }
 
-  // An engine that makes films gets pictures; else the browser records the canvas.
+  // Sends pictures to an engine that makes films; else the browser records the canvas.
   record(on) {
     this.showRecording(on);
     if (!on) {
@@ -581,7 +578,7 @@ class Page {
       this.recording = { picture, last: 0, stop: () => this.send({ type: "film", action: "stop" }) };
       this.send({ type: "film", action: "start" });
       this.dirty = true;
-    } else this.recording = recorder(this.canvas, (name, url) => this.offer(name, url));
+    } else this.recording = recorder(this.canvas, (name, url) => this.offerFile(name, url));
   }
 
   showRecording(on) {
@@ -623,7 +620,7 @@ function numbers(hex) {
   return [1, 3, 5].map((k) => parseInt(hex.trim().slice(k, k + 2), 16) / 255);
 }
 
-// Choices are stored where the browser allows it.
+// Choices are stored if the browser allows it.
 function keep(name, value) {
   try { localStorage.setItem(`npa-envs ${name}`, value); } catch { /* private windows */ }
 }
