@@ -1,4 +1,4 @@
-"""The command `npa-envs`: one module a sub-command, imported only when it is asked for."""
+"""The command `npa-envs`: each sub-command is a module, imported only when it is called."""
 
 from __future__ import annotations
 
@@ -10,47 +10,57 @@ from collections.abc import Sequence
 
 from npa_envs.errors import NPAError, suggest
 
-COMMANDS = {
-    "demo": "grow, hurt and heal the shipped rule, and train a small one; about a minute on a CPU",
-    "train": "train a rule on a task",
-    "learn": "learn an environment by reinforcement learning, on one GPU or several",
-    "sweep": "train with every combination of some options, over devices and machines",
-    "rollout": "grow a rule from its seed, with damage on the way; writes GIF, MP4 and a filmstrip",
-    "view": "watch and touch a rule, a training run or an environment in the browser",
-    "export-web": "rules as one HTML file that runs in any browser, without a server",
-    "evaluate": "measure a rule: loss, PSNR, overflow and extent over thousands of steps",
-    "interact": "grow rules next to each other and measure how each changes the other",
-    "bench": "run time against error, the paper's table, scaling; a call explained",
-    "stress": "hard cases, what is expected of each, and where things break",
-    "robustness": "losses of rules under other conditions and recovery times after damage",
-    "compare": "reinforcement learning, evolution and the gradient on the same tasks",
-    "search": "rules nobody asked for: an archive of what differs and stays alive, as an atlas",
-    "record": "episodes of a policy as a dataset of Minari",
-    "list": "tasks, presets, environments, built-in targets, losses, shipped rules",
-    "warmup": "compile the kernels ahead of time",
-    "doctor": "what is broken, slow or missing on this machine, and the cure",
+GROUPS = {
+    "make": {
+        "demo": "grow a shipped rule, damage it, let it heal; train a small one: a minute on a CPU",
+        "train": "train a rule on a task",
+        "sweep": "train with every combination of some options, over devices and machines",
+        "search": "search for rules that differ from each other and stay alive; an archive of them",
+    },
+    "look": {
+        "view": "watch a rule, a training run or an environment in the browser, with brushes",
+        "rollout": "grow a rule from its seed, with damage; writes GIF, MP4 and a filmstrip",
+        "export-web": "write an HTML file that runs rules in any browser, without a server",
+        "list": "list tasks, presets, environments, targets, losses and shipped rules",
+    },
+    "learn": {
+        "learn": "reinforcement learning of an environment, on one GPU or several",
+        "compare": "compare reinforcement learning, evolution and the gradient on equal tasks",
+        "record": "write episodes of a policy as a Minari dataset",
+    },
+    "measure": {
+        "evaluate": "loss, PSNR, overflow and extent of a rule over thousands of steps",
+        "robustness": "losses of rules under changed conditions; recovery times after damage",
+        "interact": "how rules that grow next to each other change each other",
+        "stress": "correctness: hard cases, each with an expectation and a verdict",
+        "bench": "speed: the paper's table and scaling; which kernels a step runs, and why",
+        "doctor": "what is broken, slow or missing on this machine, and how to fix it",
+        "warmup": "compile the kernels ahead of time",
+    },
 }
-"""Every sub-command with its summary."""
+"""The sub-commands with their summaries, in the groups of the help."""
+
+COMMANDS = {name: summary for group in GROUPS.values() for name, summary in group.items()}
 
 USAGE_ERROR = 2
 INTERRUPTED = 130
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command line, by default the process's words, and return the exit code.
+    """Run the command line, by default the process's arguments, and return the exit code.
 
-    That is 0, 2 for a mistake in what was asked for, or 130 after Ctrl-C.
+    The code is 0, 2 for a mistake in the arguments, or 130 after Ctrl-C.
     """
-    # Read once, when torch is loaded: where other programs want the cores, threads that wait in
-    # busy loops make every operation several times as slow.
+    # Read when torch is loaded. On a busy machine, threads that wait in busy loops make every
+    # operation several times as slow.
     os.environ.setdefault("OMP_WAIT_POLICY", "passive")
-    words = list(sys.argv[1:] if arguments is None else arguments)
+    given = list(sys.argv[1:] if arguments is None else arguments)
     for stream in (sys.stdout, sys.stderr):
-        # Terminals without UTF-8 show "?" for letters that they lack.
+        # Terminals without UTF-8 show "?" for letters that are missing.
         if isinstance(stream, io.TextIOWrapper) and stream.encoding.lower() != "utf-8":
             stream.reconfigure(errors="replace")
     try:
-        return _dispatch(words)
+        return _dispatch(given)
     except NPAError as error:
         print(f"npa-envs: error: {' '.join(str(error).split())}", file=sys.stderr)
         return USAGE_ERROR
@@ -58,8 +68,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print("npa-envs: interrupted", file=sys.stderr)
         return INTERRUPTED
     except BrokenPipeError:
-        # The reader of a pipe (head, less) has seen enough; the interpreter's own flush at its
-        # end must not complain about that either.
+        # The reader of a pipe (head, less) has ended. The interpreter's last flush must not raise
+        # the same error.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
     except OSError as error:
@@ -72,16 +82,16 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return USAGE_ERROR
 
 
-def _dispatch(words: list[str]) -> int:
-    if not words or words[0] in {"-h", "--help", "help"}:
+def _dispatch(arguments: list[str]) -> int:
+    if not arguments or arguments[0] in {"-h", "--help", "help"}:
         print(_help())
-        return 0 if words else USAGE_ERROR
-    if words[0] in {"-V", "--version"}:
+        return 0 if arguments else USAGE_ERROR
+    if arguments[0] in {"-V", "--version"}:
         from npa_envs import __version__
 
         print(f"npa-envs {__version__}")
         return 0
-    name, rest = words[0], words[1:]
+    name, rest = arguments[0], arguments[1:]
     if name not in COMMANDS:
         raise NPAError(f"unknown command {name!r}: {suggest(name, COMMANDS)}")
     module = {"list": "listing"}.get(name, name.replace("-", "_"))
@@ -90,7 +100,10 @@ def _dispatch(words: list[str]) -> int:
 
 def _help() -> str:
     width = max(map(len, COMMANDS))
-    lines = "\n".join(f"  {name:<{width}}  {summary}" for name, summary in COMMANDS.items())
+    lines = "\n".join(
+        "\n".join([f"{group}:", *(f"  {name:<{width}}  {text}" for name, text in commands.items())])
+        for group, commands in GROUPS.items()
+    )
     return (
         "usage: npa-envs COMMAND [options]\n\n"
         "Neural Particle Automata: differentiable particle worlds.\n\n"

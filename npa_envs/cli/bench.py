@@ -1,4 +1,4 @@
-"""`npa-envs bench`: the paper's table, scaling, and a call explained."""
+"""`npa-envs bench`: times of steps and gradients; which kernels a step runs."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from npa_envs.errors import NPAError
 
 @dataclass(frozen=True, kw_only=True)
 class BenchOptions(common.MeasureOptions):
-    """Measure the paper's table, scaling and other times; or explain what a step runs."""
+    """Measure the paper's table, scaling and other times; or list the kernels of a step."""
 
     suite: str | None = None
     """quick (the default), paper, scaling, skips, species or kernels."""
@@ -25,13 +25,14 @@ class BenchOptions(common.MeasureOptions):
     out: Path | None = None
     """Folder for SUITE_DEVICE.json and plots; default: nothing is written."""
     max_seconds: float | None = None
-    """Leave out what has not begun after this time [s]; the rest is written. Default: never."""
+    """Start no measurement after this time [s]; those done are written. Default: never."""
     plots: bool = False
     """Also draw plots into the output folder; needs the extra `bench`."""
     explain: bool = False
-    """Measure nothing: say which kernels a step launches, and why. The options below tell which."""
+    """Measure nothing: print which kernels a step launches, and why. The options below set the
+    step."""
     space_dim: Literal[2, 3] = 2
-    """Space dimension of the step explained."""
+    """Space dimension of the step."""
     world_count: int = 1
     """Its worlds B."""
     particle_count: int = 4096
@@ -45,7 +46,7 @@ class BenchOptions(common.MeasureOptions):
     dtype: Literal["float32", "float64"] = "float32"
     """Its precision."""
     gradients: Literal["none", "weights", "positions"] = "weights"
-    """What it is differentiated by: nothing, weights and states, or positions as well."""
+    """With respect to which inputs: none, weights and states, or also positions."""
 
 
 def main(arguments: Sequence[str]) -> int:
@@ -60,7 +61,7 @@ def main(arguments: Sequence[str]) -> int:
     )
     if options.plots and options.out is None:
         raise NPAError("plots need a folder to be written to: give --out DIR as well")
-    device = options.place()
+    device = options.checked_device()
     (name,) = common.chosen_names("suite", [options.suite or "quick"], suites.SUITES)
     if options.explain:
         import torch

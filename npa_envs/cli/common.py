@@ -1,4 +1,4 @@
-"""Common parts of the commands: options, folders to write to, checks, progress bars."""
+"""Parts of all commands: options, output folders, checks, progress bars."""
 
 from __future__ import annotations
 
@@ -89,10 +89,10 @@ def parse_options(
     description: str | None = None,
     default: OptionsT | None = None,
 ) -> OptionsT:
-    """Return the options of a command; its words override `default` or the dataclass's defaults.
+    """Parse a command's arguments over `default`, or over the dataclass's defaults.
 
-    Ends the process, as parsers do, after `--help` and with code 2 for a wrong word. The help
-    begins with `description` or the dataclass's docstring.
+    Ends the process after `--help`, and with code 2 for a wrong argument. The help begins with
+    `description` or the dataclass's docstring.
     """
     shown = "\n".join(f"  npa-envs {example}" for example in EXAMPLES[command])
     given: dict[str, Any] = {} if default is None else {"default": default}
@@ -114,7 +114,7 @@ class DeviceOptions:
     device: str = "cpu"
     """Where to run: cpu, cuda, cuda:1."""
 
-    def place(self) -> torch.device:
+    def checked_device(self) -> torch.device:
         """Return the checked device."""
         from npa_envs.devices import check_device
 
@@ -131,7 +131,7 @@ class RunOptions(DeviceOptions):
 
 @dataclass(frozen=True, kw_only=True)
 class RuleOptions(RunOptions):
-    """Options of commands that run one rule: which one, in which world, and where."""
+    """Options of commands that run one rule: the rule, its world and the device."""
 
     rule: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="RULE")]
     """A shipped rule (`npa-envs list`), the folder of a run, a file of ours or the authors'
@@ -151,20 +151,22 @@ class RuleOptions(RunOptions):
 
     @property
     def world(self) -> dict[str, Any]:
-        """The options of the rule's world, as `task_of_rule` takes them."""
+        """The options of the rule's world, as keywords of `task_of_rule`."""
         names = ("target", "loss", "data", "particle_count", "eps", "update_prob")
         return {name: getattr(self, name) for name in names}
 
 
-def named_rules(words: Iterable[str]) -> dict[str, str]:
-    """Return rules by name, the package's own first: shipped or presets, files, folders of runs."""
+def named_rules(arguments: Iterable[str]) -> dict[str, str]:
+    """Return the sources of rules by name: the package's rules, then files and run folders."""
     from npa_envs.rule.files import preset_rules, shipped_rules
     from npa_envs.web.rule_world import name_of
 
-    words = list(words)
+    arguments = list(arguments)
     own = [*shipped_rules(), *(name for name in preset_rules() if name not in shipped_rules())]
-    files = [w for w in words if w not in own and (w.endswith(".safetensors") or Path(w).is_dir())]
-    named = [word for word in words if word not in files]
+    files = [
+        w for w in arguments if w not in own and (w.endswith(".safetensors") or Path(w).is_dir())
+    ]
+    named = [word for word in arguments if word not in files]
     found = {name: name for name in (chosen_names("rule", named, own) if named else ())}
     for source in files:
         name = name_of(source)
@@ -178,7 +180,7 @@ def named_rules(words: Iterable[str]) -> dict[str, str]:
 
 
 def duration(seconds: float) -> str:
-    """Return a time [s] in words, in seconds, minutes or hours."""
+    """Return a time [s] as text, in seconds, minutes or hours."""
     for unit, size in (("hours", 3600.0), ("minutes", 60.0)):
         if seconds >= 1.5 * size:
             return f"{seconds / size:.0f} {unit}"
@@ -186,9 +188,9 @@ def duration(seconds: float) -> str:
 
 
 def writable_folder(path: Path, name: str = "out") -> Path:
-    """Create a folder where missing, and check that files can be made in it, before work is done.
+    """Create a folder if it is missing, and check that files can be written to it.
 
-    Errors call it `name`, which is the option of the command.
+    `name` is the command's option, for errors.
     """
     must = "created"
     try:
@@ -210,13 +212,13 @@ class MeasureOptions(RunOptions):
     """Options of the commands that measure and keep records."""
 
     threads: int = 1
-    """CPU threads of torch and of the kernels, of each run; figures are the same, times are not."""
+    """CPU threads of torch and the kernels in each run; they change times, not figures."""
     commit: str | None = None
-    """Commit that is measured; default: that of the checkout."""
+    """The measured commit, for the record; default: that of the checkout."""
 
 
 def check_numbers(options: Any, **least: int) -> None:
-    """Check that options, where given, are large enough, and that `max_seconds` is positive."""
+    """Check that options are None or at least so large, and that `max_seconds` is positive."""
     for name, smallest in least.items():
         value = getattr(options, name)
         if value is not None and value < smallest:
@@ -226,10 +228,10 @@ def check_numbers(options: Any, **least: int) -> None:
         raise NPAError(f"max_seconds must be positive, got {seconds}: leave it out for no limit")
 
 
-def named_values(name: str, words: Iterable[str]) -> dict[str, Any]:
-    """Return the values of words NAME=VALUE of an option, which are JSON or plain text."""
+def named_values(name: str, arguments: Iterable[str]) -> dict[str, Any]:
+    """Parse arguments NAME=VALUE of an option; values are JSON or plain text."""
     found: dict[str, Any] = {}
-    for word in words:
+    for word in arguments:
         key, mark, value = word.partition("=")
         if not mark:
             raise NPAError(f"{name} must be NAME=VALUE, got {word!r}: target=heart")
@@ -240,16 +242,19 @@ def named_values(name: str, words: Iterable[str]) -> dict[str, Any]:
     return found
 
 
-def resolve_resume(words: Sequence[str], out_of: Callable[[Sequence[str]], Path]) -> list[str]:
-    """Return a command's words with `--resume auto` decided by the folder that `out_of` finds."""
+def resolve_resume(arguments: Sequence[str], out_of: Callable[[Sequence[str]], Path]) -> list[str]:
+    """Return arguments in which `--resume auto` is replaced by `--resume` or nothing.
+
+    `out_of` returns the folder of the run, in which a checkpoint is looked for.
+    """
     parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False, exit_on_error=False)
     parser.add_argument("--resume", nargs="?", const=True, choices=("auto",))
     parser.add_argument("--overwrite", action="store_true")
     try:
-        first, _ = parser.parse_known_args(words)
+        first, _ = parser.parse_known_args(arguments)
     except argparse.ArgumentError as error:
         raise NPAError(f"{error.argument_name}: {error.message}") from error
-    chosen = list(words)
+    chosen = list(arguments)
     if first.resume is None:
         return chosen
     from npa_envs.training.run import RunFolder, check_choice
@@ -259,15 +264,15 @@ def resolve_resume(words: Sequence[str], out_of: Callable[[Sequence[str]], Path]
         if "--resume=auto" in chosen:
             chosen.remove("--resume=auto")
         else:
-            place = chosen.index("--resume")
-            del chosen[place : place + 2]
+            index = chosen.index("--resume")
+            del chosen[index : index + 2]
         if RunFolder(out_of(chosen)).checkpoint.exists():
             chosen.append("--resume")
     return chosen
 
 
 def chosen_names(kind: str, names: Sequence[str], known: Iterable[str]) -> list[str]:
-    """Return the known names that were asked for, in their own order; all where none was."""
+    """Return `names` in the order of `known`; all known ones if `names` is empty."""
     known = list(known)
     for name in names:
         if name not in known:
@@ -277,7 +282,7 @@ def chosen_names(kind: str, names: Sequence[str], known: Iterable[str]) -> list[
 
 @contextlib.contextmanager
 def torch_threads(count: int) -> Iterator[None]:
-    """Let torch use so many CPU threads while a block runs."""
+    """Set torch's number of CPU threads within the block."""
     import torch
 
     before = torch.get_num_threads()
@@ -289,7 +294,7 @@ def torch_threads(count: int) -> Iterator[None]:
 
 
 class StepBar:
-    """A progress bar that counts steps or another unit; a context manager."""
+    """A progress bar, as a context manager."""
 
     def __init__(self, total: int | None, *, show: bool, unit: str = "step") -> None:
         self.done = 0
@@ -309,6 +314,6 @@ class StepBar:
 
 @contextlib.contextmanager
 def measuring(options: Any, total: int | None, unit: str = "step") -> Iterator[StepBar]:
-    """Show the bar of options with `progress`, and use their number of `threads`, in a block."""
+    """Show a progress bar and use `options.threads` CPU threads within the block."""
     with StepBar(total, show=options.progress, unit=unit) as bar, torch_threads(options.threads):
         yield bar

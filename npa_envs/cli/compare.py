@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 RUN_FAILED = 1
 
 ROWS = "rows"
-"""Folder of a suite's rows, below that of the comparison."""
+"""Folder of a suite's rows in that of the comparison."""
 
 QUICK_EPISODES, QUICK_STEPS = 4, 200_000
 """Held-out episodes and particle-steps of a quick comparison."""
@@ -44,53 +44,51 @@ QUICK: dict[str, Any] = {
 class CompareOptions(common.MeasureOptions):
     """Compare methods on tasks over seeds, for equal wall time, equal particle-steps, or both.
 
-    Runs learn in processes. One that fails is recorded with its error, and the others go on; a
-    comparison that was stopped goes on where it was, and repeats runs that failed. Ends with code 1
-    where a run failed.
+    Each run learns in its own process. A failed run is recorded with its error, and the others
+    continue. A stopped comparison continues and repeats failed runs. The exit code is 1 if a run
+    failed.
     """
 
     out: Path = Path("comparison")
-    """Folder for AXIS/TASK/METHOD/seed-K/, and for comparison.md, .json, .csv and pictures of what
-    the command names (curves need the extra `bench`)."""
+    """Folder for AXIS/TASK/METHOD/seed-K/, comparison.md, .json, .csv, curves (extra `bench`)."""
     suite: Literal["npa-bench-v0", "npa-bench-small-v0"] | None = None
-    """Run a frozen benchmark, the small one on a laptop, with its own tasks, budgets and episodes;
-    write a row for each method, OUT/rows/METHOD.json, and keep what it has of other tasks and
-    seeds."""
+    """Run a frozen benchmark, which fixes tasks, budgets and episodes; the small one runs on a
+    laptop. OUT/rows/METHOD.json gets the results of each method; those of other tasks and seeds
+    stay there."""
     tasks: tuple[str, ...] = ()
-    """morphogenesis2d, regeneration2d, point_classification, mixing, or those of the suite, its ids
-    without npa/; default: all, or the first when quick."""
+    """morphogenesis2d, regeneration2d, point_classification, mixing, or ids of the suite without
+    npa/; default: all, or the first when quick."""
     methods: tuple[str, ...] = ()
-    """Methods of npa_envs.agents.learning; default: all but `clone`, which needs a teacher: the run
-    of `gradient` from the same seed, or options; of a suite: all of them. NAME=METHOD gives one a
-    name of its own, for other options (bold=ppo), or runs your function (mine=module:function)."""
+    """Methods of npa_envs.agents.learning; default: those of the suite, or all but `clone`, which
+    imitates the run of `gradient` from the same seed. NAME=METHOD gives one a new name, for other
+    options (bold=ppo), or runs your function (mine=module:function)."""
     seeds: int | None = None
-    """Seeds for each method and task: 0, 1, ...; default: 3, 5 of a suite, or 1 when quick."""
+    """Number of seeds 0, 1, ... for each method and task; default: 3, in a suite 5, quick 1."""
     seconds: float | None = None
-    """Compare for equal wall time: seconds that each run may learn. Its start and evaluations come
-    on top."""
+    """Compare for equal wall time: seconds of learning of each run, without evaluations."""
     particle_steps: float | None = None
-    """Compare for equal particle-steps: as many as each run may learn from, for example 1e8."""
+    """Compare for equal particle-steps: how many each run may learn from, for example 1e8."""
     episodes: int | None = None
-    """Held-out episodes that measure a run; default: 32, or 4 when quick."""
+    """Held-out episodes that evaluate a run; default: 32, or 4 when quick."""
     options: Annotated[tuple[str, ...], tyro.conf.arg(metavar="METHOD.NAME=VALUE")] = ()
     """Options of methods, values as JSON or plain text: evolution.population=64."""
     quick: bool = False
-    """Tiny worlds and, unless said otherwise, few steps, methods, tasks and one seed, a minute at
-    most on two CPU cores: figures that say nothing but that it runs."""
+    """Tiny worlds and, by default, few steps, methods, tasks and one seed: a test that it runs, a
+    minute at most on two CPU cores."""
     devices: tuple[str, ...] = ()
-    """Several devices that runs are dealt out to, for example cuda:0 cuda:1; default: --device."""
+    """Devices to distribute the runs over, for example cuda:0 cuda:1; default: --device."""
     jobs: int | None = None
-    """Runs at once; default: one for each device. Those on one device share its time, which counts
-    where wall time is equal: with --seconds, as many on each device."""
+    """Runs at the same time; default: one for each device. With --seconds each device must have the
+    same number, as runs on one device share its time."""
     part: Annotated[str | None, tyro.conf.arg(metavar="K/N")] = None
-    """Run the K-th of N parts alone: a machine, or a task of a scheduler's array, takes one each,
-    all with the same --out on a shared disk."""
+    """Run only the K-th of N parts: several machines, or tasks of a scheduler's array, run one part
+    each, all with the same --out on a shared disk."""
     max_seconds: float = math.inf
-    """No run begins after so long; the next call goes on."""
+    """No run starts after this time [s]; the next call continues."""
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Run what is missing, print and write; return 1 where a run failed."""
+    """Run what is missing, print and write; return 1 if a run failed."""
     options = common.parse_options(CompareOptions, "compare", arguments)
     from npa_envs.agents.comparison.npa_bench import SUITES, check_rows, write_rows
     from npa_envs.agents.comparison.report import write_pictures, write_table
@@ -98,11 +96,10 @@ def main(arguments: Sequence[str]) -> int:
     from npa_envs.measure.record import without_folders
     from npa_envs.processes import Places
 
-    words = without_folders(arguments, "--out")
-    command = shlex.join(["npa-envs", "compare", *words])
+    command = shlex.join(["npa-envs", "compare", *without_folders(arguments, "--out")])
     plan = make_plan(options)
     folder = common.writable_folder(options.out)
-    # All are read first: a record of other settings is refused before any work is done.
+    # Read before any run, so that a record of other settings is refused at once.
     records = held_records(plan, folder)
     if options.suite is not None:
         check_rows(SUITES[options.suite], plan, folder / ROWS)
@@ -144,10 +141,7 @@ def main(arguments: Sequence[str]) -> int:
 
 
 def make_plan(options: CompareOptions) -> ComparisonPlan:
-    """Return the plan that the command line asks for.
-
-    Of a suite, whose protocol is frozen, some tasks, methods and seeds may be chosen.
-    """
+    """Return the plan of the options; with a suite they choose only tasks, methods and seeds."""
     from npa_envs.agents.comparison import npa_bench
     from npa_envs.agents.comparison.plan import LEFT_OUT, PROBLEMS, ComparisonPlan, make_problem
     from npa_envs.agents.learning import METHODS
@@ -232,17 +226,19 @@ def _budgets(options: CompareOptions) -> dict[Axis, float]:
     return budgets
 
 
-def _chosen_methods(words: Sequence[str], known: Iterable[str]) -> tuple[list[str], dict[str, str]]:
-    """Return the names of the methods to run, and of those with names of their own what is run."""
+def _chosen_methods(
+    arguments: Sequence[str], known: Iterable[str]
+) -> tuple[list[str], dict[str, str]]:
+    """Return the names of the methods to run, and the methods of new names (NAME=METHOD)."""
     from npa_envs.agents.learning import method_options
 
     known = list(known)
-    named = [word.split("=", 1) for word in words if "=" in word]
+    named = [word.split("=", 1) for word in arguments if "=" in word]
     own = dict(named)
     for name, count in Counter(name for name, _ in named).items():
         if count > 1:
-            same = " and ".join(word for word in words if word.startswith(f"{name}="))
-            raise NPAError(f"methods must have names of their own, got {same}: rename one")
+            same = " and ".join(word for word in arguments if word.startswith(f"{name}="))
+            raise NPAError(f"methods must have different names, got {same}: rename one")
     for name, method in own.items():
         if not re.fullmatch("[a-z0-9_]+", name) or name in known:
             raise NPAError(
@@ -251,13 +247,13 @@ def _chosen_methods(words: Sequence[str], known: Iterable[str]) -> tuple[list[st
             )
         with _this_folder_searched():
             method_options(method)
-    plain = [word for word in words if "=" not in word]
+    plain = [word for word in arguments if "=" not in word]
     return [*(common.chosen_names("method", plain, known) if plain or not own else []), *own], own
 
 
 @contextlib.contextmanager
 def _this_folder_searched() -> Iterator[None]:
-    """Let Python find modules in the current folder while a block runs, as runs' processes do."""
+    """Let Python import modules of the current folder within the block, as in runs' processes."""
     before = list(sys.path)
     sys.path.insert(0, str(Path.cwd()))
     try:
@@ -267,12 +263,12 @@ def _this_folder_searched() -> Iterator[None]:
 
 
 def _method_options(
-    words: Sequence[str], methods: Sequence[str], own: Mapping[str, str]
+    arguments: Sequence[str], methods: Sequence[str], own: Mapping[str, str]
 ) -> dict[str, dict[str, Any]]:
     from npa_envs.agents.learning import method_options
 
     found: dict[str, dict[str, Any]] = {}
-    for word in words:
+    for word in arguments:
         name, mark, value = word.partition("=")
         method, dot, option = name.partition(".")
         if not (mark and dot and option):
@@ -290,7 +286,7 @@ def _method_options(
 
 
 def _jobs(options: CompareOptions) -> int:
-    """Return how many runs there are at once, as fairly as times are compared."""
+    """Return the number of runs at the same time; with --seconds, equal on all devices."""
     count = len(options.devices or (options.device,))
     jobs = count if options.jobs is None else options.jobs
     if options.seconds is not None and jobs % count:
@@ -302,7 +298,7 @@ def _jobs(options: CompareOptions) -> int:
 
 
 def _settings(options: CompareOptions) -> dict[str, Any]:
-    """Return the facts of figures other than problems, budgets and options."""
+    """Return the machine, versions and threads, which the record names."""
     from npa_envs.devices import check_device
     from npa_envs.measure.record import installed_version, machine, measured_facts
 

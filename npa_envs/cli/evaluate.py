@@ -1,4 +1,4 @@
-"""`npa-envs evaluate RULE`: how good a rule is, in numbers."""
+"""`npa-envs evaluate RULE`: measures how good a rule is."""
 
 from __future__ import annotations
 
@@ -18,32 +18,32 @@ if TYPE_CHECKING:
 class EvaluateOptions(common.RuleOptions):
     """Measure loss, PSNR, overflow and extent of a rule over thousands of steps.
 
-    Of a rule that classifies point clouds: the accuracy on clouds it was not trained on, and what
-    they say when they are cut or become others. Of a rule of many pictures, unless `--target` names
-    one of them: loss and PSNR of each, and the loss with the code of another.
+    For a rule that classifies point clouds: the accuracy on clouds that it was not trained on, also
+    after they are cut or replaced. For a rule of many pictures, unless `--target` names one of
+    them: loss and PSNR of each picture, and the loss with the code of another.
     """
 
     data_folder: str | None = None
     """Point clouds only: where torchvision keeps "mnist"; default: as trained."""
     checkpoints: tuple[int, ...] | None = None
-    """Steps from the seed to measure at, increasing; default: 64, 128, ... 4096, or 8, 16, 24, 32,
-    64, 128 of point clouds."""
+    """Steps from the seed to measure at, increasing; default: 64, 128, ... 4096, for point clouds
+    8, 16, 24, 32, 64, 128."""
     seed_count: int = 8
-    """Worlds to measure, each from a seed of its own; of point clouds all test clouds are taken."""
+    """Worlds to measure, each from a different seed; for point clouds all test clouds."""
     first_seed: int = 1_000_000
     """The first world's number; training uses others."""
     healing: bool = False
-    """Also cut the grown worlds and wipe a part, and measure how they heal. Point clouds are
-    always cut and changed."""
+    """Also damage the grown worlds by a cut and a wipe, and measure how they heal. Point clouds are
+    always damaged."""
     judge: bool = False
-    """Textures only: also judge worlds by three distances from the target that no loss compares, as
-    ratios: at 1 they differ from it as drawings of it by particles do."""
+    """Textures only: also measure three distances from the target that no loss uses, as ratios: 1
+    is the distance of the target drawn by particles."""
     json: Path | None = None
     """Also write the table to this JSON file."""
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Measure, print and, if asked for, write."""
+    """Measure, print and write the table."""
     options = common.parse_options(EvaluateOptions, "evaluate", arguments)
     from npa_envs.files import write_text
     from npa_envs.measure import quality
@@ -55,7 +55,7 @@ def main(arguments: Sequence[str]) -> int:
     checkpoints = options.checkpoints or quality.CHECKPOINTS
     quality.check_steps("checkpoints", checkpoints)
     common.check_numbers(options, seed_count=1)
-    device = options.place()
+    device = options.checked_device()
     rule = load_rule(options.rule, device=device).float()
     seeds = range(options.first_seed, options.first_seed + options.seed_count)
     given: dict[str, Any] = {"seeds": seeds, "device": device}

@@ -1,4 +1,4 @@
-"""`npa-envs export-web RULE...`: rules as one HTML file that runs in any browser by itself."""
+"""`npa-envs export-web RULE...`: one HTML file that runs rules in any browser."""
 
 from __future__ import annotations
 
@@ -15,18 +15,18 @@ from npa_envs.errors import NPAError
 
 @dataclass(frozen=True, kw_only=True)
 class ExportOptions:
-    """Write one HTML file that runs rules in a browser, on a phone too, with brushes and sliders.
+    """Write one HTML file that runs rules in a browser, also on a phone, with brushes and sliders.
 
-    It needs neither a server nor a network. A name that ends in .json writes the collection that
-    the authors' web demo reads instead, with neither title nor gallery.
+    It needs no server and no network. If the name ends in .json, it writes a collection for the
+    authors' web demo instead, without title or gallery.
     """
 
     rules: Annotated[tuple[str, ...], tyro.conf.Positional, tyro.conf.arg(metavar="RULE")] = ()
-    """Shipped rules (`npa-envs list`), folders of runs, or files of ours or the authors'."""
+    """Shipped rules (`npa-envs list`), folders of runs, or files of rules."""
     out: Annotated[Path, tyro.conf.arg(aliases=("-o",))] = Path("page.html")
     """The file to write."""
     gallery: bool = False
-    """Begin with pictures to choose from; without RULE of all shipped 2D rules."""
+    """Begin with pictures to choose from; default of RULE: all shipped 2D rules."""
     title: str | None = None
     """Title of the page; default: the first rule's name."""
     particle_count: int | None = None
@@ -34,7 +34,7 @@ class ExportOptions:
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Write what the words after `npa-envs export-web` ask for; return 0."""
+    """Write the page or the collection; return 0."""
     options = common.parse_options(ExportOptions, "export-web", arguments)
     common.check_numbers(options, particle_count=1)
     from npa_envs.rule.authors import save_demo_json

@@ -1,4 +1,4 @@
-"""Films of a world, with damage on the way."""
+"""Films of a world: frames during a rollout with damage, and their files."""
 
 from __future__ import annotations
 
@@ -34,16 +34,16 @@ if TYPE_CHECKING:
     from npa_envs.tasks.base import Task
 
 SCREEN = 256
-"""Least pixels on each side of a film whose resolution is not asked for."""
+"""Least default resolution of a film [pixels]."""
 
 Style = Literal["splats", "points"]
-"""How large particles are drawn: as in training, or so small that they stand apart."""
+"""How particles are drawn: as large as in training, or as small separate points."""
 
 FRAME_COUNT = 150
-"""Frames of a film whose pace is not asked for, without those of damage."""
+"""Default number of frames of a film, without those of damage."""
 
 EARLY_STEPS = (0, 16, 32, 64, 128)
-"""Steps that a filmstrip shows, or the frames nearest to them: most of the growth is there."""
+"""Steps whose nearest frames are in every filmstrip: most of the growth is there."""
 
 
 @dataclass
@@ -57,7 +57,7 @@ class WorldFilm:
     marked: list[int] = field(default_factory=list)
     """Frames that show fresh damage."""
     steps: dict[int, int] = field(default_factory=dict)
-    """Steps from the seed of each frame for which they are known, in order."""
+    """Steps from the seed by frame; frames of fresh damage are left out."""
 
     def shoot(
         self,
@@ -69,7 +69,7 @@ class WorldFilm:
         mark: bool = False,
         step: int | None = None,
     ) -> None:
-        """Add a picture of one world; the filmstrip has all marked ones."""
+        """Add a picture of one world; a filmstrip contains all pictures with `mark`."""
         if mark:
             self.marked.append(len(self.frames))
         if step is not None:
@@ -78,9 +78,9 @@ class WorldFilm:
         self.captions.append(caption)
 
     def strip(self, count: int = 10) -> tuple[list[NDArray[np.uint8]], list[str]]:
-        """Return frames for a filmstrip: early ones, those with damage, the last, some between.
+        """Return frames and captions of a filmstrip: early, damaged, some between, the last.
 
-        A film that ends with the early steps gives those with damage, and others evenly spread.
+        Of a film that is not longer than the early steps: damaged and evenly spaced ones.
         """
         last = len(self.frames) - 1
         if max(self.steps.values(), default=0) <= EARLY_STEPS[-1]:
@@ -111,15 +111,15 @@ def film_world(
     progress: Callable[[int], None] = lambda _: None,
     stop: Callable[[], bool] = lambda: False,
 ) -> tuple[Tensor, Tensor, WorldFilm]:
-    """Run one world with damages on the way, and film it `every` so many steps.
+    """Run one world with damage, and add a frame to `film` every `every` steps.
 
-    `first_step` is its age, `film` one to go on with; `progress` is called with the number of steps
-    done since its last call, and `stop` is asked after each frame whether to end.
+    `first_step` is the world's age in steps. `progress` is called with the number of steps since
+    its last call. After each frame the run ends if `stop` returns true.
     """
     film = WorldFilm() if film is None else film
     last = first_step + steps
-    hurts = {damage.step: [d for d in damages if d.step == damage.step] for damage in damages}
-    stops = {step for step in hurts if first_step <= step < last}
+    by_step = {damage.step: [d for d in damages if d.step == damage.step] for damage in damages}
+    stops = {step for step in by_step if first_step <= step < last}
     stops |= {*range(first_step, last, every), last}
     now = first_step
     with torch.no_grad():
@@ -129,7 +129,7 @@ def film_world(
             now = step
             if not film.frames or step > first_step:
                 film.shoot(task, x, s, f"step {step}", step=step)
-            for damage in hurts.get(step, ()) if step < last else ():
+            for damage in by_step.get(step, ()) if step < last else ():
                 x, s = damage_worlds(x, s, kind=damage.kind, size=damage.size, generator=generator)
                 s = task.coded(s)
                 film.shoot(task, x, s, f"step {step}: {damage.text}", mark=True)
@@ -139,7 +139,7 @@ def film_world(
 
 
 def frame_steps(steps: int) -> int:
-    """Return the steps between two frames that make about `FRAME_COUNT` of them."""
+    """Return the steps between two frames of a film of about `FRAME_COUNT` frames."""
     return math.ceil(steps / FRAME_COUNT)
 
 
@@ -155,8 +155,8 @@ def large_task(
 ) -> Task:
     """Return a rule's task with pictures that are large enough for a film.
 
-    `source` is the rule's name or file; a resolution of None is that of training, but at least
-    `SCREEN`; "points" stand apart; `world` are options of `task_of_rule`.
+    `source` is the rule's name or file; the default resolution is that of training, at least
+    `SCREEN`; `world` has further options of `task_of_rule`.
     """
     chosen = dict(world)
     if resolution is not None or len(task.target_picture) < SCREEN:
@@ -165,7 +165,6 @@ def large_task(
         sigma = getattr(getattr(task, "config", None), "sigma", None)
         if sigma is None:
             raise NPAError("style must be 'splats' for clouds that never move, got 'points'")
-        # So small that they stand apart.
         chosen["sigma"] = 0.35 * sigma
     return task if chosen == world else task_of_rule(source, rule, device, **chosen).task
 
@@ -178,7 +177,7 @@ def write_film(film: WorldFilm, folder: Path, name: str, *, fps: float = 25.0) -
     rows = math.ceil(len(strip) / 8)
     columns = math.ceil(len(strip) / rows)
     write_filmstrip(paths[2], strip, captions, columns=columns, background=film.background)
-    # Last: the others need no ffmpeg.
+    # Written last, as it needs ffmpeg and the others do not.
     write_mp4(paths[1], film.frames, fps)
     return paths
 

@@ -1,4 +1,4 @@
-"""`npa-envs interact`: what trained rules do to each other in one world."""
+"""`npa-envs interact`: grows rules in one world and measures how each changes the other."""
 
 from __future__ import annotations
 
@@ -19,11 +19,8 @@ if TYPE_CHECKING:
 
     from npa_envs.measure.interaction import RuleUnderTest
 
-RESULTS = "interactions.json"
-"""The file that says everything, and that a stopped run goes on from."""
-
 TASK = "morphogenesis2d"
-"""The task of the rules that are brought together."""
+"""The task of all rules."""
 
 QUICK: dict[str, Any] = {
     "seed_count": 2,
@@ -31,36 +28,35 @@ QUICK: dict[str, Any] = {
     "steps": 32,
     "particle_count": 512,
 }
-"""What `--quick` puts in place of the defaults."""
+"""Defaults of `--quick`."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class InteractOptions(common.RunOptions):
     """Grow every rule next to every other one, and measure how that changes it.
 
-    Every ordered pair of rules, also of a rule with itself, at every distance, ratio and radius:
-    the first one's task loss on its own particles together and alone, how much both mix, and how
-    far its centroid is moved. "cooperates": the loss falls by more than the margin; "disrupted": it
-    rises by more; "mixes": the mixing index is 0.25 or more. Each rule sees densities as it does
-    alone: divided by its own particles. The folder gets a JSON file, a heat map and a filmstrip of
-    each pair, and a phase diagram of each where there are several ratios or radii; a run that was
-    stopped goes on where it was.
+    For every ordered pair of rules, distance, ratio and radius it measures: the first rule's task
+    loss on its own particles, together and alone; how much both mix; how far its centroid moves.
+    "cooperates": the loss falls by more than the margin; "disrupted": it rises by more; "mixes":
+    the mixing index is 0.25 or more. Densities of each rule are divided by its own particles. The
+    folder gets a JSON file, a heat map, a filmstrip of each pair, and phase diagrams if there are
+    several ratios or radii. A stopped run continues.
     """
 
     rules: Annotated[tuple[str, ...], tyro.conf.Positional, tyro.conf.arg(metavar="RULE")] = ()
     """Rules of 2D morphogenesis: shipped ones (`npa-envs list`) or files; default: all shipped."""
     seed_count: int = 8
-    """Worlds of each encounter, each from seeds of its own."""
+    """Worlds of each pair, each from its own seed."""
     first_seed: int = 1_000_000
-    """The first world's number; training uses others."""
+    """The first world's seed; training uses others."""
     distances: tuple[float, ...] = (0.0, 0.5, 1.0)
     """Distances between the centres of the two seeds [length units]."""
     ratios: tuple[float, ...] = (0.5,)
-    """Shares of the particles that are the measured rule's."""
+    """Fractions of the particles that are the measured rule's."""
     eps_factors: tuple[float, ...] = (1.0,)
-    """Perception radii, over that of the rules."""
+    """Perception radii as multiples of the rules' own."""
     itself: bool = True
-    """Also bring each rule together with itself."""
+    """Also pair each rule with itself."""
     steps: int = 512
     """Steps from the seeds."""
     particle_count: int | None = None
@@ -68,10 +64,9 @@ class InteractOptions(common.RunOptions):
     update_prob: float | None = None
     """Probability of each particle's update in a step; default: of each rule as trained."""
     margin: float = 0.2
-    """Share by which a loss must change to count as changed."""
+    """Fraction by which a loss must change to count as changed."""
     quick: bool = False
-    """Two rules, worlds and distances, few particles and steps, unless said otherwise: figures that
-    say nothing but that it runs."""
+    """Two rules, two seeds and distances, few particles and steps: only shows that it runs."""
     out: Path = Path("runs/interact")
     """Folder to write to; created where missing."""
 
@@ -90,71 +85,71 @@ def main(arguments: Sequence[str]) -> int:
         options = common.parse_options(InteractOptions, "interact", arguments, default=few)
     common.check_numbers(options, seed_count=1)
     shipped = list(shipped_rules(TASK))[: 2 if options.quick else None]
-    device = options.place()
+    device = options.checked_device()
     rules = _rules(options.rules or shipped, device)
-    count = options.particle_count
-    own = ("distances", "ratios", "eps_factors", "steps", "update_prob", "margin")
-    settings = interaction.InteractionSettings(
-        particle_count=max(rule.particle_count for rule in rules) if count is None else count,
-        seeds=tuple(range(options.first_seed, options.first_seed + options.seed_count)),
-        **{name: getattr(options, name) for name in own},
-    )
-    if len(rules) < 2 and not options.itself:
+    pairs: dict[str, tuple[RuleUnderTest, RuleUnderTest]] = {}
+    for first, second in itertools.product(rules, rules):
+        if options.itself or first is not second:
+            name = f"{first.name}-{second.name}"
+            # Different pairs can have the same name if those of rules contain hyphens.
+            pairs[f"{name}-2" if name in pairs else name] = first, second
+    if not pairs:
         raise NPAError(
             f"rules must be two or more without itself, got {rules[0].name}: name another one, "
             "or leave out --no-itself"
         )
+    own = ("distances", "ratios", "eps_factors", "steps", "update_prob", "margin")
+    settings = interaction.InteractionSettings(
+        particle_count=max(rule.particle_count for rule in rules)
+        if options.particle_count is None
+        else options.particle_count,
+        seeds=tuple(range(options.first_seed, options.first_seed + options.seed_count)),
+        **{name: getattr(options, name) for name in own},
+    )
     folder = common.writable_folder(options.out)
     weights = {rule.name: rule_digest(rule.rule) for rule in rules}
     facts = {**plain_numbers(asdict(settings)), "rules": weights}
-    record = interaction.InteractionRecord(facts, folder / RESULTS).read()
-    files: dict[str, tuple[RuleUnderTest, RuleUnderTest]] = {}
-    for pair in itertools.product(rules, rules):
-        if options.itself or pair[0] is not pair[1]:
-            # Pairs whose rules' names have hyphens may look alike.
-            plain, number = f"{pair[0].name}-{pair[1].name}", 2
-            name = plain
-            while name in files:
-                name, number = f"{plain}-{number}", number + 1
-            files[name] = pair
+    path = folder / "interactions.json"
+    record = interaction.InteractionRecord(facts, path).read()
     done = {(row.rule, row.beside) for row in record.rows}
-    missing = {n: (a, b) for n, (a, b) in files.items() if (a.name, b.name) not in done}
+    missing = {n: (a, b) for n, (a, b) in pairs.items() if (a.name, b.name) not in done}
     if done:
-        print(f"{len(files) - len(missing)} of {len(files)} pairs were measured before")
+        print(f"{len(pairs) - len(missing)} of {len(pairs)} pairs were measured before")
     # A rule is grown alone once for each ratio and radius.
-    alone = len({first.name for first, _ in missing.values()})
-    runs = len(missing) * len(settings.distances) + alone
+    runs = len(missing) * len(settings.distances) + len(
+        {first.name for first, _ in missing.values()}
+    )
     total = runs * len(settings.ratios) * len(settings.eps_factors) * settings.steps
     with common.StepBar(total, show=options.progress) as bar:
         encounters = interaction.Encounters(settings, device=device, progress=bar.advance)
         encounters.check(rules)
         for name, pair in missing.items():
-            fresh, scenes = encounters.meet(*pair)
-            columns = len(scenes.frames) // len(fresh)
+            rows, scenes = encounters.meet(*pair)
+            columns = len(scenes.frames) // len(rows)
             write_filmstrip(folder / f"{name}.png", scenes.frames, scenes.captions, columns=columns)
-            record.add(*fresh)
-    rows = record.rows
+            record.add(*rows)
 
     def phases() -> dict[str, bytes]:
         return {
             name: interaction.phase_diagram(
-                [row for row in rows if (row.rule, row.beside) == (first.name, second.name)]
+                [row for row in record.rows if (row.rule, row.beside) == (a.name, b.name)]
             )
-            for name, (first, second) in files.items()
+            for name, (a, b) in pairs.items()
         }
 
     print(record.table())
-    print(f"wrote {folder / RESULTS} and a filmstrip of each pair")
-    place = folder / "interactions.png"
-    maps = write_plots(lambda: {"": interaction.heat_map(rows)}, place, "heat map")
+    print(f"wrote {path} and a filmstrip of each pair")
+    plots = write_plots(
+        lambda: {"": interaction.heat_map(record.rows)}, folder / "interactions.png", "heat map"
+    )
     if len(settings.ratios) > 1 or len(settings.eps_factors) > 1:
-        maps += write_plots(phases, folder / "phases-*.png", "phase diagrams")
-    print("\n".join(maps))
+        plots += write_plots(phases, folder / "phases-*.png", "phase diagrams")
+    print("\n".join(plots))
     return 0
 
 
 def _rules(sources: Sequence[str], device: torch.device) -> list[RuleUnderTest]:
-    """Return the rules with their tasks, each under a name of its own."""
+    """Return the rules with their tasks, each under a different name."""
     from npa_envs.measure.interaction import RuleUnderTest
     from npa_envs.rule.files import load_rule
     from npa_envs.training.trained_tasks import task_of_rule
@@ -175,8 +170,8 @@ def _rules(sources: Sequence[str], device: torch.device) -> list[RuleUnderTest]:
         def task_of(count: int, source: str = source, rule: Any = rule) -> Any:
             return task_of_rule(source, rule, device, particle_count=count).task
 
-        task = trained.task
+        config = trained.task.config
         rules[name] = RuleUnderTest(
-            name, rule, task_of, task.update_prob, task.config.particle_count
+            name, rule, task_of, trained.task.update_prob, config.particle_count
         )
     return list(rules.values())

@@ -1,4 +1,4 @@
-"""Several processes of one command on this machine, started and watched by torchrun's launcher."""
+"""Runs one command in several processes on this machine, by torchrun's launcher."""
 
 from __future__ import annotations
 
@@ -25,11 +25,11 @@ if TYPE_CHECKING:
     from torch.distributed.elastic.multiprocessing.errors import ProcessFailure
 
 
-def launch(count: int, words: Sequence[str], out: Path, device: str) -> int:
+def launch(count: int, arguments: Sequence[str], out: Path, device: str) -> int:
     """Run a command in several processes, and return the exit code once all have ended.
 
-    If one ends early, the others are asked to end, and are killed after half a minute. On CUDA each
-    process has a device of its own. `out` is the folder of the run, for errors.
+    If one ends early, the others are terminated, and killed after half a minute. On CUDA each
+    process gets one device. `out` is the folder of the run, for errors.
     """
     found = torch.cuda.device_count()
     if device != "cpu" and count > found:
@@ -41,7 +41,7 @@ def launch(count: int, words: Sequence[str], out: Path, device: str) -> int:
         raise NPAError(
             f"processes must be 1 with a torch that has no torch.distributed, got {count}"
         )
-    # Only runs of several processes need it, and it takes a while.
+    # These imports are slow, and only runs of several processes need them.
     from torch.distributed.elastic.multiprocessing.api import SignalException
     from torch.distributed.elastic.multiprocessing.errors import ChildFailedError
     from torch.distributed.elastic.rendezvous.api import RendezvousError
@@ -60,11 +60,11 @@ def launch(count: int, words: Sequence[str], out: Path, device: str) -> int:
         rdzv_endpoint="localhost:0",
         max_restarts=0,
         monitor_interval=0.5,
-        # A machine need not know its own name.
+        # Works even if the machine cannot resolve its own name.
         local_addr="localhost",
     )
     try:
-        elastic_launch(config, sys.executable)("-m", "npa_envs", *words)
+        elastic_launch(config, sys.executable)("-m", "npa_envs", *arguments)
     except SignalException:
         return INTERRUPTED
     except RendezvousError as error:
@@ -78,13 +78,13 @@ def launch(count: int, words: Sequence[str], out: Path, device: str) -> int:
             # The first process prints its own.
             if reason not in ("", left.get(0)):
                 raise NPAError(reason) from error
-        # A killed process comes before those that report it or were then asked to end.
+        # First a killed process, then those that report it, then those terminated afterwards.
         rank, failure = min(
             error.failures.items(),
             key=lambda item: (item[1].exitcode == -signal.SIGTERM, item[1].exitcode > 0),
         )
         if failure.exitcode > 0:
-            return int(failure.exitcode)  # It has said why.
+            return int(failure.exitcode)  # It has printed why.
         name = signal.Signals(-failure.exitcode).name
         raise NPAError(
             f"process {rank} of {count} was ended by {name}, and the others with it (SIGKILL is "
@@ -94,21 +94,21 @@ def launch(count: int, words: Sequence[str], out: Path, device: str) -> int:
     return 0
 
 
-def with_device_of_gpus(words: Sequence[str]) -> list[str]:
-    """Return options with CUDA as their device, where they say `--gpus` and no device."""
+def with_device_of_gpus(arguments: Sequence[str]) -> list[str]:
+    """Add `--device cuda` to arguments that have `--gpus` and no device."""
     parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
     parser.add_argument("--gpus")
     parser.add_argument("--device")
-    first, _ = parser.parse_known_args(words)
+    first, _ = parser.parse_known_args(arguments)
     cuda = first.gpus is not None and first.device is None
-    return [*words, "--device", "cuda"] if cuda else list(words)
+    return [*arguments, "--device", "cuda"] if cuda else list(arguments)
 
 
 def asked_count(gpus: int | None, processes: int | None, device: str) -> int | None:
-    """Return how many processes `--gpus` or `--processes` asks for; None for neither."""
+    """Return the number of processes of `--gpus` or `--processes`; None if neither is given."""
     if gpus is not None and processes is not None:
         raise NPAError(
-            f"gpus says how many processes there are, got gpus {gpus} and processes {processes}: "
+            f"gpus sets the number of processes, got gpus {gpus} and processes {processes}: "
             "give one of them"
         )
     if gpus is not None and device == "cpu":
@@ -135,7 +135,7 @@ def print_once(ranks: Ranks) -> Iterator[None]:
 
 
 def _left_by(failure: ProcessFailure) -> str:
-    """Return the reason that a process has left, or an empty string."""
-    said = failure.error_file_data["message"]
+    """Return the error message that a process has left, or an empty string."""
+    content = failure.error_file_data["message"]
     # Torch writes the error's class before it.
-    return str(said["message"]).partition(": ")[2] if isinstance(said, dict) else ""
+    return str(content["message"]).partition(": ")[2] if isinstance(content, dict) else ""

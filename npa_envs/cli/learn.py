@@ -1,4 +1,4 @@
-"""`npa-envs learn`: one method on one environment, kept in a folder, on one device or several."""
+"""`npa-envs learn`: reinforcement learning of one environment, on one device or several."""
 
 from __future__ import annotations
 
@@ -20,15 +20,15 @@ if TYPE_CHECKING:
 
 
 WORLDS = 16
-"""Worlds to act in, and at most to be evaluated in, where nothing is said."""
+"""Default number of worlds, and the most for evaluations."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class LearnOptions(common.RunOptions):
-    """Learn an environment by reinforcement learning, and keep the run in a folder.
+    """Learn an environment by reinforcement learning, and write the run to a folder.
 
-    A line is printed, and a checkpoint written, for each point of the learning curve. A run that
-    was stopped, by SIGTERM, Ctrl-C or a kill, goes on with `--resume`, on any number of processes.
+    Each point of the learning curve prints a line and writes a checkpoint. A run that was stopped
+    by SIGTERM, Ctrl-C or a kill continues with `--resume`, on any number of processes.
     """
 
     method: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="METHOD")]
@@ -38,66 +38,66 @@ class LearnOptions(common.RunOptions):
     keywords: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME=VALUE")] = ()
     """Keywords of the environment, values as JSON or plain text: target=heart."""
     options: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME=VALUE")] = ()
-    """Options of the method, likewise: steps=32 (docs/learning.md)."""
+    """Options of the method, values as JSON or plain text: steps=32 (docs/learning.md)."""
     episode_steps: int | None = None
-    """Steps after which an episode is cut off; default: as registered, or 256."""
+    """Steps after which an episode is truncated; default: as registered, or 256."""
     worlds: int | None = None
-    """Worlds to act in, of all processes; default: 16, of shac 8. On CUDA ppo takes more where it
+    """Worlds of all processes together; default: 16, for shac 8. On CUDA ppo takes more if it
     can."""
     seed: int = 0
-    """Of everything that is drawn, from 0 to 99."""
+    """Seed of everything random, from 0 to 99."""
     particle_steps: float | None = None
-    """Steps of the worlds, times the particles that took them, to learn from: 1e8."""
+    """Budget in particle-steps (steps of the worlds times their particles), for example 1e8."""
     seconds: float | None = None
-    """Time to learn [s]; start and evaluations come on top."""
+    """Budget in seconds of learning, without start and evaluations."""
     episodes: int = 16
-    """Episodes by which a point of the curve is measured."""
+    """Episodes that evaluate each point of the curve."""
     entries: int = 20
     """Points of the curve after the first, and checkpoints."""
     out: Path = Path("runs/learn")
     """Folder for checkpoint, rules and curve."""
     processes: int | None = None
-    """Processes that share the run, on CUDA each with a GPU of its own; by default 1. `torchrun
+    """Processes that share the run, on CUDA one GPU each; by default 1. `torchrun
     --nproc-per-node=4 -m npa_envs learn ...` does the same."""
     gpus: int | None = None
-    """GPUs that share the run: `--gpus 4` says `--device cuda --processes 4`."""
+    """GPUs that share the run: `--gpus 4` means `--device cuda --processes 4`."""
     resume: bool = False
-    """Go on from the checkpoint in the folder `out`. `--resume auto`: if there is one; else
-    begin."""
+    """Continue from the checkpoint in the folder `out`. `--resume auto`: if there is one; else
+    start."""
     overwrite: bool = False
-    """Begin anew although the folder `out` holds a run; the run's files are removed."""
+    """Start again even if the folder `out` contains a run; the run's files are removed."""
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Learn; return 130 where it was stopped."""
+    """Learn; return 130 if it was stopped."""
     from npa_envs.training.ranks import joined_ranks
 
     with joined_ranks() as ranks:
         asked = None
         if ranks.first:
-            words = common.resolve_resume(
-                with_device_of_gpus(arguments), lambda words: parse(words).out
+            resolved = common.resolve_resume(
+                with_device_of_gpus(arguments), lambda given: parse(given).out
             )
-            asked = words, parse(words)
+            asked = resolved, parse(resolved)
         asked = ranks.broadcast(asked)
-        assert asked is not None, "said by the first process"
-        words, options = asked
+        assert asked is not None, "broadcast by the first process"
+        resolved, options = asked
         count = asked_count(options.gpus, options.processes, options.device) or 1
         if count > 1 and not ranks.together:
-            return launch(count, ("learn", *words), options.out, options.device)
+            return launch(count, ("learn", *resolved), options.out, options.device)
         with print_once(ranks):
             return run(options, ranks)
 
 
-def parse(words: Sequence[str]) -> LearnOptions:
+def parse(arguments: Sequence[str]) -> LearnOptions:
     """Return the options of `npa-envs learn`."""
-    options = common.parse_options(LearnOptions, "learn", words)
+    options = common.parse_options(LearnOptions, "learn", arguments)
     common.check_numbers(options, worlds=1, episodes=1, entries=1)
     return options
 
 
 def run(options: LearnOptions, ranks: Ranks) -> int:
-    """Learn as one process of those that share the run, and return the exit code."""
+    """Learn as one of the processes that share the run, and return the exit code."""
     from npa_envs.agents.learning import Budget, train
     from npa_envs.agents.learning.problem import FIRST_EVALUATION_SEED
     from npa_envs.cli import INTERRUPTED
@@ -137,7 +137,7 @@ def run(options: LearnOptions, ranks: Ranks) -> int:
         **given,
     )
     if ranks.first:
-        end = "stopped; the same words with --resume go on" if stopped else "finished"
+        end = "stopped; the same arguments with --resume continue" if stopped else "finished"
         print(f"{end}: rules, curve and checkpoint are in {options.out}/")
     return INTERRUPTED if stopped else 0
 

@@ -1,4 +1,4 @@
-"""`npa-envs list`: everything that has a name."""
+"""`npa-envs list`: prints the names of tasks, environments, targets and rules."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ from npa_envs.cli import common
 
 @dataclass(frozen=True)
 class ListOptions:
-    """Tasks and presets, environments, targets, texture losses, data sets, rules with scores."""
+    """List tasks, presets, environments, targets, texture losses, data sets, rules with scores."""
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Print everything that has a name."""
+    """Print the lists; return 0."""
     common.parse_options(ListOptions, "list", arguments)
     from npa_envs.envs.multi.tasks import ENVIRONMENTS as OF_SPECIES
     from npa_envs.measure.quality import score_line, scores

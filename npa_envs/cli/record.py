@@ -1,4 +1,4 @@
-"""`npa-envs record`: episodes of a policy as a dataset of Minari."""
+"""`npa-envs record`: writes episodes of a policy as a Minari dataset."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ from npa_envs.errors import NPAError
 if TYPE_CHECKING:
     from npa_envs.agents.learning import Problem
 
-LEARNS_NOTHING = ("zero", "random", "scripted")
+UNTRAINED = ("zero", "random", "scripted")
 """Policies that need no file."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class RecordOptions(common.RunOptions):
-    """Write episodes of a policy as a dataset of Minari, to learn from without the environment.
+    """Write episodes of a policy as a Minari dataset, to learn from without the environment.
 
     `minari.load_dataset` reads it; `npa_envs.agents.learning.train("clone", ..., dataset=ID)`
     learns from it.
@@ -32,12 +32,12 @@ class RecordOptions(common.RunOptions):
     env: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="ENV")]
     """Id of an environment of one species, such as npa/Morphogenesis2D-v0."""
     dataset: Annotated[str, tyro.conf.arg(metavar="ID")]
-    """What the dataset is called: NAMESPACE/NAME-v0."""
+    """Name of the dataset: NAMESPACE/NAME-v0."""
     policy: str = "random"
-    """What acts: "zero", "random", "scripted", or a rule that fits: a shipped one, a file, or the
-    folder of a run. In gardens also "gradient", or a run's sac.zip or ppo.zip."""
+    """The policy: "zero", "random", "scripted", or a rule (shipped, a file, or a run's
+    folder). In gardens also "gradient", or a run's sac.zip or ppo.zip."""
     episodes: int = 16
-    """Episodes to record, each from a seed of its own."""
+    """Episodes to record, each from a different seed."""
     first_seed: int = 0
     """The first one's seed; the others follow."""
     worlds: int = 16
@@ -45,11 +45,11 @@ class RecordOptions(common.RunOptions):
     options: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME=VALUE")] = ()
     """Keywords of the environment, values as JSON or plain text: target=heart."""
     root: Path | None = None
-    """Folder of datasets; default: Minari's own, which MINARI_DATASETS_PATH names."""
+    """Folder of datasets; default: Minari's, which MINARI_DATASETS_PATH sets."""
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Record and write."""
+    """Record the episodes and write the dataset."""
     options = common.parse_options(RecordOptions, "record", arguments)
     common.check_numbers(options, episodes=1, worlds=1)
     from npa_envs.agents.evaluation import policy_in
@@ -59,7 +59,6 @@ def main(arguments: Sequence[str]) -> int:
     problem = problem_of(options)
     envs: Any = problem.make_envs(device=options.device)
     policy = policy_in(envs, policy_of(options, problem))
-    words = without_folders(arguments, "--root")
     seeds = range(options.first_seed, options.first_seed + options.episodes)
     returns: list[float] = []
     if options.root is not None:
@@ -77,7 +76,7 @@ def main(arguments: Sequence[str]) -> int:
             spec_of(problem.env_id, dict(problem.keywords), problem.episode_steps),
             episodes(),
             algorithm=options.policy,
-            description=shlex.join(["npa-envs", "record", *words]),
+            description=shlex.join(["npa-envs", "record", *without_folders(arguments, "--root")]),
         )
     print(f"{options.episodes} episodes, mean return {sum(returns) / len(returns):.3f}: {folder}")
     return 0
@@ -102,12 +101,12 @@ def problem_of(options: RecordOptions) -> Problem:
 
 
 def policy_of(options: RecordOptions, problem: Problem) -> Callable[[Any], Any]:
-    """Return the policy."""
+    """Return the policy that the options name."""
     from npa_envs.agents.learning import Budget, RuleSet, train
 
-    known = (*LEARNS_NOTHING, "gradient") if problem.actor == "brushes" else LEARNS_NOTHING
+    known = (*UNTRAINED, "gradient") if problem.actor == "brushes" else UNTRAINED
     if options.policy in known:
-        # What learns nothing is only chosen, by seeds that are not recorded.
+        # These learn nothing: `train` only chooses among them, by seeds that are not recorded.
         return train(
             options.policy,
             problem,
@@ -130,7 +129,7 @@ def policy_of(options: RecordOptions, problem: Problem) -> Callable[[Any], Any]:
 
 
 def _choice_seed(options: RecordOptions) -> int:
-    """Return the seed of a run that plays in none of the worlds that are recorded."""
+    """Return the seed of a run whose worlds are none of the recorded ones."""
     from npa_envs.agents.learning.problem import RUNS, WORLDS_PER_SEED
 
     first, last = options.first_seed, options.first_seed + options.episodes - 1

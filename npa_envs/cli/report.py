@@ -1,4 +1,4 @@
-"""The report of a training run: figures, a film and a card of the rule, in the run's folder."""
+"""The report of a training run in its folder: figures, a film and a card of the rule."""
 
 from __future__ import annotations
 
@@ -42,30 +42,30 @@ if TYPE_CHECKING:
     from npa_envs.rule.rule import NPARule
 
 FIRST_SEED = 1_000_000
-"""The first world's number; training uses others."""
+"""Seed of the first world; training uses others."""
 
 FILM_STEPS = 512
 """Steps of the film."""
 
 FILM_DAMAGES = (DamageEvent(200, "cut"), DamageEvent(350, "wipe"))
-"""Damage of filmed worlds that are to match their target pixel by pixel."""
+"""Damage in films of tasks that compare pixel by pixel."""
 
 TITLES: Mapping[str, str] = {
     "growth": "",
-    "healing": "Damaged, and left to themselves:",
+    "healing": "After damage:",
     "pictures": "Each picture by its own code, and by that of the next one, shuffled:",
-    "judge": "Judged by what no loss compares; at 1 worlds differ as drawings of the target do:",
+    "judge": "Distances that no loss uses; 1 is that of the target drawn by particles:",
     "accuracy": "",
-    "changes": "Some steps after something was done to the clouds:",
+    "changes": "Some steps after a change of the clouds:",
 }
-"""What stands above each table of a card."""
+"""Line above each table of a card."""
 
 
 class Training(NamedTuple):
-    """How a rule came to be, for its card: task, words after `npa-envs`, iterations, time [s]."""
+    """How a rule was trained: task, arguments after `npa-envs`, iterations, time [s]."""
 
     task_name: str
-    words: Sequence[str]
+    arguments: Sequence[str]
     iterations: int
     seconds: float
 
@@ -73,11 +73,11 @@ class Training(NamedTuple):
 def write_report(
     path: Path, folder: Path, training: Training, device: torch.device, *, progress: bool
 ) -> tuple[Path, str]:
-    """Measure and film a rule that was trained, write its card, and return its path and scores.
+    """Measure and film a trained rule, write its card, and return the card's path and scores.
 
-    The folder gets STEM.md, the card, STEM.json as of `npa-envs evaluate --json`, STEM.gif,
-    STEM.mp4 and STEM-filmstrip.png; of a 3D rule also a turntable and point files. On a CPU, where
-    worlds take as long as training does, fewer are measured, for fewer steps, and not damaged.
+    The folder gets the card STEM.md, STEM.json as of `npa-envs evaluate --json`, STEM.gif,
+    STEM.mp4 and STEM-filmstrip.png, for a 3D rule also a turntable and point files. On a CPU fewer
+    worlds are measured, for fewer steps and without damage, as they are slow there.
     """
     common.writable_folder(folder)
     rule = load_rule(path, device=device).float()
@@ -137,12 +137,11 @@ def write_report(
     write_text(card, _card(rule, task, training, facts, tables) + picture)
     rows = tables.get("growth", ())
     least = min(filter(math.isfinite, (row.loss for row in rows)), default=math.nan)
-    # A last loss of more than four times the least, or NaN: no comparison with it holds.
-    holds = not rows or rows[-1].loss <= 4.0 * least
-    said = score_line(json.loads(text))
-    if not holds:
-        said += f"; worlds do not hold: at step {rows[-1].step} their loss is many times the least"
-    return card, said + not_filmed
+    scores = score_line(json.loads(text))
+    # Written so that a last loss of NaN also counts as unstable.
+    if rows and not rows[-1].loss <= 4.0 * least:
+        scores += f"; unstable: at step {rows[-1].step} the loss is many times the least"
+    return card, scores + not_filmed
 
 
 def _card(
@@ -178,7 +177,7 @@ def _card(
         markdown_table(("", ""), rows),
         "## Training",
         f"Commit {facts['commit']}: {training.iterations} iterations in {training.seconds:.0f} s.",
-        f"```sh\n{shlex.join(['npa-envs', *training.words])}\n```",
+        f"```sh\n{shlex.join(['npa-envs', *training.arguments])}\n```",
         "## Measured",
         f"`{facts['command']}`, seeds that training never saw. Loss: {task.metric_name}.",
     ]

@@ -1,4 +1,4 @@
-"""`npa-envs robustness`: what rules bear, and what they heal, over many seeds."""
+"""`npa-envs robustness`: rules under changed conditions and after damage, over many seeds."""
 
 from __future__ import annotations
 
@@ -18,31 +18,29 @@ QUICK_SEEDS, QUICK_PARTICLES = 2, 256
 
 @dataclass(frozen=True, kw_only=True)
 class RobustnessOptions(common.MeasureOptions):
-    """Measure how rules grow under other conditions, and how they recover from damage.
+    """Measure how rules grow under changed conditions, and how they recover from damage.
 
-    Unlike `npa-envs stress` this expects nothing and gives no verdicts: it is a table of figures
-    over seeds. With --out a rule's JSON file is written after each value, and a run that was
-    stopped goes on there.
+    The result is a table of figures over seeds; `npa-envs stress` is the command with verdicts.
+    With --out a rule's JSON file is written after each value, and a stopped run continues there.
     """
 
     rules: Annotated[tuple[str, ...], tyro.conf.Positional, tyro.conf.arg(metavar="RULES")] = ()
-    """Shipped rules (`npa-envs list`), rules that runs begin with (`seven-pictures`), files of
-    rules, or folders of runs; default: all shipped ones, or one of each task when quick."""
+    """Shipped rules (`npa-envs list`), initial rules of presets (`seven-pictures`), files of rules,
+    or folders of runs; default: all shipped ones, or one of each task when quick."""
     seed_count: int | None = None
     """Seeds for each figure; default: 8, or 2 when quick."""
     first_seed: int = 1_000_000
     """The first seed's number; training uses others."""
     most_particles: int | None = None
-    """Particles of all seeds' worlds together, above which a condition is left out; default:
-    131072 on a CPU, 2097152 on CUDA."""
+    """Conditions with more particles in all seeds' worlds together are left out; default: 131072 on
+    a CPU, 2097152 on CUDA."""
     quick: bool = False
-    """Small worlds, few steps and values, a minute at most on two CPU cores: figures that say
-    nothing but that it runs."""
+    """Small worlds, few steps and values: a test that it runs, at most a minute on two cores."""
     out: Path | None = None
     """Folder for robustness_RULE.json, robustness.md, and curves (extra `bench`); default: nothing
     is written."""
     max_seconds: float | None = None
-    """Stop after this time; the same command goes on. Default: never."""
+    """Stop after this time [s]; the same command continues. Default: never."""
 
 
 def main(arguments: Sequence[str]) -> int:
@@ -58,13 +56,12 @@ def main(arguments: Sequence[str]) -> int:
 
     common.check_numbers(options, seed_count=1, first_seed=0, most_particles=1, threads=1)
     enough = time_limit(options.max_seconds)
-    # Rules that runs begin with are measured where they are named.
     sources = common.named_rules(options.rules or rule_names())
     names = list(sources)
     if options.quick and not options.rules:
         # One of each task.
         names = list({task_name(name): name for name in reversed(names)}.values())[::-1]
-    device = options.place()
+    device = options.checked_device()
     most = options.most_particles or study.MOST_PARTICLES[device.type]
     count = options.seed_count or (QUICK_SEEDS if options.quick else 8)
     seeds = range(options.first_seed, options.first_seed + count)
@@ -72,17 +69,16 @@ def main(arguments: Sequence[str]) -> int:
         device, options.commit, quick=options.quick, seeds=list(seeds), most_particles=most
     )
     folder = None if options.out is None else common.writable_folder(options.out)
-    words = without_folders(arguments, "--out")
     records = {}
-    # All are read first: a file of other settings is refused before any work is done.
+    # Read before any measurement, so that a file of other settings is refused at once.
     for name in names:
-        # A rule's name stays where it is trained anew.
+        # A rule that is trained again keeps its name, but not its weights.
         records[name] = study.RuleRecord(
             facts | {"weights": rule_digest(load_rule(sources[name]))},
             folder and folder / f"robustness_{name}.json",
             rule=name,
             done=False,
-            command=shlex.join(["npa-envs", "robustness", *words]),
+            command=shlex.join(["npa-envs", "robustness", *without_folders(arguments, "--out")]),
         ).read()
     with common.measuring(options, len(names), "rule") as bar:
         for name, record in records.items():
@@ -98,7 +94,7 @@ def main(arguments: Sequence[str]) -> int:
     if done:
         lines.append(study.tables(done))
     if done and folder is not None:
-        # Written before anything is printed: whoever reads that may have seen enough.
+        # Written before printing, which fails if the reader of a pipe has ended.
         write_text(folder / "robustness.md", lines[0])
         lines.append(f"wrote {folder}: robustness.md and a record for each rule")
         place = folder / "robustness_*.png"

@@ -1,4 +1,4 @@
-"""`npa-envs rollout RULE`: grow a rule from its seed and film it."""
+"""`npa-envs rollout RULE`: grows a rule from its seed and writes a film."""
 
 from __future__ import annotations
 
@@ -15,35 +15,34 @@ from npa_envs.errors import NPAError
 
 @dataclass(frozen=True, kw_only=True)
 class RolloutCommand(common.RuleOptions):
-    """Grow a rule from its seed, damage it on the way, and write a GIF, an MP4 and a filmstrip.
+    """Grow a rule from its seed, with damage, and write a GIF, an MP4 and a filmstrip.
 
-    Of a 3D world also a turntable GIF, and the grown cloud as points (PLY) and as Gaussians (PLY,
-    .splat).
+    A 3D world also gets a turntable GIF, and files of the grown cloud as points (PLY) and as
+    Gaussians (PLY, .splat).
     """
 
     steps: int = 512
     """Steps to run."""
     damage: Annotated[tuple[tuple[str, ...], ...], tyro.conf.UseAppendAction] = ()
-    """Damage on the way, STEP:KIND or STEP:KIND:SIZE: 200:cut (gap 0.1), 300:wipe (radius 0.2),
+    """Damage during the run, STEP:KIND or STEP:KIND:SIZE: 200:cut (gap 0.1), 300:wipe (radius 0.2),
     400:clump (radius 0.2); sizes in length units."""
     out: Path = Path("runs/rollout")
     """Folder to write to; created where missing."""
     resolution: int | None = None
     """Pixels on each side of the film; default: as trained, but at least 256."""
     style: Literal["splats", "points"] = "splats"
-    """Particles as large as in training, or points that stand apart; for those 512 pixels are
-    better."""
+    """Particles as large as in training, or small separate points; those need about 512 pixels."""
     background: str = "white"
-    """What lies behind them: a colour name such as black, or "#rrggbb"."""
+    """Colour behind the particles: a name such as black, or "#rrggbb"."""
     every: int | None = None
-    """Steps between two frames; default: as many as make about 150 frames."""
+    """Steps between two frames; default: for about 150 frames."""
     fps: float = 25.0
     """Frames a second, 0.1 to 50."""
     seed: int = 0
     """Randomness, 0 to 2^63 - 1; the same seed gives the same film."""
 
     def __post_init__(self) -> None:
-        """Check the numbers that nothing else checks; raises NPAError."""
+        """Check the numbers; raises NPAError."""
         for name in ("steps", "every"):
             value = getattr(self, name)
             if value is not None and value < 1:
@@ -58,7 +57,7 @@ class RolloutCommand(common.RuleOptions):
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Grow, film and write what the words after `npa-envs rollout` ask for; return 0."""
+    """Grow, film and write; return 0."""
     options = common.parse_options(RolloutCommand, "rollout", arguments)
     import torch
 
@@ -70,17 +69,17 @@ def main(arguments: Sequence[str]) -> int:
     from npa_envs.training.run import stop_flag
     from npa_envs.training.trained_tasks import task_of_rule
 
-    device = options.place()
-    damages = [parse_damage(text) for words in options.damage for text in words]
-    late = [damage for damage in damages if damage.step >= options.steps]
-    if late:
+    device = options.checked_device()
+    damages = [parse_damage(text) for texts in options.damage for text in texts]
+    after = [damage for damage in damages if damage.step >= options.steps]
+    if after:
         raise NPAError(
-            f"damage must come before the last of {options.steps} steps, got step {late[0].step}: "
-            f"raise --steps above {late[0].step}"
+            f"damage must come before the last of {options.steps} steps, got step {after[0].step}: "
+            f"raise --steps above {after[0].step}"
         )
     rule = load_rule(options.rule, device=device).float()
     trained = task_of_rule(options.rule, rule, device, **options.world)
-    # Drawn as asked for; measured as trained, so that the figures can be compared.
+    # The film has the size and style of the options; figures are those of the trained task.
     task = trained.task
     looks: dict[str, Any] = {"resolution": options.resolution, "style": options.style}
     shown = film.large_task(task, options.rule, rule, device, **looks, **options.world)

@@ -70,7 +70,7 @@ def main(arguments: Sequence[str]) -> int:
             f"budget must be finite and at least that of one batch, {least} particle-steps, got "
             f"{options.budget:g}: raise it"
         )
-    device = options.place()
+    device = options.checked_device()
     folder = common.writable_folder(options.out)
     search = Search(
         world,

@@ -1,4 +1,4 @@
-"""`npa-envs stress`: hard cases, what is expected of each, and where things break."""
+"""`npa-envs stress`: checks of hard cases, each with an expectation and a verdict."""
 
 from __future__ import annotations
 
@@ -11,38 +11,36 @@ import tyro
 
 from npa_envs.cli import common
 
-FAILED = 1
-
 
 @dataclass(frozen=True, kw_only=True)
 class StressOptions(common.MeasureOptions):
     """Check hard geometry, hard values, long runs of rules, gradients, precision.
 
-    Every check has an expectation, figures and a verdict: pass, fail, a range (where something
-    holds), or skipped. With --out a JSON file is written after each check, and a run that was
-    stopped goes on where it was: what passed is not repeated.
+    Every check has an expectation, figures and a verdict: pass, fail, a range in which a property
+    is true, or skipped. With --out a JSON file is written after each check, and a stopped run
+    continues: checks that passed are not repeated.
     """
 
     rules: Annotated[tuple[str, ...], tyro.conf.Positional, tyro.conf.arg(metavar="RULES")] = ()
-    """Check these rules alone, in all checks that are of a rule: shipped ones (`npa-envs list`),
-    files of rules, or folders of runs; default: the library and the shipped rules."""
+    """Run only the checks of rules, for these: shipped ones (`npa-envs list`), files of rules, or
+    folders of runs; default: all checks, with the shipped rules."""
     quick: bool = False
     """Small worlds, few steps, some rules: about a minute on two CPU cores."""
     only: tuple[str, ...] = ()
-    """Groups (geometry, values, time, gradients, precision), checks (time/gecko), or the first
-    words of checks (geometry/clump); default: all."""
+    """Groups (geometry, values, time, gradients, precision), checks (time/gecko), or beginnings of
+    names (geometry/clump); default: all."""
     max_seconds: float | None = None
-    """Begin no check after so long [s]; what is left is skipped, and run by the next call."""
+    """Start no check after this time [s]; the others are skipped, and run by the next call."""
     seed: int = 0
-    """What random worlds are drawn from."""
+    """Seed of random worlds."""
     out: Path | None = None
     """Folder for stress_DEVICE.json and heat maps (extra `bench`); default: nothing is written."""
     list: bool = False
-    """Run nothing: say which checks there are and what each expects."""
+    """Run nothing: print the checks and what each expects."""
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Check, print and write; return 1 where a check failed."""
+    """Check, print and write; return 1 if a check failed."""
     options = common.parse_options(StressOptions, "stress", arguments)
     from npa_envs.measure import accuracy
     from npa_envs.measure.accuracy import suite
@@ -60,7 +58,7 @@ def main(arguments: Sequence[str]) -> int:
                 print(f"{group}: {summary}")
                 print("\n".join(f"  {check.name}: {check.expected}" for check in some))
         return 0
-    device = options.place()
+    device = options.checked_device()
     path = None
     if options.out is not None:
         name = f"stress_{device.type}{'_quick' * options.quick}.json"
@@ -87,4 +85,4 @@ def main(arguments: Sequence[str]) -> int:
         maps = path.with_name(f"{path.stem}_*.png")
         drawn = write_plots(lambda: suite.heat_maps(record), maps, "heat maps")
         print("\n".join([f"wrote {path}", *drawn]))
-    return FAILED if record.failed() else 0
+    return 1 if record.failed() else 0

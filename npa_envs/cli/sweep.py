@@ -1,20 +1,18 @@
-"""`npa-envs sweep`: many training runs, one for each combination of options, over devices."""
+"""`npa-envs sweep`: one training run for each combination of options, over several devices."""
 
 from __future__ import annotations
 
-import hashlib
 import itertools
 import math
 import os
-import re
 import subprocess
 import sys
 import time
-from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
+from urllib.parse import quote
 
 import tyro
 
@@ -24,75 +22,68 @@ from npa_envs.files import read_json, write_text
 from npa_envs.measure.record import NONE, markdown_table, read_record, write_record
 from npa_envs.processes import Child, Places, part_of, run_children
 
-RUN_FAILED = 1
-
 RECORD, OUTPUT, TABLE = "run.json", "output.txt", "sweep.md"
 """Files: record and output of a run, and the table of all runs."""
 
-OWN = ("out", "device", "resume", "overwrite", "max-seconds", "processes", "gpus")
-"""Options of `npa-envs train` that a sweep gives by itself, or that would break it."""
+RESERVED = ("out", "device", "resume", "overwrite", "max-seconds", "processes", "gpus")
+"""Options of `npa-envs train` that a sweep sets itself, or that would break it."""
 
 PROGRAM = (sys.executable, "-m", "npa_envs", "train")
 
-SHOWN, HASH = 300, 12
-"""Characters of a failed run's last output, and of a hash in a folder's name."""
+SHOWN = 300
+"""Last characters of a failed run's output that are printed."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class SweepOptions:
-    """Train with every combination of some options, each run a process of its own.
+    """Train with every combination of some options, each run in its own process.
 
-    The words after `--` are those of `npa-envs train` for all runs. A sweep that was stopped goes
-    on where it was: runs that are over are left as they are, begun ones resume from their
-    checkpoints, and failed ones are tried again. Ctrl-C or SIGTERM lets runs write checkpoints; a
-    second one ends them at once. Ends with code 1 where a run failed.
+    The arguments after `--` are those of `npa-envs train`, the same for all runs. A stopped sweep
+    continues: finished runs stay as they are, started ones resume from their checkpoints, failed
+    ones are tried again. Ctrl-C or SIGTERM lets runs write checkpoints; a second one ends them at
+    once. The exit code is 1 if a run failed.
     """
 
     over: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME=A,B,C")]
-    """Options of `npa-envs train` with the values to take: target=heart,ring seed=0,1,2."""
+    """Options of `npa-envs train` with the values to try: target=heart,ring seed=0,1,2."""
     out: Path = Path("runs/sweep")
-    """Folder for a run's folder each, named by its values, and sweep.md, the table of all."""
+    """Folder with a folder for each run, named by its values, and sweep.md, the table of all."""
     devices: tuple[str, ...] = ("cpu",)
-    """Devices that runs are dealt out to, for example cuda:0 cuda:1."""
+    """Devices to distribute the runs over, for example cuda:0 cuda:1."""
     jobs: int | None = None
-    """Runs at once; default: one for each device."""
+    """Runs at the same time; default: one for each device."""
     threads: int = 1
     """CPU threads of each run."""
     part: Annotated[str | None, tyro.conf.arg(metavar="K/N")] = None
-    """Run the K-th of N parts alone: a machine, or a task of a scheduler's array, takes one each,
-    all with the same --out on a shared disk."""
+    """Run only the K-th of N parts: several machines, or tasks of a scheduler's array, run one part
+    each, all with the same --out on a shared disk."""
     max_seconds: float = math.inf
-    """No run begins after so long [s]; the next call goes on."""
+    """No run starts after this time [s]; the next call continues."""
     progress: bool = True
     """Show a progress bar."""
 
 
 @dataclass
 class SweepRun(Child):
-    """One combination: a process that trains, or goes on training, in a folder."""
+    """One combination: a process that starts or resumes training in a folder."""
 
     values: Mapping[str, str]
     """Values by option."""
-    words: list[str]
-    """Words after `npa-envs train`."""
+    arguments: list[str]
+    """Arguments after `npa-envs train`."""
     folder: Path
     threads: int = 1
     process: subprocess.Popen[bytes] | None = None
-    begin: float = 0.0
-
-    @property
-    def name(self) -> str:
-        """The name of its folder."""
-        return self.folder.name
+    start_time: float = 0.0
 
     def go(self, device: str) -> None:
         """Start it on a device."""
-        self.begin = time.perf_counter()
+        self.start_time = time.perf_counter()
         self.folder.mkdir(parents=True, exist_ok=True)
-        given = ("--out", str(self.folder), "--device", device, "--resume", "auto")
+        own = ("--out", str(self.folder), "--device", device, "--resume", "auto", "--no-progress")
         with (self.folder / OUTPUT).open("wb") as output:
             self.process = subprocess.Popen(
-                [*PROGRAM, *self.words, *given, "--no-progress"],
+                [*PROGRAM, *self.arguments, *own],
                 stdin=subprocess.DEVNULL,
                 stdout=output,
                 stderr=output,
@@ -108,7 +99,7 @@ class SweepRun(Child):
         return self.process is not None and self.process.poll() is not None
 
     def stop(self, *, at_once: bool) -> None:
-        """Ask it to write its checkpoint and end, or only to end."""
+        """Ask it to end, after a checkpoint unless `at_once`."""
         if self.process is not None:
             (self.process.kill if at_once else self.process.terminate)()
 
@@ -118,38 +109,40 @@ class SweepRun(Child):
             self.process.wait()
 
     def write(self) -> None:
-        """Write its words, exit code and wall time [s]."""
+        """Write its arguments, exit code and wall time [s]."""
         assert self.process is not None, "it is over"
-        seconds = time.perf_counter() - self.begin
+        seconds = time.perf_counter() - self.start_time
         held = {"code": int(self.process.returncode), "seconds": seconds}
-        write_record(self.folder / RECORD, {"facts": {"words": self.words}, **held})
+        write_record(self.folder / RECORD, {"facts": {"words": self.arguments}, **held})
 
     def record(self) -> tuple[int, float] | None:
-        """Return the exit code and time that were written; None: none. Refuses other words."""
-
-        def read(held: dict[str, Any]) -> tuple[int, float]:
-            return int(held["code"]), float(held["seconds"])
-
-        return read_record(self.folder / RECORD, {"words": self.words}, read, command="sweep")
+        """Return the recorded exit code and time, or None; refuses those of other arguments."""
+        return read_record(
+            self.folder / RECORD,
+            {"words": self.arguments},
+            lambda content: (int(content["code"]), float(content["seconds"])),
+            command="sweep",
+        )
 
     @property
     def done(self) -> bool:
-        """Whether it has ended well, as its record says."""
+        """Whether its record says that it ended without an error."""
         held = self.record()
         return held is not None and held[0] == 0
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Run what is missing, print and write; return 1 where a run failed."""
-    words = list(arguments)
-    place = words.index("--") if "--" in words else len(words)
-    options = common.parse_options(SweepOptions, "sweep", words[:place])
+    """Run what is missing, print and write; return 1 if a run failed."""
+    given = list(arguments)
+    split = given.index("--") if "--" in given else len(given)
+    options = common.parse_options(SweepOptions, "sweep", given[:split])
     common.check_numbers(options, jobs=1, threads=1)
     folder = common.writable_folder(options.out)
-    runs = combinations(options.over, words[place + 1 :], folder, options.threads)
-    mine = part_of(runs, options.part, lambda run: run.name)
+    runs = combinations(options.over, given[split + 1 :], folder, options.threads)
+    mine = part_of(runs, options.part, lambda run: run.folder.name)
     waiting = [run for run in mine if not run.done]
     places = Places(options.devices, options.jobs or len(options.devices), options.threads)
+    again = "runs are left: call again with the same arguments"
     with common.StepBar(len(waiting), show=options.progress, unit="run") as bar:
 
         def finished(run: SweepRun) -> None:
@@ -166,8 +159,7 @@ def main(arguments: Sequence[str]) -> int:
                 max_seconds=options.max_seconds,
             )
         except KeyboardInterrupt:
-            left_count = sum(not run.done for run in mine)
-            print(f"interrupted; {left_count} runs are left: call again with the same words")
+            print(f"interrupted; {sum(not run.done for run in mine)} {again}")
             raise
     text = table(runs)
     write_text(folder / TABLE, text)
@@ -175,11 +167,11 @@ def main(arguments: Sequence[str]) -> int:
     left = [run for run in mine if not run.done]
     failed = [run for run in left if (run.folder / RECORD).exists()]
     for run in failed:
-        said = (run.folder / OUTPUT).read_text("utf-8", errors="replace").strip()[-SHOWN:]
-        print(f"{run.name} failed: {' '.join(said.split())}")
+        output = (run.folder / OUTPUT).read_text("utf-8", errors="replace").strip()[-SHOWN:]
+        print(f"{run.folder.name} failed: {' '.join(output.split())}")
     if len(left) > len(failed):
-        print(f"{len(left) - len(failed)} runs are left: call again with the same words")
-    return RUN_FAILED if failed else 0
+        print(f"{len(left) - len(failed)} {again}")
+    return 1 if failed else 0
 
 
 def combinations(
@@ -190,28 +182,29 @@ def combinations(
 
     if not common or common[0] not in TASKS:
         cure = suggest(common[0], TASKS) if common else ", ".join(TASKS)
-        raise NPAError(f"the words after -- must begin with a task of npa-envs train: {cure}")
-    given = {_option(word.partition("=")[0]) for word in common if word.startswith("--")}
+        raise NPAError(f"the arguments after -- must begin with a task of npa-envs train: {cure}")
+    used = [_option(word.partition("=")[0]) for word in common if word.startswith("--")]
     values: dict[str, list[str]] = {}
     for word in over:
-        name, mark, listed = word.partition("=")
+        name, _, listed = word.partition("=")
         name, each = _option(name), listed.split(",")
-        if not (mark and name and all(each)):
+        if not (name and all(each)):
             raise NPAError(f"over must be NAME=A,B,C, got {word!r}: seed=0,1,2")
-        if name in values or name in given:
+        if name in used:
             raise NPAError(f"--{name} must be given once, in --over or after --, got it twice")
+        if len(set(each)) < len(each):
+            raise NPAError(f"over must name each value once, got {word!r}: leave the others out")
         values[name] = each
-        twice = [value for value, count in Counter(each).items() if count > 1]
-        if twice:
-            raise NPAError(f"over must name each value once, got {word!r}: leave out {twice[0]!r}")
-    for name in OWN:
-        if name in values or name in given:
+        used.append(name)
+    for name in RESERVED:
+        if name in used:
             raise NPAError(f"--{name} must not be given to the runs: a sweep does so by itself")
-    chosen = [dict(zip(values, one, strict=True)) for one in itertools.product(*values.values())]
     runs = []
-    for one, name in zip(chosen, _folder_names(chosen), strict=True):
-        own = [word for option, value in one.items() for word in (f"--{option}", value)]
-        runs.append(SweepRun(one, [*common, *own], folder / name, threads))
+    for one in itertools.product(*values.values()):
+        chosen = dict(zip(values, one, strict=True))
+        own = [word for option, value in chosen.items() for word in (f"--{option}", value)]
+        name = ",".join(f"{option}={quote(value, safe='')}" for option, value in chosen.items())
+        runs.append(SweepRun(chosen, [*common, *own], folder / name, threads))
     return runs
 
 
@@ -220,22 +213,11 @@ def _option(word: str) -> str:
     return word.removeprefix("--").replace("_", "-")
 
 
-def _folder_names(chosen: Sequence[Mapping[str, str]]) -> list[str]:
-    """Return a folder's name for each combination; those that would be alike end with a hash."""
-    full = [",".join(f"{name}={value}" for name, value in one.items()) for one in chosen]
-    plain = [re.sub(r"[^\w=,.+-]", "_", words) for words in full]
-    count = Counter(plain)
-    return [
-        name if count[name] == 1 else f"{name}-{hashlib.sha256(words.encode()).hexdigest()[:HASH]}"
-        for name, words in zip(plain, full, strict=True)
-    ]
-
-
 def table(runs: Sequence[SweepRun]) -> str:
     """Return the runs with the scores of their reports, in Markdown."""
     from npa_envs.measure.quality import score_line
 
-    lines = []
+    rows = []
     for run in runs:
         state, seconds, scores = "not run", NONE, NONE
         held = run.record()
@@ -244,6 +226,5 @@ def table(runs: Sequence[SweepRun]) -> str:
             seconds = f"{held[1]:.0f}"
             reports = sorted((run.folder / "report").glob("rule*.json"))
             scores = "; ".join(score_line(read_json(report)) for report in reports) or NONE
-        lines.append([*run.values.values(), state, seconds, scores])
-    names = list(runs[0].values) if runs else []
-    return markdown_table([*names, "run", "seconds", "measured"], lines) + "\n"
+        rows.append([*run.values.values(), state, seconds, scores])
+    return markdown_table([*runs[0].values, "run", "seconds", "measured"], rows) + "\n"

@@ -1,4 +1,4 @@
-"""`npa-envs train TASK`: its options, how many processes a run has, what it says, how it ends."""
+"""`npa-envs train TASK`: options, number of processes, output, and the end of a run."""
 
 from __future__ import annotations
 
@@ -41,11 +41,10 @@ VIEWER = ("starlette", "uvicorn")
 """Packages that `npa-envs view` needs."""
 
 THREADED_BATCH = 4096
-"""Particles of a batch from which on two threads train faster than one (docs/performance.md)."""
+"""From this number of particles of a batch on, two threads are faster than one."""
 
 COMMON = ("target", "iterations", "device", "out")
-"""Fields of configurations that stand among the most common options, where a task has them."""
-
+"""Fields of configurations that are options of `TrainOptions`."""
 
 SHOWN = {
     *("initial_rule", "initial_rules", "frozen", "repeats", "world_count", "pool_size", "steps"),
@@ -57,34 +56,32 @@ SHOWN = {
 
 @dataclass(frozen=True, kw_only=True)
 class TrainOptions:
-    """The most common options; the paper's schedule, pool and world follow below."""
+    """The most common options."""
 
     preset: str = ""
     """Configuration to start from: `paper`, `fast` (minutes on a CPU), `tiny` (seconds), or for
-    pictures and textures `best` (minutes on a GPU); `npa-envs list` has their sizes and times. By
-    default `best` on CUDA where the task has it, else `fast`."""
+    pictures and textures `best` (minutes on a GPU); `npa-envs list` prints sizes and times. By
+    default `best` on CUDA if the task has it, else `fast`."""
     target: str = ""
-    """What is to be learned: a built-in name (`npa-envs list`), a file, or for morphogenesis2d an
-    emoji."""
+    """The target: a built-in name (`npa-envs list`), a file, or for morphogenesis2d an emoji."""
     iterations: int = 0
     """Optimiser steps in one repeat."""
     device: str = "cpu"
     """Where to train: cpu, cuda, cuda:1."""
     out: Path = Path()
-    """Folder that log, pictures, checkpoint and rule are written to; created where missing."""
+    """Folder for log, pictures, checkpoint and rule; created where missing."""
     config: Path | None = None
-    """YAML, TOML or JSON file with field names and values, also `preset`; goes over the preset."""
+    """YAML, TOML or JSON file of fields and values, also `preset`; overrides the preset."""
     processes: int | None = None
-    """Processes that share the run, on CUDA each with a GPU of its own; by default 1, but 2 where
-    a CPU has cores for them and the batch is small. `torchrun --nproc-per-node=4 -m npa_envs train
-    ...` does the same."""
+    """Processes that share the run, on CUDA one GPU each; by default 1, but 2 for small batches on
+    a CPU with enough cores. `torchrun --nproc-per-node=4 -m npa_envs train ...` does the same."""
     gpus: int | None = None
-    """GPUs that share the run: `--gpus 4` says `--device cuda --processes 4`."""
+    """GPUs that share the run: `--gpus 4` means `--device cuda --processes 4`."""
     resume: bool = False
-    """Go on from the checkpoint in the folder `out`, with the configuration that lies there.
-    `--resume auto`: if there is one; else begin."""
+    """Continue from the checkpoint in the folder `out`, with the configuration of that folder.
+    `--resume auto`: if there is one; else start."""
     overwrite: bool = False
-    """Start anew although the folder `out` holds a run; the run's files are removed."""
+    """Start again even if the folder `out` contains a run; the run's files are removed."""
     max_seconds: float | None = None
     """Stop after this time [s]; the run can be resumed."""
     progress: bool = True
@@ -93,51 +90,48 @@ class TrainOptions:
     """End with a report in the folder `out`: figures, a film and a card of the rule."""
 
 
-def resolve_task(task_name: str, words: Sequence[str]) -> list[str]:
-    """Return the options with `--resume auto` decided, and with CUDA as the device of `--gpus`."""
+def resolve_task(task_name: str, arguments: Sequence[str]) -> list[str]:
+    """Return the arguments with `--resume auto` replaced, and with the device of `--gpus`."""
 
-    def out_of(words: Sequence[str]) -> Path:
-        return parse(task_name, starting_configuration(task_name, words), words)[1].out
+    def out_of(given: Sequence[str]) -> Path:
+        return parse(task_name, starting_configuration(task_name, given), given)[1].out
 
-    return common.resolve_resume(with_device_of_gpus(words), out_of)
+    return common.resolve_resume(with_device_of_gpus(arguments), out_of)
 
 
 def _check_preset(
     name: str, run: TrainConfig[Any], task_name: str, folder: RunFolder, arguments: Sequence[str]
 ) -> None:
-    """Check that a run that goes on is of the preset that was named."""
+    """Check that a resumed run was started with the preset of the arguments."""
     names = task_entry(task_name).presets
     flat = {preset_name: _fields_of(preset(preset_name, task_name)) for preset_name in names}
-    wanted, held = flat[name], _fields_of(run)
-    said = {word.partition("=")[0].lstrip("-").replace("-", "_") for word in arguments}
-    said |= {word.removeprefix("no_") for word in said} | {"out", "device"}
+    wanted, found = flat[name], _fields_of(run)
+    given = {word.partition("=")[0].lstrip("-").replace("-", "_") for word in arguments}
+    given |= {word.removeprefix("no_") for word in given} | {"out", "device"}
     others = [
         field
         for field, value in wanted.items()
-        if field not in said
-        and held.get(field) != value
+        if field not in given
+        and found.get(field) != value
         and any(other.get(field) != value for other in flat.values())
     ]
     if others:
-        shown_fields = ", ".join(f"{field}: {shown(held.get(field))}" for field in others[:3])
+        shown_fields = ", ".join(f"{field}: {shown(found.get(field))}" for field in others[:3])
         more = f" and {len(others) - 3} more" if len(others) > 3 else ""
         raise NPAError(
             f"preset must be the one that the run in {shown(str(folder.path))} was begun with, "
-            f"but {name!r} differs from it ({shown_fields}{more} there): leave --preset out, and "
-            "it goes on as it was"
+            f"but {name!r} differs from it ({shown_fields}{more} there): leave --preset out"
         )
 
 
 def _fields_of(config: TrainConfig[Any]) -> dict[str, Any]:
-    """Return a configuration's own fields; those of its task may follow from its target."""
-    own = config_to_dict(config)
-    del own["task"]
-    return own
+    """Return the fields of a configuration without its task."""
+    return {name: value for name, value in config_to_dict(config).items() if name != "task"}
 
 
 def starting_configuration(task_name: str, arguments: Sequence[str]) -> TrainConfig[Any]:
-    """Return the configuration that the options are laid over: preset, file, or the run resumed."""
-    # These options decide what the others' defaults are, so they are looked at first.
+    """Return the configuration that the options change: that of the preset, file or resumed run."""
+    # Parsed first, as these options decide the defaults of the others.
     parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False, exit_on_error=False)
     parser.add_argument("--preset")
     parser.add_argument("--config", type=Path)
@@ -160,7 +154,7 @@ def starting_configuration(task_name: str, arguments: Sequence[str]) -> TrainCon
         try:
             base = load_config(folder.config, base)
         except NPAError:
-            # Fields of another task are unknown: its name is the better error.
+            # The run may be of another task, whose fields are unknown: report that instead.
             check_task(load_checkpoint(folder.checkpoint), task_name, folder.checkpoint)
             raise
         if first.preset and first.config is None:
@@ -168,14 +162,14 @@ def starting_configuration(task_name: str, arguments: Sequence[str]) -> TrainCon
     if first.config is not None:
         presets = task_entry(task_name).presets
         if first.preset or first.resume:
-            # What is said on the command line, or was of the run resumed, goes over the file.
+            # The preset of the command line, or the resumed run, overrides that of the file.
             presets = dict.fromkeys(presets, base)
         base = load_config(first.config, base, presets=presets)
     return base
 
 
 def default_preset(task_name: str, device: str) -> str:
-    """Return the preset of runs that name none: `best` on CUDA where there is one, else `fast`."""
+    """Return the default preset: `best` on CUDA if the task has it, else `fast`."""
     cuda = device.startswith("cuda")
     return "best" if cuda and "best" in task_entry(task_name).presets else "fast"
 
@@ -183,16 +177,16 @@ def default_preset(task_name: str, device: str) -> str:
 def parse(
     task_name: str, base: TrainConfig[Any], arguments: Sequence[str]
 ) -> tuple[TrainOptions, TrainConfig[Any]]:
-    """Lay the command line's options over a configuration.
+    """Return the launch options, and the configuration changed by the others.
 
     Ends the process after `--help`, which shows the most used options, and `--help-all`.
     """
-    # What a help leaves out could not be given either.
+    # An option that is hidden from the help cannot be parsed, so only the help hides any.
     whole = not {"-h", "--help"} & set(arguments)
     arguments = ["--help" if word == "--help-all" else word for word in arguments]
 
     def read(defaults: Any) -> tuple[TrainOptions, Any]:
-        # These stand first, as options of their own, and not once more below.
+        # These fields are options of `TrainOptions`, and hidden among those of the configuration.
         shared = {
             name: getattr(holder, name)
             for name in COMMON
@@ -223,9 +217,9 @@ def parse(
 
 
 def _without(source: Any, names: Iterable[str], *, whole: bool = True) -> Any:
-    """Return a dataclass of which some fields, where it has them, are no options.
+    """Return a dataclass in which the fields `names` are no options.
 
-    Unless it is to be whole, fields that are not `SHOWN` are none either.
+    Unless `whole`, fields that are not in `SHOWN` are hidden too.
     """
     kind: Any = type(source)
     fixed: Any = tyro.conf.Fixed
@@ -241,12 +235,12 @@ def _without(source: Any, names: Iterable[str], *, whole: bool = True) -> Any:
     return _of_type(narrow, source)
 
 
-# Options of tasks of several species: flat, although configurations nest.
+# Options of tasks of several species: one level, although their configurations nest.
 
 
 @dataclass(frozen=True, kw_only=True)
 class SpeciesOptions(Morphogenesis2DConfig):
-    """What all species share is said once; a --config file says it species by species."""
+    """Options that hold for all species; a --config file can set them for each species."""
 
     target: tyro.conf.Suppress[str] = "gecko"
     code_dim: tyro.conf.Suppress[int] = 8
@@ -263,7 +257,7 @@ class SpeciesOptions(Morphogenesis2DConfig):
 
 @dataclass(frozen=True, kw_only=True)
 class JointOptions(JointTrainConfig[SpeciesOptions]):
-    """A training run of several rules in one world; what is said of a species holds for all."""
+    """A training run of several rules in one world; options of a species hold for all."""
 
     initial_rule: tyro.conf.Suppress[str] = ""
 
@@ -274,7 +268,7 @@ def parse_joint(
 ) -> tuple[TrainOptions, JointTrainConfig[CoMorphogenesis2DConfig]]:
     """Return the command line's configuration of a run of several species."""
     task = base.task
-    # Once for each species, so that fields without an option keep each species' value.
+    # Parsed once for each species, so that fields without an option keep each species' value.
     launch, shared = read(_flat(base, task, 0))
     targets = shared.task.targets
     if len(targets) < 2:
@@ -292,7 +286,7 @@ def parse_joint(
 def _flat(
     base: JointTrainConfig[CoMorphogenesis2DConfig], task: CoMorphogenesis2DConfig, number: int
 ) -> JointOptions:
-    """Return a configuration as options, with the fields of one species for all."""
+    """Return the options of a configuration, with the fields of species `number`."""
     targets = tuple(config.target for config in task.species)
     options = _of_type(
         SpeciesOptions, task.species[number], targets=targets, distance=task.distance
@@ -302,7 +296,7 @@ def _flat(
 
 
 def _of_type(kind: Any, source: Any, **others: Any) -> Any:
-    """Return a dataclass with the fields that another one has, and others."""
+    """Return a dataclass of the type `kind` with the fields of `source`, and others."""
     own = {field.name for field in fields(kind)}
     same = {f.name: getattr(source, f.name) for f in fields(source) if f.name in own}
     return kind(**same | others)
@@ -326,32 +320,32 @@ def main(arguments: Sequence[str]) -> int:
     with joined_ranks() as ranks:
         asked = None
         if ranks.first:
-            words = resolve_task(task_name, arguments[1:])
-            asked = words, *parse(task_name, starting_configuration(task_name, words), words)
-        # The first process alone reads files, so that all of them train the same.
+            given = resolve_task(task_name, arguments[1:])
+            asked = given, *parse(task_name, starting_configuration(task_name, given), given)
+        # Only the first process reads files, so that all have the same configuration.
         asked = ranks.broadcast(asked)
-        assert asked is not None, "said by the first process"
-        words, options, config = asked
+        assert asked is not None, "broadcast by the first process"
+        given, options, config = asked
         count = process_count(task_name, options, config)
         if count > 1 and not ranks.together:
-            command = ["train", task_name, *words]
+            command = ["train", task_name, *given]
             if options.processes is None and options.gpus is None:
                 command += ["--processes", str(count)]
             return launch(count, command, config.out, config.device)
         with print_once(ranks):
-            return run(task_name, options, config, (task_name, *words), ranks)
+            return run(task_name, options, config, (task_name, *given), ranks)
 
 
 def run(
     task_name: str,
     options: TrainOptions,
     config: TrainConfig[Any],
-    words: Sequence[str],
+    arguments: Sequence[str],
     ranks: Ranks,
 ) -> int:
     """Train as one of the processes that share the run, and return the exit code.
 
-    `words` are those after `npa-envs train`, for the report.
+    The report prints `arguments`, those after `npa-envs train`.
     """
     if options.max_seconds is not None and not 0 < options.max_seconds < math.inf:
         raise NPAError(f"max_seconds must be positive and finite, got {options.max_seconds}")
@@ -363,7 +357,7 @@ def run(
     def begun() -> None:
         if ranks.first:
             print("\n".join(announcement(task_name, options, config, ranks.count)))
-            end = f"(Ctrl-C stops in order; {resume_command} goes on)"
+            end = f"(Ctrl-C writes a checkpoint and stops; {resume_command} continues)"
             print(f"writing to {config.out}/ {end}", flush=True)
 
     try:
@@ -378,7 +372,7 @@ def run(
                 begun=begun,
             )
     except KeyboardInterrupt:
-        print(f"interrupted; the last checkpoint is {folder.checkpoint}\ngo on: {resume_command}")
+        print(f"interrupted; the last checkpoint is {folder.checkpoint}\nresume: {resume_command}")
         raise
     if not ranks.first:
         return INTERRUPTED if result.interrupted else 0
@@ -400,8 +394,8 @@ def run(
         print(f"  rule        {rule}")
     print(f"  log         {folder.log}\n  pictures    {folder.pictures}/")
     if options.report and result.iteration > 0 and not result.interrupted:
-        command = ("train", *words)
-        if options.resume:  # The file of the run has what these words leave out.
+        command = ("train", *arguments)
+        if options.resume:  # The run's file has the options that these arguments leave out.
             command = ("train", task_name, "--config", str(folder.config))
             command += ("--processes", str(ranks.count)) if ranks.count > 1 else ()
         seconds = result.record.get("seconds", 0.0)
@@ -414,7 +408,7 @@ def run(
                 )
                 print(f"  report      {card}: {scores}")
             except NPAError as error:
-                # The rule is there all the same; a bad one may not live as long as is measured.
+                # The rule is written in any case; a bad one may diverge while it is measured.
                 print(f"  no report   {error}")
     if meet:
         print(f"  together    {meet}")
@@ -427,20 +421,16 @@ def run(
 
 
 def thread_count(config: TrainConfig[Any]) -> int:
-    """Return how many CPU threads torch and the kernels train with: one where batches are small.
-
-    Several would wait for each other longer than they work (`THREADED_BATCH`).
-    """
+    """Return the number of CPU threads for training: 1 for batches below `THREADED_BATCH`."""
     batch = config.world_count * sum(own.particle_count for own in _species(config))
     return 1 if batch < THREADED_BATCH else torch.get_num_threads()
 
 
 def process_count(task_name: str, options: TrainOptions, config: TrainConfig[Any]) -> int:
-    """Return how many processes train: by default two where a CPU's other cores would be idle.
+    """Return the number of processes: by default 2 if small batches leave cores of the CPU idle.
 
-    They are where batches are too small for several threads. A run of less than a minute is over
-    before the second process has paid for its start, and one that was begun alone goes on with the
-    same draws.
+    1 for runs of less than a minute, in which the start of the second process takes too long, and
+    for resumed runs of one process, which draw other random numbers than two.
     """
     asked = asked_count(options.gpus, options.processes, config.device)
     if asked is not None:
@@ -459,14 +449,14 @@ def process_count(task_name: str, options: TrainOptions, config: TrainConfig[Any
 
 
 def _species(config: TrainConfig[Any]) -> Sequence[Any]:
-    """Return the tasks of all species; of one, where a task has no others."""
+    """Return the tasks of all species, one or several."""
     return getattr(config.task, "species", (config.task,))
 
 
 def announcement(
     task_name: str, options: TrainOptions, config: TrainConfig[Any], process_count: int = 1
 ) -> tuple[str, str]:
-    """Return a run's targets in a line, and its size and expected time in another."""
+    """Return two lines: a run's targets, and its size and expected time."""
     species = _species(config)
     goals: list[str] = []
     for own in species:
@@ -481,9 +471,9 @@ def announcement(
     elif process_count > 1:
         expected = None
     if expected is None:
-        time = f"how long that takes on {config.device} the progress bar tells"
+        time = f"the progress bar shows the time on {config.device}"
     else:
-        time = f"about {common.duration(expected)} on a CPU that has little else to do"
+        time = f"about {common.duration(expected)} on an idle CPU"
     if options.max_seconds is not None:
         time += f", at most {common.duration(options.max_seconds)}"
     where = config.device

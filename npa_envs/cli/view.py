@@ -1,4 +1,4 @@
-"""`npa-envs view`: a world to watch and to touch, in the browser."""
+"""`npa-envs view`: serves a live world to the browser."""
 
 from __future__ import annotations
 
@@ -20,36 +20,36 @@ if TYPE_CHECKING:
 
     from npa_envs.web.live import LiveWorld
 
-OWN_KEYWORDS = ("id", "policy", "device", "output", "disable_env_checker")
-"""What the command says itself of an environment that it makes."""
+RESERVED = ("id", "policy", "device", "output", "disable_env_checker")
+"""Keywords of an environment that the command sets itself."""
 
 RUN_FILES = ("config.json", "log.jsonl", "checkpoint.pt")
-"""What tells the folder of a run from others."""
+"""Files that mark a folder as that of a run."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class ViewOptions(common.DeviceOptions):
-    """Watch and touch a live world in the browser: a rule, a training run or an environment.
+    """Watch and change a live world in the browser: a rule, a training run or an environment.
 
     The page has brushes, sliders, damage and films. A run's world follows its newest checkpoint.
-    The server answers this computer alone; with another --host it prints a link with a token.
+    The server answers only this computer; with another --host it prints a link with a token.
     """
 
     what: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="RULE|RUN|ENV")] = "gecko"
     """A shipped rule (`npa-envs list`), a rule's file, the folder of a run, or the id of an
     environment such as npa/Texture-v0."""
     policy: str = "zero"
-    """What acts in an environment: "zero", "random", or a rule that fits it."""
+    """The policy in an environment: "zero", "random", or a rule for it."""
     options: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME=VALUE")] = ()
     """Keywords of the environment, for example target=dots eps=0.3 eps0=0.3."""
     particle_count: int | None = None
     """Particles N; default: as trained."""
     seed: int = 0
-    """The first world's number."""
+    """Seed of the first world."""
     threads: int = 1
     """CPU threads of torch and of the kernels; the browser needs a core as well."""
     host: str = "127.0.0.1"
-    """The address to bind; 0.0.0.0 lets other computers in, who need the token."""
+    """The address to bind; with 0.0.0.0 other computers can connect with the token."""
     port: int | None = None
     """The port; default: the first free one from 8765 on."""
     browser: bool = True
@@ -59,11 +59,11 @@ class ViewOptions(common.DeviceOptions):
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Serve what the words after `npa-envs view` ask for until Ctrl-C; return 0."""
+    """Serve the world until Ctrl-C; return 0."""
     options = common.parse_options(ViewOptions, "view", arguments)
     if not 1 <= options.threads <= 256:
         raise NPAError(f"threads must be in [1, 256], got {options.threads}")
-    device = options.place()
+    device = options.checked_device()
     make_world = world_maker(options, device)
     with common.torch_threads(options.threads):
         # Made once before the server starts, so that errors come at once.
@@ -87,7 +87,7 @@ def main(arguments: Sequence[str]) -> int:
 
 
 def open_browser(address: str) -> bool:
-    """Open a page in a browser; return whether there is one that leaves the terminal alone."""
+    """Open a page in a graphical browser; return whether there is one."""
     return has_screen() and webbrowser.open(address)
 
 
@@ -99,7 +99,7 @@ def world_maker(options: ViewOptions, device: torch.device) -> Callable[[], Live
     if options.what.startswith("npa/"):
         policy = options.policy
         keywords = common.named_values("options", options.options)
-        for name in OWN_KEYWORDS:
+        for name in RESERVED:
             if name in keywords:
                 said = name in ("device", "policy")
                 cure = f"say --{name} {keywords[name]}" if said else "leave it out"

@@ -1,4 +1,4 @@
-"""`npa-envs warmup`: compile the kernels before they are needed."""
+"""`npa-envs warmup`: compiles the kernels ahead of time."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from npa_envs.errors import NPAError
 
 @dataclass(frozen=True, kw_only=True)
 class WarmupOptions(common.DeviceOptions):
-    """Compile the kernels ahead of time, into Warp's cache (`npa-envs doctor` says where)."""
+    """Compile the kernels ahead of time, into Warp's cache (`npa-envs doctor` prints where)."""
 
     space_dims: tuple[int, ...] = (2,)
     """Space dimensions: 2, 3 or both."""
@@ -22,7 +22,7 @@ class WarmupOptions(common.DeviceOptions):
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Compile what the words after `npa-envs warmup` ask for; return 0."""
+    """Compile the kernels; return 0."""
     options = common.parse_options(WarmupOptions, "warmup", arguments)
     import torch
 
@@ -36,7 +36,7 @@ def main(arguments: Sequence[str]) -> int:
         )
     start = time.perf_counter()
     dtypes = [getattr(torch, name) for name in options.dtypes]
-    warmup(options.place(), space_dims=options.space_dims, dtypes=dtypes)
+    warmup(options.checked_device(), space_dims=options.space_dims, dtypes=dtypes)
     seconds = time.perf_counter() - start
     print(f"kernels for {options.device} are ready ({seconds:.1f} s), in {kernel_cache_folder()}")
     return 0

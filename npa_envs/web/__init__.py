@@ -1,1 +1,1 @@
-"""Worlds to watch and to touch in a browser."""
+"""Live worlds in a browser: the server of `npa-envs view`, and exported HTML files."""

@@ -1,4 +1,4 @@
-"""Live worlds of environments in which a policy acts, episode after episode."""
+"""Live worlds of environments, which a policy runs episode by episode."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def make_environment(
 ) -> tuple[Any, Callable[[Any], Any]]:
     """Return an environment of this package, and a policy for it.
 
-    The policy is "zero", "random", or the source of a rule. Keywords that are None keep their
+    `policy` is "zero", "random", or the source of a rule. Keywords that are None keep their
     defaults.
     """
     others = {*GARDEN_IDS, *(environment.id for environment in CODED)}
@@ -51,7 +51,7 @@ def make_environment(
     given = {name: value for name, value in keywords.items() if value is not None}
     limit = given.get("max_episode_steps", 1)
     if not is_whole(limit) or limit < 1:
-        # Gymnasium's own message does not say how to mend it.
+        # Checked here because Gymnasium's message does not say how to fix it.
         raise NPAError(
             f"max_episode_steps must be a whole number of at least 1, got {shown(limit)}: try 512"
         )
@@ -60,7 +60,7 @@ def make_environment(
 
 
 class EnvironmentWorld(LiveWorld):
-    """An environment of this package in which a policy acts; it is closed with the world."""
+    """The world of an environment that a policy runs; `close` closes the environment."""
 
     def __init__(
         self, env: Any, policy: Callable[[Any], Any], *, seed: int = 0, title: str | None = None
@@ -79,7 +79,7 @@ class EnvironmentWorld(LiveWorld):
         self.reset(self.seed)
 
     def reset(self, seed: int | None) -> None:
-        """Begin an episode."""
+        """Start an episode."""
         self.seed = self.seed + 1 if seed is None else seed
         self._begin(self.seed)
 
@@ -101,10 +101,12 @@ class EnvironmentWorld(LiveWorld):
             "box": None if box is None else list(box),
             "half_width": task.half_width if box is None else 0.5 * min(box),
             "spot": 0.7 * float(task.pixel_size),
-            "tools": [*(("push", "clump", "cut") if physics.moving else ()), "inject"],
             "damages": list(DAMAGE_SIZES) if physics.moving else ["wipe"],
             "capabilities": ["step", "reset", "film", "loss"],
         }
+
+    def _allowed(self) -> set[str]:
+        return {"moves", "states"} if self._inner.worlds.physics.moving else {"states"}
 
     def _shows(self) -> list[str]:
         return shows_of(self._inner.worlds.physics.state_dim, species=False)
@@ -113,14 +115,14 @@ class EnvironmentWorld(LiveWorld):
         for _ in range(steps):
             before = self._inner.particles()[0] if self.show == "speed" else None
             action = self._policy(self._observation)
-            self._observation, reward, ended, late, self._info = self._env.step(action)
+            self._observation, reward, ended, truncated, self._info = self._env.step(action)
             self.step += 1
             self._return += float(reward)
             if before is not None:
                 physics = self._inner.worlds.physics
-                way = nearest_image(self._inner.particles()[0] - before, physics.box)
-                self._travelled = way.norm(dim=-1)[None] / max(physics.max_displacement, 1e-12)
-            if ended or late:
+                moved = nearest_image(self._inner.particles()[0] - before, physics.box)
+                self._travelled = moved.norm(dim=-1)[None] / max(physics.max_displacement, 1e-12)
+            if ended or truncated:
                 self._ended = (
                     f"; the last one ended after {self.step} steps: "
                     f"{self._info.get('reason')}, return {self._return:.3g}"

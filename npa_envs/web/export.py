@@ -1,4 +1,4 @@
-"""HTML files that run rules in a browser without a server."""
+"""HTML files that run rules in a browser, without a server."""
 
 from __future__ import annotations
 
@@ -20,15 +20,17 @@ from npa_envs.errors import NPAError, shown
 from npa_envs.files import atomic_path, checked_path
 from npa_envs.rule.files import load_rule
 from npa_envs.rule.rule import NPARule, check_rule
+from npa_envs.tasks.damage import CLUMP_FACTOR, DAMAGE_SIZES
 from npa_envs.tasks.point_classification import PALETTE, UNDECIDED, PointClassification
-from npa_envs.web.live import checked_seed, colour_ramp
-from npa_envs.web.rule_world import RuleWorld, name_of
+from npa_envs.web.live import CLUMP_RATE, INJECT_RATE, checked_seed, colour_ramp
+from npa_envs.web.rule_world import LEAST_SEED, SEED_FRACTION, RuleWorld, name_of
+from npa_envs.world.species import AGREEMENTS
 
 PAGE = Path(__file__).resolve().parent / "page"
-"""The folder of the page's own files."""
+"""The folder of the page's files."""
 
 PREVIEW_STEPS = 256
-"""Steps of a world before its preview; half as many for textures and clouds."""
+"""Steps of a world before its preview; half of them for textures and clouds."""
 
 PREVIEW_PIXELS = 192
 """Pixels on each side of a preview."""
@@ -40,7 +42,18 @@ POLICY = (
     "default-src 'none'; script-src {scripts} 'wasm-unsafe-eval'; style-src {styles}; "
     "worker-src blob:; img-src data: blob:; media-src blob:; base-uri 'none'; form-action 'none'"
 )
-"""The page's content security policy: nothing is loaded."""
+"""The page's content security policy: it may load nothing."""
+
+CONSTANTS = {
+    "AGREEMENTS": AGREEMENTS,
+    "CLUMP_FACTOR": CLUMP_FACTOR,
+    "CLUMP_RATE": CLUMP_RATE,
+    "DAMAGE_SIZES": DAMAGE_SIZES,
+    "INJECT_RATE": INJECT_RATE,
+    "LEAST_SEED": LEAST_SEED,
+    "SEED_FRACTION": SEED_FRACTION,
+}
+"""Numbers and names of the Python worlds that live_world.js also needs."""
 
 _IMPORT = re.compile(r'^import \{ ([\w, ]+) \} from "\./(\w+\.js)";$', re.MULTILINE)
 _EXPORT = re.compile(r"^export (?=(?:async function|function|class|const) (\w+))", re.MULTILINE)
@@ -48,9 +61,9 @@ _MODULE_LINE = re.compile(r"^(?:import|export)\b.*$", re.MULTILINE)
 
 
 def joined_modules(names: Sequence[str], folder: Path = PAGE) -> str:
-    """Return modules and all that they import as one script, each in a scope of its own.
+    """Return JavaScript modules, with those that they import, as one script.
 
-    The exports of `page.js` become members of the constant `page`, and so on.
+    Each module becomes a function scope; the exports of `page.js` become members of `page`.
     """
     order: list[str] = []
     texts: dict[str, str] = {}
@@ -92,21 +105,21 @@ def export_web(
     previews: bool = False,
     seed: int = 0,
 ) -> None:
-    """Write one HTML file that runs rules in a browser, whole or not at all.
+    """Write one HTML file that runs rules in a browser; after an error no file is left.
 
-    Weights, engine and page are in the file, and its policy forbids the browser any connection.
+    Weights, code and page are in the file, and its policy forbids any connection.
 
     Args:
-        sources: Rules, each as `load_rule` takes it; the first one is shown first.
+        sources: Rules, as for `load_rule`; the first one is shown first.
         path: The file to write, ending in `.html`; an existing one is replaced.
-        title: Of the page; None: the first rule's name.
+        title: Title of the page; None: the first rule's name.
         particle_count: Particles of each world; None: as trained.
-        previews: The page begins with a picture of each rule's grown world, to choose from.
-        seed: Randomness of the first world, 0 to 2^53 - 1.
+        previews: Begin with pictures of the rules' grown worlds to choose from.
+        seed: Seed of the first world, 0 to 2^53 - 1.
 
     Raises:
-        NPAError: The suffix is another one, a rule cannot be loaded, two have one name, a browser
-            cannot run one, or the file cannot be written.
+        NPAError: The suffix is not .html, a rule cannot be loaded or run in a browser, two have the
+            same name, or the file cannot be written.
     """
     path = checked_path(path)
     if path.suffix != ".html":
@@ -130,7 +143,7 @@ def export_web(
     words = [str(source) for source in sources]
     names = distinct_names(words, "a page")
     seed = checked_seed(seed)
-    # The file is opened before previews are grown, which takes long.
+    # Opened first: an error in the path is reported before the slow growth of previews.
     with atomic_path(path) as temporary:
         rules = [page_rule(source, particle_count=particle_count) for source in words]
         if previews:
@@ -141,7 +154,7 @@ def export_web(
 
 
 def distinct_names(sources: Sequence[str], what: str) -> list[str]:
-    """Return the names of rules in one file, which errors call `what`."""
+    """Return the names of rules, which must differ; `what` is their file, for errors."""
     names = [name_of(source) for source in sources]
     if not names or len(set(names)) < len(names):
         raise NPAError(
@@ -152,7 +165,7 @@ def distinct_names(sources: Sequence[str], what: str) -> list[str]:
 
 
 def page_rule(source: str, *, particle_count: int | None = None) -> dict[str, Any]:
-    """Return a rule and its world as the page's engine reads them: numbers as float32 in base64."""
+    """Return a rule and its world for live_world.js, as JSON; arrays are float32 in base64."""
     check_browser_rule(load_rule(source), name_of(source))
     live = RuleWorld(source, device=torch.device("cpu"), particle_count=particle_count, choices={})
     rule, task = live.main.rule, live.task
@@ -160,7 +173,7 @@ def page_rule(source: str, *, particle_count: int | None = None) -> dict[str, An
     if task.classifies:
         clouds = cast(PointClassification, task).clouds
         label = clouds.label.tolist()
-        # The first cloud of each class.
+        # One cloud of each class, the first.
         chosen = [clouds.x[label.index(kind)] for kind in sorted(set(label))]
         seed = {"kind": "clouds", "clouds": [_packed(cloud) for cloud in chosen]}
     elif task.box is not None:
@@ -172,7 +185,7 @@ def page_rule(source: str, *, particle_count: int | None = None) -> dict[str, An
             f"a page grows rules from a ball, a box or a point cloud, {shown(source)} begins with "
             f"a {type(task).__name__}: watch it with npa-envs view"
         )
-    # Fields that the engine in the page adds itself.
+    # Fields that live_world.js adds itself.
     own = {"type", "rules", "rule", "others", "species", "show", "capabilities", "playing", "seed"}
     world = {name: value for name, value in live.describe().items() if name not in own}
     classes = {"palette": PALETTE, "undecided": UNDECIDED}
@@ -186,7 +199,7 @@ def page_rule(source: str, *, particle_count: int | None = None) -> dict[str, An
 
 
 def check_browser_rule(rule: NPARule, name: str) -> None:
-    """Raise an `NPAError` if the page's engine cannot run a rule."""
+    """Raise an `NPAError` if the JavaScript of the page cannot run a rule."""
     check_rule(rule)
     view = "watch it with npa-envs view"
     kind, species, size = type(rule).__name__, rule.species_count, rule.weight_count
@@ -209,7 +222,7 @@ def check_browser_rule(rule: NPARule, name: str) -> None:
 
 
 def preview(source: str, *, particle_count: int | None = None, seed: int = 0) -> str:
-    """Return a picture of a rule's grown world as a data address: WebP with transparency."""
+    """Return a picture of a rule's grown world as a data URL: WebP with transparency."""
     live = RuleWorld(
         source, device=torch.device("cpu"), seed=seed, particle_count=particle_count, choices={}
     )
@@ -232,9 +245,10 @@ def page_text(rules: Sequence[Mapping[str, Any]], *, title: str, seed: int = 0) 
         "worker": "worker",
         "seed": seed,
         "ramp": base64.b64encode(colour_ramp().tobytes()).decode(),
+        "constants": CONSTANTS,
         "rules": rules,
     }
-    # "<" would allow a rule's text to end the element that holds it.
+    # With "<" a rule's text could end the script element.
     data = json.dumps(settings, separators=(",", ":")).replace("<", "\\u003c")
     worker = f"{joined_modules(['live_world.js'])}\nlive_world.serve(self);\n"
     code = f"{joined_modules(['exported.js'])}\nexported.begin();\n"

@@ -1,6 +1,6 @@
 """Worlds that a page shows and changes while they run: messages, frames, brushes, colours.
 
-The messages and what `describe` returns are listed at the head of `npa_envs/web/page/page.js`.
+The head of `npa_envs/web/page/page.js` lists the messages and the events.
 """
 
 from __future__ import annotations
@@ -23,22 +23,58 @@ from npa_envs.tasks.damage import check_damage
 from npa_envs.world.brushes import clump, cut, inject, push, state_around
 
 MOST_STEPS = 64
-"""Most steps from frame to frame."""
+"""Most steps between two frames."""
 
-LOSS_SHARE = 0.1
-"""Largest share of the time that losses take while their plot is open."""
+LOSS_FRACTION = 0.1
+"""Largest fraction of the time for computing losses while their plot is open."""
 
 CLUMP_RATE = 0.25
-"""Share of its distance by which the brush `clump` of strength 1 pulls a particle per message."""
+"""Fraction of a particle's distance that a message of the brush `clump` of strength 1 removes."""
 
 INJECT_RATE = 0.5
-"""Share of the way to the new state that the brush `inject` of strength 1 goes per message."""
+"""Fraction of the new state that a message of the brush `inject` of strength 1 mixes in."""
 
 FARTHEST = 1e4
-"""Largest coordinate that a message may name [length units]."""
+"""Largest coordinate in a message [length units]."""
 
 LARGEST_RADIUS = 10.0
 """Largest radius of a brush [length units]."""
+
+
+class Tool(NamedTuple):
+    """A brush of the page."""
+
+    name: str
+    """What messages call it."""
+    label: str
+    """Its tooltip."""
+    needs: str
+    """What a world must allow to offer it: "moves", "states", "removal", "species" or "growth"."""
+    takes: str
+    """Other content of its messages: "source", "rule", "line" (one message at the end of a stroke),
+    or ""."""
+    icon: str
+    """Path of its picture, in SVG, on a square of side 24."""
+
+
+TOOLS = (
+    Tool("remove", "Remove", "removal", "", "M4 15l8-9 7 6-7 8H8zM9 20h11"),
+    Tool("push", "Pull with the pointer", "moves", "",
+         "M12 20c-4 0-6-3-7-7 2-1 3 0 4 2V6a1.4 1.4 0 0 1 3 0v5a1.4 1.4 0 0 1 3 0v1a1.4 1.4 0 0 1 "
+         "3 0v3c0 3-2 5-6 5z"),
+    Tool("clump", "Clump", "moves", "",
+         "M4 4l5 5M20 4l-5 5M4 20l5-5M20 20l-5-5M9 6v3H6M15 6v3h3M9 18v-3H6M15 18v-3h3"),
+    Tool("cut", "Cut along a line", "moves", "line",
+         "M5 19L19 5M6 8a2 2 0 1 0 0-.1M16 18a2 2 0 1 0 0-.1M8 9l8 8"),
+    Tool("inject", "Inject: the state of where you press spreads to where you drag", "states",
+         "source",
+         "M4 20l3-1 8-8-2-2-8 8zM12 8l4 4M14 10l3-4a1.8 1.8 0 0 1 3 0 1.8 1.8 0 0 1-1 3l-4 2"),
+    Tool("graft", "Graft: particles take another rule", "species", "rule",
+         "M12 21v-9M12 12c0-5 3-7 8-7 0 5-3 7-8 7zM12 15c0-4-3-6-8-6 0 4 3 6 8 6z"),
+    Tool("add", "Add a seed of another rule", "growth", "rule",
+         "M12 4a8 8 0 1 0 .1 0M12 8v8M8 12h8"),
+)  # fmt: skip
+"""All brushes. `brushed`, `RuleWorld._brush` and `brush` of live_world.js apply them."""
 
 
 class WorldView(NamedTuple):
@@ -51,13 +87,13 @@ class WorldView(NamedTuple):
     colours: NDArray[np.uint8]
     """Red, green and blue, shape [N, 3]."""
     milliseconds: float
-    """Mean time of the last steps [ms]."""
+    """Moving average of the time of a step [ms]."""
     loss: float | None
-    """The metric of the world's task, where it was computed."""
+    """The metric of the world's task; None: not computed for this frame."""
 
 
 class Range(NamedTuple):
-    """The range of a number."""
+    """The range of a setting."""
 
     low: float
     high: float
@@ -65,7 +101,7 @@ class Range(NamedTuple):
     whole: bool = False
 
     def checked(self, name: str, value: Any) -> float:
-        """Return a number that lies in the range."""
+        """Return `value` if it lies in the range; raises NPAError."""
         valid = is_whole(value) if self.whole else is_real(value)
         if not valid or not self.low <= value <= self.high:
             kind = "a whole number" if self.whole else "a number"
@@ -75,7 +111,7 @@ class Range(NamedTuple):
         return int(value) if self.whole else float(value)
 
     def to_dict(self, value: float) -> dict[str, Any]:
-        """Return the range and the present value as the page reads them."""
+        """Return the range and the present value as JSON for the page."""
         optional = {"scale": self.scale, "whole": self.whole}
         given = {name: part for name, part in optional.items() if part}
         return {"value": value, "low": self.low, "high": self.high} | given
@@ -88,7 +124,7 @@ class LiveWorld(ABC):
 
     def __init__(self) -> None:
         self.playing = True
-        """Whether it runs by itself."""
+        """Whether it runs; else it makes steps only by the message "step"."""
         self.speed = 1
         self.show = "colours"
         self.step = 0
@@ -101,6 +137,7 @@ class LiveWorld(ABC):
         """Return the event "world"."""
         return {
             "type": "world",
+            "tools": [tool._asdict() for tool in TOOLS if tool.needs in self._allowed()],
             "shows": self._shows(),
             "show": self.show,
             "settings": {k: r.to_dict(getattr(self, k)) for k, r in self._ranges().items()},
@@ -109,14 +146,14 @@ class LiveWorld(ABC):
         }
 
     def handle(self, message: Mapping[str, Any]) -> bool:
-        """Apply a message, or none of a wrong one; return whether `describe` has changed."""
+        """Apply a message, and return whether `describe` has changed; raises NPAError."""
         kind = message.get("type") if isinstance(message, Mapping) else None
         match kind:
             case "play":
                 self.playing = checked_flag("on", message.get("on"))
             case "step":
                 self.playing = False
-                self._timed(1)
+                self._run_timed(1)
             case "reset":
                 seed = message.get("seed")
                 self.reset(None if seed is None else checked_seed(seed))
@@ -135,23 +172,23 @@ class LiveWorld(ABC):
 
     def advance(self) -> None:
         """Run to the next frame."""
-        self._timed(self.speed)
+        self._run_timed(self.speed)
 
     @abstractmethod
     def frame(self) -> WorldView:
         """Return the present frame."""
 
     def news(self) -> list[dict[str, Any]]:
-        """Return other events since the last call: curves, errors, changed descriptions."""
+        """Return the other events since the last call: curves, errors, changed descriptions."""
         events, self._news = self._news, []
         return events
 
     def close(self) -> None:  # noqa: B027
-        """Release what the world holds."""
+        """Release the world's resources."""
 
     @abstractmethod
     def reset(self, seed: int | None) -> None:
-        """Begin a fresh world; without a seed, of the next one."""
+        """Start a fresh world; `None`: of the next seed."""
 
     @abstractmethod
     def _run(self, steps: int) -> None: ...
@@ -161,6 +198,10 @@ class LiveWorld(ABC):
 
     @abstractmethod
     def _brush(self, message: Mapping[str, Any]) -> bool: ...
+
+    @abstractmethod
+    def _allowed(self) -> set[str]:
+        """Return what brushes may do in this world, in the terms of `Tool.needs`."""
 
     @abstractmethod
     def _shows(self) -> list[str]: ...
@@ -181,32 +222,32 @@ class LiveWorld(ABC):
         return bool(name != "loss")
 
     def _ranges(self) -> dict[str, Range]:
-        """Return the ranges of the attributes that the page sets, by name."""
+        """Return the ranges of the settings, by the name of the attribute."""
         return {"speed": Range(1, MOST_STEPS, "log", whole=True)}
 
-    def _timed(self, steps: int) -> None:
+    def _run_timed(self, steps: int) -> None:
         start = time.perf_counter()
         self._run(steps)
         each = 1000.0 * (time.perf_counter() - start) / steps
-        # The mean of the last few: single steps are compiled, recorded, interrupted.
+        # A moving average, as single steps may compile kernels or be interrupted.
         self._milliseconds += (0.2 if self._milliseconds else 1.0) * (each - self._milliseconds)
 
     def _loss(self, compute: Callable[[], float]) -> float | None:
-        """Return the loss while its plot is open, at most as often as `LOSS_SHARE` allows."""
+        """Return the loss, or None if its plot is closed or it is too early (`LOSS_FRACTION`)."""
         start = time.perf_counter()
         if not self._loss_wanted or start < self._loss_due:
             return None
         loss = compute()
-        self._loss_due = start + (time.perf_counter() - start) / LOSS_SHARE
+        self._loss_due = start + (time.perf_counter() - start) / LOSS_FRACTION
         return loss
 
 
 class Touch(NamedTuple):
-    """A brush at a place."""
+    """The brush of a message."""
 
     tool: str
     at: Tensor
-    """Where [length units], shape [1, D]."""
+    """Position [length units], shape [1, D]."""
     move: Tensor
     """Its movement [length units], shape [1, D]."""
     radius: float
@@ -214,20 +255,20 @@ class Touch(NamedTuple):
     strength: float
     """From 0 to 1, dimensionless."""
     source: Tensor
-    """Place whose state the brush `inject` spreads [length units], shape [1, D]."""
+    """Position whose state the brush `inject` spreads [length units], shape [1, D]."""
     view: Tensor | None
     """In 3D the unit vector towards the viewer, shape [1, D], or None."""
 
     @classmethod
     def read(cls, message: Mapping[str, Any], x: Tensor) -> Touch:
-        """Return the brush of a message, for a world at x [1, N, D]."""
-        tool = message.get("tool")
-        tools = ("remove", "push", "clump", "cut", "inject", "graft", "add")
-        if tool not in tools:
-            raise NPAError(f"unknown tool {shown(tool)}: {suggest(tool, tools)}")
+        """Parse the brush of a message for a world with positions x [1, N, D]."""
+        name = message.get("tool")
+        names = [tool.name for tool in TOOLS]
+        if name not in names:
+            raise NPAError(f"unknown tool {shown(name)}: {suggest(name, names)}")
         at, view = message.get("at"), message.get("view")
         return cls(
-            str(tool),
+            str(name),
             _checked_vector("at", at, x),
             _checked_vector("move", message.get("move", [0.0] * x.shape[2]), x),
             Range(1e-4, LARGEST_RADIUS).checked("radius", message.get("radius")),
@@ -240,7 +281,7 @@ class Touch(NamedTuple):
 def brushed(
     x: Tensor, s: Tensor, touch: Touch, box: tuple[float, ...] | None
 ) -> tuple[Tensor, Tensor]:
-    """Return worlds after a brush that keeps all particles: push, clump, cut or inject."""
+    """Return x and s after push, clump, cut or inject, which keep all particles."""
     match touch.tool:
         case "push":
             moved = push(
@@ -259,8 +300,8 @@ def brushed(
             )  # fmt: skip
         case "inject":
             disk: dict[str, Any] = {"radius": touch.radius, "box": box}
-            state, holds = state_around(x, s, centre=touch.source, **disk)
-            strength = INJECT_RATE * touch.strength * holds.to(x.dtype)
+            state, found = state_around(x, s, centre=touch.source, **disk)
+            strength = INJECT_RATE * touch.strength * found.to(x.dtype)
             return x, inject(x, s, centre=touch.at, state=state, strength=strength, **disk)
     raise NPAError(
         f"this world keeps its particles, so that the brush {shown(touch.tool)} does nothing: take "
@@ -278,14 +319,14 @@ def across(move: Tensor, view: Tensor | None) -> Tensor:
 
 
 def checked_flag(name: str, value: Any) -> bool:
-    """Return a flag of a message."""
+    """Return `value` if it is a bool; raises NPAError."""
     if not isinstance(value, bool):
         raise NPAError(f"{name} must be true or false, got {shown(value)}")
     return value
 
 
 def checked_seed(value: Any) -> int:
-    """Return a valid seed."""
+    """Return `value` if it is a valid seed; raises NPAError."""
     return int(Range(0, 2**53, whole=True).checked("seed", value))
 
 
@@ -300,7 +341,7 @@ def _checked_vector(name: str, value: Any, x: Tensor) -> Tensor:
 # Colours of particles by state, density, species, speed or update mask.
 
 SHOWS = ("colours", "density", "components", "species", "speed", "mask")
-"""Choices of the page, followed by the state channels: "state 0", "state 1", ..."""
+"""Choices of the page; those of the state channels follow: "state 0", "state 1", ..."""
 
 DARK = (0.05, 0.06, 0.09)
 """First colour of the ramp of densities and speeds."""
@@ -318,49 +359,49 @@ class ColouredWorld(NamedTuple):
     x: Tensor
     s: Tensor
     colours: Callable[[Tensor], Tensor]
-    """Own colours [1, N, 3] of particles with states [1, N, C]; they may exceed [0, 1]."""
+    """Maps states [1, N, C] to the rule's colours [1, N, 3], which may exceed [0, 1]."""
     eps: float
     box: tuple[float, ...] | None
     counts: Sequence[int]
     """Particles of each species, species after species."""
     full: int
-    """Particles of the fresh world."""
+    """Particles of a fresh world."""
     travelled: Tensor | None
-    """Path of each particle in the last step over the longest possible one, [1, N]."""
+    """Distance of each particle in the last step over the largest possible one, [1, N]."""
     updated: Tensor | None
     """Which particles the last step updated, bool, shape [1, N]."""
 
 
 class Colouring:
-    """Colours of the particles of one world, frame after frame."""
+    """Computes the particles' colours of one world, frame by frame."""
 
     def __init__(self) -> None:
         self._covariance: Tensor | None = None
         self._basis: Tensor | None = None
 
     def __call__(self, show: str, world: ColouredWorld) -> NDArray[np.uint8]:
-        """Return red, green and blue of each particle, uint8, [N, 3], by one of `shows_of`."""
+        """Return red, green and blue of each particle, uint8, [N, 3]; `show`: one of `shows_of`."""
         if world.x.shape[1] == 0:
             return np.zeros((0, 3), dtype=np.uint8)
         match show.split():
             case ["colours"]:
                 return _bytes(world.colours(world.s)[0])
             case ["density"]:
-                # 1 is a world whose particles fill [-1, 1]^D, or its box, evenly.
+                # 1 if the particles fill [-1, 1]^D, or the box, evenly.
                 rho = species_fields(world.x, [world.x.shape[1]], eps=world.eps, box=world.box).rho
                 volume = float(np.prod(world.box or (2.0,) * world.x.shape[2]))
                 crowding = rho[0].sum(dim=-1) * (volume / world.full)
-                # Worlds in open space fill a part of it, and are denser.
+                # Particles in open space are denser, as they fill only a part of [-1, 1]^D.
                 return _ramp(1.0 - torch.exp2(-crowding / (1.0 if world.box else 4.0)))
             case ["components"]:
                 return _bytes(self._components(world.s[0]))
             case ["species"]:
                 return species_colours(len(world.counts)).repeat(world.counts, axis=0)
             case ["speed"]:
-                share = _known(world.travelled, world)
-                return _ramp(share.clamp(0.0, 1.0).sqrt())
+                speed = _or_zeros(world.travelled, world)
+                return _ramp(speed.clamp(0.0, 1.0).sqrt())
             case ["mask"]:
-                updated = _known(world.updated, world).bool()[:, None]
+                updated = _or_zeros(world.updated, world).bool()[:, None]
                 on, off = (updated.new_tensor(tint, dtype=torch.float32) for tint in MASK_COLOURS)
                 return _bytes(torch.where(updated, on, off))
             case ["state", number] if number.isdecimal() and int(number) < world.s.shape[2]:
@@ -371,8 +412,8 @@ class Colouring:
         )
 
     def _components(self, s: Tensor) -> Tensor:
-        """Return the first three principal components as colours; the basis moves slowly."""
-        # One NaN in the moving average would stay there.
+        """Return the first three principal components as colours, in a slowly changing basis."""
+        # A NaN would stay in the moving average.
         known = s[s.isfinite().all(dim=-1)].double()
         mean = known.mean(dim=0)
         covariance = (known - mean).T @ (known - mean) / max(len(known), 1)
@@ -393,27 +434,27 @@ class Colouring:
 
 
 def shows_of(state_dim: int, *, species: bool = True) -> list[str]:
-    """Return what `Colouring` can show of particles with so many state channels."""
+    """Return the choices of `Colouring` for particles with `state_dim` state channels."""
     own = SHOWS if species else ("colours", "density", "components", "speed")
     return [*own, *(f"state {k}" for k in range(state_dim))]
 
 
 def signed_colours(values: Tensor) -> Tensor:
-    """Return colours of numbers [...]: blue below 0, grey at 0, orange above; [..., 3]."""
+    """Return colours [..., 3] of numbers [...]: blue below 0, grey at 0, orange above."""
     pull = torch.tanh(0.5 * STATE_GAIN * values)
     lab = (0.62 + 0.18 * pull.abs(), 0.5 * STATE_CHROMA * pull, STATE_CHROMA * pull)
     return srgb(torch.stack(lab, dim=-1))
 
 
 def species_colours(count: int) -> NDArray[np.uint8]:
-    """Return distinct colours of any number of species, uint8, shape [count, 3]."""
+    """Return different colours for `count` species, uint8, shape [count, 3]."""
     hue = 0.9 + GOLDEN_ANGLE * torch.arange(count, dtype=torch.float64)
     lab = (torch.full_like(hue, 0.72), 0.13 * hue.cos(), 0.13 * hue.sin())
     return _bytes(srgb(torch.stack(lab, dim=-1)))
 
 
-def _known(values: Tensor | None, world: ColouredWorld) -> Tensor:
-    """Return values of the last step [N], or zeros before the first one."""
+def _or_zeros(values: Tensor | None, world: ColouredWorld) -> Tensor:
+    """Return `values` of the last step [N], or zeros if there are none."""
     if values is None or values.shape[1] != world.x.shape[1]:
         return torch.zeros(world.x.shape[1], device=world.x.device)
     return values[0]
@@ -422,13 +463,13 @@ def _known(values: Tensor | None, world: ColouredWorld) -> Tensor:
 def colour_ramp() -> NDArray[np.uint8]:
     """Return the colours of densities and speeds from low to high, uint8, shape [entries, 3]."""
     table = ramp(DARK)
-    # The darkest colours would vanish on a dark background.
+    # The darkest colours are invisible on a dark background.
     return table[len(table) // 6 :]
 
 
-def _ramp(share: Tensor) -> NDArray[np.uint8]:
+def _ramp(values: Tensor) -> NDArray[np.uint8]:
     table = colour_ramp()
-    entry = (share.nan_to_num(0.0) * (len(table) - 1)).round()
+    entry = (values.nan_to_num(0.0) * (len(table) - 1)).round()
     colours: NDArray[np.uint8] = table[entry.to(torch.int32).cpu().numpy()]
     return colours
 

@@ -1,4 +1,4 @@
-"""Live worlds of rules, and of the newest rules of a training run."""
+"""Live worlds of a rule, and of the newest rules of a training run."""
 
 from __future__ import annotations
 
@@ -44,39 +44,40 @@ from npa_envs.world.rollout import at_rest, rollout
 from npa_envs.world.species import AGREEMENTS, rollout_species
 
 MOST_PARTICLES = {"cpu": 16384, "cuda": 131072}
-"""Most particles of a world, by the kind of device."""
+"""Most particles of a world, by device type."""
 
-SEED_SHARE = 0.5
-"""Particles that the brush `add` of strength 1 adds, over those of a fresh world."""
+SEED_FRACTION, LEAST_SEED = 0.5, 16
+"""Particles that the brush `add` of strength 1 adds, as a fraction of a fresh world's; the least
+number of them."""
 
 SMALL_VIEWS = {"resolution": 64, "training_views": 1, "held_out_views": 6}
-"""Smaller views for the loss of 3D worlds, whose targets take many seconds to draw."""
+"""Options of 3D tasks for a fast start: targets of full size take many seconds to draw."""
 
 MOST_TASKS = 8
-"""Tasks that are cached, with their targets: the slider of N makes many."""
+"""Cached tasks with their targets; the slider of N makes many."""
 
-REST_LOOK = 64
+REST_CHECK_STEPS = 64
 """Steps between two checks whether the world is at rest."""
 
 POLL_SECONDS = 1.0
-"""Time between two looks at the files of a run [s]."""
+"""Time between two checks of the files of a run [s]."""
 
 
 @dataclass
 class LiveRule:
-    """A float32 rule and its particles."""
+    """A float32 rule in the world, with the number of its particles."""
 
     name: str
     rule: NPARule
     count: int = 0
     divisor: float = 0.0
-    """Its densities are divided by this number of particles."""
+    """Number by which its densities are divided."""
 
 
 class RuleWorld(LiveWorld):
-    """A world of one rule, and of others that the brushes graft and add bring in.
+    """A world of one rule, and of other rules that the brushes graft and add put into it.
 
-    The choices are other rules by their names: the shipped ones, unless some are given.
+    `choices` has the sources of the other rules by name; None: the shipped ones.
     """
 
     def __init__(
@@ -121,7 +122,7 @@ class RuleWorld(LiveWorld):
         return self._trained[key]
 
     def _plant(self, name: Any, particle_count: int | None = None) -> None:
-        """Begin a fresh world of a rule with the task that it was trained on."""
+        """Start a fresh world of a rule with the task that it was trained on."""
         live_rule = self._live_rule(name)
         self.trained = self._task_of(live_rule, particle_count)
         self.main = live_rule
@@ -133,7 +134,7 @@ class RuleWorld(LiveWorld):
 
     @torch.no_grad()
     def reset(self, seed: int | None) -> None:
-        """Begin a fresh world of the chosen rule alone."""
+        """Start a fresh world of the chosen rule alone."""
         self.seed = self.seed + 1 if seed is None else seed
         self._generator = torch.Generator(self._device).manual_seed(self.seed)
         self.x, self.s, self._goal = self.task.seed(
@@ -146,8 +147,8 @@ class RuleWorld(LiveWorld):
         self._updated: Tensor | None = None
         self.step, self._milliseconds, self._loss_due = 0, 0.0, 0.0
         self._still: tuple[Any, ...] = ()
-        """The tensors, their versions, the rule and ε that were found to be at rest."""
-        self._looked = 0
+        """Tensors, their ids and versions, rule and ε of a world that is at rest, or empty."""
+        self._checked_step = 0
         """Step of the last check for rest."""
 
     @property
@@ -169,10 +170,6 @@ class RuleWorld(LiveWorld):
         """Return the event "world"."""
         task, box = self.task, self.task.box
         centre, half_width = list(task.frame.centre), task.frame.half_width
-        tools = ["remove", "push", "clump", "cut"]
-        # A rule that divides lives alone and fills its world; its dead particles have no state.
-        if not self.main.rule.divides:
-            tools += ["inject", "graft"] if self.main.rule.static else ["inject", "graft", "add"]
         capabilities = ["step", "reset", "film"]
         return super().describe() | {
             "title": self.main.name,
@@ -186,16 +183,23 @@ class RuleWorld(LiveWorld):
             "rule": self.main.name,
             "others": [name for name in self._choices if self._may_join(name)],
             "species": [live_rule.name for live_rule in self.live_rules],
-            "tools": tools,
             "damages": list(DAMAGE_SIZES),
             "capabilities": [*capabilities, "loss"] if self._has_loss() else capabilities,
         }
+
+    def _allowed(self) -> set[str]:
+        allowed = {"moves", "removal"}
+        # Rules that divide allow no others in their worlds; their dead particles have no state.
+        if not self.main.rule.divides:
+            allowed |= {"states", "species"}
+            allowed |= set() if self.main.rule.static else {"growth"}
+        return allowed
 
     def _has_loss(self) -> bool:
         return self.trained.doubt is None
 
     def _may_join(self, name: str) -> bool:
-        """Return whether particles of another rule can live in this world."""
+        """Return whether particles of another rule can be put into this world."""
         own = self.main.rule
         try:
             other = self._live_rule(name).rule
@@ -206,7 +210,7 @@ class RuleWorld(LiveWorld):
 
     def _ranges(self) -> dict[str, Range]:
         eps0, box = self.main.rule.eps0, self.task.box
-        # A periodic box holds at least two cells of width ε.
+        # A periodic box must have at least two cells of width ε in each direction.
         most = 2.5 * eps0 if box is None else min(2.5 * eps0, 0.499 * min(box))
         ranges = super()._ranges() | {
             "eps": Range(0.4 * eps0, most, "log"),
@@ -245,10 +249,10 @@ class RuleWorld(LiveWorld):
             "position_noise": self.noise, "generator": self._generator,
         }  # fmt: skip
         if watched and steps > 1:
-            # Masks and speeds are those of the last step alone.
-            self._go(steps - 1, options)
+            # The last step runs by itself, as masks and speeds are those of one step.
+            self._rollout(steps - 1, options)
         before = self.s
-        path_length = self._go(1 if watched else steps, options)
+        path_length = self._rollout(1 if watched else steps, options)
         if watched:
             longest = max(live_rule.rule.alpha for live_rule in self.live_rules) * self.eps
             self._travelled = path_length / longest
@@ -257,37 +261,37 @@ class RuleWorld(LiveWorld):
             torch.cuda.synchronize(self._device)
 
     def _rests(self) -> bool:
-        """Return whether a world of one rule is at rest, checked every `REST_LOOK` steps."""
+        """Return whether a world of one rule is at rest; checks every `REST_CHECK_STEPS` steps."""
         rule = self.main.rule
-        if not rule.dead_zone or rule.divides or self.noise > 0.0 or not self._is_as_planted():
+        if not rule.dead_zone or rule.divides or self.noise > 0.0 or not self._is_unchanged():
             return False
         worlds = self.x, self.s
         now = (*map(id, worlds), *(value._version for value in worlds), rule, self.eps)
         if now == self._still[2:]:
             return True
-        if self.step < self._looked + REST_LOOK:
+        if self.step < self._checked_step + REST_CHECK_STEPS:
             return False
-        self._looked = self.step
+        self._checked_step = self.step
         rests = bool(at_rest(rule, *worlds, eps=self.eps, box=self.task.box))
         if rests:
-            # The tensors are kept, so that no others get their ids.
+            # Keeping the tensors makes sure that no other tensors get their ids.
             self._still = (*worlds, *now)
         return rests
 
-    def _is_as_planted(self) -> bool:
-        """Return whether the particles are those of a fresh world of one rule."""
+    def _is_unchanged(self) -> bool:
+        """Return whether no brush has added or removed particles or rules."""
         return [(own.count, own.divisor) for own in self.live_rules] == [(self.full, self.full)]
 
-    def _go(self, steps: int, options: Mapping[str, Any]) -> Tensor:
+    def _rollout(self, steps: int, options: Mapping[str, Any]) -> Tensor:
         """Run steps and return the path length of each particle."""
         rules = [own.rule for own in self.live_rules]
-        if self._is_as_planted():
+        if self._is_unchanged():
             self.x, self.s, path_length = rollout(
                 rules[0], self.x, self.s, steps, return_path_length=True, **options
             )
         else:
-            # Densities are divided by the particles of a fresh world, so that particles that a
-            # brush adds or removes change densities in their neighbourhood only.
+            # Divided by the particles of a fresh world: particles that a brush adds or removes
+            # change only the densities around them.
             divisors = [own.divisor for own in self.live_rules]
             self.x, self.s, path_length = rollout_species(
                 rules, self.x, self.s, steps, counts=self.counts, density_counts=divisors,
@@ -352,13 +356,13 @@ class RuleWorld(LiveWorld):
 
     def _graft(self, touch: Touch, live_rule: LiveRule) -> None:
         inside = inside_ball(self.x, centre=touch.at, radius=touch.radius, box=self.task.box)
-        # Grafted particles divide densities by the same number as those around them.
+        # Grafted particles divide densities by the same number as their neighbours.
         number = self._number(live_rule, float(self.full))
         s = torch.where(inside[..., None], self._coded(live_rule, self.s), self.s)
         self._arrange(self.x, s, torch.where(inside[0], number, self._species()))
 
     def _add(self, touch: Touch, live_rule: LiveRule) -> None:
-        count = max(16, round(touch.strength * SEED_SHARE * self.full))
+        count = max(LEAST_SEED, round(touch.strength * SEED_FRACTION * self.full))
         room = MOST_PARTICLES[self._device.type] - self.x.shape[1]
         if count > room:
             raise NPAError(f"the world has room for {max(room, 0)} particles more, got {count}")
@@ -366,7 +370,7 @@ class RuleWorld(LiveWorld):
             1, count, self.x.shape[2], touch.radius, generator=self._generator,
             device=self._device, dtype=self.x.dtype,
         )  # fmt: skip
-        # A new species divides densities by its own number of particles, as if it grew alone.
+        # A new species divides densities by its own number of particles, as in a world alone.
         number = self._number(live_rule, float(count))
         x = torch.cat((self.x, ball + touch.at[:, None]), dim=1)
         fresh = self._coded(live_rule, self.s.new_zeros(1, count, self.s.shape[2]))
@@ -379,7 +383,7 @@ class RuleWorld(LiveWorld):
         return torch.cat([self._coded(live_rule, part) for live_rule, part in parts], dim=1)
 
     def _coded(self, live_rule: LiveRule, s: Tensor) -> Tensor:
-        """Return states of a species with its rule's code, if the rule has codes."""
+        """Return states of a species with its rule's code, if it has one."""
         if live_rule.rule.codes is None:
             return s
         own = live_rule.name == self.main.name
@@ -395,7 +399,7 @@ class RuleWorld(LiveWorld):
         return live_rule
 
     def _number(self, live_rule: LiveRule, divisor: float) -> int:
-        """Return the number of a rule's species; a rule new to the world gets the next number."""
+        """Return the index of a rule's species; a rule that is new in the world is appended."""
         names = [own.name for own in self.live_rules]
         if live_rule.name not in names:
             names.append(live_rule.name)
@@ -403,12 +407,12 @@ class RuleWorld(LiveWorld):
         return names.index(live_rule.name)
 
     def _species(self) -> Tensor:
-        """Return the species of each particle, int64, shape [N]."""
+        """Return the species index of each particle, int64, shape [N]."""
         numbers = torch.arange(len(self.counts))
         return numbers.repeat_interleave(torch.tensor(self.counts)).to(self._device)
 
     def _arrange(self, x: Tensor, s: Tensor, species: Tensor) -> None:
-        """Store particles, sorted by species."""
+        """Set the world's particles, sorted by species."""
         order = species.argsort(stable=True)
         if not torch.equal(order, torch.arange(self.x.shape[1], device=order.device)):
             # The page's tracers follow particles by their index.
@@ -421,7 +425,7 @@ class RuleWorld(LiveWorld):
 
 
 def name_of(source: str) -> str:
-    """Return the name of a rule's file, or of the run that the file belongs to."""
+    """Return the name of a rule: that of its file, or of the run's folder for rule.safetensors."""
     if "#" in source:
         return source.rpartition("#")[2]
     path = rule_file(source)
@@ -429,7 +433,7 @@ def name_of(source: str) -> str:
 
 
 class FollowedLog:
-    """The log of a run in progress, `path`, read record by record as it grows."""
+    """Reads new records of the log of a run in progress."""
 
     def __init__(self, path: Path) -> None:
         self._path = path
@@ -442,7 +446,7 @@ class FollowedLog:
         """Iteration of the last record, or -1."""
 
     def news(self) -> tuple[list[dict[str, Any]], bool]:
-        """Return new records, and whether the log has begun anew. Broken lines are skipped."""
+        """Return new records, and whether they are the log's first; broken lines are skipped."""
         try:
             now = self._path.stat()
         except FileNotFoundError:
@@ -454,13 +458,13 @@ class FollowedLog:
         with open_regular(self._path, limit=LARGEST_LOG, what="the log") as file:
             file.seek(self._end - len(self._last_line))
             if file.read(len(self._last_line)) != self._last_line:
-                # The run was resumed from a checkpoint, or another one has begun in its folder.
+                # The run was resumed from a checkpoint, or another one was started in its folder.
                 self._forget()
                 file.seek(0)
             text = file.read(LARGEST_LOG)
-        # The last line is complete once it ends with a newline.
+        # A last line without newline is not complete yet.
         text = text[: text.rfind(b"\n") + 1]
-        anew = self.iteration < 0
+        first = self.iteration < 0
         records = []
         for line in text.splitlines(keepends=True):
             self._end += len(line)
@@ -470,11 +474,11 @@ class FollowedLog:
                 if isinstance(record, dict) and is_whole(record.get("iteration")):
                     self.iteration = record["iteration"]
                     records.append(record)
-        return records, anew
+        return records, first
 
 
 class RunWorld(RuleWorld):
-    """A world of the rules of a run's folder, replaced by those of each new checkpoint."""
+    """A world of the rules of a run, which are replaced by those of each new checkpoint."""
 
     def __init__(
         self,
@@ -506,7 +510,7 @@ class RunWorld(RuleWorld):
 
     @torch.no_grad()
     def reset(self, seed: int | None) -> None:
-        """Begin a fresh world of all rules of the run."""
+        """Start a fresh world of all rules of the run."""
         super().reset(seed)
         if len(self._files) == 1:
             return
@@ -538,45 +542,45 @@ class RunWorld(RuleWorld):
         return ranges
 
     def news(self) -> list[dict[str, Any]]:
-        """Return other events since the last call, with the run's new losses and rules."""
+        """Return the other events since the last call, also the run's new losses and rules."""
         if time.monotonic() >= self._due:
             self._due = time.monotonic() + POLL_SECONDS
             try:
                 self._poll()
             except NPAError as error:
-                # A file that is being written can be read a moment later.
+                # Usually a file that is being written; the next check reads it.
                 self._news.append({"type": "error", "message": str(error)})
         return super().news()
 
     def _stamp(self) -> list[int]:
-        """Return when the rules were written."""
+        """Return the modification times of the rules' files."""
         return [path.stat().st_mtime_ns if path.exists() else 0 for path in self._files.values()]
 
     def _poll(self) -> None:
-        fresh, anew = self._log.news()
+        fresh, restarted = self._log.news()
         if fresh:
             self._iteration = self._log.iteration
             points = [[r["iteration"], r["loss"]] for r in fresh if is_real(r.get("loss"))]
             curve = {"type": "curve", "name": "Training loss", "points": points}
-            self._news.append(curve | {"append": not anew})
+            self._news.append(curve | {"append": not restarted})
         written = self._stamp()
         fresher = written != self._written
         if fresher:
-            # Set even if it cannot be read: the error is reported once.
+            # Set before reading, so that an error is reported only once.
             self._written = written
             self._take_rules()
         if fresh or fresher:
             self._news.append(self.describe())
 
     def _take_rules(self) -> None:
-        """Load the newest rules; the world continues with them if they have the same form."""
+        """Load the newest rules; the world continues if they have the same hyper-parameters."""
         self._still = ()
         fresh = {
             name: load_rule(path, device=self._device).float() for name, path in self._files.items()
         }
         own = {name: self._live_rule(name).rule for name in fresh}
         goals = self._goal_choices()
-        # Tasks hold the old rules' codes.
+        # Cached tasks have the codes of the old rules.
         self._trained.clear()
         if goals == self._goals and all(
             fresh[k].hyper_parameters() == own[k].hyper_parameters() for k in own
@@ -588,14 +592,14 @@ class RunWorld(RuleWorld):
             with torch.no_grad():
                 self.s = self._all_coded(self.s)
         else:
-            # Another run has begun in the folder.
+            # Another run was started in the folder.
             self._rules.clear()
             self._plant(self.main.name, self._each)
             self._news.append({"type": "reordered"})
         self._goals = goals
 
     def _goal_choices(self) -> list[Any]:
-        """Return the tasks of the rules' files, with their options."""
+        """Return task name and configuration of each rule's file."""
         found: list[Any] = []
         for path in self._files.values():
             metadata = rule_metadata(path)
@@ -605,7 +609,7 @@ class RunWorld(RuleWorld):
 
 
 def rules_of_run(folder: RunFolder) -> list[Path]:
-    """Return the file of a run's rule, or those of the species that it trains together."""
+    """Return the file of a run's rule, or the files of all rules that it trains together."""
     path = str(folder.path)
     if not folder.path.is_dir():
         raise NPAError(f"a run must be a folder, got {shown(path)}: name the one given as --out")

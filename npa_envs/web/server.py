@@ -1,7 +1,7 @@
-"""A server for one page: files, a socket to a live world for each reader, films.
+"""The viewer's server: files of the page, a live world for each WebSocket, films.
 
-It binds the loopback address by default; bound elsewhere it asks for a token. It refuses requests
-whose `Host` is another name than its own (DNS rebinding) and sockets of pages of another origin.
+It binds the loopback address by default; at another address it requires a token. It refuses
+requests with a foreign `Host` (DNS rebinding), and sockets of pages of another origin.
 """
 
 from __future__ import annotations
@@ -47,28 +47,28 @@ PAGE = Path(__file__).resolve().parent / "page"
 """The folder of the page's files."""
 
 PORT = 8765
-"""First port that is tried."""
+"""First default port."""
 
 PORTS_TRIED = 20
-"""Number of ports from `PORT` on that are tried if the user names none."""
+"""Number of default ports from `PORT` on."""
 
 MOST_SESSIONS = 4
-"""Most readers at a time; each has a world of their own."""
+"""Most open pages; each has its own world."""
 
 FRAMES_AHEAD = 2
-"""Most frames that a page has not drawn yet."""
+"""Most frames that are sent and not drawn yet."""
 
 FRAME_SECONDS = 1.0 / 60.0
-"""Least time from frame to frame [s]."""
+"""Least time between two frames [s]."""
 
 LARGEST_MESSAGE = 2**20
 """Most bytes of a message."""
 
 MESSAGES_KEPT = 256
-"""Most messages in a queue; more are refused."""
+"""Most messages in a queue; others are dropped."""
 
 MOST_PICTURES = 500
-"""Most pictures of a film, 20 seconds: each takes a megabyte while it is written."""
+"""Most pictures of a film, 20 seconds; each takes a megabyte of memory when it is written."""
 
 FILM_RATE = 25.0
 """Pictures of a film per second."""
@@ -88,47 +88,47 @@ SECURITY = {
     "Referrer-Policy": "no-referrer",
     "Cache-Control": "no-store",
 }
-"""Headers of every answer."""
+"""Headers of every response."""
 
 
 @dataclass(frozen=True)
 class Site:
-    """The worlds, the address and the token of a server."""
+    """Worlds, address and token of a server."""
 
     make_world: Callable[[], LiveWorld]
-    """Makes a reader's world, in the thread that runs it."""
+    """Makes the world of a page, in the thread that runs it."""
     films: Path
     """Folder of films; created with the first one."""
     host: str = "127.0.0.1"
     """The bound address."""
     token: str | None = None
-    """The token that readers must give, or None."""
+    """The required token, or None."""
     one_at_a_time: bool = False
-    """Worlds take turns: on CUDA, one thread's work must not be recorded by another."""
+    """Worlds run one at a time: a CUDA graph of one thread must not record another's work."""
     turn: threading.Lock = field(default_factory=threading.Lock)
     open_sessions: list[ViewerSession] = field(default_factory=list)
 
     def alone(self) -> contextlib.AbstractContextManager[Any]:
-        """Return the context in which a world takes its turn."""
+        """Return the context in which a world runs alone."""
         return self.turn if self.one_at_a_time else contextlib.nullcontext()
 
-    def knows(self, host: str) -> bool:
-        """Return whether a request's `Host` may name this server."""
-        # Without its port and without brackets.
+    def allows_host(self, host: str) -> bool:
+        """Return whether a request's `Host` is a name of this server."""
+        # The name without port and brackets.
         closed = host.startswith("[")
         name = host[1:].partition("]")[0] if closed else host.partition(":")[0].lower()
         if self.token is not None:
-            # The token is proof enough, under any name of this computer.
+            # With a token, any name is allowed: the token protects enough.
             return bool(name)
         return name == self.host or name in ("localhost", "127.0.0.1", "::1")
 
     @property
     def query(self) -> str:
-        """The token as the end of an address, or nothing."""
+        """The query string with the token, or an empty string."""
         return "" if self.token is None else f"?token={self.token}"
 
-    def admits(self, token: str | None) -> bool:
-        """Return whether a token is right, or none is asked for."""
+    def allows_token(self, token: str | None) -> bool:
+        """Return whether the token is right, or none is required."""
         own = self.token
         return own is None or secrets.compare_digest((token or "").encode(), own.encode())
 
@@ -140,13 +140,13 @@ def make_site(
     host: str = "127.0.0.1",
     one_at_a_time: bool = False,
 ) -> Site:
-    """Return a site; unless its address is a loopback address, it asks for a fresh token."""
+    """Return a site; if `host` is no loopback address, it requires a new random token."""
     token = None if is_loopback(host) else secrets.token_urlsafe(24)
     return Site(make_world, films, host, token, one_at_a_time)
 
 
 def is_loopback(host: str) -> bool:
-    """Return whether only this computer can reach an address."""
+    """Return whether only this computer can connect to an address."""
     if host == "localhost":
         return True
     try:
@@ -159,7 +159,7 @@ def make_app(site: Site) -> Starlette:
     """Return the application that serves a site."""
 
     async def page(request: Request) -> Response:
-        if not site.admits(request.query_params.get("token")):
+        if not site.allows_token(request.query_params.get("token")):
             return _refused("open the link that npa-envs view has printed: it holds the token")
         return FileResponse(PAGE / "index.html", headers=SECURITY)
 
@@ -168,7 +168,7 @@ def make_app(site: Site) -> Starlette:
         return _file(PAGE, name, {".js": "text/javascript", ".css": "text/css"})
 
     async def film(request: Request) -> Response:
-        if not site.admits(request.query_params.get("token")):
+        if not site.allows_token(request.query_params.get("token")):
             return _refused("films need the token of the page")
         name = request.path_params["name"]
         return _file(site.films, name, {".gif": "image/gif", ".mp4": "video/mp4"})
@@ -176,9 +176,9 @@ def make_app(site: Site) -> Starlette:
     async def meet(reader: WebSocket) -> None:
         host, origin = reader.headers.get("host", ""), reader.headers.get("origin")
         own = {f"http://{host}", f"https://{host}"}
-        if not site.knows(host) or (origin is not None and origin not in own):
+        if not site.allows_host(host) or (origin is not None and origin not in own):
             return await reader.close(1008, "this server answers its own page alone")
-        if not site.admits(reader.query_params.get("token")):
+        if not site.allows_token(reader.query_params.get("token")):
             return await reader.close(1008, "the token is missing or wrong")
         await reader.accept()
         if len(site.open_sessions) >= MOST_SESSIONS:
@@ -212,16 +212,16 @@ class HostCheck:
         """Answer a request."""
         if scope["type"] == "http":
             host = dict(scope["headers"]).get(b"host", b"").decode("latin-1")
-            if not self._site.knows(host):
+            if not self._site.allows_host(host):
                 name = self._site.host
                 return await _refused(f"ask for {name}, got {shown(host)}")(scope, receive, send)
         await self._app(scope, receive, send)
 
 
 def _file(folder: Path, name: str, kinds: Mapping[str, str]) -> Response:
-    """Return a file of a folder, not of one above or below it, with the type of its suffix."""
+    """Return the response with a file directly in a folder, or 404."""
     path = folder / name
-    with contextlib.suppress(OSError, ValueError):  # A name that no file can have.
+    with contextlib.suppress(OSError, ValueError):  # Invalid file names.
         if path.parent == folder and path.suffix in kinds and path.is_file():
             return FileResponse(path, media_type=kinds[path.suffix], headers=SECURITY)
     return PlainTextResponse("no such file", 404, SECURITY)
@@ -241,22 +241,22 @@ def frame_bytes(frame: WorldView) -> bytes:
 
 
 class ViewerSession:
-    """One reader's socket, and a thread with their world.
+    """One page's socket, and a thread with its world.
 
-    The world waits for a page that is slow or hidden: at most `FRAMES_AHEAD` frames are on the way.
+    The world waits for a slow or hidden page: at most `FRAMES_AHEAD` frames are not drawn yet.
     """
 
     def __init__(self, site: Site, reader: WebSocket, loop: asyncio.AbstractEventLoop) -> None:
         self._site, self._reader, self._loop = site, reader, loop
         self._inbox: queue.Queue[dict[str, Any] | bytes] = queue.Queue(MESSAGES_KEPT)
         self._outbox: asyncio.Queue[bytes | str | None] = asyncio.Queue()
-        self._room = threading.BoundedSemaphore(FRAMES_AHEAD)
+        self._free_frames = threading.BoundedSemaphore(FRAMES_AHEAD)
         self._stopped = threading.Event()
         self._film: PageFilm | None = None
 
     async def serve(self) -> None:
-        """Read and write until the reader leaves or the server stops."""
-        threading.Thread(target=self._live, name="npa-envs world", daemon=True).start()
+        """Read and write until the page disconnects or the server stops."""
+        threading.Thread(target=self._world_thread, name="npa-envs world", daemon=True).start()
         writing = asyncio.create_task(self._write())
         try:
             await self._read()
@@ -265,9 +265,9 @@ class ViewerSession:
             writing.cancel()
 
     def stop(self) -> None:
-        """Let the world end after its present frame."""
+        """End the world after its present frame."""
         self._stopped.set()
-        self._give_room()
+        self._frame_drawn()
         self._post(None)
 
     async def _read(self) -> None:
@@ -280,17 +280,17 @@ class ViewerSession:
                 with contextlib.suppress(ValueError, RecursionError):
                     message = json.loads(text)
             if not isinstance(message, dict | bytes):
-                self._complain(f"a message must be a JSON object, got {shown(text)}")
+                self._send_error(f"a message must be a JSON object, got {shown(text)}")
             elif isinstance(message, dict) and message.get("type") == "drawn":
-                self._give_room()
+                self._frame_drawn()
             else:
-                self._keep(message)
+                self._enqueue(message)
 
-    def _keep(self, message: dict[str, Any] | bytes) -> None:
+    def _enqueue(self, message: dict[str, Any] | bytes) -> None:
         try:
             self._inbox.put_nowait(message)
         except queue.Full:
-            self._complain("too many messages: some are lost")
+            self._send_error("too many messages: some are lost")
 
     async def _write(self) -> None:
         while (data := await self._outbox.get()) is not None:
@@ -302,56 +302,56 @@ class ViewerSession:
             except (WebSocketDisconnect, RuntimeError):
                 return
 
-    def _give_room(self) -> None:
-        with contextlib.suppress(ValueError):  # A page reported more frames than it got.
-            self._room.release()
+    def _frame_drawn(self) -> None:
+        with contextlib.suppress(ValueError):  # The page reported more frames than were sent.
+            self._free_frames.release()
 
-    def _tell(self, event: Mapping[str, Any]) -> None:
+    def _send_event(self, event: Mapping[str, Any]) -> None:
         self._post(json.dumps(event))
 
-    def _complain(self, message: str) -> None:
-        self._tell({"type": "error", "message": message})
+    def _send_error(self, message: str) -> None:
+        self._send_event({"type": "error", "message": message})
 
     def _post(self, data: bytes | str | None) -> None:
         def put() -> None:
-            # A page that does not read gets no more events; None ends the loop of `_write`.
+            # Events are dropped if the page does not read them; None ends the loop of `_write`.
             if data is None or self._outbox.qsize() < MESSAGES_KEPT:
                 self._outbox.put_nowait(data)
 
         with contextlib.suppress(RuntimeError):  # The loop has ended.
             self._loop.call_soon_threadsafe(put)
 
-    def _live(self) -> None:
+    def _world_thread(self) -> None:
         try:
             with self._site.alone():
                 world = self._site.make_world()
         except NPAError as error:
-            return self._complain(str(error))
+            return self._send_error(str(error))
         try:
-            self._go_on(world)
+            self._run_world(world)
         except Exception as error:
-            # A bug or a failed device: shown in the page, and raised for the log.
-            self._complain(f"the world has ended: {shown(error)}")
+            # A bug or a failed device: shown on the page, and raised for the log.
+            self._send_error(f"the world has ended: {shown(error)}")
             raise
         finally:
             world.close()
 
-    def _go_on(self, world: LiveWorld) -> None:
-        self._tell(world.describe())
+    def _run_world(self, world: LiveWorld) -> None:
+        self._send_event(world.describe())
         changed = True
         clock = self._loop.time
         due = clock()
         while not self._stopped.is_set():
-            changed |= self._take(world, wait=not (world.playing or changed))
+            changed |= self._apply_messages(world, wait=not (world.playing or changed))
             with self._site.alone():
                 events = world.news()
             for event in events:
-                self._tell(event)
+                self._send_event(event)
                 changed = True
             if not (world.playing or changed):
                 continue
-            # A hidden page draws nothing; its messages are answered meanwhile.
-            if not self._room.acquire(timeout=0.25):
+            # A hidden page draws nothing; the loop still applies its messages.
+            if not self._free_frames.acquire(timeout=0.25):
                 continue
             self._stopped.wait(max(0.0, due - clock()))
             due = max(due, clock() - FRAME_SECONDS) + FRAME_SECONDS
@@ -363,12 +363,12 @@ class ViewerSession:
                 self._post(frame_bytes(frame))
             except NPAError as error:
                 world.playing = False
-                self._give_room()
-                self._complain(f"{error}; the world is paused")
-                self._tell(world.describe())
+                self._frame_drawn()
+                self._send_error(f"{error}; the world is paused")
+                self._send_event(world.describe())
             changed = False
 
-    def _take(self, world: LiveWorld, *, wait: bool) -> bool:
+    def _apply_messages(self, world: LiveWorld, *, wait: bool) -> bool:
         """Apply messages; return whether there were any."""
         taken = False
         while not self._stopped.is_set():
@@ -381,17 +381,17 @@ class ViewerSession:
                 if isinstance(message, bytes):
                     self._add_picture(message)
                 elif message.get("type") == "film":
-                    self._direct(message.get("action"))
+                    self._film_action(message.get("action"))
                 else:
                     with self._site.alone():
                         changed = world.handle(message)
                     if changed:
-                        self._tell(world.describe())
+                        self._send_event(world.describe())
             except NPAError as error:
-                self._complain(str(error))
+                self._send_error(str(error))
         return taken
 
-    def _direct(self, action: Any) -> None:
+    def _film_action(self, action: Any) -> None:
         if action == "start":
             self._film = PageFilm()
         elif action == "stop" and self._film is not None:
@@ -404,12 +404,12 @@ class ViewerSession:
             try:
                 for path in film.write(self._site.films):
                     url = f"films/{path.name}{self._site.query}"
-                    self._tell({"type": "file", "name": path.name, "url": url})
+                    self._send_event({"type": "file", "name": path.name, "url": url})
             except NPAError as error:
-                self._complain(str(error))
+                self._send_error(str(error))
 
         self._film = None
-        # The world runs meanwhile.
+        # In a thread, so that the world keeps running.
         threading.Thread(target=write, daemon=True).start()
 
     def _add_picture(self, data: bytes) -> None:
@@ -417,7 +417,7 @@ class ViewerSession:
         if self._film is not None:
             self._film.add(data)
             if len(self._film.pictures) >= MOST_PICTURES:
-                self._tell({"type": "film", "action": "stop"})
+                self._send_event({"type": "film", "action": "stop"})
                 self._end_film(self._film)
 
 
@@ -450,10 +450,10 @@ class PageFilm:
                 np.asarray(Image.open(io.BytesIO(data), formats=["JPEG"]).convert("RGB"))
                 for data in self.pictures
             ]
-            # Several readers may end their films within a second.
+            # Random, as several films may end within the same second.
             name = f"{time.strftime('film-%Y%m%d-%H%M%S')}-{secrets.token_hex(3)}"
             with made_folder(folder):
-                # A GIF needs no ffmpeg.
+                # The GIF comes first, as it needs no ffmpeg.
                 for suffix, write in ((".gif", write_gif), (".mp4", write_mp4)):
                     path = folder / f"{name}{suffix}"
                     write(path, frames, FILM_RATE)
@@ -465,7 +465,7 @@ class PageFilm:
 
 
 def open_port(host: str, port: int | None) -> socket.socket:
-    """Return a listening socket on a port, or for None on the first free one from `PORT` on."""
+    """Return a listening socket on a port; None: the first free one from `PORT` on."""
     if port is not None and not 0 <= port <= 65535:
         raise NPAError(f"port must be in [0, 65535], got {port}: leave it out for a free one")
     tried = [port] if port is not None else [*range(PORT, PORT + PORTS_TRIED), 0]
@@ -481,7 +481,7 @@ def open_port(host: str, port: int | None) -> socket.socket:
                 "127.0.0.1"
             ) from error
         try:
-            # Allows the port of a server that has just ended, not of one that runs.
+            # The port of a server that has just ended can be used at once.
             listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
             listener.bind(address)
             listener.listen(128)
@@ -497,9 +497,9 @@ def open_port(host: str, port: int | None) -> socket.socket:
 
 
 def address_of(site: Site, listener: socket.socket) -> str:
-    """Return the link that opens a site."""
+    """Return the link to the page."""
     port = listener.getsockname()[1]
-    # The link of a server on all addresses opens the page on this computer.
+    # For a server on all addresses, the link names this computer.
     name = {"0.0.0.0": "127.0.0.1", "": "127.0.0.1", "::": "::1"}.get(site.host, site.host)
     name = f"[{name}]" if ":" in name else name
     return f"http://{name}:{port}/{site.query}"
@@ -511,7 +511,7 @@ def make_server(site: Site) -> uvicorn.Server:
         make_app(site),
         log_level="warning",
         ws_max_size=LARGEST_MESSAGE,
-        # Frames hardly compress, and compressing takes longer than sending.
+        # Compressing frames takes longer than sending them, and gains little.
         ws_per_message_deflate=False,
         server_header=False,
         timeout_graceful_shutdown=2,
@@ -521,6 +521,6 @@ def make_server(site: Site) -> uvicorn.Server:
 
 def serve(site: Site, listener: socket.socket) -> None:
     """Serve a site until Ctrl-C."""
-    # The server stops in order and then raises it.
+    # The server shuts down first, then raises this.
     with contextlib.suppress(KeyboardInterrupt):
         make_server(site).run(sockets=[listener])

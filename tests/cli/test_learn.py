@@ -79,7 +79,7 @@ def test_a_killed_process_ends_a_run_and_a_signal_stops_it(tmp_path):
     run.terminate()
     said, _ = run.communicate(timeout=60)
     assert run.returncode == 130
-    assert "stopped; the same words with --resume go on" in said
+    assert "stopped; the same arguments with --resume continue" in said
     assert load_checkpoint(tmp_path / "checkpoint.pt")["iteration"] > done > 0
 
 
@@ -89,7 +89,7 @@ def test_a_killed_process_ends_a_run_and_a_signal_stops_it(tmp_path):
         (["--particle-steps", "nan"], "particle_steps must be finite"),
         (["--options", "tempo=3"], "has no option 'tempo'"),
         (["--keywords", "heart"], "keywords must be NAME=VALUE, got 'heart'"),
-        (["--gpus", "2", "--processes", "2"], "gpus says how many processes there are"),
+        (["--gpus", "2", "--processes", "2"], "gpus sets the number of processes"),
         (["--gpus=2", "--device=cpu"], "gpus goes with device 'cuda', got 'cpu'"),
         (["--gpus", "0"], "gpus must be at least 1, got 0"),
         (["--episode-steps", "0"], "episode_steps must be"),

@@ -66,7 +66,7 @@ const acts = {
     for (const message of script) {
       if (message.type === "advance") {
         await live.advance();
-        live.onTheWay = 0;
+        live.undrawn = 0;
         continue;
       }
       try {

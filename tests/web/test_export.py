@@ -409,8 +409,8 @@ def test_the_command_writes_pages_and_collections(tmp_path, capsys):
     run_folder = str(tmp_path / "run")
     assert main(["export-web", "gecko", run_folder, "-o", str(page)]) == 0
     assert f"wrote {page}" in capsys.readouterr().out
-    names = re.findall(r'"name":"(\w+)"', page.read_text(encoding="utf-8"))
-    assert names == ["gecko", "run"]
+    written = re.search(r'id="rules">(.*?)</script>', page.read_text(encoding="utf-8"))[1]
+    assert [rule["name"] for rule in json.loads(written)["rules"]] == ["gecko", "run"]
     assert main(["export-web", "gecko", "--out", str(collection), "--particle-count", "77"]) == 0
     assert '"N0": 77' in collection.read_text(encoding="utf-8")
     assert torch.equal(

@@ -196,7 +196,7 @@ def test_a_world_that_divides_shows_its_living_particles(tmp_path, device):
     rule, path = dividing(load_rule("gecko")), tmp_path / "dividing.safetensors"
     world = world_of(rule, path, device, division=True, particle_count=64)
     assert len(world.frame().positions) == 1
-    assert not {"inject", "graft", "add"} & set(world.describe()["tools"])
+    assert not {"inject", "graft", "add"} & {tool["name"] for tool in world.describe()["tools"]}
     put(world, speed=8)
     for show in ("colours", "mask", "speed", "density", "components", "species", "state 3"):
         put(world, show=show)

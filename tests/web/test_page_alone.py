@@ -11,7 +11,8 @@ import pytest
 
 SETUP = """
 const world = {
-  type: "world", title: "t", dimension: 2, tools: ["remove"],
+  type: "world", title: "t", dimension: 2,
+  tools: [{ name: "remove", label: "Remove", takes: "", icon: "M0 0" }],
   capabilities: ["film", "step", "reset"],
 };
 const frame = (step, places = [0, 0, 1, 1]) => ({

@@ -486,8 +486,8 @@ def test_more_messages_than_there_is_room_for_are_refused(site):
     session = server.ViewerSession.__new__(server.ViewerSession)
     session._inbox = queue.Queue(2)
     told = []
-    session._tell = told.append
+    session._send_event = told.append
     for _ in range(4):
-        session._keep({"type": "brush"})
+        session._enqueue({"type": "brush"})
     assert session._inbox.qsize() == 2
     assert [event["message"] for event in told] == ["too many messages: some are lost"] * 2

@@ -1,10 +1,10 @@
 // Brushes, by the formulas of npa_envs/world/brushes.py, in place.
 //
-// x: positions [length units], s: states, one particle after the other; box: sides [length units] of
-// the periodic box, across whose edges a brush reaches, or null.
+// x: positions [length units], s: states, particle by particle; box: sides of the periodic box [length
+// units], in which distances are those to the nearest image, or null.
 
-// Calls visit(i, offset, square) for each particle: its offset from a place, to its nearest image in a
-// box, which `visit` may change but not keep, and the square of its length.
+// Calls visit(i, offset, square) for each particle: its offset from `centre`, which is valid only during
+// the call, and the square of the offset's length.
 function forEach(x, dimension, centre, box, visit) {
   const offset = new Float64Array(dimension);
   const count = x.length / dimension;
@@ -20,7 +20,7 @@ function forEach(x, dimension, centre, box, visit) {
   }
 }
 
-// Which particles lie in a ball, as an array of their numbers.
+// Returns the indices of the particles in a ball.
 export function insideBall(x, dimension, centre, radius, box) {
   const found = [];
   forEach(x, dimension, centre, box, (i, _, square) => {
@@ -34,41 +34,41 @@ export function wipeState(x, s, dimension, centre, radius, box) {
   for (const i of insideBall(x, dimension, centre, radius, box)) s.fill(0, i * channels, (i + 1) * channels);
 }
 
-// Carries particles along with a movement, those in the middle by `strength` of it.
+// Moves particles by a fraction of `move`, in the centre `strength`, less towards the rim.
 export function push(x, dimension, centre, move, radius, strength, box) {
   forEach(x, dimension, centre, box, (i, _, square) => {
-    const share = strength * softness(square, radius);
-    for (let d = 0; d < dimension; d++) x[i * dimension + d] += share * move[d];
+    const weight = strength * softness(square, radius);
+    for (let d = 0; d < dimension; d++) x[i * dimension + d] += weight * move[d];
   });
 }
 
-// The mean state under a soft brush, or null where it holds no particle.
+// Returns the mean state under a soft brush, or null if there is no particle.
 export function stateAround(x, s, dimension, centre, radius, box) {
   const channels = (s.length / x.length) * dimension, mean = new Float64Array(channels);
   let total = 0;
   forEach(x, dimension, centre, box, (i, _, square) => {
-    const share = softness(square, radius);
-    total += share;
-    for (let c = 0; c < channels; c++) mean[c] += share * s[i * channels + c];
+    const weight = softness(square, radius);
+    total += weight;
+    for (let c = 0; c < channels; c++) mean[c] += weight * s[i * channels + c];
   });
   return total > 0 ? mean.map((sum) => sum / total) : null;
 }
 
-// Draws states towards a given one, those in the middle by `strength` of the way.
+// Mixes a state into those of particles, in the centre by the fraction `strength`.
 export function inject(x, s, dimension, centre, radius, state, strength, box) {
   const channels = state.length;
   forEach(x, dimension, centre, box, (i, _, square) => {
-    const share = strength * softness(square, radius);
-    for (let c = 0; c < channels; c++) s[i * channels + c] += share * (state[c] - s[i * channels + c]);
+    const weight = strength * softness(square, radius);
+    for (let c = 0; c < channels; c++) s[i * channels + c] += weight * (state[c] - s[i * channels + c]);
   });
 }
 
-// The weight of a soft brush at a distance whose square is given.
+// Returns the weight of a soft brush at a squared distance.
 function softness(square, radius) {
   return radius > 0 ? Math.max(0, 1 - square / (radius * radius)) ** 2 : 0;
 }
 
-// Takes particles nearer to the centre by a share `factor` of their distance.
+// Moves particles towards the centre by the fraction `factor` of their distance.
 export function clump(x, dimension, centre, radius, factor, box) {
   forEach(x, dimension, centre, box, (i, offset, square) => {
     if (Math.sqrt(square) > radius) return;
@@ -76,8 +76,8 @@ export function clump(x, dimension, centre, radius, factor, box) {
   });
 }
 
-// Opens a slit along a line (a plane in 3D) with a `normal`; `along` leads from its centre to an end,
-// or is null where it has none.
+// Opens a gap along a line (a plane in 3D) with a `normal`; `along` is the vector from its centre to an
+// end, or null for an endless one.
 export function cut(x, dimension, centre, normal, gap, along, box) {
   const length = Math.hypot(...normal) || 1;
   const direction = normal.map((part) => part / length);

@@ -12,7 +12,7 @@ const RESTING = [0.29, 0.33, 0.42];
 const ROWS_TOGETHER = 64;
 const JACOBI_SWEEPS = 12;
 
-// Colours frame after frame: bytes red, green and blue of each particle.
+// Computes red, green and blue bytes of each particle, frame by frame.
 export class Colouring {
   // ramp: Uint8Array, red, green and blue from sparse to dense.
   constructor(ramp) {
@@ -59,7 +59,7 @@ export class Colouring {
   // The first three principal components as colours; their basis moves slowly.
   components(s, channels, bytes) {
     const count = s.length / channels;
-    // One NaN in the moving average would stay there.
+    // A NaN would stay in the moving average.
     const known = [];
     for (let i = 0; i < count; i++) {
       if (s.subarray(i * channels, (i + 1) * channels).every(Number.isFinite)) known.push(i);
@@ -113,7 +113,7 @@ export class Look {
     this.kernels = kernels;
     this.outputs = outputs === 0 ? this.channels : rule.classes === null ? 3 : outputs;
     if (outputs === 0) return;
-    // Only those outputs of the read-out that have colours.
+    // Only the read-out's outputs that are colours or classes.
     const kept = this.outputs;
     this.first = kernels.layer(weights["readout.0.weight"], weights["readout.0.bias"], this.channels, hidden);
     this.second = kernels.layer(

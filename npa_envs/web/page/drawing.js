@@ -1,4 +1,4 @@
-// Particles on a canvas: cameras, and painters with WebGL2 or, where there is none, without it.
+// Particles on a canvas: the camera, and painters with and without WebGL2.
 
 // The camera moves and zooms over 2D worlds, and goes round 3D worlds in perspective: y is up, angles are
 // in degrees.
@@ -8,7 +8,7 @@ export class Camera {
     this.halfWidth = halfWidth;
     this.centre = [0, 1, 2].map((k) => centre[k] ?? 0);
     this.zoom = 1;
-    this.covered = 0; // share of the canvas's height that controls cover, at its lower edge
+    this.covered = 0; // fraction of the canvas's height that controls cover, at its lower edge
     this.azimuth = 0;
     this.elevation = dimension === 3 ? 15 : 0;
   }
@@ -25,7 +25,7 @@ export class Camera {
     ];
   }
 
-  // From the camera to the centre [length units]; 0 stands for far away, without perspective.
+  // Distance from the camera to the centre [length units]; 0: no perspective.
   get distance() {
     return this.dimension === 2 ? 0 : 5 * this.halfWidth;
   }
@@ -40,7 +40,7 @@ export class Camera {
     return height * (1 - this.covered);
   }
 
-  // Place on the canvas [pixels from its upper left corner], nearness and scale of a position.
+  // Projects a position to [column, row, nearness, scale]; pixels from the upper left corner.
   project(position, width, height) {
     const offset = this.centre.map((middle, k) => (position[k] ?? 0) - middle);
     const [across, up, near] = this.axes.map((axis) => dot(axis, offset));
@@ -62,7 +62,7 @@ export class Camera {
     return [0, 1, 2].map((k) => share * unit * (columns * right[k] - rows * up[k]));
   }
 
-  // Follow a pointer that drags the world [pixels].
+  // Moves or turns the camera by a drag [pixels].
   drag(columns, rows, width, height) {
     if (this.dimension === 2) {
       const move = this.movement(columns, rows, width, height);
@@ -73,7 +73,7 @@ export class Camera {
     }
   }
 
-  // Show all positions, but for strays.
+  // Shows all positions except a few outliers.
   fit(positions) {
     const { dimension } = this, count = positions.length / dimension;
     if (!count) return;
@@ -111,7 +111,7 @@ export function makePainter(canvas, kind = "auto") {
 }
 
 function quickest() {
-  // On a canvas of its own, because a canvas has one kind of context.
+  // On another canvas, because a canvas has only one kind of context.
   const gl = document.createElement("canvas").getContext("webgl2", { failIfMajorPerformanceCaveat: true });
   const names = gl?.getExtension("WEBGL_debug_renderer_info");
   const name = names ? gl.getParameter(names.UNMASKED_RENDERER_WEBGL) : "";
@@ -119,7 +119,7 @@ function quickest() {
   return gl && !/swiftshader|llvmpipe|software|basic render/i.test(name) ? "webgl2" : "canvas";
 }
 
-// Offsets of the images of a periodic world that a camera sees [length units].
+// Offsets of the images of a periodic world in the camera's view [length units].
 function tiles(scene, width, height) {
   const { box, camera, dimension } = scene;
   if (!box || dimension !== 2) return [[0, 0, 0]];
@@ -140,7 +140,7 @@ uniform vec3 right, up, toward, centre, offset;
 uniform vec2 unit;        // device units a length unit
 uniform float distance_;  // of the camera; 0: no perspective
 uniform float nearest;    // nearness that counts as the front
-uniform float covered;    // share of the height that controls cover
+uniform float covered;    // fraction of the height that controls cover
 vec4 place(vec3 position, out float scale, out float near) {
   vec3 p = position + offset - centre;
   near = dot(p, toward);
@@ -188,7 +188,7 @@ void main() {
   shown = vec4(mix(background, sum.rgb / max(sum.a, 1e-3), cover), 1.0);
 }`;
 
-// Crisp spots: discs in 2D, and in 3D balls that hide what lies behind them.
+// Crisp spots: discs in 2D, opaque balls in 3D.
 const BALL_FRAGMENT = `#version 300 es
 precision mediump float;
 in vec3 tint; in float light; uniform bool ball; uniform float edge; out vec4 shown;
@@ -365,7 +365,7 @@ function attribute(gl, place, buffer, size, type, normalised) {
   gl.vertexAttribPointer(place, size, type, normalised, 0, 0);
 }
 
-// A program with the places of its uniforms by their names.
+// A program with the locations of its uniforms by name.
 function linked(gl, vertex, fragment) {
   const program = gl.createProgram();
   for (const [type, source] of [[gl.VERTEX_SHADER, vertex], [gl.FRAGMENT_SHADER, fragment]]) {
@@ -388,8 +388,7 @@ const PLAIN_PIXELS = [360, 1200]; // on the longer side of the small picture, le
 const PLAIN_TIME = 10; // milliseconds that a picture may take
 const COVERS = Float32Array.from({ length: 1024 }, (_, k) => 1 - Math.exp(-2.4 * (k / 256)));
 
-// Without WebGL: spots written into a small picture, as large as there is time for, which the canvas
-// then stretches.
+// Without WebGL: spots are written into a picture, as large as time allows, and stretched to the canvas.
 class PlainPainter {
   constructor(context) {
     this.context = context;
@@ -424,7 +423,7 @@ class PlainPainter {
     if (scene.trails) this.drawTrails(scene, width, height);
     if (scene.still) return;
     const taken = performance.now() - started, [least, most] = PLAIN_PIXELS;
-    // In steps, so that the picture is not laid out anew in every frame.
+    // In steps, so that the picture is not allocated again in every frame.
     if (taken > 1.5 * PLAIN_TIME) this.pixels = Math.max(least, this.pixels - 80);
     else if (taken < 0.4 * PLAIN_TIME) this.pixels = Math.min(most, this.pixels + 80);
   }
@@ -444,7 +443,7 @@ class PlainPainter {
   }
 }
 
-// Column, row, nearness and scale of each particle, as `Camera.project` gives them one by one.
+// Column, row, nearness and scale of all particles, as by `Camera.project`.
 function projected({ positions, dimension, camera }, offset, width, height) {
   const count = positions.length / dimension, places = new Float32Array(4 * count);
   const [right, up, toward] = camera.axes, unit = camera.unit(width, height), { distance, centre } = camera;
@@ -487,7 +486,7 @@ function addSpots(sums, width, height, places, colours, spot) {
   }
 }
 
-// Writes balls that hide what lies behind them, or flat discs; the fourth sum holds how near they are.
+// Writes opaque balls or flat discs; the fourth sum is their nearness.
 function addBalls(sums, width, height, places, { colours, dimension, camera }, spot) {
   const solid = dimension === 3, span = 2 * camera.halfWidth;
   for (let k = 0; k < places.length / 4; k++) {
@@ -527,9 +526,9 @@ function show(data, sums, background, soft) {
 }
 
 const TRACED = 300; // particles with a trail
-const TRAIL_LENGTH = 48; // frames that a trail goes back
+const TRAIL_LENGTH = 48; // frames of a trail
 
-// Where some particles have been in the last frames.
+// Positions of some particles in the last frames.
 export class Tracers {
   constructor() {
     this.clear();
@@ -553,7 +552,7 @@ export class Tracers {
     if (this.frames.length > TRAIL_LENGTH) this.frames.shift();
   }
 
-  // Lines from frame to frame, older ones fainter; none where a particle crossed a box's edge.
+  // Lines from frame to frame, older ones fainter; none across a box's edge.
   lines(box) {
     const places = [], fades = [], longest = box ? Math.min(...box) / 2 : Infinity;
     for (let f = 1; f < this.frames.length; f++) {

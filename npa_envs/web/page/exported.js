@@ -1,13 +1,13 @@
-// The page without a server: a worker computes worlds, and pictures offer a choice of rules. See page.js.
+// The engine of the exported page, a worker in the page, and a gallery to choose a rule. See page.js.
 
 import { start } from "./page.js";
 
-// Starts the worker whose text stands in the element that `settings.worker` names; the rest of the
-// settings is what LiveWorld takes.
+// Starts the worker with the code in the element `settings.worker`; the other settings are those of
+// LiveWorld.
 async function connect({ worker: element, ...settings }, listener) {
   const text = document.getElementById(element).textContent;
   const worker = new Worker(URL.createObjectURL(new Blob([text], { type: "text/javascript" })));
-  // The worker is a frame ahead; the page gets the next one when it has drawn the one before.
+  // The worker computes a frame ahead; the page gets it when it has drawn the frame before.
   const ready = [];
   let drawing = false;
   const pump = () => {
@@ -19,7 +19,7 @@ async function connect({ worker: element, ...settings }, listener) {
   worker.onmessage = ({ data }) => {
     if (data.type === "frame") ready.push(data);
     else {
-      // Frames of a world that is no more.
+      // Drops the frames of the former world.
       if (data.type === "world") ready.splice(0).forEach(drop);
       listener(data);
     }
@@ -29,7 +29,7 @@ async function connect({ worker: element, ...settings }, listener) {
     event.preventDefault();
     listener({ type: "error", message: event.message || "this browser does not let the page start a worker" });
   };
-  // "?engine=processor" behind the address keeps off the graphics card, "?engine=gpu" insists on it.
+  // "?engine=processor" in the address avoids the graphics card, "?engine=gpu" always uses it.
   const engine = new URLSearchParams(location.search).get("engine") ?? "auto";
   worker.postMessage({ type: "begin", settings: { ...settings, engine } });
   return {
@@ -37,13 +37,13 @@ async function connect({ worker: element, ...settings }, listener) {
       worker.postMessage(message);
       if (message.type !== "drawn") return;
       drawing = false;
-      // Never from within a call of the page's own.
+      // Later, not within this call of the page.
       queueMicrotask(pump);
     },
   };
 }
 
-// Begins with what the page holds in its element `rules`.
+// Starts the page with the settings in its element `rules`.
 export function begin() {
   const settings = JSON.parse(document.getElementById("rules").textContent);
   const pictured = settings.rules.filter((rule) => rule.preview);
@@ -51,7 +51,7 @@ export function begin() {
   else new Gallery(settings, pictured);
 }
 
-// The address chooses: "#gecko" shows that rule's world, no name shows all pictures.
+// The address decides: "#gecko" shows that rule's world, without a name all pictures are shown.
 class Gallery {
   constructor(settings, pictured) {
     this.settings = settings;

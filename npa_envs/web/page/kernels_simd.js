@@ -1,8 +1,8 @@
 // The kernels of physics.js in WebAssembly with 128-bit vectors, assembled here: no compiler, no
 // binary file. Four channels, or four hidden units, are added up at a time, in float32.
 //
-// The texts of the kernels stand below as functions of the assembler's words; the instructions and
-// the format of a module are those of https://webassembly.github.io/spec/core/binary/.
+// The kernels are written with the assembler's functions. Instructions and module format:
+// https://webassembly.github.io/spec/core/binary/.
 
 import { plainKernels, TILE_OUTPUTS, tiledLayer } from "./physics.js";
 
@@ -12,7 +12,7 @@ const PAGE_BYTES = 65536;
 // Rows that a step of the product computes together, in registers.
 const TILE_ROWS = 4;
 
-// The assembler's words: each gives the bytes of one instruction.
+// The assembler: each function returns the bytes of one instruction.
 
 function unsigned(value) {
   const bytes = [];
@@ -68,7 +68,7 @@ const select = (yes, no, condition) => [...yes, ...no, ...condition, 0x1b];
 
 const zeros = constant(new Array(16).fill(0));
 
-// Repeats a body while a local is below a limit, which is looked at first.
+// Repeats a body while a local is below a limit; tests before the first time.
 function loopBelow(local, limit, body) {
   return [0x02, 0x40, 0x03, 0x40, ...below(get(local), limit), 0x45, 0x0d, 1, ...body, 0x0c, 0, 0x0b, 0x0b];
 }
@@ -122,7 +122,7 @@ const PROBE = ["x", "y", "z", "eps", "square", "weight", "slope", "sideX", "side
 function pairsCode(dimension) {
   const names = [
     "probe", "order", "x", "y", "z", "volume", "ranges", "rangesEnd", "width", "place", "a", "kx", "ky", "kz", "out",
-    // Integers of its own.
+    // Local integers.
     "byte", "end", "count", "found", "at",
     // Vectors.
     "lanes", "dx", "dy", "dz", "squared", "inside", "left", "distance", "share", "front",
@@ -147,7 +147,7 @@ function pairsCode(dimension) {
     ...put("share", minus(probed("eps"), value("distance"))),
     ...put("share", over(times(probed("slope"), times(value("share"), value("share"))), value("distance"))),
     ...put("share", times(value("share"), load(add(value("volume"), value("byte"))))),
-    // What is no number where a particle meets itself, or behind the last one, is masked.
+    // Masks the NaN of the particle itself, and lanes behind the last particle.
     ...put("share", and(value("share"), and(value("inside"), less(zeros, value("squared"))))),
     ...axes.flatMap((axis) => put(`s${axis}`, times(value("share"), value(`d${axis}`)))),
     ...axes.flatMap((axis, k) => axes.slice(k).flatMap((other) =>
@@ -314,7 +314,7 @@ export function simdKernels(width, dimension) {
   function pairs(points, i, ranges, used, { eps, weight, slope, sides, width: stride }, list, moment) {
     const { x, y, z, volume } = points;
     const scalars = [x[i], y[i], z[i], eps, eps * eps, weight, slope];
-    // In open space no image is nearer.
+    // In open space there are no images.
     probe.set(scalars);
     for (let d = 0; d < 3; d++) {
       const periodic = sides[d] < Infinity;

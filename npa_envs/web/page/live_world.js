@@ -1,5 +1,5 @@
-// The world of the exported page. Messages and events are those of page.js, and their effects those of
-// RuleWorld in npa_envs/web/rule_world.py.
+// The world of the exported page, as RuleWorld of npa_envs/web/rule_world.py. page.js lists messages and
+// events.
 
 import { clump, cut, wipeState, inject, insideBall, push, stateAround } from "./brushes.js";
 import { Colouring, Look } from "./colours.js";
@@ -7,53 +7,40 @@ import { fastestKernels } from "./kernels_simd.js";
 import { padded, Physics, prepareRule, wrap } from "./physics.js";
 import { GpuPhysics, openDevice } from "./physics_gpu.js";
 
-// Frames that are on the way to the page at most: a page that is slow or hidden holds the world.
+// Most frames that the page has not drawn yet: the world waits for a slow or hidden page.
 const FRAMES_AHEAD = 2;
 
-// Numbers of npa_envs/web/live.py, npa_envs/web/rule_world.py and npa_envs/tasks/damage.py.
-const CLUMP_RATE = 0.25;
-const INJECT_RATE = 0.5;
-const CLUMP_FACTOR = 0.9;
-const SEED_SHARE = 0.5;
-const LEAST_SEED = 16;
-const DAMAGE_SIZES = { wipe: 0.2, cut: 0.1, clump: 0.2, noise: 0.05 };
-
-// A graphics card is tried for so many steps, whose results may differ so much from the processor's.
+// Steps that a graphics card is tried for, and the largest difference from the processor's results.
 const TRIAL_STEPS = 4;
 const TRIAL_TOLERANCE = 1e-3;
 
-// What rules must have in common to live in one world, as AGREEMENTS of npa_envs/world/species.py.
-const AGREEMENTS = [
-  "space_dim", "state_dim", "eps0", "static", "state_gradient", "moment_correction", "moment_inverse",
-  "density_gradient",
-];
-
 export class LiveWorld {
-  // settings: {rules: [...], seed, ramp} as npa_envs/web/export.py writes them; the first rule is shown
-  // first. send(event, transferred) hands an event to the page; device: a graphics card, or null.
-  // settings.engine: "auto" tries the card and keeps what is faster, "gpu" takes it untried.
+  // settings: {rules, seed, ramp, constants} as npa_envs/web/export.py writes them; the first rule is shown
+  // first. send(event, transferred) sends an event to the page; device: a graphics card, or null.
+  // settings.engine: "auto" uses the card if it is faster, "gpu" always.
   constructor(settings, send, device = null) {
     this.device = device;
     this.engine = settings.engine ?? "auto";
     this.rules = settings.rules.map(decoded);
     this.ramp = bytesOf(settings.ramp);
+    this.constants = settings.constants;
     this.send = send;
     this.playing = true;
     this.changed = false;
-    this.onTheWay = 0;
+    this.undrawn = 0;
     this.show = "colours";
     this.seed = settings.seed;
     this.plant(this.rules[0]);
   }
 
-  // A rule by its name.
+  // Returns the rule of a name.
   known(name) {
     const rule = this.rules.find((own) => own.name === name);
     if (rule === undefined) throw Error(`no rule is called ${name}`);
     return rule;
   }
 
-  // Begins a fresh world of a rule, in the world that it was trained in.
+  // Starts a fresh world of a rule, with the settings of its task.
   plant(rule) {
     this.rule = rule;
     this.values = {};
@@ -63,18 +50,18 @@ export class LiveWorld {
     this.reset(this.seed);
   }
 
-  // A fresh world of the chosen rule alone.
+  // Starts a fresh world of the chosen rule alone.
   reset(seed) {
     this.seed = seed;
     this.random = new Random(seed);
     this.steps = this.milliseconds = 0;
     this.species = [this.rule];
-    // Each species divides densities by the particles of a fresh world, so that particles that a brush
-    // adds or removes change densities in their neighbourhood only.
+    // Each species divides densities by the particles of a fresh world: particles that a brush adds or
+    // removes change only the densities around them.
     this.full = this.values.count;
     this.divisors = [this.full];
     this.colouring = new Colouring(this.ramp);
-    this.take(this.places(), new Float32Array(this.full * this.channels), new Uint8Array(this.full));
+    this.setParticles(this.seedPositions(), new Float32Array(this.full * this.channels), new Uint8Array(this.full));
     this.prepare();
     this.announce();
   }
@@ -95,16 +82,16 @@ export class LiveWorld {
     return this.values.eps;
   }
 
-  // Where the particles of a fresh world lie [length units].
-  places() {
+  // Returns positions of a fresh world [length units].
+  seedPositions() {
     const { seed } = this.rule.world;
     if (seed.kind === "ball") return this.random.ball(this.full, this.dimension, seed.radius);
     if (seed.kind === "box") return this.random.box(this.full, this.box);
     return seed.clouds[this.random.below(seed.clouds.length)].slice();
   }
 
-  // Goes on with these particles.
-  take(x, s, species) {
+  // Replaces the particles of the world.
+  setParticles(x, s, species) {
     const count = species.length;
     this.world = { count, x, s, species };
     // Each particle's path in the last step over the longest possible one, and whether it was updated.
@@ -113,7 +100,7 @@ export class LiveWorld {
     if (this.physics !== undefined && count > this.physics.capacity) this.prepare();
   }
 
-  // Room and weights for the particles and species that live now.
+  // Allocates memory for the present particles, and prepares the weights of the present species.
   prepare() {
     const kernels = (this.kernels = fastestKernels(padded(this.channels), this.dimension));
     this.physics = new Physics(this.species.map((rule) => prepareRule(rule, kernels)), this.world.count, kernels);
@@ -123,7 +110,7 @@ export class LiveWorld {
     this.trial = { left: this.engine === "gpu" ? 0 : TRIAL_STEPS, processor: Infinity, card: Infinity };
   }
 
-  // One step of the physics: by the graphics card where it is faster, and right.
+  // Makes a step of the physics, on the graphics card if it is faster and its results are right.
   async compute(options) {
     const { world, physics, trial } = this;
     if (this.device === null) return physics.step(world, options);
@@ -174,10 +161,10 @@ export class LiveWorld {
     this.milliseconds += (this.milliseconds > 0 ? 0.2 : 1) * (taken - this.milliseconds);
   }
 
-  // Does what a message of the page says.
+  // Applies a message of the page.
   async receive(message) {
     const acts = {
-      drawn: () => (this.onTheWay = Math.max(0, this.onTheWay - 1)),
+      drawn: () => (this.undrawn = Math.max(0, this.undrawn - 1)),
       play: () => (this.playing = Boolean(message.on)),
       step: () => {
         this.playing = false;
@@ -214,7 +201,7 @@ export class LiveWorld {
 
   // Applies a brush; page.js describes the message.
   brush({ tool, at, move, radius, strength, source, rule, view }) {
-    const { dimension, box } = this;
+    const { dimension, box, constants } = this;
     const { x, s, species } = this.world;
     if (tool === "remove") {
       const gone = new Set(insideBall(x, dimension, at, radius, box));
@@ -222,25 +209,26 @@ export class LiveWorld {
     } else if (tool === "push") {
       push(x, dimension, at, move, radius, Math.min(1, 0.5 + strength), box);
     } else if (tool === "clump") {
-      clump(x, dimension, at, radius, CLUMP_RATE * strength, box);
+      clump(x, dimension, at, radius, constants.CLUMP_RATE * strength, box);
     } else if (tool === "cut") {
       const half = move.map((part) => part / 2);
       const normal = dimension === 2 ? [-move[1], move[0]] : cross(view ?? [0, 0, 1], move);
       cut(x, dimension, at.map((part, d) => part + half[d]), normal, radius, half, box);
     } else if (tool === "inject") {
       const state = stateAround(x, s, dimension, source ?? at, radius, box);
-      if (state !== null) inject(x, s, dimension, at, radius, state, INJECT_RATE * strength, box);
+      if (state !== null) inject(x, s, dimension, at, radius, state, constants.INJECT_RATE * strength, box);
     } else if (tool === "graft") {
       const inside = insideBall(x, dimension, at, radius, box);
       const number = this.speciesOf(rule, this.full);
       for (const i of inside) species[i] = number;
     } else if (tool === "add") {
-      this.add(at, radius, Math.max(LEAST_SEED, Math.round(strength * SEED_SHARE * this.full)), rule);
+      const count = Math.round(strength * constants.SEED_FRACTION * this.full);
+      this.add(at, radius, Math.max(constants.LEAST_SEED, count), rule);
     } else throw Error(`no brush is called ${tool}`);
     if (box !== null) wrap(this.world.x, this.world.count, box);
   }
 
-  // Removes the particles that are not kept.
+  // Removes the particles for which kept(i) is false.
   keep(kept) {
     const { x, s, species, count } = this.world;
     const left = Array.from({ length: count }, (_, i) => i).filter(kept);
@@ -250,32 +238,32 @@ export class LiveWorld {
       left.forEach((i, k) => chosen.set(array.subarray(i * width, (i + 1) * width), k * width));
       return chosen;
     };
-    this.take(rows(x, this.dimension), rows(s, this.channels), rows(species, 1));
+    this.setParticles(rows(x, this.dimension), rows(s, this.channels), rows(species, 1));
   }
 
-  // Adds blank particles of a rule in a ball.
+  // Adds particles of a rule, with states 0, in a ball.
   add(at, radius, count, name) {
     const { x, s, species } = this.world;
     const room = (this.rule.world.settings.count?.high ?? this.full) - this.world.count;
     if (count > room) throw Error(`the world has room for ${Math.max(0, room)} particles more, got ${count}`);
-    // A new species divides densities by its own number of particles, as if it grew alone.
+    // A new species divides densities by its own number of particles, as in a world alone.
     const number = this.speciesOf(name, count);
     const ball = this.random.ball(count, this.dimension, radius);
     for (let k = 0; k < ball.length; k++) ball[k] += at[k % this.dimension];
-    this.take(
+    this.setParticles(
       joined(x, ball),
       joined(s, new Float32Array(count * this.channels)),
       joined(species, new Uint8Array(count).fill(number)),
     );
   }
 
-  // The number of a rule's species; a rule new to the world gets the next number.
+  // Returns the index of a rule's species; a rule that is new in the world is appended.
   speciesOf(name, divisor) {
     const rule = this.known(name);
     const number = this.species.indexOf(rule);
     if (number >= 0) return number;
     if (!this.mayJoin(rule)) {
-      throw Error(`${name} cannot live in a world of ${this.rule.name}: rules of one world must agree in ${AGREEMENTS.join(", ")}`);
+      throw Error(`${name} cannot live in a world of ${this.rule.name}: rules of one world must agree in ${this.constants.AGREEMENTS.join(", ")}`);
     }
     this.species.push(rule);
     this.divisors.push(divisor);
@@ -285,43 +273,43 @@ export class LiveWorld {
   }
 
   mayJoin(rule) {
-    return AGREEMENTS.every((what) => rule[what] === this.rule[what]);
+    return this.constants.AGREEMENTS.every((what) => rule[what] === this.rule[what]);
   }
 
   // Damage at a random place, or through the middle at a random angle.
   damage(name) {
-    const { dimension, random } = this;
+    const { dimension, random, constants } = this;
     const { x, s, count } = this.world;
-    const size = DAMAGE_SIZES[name];
+    const size = constants.DAMAGE_SIZES[name];
     if (size === undefined) throw Error(`no damage is called ${name}`);
     if (count === 0) return;
     const particle = random.below(count);
     const centre = x.slice(particle * dimension, (particle + 1) * dimension);
     if (name === "wipe") wipeState(x, s, dimension, centre, size, null);
-    if (name === "clump") clump(x, dimension, centre, size, CLUMP_FACTOR, null);
+    if (name === "clump") clump(x, dimension, centre, size, constants.CLUMP_FACTOR, null);
     if (name === "cut") cut(x, dimension, meanOf(x, dimension), random.direction(dimension), size, null, null);
     if (name === "noise") random.normals(x.length, size).forEach((part, k) => (x[k] += part));
     if (this.box !== null) wrap(x, count, this.box);
   }
 
-  // Whether there is something to show, and the page takes it.
+  // Whether there is a new frame to show, and the page is ready for it.
   get pending() {
-    return (this.playing || this.changed) && this.onTheWay < FRAMES_AHEAD;
+    return (this.playing || this.changed) && this.undrawn < FRAMES_AHEAD;
   }
 
-  // Goes on to the next frame where the world runs, and shows it.
+  // Runs to the next frame unless the world is paused, and sends the frame.
   async advance() {
     if (this.playing) for (let k = 0; k < this.values.speed; k++) await this.step();
     const positions = this.world.x.slice();
     const colours = this.colouring.of(this, this.show);
     const { steps: step, milliseconds } = this;
     const engine = this.card !== null && this.trial.left === 0 ? "WebGPU" : this.kernels.name;
-    this.onTheWay++;
+    this.undrawn++;
     this.changed = false;
     this.send({ type: "frame", step, positions, colours, milliseconds, engine }, [positions.buffer, colours.buffer]);
   }
 
-  // Tells the page what there is.
+  // Sends the event "world".
   announce() {
     const { rule, values, show, playing, seed } = this;
     const { settings: ranges, ...world } = rule.world;
@@ -396,7 +384,7 @@ export function serve(scope) {
     }
   };
 
-  const obey = async ({ type, settings, ...rest }) => {
+  const apply = async ({ type, settings, ...rest }) => {
     if (type !== "begin") return live.receive({ type, ...rest });
     const device = settings.engine === "processor" ? null : await openDevice().catch(() => null);
     live = new LiveWorld(settings, send, device);
@@ -408,14 +396,14 @@ export function serve(scope) {
     busy = true;
     while (messages.length > 0) {
       const message = messages.shift();
-      await attempt(() => obey(message));
+      await attempt(() => apply(message));
     }
     if (live?.pending) {
-      // A world that cannot go on stands still.
+      // After an error the world is paused.
       if (!(await attempt(() => live.advance()))) live.playing = live.changed = false;
     }
     busy = false;
-    // New messages get their turn first.
+    // Messages that have arrived meanwhile come first.
     if (messages.length > 0 || live?.pending) clock.port2.postMessage(null);
   };
 
@@ -426,8 +414,7 @@ export function serve(scope) {
   };
 }
 
-// Reproducible random numbers: the same seed gives the same world on every machine. Python draws
-// others from the same seed.
+// Random numbers that depend only on the seed, and differ from Python's for the same seed.
 // The generator is sfc32 of Chris Doty-Humphrey (PractRand), 128 bits of state.
 class Random {
   constructor(seed) {

@@ -1,7 +1,5 @@
-// The page: one canvas, brushes, controls and plots over an engine that moves the particles.
-//
-// An engine is a function `connect`: that of `viewer.js` speaks to a server that runs the Python engine,
-// that of `exported.js` computes in the page. Nothing else knows which one runs.
+// The page: a canvas, brushes, controls and plots. An engine runs the world: its function `connect` is
+// that of `viewer.js`, for a server in Python, or of `exported.js`, for a worker in the page.
 //
 //   const engine = await connect(settings, listener);   // settings: those of `start`
 //   engine.send(message);                               // page -> engine, a JSON object
@@ -14,42 +12,42 @@
 //   {type: "set", name, value}         name: a key of the world's `settings`, or "rule", "show",
 //                                      "loss" (true while its plot is open: else it is not computed)
 //   {type: "brush", tool, at, move, radius, strength, source?, rule?, view?}
-//                                      tool: remove | push | clump | cut | inject | graft | add
-//                                      at, move: [x, y] or [x, y, z] [length units]; push, clump and
-//                                      inject come again and again while the pointer is down, cut
-//                                      once, at its end: the line from `at` to `at + move`, of
-//                                      half-width `radius`; strength in [0, 1]; source: of inject,
-//                                      where the state comes from; rule: of graft and add, a name of
-//                                      `rules`; view: in 3D the unit vector towards the viewer
+//                                      tool: the name of one of the world's `tools`
+//                                      at, move: [x, y] or [x, y, z] [length units]; sent for each
+//                                      drawn frame while the pointer is down, by cut once, at the
+//                                      end: the line from `at` to `at + move`, of half-width
+//                                      `radius`; strength in [0, 1]; source (inject): where the
+//                                      state comes from; rule (graft, add): a name of `rules`;
+//                                      view (3D): the unit vector towards the viewer
 //   {type: "damage", name}             one of the world's `damages`, at a random place
-//   {type: "drawn"}                    the page has drawn a frame and is ready for another. An engine
-//                                      has at most two frames on the way: a page that is slow or
-//                                      hidden holds the world, it does not lag behind it.
-//   {type: "film", action}             where capabilities hold "film": "start", "stop"; between them
+//   {type: "drawn"}                    the page has drawn a frame. An engine sends at most two frames
+//                                      that are not drawn yet: it waits for a slow or hidden page.
+//   {type: "film", action}             "start" or "stop", if capabilities contain "film"; between them
 //                                      the page sends pictures as Blob objects by engine.send(blob)
 //
 // Events:
 //   {type: "world", title, note, dimension, box, centre, half_width, spot, rules, rule, others,
 //    species, shows, show, tools, damages, settings, capabilities, playing, seed}
-//       once, and after changes. note: a sentence for the reader, or ""; box: sides [length units] or
-//       null; centre, half_width: what the canvas shows at first; spot: standard deviation of a
-//       particle's spot [length units]; rules: names that `rule` may take; others: names that graft
-//       and add may take; species: names of the rules of the world's particles; settings: {name:
-//       {value, low, high, scale?: "log", whole?: true}} with names among eps, update_prob, noise, count, speed (steps a frame);
+//       once, and after changes. note: a sentence for the user, or ""; box: sides [length units] or
+//       null; centre, half_width: the first view; spot: standard deviation of a particle's spot
+//       [length units]; rules: choices of `rule`; others: choices of graft and add; species: names of
+//       the rules of the world's particles; settings: {name: {value, low, high, scale?: "log",
+//       whole?: true}}, names: eps, update_prob, noise, count, speed (steps a frame);
+//       tools: [{name, label, icon, takes}], the rows of TOOLS in npa_envs/web/live.py;
 //       capabilities: some of "step", "reset", "film", "loss".
-//       A key that an engine leaves out is as in `BLANK` below.
+//       `BLANK` below has the defaults of missing keys.
 //   {type: "frame", step, positions, colours, milliseconds, loss?}
 //       positions: Float32Array, count * dimension; colours: Uint8Array, count * 3 (red, green, blue);
-//       milliseconds: one step took so long; loss: where it was computed
-//   {type: "reordered"}                                            particles stand elsewhere in frames
+//       milliseconds: time of a step; loss: if it was computed
+//   {type: "reordered"}                                            particles have other indices
 //   {type: "curve", name, points: [[x, y], ...], append?}          a plot of a training run
-//   {type: "film", action: "stop"}                                 the film is as long as it may be
+//   {type: "film", action: "stop"}                                 the film has its greatest length
 //   {type: "file", name, url}                                      a file of a film is ready
 //   {type: "error", message}
 //
-// index.html loads viewer.js. For the exported page, exported.js and the modules that it imports are
-// joined into one file. For that, imports are single lines of names in braces, exports stand before
-// `function`, `class` or `const`, and top-level names differ between modules.
+// index.html loads viewer.js. npa_envs/web/export.py joins exported.js and its imports into one file.
+// For that, imports are single lines of names in braces, and exports stand before `function`, `class`
+// or `const`.
 //
 // `show`: "colours", "density", "species", "speed", "mask", "components" (the first three principal
 // components of the state as red, green and blue), "state 0", "state 1", ...
@@ -63,15 +61,10 @@ const BLANK = {
   capabilities: [], playing: true, seed: 0,
 };
 
-const TOOLS = {
-  look: ["Look: drag to move, wheel or pinch to zoom, double click to see all", "M12 5v14M5 12h14M12 5l-2 2M12 5l2 2M12 19l-2-2M12 19l2-2M5 12l2-2M5 12l2 2M19 12l-2-2M19 12l-2 2"],
-  remove: ["Remove", "M4 15l8-9 7 6-7 8H8zM9 20h11"],
-  push: ["Pull with the pointer", "M12 20c-4 0-6-3-7-7 2-1 3 0 4 2V6a1.4 1.4 0 0 1 3 0v5a1.4 1.4 0 0 1 3 0v1a1.4 1.4 0 0 1 3 0v3c0 3-2 5-6 5z"],
-  clump: ["Clump", "M4 4l5 5M20 4l-5 5M4 20l5-5M20 20l-5-5M9 6v3H6M15 6v3h3M9 18v-3H6M15 18v-3h3"],
-  cut: ["Cut along a line", "M5 19L19 5M6 8a2 2 0 1 0 0-.1M16 18a2 2 0 1 0 0-.1M8 9l8 8"],
-  inject: ["Inject: the state of where you press spreads to where you drag", "M4 20l3-1 8-8-2-2-8 8zM12 8l4 4M14 10l3-4a1.8 1.8 0 0 1 3 0 1.8 1.8 0 0 1-1 3l-4 2"],
-  graft: ["Graft: particles take another rule", "M12 21v-9M12 12c0-5 3-7 8-7 0 5-3 7-8 7zM12 15c0-4-3-6-8-6 0 4 3 6 8 6z"],
-  add: ["Add a seed of another rule", "M12 4a8 8 0 1 0 .1 0M12 8v8M8 12h8"],
+// The page's own tool; a world says which brushes it offers.
+const LOOK = {
+  name: "look", takes: "", label: "Look: drag to move, wheel or pinch to zoom, double click to see all",
+  icon: "M12 5v14M5 12h14M12 5l-2 2M12 5l2 2M12 19l-2-2M12 19l2-2M5 12l2-2M5 12l2 2M19 12l-2-2M19 12l-2 2",
 };
 
 const ICONS = {
@@ -101,7 +94,7 @@ export async function start(connect, settings) {
     page.engine = await connect(settings, (event) => page.listen(event));
     for (const message of page.waiting.splice(0)) page.engine.send(message);
   } catch (error) {
-    page.complain(error.message);
+    page.showError(error.message);
   }
   return page;
 }
@@ -112,13 +105,14 @@ class Page {
     this.waiting = [];
     this.world = { ...BLANK };
     this.frame = null;
-    this.undrawn = 0; // frames that came since the last one was drawn
+    this.undrawn = 0; // frames received since the last drawing
     this.camera = new Camera(2, BLANK.half_width);
     this.canvas = $("world");
     const wanted = new URLSearchParams(location.search).get("painter");
     this.painter = makePainter(this.canvas, wanted ?? "auto");
     this.tracers = new Tracers();
-    this.tool = "look";
+    this.tool = LOOK.name;
+    this.takes = LOOK.takes;
     this.pointers = new Map();
     this.recording = null;
     this.frameTimes = [];
@@ -128,9 +122,9 @@ class Page {
     };
     this.curves = {};
     this.dirty = true;
-    this.build();
-    this.watch();
-    requestAnimationFrame(() => this.tick());
+    this.buildControls();
+    this.watchPointers();
+    requestAnimationFrame(() => this.drawIfNeeded());
   }
 
   send(message) {
@@ -144,31 +138,32 @@ class Page {
     if (event.type === "frame") {
       this.frame = event;
       this.undrawn++;
-    } else if (event.type === "world") this.meet(event);
+    } else if (event.type === "world") this.readWorld(event);
     else if (event.type === "curve") this.curve(event);
     else if (event.type === "reordered") this.tracers.clear();
     else if (event.type === "film" && this.recording?.picture) this.showRecording((this.recording = null));
-    else if (event.type === "file") this.offer(event.name, event.url);
-    else if (event.type === "error") this.complain(event.message);
+    else if (event.type === "file") this.offerFile(event.name, event.url);
+    else if (event.type === "error") this.showError(event.message);
   }
 
-  meet(event) {
+  readWorld(event) {
     const before = this.world, world = { ...BLANK, ...event };
     this.world = world;
-    if (!this.met || before.dimension !== world.dimension || before.half_width !== world.half_width) {
+    if (!this.described || before.dimension !== world.dimension || before.half_width !== world.half_width) {
       this.camera = new Camera(world.dimension, world.half_width, world.centre);
       this.frame = null;
-      // Also the undrawn frames of the former world: the engine waits for each.
-      this.tellDrawn();
-      const first = world.tools.includes("remove") && world.dimension === 2 ? "remove" : "look";
-      const keep = before.dimension === world.dimension && world.tools.includes(this.tool);
+      // Also for undrawn frames of the former world: the engine waits for each.
+      this.reportDrawn();
+      const has = (tool) => world.tools.some(({ name }) => name === tool);
+      const first = has("remove") && world.dimension === 2 ? "remove" : LOOK.name;
+      const keep = before.dimension === world.dimension && has(this.tool);
       this.choose(keep ? this.tool : first);
     }
     if (before.rule !== world.rule || before.seed !== world.seed) {
       this.tracers.clear();
       Object.values(this.plots).forEach((plot) => plot.clear());
     }
-    this.met = true;
+    this.described = true;
     document.title = `${world.title} · npa-envs`;
     $("title").textContent = world.title;
     $("note").textContent = world.note;
@@ -179,7 +174,7 @@ class Page {
     options($("other"), world.others, other);
     options($("show"), world.shows, world.show);
     $("rule-field").hidden = world.rules.length < 2;
-    $("other-field").hidden = !world.tools.some((tool) => tool === "graft" || tool === "add");
+    $("other-field").hidden = !world.tools.some(({ takes }) => takes === "rule");
     $("brush").hidden = !world.tools.length;
     $("one").disabled = !world.capabilities.includes("step");
     $("reset").disabled = !world.capabilities.includes("reset");
@@ -197,7 +192,7 @@ class Page {
     plot.draw();
   }
 
-  offer(name, url) {
+  offerFile(name, url) {
     const item = document.createElement("li"), link = document.createElement("a");
     Object.assign(link, { href: url, download: name, textContent: name });
     item.append(link);
@@ -206,7 +201,7 @@ class Page {
     return link;
   }
 
-  complain(message) {
+  showError(message) {
     $("message").textContent = message;
     $("message").hidden = false;
     clearTimeout(this.quiet);
@@ -215,7 +210,7 @@ class Page {
 
   // Controls.
 
-  build() {
+  buildControls() {
     $("one").innerHTML = icon(ICONS.one);
     $("reset").innerHTML = icon(ICONS.reset);
     $("fold").innerHTML = icon(ICONS.fold);
@@ -270,13 +265,13 @@ class Page {
   }
 
   showTools() {
-    const names = ["look", ...this.world.tools.filter((name) => name in TOOLS)];
-    if ($("tools").dataset.names === names.join()) return;
-    $("tools").dataset.names = names.join();
-    $("tools").replaceChildren(...names.map((name, k) => {
+    const tools = [LOOK, ...this.world.tools], names = tools.map(({ name }) => name).join();
+    if ($("tools").dataset.names === names) return;
+    $("tools").dataset.names = names;
+    $("tools").replaceChildren(...tools.map(({ name, label, icon: path }, k) => {
       const button = document.createElement("button");
-      button.innerHTML = icon(TOOLS[name][1]);
-      button.title = `${TOOLS[name][0]} (${k + 1})`;
+      button.innerHTML = icon(path);
+      button.title = `${label} (${k + 1})`;
       button.dataset.tool = name;
       button.setAttribute("role", "radio");
       button.setAttribute("aria-label", name);
@@ -288,6 +283,7 @@ class Page {
 
   choose(name) {
     this.tool = name;
+    this.takes = this.world.tools.find((tool) => tool.name === name)?.takes ?? "";
     for (const button of $("tools").children)
       button.setAttribute("aria-checked", String(button.dataset.tool === name));
     if (name === "look") $("cursor").hidden = true;
@@ -305,7 +301,7 @@ class Page {
     }));
   }
 
-  // Sliders are made once and kept, so that one that is being dragged stays under the finger.
+  // Sliders are made once and updated, so that a dragged one is not replaced.
   showSettings() {
     const { settings } = this.world;
     $("speed-field").hidden = !settings.speed;
@@ -345,7 +341,7 @@ class Page {
     input.oninput = () => {
       output.textContent = short(read());
       clearTimeout(this.settling);
-      // A world is made anew for another number of particles: only once the slider rests.
+      // Another number of particles restarts the world: sent only once the slider rests.
       const send = () => this.send({ type: "set", name, value: read() });
       if (name === "count") this.settling = setTimeout(send, 150);
       else send();
@@ -365,9 +361,9 @@ class Page {
     act();
   }
 
-  // Pointers: one works, two look.
+  // Pointers: one uses the tool, two move the camera.
 
-  watch() {
+  watchPointers() {
     const { canvas } = this;
     canvas.onpointerdown = (event) => this.press(event);
     canvas.onpointermove = (event) => this.move(event);
@@ -405,7 +401,7 @@ class Page {
     }
     const near = this.nearness(place);
     this.stroke = { near, from: place, at: place, sent: place };
-    if (this.tool !== "cut") this.brush(place, [0, 0]);
+    if (this.takes !== "line") this.brush(place, [0, 0]);
     this.showCursor(place);
   }
 
@@ -434,7 +430,7 @@ class Page {
   release(event) {
     const { stroke } = this;
     this.pointers.delete(event.pointerId);
-    if (stroke && this.tool === "cut" && event.type === "pointerup") {
+    if (stroke && this.takes === "line" && event.type === "pointerup") {
       const move = [stroke.at[0] - stroke.from[0], stroke.at[1] - stroke.from[1]];
       if (Math.hypot(...move) > 4) this.brush(stroke.from, move);
     }
@@ -444,7 +440,7 @@ class Page {
     if (event.pointerType !== "mouse") $("cursor").hidden = true;
   }
 
-  // How near the surface under the pointer is: brushes of 3D worlds work there.
+  // Nearness of the surface under the pointer, where brushes of 3D worlds act.
   nearness([column, row]) {
     const { frame, camera, canvas } = this;
     if (!frame || this.world.dimension !== 3) return 0;
@@ -458,7 +454,7 @@ class Page {
     return Number.isFinite(nearest) ? nearest : 0;
   }
 
-  // The brush at a place on the canvas, moved so many pixels.
+  // Sends the brush at a place on the canvas, with its movement in pixels.
   brush(place, pixels) {
     const { camera, canvas, world, stroke } = this;
     const width = canvas.clientWidth, height = canvas.clientHeight, { dimension, box } = world;
@@ -471,15 +467,15 @@ class Page {
       type: "brush", tool: this.tool, at: wrapped, move,
       radius: this.radius(), strength: +$("strength").value,
     };
-    if (this.tool === "inject") message.source = stroke?.source ?? wrapped;
-    if (this.tool === "graft" || this.tool === "add") message.rule = $("other").value;
+    if (this.takes === "source") message.source = stroke?.source ?? wrapped;
+    if (this.takes === "rule") message.rule = $("other").value;
     if (dimension === 3) message.view = camera.axes[2];
     this.send(message);
   }
 
-  // A cut is a line: of its radius only a part is the gap.
+  // The brush's radius [length units]; for a line the width of its gap.
   radius() {
-    return +$("radius").value * (this.tool === "cut" ? 0.4 : 1);
+    return +$("radius").value * (this.takes === "line" ? 0.4 : 1);
   }
 
   showCursor([column, row]) {
@@ -490,7 +486,7 @@ class Page {
     cursor.style.width = cursor.style.height = `${size}px`;
     cursor.style.transform = `translate(${column - size / 2}px, ${row - size / 2}px)`;
     cursor.classList.toggle("pressed", Boolean(stroke));
-    knife.hidden = !(stroke && this.tool === "cut");
+    knife.hidden = !(stroke && this.takes === "line");
     if (!knife.hidden) {
       const across = column - stroke.from[0], down = row - stroke.from[1];
       knife.style.width = `${Math.hypot(across, down)}px`;
@@ -501,10 +497,10 @@ class Page {
 
   // Each frame of the screen: the brush, and new frames of the world.
 
-  tick() {
-    requestAnimationFrame(() => this.tick());
+  drawIfNeeded() {
+    requestAnimationFrame(() => this.drawIfNeeded());
     const { stroke } = this;
-    if (stroke && !["cut", "graft", "add"].includes(this.tool)) {
+    if (stroke && !["line", "rule"].includes(this.takes)) {
       const move = [stroke.at[0] - stroke.sent[0], stroke.at[1] - stroke.sent[1]];
       if (this.tool !== "push" || Math.hypot(...move) > 0) this.brush(stroke.sent, move);
       stroke.sent = stroke.at;
@@ -513,18 +509,18 @@ class Page {
       this.brush(stroke.at, [0, 0]);
     }
     if (!this.undrawn && !this.dirty) return;
-    if (this.undrawn) this.take();
+    if (this.undrawn) this.readFrame();
     this.draw();
-    this.tellDrawn();
+    this.reportDrawn();
     this.dirty = false;
   }
 
-  // Also of frames that later ones have replaced: the engine waits for each.
-  tellDrawn() {
+  // Also for frames that later ones have replaced: the engine waits for each.
+  reportDrawn() {
     for (; this.undrawn > 0; this.undrawn--) this.send({ type: "drawn" });
   }
 
-  take() {
+  readFrame() {
     const { frame, world } = this, now = performance.now();
     if ($("tracers").checked) this.tracers.add(frame.positions, world.dimension);
     this.frameTimes.push(now);
@@ -544,12 +540,12 @@ class Page {
 
   draw({ still = false } = {}) {
     const { canvas, frame, world, camera } = this;
-    // More pixels are invisible, and slow where the processor draws.
+    // More pixels are invisible, and slow without a graphics card.
     const ratio = Math.min(devicePixelRatio || 1, 1600 / Math.max(canvas.clientWidth, canvas.clientHeight, 1), 2);
     const width = Math.round(canvas.clientWidth * ratio), height = Math.round(canvas.clientHeight * ratio);
     if (!width || !height) return;
     if (canvas.width !== width || canvas.height !== height) Object.assign(canvas, { width, height });
-    // What fills the canvas may lie under the bar as well.
+    // A box may also extend below the bar.
     camera.covered = world.box ? 0 : (canvas.clientHeight - $("bar").offsetTop) / canvas.clientHeight;
     this.painter.draw({
       positions: frame?.positions ?? new Float32Array(), colours: frame?.colours ?? new Uint8Array(),
@@ -567,11 +563,11 @@ class Page {
     this.draw({ still: true });
     this.canvas.toBlob((blob) => {
       const name = `${this.world.title}-${this.frame?.step ?? 0}.png`.replace(/[^\w.-]+/g, "-");
-      this.offer(name, URL.createObjectURL(blob)).click();
+      this.offerFile(name, URL.createObjectURL(blob)).click();
     }, "image/png");
   }
 
-  // An engine that makes films gets pictures; else the browser records the canvas.
+  // Sends pictures to an engine that makes films; else the browser records the canvas.
   record(on) {
     this.showRecording(on);
     if (!on) {
@@ -582,7 +578,7 @@ class Page {
       this.recording = { picture, last: 0, stop: () => this.send({ type: "film", action: "stop" }) };
       this.send({ type: "film", action: "start" });
       this.dirty = true;
-    } else this.recording = recorder(this.canvas, (name, url) => this.offer(name, url));
+    } else this.recording = recorder(this.canvas, (name, url) => this.offerFile(name, url));
   }
 
   showRecording(on) {
@@ -624,7 +620,7 @@ function numbers(hex) {
   return [1, 3, 5].map((k) => parseInt(hex.trim().slice(k, k + 2), 16) / 255);
 }
 
-// Choices are stored where the browser allows it.
+// Choices are stored if the browser allows it.
 function keep(name, value) {
   try { localStorage.setItem(`npa-envs ${name}`, value); } catch { /* private windows */ }
 }

@@ -2,24 +2,23 @@
 // npa_envs/reference.py and docs/mathematics.md.
 //
 // Particles are sorted by cell, densities are summed over pairs in double precision, and only active
-// particles perceive. The two sums that take most of the time, states over neighbours and the
-// network, are `kernels`: those of this file, or the WebAssembly ones of kernels_simd.js.
+// particles perceive. Most of the time goes into sums over neighbours and the network, the `kernels`:
+// those of this file, or the WebAssembly ones of kernels_simd.js.
 
 const MOMENT_THRESHOLD = 1e-3;
 const MOMENT_SOFTENING = 1e-2;
 
-// Rows that the network takes at once.
+// Rows in a batch of the network.
 const BLOCK_ROWS = 64;
 
-// What states are padded to a multiple of, and what a layer's outputs are.
+// States, and a layer's outputs, are padded to multiples of these.
 const LANES = 4;
 export const TILE_OUTPUTS = 8;
 
-// Most cells on each side of the grid: farther particles share cells with others, and distances are
-// checked.
+// Most cells on each side of the grid. Beyond it cells are reused; distances are checked in any case.
 export const MOST_CELLS = { 2: 256, 3: 64 };
 
-// Cells in which eps is divided.
+// Cells per eps.
 export const CELLS_PER_RADIUS = { 2: 2, 3: 2 };
 
 export function padded(channels) {
@@ -38,7 +37,7 @@ export function prepareRule(description, kernels) {
   return rule;
 }
 
-// The kernels in plain JavaScript. `floats` and `integers` give zeroed arrays that they can read.
+// The kernels in plain JavaScript. `floats` and `integers` return zeroed arrays for them.
 export function plainKernels() {
   // Sums over the neighbours of a particle whose state begins at `own`, into `sums` [1 + D, width]:
   // Σ a s_j, and Σ k (s_j - s_i) for each axis. Neighbours' states begin where `place` says.
@@ -171,7 +170,7 @@ export function tiledLayer(floats, weight, bias, inputs, outputs) {
   return { inputs, width, weights, offset };
 }
 
-// What a step needs besides the world: sorted copies, densities, lists. Made once for each size.
+// Memory and methods of a step: sorted copies, densities, lists. Made once for each size.
 export class Physics {
   // rules: prepared, all of one dimension and number of channels. capacity: particles at most.
   constructor(rules, capacity, kernels) {
@@ -216,8 +215,8 @@ export class Physics {
   // Advances a world {count, x, s, species} by one step, in place.
   //
   // eps: perception radius [length units]; box: sides, or null; mask: Uint8Array, 1 where a particle
-  // is updated, or null for all; noise: what positions are moved by, or null; densityCounts: what each
-  // rule divides densities by, by default the particles of the world; dt: dimensionless.
+  // is updated, or null for all; noise: offsets of positions, or null; densityCounts: divisors of each
+  // rule's densities, by default the particles of the world; dt: dimensionless.
   step(world, { eps, box = null, mask = null, noise = null, densityCounts = null, dt = 1 }) {
     this.sort(world, eps, box);
     this.computeDensities(world.count, eps);
@@ -228,7 +227,7 @@ export class Physics {
     this.finish(world, noise, box);
   }
 
-  // What a step ends with: noise, and back into the box.
+  // Adds noise and moves particles back into the box.
   finish(world, noise, box) {
     if (noise !== null) {
       for (let n = 0; n < noise.length; n++) world.x[n] += noise[n];
@@ -275,7 +274,7 @@ export class Physics {
       starts[cell + 1]++;
     }
     for (let cell = 0; cell < total; cell++) starts[cell + 1] += starts[cell];
-    // Counted down from the end, so that `starts` itself can serve as the cursor of each cell.
+    // Backwards, so that `starts` itself is the cursor of each cell.
     for (let i = count - 1; i >= 0; i--) order[--starts[cellOf[i] + 1]] = i;
     for (let cell = 0; cell < total; cell++) starts[cell] = starts[cell + 1];
     starts[total] = count;
@@ -296,7 +295,7 @@ export class Physics {
     const { starts, ranges, dimension } = this;
     const span = CELLS_PER_RADIUS[dimension];
     const cx = cell % nx, cy = Math.floor(cell / nx) % ny, cz = Math.floor(cell / (nx * ny));
-    // In a small box each cell is looked at once, however often it lies around.
+    // In a small box each cell is visited only once.
     const around = 2 * span + 1;
     const countX = Math.min(nx, around), countY = Math.min(ny, around), countZ = Math.min(nz, around);
     const firstX = countX < around ? 0 : (cx - span + nx) % nx;
@@ -330,7 +329,7 @@ export class Physics {
     gradientX.fill(0, 0, count);
     gradientY.fill(0, 0, count);
     gradientZ.fill(0, 0, count);
-    // A particle counts itself.
+    // The particle itself.
     density.fill(weight * squaredRadius ** 3, 0, count);
     const total = this.cells[0] * this.cells[1] * this.cells[2];
     for (let cell = 0; cell < total; cell++) {
@@ -342,7 +341,7 @@ export class Physics {
         let sum = 0, sumX = 0, sumY = 0, sumZ = 0;
         for (let r = 0; r < used; r += 2) {
           const last = ranges[r + 1];
-          // Each pair once: what i adds to j is what j adds to i, the gradient with the other sign.
+          // Each pair once: i and j add the same to each other, the gradient with opposite sign.
           for (let j = Math.max(ranges[r], i + 1); j < last; j++) {
             let dx = px[j] - x, dy = py[j] - y, dz = pz[j] - z;
             if (dx > halfX) dx -= sideX;
@@ -442,8 +441,8 @@ export class Physics {
     }
   }
 
-  // x ← x + dt α ε δ / (1 + |δ|), s ← s + dt Δs for one particle, whose δ and Δs begin at `from`; what
-  // of both lies in the rule's dead zone is 0.
+  // x ← x + dt α ε δ / (1 + |δ|), s ← s + dt Δs for one particle, whose δ and Δs begin at `from`; numbers
+  // in the rule's dead zone count as 0.
   update({ x, s }, rule, particle, updates, from, eps, dt) {
     const { dimension, channels } = this;
     if (rule.dead_zone > 0) {
@@ -479,7 +478,7 @@ export function spikyNorm(eps, dimension) {
   return dimension === 2 ? 30 / (Math.PI * eps ** 5) : 45 / (Math.PI * eps ** 6);
 }
 
-// Writes L(v) = log(1 + |v|) v / |v| and returns the place behind it.
+// Writes L(v) = log(1 + |v|) v / |v| and returns the next index.
 function logScaled(rows, at, dimension, x, y, z) {
   if (dimension === 2) z = 0;
   const length = Math.sqrt(x * x + y * y + z * z);
@@ -491,7 +490,7 @@ function logScaled(rows, at, dimension, x, y, z) {
   return at + 3;
 }
 
-// The upper triangle (xx, xy, xz, yy, yz, zz) of what stands for M^-1.
+// The upper triangle (xx, xy, xz, yy, yz, zz) of the inverse of M, or of its replacement.
 function momentInverse(dimension, [xx, xy, xz, yy, yz, zz], kind) {
   let determinant, adjugate;
   if (dimension === 2) {

@@ -6,7 +6,7 @@ import { CELLS_PER_RADIUS, MOST_CELLS, smoothingNorm, spikyNorm } from "./physic
 const GROUP = 64;
 const UNIFORM_BYTES = 96;
 
-// A device of the browser, or null where there is none.
+// Returns a device of the browser, or null.
 export async function openDevice() {
   const adapter = await navigator.gpu?.requestAdapter({ powerPreference: "high-performance" });
   return adapter ? adapter.requestDevice() : null;
@@ -87,7 +87,7 @@ function shaders(rule) {
 
   fn logScaled(v: vec3f) -> vec3f {
     let length = length(v);
-    // Of small vectors the logarithm would lose digits.
+    // For small vectors, as the logarithm would lose digits.
     let factor = select(log(1.0 + length) / max(length, 1e-30), 1.0 - 0.5 * length + length * length / 3.0, length < 0.01);
     return factor * v;
   }
@@ -140,9 +140,9 @@ function shaders(rule) {
   }`;
 }
 
-// Does what Physics does, in turns with the processor: `step` is a promise.
+// Physics on the graphics card; `step` returns a promise.
 export class GpuPhysics {
-  // Makes one, or fails where the device refuses a shader or a buffer.
+  // Makes an instance; throws if the device refuses a shader or a buffer.
   static async make(device, physics) {
     for (const kind of ["out-of-memory", "validation"]) device.pushErrorScope(kind);
     const made = new GpuPhysics(device, physics);
@@ -256,7 +256,7 @@ function uniforms(rule, eps, sides, cells, count, rows, divisor, dimension) {
   const bytes = new ArrayBuffer(UNIFORM_BYTES);
   const floats = new Float32Array(bytes), integers = new Uint32Array(bytes);
   sides.forEach((side, d) => {
-    // In open space no image is nearer.
+    // In open space there are no images.
     floats[d] = side < Infinity ? side : 0;
     floats[4 + d] = side < Infinity ? 1 / side : 0;
   });

@@ -1,4 +1,4 @@
-// Small plots of numbers that come one after the other.
+// Small line plots to which points are added.
 
 const KEPT = 2000; // points of a plot; older ones are thinned out
 
@@ -26,7 +26,7 @@ export class Plot {
     if (!Number.isFinite(y)) return;
     const last = this.points.at(-1);
     if (last && x < last[0]) this.points = [];
-    if (last && x === last[0]) this.points.pop(); // A world that stands still.
+    if (last && x === last[0]) this.points.pop(); // Replaces the last point while the world is paused.
     this.points.push([x, y]);
     if (this.points.length > KEPT) this.points = this.points.filter((_, k) => k % 2 || k > KEPT / 2);
   }

@@ -1,8 +1,8 @@
-// The page over the engine behind a server: frames and events come over a WebSocket. See page.js.
+// The engine of the viewer: a server sends frames and events over a WebSocket. See page.js.
 
 import { start } from "./page.js";
 
-const WORDS = 6; // 32-bit numbers before a frame's positions
+const HEADER = 6; // 32-bit numbers before a frame's positions
 const KIND = 1;
 
 // Connects to the server that the page came from; it has no settings.
@@ -37,8 +37,8 @@ function frameOf(data) {
   const [kind, step, count, dimension] = new Uint32Array(data, 0, 4);
   if (kind !== KIND) throw Error(`frames must be of kind ${KIND}, got ${kind}`);
   const [milliseconds, loss] = new Float32Array(data, 16, 2);
-  const positions = new Float32Array(data, 4 * WORDS, count * dimension);
-  const colours = new Uint8Array(data, 4 * (WORDS + count * dimension), 3 * count);
+  const positions = new Float32Array(data, 4 * HEADER, count * dimension);
+  const colours = new Uint8Array(data, 4 * (HEADER + count * dimension), 3 * count);
   const frame = { type: "frame", step, positions, colours, milliseconds };
   return Number.isFinite(loss) ? { ...frame, loss } : frame;
 }
