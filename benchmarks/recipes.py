@@ -149,7 +149,7 @@ def strip(trainer: Trainer, steps: Sequence[int]) -> np.ndarray[Any, Any]:
     rule = trainer.kept_rule
     device = torch.device(trainer.config.device)
     runner = RuleRunner(rule, task, device, SEEDS[0], None)
-    x, s, _ = task.seed(1, generator=torch.Generator(device).manual_seed(SEEDS[0]), device=device)
+    x, s, *_ = task.seed(1, generator=torch.Generator(device).manual_seed(SEEDS[0]), device=device)
     frames, before = [task.target_picture[None]], 0
     for step in steps:
         x, s = runner.run(x, s, step - before)

@@ -113,7 +113,7 @@ class PicturesTask(PictureEnvTask[Pictures2DEnvConfig]):
 
     def fresh(self, random: WorldRandom) -> Start:
         """Return worlds as training begins with them, and the numbers of their pictures."""
-        x, s, number = self.goal.seed(random.world_count, generator=random, device=self.device)
+        x, s, _, number = self.goal.seed(random.world_count, generator=random, device=self.device)
         # No rule of codes acts on these worlds.
         return Start(x, s[..., -self.config.state_dim :].contiguous(), goal=number)
 

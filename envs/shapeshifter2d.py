@@ -28,7 +28,7 @@ from npa_envs.rule.files import load_rule
 from npa_envs.rule.rule import NPARule
 from npa_envs.tasks.many_pictures import ManyPictures
 from npa_envs.tasks.morphogenesis2d import Morphogenesis2DConfig
-from npa_envs.training.trained_tasks import sources_of_codes
+from npa_envs.training.task_of_rule import sources_of_codes
 from npa_envs.world.actions import Physics
 from npa_envs.world.randomness import WorldRandom
 
@@ -200,7 +200,7 @@ class ShapeshifterTask(Living, PictureEnvTask[Shapeshifter2DEnvConfig]):
 
     def fresh(self, random: WorldRandom) -> Start:
         """Return grown worlds of random pictures, with another picture as their goal."""
-        x, s, grown = self.goal.seed(random.world_count, generator=random, device=self.device)
+        x, s, _, grown = self.goal.seed(random.world_count, generator=random, device=self.device)
         assert grown is not None, "worlds of many pictures have goals"
         s = self.rule.with_code(s, self.codes.table[grown][:, None])
         x, s = grow(self.rule, self.config, x, s, random)

@@ -227,8 +227,7 @@ class SHACLearner:
         random = self.random
         if isinstance(random, WorldRandom):
             random = random.take(torch.tensor(worlds, device=self.device))
-        x, s, goal = self.task.seed(len(worlds), generator=random, device=self.device)
-        return Particles(x, s, goal=goal)
+        return self.task.seed(len(worlds), generator=random, device=self.device)
 
     def gain(self, window: StepWindow) -> Tensor:
         """Return the mean discounted reward of a window and value after it."""

@@ -290,7 +290,7 @@ class TargetEnvTask(EnvTask[Config]):
 
     def seed(self, random: WorldRandom) -> tuple[Tensor, Tensor]:
         """Return worlds as training begins with them, all states zero."""
-        x, s, _ = self.goal.seed(random.world_count, generator=random, device=self.device)
+        x, s, *_ = self.goal.seed(random.world_count, generator=random, device=self.device)
         return x, s
 
     def toward(self, goal: Tensor) -> Self:

@@ -83,12 +83,12 @@ def grow_and_heal(options: DemoOptions, device: torch.device, say: Callable[[str
     from npa_envs.measure.quality import measure
     from npa_envs.rule.files import load_rule
     from npa_envs.tasks.damage import DamageEvent, damage_worlds
-    from npa_envs.training.trained_tasks import task_of_rule
+    from npa_envs.training.task_of_rule import task_of_rule
 
     rule = load_rule(options.rule, device=device).float()
     trained = task_of_rule(options.rule, rule, device)
     generator = torch.Generator(device).manual_seed(options.seed)
-    x, s, goal = trained.task.seed(1, generator=generator, device=device)
+    x, s, _, goal = trained.task.seed(1, generator=generator, device=device)
     task = trained.task.toward(goal)
     say(f"{options.rule}: {x.shape[1]} particles, {rule.weight_count} weights")
 
@@ -156,7 +156,7 @@ def train_small(options: DemoOptions, device: torch.device, say: Callable[[str],
     # The loss saw fewer pixels.
     task = task_entry(task_name).make(override(config, resolution=192).task, device)
     generator = torch.Generator(device).manual_seed(options.seed + 1)
-    x, s, _ = task.seed(1, generator=generator, device=device)
+    x, s, *_ = task.seed(1, generator=generator, device=device)
     steps = 4 * config.steps[1]
     with common.StepBar(steps, show=options.progress) as bar:
         x, s, film = film_world(

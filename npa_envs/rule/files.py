@@ -73,7 +73,7 @@ def preset_rules() -> dict[str, Path]:
 
     They stay as they are when a shipped rule of the same picture is trained anew.
     """
-    folder = Path(__file__).resolve().parent / "first"
+    folder = Path(__file__).resolve().parent / "initial"
     return {path.stem: path for path in sorted(folder.glob("*.safetensors"))}
 
 

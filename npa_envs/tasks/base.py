@@ -20,10 +20,8 @@ from npa_envs.rule.rule import COLOUR_OFFSET, NPARule
 from npa_envs.tasks.appearance import Gaussians
 from npa_envs.tasks.damage import PoolDamage, damage_pool, escape_motion
 from npa_envs.tasks.seeds import uniform_ball
+from npa_envs.world.particles import Particles
 from npa_envs.world.randomness import Randomness
-
-Worlds = tuple[Tensor, Tensor, Tensor | None]
-"""Positions x [B, N, D], states s [B, N, C], and goals, int64 [B], of worlds that have such."""
 
 
 class Frame(NamedTuple):
@@ -173,14 +171,14 @@ class ParticleTask(Generic[ConfigT]):
 
     def seed(
         self, world_count: int, *, generator: Randomness, device: str | torch.device = "cpu"
-    ) -> Worlds:
+    ) -> Particles:
         """Return fresh worlds: positions of `places`, all states zero, without goals."""
         x = self.places(world_count, generator, torch.device(device))
-        return x, x.new_zeros(*x.shape[:2], self.config.state_dim), None
+        return Particles(x, x.new_zeros(*x.shape[:2], self.config.state_dim))
 
-    def damage(self, x: Tensor, s: Tensor, goal: Tensor | None, generator: Randomness) -> Worlds:
-        """Return worlds of the pool damaged, so that they heal, and their goals from then on."""
-        return x, s, goal
+    def damage(self, worlds: Particles, generator: Randomness) -> Particles:
+        """Return worlds of the pool, damaged; their goals may change."""
+        return worlds
 
     def begin(self, iteration: int) -> None:
         """Prepare the loss of an iteration, without waiting for the device.
@@ -360,9 +358,9 @@ class GrowthTask(ParticleTask[GrowthConfigT]):
             world_count, count, self.space_dim, radius, generator=generator, device=device
         )
 
-    def damage(self, x: Tensor, s: Tensor, goal: Tensor | None, generator: Randomness) -> Worlds:
-        """Return the worlds damaged as the configuration says, each at a place of its own."""
-        return *damage_pool(x, s, self.config, generator=generator), goal
+    def damage(self, worlds: Particles, generator: Randomness) -> Particles:
+        """Return the worlds, damaged as the configuration says, each at its own random position."""
+        return damage_pool(worlds, self.config, generator=generator)
 
     def penalties(
         self, x: Tensor, s: Tensor, path_length: Tensor

@@ -14,7 +14,7 @@ from torch import Tensor
 from npa_envs.checks import check_non_negative
 from npa_envs.errors import NPAError
 from npa_envs.rule.rule import COLOUR_OFFSET, NPARule
-from npa_envs.tasks.base import ParticleTask, Worlds
+from npa_envs.tasks.base import ParticleTask
 from npa_envs.tasks.morphogenesis2d import (
     HALF_SEEDS,
     MORPHOGENESIS2D_PRESETS,
@@ -23,6 +23,7 @@ from npa_envs.tasks.morphogenesis2d import (
     Morphogenesis2DTrainConfig,
 )
 from npa_envs.tasks.train_config import JointTrainConfig
+from npa_envs.world.particles import Particles, combined
 from npa_envs.world.randomness import Randomness
 
 
@@ -106,23 +107,22 @@ class CoMorphogenesis2D(ParticleTask[Any]):
 
     def seed(
         self, world_count: int, *, generator: Randomness, device: str | torch.device = "cpu"
-    ) -> Worlds:
+    ) -> Particles:
         """Return fresh worlds: each species uniform in a disk of its own, all states zero."""
         seeds = [task.seed(world_count, generator=generator, device=device) for task in self.tasks]
         positions = [
             torch.stack((x[..., 0] + centre, x[..., 1]), dim=-1)
             for (x, *_), centre in zip(seeds, self.config.centres, strict=True)
         ]
-        return torch.cat(positions, dim=1), torch.cat([s for _, s, _ in seeds], dim=1), None
+        return Particles(torch.cat(positions, 1), torch.cat([one.s for one in seeds], 1))
 
-    def damage(self, x: Tensor, s: Tensor, goal: Tensor | None, generator: Randomness) -> Worlds:
+    def damage(self, worlds: Particles, generator: Randomness) -> Particles:
         """Return the worlds with each species damaged as it is alone."""
-        hurt = [
-            task.damage(own_x, own_s, None, generator)
-            for task, own_x, own_s in zip(self.tasks, *self._split(x, s), strict=True)
+        damaged = [
+            task.damage(Particles(x, s), generator)
+            for task, x, s in zip(self.tasks, *self._split(worlds.x, worlds.s), strict=True)
         ]
-        x, s = torch.cat([x for x, *_ in hurt], dim=1), torch.cat([s for _, s, _ in hurt], dim=1)
-        return x, s, goal
+        return combined(lambda parts: torch.cat(parts, 1), damaged)
 
     def loss(self, x: Tensor, s: Tensor, path_length: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
         """Return the sum of the species' training losses and its parts, named "k.part"."""

@@ -25,6 +25,7 @@ from npa_envs.errors import NPAError, shown, suggest
 from npa_envs.ops import world_mean
 from npa_envs.tasks.seeds import drawn_indices, uniform_ball
 from npa_envs.world.brushes import clump, cut, wipe_state
+from npa_envs.world.particles import Particles
 from npa_envs.world.randomness import Randomness, check_generator, normal_draws, uniform_draws
 
 DAMAGE_SIZES = {"wipe": 0.2, "cut": 0.1, "clump": 0.2, "noise": 0.05}
@@ -255,10 +256,9 @@ class PoolDamage:
         )
 
 
-def damage_pool(
-    x: Tensor, s: Tensor, damage: PoolDamage, *, generator: Randomness
-) -> tuple[Tensor, Tensor]:
-    """Return worlds that are damaged at random places; nothing waits for the device."""
+def damage_pool(worlds: Particles, damage: PoolDamage, *, generator: Randomness) -> Particles:
+    """Return the worlds, damaged at random positions; nothing waits for the device."""
+    x, s, *_ = worlds
     if damage.damage_radius > 0.0:
         centre = random_particle(x, generator)
         s = wipe_state(x, s, centre=centre, radius=damage.damage_radius)
@@ -275,4 +275,4 @@ def damage_pool(
         x = tear_off(x, radius=damage.flake_radius, chance=SHARE, generator=generator)
     if damage.escape_share > 0.0:
         x = displace(x, share=damage.escape_share, generator=generator)
-    return x, s
+    return worlds._replace(x=x, s=s)

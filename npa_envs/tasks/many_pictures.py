@@ -13,11 +13,11 @@ from npa_envs.errors import NPAError, shown
 from npa_envs.files import home_path
 from npa_envs.rule.codes import Codes, carrying
 from npa_envs.rule.rule import NPARule
-from npa_envs.tasks.base import Worlds
 from npa_envs.tasks.morphogenesis2d import Morphogenesis2D, Morphogenesis2DConfig
 from npa_envs.tasks.seeds import drawn_indices, drawn_worlds
 from npa_envs.tasks.targets.images import looks_like_path
 from npa_envs.tasks.targets.points import builtin_targets
+from npa_envs.world.particles import Particles
 from npa_envs.world.randomness import Randomness
 
 PICTURE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp")
@@ -111,23 +111,25 @@ class ManyPictures(Morphogenesis2D):
 
     def seed(
         self, world_count: int, *, generator: Randomness, device: str | torch.device = "cpu"
-    ) -> Worlds:
+    ) -> Particles:
         """Return fresh worlds of random targets, and which ones these are."""
-        x, s, _ = super().seed(world_count, generator=generator, device=device)
+        x, s, *_ = super().seed(world_count, generator=generator, device=device)
         goal = drawn_indices(len(self.names), world_count, generator, torch.device(device))
         blank = s.new_zeros(*s.shape[:2], self.config.code_dim)
         s = torch.cat((blank, s), dim=-1)
         if self._codes is not None:
             s = carrying(s, self._codes.table.detach().index_select(0, goal)[:, None])
-        return x, s, goal
+        return Particles(x, s, goal=goal)
 
-    def damage(self, x: Tensor, s: Tensor, goal: Tensor | None, generator: Randomness) -> Worlds:
-        """Return the worlds damaged, some with another target, and their goals."""
-        x, s, goal = super().damage(x, s, goal, generator)
+    def damage(self, worlds: Particles, generator: Randomness) -> Particles:
+        """Return the worlds, damaged, some with another goal."""
+        worlds = super().damage(worlds, generator)
+        x, goal = worlds.x, worlds.goal
         if goal is None or self.config.switch_share == 0.0:
-            return x, s, goal
+            return worlds
         other = drawn_indices(len(self.names), len(x), generator, x.device)
-        return x, s, torch.where(drawn_worlds(x, generator, self.config.switch_share), other, goal)
+        switched = drawn_worlds(x, generator, self.config.switch_share)
+        return worlds._replace(goal=torch.where(switched, other, goal))
 
     def coded(self, s: Tensor) -> Tensor:
         """Return states with the codes of their worlds' goals, differentiable in the codes."""

@@ -23,12 +23,13 @@ from npa_envs.ops import splat, world_mean
 from npa_envs.ops.pictures.losses import picture_losses
 from npa_envs.rule.codes import carrying
 from npa_envs.rule.rule import COLOUR_OFFSET, LIFE, NPARule
-from npa_envs.tasks.base import GrowthConfig, GrowthTask, Worlds
+from npa_envs.tasks.base import GrowthConfig, GrowthTask
 from npa_envs.tasks.damage import damage_pool
 from npa_envs.tasks.targets.images import LARGEST_POINT_COUNT
 from npa_envs.tasks.targets.points import PointTarget, load_target
 from npa_envs.tasks.train_config import TrainConfig, fast_run, presets_of, tiny_run
 from npa_envs.world.division import living
+from npa_envs.world.particles import Particles
 from npa_envs.world.randomness import Randomness, uniform_draws
 
 LARGEST_CODE = 1024
@@ -215,14 +216,14 @@ class Morphogenesis2D(GrowthTask[Morphogenesis2DConfig]):
 
     def seed(
         self, world_count: int, *, generator: Randomness, device: str | torch.device = "cpu"
-    ) -> Worlds:
+    ) -> Particles:
         """Return fresh worlds: of an equivariant rule with a head and a tail, of one that divides
         with one living particle, at the origin."""
-        x, s, goal = super().seed(world_count, generator=generator, device=device)
+        x, s, *_ = super().seed(world_count, generator=generator, device=device)
         config = self.config
         if config.division:
             s[:, 0, LIFE] = 1.0
-            return torch.zeros_like(x), s, goal
+            return Particles(torch.zeros_like(x), s)
         if config.equivariant and max(config.seed_axis, config.seed_across) > 0.0:
             share = uniform_draws(generator, (world_count, 1), x)
             angle = 2.0 * math.pi * (share if config.angles > 0 else torch.zeros_like(share))
@@ -234,22 +235,23 @@ class Morphogenesis2D(GrowthTask[Morphogenesis2DConfig]):
                 s[..., 1] = config.seed_across * across / config.seed_radius
         if self._code is not None:
             s = self.coded(torch.cat((s.new_zeros(*s.shape[:2], len(self._code)), s), dim=-1))
-        return x, s, goal
+        return Particles(x, s)
 
     def coded(self, s: Tensor) -> Tensor:
         """Return states with the task's code, or as they are where it has none."""
         return s if self._code is None else carrying(s, self._code)
 
-    def damage(self, x: Tensor, s: Tensor, goal: Tensor | None, generator: Randomness) -> Worlds:
-        """Return the worlds damaged; of one that divides particles die, but never all."""
+    def damage(self, worlds: Particles, generator: Randomness) -> Particles:
+        """Return the worlds, damaged; where particles divide, some die, but never all."""
         if not (self.config.division and self.config.damage_radius > 0.0):
-            return super().damage(x, s, goal, generator)
+            return super().damage(worlds, generator)
         # Children of a crowd that is thinned learn who they are among its grown particles.
+        x, s, *_ = worlds
         stay = uniform_draws(generator, x.shape[:2], x) < SURVIVING
         left = torch.where(stay[..., None], s, 0.0)
         left = torch.where(living(left).any(dim=1)[:, None, None], left, s)
         rest = replace(self.config, damage_radius=0.0)
-        return *damage_pool(x, left, rest, generator=generator), goal
+        return damage_pool(worlds._replace(s=left), rest, generator=generator)
 
     def picture(self, x: Tensor, s: Tensor, *, centred: bool = True) -> Tensor:
         """Return each world's picture: colour sums and density, dimensionless, shape [B, R, R, 4].

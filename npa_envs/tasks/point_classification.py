@@ -14,7 +14,7 @@ from npa_envs.checks import check_non_negative, check_positive, check_seed, chec
 from npa_envs.errors import NPAError
 from npa_envs.ops import splat, world_mean
 from npa_envs.rule.rule import NPARule
-from npa_envs.tasks.base import Frame, ParticleTask, TaskConfig, Worlds
+from npa_envs.tasks.base import Frame, ParticleTask, TaskConfig
 from npa_envs.tasks.seeds import drawn_indices, drawn_worlds
 from npa_envs.tasks.targets.clouds import (
     PointClouds,
@@ -23,6 +23,7 @@ from npa_envs.tasks.targets.clouds import (
     varied,
 )
 from npa_envs.tasks.train_config import TrainConfig, fast_run, presets_of, tiny_run
+from npa_envs.world.particles import Particles
 from npa_envs.world.randomness import Randomness
 
 
@@ -175,7 +176,7 @@ class PointClassification(ParticleTask[PointClassificationConfig]):
 
     def seed(
         self, world_count: int, *, generator: Randomness, device: str | torch.device = "cpu"
-    ) -> Worlds:
+    ) -> Particles:
         """Return random clouds, varied as the configuration says, all states zero, and classes.
 
         They are made on the device of the task and copied to `device`.
@@ -192,18 +193,16 @@ class PointClassification(ParticleTask[PointClassificationConfig]):
                 jitter=config.jitter,
                 generator=generator,
             )
-        return x, x.new_zeros(*x.shape[:2], config.state_dim), goal
+        return Particles(x, x.new_zeros(*x.shape[:2], config.state_dim), goal=goal)
 
-    def damage(self, x: Tensor, s: Tensor, goal: Tensor | None, generator: Randomness) -> Worlds:
-        """Return some worlds as other clouds, with their states as they were, and the classes."""
-        share = self.config.mutated_share
-        if goal is None or share == 0.0:
-            return x, s, goal
-        other, _, other_goal = self.seed(len(x), generator=generator, device=x.device)
-        mutated = drawn_worlds(x, generator, share)
-        x = torch.where(mutated[:, None, None], other.to(x.dtype), x)
-        assert other_goal is not None, "clouds come with their classes"
-        return x, s, torch.where(mutated, other_goal, goal)
+    def damage(self, worlds: Particles, generator: Randomness) -> Particles:
+        """Return the worlds, some with the positions and class of another cloud; states stay."""
+        x, share = worlds.x, self.config.mutated_share
+        if worlds.goal is None or share == 0.0:
+            return worlds
+        other = self.seed(len(x), generator=generator, device=x.device)
+        other = worlds._replace(x=other.x.to(x.dtype), goal=other.goal)
+        return other.where(drawn_worlds(x, generator, share), worlds)
 
     def outputs(self, s: Tensor) -> Tensor:
         """Return what each particle says of each class, dimensionless, shape [B, N, K]."""

@@ -20,7 +20,7 @@ from npa_envs.checks import (
 from npa_envs.errors import NPAError
 from npa_envs.ops import periodic_splat
 from npa_envs.rule.rule import COLOUR_OFFSET
-from npa_envs.tasks.base import ParticleTask, TaskConfig, Worlds, shares_of_loss
+from npa_envs.tasks.base import ParticleTask, TaskConfig, shares_of_loss
 from npa_envs.tasks.damage import random_particle
 from npa_envs.tasks.losses.texture import (
     DEFAULT_LOSS,
@@ -34,6 +34,7 @@ from npa_envs.tasks.seeds import uniform_box
 from npa_envs.tasks.targets.textures import TextureTarget, load_texture
 from npa_envs.tasks.train_config import TrainConfig, presets_of, tiny_run
 from npa_envs.world.brushes import wipe_state
+from npa_envs.world.particles import Particles
 from npa_envs.world.randomness import Randomness
 
 
@@ -180,12 +181,13 @@ class Texture(ParticleTask[TextureConfig]):
         count = self.config.particle_count
         return uniform_box(world_count, count, self.box, generator=generator, device=device)
 
-    def damage(self, x: Tensor, s: Tensor, goal: Tensor | None, generator: Randomness) -> Worlds:
+    def damage(self, worlds: Particles, generator: Randomness) -> Particles:
         """Return the worlds with the states in a disk around one random particle set to zero."""
         if self.config.damage_radius == 0.0:
-            return x, s, goal
+            return worlds
+        x, s, *_ = worlds
         centre, radius = random_particle(x, generator), self.config.damage_radius
-        return x, wipe_state(x, s, centre=centre, radius=radius, box=self.box), goal
+        return worlds._replace(s=wipe_state(x, s, centre=centre, radius=radius, box=self.box))
 
     def picture(self, x: Tensor, s: Tensor) -> Tensor:
         """Return the picture of each world: colour sums and density, shape [B, R, R, 4]."""

@@ -257,8 +257,7 @@ class TrainingCycle:
             again = over & (drawn < config.damage_and_keep_share)
             over, hit = over & ~again, hit | again
         if config.damages:
-            x, s, goal = self.task.damage(begun.x, begun.s, begun.goal, worlds)
-            damaged = Particles(x, s, goal=goal)
+            damaged = self.task.damage(begun, worlds)
             begun = damaged if config.damage_share == 1.0 else damaged.where(hit, begun)
         # Drawn in every iteration, needed or not: nobody on the host knows which worlds run away.
         fresh = self._seeds(len(self._index), worlds)
@@ -282,13 +281,13 @@ class TrainingCycle:
 
     def _seeds(self, world_count: int, random: Randomness) -> Particles:
         dtype = self._config.torch_dtype
-        x, s, goal = self.task.seed(world_count, generator=random, device=random.device)
+        seeds = self.task.seed(world_count, generator=random, device=random.device)
         lo, hi = map(math.log, self._config.vary_eps)
         if (lo, hi) != (0.0, 0.0):
             # Scaling positions and ε alike is a symmetry: a larger ε is a smaller disk.
-            share = uniform_draws(random, (world_count, 1), x)[:, :, None]
-            x = x * torch.exp(-lo - (hi - lo) * share)
-        return Particles(x.to(dtype), s.to(dtype), goal=goal)
+            fraction = uniform_draws(random, (world_count, 1), seeds.x)[:, :, None]
+            seeds = seeds._replace(x=seeds.x * torch.exp(-lo - (hi - lo) * fraction))
+        return seeds._replace(x=seeds.x.to(dtype), s=seeds.s.to(dtype))
 
 
 def _check_varied_eps(task: Task, rule: NPARule, config: TrainConfig[Any]) -> None:

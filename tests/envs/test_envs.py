@@ -281,7 +281,7 @@ def test_regeneration_starts_grown_and_damaged():
     assert 10 < int(wiped.sum()) < 400
     assert float((x.amax(0) - x.amin(0)).max()) > 1.0
     random = npa_envs.WorldRandom([0]).substream(StreamId.GROWTH)
-    start_x, start_s, _ = env.task.goal.seed(1, generator=random)
+    start_x, start_s, *_ = env.task.goal.seed(1, generator=random)
     growth = random.substream(StreamId.GROWTH)
     with torch.no_grad():
         expected = npa_envs.rollout(grown, start_x, start_s, 48, generator=growth)

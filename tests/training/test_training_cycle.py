@@ -110,7 +110,7 @@ def test_recorded_iterations_take_means_over_processes_where_eager_ones_do(tmp_p
         for weights in rule.parameters():
             weights.add_(0.05 * torch.randn_like(weights))
     generator = torch.Generator(device)
-    x, s, _ = task.seed(4, generator=generator.manual_seed(2), device=device)
+    x, s, *_ = task.seed(4, generator=generator.manual_seed(2), device=device)
     found = []
     for kind in (EagerIteration, GraphedIteration):
         counts = []

@@ -156,7 +156,7 @@ def make_iteration(config, kind=EagerIteration, device="cpu"):
     task, device = CircleTask(), torch.device(device)
     rule = task.make_rule(torch.Generator().manual_seed(1)).to(device, config.torch_dtype)
     generator = torch.Generator(device).manual_seed(2)
-    x, s, _ = task.seed(config.world_count, generator=generator, device=device)
+    x, s, *_ = task.seed(config.world_count, generator=generator, device=device)
     x, s = x.to(config.torch_dtype), s.to(config.torch_dtype)
     generator.manual_seed(3)
     return task, rule, kind(task, rule, config, Particles(x, s), generator, plain_rollout)
