@@ -215,8 +215,7 @@ class Texture(ParticleTask[TextureConfig]):
 
     @cached_property
     def drawable(self) -> Tensor:
-        """The target at the sharpness that particles can draw: a mean of drawings, shape [R, R,
-        4]."""
+        """The target as sharp as particles can draw it: a mean of drawings, [R, R, 4]."""
         drawn = [self.drawing(number, shifted=False) for number in range(DRAWINGS)]
         return torch.cat(drawn).mean(0)
 
@@ -294,14 +293,12 @@ class Texture(ParticleTask[TextureConfig]):
         if compare_densities is None:
             joint = compare_colours(self.joint_image(channels))
             return joint, torch.zeros_like(joint)
-        # World by world: a power rounds otherwise at the end of a tensor, which depends on the
-        # batch.
+        # World by world: a power rounds otherwise at the end of a tensor.
         density = torch.stack([density_image(world) for world in channels[:, 3:]])
         return compare_colours(colour_image(channels)), compare_densities(density)
 
     def joint_image(self, channels: Tensor) -> Tensor:
-        """Return colours and powers of densities, [..., 4, R, R], each times the root of its
-        weight."""
+        """Return colours and powers of densities, times roots of weights, [..., 4, R, R]."""
         density = (channels[..., 3:, :, :] + DENSITY_FLOOR) ** JOINT_POWER
         colour_scale = self.config.colour_weight**0.5
         density_scale = self.config.density_weight**0.5
