@@ -100,7 +100,7 @@ def run(arguments: argparse.Namespace) -> None:
     seeds = SEEDS[: 8 if arguments.device.startswith("cuda") else 1]
     for name, trainer in zip(names, trainers, strict=True):
         begun = time.perf_counter()
-        rule = trainer.kept_rule
+        rule = trainer.saved_rule
         told_task = trainer.config.task
         if arguments.particles:
             told_task = told_task.with_particle_count(arguments.particles)

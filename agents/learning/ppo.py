@@ -135,8 +135,8 @@ class PPOLearner:
     ) -> None:
         self.options, self.pace, self.ranks = options, options.pace(start), ranks
         total = problem.num_envs if options.worlds is None else options.worlds
-        ranks.check_dealt("worlds", total)
-        places = ranks.places(total)
+        ranks.check_even("worlds", total)
+        places = ranks.indices(total)
         self.envs = problem.make_envs(
             len(places),
             device=device,

@@ -134,8 +134,8 @@ class SHACLearner:
         ranks: Ranks = ALONE,
     ) -> None:
         self.options, self.device, self.ranks = options, device, ranks
-        ranks.check_dealt("world_count", options.world_count)
-        places = ranks.places(options.world_count)
+        ranks.check_even("world_count", options.world_count)
+        places = ranks.indices(options.world_count)
         self.rules = zero_output_rules(problem, seed, start).to(device)
         count = -(-problem.episode_steps // options.steps)
         self.window = -(-problem.episode_steps // count)

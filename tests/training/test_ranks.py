@@ -287,7 +287,7 @@ def test_worlds_of_all_processes_are_diagnosed_when_the_loss_is_not_finite(tmp_p
 
 
 def test_what_cannot_be_shared_out_is_refused():
-    assert Ranks(1, 4).places(16, 2).tolist() == [2, 3, 10, 11]
+    assert Ranks(1, 4).indices(16, 2).tolist() == [2, 3, 10, 11]
     parts = [Ranks(rank, 4).own(torch.arange(16), 2) for rank in range(4)]
     assert sorted(torch.cat(parts).tolist()) == list(range(16))
     for worlds, pool, said in (
