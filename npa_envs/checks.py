@@ -66,20 +66,11 @@ def check_floating(name: str, tensor: Any, shape: str = "") -> None:
 def check_world(x: Tensor, s: Tensor) -> None:
     """Check shapes, dtypes and devices of positions and states."""
     for name, tensor, last in (("x", x, "D"), ("s", s, "C")):
-        if not isinstance(tensor, Tensor):
-            raise NPAError(
-                f"{name} must be a torch tensor, got {type(tensor).__name__}: "
-                f"convert it with torch.as_tensor"
-            )
-        check_dense(name, tensor)
+        check_floating(name, tensor)
         if tensor.ndim != 3:
             cure = f"add a world dimension with {name}[None]" if tensor.ndim == 2 else "reshape it"
             raise NPAError(
                 f"{name} must have shape [B, N, {last}], got {tuple(tensor.shape)}: {cure}"
-            )
-        if tensor.dtype not in DTYPES:
-            raise NPAError(
-                f"{name} must be float32 or float64, got {tensor.dtype}: convert it with .float()"
             )
     if x.shape[2] not in (2, 3):
         raise NPAError(f"x must have 2 or 3 coordinates, got shape {tuple(x.shape)}")

@@ -302,9 +302,6 @@ class ParticleTask(Generic[ConfigT]):
 Task = ParticleTask[Any]
 """Any task."""
 
-PictureTask = Task
-"""Any task, where only pictures are asked for."""
-
 
 @dataclass(frozen=True, kw_only=True)
 class GrowthConfig(PoolDamage, TaskConfig):

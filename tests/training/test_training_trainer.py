@@ -354,7 +354,7 @@ def explode_after(iterations):
 def logging_late(config, **options):
     """A trainer that writes each record an iteration later, as it does on CUDA."""
     trainer = trainer_of(config, **options)
-    trainer._log_late = True
+    trainer._defer_records = True
     return trainer
 
 
