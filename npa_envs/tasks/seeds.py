@@ -101,7 +101,7 @@ def _check_points(number_count: int, dtype: torch.dtype) -> None:
         raise NPAError(f"dtype must be torch.float32 or torch.float64, got {dtype}")
     if number_count > LARGEST_INDEX:
         raise NPAError(
-            f"a batch must have at most {LARGEST_INDEX} coordinates, got {shown(number_count)}: "
+            f"coordinates must be at most {LARGEST_INDEX} in one batch, got {shown(number_count)}: "
             "make fewer worlds or particles"
         )
 

@@ -145,7 +145,7 @@ def many(*targets, **fields):
         (lambda: Texture(SMALL_TEXTURE, target=DOTS), "target must have 24 x 24 pixels"),
         (lambda: Morphogenesis3D(SMALL, target=VIEWS), "views must have 16 x 16 pixels"),
         (lambda: Morphogenesis3D(TINY), "at least 16 pixels for MS-SSIM"),
-        (lambda: Morphogenesis3D(SMALL).for_rule(NINE), "must read out 20 numbers of a state, or"),
+        (lambda: Morphogenesis3D(SMALL).for_rule(NINE), "must have a read-out of 20 outputs, or"),
     ],
 )
 def test_damages_and_targets(call, message):

@@ -348,7 +348,7 @@ class Store:
     ("make", "said"),
     [
         (dist.HashStore, "process 0 of 3 has heard nothing from process 2 for"),
-        (lambda: Store(gone=True), "s, as the store that processes meet in is gone"),
+        (lambda: Store(gone=True), "s, as the store of the processes is gone"),
         (lambda: Store(gone=False), "has heard nothing from process 1"),
     ],
 )
