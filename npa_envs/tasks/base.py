@@ -78,7 +78,7 @@ ConfigT = TypeVar("ConfigT", bound=TaskConfig)
 class ParticleTask(Generic[ConfigT]):
     """A task: its world, untrained rule, seeds, loss, metric and pictures.
 
-    A subclass defines where particles start (`positions`), the loss (`compare`), a metric and a
+    A subclass defines where particles start (`places`), the loss (`compare`), a metric and a
     picture; all else has defaults. In all methods x are positions [length units], shape [B, N, D],
     s states (dimensionless), shape [B, N, C], and path_length the length of each particle's path
     in the rollout [length units], shape [B, N].
@@ -166,7 +166,7 @@ class ParticleTask(Generic[ConfigT]):
         sizes = {"state_dim": config.state_dim, "hidden_dim": config.hidden_dim}
         return untrained_rule(generator, **(sizes | {"eps0": config.eps} | self.rule_shape))
 
-    def positions(self, world_count: int, generator: Randomness, device: torch.device) -> Tensor:
+    def places(self, world_count: int, generator: Randomness, device: torch.device) -> Tensor:
         """Return the particles' positions in fresh worlds, shape [B, N, D]."""
         raise NotImplementedError
 
@@ -174,7 +174,7 @@ class ParticleTask(Generic[ConfigT]):
         self, world_count: int, *, generator: Randomness, device: str | torch.device = "cpu"
     ) -> Particles:
         """Return fresh worlds with all states zero and without goals."""
-        x = self.positions(world_count, generator, torch.device(device))
+        x = self.places(world_count, generator, torch.device(device))
         return Particles(x, x.new_zeros(*x.shape[:2], self.config.state_dim))
 
     def damage(self, worlds: Particles, generator: Randomness) -> Particles:
@@ -348,7 +348,7 @@ class GrowthTask(ParticleTask[GrowthConfigT]):
         """Further arguments of `NPARule`: all but channels, hidden width and ε0."""
         return {"space_dim": self.space_dim, "alpha": self.config.alpha}
 
-    def positions(self, world_count: int, generator: Randomness, device: torch.device) -> Tensor:
+    def places(self, world_count: int, generator: Randomness, device: torch.device) -> Tensor:
         """Return positions uniform in a ball around the origin."""
         count, radius = self.config.particle_count, self.config.seed_radius
         return uniform_ball(

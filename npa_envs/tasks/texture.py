@@ -176,7 +176,7 @@ class Texture(ParticleTask[TextureConfig]):
         """Further arguments of `NPARule`: all but channels, hidden width and ε0."""
         return {"alpha": self.config.alpha}
 
-    def positions(self, world_count: int, generator: Randomness, device: torch.device) -> Tensor:
+    def places(self, world_count: int, generator: Randomness, device: torch.device) -> Tensor:
         """Return positions uniform in the box."""
         count = self.config.particle_count
         return uniform_box(world_count, count, self.box, generator=generator, device=device)

@@ -20,7 +20,7 @@ def make_task(**fields):
 
 def half_alive(task, seed=0):
     """Worlds of the task with 32 living particles, the dead amidst them."""
-    x = task.positions(2, torch.Generator().manual_seed(seed), torch.device("cpu"))
+    x = task.places(2, torch.Generator().manual_seed(seed), torch.device("cpu"))
     s = torch.rand(2, 64, task.config.state_dim, generator=torch.Generator().manual_seed(1)) - 0.5
     s[:, :32, LIFE], s[:, 32:] = 1.0, 0.0
     x[:, 32:] = x[:, :32].mean(dim=1, keepdim=True)
