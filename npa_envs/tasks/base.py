@@ -386,7 +386,7 @@ def check_goal(goal: Tensor, count: int) -> None:
         )
     if goal.device.type == "cpu" and not bool(((goal >= 0) & (goal < count)).all()):
         raise NPAError(
-            f"goal must have entries in [0, {count - 1}], got {shown(goal.tolist())}: "
+            f"goal must have entries of at least 0 and below {count}, got {shown(goal.tolist())}: "
             "for example torch.tensor([0])"
         )
 
