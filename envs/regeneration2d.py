@@ -130,7 +130,7 @@ class RegenerationTask(GrownTask[Regeneration2DEnvConfig]):
 
     def _picture_worlds(self, random: WorldRandom) -> tuple[Tensor, Tensor]:
         x, s = PictureEnvTask.seed(self, random)
-        points, colours = self.goal.target.points, self.goal.target.colours
+        points, colours = self.task.target.points, self.task.target.colours
         # The target's points are about as many as the particles: some stand twice, or are left out.
         chosen = torch.linspace(0, len(points) - 1, x.shape[1], device=x.device).round().long()
         s[..., -3:] = colours[chosen] - COLOUR_OFFSET

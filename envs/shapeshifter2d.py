@@ -155,13 +155,13 @@ class ShapeshifterTask(Living, PictureEnvTask[Shapeshifter2DEnvConfig]):
     config_type = Shapeshifter2DEnvConfig
     form_type = CodeForm
     context_count = 1 + GOAL_COUNT
-    goal: ManyPictures
+    task: ManyPictures
 
-    def _make_goal(self) -> ManyPictures:
+    def _make_task(self) -> ManyPictures:
         config = self.config
         self.rule, self.codes = rule_of(config, self.device)
         sources = sources_of_codes(config.rule, self.codes)
-        own = config.task_config(
+        own = config.as_config(
             Morphogenesis2DConfig,
             target_point_count=config.particle_count,
             targets=tuple(sources.values()),
@@ -184,7 +184,7 @@ class ShapeshifterTask(Living, PictureEnvTask[Shapeshifter2DEnvConfig]):
     @property
     def pixel_size(self) -> float:
         """Size of a particle in pictures [length units]."""
-        return self.goal.pixel_size
+        return self.task.pixel_size
 
     @cached_property
     def blank_losses(self) -> Tensor:
@@ -193,14 +193,14 @@ class ShapeshifterTask(Living, PictureEnvTask[Shapeshifter2DEnvConfig]):
         x = torch.full((len(goals), 1, 2), 1e3, device=self.device)
         s = x.new_zeros(len(goals), 1, self.config.state_dim)
         # Where nothing lies in the picture, colours do not count; the mean is not moved.
-        aimed = self.goal.toward(goals)
+        aimed = self.task.toward(goals)
         difference = aimed.picture(x, s, centred=False) - aimed.target_picture
         error = difference[..., 3].square() + difference[..., 3].abs()
         return error.flatten(1).mean(dim=1)
 
     def fresh(self, random: WorldRandom) -> Start:
         """Return grown worlds of random pictures, with another picture as their goal."""
-        x, s, _, grown = self.goal.seed(random.world_count, generator=random, device=self.device)
+        x, s, _, grown = self.task.seed(random.world_count, generator=random, device=self.device)
         assert grown is not None, "worlds of many pictures have goals"
         s = self.rule.with_code(s, self.codes.table[grown][:, None])
         x, s = grow(self.rule, self.config, x, s, random)
@@ -253,7 +253,7 @@ class ShapeshifterTask(Living, PictureEnvTask[Shapeshifter2DEnvConfig]):
 
     def observe(self, x: Tensor, s: Tensor, loss: Tensor, context: Tensor) -> Tensor:
         """Return coarse pictures of worlds and of their goals, shape [B, 8 G²]."""
-        aimed = self.goal.toward(context[:, 0].long())
+        aimed = self.task.toward(context[:, 0].long())
         both = torch.cat((aimed.picture(x, s), aimed.target_picture), dim=-1)
         pixels = self.config.resolution // self.config.picture_size
         seen = F.avg_pool2d(both.permute(0, 3, 1, 2), pixels).flatten(1)

@@ -214,7 +214,7 @@ class WorldConfig:
                 raise UnknownKeywordError(f"got an unexpected keyword argument {name!r}: {hint}")
         return cls(**{name: plain(value) for name, value in keywords.items()})
 
-    def task_config(self, config_type: type[TaskConfig], **changes: Any) -> TaskConfig:
+    def as_config(self, config_type: type[TaskConfig], **changes: Any) -> TaskConfig:
         """Return a task's own configuration, with all fields that the environment has as well.
 
         It checks them: so each field is explained, and checked, once.

@@ -285,23 +285,23 @@ class EnvTask(WorldTask[Config]):
 class TargetEnvTask(EnvTask[Config]):
     """A task that rules are trained on, too: `npa_envs.tasks` has its targets and losses."""
 
-    goal: Any
+    task: Any
     """The task as training sees it."""
 
     def seed(self, random: WorldRandom) -> tuple[Tensor, Tensor]:
         """Return worlds as training begins with them, all states zero."""
-        x, s, *_ = self.goal.seed(random.world_count, generator=random, device=self.device)
+        x, s, *_ = self.task.seed(random.world_count, generator=random, device=self.device)
         return x, s
 
     def toward(self, goal: Tensor) -> Self:
         """Return the task with losses for worlds of these goals, where training has such too."""
         aimed = copy.copy(self)
-        aimed.goal = self.goal.toward(goal)
+        aimed.task = self.task.toward(goal)
         return aimed
 
     def particle_losses(self, x: Tensor, s: Tensor) -> Tensor:
         """Return each particle's share of the task's loss."""
-        shares: Tensor = self.goal.particle_shares(x, s)
+        shares: Tensor = self.task.particle_shares(x, s)
         return shares
 
 

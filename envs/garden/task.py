@@ -197,7 +197,7 @@ class GardenTask(Living, GrownTask[Config]):
         constants = {"eps0": config.eps0, "moment_inverse": config.moment_inverse}
         check_runs(self.rule, alpha=config.alpha, **constants)
         self.rule.requires_grad_(False)
-        self.lacking = TargetDeficit(grid_places(config, device), self.goal.target, config)
+        self.lacking = TargetDeficit(grid_places(config, device), self.task.target, config)
         """What lacks at the places of the grid."""
 
     @classmethod
@@ -250,7 +250,7 @@ class GardenTask(Living, GrownTask[Config]):
 
     def middle(self, x: Tensor) -> Tensor:
         """Return what brushes' places are counted from: the mean, less the target's, [B, 2]."""
-        return world_mean(x) - self.goal.target.points.mean(dim=0)
+        return world_mean(x) - self.task.target.points.mean(dim=0)
 
     def observe(self, x: Tensor, s: Tensor, loss: Tensor, context: Tensor) -> Tensor:
         """Return what is seen of worlds, shape [B, O]."""
@@ -267,7 +267,7 @@ class GardenTask(Living, GrownTask[Config]):
         Each is the mean over pixels of the picture that the loss compares. With `observe_error`
         four channels more are what it lacks to the target's.
         """
-        picture, target = self.goal.picture(x, s), self.goal.target_picture
+        picture, target = self.task.picture(x, s), self.task.target_picture
         if self.config.observe_error:
             picture = torch.cat((picture, target - picture), dim=-1)
         pixels = self.config.resolution // self.config.picture_size

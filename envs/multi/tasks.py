@@ -111,13 +111,13 @@ class PictureLossConfig(SpeciesConfig):
     def __post_init__(self) -> None:
         """Check every field."""
         super().__post_init__()
-        _ = self.goal()
+        _ = self.task_config()
 
-    def goal(
+    def task_config(
         self, target: str = Morphogenesis2DConfig.target, particle_count: int = 1
     ) -> Morphogenesis2DConfig:
         """Return what the task of growing a target with so many particles is told."""
-        return self.task_config(
+        return self.as_config(
             Morphogenesis2DConfig,
             target=target,
             target_point_count=particle_count,
@@ -134,7 +134,7 @@ class OnePictureConfig(PictureLossConfig):
     def __post_init__(self) -> None:
         """Check every field."""
         super().__post_init__()
-        _ = self.goal(self.target)
+        _ = self.task_config(self.target)
 
 
 class PictureLossTask(SpeciesTask):
@@ -142,20 +142,22 @@ class PictureLossTask(SpeciesTask):
 
     def __init__(self, config: Any, device: torch.device, *pictures: tuple[str, int]) -> None:
         super().__init__(config, device)
-        self.goals = [Morphogenesis2D(config.goal(*picture), device=device) for picture in pictures]
+        self.tasks = [
+            Morphogenesis2D(config.task_config(*picture), device=device) for picture in pictures
+        ]
         """The tasks of growing each picture, with targets and losses."""
-        self.goal = self.goals[0]
+        self.task = self.tasks[0]
         """The first of them, whose target's colour scripted policies take."""
 
     def picture_parts(self, k: int, x: Tensor, s: Tensor) -> dict[str, Tensor]:
         """Return density error and weighted colour error against picture k, shape [B] each."""
-        density, colour = self.goals[k].splat_losses(x, s)
+        density, colour = self.tasks[k].splat_losses(x, s)
         return {"density": density, "colour": self.config.colour_weight * colour}
 
     @property
     def pixel_size(self) -> float:
         """Size of a particle in pictures: the distance of the first target's points."""
-        return self.goal.target.pixel_size
+        return self.task.target.pixel_size
 
     @property
     def open_half_width(self) -> float:
@@ -188,7 +190,7 @@ class CoMorphogenesisConfig(PictureLossConfig):
             )
 
     @property
-    def goals(self) -> tuple[str, ...]:
+    def grown(self) -> tuple[str, ...]:
         """What each species grows."""
         return self.targets or self._usual
 
@@ -204,7 +206,7 @@ class CoMorphogenesisTask(PictureLossTask):
     least_species = 1
 
     def __init__(self, config: CoMorphogenesisConfig, device: torch.device) -> None:
-        super().__init__(config, device, *zip(config.goals, config.counts, strict=True))
+        super().__init__(config, device, *zip(config.grown, config.counts, strict=True))
 
     def losses(self, population: Population) -> Mapping[str, Tensor]:
         """Return the density error and the weighted colour error of each species' picture."""
@@ -213,7 +215,7 @@ class CoMorphogenesisTask(PictureLossTask):
 
     def particle_losses(self, population: Population) -> Mapping[str, Tensor]:
         """Return each particle's share of its species' splat loss."""
-        shares = [self.goals[k].particle_shares(*population.of(k)) for k in _present(population)]
+        shares = [self.tasks[k].particle_shares(*population.of(k)) for k in _present(population)]
         return {"picture": torch.cat(shares, dim=1)}
 
 
@@ -261,7 +263,7 @@ class InvasionTask(PictureLossTask):
 
     def particle_losses(self, population: Population) -> Mapping[str, Tensor]:
         """Return shares of species 0's splat loss, and minus an equal share for each other one."""
-        own = self.goal.particle_shares(*population.of(0))
+        own = self.task.particle_shares(*population.of(0))
         own_count, other_count = own.shape[1], sum(population.counts[1:])
         share = world_mean(own[..., None])[:, 0] * (-own_count / max(other_count, 1))
         return {"picture": torch.cat((own, share[:, None].expand(-1, other_count)), dim=1)}
@@ -309,7 +311,7 @@ class SymbiosisTask(PictureLossTask):
 
     def particle_losses(self, population: Population) -> Mapping[str, Tensor]:
         """Return each particle's share of the splat loss."""
-        return {"picture": self.goal.particle_shares(population.x, population.s)}
+        return {"picture": self.task.particle_shares(population.x, population.s)}
 
     # One picture in the middle, however far from it species begin.
     open_half_width = SpeciesTask.open_half_width
