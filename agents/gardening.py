@@ -98,7 +98,7 @@ class ScriptedGardener(BrushPolicy):
         if self.config.actions == "free":
             fine = replace(self.config, place_count=FREE_PLACES)
             places = grid_places(fine, self.task.device)
-            self._deficit = TargetDeficit(places, self.task.goal.target, fine)
+            self._deficit = TargetDeficit(places, self.task.task.target, fine)
         places = self._deficit.places
         away = places[None] - places[:, None]
         weight = (-0.5 * away.square().sum(dim=-1) / checked_positive("width", width) ** 2).exp()

@@ -356,7 +356,7 @@ class SpreadPolicy(Policy):
 
 def target_colour(env: Any) -> Tensor | None:
     """Return the mean colour of an environment's target, shape [3]; None where it has no target."""
-    target = getattr(getattr(unwrapped(env).task, "goal", None), "target", None)
+    target = getattr(getattr(unwrapped(env).task, "task", None), "target", None)
     return None if target is None else target.mean_colour
 
 

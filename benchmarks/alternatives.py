@@ -82,7 +82,7 @@ def gecko(world_count: int, particle_count: int, device: torch.device) -> Gecko:
     config = Morphogenesis2DConfig(particle_count=particle_count, target_point_count=particle_count)
     task = Morphogenesis2D(config, device=device)
     generator = torch.Generator(device).manual_seed(0)
-    x, s, _ = task.seed(world_count, generator=generator, device=device)
+    x, s, *_ = task.seed(world_count, generator=generator, device=device)
     return Gecko(load_rule("gecko", device=device).float(), task, x, s)
 
 

@@ -35,7 +35,7 @@ from npa_envs.tasks.morphogenesis2d import (
     turns,
 )
 from npa_envs.training import preset
-from npa_envs.training.trained_tasks import trained_config
+from npa_envs.training.task_of_rule import trained_config
 from npa_envs.world.randomness import WorldRandom
 
 TARGETS = ("gecko", "heart", "octopus")
@@ -106,7 +106,7 @@ def measured(rule: npa_envs.NPARule, config: Morphogenesis2DConfig, device: str)
     """Return losses over the steps, and those of creatures turned by 90 degrees."""
     task, blind = tasks_of(config, device)
     random = WorldRandom(SEEDS, device=device)
-    x, s, _ = task.seed(len(SEEDS), generator=random, device=device)
+    x, s, *_ = task.seed(len(SEEDS), generator=random, device=device)
     found: dict[str, Any] = {"upright": {}, "best_angle": {}}
     done, grown = 0, (x, s)
     for steps in STEPS:

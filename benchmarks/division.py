@@ -27,7 +27,7 @@ from npa_envs.measure.record import machine, write_record
 from npa_envs.rule.files import rule_metadata
 from npa_envs.tasks.base import Task
 from npa_envs.training import preset
-from npa_envs.training.trained_tasks import task_of_rule
+from npa_envs.training.task_of_rule import task_of_rule
 from npa_envs.world.division import living
 from npa_envs.world.randomness import WorldRandom
 
@@ -98,7 +98,7 @@ def measured(path: Path, device: torch.device) -> dict[str, Any]:
             rule, x, s, steps, eps=task.eps, update_prob=task.update_prob, generator=random
         )
 
-    x, s, _ = task.seed(len(SEEDS), generator=random, device=device)
+    x, s, *_ = task.seed(len(SEEDS), generator=random, device=device)
     found: dict[str, Any] = {"iteration": int(rule_metadata(path)["iteration"]), "grown": {}}
     done = 0
     for steps in STEPS:

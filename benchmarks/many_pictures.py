@@ -44,7 +44,7 @@ from npa_envs.rule.files import rule_metadata
 from npa_envs.tasks.many_pictures import ManyPictures, named_targets
 from npa_envs.tasks.morphogenesis2d import Morphogenesis2D
 from npa_envs.training import Trainer, preset
-from npa_envs.training.trained_tasks import trained_config
+from npa_envs.training.task_of_rule import trained_config
 
 KINDS: Mapping[str, Mapping[str, Any]] = {
     "codes": {},

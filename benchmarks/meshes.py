@@ -375,7 +375,7 @@ def measure(
 ) -> None:
     """Measure a trained rule, and write the results."""
     out, config = arguments.out, trainer.config
-    rule = trainer.kept_rule
+    rule = trainer.saved_rule
     save_rule(rule, out / f"{config.out.name}.safetensors", metadata=context_info(trainer))
     task = trainer.task.for_rule(rule)
     worlds = []

@@ -74,7 +74,7 @@ def follow(arguments: argparse.Namespace) -> None:
     rule = load_rule(arguments.rule)
     task = Morphogenesis2D(preset(arguments.preset, target=arguments.target).task)
     generator = torch.Generator().manual_seed(SEEDS[0])
-    x, s, _ = task.seed(1, generator=generator)
+    x, s, *_ = task.seed(1, generator=generator)
     before = 0
     options = {"eps": task.eps, "update_prob": task.update_prob, "generator": generator}
     print(f"step  loss  {'  '.join(MOTIONS)}  motion in 64 steps, of it the whole's")
@@ -179,7 +179,7 @@ def run_long(arguments: argparse.Namespace) -> None:
             task.seed(1, generator=torch.Generator(device).manual_seed(seed), device=device)
             for seed in SEEDS
         ]
-        x, s = torch.cat([x for x, *_ in seeds]), torch.cat([s for _, s, _ in seeds])
+        x, s = torch.cat([one.x for one in seeds]), torch.cat([one.s for one in seeds])
         home = long_runs.TrialWorlds(rule, task, x.float(), s.float())
         generators = [torch.Generator(device).manual_seed(seed) for seed in (1, 2)]
         line = {"picture": picture} | endurance(home, arguments.steps, generators)

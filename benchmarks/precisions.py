@@ -21,7 +21,7 @@ from npa_envs.ops.equivariance import invariants, steered
 from npa_envs.rule.files import load_rule
 from npa_envs.rule.network import without_small
 from npa_envs.rule.rule import NPARule
-from npa_envs.training.trained_tasks import task_of_rule
+from npa_envs.training.task_of_rule import task_of_rule
 from npa_envs.world.rollout import rollout
 
 HORIZONS = {"morphogenesis3d": 128, "point_classification": 32}
@@ -123,7 +123,7 @@ def metric(name: str, precision: Precision, device: torch.device) -> float:
     rule = load_rule(name, device=device).float().requires_grad_(False)
     trained = task_of_rule(name, rule, device)
     generator = torch.Generator(device).manual_seed(0)
-    x, s, goal = trained.task.seed(1, generator=generator, device=device)
+    x, s, _, goal = trained.task.seed(1, generator=generator, device=device)
     task = trained.task.toward(goal)
     x, s, own = x.float(), precision.kept(s.float()), precision.rule(rule)
     x, s = x.to(precision.dtype), s.to(precision.dtype)

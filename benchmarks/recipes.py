@@ -113,7 +113,7 @@ def keep(trainers: Sequence[Trainer], folder: Path) -> None:
 def measured(trainer: Trainer, size: str, last_step: int = LAST) -> dict[str, Any]:
     """Return growth and, where `last_step` is `LAST`, healing of a rule, by all worlds' means."""
     task: Any = trainer.task
-    rule = trainer.kept_rule
+    rule = trainer.saved_rule
     device = trainer.config.device
     steps = (4, 8) if size == "tiny" else (*STEPS, LAST)
     steps = tuple(step for step in steps if step <= last_step)
@@ -146,10 +146,10 @@ def measured(trainer: Trainer, size: str, last_step: int = LAST) -> dict[str, An
 def strip(trainer: Trainer, steps: Sequence[int]) -> np.ndarray[Any, Any]:
     """Return a strip of pictures of the target and of one world as it grows."""
     task: Any = trainer.task
-    rule = trainer.kept_rule
+    rule = trainer.saved_rule
     device = torch.device(trainer.config.device)
     runner = RuleRunner(rule, task, device, SEEDS[0], None)
-    x, s, _ = task.seed(1, generator=torch.Generator(device).manual_seed(SEEDS[0]), device=device)
+    x, s, *_ = task.seed(1, generator=torch.Generator(device).manual_seed(SEEDS[0]), device=device)
     frames, before = [task.target_picture[None]], 0
     for step in steps:
         x, s = runner.run(x, s, step - before)
@@ -233,7 +233,7 @@ def run_all(arguments: argparse.Namespace) -> None:
                 if arguments.clock < math.inf:
                     line["clock"] = arguments.clock
                 line |= measured(trainer, run.size, arguments.last_step)
-                rule = trainer.kept_rule
+                rule = trainer.saved_rule
                 save_rule(rule, out / f"rule-{run.name}.safetensors")
                 if arguments.strips:
                     steps = (4, 8) if run.size == "tiny" else (32, 64, 128, 512, 4096)

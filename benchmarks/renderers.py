@@ -25,7 +25,7 @@ import npa_envs
 from npa_envs.ops import Cameras
 from npa_envs.tasks.appearance import Gaussians, draw_gaussians
 from npa_envs.tasks.targets.views import some_views
-from npa_envs.training.trained_tasks import task_of_rule
+from npa_envs.training.task_of_rule import task_of_rule
 from npa_envs.world.cuda_graph import capture
 
 DEVICE = torch.device("cuda")
@@ -124,7 +124,7 @@ def main() -> None:
     rule = npa_envs.load_rule("duck-v0", device=DEVICE).requires_grad_(False)
     task = task_of_rule("duck-v0", rule, DEVICE).task
     generator = torch.Generator(DEVICE).manual_seed(1)
-    x, s, _ = task.seed(4, generator=generator, device=DEVICE)
+    x, s, *_ = task.seed(4, generator=generator, device=DEVICE)
     with torch.no_grad():
         grown = npa_envs.rollout(rule, x, s, 128, generator=generator)
     cameras = some_views(task.target.training, torch.arange(4, device=DEVICE)).cameras

@@ -20,7 +20,7 @@ import npa_envs
 from npa_envs.measure.record import write_record
 from npa_envs.measure.speed.timing import synchronize
 from npa_envs.rule.files import load_rule
-from npa_envs.training.trained_tasks import task_of_rule
+from npa_envs.training.task_of_rule import task_of_rule
 
 AGES = (0, 512, 1024, 2048, 4096)
 STEPS, READINGS = 512, 3
@@ -47,7 +47,7 @@ def measured(source: str, device: torch.device) -> dict[str, Any]:
 
     rows = []
     with torch.no_grad():
-        x, s, _ = task.seed(1, generator=generator, device=device)
+        x, s, *_ = task.seed(1, generator=generator, device=device)
         for age, before in zip(AGES, (0, *AGES), strict=False):
             x, s = npa_envs.rollout(rule, x, s, age - before, generator=generator, **options)
             rests = npa_envs.at_rest(rule, x, s, eps=task.eps, box=task.box)

@@ -34,7 +34,7 @@ from npa_envs.rule.files import load_rule
 from npa_envs.rule.rule import NPARule
 from npa_envs.tasks.texture import Texture
 from npa_envs.training import Trainer, preset
-from npa_envs.training.trained_tasks import task_of_rule
+from npa_envs.training.task_of_rule import task_of_rule
 from npa_envs.world.recorded import release_recordings
 
 SEEDS = tuple(range(1_000_000, 1_000_008))
@@ -100,7 +100,7 @@ def run(arguments: argparse.Namespace) -> None:
     seeds = SEEDS[: 8 if arguments.device.startswith("cuda") else 1]
     for name, trainer in zip(names, trainers, strict=True):
         begun = time.perf_counter()
-        rule = trainer.kept_rule
+        rule = trainer.saved_rule
         told_task = trainer.config.task
         if arguments.particles:
             told_task = told_task.with_particle_count(arguments.particles)
@@ -138,7 +138,7 @@ def particles(arguments: argparse.Namespace) -> None:
             config = preset("paper", "texture", target=target, loss=loss, **changes).task
             task = Texture(config, device=device)
             generator = torch.Generator(device).manual_seed(0)
-            x, s, _ = task.seed(1, generator=generator, device=device)
+            x, s, *_ = task.seed(1, generator=generator, device=device)
             colour = s[..., -3:].clone().requires_grad_()
             x.requires_grad_()
             half = 0.5 * config.box_size

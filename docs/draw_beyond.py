@@ -26,7 +26,7 @@ from torch import Tensor
 import npa_envs
 from npa_envs.render import to_uint8, write_filmstrip
 from npa_envs.tasks.morphogenesis2d import Morphogenesis2D, turned, turns
-from npa_envs.training.trained_tasks import task_of_rule, tasks_of_codes
+from npa_envs.training.task_of_rule import task_of_rule, tasks_of_codes
 from npa_envs.world.division import living
 
 IMAGES = Path(__file__).resolve().parent / "images"
@@ -143,7 +143,7 @@ def sizes(paths: list[str]) -> Shots:
         for share in RADII:
             # A larger radius is a smaller disk: scaling both is a symmetry.
             generator = torch.Generator().manual_seed(SEEDS[0])
-            x, s, _ = trained.seed(1, generator=generator)
+            x, s, *_ = trained.seed(1, generator=generator)
             x, s = run(rule, trained, x / share, s, GROWN, seed=SEEDS[0])
             shots.append((f"{share:g} x radius", as_it_lies(trained, x, s)))
     return shots
@@ -153,7 +153,7 @@ def division(paths: list[str]) -> Shots:
     """Return a world that grows from one particle, loses a half, and grows it again."""
     rule = npa_envs.load_rule(paths[0])
     task = task_of(paths[0], rule)
-    x, s, _ = task.seed(1, generator=torch.Generator())
+    x, s, *_ = task.seed(1, generator=torch.Generator())
     shots: Shots = [("step 0: 1 lives", as_it_lies(task, x, s))]
     step = 0
     for steps in GROWTH:
@@ -180,7 +180,7 @@ def pictures(paths: list[str]) -> Shots:
     names = rule.codes.names[:COLUMNS]
     found = [task_of_rule(path, rule, CPU, target=name).task for name in names]
     tasks = [task for task in found if isinstance(task, Morphogenesis2D)]
-    blank = tasks[0].seed(1, generator=torch.Generator().manual_seed(SEEDS[0]))
+    blank = tasks[0].seed(1, generator=torch.Generator().manual_seed(SEEDS[0]))[:2]
     shots = [(f"{task.target.name}, target", enlarged(task.target_picture)) for task in tasks]
     for task in tasks:
         x, s = run(rule, task, blank[0], task.coded(blank[1]), GROWN, seed=SEEDS[0])
@@ -205,7 +205,7 @@ def sixty(path: str) -> Image.Image:
     rule = npa_envs.load_rule(path)
     tiles = []
     for task in tasks_of_codes(path, rule, CPU):
-        x, s, _ = task.seed(1, generator=torch.Generator().manual_seed(SEEDS[0]))
+        x, s, *_ = task.seed(1, generator=torch.Generator().manual_seed(SEEDS[0]))
         tile = [to_uint8(task.target_picture)]
         for before, after in pairwise((0, *LATER)):
             x, s = run(rule, task, x, s, after - before, seed=SEEDS[0] + after)

@@ -21,7 +21,7 @@ from torch import Tensor
 import npa_envs
 from npa_envs.files import atomic_path
 from npa_envs.reference import smoothing_kernel
-from npa_envs.training.trained_tasks import task_of_rule
+from npa_envs.training.task_of_rule import task_of_rule
 
 SEED = 1_000_001
 GROWN = 40
@@ -40,7 +40,7 @@ def growing_world() -> tuple[npa_envs.NPARule, Any, Tensor, Tensor]:
     rule = npa_envs.load_rule("gecko")
     task = task_of_rule("gecko", rule, torch.device("cpu")).task
     generator = torch.Generator().manual_seed(SEED)
-    x, s, _ = task.seed(1, generator=generator)
+    x, s, *_ = task.seed(1, generator=generator)
     with torch.no_grad():
         x, s = npa_envs.rollout(rule, x, s, GROWN, update_prob=0.5, generator=generator)
     return rule, task, x, s

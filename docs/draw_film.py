@@ -15,7 +15,7 @@ from torch import Tensor
 
 import npa_envs
 from npa_envs.render import draw_worlds, write_webp
-from npa_envs.training.trained_tasks import task_of_rule
+from npa_envs.training.task_of_rule import task_of_rule
 from npa_envs.world.brushes import cut, wipe_state
 
 SEED = 1_000_001

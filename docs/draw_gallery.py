@@ -21,7 +21,7 @@ import npa_envs
 from npa_envs.render import to_uint8, turntable_frames, write_webp
 from npa_envs.rule.files import shipped_rules
 from npa_envs.tasks.damage import damage_worlds
-from npa_envs.training.trained_tasks import task_of_rule
+from npa_envs.training.task_of_rule import task_of_rule
 
 FOLDER = IMAGES / "gallery"
 SEED = 1_000_001

@@ -20,7 +20,7 @@ import npa_envs
 from npa_envs.render import to_uint8, write_filmstrip
 from npa_envs.rule.files import shipped_rules
 from npa_envs.tasks.targets.views import over
-from npa_envs.training.trained_tasks import task_of_rule
+from npa_envs.training.task_of_rule import task_of_rule
 
 IMAGES = Path(__file__).resolve().parent / "images"
 SEED = 1_000_000
@@ -35,7 +35,7 @@ def grown(name: str, steps: tuple[int, ...]) -> tuple[Any, list[tuple[Tensor, Te
     rule = npa_envs.load_rule(name)
     task = task_of_rule(name, rule, CPU).task
     generator = torch.Generator().manual_seed(SEED)
-    x, s, _ = task.seed(1, generator=generator)
+    x, s, *_ = task.seed(1, generator=generator)
     worlds, before = [], 0
     for mark in steps:
         x, s = npa_envs.rollout(

@@ -43,7 +43,7 @@ class FilmedWorld:
         self.rule, self.task, self.draw = rule, task, draw
         self.generator = torch.Generator().manual_seed(seed)
         cpu = torch.device("cpu")
-        self.x, self.s, _ = task.seed(world_count, generator=self.generator, device=cpu)
+        self.x, self.s, *_ = task.seed(world_count, generator=self.generator, device=cpu)
 
     @torch.no_grad()
     def run(self, stretches: Sequence[int]) -> Iterator[Frame]:

@@ -34,13 +34,13 @@ class PictureConfig(EnvConfig):
         super().__post_init__()
         # The target has as many points as particles.
         check_positive(self, int, "particle_count", at_most=LARGEST_POINT_COUNT)
-        _ = self.goal
+        _ = self.task_config
         self.check_start_radius(self.seed_radius)
 
     @property
-    def goal(self) -> Morphogenesis2DConfig:
+    def task_config(self) -> Morphogenesis2DConfig:
         """Configuration of the training task."""
-        return self.task_config(Morphogenesis2DConfig, target_point_count=self.particle_count)
+        return self.as_config(Morphogenesis2DConfig, target_point_count=self.particle_count)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -57,16 +57,16 @@ class PictureEnvTask(TargetEnvTask[Config]):
     """A picture to grow, compared by the splat loss of `npa_envs.tasks.morphogenesis2d`."""
 
     config_type: ClassVar[type[PictureConfig]] = Morphogenesis2DEnvConfig
-    goal: Morphogenesis2D
-    goal_type: ClassVar[type[Morphogenesis2D]] = Morphogenesis2D
+    task: Morphogenesis2D
+    task_type: ClassVar[type[Morphogenesis2D]] = Morphogenesis2D
     """Class of the training task."""
 
     def __init__(self, config: Config, device: torch.device) -> None:
         super().__init__(config, device)
-        self.goal = self._make_goal()
+        self.task = self._make_task()
 
-    def _make_goal(self) -> Morphogenesis2D:
-        return self.goal_type(self.config.goal, device=self.device)
+    def _make_task(self) -> Morphogenesis2D:
+        return self.task_type(self.config.task_config, device=self.device)
 
     @classmethod
     def extra_bytes(cls, config: Any, world_count: int) -> int:
@@ -77,13 +77,13 @@ class PictureEnvTask(TargetEnvTask[Config]):
 
     def losses(self, x: Tensor, s: Tensor) -> Mapping[str, Tensor]:
         """Return the density error and the weighted colour error of each world."""
-        density, colour = self.goal.splat_losses(x, s)
+        density, colour = self.task.splat_losses(x, s)
         return {"density": density, "colour": self.config.colour_weight * colour}
 
     @property
     def pixel_size(self) -> float:
         """Size of a particle in pictures: the spacing of the target's points."""
-        return self.goal.target.pixel_size
+        return self.task.target.pixel_size
 
 
 class Morphogenesis2DEnv(NPAEnv):

@@ -62,13 +62,13 @@ class Morphogenesis3DEnvConfig(EnvConfig):
                 "for example readout='mushroom'"
             )
         check_positive(self, int, "view_count")
-        _ = self.goal
+        _ = self.task_config
         self.check_start_radius(self.seed_radius)
 
     @property
-    def goal(self) -> Morphogenesis3DConfig:
+    def task_config(self) -> Morphogenesis3DConfig:
         """Configuration of the training task; the compared views are the held-out ones."""
-        return self.task_config(
+        return self.as_config(
             Morphogenesis3DConfig,
             training_views=1,
             held_out_views=self.view_count,
@@ -80,16 +80,16 @@ class SolidTask(TargetEnvTask[Morphogenesis3DEnvConfig]):
     """An object to grow, compared view by view by `npa_envs.tasks.morphogenesis3d`."""
 
     config_type = Morphogenesis3DEnvConfig
-    goal: Morphogenesis3D
+    task: Morphogenesis3D
     space_dim = 3
 
     def __init__(self, config: Morphogenesis3DEnvConfig, device: torch.device) -> None:
         super().__init__(config, device)
-        goal = Morphogenesis3D(config.goal, device=device)
+        task = Morphogenesis3D(config.task_config, device=device)
         self._rule = None
         if config.readout:
             self._rule = load_read_out("readout", config.readout, config.state_dim, device)
-        self.goal = goal if self._rule is None else goal.for_rule(self._rule)
+        self.task = task if self._rule is None else task.for_rule(self._rule)
 
     @classmethod
     def extra_bytes(cls, config: Any, world_count: int) -> int:
@@ -101,7 +101,7 @@ class SolidTask(TargetEnvTask[Morphogenesis3DEnvConfig]):
 
     def losses(self, x: Tensor, s: Tensor) -> Mapping[str, Tensor]:
         """Return the mean absolute difference of each world's views."""
-        return {"views": self.goal.metric(x, s)}
+        return {"views": self.task.metric(x, s)}
 
     def draw(self, x: Tensor, s: Tensor, steps: NDArray[np.int64]) -> NDArray[np.uint8]:
         """Return a picture of each world; with a read-out, of its Gaussians."""
@@ -109,7 +109,7 @@ class SolidTask(TargetEnvTask[Morphogenesis3DEnvConfig]):
             return super().draw(x, s, steps)
         frames = []
         for k, step in enumerate(steps):
-            views = partial(self.goal.views, x[k : k + 1], s[k : k + 1])
+            views = partial(self.task.views, x[k : k + 1], s[k : k + 1])
             frames += turntable_frames(
                 views,
                 frame_count=1,

@@ -63,7 +63,7 @@ class Pictures2DEnvConfig(PictureConfig):
                 f"{shown(self.targets)} and {shown(self.test_targets)}: for example ('heart',)"
             )
         # Checks the names of both splits.
-        _ = self._goal_of(self.targets), self._goal_of(self.test_targets)
+        _ = self._config_of(self.targets), self._config_of(self.test_targets)
         both = named_targets(self.targets).keys() & named_targets(self.test_targets).keys()
         if both:
             raise NPAError(
@@ -72,33 +72,33 @@ class Pictures2DEnvConfig(PictureConfig):
             )
 
     @property
-    def goal(self) -> Morphogenesis2DConfig:
+    def task_config(self) -> Morphogenesis2DConfig:
         """Configuration of the training task."""
-        return self._goal_of(self.targets if self.split == "train" else self.test_targets)
+        return self._config_of(self.targets if self.split == "train" else self.test_targets)
 
     @property
     def target_dim(self) -> int:
         """Columns of the target after those of perception in an observation's row, T."""
         return CHANNELS * self.picture_size**2 if self.observe_target else 0
 
-    def _goal_of(self, targets: tuple[str, ...]) -> Morphogenesis2DConfig:
+    def _config_of(self, targets: tuple[str, ...]) -> Morphogenesis2DConfig:
         count = self.particle_count
-        return self.task_config(Morphogenesis2DConfig, targets=targets, target_point_count=count)
+        return self.as_config(Morphogenesis2DConfig, targets=targets, target_point_count=count)
 
 
 class PicturesTask(PictureEnvTask[Pictures2DEnvConfig]):
     """Several pictures to grow, one target in each world."""
 
     config_type = Pictures2DEnvConfig
-    goal: ManyPictures
-    goal_type = ManyPictures
+    task: ManyPictures
+    task_type = ManyPictures
 
     def __init__(self, config: Pictures2DEnvConfig, device: torch.device) -> None:
         super().__init__(config, device)
-        self.names = self.goal.names
+        self.names = self.task.names
         """Names of the pictures of the split, by their indices."""
         everyone = torch.arange(len(self.names), device=device)
-        pictures = self.goal.toward(everyone).target_picture.permute(0, 3, 1, 2)
+        pictures = self.task.toward(everyone).target_picture.permute(0, 3, 1, 2)
         small = F.avg_pool2d(pictures, config.resolution // config.picture_size)
         limit = config.observation_limit
         if config.observe_target:
@@ -113,7 +113,7 @@ class PicturesTask(PictureEnvTask[Pictures2DEnvConfig]):
 
     def fresh(self, random: WorldRandom) -> Start:
         """Return the training task's initial worlds, and the indices of their pictures."""
-        x, s, number = self.goal.seed(random.world_count, generator=random, device=self.device)
+        x, s, _, number = self.task.seed(random.world_count, generator=random, device=self.device)
         # Drops the channels of codes, which only rules of many pictures use.
         return Start(x, s[..., -self.config.state_dim :].contiguous(), goal=number)
 

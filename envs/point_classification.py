@@ -76,14 +76,14 @@ class PointClassificationEnvConfig(EnvConfig):
             raise NPAError(f"split must be 'train' or 'test', got {shown(self.split)}")
         if not isinstance(self.rule, str):
             raise NPAError(f"rule must be the path of a rule as a string, got {shown(self.rule)}")
-        _ = self.goal
+        _ = self.task_config
         check_positive(self, float, "sharpness")
         check_positive(self, int, "state_dim", at_least=3 if self.rule else self.class_count)
 
     @property
-    def goal(self) -> PointClassificationConfig:
+    def task_config(self) -> PointClassificationConfig:
         """Configuration of the training task."""
-        return self.task_config(PointClassificationConfig)
+        return self.as_config(PointClassificationConfig)
 
 
 class _WorldByWorld(NPARule):
@@ -97,35 +97,35 @@ class PointClassificationTask(TargetEnvTask[PointClassificationEnvConfig]):
     """Clouds of digits, and the error of their particles' outputs."""
 
     config_type = PointClassificationEnvConfig
-    goal: PointClassification
+    task: PointClassification
     static = True
 
     def __init__(self, config: PointClassificationEnvConfig, device: torch.device) -> None:
         super().__init__(config, device)
-        self.goal = PointClassification(config.goal, device=device, split=config.split)
+        self.task = PointClassification(config.task_config, device=device, split=config.split)
         if config.rule:
             given = load_read_out("rule", config.rule, config.state_dim, device)
             rule = _WorldByWorld(**given.hyper_parameters()).to(device)
             rule.load_state_dict(given.state_dict())
-            self.goal = self.goal.for_rule(rule.requires_grad_(False))
-        self._coverage = self.goal.clouds.coverage
+            self.task = self.task.for_rule(rule.requires_grad_(False))
+        self._coverage = self.task.clouds.coverage
 
     def fresh(self, random: WorldRandom) -> Start:
         """Return random clouds with all states zero, and their classes."""
-        x, s, label = self.goal.seed(random.world_count, generator=random, device=self.device)
+        x, s, _, label = self.task.seed(random.world_count, generator=random, device=self.device)
         return Start(x, s, goal=label)
 
     def losses(self, x: Tensor, s: Tensor) -> Mapping[str, Tensor]:
         """Return each world's loss of its outputs, and its weighted overflow."""
         score = self.config.score
-        overflow = self.config.overflow_weight * self.goal.overflow(s)
+        overflow = self.config.overflow_weight * self.task.overflow(s)
         if score == "error":
-            return {"error": self.goal.metric(x, s), "overflow": overflow}
+            return {"error": self.task.metric(x, s), "overflow": overflow}
         return {score: world_mean(self._scores(s)[..., None])[:, 0], "overflow": overflow}
 
     def particle_losses(self, x: Tensor, s: Tensor) -> Tensor:
         """Return each particle's own loss and overflow."""
-        return self._scores(s) + self.config.overflow_weight * self.goal.overflows(s)
+        return self._scores(s) + self.config.overflow_weight * self.task.overflows(s)
 
     def particle_gains(self, before: tuple[Tensor, Tensor], after: tuple[Tensor, Tensor]) -> Tensor:
         """Return the fall of each particle's loss, which no other particle's action changes."""
@@ -133,21 +133,21 @@ class PointClassificationTask(TargetEnvTask[PointClassificationEnvConfig]):
 
     def accuracy(self, s: Tensor) -> Tensor:
         """Return the fraction of particles whose largest output is of the world's class, [B]."""
-        return 1.0 - world_mean(self.goal.mistakes(s)[..., None])[:, 0]
+        return 1.0 - world_mean(self.task.mistakes(s)[..., None])[:, 0]
 
     def extra_info(self, s: Tensor) -> dict[str, Tensor]:
         """Return each world's class, int64, and accuracy, shape [B] each."""
-        return {"label": self.goal.goal.clone(), "accuracy": self.accuracy(s)}
+        return {"label": self.task.goal.clone(), "accuracy": self.accuracy(s)}
 
     def _scores(self, s: Tensor) -> Tensor:
         """Return the loss of each particle's outputs, [B, N]."""
         if self.config.score == "cross_entropy":
-            return self.goal.cross_entropies(s, self.config.sharpness)
-        return self.goal.mistakes(s) if self.config.score == "accuracy" else self.goal.errors(s)
+            return self.task.cross_entropies(s, self.config.sharpness)
+        return self.task.mistakes(s) if self.config.score == "accuracy" else self.task.errors(s)
 
     def draw(self, x: Tensor, s: Tensor, steps: NDArray[np.int64]) -> NDArray[np.uint8]:
         """Return pictures of the unit square with a margin, in the colours of predicted classes."""
-        colours = class_colours(self.goal.outputs(s)) - COLOUR_OFFSET
+        colours = class_colours(self.task.outputs(s)) - COLOUR_OFFSET
         return super().draw(
             MAGNIFICATION * (x - 0.5), torch.cat((s[..., :-3], colours), dim=-1), steps
         )
@@ -155,7 +155,7 @@ class PointClassificationTask(TargetEnvTask[PointClassificationEnvConfig]):
     @property
     def pixel_size(self) -> float:
         """Size of a particle in pictures, which show the unit square magnified."""
-        return MAGNIFICATION * self.goal.pixel_size
+        return MAGNIFICATION * self.task.pixel_size
 
 
 MAGNIFICATION = 2.0 / (1.0 + 2.0 * PICTURE_MARGIN)

@@ -127,7 +127,7 @@ class RegenerationTask(GrownTask[Regeneration2DEnvConfig]):
 
     def _picture_worlds(self, random: WorldRandom) -> tuple[Tensor, Tensor]:
         x, s = PictureEnvTask.seed(self, random)
-        points, colours = self.goal.target.points, self.goal.target.colours
+        points, colours = self.task.target.points, self.task.target.colours
         # The numbers of points and particles differ a little: some points repeat or are skipped.
         chosen = torch.linspace(0, len(points) - 1, x.shape[1], device=x.device).round().long()
         s[..., -3:] = colours[chosen] - COLOUR_OFFSET

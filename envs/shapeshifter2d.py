@@ -28,7 +28,7 @@ from npa_envs.rule.files import load_rule
 from npa_envs.rule.rule import NPARule
 from npa_envs.tasks.many_pictures import ManyPictures
 from npa_envs.tasks.morphogenesis2d import Morphogenesis2DConfig
-from npa_envs.training.trained_tasks import sources_of_codes
+from npa_envs.training.task_of_rule import sources_of_codes
 from npa_envs.world.actions import Physics
 from npa_envs.world.randomness import WorldRandom
 
@@ -156,13 +156,13 @@ class ShapeshifterTask(RuleDriven, PictureEnvTask[Shapeshifter2DEnvConfig]):
     form_type = CodeForm
     actor = "codes"
     context_count = 1 + GOAL_COUNT
-    goal: ManyPictures
+    task: ManyPictures
 
-    def _make_goal(self) -> ManyPictures:
+    def _make_task(self) -> ManyPictures:
         config = self.config
         self.rule, self.codes = rule_of(config, self.device)
         sources = sources_of_codes(config.rule, self.codes)
-        own = config.task_config(
+        own = config.as_config(
             Morphogenesis2DConfig,
             target_point_count=config.particle_count,
             targets=tuple(sources.values()),
@@ -185,7 +185,7 @@ class ShapeshifterTask(RuleDriven, PictureEnvTask[Shapeshifter2DEnvConfig]):
     @property
     def pixel_size(self) -> float:
         """Size of a particle in pictures [length units]."""
-        return self.goal.pixel_size
+        return self.task.pixel_size
 
     @cached_property
     def blank_losses(self) -> Tensor:
@@ -194,14 +194,14 @@ class ShapeshifterTask(RuleDriven, PictureEnvTask[Shapeshifter2DEnvConfig]):
         x = torch.full((len(goals), 1, 2), 1e3, device=self.device)
         s = x.new_zeros(len(goals), 1, self.config.state_dim)
         # Without particles in the picture colours do not count, and nothing is centred.
-        goal_task = self.goal.toward(goals)
+        goal_task = self.task.toward(goals)
         difference = goal_task.picture(x, s, centred=False) - goal_task.target_picture
         error = difference[..., 3].square() + difference[..., 3].abs()
         return error.flatten(1).mean(dim=1)
 
     def fresh(self, random: WorldRandom) -> Start:
         """Return grown worlds of random pictures, with another picture as their goal."""
-        x, s, grown = self.goal.seed(random.world_count, generator=random, device=self.device)
+        x, s, _, grown = self.task.seed(random.world_count, generator=random, device=self.device)
         assert grown is not None, "worlds of many pictures have goals"
         s = self.rule.with_code(s, self.codes.table[grown][:, None])
         x, s = grow(self.rule, self.config, x, s, random)
@@ -247,7 +247,7 @@ class ShapeshifterTask(RuleDriven, PictureEnvTask[Shapeshifter2DEnvConfig]):
 
     def observe(self, x: Tensor, s: Tensor, loss: Tensor, context: Tensor) -> Tensor:
         """Return coarse pictures of worlds and of their goals, shape [B, 8 G²]."""
-        goal_task = self.goal.toward(context[:, 0].long())
+        goal_task = self.task.toward(context[:, 0].long())
         both = torch.cat((goal_task.picture(x, s), goal_task.target_picture), dim=-1)
         pixels = self.config.resolution // self.config.picture_size
         coarse = F.avg_pool2d(both.permute(0, 3, 1, 2), pixels).flatten(1)

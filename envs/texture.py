@@ -49,23 +49,23 @@ class TextureEnvConfig(EnvConfig):
                 f"boundary must be 'periodic' for textures, got {shown(self.boundary)}: leave it "
                 "out"
             )
-        _ = self.goal
+        _ = self.task_config
 
     @property
-    def goal(self) -> TextureConfig:
+    def task_config(self) -> TextureConfig:
         """Configuration of the training task."""
-        return self.task_config(TextureConfig)
+        return self.as_config(TextureConfig)
 
 
 class TextureTask(TargetEnvTask[TextureEnvConfig]):
     """A texture, compared by a loss of `npa_envs.tasks.losses.texture`."""
 
     config_type = TextureEnvConfig
-    goal: Texture
+    task: Texture
 
     def __init__(self, config: TextureEnvConfig, device: torch.device) -> None:
         super().__init__(config, device)
-        self.goal = Texture(config.goal, device=device)
+        self.task = Texture(config.task_config, device=device)
 
     @classmethod
     def extra_bytes(cls, config: Any, world_count: int) -> int:
@@ -76,14 +76,14 @@ class TextureTask(TargetEnvTask[TextureEnvConfig]):
 
     def losses(self, x: Tensor, s: Tensor) -> Mapping[str, Tensor]:
         """Return the weighted losses of each world's colour image and of its density image."""
-        colour, density = self.goal.texture_losses(x, s)
-        colour_weight, density_weight = self.goal.weights()
+        colour, density = self.task.texture_losses(x, s)
+        colour_weight, density_weight = self.task.weights()
         return {"colour": colour_weight * colour, "density": density_weight * density}
 
     @property
     def pixel_size(self) -> float:
         """Size of a particle in pictures, at which the mean density is the target's."""
-        return self.goal.pixel_size
+        return self.task.pixel_size
 
 
 class TextureEnv(NPAEnv):

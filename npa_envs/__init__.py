@@ -1,7 +1,7 @@
 """Neural Particle Automata: differentiable SPH particle worlds.
 
-Importing it registers the Gymnasium environments `npa/...`. Names are imported when they are first
-used, so that the import starts neither torch nor Warp, and the command line answers at once.
+Importing it registers the Gymnasium environments `npa/...`. Names are imported at their first use,
+so that the import loads neither torch nor Warp and the command line starts fast.
 """
 
 from importlib import import_module as _import_module
@@ -57,7 +57,7 @@ __all__ = [
     "world_mean",
 ]
 
-_HOMES = {
+_MODULES = {
     "errors": {"DivergedError", "MissingDependencyError", "NPAError"},
     "rule.files": {"load_rule", "save_rule", "shipped_rules"},
     "rule.rule": {"NPARule"},
@@ -66,14 +66,14 @@ _HOMES = {
     "world.rollout": {"at_rest", "rollout", "step"},
     "world.species": {"rollout_species"},
 }
-"""Where the names are; all others are of `npa_envs.ops`."""
+"""Modules of the public names; all others are in `npa_envs.ops`."""
 
 
 def __getattr__(name: str) -> Any:
     if name not in __all__:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    home = next((module for module, names in _HOMES.items() if name in names), "ops")
-    return getattr(_import_module(f"npa_envs.{home}"), name)
+    module = next((path for path, names in _MODULES.items() if name in names), "ops")
+    return getattr(_import_module(f"npa_envs.{module}"), name)
 
 
 def __dir__() -> list[str]:

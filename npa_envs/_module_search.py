@@ -1,8 +1,8 @@
-"""Search for the package's modules in a checkout as it lies on the disk.
+"""The import path of `npa_envs` in a checkout of the repository.
 
-`envs/`, `wrappers/` and `agents/` lie beside `npa_envs/` in the repository and inside it once
-installed. Python started in the repository's root imports the bare folder `npa_envs/` before any
-installed one, and would miss the other three.
+`envs/`, `wrappers/` and `agents/` are next to `npa_envs/` in the repository, and inside of it once
+installed. Python started in the repository's root imports the folder `npa_envs/` before an
+installed package, and would not find the other three.
 """
 
 from __future__ import annotations
@@ -10,14 +10,14 @@ from __future__ import annotations
 from pathlib import Path
 
 MAPPED_PACKAGES = ("envs", "wrappers", "agents")
-"""Sub-packages of `npa_envs` that lie beside it in the repository."""
+"""Sub-packages of `npa_envs` that are next to it in the repository."""
 
 
 def extend_path(package_path: list[str], package_file: str) -> None:
-    """Add the repository's root to the search path of `npa_envs` where it is imported from there.
+    """Add the repository's root to the search path of `npa_envs` if it is imported from there.
 
-    Does nothing for an installed package, so that a folder called `envs` which some other project
-    left in site-packages is never taken for ours.
+    An installed package is left unchanged, so that a folder `envs` of another project in
+    site-packages is never imported.
     """
     package = Path(package_file).resolve().parent
     root = package.parent

@@ -1,4 +1,4 @@
-"""Checks of arguments and of configurations: what lies behind them may trust what it is given."""
+"""Checks of arguments and of configuration fields; each error says how to correct it."""
 
 from __future__ import annotations
 
@@ -23,22 +23,22 @@ LENGTH_RANGE = {
     (2, torch.float64): (1e-60, 1e60),
     (3, torch.float64): (1e-50, 1e50),
 }
-"""Perception radii [length units] whose powers in the kernels stay numbers of the dtype, by space
-dimension and dtype."""
+"""Allowed perception radii [length units] by D and dtype, whose powers in the kernels are
+finite."""
 
 LARGEST_SIDE = 16384
-"""Pixels along a side of a picture, at most."""
+"""Largest side of a picture [pixels]."""
 
 MomentInverse = Literal["threshold", "smooth"]
-"""What corrects state gradients: M^-1 where |det M| is at least 1e-3 and nothing below, as in the
-paper, or a smooth function of M that tends to M^-1, and to I as det M tends to 0."""
+"""Correction of state gradients: "threshold" is the paper's, M^-1 where |det M| >= 1e-3, else I;
+"smooth" is a smooth function of M that tends to M^-1, and to I as det M tends to 0."""
 
 Box = float | Sequence[float] | None
 """Sides of a periodic box centred on the origin [length units], one number for all; None: open."""
 
 
 def check_dense(name: str, tensor: Tensor) -> None:
-    """Check that a tensor has its numbers one beside the other, on a CPU or a CUDA device."""
+    """Check that a tensor is strided, not nested, and on a CPU or a CUDA device."""
     if tensor.is_nested:
         raise NPAError(f"{name} must be one dense tensor, got a nested one: run each by itself")
     if tensor.layout != torch.strided or tensor.device.type not in ("cpu", "cuda"):
@@ -49,11 +49,7 @@ def check_dense(name: str, tensor: Tensor) -> None:
 
 
 def check_floating(name: str, tensor: Any, shape: str = "") -> None:
-    """Check that something is a dense tensor of float32 or float64.
-
-    Raises:
-        NPAError: It is not; the message may say which shape it is to have.
-    """
+    """Check for a dense tensor of float32 or float64; `shape` is for the error message."""
     if not isinstance(tensor, Tensor):
         wanted = f" of shape {shape}" if shape else ""
         raise NPAError(
@@ -70,20 +66,11 @@ def check_floating(name: str, tensor: Any, shape: str = "") -> None:
 def check_world(x: Tensor, s: Tensor) -> None:
     """Check shapes, dtypes and devices of positions and states."""
     for name, tensor, last in (("x", x, "D"), ("s", s, "C")):
-        if not isinstance(tensor, Tensor):
-            raise NPAError(
-                f"{name} must be a torch tensor, got {type(tensor).__name__}: "
-                f"convert it with torch.as_tensor"
-            )
-        check_dense(name, tensor)
+        check_floating(name, tensor)
         if tensor.ndim != 3:
             cure = f"add a world dimension with {name}[None]" if tensor.ndim == 2 else "reshape it"
             raise NPAError(
                 f"{name} must have shape [B, N, {last}], got {tuple(tensor.shape)}: {cure}"
-            )
-        if tensor.dtype not in DTYPES:
-            raise NPAError(
-                f"{name} must be float32 or float64, got {tensor.dtype}: convert it with .float()"
             )
     if x.shape[2] not in (2, 3):
         raise NPAError(f"x must have 2 or 3 coordinates, got shape {tuple(x.shape)}")
@@ -105,7 +92,7 @@ def check_world(x: Tensor, s: Tensor) -> None:
 
 def check_finite_positions(x: Tensor) -> None:
     """Check that every position is finite; skipped while compiled or captured."""
-    # Asked in this order: a compiler cannot trace what a stream does.
+    # In this order: torch.compile cannot trace the second call.
     if torch.compiler.is_compiling():
         return
     if x.is_cuda and torch.cuda.is_current_stream_capturing():
@@ -114,9 +101,9 @@ def check_finite_positions(x: Tensor) -> None:
 
 
 class FiniteCheck:
-    """The check that every position is finite: asked of the device now, answered by `wait`.
+    """A check that every position is finite, started on the device and finished by `wait`.
 
-    x stays as it is until then. With an event, on CUDA, it is read on another stream after that.
+    x must not change before that. With an event, on CUDA, x is read on another stream after it.
     """
 
     def __init__(self, x: Tensor, ready: torch.cuda.Event | None = None) -> None:
@@ -136,7 +123,7 @@ class FiniteCheck:
             self._arrival.record(stream)
 
     def wait(self) -> None:
-        """Wait for the answer, and for nothing that was launched since the question."""
+        """Wait for the result, not for later work; raise NPAError if a position is not finite."""
         if self._arrival is not None:
             self._arrival.synchronize()
         if math.isfinite(self._answer):
@@ -150,7 +137,7 @@ class FiniteCheck:
 
 
 def _largest_size(x: Tensor) -> Tensor:
-    """Return the size of the largest number, which is NaN where one is, in one short kernel."""
+    """Return the largest absolute value, NaN if there is one, by one kernel."""
     largest: Tensor = torch.linalg.vector_norm(x, math.inf)
     return largest
 
@@ -161,25 +148,25 @@ def _side_stream(device: torch.device) -> torch.cuda.Stream:
 
 
 def constant(number: float) -> float:
-    """Return a number; one that `torch.compile(dynamic=True)` takes for a variable as a constant.
+    """Return a number; within `torch.compile(dynamic=True)`, specialised to its present value.
 
-    Kernels take numbers, and the compiler loses its variables on the way to them.
+    Custom operators take Python numbers, not the compiler's symbolic ones.
     """
     if not torch.compiler.is_compiling():
         return number
-    # The compiler computes these from values; most other functions give another variable.
+    # The compiler evaluates these two; most other functions return another symbol.
     return math.ldexp(*math.frexp(number))
 
 
 def checked_flag(name: str, value: Any) -> bool:
-    """Return whether something is true."""
+    """Return a value as a bool, by its truth."""
     with contextlib.suppress(TypeError, ValueError, RuntimeError):
         return bool(value)
     raise NPAError(f"{name} must be True or False, got {shown(value)}")
 
 
 def checked_moment_inverse(value: Any) -> MomentInverse:
-    """Return how moment matrices are inverted."""
+    """Return the option `moment_inverse`, checked."""
     if isinstance(value, str) and value == "threshold":
         return "threshold"
     if isinstance(value, str) and value == "smooth":
@@ -191,7 +178,7 @@ def checked_moment_inverse(value: Any) -> MomentInverse:
 
 
 def checked_number(name: str, value: Any) -> float:
-    """Return a number as a float; zero-dimensional tensors and NumPy scalars are numbers too."""
+    """Return a number as a float; 0-dimensional tensors and NumPy scalars are allowed."""
     if not isinstance(value, str | bytes | bool):
         with contextlib.suppress(TypeError, ValueError, RuntimeError, OverflowError):
             return constant(float(value))
@@ -199,7 +186,7 @@ def checked_number(name: str, value: Any) -> float:
 
 
 def checked_count(name: str, value: Any) -> int:
-    """Return a number of things as an int; NumPy's integers are integers too."""
+    """Return an integer of at least 0 as an int; NumPy's integers are allowed."""
     if not isinstance(value, bool):
         with contextlib.suppress(TypeError):
             count = operator.index(value)
@@ -209,7 +196,7 @@ def checked_count(name: str, value: Any) -> int:
 
 
 def checked_positive(name: str, value: Any, unit: str = "") -> float:
-    """Return a number that must be positive and finite, as a float."""
+    """Return a positive, finite number as a float."""
     number = checked_number(name, value)
     if not (math.isfinite(number) and number > 0.0):
         raise NPAError(f"{name} must be positive and finite{unit}, got {number:g}")
@@ -217,7 +204,7 @@ def checked_positive(name: str, value: Any, unit: str = "") -> float:
 
 
 def checked_finite(name: str, value: Any, unit: str = "") -> float:
-    """Return a number that must be finite, as a float."""
+    """Return a finite number as a float."""
     number = checked_number(name, value)
     if not math.isfinite(number):
         raise NPAError(f"{name} must be finite{unit}, got {number:g}")
@@ -225,7 +212,7 @@ def checked_finite(name: str, value: Any, unit: str = "") -> float:
 
 
 def checked_side(name: str, value: Any) -> int:
-    """Return how many pixels a side of a picture has."""
+    """Return the side of a picture in pixels, checked."""
     side = checked_count(name, value)
     if not 1 <= side <= LARGEST_SIDE:
         raise NPAError(f"{name} must lie in [1, {LARGEST_SIDE}] pixels, got {shown(side)}")
@@ -233,7 +220,7 @@ def checked_side(name: str, value: Any) -> int:
 
 
 def entries(value: Any) -> list[Any] | None:
-    """Return the entries of a sequence of any library as a list, or None where it is none."""
+    """Return the entries of a sequence of any library as a list, or None if it is not one."""
     if isinstance(value, str | bytes) or getattr(value, "ndim", 1) == 0:
         return None
     with contextlib.suppress(TypeError, ValueError, RuntimeError):
@@ -254,7 +241,7 @@ def number_tensor(name: str, value: Any) -> Tensor:
 
 
 def checked_eps(name: str, eps: float, space_dim: int, dtype: torch.dtype) -> float:
-    """Return a perception radius as a float [length units], whose powers the dtype can hold."""
+    """Return a perception radius as a float [length units], in `LENGTH_RANGE`."""
     value = checked_positive(name, eps, " [length units]")
     low, high = LENGTH_RANGE[space_dim, dtype]
     if not low <= value <= high:
@@ -266,9 +253,9 @@ def checked_eps(name: str, eps: float, space_dim: int, dtype: torch.dtype) -> fl
 
 
 def check_scale(eps: float, eps0: float, space_dim: int, dtype: torch.dtype) -> None:
-    """Check that (eps / eps0)^(1+D), a factor of density gradients, is a number of the dtype."""
+    """Check that (eps / eps0)^(1+D), a factor of density gradients, is finite in the dtype."""
     limits = torch.finfo(dtype)
-    # As logarithms: the power of a ratio may be beyond any number.
+    # By logarithms, as the power may overflow.
     scale = (1 + space_dim) * (math.log(eps) - math.log(eps0))
     if not math.log(1e6 * limits.tiny) < scale < math.log(1e-6 * limits.max):
         raise NPAError(
@@ -280,7 +267,7 @@ def check_scale(eps: float, eps0: float, space_dim: int, dtype: torch.dtype) -> 
 def checked_box(
     box: Box, space_dim: int, eps: float | None, dtype: torch.dtype
 ) -> tuple[float, ...] | None:
-    """Return the sides of a box as a tuple of D floats, or None; eps None: its walls reflect."""
+    """Return the sides of a box as D floats, or None for open space; eps None: walls reflect."""
     if box is None:
         return None
     given = entries(box)
@@ -292,7 +279,7 @@ def checked_box(
         raise NPAError(f"box must have {space_dim} sides, got {len(sides)}: {shown(sides)}")
     if eps is None and not all(math.isfinite(side) and side > 0.0 for side in sides):
         raise NPAError(f"box sides must be finite and positive, got {shown(sides)}")
-    # Ten digits of grace: a box of exactly 2 eps must pass however both were rounded.
+    # With a tolerance: a box of exactly 2 eps passes however both were rounded.
     if eps is not None and not all(
         math.isfinite(side) and side >= 2.0 * eps * (1.0 - 1e-10) for side in sides
     ):
@@ -309,13 +296,13 @@ def checked_box(
     return sides
 
 
-# Fields of configurations: each error names field, rule, value and cure.
+# Fields of configurations: each error names the field, the rule, the value and a correction.
 
 
 def check_field(
     config: object, name: str, ok: bool, rule: str, cure: str = "", *, otherwise: object = None
 ) -> None:
-    """Refuse a field that is wrong; without `cure` it shows the default, or `otherwise`."""
+    """Raise unless `ok`; the error ends with `cure`, else the field's default or `otherwise`."""
     if not ok:
         cure = cure or f"for example {name}={getattr(type(config), name, otherwise)!r}"
         raise NPAError(f"{name} must {rule}, got {shown(getattr(config, name))}: {cure}")
@@ -360,7 +347,7 @@ def check_flag(config: object, *names: str) -> None:
 
 
 def check_text(config: object, name: str, what: str) -> None:
-    """Check that a field is text and not empty; the error calls it `what`."""
+    """Check that a field is a non-empty string; the error describes it as `what`."""
     value = getattr(config, name)
     ok = isinstance(value, str) and value != ""
     check_field(config, name, ok, f"be {what}", otherwise="name")
@@ -381,13 +368,13 @@ def is_whole(value: Any) -> TypeGuard[int]:
 
 def is_real(value: Any) -> bool:
     """Return whether `value` is a finite int or float (a bool is not)."""
-    # Compared, not converted: an int may be too large for a float.
+    # Compared, not converted, as an int may be too large for a float.
     real = isinstance(value, int | float) and not isinstance(value, bool)
     return real and -sys.float_info.max <= value <= sys.float_info.max
 
 
 def are_texts(value: Any) -> bool:
-    """Return whether `value` is a tuple of texts, none of them empty."""
+    """Return whether `value` is a tuple of non-empty strings."""
     return isinstance(value, tuple) and all(isinstance(part, str) and part for part in value)
 
 

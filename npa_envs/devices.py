@@ -1,4 +1,4 @@
-"""Devices by name."""
+"""Parsing and checking of device names."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from npa_envs.errors import NPAError, shown
 
 
 def parse_device(name: str) -> torch.device:
-    """Return the device of that name, whether or not this machine has it."""
+    """Return the torch device of a name, without checking that it exists."""
     cure = "use 'cpu', 'cuda' or 'cuda:1'"
     if not isinstance(name, str):
         raise NPAError(f"device must be text, got {shown(name)}: {cure}")
@@ -22,15 +22,15 @@ def parse_device(name: str) -> torch.device:
     elif device.type == "cpu" and name not in ("cpu", "cpu:0"):
         rule = "be 'cpu' without a number"
     elif str(device) != name:
-        # Torch keeps the number in eight bits: "cuda:256" would be the first device.
-        rule = "have a number that torch can count to"
+        # Torch stores the number in eight bits: "cuda:256" would be the first device.
+        rule = "have a number that torch can represent"
     if rule:
         raise NPAError(f"device must {rule}, got {shown(name)}: {cure}")
     return device
 
 
 def check_device(name: str | torch.device) -> torch.device:
-    """Return the device of that name, with its number where it is a CUDA device."""
+    """Return an existing device by name; a CUDA device with its number."""
     device = parse_device(str(name) if isinstance(name, torch.device) else name)
     if device.type != "cuda":
         return device

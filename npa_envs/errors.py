@@ -1,4 +1,4 @@
-"""Errors of the public API: each names the argument, the rule, what came, and the cure."""
+"""Errors of the public API: each names the argument, the rule, the value, and a correction."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import reprlib
 from collections.abc import Iterable
 
 SHOWN_LENGTH = 200
-"""Characters of what came that an error shows, about."""
+"""Largest number of characters of a value in an error, about."""
 
 _brief = reprlib.Repr()
 _brief.maxlevel = 3
@@ -17,11 +17,11 @@ _brief.maxstring = _brief.maxlong = _brief.maxother = SHOWN_LENGTH
 
 
 class NPAError(ValueError):
-    """A mistake in what the caller gave; the message says how to mend it."""
+    """A wrong argument or file; the message says how to correct it."""
 
 
 class LostProcessError(NPAError):
-    """Another process of a run has ended or cannot be reached; it says why, or its launcher."""
+    """Another process of a run has ended or cannot be reached; its own output says why."""
 
 
 class DivergedError(NPAError):
@@ -29,20 +29,20 @@ class DivergedError(NPAError):
 
 
 class UnknownKeywordError(NPAError, TypeError):
-    """A keyword that an environment does not have, worded as Python's own error.
+    """A keyword that an environment does not have, with the type and message of Python's error.
 
-    By that type and those words libraries know that they may leave a keyword out.
+    Libraries recognise them and leave the keyword out.
     """
 
 
 class MissingDependencyError(NPAError, ImportError):
-    """An optional dependency is not installed; the message holds the command that installs it."""
+    """An optional dependency is not installed; the message has the command that installs it."""
 
 
 def shown(value: object) -> str:
-    """Return what came as an error shows it: in about 200 characters, however large it is.
+    """Return a value as text for an error, in about 200 characters.
 
-    Nested values that share parts, numbers of many digits and whole files cost no more than that.
+    The cost is limited too, for nested values that share parts, long numbers and whole files.
     """
     try:
         brief = str(value) if isinstance(value, BaseException) else _brief.repr(value)
@@ -56,7 +56,7 @@ def shown(value: object) -> str:
 
 
 def suggest(name: object, known: Iterable[str]) -> str:
-    """Return the tail of an error about an unknown name: the nearest known one, then all."""
+    """Return the end of an error about an unknown name: the nearest known name, then all."""
     names = sorted(known)
     nearest = difflib.get_close_matches(name, names, n=1) if isinstance(name, str) else []
     hint = f"did you mean {shown(nearest[0])}? " if nearest else ""

@@ -1,9 +1,8 @@
-"""Files that are written whole or not at all, and guards for what is read.
+"""Atomic writing of files, and checks of files before they are read.
 
-Whatever is written goes to a temporary file in the same folder first and is renamed over its
-destination once it is complete and on the disk: a killed program, a full disk, or an error
-half-way leaves the file that was there before. Only regular files are read, of a limited size:
-a pipe or a device would block for ever, and a small file may ask for gigabytes.
+Files are written to a temporary file in the same folder, synchronised to the disk, and renamed: a
+killed program, a full disk or an error leaves the previous file. Only regular files of a limited
+size are read: a pipe or a device would block for ever, and a small file may declare gigabytes.
 """
 
 from __future__ import annotations
@@ -30,11 +29,11 @@ _STEM_BYTES = 100
 _MIB = 2**20
 
 NEARLY_FULL_BYTES = 64 * 1024
-"""A disk with less room counts as full."""
+"""A disk with less free space counts as full."""
 
 
 def checked_path(path: str | Path) -> Path:
-    """Return a path as pathlib's own."""
+    """Return a path as a pathlib.Path, checked."""
     if not isinstance(path, str | os.PathLike):
         raise NPAError(f"a path must be text or a pathlib.Path, got {shown(path)}")
     try:
@@ -42,20 +41,20 @@ def checked_path(path: str | Path) -> Path:
     except UnicodeEncodeError:
         encoded = b"\0"
     if b"\0" in encoded:
-        raise NPAError(f"a path must hold no characters that none may, got {shown(str(path))}")
+        raise NPAError(f"a path must have no null or invalid characters, got {shown(str(path))}")
     return Path(path)
 
 
 def home_path(path: str | Path) -> Path:
-    """Return a path in which a `~` at the beginning is the user's home."""
+    """Return a path with `~` at the beginning replaced by the user's home."""
     return Path(os.path.expanduser(checked_path(path)))
 
 
 def open_regular(path: str | Path, *, limit: int, what: str = "the file") -> IO[bytes]:
-    """Open a regular file to read its bytes; pipes, devices and folders are refused."""
+    """Open a regular file for reading bytes; raise NPAError for pipes, devices and folders."""
     path = checked_path(path)
     try:
-        # Opening a pipe that nobody writes to would block without this flag.
+        # Without this flag, opening a pipe without a writer would block.
         descriptor = os.open(path, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0))
     except OSError as error:
         raise NPAError(_unreadable(f"{what} {shown(str(path))}", error)) from error
@@ -73,7 +72,7 @@ def open_regular(path: str | Path, *, limit: int, what: str = "the file") -> IO[
 
 
 def check_regular(path: str | Path, *, limit: int, what: str = "the file") -> None:
-    """Check a file that a library reads by its path, as `open_regular` does."""
+    """Check a file as `open_regular` does, before a library opens it by its path."""
     open_regular(path, limit=limit, what=what).close()
 
 
@@ -81,7 +80,7 @@ def read_bytes(path: str | Path, *, limit: int, what: str = "the file") -> bytes
     """Return the content of a regular file."""
     with open_regular(path, limit=limit, what=what) as file:
         try:
-            # Some files of the system have more in them than they say.
+            # Some system files contain more than their size says.
             return file.read(limit)
         except OSError as error:
             raise NPAError(_unreadable(f"{what} {shown(str(path))}", error)) from error
@@ -101,27 +100,27 @@ def read_json(path: str | Path, *, limit: int = 16 * _MIB) -> Any:
 
 
 def check_torch_archive(file: IO[bytes], *, checksums: bool = True) -> None:
-    """Check the archive that `torch.save` writes before anything of it is unpacked.
+    """Check an archive of `torch.save` before it is unpacked; torch does not compare checksums.
 
-    Torch neither compresses nor shares entries: an archive whose entries declare more than the file
-    holds would take more memory than it is worth. Torch itself compares no checksums.
+    Torch does not compress entries: one that declares more bytes than the file has is refused, as
+    it could take any amount of memory.
     """
     try:
-        held = file.seek(0, os.SEEK_END)
+        size = file.seek(0, os.SEEK_END)
         with zipfile.ZipFile(file) as archive:
             entries = archive.infolist()
             plain = all(entry.compress_type == zipfile.ZIP_STORED for entry in entries)
             declared = sum(entry.file_size for entry in entries)
-            bad = archive.testzip() if checksums and plain and declared <= held else None
+            bad = archive.testzip() if checksums and plain and declared <= size else None
     except Exception as error:
-        # What zipfile raises depends on where the damage lies.
+        # zipfile raises exceptions of many kinds.
         raise NPAError(
             f"the file is damaged or truncated ({type(error).__name__}): fetch or save it again"
         ) from error
-    if not plain or declared > held:
+    if not plain or declared > size:
         raise NPAError(
             f"the file must not be compressed, but {declared} bytes are declared in a file of "
-            f"{held}: save it with torch.save"
+            f"{size}: save it with torch.save"
         )
     if bad is not None:
         raise NPAError(
@@ -140,17 +139,17 @@ def _unreadable(what: str, error: OSError) -> str:
 def atomic_path(path: str | Path) -> Iterator[Path]:
     """Yield a temporary path to write to, and rename it over `path` when the block succeeds.
 
-    The temporary file lies in the folder of `path` and has the same suffix, so that writers that
-    look at the suffix work. It exists (empty) from the start, so that a folder that cannot be
-    written to is noticed before any work is done. If the block raises, it is removed and `path`
-    stays as it was. A symbolic link is followed: the file that it points to is replaced.
+    The temporary file is in the folder of `path` and has the same suffix, which some writers need.
+    It is created before the block, so that a folder without write permission is noticed first. If
+    the block raises, it is removed and `path` is unchanged. Symbolic links are followed: the file
+    that they point to is replaced.
     """
     given = checked_path(path)
     target = Path(os.path.realpath(given))
     _check_target(given, target)
     temporary = target.with_name(_temporary_name(target, secrets.token_hex(_TOKEN_BYTES)))
     try:
-        # os.open keeps to the umask; the tempfile module would leave files only their owner reads.
+        # os.open respects the umask; files of the tempfile module are private to their owner.
         os.close(os.open(temporary, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o666))
         yield temporary
         _sync(temporary)
@@ -162,11 +161,11 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
     except OSError as error:
         ours = {str(temporary), str(target), str(target.parent)}
         if error.filename is not None and os.fsdecode(error.filename) not in ours:
-            # It concerns another file.
+            # The error is about another file.
             raise
         raise NPAError(_explain(given, error)) from error
     except Exception as error:
-        # Writers in C report a full disk as RuntimeError or an exception of their own.
+        # Writers in C report a full disk by other exceptions.
         if not isinstance(error, NPAError) and _disk_is_full(target.parent):
             raise NPAError(_explain(given, OSError(errno.ENOSPC, str(error)))) from error
         raise
@@ -177,7 +176,7 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
 
 @contextlib.contextmanager
 def made_folder(path: Path) -> Iterator[None]:
-    """Create a folder and its parents where missing; if the block fails, remove the empty ones."""
+    """Create a folder and missing parents; if the block raises, remove those that are empty."""
     missing = [folder for folder in (path, *path.parents) if not folder.exists()]
     try:
         path.mkdir(parents=True, exist_ok=True)
@@ -190,28 +189,27 @@ def made_folder(path: Path) -> Iterator[None]:
 
 
 def remove_unfinished(path: Path) -> None:
-    """Remove the temporary files that killed writes of a file have left in its folder."""
+    """Remove temporary files of a file that interrupted writes have left in its folder."""
     pattern = _temporary_name(path, "[0-9a-f]" * 2 * _TOKEN_BYTES)
     for left in path.parent.glob(pattern):
-        # One that cannot be removed takes up space, and nothing else.
         with contextlib.suppress(OSError):
             left.unlink()
 
 
 def _temporary_name(path: Path, token: str) -> str:
-    # Systems count bytes, not letters.
+    # File systems limit the bytes of a name, not its letters.
     stem = path.stem.encode(errors="ignore")[:_STEM_BYTES].decode(errors="ignore")
     return f".{stem}.{token}.tmp{path.suffix}"
 
 
 def write_bytes(path: str | Path, data: bytes) -> None:
-    """Write `data` to `path`, whole or not at all."""
+    """Write `data` to `path`, completely or not at all."""
     with atomic_path(path) as temporary:
         temporary.write_bytes(data)
 
 
 def write_text(path: str | Path, text: str) -> None:
-    """Write `text` as UTF-8 with plain newlines to `path`, whole or not at all."""
+    """Write `text` as UTF-8 to `path`, completely or not at all; newlines are not changed."""
     write_bytes(path, text.encode("utf-8"))
 
 
@@ -220,7 +218,7 @@ def _check_target(given: Path, target: Path) -> None:
     try:
         if target.is_dir():
             fault = "that is a folder: give the path of a file inside it"
-        # Asked of what was given: a link of the system to a pipe leads to a name that is none.
+        # `given`, not `target`: a system link to a pipe resolves to a name that does not exist.
         elif given.exists() and not given.is_file():
             fault = "that is a pipe or a device, which must not be replaced by a file: give the "
             fault += "path of a file"
@@ -235,8 +233,8 @@ def _check_target(given: Path, target: Path) -> None:
 
 
 def _sync(path: Path) -> None:
-    """Wait until the file or folder is on the disk; a late write error is raised here."""
-    # Windows brings only files that are open for writing to the disk; POSIX opens no folder so.
+    """Synchronise a file or folder to the disk; delayed write errors are raised here."""
+    # Windows requires files to be open for writing; POSIX does not allow that for folders.
     descriptor = os.open(path, os.O_RDONLY if path.is_dir() else os.O_RDWR)
     try:
         os.fsync(descriptor)
@@ -263,7 +261,7 @@ def _explain(given: Path, error: OSError) -> str:
 
 
 def plain_numbers(value: Any) -> Any:
-    """Return a tree of values as JSON has it; numbers that are not finite are None."""
+    """Return nested values as lists and dicts, with None for numbers that are not finite."""
     if isinstance(value, Mapping):
         return {key: plain_numbers(inner) for key, inner in value.items()}
     if isinstance(value, list | tuple):
@@ -272,5 +270,5 @@ def plain_numbers(value: Any) -> Any:
 
 
 def json_text(value: Any) -> str:
-    """Return a tree of values as the text of a JSON file, by `plain_numbers`."""
+    """Return nested values as the text of a JSON file; numbers that are not finite are null."""
     return json.dumps(plain_numbers(value), indent=1, allow_nan=False, ensure_ascii=False) + "\n"

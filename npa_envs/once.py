@@ -1,7 +1,6 @@
-"""What one thread at a time does: making, compiling and loading kernels.
+"""A lock and a cache for making, compiling and loading kernels, by one thread at a time.
 
-Warp's tables of modules and kernels are not made for several threads. What is made once is found
-without the lock from then on.
+Warp's tables of modules and kernels are not thread-safe. Cached objects are found without the lock.
 """
 
 from __future__ import annotations
@@ -16,20 +15,20 @@ P = ParamSpec("P")
 R = TypeVar("R")
 
 alone = threading.RLock()
-"""Held by the thread that makes, compiles or loads kernels."""
+"""Lock of the thread that makes, compiles or loads kernels."""
 
 if hasattr(os, "register_at_fork"):
-    # A forked process has none of its parent's other threads, which would leave a half-made kernel
-    # and the lock held for ever.
+    # A forked process does not have its parent's other threads: one of them could have left a
+    # half-made kernel and the lock.
     os.register_at_fork(
         before=alone.acquire, after_in_parent=alone.release, after_in_child=alone.release
     )
 
 
 def made_once(kept: int | None = None) -> Callable[[Callable[P, R]], Callable[P, R]]:
-    """Return a decorator that caches a function as `functools.lru_cache` does, for all threads.
+    """Return a decorator like `functools.lru_cache(kept)` that calls the function under the lock.
 
-    Threads that call the function at the same time get the same object, of one call.
+    Threads that call it at the same time get the same object.
     """
 
     def decorate(make: Callable[P, R]) -> Callable[P, R]:

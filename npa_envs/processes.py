@@ -1,7 +1,6 @@
-"""Processes over devices: a queue that gives each place one process at a time.
+"""A queue of child processes over devices, each of which runs one process at a time.
 
-What a process does, and what becomes of its results, is its owner's matter. Machines that share a
-disk take parts of the same runs (`part_of`), each with a queue of its own.
+Machines that share a disk can divide the same runs among them (`part_of`), each with its own queue.
 """
 
 from __future__ import annotations
@@ -21,52 +20,52 @@ from typing import Any, TypeVar
 
 from npa_envs.errors import NPAError
 
-LOOK_SECONDS = 0.1
-"""Pause between two looks at the processes [s]."""
+POLL_SECONDS = 0.1
+"""Time between two polls of the processes [s]."""
 
 STOPPING = ("SIGINT", "SIGTERM", "SIGHUP")
-"""Signals that stop a queue: Ctrl-C, a scheduler, a terminal that is closed."""
+"""Signals that stop a queue: from Ctrl-C, a scheduler, a closed terminal."""
 
 
 @dataclass(frozen=True)
 class Places:
-    """Where processes run."""
+    """The slots in which processes run."""
 
     devices: Sequence[str]
-    """Devices, of which each process gets one."""
+    """Devices; each process gets one."""
     jobs: int = 1
-    """Processes at once; they are dealt out over the devices."""
+    """Number of processes at once, distributed over the devices in turn."""
     threads: int = 1
-    """CPU threads of each."""
+    """CPU threads of each process."""
 
     def device(self, number: int) -> str:
-        """Return the device of the process of a number below `jobs`."""
+        """Return the device of slot `number`, below `jobs`."""
         return self.devices[number % len(self.devices)]
 
     @property
     def ahead(self) -> bool:
-        """Whether the next process gets ready during a run: not on CPUs, which it would slow."""
+        """Whether the next process starts early, during a run: not on CPUs, which it would slow."""
         return not any(name.startswith("cpu") for name in self.devices)
 
 
 class Child(ABC):
-    """A process that learns its device once its turn has come."""
+    """A child process, which gets its device when its turn comes."""
 
     @abstractmethod
     def go(self, device: str) -> None:
-        """Let it begin on a device."""
+        """Start its work on a device."""
 
     @property
     @abstractmethod
     def over(self) -> bool:
-        """Whether it has ended by itself, in whatever way."""
+        """Whether the process has ended, successfully or not."""
 
     def stop(self, *, at_once: bool) -> None:  # noqa: B027 - not all have something to save
-        """Ask it to end, without time to save anything if `at_once`; `end` follows and waits."""
+        """Ask the process to end, without saving if `at_once`; does not wait (`end` does)."""
 
     @abstractmethod
     def end(self) -> None:
-        """End it, or wait until it has ended after `stop`, and leave nothing of it."""
+        """End the process, or wait for it after `stop`, and release its resources."""
 
 
 SomeChild = TypeVar("SomeChild", bound=Child)
@@ -80,11 +79,11 @@ def run_children(
     ahead: bool,
     max_seconds: float = math.inf,
 ) -> None:
-    """Run children until none is left; if this is interrupted, all of them are ended.
+    """Run child processes until none is left; an interruption ends all of them.
 
-    All are asked to end before one is waited for. A second signal ends them at once. `start` gets
-    those that are not over, and returns the next one, or None where none is left or can begin yet.
-    With `ahead` as many children start early, which get ready and wait.
+    All are asked to end before the first is waited for; a second signal ends them at once. `start`
+    gets the children that are not over, and returns the next one, or None if none is left or can
+    begin yet. With `ahead`, up to `places.jobs` more children start early and wait for their turn.
     """
     ready, running = deque[SomeChild](), dict[int, SomeChild]()
     until = time.monotonic() + max_seconds
@@ -114,18 +113,18 @@ def run_children(
                     interruption.check()
                 for number, one in list(running.items()):
                     if one.over:
-                        # The same signal may have ended it: then it is to be run again.
+                        # The signal may have ended it too: then it is not finished.
                         interruption.check()
                         del running[number]
                         finished(one)
-                time.sleep(LOOK_SECONDS if running else 0.0)
+                time.sleep(POLL_SECONDS if running else 0.0)
         finally:
-            interruption.came = True  # The next signal acts at once.
+            interruption.came = True  # The next signal raises at once.
             _end([*running.values(), *ready])
 
 
 def _end(children: Sequence[Child]) -> None:
-    """End children: all are asked first, so that they save what they have at the same time."""
+    """End children: all are asked first, so that they save their work at the same time."""
     try:
         for one in children:
             one.stop(at_once=False)
@@ -140,25 +139,25 @@ def _end(children: Sequence[Child]) -> None:
 
 
 class _Interruption:
-    """Signals within a block: the first waits for `check`, the next one acts at once.
+    """Signals within a block: the first raises KeyboardInterrupt in `check`, the next one at once.
 
-    So the first never comes while a process is being started, which nobody would end then. Both
-    raise KeyboardInterrupt. Signals that are ignored, as by nohup, stay so. In a thread other than
-    the main one, where signals cannot be caught, nothing is changed.
+    So the first cannot interrupt the start of a process, which would then never be ended. Ignored
+    signals, as with nohup, stay ignored. In threads other than the main one, where signals cannot
+    be caught, nothing changes.
     """
 
     def __init__(self) -> None:
         self.came = False
-        """Whether the first has come."""
+        """Whether the first signal has come."""
         self._previous: dict[signal.Signals, Any] = {}
 
     def __enter__(self) -> _Interruption:
         if threading.current_thread() is not threading.main_thread():
             return self
         for name in STOPPING:
-            # Not every system has each of them.
+            # Some systems do not have all of them.
             number = getattr(signal, name, None)
-            # None: a handler that is not Python's, which could not be put back.
+            # None: a handler in C, which could not be restored.
             if number is not None and signal.getsignal(number) not in (None, signal.SIG_IGN):
                 self._previous[number] = signal.signal(number, self._note)
         return self
@@ -173,9 +172,9 @@ class _Interruption:
         self.came = True
 
     def check(self) -> None:
-        """Raise KeyboardInterrupt where a signal has come."""
+        """Raise KeyboardInterrupt if a signal has come."""
         if self.came:
-            # A terminal that was closed shows nothing.
+            # Printing to a closed terminal fails.
             with contextlib.suppress(OSError):
                 print("\nending all runs; once more to end them at once", file=sys.stderr)
             raise KeyboardInterrupt
@@ -185,18 +184,17 @@ Item = TypeVar("Item")
 
 
 def part_of(
-    items: Sequence[Item], words: str | None, together: Callable[[Item], Hashable]
+    items: Sequence[Item], part: str | None, together: Callable[[Item], Hashable]
 ) -> list[Item]:
-    """Return the items of one of several machines, as "2/8" says; all of them for None.
+    """Return part K of N of the items, for `part` "K/N" such as "2/8"; None: all of them.
 
-    The order of items is the same on all machines. Items for which `together` is equal belong to
-    the same part.
+    Items must be in the same order on all machines. Items with equal `together` are in one part.
     """
-    if words is None:
+    if part is None:
         return list(items)
-    number, mark, count = words.partition("/")
+    number, mark, count = part.partition("/")
     if not (mark and number.isdecimal() and count.isdecimal() and 1 <= int(number) <= int(count)):
-        raise NPAError(f"part must be K/N with K from 1 to N, got {words!r}: --part 2/8")
+        raise NPAError(f"part must be K/N with K from 1 to N, got {part!r}: --part 2/8")
     groups = list(dict.fromkeys(map(together, items)))
     mine = set(groups[int(number) - 1 :: int(count)])
     return [item for item in items if together(item) in mine]

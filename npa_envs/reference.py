@@ -1,7 +1,7 @@
-"""The SPH operators in plain torch, O(N^2), any floating dtype: the oracle of the tests.
+"""The SPH operators in plain torch, O(N^2), any floating dtype: the reference of the tests.
 
-Everything is written as the formulas of arXiv 2601.16096, section 3, stand; autograd gives the
-adjoints. Memory is B N^2 C D numbers: for a few hundred particles. Positions x [B, N, D], the
+The code follows the formulas of arXiv 2601.16096, section 3; autograd computes the adjoints. It
+allocates B N^2 C D numbers, enough for a few hundred particles. Positions x [B, N, D], the
 perception radius eps and the sides of a periodic box are in length units, states s [B, N, C] are
 dimensionless.
 """
@@ -18,7 +18,7 @@ MOMENT_THRESHOLD = 1e-3
 """Smallest |det M| that is inverted, dimensionless."""
 
 MOMENT_SOFTENING = 1e-2
-"""τ: the smooth inverse is half way between M^-1 and I at this det M, dimensionless."""
+"""τ: the det M at which the smooth inverse is midway between M^-1 and I, dimensionless."""
 
 
 class ReferenceFields(NamedTuple):
@@ -42,7 +42,7 @@ def differences(x: Tensor, box: tuple[float, ...] | None = None) -> Tensor:
 
 
 def reflected(x: Tensor, box: tuple[float, ...]) -> Tensor:
-    """Return positions folded at the walls of a box, a triangle wave of each coordinate."""
+    """Return positions reflected at the walls of a box: a triangle wave of each coordinate."""
     sides = torch.tensor(box, dtype=x.dtype, device=x.device)
     return 0.5 * sides - (torch.remainder(x + 0.5 * sides, 2.0 * sides) - sides).abs()
 
@@ -64,7 +64,7 @@ def spiky_gradient(r: Tensor, eps: float) -> Tensor:
     norm = 30.0 / math.pi / eps**5 if space_dim == 2 else 45.0 / math.pi / eps**6
     squared = (r * r).sum(dim=-1, keepdim=True)
     inside = (squared < eps * eps) & (squared > 0.0)
-    # Masked before dividing: 0 / 0 would reach the gradients even where it is not chosen.
+    # Masked before dividing: gradients of 0 / 0 would be NaN even where it is not chosen.
     distance = torch.where(inside, squared, 1.0).sqrt()
     return torch.where(inside, norm * (eps - distance) ** 2 / distance * r, 0.0)
 
@@ -72,7 +72,7 @@ def spiky_gradient(r: Tensor, eps: float) -> Tensor:
 def log_scale(v: Tensor) -> Tensor:
     """Return L(v) = log(1 + |v|) v / |v| of vectors in the last dimension; 0 at 0."""
     largest = v.detach().abs().amax(dim=-1, keepdim=True)
-    # In units in which its square does not overflow.
+    # Scaled so that the square does not overflow.
     unit = torch.where(largest > 1e18, largest, 1.0)
     v = v / unit
     squared = (v * v).sum(dim=-1, keepdim=True)
@@ -90,12 +90,12 @@ def threshold_inverse(moment: Tensor) -> Tensor:
 
 
 def adjugate(moment: Tensor) -> Tensor:
-    """Return adj M of symmetric matrices M: adj M = det M M^-1 where there is one, [..., D, D]."""
+    """Return the adjugates of symmetric matrices M, det M M^-1 if invertible, [..., D, D]."""
     trace = torch.diagonal(moment, dim1=-2, dim2=-1).sum(dim=-1)[..., None, None]
     unit = torch.eye(moment.shape[-1], dtype=moment.dtype, device=moment.device)
     if moment.shape[-1] == 2:
         return trace * unit - moment
-    # By the theorem of Cayley and Hamilton.
+    # By the Cayley-Hamilton theorem.
     square = moment @ moment
     square_trace = torch.diagonal(square, dim1=-2, dim2=-1).sum(dim=-1)[..., None, None]
     return square - trace * moment + 0.5 * (trace * trace - square_trace) * unit
@@ -176,17 +176,17 @@ def splat(
     pixels = resolution * pixel_size / (hi - lo)
     deviation = sigma * pixels
     radius = math.ceil(patch_sigmas * deviation)
-    place = (x - lo) / (hi - lo) * (resolution - 1)
-    centre = torch.floor(place + 0.5)
+    position = (x - lo) / (hi - lo) * (resolution - 1)
+    centre = torch.floor(position + 0.5)
     patch = torch.arange(-radius, radius + 1, dtype=x.dtype, device=x.device)
     grid = torch.arange(resolution, dtype=x.dtype, device=x.device)
 
-    def gaussian(away: Tensor) -> Tensor:
-        return torch.exp(-0.5 * (away / deviation) ** 2)
+    def gaussian(offset: Tensor) -> Tensor:
+        return torch.exp(-0.5 * (offset / deviation) ** 2)
 
-    patch_sum = gaussian((centre - place)[..., None] + patch).sum(dim=-1).prod(dim=-1)
+    patch_sum = gaussian((centre - position)[..., None] + patch).sum(dim=-1).prod(dim=-1)
     covered = (grid - centre[..., None]).abs() <= radius
-    along = torch.where(covered, gaussian(grid - place[..., None]), 0.0)
+    along = torch.where(covered, gaussian(grid - position[..., None]), 0.0)
     weight = along[..., 1, :, None] * along[..., 0, None, :]
     weight = weight * (pixels * pixels / patch_sum)[..., None, None]
     channels = torch.cat((colour, torch.ones_like(colour[..., :1])), dim=-1)

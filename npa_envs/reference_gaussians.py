@@ -1,7 +1,7 @@
-"""3D Gaussian splatting in plain torch, O(pixels x Gaussians): the oracle of its tests.
+"""3D Gaussian splatting in plain torch, O(pixels x Gaussians): the reference of its tests.
 
-Every Gaussian is weighed at every pixel, without tiles; autograd gives the adjoints. Memory is
-N H W K numbers for a picture.
+Every Gaussian is evaluated at every pixel, without tiles; autograd computes the adjoints. A picture
+allocates N H W K numbers.
 """
 
 from __future__ import annotations
@@ -28,41 +28,42 @@ def rotations(quaternions: Tensor) -> Tensor:
     return torch.stack([torch.stack(row, dim=-1) for row in rows], dim=-2)
 
 
-def seen_colours(coefficients: Tensor, directions: Tensor) -> Tensor:
-    """Return colours [N, 3] of harmonics [N, 4, 3] seen along unit vectors [N, 3]."""
+def directed_colours(coefficients: Tensor, directions: Tensor) -> Tensor:
+    """Return colours [N, 3] of harmonics [N, 4, 3] in viewing directions, unit vectors [N, 3]."""
     x, y, z = directions.unbind(-1)
     basis = torch.stack((torch.full_like(x, HARMONICS[0] / HARMONICS[1]), -y, z, -x), dim=-1)
     return (HARMONICS[1] * torch.einsum("nk,nkc->nc", basis, coefficients) + 0.5).clamp(min=0.0)
 
 
 def projected(
-    places: Tensor,
+    positions: Tensor,
     spreads: Tensor,
     intrinsics: Tensor,
     width: int,
     height: int,
     dilation: float,
 ) -> tuple[Tensor, Tensor]:
-    """Return means [N, 2] and covariances [N, 2, 2] on the picture [pixels, pixels squared].
+    """Return means [N, 2] and covariances [N, 2, 2] in the picture [pixels, pixels squared].
 
-    Means and roots of covariances are in the camera's frame [length units], intrinsics in pixels.
+    `positions` and `spreads`, roots of covariances, are in the camera's frame [length units],
+    intrinsics in pixels.
     """
     focal, middle = intrinsics[:2], intrinsics[2:]
-    depth = places[:, 2:]
-    ratio = places[:, :2] / depth
-    size = torch.tensor([width, height], dtype=places.dtype)
+    depth = positions[:, 2:]
+    ratio = positions[:, :2] / depth
+    size = torch.tensor([width, height], dtype=positions.dtype)
     margin = CLAMP_MARGIN * 0.5 * size / focal
     near_view = ratio.clamp(-middle / focal - margin, (size - middle) / focal + margin)
     jacobian = torch.cat(
         ((focal / depth)[..., None] * torch.eye(2), (-focal * near_view / depth)[..., None]), -1
     )
     root = jacobian @ spreads
-    covariance = root @ root.mT + dilation * torch.eye(2, dtype=places.dtype)
+    covariance = root @ root.mT + dilation * torch.eye(2, dtype=positions.dtype)
     return focal * ratio + middle, covariance
 
 
 def blended(alphas: Tensor, colours: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the sum of colours [H, W, K] and what passes [H, W] of sorted alphas [N, H, W]."""
+    """Return composited colours [H, W, K] and transmittance [H, W] of sorted alphas [N, H, W]."""
     alphas = torch.where(alphas >= SMALLEST_ALPHA, alphas, 0.0)
     after = torch.cumprod(1.0 - alphas, dim=0)
     alphas = torch.where(after >= SMALLEST_PASSING, alphas, 0.0)
@@ -85,29 +86,29 @@ def draw(
     near: float,
     dilation: float = 0.3,
 ) -> tuple[Tensor, Tensor]:
-    """Return one picture [H, W, K], without background, and what passes [H, W].
+    """Return one picture [H, W, K], without background, and its transmittance [H, W].
 
     Arguments are those of `npa_envs.ops.render_gaussians` for one world, with one camera's
     world-to-camera matrix [4, 4] and fx, fy, cx, cy [4].
     """
     rotation, shift = view[:3, :3], view[:3, 3]
-    places = means @ rotation.mT + shift
-    seen = places[:, 2] >= near
-    # Replaced before dividing: what is left out must not reach the gradients as 0 times infinity.
-    places = torch.where(seen[:, None], places, places.new_tensor([0.0, 0.0, 1.0]))
+    positions = means @ rotation.mT + shift
+    visible = positions[:, 2] >= near
+    # Replaced before dividing, so that gradients of hidden ones are not 0 times infinity.
+    positions = torch.where(visible[:, None], positions, positions.new_tensor([0.0, 0.0, 1.0]))
     spreads = rotation @ rotations(quaternions) * scales[:, None, :]
-    centres, covariance = projected(places, spreads, intrinsics, width, height, dilation)
+    centres, covariance = projected(positions, spreads, intrinsics, width, height, dilation)
     if colours.ndim == 3:
         directions = means + rotation.mT @ shift
-        colours = seen_colours(colours, directions / directions.norm(dim=-1, keepdim=True))
+        colours = directed_colours(colours, directions / directions.norm(dim=-1, keepdim=True))
     rows = torch.arange(height, dtype=means.dtype) + 0.5
     columns = torch.arange(width, dtype=means.dtype) + 0.5
     pixels = torch.stack(torch.meshgrid(columns, rows, indexing="xy"), dim=-1)
-    away = pixels - centres[:, None, None, :]
-    power = torch.einsum("nhwi,nij,nhwj->nhw", away, torch.linalg.inv(covariance), away)
+    offset = pixels - centres[:, None, None, :]
+    power = torch.einsum("nhwi,nij,nhwj->nhw", offset, torch.linalg.inv(covariance), offset)
     alphas = (opacities[:, None, None] * torch.exp(-0.5 * power)).clamp(max=LARGEST_ALPHA)
-    alphas = torch.where(seen[:, None, None], alphas, 0.0)
-    order = torch.argsort(places[:, 2].detach(), stable=True)
+    alphas = torch.where(visible[:, None, None], alphas, 0.0)
+    order = torch.argsort(positions[:, 2].detach(), stable=True)
     return blended(alphas[order], colours[order])
 
 

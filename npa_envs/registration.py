@@ -1,6 +1,6 @@
-"""The one table of Gymnasium environments; importing `npa_envs` registers them.
+"""The table of Gymnasium environments; importing `npa_envs` registers them.
 
-Entry points are strings: nothing of torch or Warp is imported before an environment is made.
+Entry points are strings: torch and Warp are not imported before an environment is made.
 """
 
 from __future__ import annotations
@@ -13,42 +13,42 @@ import gymnasium
 
 
 class Registration(NamedTuple):
-    """One environment."""
+    """A row of the table: one environment."""
 
     id: str
-    """What `gym.make` takes."""
+    """Id for `gym.make`."""
 
     module: str
-    """Module of the classes."""
+    """Module of its classes."""
 
     name: str
-    """The single environment's class is this with `Env` behind it, the batched with `VectorEnv`."""
+    """Name of its classes, without the suffixes `Env` and `VectorEnv`."""
 
     max_episode_steps: int
     """Steps after which an episode is truncated."""
 
     keywords: Mapping[str, Any] = MappingProxyType({})
-    """Keywords of the classes, where they are not the usual ones."""
+    """Keywords of the classes that differ from their defaults."""
 
     @property
     def entry_point(self) -> str:
-        """Where the single environment is."""
+        """Entry point of the single environment."""
         return f"{self.module}:{self.name}Env"
 
     @property
     def vector_entry_point(self) -> str:
-        """Where the batched environment is."""
+        """Entry point of the batched environment."""
         return f"{self.module}:{self.name}VectorEnv"
 
 
 def _row(name: str, steps: int, size: str = "", **keywords: Any) -> Registration:
-    """Return the row of an environment, or of a form of it that has another size."""
+    """Return the row of an environment, or of a variant of another size."""
     module = f"npa_envs.envs.{MODULES.get(name, name.lower())}"
     return Registration(f"npa/{name}{size}-v0", module, name, steps, MappingProxyType(keywords))
 
 
 MODULES = {"PointClassification": "point_classification"}
-"""Modules of environments whose names are not those of the classes in small letters."""
+"""Modules whose names are not those of their classes in lower case."""
 
 ENVIRONMENTS = (
     _row("Morphogenesis2D", 256),
@@ -58,13 +58,14 @@ ENVIRONMENTS = (
     _row("Morphogenesis3D", 128),
     _row("Pictures2D", 256),
 )
-"""Where an action has a row for each particle. A change of behaviour is a new version of the id."""
+"""Environments with an action for each particle. A change of behaviour is a new version of the
+id."""
 
 GARDENS = (_row("Gardener2D", 32), _row("Shepherd2D", 32))
-"""Where a trained rule runs the particles, and an action says what few brushes do."""
+"""Environments in which a trained rule runs the particles and actions control a few brushes."""
 
 CODED = (_row("Shapeshifter2D", 64),)
-"""Where a trained rule of many pictures runs the particles, and an action is a code."""
+"""Environments in which a rule of many pictures runs the particles and actions are codes."""
 
 _GUSTS = {"push_length": 0.1, "gust_chance": 0.5, "gust_radius": 0.6, "blight_chance": 0.25}
 
@@ -72,7 +73,7 @@ SMALL = (
     _row("Gardener2D", 32, "Small", particle_count=256, **_GUSTS),
     _row("Shepherd2D", 32, "Small", particle_count=256),
 )
-"""Gardens with few particles and few numbers to act by, never changed under the same version."""
+"""Gardens with few particles; their settings never change under the same version."""
 
 
 GARDEN_IDS = tuple(
@@ -84,7 +85,7 @@ GARDEN_IDS = tuple(
 _STATES: Mapping[str, Any] = {"state_dim": 4, "state_scale": 0.1}
 
 _FEW: Mapping[str, Any] = {"particle_count": 64, **_STATES, "eps": 0.2}
-"""What small worlds have in common."""
+"""Keywords of all small worlds."""
 
 _SMALL_PICTURE: Mapping[str, Any] = {**_FEW, "colour_weight": 20.0}
 
@@ -108,18 +109,18 @@ SIZES = (
     _row("PointClassification", 64, "Large", particle_count=2048),
     _row("Morphogenesis3D", 256, "Large", particle_count=4096),
 )  # fmt: skip
-"""Worlds of few particles, in which PPO learns within minutes on a laptop, and of many, for a GPU.
-Settings are never changed under the same version."""
+"""Variants with few particles, in which PPO learns within minutes on a laptop, and with many, for a
+GPU. Settings never change under the same version."""
 
 ALL = (*ENVIRONMENTS, *GARDENS, *CODED, *SMALL, *SIZES)
-"""All that Gymnasium knows."""
+"""All rows that are registered with Gymnasium."""
 
 
 class SpeciesRegistration(NamedTuple):
-    """One size of a task of several species, for PettingZoo and for batches."""
+    """A variant of a task of several species, for PettingZoo and for batches."""
 
     id: str
-    """What `pettingzoo.make` and `npa_envs.envs.multispecies_v0.batched` take."""
+    """Id for `pettingzoo.make` and `npa_envs.envs.multispecies_v0.batched`."""
 
     task: str
     """A name from `npa_envs.envs.multi.TASKS`."""
@@ -129,7 +130,7 @@ class SpeciesRegistration(NamedTuple):
 
     @property
     def max_episode_steps(self) -> int:
-        """Steps after which an episode is cut off."""
+        """Steps after which an episode is truncated."""
         steps: int = self.keywords["max_cycles"]
         return steps
 
@@ -141,7 +142,7 @@ SPECIES = {
     "npa/Invasion-v0": "invasion",
     "npa/Symbiosis-v0": "symbiosis",
 }
-"""Tasks of several species by the ids that `pettingzoo.make` takes."""
+"""Ids for `pettingzoo.make` -> tasks of several species."""
 
 
 _PERCEIVED: Mapping[str, Any] = {"perception": "per_species", "max_cycles": 32}
@@ -185,11 +186,11 @@ SPECIES_SIZES = tuple(
         ("Invasion", _INVASIONS),
     )
 )
-"""The same for tasks of several species. The opponent of an invasion is fixed."""
+"""Variants of the tasks of several species. The opponent of an invasion is fixed."""
 
 
 def register_environments() -> None:
-    """Put the table into Gymnasium's registry; what is there already is left as it is."""
+    """Register the table with Gymnasium; ids that are registered already are skipped."""
     for environment in ALL:
         if environment.id not in gymnasium.registry:
             gymnasium.register(

@@ -1,4 +1,4 @@
-"""Warp's runtime: its quiet start, its devices and its kernel cache."""
+"""Warp's runtime: its start, its devices and its kernel cache."""
 
 from __future__ import annotations
 
@@ -23,31 +23,31 @@ except ImportError:  # Windows
     fcntl = None  # type: ignore[assignment]
 
 _NO_DRIVER = b"Could not find or load the NVIDIA CUDA driver"
-"""What Warp's native code says on every computer without such a card; `npa-envs doctor`, too."""
+"""Message of Warp's native code on computers without an NVIDIA GPU (`npa-envs doctor` has it)."""
 
 _BROKEN_CACHE = ("Failed to load CPU", "Failed to load CUDA")
-"""How what Warp says about object files that it cannot load begins."""
+"""First words of Warp's errors about object files that it cannot load."""
 
 
 @contextlib.contextmanager
 def quiet_warp() -> Iterator[None]:
-    """Keep Warp's banner and its notes on loading modules out of the caller's output."""
+    """Suppress Warp's banner and its messages on loading modules; explain errors of its cache."""
     level = wp.config.log_level
     wp.config.log_level = max(level, wp.LOG_WARNING)
     try:
         yield
     except Exception as error:
-        # Its descriptions of object files are JSON.
+        # Warp describes object files by JSON files.
         of_cache = isinstance(error, OSError | json.JSONDecodeError)
         if not of_cache and not str(error).startswith(_BROKEN_CACHE):
             raise
-        # A second try names the version twice in the configuration.
+        # The error's own name, as a second try repeats the version in the configuration.
         folder = getattr(error, "filename", None) or wp.config.kernel_cache_dir
         folder = folder or os.environ.get("WARP_CACHE_PATH", "Warp's cache")
         raise NPAError(
-            "Warp's cache of compiled kernels must be a folder that can be written to, and whole, "
+            "Warp's cache of compiled kernels must be an intact folder that can be written to, "
             f"but {shown(str(folder))} cannot be used ({shown(error)}): remove it, and kernels are "
-            "compiled anew, or set WARP_CACHE_PATH to another folder"
+            "compiled again, or set WARP_CACHE_PATH to another folder"
         ) from error
     finally:
         wp.config.log_level = level
@@ -55,31 +55,31 @@ def quiet_warp() -> Iterator[None]:
 
 @contextlib.contextmanager
 def without_line(unwanted: bytes) -> Iterator[None]:
-    """Keep a line out of what native code writes to standard error in the block."""
+    """Remove lines with `unwanted` from what native code writes to standard error in the block."""
     try:
         own = os.dup(2)
-    except OSError:  # There is none.
+    except OSError:  # There is no standard error.
         yield
         return
-    with tempfile.TemporaryFile() as told:
-        os.dup2(told.fileno(), 2)
+    with tempfile.TemporaryFile() as written:
+        os.dup2(written.fileno(), 2)
         try:
             yield
         finally:
             os.dup2(own, 2)
             os.close(own)
-            told.seek(0)
-            for line in told:
+            written.seek(0)
+            for line in written:
                 if unwanted not in line:
                     os.write(2, line)
 
 
 @made_once()
 def start_warp() -> None:
-    """Start Warp, quietly; does nothing from the second call on."""
+    """Start Warp without output; later calls do nothing."""
     with without_line(_NO_DRIVER), quiet_warp():
         wp.init()  # type: ignore[no-untyped-call]
-    # Handlers go in the reverse order: the one that warns has to be there before this one.
+    # Exit handlers run in reverse order: the one that warns must be registered first.
     weakref.finalize(wp, int).detach()
     atexit.register(_remove_header_folders)
 
@@ -88,35 +88,34 @@ def start_warp() -> None:
 def in_turn(module: str) -> Iterator[None]:
     """Let one process at a time compile or load a module of kernels, within the block.
 
-    Of many that start together, on one computer or on several that share a folder, the first one
-    compiles. The others wait, and load what it has left. The system frees the lock of a process
-    that ends in whatever way. Where it has no such locks, or the cache cannot be written to, each
-    process does all by itself.
+    Of several processes, on one computer or on several that share a folder, the first compiles; the
+    others wait and load the result. The system releases the lock when a process ends, in any way.
+    Without such locks, or if the cache cannot be written to, every process compiles.
     """
-    with contextlib.ExitStack() as held:
+    with contextlib.ExitStack() as stack:
         with contextlib.suppress(OSError):
             lock = (kernel_cache_folder() / f"{module}.lock").open("a", encoding="utf-8")
-            held.enter_context(lock)
+            stack.enter_context(lock)
             if fcntl is not None:
                 fcntl.flock(lock, fcntl.LOCK_EX)
         yield
 
 
 def _remove_header_folders() -> None:
-    """Remove Warp's folders of precompiled headers: left to the interpreter, that warns of them."""
+    """Remove Warp's folders of precompiled headers, of which the interpreter would warn."""
     runtime = getattr(sys.modules.get("warp._src.context"), "runtime", None)
     for folder in getattr(runtime, "_pch_dirs", {}).values():
         folder.cleanup()
 
 
 def warp_devices() -> list[str]:
-    """Return one line for each device that Warp sees; starts Warp, quietly."""
+    """Return one line for each of Warp's devices; starts Warp."""
     start_warp()
     return [f"{device.alias}: {device.name}" for device in wp.get_devices()]
 
 
 def kernel_cache_folder() -> Path:
-    """Return the folder that compiled kernels are kept in; starts Warp, quietly."""
+    """Return the folder of compiled kernels; starts Warp."""
     start_warp()
     folder = wp.config.kernel_cache_dir
     assert folder is not None, "Warp sets its cache folder when it starts"

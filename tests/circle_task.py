@@ -6,9 +6,10 @@ import torch
 from torch import Tensor
 
 from npa_envs.rule.rule import NPARule
-from npa_envs.tasks.base import ParticleTask, Worlds
+from npa_envs.tasks.base import ParticleTask
 from npa_envs.tasks.morphogenesis2d import Morphogenesis2DConfig
 from npa_envs.training import TrainConfig
+from npa_envs.world.particles import Particles
 from npa_envs.world.rollout import Memory
 
 PARTICLE_COUNT = 12
@@ -35,16 +36,17 @@ class CircleTask(ParticleTask):
                 parameter.uniform_(-0.1, 0.1, generator=generator)
         return rule
 
-    def seed(self, world_count: int, *, generator: torch.Generator, device: torch.device) -> Worlds:
+    def seed(
+        self, world_count: int, *, generator: torch.Generator, device: torch.device
+    ) -> Particles:
         x = torch.rand(world_count, PARTICLE_COUNT, 2, generator=generator, device=device)
         s = torch.zeros(world_count, PARTICLE_COUNT, STATE_DIM, device=device)
-        return 0.4 * x - 0.2, s, None
+        return Particles(0.4 * x - 0.2, s)
 
-    def damage(
-        self, x: Tensor, s: Tensor, goal: Tensor | None, generator: torch.Generator
-    ) -> Worlds:
+    def damage(self, worlds: Particles, generator: torch.Generator) -> Particles:
+        s = worlds.s
         blank = torch.rand(s.shape[:2], generator=generator, device=s.device) < 0.2
-        return x, s.masked_fill(blank[..., None], 0.0), goal
+        return worlds._replace(s=s.masked_fill(blank[..., None], 0.0))
 
     def loss(self, x: Tensor, s: Tensor, path_length: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
         self.loss_calls += 1

@@ -22,9 +22,10 @@ from npa_envs.envs.multi.task import Population, SpeciesConfig, SpeciesTask
 from npa_envs.errors import NPAError, shown
 from npa_envs.rule.network import FoldedRule
 from npa_envs.rule.rule import NPARule
-from npa_envs.tasks.base import ParticleTask, Worlds
+from npa_envs.tasks.base import ParticleTask
 from npa_envs.tasks.train_config import TrainConfig
 from npa_envs.training.cycle import TrainingCycle
+from npa_envs.world.particles import Particles
 from npa_envs.world.randomness import Randomness, WorldRandom
 from npa_envs.world.rollout import Memory
 
@@ -170,14 +171,14 @@ class EnvironmentTask(ParticleTask[Any]):
 
     def seed(
         self, world_count: int, *, generator: Randomness, device: str | torch.device = "cpu"
-    ) -> Worlds:
+    ) -> Particles:
         """Return the first worlds of episodes, with their goals, if any."""
         if isinstance(generator, WorldRandom):
             keys = generator.integers(KEY_RANGE[1])
         else:
             keys = torch.randint(*KEY_RANGE, (world_count,), generator=generator, device=device)
         x, s, *rest = self.inner.start(WorldRandom.from_keys(keys))
-        return x, s, rest[1] if rest else None
+        return Particles(x, s, goal=rest[1] if rest else None)
 
     def toward(self, goal: Tensor | None) -> Self:
         """Return a copy of the task whose losses are for these goals, shape [B]."""

@@ -138,8 +138,8 @@ class PPOLearner:
     ) -> None:
         self.options, self.pace, self.ranks = options, options.pace(start), ranks
         total = problem.num_envs if options.worlds is None else options.worlds
-        ranks.check_dealt("worlds", total)
-        indices = ranks.places(total)
+        ranks.check_even("worlds", total)
+        indices = ranks.indices(total)
         self.envs = problem.make_envs(
             len(indices),
             device=device,

@@ -131,8 +131,8 @@ class SHACLearner:
         ranks: Ranks = ALONE,
     ) -> None:
         self.options, self.device, self.ranks = options, device, ranks
-        ranks.check_dealt("world_count", options.world_count)
-        indices = ranks.places(options.world_count)
+        ranks.check_even("world_count", options.world_count)
+        indices = ranks.indices(options.world_count)
         self.rules = zero_output_rules(problem, seed, start).to(device)
         count = -(-problem.episode_steps // options.steps)
         self.window = -(-problem.episode_steps // count)
@@ -224,8 +224,7 @@ class SHACLearner:
         random = self.random
         if isinstance(random, WorldRandom):
             random = random.take(torch.tensor(worlds, device=self.device))
-        x, s, goal = self.task.seed(len(worlds), generator=random, device=self.device)
-        return Particles(x, s, goal=goal)
+        return self.task.seed(len(worlds), generator=random, device=self.device)
 
     def gain(self, window: StepWindow) -> Tensor:
         """Return the rules' objective: discounted rewards plus the value at the end, averaged."""

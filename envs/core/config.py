@@ -211,7 +211,7 @@ class WorldConfig:
                 raise UnknownKeywordError(f"got an unexpected keyword argument {name!r}: {hint}")
         return cls(**{name: plain(value) for name, value in keywords.items()})
 
-    def task_config(self, config_type: type[TaskConfig], **changes: Any) -> TaskConfig:
+    def as_config(self, config_type: type[TaskConfig], **changes: Any) -> TaskConfig:
         """Return a training task's configuration, which takes and checks the shared fields."""
         names = [field.name for field in fields(config_type)]  # type: ignore[arg-type]
         shared = {name: getattr(self, name) for name in names if hasattr(self, name)}

@@ -290,23 +290,23 @@ class EnvTask(WorldTask[Config]):
 class TargetEnvTask(EnvTask[Config]):
     """A task with the targets and losses of a training task of `npa_envs.tasks`."""
 
-    goal: Any
+    task: Any
     """The training task."""
 
     def seed(self, random: WorldRandom) -> tuple[Tensor, Tensor]:
         """Return the training task's initial worlds, all states zero."""
-        x, s, _ = self.goal.seed(random.world_count, generator=random, device=self.device)
+        x, s, *_ = self.task.seed(random.world_count, generator=random, device=self.device)
         return x, s
 
     def toward(self, goal: Tensor) -> Self:
         """Return a task whose losses are for worlds of these goals."""
         goal_task = copy.copy(self)
-        goal_task.goal = self.goal.toward(goal)
+        goal_task.task = self.task.toward(goal)
         return goal_task
 
     def particle_losses(self, x: Tensor, s: Tensor) -> Tensor:
         """Return the training task's loss of each particle."""
-        shares: Tensor = self.goal.particle_shares(x, s)
+        shares: Tensor = self.task.particle_shares(x, s)
         return shares
 
 

@@ -201,7 +201,7 @@ class GardenTask(RuleDriven, GrownTask[Config]):
         constants = {"eps0": config.eps0, "moment_inverse": config.moment_inverse}
         check_runs(self.rule, alpha=config.alpha, **constants)
         self.rule.requires_grad_(False)
-        self.deficit = TargetDeficit(grid_places(config, device), self.goal.target, config)
+        self.deficit = TargetDeficit(grid_places(config, device), self.task.target, config)
         """Difference between the target and worlds at the places of the grid."""
 
     @classmethod
@@ -251,7 +251,7 @@ class GardenTask(RuleDriven, GrownTask[Config]):
 
     def middle(self, x: Tensor) -> Tensor:
         """Return the origin of brushes' places: the mean position minus the target's, [B, 2]."""
-        return world_mean(x) - self.goal.target.points.mean(dim=0)
+        return world_mean(x) - self.task.target.points.mean(dim=0)
 
     def observe(self, x: Tensor, s: Tensor, loss: Tensor, context: Tensor) -> Tensor:
         """Return observations, shape [B, O], in the form that `observe` names."""
@@ -267,7 +267,7 @@ class GardenTask(RuleDriven, GrownTask[Config]):
         A coarse pixel is the mean of pixels of the picture that the loss compares. `observe_error`
         adds four channels: the target's picture minus this one.
         """
-        picture, target = self.goal.picture(x, s), self.goal.target_picture
+        picture, target = self.task.picture(x, s), self.task.target_picture
         if self.config.observe_error:
             picture = torch.cat((picture, target - picture), dim=-1)
         pixels = self.config.resolution // self.config.picture_size

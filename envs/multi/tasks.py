@@ -107,13 +107,13 @@ class PictureLossConfig(SpeciesConfig):
     def __post_init__(self) -> None:
         """Check every field."""
         super().__post_init__()
-        _ = self.goal()
+        _ = self.task_config()
 
-    def goal(
+    def task_config(
         self, target: str = Morphogenesis2DConfig.target, particle_count: int = 1
     ) -> Morphogenesis2DConfig:
         """Return the training task's configuration for a target and a number of particles."""
-        return self.task_config(
+        return self.as_config(
             Morphogenesis2DConfig,
             target=target,
             target_point_count=particle_count,
@@ -130,7 +130,7 @@ class OnePictureConfig(PictureLossConfig):
     def __post_init__(self) -> None:
         """Check every field."""
         super().__post_init__()
-        _ = self.goal(self.target)
+        _ = self.task_config(self.target)
 
 
 class PictureLossTask(SpeciesTask):
@@ -138,20 +138,20 @@ class PictureLossTask(SpeciesTask):
 
     def __init__(self, config: Any, device: torch.device, *pictures: tuple[str, int]) -> None:
         super().__init__(config, device)
-        self.goals = [Morphogenesis2D(config.goal(*picture), device=device) for picture in pictures]
+        self.tasks = [Morphogenesis2D(config.task_config(*picture), device=device) for picture in pictures]
         """Training tasks, with target and loss, of each picture."""
-        self.goal = self.goals[0]
+        self.task = self.tasks[0]
         """The first of them, whose target scripted policies use."""
 
     def picture_parts(self, k: int, x: Tensor, s: Tensor) -> dict[str, Tensor]:
         """Return density error and weighted colour error against picture k, shape [B] each."""
-        density, colour = self.goals[k].splat_losses(x, s)
+        density, colour = self.tasks[k].splat_losses(x, s)
         return {"density": density, "colour": self.config.colour_weight * colour}
 
     @property
     def pixel_size(self) -> float:
         """Size of a particle in pictures: the spacing of the first target's points."""
-        return self.goal.target.pixel_size
+        return self.task.target.pixel_size
 
     @property
     def open_half_width(self) -> float:
@@ -184,7 +184,7 @@ class CoMorphogenesisConfig(PictureLossConfig):
             )
 
     @property
-    def goals(self) -> tuple[str, ...]:
+    def grown(self) -> tuple[str, ...]:
         """Target of each species."""
         return self.targets or self._usual
 
@@ -200,7 +200,7 @@ class CoMorphogenesisTask(PictureLossTask):
     least_species = 1
 
     def __init__(self, config: CoMorphogenesisConfig, device: torch.device) -> None:
-        super().__init__(config, device, *zip(config.goals, config.counts, strict=True))
+        super().__init__(config, device, *zip(config.grown, config.counts, strict=True))
 
     def losses(self, population: Population) -> Mapping[str, Tensor]:
         """Return the density error and the weighted colour error of each species' picture."""
@@ -209,7 +209,7 @@ class CoMorphogenesisTask(PictureLossTask):
 
     def particle_losses(self, population: Population) -> Mapping[str, Tensor]:
         """Return each particle's part of its species' splat loss."""
-        losses = [self.goals[k].particle_shares(*population.of(k)) for k in _present(population)]
+        losses = [self.tasks[k].particle_shares(*population.of(k)) for k in _present(population)]
         return {"picture": torch.cat(losses, dim=1)}
 
 
@@ -257,7 +257,7 @@ class InvasionTask(PictureLossTask):
 
     def particle_losses(self, population: Population) -> Mapping[str, Tensor]:
         """Return parts of species 0's splat loss, and minus an equal part for each invader."""
-        own = self.goal.particle_shares(*population.of(0))
+        own = self.task.particle_shares(*population.of(0))
         own_count, other_count = own.shape[1], sum(population.counts[1:])
         part = world_mean(own[..., None])[:, 0] * (-own_count / max(other_count, 1))
         return {"picture": torch.cat((own, part[:, None].expand(-1, other_count)), dim=1)}
@@ -305,7 +305,7 @@ class SymbiosisTask(PictureLossTask):
 
     def particle_losses(self, population: Population) -> Mapping[str, Tensor]:
         """Return each particle's part of the splat loss."""
-        return {"picture": self.goal.particle_shares(population.x, population.s)}
+        return {"picture": self.task.particle_shares(population.x, population.s)}
 
     # There is one picture, in the middle.
     open_half_width = SpeciesTask.open_half_width

@@ -78,12 +78,12 @@ def grow_and_heal(options: DemoOptions, device: torch.device) -> Iterator[str]:
     from npa_envs.measure.quality import measure
     from npa_envs.rule.files import load_rule
     from npa_envs.tasks.damage import DamageEvent
-    from npa_envs.training.trained_tasks import task_of_rule
+    from npa_envs.training.task_of_rule import task_of_rule
 
     rule = load_rule(options.rule, device=device).float()
     trained = task_of_rule(options.rule, rule, device)
     generator = torch.Generator(device).manual_seed(options.seed)
-    x, s, goal = trained.task.seed(1, generator=generator, device=device)
+    x, s, _, goal = trained.task.seed(1, generator=generator, device=device)
     task = trained.task.toward(goal)
     yield f"{options.rule}: {x.shape[1]} particles, {rule.weight_count} weights"
     figures, film, step = [], WorldFilm(), 0
@@ -139,7 +139,7 @@ def train_small(options: DemoOptions, device: torch.device) -> Iterator[str]:
     # Figures and film have more pixels than the loss.
     task = task_entry(task_name).make(override(config, resolution=192).task, device)
     generator = torch.Generator(device).manual_seed(options.seed + 1)
-    x, s, _ = task.seed(1, generator=generator, device=device)
+    x, s, *_ = task.seed(1, generator=generator, device=device)
     steps = 4 * config.steps[1]
     x, s, film = film_world(result.rule, task, x, s, steps, generator=generator, every=1)
     yield f"  grown for {steps} steps: {measure(task, x, s, steps).figures}"

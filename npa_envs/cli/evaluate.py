@@ -50,7 +50,7 @@ def main(arguments: Sequence[str]) -> int:
     from npa_envs.measure.judge import TextureJudge
     from npa_envs.measure.record import UNMEASURED, table_text, tables_json
     from npa_envs.rule.files import load_rule
-    from npa_envs.training.trained_tasks import task_of_rule, tasks_of_codes
+    from npa_envs.training.task_of_rule import task_of_rule, tasks_of_codes
 
     checkpoints = options.checkpoints or quality.CHECKPOINTS
     quality.check_steps("checkpoints", checkpoints)

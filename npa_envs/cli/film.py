@@ -28,7 +28,7 @@ from npa_envs.render import (
 )
 from npa_envs.rule.rule import NPARule
 from npa_envs.tasks.damage import DamageEvent, damage_worlds
-from npa_envs.training.trained_tasks import task_of_rule
+from npa_envs.training.task_of_rule import task_of_rule
 
 if TYPE_CHECKING:
     from npa_envs.tasks.base import Task

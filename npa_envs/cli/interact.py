@@ -152,7 +152,7 @@ def _rules(sources: Sequence[str], device: torch.device) -> list[RuleUnderTest]:
     """Return the rules with their tasks, each under a different name."""
     from npa_envs.measure.interaction import RuleUnderTest
     from npa_envs.rule.files import load_rule
-    from npa_envs.training.trained_tasks import task_of_rule
+    from npa_envs.training.task_of_rule import task_of_rule
 
     rules: dict[str, RuleUnderTest] = {}
     for source in dict.fromkeys(sources):

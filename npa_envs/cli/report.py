@@ -36,7 +36,7 @@ from npa_envs.measure.record import (
 from npa_envs.rule.files import load_rule
 from npa_envs.tasks.damage import DamageEvent
 from npa_envs.tasks.texture import Texture
-from npa_envs.training.trained_tasks import task_of_rule, tasks_of_codes
+from npa_envs.training.task_of_rule import task_of_rule, tasks_of_codes
 
 if TYPE_CHECKING:
     from npa_envs.rule.rule import NPARule
@@ -100,7 +100,7 @@ def write_report(
             judge=judge,
         )
         generator = torch.Generator(device).manual_seed(FIRST_SEED)
-        x, s, _ = task.seed(1, generator=generator, device=device)
+        x, s, *_ = task.seed(1, generator=generator, device=device)
         shown = large_task(task, str(path), rule, device)
         x, s, film = film_world(
             rule,

@@ -67,7 +67,7 @@ def main(arguments: Sequence[str]) -> int:
     from npa_envs.tasks.damage import parse_damage
     from npa_envs.tasks.point_classification import PointClassification, majority
     from npa_envs.training.run import stop_flag
-    from npa_envs.training.trained_tasks import task_of_rule
+    from npa_envs.training.task_of_rule import task_of_rule
 
     device = options.checked_device()
     damages = [parse_damage(text) for texts in options.damage for text in texts]
@@ -85,7 +85,7 @@ def main(arguments: Sequence[str]) -> int:
     shown = film.large_task(task, options.rule, rule, device, **looks, **options.world)
     folder = common.writable_folder(options.out)
     generator = torch.Generator(device).manual_seed(options.seed)
-    x, s, goal = task.seed(1, generator=generator, device=device)
+    x, s, _, goal = task.seed(1, generator=generator, device=device)
     task = task.toward(goal)
     with stop_flag() as stop, common.StepBar(options.steps, show=options.progress) as bar:
         x, s, filmed = film.film_world(

@@ -528,7 +528,7 @@ def grown(
             task.seed(len(seeds), generator=WorldRandom(seeds, device=device), device=device)
             for task in some
         ]
-        x, s = torch.cat([x for x, *_ in fresh]), torch.cat([s for _, s, _ in fresh])
+        x, s = torch.cat([one.x for one in fresh]), torch.cat([one.s for one in fresh])
         random = WorldRandom([*seeds] * len(some), device=device)
         for kept, step, before in zip(found, checkpoints, (0, *checkpoints), strict=False):
             x, s = run_worlds(rule, some[0], x, s, step - before, random)

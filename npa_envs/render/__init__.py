@@ -1,6 +1,6 @@
 """Pictures and films of particle worlds, and a window that shows them.
 
-Wrong arguments and files that cannot be written raise an `NPAError`.
+Wrong arguments and files that cannot be written raise NPAError.
 """
 
 from npa_envs.render.colours import to_uint8

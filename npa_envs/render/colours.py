@@ -18,7 +18,7 @@ Background = str | tuple[float, float, float]
 
 
 def to_uint8(picture: Tensor, background: Background = "white") -> NDArray[np.uint8]:
-    """Return splatted colours over a background as pixels, with y upwards.
+    """Return pixels of splatted pictures over a background, with y upwards.
 
     Colours are averaged where the density is above 1, and mixed with the background where it is
     below 1. Pixels that are not finite are background.
@@ -77,29 +77,29 @@ def background_colour(background: Background) -> tuple[float, float, float]:
     return channels[0], channels[1], channels[2]
 
 
-# Densities have an even ramp, states a fixed map, both in OKLab (B. Ottosson, 2020), whose
-# distances are about those that the eye perceives.
+# Colours of densities (a ramp) and of states, in OKLab (B. Ottosson, 2020), whose distances are
+# about perceptual.
 
 RAMP_STOPS = ("#2a1858", "#792a86", "#cc4a70", "#f2985f", "#fbe6bd")
 """The ramp's colours from dark to light; reversed over a light background."""
 
 RAMP_LENGTH = 1024
-"""Entries of a ramp's table."""
+"""Number of colours of a ramp."""
 
 LIGHT_BACKGROUND = 0.6
 """OKLab lightness of backgrounds above which a ramp gets darker with density."""
 
 GOLDEN_ANGLE = math.pi * (3.0 - math.sqrt(5.0))
-"""Angle between the hues of successive channels, which spreads any number over the circle."""
+"""Angle between the hues of successive channels, which spreads any number of hues evenly."""
 
 STATE_LIGHTNESS = (0.67, 0.2)
-"""OKLab lightness of a blank particle, and the most that a state changes it."""
+"""OKLab lightness of a particle with zero states, and its largest change by states."""
 
 STATE_CHROMA = 0.16
-"""Largest OKLab chroma of a state along each of the two axes."""
+"""Largest OKLab a and b of a state."""
 
 STATE_GAIN = 2.8
-"""Inverse of a usual state's size, for the argument of tanh (dimensionless)."""
+"""Factor on states in the argument of tanh (dimensionless)."""
 
 _LMS_FROM_RGB = (
     (0.4122214708, 0.5363325363, 0.0514459929),
@@ -126,10 +126,10 @@ _RGB_FROM_LMS = (
 def density_colours(density: Tensor, background: tuple[float, float, float]) -> NDArray[np.uint8]:
     """Return the ramp's colours, [..., 3], of finite densities [...] of 0 or more (dimensionless).
 
-    Density 0 is the background, 1 the middle of the ramp; crowding nears its end.
+    Density 0 is the background, 1 the middle of the ramp; larger densities tend to its end.
     """
-    share = 1.0 - torch.exp2(-density.clamp(min=0.0))
-    entry = (share * (RAMP_LENGTH - 1)).round().to(torch.int32).cpu().numpy()
+    position = 1.0 - torch.exp2(-density.clamp(min=0.0))
+    entry = (position * (RAMP_LENGTH - 1)).round().to(torch.int32).cpu().numpy()
     colours: NDArray[np.uint8] = ramp(background)[entry]
     return colours
 
@@ -142,9 +142,9 @@ def ramp(background: tuple[float, float, float]) -> NDArray[np.uint8]:
     if first[0, 0] > LIGHT_BACKGROUND:
         stops.reverse()
     knots = torch.cat([first, oklab(torch.tensor(stops, dtype=torch.float64))]).numpy()
-    walked = np.cumsum([0.0, *np.linalg.norm(np.diff(knots, axis=0), axis=1)])
-    places = np.linspace(0.0, walked[-1], RAMP_LENGTH)
-    lab = np.stack([np.interp(places, walked, knots[:, k]) for k in range(3)], axis=1)
+    lengths = np.cumsum([0.0, *np.linalg.norm(np.diff(knots, axis=0), axis=1)])
+    positions = np.linspace(0.0, lengths[-1], RAMP_LENGTH)
+    lab = np.stack([np.interp(positions, lengths, knots[:, k]) for k in range(3)], axis=1)
     colours = (srgb(torch.from_numpy(lab)) * 255).round().to(torch.uint8).numpy()
     # The cached array must not change.
     colours.setflags(write=False)
@@ -154,13 +154,13 @@ def ramp(background: tuple[float, float, float]) -> NDArray[np.uint8]:
 def state_colours(hidden: Tensor) -> Tensor:
     """Return a colour in [0, 1], [..., 3], for each hidden state [..., H], H 0 or more.
 
-    Each channel has a hue and a lightness, negative values the opposite ones. Zeros are grey.
+    Each channel adds its own hue and lightness; negative values the opposite ones. Zeros are grey.
     """
     count = hidden.shape[-1]
     pull = []
     for part in range(3):
         total = hidden.new_zeros(hidden.shape[:-1])
-        # A matrix product's order of additions would depend on the device and on B.
+        # In a fixed order: that of a matrix product depends on the device and on B.
         for channel in range(count):
             angle = channel * GOLDEN_ANGLE
             weight = (math.cos(1.5 * angle + 1.0), math.cos(angle), math.sin(angle))[part]

@@ -23,14 +23,14 @@ from npa_envs.render.film import Frame, check_rate, checked_frames, encode_frame
 from npa_envs.render.worlds import draw_worlds
 
 MOST_SHOWN = 16
-"""Most worlds side by side."""
+"""Largest number of worlds in a picture."""
 
 _CELL_PARTICLES = 4
 _GAP = 4
 
 
 class Shown:
-    """A picture or a repeating film, which a notebook displays as the value of a cell.
+    """A picture or a repeating film, which a notebook displays when it is the value of a cell.
 
     Args:
         frames: Pictures of one size, uint8, shape [H, W, 3] each.
@@ -48,7 +48,7 @@ class Shown:
         return f"a film of {len(self.frames)} pictures of {width} × {height} pixels"
 
     def _repr_mimebundle_(self, include: Any = None, exclude: Any = None) -> dict[str, Any]:
-        """Return a JPEG, a tenth of a PNG, or a film within HTML, which more programs show."""
+        """Return a JPEG, which is smaller than a PNG, or a WebP film in HTML."""
         shown: dict[str, Any] = {"text/plain": repr(self)}
         if len(self.frames) == 1:
             return shown | {"image/jpeg": _base64(encode_frame(self.frames[0], "JPEG"))}
@@ -57,7 +57,8 @@ class Shown:
 
 
 def show(frames: Frame | Iterable[Frame], *, fps: float = 25.0) -> Shown:
-    """Return one picture [H, W, 3], as of `env.render()`, or several as a film for a notebook."""
+    """Return one picture [H, W, 3], such as `env.render()`, or several as a film, for a
+    notebook."""
     check_rate(fps)
     if isinstance(frames, np.ndarray) and frames.ndim == 3:
         return Shown(checked_frames([frames]), fps)
@@ -72,10 +73,10 @@ def show_worlds(
     Args:
         x: Particle positions [length units], shape [B, N, D], or [K, B, N, D] of a trajectory, as
             `rollout(..., keep_every=...)` returns it.
-        s: Particle states (dimensionless), shape [B, N, C] or [K, B, N, C]; of a rule with a
-            read-out the value of `rule.read_out(s)`.
+        s: Particle states (dimensionless), shape [B, N, C] or [K, B, N, C]; for a rule with a
+            read-out give `rule.read_out(s)`.
         fps: Frames a second of a film.
-        pixel_size: Distance between particles [length units]; None: that of the last step.
+        pixel_size: Distance between particles [length units]; None: measured at the last step.
         drawing: Other arguments of `draw_worlds`.
     """
     check_rate(fps)
@@ -100,7 +101,7 @@ def show_worlds(
 
 
 def side_by_side(pictures: NDArray[np.uint8]) -> Frame:
-    """Return pictures [B, R, R, 3] as one, in rows of about as many as there are rows."""
+    """Return pictures [B, R, R, 3] as one picture, in a nearly square grid."""
     count, height, width, _ = pictures.shape
     across = math.ceil(math.sqrt(count))
     down = math.ceil(count / across)
@@ -118,44 +119,44 @@ def _base64(content: bytes) -> str:
 
 
 def _spacing(x: Tensor) -> float:
-    """Return the distance between particles of the first world, by the cells that they fill."""
-    places = x[0].detach().double()
-    places = places[places.isfinite().all(dim=-1)]
-    if not len(places):
+    """Return an estimate of the distance between particles, by the area of the first world."""
+    points = x[0].detach().double()
+    points = points[points.isfinite().all(dim=-1)]
+    if not len(points):
         return 1.0
-    count, space_dim = places.shape
-    extent = (places.amax(dim=0) - places.amin(dim=0)).clamp(min=1e-6)
+    count, space_dim = points.shape
+    extent = (points.amax(dim=0) - points.amin(dim=0)).clamp(min=1e-6)
     side = (float(extent.prod()) * _CELL_PARTICLES / count) ** (1.0 / space_dim)
-    filled = len(torch.unique(torch.floor(places / side), dim=0))
+    filled = len(torch.unique(torch.floor(points / side), dim=0))
     spacing: float = (filled / count) ** (1.0 / space_dim) * side
     return max(spacing, 1e-6)
 
 
-# A window on the screen; all else does without pygame.
+# A window on the screen, which needs pygame.
 
 _SETTINGS = {
     "PYGAME_HIDE_SUPPORT_PROMPT": "1",
-    # SDL would swallow SIGTERM and make a click on the window's cross of it.
+    # SDL would turn SIGTERM into a QUIT event of the window.
     "SDL_NO_SIGNAL_HANDLERS": "1",
 }
 
 _NO_SCREEN = ("offscreen", "dummy")
-"""SDL's drivers without a screen; `SDL_VIDEODRIVER` may ask for one by name."""
+"""SDL's drivers without a screen, which `SDL_VIDEODRIVER` may select."""
 
 _shown: Window | None = None
-"""The open window: pygame has one for each process."""
+"""The open window: pygame allows one for each process."""
 
 
 class Window:
     """A window on the screen; without a screen it warns once and then does nothing.
 
-    A process has one window: a new one closes the older one.
+    A process has one window: a new one closes the previous one.
 
     Args:
         title: Text of the title bar.
         size: Width and height [screen pixels], or one number for both. Frames of another size are
             scaled to it.
-        fps: Most frames a second, for which `show` waits; None: no limit.
+        fps: Largest number of frames a second, kept by waiting in `show`; None: no limit.
 
     Raises:
         MissingDependencyError: pygame is not installed.
@@ -170,9 +171,9 @@ class Window:
         self.size = _checked_size(size)
         """Width and height [screen pixels]."""
         self.fps = fps
-        """Most frames shown a second; None: no limit."""
+        """Largest number of frames a second; None: no limit."""
         self.closed = False
-        """Whether the user, `close` or another window has closed it."""
+        """Whether it was closed, by the user, `close` or a new window."""
         self._pygame = _import_pygame()
         self._clock = self._pygame.time.Clock()
         self._surface: Any = None
@@ -194,7 +195,7 @@ class Window:
         return self._surface is not None
 
     def show(self, frame: Frame) -> None:
-        """Show a frame, uint8, shape [H, W, 3]; handle events and keep to `fps`."""
+        """Show a frame, uint8, shape [H, W, 3]; handle events, and wait as `fps` requires."""
         (pixels,) = checked_frames([frame])
         self.answer_events()
         if self._surface is None:
@@ -209,7 +210,7 @@ class Window:
             self._clock.tick(self.fps)
 
     def answer_events(self) -> None:
-        """Handle the window's events, also between frames that come slowly."""
+        """Handle the window's events; call it between slow frames."""
         if self._surface is None:
             return
         # Another library of the process may have shut the display down.
@@ -227,7 +228,7 @@ class Window:
             self._pygame.display.quit()
 
     def _open(self, title: str) -> str | None:
-        """Open the window; return why it could not be opened, or None."""
+        """Open the window; return None, or the reason why there is no screen."""
         display = self._pygame.display
         try:
             with _settings():
@@ -286,7 +287,7 @@ def _import_pygame() -> Any:
 
 @contextlib.contextmanager
 def _settings() -> Iterator[None]:
-    """Set pygame's environment variables for a while, unless the user has set them."""
+    """Set pygame's environment variables within the block, unless the user has set them."""
     missing = {name: value for name, value in _SETTINGS.items() if name not in os.environ}
     os.environ.update(missing)
     try:

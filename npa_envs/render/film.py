@@ -1,4 +1,4 @@
-"""Picture and film files; each appears whole or not at all."""
+"""Picture and film files, written completely or not at all."""
 
 from __future__ import annotations
 
@@ -24,30 +24,30 @@ from npa_envs.render.colours import Background, background_colour, to_uint8
 from npa_envs.tasks.targets.views import ANGLE, DISTANCE
 
 Frame = NDArray[np.uint8]
-"""Pixels of a picture, uint8, shape [H, W, 3]; the first row is the upper one."""
+"""Pixels of a picture, uint8, shape [H, W, 3]; the first row is the top."""
 
 GIF_HIGHEST_RATE = 50
-"""Most frames a second that players show of a GIF."""
+"""Largest number of frames a second of a GIF in players."""
 
 GIF_LONGEST = 655.35
-"""Longest time that a GIF can show one frame [s]."""
+"""Longest duration of a GIF's frame [s]."""
 
 _PALETTE_SAMPLE = 2**20
 _MARGIN = 8
 
 
 def write_png(path: str | Path, frame: Frame) -> None:
-    """Write one picture, uint8, shape [H, W, 3], as small as a PNG can be."""
+    """Write one picture, uint8, shape [H, W, 3], as a PNG of small size."""
     write_bytes(path, _encoded([frame], format="PNG", optimize=True))
 
 
 def encode_frame(frame: Frame, kind: Literal["PNG", "JPEG"]) -> bytes:
-    """Return the content of a picture's file, fast rather than small."""
+    """Return a picture's file as bytes, encoded fast rather than small."""
     return _encoded([frame], format=kind, compress_level=1, quality=90)
 
 
 def _encoded(frames: Iterable[Frame], **options: Any) -> bytes:
-    """Return the content of the file that Pillow makes of pictures."""
+    """Return the file that Pillow encodes pictures to, as bytes."""
     first, *others = map(Image.fromarray, checked_frames(frames))
     buffer = io.BytesIO()
     first.save(buffer, append_images=others, **options)
@@ -60,8 +60,8 @@ def write_gif(path: str | Path, frames: Iterable[Frame], fps: float = 25) -> Non
     Args:
         path: The GIF file.
         frames: Pictures of one size, uint8, shape [H, W, 3] each.
-        fps: Frames a second, at most 50. Times of single frames are rounded to hundredths of a
-            second, the length of the film is not.
+        fps: Frames a second, at most 50. Times at which frames change are rounded to hundredths of
+            a second.
 
     Raises:
         NPAError: Wrong frames or rate, more than 655 s of equal frames, or the file cannot be
@@ -73,7 +73,7 @@ def write_gif(path: str | Path, frames: Iterable[Frame], fps: float = 25) -> Non
     indexed = []
     for picture in pictures:
         quantised = Image.fromarray(picture).quantize(palette=palette, dither=Image.Dither.NONE)
-        # Pillow's choice of entries is approximate; a background off by one level would flicker.
+        # Pillow chooses entries approximately; a background off by one level would flicker.
         index = np.array(quantised)
         index[(picture == background).all(axis=-1)] = entry
         exact = Image.fromarray(index, "P")
@@ -110,7 +110,7 @@ def write_webp(
 
 
 def encode_webp(frames: Iterable[Frame], fps: float = 25, *, quality: int = 50) -> bytes:
-    """Return the content of the file that `write_webp` writes."""
+    """Return the file that `write_webp` writes, as bytes."""
     pictures = checked_frames(frames)
     check_rate(fps)
     if not (is_real(quality) and 0 <= quality <= 100):
@@ -156,7 +156,7 @@ def write_filmstrip(
     columns: int | None = None,
     background: Background = "white",
 ) -> None:
-    """Write frames side by side into one picture, each with a caption below.
+    """Write frames in a grid into one picture, each with a caption below.
 
     Args:
         path: A WebP file where the name ends in `.webp`, else a PNG file.
@@ -253,7 +253,7 @@ def checked_frames(frames: Iterable[Frame]) -> list[Frame]:
 
 
 def _shared_palette(pictures: list[Frame]) -> tuple[Image.Image, Frame, int]:
-    """Return a palette for all frames, the commonest colour, and the entry that holds it."""
+    """Return a palette for all frames, the most frequent colour, and its index."""
     step = max(1, math.ceil(sum(p.size // 3 for p in pictures) / _PALETTE_SAMPLE))
     sample = np.concatenate([p.reshape(-1, 3)[k % step :: step] for k, p in enumerate(pictures)])
     _, which, counts = np.unique(
@@ -262,7 +262,7 @@ def _shared_palette(pictures: list[Frame]) -> tuple[Image.Image, Frame, int]:
     means = [np.bincount(which, weights=sample[:, k]) / counts for k in range(3)]
     shades, shade_counts = np.unique(sample[which == counts.argmax()], axis=0, return_counts=True)
     background = shades[shade_counts.argmax()]
-    # Each colour by the root of its count: a wide background would take the palette of small spots.
+    # Weighted by roots of counts: otherwise a large background takes most of the palette.
     repeats = np.ceil(np.sqrt(counts)).astype(np.int64)
     swatch = np.repeat(np.stack(means, axis=1).round().astype(np.uint8), repeats, axis=0)[None]
     palette = Image.fromarray(swatch).quantize(
@@ -285,7 +285,7 @@ def _import_imageio() -> tuple[Any, Any]:
 
 
 def _check_film(path: Path, frame_count: int, ffmpeg: Any) -> None:
-    # The writer does not report an encoder that failed, for example on a full disk.
+    # The writer does not report failures of the encoder, for example on a full disk.
     try:
         found, _ = ffmpeg.count_frames_and_secs(str(path))
     except RuntimeError as error:
@@ -315,10 +315,10 @@ def turntable_frames(
     background: Background = "white",
     device: str | torch.device = "cpu",
 ) -> list[NDArray[np.uint8]]:
-    """Return pictures of a world from cameras that go once around it.
+    """Return pictures of a world from cameras on a circle around it.
 
     Args:
-        views: Draws the world: colours times alpha, and alpha, shape [1, V, H, W, 4].
+        views: Returns pictures of V cameras: colours times alpha, and alpha, [1, V, H, W, 4].
         frame_count: Pictures of one turn.
         resolution: Pixels along each side.
         elevation: Angle of the cameras above the horizon [degrees].
@@ -327,7 +327,7 @@ def turntable_frames(
         device: The world's device.
 
     Returns:
-        Pixels, uint8, shape [R, R, 3] each; the first row is the upper one.
+        Pixels, uint8, shape [R, R, 3] each; the first row is the top.
     """
     frame_count = checked_count("frame_count", frame_count)
     azimuth = checked_finite("azimuth", azimuth, " [degrees]")

@@ -1,4 +1,4 @@
-"""Grown 3D worlds as files for other programs: point clouds and Gaussian splats."""
+"""Files of 3D worlds for other programs: point clouds and Gaussian splats."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ from npa_envs.tasks.appearance import FLAT, Gaussians
 Columns = dict[str, NDArray[np.generic]]
 
 LEAST_OPACITY = 1e-6
-"""Least distance of an opacity from 0 and 1 in a file of logits."""
+"""Opacities are clipped to this distance from 0 and 1, so that logits are finite."""
 
 
 def write_points(path: str | Path, x: Tensor, gaussians: Gaussians) -> None:
     """Write one world, x [1, N, 3], as a binary PLY file: x, y, z and red, green, blue."""
-    places = _checked(x)
-    columns: Columns = {name: places[:, k] for k, name in enumerate("xyz")}
+    positions = _checked(x)
+    columns: Columns = {name: positions[:, k] for k, name in enumerate("xyz")}
     colours = (255.0 * _colours(gaussians)).round().astype(np.uint8)
     columns |= {name: colours[:, k] for k, name in enumerate(("red", "green", "blue"))}
     write_bytes(path, _ply(columns))
@@ -30,15 +30,15 @@ def write_points(path: str | Path, x: Tensor, gaussians: Gaussians) -> None:
 def write_gaussians(path: str | Path, x: Tensor, gaussians: Gaussians) -> None:
     """Write one world, x [1, N, 3], as a PLY file of 3D Gaussian splatting (Kerbl et al. 2023).
 
-    Scales are logarithms, opacities logits; `f_rest` holds degree 1, channel by channel.
+    Scales are logarithms, opacities logits; `f_rest` are coefficients of degree 1 by channel.
     """
-    places = _checked(x)
+    positions = _checked(x)
     harmonics = _numpy(gaussians.colours)
     opacity = _numpy(gaussians.opacities).clip(LEAST_OPACITY, 1.0 - LEAST_OPACITY)
-    columns: Columns = {name: places[:, k] for k, name in enumerate("xyz")}
-    columns |= {f"n{name}": np.zeros(len(places), np.float32) for name in "xyz"}
+    columns: Columns = {name: positions[:, k] for k, name in enumerate("xyz")}
+    columns |= {f"n{name}": np.zeros(len(positions), np.float32) for name in "xyz"}
     columns |= {f"f_dc_{k}": harmonics[:, 0, k] for k in range(3)}
-    rest = harmonics[:, 1:].transpose(0, 2, 1).reshape(len(places), 9)
+    rest = harmonics[:, 1:].transpose(0, 2, 1).reshape(len(positions), 9)
     columns |= {f"f_rest_{k}": rest[:, k] for k in range(9)}
     columns["opacity"] = np.log(opacity / (1.0 - opacity))
     scales, rotations = np.log(_numpy(gaussians.scales)), _rotations(gaussians)
@@ -52,15 +52,15 @@ def write_splat(path: str | Path, x: Tensor, gaussians: Gaussians) -> None:
 
     A particle takes 32 bytes: position and scale as float32; red, green, blue and opacity as bytes;
     the rotation (w, x, y, z) as bytes around 128. The largest and most opaque come first. Colours
-    are means over all directions of sight.
+    are averages over viewing directions.
     """
-    places = _checked(x)
+    positions = _checked(x)
     scales, opacities = _numpy(gaussians.scales), _numpy(gaussians.opacities)
     kind = np.dtype(
-        [("place", "<f4", 3), ("scale", "<f4", 3), ("rgba", "u1", 4), ("rotation", "u1", 4)]
+        [("position", "<f4", 3), ("scale", "<f4", 3), ("rgba", "u1", 4), ("rotation", "u1", 4)]
     )
-    rows = np.zeros(len(places), kind)
-    rows["place"], rows["scale"] = places, scales
+    rows = np.zeros(len(positions), kind)
+    rows["position"], rows["scale"] = positions, scales
     rgba = np.concatenate((_colours(gaussians), opacities[:, None]), axis=1)
     rows["rgba"] = (255.0 * rgba).round()
     rows["rotation"] = (128.0 * _rotations(gaussians) + 128.0).round().clip(0, 255)
@@ -69,13 +69,13 @@ def write_splat(path: str | Path, x: Tensor, gaussians: Gaussians) -> None:
 
 
 def _ply(columns: Columns) -> bytes:
-    """Return a binary PLY file of one property for each column."""
+    """Return a binary PLY file with one property for each column, as bytes."""
     kinds = {name: "u1" if c.dtype == np.uint8 else "<f4" for name, c in columns.items()}
-    words = {"u1": "uchar", "<f4": "float"}
+    types = {"u1": "uchar", "<f4": "float"}
     rows = np.zeros(len(columns["x"]), np.dtype(list(kinds.items())))
     for name, column in columns.items():
         rows[name] = column
-    properties = [f"property {words[kind]} {name}" for name, kind in kinds.items()]
+    properties = [f"property {types[kind]} {name}" for name, kind in kinds.items()]
     header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(rows)}"]
     return "\n".join((*header, *properties, "end_header\n")).encode() + rows.tobytes()
 
@@ -90,18 +90,18 @@ def _checked(x: Tensor) -> NDArray[np.float32]:
 
 
 def _numpy(values: Tensor) -> NDArray[np.float32]:
-    """Return the values of the one world."""
+    """Return the values of the first world."""
     array: NDArray[np.float32] = values.detach()[0].float().cpu().numpy()
     return array
 
 
 def _colours(gaussians: Gaussians) -> NDArray[np.float32]:
-    """Return red, green and blue in [0, 1], the mean over all directions of sight, [N, 3]."""
+    """Return red, green and blue in [0, 1], averaged over viewing directions, [N, 3]."""
     return (FLAT * _numpy(gaussians.colours)[:, 0] + 0.5).clip(0.0, 1.0)
 
 
 def _rotations(gaussians: Gaussians) -> NDArray[np.float32]:
-    """Return unit quaternions (w, x, y, z), [N, 4]; a zero stands for no rotation."""
+    """Return unit quaternions (w, x, y, z), [N, 4]; zero quaternions become (1, 0, 0, 0)."""
     rotations = _numpy(gaussians.quaternions).copy()
     rotations[~rotations.any(axis=1), 0] = 1.0
     unit: NDArray[np.float32] = rotations / np.linalg.norm(rotations, axis=1, keepdims=True)

@@ -1,4 +1,4 @@
-"""Pictures of worlds, without legend or axes."""
+"""Pictures of worlds."""
 
 from __future__ import annotations
 
@@ -34,19 +34,19 @@ STYLES = ("particles", "density", "states")
 """Styles of pictures: the particles' own colours, their density, their hidden states."""
 
 COLOUR_CHANNELS = 3
-"""The last channels of a state, which are its colour less `COLOUR_OFFSET`."""
+"""Number of the last channels of a state, which are its colour minus `COLOUR_OFFSET`."""
 
 LAYERS = 24
-"""Layers of a 3D world from near to far, with equal numbers of particles."""
+"""Number of depth layers of a 3D world, with equal numbers of particles."""
 
 OPACITY = 5.0
 """Optical depth of a layer of density 1 in 3D (dimensionless)."""
 
 BEAD = 0.7
-"""Size of a particle in 3D over its size in 2D, where spots must close the gaps."""
+"""Size of a particle in 3D, relative to 2D, where splats must close gaps."""
 
 SHADE = 0.45
-"""Share of light that a particle at the far end of the view loses."""
+"""Fraction by which particles at the far end of the view are darker."""
 
 
 def draw_worlds(
@@ -64,26 +64,26 @@ def draw_worlds(
     elevation: float = 20.0,
     background: Background = "white",
 ) -> NDArray[np.uint8]:
-    """Draw worlds: every particle is a soft spot, y is up.
+    """Draw worlds: every particle is a Gaussian splat, y is up.
 
-    Nothing is fitted to a frame or a batch, so colours mean the same in every picture. Particles
-    whose position (or state, where the style shows it) is not finite are left out. 3D worlds are
-    drawn without perspective: near particles cover far ones, and far ones are darker.
+    Colours do not depend on other pictures or worlds. Particles whose position (or state, where the
+    style shows it) is not finite are left out. 3D worlds are drawn in parallel projection: near
+    particles cover far ones, and far ones are darker.
 
     Args:
         x: Particle positions [length units], shape [B, N, D], D = 2 or 3, on any device.
         s: Particle states (dimensionless), shape [B, N, C].
         style: "particles" shows the last three channels plus 0.5 as red, green and blue, clipped;
-            "density" the density, with that of the target's pixels in the middle of the colour ramp
-            (in 3D along the line of sight, with half the depth of the view full); "states" all
-            other channels, each by a hue (grey: a blank particle).
+            "density" the density, where that of the target is the middle of the colour ramp (in 3D
+            integrated along the line of sight, over half the depth of the view); "states" all
+            other channels, each with its own hue (grey: all states are 0).
         resolution: Pixels R along each side, 2 or more.
         pixel_size: Side of a pixel of the target, or usual distance between particles [length
             units].
-        sigma: Standard deviation of a particle's spot in `pixel_size`, dimensionless.
+        sigma: Standard deviation of a particle's splat, in units of `pixel_size` (dimensionless).
         centre: Middle of the picture [length units], shape [D] or [B, D]; None is the origin.
-        half_width: From the middle of the picture to its edge [length units].
-        periodic: 2D only: the picture is a periodic box, whose edges are joined.
+        half_width: Distance from the middle of the picture to its edge [length units].
+        periodic: 2D only: the picture is the periodic box.
         azimuth: 3D only: angle of the camera around the vertical axis [degrees], counterclockwise
             from above; at 0 x points right and z towards the viewer.
         elevation: 3D only: angle of the camera above the horizon [degrees].
@@ -108,33 +108,33 @@ def draw_worlds(
         raise NPAError(f"periodic pictures are of 2D worlds, got D = {x.shape[2]}: leave it out")
     behind = background_colour(background)
     with torch.no_grad():
-        places = (x - _middle(centre, x)).float()
+        points = (x - _middle(centre, x)).float()
         colour = _colours(s.float(), style)
         depth = None
         if x.shape[2] == 3:
-            places, depth = _seen_from(places, azimuth, elevation)
+            points, depth = _projected(points, azimuth, elevation)
         limit = 1e3 * (half_width + sigma * pixel_size)
-        visible = (places.abs() <= limit).all(-1, keepdim=True)
+        visible = (points.abs() <= limit).all(-1, keepdim=True)
         if style != "density":
             visible = visible & s.isfinite().all(-1, keepdim=True)
-        # A periodic box draws every finite position; NaN draws nothing.
-        nowhere = math.nan if periodic else limit
-        places, colour = places.where(visible, nowhere), colour.where(visible, 0.0)
+        # A periodic splat draws every finite position; NaN draws nothing.
+        outside = math.nan if periodic else limit
+        points, colour = points.where(visible, outside), colour.where(visible, 0.0)
         draw = partial(
             periodic_splat if periodic else splat,
             resolution=resolution, pixel_size=pixel_size, lo=-half_width, hi=half_width,
         )  # fmt: skip
         if style == "density":
-            density = draw(places, colour, sigma=sigma)[..., 3]
+            density = draw(points, colour, sigma=sigma)[..., 3]
             if depth is not None:
                 density = density * (pixel_size / half_width)
             return density_colours(density.flip(-2), behind)
         if depth is None:
-            return to_uint8(draw(places, colour, sigma=sigma), behind)
+            return to_uint8(draw(points, colour, sigma=sigma), behind)
         depth = depth.where(visible, 0.0)
         light = 1.0 - SHADE * (0.5 - 0.5 * depth / half_width).clamp(0.0, 1.0)
         beads = partial(draw, sigma=BEAD * sigma)
-        return to_uint8(_stack_layers(beads, places, depth, colour * light), behind)
+        return to_uint8(_stack_layers(beads, points, depth, colour * light), behind)
 
 
 def _middle(centre: Tensor | Sequence[float] | None, x: Tensor) -> Tensor:
@@ -163,8 +163,8 @@ def _colours(s: Tensor, style: str) -> Tensor:
     return (s[..., -COLOUR_CHANNELS:] + COLOUR_OFFSET).clamp(0.0, 1.0)
 
 
-def _seen_from(x: Tensor, azimuth: float, elevation: float) -> tuple[Tensor, Tensor]:
-    """Return places on the picture, [B, N, 2], and distances towards the viewer, [B, N, 1]."""
+def _projected(x: Tensor, azimuth: float, elevation: float) -> tuple[Tensor, Tensor]:
+    """Return positions in the picture, [B, N, 2], and towards the viewer, [B, N, 1]."""
     turn, tilt = (math.radians(angle % 360.0) for angle in (azimuth, elevation))
     right, height, outward = x.unbind(-1)
     across = math.cos(turn) * right - math.sin(turn) * outward
@@ -175,21 +175,21 @@ def _seen_from(x: Tensor, azimuth: float, elevation: float) -> tuple[Tensor, Ten
 
 
 def _stack_layers(
-    draw: Callable[[Tensor, Tensor], Tensor], places: Tensor, depth: Tensor, colour: Tensor
+    draw: Callable[[Tensor, Tensor], Tensor], points: Tensor, depth: Tensor, colour: Tensor
 ) -> Tensor:
-    """Lay splats of particles at about the same depth over each other, the nearest on top."""
+    """Return the picture of splatted layers of equal depth, composited with the nearest on top."""
     order = depth.argsort(dim=1, descending=True, stable=True)
-    places = places.gather(1, order.expand_as(places))
+    points = points.gather(1, order.expand_as(points))
     colour = colour.gather(1, order.expand_as(colour))
-    picture, through = places.new_zeros(()), places.new_ones(())
-    layers = min(LAYERS, places.shape[1])
+    picture, through = points.new_zeros(()), points.new_ones(())
+    layers = min(LAYERS, points.shape[1])
     for part, tint in zip(
-        places.tensor_split(layers, 1), colour.tensor_split(layers, 1), strict=True
+        points.tensor_split(layers, 1), colour.tensor_split(layers, 1), strict=True
     ):
         layer = draw(part, tint)
         density = layer[..., 3:]
         passing = torch.exp(-OPACITY * density)
-        share = through * (1.0 - passing)
-        picture = picture + share * layer / density.clamp(min=torch.finfo(density.dtype).tiny)
+        covering = through * (1.0 - passing)
+        picture = picture + covering * layer / density.clamp(min=torch.finfo(density.dtype).tiny)
         through = through * passing
     return picture

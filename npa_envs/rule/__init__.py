@@ -1,4 +1,4 @@
-"""The update rule and its files: the network that every particle runs, loading, saving."""
+"""The update rule, the network that every particle runs; loading and saving it."""
 
 from npa_envs.rule.files import load_rule, save_rule, shipped_rules
 from npa_envs.rule.rule import NPARule

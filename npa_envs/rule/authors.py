@@ -4,13 +4,13 @@ State dict (`npa.pth`): `model.0.weight` [H, P], `model.0.bias` [H], `model.2.we
 rows [δ (D); Δs (C)], `eps0`, `alpha`, and for rules with a read-out `decoder.0.*`, `decoder.2.*`.
 Web demo (`models.json`): for each name `w1.weight` [H, P], `w1.bias`, `w2.weight.T` [H, A] with
 columns [Δs (C), δ (2)], both padded with zeros to a multiple of four columns; float32 in base64;
-`eps0`, `alpha`, and `N0`, with how many particles the demo starts. `save_demo_json` writes it.
+`eps0`, `alpha`, and `N0`, the demo's number of particles. `save_demo_json` writes it.
 
 Equivariant rules (`equivariant_demo/`) hold `W_hidden` [C+1, K], `W_out` [K, 1], `w1.weight` [H, I]
 with columns [s; smoothed s; u_a · u_b, a <= b], `w1.bias`, `w2.weight` [C+K, H] with rows [Δs; g],
-`w2.bias`; in the web demo each number of the first two stands there four times. A state dict
-calls them `model.W_hidden`, `model.W_out`, `model.mlp.0.*` and `model.mlp.2.*`. Ours have no bias
-of outputs: one more hidden unit, which always says 1, stands for it.
+`w2.bias`; in the web demo each number of the first two is repeated four times. A state dict
+calls them `model.W_hidden`, `model.W_out`, `model.mlp.0.*` and `model.mlp.2.*`. `NPARule` has no
+output bias: an additional hidden unit whose value is always 1 replaces it.
 
 Stacks (`models_digits.json`) hold several rules without names: each tensor has one more dimension
 at the front, and `eps0`, `N0` and `alpha` are common to all.
@@ -40,16 +40,16 @@ from npa_envs.rule.rule import NPARule, check_rule
 
 _DEMO_SPACE_DIM = 2
 _DEMO_FREE = {"state_dim", "hidden_dim", "eps0", "alpha", "readout_hidden_dim", "mixed_vectors"}
-"""In these rules of the web demo may differ from `NPARule()`; its files do not hold the others."""
+"""Hyper-parameters in the web demo's files; all others must be the defaults of `NPARule`."""
 
 DEMO_PARTICLE_COUNT = 4096
-"""Particles of a world in the web demo where nothing else is said."""
+"""Default number of particles in the web demo."""
 
 _TEXEL = 4
-"""The web demo keeps its weights in RGBA textures: rows are padded to a multiple of this."""
+"""Rows of the web demo's weights, stored as RGBA textures, are padded to a multiple of this."""
 
 ZIP_MARK = b"PK\x03\x04"
-"""What a file of torch.save begins with, which has checksums, unless it is in the legacy format."""
+"""First bytes of a file of torch.save in its zip format, which has checksums."""
 
 _EQUIVARIANT_NAMES = {
     "model.W_hidden": "W_hidden",
@@ -59,7 +59,7 @@ _EQUIVARIANT_NAMES = {
     "model.mlp.2.weight": "w2.weight",
     "model.mlp.2.bias": "w2.bias",
 }
-"""An equivariant rule's tensors in a state dict, and in the web demo."""
+"""Names of an equivariant rule's tensors: in a state dict -> in the web demo."""
 
 _WEIGHT_NAMES = {
     "model.0.weight": "hidden.weight",
@@ -76,7 +76,7 @@ _IGNORED = {"N0"}
 
 @dataclass(frozen=True)
 class RuleParts:
-    """A rule taken apart: what `NPARule` is made with, and its weights by its own names."""
+    """A rule's hyper-parameters, and its weights by `NPARule`'s names."""
 
     hyper_parameters: dict[str, Any]
     weights: dict[str, Tensor]
@@ -106,7 +106,7 @@ def check_finite(weights: Mapping[str, Tensor]) -> None:
 
 
 def read_state_dict(data: bytes) -> RuleParts:
-    """Read the authors' state dict; dimension and channels follow from the shapes."""
+    """Read the authors' state dict; shapes determine D and C."""
     state = _unpickle(data)
     known, kind, more = _WEIGHT_NAMES, "", f" and, with a read-out, {sorted(_DECODER_NAMES)}"
     if state.keys() & _EQUIVARIANT_NAMES:
@@ -144,7 +144,7 @@ def read_state_dict(data: bytes) -> RuleParts:
 
 
 def _equivariant_parts(tensors: Mapping[str, Tensor], numbers: Mapping[Any, Any]) -> RuleParts:
-    """Return an equivariant rule of 2D worlds from its tensors, by their names in the web demo."""
+    """Return a 2D equivariant rule from tensors by the web demo's names."""
     mixing, first, second = (tensors[name] for name in ("W_hidden", "w1.weight", "w2.weight"))
     state_dim, mixed = mixing.shape[0] - 1, mixing.shape[1]
     hidden_dim = first.shape[0]
@@ -163,7 +163,7 @@ def _equivariant_parts(tensors: Mapping[str, Tensor], numbers: Mapping[Any, Any]
             f"an equivariant rule with W_hidden {tuple(mixing.shape)}, [C+1, K], must have the "
             f"shapes {wanted}, got {got}"
         )
-    # A unit that always says 1 stands for the bias of the outputs.
+    # The additional hidden unit is always 1: its output weights are the bias.
     with_bias = torch.cat((second, tensors["w2.bias"][:, None]), dim=1)
     weights = {
         "hidden.weight": torch.cat((first, first.new_zeros(1, input_dim))),
@@ -186,12 +186,12 @@ def _equivariant_parts(tensors: Mapping[str, Tensor], numbers: Mapping[Any, Any]
 
 def read_demo_json(data: bytes, name: str | None) -> RuleParts:
     """Read one rule of the authors' web demo."""
-    entry, place = _demo_rule(parse_json(data), name)
+    entry, index = _demo_rule(parse_json(data), name)
     if "W_hidden" in entry:
-        return _read_equivariant_entry(entry, place)
-    first = _decode(entry, "w1.weight", 2, place)
-    bias = _decode(entry, "w1.bias", 1, place)
-    second = _decode(entry, "w2.weight.T", 2, place)
+        return _read_equivariant_entry(entry, index)
+    first = _decode(entry, "w1.weight", 2, index)
+    bias = _decode(entry, "w1.bias", 1, index)
+    second = _decode(entry, "w2.weight.T", 2, index)
     hidden_dim, padded = first.shape
     state_dim = padded // _TEXEL - 1
     update_dim = state_dim + _DEMO_SPACE_DIM
@@ -220,9 +220,9 @@ def read_demo_json(data: bytes, name: str | None) -> RuleParts:
 
 
 def _demo_rule(content: Any, name: str | None) -> tuple[Mapping[str, Any], int | None]:
-    """Return the entry of one rule, and which rule of a stack it is."""
+    """Return the entry of one rule, and its index in a stack, or None without a stack."""
     if isinstance(content, dict) and isinstance(content.get("w1.weight"), dict):
-        return content, _number_in_stack(content["w1.weight"], name)
+        return content, _index_in_stack(content["w1.weight"], name)
     names = sorted(content) if isinstance(content, dict) else []
     if not names or not all(isinstance(content[known], dict) for known in names):
         raise NPAError(
@@ -239,8 +239,8 @@ def _demo_rule(content: Any, name: str | None) -> tuple[Mapping[str, Any], int |
     return content[name], None
 
 
-def _number_in_stack(packed: Mapping[str, Any], name: str | None) -> int:
-    """Return the number of a rule in a stack, from 0."""
+def _index_in_stack(packed: Mapping[str, Any], name: str | None) -> int:
+    """Return the index, from 0, of the rule called `name` in a stack."""
     shape = packed.get("shape")
     if not isinstance(shape, list) or len(shape) != 3 or type(shape[0]) is not int or shape[0] < 1:
         raise NPAError(
@@ -251,19 +251,19 @@ def _number_in_stack(packed: Mapping[str, Any], name: str | None) -> int:
             f"the file is a stack of {shape[0]} rules without names: add #0 to #{shape[0] - 1}"
         )
     digits = "0" if name is None else name
-    number = int(digits) if digits.isascii() and digits.isdigit() and len(digits) < 10 else -1
-    if not 0 <= number < shape[0]:
+    index = int(digits) if digits.isascii() and digits.isdigit() and len(digits) < 10 else -1
+    if not 0 <= index < shape[0]:
         raise NPAError(
             f"the file is a stack of {shape[0]} rules, got #{shown(name)[1:-1]}: give #0 to "
             f"#{shape[0] - 1}"
         )
-    return number
+    return index
 
 
-def _read_equivariant_entry(entry: Mapping[str, Any], place: int | None) -> RuleParts:
-    """Read an equivariant rule of the web demo; what is padded is cut to size."""
+def _read_equivariant_entry(entry: Mapping[str, Any], index: int | None) -> RuleParts:
+    """Read an equivariant rule of the web demo, without the padding."""
     tensors = {
-        name: _decode(entry, name, 1 if name.endswith("bias") else 2, place)
+        name: _decode(entry, name, 1 if name.endswith("bias") else 2, index)
         for name in _EQUIVARIANT_NAMES.values()
     }
     for name in ("W_hidden", "W_out"):
@@ -283,9 +283,9 @@ def save_demo_json(
     *,
     particle_counts: Mapping[str, int] | None = None,
 ) -> None:
-    """Write rules as a collection of the authors' web demo, in float32, whole or not at all.
+    """Write rules as a collection of the authors' web demo, in float32.
 
-    `load_rule("models.json#name")` gives each of them back.
+    `load_rule("models.json#name")` reads each of them.
     """
     path = checked_path(path)
     if path.suffix != ".json":
@@ -316,7 +316,7 @@ def _demo_entry(name: str, rule: NPARule, particle_count: int) -> dict[str, Any]
     if not rule.is_plain():
         raise NPAError(
             f"the authors' demo runs rules of two plain layers only, {shown(name)} is a "
-            f"{type(rule).__name__} with a network of its own"
+            f"{type(rule).__name__} with another network"
         )
     weights = {k: v.detach().cpu().float() for k, v in rule.state_dict().items()}
     check_finite(weights)
@@ -332,7 +332,7 @@ def _demo_entry(name: str, rule: NPARule, particle_count: int) -> dict[str, Any]
 
 
 def _texels(matrix: Tensor) -> Tensor:
-    """Return a matrix padded with columns of zeros to whole texels."""
+    """Return a matrix padded with columns of zeros to a multiple of `_TEXEL`."""
     return torch.nn.functional.pad(matrix, (0, -matrix.shape[1] % _TEXEL))
 
 
@@ -354,7 +354,7 @@ def _unpickle(data: bytes) -> Mapping[Any, Any]:
             "plain state dict with torch.save(model.state_dict(), path)"
         ) from error
     except Exception as error:
-        # What torch raises for garbage depends on where in its readers the garbage lands.
+        # Torch raises exceptions of many kinds for damaged data.
         raise NPAError(
             "this is no state dict of tensors that torch reads without running code, or a "
             f"truncated one ({shown(error)})"
@@ -370,16 +370,16 @@ def _check_plain(name: str, tensor: Tensor) -> None:
             f"{name} must be a dense tensor with data, got a sparse, meta, nested or quantised "
             "one: export the state dict with plain tensors"
         )
-    held = tensor.untyped_storage().nbytes()
-    if tensor.numel() * tensor.element_size() > held:
+    stored = tensor.untyped_storage().nbytes()
+    if tensor.numel() * tensor.element_size() > stored:
         raise NPAError(
-            f"{name} must hold all its numbers, got shape {shown(tuple(tensor.shape))} of {held} "
+            f"{name} must hold all its numbers, got shape {shown(tuple(tensor.shape))} of {stored} "
             "bytes: export the state dict with tensors that are not expanded"
         )
 
 
 def _matrix(name: str, value: Any) -> Tensor:
-    """Return a weight or a bias; some of the authors' matrices come as 1x1 convolutions."""
+    """Return a weight or a bias; 1x1 convolutions become matrices."""
     rank = 1 if name.endswith("bias") else 2
     if not isinstance(value, Tensor):
         raise NPAError(f"{name} must be a tensor, got a {type(value).__name__}")
@@ -395,7 +395,7 @@ def _matrix(name: str, value: Any) -> Tensor:
 def _infer_dimensions(
     perception_dim: int, update_dim: int, channels: int | None
 ) -> tuple[int, int, bool]:
-    """Find (D, C, static) with P = C(2+D)+D and A = C+D, or C where static."""
+    """Return (D, C, static) such that P = C(2+D)+D and A = C+D, or C if static."""
     found = []
     for space_dim in (2, 3):
         state_dim, rest = divmod(perception_dim - space_dim, 2 + space_dim)
@@ -413,7 +413,7 @@ def _infer_dimensions(
 
 
 def _scalar(name: str, value: Any) -> float:
-    """Return a number that the authors' tools may have rounded to float32 as the decimal meant."""
+    """Return a number as the shortest decimal that rounds to it in float32."""
     if isinstance(value, Tensor):
         _check_plain(name, value)
         value = value.item() if value.numel() == 1 else value
@@ -439,9 +439,9 @@ def _as_float32(number: float) -> float:
         return math.inf
 
 
-def _decode(entry: Mapping[str, Any], name: str, rank: int, place: int | None) -> Tensor:
-    """Return a tensor of an entry; that of one rule where the entry is a stack."""
-    stacked = place is not None
+def _decode(entry: Mapping[str, Any], name: str, rank: int, index: int | None) -> Tensor:
+    """Return a tensor of an entry, or of the rule `index` of a stack."""
+    stacked = index is not None
     rank += stacked
     packed = entry.get(name)
     if not isinstance(packed, dict) or not {"shape", "dtype", "data64"} <= packed.keys():
@@ -462,8 +462,8 @@ def _decode(entry: Mapping[str, Any], name: str, rank: int, place: int | None) -
             f"{shown(shape)}, got {len(data)}: the file is damaged"
         )
     tensor = torch.frombuffer(bytearray(data), dtype=torch.float32).reshape(shape)
-    if place is None:
+    if index is None:
         return tensor
-    if place >= shape[0]:
-        raise NPAError(f"{name} must be of as many rules as w1.weight, got {shape[0]}")
-    return tensor[place].clone()
+    if index >= shape[0]:
+        raise NPAError(f"{name} must have as many rules as w1.weight, got {shape[0]}")
+    return tensor[index].clone()

@@ -1,4 +1,4 @@
-"""Codes: the numbers that say which picture a rule of many pictures grows."""
+"""Codes: vectors that tell a rule of many pictures which one to grow."""
 
 from __future__ import annotations
 
@@ -13,25 +13,25 @@ from torch import Tensor, nn
 from npa_envs.errors import NPAError, shown, suggest
 
 LARGEST_CODE_COUNT = 65536
-"""No rule knows more codes by name."""
+"""Largest number of codes of a rule."""
 
 PICTURE_SIDE = 32
-"""Pixels on each side of the pictures that an encoder reads."""
+"""Side of the pictures that an encoder reads [pixels]."""
 
 WIDTHS = (16, 32, 64)
-"""Channels of an encoder's layers, each of which halves the picture."""
+"""Channels of an encoder's layers, each of which halves the picture's side."""
 
 
 class Codes(nn.Module):
-    """Codes by name, each of `dim` numbers in about [-1, 1] (dimensionless).
+    """Codes by name, each a vector of length `dim`, K, in about [-1, 1] (dimensionless).
 
-    A code is state that a rule perceives and never changes: the first `code_dim` channels of each
-    particle. It is learned by itself, or a trained network, the encoder, reads it from a picture,
-    so that a picture that was never trained on has one too.
+    A code is the first K state channels of each particle, which a rule perceives and never changes.
+    Codes are parameters, or a trained network, the encoder, computes them from pictures, also from
+    pictures that were not trained on.
     """
 
     table: Tensor
-    """The codes, shape [T, K]: learned, or what the encoder said last of the pictures."""
+    """The codes, shape [T, K]: parameters, or the encoder's last outputs."""
 
     def __init__(self, names: Sequence[str], dim: int, *, encoder: bool = False) -> None:
         super().__init__()
@@ -41,14 +41,14 @@ class Codes(nn.Module):
                 f"{shown(list(names))}: leave one of each"
             )
         self.names = tuple(names)
-        """What each code stands for."""
+        """Names of the codes, in the order of `table`."""
         table = torch.empty(len(names), dim).uniform_(-1.0, 1.0)
         if encoder:
             self.register_buffer("table", table.zero_())
         else:
             self.table = nn.Parameter(table)
         self.encoder = PictureEncoder(dim) if encoder else None
-        """Reads codes from pictures, where the rule was trained with one."""
+        """Computes codes from pictures; None where codes are parameters."""
 
     def __len__(self) -> int:
         return len(self.names)
@@ -58,7 +58,7 @@ class Codes(nn.Module):
         return name in self.names
 
     def __iter__(self) -> Iterator[str]:
-        """Return the names, one by one."""
+        """Iterate over the names."""
         return iter(self.names)
 
     def __getitem__(self, name: str) -> Tensor:
@@ -68,7 +68,7 @@ class Codes(nn.Module):
         return self.table[self.names.index(name)]
 
     def blend(self, shares: Mapping[str, float]) -> Tensor:
-        """Return the mean of codes, each weighted by its share, shape [K]."""
+        """Return the mean of codes with weights `shares`, by name, shape [K]."""
         total = sum(shares.values())
         if not (math.isfinite(total) and total > 0.0):
             raise NPAError(
@@ -92,13 +92,13 @@ class Codes(nn.Module):
 
 
 def carrying(states: Tensor, code: Tensor) -> Tensor:
-    """Return states [..., C] that begin with a code, of a shape that expands to [..., K]."""
-    carried = code.to(states).expand(*states.shape[:-1], code.shape[-1])
-    return torch.cat((carried, states[..., code.shape[-1] :]), dim=-1)
+    """Return states [..., C] whose first channels are a code, which expands to [..., K]."""
+    expanded = code.to(states).expand(*states.shape[:-1], code.shape[-1])
+    return torch.cat((expanded, states[..., code.shape[-1] :]), dim=-1)
 
 
 def check_names(names: object) -> None:
-    """Check that what codes are to be called is several texts."""
+    """Check that names of codes are a collection of strings."""
     given = names if isinstance(names, Collection) and not isinstance(names, str) else None
     if given is None or not all(isinstance(name, str) for name in given):
         raise NPAError(

@@ -1,8 +1,7 @@
-"""Files of rules in our own format (safetensors), and the way to all formats by `load_rule`.
+"""Files of rules: `save_rule` writes safetensors, `load_rule` reads them and the authors' formats.
 
-Ours holds the weights under `NPARule`'s own names and, in the header's metadata, the format's name
-and version, every hyper-parameter and a checksum, so that a file is all that is needed to run a
-rule. The checksum is SHA-256 over all else that the file says.
+A file has the weights under `NPARule`'s names and, in the header's metadata, the format's name and
+version, every hyper-parameter, and a SHA-256 checksum over all of that.
 """
 
 from __future__ import annotations
@@ -47,17 +46,17 @@ _FIELDS = {name: _PLAIN.get(get_origin(kind), kind) for name, kind in HYPER_PARA
 _RESERVED = {"format", "version", "checksum", *_FIELDS}
 _SUFFIXES = (".safetensors", ".pth", ".pt", ".json")
 _LARGEST_FILE = 64 * 2**20
-"""Bytes that a rule's file has at most; the largest rule that is shipped has 0.1 MiB."""
+"""Largest file of a rule [bytes]; the largest shipped one has 0.1 MiB."""
 
 
 def shipped_rules(task: str | None = None) -> dict[str, Path]:
     """Return the rules that come with the package: name -> file, sorted by name.
 
     Args:
-        task: Only those that were trained on this task, for example "morphogenesis2d".
+        task: Return only rules of this task, for example "morphogenesis2d".
 
     Raises:
-        NPAError: The task is no text.
+        NPAError: The task is not a string.
     """
     folder = Path(__file__).resolve().parent / "shipped"
     rules = {path.stem: path for path in sorted(folder.glob("*.safetensors"))}
@@ -69,11 +68,11 @@ def shipped_rules(task: str | None = None) -> dict[str, Path]:
 
 
 def preset_rules() -> dict[str, Path]:
-    """Return the rules that runs of presets and environments begin with: name -> file, by name.
+    """Return the initial rules of presets and environments: name -> file, sorted by name.
 
-    They stay as they are when a shipped rule of the same picture is trained anew.
+    They do not change when a shipped rule of the same picture is trained again.
     """
-    folder = Path(__file__).resolve().parent / "first"
+    folder = Path(__file__).resolve().parent / "initial"
     return {path.stem: path for path in sorted(folder.glob("*.safetensors"))}
 
 
@@ -89,14 +88,14 @@ def load_rule(source: str | Path, *, device: str | torch.device = "cpu") -> NPAR
 
     Returns:
         The rule, its weights in the precision of the file (float32 or float64). Torch's random
-        state is left alone. A file without a checksum is loaded with a `UserWarning`, as damage
-        cannot be told there: the authors' `.json`, and a state dict that torch before 1.6 wrote,
-        or that was saved in its format.
+        state is not changed. A file without a checksum, in which damage cannot be detected, is
+        loaded with a `UserWarning`: the authors' `.json`, and state dicts in torch's format before
+        1.6.
 
     Raises:
         NPAError: The name is unknown, the file is missing, garbage, truncated, of an unknown
-            version, does not hold a rule, holds weights that are not finite, or has changed since
-            it was written; or there is no such device.
+            version, has no rule in it or weights that are not finite, or has changed since it
+            was written; or there is no such device.
     """
     target = check_device(device)
     path, name = _locate(source)
@@ -121,7 +120,7 @@ def load_rule(source: str | Path, *, device: str | torch.device = "cpu") -> NPAR
         raise NPAError(f"cannot load a rule from {shown(str(source))}: {error}") from error
     if not (ours or content.startswith(ZIP_MARK)):
         warnings.warn(
-            f"the rule's file {shown(str(path))} has no checksum, so that damage cannot be told: "
+            f"the rule's file {shown(str(path))} has no checksum, so damage cannot be detected: "
             "if it is known to be good, save it again with npa_envs.save_rule",
             stacklevel=2,
         )
@@ -131,27 +130,28 @@ def load_rule(source: str | Path, *, device: str | torch.device = "cpu") -> NPAR
 def save_rule(
     rule: NPARule, path: str | Path, *, metadata: Mapping[str, str] | None = None
 ) -> None:
-    """Write a rule with all its hyper-parameters to a `.safetensors` file, whole or not at all.
+    """Write a rule with all its hyper-parameters to a `.safetensors` file, completely or not at
+    all.
 
     The same rule and metadata give the same bytes.
 
     Args:
         rule: The rule; its weights are written in their own precision.
         path: The file to write, ending in `.safetensors`; an existing one is replaced.
-        metadata: More text for the header, for example how the rule was trained.
+        metadata: Further text for the header, for example how the rule was trained.
 
     Raises:
-        NPAError: The rule's network is not the one that files have; the suffix is another one, the
+        NPAError: The rule's network is not that of `NPARule`; the suffix is another one, the
             metadata is not text or takes a reserved name, the weights are not finite or not all
             float32 or all float64, or the file cannot be written.
     """
     check_rule(rule)
-    # One that torch.compile has taken has its weights by other names.
+    # A module of torch.compile has other names of weights.
     rule = getattr(rule, "_orig_mod", rule)
     if not _is_as_made(rule):
         raise NPAError(
-            f"rule must have the network that NPARule makes, got a {type(rule).__name__} with one "
-            "of its own, which the file would not hold: remove its hooks, or keep its state_dict "
+            f"rule must have the network of NPARule, got a {type(rule).__name__} with another "
+            "one, which the file would not contain: remove its hooks, or keep its state_dict "
             "with torch.save"
         )
     path = checked_path(path)
@@ -188,7 +188,7 @@ def save_rule(
 
 
 def _is_as_made(rule: NPARule) -> bool:
-    """Return whether a rule computes what the rule does that its file is loaded as."""
+    """Return whether the rule that its file would be loaded as computes the same."""
     loaded = _without_weights(rule.hyper_parameters())
     same_shapes = _shapes(rule.state_dict()) == _shapes(loaded.state_dict())
     if type(rule).forward is not NPARule.forward or is_altered(rule) or not same_shapes:
@@ -212,7 +212,7 @@ def _with_sorted_metadata(file: bytes) -> bytes:
 
 
 def rule_metadata(path: str | Path) -> dict[str, str]:
-    """Return the text in the header of a file that `save_rule` wrote, all of it."""
+    """Return the metadata in the header of a file that `save_rule` wrote."""
     try:
         return _read_ours(checked_path(path), with_weights=False)[0]
     except NPAError as error:
@@ -220,7 +220,7 @@ def rule_metadata(path: str | Path) -> dict[str, str]:
 
 
 def rule_digest(rule: NPARule) -> str:
-    """Return 16 hexadecimal digits by which the weights of a rule are known: SHA-256 of them."""
+    """Return the first 16 hexadecimal digits of the SHA-256 of a rule's weights."""
     found = hashlib.sha256()
     for weight in rule.state_dict().values():
         found.update(weight.cpu().numpy().tobytes())
@@ -228,12 +228,12 @@ def rule_digest(rule: NPARule) -> str:
 
 
 def rule_file(source: str | Path) -> Path:
-    """Return the file of a rule."""
+    """Return the file of a rule, given as for `load_rule`."""
     return _locate(source)[0]
 
 
 def _locate(source: str | Path) -> tuple[Path, str | None]:
-    """Find the file that `source` means, and the name after '#'."""
+    """Return the file of `source`, and the name after '#' or None."""
     if not isinstance(source, str | os.PathLike):
         raise NPAError(
             f"source must be a rule's name or the path of its file, got {shown(source)}: "
@@ -272,7 +272,7 @@ def _locate(source: str | Path) -> tuple[Path, str | None]:
 
 
 def _read_ours(path: Path, *, with_weights: bool) -> tuple[dict[str, str], dict[str, Tensor]]:
-    """Return the metadata of a file in our format, and its weights or none."""
+    """Return the metadata of a file that `save_rule` wrote, and its weights if asked for."""
     check_regular(path, limit=_LARGEST_FILE)
     try:
         with safe_open(path, framework="pt") as file:
@@ -297,9 +297,9 @@ def _read_ours(path: Path, *, with_weights: bool) -> tuple[dict[str, str], dict[
 
 
 def _checksum(header: Mapping[str, str], weights: Mapping[str, Tensor]) -> str:
-    """Return SHA-256 over the metadata, but for the checksum itself, and over all weights."""
+    """Return the SHA-256 of the metadata, without the checksum, and of all weights."""
     content: list[Any] = sorted(item for item in header.items() if item[0] != "checksum")
-    content += [(name, str(held.dtype), *held.shape) for name, held in sorted(weights.items())]
+    content += [(name, str(w.dtype), *w.shape) for name, w in sorted(weights.items())]
     found = hashlib.sha256(json.dumps(content).encode())
     for _, tensor in sorted(weights.items()):
         found.update(tensor.numpy().tobytes())
@@ -325,7 +325,7 @@ def _parse(header: Mapping[str, str], name: str, kind: type) -> Any:
 
 
 def _without_weights(hyper_parameters: Mapping[str, Any]) -> NPARule:
-    """Return a rule whose weights have shapes and no memory."""
+    """Return a rule on the meta device: its weights have shapes and no memory."""
     with torch.device("meta"):
         return NPARule(**hyper_parameters)
 
@@ -335,7 +335,7 @@ def _shapes(weights: Mapping[str, Tensor]) -> dict[str, tuple[int, ...]]:
 
 
 def _assemble(parts: RuleParts) -> NPARule:
-    """Build the rule without drawing initial weights: shapes first, then the tensors themselves."""
+    """Return the rule of these parts, without drawing random weights."""
     try:
         rule = _without_weights(parts.hyper_parameters)
     except (RuntimeError, TypeError, OverflowError) as error:

@@ -1,4 +1,4 @@
-"""A rule's network as it is run: its weights as two plain products that map rows to updates."""
+"""A rule's network as steps run it: fused weights that map rows of perception to updates."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from npa_envs.ops.network import ArrangedWeights, arrange_weights, run_network
 from npa_envs.ops.opaque import without_autocast
 
 FOLD = 4
-"""Rows of products are padded to a multiple of this many columns: 16 bytes of float32."""
+"""Rows of perception and of updates are padded to a multiple of this: 16 bytes of float32."""
 
 OUTPUT_BLOCKS = 4
-"""The sum over hidden units is taken in this many blocks."""
+"""Number of blocks in which the sum over hidden units is computed."""
 
 
 def _blocked_product(hidden: Tensor, weight: Tensor) -> Tensor:
@@ -27,9 +27,9 @@ def _blocked_product(hidden: Tensor, weight: Tensor) -> Tensor:
 
 
 class _TwoLayers(torch.autograd.Function):
-    """relu(rows W1.T) W2.T, the latter product summed in blocks: rules amplify rounding.
+    """relu(rows W1.T) W2.T, with the second product summed in blocks to limit rounding.
 
-    One function in place of four takes the host less time, which small worlds are bound by.
+    One function in place of four costs less CPU time, which limits small worlds.
     """
 
     @staticmethod
@@ -50,12 +50,12 @@ class _TwoLayers(torch.autograd.Function):
 
 
 def without_small(update: Tensor, dead_zone: float) -> Tensor:
-    """Return updates with 0 in place of all numbers y with |y| <= `dead_zone`."""
+    """Return updates in which entries y with |y| <= `dead_zone` are set to 0."""
     return torch.nn.functional.hardshrink(update, dead_zone) if dead_zone > 0.0 else update
 
 
 class Network(Protocol):
-    """What maps rows of perception to updates."""
+    """Maps rows of perception to updates."""
 
     @property
     def row_width(self) -> int:
@@ -63,29 +63,30 @@ class Network(Protocol):
 
     @property
     def update_width(self) -> int:
-        """Columns of an update, A'."""
+        """Columns of an update, A': A, rounded up to a multiple of `FOLD`."""
 
     def __call__(self, rows: Tensor) -> Tensor:
-        """Map rows [z | 1 | 0], shape [K, row_width], to raw updates [y | 0], shape [K, A']."""
+        """Map rows [K, row_width], perception z, then 1, then zeros, to updates y, then zeros, [K,
+        A']."""
 
 
 class FoldedRule(NamedTuple):
-    """A rule's weights as two plain products: the bias is one more column of the first.
+    """A rule's weights as two matrix products: the bias is a column of the first matrix.
 
-    A row of perception is followed by a one and by zeros up to a multiple of `FOLD` columns, which
-    saves the passes over all rows that a bias and its gradient cost, and aligns the products.
+    A row of perception is followed by 1 and zero padding. That saves the passes over all rows that
+    a bias and its gradient cost, and aligns the rows.
     """
 
     hidden_weight: Tensor
-    """[W1 | b1 | 0], shape [H, row_width]."""
+    """W1, then b1, then zeros, shape [H, row_width]."""
     output_weight: Tensor
-    """W2 and rows of zeros up to a multiple of `FOLD`, shape [A', H]."""
+    """W2, then rows of zeros, shape [A', H]."""
     arranged: ArrangedWeights | None = None
-    """Both as the fused kernels read them, where there are such for their device and sizes."""
+    """Both in the order of the fused kernels, if there are such for the device and sizes."""
     joined: Tensor | None = None
-    """Both one after the other where there are: gradients of many steps are added up at once."""
+    """Both flattened into one tensor for these kernels, so that gradients are added at once."""
     dead_zone: float = 0.0
-    """Outputs of this size or smaller are 0."""
+    """Outputs y with |y| <= this are set to 0."""
 
     @property
     def row_width(self) -> int:
@@ -94,11 +95,12 @@ class FoldedRule(NamedTuple):
 
     @property
     def update_width(self) -> int:
-        """Columns of an update, A'."""
+        """Columns of an update, A': A, rounded up to a multiple of `FOLD`."""
         return self.output_weight.shape[0]
 
     def __call__(self, rows: Tensor) -> Tensor:
-        """Map rows [z | 1 | 0], shape [K, row_width], to raw updates [y | 0], shape [K, A']."""
+        """Map rows [K, row_width], perception z, then 1, then zeros, to updates y, then zeros, [K,
+        A']."""
         return without_small(self._product(rows), self.dead_zone)
 
     def _product(self, rows: Tensor) -> Tensor:
@@ -112,24 +114,25 @@ class FoldedRule(NamedTuple):
 
 
 class FoldedInvariants(NamedTuple):
-    """An equivariant rule's weights: two plain products between mixtures and gates."""
+    """An equivariant rule's weights: mix vectors, two matrix products, gate the mixed vectors."""
 
     products: FoldedRule
-    """The products, whose rows are scalars and products of mixed vectors, and whose gates are as
-    large as they steer."""
+    """The matrix products; inputs are scalars and products of mixed vectors, outputs are gates,
+    scaled by the size of their steering weights, and Δs."""
     mixing: Tensor
-    """Weights of the mixtures."""
+    """Weights that mix vectors."""
     signs: Tensor
-    """Whether a gate moves along its vector or against it."""
+    """Signs of the steering weights: along or against the vector."""
     form: VectorForm
-    """What of a row is a vector."""
+    """Positions of vectors in a row."""
     row_width: int
     """Columns of a row of perception: P + 1, rounded up to a multiple of `FOLD`."""
     update_width: int
-    """Columns of an update, A'."""
+    """Columns of an update, A': A, rounded up to a multiple of `FOLD`."""
 
     def __call__(self, rows: Tensor) -> Tensor:
-        """Map rows [z | 1 | 0], shape [K, row_width], to raw updates [y | 0], shape [K, A']."""
+        """Map rows [K, row_width], perception z, then 1, then zeros, to updates y, then zeros, [K,
+        A']."""
         mixed, inputs = read_rows(rows, self.mixing, self.form, self.products.row_width)
         output = self.products(inputs)
         if len(self.signs) == 0:
@@ -140,7 +143,7 @@ class FoldedInvariants(NamedTuple):
 def fold_weights(
     hidden_weight: Tensor, output_weight: Tensor, dead_zone: float = 0.0
 ) -> FoldedRule:
-    """Return folded weights as they are run on their device, differentiable in both."""
+    """Return fused weights, arranged for the device's kernels; differentiable in both."""
     arranged = arrange_weights(hidden_weight, output_weight)
     if arranged is None:
         return FoldedRule(hidden_weight, output_weight, dead_zone=dead_zone)

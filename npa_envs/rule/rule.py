@@ -1,4 +1,4 @@
-"""The rule: one small network that every particle runs on its own perception vector."""
+"""The rule: a small network that every particle applies to its perception vector."""
 
 from __future__ import annotations
 
@@ -33,19 +33,19 @@ from npa_envs.rule.network import (
 )
 
 COLOUR_OFFSET = 0.5
-"""A particle's colour is its last three outputs plus this, dimensionless."""
+"""Added to a particle's last three outputs to get its colour, dimensionless."""
 
 INIT_GAIN = 0.1
 """Gain of the Xavier-uniform initialisation: a fresh rule hardly moves its particles."""
 
 LARGEST_DIM = 65536
-"""No dimension of a rule is larger."""
+"""Largest dimension of a rule."""
 
 LIFE = 0
-"""State channel of particles that divide: 1 where they live, 0 where they are dead."""
+"""State channel that is 1 for living and 0 for dead particles, in rules that divide."""
 
 FIRST_FATES = (5.0, -8.0)
-"""Log odds of an untrained rule's particles to divide and to die, over staying."""
+"""Initial log odds of division and of death against neither."""
 
 
 STEP_PARTS = frozenset(
@@ -70,7 +70,7 @@ STEP_PARTS = frozenset(
         "vector_form",
     ]
 )
-"""What a step of a rule is made of: where a subclass changes any of it, the rule is not plain."""
+"""Attributes that a step uses: a subclass that overrides one of them is not plain."""
 
 
 class NPARule(nn.Module):
@@ -80,45 +80,44 @@ class NPARule(nn.Module):
     `static`).
     Source: arXiv 2601.16096, section 3; the same network for every particle and every step.
 
-    An equivariant rule knows no direction: with every start that is turned, all that follows is
-    turned. It mixes the gradients that it perceives, u = mixing^T v, and its network reads the
-    states and the products of pairs of mixed vectors. In place of δ it gives gates g, and
-    δ = Σ relu(g_a) steering_a u_a. Rules of the authors' web demo are like this. Without `chiral`
-    a rule of 2D worlds does not tell left from right either. With it, it also reads u_a × u_b, and
-    has gates for the vectors turned by 90 degrees.
+    An equivariant rule commutes with rotations: rotated worlds stay rotated. It mixes the gradients
+    that it perceives, u = mixing^T v, and its network reads the states and the scalar products of
+    pairs of mixed vectors. In place of δ it outputs gates g, and δ = Σ relu(g_a) steering_a u_a, as
+    rules of the authors' web demo do. Without `chiral` it commutes with reflections too. With it, a
+    rule of 2D worlds also reads u_a × u_b, and has gates for the vectors rotated by 90 degrees.
 
     Args:
         space_dim: Space dimension D, 2 or 3.
         state_dim: State channels C.
         hidden_dim: Width of the hidden layer.
-        eps0: Perception radius at which the rule is trained [length units]: it scales what is
-            perceived at another radius.
+        eps0: Perception radius at which the rule is trained [length units]; perception at another
+            radius is scaled to it.
         alpha: Largest displacement in one step as a fraction of the perception radius.
-        static: Particles never move, so the rule has no displacement outputs.
+        static: Particles never move: the rule has no displacement outputs.
         readout_dim: Outputs of the read-out network s -> outputs; 0 for none.
         readout_hidden_dim: Width of the read-out's hidden layer; needed where `readout_dim` > 0.
         moment_correction: The perceived state gradient is corrected by the moment matrix.
         state_gradient: The rule perceives the state gradient.
         density_gradient: The rule perceives the density gradient.
-        species_count: Species whose densities and density gradients the rule perceives one by one,
-            besides; 0: it does not tell them apart. Others are run by `npa_envs.rollout_species`.
+        species_count: Species whose densities and density gradients the rule also perceives
+            separately, as `npa_envs.rollout_species` runs it; 0: it does not distinguish species.
         moment_inverse: How the moment matrix is inverted for the correction: "threshold", the
             paper's, or "smooth", as in `npa_envs.perceive`.
-        equivariant: The rule knows no direction.
-        chiral: An equivariant rule of 2D worlds tells left from right.
+        equivariant: The rule is rotation-equivariant.
+        chiral: An equivariant rule of 2D worlds distinguishes left from right.
         mixed_vectors: Mixed vectors of an equivariant rule, at least 1.
-        code_dim: The first so many of the state channels are a code, K, which the rule perceives
-            and never changes: it says what to grow.
-        code_names: What the codes that the rule knows stand for; there are some if there is a code.
-        encoder: The rule reads codes from pictures (`codes.encode`).
-        divides: Particles divide and die, with odds that follow from their states. Their first
-            state is 1 where they live and 0 where they are dead (`npa_envs.world.division`).
-        dead_zone: Each number y of an update with |y| <= `dead_zone` counts as 0 (dimensionless).
-            Worlds that hardly change then come to rest (`at_rest`).
+        code_dim: Length K of a code, which names what to grow: the first K state channels, which
+            the rule perceives and never changes.
+        code_names: Names of the known codes, at least one if `code_dim` > 0.
+        encoder: A network computes codes from pictures (`codes.encode`).
+        divides: Particles divide and die, with probabilities that depend on their states. Their
+            first state is 1 for living and 0 for dead particles (`npa_envs.world.division`).
+        dead_zone: Entries y of an update with |y| <= `dead_zone` are set to 0 (dimensionless), so
+            that worlds that hardly change come to rest (`at_rest`).
 
     Raises:
-        NPAError: A dimension or a length is out of range, `moment_inverse` is another word, or what
-            is asked of an equivariant rule, of codes or of division does not go together.
+        NPAError: A dimension or a length is out of range, `moment_inverse` is unknown, or arguments
+            exclude each other.
     """
 
     def __init__(
@@ -192,7 +191,7 @@ class NPARule(nn.Module):
             steering = torch.empty(1, 0 if self.static else vectors.gate_count)
             self.steering = nn.Parameter(nn.init.xavier_uniform_(steering)[0])
         self.codes = Codes(code_names, code_dim, encoder=encoder) if code_dim else None
-        """The codes that the rule knows, where it perceives such."""
+        """The known codes, or None without `code_dim`."""
 
     def _check_sizes(self) -> None:
         positive = ("state_dim", "hidden_dim", "mixed_vectors")
@@ -216,7 +215,7 @@ class NPARule(nn.Module):
             )
 
     def _check_parts(self, name_count: int, encoder: bool) -> None:
-        """Check what the dead zone, equivariance, codes and division need and exclude."""
+        """Check requirements of the dead zone, equivariance, codes and division."""
         turning, code_dim, zone = self.equivariant, self.code_dim, self.dead_zone
         for fails, fault in (
             (
@@ -288,26 +287,26 @@ class NPARule(nn.Module):
 
     @property
     def output_dim(self) -> int:
-        """Outputs of the network: A less the code, or an equivariant rule's gates, then Δs."""
+        """Outputs of the network: A - K without the code, or an equivariant rule's gates + C."""
         if not self.equivariant or self.static:
             return self.update_dim - self.code_dim
         return self.vector_form.gate_count + self.state_dim
 
     @property
     def perception_dim(self) -> int:
-        """Length P of the perception vector: C(2+D)+D, and (1+D) for each species told apart."""
+        """Length P of the perception vector: C(2+D)+D, and 1+D for each distinguished species."""
         gradients = self.state_dim * self.space_dim * self.state_gradient
         shared = 2 * self.state_dim + gradients + self.space_dim * self.density_gradient
         return shared + self.species_count * (1 + self.space_dim)
 
     @property
     def update_dim(self) -> int:
-        """Length A of the update: D+C, or C where particles are static."""
+        """Length A of the update: D+C, or C if static."""
         return self.state_dim + (0 if self.static else self.space_dim)
 
     @property
     def weight_count(self) -> int:
-        """Numbers that the rule is made of."""
+        """Number of parameters."""
         return sum(parameter.numel() for parameter in self.parameters())
 
     def forward(self, perception: Tensor) -> Tensor:
@@ -331,7 +330,7 @@ class NPARule(nn.Module):
 
     @property
     def update_weight(self) -> Tensor:
-        """W2, with rows of zeros for the code, which never changes; shape [A, H]."""
+        """W2, with rows of zeros for the code; shape [A, H]."""
         weight = self.output.weight
         if self.code_dim == 0:
             return weight
@@ -339,31 +338,30 @@ class NPARule(nn.Module):
         return torch.cat((moves, weight.new_zeros(self.code_dim, self.hidden_dim), states))
 
     def _update_by_invariants(self, perception: Tensor) -> Tensor:
-        """Map perception vectors to raw updates by what stays the same in a turned world."""
+        """Map perception vectors to raw updates by rotation-invariant inputs."""
         mixed, inputs = invariants(perception, self.mixing, self.vector_form)
         output: Tensor = self.output(torch.relu(self.hidden(inputs)))
         return output if self.static else steered(output, mixed, self.steering, self.vector_form)
 
     def is_plain(self) -> bool:
-        """Return whether the rule is just its two layers, so that `folded` may stand in for it.
+        """Return whether the rule computes only its two layers, so that `folded` may replace it.
 
-        A rule of a subclass that changes what a step runs (`STEP_PARTS`) is not, nor is one that
-        was given such a part of its own, one whose layers or their `forward` were replaced, one
-        with hooks, or any while there are hooks of all modules; nor is an equivariant one.
+        It does not if it is equivariant, has hooks, or there are global hooks, or if a subclass or
+        the object itself overrides an attribute of `STEP_PARTS`, a layer, or a layer's `forward`.
         """
         return not self.equivariant and self._is_unchanged()
 
     def _is_unchanged(self) -> bool:
-        """Return whether the rule's network is the one that it was made with."""
+        """Return whether the rule's network is that of `NPARule`."""
         names = ("hidden", "output", "fate") if self.divides else ("hidden", "output")
-        # Attributes of modules take the host longer.
+        # `_modules` is faster than attributes of modules.
         layers = [own for own in map(self._modules.get, names) if type(own) is nn.Linear]
         if len(layers) < len(names):
             return False
         hidden, output = layers[:2]
         return (
-            (type(self) is NPARule or _steps_alike(type(self)))
-            # Compilers trace no set operation on a module's attributes.
+            (type(self) is NPARule or _overrides_no_part(type(self)))
+            # A loop, as torch.compile traces no set operation on these attributes.
             and not any(name in self.__dict__ for name in STEP_PARTS)
             and getattr(hidden, "bias", None) is not None
             and getattr(output, "bias", None) is None
@@ -373,17 +371,19 @@ class NPARule(nn.Module):
         )
 
     def has_network(self) -> bool:
-        """Return whether `network` stands in for the rule: plain or equivariant, as it was made."""
+        """Return whether `network` returns fused weights: the rule is plain, or unchanged
+        equivariant."""
         return self.is_plain() or (self.equivariant and self._is_unchanged())
 
     def network(self) -> Network | None:
-        """Return what maps rows of perception to updates; None: the module that the rule is."""
+        """Return fused weights that map rows to updates; None: call the rule as a module
+        instead."""
         if self.is_plain():
             return self.folded()
         return self._folded_invariants() if self.has_network() else None
 
     def _folded_invariants(self) -> FoldedInvariants:
-        """Return the weights of an equivariant rule, differentiable in them."""
+        """Return an equivariant rule's fused weights, differentiable in the parameters."""
         width = self.perception_dim + 1
         weight, signs = signed_gates(self.output.weight, self.steering)
         return FoldedInvariants(
@@ -396,13 +396,13 @@ class NPARule(nn.Module):
         )
 
     def network_weights(self) -> list[Tensor]:
-        """Return the parameters of a step, without those of the read-out."""
+        """Return the parameters that a step uses, without those of the read-out."""
         weights = [self.hidden.weight, self.hidden.bias, self.output.weight]
         weights += [self.mixing, self.steering] if self.equivariant else []
         return weights + ([self.fate.weight, self.fate.bias] if self.divides else [])
 
     def folded(self) -> FoldedRule:
-        """Return the weights as two plain products, differentiable in the parameters."""
+        """Return the weights as two matrix products, differentiable in the parameters."""
         return self._folded(self.update_weight)
 
     def _folded(self, update_weight: Tensor) -> FoldedRule:
@@ -413,9 +413,9 @@ class NPARule(nn.Module):
         return fold_weights(hidden_weight, output_weight, constant(self.dead_zone))
 
     def division_probabilities(self, states: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the probabilities with which updated particles divide and die, shape [...] each.
+        """Return the probabilities that updated particles divide and die, shape [...] each.
 
-        They are the softmax of (a, 0, b), where (a, b) = W s + c and 0 is for staying.
+        They are the softmax of (a, 0, b), where (a, b) = W s + c and 0 is for neither.
 
         Args:
             states: Particle states, dimensionless, shape [..., C], of a rule that divides.
@@ -426,7 +426,7 @@ class NPARule(nn.Module):
         return divide, die
 
     def read_out(self, states: Tensor) -> Tensor:
-        """Return the rule's outputs: the read-out network's, or the states where it has none.
+        """Return the outputs of the read-out network, or the states without one.
 
         Args:
             states: Particle states, dimensionless, shape [..., C].
@@ -454,7 +454,7 @@ class NPARule(nn.Module):
         return outputs[..., -3:] + COLOUR_OFFSET
 
     def with_code(self, states: Tensor, code: Tensor) -> Tensor:
-        """Return states that carry a code; all else of them stays as it is.
+        """Return states whose first channels are replaced by a code.
 
         Args:
             states: Particle states, dimensionless, shape [B, N, C].
@@ -481,17 +481,17 @@ class NPARule(nn.Module):
             ) from error
 
     def _repr_html_(self) -> str:
-        """Return what Jupyter shows: what the rule sees, what it does, how large it is."""
-        seen = ["its own state", "the states around it"]
-        seen += ["where they change"] * self.state_gradient
-        seen += ["where particles stand denser"] * self.density_gradient
-        seen += [f"{self.species_count} species apart"] * (self.species_count > 0)
-        seen += ["no direction"] * self.equivariant
-        seen += ["a code of what to grow"] * (self.code_dim > 0)
+        """Return the HTML for Jupyter: perception, update and sizes of the rule."""
+        perceived = ["its own state", "the states around it"]
+        perceived += ["where they change"] * self.state_gradient
+        perceived += ["where particles stand denser"] * self.density_gradient
+        perceived += [f"{self.species_count} species apart"] * (self.species_count > 0)
+        perceived += ["no direction"] * self.equivariant
+        perceived += ["a code of what to grow"] * (self.code_dim > 0)
         done = "changes its state" if self.static else "moves and changes its state"
         done += ", divides and dies" * self.divides
         rows = {
-            "a particle perceives": f"{', '.join(seen)}: {self.perception_dim} numbers",
+            "a particle perceives": f"{', '.join(perceived)}: {self.perception_dim} numbers",
             "how far": f"ε0 = {self.eps0:g} (length units)",
             "and then": f"{done}: {self.update_dim} numbers",
             "state": f"{self.state_dim} channels",
@@ -510,15 +510,15 @@ class NPARule(nn.Module):
             return super().__getattr__(name)
         except AttributeError as error:
             if name.startswith("_"):
-                # What libraries ask for to see whether it is there must cost nothing.
+                # Libraries probe for private names, which must be fast.
                 raise
-            # As Python's own errors do, which torch's modules replace.
+            # A hint as in Python's own errors, which torch's modules replace.
             nearest = difflib.get_close_matches(name, [n for n in dir(self) if n[0] != "_"], n=1)
             hint = f": did you mean {nearest[0]!r}?" if nearest else ""
             raise AttributeError(f"{error}{hint}", name=name, obj=self) from None
 
     def hyper_parameters(self) -> dict[str, Any]:
-        """Return all that `NPARule` takes: `NPARule(**rule.hyper_parameters())` has this shape."""
+        """Return the arguments of `NPARule` for a rule of the same shape."""
         codes = self.codes
         own = {
             "code_names": () if codes is None else codes.names,
@@ -529,16 +529,16 @@ class NPARule(nn.Module):
 
 
 HYPER_PARAMETERS = {k: v for k, v in get_type_hints(NPARule.__init__).items() if k != "return"}
-"""What makes a rule, but for its weights: name -> type."""
+"""Arguments of `NPARule`: name -> type."""
 
 
-def _steps_alike(kind: type[NPARule]) -> bool:
-    """Return whether rules of a subclass make a step of nothing but what `NPARule` makes it of."""
+def _overrides_no_part(kind: type[NPARule]) -> bool:
+    """Return whether a subclass overrides none of `STEP_PARTS`."""
     return all(getattr(kind, name) is getattr(NPARule, name) for name in STEP_PARTS)
 
 
 def is_altered(module: nn.Module) -> bool:
-    """Return whether a module was given another `forward`, or something before or after it."""
+    """Return whether a module has its own `forward` or forward hooks."""
     return bool("forward" in vars(module) or module._forward_hooks or module._forward_pre_hooks)
 
 
@@ -548,9 +548,10 @@ def _has_backward_hooks(module: nn.Module) -> bool:
 
 @torch.no_grad()
 def with_codes(rule: NPARule, untrained: NPARule) -> NPARule:
-    """Return an untrained rule with the weights that a rule without codes has.
+    """Copy the weights of a rule without codes into an untrained rule with codes, and return it.
 
-    What is new, the columns of the codes, stays as it is, and so do further hidden units.
+    The columns of the code and additional hidden units keep their untrained weights. Where the
+    shapes do not fit, `rule` is returned.
     """
     count, space_dim, code_dim = untrained.state_dim, untrained.space_dim, untrained.code_dim
     own = torch.ones(untrained.perception_dim, dtype=torch.bool)
@@ -575,20 +576,20 @@ def with_codes(rule: NPARule, untrained: NPARule) -> NPARule:
 
 
 def dividing(rule: NPARule) -> NPARule:
-    """Return a copy of a rule whose particles also divide and die, with untrained odds."""
+    """Return a copy of a rule with division, whose weights of division are untrained."""
     made = NPARule(**rule.hyper_parameters() | {"divides": True}).to(rule.hidden.weight)
     made.load_state_dict(made.state_dict() | rule.state_dict())
     return made
 
 
 def fate_parameters(rules: nn.Module) -> list[nn.Parameter]:
-    """Return the weights by which particles divide and die, of a rule or of several in a module."""
+    """Return the weights of division and death, of one rule or several in a module."""
     found = (module for module in rules.modules() if isinstance(module, NPARule))
     return [parameter for rule in found if rule.divides for parameter in rule.fate.parameters()]
 
 
 def check_rule(rule: Any) -> None:
-    """Check that something is a rule; one that `torch.compile` has wrapped is one too."""
+    """Check that an object is a rule, or one that `torch.compile` has wrapped."""
     if not isinstance(rule, NPARule) and not isinstance(getattr(rule, "_orig_mod", None), NPARule):
         raise NPAError(
             f"rule must be an NPARule, got {type(rule).__name__}: load it with npa_envs.load_rule"

@@ -1,4 +1,4 @@
-"""Looks of particles in 3D: Gaussians from a rule's outputs, and views of them."""
+"""Appearance of particles in 3D: Gaussians from a rule's outputs, and pictures of them."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from torch import Tensor
 from npa_envs.ops import Cameras, render_gaussians
 
 OUTPUTS = 20
-"""Read-out dimensions: rotation 4, log-anisotropy 3, opacity 1, colours of degree 1 9, of 0 3."""
+"""Read-out channels: 4 rotation, 3 log-anisotropy, 1 opacity, 9 and 3 colours of degree 1 and 0."""
 
 FLAT = 0.5 * math.sqrt(1.0 / math.pi)
-"""The spherical harmonic of degree 0 (dimensionless)."""
+"""Value of the spherical harmonic of degree 0 (dimensionless)."""
 
 
 class Gaussians(NamedTuple):
@@ -39,12 +39,12 @@ class Gaussians(NamedTuple):
 
 @dataclass(frozen=True)
 class Appearance:
-    """How outputs become Gaussians.
+    """Maps outputs of particles to Gaussians.
 
-    20 outputs are a read-out's: four are added to the quaternion (1, 0, 0, 0), three stretch the
-    axes, one changes the opacity, nine are colours that depend on where one looks from, and the
-    last three, plus 0.5, the colour itself. Of any other number the last three, plus 0.5, are the
-    colour, and particles are round.
+    20 outputs are those of a read-out: four are added to the quaternion (1, 0, 0, 0), three stretch
+    the axes, one changes the opacity, nine are coefficients of view-dependent colour, and the last
+    three, plus 0.5, are the colour. With any other number of outputs particles are round, and the
+    last three outputs, plus 0.5, are the colour.
     """
 
     sigma: float
@@ -57,7 +57,7 @@ class Appearance:
     """Opacity of a particle whose output is 0, in (0, 1)."""
 
     def gaussians(self, outputs: Tensor) -> Gaussians:
-        """Return the Gaussians of particles."""
+        """Return the Gaussians of particles with outputs [B, N, K]."""
         lead = outputs.shape[:-1]
         # The renderer adds one half, as `NPARule.colour` does.
         flat = outputs[..., None, -3:]
@@ -81,7 +81,7 @@ class Appearance:
 
 
 def draw_gaussians(x: Tensor, gaussians: Gaussians, cameras: Cameras) -> tuple[Tensor, Tensor]:
-    """Return colours [B, V, H, W, 3] before black, and alpha [B, V, H, W]."""
+    """Return pictures over black [B, V, H, W, 3], and their alpha [B, V, H, W]."""
     pictures = render_gaussians(
         x,
         gaussians.scales,

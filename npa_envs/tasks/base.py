@@ -1,7 +1,7 @@
-"""Tasks: what the trainer asks of one, and what most of them have in common.
+"""Base classes of tasks.
 
-Any object with the methods of `Task` can be trained on; `ParticleTask` has those that are alike,
-`GrowthTask` those of what grows from a ball of blank particles.
+The trainer calls the methods of `ParticleTask`, which has defaults for most of them. `GrowthTask`
+adds those of tasks in which a ball of particles with zero states grows into a target.
 """
 
 from __future__ import annotations
@@ -20,17 +20,15 @@ from npa_envs.rule.rule import COLOUR_OFFSET, NPARule
 from npa_envs.tasks.appearance import Gaussians
 from npa_envs.tasks.damage import PoolDamage, damage_pool, escape_motion
 from npa_envs.tasks.seeds import uniform_ball
+from npa_envs.world.particles import Particles
 from npa_envs.world.randomness import Randomness
-
-Worlds = tuple[Tensor, Tensor, Tensor | None]
-"""Positions x [B, N, D], states s [B, N, C], and goals, int64 [B], of worlds that have such."""
 
 
 class Frame(NamedTuple):
-    """Where viewers look."""
+    """The region that viewers show."""
 
     centre: tuple[float, ...]
-    """Middle of what is shown [length units]."""
+    """Its centre [length units]."""
 
     half_width: float
     """Half of its side [length units]."""
@@ -78,16 +76,17 @@ ConfigT = TypeVar("ConfigT", bound=TaskConfig)
 
 
 class ParticleTask(Generic[ConfigT]):
-    """A thing to learn: world, untrained rule, fresh worlds, loss, metric and pictures.
+    """A task: its world, untrained rule, seeds, loss, metric and pictures.
 
-    A task says where particles begin (`places`) and what is compared (`compare`), and has a
-    metric and a picture; all else has defaults. In all methods x are positions [length units],
-    shape [B, N, D], s states (dimensionless), shape [B, N, C], and path_length is how far each
-    particle travelled in the rollout [length units], shape [B, N].
+    A subclass defines where particles start (`places`), the loss (`compare`), a metric and a
+    picture; all else has defaults. In all methods x are positions [length units], shape [B, N, D],
+    s states (dimensionless), shape [B, N, C], and path_length the length of each particle's path
+    in the rollout [length units], shape [B, N].
 
     No method may wait for the device (no `.item()`, no branch on a tensor's value): the trainer
     captures `seed`, `damage` and `loss` in CUDA graphs and never reads a number back between two
-    log lines. So these must do the same in every iteration, and draw from their generator alone.
+    log lines. So these must launch the same work in every iteration, and draw from their generator
+    alone.
     """
 
     config: ConfigT
@@ -97,22 +96,22 @@ class ParticleTask(Generic[ConfigT]):
     """Space dimension D."""
 
     metric_name: str = "loss"
-    """What `metric` is, in a word or two."""
+    """Name of `metric` in tables."""
 
     aligned: bool = False
-    """Whether worlds are to match `target_picture` pixel by pixel: a PSNR means something."""
+    """Whether worlds are compared with `target_picture` pixel by pixel, so a PSNR makes sense."""
 
     has_views: bool = False
-    """Whether worlds are seen from several sides, by `views`, `view_psnr` and `gaussians`."""
+    """Whether the task has `views`, `view_psnr` and `gaussians`: pictures from several cameras."""
 
     classifies: bool = False
-    """Whether particles that stay where they are say what their cloud shows."""
+    """Whether static particles output class scores of their point cloud."""
 
     goal_count: int = 0
-    """Goals that a world may have; 0: none."""
+    """Number of different goals of worlds; 0: worlds have no goals."""
 
     _kept: tuple[str, ...] = ()
-    """Attributes that are arguments, too, and that a task of another size keeps."""
+    """Attributes that `resized` passes to the constructor."""
 
     _goal: Tensor | None = None
     _target_picture: Tensor | None = None
@@ -135,14 +134,14 @@ class ParticleTask(Generic[ConfigT]):
 
     @property
     def frame(self) -> Frame:
-        """Where viewers look: at the box, or around the origin."""
+        """The region that viewers show: the box, or a square or cube around the origin."""
         open_space = 1.1 if self.space_dim == 2 else 0.95
         half_width = open_space if self.box is None else 0.5 * min(self.box)
         return Frame((0.0,) * self.space_dim, half_width)
 
     @property
     def pixel_size(self) -> float:
-        """Usual distance between particles: the side of what one fills [length units]."""
+        """Usual distance between particles [length units]."""
         return self._pixel_size or (0.1 / self.config.particle_count) ** (1.0 / 3.0)
 
     @property
@@ -168,19 +167,19 @@ class ParticleTask(Generic[ConfigT]):
         return untrained_rule(generator, **(sizes | {"eps0": config.eps} | self.rule_shape))
 
     def places(self, world_count: int, generator: Randomness, device: torch.device) -> Tensor:
-        """Return the positions of fresh worlds."""
+        """Return the particles' positions in fresh worlds, shape [B, N, D]."""
         raise NotImplementedError
 
     def seed(
         self, world_count: int, *, generator: Randomness, device: str | torch.device = "cpu"
-    ) -> Worlds:
-        """Return fresh worlds: positions of `places`, all states zero, without goals."""
+    ) -> Particles:
+        """Return fresh worlds with all states zero and without goals."""
         x = self.places(world_count, generator, torch.device(device))
-        return x, x.new_zeros(*x.shape[:2], self.config.state_dim), None
+        return Particles(x, x.new_zeros(*x.shape[:2], self.config.state_dim))
 
-    def damage(self, x: Tensor, s: Tensor, goal: Tensor | None, generator: Randomness) -> Worlds:
-        """Return worlds of the pool damaged, so that they heal, and their goals from then on."""
-        return x, s, goal
+    def damage(self, worlds: Particles, generator: Randomness) -> Particles:
+        """Return worlds of the pool, damaged; their goals may change."""
+        return worlds
 
     def begin(self, iteration: int) -> None:
         """Prepare the loss of an iteration, without waiting for the device.
@@ -190,17 +189,17 @@ class ParticleTask(Generic[ConfigT]):
         """
 
     def for_rule(self, rule: NPARule) -> Self:
-        """Return the task as it is for the worlds of a rule; most are the same for all rules.
+        """Return the task for worlds that a rule runs; by default the task itself.
 
-        The rule's parameters are read anew at each call: losses are differentiable in them and
-        change with them. The task itself stays as it is.
+        Losses read the rule's parameters at each call and are differentiable in them. The task
+        itself is not changed.
         """
         return self
 
     def toward(self, goal: Tensor | None) -> Self:
-        """Return the task with loss and metric for worlds of these goals, int64, shape [B].
+        """Return the task with loss and metric for worlds with these goals, int64, shape [B].
 
-        Most have none. The tensor is read anew at each call. The task itself stays as it is.
+        By default worlds have none. The tensor is read at each call. The task is not changed.
         """
         if goal is None or self.goal_count == 0:
             return self
@@ -215,14 +214,14 @@ class ParticleTask(Generic[ConfigT]):
         return self._goal
 
     def coded(self, s: Tensor) -> Tensor:
-        """Return states with the code of each world, which damage takes away, where it has one.
+        """Return states with their worlds' codes written again, which damage may have wiped.
 
-        Where it is learned, they are differentiable in it.
+        Without codes they are unchanged. They are differentiable in codes that are learned.
         """
         return s
 
     def held_out(self) -> Self:
-        """Return the task with worlds that no rule was trained on, where data are split."""
+        """Return the task with test data, where data are split; else the task itself."""
         return self
 
     def resized(self, particle_count: int) -> Self:
@@ -234,13 +233,13 @@ class ParticleTask(Generic[ConfigT]):
         return found
 
     def compare(self, x: Tensor, s: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
-        """Return how far worlds are from the goal, weighted, and its named parts, unweighted."""
+        """Return the weighted distance from the target, and its named parts, unweighted."""
         raise NotImplementedError
 
     def penalties(
         self, x: Tensor, s: Tensor, path_length: Tensor
     ) -> dict[str, tuple[float, Tensor]]:
-        """Return what the loss adds to `compare`: weight and term by name."""
+        """Return the terms that the loss adds to `compare`: name -> (weight, term)."""
         overflow = (s - s.clamp(-1.0, 1.0)).abs().mean()
         return {"overflow": (self.config.overflow_weight, overflow)}
 
@@ -265,16 +264,16 @@ class ParticleTask(Generic[ConfigT]):
         raise NotImplementedError
 
     def metric(self, x: Tensor, s: Tensor) -> Tensor:
-        """Return how far each world is from the goal, shape [B]; lower is better."""
+        """Return each world's distance from the target, shape [B]; lower is better."""
         raise NotImplementedError
 
     @property
     def trial_name(self) -> str:
-        """What `trial_metric` is."""
+        """Name of `trial_metric`."""
         return self.metric_name
 
     def trial_metric(self, x: Tensor, s: Tensor) -> Tensor:
-        """Return what trials of robustness count, shape [B]: as a default `metric`."""
+        """Return the metric of robustness trials, shape [B]; by default `metric`."""
         return self.metric(x, s)
 
     def colours(self, s: Tensor) -> Tensor:
@@ -282,7 +281,7 @@ class ParticleTask(Generic[ConfigT]):
         return s[..., -3:] + COLOUR_OFFSET
 
     def views(self, x: Tensor, s: Tensor, cameras: Cameras) -> Tensor:
-        """Return what V cameras see: colours times alpha, and alpha, shape [B, V, H, W, 4]."""
+        """Return pictures of V cameras: colours times alpha, and alpha, shape [B, V, H, W, 4]."""
         raise NotImplementedError
 
     def view_psnr(self, x: Tensor, s: Tensor) -> Tensor:
@@ -290,11 +289,11 @@ class ParticleTask(Generic[ConfigT]):
         raise NotImplementedError
 
     def gaussians(self, s: Tensor) -> Gaussians:
-        """Return how particles of states s look."""
+        """Return the Gaussians that particles with states s are drawn as."""
         raise NotImplementedError
 
     def _with(self, **fields: object) -> Self:
-        """Return a copy with other attributes."""
+        """Return a shallow copy with some attributes replaced."""
         bound = copy.copy(self)
         vars(bound).update(fields)
         return bound
@@ -303,13 +302,10 @@ class ParticleTask(Generic[ConfigT]):
 Task = ParticleTask[Any]
 """Any task."""
 
-PictureTask = Task
-"""Any task, where only pictures are asked for."""
-
 
 @dataclass(frozen=True, kw_only=True)
 class GrowthConfig(PoolDamage, TaskConfig):
-    """What is grown from a ball, how it is damaged, and what the loss penalises."""
+    """Configuration of growth from a ball: target, damage in training, penalties of the loss."""
 
     target: str
     """What to grow."""
@@ -343,10 +339,9 @@ GrowthConfigT = TypeVar("GrowthConfigT", bound=GrowthConfig)
 
 
 class GrowthTask(ParticleTask[GrowthConfigT]):
-    """A thing that grows in open space; a subclass compares it with its target."""
+    """A task of growing a target in open space; a subclass compares worlds with the target."""
 
     aligned = True
-    """What is grown is compared with the target pixel by pixel."""
 
     @property
     def rule_shape(self) -> dict[str, Any]:
@@ -360,14 +355,14 @@ class GrowthTask(ParticleTask[GrowthConfigT]):
             world_count, count, self.space_dim, radius, generator=generator, device=device
         )
 
-    def damage(self, x: Tensor, s: Tensor, goal: Tensor | None, generator: Randomness) -> Worlds:
-        """Return the worlds damaged as the configuration says, each at a place of its own."""
-        return *damage_pool(x, s, self.config, generator=generator), goal
+    def damage(self, worlds: Particles, generator: Randomness) -> Particles:
+        """Return the worlds, damaged as the configuration says, each at its own random position."""
+        return damage_pool(worlds, self.config, generator=generator)
 
     def penalties(
         self, x: Tensor, s: Tensor, path_length: Tensor
     ) -> dict[str, tuple[float, Tensor]]:
-        """Return motion, overflow, what lies outside of [-1, 1]^D, and the paths of strays."""
+        """Return terms for motion, overflow, positions outside of [-1, 1]^D, and motion there."""
         config = self.config
         terms = {"motion": (config.motion_weight, path_length.mean())}
         terms |= super().penalties(x, s, path_length)
@@ -378,12 +373,12 @@ class GrowthTask(ParticleTask[GrowthConfigT]):
         return terms
 
     def bounded(self, x: Tensor) -> Tensor:
-        """Return what should lie in [-1, 1], of positions [B, N, D]: their coordinates."""
+        """Return the coordinates that the loss keeps in [-1, 1]: by default x itself."""
         return x
 
 
 def check_goal(goal: Tensor, count: int) -> None:
-    """Check goals, each below `count`; their range only on a CPU, as no task may wait for CUDA."""
+    """Check int64 goals [B] in [0, count); their range only on a CPU, as no task waits for CUDA."""
     if not isinstance(goal, Tensor) or goal.dtype != torch.int64 or goal.ndim != 1:
         came = f"{goal.dtype} {tuple(goal.shape)}" if isinstance(goal, Tensor) else shown(goal)
         raise NPAError(
@@ -391,17 +386,17 @@ def check_goal(goal: Tensor, count: int) -> None:
         )
     if goal.device.type == "cpu" and not bool(((goal >= 0) & (goal < count)).all()):
         raise NPAError(
-            f"goal must hold numbers of at least 0 and below {count}, got {shown(goal.tolist())}: "
+            f"goal must have entries of at least 0 and below {count}, got {shown(goal.tolist())}: "
             "for example torch.tensor([0])"
         )
 
 
 def shares_of_loss(loss: Tensor, amounts: Tensor) -> Tensor:
-    """Return each particle's share of its world's loss, times N; shape [B, N].
+    """Return each particle's contribution to its world's loss, times N; shape [B, N].
 
-    To first order, the loss changes by some amount with what a particle adds to the world. Its
-    share is the loss plus N times what its amount exceeds the mean by; so the mean of the shares is
-    the loss, up to rounding. Losses have shape [B], amounts, what each particle adds, [B, N].
+    It is the loss [B] plus N times the difference between the particle's amount and its world's
+    mean amount, so that the mean contribution is the loss, up to rounding. `amounts` [B, N] are the
+    first-order changes of the loss by what each particle adds to the world.
     """
     worse = amounts - world_mean(amounts[..., None])
     return loss[:, None] + amounts.shape[1] * worse

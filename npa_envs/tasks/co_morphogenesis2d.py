@@ -14,7 +14,7 @@ from torch import Tensor
 from npa_envs.checks import check_non_negative
 from npa_envs.errors import NPAError
 from npa_envs.rule.rule import COLOUR_OFFSET, NPARule
-from npa_envs.tasks.base import ParticleTask, Worlds
+from npa_envs.tasks.base import ParticleTask
 from npa_envs.tasks.morphogenesis2d import (
     HALF_SEEDS,
     MORPHOGENESIS2D_PRESETS,
@@ -23,22 +23,22 @@ from npa_envs.tasks.morphogenesis2d import (
     Morphogenesis2DTrainConfig,
 )
 from npa_envs.tasks.train_config import JointTrainConfig
+from npa_envs.world.particles import Particles, combined
 from npa_envs.world.randomness import Randomness
 
 
 @dataclass(frozen=True, kw_only=True)
 class CoMorphogenesis2DConfig:
-    """Several pictures that grow in one world, each by a rule of its own."""
+    """Several pictures that grow in one world, each by its own rule."""
 
     species: tuple[Morphogenesis2DConfig, ...] = (
         Morphogenesis2DConfig(),
         Morphogenesis2DConfig(target="heart"),
     )
-    """What each species grows, and of how many particles. All have the same eps, update_prob and
-    state_dim."""
+    """The configuration of each species' task. All have the same eps, update_prob and state_dim."""
 
     distance: float = 0.0
-    """Distance between the centres of neighbouring seeds, which lie in a row [length units]."""
+    """Distance between the centres of neighbouring seeds, on the x axis [length units]."""
 
     def __post_init__(self) -> None:
         """Check every field."""
@@ -70,7 +70,7 @@ class CoMorphogenesis2DConfig:
 class CoMorphogenesis2D(ParticleTask[Any]):
     """`Morphogenesis2D` of every species, each on its own particles.
 
-    Worlds hold the particles of all species, one species after the other.
+    Worlds contain the particles of all species, one species after the other.
     """
 
     def __init__(
@@ -98,7 +98,7 @@ class CoMorphogenesis2D(ParticleTask[Any]):
         return [task.make_rule(generator) for task in self.tasks]
 
     def make_rule(self, generator: torch.Generator) -> NPARule:
-        """Refuse: there is a rule for each species."""
+        """Raise NPAError: each species has its own rule (`make_rules`)."""
         raise NPAError(
             f"{len(self.tasks)} species need as many rules, not one: "
             "train them with npa_envs.training.train_together"
@@ -106,23 +106,22 @@ class CoMorphogenesis2D(ParticleTask[Any]):
 
     def seed(
         self, world_count: int, *, generator: Randomness, device: str | torch.device = "cpu"
-    ) -> Worlds:
-        """Return fresh worlds: each species uniform in a disk of its own, all states zero."""
+    ) -> Particles:
+        """Return fresh worlds: each species uniform in its own disk, all states zero."""
         seeds = [task.seed(world_count, generator=generator, device=device) for task in self.tasks]
         positions = [
             torch.stack((x[..., 0] + centre, x[..., 1]), dim=-1)
             for (x, *_), centre in zip(seeds, self.config.centres, strict=True)
         ]
-        return torch.cat(positions, dim=1), torch.cat([s for _, s, _ in seeds], dim=1), None
+        return Particles(torch.cat(positions, 1), torch.cat([one.s for one in seeds], 1))
 
-    def damage(self, x: Tensor, s: Tensor, goal: Tensor | None, generator: Randomness) -> Worlds:
-        """Return the worlds with each species damaged as it is alone."""
-        hurt = [
-            task.damage(own_x, own_s, None, generator)
-            for task, own_x, own_s in zip(self.tasks, *self._split(x, s), strict=True)
+    def damage(self, worlds: Particles, generator: Randomness) -> Particles:
+        """Return the worlds with each species damaged independently."""
+        damaged = [
+            task.damage(Particles(x, s), generator)
+            for task, x, s in zip(self.tasks, *self._split(worlds.x, worlds.s), strict=True)
         ]
-        x, s = torch.cat([x for x, *_ in hurt], dim=1), torch.cat([s for _, s, _ in hurt], dim=1)
-        return x, s, goal
+        return combined(lambda parts: torch.cat(parts, 1), damaged)
 
     def loss(self, x: Tensor, s: Tensor, path_length: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
         """Return the sum of the species' training losses and its parts, named "k.part"."""
@@ -130,9 +129,9 @@ class CoMorphogenesis2D(ParticleTask[Any]):
         parts: dict[str, Tensor] = {}
         split = zip(self.tasks, self.config.centres, *self._split(x, s, path_length), strict=True)
         for number, (task, centre, own_x, own_s, own_path) in enumerate(split):
-            # What must stay within bounds is each species around its own seed.
-            place = torch.stack((own_x[..., 0] - centre, own_x[..., 1]), dim=-1)
-            loss, own_parts = task.loss(place, own_s, own_path)
+            # Positions relative to the seed: the loss bounds each species around its own.
+            relative = torch.stack((own_x[..., 0] - centre, own_x[..., 1]), dim=-1)
+            loss, own_parts = task.loss(relative, own_s, own_path)
             total = total + loss
             parts |= {f"{number}.{name}": value for name, value in own_parts.items()}
         return total, parts
@@ -140,20 +139,20 @@ class CoMorphogenesis2D(ParticleTask[Any]):
     def picture(self, x: Tensor, s: Tensor) -> Tensor:
         """Return each world's picture with all species, shape [B, R, R, 4].
 
-        It spans [-1, 1] x [-1, 1]; its resolution is the first species' own.
+        It spans [-1, 1] x [-1, 1], at the resolution of the first species.
         """
         return self.tasks[0].picture(x, s, centred=False)
 
     @property
     def target_picture(self) -> Tensor:
-        """What all species together are to look like, each around its seed; shape [R, R, 4]."""
-        places, states = [], []
+        """The picture of all targets, each around its species' seed; shape [R, R, 4]."""
+        positions, states = [], []
         for task, centre in zip(self.tasks, self.config.centres, strict=True):
             points, colours = task.target.points, task.target.colours
-            places.append(points + points.new_tensor((centre, 0.0)))
+            positions.append(points + points.new_tensor((centre, 0.0)))
             states.append(colours.new_zeros(len(colours), task.config.state_dim))
             states[-1][:, -3:] = colours - COLOUR_OFFSET
-        return self.picture(torch.cat(places)[None], torch.cat(states)[None])[0]
+        return self.picture(torch.cat(positions)[None], torch.cat(states)[None])[0]
 
     def metrics(self, x: Tensor, s: Tensor) -> Tensor:
         """Return each species' splat loss in each world, shape [B, K]."""
@@ -187,26 +186,26 @@ _MEASURED: Mapping[str, Mapping[str, Any]] = {
     },
     "fast": {**HALF_SEEDS, "learning_rate": 4e-3},
 }
-"""What presets had when several species were measured (docs/species.md); Muon was not."""
+"""Settings of each preset that docs/species.md measured, by AdamW."""
 
 _OWN: Mapping[str, Mapping[str, Any]] = {"best": {"cut_share": 0.25}, "fast": {"hidden_dim": 64}}
-"""What each species had then."""
+"""Settings of each species in those measurements."""
 
 
-def _beside(
+def _with_neighbour(
     name: str, alone: Morphogenesis2DTrainConfig, neighbour: str
 ) -> JointTrainConfig[CoMorphogenesis2DConfig]:
-    """Return a run of one species, together with another one of the same kind."""
+    """Return the run of a species together with a second one that grows `neighbour`."""
     own = dataclasses.replace(alone.task, **_OWN.get(name, {}))
     species = (own, dataclasses.replace(own, target=neighbour))
     run = {field.name: getattr(alone, field.name) for field in dataclasses.fields(alone)}
     run["task"] = CoMorphogenesis2DConfig(species=species, distance=DISTANCE)
-    # As many rules as there are species would have to be named.
+    # A preset names no initial rules of species.
     run |= {"initial_rule": "", "out": Path("runs/co_morphogenesis2d")}
     return JointTrainConfig(**{**run, **_MEASURED.get(name, {})})
 
 
 CO_MORPHOGENESIS2D_PRESETS: Mapping[str, JointTrainConfig[CoMorphogenesis2DConfig]] = {
-    name: _beside(name, alone, "heart") for name, alone in MORPHOGENESIS2D_PRESETS.items()
+    name: _with_neighbour(name, alone, "heart") for name, alone in MORPHOGENESIS2D_PRESETS.items()
 }
 """Each preset of 2D morphogenesis, with as many particles of a second species, by AdamW."""

@@ -1,4 +1,4 @@
-"""Damage that a rule should heal: to worlds of a rollout, and to those of the training pool.
+"""Damage that a rule should heal, in rollouts and in the training pool.
 
 No function reads a value back from the device, so all may be captured in a CUDA graph.
 """
@@ -25,13 +25,14 @@ from npa_envs.errors import NPAError, shown, suggest
 from npa_envs.ops import world_mean
 from npa_envs.tasks.seeds import drawn_indices, uniform_ball
 from npa_envs.world.brushes import clump, cut, wipe_state
+from npa_envs.world.particles import Particles
 from npa_envs.world.randomness import Randomness, check_generator, normal_draws, uniform_draws
 
 DAMAGE_SIZES = {"wipe": 0.2, "cut": 0.1, "clump": 0.2, "noise": 0.05}
 """Kinds of damage with their usual size: radius, gap, radius, standard deviation [length units]."""
 
 CLUMP_FACTOR = 0.9
-"""Share of its distance from the centre that a particle loses when it is clumped."""
+"""Fraction of its distance from the centre by which clumping moves a particle inwards."""
 
 
 def check_damage(kind: object) -> None:
@@ -42,10 +43,10 @@ def check_damage(kind: object) -> None:
 
 @dataclass(frozen=True)
 class DamageEvent:
-    """Something done to worlds after a number of steps."""
+    """One damage of a world, after a number of steps."""
 
     step: int
-    """Steps from the seed."""
+    """Steps since the seed."""
 
     kind: str
     """One of `DAMAGE_SIZES`."""
@@ -63,7 +64,7 @@ class DamageEvent:
 
     @property
     def extent(self) -> float:
-        """The size [length units], be it given or the usual one."""
+        """The size [length units], given or usual."""
         return DAMAGE_SIZES[self.kind] if self.size is None else self.size
 
     @property
@@ -72,7 +73,7 @@ class DamageEvent:
         return f"{self.kind} {self.extent:g}"
 
     def __str__(self) -> str:
-        """The event as `parse_damage` reads it."""
+        """The text that `parse_damage` reads as this event."""
         return f"{self.step}:{self.kind}" + ("" if self.size is None else f":{self.size!r}")
 
 
@@ -104,14 +105,14 @@ def damage_worlds(
     size: float | None = None,
     generator: Randomness | None = None,
 ) -> tuple[Tensor, Tensor]:
-    """Damage worlds at a random place, or cut them through the middle at a random angle.
+    """Damage worlds at a random position, or cut them through the middle at a random angle.
 
     Args:
         x: Particle positions [length units], shape [B, N, D].
         s: Particle states (dimensionless), shape [B, N, C].
         kind: "wipe", "cut", "clump", or "noise" on every position.
         size: Radius, gap or standard deviation [length units]; None is the usual one.
-        generator: Where the place comes from, on the device of `x`; None is torch's own.
+        generator: Source of the random position, on the device of `x`; None is torch's own.
 
     Returns:
         The new positions, shape [B, N, D], and states, shape [B, N, C].
@@ -144,16 +145,16 @@ def random_particle(x: Tensor, generator: Randomness | None = None) -> Tensor:
     return x.take_along_dim(chosen[:, None, None], dim=1).squeeze(1)
 
 
-# Strays see nobody, so nothing says where to stay: a rule that was trained in whole worlds alone
-# may let a lone particle walk on for ever, too slowly to be seen in a picture. Throwing some out,
-# and counting how far they walk, teaches it to rest.
+# A particle that escapes has no neighbours: a rule that was trained without such particles may let
+# it drift for ever, too slowly to notice in a picture. Training throws some particles out of their
+# worlds and penalises their paths, so that the rule learns to let them rest.
 
 NEAREST, FARTHEST = 2.0, 4.0
-"""Distances from the origin between which particles are thrown [length units]."""
+"""Range of distances from the origin to which particles are thrown [length units]."""
 
 
 def displace(x: Tensor, *, share: float, generator: Randomness | None = None) -> Tensor:
-    """Return positions with a share of the particles, drawn one by one, thrown out on all sides."""
+    """Return positions with some particles, each with probability `share`, thrown far out."""
     world_count, particle_count, space_dim = x.shape
     check_generator(generator, x.device, world_count)
     chance = uniform_draws(generator, (world_count, particle_count, 1), x)
@@ -167,36 +168,36 @@ def displace(x: Tensor, *, share: float, generator: Randomness | None = None) ->
 def tear_off(
     x: Tensor, *, radius: float, chance: float, generator: Randomness | None = None
 ) -> Tensor:
-    """Return the positions with a flake of some worlds torn off and thrown out, as a whole.
+    """Return positions where some worlds lose a flake, which is thrown far out in one piece.
 
-    Particles that leave together see each other, and may walk on where a lone one has learned to
-    rest. A flake is a ball around a random particle, of any radius up to `radius` [length units];
-    a world loses one with the probability `chance`.
+    Its particles perceive each other, and may drift on where a lone particle has learned to rest.
+    A flake is a ball around a random particle, of a random radius up to `radius` [length units]; a
+    world loses one with probability `chance`.
     """
     world_count, _, space_dim = x.shape
     centre = random_particle(x, generator)
     draws = uniform_draws(generator, (world_count, 2), x)
-    reach = torch.where(draws[:, :1] < chance, radius * draws[:, 1:], -1.0)
-    place = uniform_ball(
+    flake_radius = torch.where(draws[:, :1] < chance, radius * draws[:, 1:], -1.0)
+    target = uniform_ball(
         world_count, 1, space_dim, 1.0, generator=generator, device=x.device, dtype=x.dtype
     )[:, 0]
-    torn = (x - centre[:, None]).norm(dim=-1) <= reach
-    return torch.where(torn[..., None], x + (_outside(place) - centre)[:, None], x)
+    torn = (x - centre[:, None]).norm(dim=-1) <= flake_radius
+    return torch.where(torn[..., None], x + (_outside(target) - centre)[:, None], x)
 
 
 def _outside(ball: Tensor) -> Tensor:
-    """Return places between `NEAREST` and `FARTHEST` for places in the unit ball, [..., D]."""
+    """Map points of the unit ball [..., D] to distances from `NEAREST` to `FARTHEST`."""
     length: Tensor = ball.norm(dim=-1, keepdim=True)
     return ball * ((NEAREST + (FARTHEST - NEAREST) * length) / length.clamp_min(1e-12))
 
 
 _counting: ContextVar[Callable[[Tensor], Tensor] | None] = ContextVar("counting", default=None)
-"""What makes of a process's number of strays the mean over all processes; None: it is alone."""
+"""Averages a count over all processes; None: there is one process."""
 
 
 @contextmanager
 def counted_together(mean: Callable[[Tensor], Tensor]) -> Iterator[None]:
-    """Let losses in the block count the strays of all processes; `mean` is over these."""
+    """Let `escape_motion` in the block count particles of all processes, averaged by `mean`."""
     before = _counting.set(mean)
     try:
         yield
@@ -205,27 +206,27 @@ def counted_together(mean: Callable[[Tensor], Tensor]) -> Iterator[None]:
 
 
 def escape_motion(x: Tensor, path_length: Tensor) -> Tensor:
-    """Return how far particles travelled that are outside of [-1, 1]^D, mean [length units], [].
+    """Return the mean path length of the particles outside of [-1, 1]^D [length units], shape [].
 
-    It is 0 where there are none. Within `counted_together` the mean of what all processes return
-    is the mean over the particles of all of them.
+    It is 0 where there are none. Within `counted_together` the mean of all processes' results is
+    the mean over the particles of all processes.
     """
     outside = (x.detach().abs().amax(dim=-1) > 1.0).to(x.dtype)
     count, mean = outside.sum(), _counting.get()
     if mean is not None:
-        # Of R processes it is 0 or at least 1 / R.
+        # The mean count of R processes is 0 or at least 1 / R.
         count = mean(count)
         return (outside * path_length).sum() / torch.where(count > 0.0, count, 1.0)
     return (outside * path_length).sum() / count.clamp_min(1.0)
 
 
 SHARE = 0.25
-"""Share of the worlds that are clumped, that are cut, that lose a flake (dimensionless)."""
+"""Probability of a world to be clumped, to be cut, to lose a flake (dimensionless)."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class PoolDamage:
-    """How much worlds of the pool are damaged; 0 is none."""
+    """Damage of worlds from the pool; a radius, gap or probability of 0: none of that kind."""
 
     damage_radius: float = 0.0
     """Radius of the ball whose state is wiped in worlds from the pool [length units]; 0: none."""
@@ -255,10 +256,9 @@ class PoolDamage:
         )
 
 
-def damage_pool(
-    x: Tensor, s: Tensor, damage: PoolDamage, *, generator: Randomness
-) -> tuple[Tensor, Tensor]:
-    """Return worlds that are damaged at random places; nothing waits for the device."""
+def damage_pool(worlds: Particles, damage: PoolDamage, *, generator: Randomness) -> Particles:
+    """Return the worlds, damaged at random positions; nothing waits for the device."""
+    x, s, *_ = worlds
     if damage.damage_radius > 0.0:
         centre = random_particle(x, generator)
         s = wipe_state(x, s, centre=centre, radius=damage.damage_radius)
@@ -267,7 +267,7 @@ def damage_pool(
         hit = (uniform_draws(generator, (len(x), 1), x)[:, 0] < SHARE).to(x.dtype)
         x, s = clump(x, s, centre=centre, radius=damage.clump_radius * hit, factor=1.0)
     if damage.cut_gap > 0.0:
-        # Directions need not be spread evenly, and of a zero vector nothing is cut.
+        # Directions need not be uniform; a zero vector cuts nothing.
         normal = 2.0 * uniform_draws(generator, (len(x), x.shape[2]), x) - 1.0
         hit = (uniform_draws(generator, (len(x), 1), x)[:, 0] < damage.cut_share).to(x.dtype)
         x, s = cut(x, s, centre=world_mean(x), normal=normal, gap=damage.cut_gap * hit)
@@ -275,4 +275,4 @@ def damage_pool(
         x = tear_off(x, radius=damage.flake_radius, chance=SHARE, generator=generator)
     if damage.escape_share > 0.0:
         x = displace(x, share=damage.escape_share, generator=generator)
-    return x, s
+    return worlds._replace(x=x, s=s)

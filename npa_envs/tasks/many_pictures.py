@@ -1,4 +1,4 @@
-"""Many pictures by one rule: each world has a target of its own, which a code names."""
+"""Many pictures grown by one rule: each world has its own target, named by a code."""
 
 from __future__ import annotations
 
@@ -13,19 +13,19 @@ from npa_envs.errors import NPAError, shown
 from npa_envs.files import home_path
 from npa_envs.rule.codes import Codes, carrying
 from npa_envs.rule.rule import NPARule
-from npa_envs.tasks.base import Worlds
 from npa_envs.tasks.morphogenesis2d import Morphogenesis2D, Morphogenesis2DConfig
 from npa_envs.tasks.seeds import drawn_indices, drawn_worlds
 from npa_envs.tasks.targets.images import looks_like_path
 from npa_envs.tasks.targets.points import builtin_targets
+from npa_envs.world.particles import Particles
 from npa_envs.world.randomness import Randomness
 
 PICTURE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp")
-"""Files of a folder that are targets."""
+"""Suffixes of the files in a folder that are targets."""
 
 
 def named_targets(targets: Sequence[str]) -> dict[str, str]:
-    """Return what targets hold: name -> what `load_target` takes; a folder stands for its files."""
+    """Return name -> source for `load_target` of all targets; folders stand for their files."""
     named: dict[str, str] = {}
     for target in targets:
         for source in _pictures_of(target):
@@ -56,8 +56,8 @@ def _pictures_of(target: str) -> list[str]:
 class ManyPictures(Morphogenesis2D):
     """Morphogenesis of several targets by one rule; each world has a goal and a code.
 
-    A world's goal is the place of its target among `targets`. Particles of all targets are drawn
-    equally large, and pictures are scaled so that each target's density is about 1.
+    A world's goal is the index of its target in `names`. Particles are drawn equally large for all
+    targets, and pictures are scaled so that each target's density is about 1.
     """
 
     def __init__(
@@ -100,9 +100,9 @@ class ManyPictures(Morphogenesis2D):
         }
 
     def for_rule(self, rule: NPARule) -> Self:
-        """Return the task whose worlds carry the codes of a rule.
+        """Return the task whose worlds have the codes of a rule.
 
-        An encoder reads them from the pictures now, and each time that states are `coded`.
+        With an encoder they are computed now and at each call of `coded`.
         """
         if rule.codes is not None:
             with torch.no_grad():
@@ -111,36 +111,37 @@ class ManyPictures(Morphogenesis2D):
 
     def seed(
         self, world_count: int, *, generator: Randomness, device: str | torch.device = "cpu"
-    ) -> Worlds:
-        """Return fresh worlds of random targets, and which ones these are."""
-        x, s, _ = super().seed(world_count, generator=generator, device=device)
+    ) -> Particles:
+        """Return fresh worlds with random goals and their codes."""
+        x, s, *_ = super().seed(world_count, generator=generator, device=device)
         goal = drawn_indices(len(self.names), world_count, generator, torch.device(device))
         blank = s.new_zeros(*s.shape[:2], self.config.code_dim)
         s = torch.cat((blank, s), dim=-1)
         if self._codes is not None:
             s = carrying(s, self._codes.table.detach().index_select(0, goal)[:, None])
-        return x, s, goal
+        return Particles(x, s, goal=goal)
 
-    def damage(self, x: Tensor, s: Tensor, goal: Tensor | None, generator: Randomness) -> Worlds:
-        """Return the worlds damaged, some with another target, and their goals."""
-        x, s, goal = super().damage(x, s, goal, generator)
+    def damage(self, worlds: Particles, generator: Randomness) -> Particles:
+        """Return the worlds, damaged, some with another goal."""
+        worlds = super().damage(worlds, generator)
+        x, goal = worlds.x, worlds.goal
         if goal is None or self.config.switch_share == 0.0:
-            return x, s, goal
+            return worlds
         other = drawn_indices(len(self.names), len(x), generator, x.device)
-        return x, s, torch.where(drawn_worlds(x, generator, self.config.switch_share), other, goal)
+        switched = drawn_worlds(x, generator, self.config.switch_share)
+        return worlds._replace(goal=torch.where(switched, other, goal))
 
     def coded(self, s: Tensor) -> Tensor:
-        """Return states with the codes of their worlds' goals, differentiable in the codes."""
+        """Return states with the codes of their worlds' goals; differentiable in the codes."""
         if self._codes is None or self._goal is None:
             return s
         return carrying(s, self._read_codes(self._codes).index_select(0, self.goal)[:, None])
 
     def _read_codes(self, codes: Codes) -> Tensor:
-        """Return the targets' codes, those of an encoder as it is now, shape [T, K]."""
+        """Return the targets' codes, shape [T, K]; an encoder also writes them to the table."""
         if codes.encoder is None:
             return codes.table
         read = codes.encode(self._target_pictures)
-        # What files and users read.
         with torch.no_grad():
             codes.table.copy_(read)
         return read
@@ -157,7 +158,7 @@ class ManyPictures(Morphogenesis2D):
     def picture(self, x: Tensor, s: Tensor, *, centred: bool = True) -> Tensor:
         """Return each world's picture: colour sums and density, dimensionless, [B, R, R, 4].
 
-        Without goals, densities are those of a target of the mean size.
+        Without goals, densities are scaled for a target of the mean size.
         """
         picture = super().picture(x, s, centred=centred)
         if self._goal is None:

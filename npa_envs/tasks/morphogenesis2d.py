@@ -23,16 +23,17 @@ from npa_envs.ops import splat, world_mean
 from npa_envs.ops.pictures.losses import picture_losses
 from npa_envs.rule.codes import carrying
 from npa_envs.rule.rule import COLOUR_OFFSET, LIFE, NPARule
-from npa_envs.tasks.base import GrowthConfig, GrowthTask, Worlds
+from npa_envs.tasks.base import GrowthConfig, GrowthTask
 from npa_envs.tasks.damage import damage_pool
 from npa_envs.tasks.targets.images import LARGEST_POINT_COUNT
 from npa_envs.tasks.targets.points import PointTarget, load_target
 from npa_envs.tasks.train_config import TrainConfig, fast_run, presets_of, tiny_run
 from npa_envs.world.division import living
+from npa_envs.world.particles import Particles
 from npa_envs.world.randomness import Randomness, uniform_draws
 
 LARGEST_CODE = 1024
-"""Numbers of a code, at most."""
+"""Largest length of a code."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -50,26 +51,25 @@ class Morphogenesis2DConfig(GrowthConfig):
     """Several things to grow by one rule, in place of `target`: as that, or folders of pictures."""
 
     code_dim: int = 8
-    """Numbers of the code by which particles are told which of `targets` to grow, K: so many state
-    channels more, in front of the others."""
+    """Length K of the code that names one of `targets` to the particles: K more state channels, in
+    front of the others."""
 
     encoder: bool = False
-    """Codes are read from the pictures by a network that is trained along, so that new pictures
-    have one too. Without, each target's code is learned by itself."""
+    """A network that is trained with the rule computes codes from pictures, so that new pictures
+    have one too. Without it, each target's code is a parameter."""
 
     switch_share: float = 0.1
-    """Probability of a world from the pool that is damaged to become another one of `targets` in
-    mid-life."""
+    """Probability that a damaged world from the pool also gets another one of `targets`."""
 
     target_point_count: int = 4096
-    """About how many opaque pixels the target is resampled to; as many as there are particles."""
+    """Opaque pixels that the target is resampled to, about; usually the number of particles."""
 
     keep_background: bool = False
     """Grow the picture's whole rectangle, white where it is transparent: for photographs."""
 
     damage_radius: float = 0.1
-    """Radius of the disk whose state is wiped in worlds from the pool [length units]; 0: none. Of
-    worlds that divide each particle dies with probability one half instead."""
+    """Radius of the disk whose state is wiped in worlds from the pool [length units]; 0: none. With
+    `division`, each particle dies with probability one half instead."""
 
     resolution: int = 256
     """Pixels on each side of the picture that the loss compares, R."""
@@ -84,33 +84,31 @@ class Morphogenesis2DConfig(GrowthConfig):
     """Weight of the colour term against the density term inside the splat loss (dimensionless)."""
 
     drift_weight: float = 0.0
-    """Weight of the centroids' distance from the origin, where worlds begin (per length unit)."""
+    """Weight of the distance of worlds' centroids from the origin (per length unit)."""
 
     equivariant: bool = False
-    """The rule knows no direction, and each world is compared at the angle that suits it best, or,
-    where `angles` is 0, as it lies."""
+    """The rule is rotation-equivariant, and each world is compared with the target at its best
+    angle, or, where `angles` is 0, without rotation."""
 
     chiral: bool = True
-    """An equivariant rule tells left from right. Without, a mirrored picture is as good, where
-    angles are tried."""
+    """An equivariant rule distinguishes left from right. Without it, mirrored worlds are compared
+    too, where angles are tried."""
 
     seed_axis: float = 0.5
-    """Seeds of an equivariant rule have a head and a tail: across the disk, the first state goes
-    from minus this to this (dimensionless), along a direction drawn for each world; along x where
-    `angles` is 0. 0: no such."""
+    """Seeds of an equivariant rule have an axis: the first state rises linearly across the disk,
+    from minus this to this (dimensionless), along a random direction of each world, or along x
+    where `angles` is 0. 0: no axis."""
 
     seed_across: float = 0.0
-    """And a left and a right: the second state goes from minus this to this (dimensionless), across
-    that direction. 0: no such."""
+    """The same for the second state, at right angles to that direction (dimensionless). 0: none."""
 
     division: bool = False
     """A world starts with one particle. Particles divide and die; at most `particle_count` live."""
 
     angles: int = 16
-    """Angles that are tried first for an equivariant rule's world, evenly spread. Sixteen more near
-    the best of them are tried next: 1/39 of the step between the first ones remains. 0: none; all
-    seeds point one way, and what grows is to stand upright there. A rule that knows no direction
-    then grows as well from seeds that are turned."""
+    """Evenly spaced angles at which an equivariant rule's worlds are compared first; four
+    refinements of four angles each follow, down to 1/39 of the first step. 0: no search; all seeds
+    point the same way, and worlds are compared upright."""
 
     def __post_init__(self) -> None:
         """Check every field; raise NPAError where one has a wrong type or lies out of its range."""
@@ -131,7 +129,7 @@ class Morphogenesis2DConfig(GrowthConfig):
         upright = self.seed_across > 0.0 or (self.chiral and self.seed_axis > 0.0)
         if self.equivariant and self.angles == 0 and not upright:
             raise NPAError(
-                "angles=0 needs seeds that tell how a world is to stand, got "
+                "angles=0 needs seeds that have a direction, got "
                 f"seed_axis={self.seed_axis}, seed_across={self.seed_across} and chiral="
                 f"{self.chiral}: set seed_across=0.5, or angles=16"
             )
@@ -147,28 +145,28 @@ class Morphogenesis2DConfig(GrowthConfig):
 
 
 FINER_COUNT = 4
-"""Angles around the best one that are tried next, at even distances."""
+"""Angles around the best one that each refinement tries, evenly spaced."""
 
 FINER_STEP = 0.4
-"""Their distance, in steps of the angles tried before."""
+"""Their spacing, as a fraction of the spacing before."""
 
 FINER_TIMES = 4
-"""How often that is done."""
+"""Number of refinements."""
 
 SURVIVING = 0.5
 """Probability of a particle to survive damage, in worlds whose particles divide (dimensionless)."""
 
 UNSEEN = 1e3
-"""Coordinate of what no picture shows [length units]."""
+"""Coordinate to which dead particles are moved, out of every picture [length units]."""
 
 UNOWNED = 0.05
-"""Density that belongs to nobody when a pixel's error is shared out among particles."""
+"""Density per pixel whose part of the error is divided evenly among all particles."""
 
 
 class Morphogenesis2D(GrowthTask[Morphogenesis2DConfig]):
     """The task of arXiv 2601.16096, section 4.1, with its loss.
 
-    Of a rule of many pictures, `for_rule` gives the task of one of them.
+    `for_rule` binds the code that a rule of many pictures has for this target.
     """
 
     metric_name = "splat loss"
@@ -188,7 +186,7 @@ class Morphogenesis2D(GrowthTask[Morphogenesis2DConfig]):
                 keep_background=self.config.keep_background,
             )
         self.target = target.to(device)
-        """What is to be grown."""
+        """The target picture as points."""
         self._target_mean = self.target.points.mean(dim=0)
         radius = float((self.target.points - self._target_mean).norm(dim=1).max())
         self._reach = max(1.0, radius)
@@ -198,9 +196,9 @@ class Morphogenesis2D(GrowthTask[Morphogenesis2DConfig]):
         self._target_picture = self._splat(points, colours)[0]
 
     def for_rule(self, rule: NPARule) -> Self:
-        """Return the task whose fresh worlds carry the code that a rule has for the target.
+        """Return the task whose fresh worlds have the rule's code for the target.
 
-        It is the code of the target's name, or else what the rule's encoder reads from its picture.
+        It is the code of the target's name, or else the encoder's code of its picture.
         """
         codes = rule.codes
         if codes is None:
@@ -210,22 +208,22 @@ class Morphogenesis2D(GrowthTask[Morphogenesis2DConfig]):
         return self.with_code(codes.encode(self.target_picture[None].to(codes.table))[0])
 
     def with_code(self, code: Tensor) -> Self:
-        """Return the task whose fresh worlds carry a code [K], in front of the other states."""
+        """Return the task whose fresh worlds have a code [K] in front of the other states."""
         return self._with(_code=code.detach())
 
     def seed(
         self, world_count: int, *, generator: Randomness, device: str | torch.device = "cpu"
-    ) -> Worlds:
-        """Return fresh worlds: of an equivariant rule with a head and a tail, of one that divides
-        with one living particle, at the origin."""
-        x, s, goal = super().seed(world_count, generator=generator, device=device)
+    ) -> Particles:
+        """Return fresh worlds; with `division` one particle lives, at the origin, and with
+        `equivariant` the first states have an axis."""
+        x, s, *_ = super().seed(world_count, generator=generator, device=device)
         config = self.config
         if config.division:
             s[:, 0, LIFE] = 1.0
-            return torch.zeros_like(x), s, goal
+            return Particles(torch.zeros_like(x), s)
         if config.equivariant and max(config.seed_axis, config.seed_across) > 0.0:
-            share = uniform_draws(generator, (world_count, 1), x)
-            angle = 2.0 * math.pi * (share if config.angles > 0 else torch.zeros_like(share))
+            drawn = uniform_draws(generator, (world_count, 1), x)
+            angle = 2.0 * math.pi * (drawn if config.angles > 0 else torch.zeros_like(drawn))
             cos, sin = angle.cos(), angle.sin()
             along = x[..., 0] * cos + x[..., 1] * sin
             across = x[..., 1] * cos - x[..., 0] * sin
@@ -234,22 +232,23 @@ class Morphogenesis2D(GrowthTask[Morphogenesis2DConfig]):
                 s[..., 1] = config.seed_across * across / config.seed_radius
         if self._code is not None:
             s = self.coded(torch.cat((s.new_zeros(*s.shape[:2], len(self._code)), s), dim=-1))
-        return x, s, goal
+        return Particles(x, s)
 
     def coded(self, s: Tensor) -> Tensor:
-        """Return states with the task's code, or as they are where it has none."""
+        """Return states with the task's code, or unchanged where it has none."""
         return s if self._code is None else carrying(s, self._code)
 
-    def damage(self, x: Tensor, s: Tensor, goal: Tensor | None, generator: Randomness) -> Worlds:
-        """Return the worlds damaged; of one that divides particles die, but never all."""
+    def damage(self, worlds: Particles, generator: Randomness) -> Particles:
+        """Return the worlds, damaged; where particles divide, some die, but never all."""
         if not (self.config.division and self.config.damage_radius > 0.0):
-            return super().damage(x, s, goal, generator)
-        # Children of a crowd that is thinned learn who they are among its grown particles.
+            return super().damage(worlds, generator)
+        # Survivors are grown particles, among which newly divided ones must find their role.
+        x, s, *_ = worlds
         stay = uniform_draws(generator, x.shape[:2], x) < SURVIVING
         left = torch.where(stay[..., None], s, 0.0)
         left = torch.where(living(left).any(dim=1)[:, None, None], left, s)
         rest = replace(self.config, damage_radius=0.0)
-        return *damage_pool(x, left, rest, generator=generator), goal
+        return damage_pool(worlds._replace(s=left), rest, generator=generator)
 
     def picture(self, x: Tensor, s: Tensor, *, centred: bool = True) -> Tensor:
         """Return each world's picture: colour sums and density, dimensionless, shape [B, R, R, 4].
@@ -264,30 +263,29 @@ class Morphogenesis2D(GrowthTask[Morphogenesis2DConfig]):
         return self._splat(x, colour)
 
     def _living_picture(self, x: Tensor, s: Tensor, colour: Tensor) -> Tensor:
-        """Return pictures of the living, differentiable in their life."""
+        """Return pictures of living particles, differentiable in their first state."""
         x, life = torch.where(living(s)[..., None], x, UNSEEN), s[..., LIFE : LIFE + 1]
         picture = self._splat(x, colour * life)
         if not life.requires_grad:
             return picture
-        # Spots have no weights, so life is drawn once more as a colour: that is the density.
+        # Splats have no weights, so the density is the first state drawn as a colour.
         density = self._splat(x, life.expand_as(colour))[..., :1]
         return torch.cat((picture[..., :3], density), dim=-1)
 
     def splat_errors(self, x: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
         """Return each pixel's density error and colour error, dimensionless, shape [B, R, R] each.
 
-        Both are |d| + d^2 between the centred picture and the target's, the second averaged over
-        the colours. The colour error is weighted by exp(-(density error)), without gradient:
-        colours count where there is something to colour. World k's errors are the same, bit for
-        bit, in every batch.
+        Both are |d| + d^2 of the difference d between the centred picture and the target's; the
+        colour error is averaged over the colours and weighted by exp(-(density error)), without
+        gradient. World k's errors are the same, bit for bit, in every batch.
         """
         return _errors(self.picture(x, s) - self.target_picture.to(x))
 
     def splat_losses(self, x: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
         """Return each world's density loss and colour loss, dimensionless, shape [B] each.
 
-        They are the means of `splat_errors` over the pixels. Where no gradient is asked for, no
-        picture is kept.
+        They are the means of `splat_errors` over the pixels. Where no gradient is needed, no
+        picture is stored.
         """
         wanted = torch.is_grad_enabled() and (x.requires_grad or s.requires_grad)
         if not (wanted or self.config.division):
@@ -321,9 +319,9 @@ class Morphogenesis2D(GrowthTask[Morphogenesis2DConfig]):
         return super().rule_shape | known
 
     def bounded(self, x: Tensor) -> Tensor:
-        """Return positions, or where no direction is known radii; what lies in [-1, 1] is inside.
+        """Return positions, or where worlds are turned, distances from the origin.
 
-        A circle that holds the target at every angle then stands for the square.
+        The latter are relative to the circle that contains the target at every angle.
         """
         if not self._turns:
             return x
@@ -332,7 +330,7 @@ class Morphogenesis2D(GrowthTask[Morphogenesis2DConfig]):
     def penalties(
         self, x: Tensor, s: Tensor, path_length: Tensor
     ) -> dict[str, tuple[float, Tensor]]:
-        """Return the penalties of growth, and how far the centroids have drifted."""
+        """Return the penalties of growth, and the drift of centroids from the origin."""
         terms = super().penalties(x, s, path_length)
         if self.config.drift_weight > 0.0:
             drift = world_mean(x).square().sum(dim=-1).add(1e-12).sqrt().mean()
@@ -340,11 +338,11 @@ class Morphogenesis2D(GrowthTask[Morphogenesis2DConfig]):
         return terms
 
     def particle_shares(self, x: Tensor, s: Tensor) -> Tensor:
-        """Return each particle's share of its world's splat loss, times N; [B, N].
+        """Return each particle's contribution to its world's splat loss, times N; [B, N].
 
-        A pixel's error is shared out among the particles that cover it, by their weights there;
-        what no particle covers is shared by all alike. The mean over the particles is `metric`, up
-        to rounding.
+        A pixel's error is divided among the particles that cover it, by their weights there; the
+        error of uncovered pixels is divided evenly among all. The mean over the particles is
+        `metric`, up to rounding.
         """
         with torch.no_grad():
             density, colour = self.splat_errors(x, s)
@@ -353,7 +351,7 @@ class Morphogenesis2D(GrowthTask[Morphogenesis2DConfig]):
         with torch.enable_grad():
             picture = self._splat(self._placed(x.detach(), s), blank)
             owned = errors / (picture[..., 3].detach() + UNOWNED)
-            # The picture is linear in the colours: its pull-back sums over a particle's patch.
+            # The picture is linear in the colours: its gradient sums over a particle's splat.
             (pulled,) = torch.autograd.grad(picture[..., 0], blank, owned)
         pixel_count = self.config.resolution**2
         unowned = _pixel_mean(UNOWNED * owned)
@@ -361,10 +359,10 @@ class Morphogenesis2D(GrowthTask[Morphogenesis2DConfig]):
 
     @torch.no_grad()
     def best_turn(self, x: Tensor, s: Tensor) -> Tensor:
-        """Return the turn of each world around its mean that brings it closest to the target.
+        """Return the rotation of each world around its mean that brings it closest to the target.
 
-        Angles are tried evenly spread, and then finer near the best. Where the rule is not chiral
-        mirrored worlds are tried too. Matrices, [B, 2, 2]; where no angles are tried, the identity.
+        Evenly spaced angles are tried, then finer ones near the best; of a rule that is not chiral
+        also mirrored worlds. Matrices, [B, 2, 2]; the identity where `angles` is 0.
         """
         config = self.config
         if config.angles == 0:
@@ -386,7 +384,7 @@ class Morphogenesis2D(GrowthTask[Morphogenesis2DConfig]):
         return turns(angle, hand)[:, 0]
 
     def _closest(self, x: Tensor, s: Tensor, tried: Tensor) -> Tensor:
-        """Return which of the turns [B, K, 2, 2] brings each world closest, shape [B, 1]."""
+        """Return the index of the rotation [B, K, 2, 2] that brings each world closest, [B, 1]."""
         world_count, count = tried.shape[:2]
         every = x[:, None].expand(-1, count, -1, -1).flatten(0, 1)
         colours = s[:, None, :, -3:].expand(-1, count, -1, -1).flatten(0, 1)
@@ -395,7 +393,7 @@ class Morphogenesis2D(GrowthTask[Morphogenesis2DConfig]):
         return losses.view(world_count, count).argmin(dim=1, keepdim=True)
 
     def _picture_losses(self, x: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the density and colour losses of worlds as they lie, shape [B] each."""
+        """Return the density and colour losses of worlds without rotation, shape [B] each."""
         return picture_losses(
             x,
             s,
@@ -408,11 +406,11 @@ class Morphogenesis2D(GrowthTask[Morphogenesis2DConfig]):
 
     @property
     def _turns(self) -> bool:
-        """Whether worlds are compared at the angle that suits them best."""
+        """Whether worlds are compared at their best angles."""
         return self.config.equivariant and self.config.angles > 0
 
     def _placed(self, x: Tensor, s: Tensor) -> Tensor:
-        """Return positions where they are compared with the target."""
+        """Return positions centred on the target, and rotated where worlds are."""
         if self._turns:
             x = turned(x, self.best_turn(x, s))
         return x - world_mean(x)[:, None] + self._target_mean.to(x)
@@ -428,13 +426,13 @@ class Morphogenesis2D(GrowthTask[Morphogenesis2DConfig]):
 
 
 def turns(angle: Tensor, hand: Tensor) -> Tensor:
-    """Return turns by angles [rad], of worlds mirrored where `hand` is -1; shape [..., 2, 2]."""
+    """Return rotations by angles [rad], mirrored where `hand` is -1; shape [..., 2, 2]."""
     cos, sin = angle.cos(), angle.sin()
     return torch.stack((cos, -sin * hand, sin, cos * hand), dim=-1).view(*angle.shape, 2, 2)
 
 
 def turned(x: Tensor, turn: Tensor) -> Tensor:
-    """Return worlds [B, N, 2] turned around the origin by matrices [B, 2, 2]."""
+    """Return positions [B, N, 2] rotated around the origin by matrices [B, 2, 2]."""
     (a, b), (c, d) = (row.unbind(dim=-1) for row in turn.to(x)[:, None].unbind(dim=-2))
     u, v = x.unbind(dim=-1)
     # Written out: the order of torch's own batched products may depend on the batch.
@@ -442,16 +440,16 @@ def turned(x: Tensor, turn: Tensor) -> Tensor:
 
 
 def _errors(difference: Tensor) -> tuple[Tensor, Tensor]:
-    """Return density errors and colour errors of pictures' differences, shape [B, R, R] each."""
-    density = _growth(difference[..., 3])
+    """Return density and colour errors of picture differences, shape [B, R, R] each."""
+    density = _penalty(difference[..., 3])
     # Added one by one: the order of torch's own sums is not promised.
-    red, green, blue = _growth(difference[..., :3]).unbind(dim=-1)
+    red, green, blue = _penalty(difference[..., :3]).unbind(dim=-1)
     colour = (red + green + blue) / 3.0
     return density, colour * torch.exp(-density.detach())
 
 
-def _growth(difference: Tensor) -> Tensor:
-    """|d| + d^2 of every pixel: linear near the goal, quadratic far from it."""
+def _penalty(difference: Tensor) -> Tensor:
+    """Return |d| + d^2 of every pixel: linear for small differences, quadratic for large ones."""
     size = difference.abs()
     return size + size * size
 
@@ -470,7 +468,7 @@ _TOGETHER: Mapping[str, Any] = {
     "clump_radius": 0.2,
     "cut_gap": 0.1,
 }
-"""What keeps worlds together for long, and heals clumps and cuts (docs/stability.md)."""
+"""Settings for long stability and for healing clumps and cuts (docs/stability.md)."""
 
 HALF_SEEDS: Mapping[str, Any] = {
     "optimiser": "adamw",
@@ -479,7 +477,8 @@ HALF_SEEDS: Mapping[str, Any] = {
     "damage_share": 1.0,
     "stillness_weight": 0.0,
 }
-"""What `fast` had before Muon: half of its worlds are seeds, and none has to rest."""
+"""AdamW, with a seed in every batch and no stillness loss: for several species
+(docs/species.md)."""
 
 MORPHOGENESIS2D_PRESETS = presets_of(
     "morphogenesis2d",

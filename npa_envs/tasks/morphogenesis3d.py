@@ -1,4 +1,4 @@
-"""3D morphogenesis: a ball of blank particles grows into a thing seen from all sides."""
+"""3D morphogenesis: a ball of blank particles grows into an object, compared in views."""
 
 from __future__ import annotations
 
@@ -31,14 +31,14 @@ from npa_envs.world.cuda_graph import to_device_async
 
 @dataclass(frozen=True, kw_only=True)
 class Morphogenesis3DConfig(GrowthConfig):
-    """3D morphogenesis: a ball of blank particles grows into a thing seen from all sides.
+    """3D morphogenesis: a ball of blank particles grows into an object, compared in views.
 
     The defaults are the paper's (arXiv 2601.16096) where it is known. Lengths are in length units:
     the target lies within 0.85 of the origin.
     """
 
     target: str = "mushroom"
-    """What to grow: a built-in mesh, a mesh file, or a folder as NeRF-synthetic scenes are."""
+    """What to grow: a built-in mesh, a mesh file, or a folder in the format of NeRF-synthetic."""
 
     particle_count: int = 16384
     """Particles in a world, N."""
@@ -47,7 +47,7 @@ class Morphogenesis3DConfig(GrowthConfig):
     """Width of the rule's hidden layer."""
 
     readout_hidden_dim: int = 256
-    """Width of the hidden layer of the read-out, which makes Gaussians of states."""
+    """Width of the hidden layer of the read-out, which maps states to Gaussians."""
 
     alpha: float = 1.0
     """Largest displacement in one step, as a fraction of ε (dimensionless)."""
@@ -59,16 +59,16 @@ class Morphogenesis3DConfig(GrowthConfig):
     """Pixels on each side of a view, R."""
 
     training_views: int = 48
-    """Views of the target to train with, at most."""
+    """Largest number of views of the target to train with."""
 
     held_out_views: int = 12
-    """Views of the target to measure by, at most; none of them is trained with."""
+    """Largest number of other views of the target, which only metrics use."""
 
     views_per_iteration: int = 4
-    """Training views that a loss looks at; each iteration takes other ones."""
+    """Training views that the loss compares, drawn again in each iteration."""
 
     view_seed: int = 0
-    """Seed that the views and backgrounds of each iteration are drawn from."""
+    """Seed of the views and backgrounds of the iterations."""
 
     sigma: float = 0.02
     """Standard deviation of a round particle [length units]."""
@@ -80,16 +80,16 @@ class Morphogenesis3DConfig(GrowthConfig):
     """Opacity of a particle whose read-out is 0, in (0, 1)."""
 
     blur_sigma: float = 20.0
-    """Standard deviation of the blur that targets begin with [pixels]; 0: none."""
+    """Standard deviation of the targets' blur at the first iteration [pixels]; 0: none."""
 
     blur_iterations: int = 1000
-    """Iterations over which the blur falls evenly to none; in the paper a twentieth of all."""
+    """Iterations over which the blur falls linearly to 0; in the paper a twentieth of all."""
 
     view_weight: float = 2.0
     """Weight of the loss of the views (dimensionless)."""
 
     ssim_weight: float = 0.2
-    """Weight of 1 − MS-SSIM beside the mean absolute difference of views (dimensionless)."""
+    """Weight of 1 − MS-SSIM, relative to the mean absolute difference of views (dimensionless)."""
 
     isotropy_weight: float = 0.5
     """Weight of mean |log(standard deviation / sigma)| (dimensionless)."""
@@ -124,8 +124,8 @@ GREY = 0.5
 class Morphogenesis3D(GrowthTask[Morphogenesis3DConfig]):
     """The task of arXiv 2601.16096 with its loss.
 
-    As it is, the last three channels of a state are its colour and particles are round; `for_rule`
-    gives the task that sees what a rule reads out of the states.
+    Without a rule, particles are round and the last three channels of their states are the colour;
+    `for_rule` returns the task that draws the outputs of the rule's read-out.
     """
 
     space_dim = 3
@@ -159,20 +159,20 @@ class Morphogenesis3D(GrowthTask[Morphogenesis3DConfig]):
                 )
         visible = nearest_camera(target.held_out.cameras, SHOWN_FROM)
         self.target = target.to(device)
-        """What worlds are to look like."""
+        """The views of the target."""
         self._shown = some_views(self.target.held_out, torch.tensor([visible], device=device))
-        # The view that pictures show; rows point up.
+        # Pictures show this view; rows point up.
         self._target_picture = self._shown.pictures[0].flip(0)
         self._appearance = Appearance(config.sigma, config.anisotropy, config.opacity)
         self.schedule = ViewSchedule(len(target.training.pictures), config, device)
-        """Which views, how much blur and which backgrounds an iteration has."""
+        """Views, blur and backgrounds of an iteration."""
         self._rule: NPARule | None = None
 
     def for_rule(self, rule: NPARule) -> Self:
-        """Return the task that sees what a rule reads out of the states; all else is shared."""
+        """Return the task that draws the outputs of a rule's read-out; all else is shared."""
         if rule.readout_dim not in (0, OUTPUTS):
             raise NPAError(
-                f"the rule must read out {OUTPUTS} numbers of a state, or none, got readout_dim="
+                f"the rule must have a read-out of {OUTPUTS} outputs, or none, got readout_dim="
                 f"{rule.readout_dim}: it was made for another task"
             )
         return self._with(_rule=rule if rule.readout_dim else None)
@@ -184,20 +184,20 @@ class Morphogenesis3D(GrowthTask[Morphogenesis3DConfig]):
         return super().rule_shape | readout
 
     def begin(self, iteration: int) -> None:
-        """Choose the views, backgrounds and blur that `loss` sees from now on."""
+        """Choose the views, backgrounds and blur of the next calls of `loss`."""
         self.schedule.begin(iteration)
 
     def gaussians(self, s: Tensor) -> Gaussians:
-        """Return how particles look."""
+        """Return the Gaussians that particles are drawn as."""
         outputs = s[..., -3:] if self._rule is None else self._rule.read_out(s)
         return self._appearance.gaussians(outputs)
 
     def views(self, x: Tensor, s: Tensor, cameras: Cameras) -> Tensor:
-        """Return what cameras see: colours times alpha, and alpha, shape [B, V, H, W, 4]."""
+        """Return pictures of V cameras: colours times alpha, and alpha, shape [B, V, H, W, 4]."""
         return self._draw(x, self.gaussians(s), cameras)
 
     def picture(self, x: Tensor, s: Tensor) -> Tensor:
-        """Return one view of each world as pictures are: rows point up, shape [B, R, R, 4]."""
+        """Return one held-out view of each world; rows point up, shape [B, R, R, 4]."""
         return self.views(x, s, self._shown.cameras)[:, 0].flip(1)
 
     def metric(self, x: Tensor, s: Tensor) -> Tensor:
@@ -212,9 +212,9 @@ class Morphogenesis3D(GrowthTask[Morphogenesis3DConfig]):
         return (-10.0 * error.square().mean(dim=(2, 3, 4)).log10()).mean(dim=1)
 
     def particle_shares(self, x: Tensor, s: Tensor) -> Tensor:
-        """Return each particle's share of its world's view loss, times N; [B, N].
+        """Return each particle's contribution to its world's view loss, times N; [B, N].
 
-        By `shares_of_loss`, from how the loss changes with a particle's opacity.
+        See `shares_of_loss`; amounts are the slope of the loss times the particle's opacity.
         """
         with torch.enable_grad():
             gaussians = self.gaussians(s.detach())
@@ -224,7 +224,7 @@ class Morphogenesis3D(GrowthTask[Morphogenesis3DConfig]):
         return shares_of_loss(loss.detach(), opacities.detach() * slope)
 
     def compare(self, x: Tensor, s: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
-        """Return the loss of the views of this iteration, weighted, and its parts."""
+        """Return the weighted loss of this iteration's views, and its parts."""
         config, schedule = self.config, self.schedule
         gaussians = self.gaussians(s)
         chosen = some_views(self.target.training, schedule.index)
@@ -269,8 +269,8 @@ class Morphogenesis3D(GrowthTask[Morphogenesis3DConfig]):
 class ViewSchedule:
     """Views, backgrounds and blur of an iteration, on the device.
 
-    All follow from the seed and the iteration alone, so a resumed run goes on as it would have; the
-    tensors stay the same ones, so a recorded graph reads what was written last.
+    They depend on the seed and the iteration alone, so a resumed run has the same ones. They are
+    always written to the same tensors, as recorded graphs need it.
     """
 
     def __init__(
@@ -279,15 +279,15 @@ class ViewSchedule:
         self._view_count, self._config = view_count, config
         chosen_count = min(config.views_per_iteration, view_count)
         self.index = torch.zeros(chosen_count, dtype=torch.int64, device=device)
-        """Which views, shape [V]."""
+        """Indices of the views, shape [V]."""
         self.backgrounds = torch.zeros(chosen_count, 3, device=device)
-        """Red, green and blue behind them, in [0, 1], shape [V, 3]."""
+        """Their background colours, in [0, 1], shape [V, 3]."""
         self.sigma = torch.zeros((), device=device)
         """Standard deviation of their blur [pixels], shape []."""
         self.begin(0)
 
     def begin(self, iteration: int) -> None:
-        """Write what an iteration sees; the host does not wait for the device."""
+        """Write the views, backgrounds and blur of an iteration, without synchronising."""
         config = self._config
         random = np.random.default_rng((config.view_seed, iteration))
         index = random.choice(self._view_count, len(self.index), replace=False)
@@ -301,10 +301,10 @@ class ViewSchedule:
 
 
 def blurred(pictures: Tensor, sigma: Tensor) -> Tensor:
-    """Return pictures blurred by a Gaussian; beyond their edges they are 0.
+    """Return pictures [V, H, W, K] blurred by a Gaussian; outside of their edges they are 0.
 
-    Two products with a matrix of weights: the standard deviation may change without the host
-    knowing it [pixels], and one of 0 leaves the pictures as they are, bit for bit.
+    `sigma` [pixels], shape [], is read on the device alone; 0 leaves pictures unchanged, bit for
+    bit.
     """
     rows, columns = (_weights(size, sigma, pictures) for size in pictures.shape[1:3])
     across = torch.einsum("xw,vhwk->vhxk", columns, pictures)
@@ -314,10 +314,10 @@ def blurred(pictures: Tensor, sigma: Tensor) -> Tensor:
 def _weights(size: int, sigma: Tensor, like: Tensor) -> Tensor:
     """Return the matrix of a blur along one side, [size, size]."""
     far = torch.arange(-size, size + 1, device=like.device, dtype=like.dtype)
-    place = far[size : 2 * size]
+    pixel = far[size : 2 * size]
     variance = sigma.to(like).square().clamp_min(1e-6)
     whole = torch.exp(-0.5 * far.square() / variance).sum()
-    return torch.exp(-0.5 * (place[:, None] - place).square() / variance) / whole
+    return torch.exp(-0.5 * (pixel[:, None] - pixel).square() / variance) / whole
 
 
 _STRETCHED: Mapping[str, Any] = {
@@ -327,7 +327,7 @@ _STRETCHED: Mapping[str, Any] = {
     "clump_radius": 0.2,
     "cut_gap": 0.1,
 }
-"""Particles that may stretch, and what keeps worlds together and heals clumps and cuts."""
+"""Settings for stretched particles, stable worlds, and healing of clumps and cuts."""
 
 MORPHOGENESIS3D_PRESETS = presets_of(
     "morphogenesis3d",

@@ -1,4 +1,4 @@
-"""Self-classifying point clouds: particles that never move agree on what they form."""
+"""Self-classifying point clouds: static particles agree on the class of their cloud."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from npa_envs.checks import check_non_negative, check_positive, check_seed, chec
 from npa_envs.errors import NPAError
 from npa_envs.ops import splat, world_mean
 from npa_envs.rule.rule import NPARule
-from npa_envs.tasks.base import Frame, ParticleTask, TaskConfig, Worlds
+from npa_envs.tasks.base import Frame, ParticleTask, TaskConfig
 from npa_envs.tasks.seeds import drawn_indices, drawn_worlds
 from npa_envs.tasks.targets.clouds import (
     PointClouds,
@@ -23,12 +23,13 @@ from npa_envs.tasks.targets.clouds import (
     varied,
 )
 from npa_envs.tasks.train_config import TrainConfig, fast_run, presets_of, tiny_run
+from npa_envs.world.particles import Particles
 from npa_envs.world.randomness import Randomness
 
 
 @dataclass(frozen=True, kw_only=True)
 class PointClassificationConfig(TaskConfig):
-    """Particles that stay where they are agree on what their cloud shows (arXiv 2601.16096).
+    """Static particles agree on the class of their point cloud (arXiv 2601.16096).
 
     The defaults are the paper's, but for the data, which are small. Lengths are in length units;
     a cloud fills about [0, 1]².
@@ -38,26 +39,26 @@ class PointClassificationConfig(TaskConfig):
     """The pictures: "digits" (scikit-learn), "mnist" (torchvision), or a folder of IDX files."""
 
     data_folder: str = "data"
-    """Where torchvision keeps "mnist"."""
+    """Folder of torchvision's "mnist"."""
 
     class_count: int = 10
     """Number of classes."""
 
     sample_seed: int = 0
-    """Seed of the places among which the farthest points are chosen, drawn once."""
+    """Seed of the candidates for farthest-point sampling of the pictures."""
 
     rotation: float = 0.0
-    """Fresh clouds are turned by up to this, either way [degrees]."""
+    """Largest random rotation of fresh clouds, in either direction [degrees]."""
 
     stretch: float = 0.0
-    """Fresh clouds are stretched and sheared by up to this share (dimensionless)."""
+    """Largest random stretch and shear of fresh clouds (dimensionless)."""
 
     jitter: float = 0.0
     """Standard deviation of the noise on fresh clouds' coordinates [length units]."""
 
     mutated_share: float = 0.0
-    """Share of the worlds from the pool that become other clouds and keep their states, if the run
-    has `damage`."""
+    """Probability that a damaged world from the pool gets the positions and class of another cloud
+    and keeps its states."""
 
     particle_count: int = 512
     """Particles in a world, N: points of a cloud."""
@@ -66,7 +67,7 @@ class PointClassificationConfig(TaskConfig):
     """Width of the rule's hidden layer."""
 
     readout_hidden_dim: int = 256
-    """Width of the hidden layer of the read-out, from states to one number for each class."""
+    """Width of the hidden layer of the read-out, which maps states to class scores."""
 
     overflow_weight: float = 1.0
     """Weight of mean |s − clip(s, −1, 1)| (dimensionless)."""
@@ -88,13 +89,13 @@ SIGMA = 0.7
 
 
 class PointClassification(ParticleTask[PointClassificationConfig]):
-    """The classification task of arXiv 2601.16096; its worlds have goals.
+    """The classification task of arXiv 2601.16096.
 
-    The goal of a world is its cloud's class. A rule's read-out gives one number for each class;
-    without a rule, or where it has no read-out, these are the last channels of the states.
+    The goal of a world is its cloud's class. Class scores are the outputs of the rule's read-out;
+    without a read-out, they are the last channels of the states.
 
     Args:
-        split: Which clouds worlds are made of; those of "test" are not varied.
+        split: The clouds that worlds are made of; those of "test" are not augmented.
     """
 
     metric_name = "mean squared error to the class"
@@ -111,7 +112,7 @@ class PointClassification(ParticleTask[PointClassificationConfig]):
     ) -> None:
         self.config = config = config or PointClassificationConfig()
         self.split: Split = split
-        """Which clouds worlds are made of."""
+        """The clouds that worlds are made of, "train" or "test"."""
         self._device = torch.device(device)
         self._rule: NPARule | None = None
         self.goal_count = config.class_count
@@ -121,7 +122,7 @@ class PointClassification(ParticleTask[PointClassificationConfig]):
 
     @cached_property
     def clouds(self) -> PointClouds:
-        """All clouds that worlds are made of, loaded when first asked for."""
+        """All clouds of the split, loaded at the first use."""
         config = self.config
         clouds = load_clouds(
             config.data,
@@ -141,12 +142,12 @@ class PointClassification(ParticleTask[PointClassificationConfig]):
 
     @property
     def frame(self) -> Frame:
-        """Where viewers look: at [0, 1]²."""
+        """The region that viewers show: [0, 1]² and a margin."""
         return Frame((0.5, 0.5), 0.6)
 
     @property
     def pixel_size(self) -> float:
-        """Usual distance between particles: the side of what one fills [length units]."""
+        """Usual distance between particles [length units]."""
         return math.sqrt(self.clouds.coverage / self.config.particle_count)
 
     @property
@@ -160,7 +161,7 @@ class PointClassification(ParticleTask[PointClassificationConfig]):
         return {"alpha": 1.0, "static": True, **readout}
 
     def for_rule(self, rule: NPARule) -> Self:
-        """Return the task with losses and pictures that read states through `rule`."""
+        """Return the task whose losses and pictures use the rule's read-out."""
         return self._with(_rule=rule)
 
     def on(self, split: Split) -> Self:
@@ -170,15 +171,15 @@ class PointClassification(ParticleTask[PointClassificationConfig]):
         return other
 
     def held_out(self) -> Self:
-        """Return the task with the clouds of "test": those of "train" may be known by heart."""
+        """Return the task with the clouds of "test"."""
         return self.on("test")
 
     def seed(
         self, world_count: int, *, generator: Randomness, device: str | torch.device = "cpu"
-    ) -> Worlds:
-        """Return random clouds, varied as the configuration says, all states zero, and classes.
+    ) -> Particles:
+        """Return random clouds with all states zero; goals are their classes.
 
-        They are made on the device of the task and copied to `device`.
+        Clouds of "train" are augmented. They are made on the task's device and copied to `device`.
         """
         config, clouds = self.config, self.clouds
         chosen = drawn_indices(len(clouds.label), world_count, generator, torch.device(device))
@@ -192,21 +193,19 @@ class PointClassification(ParticleTask[PointClassificationConfig]):
                 jitter=config.jitter,
                 generator=generator,
             )
-        return x, x.new_zeros(*x.shape[:2], config.state_dim), goal
+        return Particles(x, x.new_zeros(*x.shape[:2], config.state_dim), goal=goal)
 
-    def damage(self, x: Tensor, s: Tensor, goal: Tensor | None, generator: Randomness) -> Worlds:
-        """Return some worlds as other clouds, with their states as they were, and the classes."""
-        share = self.config.mutated_share
-        if goal is None or share == 0.0:
-            return x, s, goal
-        other, _, other_goal = self.seed(len(x), generator=generator, device=x.device)
-        mutated = drawn_worlds(x, generator, share)
-        x = torch.where(mutated[:, None, None], other.to(x.dtype), x)
-        assert other_goal is not None, "clouds come with their classes"
-        return x, s, torch.where(mutated, other_goal, goal)
+    def damage(self, worlds: Particles, generator: Randomness) -> Particles:
+        """Return the worlds, some with the positions and class of another cloud; states stay."""
+        x, share = worlds.x, self.config.mutated_share
+        if worlds.goal is None or share == 0.0:
+            return worlds
+        other = self.seed(len(x), generator=generator, device=x.device)
+        other = worlds._replace(x=other.x.to(x.dtype), goal=other.goal)
+        return other.where(drawn_worlds(x, generator, share), worlds)
 
     def outputs(self, s: Tensor) -> Tensor:
-        """Return what each particle says of each class, dimensionless, shape [B, N, K]."""
+        """Return each particle's class scores, dimensionless, shape [B, N, K]."""
         outputs = s if self._rule is None else self._rule.read_out(s)
         if outputs.shape[-1] < self.config.class_count:
             raise NPAError(
@@ -223,7 +222,7 @@ class PointClassification(ParticleTask[PointClassificationConfig]):
         return channel_mean((outputs - wanted[:, None]).square())
 
     def mistakes(self, s: Tensor) -> Tensor:
-        """Return 1 for particles that say another class than their world's most loudly, [B, N]."""
+        """Return 1 for particles whose largest class score is of a wrong class, else 0, [B, N]."""
         return (self.outputs(s).argmax(dim=-1) != self.goal[:, None]).to(s.dtype)
 
     def cross_entropies(self, s: Tensor, sharpness: float) -> Tensor:
@@ -237,11 +236,11 @@ class PointClassification(ParticleTask[PointClassificationConfig]):
         return world_mean(self.errors(s)[..., None])[:, 0]
 
     def trial_metric(self, x: Tensor, s: Tensor) -> Tensor:
-        """Return the share of each world's particles that are wrong, shape [B]."""
+        """Return the fraction of each world's particles with a wrong class, shape [B]."""
         return self.mistakes(s).mean(1)
 
     def colours(self, s: Tensor) -> Tensor:
-        """Return each particle's colour, its class's; [B, N, 3]."""
+        """Return each particle's colour, by its class; [B, N, 3]."""
         return class_colours(self.outputs(s))
 
     def overflows(self, s: Tensor) -> Tensor:
@@ -253,12 +252,12 @@ class PointClassification(ParticleTask[PointClassificationConfig]):
         return world_mean(self.overflows(s)[..., None])[:, 0]
 
     def compare(self, x: Tensor, s: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
-        """Return the batch's mean squared error, and it by name."""
+        """Return the batch's mean squared error, also as a named part."""
         error = self.errors(s).mean()
         return error, {"error": error}
 
     def loss(self, x: Tensor, s: Tensor, path_length: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
-        """Return the training loss and its named parts, unweighted, and the share that is right."""
+        """Return the training loss and its named parts, with the accuracy among them."""
         total, parts = super().loss(x, s, path_length)
         return total, {**parts, "accuracy": 1.0 - self.mistakes(s.detach()).mean()}
 
@@ -275,7 +274,7 @@ class PointClassification(ParticleTask[PointClassificationConfig]):
         )
 
     def __getstate__(self) -> dict[str, object]:
-        """Leave out the clouds, which are loaded again when they are asked for."""
+        """Return the attributes to pickle, without the clouds, which are loaded again."""
         return {name: value for name, value in vars(self).items() if name != "clouds"}
 
     def _with(self, **fields: object) -> Self:
@@ -284,7 +283,7 @@ class PointClassification(ParticleTask[PointClassificationConfig]):
 
 
 PICTURE_MARGIN = 0.0625
-"""Room around the square of the points in pictures [length units]: ink reaches its sides."""
+"""Margin around [0, 1]² in pictures [length units]."""
 
 PALETTE = (
     (0.90, 0.10, 0.29),
@@ -298,21 +297,21 @@ PALETTE = (
     (0.50, 0.35, 0.14),
     (0.05, 0.05, 0.05),
 )
-"""Red, green and blue of class 0, 1, ...; classes beyond begin anew."""
+"""Red, green and blue of class 0, 1, ..., repeated for more classes."""
 
 UNDECIDED = (0.6, 0.6, 0.6)
-"""Colour of a particle that says nothing."""
+"""Colour of a particle whose scores are 0."""
 
 
 def particle_classes(outputs: Tensor) -> Tensor:
-    """Return the class that each particle says, int64, shape [B, N]."""
+    """Return the class with each particle's largest score, int64, shape [B, N]."""
     return outputs.argmax(-1)
 
 
 def majority(outputs: Tensor) -> Tensor:
-    """Return the class that most particles of each world say, int64, shape [B].
+    """Return the majority class of each world's particles, int64, shape [B].
 
-    Of several with as many votes it is the one with the larger sum of outputs.
+    Of several with equally many votes it is the one with the largest sum of scores.
     """
     particle_count, class_count = outputs.shape[1:]
     classes = torch.arange(class_count, device=outputs.device)
@@ -324,13 +323,13 @@ def majority(outputs: Tensor) -> Tensor:
 
 
 def class_colours(outputs: Tensor) -> Tensor:
-    """Return each particle's colour, its class's, greyer the less it is sure of it; [B, N, 3]."""
+    """Return each particle's colour, by its class, greyer the lower the score; [B, N, 3]."""
     rows = [PALETTE[k % len(PALETTE)] for k in range(outputs.shape[-1])]
     sure, chosen = outputs.max(-1, keepdim=True)
     sure = sure.clamp(0.0, 1.0)
     colours = []
     for channel, grey in enumerate(UNDECIDED):
-        # Scalar by scalar: a tensor of the palette would be a copy to the device in each picture.
+        # Scalar by scalar: a tensor of the palette would be copied to the device for each picture.
         colour = torch.zeros_like(sure)
         for number, row in enumerate(rows):
             colour = torch.where(chosen == number, row[channel], colour)
@@ -339,8 +338,8 @@ def class_colours(outputs: Tensor) -> Tensor:
 
 
 def channel_mean(values: Tensor) -> Tensor:
-    """Return the mean over the last dimension, rounded alike in every batch, [...]."""
-    # One by one: torch's mean may round otherwise in another batch.
+    """Return the mean over the last dimension, the same bits in every batch, [...]."""
+    # One by one: the rounding of torch's mean may depend on the batch.
     total, *rest = values.unbind(-1)
     for term in rest:
         total = total + term

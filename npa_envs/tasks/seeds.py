@@ -1,4 +1,4 @@
-"""Positions that worlds begin with: uniform in a ball or a box."""
+"""Start positions of particles: uniform in a ball or a box; draws by world."""
 
 from __future__ import annotations
 
@@ -74,24 +74,24 @@ def uniform_box(
     _check_points(world_count * particle_count * len(sides), dtype)
     check_generator(generator, device, world_count)
     if isinstance(generator, WorldRandom):
-        share = generator.uniform(particle_count, len(sides), dtype=dtype)
+        fraction = generator.uniform(particle_count, len(sides), dtype=dtype)
     else:
         shape = (world_count, particle_count, len(sides))
-        share = torch.rand(shape, generator=generator, device=device, dtype=dtype)
-    return torch.stack([side * (share[..., d] - 0.5) for d, side in enumerate(sides)], dim=-1)
+        fraction = torch.rand(shape, generator=generator, device=device, dtype=dtype)
+    return torch.stack([side * (fraction[..., d] - 0.5) for d, side in enumerate(sides)], dim=-1)
 
 
 def drawn_indices(
     count: int, world_count: int, generator: Randomness | None, device: torch.device
 ) -> Tensor:
-    """Return one random number below `count` for each world, int64, shape [B]."""
+    """Return one random index in [0, count) for each world, int64, shape [B]."""
     if isinstance(generator, WorldRandom):
         return generator.integers(count, 1)[:, 0]
     return torch.randint(count, (world_count,), generator=generator, device=device)
 
 
 def drawn_worlds(x: Tensor, generator: Randomness, share: float) -> Tensor:
-    """Return which of some worlds are drawn, each with the probability `share`, bool, shape [B]."""
+    """Return a random bool for each world, True with probability `share`, shape [B]."""
     single = x.new_empty(0, dtype=torch.float32)
     return uniform_draws(generator, (len(x), 1), single)[:, 0] < share
 
@@ -109,7 +109,7 @@ def _check_points(number_count: int, dtype: torch.dtype) -> None:
 def _unit_ball_by_world(
     generator: WorldRandom, particle_count: int, space_dim: int, dtype: torch.dtype
 ) -> Tensor:
-    """Return points uniform in the unit ball, by operations that round alike wherever they run."""
+    """Return points uniform in the unit ball, the same bits on every device and in every batch."""
     direction = generator.normal(particle_count, space_dim, dtype=dtype)
     squares = direction * direction
     length = sum(squares.unbind(dim=-1), torch.zeros_like(squares[..., 0])).sqrt()

@@ -20,7 +20,7 @@ from npa_envs.checks import (
 from npa_envs.errors import NPAError
 from npa_envs.ops import periodic_splat
 from npa_envs.rule.rule import COLOUR_OFFSET
-from npa_envs.tasks.base import ParticleTask, TaskConfig, Worlds, shares_of_loss
+from npa_envs.tasks.base import ParticleTask, TaskConfig, shares_of_loss
 from npa_envs.tasks.damage import random_particle
 from npa_envs.tasks.losses.texture import (
     DEFAULT_LOSS,
@@ -34,6 +34,7 @@ from npa_envs.tasks.seeds import uniform_box
 from npa_envs.tasks.targets.textures import TextureTarget, load_texture
 from npa_envs.tasks.train_config import TrainConfig, presets_of, tiny_run
 from npa_envs.world.brushes import wipe_state
+from npa_envs.world.particles import Particles
 from npa_envs.world.randomness import Randomness
 
 
@@ -49,10 +50,10 @@ class TextureConfig(TaskConfig):
     """The texture: a built-in name, or the path of a PNG, JPEG or WebP file."""
 
     target_tiles: bool = False
-    """Whether the opposite edges of a picture file fit together; built-in textures tile."""
+    """Whether opposite edges of a picture file fit together; those of built-in textures do."""
 
     loss: str = DEFAULT_LOSS
-    """How textures are compared: a name of `TEXTURE_LOSSES` such as "patch_ot" or the paper's
+    """Loss between textures: a name of `TEXTURE_LOSSES` such as "patch_ot" or the paper's
     "vgg_ot", or the sum of some, such as "patch_ot+joint_swd"."""
 
     loss_seed: int = 0
@@ -65,8 +66,8 @@ class TextureConfig(TaskConfig):
     """Perception radius ε [length units]; the rule is trained at it, so it is also its ε0."""
 
     see_across: bool = False
-    """Raise ε, where the target's things lie far apart, to twice the median gap between neighbours,
-    at most to 0.3: so that particles of one thing perceive the next."""
+    """Raise ε to twice the median gap between neighbouring things of the target, at most to 0.3, so
+    that particles of one thing perceive the next."""
 
     alpha: float = 0.5
     """Largest displacement in one step, as a fraction of ε (dimensionless)."""
@@ -110,22 +111,22 @@ class TextureConfig(TaskConfig):
 
 
 LARGEST_EPS = 0.3
-"""ε that `see_across` raises to, at most [length units]."""
+"""Largest ε that `see_across` sets [length units]."""
 
 DENSITY_FLOOR = 1e-6
-"""Density that empty places count as, so that the power has a slope there."""
+"""Added to densities, so that their power has a finite slope at 0."""
 
 DENSITY_POWER = 0.1
-"""Power that densities are compared in: what is empty differs most from what is not."""
+"""Power of densities that are compared: it separates empty from covered."""
 
 JOINT_POWER = 0.5
-"""The same where colours and density are compared at once."""
+"""Power of densities where colours and density are compared together."""
 
 JITTER = 0.35
-"""How far points of a drawing lie from their lattice, as a share of its spacing, at most."""
+"""Largest displacement of a drawing's points from their lattice, as a fraction of its spacing."""
 
 DRAWINGS = 16
-"""Drawings that `Texture.drawable` is the mean of."""
+"""Number of drawings that `Texture.drawable` averages."""
 
 
 class Texture(ParticleTask[TextureConfig]):
@@ -154,12 +155,12 @@ class Texture(ParticleTask[TextureConfig]):
                 f"config.resolution says, got {tuple(target.picture.shape)}: load it at that size"
             )
         if config.see_across:
-            seen = min(2.0 * target.gap * config.box_size, LARGEST_EPS, 0.5 * config.box_size)
-            config = replace(config, see_across=False, eps=max(config.eps, seen))
+            across = min(2.0 * target.gap * config.box_size, LARGEST_EPS, 0.5 * config.box_size)
+            config = replace(config, see_across=False, eps=max(config.eps, across))
         self.config = config
-        """The configuration; its ε is the one that rules are trained at."""
+        """The configuration; its ε may be raised by `see_across`."""
         self.target = target
-        """What worlds are to look like."""
+        """The target texture."""
         self._target_picture = target.picture.to(device)
         self.metric_name = config.loss
         # All particles together have the target's mean density.
@@ -180,55 +181,56 @@ class Texture(ParticleTask[TextureConfig]):
         count = self.config.particle_count
         return uniform_box(world_count, count, self.box, generator=generator, device=device)
 
-    def damage(self, x: Tensor, s: Tensor, goal: Tensor | None, generator: Randomness) -> Worlds:
+    def damage(self, worlds: Particles, generator: Randomness) -> Particles:
         """Return the worlds with the states in a disk around one random particle set to zero."""
         if self.config.damage_radius == 0.0:
-            return x, s, goal
+            return worlds
+        x, s, *_ = worlds
         centre, radius = random_particle(x, generator), self.config.damage_radius
-        return x, wipe_state(x, s, centre=centre, radius=radius, box=self.box), goal
+        return worlds._replace(s=wipe_state(x, s, centre=centre, radius=radius, box=self.box))
 
     def picture(self, x: Tensor, s: Tensor) -> Tensor:
         """Return the picture of each world: colour sums and density, shape [B, R, R, 4]."""
         return self.splat(x, s[..., -3:] + COLOUR_OFFSET)
 
     def drawing(self, number: int, *, shifted: bool = True) -> Tensor:
-        """Return the target as a jittered lattice of particles draws it, shape [1, R, R, 4].
+        """Return the target drawn by particles on a jittered lattice, shape [1, R, R, 4].
 
-        It is moved round the box if `shifted`, so that another part is cut out.
+        `number` seeds the jitter. `shifted` also translates it at random across the periodic box.
         """
         side, resolution = self.config.box_size, self.config.resolution
         generator = torch.Generator().manual_seed(number)
         count = max(1, round(side / self.pixel_size))
         axis = (torch.arange(count, dtype=torch.float64) + 0.5) / count
-        places = torch.stack(torch.meshgrid(axis, axis, indexing="xy"), dim=-1).flatten(0, 1)
-        jitter = torch.rand(places.shape, generator=generator, dtype=torch.float64) - 0.5
-        places = (places + 2.0 * JITTER * jitter / count) % 1.0
-        column, row = (places * resolution).long().clamp_max(resolution - 1).unbind(1)
-        seen = self.target_picture.double().cpu()[row, column]
-        kept = torch.rand(len(seen), generator=generator, dtype=torch.float64) < seen[:, 3]
+        points = torch.stack(torch.meshgrid(axis, axis, indexing="xy"), dim=-1).flatten(0, 1)
+        jitter = torch.rand(points.shape, generator=generator, dtype=torch.float64) - 0.5
+        points = (points + 2.0 * JITTER * jitter / count) % 1.0
+        column, row = (points * resolution).long().clamp_max(resolution - 1).unbind(1)
+        pixels = self.target_picture.double().cpu()[row, column]
+        kept = torch.rand(len(pixels), generator=generator, dtype=torch.float64) < pixels[:, 3]
         shift = shifted * torch.rand(2, generator=generator, dtype=torch.float64)
-        x = ((places[kept] + shift) % 1.0 - 0.5) * side
-        colour = seen[kept, :3] / seen[kept, 3:]
+        x = ((points[kept] + shift) % 1.0 - 0.5) * side
+        colour = pixels[kept, :3] / pixels[kept, 3:]
         return self.splat(x[None].to(self.target_picture), colour[None].to(self.target_picture))
 
     @cached_property
     def drawable(self) -> Tensor:
-        """The target as fine as particles can draw it: a mean of drawings, shape [R, R, 4]."""
+        """The target as sharp as particles can draw it: a mean of drawings, [R, R, 4]."""
         drawn = [self.drawing(number, shifted=False) for number in range(DRAWINGS)]
         return torch.cat(drawn).mean(0)
 
     def texture_losses(self, x: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
         """Return each world's loss of the colour image and of the density image, shape [B] each.
 
-        A joint loss sees the density with the colours, and has no part of the density alone.
-        Losses that look at some places only see each world as its first particle does, in the
-        middle: which places these are then differs from world to world and from step to step.
+        The second is 0 for a joint loss, which compares the density together with the colours.
+        Worlds are translated so that their first particle is in the middle: losses that sample
+        some positions then sample others in each world and step.
         """
         return self.compare_pictures(self.picture(x - x[:, :1].detach(), s))
 
     def weights(self) -> tuple[float, float]:
-        """Return what both parts of `texture_losses` are multiplied by; joint losses are weighted
-        as they are."""
+        """Return the weights of both parts of `texture_losses`; 1 for joint losses, which include
+        them."""
         if is_joint(self.config.loss):
             return 1.0, 1.0
         return self.config.colour_weight, self.config.density_weight
@@ -238,9 +240,9 @@ class Texture(ParticleTask[TextureConfig]):
         return self.weighted(*self.texture_losses(x, s))
 
     def particle_shares(self, x: Tensor, s: Tensor) -> Tensor:
-        """Return each particle's share of its world's texture loss, times N; [B, N].
+        """Return each particle's contribution to its world's texture loss, times N; [B, N].
 
-        By `shares_of_loss`, from how the loss changes with what a particle adds to the picture.
+        See `shares_of_loss`; amounts are the slope of the loss times the particle's splat.
         """
         x, s = x.detach(), s.detach()
         x = x - x[:, :1]
@@ -249,7 +251,7 @@ class Texture(ParticleTask[TextureConfig]):
             picture = self.picture(x, s).requires_grad_()
             loss = self.weighted(*self.compare_pictures(picture))
             (slope,) = torch.autograd.grad(loss.sum(), picture)
-            # The picture is linear in the colours: its pull-back sums over a particle's patch.
+            # The picture is linear in the colours: its gradient sums over a particle's splat.
             drawn = self.splat(x, blank)
             (pulled,) = torch.autograd.grad(drawn, blank, slope, retain_graph=True)
             by_density = torch.zeros_like(slope)
@@ -291,12 +293,12 @@ class Texture(ParticleTask[TextureConfig]):
         if compare_densities is None:
             joint = compare_colours(self.joint_image(channels))
             return joint, torch.zeros_like(joint)
-        # One by one: the end of a tensor, which lies elsewhere in other batches, rounds otherwise.
+        # World by world: a power rounds otherwise at the end of a tensor.
         density = torch.stack([density_image(world) for world in channels[:, 3:]])
         return compare_colours(colour_image(channels)), compare_densities(density)
 
     def joint_image(self, channels: Tensor) -> Tensor:
-        """Return colours and densities, shape [..., 4, R, R], each times the root of its weight."""
+        """Return colours and powers of densities, times roots of weights, [..., 4, R, R]."""
         density = (channels[..., 3:, :, :] + DENSITY_FLOOR) ** JOINT_POWER
         colour_scale = self.config.colour_weight**0.5
         density_scale = self.config.density_weight**0.5
@@ -309,7 +311,7 @@ class Texture(ParticleTask[TextureConfig]):
 
     @cached_property
     def _losses(self) -> tuple[TextureLoss, TextureLoss | None]:
-        # Made when first asked for: pictures can be drawn without weights.
+        # Made at the first use: pictures can be drawn without weights.
         config = self.config
         options = LossOptions(self.target.tiles, config.loss_seed, config.vgg_weights)
         if is_joint(config.loss):
@@ -323,13 +325,13 @@ class Texture(ParticleTask[TextureConfig]):
 
 
 def colour_image(channels: Tensor) -> Tensor:
-    """Return colours [..., 3, R, R] as they are compared: where particles overlap, their mean."""
+    """Return the colours that losses compare, [..., 3, R, R]: means where particles overlap."""
     sums, density = channels[..., :3, :, :], channels[..., 3:, :, :]
     return sums / density.clamp_min(1.0)
 
 
 def density_image(density: Tensor) -> Tensor:
-    """Return densities as they are compared: (D + 1e-6) to the power of 0.1 (dimensionless)."""
+    """Return the densities that losses compare: (density + 1e-6)^0.1 (dimensionless)."""
     return (density + DENSITY_FLOOR) ** DENSITY_POWER
 
 

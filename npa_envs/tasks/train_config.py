@@ -28,22 +28,22 @@ from npa_envs.world.rollout import Memory
 TaskConfigT = TypeVar("TaskConfigT")
 
 Schedule = Literal["milestones", "cosine"]
-"""How a learning rate falls."""
+"""Learning-rate schedules."""
 
 OptimiserName = Literal["adamw", "muon"]
-"""What takes the steps along gradients."""
+"""Names of optimisers."""
 
 RISE = 0.01
-"""Share of a repeat in which the learning rate of the schedule "cosine" rises."""
+"""Fraction of a repeat in which the learning rate of the schedule "cosine" rises."""
 
 LOWEST = 0.01
-"""What is left of the learning rate at the end of the schedule "cosine"."""
+"""Final learning rate of the schedule "cosine", as a fraction of the largest."""
 
 DECAY = 0.3
 """Factor on the learning rate at each milestone."""
 
 LARGEST_POWER = 8.0
-"""Largest power of the mean of what grown worlds change: float32 rounds higher ones to 0."""
+"""Largest `stillness_power`: float32 would round higher powers of small changes to 0."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -58,41 +58,40 @@ class TrainConfig(Generic[TaskConfigT]):
     """The task's own configuration."""
 
     initial_rule: str = ""
-    """Start from this rule, a name, a file or a run's folder, instead of random weights; '': from
-    these. The preset `best` of morphogenesis2d starts from a heart (`heart-first`), that of
-    morphogenesis3d from `rocket-8192`."""
+    """Rule to start from: a name, a file or a run's folder; '': random weights. The preset `best`
+    of morphogenesis2d starts from a heart (`heart-first`), that of morphogenesis3d from
+    `rocket-8192`."""
 
     vary_eps: tuple[float, float] = (1.0, 1.0)
-    """Range of factors on ε, in open space: one is drawn for each fresh world, evenly in the
-    logarithm. A world at a larger ε is one at the task's ε that begins as a smaller disk."""
+    """Range of random factors on ε, log-uniform, one for each fresh world in open space. Instead of
+    ε, the start positions are divided by the factor, which is equivalent."""
 
     moment_inverse: MomentInverse = "threshold"
     """How the rule's state gradients are corrected: "threshold", the paper's, or "smooth"."""
 
     dead_zone: float = 0.0
-    """Each number y of an update with |y| <= `dead_zone` counts as 0 (dimensionless): worlds that
-    hardly change then come to rest. It replaces that of `initial_rule`, also where it is 0; of
-    several rules that learn together, those that are given keep theirs. Equivariant rules have
-    none, whatever is said here."""
+    """Entries y of an update with |y| <= `dead_zone` are set to 0 (dimensionless), so that worlds
+    that hardly change come to rest. It replaces that of `initial_rule`, even if it is 0; rules that
+    are given for several species keep theirs. Ignored for equivariant rules, which have none."""
 
     iterations: int = 10_000
     """Optimiser steps in one repeat."""
 
     repeats: int = 3
-    """How often the schedule runs. Rule and pool go on; the optimiser starts afresh."""
+    """How often the schedule runs. Rule and pool continue; the optimiser is reset."""
 
     world_count: int = 8
     """Worlds in a batch, B."""
 
     pool_size: int = 512
-    """Worlds that live on between batches."""
+    """Worlds that are stored between batches."""
 
     steps: tuple[int, int] = (32, 96)
     """Range [lo, hi) that the number of steps of a rollout is drawn from, uniformly."""
 
     optimiser: OptimiserName = "adamw"
-    """What takes the steps: "adamw" as in the paper, or "muon", which makes the steps of layers'
-    matrices orthogonal (Jordan et al. 2024) and gives all else, such as biases, to AdamW."""
+    """"adamw" as in the paper, or "muon": orthogonal steps of the layers' matrices (Jordan et al.
+    2024), and AdamW for all else, such as biases."""
 
     learning_rate: float = 5e-4
     """The optimiser's learning rate at the start of each repeat."""
@@ -108,59 +107,57 @@ class TrainConfig(Generic[TaskConfigT]):
     """The optimiser's weight decay."""
 
     seed_interval: int = 16
-    """Every so many batches, the first world of the batch is a fresh seed. 1: in every batch."""
+    """Every this many batches, the first worlds of the batch are fresh seeds; 1: in every batch."""
 
     fresh_share: float = 0.0
-    """Share of fresh seeds in a batch that has any by `seed_interval`; at least one world. Without
-    effect where worlds have `max_age_range`, at the end of which seeds come."""
+    """Fraction of fresh seeds in a batch with seeds (`seed_interval`); at least one world. No
+    effect with `max_age_range`."""
 
     max_age_range: tuple[int, int] = (0, 0)
-    """Steps that a world of the pool lives until a fresh seed takes its place, or it is damaged and
-    is kept (`damage_and_keep_share`): the least, in the pool's first place, and the most, in its
-    last; evenly in the logarithm between them. A batch has one world from each of B equal
-    sections of the pool, so it holds young and old worlds. (0, 0): fresh seeds come by
-    `seed_interval` instead."""
+    """Range of the lifetimes [steps] after which a world of the pool is replaced by a fresh seed,
+    or damaged and kept (`damage_and_keep_share`): shortest at the pool's first index, longest at
+    its last, geometrically spaced between. A batch has one world from each of B equal sections of
+    the pool, so it has young and old worlds. (0, 0): `seed_interval` instead."""
 
     damage_and_keep_share: float = 0.0
-    """Share in [0, 1) of the worlds whose time is over that are damaged at that moment and live as
-    long again; a fresh seed takes the place of the others (dimensionless). So a rule learns what
-    comes of a damage long after it. Needs `max_age_range`."""
+    """Fraction in [0, 1) of the worlds at the end of their lifetime that are damaged and kept for
+    another lifetime instead of being replaced (dimensionless), so that a rule learns the long-term
+    effects of damage. Needs `max_age_range`."""
 
     stillness_weight: float = 0.0
-    """Weight of what a rollout changes in grown worlds: the mean path length of their particles in
-    perception radii, and the mean |Δs| from its start to its end; of all others it is 0
-    (dimensionless). Births and deaths do not count. Grown are worlds of `stillness_min_age` whose
-    place in the pool is not damaged in every batch. It ends the slow flow by which worlds
-    lose their shape. Needs `max_age_range`."""
+    """Weight of the change of grown worlds in a rollout: their particles' mean path length in
+    perception radii, plus the mean |Δs| from its start to its end (dimensionless). Births and
+    deaths do not count. Grown are worlds of at least `stillness_min_age` outside of `damage_share`.
+    It stops the slow flow by which worlds lose their shape. Needs `max_age_range`."""
 
     stillness_power: float = 1.0
     """Power of the means over particles and states in `stillness_weight`:
-    (mean |a|^power)^(1/power), at least 1 and at most 8. The larger it is, the more the few
-    particles weigh that move most."""
+    (mean |a|^power)^(1/power), at least 1 and at most 8. A larger power gives more weight to the
+    particles that move most."""
 
     stillness_min_age: int = 512
-    """Steps from the seed, or from the damage before another life, after which a world is grown."""
+    """Steps since the seed, or since the damage before another lifetime, when a world is grown."""
 
     damage_share: float = 1.0
-    """Share in [0, 1] of the pool's places whose worlds are damaged in every batch, so that a rule
-    learns to heal: the first places, which with `max_age_range` are those of the shortest lives.
-    All others are damaged by `damage_and_keep_share` alone."""
+    """Fraction in [0, 1] of the pool whose worlds are damaged in every batch, so that a rule learns
+    to heal: the first indices, which with `max_age_range` have the shortest lifetimes. All others
+    are damaged by `damage_and_keep_share` alone."""
 
     seed: int = 0
     """Seed of every random number of the run, in [0, 2**63)."""
 
     device: str = "cpu"
-    """Where to train: "cpu", "cuda", "cuda:1", ..."""
+    """Device to train on: "cpu", "cuda", "cuda:1", ..."""
 
     dtype: Literal["float32", "float64"] = "float32"
     """Precision of the worlds and of the rule."""
 
     memory: Memory = "store"
-    """What the backward pass reads: "store" keeps all steps, "recompute" computes two steps in
-    three again, "minimal" all but the last."""
+    """Intermediate values for the backward pass: "store" keeps those of all steps, "recompute"
+    computes two steps in three again, "minimal" all but the last."""
 
     cuda_graph: bool = True
-    """On CUDA, capture an iteration: rollout and gradients as one graph per number of steps."""
+    """On CUDA, replay rollout and gradients as one CUDA graph for each number of steps."""
 
     out: Path = Path("runs/morphogenesis2d")
     """Folder that log, pictures, checkpoint and rule are written to; created where missing."""
@@ -210,7 +207,7 @@ class TrainConfig(Generic[TaskConfigT]):
                 "damage_and_keep_share",
                 self.damage_and_keep_share < 1.0,
                 "be below 1",
-                "with 1 there are no seeds",
+                "with 1 there would be no fresh seeds",
             ),
             (
                 "initial_rule",
@@ -268,7 +265,7 @@ class TrainConfig(Generic[TaskConfigT]):
 
     @property
     def ages(self) -> bool:
-        """Whether worlds of the pool have max_age_range."""
+        """Whether worlds of the pool have lifetimes."""
         return self.max_age_range[1] > 0
 
     @property
@@ -278,7 +275,7 @@ class TrainConfig(Generic[TaskConfigT]):
 
     @property
     def fresh_count(self) -> int:
-        """Fresh seeds in a batch that has such."""
+        """Fresh seeds in a batch that has any."""
         return max(1, round(self.fresh_share * self.world_count))
 
     @property
@@ -294,9 +291,9 @@ class TrainConfig(Generic[TaskConfigT]):
     def learning_rate_at(self, iteration: int, share: float = 0.0) -> float:
         """Return the learning rate of an iteration, counted from 0 over all repeats.
 
-        It is a function of the iteration alone, restarted with each repeat, so that a resumed run
-        needs no scheduler state: MultiStepLR, or a cosine with a short linear rise before it
-        (Loshchilov and Hutter, arXiv 1608.03983).
+        A resumed run needs no scheduler state. Each repeat restarts it: steps at the milestones, or
+        a short linear rise and a cosine (Loshchilov and Hutter, arXiv 1608.03983). `share` is the
+        least fraction of the cosine that is over.
         """
         within = iteration % self.iterations
         if self.schedule == "milestones":
@@ -310,19 +307,19 @@ class TrainConfig(Generic[TaskConfigT]):
 
 @dataclass(frozen=True, kw_only=True)
 class JointTrainConfig(TrainConfig[TaskConfigT]):
-    """A training run of several rules in one world: what they start from, and which ones learn.
+    """A training run of several rules in one world, with their initial rules and frozen ones.
 
-    `initial_rule` of a run of one rule stays empty.
+    The field `initial_rule` must be empty.
     """
 
     initial_rules: tuple[str, ...] = ()
-    """Start from these rules, shipped ones' names or files, one for each species."""
+    """Rules to start from, names of shipped rules or files, one for each species."""
 
     frozen: tuple[int, ...] = ()
-    """Numbers of the species, from 0, whose initial rules stay as they are."""
+    """Indices of the species, from 0, whose initial rules do not learn."""
 
     def __post_init__(self) -> None:
-        """Check every field; how many species there are is the task's to know."""
+        """Check every field but the number of species."""
         super().__post_init__()
         if self.initial_rule:
             raise NPAError(
@@ -356,12 +353,12 @@ TINY = {
 
 
 def fast_run(task: TaskConfigT, **fields: Any) -> TrainConfig[TaskConfigT]:
-    """Return a run of minutes on one core that learns something to look at."""
+    """Return a run of a few minutes on one core."""
     return TrainConfig(task=task, **{**FAST, **fields})
 
 
 def tiny_run(task: TaskConfigT, **fields: Any) -> TrainConfig[TaskConfigT]:
-    """Return a run of seconds, for tests."""
+    """Return a run of a few seconds, for tests."""
     return TrainConfig(task=task, **{**TINY, **fields})
 
 

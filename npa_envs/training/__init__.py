@@ -1,4 +1,4 @@
-"""Training: configurations and presets, the pool, the trainer, checkpoints and logs."""
+"""Training: presets of configurations, the pool, the trainer, checkpoints and logs."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Any
 
 from npa_envs.devices import check_device
 from npa_envs.errors import DivergedError, NPAError, shown
-from npa_envs.tasks.base import ParticleTask, PictureTask, Task
+from npa_envs.tasks.base import ParticleTask, Task
 from npa_envs.tasks.morphogenesis2d import Morphogenesis2DTrainConfig
 from npa_envs.tasks.train_config import JointTrainConfig, TrainConfig
 from npa_envs.training.presets import (
@@ -37,7 +37,6 @@ __all__ = [
     "JsonlLog",
     "Morphogenesis2DTrainConfig",
     "ParticleTask",
-    "PictureTask",
     "RunFolder",
     "Task",
     "TaskEntry",
@@ -70,11 +69,11 @@ def train(
     Args:
         config: The run's configuration, for example `preset("fast", target="heart")`.
         task_name: The task.
-        resume: Go on from the checkpoint in `config.out`.
-        overwrite: Start anew although `config.out` holds a run; its files are removed.
+        resume: Continue from the checkpoint in `config.out`.
+        overwrite: Remove the files of an earlier run in `config.out` and start a new one.
         progress: Show a progress bar.
         max_seconds: Stop after this time [s]; the run can be resumed.
-        begun: Called once when nothing is left to be refused, before the first iteration.
+        begun: Called once after all checks, before the first iteration.
 
     Raises:
         NPAError: The task is unknown, its target cannot be loaded, or as for `Trainer`.
@@ -102,7 +101,7 @@ def train(
             begun=begun,
         )
     task = entry.make(config.task, check_device(config.device))
-    # A task may settle what follows from its target; rule and checkpoint hold the result.
+    # A task may change fields that depend on its target; rule and checkpoint store the result.
     config = replace(config, task=getattr(task, "config", config.task))
     trainer = Trainer(task, config, task_name=task_name, resume=resume, overwrite=overwrite)
     begun()

@@ -1,4 +1,4 @@
-"""Checkpoints: written whole or not at all, and checked before a run goes on from them."""
+"""Checkpoints: written completely or not at all, and checked before a run is resumed."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from npa_envs.training.presets import config_to_dict
 CHECKPOINT_FORMAT = "npa-envs checkpoint"
 
 CHECKPOINT_VERSION = 1
-"""Raised whenever what a checkpoint holds changes."""
+"""Incremented when the content of checkpoints changes."""
 
 MAY_DIFFER = frozenset(
     {
@@ -34,30 +34,31 @@ MAY_DIFFER = frozenset(
         "cuda_graph",
     }
 )
-"""Fields that a resumed run may set anew: they do not change what is learned, only how long."""
+"""Configuration fields that a resumed run may change."""
 
 NEEDED: dict[str, type] = {
     "task_name": str,
     "config": dict,
     "iteration": int,
     "seconds": float,
+    "rule_hyper_parameters": dict,
     "rule": dict,
     "optimiser": dict,
     "pool": dict,
     "meter": dict,
     "random_states": dict,
 }
-"""What a run is resumed from, and of what types it is."""
+"""Entries that a run is resumed from, and their types."""
 
 NOT_NEGATIVE = {
     *("iteration", "seconds", "replaced", "count", "step_sum", "goal", "age"),
     *("step", "exp_avg_sq"),  # AdamW's
 }
-"""Names of numbers and tensors in a checkpoint that are at least 0."""
+"""Names of numbers and tensors in a checkpoint that must not be negative."""
 
 
 def save_checkpoint(path: Path, content: dict[str, Any]) -> None:
-    """Write a checkpoint, whole or not at all."""
+    """Write a checkpoint, completely or not at all."""
     with atomic_path(path) as temporary, _PatientFile(temporary, "wb") as file:
         torch.save(
             {"format": CHECKPOINT_FORMAT, "format_version": CHECKPOINT_VERSION, **content}, file
@@ -67,15 +68,15 @@ def save_checkpoint(path: Path, content: dict[str, Any]) -> None:
 
 
 class _PatientFile(FileIO):
-    """A file that keeps its first error of writing, and writes no more from then on.
+    """A file that stores the first error of writing in `error` and then writes no more.
 
-    Torch would raise an error of its own instead, which hides the system's reason (disk full).
+    Torch would raise another error, which hides the reason (such as a full disk).
     """
 
     error: OSError | None = None
 
     def write(self, data: Any, /) -> int:
-        """Write all of the data, unless something went wrong before."""
+        """Write all of the data, unless an error came before."""
         rest = memoryview(data)
         try:
             while self.error is None and len(rest) > 0:
@@ -86,7 +87,7 @@ class _PatientFile(FileIO):
 
 
 def load_checkpoint(path: Path) -> dict[str, Any]:
-    """Read a checkpoint on to the CPU; nothing in it is executed."""
+    """Read a checkpoint onto the CPU; no code in it is run."""
     if not os.path.exists(path):
         raise NPAError(
             f"there is no checkpoint to resume from at {str(path)!r}: give the folder of an "
@@ -98,7 +99,7 @@ def load_checkpoint(path: Path) -> dict[str, Any]:
             file.seek(0)
             content = torch.load(file, map_location="cpu", weights_only=True)
     except Exception as error:
-        # What is raised for garbage depends on where in the readers the garbage lands.
+        # Damaged data raise exceptions of many kinds.
         raise NPAError(
             f"{str(path)!r} is not a checkpoint or is damaged ({shown(error)}): "
             "start a new run with overwrite, or put a copy of it in its place"
@@ -114,30 +115,15 @@ def load_checkpoint(path: Path) -> dict[str, Any]:
     return content
 
 
-def drawn_by_world(content: Mapping[str, Any]) -> bool:
-    """Return whether each world of a run draws by itself, as several processes need it."""
-    states = content.get("random_states")
-    return isinstance(states, dict) and states.keys() == {"schedule"}
-
-
-def check_task(content: Mapping[str, Any], task_name: str, path: Path) -> None:
-    """Check that a checkpoint is of a task."""
-    if content.get("task_name") != task_name:
-        raise NPAError(
-            f"the checkpoint {str(path)!r} is of task {shown(content.get('task_name'))}, "
-            f"not of {task_name!r}: resume it with that task, or choose another folder"
-        )
-
-
 def check_same_run(
     content: dict[str, Any], task_name: str, config: TrainConfig[Any], path: Path
 ) -> None:
     """Check that a checkpoint belongs to the run that is to be resumed."""
-    # First what has to be known before the run itself is made.
+    # The entries that are needed before the run is built.
     needed = [(name, content.get(name), kind) for name, kind in NEEDED.items()]
     if isinstance(content.get("config"), dict):
         needed.append(("config.task", content["config"].get("task"), dict))
-    # A whole number of seconds is a number too.
+    # Seconds may be an int.
     wrong = [
         name
         for name, value, kind in needed
@@ -146,10 +132,14 @@ def check_same_run(
     if not wrong and not _is_plain(content["config"]):
         wrong = ["config"]
     if wrong:
-        raise unusable_checkpoint(path, f"lacks {', '.join(wrong)} or has it of a wrong type")
+        raise unusable_checkpoint(path, f"{', '.join(wrong)} is missing or of a wrong type")
     numbers = {name: kind() for name, kind in NEEDED.items() if kind in (int, float)}
     check_content(content, numbers, path)
-    check_task(content, task_name, path)
+    if content["task_name"] != task_name:
+        raise NPAError(
+            f"the checkpoint {str(path)!r} is of task {shown(content['task_name'])}, not of "
+            f"{task_name!r}: resume it with that task, or choose another folder"
+        )
     theirs = _flat(content["config"])
     ours = _flat(config_to_dict(config))
     differences = [
@@ -173,7 +163,7 @@ def check_same_run(
 
 
 def check_content(content: dict[str, Any], expected: Mapping[str, Any], path: Path) -> None:
-    """Check that what a run goes on from is of the kind that the run itself has."""
+    """Check that a checkpoint has the keys, types and shapes of `expected`."""
     wrong = [
         what for name, like in expected.items() for what in _wrong(name, content.get(name), like)
     ]
@@ -183,15 +173,15 @@ def check_content(content: dict[str, Any], expected: Mapping[str, Any], path: Pa
 
 
 def unusable_checkpoint(path: Path, reason: str) -> NPAError:
-    """Return the error about a checkpoint that a run cannot go on from."""
+    """Return the error about a checkpoint that cannot be resumed."""
     return NPAError(
-        f"the checkpoint {str(path)!r} must hold all that a run needs to go on, but {reason}: "
+        f"the checkpoint {str(path)!r} must hold all that a run needs, but {reason}: "
         "start a new run with overwrite, or put a copy of it in its place"
     )
 
 
 def _wrong(name: str, value: Any, like: Any) -> Iterator[str]:
-    """Yield what is wrong with a value of a checkpoint, with its name."""
+    """Yield a message for each difference of a value of a checkpoint from the expected `like`."""
     if isinstance(like, Mapping):
         if not isinstance(value, Mapping) or value.keys() != like.keys():
             names = ", ".join(map(str, like)) or "nothing"
@@ -220,7 +210,7 @@ def _kind(tensor: Tensor) -> str:
 
 
 def _is_plain(value: Any) -> bool:
-    """Return whether a value is what JSON has, as configurations in checkpoints are."""
+    """Return whether a value consists of JSON's types, as configurations in checkpoints do."""
     if isinstance(value, dict):
         return all(isinstance(key, str) and _is_plain(inner) for key, inner in value.items())
     if isinstance(value, list):

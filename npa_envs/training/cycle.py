@@ -1,7 +1,7 @@
-"""The cycle of training: worlds from a pool, rollout, gradients, worlds back, optimiser's step.
+"""The training cycle: worlds from the pool, rollout, gradients, worlds back, optimiser step.
 
-No method waits for the device. An iteration runs eagerly, or as CUDA graphs; what happened is
-kept on the device until a line of the log asks for it.
+No method synchronises with the device. An iteration runs eagerly or as CUDA graphs; its statistics
+stay on the device until a line of the log needs them.
 """
 
 from __future__ import annotations
@@ -30,14 +30,16 @@ RUNAWAY_LIMIT = 10.0
 
 
 class WorldPool:
-    """Worlds that live on between batches, on the device, so that a rule learns to be stable.
+    """Worlds that are stored on the device between batches, so that a rule learns to be stable.
 
     Args:
-        runaway_limit: A world with a larger |x| or |s|, or one that is not finite, is not kept.
-        max_age_range: Steps that the world in the first place lives, and that in the last, all
-            others between; None: for ever.
-        places: Places of these worlds among those of all processes, int64, shape [W]; None: they
+        worlds: The W worlds of this process.
+        runaway_limit: A world with a larger |x| or |s|, or one that is not finite, is replaced.
+        max_age_range: Lifetimes of the first and the last world [steps]; those between are spaced
+            geometrically. None: worlds have no lifetime.
+        indices: Indices of these worlds among those of all processes, int64, shape [W]; None: they
             are all.
+        total: Worlds of all processes; None: W.
     """
 
     def __init__(
@@ -46,57 +48,59 @@ class WorldPool:
         *,
         runaway_limit: float,
         max_age_range: tuple[int, int] | None = None,
-        places: Tensor | None = None,
+        indices: Tensor | None = None,
         total: int | None = None,
     ) -> None:
         self.worlds = worlds
         self.age: Tensor | None = None
-        """Steps since the seed, or since a life began by damage, int64, shape [W], or None."""
+        """Steps since the seed, or since the damage before another lifetime, int64, [W], or
+        None."""
         self.lifetime: Tensor | None = None
-        """Age at which the world of each place has lived, int64, shape [W], or None."""
+        """Age at which each world is replaced or damaged [steps], int64, shape [W], or None."""
         x = worlds.x
         if max_age_range is not None:
             self.age = torch.zeros_like(x[:, 0, 0], dtype=torch.int64)
             lo, hi = map(math.log, max_age_range)
             logarithms = torch.linspace(lo, hi, total or len(x), dtype=torch.float64)
-            own = logarithms if places is None else logarithms[places]
+            own = logarithms if indices is None else logarithms[indices]
             self.lifetime = own.exp().round().to(x.device, torch.int64)
         self._runaway_limit = runaway_limit
 
     def tensors(self) -> dict[str, Tensor]:
-        """Return all that changes, by name."""
-        held = self.worlds._asdict() | {"age": self.age}
-        return {name: value for name, value in held.items() if value is not None}
+        """Return the tensors of a checkpoint by name."""
+        tensors = self.worlds._asdict() | {"age": self.age}
+        return {name: value for name, value in tensors.items() if value is not None}
 
     def sample(self, world_count: int, generator: Randomness) -> Tensor:
-        """Draw the indices, shape [B], of different worlds: one of each of B equal sections.
+        """Return random indices of B different worlds, one from each of B equal sections, shape
+        [B].
 
-        From a generator and where they have no max_age_range, B of all worlds instead.
+        A torch.Generator, if worlds have no lifetimes, draws from the whole pool instead.
         """
-        whole, device = len(self.worlds.x), self.worlds.x.device
-        size = whole // world_count
+        pool_size, device = len(self.worlds.x), self.worlds.x.device
+        size = pool_size // world_count
         first = torch.arange(0, size * world_count, size, device=device)
         if isinstance(generator, WorldRandom):
             return first + generator.integers(size, 1)[:, 0]
         # The largest of random numbers: unlike randperm, one short kernel and no host copy.
-        keys = torch.rand(whole, generator=generator, device=device)
+        keys = torch.rand(pool_size, generator=generator, device=device)
         if self.age is None:
             return keys.topk(world_count).indices
         return first + keys.view(world_count, size).argmax(dim=1)
 
     def ages_of(self, index: Tensor) -> tuple[Tensor, Tensor]:
-        """Return worlds' ages, and which have reached their `max_age_range`, shape [B] each."""
-        assert self.age is not None, "made with max_age_range"
-        assert self.lifetime is not None, "made with max_age_range"
+        """Return worlds' ages, and whether they have reached their lifetimes, shape [B] each."""
+        assert self.age is not None, "worlds have ages"
+        assert self.lifetime is not None, "worlds have lifetimes"
         age = self.age.index_select(0, index)
         return age, age >= self.lifetime.index_select(0, index)
 
     def write(
         self, index: Tensor, worlds: Particles, fresh: Particles, age: Tensor | None = None
     ) -> Tensor:
-        """Put worlds of such ages back, and fresh ones for those that are not finite or run away.
+        """Store worlds and their ages, or `fresh` worlds where they are not finite or run away.
 
-        Returns which were replaced, shape [B], bool.
+        Returns a bool for each world, True where it was replaced, shape [B].
         """
         farthest = torch.maximum(_largest(worlds.x), _largest(worlds.s))
         # A comparison with NaN is false, so what is not finite is not kept either.
@@ -108,15 +112,15 @@ class WorldPool:
 
 
 def _largest(worlds: Tensor) -> Tensor:
-    """Return each world's largest absolute value, NaN where there is one; shape [B]."""
+    """Return each world's largest absolute value, or NaN if it has one; shape [B]."""
     largest: Tensor = torch.linalg.vector_norm(worlds.flatten(1), math.inf, dim=1)
     return largest
 
 
 class TrainingCycle:
-    """All that changes while a rule is trained.
+    """One iteration of training, and all of its state but the rule.
 
-    `by_world`: each world draws by itself, as several processes need it.
+    `by_world`: each world has its own random streams, as runs of several processes need.
     """
 
     def __init__(
@@ -138,29 +142,30 @@ class TrainingCycle:
         self._section = config.pool_size // config.world_count if by_world else config.pool_size
         if by_world:
             ranks.check(config)
-        places = ranks.places(config.pool_size, self._section)
+        indices = ranks.indices(config.pool_size, self._section)
         self.random = (
             RunRandomness.by_world(config, device, schedule, ranks)
             if by_world
             else RunRandomness.of_batch(config, device, schedule)
         )
-        self._places = places.to(device)
-        worlds = self._seeds(len(places), self.random.pool)
+        self._pool_indices = indices.to(device)
+        worlds = self._seeds(len(indices), self.random.pool)
         self.pool = WorldPool(
             worlds,
             runaway_limit=RUNAWAY_LIMIT,
             max_age_range=config.max_age_range if config.ages else None,
-            places=places,
+            indices=indices,
             total=config.pool_size,
         )
-        numbers = ranks.places(config.world_count)
-        # Where each world of a batch has a part of the pool to itself, they take turns.
+        numbers = ranks.indices(config.world_count)
+        # `by_world`, a world of the batch always draws from its own section of the pool: seeds go
+        # to each world in turn, so that they come into all sections.
         whole, fresh = config.world_count, config.fresh_count
-        self._fresh = [
+        self._seeded = [
             ((numbers - first) % whole < fresh).nonzero()[:, 0].to(device)
             for first in range(0, whole if by_world else 1, fresh)
         ]
-        """Which worlds of a batch begin anew, by turns."""
+        """Indices of the worlds of a batch that are replaced by seeds, taken in turn."""
         count = len(numbers)
         batch = worlds.map(lambda value: value[:count])
         graphed = device.type == "cuda" and config.cuda_graph
@@ -181,45 +186,49 @@ class TrainingCycle:
         self._steps = torch.zeros_like(self._index[0])
         self._lost = torch.zeros_like(self._index[0])
         self._fresh_worlds = batch.map(torch.empty_like)
-        self._draw, self._keep, self._note = (
+        self._draw, self._keep, self._record = (
             GraphedCallable(function, device, generator, recorded=graphed)
             for function, generator in (
                 (self._draw_worlds, registered(self.random.worlds)),
                 (self._keep_worlds, None),
-                (self._note_iteration, None),
+                (self._record_iteration, None),
             )
         )
 
     def run(self, iteration: int, share: float = 0.0) -> int:
-        """Train for one iteration, and return the steps of its rollout, T."""
+        """Train for one iteration, and return the number of steps of its rollout.
+
+        share: The least fraction of the schedule "cosine" that is over.
+        """
         config, batch = self._config, self.batch
         lo, hi = config.steps
         steps = int(torch.randint(lo, hi, (), generator=self.random.schedule))
         self.task.begin(iteration)
         self._draw()
         if not config.ages and iteration % config.seed_interval == 0:
-            index = self._fresh[iteration // config.seed_interval % len(self._fresh)]
+            index = self._seeded[iteration // config.seed_interval % len(self._seeded)]
             batch.start.put_(index, self._fresh_worlds.take(index))
         batch.run(steps)
         self.meter.begin(iteration + 1, steps)
         self._steps.fill_(steps)
         self._keep()
-        # Between two graphs: what NCCL does is then watched for processes that do not answer.
+        # Not inside a graph: torch watches NCCL only there for processes that do not answer.
         self._ranks.reduce([*batch.gradients, batch.terms], self._lost)
-        self._note()
+        self._record()
         self.optimiser.step(iteration, share)
         return steps
 
     def state_dict(self) -> dict[str, Any]:
-        """Return all that changes but the rule, for a checkpoint; of all processes on the first."""
+        """Return the state for a checkpoint, without the rule; rank 0 gets that of all
+        processes."""
         collected = self._ranks.collected
         return self._state(self.optimiser.state_dict(), lambda own: collected(own, self._section))
 
     def state_like(self, iteration: int) -> dict[str, Any]:
-        """Return what `state_dict` has after so many iterations, with other numbers in it."""
+        """Return a dict with the keys, shapes and types of `state_dict` after `iteration`."""
         moments = self.optimiser.moments_like() if iteration > 0 else {}
-        whole = self._config.pool_size
-        return self._state({"state": moments}, lambda own: own[:1].expand(whole, *own.shape[1:]))
+        size = self._config.pool_size
+        return self._state({"state": moments}, lambda own: own[:1].expand(size, *own.shape[1:]))
 
     def _state(
         self, optimiser: dict[str, Any], pooled: Callable[[Tensor], Tensor]
@@ -232,7 +241,7 @@ class TrainingCycle:
         }
 
     def load_state_dict(self, state: dict[str, Any], iteration: int) -> None:
-        """Go on after so many iterations from what `state_dict` returned; before the first one."""
+        """Restore what `state_dict` returned after `iteration`; to be called before `run`."""
         self.optimiser.load_state_dict(state["optimiser"])
         for name, own in self.pool.tensors().items():
             own.copy_(self._ranks.own(state["pool"][name], self._section))
@@ -241,26 +250,24 @@ class TrainingCycle:
 
     @torch.no_grad()
     def _draw_worlds(self) -> None:
-        """Fill the batch from the pool, and have seeds at hand."""
+        """Fill the batch from the pool, and draw seeds."""
         config, worlds = self._config, self.random.worlds
         restart(worlds, self.random.masks)
         self._index.copy_(self.pool.sample(len(self._index), worlds))
         begun = self.pool.worlds.take(self._index)
-        # Worlds from some places are damaged each time.
-        hit = self._places[self._index] < config.damage_share * config.pool_size
+        damaged = self._pool_indices[self._index] < config.damage_share * config.pool_size
         if config.ages:
             age, over = self.pool.ages_of(self._index)
             self._age.copy_(age.masked_fill(over, 0))
-            self.batch.grown.copy_((self._age >= config.stillness_min_age) & ~hit)
+            self.batch.grown.copy_((self._age >= config.stillness_min_age) & ~damaged)
         if config.damage_and_keep_share > 0.0:
             drawn = uniform_draws(worlds, (len(over), 1), begun.x)[:, 0]
-            again = over & (drawn < config.damage_and_keep_share)
-            over, hit = over & ~again, hit | again
+            kept = over & (drawn < config.damage_and_keep_share)
+            over, damaged = over & ~kept, damaged | kept
         if config.damages:
-            x, s, goal = self.task.damage(begun.x, begun.s, begun.goal, worlds)
-            damaged = Particles(x, s, goal=goal)
-            begun = damaged if config.damage_share == 1.0 else damaged.where(hit, begun)
-        # Drawn in every iteration, needed or not: nobody on the host knows which worlds run away.
+            after = self.task.damage(begun, worlds)
+            begun = after if config.damage_share == 1.0 else after.where(damaged, begun)
+        # Drawn in every iteration: the host does not know which worlds will run away.
         fresh = self._seeds(len(self._index), worlds)
         self._fresh_worlds.copy_(fresh)
         if config.ages:
@@ -274,21 +281,21 @@ class TrainingCycle:
         self._lost += lost.sum()
 
     @torch.no_grad()
-    def _note_iteration(self) -> None:
-        """Take note of what the batch of all processes came to, and prepare its gradients."""
+    def _record_iteration(self) -> None:
+        """Add the losses of all processes to the meter, and prepare the gradients."""
         self.meter.observe(self._lost)
         self._lost.zero_()
         self.optimiser.prepare_gradients()
 
     def _seeds(self, world_count: int, random: Randomness) -> Particles:
         dtype = self._config.torch_dtype
-        x, s, goal = self.task.seed(world_count, generator=random, device=random.device)
+        seeds = self.task.seed(world_count, generator=random, device=random.device)
         lo, hi = map(math.log, self._config.vary_eps)
         if (lo, hi) != (0.0, 0.0):
-            # Scaling positions and ε alike is a symmetry: a larger ε is a smaller disk.
-            share = uniform_draws(random, (world_count, 1), x)[:, :, None]
-            x = x * torch.exp(-lo - (hi - lo) * share)
-        return Particles(x.to(dtype), s.to(dtype), goal=goal)
+            # Dividing positions by a factor is equivalent to multiplying ε by it.
+            fraction = uniform_draws(random, (world_count, 1), seeds.x)[:, :, None]
+            seeds = seeds._replace(x=seeds.x * torch.exp(-lo - (hi - lo) * fraction))
+        return seeds._replace(x=seeds.x.to(dtype), s=seeds.s.to(dtype))
 
 
 def _check_varied_eps(task: Task, rule: NPARule, config: TrainConfig[Any]) -> None:

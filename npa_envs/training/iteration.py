@@ -1,4 +1,4 @@
-"""One iteration's rollout, loss and gradients, by kernels or as a CUDA graph; and its account."""
+"""Rollout, loss and gradients of one iteration, eager or as a CUDA graph; loss statistics."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ WARM_UP_STEPS = 2
 
 
 class TrainingOptions(TypedDict):
-    """Keyword arguments that the trainer gives a rollout."""
+    """Keyword arguments of a rollout in training."""
 
     eps: float
     box: tuple[float, ...] | None
@@ -41,7 +41,7 @@ class TrainingOptions(TypedDict):
 
 
 class Rollout(Protocol):
-    """`npa_envs.rollout` as the trainer calls it."""
+    """Type of `npa_envs.rollout` in training."""
 
     def __call__(
         self, rule: NPARule, x: Tensor, s: Tensor, steps: int, /, **options: Unpack[TrainingOptions]
@@ -52,7 +52,7 @@ class Rollout(Protocol):
 def power_mean(values: Tensor, power: float) -> Tensor:
     """Return (mean |a|^power)^(1/power) of each world's values [B, ...], shape [B]."""
     each = values.flatten(1)
-    # A vector's norm has a gradient of 0 where all is at rest.
+    # The gradient of a vector's norm is 0 at 0.
     norm: Tensor = torch.linalg.vector_norm(each, power, dim=1)
     return norm / math.pow(each.shape[1], 1.0 / power)
 
@@ -60,8 +60,8 @@ def power_mean(values: Tensor, power: float) -> Tensor:
 class EagerIteration:
     """One iteration up to the gradients, launched kernel by kernel.
 
-    Reads `start`; writes `end`, `terms` and the `.grad` of every parameter. All of these are the
-    same tensors in every iteration: fill them with `copy_`.
+    Reads `start`; writes `end`, `terms` and the `.grad` of every parameter, always in the same
+    tensors: write to `start` with `copy_`.
     """
 
     def __init__(
@@ -80,7 +80,7 @@ class EagerIteration:
         x, s, _, goal = self.start
         task = task.toward(goal)
         self.grown = torch.zeros_like(x[:, 0, 0], dtype=torch.bool)
-        """Which worlds are grown and whole, and are to rest, shape [B]."""
+        """Worlds to which the stillness loss applies, bool, shape [B]."""
         self._stillness_weight = config.stillness_weight
         self._stillness_power = config.stillness_power
         self._mean_over_processes = mean_over_processes
@@ -91,7 +91,7 @@ class EagerIteration:
         self.term_names: tuple[str, ...] = ("loss", *parts)
         """Names of `terms`."""
         self.terms = total.new_zeros(len(self.term_names))
-        """The loss and then its named parts, shape [K]."""
+        """The loss, followed by its named parts, shape [K]."""
         self.parameters = [p for p in rule.parameters() if p.requires_grad]
         self.gradients = [torch.zeros_like(p) for p in self.parameters]
         for parameter, buffer in zip(self.parameters, self.gradients, strict=True):
@@ -106,7 +106,7 @@ class EagerIteration:
         self._forward_backward(steps)
 
     def _forward_backward(self, steps: int) -> None:
-        # Through these states codes learn; the pool holds them as they were.
+        # Gradients of codes flow through these states; `start` keeps their values.
         s0 = self._task.coded(self.start.s)
         if s0 is not self.start.s:
             self.start.s.copy_(s0.detach())
@@ -122,8 +122,8 @@ class EagerIteration:
             generator=self._generator,
             return_path_length=True,
         )
-        alone = self._mean_over_processes is None
-        with contextlib.nullcontext() if alone else counted_together(self._mean):
+        single = self._mean_over_processes is None
+        with contextlib.nullcontext() if single else counted_together(self._mean):
             total, parts = self._loss(x, s, path_length)
         # Not backward(): its accumulation nodes remember the stream they were first used on,
         # which a capture on another stream must not touch.
@@ -137,20 +137,20 @@ class EagerIteration:
         self.end.s.copy_(s.detach())
 
     def _mean(self, value: Tensor) -> Tensor:
-        """Return the mean of a tensor over all processes, taken between two graphs."""
-        assert self._mean_over_processes is not None, "shared by several processes"
+        """Return the mean of a tensor over all processes, computed between two graphs."""
+        assert self._mean_over_processes is not None, "there are several processes"
         own, over = value.detach().clone(), self._mean_over_processes
         mean = torch.empty_like(own)
         host_call(lambda: mean.copy_(over(own)))
         return mean
 
     def _loss(self, x: Tensor, s: Tensor, path_length: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
-        """Return the task's loss and its parts, and how far grown worlds are from rest."""
+        """Return the task's loss plus the stillness loss of grown worlds, and named parts."""
         total, parts = self._task.loss(x, s, path_length)
         if self._stillness_weight > 0.0:
             change = s - self.start.s
             if self._divides:
-                # Births and deaths are no unrest; who lives is the business of the task's loss.
+                # Births and deaths do not count.
                 stayed = (living(s) & living(self.start.s))[..., None]
                 change = torch.where(stayed, change, 0.0)[..., LIFE + 1 :]
             moved, changed = (
@@ -163,13 +163,12 @@ class EagerIteration:
 
 
 class GraphedIteration(EagerIteration):
-    """The same on CUDA, captured once for every number of steps and replayed from then on.
+    """`EagerIteration` on CUDA, captured as a graph for each number of steps and then replayed.
 
-    Launches of thousands of short kernels would otherwise take longer than the kernels do. All
-    graphs share one memory pool: they never run at the same time, and everything that outlives a
-    replay lies in buffers outside that pool. What processes take means of within an iteration, they
-    take between two graphs: torch does not watch what a graph replays for processes that do not
-    answer.
+    Launching thousands of short kernels would take longer than running them. All graphs share one
+    memory pool: they never run at the same time, and all that is read after a replay is in buffers
+    outside of that pool. Means over processes are computed between two graphs: torch does not
+    notice lost processes inside a graph.
     """
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
@@ -178,7 +177,7 @@ class GraphedIteration(EagerIteration):
         self._memory_pool = torch.cuda.graph_pool_handle()
 
     def run(self, steps: int) -> None:
-        """Replay the graph for this number of steps, capturing it when it is first asked for."""
+        """Replay the graph for this number of steps, captured at the first use."""
         with torch.cuda.device(self.start.x.device):
             if steps not in self._graphs:
                 self._graphs[steps] = capture(
@@ -191,8 +190,8 @@ class GraphedIteration(EagerIteration):
             self._graphs[steps].replay()
 
     def _warm_up(self) -> None:
-        """Run eagerly once: load kernels and allocate workspaces, which no capture may do."""
-        # A resumed run warms up again: the masks that follow must not depend on that.
+        """Run eagerly once, to load kernels and allocate workspaces, which a capture cannot do."""
+        # Restored, because a resumed run warms up again and must draw the same masks.
         generator = self._generator
         if isinstance(generator, WorldRandom):
             streams = generator.take(slice(None))
@@ -204,18 +203,18 @@ class GraphedIteration(EagerIteration):
         generator.set_state(state)
 
 
-# What happened: sums on the device until the log asks, and what diverged.
+# Loss statistics, and diagnosis of divergence.
 
 NONE_YET = -1
-"""Marks that no loss was infinite or NaN so far."""
+"""Value of the bad iteration while every loss was finite."""
 
 
 @dataclass(frozen=True)
 class Interval:
-    """What happened between two log lines."""
+    """Statistics of the iterations between two log lines."""
 
     means: dict[str, float]
-    """The mean terms by name, the mean `steps`, and how many `replaced_worlds` there were."""
+    """Mean loss terms by name, mean `steps`, and the number of `replaced_worlds`."""
 
     bad_iteration: int | None
     """The first iteration of the run whose loss was not finite, or None."""
@@ -224,15 +223,15 @@ class Interval:
 class LossMeter:
     """Sums of the loss terms, and a snapshot of the first iteration whose loss is not finite.
 
-    `begin`, `observe` and `send` launch kernels and wait for nothing. `observe` can be captured
-    in a CUDA graph: the same tensors are read and written in each iteration.
+    `begin`, `observe` and `send` launch kernels and do not synchronise. `observe` can be captured
+    in a CUDA graph: it reads and writes the same tensors in each iteration.
     """
 
     def __init__(self, iteration: EagerIteration) -> None:
         self._iteration = iteration
         device = iteration.terms.device
-        # In one tensor, so that one copy brings all to the host. In float64, because a float32 sum
-        # over a long interval would lose digits of the mean; whole numbers are exact in it.
+        # One tensor, so that one copy transfers all of them; float64, in which long sums keep their
+        # digits and integers are exact.
         numbers = torch.zeros(len(iteration.terms) + 3, dtype=torch.float64, device=device)
         self._numbers = numbers
         self._sums, self._replaced, self._bad = numbers[:-3], numbers[-3], numbers[-2:]
@@ -249,14 +248,14 @@ class LossMeter:
         self._arrival = torch.cuda.Event() if on_cuda else None  # type: ignore[no-untyped-call]
 
     def begin(self, number: int, steps: int) -> None:
-        """Say which iteration is observed next."""
+        """Set the number and the steps of the iteration that is observed next."""
         self._now[0].fill_(number)
         self._now[1].fill_(steps)
         self._count += 1
         self._step_sum += steps
 
     def observe(self, replaced: Tensor) -> None:
-        """Take note of an iteration, before the optimiser changes the parameters."""
+        """Add an iteration, before the optimiser changes the parameters."""
         terms = self._iteration.terms
         self._sums += terms
         self._replaced += replaced.sum()
@@ -268,7 +267,7 @@ class LossMeter:
             torch.where(first, value, self._snapshot[name], out=self._snapshot[name])
 
     def send(self) -> None:
-        """Let the interval's numbers go to the host, and start the next interval."""
+        """Start to copy the interval's statistics to the host, and begin the next interval."""
         self._sent.copy_(self._numbers, non_blocking=True)
         if self._arrival is not None:
             self._arrival.record(torch.cuda.current_stream(self._numbers.device))
@@ -278,7 +277,7 @@ class LossMeter:
         self._step_sum = 0
 
     def receive(self) -> Interval:
-        """Return what `send` sent last; waits for that, and not for what was launched since."""
+        """Return the statistics of the last `send`; waits for that copy alone."""
         if self._arrival is not None:
             self._arrival.synchronize()
         count, step_sum = self._sent_counts
@@ -290,29 +289,29 @@ class LossMeter:
         return Interval(result, None if bad_iteration == NONE_YET else bad_iteration)
 
     def bad_iteration(self) -> int | None:
-        """Return the first iteration whose loss was not finite, or None; waits for the device."""
+        """Return the first iteration whose loss was not finite, or None; synchronises."""
         number = int(self._bad[0].item())
         return None if number == NONE_YET else number
 
     def snapshot(self) -> dict[str, Any]:
-        """Return what the first iteration with a bad loss saw, on the CPU.
+        """Return the state of the first iteration whose loss was not finite, on the CPU.
 
         Returns:
             `iteration`, `steps`, `terms` (by name), `x0`, `s0` (before the rollout), `x`, `s`
             (after it), `parameters` (one flat vector), and `goal` where the task has goals.
         """
-        kept = {name: value.cpu() for name, value in self._snapshot.items()}
-        terms = kept.pop("terms").tolist()
+        values = {name: value.cpu() for name, value in self._snapshot.items()}
+        terms = values.pop("terms").tolist()
         iteration, steps = map(int, self._bad.tolist())
         return {
             "iteration": iteration,
             "steps": steps,
             "terms": dict(zip(self._iteration.term_names, terms, strict=True)),
-            **kept,
+            **values,
         }
 
     def state_dict(self) -> dict[str, Any]:
-        """Return the open interval, for a checkpoint."""
+        """Return the statistics of the current interval, for a checkpoint."""
         return {
             "sums": self._sums,
             "replaced": self._replaced,
@@ -321,7 +320,7 @@ class LossMeter:
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Go on with the interval that `state_dict` returned."""
+        """Restore the interval that `state_dict` returned."""
         self._sums.copy_(state["sums"])
         self._replaced.copy_(state["replaced"])
         self._count = state["count"]
@@ -330,10 +329,10 @@ class LossMeter:
     def _observed(self) -> dict[str, Tensor]:
         iteration = self._iteration
         (x0, s0, _, goal), (x, s, *_) = iteration.start, iteration.end
-        seen = {"terms": iteration.terms, "x0": x0, "s0": s0, "x": x, "s": s}
+        observed = {"terms": iteration.terms, "x0": x0, "s0": s0, "x": x, "s": s}
         flat = torch.nn.utils.parameters_to_vector(iteration.parameters).detach()
         goals = {} if goal is None else {"goal": goal}
-        return goals | seen | {"parameters": flat}
+        return goals | observed | {"parameters": flat}
 
 
 def divergence_error(
@@ -353,7 +352,7 @@ def divergence_error(
 
 
 def bad_worlds(task: Task, rule: NPARule, snapshot: dict[str, Any]) -> list[int]:
-    """Return which worlds of the batch alone give a loss that is not finite."""
+    """Return the indices of the batch's worlds whose own loss is not finite."""
     rule = copy.deepcopy(rule).cpu()
     trained = [parameter for parameter in rule.parameters() if parameter.requires_grad]
     nn.utils.vector_to_parameters(snapshot["parameters"], trained)
@@ -365,8 +364,8 @@ def bad_worlds(task: Task, rule: NPARule, snapshot: dict[str, Any]) -> list[int]
         finite = bool(torch.isfinite(x[one]).all() and torch.isfinite(s[one]).all())
         if finite:
             with torch.no_grad():
-                aimed = task.toward(None if goal is None else goal[one])
-                total, parts = aimed.loss(x[one], s[one], torch.zeros_like(x[one][..., 0]))
+                goal_task = task.toward(None if goal is None else goal[one])
+                total, parts = goal_task.loss(x[one], s[one], torch.zeros_like(x[one][..., 0]))
             finite = all(bool(torch.isfinite(v).all()) for v in (total, *parts.values()))
         if not finite:
             found.append(world)

@@ -1,4 +1,4 @@
-"""From gradients to new weights: normalised gradients, an optimiser."""
+"""Gradient normalisation, and the optimiser of rules."""
 
 from __future__ import annotations
 
@@ -15,19 +15,19 @@ from npa_envs.rule.rule import NPARule, fate_parameters
 from npa_envs.tasks.train_config import TrainConfig
 
 FATE_RATE = 0.02
-"""Share of the learning rate with which rules learn when particles divide and die."""
+"""Learning rate of the weights of division and death, as a fraction of that of all others."""
 
 MUON_MOMENTUM = 0.9
-"""What Muon keeps of the mean of the gradients in an iteration; its usual 0.95 learns less well."""
+"""Muon's momentum; the usual 0.95 trains less well."""
 
 NORM_FLOOR = 1e-8
-"""Added to a gradient's norm before it is divided by it: a zero gradient stays zero."""
+"""Added to a gradient's norm before dividing by it, so that a zero gradient stays zero."""
 
 
 def normalise_gradients(gradients: Sequence[Tensor]) -> None:
     """Divide each gradient by its own norm, in place; one that is not finite becomes 0."""
     norms = torch.stack([torch.linalg.vector_norm(gradient) for gradient in gradients])
-    # A norm is not finite where an entry is not.
+    # A norm is not finite if an entry is not.
     bad = ~(norms < math.inf)
     norms += NORM_FLOOR
     for gradient, norm, is_bad in zip(gradients, norms.unbind(), bad.unbind(), strict=True):
@@ -35,9 +35,9 @@ def normalise_gradients(gradients: Sequence[Tensor]) -> None:
 
 
 def layer_weights(rules: nn.Module) -> list[Tensor]:
-    """Return the matrices of a rule's layers, or of several rules' in a module.
+    """Return the weight matrices of all layers of one rule or several in a module.
 
-    Biases, codes and fates are none of them.
+    Biases, codes and the weights of division are left out.
     """
     fates = set(map(id, fate_parameters(rules)))
     found: list[Tensor] = []
@@ -50,11 +50,10 @@ def layer_weights(rules: nn.Module) -> list[Tensor]:
 
 
 class RuleOptimiser:
-    """A step along prepared gradients, at a learning rate that is a function of the iteration.
+    """AdamW, or Muon for weight matrices and AdamW for all else; moments are reset at each repeat.
 
-    With the optimiser "muon" the matrices of layers take Muon's steps: the mean of the gradients
-    made orthogonal, in bfloat16 whatever their precision, as long as AdamW's steps are (Jordan et
-    al. 2024; Liu et al., arXiv 2502.16982). All else takes AdamW's.
+    Muon's steps are orthogonalised momentum, computed in bfloat16 and scaled to the length of
+    AdamW's steps (Jordan et al. 2024; Liu et al., arXiv 2502.16982).
     """
 
     def __init__(
@@ -63,7 +62,7 @@ class RuleOptimiser:
         self._parameters = list(parameters)
         self._config = config
         fates, matrices = (set(map(id, of(rules))) for of in (fate_parameters, layer_weights))
-        self._shares = [FATE_RATE if id(p) in fates else 1.0 for p in self._parameters]
+        self._rate_factors = [FATE_RATE if id(p) in fates else 1.0 for p in self._parameters]
         muon = config.optimiser == "muon"
         self._orthogonal = [muon and id(p) in matrices for p in self._parameters]
         self._optimisers = self._fresh(self._parameters)
@@ -73,42 +72,45 @@ class RuleOptimiser:
         normalise_gradients([p.grad for p in self._parameters if p.grad is not None])
 
     def step(self, iteration: int, share: float = 0.0) -> None:
-        """Take a step along the prepared gradients; at a repeat's start, with fresh moments."""
+        """Take a step along the prepared gradients; a new repeat begins with zero moments.
+
+        share: The least fraction of the schedule "cosine" that is over.
+        """
         if iteration > 0 and iteration % self._config.iterations == 0:
             self._optimisers = self._fresh(self._parameters)
         rate = self._config.learning_rate_at(iteration, share)
         for optimiser, _ in self._optimisers:
             for group in optimiser.param_groups:
-                group["lr"] = rate * group.get("rate_share", 1.0)
+                group["lr"] = rate * group.get("rate_factor", 1.0)
             optimiser.step()
 
     def state_dict(self) -> dict[str, Any]:
-        """Return moments and step counts by the number of a parameter, for a checkpoint."""
+        """Return moments and step counts by the index of a parameter, for a checkpoint."""
         return {"state": _moments(self._optimisers)}
 
     def moments_like(self) -> dict[int, dict[str, Tensor]]:
-        """Return moments and step counts as a first step makes them, by parameter; all are 0."""
-        twins = [nn.Parameter(torch.zeros_like(p)) for p in self._parameters]
-        optimisers = self._fresh(twins)
-        for twin in twins:
-            twin.grad = torch.zeros_like(twin)
+        """Return moments and step counts after one step with zero gradients, by parameter."""
+        copies = [nn.Parameter(torch.zeros_like(p)) for p in self._parameters]
+        optimisers = self._fresh(copies)
+        for parameter in copies:
+            parameter.grad = torch.zeros_like(parameter)
         for optimiser, _ in optimisers:
             optimiser.step()
         return _moments(optimisers)
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Go on from the `state` of what `state_dict` returned; all else is the configuration's."""
+        """Restore what `state_dict` returned."""
         moments = state["state"]
         for optimiser, numbers in self._optimisers:
             own = {at: moments[number] for at, number in enumerate(numbers) if number in moments}
             load_moments(optimiser, own)
 
     def _fresh(self, parameters: list[nn.Parameter]) -> list[tuple[Optimizer, list[int]]]:
-        """Return optimisers without moments, with the numbers of the parameters that each has."""
+        """Return new optimisers, each with the indices of its parameters."""
         decay, made = self._config.weight_decay, list[tuple[Optimizer, list[int]]]()
         numbers = [number for number, own in enumerate(self._orthogonal) if own]
         if numbers:
-            # Steps as long as AdamW's are, so that one learning rate serves both.
+            # Steps of AdamW's length, so that one learning rate serves both.
             muon = torch.optim.Muon(
                 [parameters[number] for number in numbers],
                 weight_decay=decay,
@@ -119,23 +121,23 @@ class RuleOptimiser:
         numbers = [number for number, own in enumerate(self._orthogonal) if not own]
         if numbers:
             groups = [
-                {"rate_share": share, "params": [parameters[number] for number in run]}
-                for share, run in itertools.groupby(numbers, self._shares.__getitem__)
+                {"rate_factor": factor, "params": [parameters[number] for number in run]}
+                for factor, run in itertools.groupby(numbers, self._rate_factors.__getitem__)
             ]
-            # One kernel for all parameters; the CPU's own loop is as fast there.
+            # One kernel for all parameters; a loop is as fast on a CPU.
             fused = parameters[0].is_cuda
             made.append((torch.optim.AdamW(groups, weight_decay=decay, fused=fused), numbers))
         return made
 
 
 def load_moments(optimiser: Optimizer, state: dict[int, Any]) -> None:
-    """Give an optimiser its state; its groups are those of the options."""
+    """Load an optimiser's state without its parameter groups, which stay as they are."""
     groups = optimiser.state_dict()["param_groups"]
     optimiser.load_state_dict({"state": state, "param_groups": groups})
 
 
 def _moments(optimisers: list[tuple[Optimizer, list[int]]]) -> dict[int, dict[str, Tensor]]:
-    """Return the states of all parameters, by their numbers."""
+    """Return the states of all parameters, by index."""
     return {
         numbers[at]: state
         for optimiser, numbers in optimisers

@@ -1,4 +1,4 @@
-"""The tasks that can be trained, by name; their presets, and how these are overridden."""
+"""The table of tasks that can be trained, their presets, and overrides of configurations."""
 
 from __future__ import annotations
 
@@ -39,22 +39,22 @@ class TaskEntry:
     presets: Mapping[str, TrainConfig[Any]]
     """Configurations by name: `paper`, `fast`, `tiny`, and `best` where a recipe was searched."""
     make: Callable[[Any, torch.device], Task]
-    """Builds the task from its own configuration, on a device."""
+    """Returns the task of a configuration, on a device."""
     targets: Callable[[], tuple[str, ...]]
-    """Returns the names of its built-in targets; none where `--target` is no field of its."""
+    """Returns the names of its built-in targets; none where the task has no field `target`."""
     fast_seconds: float
-    """How long the preset `fast` takes on one thread of a CPU [s]."""
+    """Duration of the preset `fast` on one thread of a CPU [s]."""
     paired_time: float = 0.8
-    """Time of two processes as a share of one's, where batches are small."""
+    """Duration with two processes as a fraction of that with one, for small batches."""
     space_dim: int = 2
     """Space dimension D of its worlds."""
     joint: bool = False
     """Whether several rules are trained, one for each species, by `train_together`."""
 
     def expected_seconds(self, config: TrainConfig[Any]) -> float | None:
-        """Return about how long a run takes on a CPU [s]: as its particle-steps to those of `fast`.
+        """Return the estimated duration of a run on a CPU [s], by its particle-steps.
 
-        None on other devices, where particle-steps say little.
+        None on other devices, where particle-steps predict little.
         """
         if config.device != "cpu":
             return None
@@ -78,16 +78,16 @@ TASKS: Mapping[str, TaskEntry] = {
         fast_seconds=220.0,
     ),
     "co_morphogenesis2d": TaskEntry(
-        summary="grow pictures in one world, each by a rule of its own",
+        summary="grow pictures in one world, each by its own rule",
         presets=CO_MORPHOGENESIS2D_PRESETS,
-        # Films and the evaluation take its rules one by one, as rules of their own task.
+        # Its rules are filmed and evaluated one by one, as rules of morphogenesis2d.
         make=lambda config, device: CoMorphogenesis2D(config, device=device),
         targets=tuple,
         fast_seconds=340.0,
         joint=True,
     ),
     "morphogenesis3d": TaskEntry(
-        summary="grow a thing seen from all sides from a ball of blank particles",
+        summary="grow a 3D object from a ball of blank particles",
         presets=MORPHOGENESIS3D_PRESETS,
         make=lambda config, device: Morphogenesis3D(config, device=device),
         targets=builtin_meshes,
@@ -100,11 +100,11 @@ TASKS: Mapping[str, TaskEntry] = {
         make=lambda config, device: Texture(config, device=device),
         targets=builtin_textures,
         fast_seconds=285.0,
-        # Each world's loss is most of the work, and each process has one.
+        # Each world's loss is most of the work.
         paired_time=0.55,
     ),
     "point_classification": TaskEntry(
-        summary="particles that stay where they are agree on which digit they form",
+        summary="static particles agree on which digit they form",
         presets=POINT_CLASSIFICATION_PRESETS,
         make=lambda config, device: PointClassification(config, device=device),
         targets=tuple,
@@ -129,12 +129,12 @@ def task_entry(task_name: str) -> TaskEntry:
 
 
 def preset(name: str, task_name: str = "morphogenesis2d", /, **fields: Any) -> TrainConfig[Any]:
-    """Return a preset with fields changed by plain name.
+    """Return a preset with fields replaced by name.
 
     Args:
         name: `paper`, `fast`, `tiny`, or `best` where the task has it.
         task_name: The task it is for.
-        fields: New values by field name, the run's and the task's alike.
+        fields: New values by field name, of the run or of the task.
 
     Raises:
         NPAError: The task, the preset or a field is unknown, or a value is not allowed.
@@ -145,24 +145,25 @@ def preset(name: str, task_name: str = "morphogenesis2d", /, **fields: Any) -> T
     return override(presets[name], **fields)
 
 
-# Overrides: by plain field names, or by a file.
+# Overrides, by field names or by a file.
 
 LARGEST_FILE = 2**20
-"""Bytes of a configuration file, at most."""
+"""Largest configuration file [bytes]."""
 
 MERGED = 10_000
-"""Fields that YAML's merge keys give a mapping, at most."""
+"""Largest number of fields that YAML's merge keys may add."""
 
 
 def override(config: TrainConfig[TaskConfigT], /, **fields: Any) -> TrainConfig[TaskConfigT]:
-    """Return `config` with fields changed, the run's and the task's alike, by plain name.
+    """Return `config` with fields of the run or of the task replaced, by name.
 
-    Values may be as plain as a file's: a list for a tuple, a string for a path, "5e-4" for a
-    number (YAML reads that as a string). `task` may be a mapping of task fields. Mappings of the
-    fields of species are laid over the species that are there; further ones over the last of them.
+    Values may be as in files: a list for a tuple, a string for a path, "5e-4" for a number (YAML
+    reads that as a string). `task` may be a mapping of task fields. `species` may be a list of
+    mappings, which override the fields of the existing species; additional ones start from the
+    last.
 
     Args:
-        config: The configuration to start from; it stays as it is.
+        config: The configuration to start from; it is not changed.
         fields: New values by field name, for example `iterations=500, target="heart"`.
 
     Raises:
@@ -188,7 +189,7 @@ def override(config: TrainConfig[TaskConfigT], /, **fields: Any) -> TrainConfig[
             task_changes[name] = value
         else:
             raise NPAError(f"unknown field {shown(name)}: {suggest(name, [*own, *task_types])}")
-    return dataclasses.replace(config, task=_laid_over("task", task, task_changes), **changes)
+    return dataclasses.replace(config, task=_replaced("task", task, task_changes), **changes)
 
 
 def load_config(
@@ -204,8 +205,8 @@ def load_config(
 
     Args:
         path: A file that ends in .yaml, .yml, .toml or .json.
-        base: The configuration that gives every field the file does not, for example a preset.
-        presets: Those that a `preset` of the file may name to stand for `base`; None: none.
+        base: The configuration of all fields that the file does not set, for example a preset.
+        presets: Presets by name, which the file's field `preset` may choose as base; None: none.
 
     Raises:
         NPAError: The file cannot be read, is no such file, names an unknown field, or gives a
@@ -235,10 +236,9 @@ def load_config(
 
 
 def config_to_dict(config: TrainConfig[Any]) -> dict[str, Any]:
-    """Return a configuration as plain numbers, strings, lists and one inner dict `task`.
+    """Return a configuration as numbers, strings, lists and an inner dict `task`, as JSON has them.
 
-    Args:
-        config: The configuration; `override(base, **config_to_dict(config))` gives it back.
+    `override(base, **config_to_dict(config))` restores it.
     """
     result = _plain(dataclasses.asdict(config))
     assert isinstance(result, dict)
@@ -265,7 +265,7 @@ def _parse(path: Path, text: str) -> Any:
     except MissingDependencyError:
         raise
     except Exception as error:
-        # What the parsers raise for garbage depends on where in them it lands.
+        # Parsers raise exceptions of many kinds.
         raise NPAError(
             f"{shown(str(path))} is not valid {suffix[1:].upper()}: {shown(error)}"
         ) from error
@@ -283,7 +283,7 @@ def _parse_yaml(text: str) -> Any:
         ) from error
 
     class Loader(yaml.SafeLoader):
-        """YAML's safe loader, which merges no more than a few mappings into each other."""
+        """YAML's safe loader with a limit on merged mappings."""
 
         def flatten_mapping(self, node: yaml.MappingNode) -> None:
             super().flatten_mapping(node)
@@ -299,8 +299,8 @@ def _field_types(config: Any) -> dict[str, Any]:
     return {field.name: hints[field.name] for field in dataclasses.fields(config)}
 
 
-def _laid_over(name: str, present: Any, fields: Mapping[str, Any]) -> Any:
-    """Return a dataclass, which errors call `name`, with fields changed to plain values."""
+def _replaced(name: str, present: Any, fields: Mapping[str, Any]) -> Any:
+    """Return the dataclass `present`, called `name` in errors, with fields replaced."""
     kinds = _field_types(present)
     for field in fields:
         if field not in kinds:
@@ -312,7 +312,7 @@ def _laid_over(name: str, present: Any, fields: Mapping[str, Any]) -> Any:
 
 
 def _convert(name: str, value: Any, kind: Any, present: Any) -> Any:
-    """Return a plain value as the field's type; ranges are the dataclass's own business."""
+    """Return a value of a file as the field's type; the dataclass checks ranges."""
     origin = typing.get_origin(kind)
     if origin is typing.Literal:
         return value
@@ -323,13 +323,13 @@ def _convert(name: str, value: Any, kind: Any, present: Any) -> Any:
         if not isinstance(value, list | tuple):
             raise NPAError(f"{name} must be a list, got {shown(value)}: for example {name}: [1, 2]")
         item = typing.get_args(kind)[0]
-        there = present if isinstance(present, tuple) and present else (None,)
+        before = present if isinstance(present, tuple) and present else (None,)
         return tuple(
-            _convert(f"{name}[{k}]", entry, item, there[min(k, len(there) - 1)])
+            _convert(f"{name}[{k}]", entry, item, before[min(k, len(before) - 1)])
             for k, entry in enumerate(value)
         )
     if dataclasses.is_dataclass(kind) and isinstance(value, Mapping):
-        return _laid_over(name, present, value)
+        return _replaced(name, present, value)
     if kind is Path and isinstance(value, str | Path):
         return Path(value)
     if kind is float and not isinstance(value, bool):

@@ -1,4 +1,5 @@
-"""Processes that train one rule together: each has a share of the worlds; what runs draw from."""
+"""Processes that train one rule together, each on its part of the worlds; random streams of
+runs."""
 
 from __future__ import annotations
 
@@ -26,53 +27,53 @@ from npa_envs.world.randomness import Randomness, WorldRandom
 ValueT = TypeVar("ValueT")
 
 AGREE_INTERVAL = 10
-"""Iterations from one question to all processes whether to stop to the next, at most."""
+"""Largest number of iterations between two checks of all processes whether to stop."""
 
 AGREE_SECONDS = 2.0
-"""Time from one question to the next [s], where one iteration does not take longer: launchers kill
-what has not stopped 30 s after they asked."""
+"""Time between two such checks, unless an iteration takes longer [s]: launchers kill a process 30 s
+after they asked it to stop."""
 
 
 class Ranks:
-    """This process among those of a run.
+    """This process (`rank`) among the `count` processes of a run.
 
-    Pool and batch are cut into as many sections as the batch has worlds. Section k belongs to
-    process k modulo their number. So each process has young and old worlds.
+    Pool and batch are cut into as many sections as the batch has worlds. Section k belongs to rank
+    k % count, so that each process has young and old worlds.
     """
 
     def __init__(self, rank: int = 0, count: int = 1, *, together: bool = False) -> None:
         self.rank = rank
         self.count = count
         self.together = together
-        """Whether they are torch's default group, even if there is only one."""
+        """Whether the processes are torch's default group, even if there is only one."""
         self._parent = os.getppid()
-        self._asked_at: tuple[int, float] | None = None
-        self._next_question = 0
+        self._checked_at: tuple[int, float] | None = None
+        self._next_check = 0
 
     @classmethod
     def current(cls) -> Ranks:
-        """Return the processes of torch's default group, or this one alone where there is none."""
+        """Return the processes of torch's default group, or a single process without a group."""
         if dist.is_available() and dist.is_initialized():
             return cls(dist.get_rank(), dist.get_world_size(), together=True)
         return cls()
 
     @property
     def first(self) -> bool:
-        """Whether this is the process that reads and writes the run's files."""
+        """Whether this is rank 0, which reads and writes the run's files."""
         return self.rank == 0
 
     def check(self, config: TrainConfig[Any]) -> None:
-        """Check that a run can be shared."""
+        """Check that a run can be divided among the processes."""
         batch, pool = config.world_count, config.pool_size
-        self.check_dealt("world_count", batch)
+        self.check_even("world_count", batch)
         if pool % batch:
             raise NPAError(
                 f"pool_size must be a multiple of world_count in a run of several processes, got "
                 f"{pool} and {batch}: set pool_size={pool // batch * batch}"
             )
 
-    def check_dealt(self, name: str, worlds: int) -> None:
-        """Check that the worlds of a batch, which the caller calls so, can be dealt out evenly."""
+    def check_even(self, name: str, worlds: int) -> None:
+        """Check that a number of worlds, called `name` in the error, is divisible by `count`."""
         if worlds % self.count:
             nearest = max(worlds // self.count, 1) * self.count
             raise NPAError(
@@ -80,22 +81,25 @@ class Ranks:
                 f"{self.count}: set {name}={nearest}"
             )
 
-    def places(self, total: int, section: int = 1) -> Tensor:
-        """Return which of all worlds are this process's, on the CPU, int64, shape [total / R]."""
+    def indices(self, total: int, section: int = 1) -> Tensor:
+        """Return the indices of this process's worlds, on the CPU, int64, shape [total / count]."""
         return self.own(torch.arange(total), section)
 
     def own(self, worlds: Tensor, section: int) -> Tensor:
-        """Return this process's share of all worlds, so many of which are a section."""
-        dealt = worlds.view(-1, self.count, section, *worlds.shape[1:])
-        return dealt[:, self.rank].flatten(0, 1)
+        """Return this process's part of all worlds, which come in sections of `section` worlds."""
+        parts = worlds.view(-1, self.count, section, *worlds.shape[1:])
+        return parts[:, self.rank].flatten(0, 1)
 
     def collected(self, worlds: Tensor, section: int) -> Tensor:
-        """Return the worlds of all processes, on the first one and the CPU where it has others."""
+        """Gather the worlds of all processes on rank 0, on the CPU; others get their own worlds.
+
+        With one process `worlds` is returned unchanged.
+        """
         if self.count == 1:
             return worlds
         mine = worlds.detach().cpu().contiguous()
         parts = [torch.empty_like(mine) for _ in range(self.count)] if self.first else None
-        with self._in_touch():
+        with self._lost_process_error():
             dist.gather(mine, parts)
         if parts is None:
             return mine
@@ -103,11 +107,11 @@ class Ranks:
         return torch.stack(sections, 1).flatten(0, 2)
 
     def broadcast(self, value: ValueT) -> ValueT:
-        """Return what the first process gives, on all of them."""
+        """Return rank 0's value on all processes."""
         if not self.together:
             return value
         given = [value]
-        with self._in_touch():
+        with self._lost_process_error():
             dist.broadcast_object_list(given)
         return given[0]
 
@@ -115,33 +119,33 @@ class Ranks:
         """Return whether the flag is set on any process."""
         if not self.together:
             return flag
-        asked = torch.tensor(int(flag))
-        with self._in_touch():
-            dist.all_reduce(asked, op=dist.ReduceOp.MAX)
-        return bool(asked)
+        largest = torch.tensor(int(flag))
+        with self._lost_process_error():
+            dist.all_reduce(largest, op=dist.ReduceOp.MAX)
+        return bool(largest)
 
     def agree_to_stop(self, asked: bool, iteration: int) -> bool:
-        """Return whether to stop before an iteration: any process was asked to."""
+        """Return whether to stop before an iteration, because any process was asked to."""
         if not self.together:
             return asked
-        if self._asked_at is not None and self._asked_at[0] < iteration < self._next_question:
+        if self._checked_at is not None and self._checked_at[0] < iteration < self._next_check:
             return False
         now, took = time.monotonic(), math.inf
-        if self._asked_at is not None and iteration > self._asked_at[0]:
-            took = (now - self._asked_at[1]) / (iteration - self._asked_at[0])
-        # Whoever started them would end them; where that one was killed, they end by themselves.
+        if self._checked_at is not None and iteration > self._checked_at[0]:
+            took = (now - self._checked_at[1]) / (iteration - self._checked_at[0])
+        # The launcher stops its processes; if it was killed, they stop by themselves.
         wanted = asked or os.getppid() != self._parent
         answer = torch.tensor([float(wanted), took], dtype=torch.float64)
-        with self._in_touch():
+        with self._lost_process_error():
             dist.all_reduce(answer, op=dist.ReduceOp.MAX)
         interval = min(max(int(AGREE_SECONDS / max(float(answer[1]), 1e-9)), 1), AGREE_INTERVAL)
-        self._asked_at, self._next_question = (iteration, now), iteration + interval
+        self._checked_at, self._next_check = (iteration, now), iteration + interval
         return bool(answer[0])
 
     def reduce(self, means: Sequence[Tensor], total: Tensor | None = None) -> None:
-        """Replace numbers by their means, and one by its sum, over all processes, in place.
+        """Replace tensors by their means, and `total` by its sum, over all processes, in place.
 
-        All means have one dtype. On CUDA the host waits for nothing.
+        All of `means` have one dtype. CUDA is not synchronised.
         """
         if not self.together:
             return
@@ -149,7 +153,7 @@ class Ranks:
         if total is not None:
             parts.append(total.reshape(1).to(means[0]))
         flat = torch.cat(parts)
-        with self._in_touch():
+        with self._lost_process_error():
             dist.all_reduce(flat)
         if total is not None:
             total.copy_(flat[-1])
@@ -160,7 +164,7 @@ class Ranks:
             first += mean.numel()
 
     def mean(self, value: Tensor) -> Tensor:
-        """Return the mean of a tensor over all processes, which all ask for it."""
+        """Return the mean of a tensor over all processes; all of them must call it."""
         mean = value.detach().clone()
         self.reduce([mean])
         return mean
@@ -171,7 +175,7 @@ class Ranks:
             return
         own = torch.cat([tensor.detach().reshape(-1).double().cpu() for tensor in tensors])
         low, high = own.clone(), own.clone()
-        with self._in_touch():
+        with self._lost_process_error():
             dist.all_reduce(low, op=dist.ReduceOp.MIN)
             dist.all_reduce(high, op=dist.ReduceOp.MAX)
         differing = int((low != high).sum())
@@ -180,11 +184,11 @@ class Ranks:
                 f"the parameters must be the same on all {self.count} processes, but {differing} "
                 f"of {len(own)} differ, by at most {float((high - low).max()):.3g}: the last "
                 "checkpoint is intact; resume it, and look for a faulty device or for processes "
-                "with other versions of a library"
+                "with different versions of a library"
             )
 
     @contextlib.contextmanager
-    def _in_touch(self) -> Iterator[None]:
+    def _lost_process_error(self) -> Iterator[None]:
         try:
             yield
         except RuntimeError as error:
@@ -193,25 +197,25 @@ class Ranks:
             raise LostProcessError(
                 f"process {self.rank} of {self.count} has lost another one, which has ended or "
                 f"cannot be reached ({shown(error)}): the last checkpoint is intact; see what "
-                "the other process said, then resume"
+                "the other process printed, then resume"
             ) from error
 
 
 ALONE = Ranks()
 
 
-# Randomness: of the batch at once, or of each world by itself.
+# Random streams: one for the whole batch, or one for each world.
 
 
 @dataclass(frozen=True)
 class RunRandomness:
-    """What a run draws from.
+    """Random sources of a run: `of_batch` for one process, `by_world` for several.
 
-    A process alone has one generator for all worlds and one for all masks. Where several share a
-    run, each world has streams of its own, which follow from the seed, the world's number among
-    those of all processes, and the iteration. So they are the same for any number of processes,
-    and nothing of them has to be kept. Numbers of steps and first weights are of the schedule, on
-    the CPU; which worlds a batch has, their damage and fresh ones of `worlds`.
+    `schedule`, on the CPU, draws numbers of steps and initial weights; `pool` the first worlds;
+    `worlds` which worlds a batch has, their damage and seeds; `masks` which particles are updated.
+    Of one process they are generators. With several, each world has streams that depend on the
+    seed, the world's index among those of all processes, and the iteration: they are the same for
+    any number of processes, and checkpoints need not store them.
     """
 
     schedule: torch.Generator
@@ -223,7 +227,7 @@ class RunRandomness:
     def of_batch(
         cls, config: TrainConfig[Any], device: torch.device, schedule: torch.Generator
     ) -> RunRandomness:
-        """Return the randomness of a process alone."""
+        """Return the generators of a run of one process."""
         worlds = torch.Generator(device).manual_seed(config.seed + 1)
         masks = torch.Generator(device).manual_seed(config.seed + 2)
         return cls(schedule, worlds, worlds, masks)
@@ -232,16 +236,16 @@ class RunRandomness:
     def by_world(
         cls, config: TrainConfig[Any], device: torch.device, schedule: torch.Generator, ranks: Ranks
     ) -> RunRandomness:
-        """Return the randomness of worlds that several processes share."""
+        """Return the streams by world of a run of several processes."""
         batch, pool = config.world_count, config.pool_size
 
-        def streams(purpose: int, total: int, places: Tensor) -> WorldRandom:
-            return world_streams((config.seed, purpose), total, places, device)
+        def streams(purpose: int, total: int, indices: Tensor) -> WorldRandom:
+            return world_streams((config.seed, purpose), total, indices, device)
 
-        of_batch = ranks.places(batch)
+        of_batch = ranks.indices(batch)
         return cls(
             schedule,
-            pool=streams(0, pool, ranks.places(pool, pool // batch)),
+            pool=streams(0, pool, ranks.indices(pool, pool // batch)),
             worlds=streams(1, batch, of_batch),
             masks=streams(2, batch, of_batch),
         )
@@ -256,7 +260,7 @@ class RunRandomness:
         }
 
     def load_state_dict(self, states: Mapping[str, Tensor], iteration: int) -> None:
-        """Go on after so many iterations from what `state_dict` returned."""
+        """Restore what `state_dict` returned after `iteration`."""
         self.schedule.set_state(states["schedule"])
         for name, source in (("worlds", self.worlds), ("masks", self.masks)):
             if isinstance(source, torch.Generator):
@@ -266,22 +270,23 @@ class RunRandomness:
 
 
 def world_streams(
-    seed: Sequence[int], total: int, places: Tensor, device: torch.device
+    seed: Sequence[int], total: int, indices: Tensor, device: torch.device
 ) -> WorldRandom:
-    """Return streams of this process's `places` among worlds: the same for any other share."""
+    """Return the streams of the worlds at `indices` among `total`, whatever the other indices
+    are."""
     keys = np.random.default_rng(seed).integers(2**64, size=total, dtype=np.uint64)
-    return WorldRandom.from_keys(torch.from_numpy(keys.view(np.int64))[places].to(device))
+    return WorldRandom.from_keys(torch.from_numpy(keys.view(np.int64))[indices].to(device))
 
 
 def restart(*sources: Randomness) -> None:
-    """Begin anew what worlds draw by themselves; a generator just goes on."""
+    """Begin the next episode of streams by world; generators are left unchanged."""
     for source in sources:
         if isinstance(source, WorldRandom):
             source.restart()
 
 
 def registered(source: Randomness) -> torch.Generator | None:
-    """Return what a CUDA graph has to know of: streams of worlds are tensors as all others."""
+    """Return the generator to register with a CUDA graph, or None for streams by world."""
     return source if isinstance(source, torch.Generator) else None
 
 
@@ -292,16 +297,15 @@ def registered(source: Randomness) -> torch.Generator | None:
 def joined_ranks() -> Iterator[Ranks]:
     """Join the other processes that torchrun has started, within the block.
 
-    Each of them sees one CUDA device, that of its number on its machine. To be called before
-    anything uses CUDA. Within the block, a process that gives no sign of life ends the others (see
-    `Heartbeat`), so whichever process keeps the store that they meet in is to leave it last.
-    Outside of torchrun, this process is alone.
+    Each process sees one CUDA device, by its local rank; call this before anything uses CUDA.
+    Within the block, a process that is lost ends all others (see `Heartbeat`), so the process that
+    hosts the store must leave last. Without torchrun there is a single process.
     """
     if not dist.is_available() or not dist.is_torchelastic_launched():
         yield Ranks()
         return
-    # Torch's builds for CUDA have NCCL on machines without a GPU too, and refuse it there. The
-    # driver's manager counts, which does not start CUDA.
+    # CUDA builds of torch have NCCL, but it fails on machines without a GPU. device_count asks
+    # NVML, which does not initialise CUDA.
     has_gpus = torch.cuda.device_count() >= int(os.environ["LOCAL_WORLD_SIZE"])
     backend = "cpu:gloo,cuda:nccl" if dist.is_nccl_available() and has_gpus else "gloo"
     _choose_device(int(os.environ["LOCAL_RANK"]))
@@ -310,10 +314,10 @@ def joined_ranks() -> Iterator[Ranks]:
         ranks = Ranks.current()
         heartbeat = None
         if ranks.count > 1:
-            # A connection of its own: that of the group waits where the group does.
+            # A separate connection: that of the group blocks while the group waits.
             address, port = os.environ["MASTER_ADDR"], int(os.environ["MASTER_PORT"])
             store = dist.TCPStore(address, port, wait_for_workers=False)  # type: ignore[attr-defined]
-            # Torchrun may keep the store where it starts processes again.
+            # Torchrun may keep the store when it restarts processes.
             prefix = ranks.broadcast(uuid.uuid4().hex)
             own = dist.PrefixStore(prefix, store)  # type: ignore[attr-defined]
             heartbeat = Heartbeat(own, ranks.rank, ranks.count)
@@ -329,46 +333,46 @@ def joined_ranks() -> Iterator[Ranks]:
     finally:
         if heartbeat is not None:
             heartbeat.end(left=left)
-    # Not after an error: others may be gone. Recorded graphs hold on to the group.
+    # Not after an error: others may be gone. Recorded graphs keep references to the group.
     gc.collect()
     dist.destroy_process_group()
 
 
 def _choose_device(number: int) -> None:
-    """Let this process see one CUDA device of those that it would see, or none beyond them."""
+    """Let this process see only the CUDA device `number` of its visible ones, if there is one."""
     if torch.cuda.device_count() == 0:
         return
-    seen = os.environ.get("CUDA_VISIBLE_DEVICES")
-    devices = [str(number)] if seen is None else seen.split(",")[number : number + 1]
+    visible = os.environ.get("CUDA_VISIBLE_DEVICES")
+    devices = [str(number)] if visible is None else visible.split(",")[number : number + 1]
     os.environ["CUDA_VISIBLE_DEVICES"] = ",".join(devices)
 
 
 BEAT_SECONDS = 5.0
-"""Pause between two signs of life [s]."""
+"""Time between two heartbeats [s]."""
 
 SILENT_BEATS = 8
-"""A process that gave no sign in so many pauses of another one is lost."""
+"""Number of missed heartbeats after which a process is lost."""
 
 LOST_CODE = 2
-"""Exit code of a process that has lost another one: the command line's for errors."""
+"""Exit code of a process that has lost another one, that of errors on the command line."""
 
 _LEFT = -(2**62)
 
 
 class Heartbeat:
-    """Ends this process, with a message, where another one gives no sign of life.
+    """Ends this process, with a message, when another one sends no heartbeats.
 
-    Collectives alone may wait for a process that was stopped, or whose machine is gone, for NCCL's
-    10 minutes. Time counts in this process's own pauses: one that was stopped itself blames nobody
-    for that. A process that waits or computes gives signs all the same.
+    Collectives would wait up to NCCL's timeout of 10 minutes for a process that was stopped or
+    whose machine is gone. Time is counted in this process's own heartbeats, so that a process that
+    was suspended does not blame others. Threads send heartbeats while a process waits or computes.
     """
 
     def __init__(self, store: Any, rank: int, count: int) -> None:
         self._store, self._rank = store, rank
-        self._signs = [0] * count
+        self._beats = [0] * count
         self._ended = threading.Event()
         self._left = self._store_gone = False
-        # Two, as a store that does not answer holds up whoever asks it.
+        # Two threads, as a store that does not answer blocks the one that reads it.
         self._threads = [
             threading.Thread(target=task, daemon=True) for task in (self._beat, self._watch)
         ]
@@ -376,7 +380,7 @@ class Heartbeat:
             thread.start()
 
     def end(self, *, left: bool) -> None:
-        """Watch no longer; where it has `left`, the others need not miss this process."""
+        """Stop watching; with `left`, tell the others that this process leaves."""
         self._left = left
         self._ended.set()
         for thread in self._threads:
@@ -385,28 +389,28 @@ class Heartbeat:
     def _beat(self) -> None:
         try:
             while not self._ended.is_set():
-                for other in range(len(self._signs)):
-                    self._signs[other] = self._store.add(str(other), int(other == self._rank))
+                for other in range(len(self._beats)):
+                    self._beats[other] = self._store.add(str(other), int(other == self._rank))
                 self._ended.wait(BEAT_SECONDS)
             if self._left:
                 self._store.add(str(self._rank), _LEFT)
         except RuntimeError:
-            # From now on all seem silent that have not left.
+            # From now on all processes that have not left seem silent.
             self._store_gone = True
 
     def _watch(self) -> None:
-        count = len(self._signs)
-        seen, silent = self._signs.copy(), [0] * count
+        count = len(self._beats)
+        last, silent = self._beats.copy(), [0] * count
         while not self._ended.wait(BEAT_SECONDS):
-            signs = self._signs.copy()
+            beats = self._beats.copy()
             for other in range(count):
-                alive = other == self._rank or signs[other] != seen[other] or signs[other] < 0
+                alive = other == self._rank or beats[other] != last[other] or beats[other] < 0
                 silent[other] = 0 if alive else silent[other] + 1
-            seen = signs
+            last = beats
             lost = [str(other) for other in range(count) if silent[other] >= SILENT_BEATS]
             if lost:
                 why = (
-                    "as the store that processes meet in is gone"
+                    "as the store of the processes is gone"
                     if self._store_gone
                     else "which was killed or stopped, or cannot be reached"
                 )
@@ -417,5 +421,5 @@ class Heartbeat:
                     file=sys.stderr,
                     flush=True,
                 )
-                # The main thread may wait in a collective for ever.
+                # The main thread may block in a collective for ever.
                 os._exit(LOST_CODE)

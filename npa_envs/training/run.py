@@ -1,4 +1,4 @@
-"""Runs that are kept in a folder: its files, one writer, checkpoints, and a stop in order."""
+"""Training runs in a folder: files, lock, checkpoints, log, and a clean stop on signals."""
 
 from __future__ import annotations
 
@@ -34,35 +34,35 @@ except ImportError:  # Windows
     fcntl = None  # type: ignore[assignment]
 
 ONE_REQUEST = 1.0
-"""Time within which signals are one request to stop [s]: a scheduler may ask both a run and its
-launcher, which passes it on."""
+"""Signals within this time are one request to stop [s]: a scheduler may signal both a run and its
+launcher, which forwards it."""
 
 Check = Callable[[dict[str, Any], Path], None]
-"""Raises NPAError where a checkpoint, given with its path, is of another run."""
+"""Raises NPAError if a checkpoint, given with its path, is of another run."""
 
 
 def check_choice(*, resume: bool, overwrite: bool) -> None:
-    """Check that a run does not both go on and start anew."""
+    """Check that a run is not both resumed and overwritten."""
     if resume and overwrite:
         raise NPAError(
-            "resume and overwrite exclude each other: resume goes on with the run in the folder, "
+            "resume and overwrite exclude each other: resume continues the run in the folder, "
             "overwrite removes it: leave one of them out"
         )
 
 
 class Run:
-    """A run of any learner; the first of the processes that share it reads and writes its files.
+    """A run of any learner; rank 0 reads and writes its files.
 
     Args:
-        folder: Where the run is kept; None: nowhere, and no signal stops it.
-        ranks: The processes that share it.
-        check: Of the checkpoint that it goes on from.
-        resume: Go on from the checkpoint in the folder.
-        overwrite: Begin anew although the folder holds a run; its files are removed.
+        folder: Its files; None: nothing is written, and no signal stops it.
+        ranks: Its processes.
+        check: Checks the checkpoint of a resumed run.
+        resume: Continue from the checkpoint in the folder.
+        overwrite: Remove the files of an earlier run in the folder.
 
     Raises:
-        NPAError: The folder holds a run, without `resume` or `overwrite`; or none, or another one,
-            with `resume`; or another process writes to it.
+        NPAError: There is a run in the folder, without `resume` or `overwrite`; there is none, or
+            another one, with `resume`; or another process writes to it.
     """
 
     def __init__(
@@ -83,11 +83,12 @@ class Run:
             check_choice(resume=resume, overwrite=overwrite)
             content = self._opened(folder, check, resume)
         self.content: dict[str, Any] | None = ranks.broadcast(content)
-        """The checkpoint to go on from; large, so who has read it sets it to None."""
+        """The checkpoint of a resumed run; set it to None after reading, to free its memory."""
 
     @contextlib.contextmanager
     def held(self, *, begin: bool = False) -> Iterator[None]:
-        """Keep other runs out of the folder within the block; at the beginning, also tidy it."""
+        """Lock the folder within the block; with `begin`, remove unfinished and overwritten
+        files."""
         folder = self.folder if self._ranks.first else None
         with contextlib.nullcontext() if folder is None else folder.locked():
             if begin and folder is not None:
@@ -105,14 +106,14 @@ class Run:
         begin: Callable[[], None] = lambda: None,
         late: Callable[[], bool] = lambda: False,
     ) -> bool:
-        """Repeat a step until all is done, or until SIGTERM, Ctrl-C or the clock asks to stop.
+        """Repeat `step` until the run is over, or until SIGTERM, Ctrl-C or a time limit stops it.
 
         Args:
-            step: One iteration; it counts `iteration`.
-            over: Whether all is done, the same on all processes.
-            end: Called when a signal may still come, with whether the run was asked to stop.
-            begin: Called before the first step, when a signal may come.
-            late: Whether the time of this process is up.
+            step: One iteration; it increments `iteration`.
+            over: Whether the run is over, the same on all processes.
+            end: Called at the end, with whether the run was stopped; signals are still caught.
+            begin: Called before the first step, when signals are caught.
+            late: Whether the time limit has passed, on this process.
 
         Returns:
             Whether a signal came.
@@ -135,8 +136,8 @@ class Run:
             return self._ranks.any(stop.is_set())
 
     def keep(self, content: dict[str, Any]) -> None:
-        """Write the checkpoint; for the first process."""
-        assert self.folder is not None, "kept in a folder"
+        """Write the checkpoint; to be called on rank 0."""
+        assert self.folder is not None, "the run has a folder"
         save_checkpoint(self.folder.checkpoint, content)
         self.folder.note_checkpoint()
 
@@ -144,7 +145,7 @@ class Run:
         folder.note_checkpoint()
         path = folder.checkpoint
         if path.exists():
-            # Refused before anything is made where another run goes on there.
+            # Raises if another run is active in the folder, before anything is created.
             with folder.locked():
                 pass
         if resume:
@@ -163,11 +164,11 @@ class Run:
 def stop_flag(*, patient: bool = False) -> Iterator[threading.Event]:
     """Within the block, the first SIGINT or SIGTERM sets the event; later ones act as usual.
 
-    What comes within `ONE_REQUEST` of the first one is the same request. In a thread other than
-    the main one, where signals cannot be caught, it stays unset.
+    Signals within `ONE_REQUEST` of the first one are ignored. In a thread other than the main one,
+    where signals cannot be caught, the event stays unset.
 
     Args:
-        patient: The next ones do nothing: torchrun passes on what a terminal has sent already.
+        patient: Ignore all later signals: torchrun forwards those that a terminal has sent already.
     """
     asked = threading.Event()
     if threading.current_thread() is not threading.main_thread():
@@ -176,7 +177,7 @@ def stop_flag(*, patient: bool = False) -> Iterator[threading.Event]:
     previous: dict[signal.Signals, Any] = {}
     first = 0.0
 
-    def give_back() -> None:
+    def restore() -> None:
         for number, handler in previous.items():
             signal.signal(number, handler)
 
@@ -188,7 +189,7 @@ def stop_flag(*, patient: bool = False) -> Iterator[threading.Event]:
             if not patient:
                 print("\nstopping after this iteration; once more to stop at once", file=sys.stderr)
         elif not patient and time.monotonic() - first > ONE_REQUEST:
-            give_back()
+            restore()
             signal.raise_signal(number)
 
     for number in (signal.SIGINT, signal.SIGTERM):
@@ -196,17 +197,17 @@ def stop_flag(*, patient: bool = False) -> Iterator[threading.Event]:
     try:
         yield asked
     finally:
-        give_back()
+        restore()
 
 
 # Files.
 
 LARGEST_LOG = 2**29
-"""Bytes of a run's log, at most."""
+"""Largest log of a run [bytes]."""
 
 
 class RunFolder:
-    """Paths of a run's files; `prepare` creates the folder."""
+    """Paths of a run's files, and the lock; `prepare` creates the folder."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -217,19 +218,20 @@ class RunFolder:
         """The rule as of the last checkpoint, for `load_rule`."""
         self.config = path / "config.json"
         self.diagnosis = path / "diverged.pt"
-        """What the first iteration with a loss that is not finite saw."""
+        """State of the first iteration whose loss was not finite."""
         self.pictures = path / "pictures"
         """Pictures of a batch, named by iteration."""
         self.report = path / "report"
-        """What the finished rule is, in figures and films (`npa-envs train`)."""
+        """Figures and films of the finished rule (`npa-envs train`)."""
         self.tensorboard = path / "tensorboard"
         self.lock = path / ".lock"
-        """Locked while a trainer writes to the folder; holds the trainer's process and computer."""
+        """Locked while a trainer writes to the folder; names the trainer's process and computer."""
         self._known: tuple[int, int] | None = None
 
     def prepare(self, byte_count: int, *, pictures: bool = True) -> None:
-        """Create the folder and see that a checkpoint of so many bytes can be written there."""
-        # A new checkpoint is written while the old one is there.
+        """Create the folder and check that a checkpoint of `byte_count` bytes can be written
+        there."""
+        # The old checkpoint exists until the new one is complete.
         needed = 2 * byte_count
         try:
             with made_folder(self.pictures if pictures else self.path):
@@ -246,16 +248,16 @@ class RunFolder:
     def _unwritable(self, what: str, error: OSError) -> NPAError:
         return NPAError(
             f"out must be a folder that can be {what}, got {str(self.path)!r} "
-            f"({error.strerror or error}): choose another one or mend its permissions"
+            f"({error.strerror or error}): choose another one or change its permissions"
         )
 
     @contextlib.contextmanager
     def locked(self) -> Iterator[None]:
-        """Keep all other trainers from writing to the folder, within the block.
+        """Lock the folder against other trainers within the block.
 
-        The system frees the lock of a process that ends in whatever way, so none is ever left
-        behind. Where the system or the file system has no such locks, nothing is locked. A folder
-        that another trainer has written to since this one's last checkpoint is refused as well.
+        The system releases the lock when the process ends, in any way. Where the system or the file
+        system has no locks, nothing is locked. Raises NPAError also if another trainer has written
+        a checkpoint since this one's last.
         """
         try:
             lock = self.lock.open("a+", encoding="utf-8", errors="replace")
@@ -280,25 +282,25 @@ class RunFolder:
                     "out must be a folder that no other run writes to, but another one has written "
                     f"{str(self.checkpoint)!r} meanwhile: resume it, or choose another folder"
                 )
-            with contextlib.suppress(OSError):  # A full disk; who reads it can do without.
+            with contextlib.suppress(OSError):  # A full disk: the text is not needed.
                 lock.truncate(0)
                 lock.write(f"process {os.getpid()} on {socket.gethostname()}")
                 lock.flush()
             yield
 
     def note_checkpoint(self) -> None:
-        """Remember the checkpoint, or that there is none: `locked` refuses where it is another."""
+        """Remember the present checkpoint file, or none, which `locked` compares later."""
         self._known = _identity(self.checkpoint)
 
     def tidy(self) -> None:
-        """Remove what killed writes of a run's files have left behind."""
+        """Remove temporary files that interrupted writes have left."""
         own = [self.checkpoint, self.rule, self.log, self.config, self.diagnosis]
         own += [self.rule_of("*"), self.pictures / "[0-9]*.png"]
         for path in own:
             remove_unfinished(path)
 
     def clear(self) -> None:
-        """Remove an earlier run's files, and nothing else that may lie in the folder."""
+        """Remove an earlier run's files, and no others."""
         patterns = (
             "rule-[0-9]*.safetensors",
             "pictures/[0-9]*.png",
@@ -308,13 +310,13 @@ class RunFolder:
         for pattern in patterns:
             for path in self.path.glob(pattern):
                 path.unlink()
-        # The checkpoint last but one: whenever this is killed, there is either a run that can be
-        # resumed or none at all.
+        # The checkpoint last but one: if this is interrupted, there is either a run that can be
+        # resumed or none.
         for path in (self.log, self.rule, self.diagnosis, self.checkpoint, self.config):
             path.unlink(missing_ok=True)
 
     def rule_of(self, species: int | str) -> Path:
-        """Return the path of the rule of a species, of a run that trains several together."""
+        """Return the path of a species' rule in a run of several rules."""
         return self.path / f"rule-{species}.safetensors"
 
     def picture(self, iteration: int) -> Path:
@@ -323,7 +325,7 @@ class RunFolder:
 
 
 def _identity(path: Path) -> tuple[int, int] | None:
-    """Return inode and time of a file, which change when it is replaced, or None without one."""
+    """Return inode and time of a file, which change when it is replaced, or None if missing."""
     try:
         status = path.stat()
     except OSError:
@@ -338,13 +340,13 @@ class JsonlLog:
         self.path = path
 
     def append(self, record: dict[str, Any]) -> None:
-        """Add a line and hand it to the system, so that a kill right after it does not lose it.
+        """Write a line without a buffer, so that a kill right after it does not lose it.
 
-        If that fails, the file is cut back to what it held before.
+        If that fails, the file is truncated to its former size.
         """
         line = (json.dumps(record, allow_nan=False) + "\n").encode()
         try:
-            # Without a buffer: one would be written again when the file closes.
+            # Without a buffer, which would be written again when the file closes.
             with self.path.open("ab", buffering=0) as file:
                 size = file.tell()
                 try:
@@ -357,20 +359,20 @@ class JsonlLog:
         except OSError as error:
             raise NPAError(
                 f"cannot write the log {str(self.path)!r} ({error.strerror or error}): free disk "
-                "space or mend the permissions, then resume the run"
+                "space or change the permissions, then resume the run"
             ) from error
 
     def truncate(self, iteration: int) -> None:
-        """Drop the lines after an iteration, and a last line that a kill cut short."""
+        """Drop the lines after an iteration, and an incomplete last line."""
         write_text(self.path, "".join(json.dumps(r) + "\n" for r in self.records(iteration)))
 
     def records(self, iteration: int | None = None) -> list[dict[str, Any]]:
-        """Return the lines, up to an iteration if one is given, but for a last one cut short."""
+        """Return the records, up to an iteration if given, without an incomplete last line."""
         if not os.path.exists(self.path):
             return []
         content = read_bytes(self.path, limit=LARGEST_LOG, what="the log")
         lines = content.decode("utf-8", errors="replace").split("\n")
-        # What stands behind the last end of a line was cut short; mostly nothing does.
+        # The part after the last newline is incomplete, or empty.
         if _parsed_record(lines[-1]) is None:
             lines.pop()
         records: list[dict[str, Any]] = []
@@ -380,8 +382,8 @@ class JsonlLog:
             if record is None or record["iteration"] <= last:
                 raise NPAError(
                     f"the log {str(self.path)!r} must hold one JSON object of numbers a line, with "
-                    f"growing iterations, but line {number} is {line[:60]!r}: mend that line, or "
-                    "move the file away to go on without it"
+                    f"growing iterations, but line {number} is {line[:60]!r}: correct "
+                    "that line, or move the file away to continue without it"
                 )
             if iteration is not None and record["iteration"] > iteration:
                 break
@@ -390,7 +392,7 @@ class JsonlLog:
 
 
 def _parsed_record(line: str) -> dict[str, Any] | None:
-    """Return a line of a log as `JsonlLog.append` was given it, or None where it is damaged."""
+    """Return the record of a line of a log, or None if it is damaged."""
     try:
         record = json.loads(line)
     except (ValueError, RecursionError):
@@ -402,8 +404,8 @@ def _parsed_record(line: str) -> dict[str, Any] | None:
 
 
 def open_tensorboard(folder: RunFolder, iteration: int) -> Any:
-    """Return a TensorBoard writer that hides what an earlier process wrote after `iteration`."""
-    # TensorBoard would look for TensorFlow, which takes seconds where it is installed.
+    """Return a TensorBoard writer that hides events of an earlier process after `iteration`."""
+    # TensorBoard imports TensorFlow if it is installed; this silences it.
     os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
     try:
         from torch.utils.tensorboard import SummaryWriter
@@ -418,13 +420,13 @@ def open_tensorboard(folder: RunFolder, iteration: int) -> Any:
         )
     except OSError as error:
         raise NPAError(
-            f"cannot write to {str(folder.tensorboard)!r} ({error}): mend its permissions or "
+            f"cannot write to {str(folder.tensorboard)!r} ({error}): change its permissions or "
             "train with tensorboard=False"
         ) from error
 
 
 PICTURE_HEIGHT = 256
-"""Least height of the pictures [pixels]; the pixels of smaller worlds are repeated."""
+"""Least height of the pictures [pixels]; pixels of smaller ones are repeated."""
 
 PICTURE_GAP = 8
 """Pixels between the worlds of a picture."""
@@ -439,11 +441,11 @@ def write_batch_picture(path: Path, picture: Tensor, board: Any, iteration: int)
     write_bytes(path, encode_frame(frame, "PNG"))
     if board is None:
         return
-    # Imported late: only runs with TensorBoard need it.
+    # Imported here: only runs with TensorBoard need it.
     from tensorboard.compat.proto.summary_pb2 import Summary
 
-    # The writer's own add_image makes a PNG, and TensorBoard takes a checksum of it in Python, byte
-    # by byte, which holds up the interpreter for longer than all the rest takes.
+    # The writer's add_image makes a PNG, whose checksum TensorBoard computes in Python, byte by
+    # byte, which takes longer than all the rest.
     height, width, channels = frame.shape
     image = Summary.Image(
         height=height,

@@ -1,4 +1,4 @@
-"""The trainer, of one rule or of several in one world, and all that a run leaves behind."""
+"""The trainer of one rule, or of several in one world: checkpoints, log, pictures, rule files."""
 
 from __future__ import annotations
 
@@ -27,7 +27,6 @@ from npa_envs.tasks.train_config import TrainConfig
 from npa_envs.training.checkpoint import (
     check_content,
     check_same_run,
-    drawn_by_world,
     save_checkpoint,
     unusable_checkpoint,
 )
@@ -39,47 +38,49 @@ from npa_envs.training.run import JsonlLog, Run, RunFolder, open_tensorboard, wr
 from npa_envs.world.species import rollout_species
 
 FIRST_PICTURE = 10
-"""Iteration after which the first picture is written, where the interval is longer."""
+"""Iteration after which the first picture is written, if the interval is longer."""
 
 
 @dataclass(frozen=True)
 class TrainResult:
-    """What a run came to."""
+    """Result of `Trainer.run`."""
 
     rule: NPARule
-    """The rule as it stands."""
+    """The rule after the last iteration."""
     iteration: int
     """Iterations done."""
     finished: bool
-    """Whether these were all of them; if not, the run was stopped and can be resumed."""
+    """Whether all iterations are done; if not, the run was stopped and can be resumed."""
     interrupted: bool
     """Whether Ctrl-C or SIGTERM stopped it."""
     record: dict[str, Any]
     """The last line of the log: loss terms (means over the interval), learning rate, seconds."""
     folder: Path
-    """Where log, pictures, checkpoint and rule lie."""
+    """Folder of log, pictures, checkpoint and rule."""
 
 
 class Trainer:
     """Trains a rule on a task.
 
-    Where torch has a default group of processes, they train together: each has its share of the
-    pool and of the batch, and the first one reads and writes the run's files.
+    The constructor creates the folder `config.out` and writes the configuration and a first
+    checkpoint there, or with `resume` reads the checkpoint. The processes of torch's default group,
+    if there is one, train together: each has a part of the pool and of the batch, and rank 0 reads
+    and writes the files.
 
     Args:
-        task: What to learn.
-        config: How.
-        task_name: The task's name, which checkpoints hold.
-        resume: Go on from the checkpoint in `config.out`.
-        overwrite: Start anew although `config.out` holds a run; its files are removed.
-        rollout: The rollout to train through; None is the engine's for one rule.
-        ranks: The processes that share the run; None: those of torch's default group.
+        task: The task.
+        config: The run's configuration.
+        task_name: The task's name in checkpoints.
+        resume: Continue from the checkpoint in `config.out`.
+        overwrite: Remove the files of an earlier run in `config.out`.
+        rollout: The rollout to train through; None: `npa_envs.rollout`.
+        ranks: The processes of the run; None: those of torch's default group.
 
     Raises:
-        NPAError: There is no such device; the folder cannot be written to, holds a run already
-            (without `resume` or `overwrite`), holds one of another task or configuration or a
-            damaged one, or another trainer is writing to it. Several processes cannot share the
-            batch evenly, or lose each other.
+        NPAError: There is no such device; the folder cannot be written to, has a run already
+            (without `resume` or `overwrite`), one of another task or configuration or a damaged
+            one, or another trainer writes to it. The batch is not divisible by the number of
+            processes, or a process is lost.
     """
 
     def __init__(
@@ -96,7 +97,7 @@ class Trainer:
         self.task = task
         self.config = config
         self.task_name = task_name
-        self._share = 0.0
+        self._schedule_share = 0.0
         self.folder = RunFolder(config.out)
         self._log = JsonlLog(self.folder.log)
         self._record: dict[str, Any] = {}
@@ -109,16 +110,16 @@ class Trainer:
         def check(content: dict[str, Any], path: Path) -> None:
             check_same_run(content, task_name, config, path)
 
-        self._kept = Run(self.folder, ranks, check, resume=resume, overwrite=overwrite)
-        content, self._kept.content = self._kept.content, None
+        self._run = Run(self.folder, ranks, check, resume=resume, overwrite=overwrite)
+        content, self._run.content = self._run.content, None
         device = check_device(config.device)
-        # While the host waits for the numbers, a GPU would have nothing to do; a CPU has done all.
-        self._log_late = device.type == "cuda"
+        # On CUDA a record is finished an iteration later, so that the device does not idle.
+        self._defer_records = device.type == "cuda"
         schedule = torch.Generator().manual_seed(config.seed)
-        held = None if content is None else content["rule_hyper_parameters"]
-        self.rule = self._make_rule(schedule, held).to(device, config.torch_dtype)
-        # A run that several processes have begun goes on as it was, if only one is left.
-        by_world = ranks.together or (content is not None and drawn_by_world(content))
+        saved = None if content is None else content["rule_hyper_parameters"]
+        self.rule = self._make_rule(schedule, saved).to(device, config.torch_dtype)
+        # A run of several processes keeps its streams by world when one process resumes it.
+        by_world = ranks.together or (content or {}).get("random_states", {}).keys() == {"schedule"}
         self._cycle = TrainingCycle(
             task, self.rule, config, device, schedule, rollout, ranks=ranks, by_world=by_world
         )
@@ -127,7 +128,7 @@ class Trainer:
             rule_bytes = sum(p.nbytes for p in self.rule.parameters())
             pool_bytes = self.pool.worlds.x.nbytes + self.pool.worlds.s.nbytes
             self.folder.prepare(ranks.count * pool_bytes + 16 * rule_bytes)
-        with self._kept.held(begin=True):
+        with self._run.held(begin=True):
             if content is not None:
                 self._restore(content)
             if ranks.first:
@@ -137,18 +138,17 @@ class Trainer:
                         "holds a log without its checkpoint: choose another folder (--out), or "
                         "overwrite it (--overwrite)"
                     )
-                # Before the first checkpoint, which cannot be resumed without it.
+                # Before the first checkpoint, whose resumption needs it.
                 text = json.dumps(config_to_dict(config), indent=2)
                 write_text(self.folder.config, text + "\n")
             if content is None:
-                # From the start, so that a run killed early can be resumed, and a disk that is too
-                # full is noticed now.
+                # Now, so that a run that is killed early can be resumed and a full disk is noticed.
                 self.save()
 
     @property
     def iteration(self) -> int:
         """Iterations done."""
-        return self._kept.iteration
+        return self._run.iteration
 
     def run(self, *, progress: bool = True, max_seconds: float | None = None) -> TrainResult:
         """Train until the end, or until Ctrl-C, SIGTERM or `max_seconds`; then save.
@@ -163,7 +163,7 @@ class Trainer:
                 was made.
         """
         check_seconds(max_seconds)
-        with self._kept.held():
+        with self._run.held():
             return self._train(progress, max_seconds)
 
     def _train(self, progress: bool, max_seconds: float | None) -> TrainResult:
@@ -179,7 +179,7 @@ class Trainer:
 
         def step() -> None:
             self.iterate()
-            # Of the iteration before: meanwhile the device has this one to do.
+            # Of the iteration before: the device runs this one meanwhile.
             self._finish_record()
             if self._due(config.log_interval) or self.iteration == total:
                 self._begin_record()
@@ -193,21 +193,21 @@ class Trainer:
                 bar.set_postfix(loss=f"{self._record['loss']:.4g}", refresh=False)
 
         try:
-            interrupted = self._kept.go(
+            interrupted = self._run.go(
                 step,
                 over=lambda: self.iteration >= total,
                 late=lambda: time.perf_counter() - start >= seconds,
                 end=lambda _: self.save(),
             )
         finally:
-            # What happens until the next `run` is no time of training.
+            # Time until the next `run` does not count.
             self._seconds_before, self._started = self._seconds(), None
             bar.close()
             if self._board is not None:
                 self._board.close()
                 self._board = None
         return TrainResult(
-            rule=self.kept_rule,
+            rule=self.saved_rule,
             iteration=self.iteration,
             finished=self.iteration >= total,
             interrupted=interrupted,
@@ -216,31 +216,31 @@ class Trainer:
         )
 
     def iterate(self, share: float = 0.0) -> None:
-        """Train for one iteration, and neither wait for the device nor write anything.
+        """Train for one iteration, without synchronising and without writing files.
 
         Args:
-            share: How much of the schedule "cosine" is over, in [0, 1], where the iterations say
-                less. `elapsed / seconds` makes it fall with the time, where nobody knows how many
-                iterations fit; such a run is not repeatable.
+            share: The least fraction of the schedule "cosine" that is over, in [0, 1].
+                `elapsed / seconds` ties the learning rate to a time limit; such a run is not
+                repeatable.
 
         Raises:
-            NPAError: The share is none.
+            NPAError: The share is not in [0, 1].
         """
         if not 0.0 <= share <= 1.0:
             raise NPAError(
                 f"share must lie in [0, 1], got {shown(share)}: min(1, elapsed / seconds)"
             )
         self._cycle.run(self.iteration, share)
-        self._share = share
-        self._kept.iteration += 1
+        self._schedule_share = share
+        self._run.iteration += 1
 
     @property
-    def kept_rule(self) -> NPARule:
-        """The rule as a run keeps it."""
+    def saved_rule(self) -> NPARule:
+        """The rule as it is saved: with the encoder's current codes in its table."""
         rule = self.rule
         codes = getattr(rule, "codes", None)
         if codes is not None and codes.encoder is not None:
-            # The table has what the encoder said in the last iteration, before its last step.
+            # The table has the codes of the last iteration, before the optimiser's step.
             rule = copy.deepcopy(rule)
             self.task.for_rule(rule)
         return rule
@@ -249,9 +249,9 @@ class Trainer:
         """Write the checkpoint and the rule.
 
         Raises:
-            DivergedError: The loss was not finite in an iteration before; nothing is written.
-            NPAError: A file cannot be written, or several processes do not agree on the parameters;
-                the last checkpoint is intact.
+            DivergedError: The loss of an earlier iteration was not finite; nothing is written.
+            NPAError: A file cannot be written, or parameters differ between processes; the last
+                checkpoint is intact.
         """
         self._finish_record()
         self._stop_if_diverged()
@@ -260,12 +260,12 @@ class Trainer:
         content |= {"rule": self.rule.state_dict(), **self._cycle.state_dict()}
         if not self._ranks.first:
             return
-        self._kept.keep(self._origin() | content)
-        # A rule is passed on: where and on what it was trained is nobody's business.
+        self._run.keep(self._origin() | content)
+        # Rule files are shared with others: paths and device are left out.
         config = config_to_dict(self.config)
         for private in ("out", "device", "initial_rule"):
             del config[private]
-        self._save_rule(self.kept_rule, config)
+        self._save_rule(self.saved_rule, config)
 
     def _save_rule(self, rule: NPARule, config: dict[str, Any]) -> None:
         metadata = {"task": self.task_name, "config": json.dumps(config)}
@@ -279,10 +279,10 @@ class Trainer:
             "rule_hyper_parameters": dict(self.rule.hyper_parameters()),
         }
 
-    def _make_rule(self, generator: torch.Generator, held: dict[str, Any] | None) -> NPARule:
-        """Return the rule to begin with, or one of the shape that a checkpoint holds."""
+    def _make_rule(self, generator: torch.Generator, saved: dict[str, Any] | None) -> NPARule:
+        """Return the initial rule, or one with the hyper-parameters of a checkpoint."""
         made = self.task.make_rule(generator)
-        return initial_rule(self.config, made) if held is None else rule_like(held)
+        return initial_rule(self.config, made) if saved is None else rule_like(saved)
 
     def _due(self, interval: int) -> bool:
         return interval > 0 and self.iteration % interval == 0
@@ -292,13 +292,13 @@ class Trainer:
         return self._seconds_before + running
 
     def _begin_record(self) -> None:
-        """Ask the device for what the log is to say of the interval that ends here."""
+        """Begin the log record of the interval that ends with this iteration."""
         self._cycle.meter.send()
         self._record_begun = {
             "iteration": self.iteration,
-            "learning_rate": self.config.learning_rate_at(self.iteration - 1, self._share),
+            "learning_rate": self.config.learning_rate_at(self.iteration - 1, self._schedule_share),
         }
-        if not self._log_late:
+        if not self._defer_records:
             self._finish_record()
 
     def _finish_record(self) -> None:
@@ -328,7 +328,7 @@ class Trainer:
         with torch.no_grad():
             end = self._cycle.batch.end
             picture = self._cycle.task.picture(end.x, end.s)
-        # Worlds that have goals of their own have no picture in common.
+        # Worlds with different goals have no common target picture.
         target = getattr(self.task, "target_picture", None) if end.goal is None else None
         if target is not None:
             picture = torch.cat((target[None].to(picture), picture))
@@ -355,11 +355,11 @@ class Trainer:
 
     def _restore(self, content: dict[str, Any]) -> None:
         path = self.folder.checkpoint
-        self._kept.iteration = content["iteration"]
+        self._run.iteration = content["iteration"]
         expected = {"rule": self.rule.state_dict(), **self._cycle.state_like(self.iteration)}
         read = dict(content)
         if self._ranks.together:
-            # The generators of a process alone are not read.
+            # The generators of a run of one process are not read.
             states = content["random_states"]
             read["random_states"] = {name: states.get(name) for name in expected["random_states"]}
         check_content(read, expected, path)
@@ -368,7 +368,7 @@ class Trainer:
         try:
             self._cycle.load_state_dict(content, self.iteration)
         except RuntimeError as error:
-            # Only a generator itself knows whether a state is one of its own.
+            # Only a generator can check its state.
             raise unusable_checkpoint(path, f"random_states cannot be used ({error})") from error
         if self._ranks.first:
             self._log.truncate(self.iteration)
@@ -385,29 +385,30 @@ def check_seconds(max_seconds: object) -> None:
         )
 
 
-def rule_like(held: dict[str, Any]) -> NPARule:
-    """Return a rule of the shape in a checkpoint, on the CPU, with random weights."""
+def rule_like(saved: dict[str, Any]) -> NPARule:
+    """Return a rule with a checkpoint's hyper-parameters, on the CPU, with random weights."""
     try:
-        return untrained_rule(torch.Generator(), **held)
+        return untrained_rule(torch.Generator(), **saved)
     except (TypeError, RuntimeError, OverflowError) as error:
         raise NPAError(
-            f"no rule has the hyper-parameters {shown(held)} of the checkpoint: it is damaged, or "
+            f"no rule has the hyper-parameters {shown(saved)} of the checkpoint: it is damaged, or "
             "of another version"
         ) from error
 
 
 def take_options(rule: NPARule, config: TrainConfig[Any]) -> None:
-    """Give an untrained rule what the configuration says of its perception and its updates."""
+    """Set an untrained rule's `moment_inverse` and `dead_zone` from the configuration."""
     rule.moment_inverse = config.moment_inverse
     rule.dead_zone = 0.0 if rule.equivariant else config.dead_zone
 
 
 def initial_rule(config: TrainConfig[Any], untrained: NPARule) -> NPARule:
-    """Return the rule that a run starts from, of the shape of the task's untrained one.
+    """Return the rule that a run starts from, with the hyper-parameters of the task's untrained
+    one.
 
-    Where particles divide, it may be one whose particles did not; a rule with codes may start from
-    one without. An equivariant rule has no dead zone, and starts from random weights where the
-    configuration names a first rule, which knows directions, as presets do.
+    A rule without division or codes may initialise one with them. An equivariant rule has no dead
+    zone, and starts from random weights where the configuration names one of `preset_rules`, which
+    are not equivariant.
     """
     take_options(untrained, config)
     if not config.initial_rule or (untrained.equivariant and config.initial_rule in preset_rules()):
@@ -447,11 +448,11 @@ def initial_rule(config: TrainConfig[Any], untrained: NPARule) -> NPARule:
 
 
 JOINT_TASK_NAME = "co_morphogenesis2d"
-"""What checkpoints call the task of several rules in one world."""
+"""Name of the task of several rules in checkpoints."""
 
 
 class JointRules(nn.Module):
-    """The rules of one world, one for each species: what the trainer takes for its rule."""
+    """The rules of one world, one for each species, as a module that the trainer trains."""
 
     def __init__(self, rules: Sequence[NPARule]) -> None:
         super().__init__()
@@ -461,12 +462,12 @@ class JointRules(nn.Module):
         return iter(self.rules)
 
     def hyper_parameters(self) -> dict[str, Any]:
-        """Return all that the rules are made with, for checkpoints."""
+        """Return the hyper-parameters of all rules, for checkpoints."""
         return {"rules": [dict(rule.hyper_parameters()) for rule in self]}
 
 
 class _JointTrainer(Trainer):
-    """`Trainer` of several rules, each of which leaves a file as if it had been trained alone."""
+    """`Trainer` of several rules, each of which is saved in its own file."""
 
     def __init__(
         self,
@@ -477,9 +478,9 @@ class _JointTrainer(Trainer):
         resume: bool,
         overwrite: bool,
     ) -> None:
-        begin_with: tuple[str, ...] = getattr(config, "initial_rules", ())
-        if rules is None and begin_with and not resume:
-            rules = [load_rule(source) for source in begin_with]
+        sources: tuple[str, ...] = getattr(config, "initial_rules", ())
+        if rules is None and sources and not resume:
+            rules = [load_rule(source) for source in sources]
         self._given, counts = rules, task.config.counts
 
         def rollout(
@@ -499,13 +500,13 @@ class _JointTrainer(Trainer):
             rollout=rollout,
         )
 
-    def _make_rule(self, generator: torch.Generator, held: dict[str, Any] | None) -> NPARule:
-        # The trainer asks of its rule what any module has, and for its hyper-parameters.
+    def _make_rule(self, generator: torch.Generator, saved: dict[str, Any] | None) -> NPARule:
+        # The trainer uses its rule only as a module with hyper-parameters.
         made = cast(CoMorphogenesis2D, self.task).make_rules(generator)
         for rule in made:
             take_options(rule, self.config)
-        if held is not None:
-            self._given = [rule_like(own) for own in held["rules"]]
+        if saved is not None:
+            self._given = [rule_like(own) for own in saved.get("rules", ())]
         frozen: tuple[int, ...] = getattr(self.config, "frozen", ())
         if self._given is None:
             if frozen:
@@ -558,21 +559,21 @@ def train_together(
     max_seconds: float | None = None,
     begun: Callable[[], None] = lambda: None,
 ) -> TrainResult:
-    """Train one rule for each species of a world that all of them share.
+    """Train one rule for each species of a common world.
 
-    Each rule sees densities divided by its own particles, as it would alone. A rule whose
-    parameters do not require gradients stays as it is: the others learn to live with it.
+    Each rule perceives densities divided by the number of its own particles, as it would alone. A
+    rule whose parameters do not require gradients does not change.
 
     Args:
         config: The run's configuration, for example `preset("fast", "co_morphogenesis2d")` or
             `TrainConfig(task=CoMorphogenesis2DConfig())`.
-        rules: What to start from, one rule for each species; copied. None: the configuration's
+        rules: Initial rules, one for each species; copied. None: the configuration's
             `initial_rules`, or untrained ones.
-        resume: Go on from the checkpoint in `config.out`; give the same `rules` again.
-        overwrite: As `progress`, `max_seconds` and `begun`, those of `train`.
+        resume: Continue from the checkpoint in `config.out`; give the same `rules` again.
+        overwrite: As of `train`, like `progress`, `max_seconds` and `begun`.
 
     Returns:
-        What the run came to; its `rule` holds the rules, in the order of the species. Their files
+        The result; its `rule` is a `JointRules`, in the order of the species. Their files
         are `rule-0.safetensors`, `rule-1.safetensors`, ... in `config.out`.
 
     Raises:

@@ -148,9 +148,9 @@ class EnvironmentWorld(LiveWorld):
         return WorldView(self.step, x[0].cpu().numpy(), colours, self._milliseconds, loss)
 
     def _own_colours(self, s: Tensor) -> Tensor:
-        goal = getattr(self._inner.task, "goal", None)
-        if getattr(goal, "classifies", False):
-            return cast(Task, goal).colours(s)
+        task = getattr(self._inner.task, "task", None)
+        if getattr(task, "classifies", False):
+            return cast(Task, task).colours(s)
         return s[..., -3:] + COLOUR_OFFSET
 
     def _damage(self, name: str) -> None:

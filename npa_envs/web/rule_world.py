@@ -26,7 +26,7 @@ from npa_envs.tasks.seeds import uniform_ball
 from npa_envs.tasks.train_config import TrainConfig
 from npa_envs.training.presets import load_config, preset
 from npa_envs.training.run import LARGEST_LOG, RunFolder
-from npa_envs.training.trained_tasks import TrainedTask, task_of_rule, trained_config
+from npa_envs.training.task_of_rule import TrainedTask, task_of_rule, trained_config
 from npa_envs.web.live import (
     ColouredWorld,
     Colouring,
@@ -137,9 +137,8 @@ class RuleWorld(LiveWorld):
         """Start a fresh world of the chosen rule alone."""
         self.seed = self.seed + 1 if seed is None else seed
         self._generator = torch.Generator(self._device).manual_seed(self.seed)
-        self.x, self.s, self._goal = self.task.seed(
-            1, generator=self._generator, device=self._device
-        )
+        seeds = self.task.seed(1, generator=self._generator, device=self._device)
+        self.x, self.s, self._goal = seeds.x, seeds.s, seeds.goal
         self.full = self.x.shape[1]
         self.live_rules = [replace(self.main, count=self.full, divisor=float(self.full))]
         self._colouring = Colouring()
@@ -518,7 +517,7 @@ class RunWorld(RuleWorld):
         worlds = []
         for own, centre in zip(self.live_rules, self._centres, strict=True):
             task = self._task_of(own, self._each).task
-            x, s, _ = task.seed(1, generator=self._generator, device=self._device)
+            x, s, *_ = task.seed(1, generator=self._generator, device=self._device)
             x[..., 0] += centre
             worlds.append((x, s))
             # As in training, each species divides densities by its own number of particles.

@@ -230,7 +230,7 @@ def test_painting_ends_in_the_targets_mean_colour():
     for _ in range(24):
         observation, *_ = env.step(policy(observation))
     x, s = env.unwrapped.particles()
-    mean = env.unwrapped.task.goal.target.colours.mean(dim=0) - COLOUR_OFFSET
+    mean = env.unwrapped.task.task.target.colours.mean(dim=0) - COLOUR_OFFSET
     torch.testing.assert_close(s[:, -3:], mean.expand(256, 3), atol=1e-5, rtol=0.0)
     assert not s[:, :-3].any()
     assert x.norm(dim=1).mean() > 1.5 * before

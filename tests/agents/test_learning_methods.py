@@ -129,7 +129,7 @@ def test_what_is_differentiated_is_the_environments_own_episode(problem):
 def test_repeated_rollouts_stay_clamped_where_they_are_recorded(cuda_graph, device):
     problem = heart(state_scale=0.1)
     rules, task = wild_rules(problem).to(device), EnvironmentTask(problem, device)
-    x, s, _ = task.seed(2, generator=torch.Generator(device).manual_seed(0), device=device)
+    x, s, *_ = task.seed(2, generator=torch.Generator(device).manual_seed(0), device=device)
     found = []
     for _ in range(4):
         _, after, _ = task.rollout(

@@ -23,7 +23,7 @@ from npa_envs.cli import main
 from npa_envs.errors import MissingDependencyError
 from npa_envs.rule.files import rule_metadata, save_rule
 from npa_envs.tasks.seeds import uniform_ball
-from npa_envs.training.trained_tasks import task_of_rule
+from npa_envs.training.task_of_rule import task_of_rule
 from npa_envs.world.randomness import WorldRandom
 
 CPU = torch.device("cpu")

@@ -15,7 +15,7 @@ from npa_envs.errors import MissingDependencyError
 from npa_envs.measure.quality import evaluate
 from npa_envs.rule.files import load_rule
 from npa_envs.training import TASKS
-from npa_envs.training.trained_tasks import task_of_rule
+from npa_envs.training.task_of_rule import task_of_rule
 
 SOLID = {"turntable.gif", "points.ply", "gaussians.ply", "cloud.splat"}
 

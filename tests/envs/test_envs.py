@@ -298,7 +298,7 @@ def test_regeneration_starts_grown_and_damaged():
     assert 10 < int(wiped.sum()) < 400
     assert float((x.amax(0) - x.amin(0)).max()) > 1.0
     random = npa_envs.WorldRandom([0]).substream(StreamId.GROWTH)
-    start_x, start_s, _ = env.task.goal.seed(1, generator=random)
+    start_x, start_s, *_ = env.task.task.seed(1, generator=random)
     growth = random.substream(StreamId.GROWTH)
     with torch.no_grad():
         expected = npa_envs.rollout(grown, start_x, start_s, 48, generator=growth)
@@ -406,7 +406,7 @@ def test_rows_end_with_the_picture_that_is_asked_for(device):
     assert wide.shape[-1] == rows.shape[-1] + TOLD
     assert_same(wide[..., :-TOLD], rows)
     task = told.unwrapped.task
-    pictures = task.goal.toward(torch.arange(2, device=device)).target_picture.cpu().numpy()
+    pictures = task.task.toward(torch.arange(2, device=device)).target_picture.cpu().numpy()
     for k, number in enumerate(infos["target"]):
         context_info = wide[k, :, -TOLD:].reshape(-1, 4, 4, 4)
         assert (context_info == context_info[0]).all()

@@ -76,7 +76,7 @@ def test_brushes_stand_on_the_grid_and_what_they_do_adds_up():
 
 def test_what_lacks_is_seen_where_it_lacks():
     env = begun(make(GARDENER, particle_count=256, eps=0.1, resolution=32))
-    task, target = env.unwrapped.task, env.unwrapped.task.goal.target
+    task, target = env.unwrapped.task, env.unwrapped.task.task.target
     whole = torch.cat((torch.zeros(256, 13), target.colours - 0.5), dim=1)
     seen = env.unwrapped.place_particles(target.points, whole)
     assert np.abs(seen).max() < 1e-3
@@ -383,7 +383,7 @@ def test_a_step_is_paid_by_the_goal_that_was_seen_before_it(coded):
 
 def test_a_goal_itself_earns_one_and_an_empty_picture_nothing(coded):
     task = make(SHAPESHIFTER, **coded, resolution=32).unwrapped.task
-    single = task.goal.toward(torch.tensor([1]))
+    single = task.task.toward(torch.tensor([1]))
     context = torch.tensor([[1.0]])
     no_loss, blank = torch.zeros(1), task.blank_losses[1:2]
     x = s = torch.zeros(1, 1, 1)
@@ -398,7 +398,7 @@ def test_the_goals_picture_is_seen_beside_the_worlds(coded):
     seen, info = env.reset(seed=2)
     assert seen.shape == (128,)
     task = env.unwrapped.task
-    target = task.goal.toward(torch.tensor([info["goal"]])).target_picture[0]
+    target = task.task.toward(torch.tensor([info["goal"]])).target_picture[0]
     coarse = target.view(4, 4, 4, 4, 4).mean(dim=(1, 3)).permute(2, 0, 1)
     assert seen[64:] == pytest.approx(coarse.flatten().numpy(), abs=1e-6)
 

@@ -18,7 +18,7 @@ import scenes
 import torch
 
 import npa_envs
-from npa_envs.training.trained_tasks import task_of_rule
+from npa_envs.training.task_of_rule import task_of_rule
 
 FOLDER = Path(__file__).resolve().parent
 
@@ -57,7 +57,7 @@ def grow(name):
     used = {"eps": task.eps, "box": task.box}
     assert used == scenes.RULES[name], f"{name} is run with {used}"
     generator = torch.Generator().manual_seed(SEEDS[name])
-    x, s, _ = task.seed(2, generator=generator, device=torch.device("cpu"))
+    x, s, *_ = task.seed(2, generator=generator, device=torch.device("cpu"))
     with torch.no_grad():
         x, s = npa_envs.rollout(rule, x, s, STEPS[name], generator=generator, **used)
     return {f"world/{name}/x": x.numpy(), f"world/{name}/s": s.numpy()}

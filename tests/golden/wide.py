@@ -28,7 +28,7 @@ from npa_envs.agents import learning
 from npa_envs.cli import main as npa_envs_command
 from npa_envs.envs import gardeners_v0, multispecies_v0, particles_v0
 from npa_envs.tasks.damage import damage_worlds
-from npa_envs.training.trained_tasks import task_of_rule
+from npa_envs.training.task_of_rule import task_of_rule
 from npa_envs.world import brushes
 
 SMALL = {"particle_count": 61, "eps": 0.3, "resolution": 16, "render_size": 24}
@@ -79,7 +79,7 @@ def of_rule(name):
     rule = load_rule(name)
     task = task_of_rule(name, rule, torch.device("cpu"), particle_count=160).task
     run = functools.partial(rollout, rule, eps=task.eps, box=task.box)
-    x, s, goal = task.seed(2, generator=WorldRandom([3, 4]), device=torch.device("cpu"))
+    x, s, _, goal = task.seed(2, generator=WorldRandom([3, 4]), device=torch.device("cpu"))
     task = task.toward(goal)
     with torch.no_grad():
         x, s = run(x, s, 16, generator=WorldRandom([5, 6]))

@@ -104,7 +104,7 @@ def test_still_rules_leave_their_seeds_and_the_metric_is_the_tasks():
     assert found.change == 1.0
     assert found.displacement == 0.0
     task = task_of(COUNT // 2)
-    x, s, _ = task.seed(3, generator=WorldRandom([1, 2, 3]))
+    x, s, *_ = task.seed(3, generator=WorldRandom([1, 2, 3]))
     assert found.alone == pytest.approx(task.metric(x, s).mean().item(), rel=1e-6)
     # A rule beside itself has seeds of its own: else every particle would see both alike.
     rows, _ = interaction.Encounters(settings(), device=CPU).meet(still[0], still[0])

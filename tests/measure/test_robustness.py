@@ -26,7 +26,7 @@ from npa_envs.measure.robustness.trials import (
 )
 from npa_envs.rule import files
 from npa_envs.tasks.damage import random_particle
-from npa_envs.training.trained_tasks import task_of_rule, trained_config
+from npa_envs.training.task_of_rule import task_of_rule, trained_config
 from npa_envs.world.brushes import nearest_image
 from npa_envs.world.randomness import WorldRandom
 

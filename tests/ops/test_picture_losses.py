@@ -25,7 +25,7 @@ def task_of(particle_count, resolution, device):
 def worlds(request, dtype, device):
     task = task_of(*request.param, device)
     random = WorldRandom(range(5), device=device)
-    x, s, _ = task.seed(5, generator=random, device=device)
+    x, s, *_ = task.seed(5, generator=random, device=device)
     x = 3.0 * x + 0.2 * random.normal(*x.shape[1:])
     s = s + 0.3 * random.normal(*s.shape[1:])
     return task, x.to(dtype), s.to(dtype)

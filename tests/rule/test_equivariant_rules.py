@@ -334,7 +334,7 @@ def test_wrong_stacks_and_state_dicts_are_refused(tmp_path):
     stack, path = stack_of([authors_rule(0), authors_rule(1)]), tmp_path / "models.json"
     stack["w2.bias"] = ones(1, 8)
     path.write_text(json.dumps(stack), encoding="utf-8")
-    with pytest.raises(npa_envs.NPAError, match=r"w2\.bias must be of as many rules as w1\.weight"):
+    with pytest.raises(npa_envs.NPAError, match=r"w2\.bias must have as many rules as w1\.weight"):
         npa_envs.load_rule(f"{path}#1")
     state = authors_rule()
     del state["model.W_out"]

@@ -62,7 +62,7 @@ def test_read_out_is_trained_and_saved_with_its_rule(tmp_path):
     before, result = train(tmp_path)
     for name, parameter in result.rule.readout.named_parameters():
         assert not torch.equal(parameter, before.readout.get_parameter(name)), name
-    x, s, _ = ReadOutTask().seed(4, generator=torch.Generator(), device=torch.device("cpu"))
+    x, s, *_ = ReadOutTask().seed(4, generator=torch.Generator(), device=torch.device("cpu"))
     saved = load_rule(tmp_path / "rule.safetensors")
     errors = [ReadOutTask().for_rule(rule).metric(x, s).mean() for rule in (before, saved)]
     # Measured: 0.26 and 0.003.
@@ -79,7 +79,7 @@ def test_divergence_is_looked_for_with_the_rule_as_it_was(tmp_path):
         train(tmp_path, Broken(), iterations=6, milestones=[4])
     rule = ReadOutTask().make_rule(torch.Generator().manual_seed(0))
     good = torch.nn.utils.parameters_to_vector(rule.parameters()).detach()
-    x, s, _ = ReadOutTask().seed(3, generator=torch.Generator(), device=torch.device("cpu"))
+    x, s, *_ = ReadOutTask().seed(3, generator=torch.Generator(), device=torch.device("cpu"))
     snapshot = {"x": x, "s": s, "parameters": good}
     assert bad_worlds(ReadOutTask(), rule, snapshot) == []
     snapshot["parameters"] = good * torch.nan

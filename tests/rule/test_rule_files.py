@@ -112,7 +112,7 @@ def test_a_network_that_files_do_not_hold_is_refused_and_nothing_is_lost(tmp_pat
     normed = NPARule(2, 4, 8)
     torch.nn.utils.parametrizations.weight_norm(normed.hidden)
     for rule in (Threefold(2, 4, 8), normed):
-        with pytest.raises(NPAError, match="rule must have the network that NPARule makes"):
+        with pytest.raises(NPAError, match="rule must have the network of NPARule"):
             save_rule(rule, path)
     assert path.read_bytes() == before
 
@@ -148,7 +148,7 @@ ALTERED = {
 def test_a_network_that_would_be_loaded_as_another_is_refused(tmp_path, kind, equivariant):
     rule = NPARule(2, 4, 8, readout_dim=3, readout_hidden_dim=5, equivariant=equivariant)
     ALTERED[kind](rule)
-    with pytest.raises(NPAError, match=r"network that NPARule makes.*remove its hooks, or keep"):
+    with pytest.raises(NPAError, match=r"network of NPARule.*remove its hooks, or keep"):
         save_rule(rule, tmp_path / "rule.safetensors")
     assert list(tmp_path.iterdir()) == []
 

@@ -10,7 +10,7 @@ from npa_envs.cli import main
 from npa_envs.errors import NPAError
 from npa_envs.measure.quality import accuracies, evaluate, score_line, scores
 from npa_envs.rule.files import rule_metadata, shipped_rules
-from npa_envs.training.trained_tasks import task_of_rule
+from npa_envs.training.task_of_rule import task_of_rule
 
 UNSEEN = range(1_000_000, 1_000_001)
 RULES = shipped_rules()

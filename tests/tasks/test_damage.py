@@ -12,6 +12,7 @@ from npa_envs.tasks.damage import FARTHEST, NEAREST, SHARE, PoolDamage, damage_p
 from npa_envs.tasks.morphogenesis2d import Morphogenesis2D, Morphogenesis2DConfig
 from npa_envs.tasks.seeds import uniform_ball
 from npa_envs.world import brushes
+from npa_envs.world.particles import Particles
 from npa_envs.world.randomness import WorldRandom
 
 B, N, C = 3, 257, 5
@@ -114,7 +115,9 @@ def changed(before, after):
 @pytest.mark.parametrize("space_dim", [2, 3])
 def test_a_ball_of_states_is_wiped_in_every_world(space_dim):
     x, s = worlds(40, space_dim)
-    found, states = damage_pool(x, s, PoolDamage(damage_radius=0.3), generator=seeded(2))
+    found, states, *_ = damage_pool(
+        Particles(x, s), PoolDamage(damage_radius=0.3), generator=seeded(2)
+    )
     assert found is x
     for places, blank in zip(x, (states == 0.0).all(dim=-1), strict=True):
         assert 0 < int(blank.sum()) < 150
@@ -131,7 +134,7 @@ def test_a_ball_of_states_is_wiped_in_every_world(space_dim):
 @pytest.mark.parametrize("space_dim", [2, 3])
 def test_as_many_worlds_are_hit_as_asked_for(fields, share, space_dim):
     x, s = worlds(400, space_dim, 60)
-    found, states = damage_pool(x, s, PoolDamage(**fields), generator=seeded(2))
+    found, states, *_ = damage_pool(Particles(x, s), PoolDamage(**fields), generator=seeded(2))
     # Five standard deviations of a share of 400 worlds; some are hit where nobody is.
     assert share - 0.13 < float(changed(x, found).float().mean()) < share + 0.11
     assert torch.equal(states, s)
@@ -139,7 +142,7 @@ def test_as_many_worlds_are_hit_as_asked_for(fields, share, space_dim):
 
 def test_a_clump_is_one_point():
     x, s = worlds(40)
-    found, _ = damage_pool(x, s, PoolDamage(clump_radius=0.3), generator=seeded(2))
+    found, *_ = damage_pool(Particles(x, s), PoolDamage(clump_radius=0.3), generator=seeded(2))
     hit = changed(x, found)
     assert hit.any()
     for before, after in zip(x[hit], found[hit], strict=True):
@@ -174,17 +177,17 @@ def test_each_world_suffers_what_it_would_suffer_alone(device):
         damage_radius=0.1, clump_radius=0.3, cut_gap=0.2, flake_radius=0.3, escape_share=0.05
     )
     x, s = (tensor.to(device) for tensor in worlds(6))
-    together = damage_pool(x, s, every, generator=WorldRandom(range(6), device=device))
+    together = damage_pool(Particles(x, s), every, generator=WorldRandom(range(6), device=device))
     for k in range(6):
         random = WorldRandom([k], device=device)
-        alone = damage_pool(x[k : k + 1], s[k : k + 1], every, generator=random)
+        alone = damage_pool(Particles(x[k : k + 1], s[k : k + 1]), every, generator=random)
         torch.testing.assert_close(alone[0], together[0][k : k + 1], rtol=0.0, atol=2e-7)
         assert torch.equal(alone[1], together[1][k : k + 1])
 
 
 def test_nothing_is_done_unless_asked_for():
     x, s = worlds(3)
-    found = damage_pool(x, s, PoolDamage(), generator=torch.Generator())
+    found = damage_pool(Particles(x, s), PoolDamage(), generator=torch.Generator())
     assert found[0] is x
     assert found[1] is s
     assert Morphogenesis2DConfig().clump_radius == Morphogenesis2DConfig().flake_radius == 0.0
@@ -227,8 +230,8 @@ def test_only_the_paths_of_those_outside_count():
 def test_a_share_throws_particles_of_the_pool_out_and_a_weight_counts_their_paths():
     task = Morphogenesis2D(SMALL)
     generator = torch.Generator().manual_seed(1)
-    x, s, _ = task.seed(2, generator=generator)
-    hurt_x, *_ = task.damage(x, s, None, generator)
+    x, s, *_ = task.seed(2, generator=generator)
+    hurt_x, *_ = task.damage(Particles(x, s), generator)
     out = hurt_x.norm(dim=-1) > 1.0
     assert 0 < int(out.sum()) < 60
     path = torch.ones(2, 96)
@@ -241,7 +244,7 @@ def test_a_share_throws_particles_of_the_pool_out_and_a_weight_counts_their_path
 
 def test_the_distance_of_the_centroid_from_where_worlds_begin_is_paid_for():
     task = Morphogenesis2D(replace(SMALL, drift_weight=2.0), device="cpu")
-    x, s, _ = task.seed(1, generator=torch.Generator().manual_seed(0), device=torch.device("cpu"))
+    x, s, *_ = task.seed(1, generator=torch.Generator().manual_seed(0), device=torch.device("cpu"))
     moved = (x + torch.tensor([0.3, -0.4])).requires_grad_()
     still = x.new_zeros(x.shape[:2])
     near, there = task.loss(x - x.mean(1, keepdim=True), s, still), task.loss(moved, s, still)

@@ -28,7 +28,7 @@ def half_alive(task, seed=0):
 
 
 def test_seeds_are_one_living_particle():
-    x, s, _ = make_task().seed(3, generator=torch.Generator().manual_seed(0))
+    x, s, *_ = make_task().seed(3, generator=torch.Generator().manual_seed(0))
     assert x.shape == (3, 64, 2)
     assert living(s).sum(dim=1).tolist() == [1, 1, 1]
     assert s.sum() == 3.0
@@ -62,16 +62,16 @@ def test_pictures_change_with_life_as_if_particles_were_taken_away():
 def test_damage_takes_about_half_of_the_particles_and_never_the_last():
     task, none = make_task(damage_radius=0.1), make_task(damage_radius=0.0)
     x, s = (value.repeat(50, 1, 1) for value in half_alive(task))
-    after = task.damage(x, s, None, torch.Generator().manual_seed(0))[1]
+    after = task.damage(Particles(x, s), torch.Generator().manual_seed(0))[1]
     gone = living(s) & ~living(after)
     # Of 3200, with a standard deviation of 28; wherever they are.
     assert abs(int(gone.sum()) - 1600) < 120
     assert 20 < int(gone[:, :32].sum(dim=0).min()) < int(gone[:, :32].sum(dim=0).max()) < 80
     assert torch.equal(after[~gone], s[~gone])
     assert not after[gone].any()
-    assert torch.equal(none.damage(x, s, None, torch.Generator().manual_seed(0))[1], s)
+    assert torch.equal(none.damage(Particles(x, s), torch.Generator().manual_seed(0))[1], s)
     s[:, 1:] = 0.0
-    assert torch.equal(task.damage(x, s, None, torch.Generator().manual_seed(0))[1], s)
+    assert torch.equal(task.damage(Particles(x, s), torch.Generator().manual_seed(0))[1], s)
 
 
 def trained(tmp_path, iterations=4, **fields):
@@ -107,7 +107,7 @@ def test_births_are_no_unrest(tmp_path):
     task = Morphogenesis2D(config.task)
     rule = task.make_rule(torch.Generator().manual_seed(0))
     torch.nn.init.zeros_(rule.output.weight)
-    x, s, _ = task.seed(1, generator=torch.Generator().manual_seed(0))
+    x, s, *_ = task.seed(1, generator=torch.Generator().manual_seed(0))
     s[:, 0, LIFE + 1 :] = 0.5
     batch = EagerIteration(
         task, rule, config, Particles(x, s), torch.Generator().manual_seed(0), npa_envs.rollout

@@ -49,8 +49,8 @@ def task_of(name, config, device="cpu"):
 def test_a_world_is_seeded_and_measured_alone_as_in_a_batch(tiny, name):
     task = task_of(name, tiny(name))
     cpu = torch.device("cpu")
-    x, s, goal = task.seed(3, generator=WorldRandom([5, 6, 7]), device=cpu)
-    alone, _, _ = task.seed(1, generator=WorldRandom([6]), device=cpu)
+    x, s, _, goal = task.seed(3, generator=WorldRandom([5, 6, 7]), device=cpu)
+    alone, *_ = task.seed(1, generator=WorldRandom([6]), device=cpu)
     assert torch.equal(x[1:2], alone)
     assert not s.any()
     s = 0.3 * torch.randn(s.shape, generator=torch.Generator().manual_seed(0))
@@ -65,7 +65,7 @@ def test_a_world_is_seeded_and_measured_alone_as_in_a_batch(tiny, name):
 def worlds(task, world_count, dtype=torch.float64):
     """Fresh worlds with states about 0.3."""
     generator = torch.Generator().manual_seed(0)
-    x, s, _ = task.seed(world_count, generator=generator)
+    x, s, *_ = task.seed(world_count, generator=generator)
     return x.to(dtype), 0.3 * torch.randn(s.shape, generator=generator, dtype=dtype)
 
 

@@ -17,7 +17,8 @@ from npa_envs.rule.files import load_rule
 from npa_envs.tasks.many_pictures import ManyPictures, named_targets
 from npa_envs.tasks.morphogenesis2d import Morphogenesis2D, Morphogenesis2DConfig
 from npa_envs.training import preset, train
-from npa_envs.training.trained_tasks import task_of_rule
+from npa_envs.training.task_of_rule import task_of_rule
+from npa_envs.world.particles import Particles
 
 SMALL = {
     "particle_count": 48, "target_point_count": 48, "state_dim": 5, "hidden_dim": 8,
@@ -78,7 +79,7 @@ def test_gradients_of_the_loss_reach_the_worlds_codes_alone(device):
     task = task_of(device)
     rule = task.make_rule(generator()).to(device)
     task = task.for_rule(rule)
-    x, s, goal = task.seed(2, generator=generator(1, device), device=device)
+    x, s, _, goal = task.seed(2, generator=generator(1, device), device=device)
     goal.fill_(1)
     aimed = task.toward(goal)
     s = aimed.coded(s)
@@ -94,14 +95,14 @@ def test_gradients_of_the_loss_reach_the_worlds_codes_alone(device):
 def test_switched_worlds_get_another_goal_and_its_code(device):
     task = task_of(device, switch_share=1.0, targets=("heart", "ring"))
     task = task.for_rule(task.make_rule(generator()).to(device))
-    x, s, goal = task.seed(16, generator=generator(1, device), device=device)
-    _, hurt, switched = task.damage(x, s, goal, generator(2, device))
+    x, s, _, goal = task.seed(16, generator=generator(1, device), device=device)
+    _, hurt, _, switched = task.damage(Particles(x, s, goal=goal), generator(2, device))
     assert 0 < int((switched != goal).sum()) < 16
     after = task.toward(switched).coded(hurt)
     codes = after[..., :3].unique(dim=1)[:, 0]
     assert len(codes.unique(dim=0)) == 2
     kept = task_of(device, switch_share=0.0)
-    assert torch.equal(kept.damage(x, s, goal, generator(2, device))[2], goal)
+    assert torch.equal(kept.damage(Particles(x, s, goal=goal), generator(2, device)).goal, goal)
 
 
 @pytest.mark.parametrize("encoder", [False, True])
@@ -139,7 +140,7 @@ def test_an_encoder_reads_the_pictures_once_in_an_iteration(monkeypatch):
     bound = task.for_rule(rule)
     # Fresh worlds carry what the encoder says, also of a rule that nobody has trained.
     assert torch.equal(rule.codes.table, encode(rule.codes, task._target_pictures))
-    _, s, goal = bound.seed(2, generator=generator(1))
+    _, s, _, goal = bound.seed(2, generator=generator(1))
     assert torch.equal(s[:, 0, :3], rule.codes.table[goal])
     config = preset("tiny", **SMALL, targets=TARGETS, encoder=True, steps=(2, 4), pool_size=6)
     cycle, _ = make_cycle(config, task)
@@ -162,7 +163,7 @@ def test_the_command_trains_and_evaluates_by_name(tmp_path, capsys):
     assert rule.state_dim == 8
     task = task_of_rule(f"{out}/rule.safetensors", rule, torch.device("cpu"), target="ring").task
     assert task.target.name == "ring"
-    _, s, _ = task.seed(1, generator=generator())
+    _, s, *_ = task.seed(1, generator=generator())
     assert torch.equal(s[0, :, :3], rule.codes["ring"].expand(48, 3))
     first = task_of_rule(f"{out}/rule.safetensors", rule, torch.device("cpu")).task
     assert first.target.name == "heart"
@@ -188,7 +189,7 @@ def test_rows_tell_the_right_code_from_another():
     assert [(row.step, row.target) for row in rows] == [(k, name) for k in (1, 2) for name in names]
     assert rows[3].loss == sorted(row.loss for row in rows[:3])[1]
     # A rule that has learned nothing does not care: all worlds stay disks.
-    x, s, _ = tasks[0].seed(2, generator=npa_envs.WorldRandom((1, 2)))
+    x, s, *_ = tasks[0].seed(2, generator=npa_envs.WorldRandom((1, 2)))
     assert rows[0].loss == pytest.approx(float(tasks[0].metric(x, s).mean()), rel=0.2)
     with pytest.raises(NPAError, match="two or more"):
         picture_rows(rule, tasks[:1], seeds=(1,))

@@ -36,7 +36,7 @@ def task(target):
 
 def worlds(task, world_count, dtype=torch.float32, seed=0):
     generator = torch.Generator().manual_seed(seed)
-    x, s, _ = task.seed(world_count, generator=generator)
+    x, s, *_ = task.seed(world_count, generator=generator)
     return 0.6 * x.to(dtype), 0.3 * torch.randn(s.shape, generator=generator, dtype=dtype)
 
 

@@ -21,6 +21,7 @@ from npa_envs.tasks.point_classification import (
     majority,
 )
 from npa_envs.training import preset, train
+from npa_envs.world.particles import Particles
 from npa_envs.world.rollout import rollout
 
 SMALL = {"class_count": 3, "particle_count": 24, "state_dim": 6, "hidden_dim": 8, "eps": 0.3}
@@ -55,7 +56,7 @@ def random(seed=0, device="cpu"):
 def test_pictures_have_room_around_the_ink():
     config = PointClassificationConfig(particle_count=64, resolution=32)
     task = PointClassification(config)
-    x, s, _ = task.seed(32, generator=random())
+    x, s, *_ = task.seed(32, generator=random())
     assert float(x.amax()) > 0.99
     density = task.picture(x, s)[..., 3]
     edges = torch.cat((density[:, 0], density[:, -1], density[:, :, 0], density[:, :, -1]), dim=1)
@@ -63,7 +64,7 @@ def test_pictures_have_room_around_the_ink():
 
 
 def test_worlds_are_clouds_of_their_class_with_blank_states(task, device):
-    x, s, goal = task.seed(50, generator=random(1, device), device=device)
+    x, s, _, goal = task.seed(50, generator=random(1, device), device=device)
     assert s.shape == (50, 24, 6)
     assert not s.any()
     assert_goals_fit(x, goal, task.clouds)
@@ -76,9 +77,9 @@ def test_test_clouds_are_others_and_never_varied(folder):
     test_task = train_task.on("test")
     assert len(train_task.clouds.label) == 36
     assert len(test_task.clouds.label) == 18
-    x, _, _ = test_task.seed(5, generator=random())
+    x, *_ = test_task.seed(5, generator=random())
     assert all((test_task.clouds.x == cloud).flatten(1).all(1).any() for cloud in x)
-    x, _, _ = train_task.seed(5, generator=random())
+    x, *_ = train_task.seed(5, generator=random())
     assert not any((train_task.clouds.x == cloud).flatten(1).all(1).any() for cloud in x)
 
 
@@ -167,9 +168,9 @@ def test_so_many_worlds_of_a_batch_are_fresh_clouds(folder, tmp_path, share, cou
 def test_mutated_worlds_keep_their_states(folder):
     config = PointClassificationConfig(data=folder, mutated_share=0.5, **SMALL)
     task = PointClassification(config)
-    x, s, goal = task.seed(200, generator=random(1))
+    x, s, _, goal = task.seed(200, generator=random(1))
     s = s + torch.arange(200.0)[:, None, None]
-    new_x, new_s, new_goal = task.damage(x, s, goal, random(2))
+    new_x, new_s, _, new_goal = task.damage(Particles(x, s, goal=goal), random(2))
     assert torch.equal(new_s, s)
     moved = (new_x != x).flatten(1).any(1)
     # Half of 200, less one in 36 that becomes what it was: 97 ± 7.

@@ -69,7 +69,7 @@ TINY = replace(SMALL, resolution=12, ssim_weight=0.2)
         (PLANE, TURNED | {"seed_across": -1.0}, "seed_across must be a finite number of at least"),
         (PLANE, TURNED | {"angles": -1}, "angles must be a whole number of at least 0, got -1"),
         (PLANE, TURNED | {"angles": 3}, "angles must be 0 or at least 4, got 3"),
-        (PLANE, TURNED | {"angles": 0, "seed_axis": 0.0}, "angles=0 needs seeds that tell how a"),
+        (PLANE, TURNED | {"angles": 0, "seed_axis": 0.0}, "angles=0 needs seeds that have a"),
         (PLANE, TURNED | {"angles": 0, "chiral": False}, "=0.0 and chiral=False: set seed_across="),
         (PLANE, TURNED | {"division": True}, "division goes neither with equivariant"),
         (PLANE, {"targets": ("ring",), "division": True}, "division goes neither with equivariant"),
@@ -145,7 +145,7 @@ def many(*targets, **fields):
         (lambda: Texture(SMALL_TEXTURE, target=DOTS), "target must have 24 x 24 pixels"),
         (lambda: Morphogenesis3D(SMALL, target=VIEWS), "views must have 16 x 16 pixels"),
         (lambda: Morphogenesis3D(TINY), "at least 16 pixels for MS-SSIM"),
-        (lambda: Morphogenesis3D(SMALL).for_rule(NINE), "must read out 20 numbers of a state, or"),
+        (lambda: Morphogenesis3D(SMALL).for_rule(NINE), "must have a read-out of 20 outputs, or"),
     ],
 )
 def test_damages_and_targets(call, message):

@@ -312,7 +312,7 @@ def test_an_empty_target_can_be_compared_with(name):
 
 @pytest.mark.parametrize("name", JOINT)
 def test_joint_losses_weigh_colours_and_density(name):
-    x, s, _ = Texture(SMALL).seed(1, generator=torch.Generator().manual_seed(1))
+    x, s, *_ = Texture(SMALL).seed(1, generator=torch.Generator().manual_seed(1))
     s[..., -3:] = 0.4 * torch.sin(9.0 * x[..., :1] + torch.tensor([0.0, 1.0, 2.0]))
     task = Texture(replace(SMALL, loss=name))
     colour, density = task.texture_losses(x, s)

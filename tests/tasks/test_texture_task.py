@@ -11,13 +11,14 @@ from npa_envs.rule.files import load_rule
 from npa_envs.tasks.targets.textures import load_texture
 from npa_envs.tasks.texture import Texture, TextureConfig, colour_image, density_image
 from npa_envs.training import override, preset, train
+from npa_envs.world.particles import Particles
 
 SMALL = TextureConfig(target="bubbles", particle_count=300, resolution=24, eps=0.3)
 
 
 def worlds(task, world_count, dtype=torch.float32, seed=0):
     generator = torch.Generator().manual_seed(seed)
-    x, s, _ = task.seed(world_count, generator=generator)
+    x, s, *_ = task.seed(world_count, generator=generator)
     return x.to(dtype), 0.3 * torch.randn(s.shape, generator=generator, dtype=dtype)
 
 
@@ -30,7 +31,7 @@ def lattice(side):
 
 def test_seeds_fill_the_box_evenly():
     task = Texture(dataclasses.replace(SMALL, particle_count=4000, box_size=3.0))
-    x, s, _ = task.seed(2, generator=torch.Generator().manual_seed(0))
+    x, s, *_ = task.seed(2, generator=torch.Generator().manual_seed(0))
     assert task.box == (3.0, 3.0)
     assert float(s.abs().max()) == 0.0
     assert 1.49 < float(x.abs().max()) <= 1.5
@@ -138,14 +139,14 @@ def test_damage_wipes_a_disk_that_reaches_across_the_seam():
     corners = x.new_tensor([[[-0.95, 0.95], [0.95, 0.95], [0.0, 0.0], [-0.3, -0.95]]])
     x = torch.cat((x, corners), dim=1)
     s = torch.ones(1, 54, 16)
-    places, states, _ = task.damage(x, s, None, torch.Generator().manual_seed(0))
+    places, states, *_ = task.damage(Particles(x, s), torch.Generator().manual_seed(0))
     assert torch.equal(places, x)
     wiped = states[0, :, 0] == 0.0
     # Drawn is one of the fifty in the corner, but for a chance of 4 in 54.
     assert wiped.tolist() == [True] * 52 + [False, False]
-    assert task.damage(x, s, None, torch.Generator())[1] is not s
+    assert task.damage(Particles(x, s), torch.Generator())[1] is not s
     unhurt = Texture(dataclasses.replace(SMALL, damage_radius=0.0))
-    assert unhurt.damage(x, s, None, torch.Generator())[1] is s
+    assert unhurt.damage(Particles(x, s), torch.Generator())[1] is s
 
 
 def test_a_target_of_another_size_is_refused():

@@ -86,7 +86,7 @@ def test_the_gradient_is_that_at_the_angle_chosen():
 
 def test_seeds_have_a_head_and_a_tail_in_a_direction_of_their_own():
     task = task_of(seed_axis=0.25)
-    x, s, _ = task.seed(3, generator=npa_envs.WorldRandom([1, 2, 3]))
+    x, s, *_ = task.seed(3, generator=npa_envs.WorldRandom([1, 2, 3]))
     radius = task.config.seed_radius
     directions = torch.linalg.lstsq(x, s[..., :1]).solution[..., 0] * radius
     along = (x @ directions[..., None])[..., 0] / radius
@@ -124,7 +124,7 @@ def test_seeds_have_a_left_and_a_right_across_their_axis():
 
 def test_without_angles_seeds_point_one_way_and_worlds_are_compared_as_they_lie():
     task, plain = task_of(angles=0, seed_across=0.25), task_of(equivariant=False)
-    x, s, _ = task.seed(3, generator=torch.Generator().manual_seed(0))
+    x, s, *_ = task.seed(3, generator=torch.Generator().manual_seed(0))
     radius = task.config.seed_radius
     assert torch.allclose(s[..., 0], 0.5 * x[..., 0] / radius)
     assert torch.allclose(s[..., 1], 0.25 * x[..., 1] / radius)

@@ -35,7 +35,7 @@ def task():
 
 def worlds(task, seed=0):
     generator = torch.Generator().manual_seed(seed)
-    x, s, _ = task.seed(3, generator=generator)
+    x, s, *_ = task.seed(3, generator=generator)
     return x, 0.3 * torch.randn(s.shape, generator=generator), generator
 
 
@@ -43,7 +43,7 @@ class TestTask:
     """The task of every species on its own particles."""
 
     def test_seeds_lie_in_a_row_around_the_origin(self, task):
-        x, s, _ = task.seed(4, generator=torch.Generator().manual_seed(0))
+        x, s, *_ = task.seed(4, generator=torch.Generator().manual_seed(0))
         assert x.shape == (4, 80, 2)
         assert not s.any()
         for part, centre in zip(x.split([48, 32], dim=1), (-0.4, 0.4), strict=True):

@@ -287,7 +287,7 @@ def test_worlds_of_all_processes_are_diagnosed_when_the_loss_is_not_finite(tmp_p
 
 
 def test_what_cannot_be_shared_out_is_refused():
-    assert Ranks(1, 4).places(16, 2).tolist() == [2, 3, 10, 11]
+    assert Ranks(1, 4).indices(16, 2).tolist() == [2, 3, 10, 11]
     parts = [Ranks(rank, 4).own(torch.arange(16), 2) for rank in range(4)]
     assert sorted(torch.cat(parts).tolist()) == list(range(16))
     for worlds, pool, said in (
@@ -348,7 +348,7 @@ class Store:
     ("make", "said"),
     [
         (dist.HashStore, "process 0 of 3 has heard nothing from process 2 for"),
-        (lambda: Store(gone=True), "s, as the store that processes meet in is gone"),
+        (lambda: Store(gone=True), "s, as the store of the processes is gone"),
         (lambda: Store(gone=False), "has heard nothing from process 1"),
     ],
 )

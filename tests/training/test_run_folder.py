@@ -196,11 +196,11 @@ def test_a_checkpoint_with_something_wrong_in_it_is_refused_by_name(finished, re
 def test_a_checkpoint_must_hold_all_that_is_read(finished, resumed):
     whole = load_checkpoint(finished / "checkpoint.pt")
     names = "task_name config iteration seconds rule optimiser pool meter random_states"
-    for name in names.split():
+    for name in ("rule_hyper_parameters", *names.split()):
         for content in ({key: whole[key] for key in whole if key != name}, whole | {name: None}):
-            resumed(content, rf"checkpoint\.pt' .*lacks {name} or")
+            resumed(content, rf"checkpoint\.pt' .*but {name} is missing or")
     del whole["config"]["task"]
-    resumed(whole, r"lacks config\.task or")
+    resumed(whole, r"but config\.task is missing or")
 
 
 @pytest.mark.parametrize(

@@ -82,7 +82,7 @@ def runaway():
 def test_replayed_operations_train_the_same_rule_as_called_ones(tmp_path, make, fields):
     (called, called_rule), (replayed, replayed_rule) = (make(tmp_path, **fields) for _ in range(2))
     replayed._draw, replayed._keep = Recording(replayed._draw), Recording(replayed._keep)
-    replayed._note = Recording(replayed._note)
+    replayed._record = Recording(replayed._record)
     for iteration in range(8):
         for cycle in (called, replayed):
             cycle.run(iteration)
@@ -96,7 +96,7 @@ def test_replayed_operations_train_the_same_rule_as_called_ones(tmp_path, make, 
     assert_same(replayed.state_dict(), called.state_dict())
     assert len(replayed._draw.recorded) > 5
     assert len(replayed._keep.recorded) > 5
-    assert len(replayed._note.recorded) > 5
+    assert len(replayed._record.recorded) > 5
 
 
 @pytest.mark.gpu
@@ -110,7 +110,7 @@ def test_recorded_iterations_take_means_over_processes_where_eager_ones_do(tmp_p
         for weights in rule.parameters():
             weights.add_(0.05 * torch.randn_like(weights))
     generator = torch.Generator(device)
-    x, s, _ = task.seed(4, generator=generator.manual_seed(2), device=device)
+    x, s, *_ = task.seed(4, generator=generator.manual_seed(2), device=device)
     found = []
     for kind in (EagerIteration, GraphedIteration):
         counts = []

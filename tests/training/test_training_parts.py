@@ -45,12 +45,12 @@ def test_pool_draws_different_worlds_and_all_of_them_in_the_long_run():
     assert (pool.worlds.x[4, 0, 0], pool.worlds.s[2, 0, 0]) == (4, 2)
 
 
-def test_a_pool_with_max_age_range_draws_one_world_of_each_section():
+def test_a_pool_with_lifetimes_draws_one_world_of_each_section():
     x = torch.zeros(12, 2, 2)
     pool = WorldPool(Particles(x, x.clone()), runaway_limit=1.0, max_age_range=(10, 1000))
-    max_age_range = pool.lifetime.tolist()
-    assert (max_age_range[0], max_age_range[-1]) == (10, 1000)
-    ratios = [b / a for a, b in itertools.pairwise(max_age_range)]
+    lifetimes = pool.lifetime.tolist()
+    assert (lifetimes[0], lifetimes[-1]) == (10, 1000)
+    ratios = [b / a for a, b in itertools.pairwise(lifetimes)]
     assert ratios == pytest.approx([100 ** (1 / 11)] * 11, rel=0.03)
     generator = torch.Generator().manual_seed(0)
     drawn = torch.stack([pool.sample(4, generator) for _ in range(60)])
@@ -156,7 +156,7 @@ def make_iteration(config, kind=EagerIteration, device="cpu"):
     task, device = CircleTask(), torch.device(device)
     rule = task.make_rule(torch.Generator().manual_seed(1)).to(device, config.torch_dtype)
     generator = torch.Generator(device).manual_seed(2)
-    x, s, _ = task.seed(config.world_count, generator=generator, device=device)
+    x, s, *_ = task.seed(config.world_count, generator=generator, device=device)
     x, s = x.to(config.torch_dtype), s.to(config.torch_dtype)
     generator.manual_seed(3)
     return task, rule, kind(task, rule, config, Particles(x, s), generator, plain_rollout)

@@ -165,8 +165,8 @@ class WatchedTask(CircleTask):
     """Its seeds' states are all 0.125, which no other world's are."""
 
     def seed(self, world_count, *, generator, device):
-        x, s, goal = super().seed(world_count, generator=generator, device=device)
-        return x, s + 0.125, goal
+        seeds = super().seed(world_count, generator=generator, device=device)
+        return seeds._replace(s=seeds.s + 0.125)
 
 
 def fresh(s):
@@ -354,7 +354,7 @@ def explode_after(iterations):
 def logging_late(config, **options):
     """A trainer that writes each record an iteration later, as it does on CUDA."""
     trainer = trainer_of(config, **options)
-    trainer._log_late = True
+    trainer._defer_records = True
     return trainer
 
 

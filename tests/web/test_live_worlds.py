@@ -73,7 +73,7 @@ def test_a_live_world_is_the_rollout_of_its_rule(world):
     device = world.x.device
     rule = load_rule("gecko", device=device).float()
     generator = torch.Generator(device).manual_seed(0)
-    x, s, _ = world.task.seed(1, generator=generator, device=device)
+    x, s, *_ = world.task.seed(1, generator=generator, device=device)
     advance(world, 2)
     with torch.no_grad():
         x, s = rollout(

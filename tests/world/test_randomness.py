@@ -220,7 +220,7 @@ def test_a_seeded_world_grows_in_a_batch_as_it_grows_alone(position_noise, task,
 
     def grown(seeds):
         random = WorldRandom(seeds, device=device)
-        x, s, _ = task.seed(random.world_count, generator=random, device=device)
+        x, s, *_ = task.seed(random.world_count, generator=random, device=device)
         with torch.no_grad():
             noise = {"generator": random, "position_noise": position_noise}
             return npa_envs.rollout(rule, x, s, steps, **noise)

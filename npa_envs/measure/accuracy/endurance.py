@@ -15,7 +15,7 @@ from npa_envs.measure.accuracy.suite import Check, CheckResult, CheckSession, ch
 from npa_envs.rule.files import load_rule, rule_file, rule_metadata, shipped_rules
 from npa_envs.rule.rule import NPARule
 from npa_envs.tasks.base import Task
-from npa_envs.training.trained_tasks import task_of_rule, trained_config
+from npa_envs.training.task_of_rule import task_of_rule, trained_config
 from npa_envs.world.brushes import nearest_image
 from npa_envs.world.cuda_graph import GraphSequence, capture
 from npa_envs.world.randomness import Randomness
@@ -112,7 +112,7 @@ def habitat(
         found = task_of_rule(name, rule, session.device, particle_count=count, **fields)
         session.kept[name, particles] = rule, found.task
     rule, task = session.kept[name, particles]
-    x, s, goal = task.seed(world_count, generator=session.generator(), device=session.device)
+    x, s, _, goal = task.seed(world_count, generator=session.generator(), device=session.device)
     return TrialWorlds(rule, task.toward(goal), x.float(), s.float(), goal)
 
 

@@ -20,12 +20,13 @@ from npa_envs.measure.accuracy.endurance import SMALLEST_VIEWS, LongRun, TrialWo
 from npa_envs.ops import world_mean
 from npa_envs.rule.files import load_rule
 from npa_envs.rule.rule import NPARule
-from npa_envs.tasks.base import ParticleTask, Worlds
+from npa_envs.tasks.base import ParticleTask
 from npa_envs.tasks.damage import DAMAGE_SIZES, random_particle
 from npa_envs.tasks.morphogenesis2d import Morphogenesis2D, Morphogenesis2DConfig
 from npa_envs.tasks.seeds import uniform_ball, uniform_box
-from npa_envs.training.trained_tasks import task_of_rule, tasks_of_codes
+from npa_envs.training.task_of_rule import task_of_rule, tasks_of_codes
 from npa_envs.world.brushes import clump, cut, nearest_image, offsets_from, wipe_state
+from npa_envs.world.particles import Particles
 from npa_envs.world.randomness import Randomness, StreamId, WorldRandom
 
 # Seeds of other shapes; ring, square and two blobs have the trained density.
@@ -187,10 +188,10 @@ class PicturesInTurn(ParticleTask[Morphogenesis2DConfig]):
 
     def seed(
         self, world_count: int, *, generator: Randomness, device: str | torch.device = "cpu"
-    ) -> Worlds:
-        """Return fresh worlds with the codes of their pictures, and their goals."""
-        x, s, _ = self._tasks[0].seed(world_count, generator=generator, device=device)
-        return x, self.coded(s), self.goal
+    ) -> Particles:
+        """Return fresh worlds with the codes of their pictures, and which ones these are."""
+        seeds = self._tasks[0].seed(world_count, generator=generator, device=device)
+        return seeds._replace(s=self.coded(seeds.s), goal=self.goal)
 
     def toward(self, goal: Tensor | None) -> Self:
         """Return the task for worlds with these goals, int64, shape [B]."""
@@ -278,7 +279,7 @@ class RuleTrial:
             self._tasks[count] = self.task.resized(count).for_rule(self.rule)
         task = self._tasks[count]
         random = self.random(StreamId.GROWTH)
-        x, s, goal = task.seed(self.world_count, generator=random, device=self._device)
+        x, s, _, goal = task.seed(self.world_count, generator=random, device=self._device)
         if shape != "trained":
             box = self.task.box
             # Trained worlds fill their box, so there is no trained radius.

@@ -1,4 +1,4 @@
-"""Texture losses: how unlike two textures are, whatever lies where."""
+"""Texture losses: distances between two textures that do not depend on positions."""
 
 from __future__ import annotations
 
@@ -39,46 +39,46 @@ DEFAULT_LOSS = "patch_swd"
 
 
 class TextureLoss(Protocol):
-    """A texture that others are compared with.
+    """The distance of images from a target texture.
 
-    Nothing random is left once it is made, and no call waits for the device. A world's loss is the
-    same, bit for bit, in every batch (for `vgg_ot`: where no gradient is asked for).
+    Calls draw no random numbers and do not synchronise. A world's loss is the same, bit for bit, in
+    every batch (of `vgg_ot`: without gradient).
     """
 
     def __call__(self, images: Tensor) -> Tensor:
-        """Return how unlike the target each image is (dimensionless), shape [B]; differentiable."""
+        """Return the distance of images [B, K, R, R] (dimensionless), shape [B]; differentiable."""
 
 
 @dataclass(frozen=True)
 class LossOptions:
-    """Options of a loss."""
+    """Options of a texture loss."""
 
     tiles: bool = True
-    """Whether the target's opposite edges fit together; where not, nothing is read across them."""
+    """Whether the target's opposite edges fit together, so that patches may cross them."""
 
     seed: int = 0
-    """What directions, filters and positions are drawn from, once."""
+    """Seed of the loss's directions, filters and positions."""
 
     vgg_weights: str = ""
     """File of VGG16's weights, for `vgg_ot`; empty: torch's usual folder of downloads."""
 
 
 DEFAULT_OPTIONS = LossOptions()
-"""A target that tiles, drawn from seed 0."""
+"""Options for a target that tiles, with seed 0."""
 
 
 @dataclass(frozen=True)
 class LossEntry:
-    """A loss that textures can be trained with."""
+    """A row of `TEXTURE_LOSSES`."""
 
     summary: str
     """One line for lists."""
 
     make: Callable[[Tensor, LossOptions], TextureLoss]
-    """Prepares a target, shape [K, R, R]."""
+    """Returns the loss against a target, shape [K, R, R]."""
 
     joint: bool = False
-    """Whether colours and density are compared at once, K = 4, and as particles can draw them."""
+    """Whether it compares colours and density together, K = 4, with `Texture.drawable`."""
 
 
 TEXTURE_LOSSES: Mapping[str, LossEntry] = {
@@ -118,7 +118,7 @@ TEXTURE_LOSSES: Mapping[str, LossEntry] = {
 
 
 def check_loss_name(name: str) -> None:
-    """Check that there is a loss of a name, or that there are all of several joined by "+"."""
+    """Check that a name, or every name joined by "+", is of a texture loss."""
     parts = name.split("+") if isinstance(name, str) else []
     for part in parts or [name]:
         if not isinstance(part, str) or part not in TEXTURE_LOSSES:
@@ -130,7 +130,7 @@ def check_loss_name(name: str) -> None:
 
 
 def is_joint(name: str) -> bool:
-    """Return whether a loss, or a sum of losses, compares colours and density at once."""
+    """Return whether a loss, or a sum of losses, compares colours and density together."""
     return TEXTURE_LOSSES[name.split("+")[0]].joint
 
 
@@ -148,9 +148,9 @@ class LossSum:
 def make_texture_loss(
     name: str, target: Tensor, options: LossOptions = DEFAULT_OPTIONS
 ) -> TextureLoss:
-    """Prepare a texture [K, R, R] to be compared with: colours, K = 3, a density, 1, or both, 4.
+    """Return the loss against a target [K, R, R]: colours (K = 3), density (1) or both (4).
 
-    Several joint losses are summed where their names are joined by "+".
+    Names of joint losses that are joined by "+" give their sum.
     """
     check_loss_name(name)
     if not isinstance(target, Tensor):
@@ -167,34 +167,32 @@ def make_texture_loss(
     return made[0] if len(made) == 1 else LossSum(made)
 
 
-# Sliced Wasserstein distances. A texture is described, size after size, by many numbers at each
-# place. Two are alike where each of these numbers is distributed alike over the places: sorted,
-# they are compared one by one.
+# Sliced Wasserstein distances. A texture is described, at each image size, by many features at each
+# position. The distributions of a feature over the positions are compared by sorting its values.
 
 PATCH = 5
-"""Pixels along each side of a patch."""
+"""Side of a patch [pixels]."""
 
 FILTERS = 24
-"""Random filters of the first layer; each gives two features, above zero and below."""
+"""Random filters of the first layer; each gives two features, its positive and negative part."""
 
 SECOND_PATCH = 3
-"""Features along each side that a filter of the second layer sees."""
+"""Side of a filter of the second layer [pixels]."""
 
 FLOOR = 0.01
-"""Variance that is added to the target's, so that an even target can be compared with, too."""
+"""Added to the target's variance, so that a uniform target works too."""
 
 
 Descriptor = Callable[..., list[Tensor]]
-"""Returns the numbers at each place of images, a table for each size, [B, M, F] each. With `wrap`
-opposite edges meet, else places near them are left out; `thinned` leaves at most `PLACES` along
-each side."""
+"""Returns the features at each position of images, [B, M, F] for each size. With `wrap` opposite
+edges meet, else positions near them are left out; `thinned`: at most `PLACES` along each side."""
 
 
 class SlicedWasserstein:
-    """The distance of images from a target; satisfies `TextureLoss`.
+    """The sliced Wasserstein distance of images from a target; satisfies `TextureLoss`.
 
-    For each size it is the mean over the numbers of the squared 2-Wasserstein distance between
-    their distributions, relative to the target's own variance; the sizes' are added.
+    At each image size it is the mean over the features of the squared 1D 2-Wasserstein distance
+    between their distributions, divided by the target's variance; sizes are summed.
     """
 
     def __init__(self, target: Tensor, descriptor: Descriptor, *, tiles: bool) -> None:
@@ -202,22 +200,22 @@ class SlicedWasserstein:
         self._descriptor = descriptor
         self._shape = tuple(target.shape)
         with torch.no_grad():
-            # The worlds' own number of places decides how finely the target's are resolved.
+            # The target has as many quantiles as worlds have positions.
             thinned = descriptor(target[None], wrap=True, thinned=True)
             described = descriptor(target[None].double(), wrap=tiles, thinned=False)
             self._quantiles = [
-                quantiles(numbers[0].T, found.shape[1]).to(target)
-                for numbers, found in zip(described, thinned, strict=True)
+                quantiles(features[0].T, found.shape[1]).to(target)
+                for features, found in zip(described, thinned, strict=True)
             ]
-            self._scales = [1.0 / (numbers[0].var(0).mean() + FLOOR) for numbers in described]
+            self._scales = [1.0 / (each[0].var(0).mean() + FLOOR) for each in described]
 
     def __call__(self, images: Tensor) -> Tensor:
         """Return the distance of each image (dimensionless), shape [B]; differentiable."""
         check_images(images, self._shape)
         described = self._descriptor(images, wrap=True, thinned=True)
         total = images.new_zeros(len(images))
-        for numbers, expected, scale in zip(described, self._quantiles, self._scales, strict=True):
-            ordered = numbers.transpose(1, 2).contiguous().sort(dim=-1).values
+        for features, expected, scale in zip(described, self._quantiles, self._scales, strict=True):
+            ordered = features.transpose(1, 2).contiguous().sort(dim=-1).values
             squares = (ordered - expected.to(ordered)).square()
             distance = world_mean(squares.flatten(1)[..., None])[:, 0]
             total = total + scale.to(distance) * distance
@@ -232,9 +230,9 @@ def _sliced(
 
 
 class PatchDescriptor:
-    """Square patches of all channels, seen from random directions.
+    """Square patches of all channels, projected on random directions.
 
-    There are as many directions as a patch has numbers, at right angles to each other.
+    The directions are an orthonormal basis of the space of patches.
     """
 
     def __init__(self, like: Tensor, *, seed: int) -> None:
@@ -243,10 +241,10 @@ class PatchDescriptor:
         self.directions = [
             orthogonal(size, size, generator).to(like) for _ in range(level_count(like.shape[-1]))
         ]
-        """Directions for each size of the image, columns of [K PATCH², K PATCH²]."""
+        """Directions for each image size, columns of [K PATCH², K PATCH²]."""
 
     def __call__(self, images: Tensor, *, wrap: bool, thinned: bool) -> list[Tensor]:
-        """Return the patches' coordinates, [B, M, K PATCH²] for each size."""
+        """Return the projections of patches, [B, M, K PATCH²] for each size."""
         sizes = pyramid(images, len(self.directions))
         return [
             products(patches(level, PATCH, stride=stride_of(level, thinned), wrap=wrap), direction)
@@ -255,10 +253,10 @@ class PatchDescriptor:
 
 
 class FilterDescriptor:
-    """Two layers of random filters with rectifiers between them: edges, spots and their corners.
+    """Two layers of random filters with rectifiers between them.
 
-    The filters of the first layer sum to zero, but for one for each channel that averages; those of
-    the second see its features from random directions.
+    Filters of the first layer sum to zero, but for one mean filter for each channel; those of the
+    second layer are random projections of patches of the first layer's features.
     """
 
     def __init__(self, like: Tensor, *, seed: int) -> None:
@@ -287,33 +285,33 @@ class FilterDescriptor:
             field = features.transpose(1, 2).reshape(len(images), -1, side, side)
             stride = stride_of(level, thinned)
             result.append(field[:, :, ::stride, ::stride].flatten(2).transpose(1, 2))
-            seen = patches(field, SECOND_PATCH, stride=stride, wrap=wrap)
-            result.append(products(seen, second))
+            around = patches(field, SECOND_PATCH, stride=stride, wrap=wrap)
+            result.append(products(around, second))
         return result
 
 
 # The paper's loss: relaxed optimal transport between features of VGG16, and their moments, after
 # Kolkin, Salavon and Shakhnarovich, "Style Transfer by Relaxed Optimal Transport and Self-
 # Similarity" (2019). Of VGG16 (Simonyan and Zisserman 2014) only the weights are needed, not
-# torchvision: the layers are few. Average pooling takes the place of maximum pooling, and worlds
-# are padded with what lies on their other side.
+# torchvision: the layers are few. Average pooling replaces maximum pooling, and worlds are padded
+# periodically.
 
 VGG_LAYERS = (1, 6, 11, 18, 25)
 """Layers of VGG16 that are compared, in torchvision's counting."""
 
 VGG_PLACES = 1024
-"""Places of a layer that are compared at most."""
+"""Largest number of positions of a layer that are compared."""
 
 VGG_SMALLEST = 32
-"""Pixels along each side that leave the deepest layer more than one place."""
+"""Least side of images with more than one position in the deepest layer [pixels]."""
 
 
 class VGGTransport(TextureDistance):
-    """The distance of images from a target; satisfies `TextureLoss`.
+    """The distance of VGG16 features of images from a target's; satisfies `TextureLoss`.
 
     For each layer it is the relaxed earth mover's distance under the cosine distance of features,
-    plus the mean absolute differences of their means and of their covariances; the layers' are
-    added. A layer with more than 1024 places is compared at 1024 of them, drawn once.
+    plus the mean absolute differences of their means and of their covariances; layers are summed. A
+    layer with more than 1024 positions is compared at 1024 random ones, the same in all calls.
     """
 
     def __init__(self, target: Tensor, *, weights: str = "", tiles: bool, seed: int) -> None:
@@ -359,17 +357,17 @@ WEIGHTS_FILE = "vgg16-397923af.pth"
 """Name of torchvision's file of weights trained on ImageNet."""
 
 WEIGHTS_URL = f"https://download.pytorch.org/models/{WEIGHTS_FILE}"
-"""Where it can be had."""
+"""Address of that file."""
 
 VGG_WIDTHS = ((64, 64), (128, 128), (256, 256, 256), (512, 512, 512), (512, 512, 512))
-"""Channels of the convolutions; a pooling layer lies between two groups."""
+"""Channels of the convolutions, with a pooling layer after each group."""
 
 VGG_MEAN, VGG_DEVIATION = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
-"""Of ImageNet's red, green and blue, by which images are normalised."""
+"""Mean and standard deviation of ImageNet's red, green and blue."""
 
 
 class VGGFeatures:
-    """Features of images at some layers."""
+    """VGG16's features of images at some layers."""
 
     def __init__(self, weights: Mapping[str, Any], layers: Sequence[int], like: Tensor) -> None:
         self._layers = frozenset(layers)
@@ -389,7 +387,7 @@ class VGGFeatures:
     def __call__(self, images: Tensor, *, wrap: bool) -> list[Tensor]:
         """Return features [B, F, R', R'] of each layer; opposite edges meet, or are mirrored."""
         mode = "circular" if wrap else "reflect"
-        # In the weights' precision, whatever the worlds' is.
+        # In the weights' precision.
         field = (images.to(self._mean) - self._mean) / self._deviation
         found = []
         index, last = 0, max(self._layers)
@@ -399,7 +397,7 @@ class VGGFeatures:
                 index += 1
             else:
                 field = F.conv2d(F.pad(field, (1, 1, 1, 1), mode=mode), *step).relu()
-                # A convolution and its rectifier; layers are read behind the latter.
+                # A convolution and its rectifier, after which features are read.
                 index += 2
             if index - 1 in self._layers:
                 found.append(field)

@@ -1,1 +1,1 @@
-"""Targets: what rules are to grow, from pictures, emoji, meshes, views, textures, digits."""
+"""Targets of the tasks, from pictures, emoji, meshes, views, textures, digits."""

@@ -23,34 +23,34 @@ from npa_envs.world.randomness import Randomness, normal_draws, uniform_draws
 Split = Literal["train", "test"]
 
 LEVELS = 2048
-"""Coordinates are whole numbers below this while points are chosen: squares of distances are exact
-in float32, so that every device chooses the same points."""
+"""Coordinates are integers below this while points are chosen, so that squared distances are exact
+in float32 and every device chooses the same points."""
 
 INK = 0.5
-"""A place has ink where there is at least this share of the picture's darkest pixel."""
+"""A position has ink where the picture has at least this fraction of its darkest pixel."""
 
 CANDIDATES = (2, 3)
-"""Points to choose from, at least and at most, for each one that is chosen."""
+"""Least and largest number of candidates for each chosen point."""
 
 FINEST = 1024
-"""Places along a side, at most, that are looked at for ink."""
+"""Finest grid of candidates: cells along each side."""
 
 CHUNK = {"cpu": 256, "cuda": 1024}
-"""Pictures that are sampled together: on a CPU as many as fit into its caches."""
+"""Pictures that are sampled in one batch, by device; a CPU's fit into its caches."""
 
 CHUNK_CELLS = 1 << 24
-"""Cells of a grid, of all pictures that are sampled together, at most."""
+"""Largest number of grid cells in one batch."""
 
 LARGEST_IDX = 600_000_000
-"""Bytes of data of an IDX file, at most; the largest of EMNIST's has 547 million."""
+"""Largest IDX file [bytes of data]; the largest of EMNIST has 547 million."""
 
 CACHED = 4
-"""Data sets that are kept in memory."""
+"""Number of data sets in the cache."""
 
 
 @dataclass(frozen=True)
 class PointClouds:
-    """Clouds, and the class of each."""
+    """Point clouds with their classes."""
 
     x: Tensor
     """Positions in [0, 1]² [length units], shape [M, N, 2]; y is up."""
@@ -59,7 +59,7 @@ class PointClouds:
     """Classes, int64, shape [M]."""
 
     coverage: float
-    """Share of the unit square that has ink, mean of the clouds."""
+    """Fraction of the unit square that has ink, averaged over the clouds."""
 
 
 @functools.lru_cache(CACHED)
@@ -72,11 +72,11 @@ def load_clouds(
     sample_seed: int = 0,
     device: torch.device,
 ) -> PointClouds:
-    """Return all clouds of a data set; computed once and kept in memory."""
+    """Return all clouds of a data set, from a cache."""
     pictures = load_pictures(data, split, folder=folder)
-    x, share = sample_ink(pictures.ink, particle_count, sample_seed=sample_seed, device=device)
+    x, area = sample_ink(pictures.ink, particle_count, sample_seed=sample_seed, device=device)
     height, width = pictures.ink.shape[1:]
-    coverage = share * (height * width / max(height, width) ** 2)
+    coverage = area * (height * width / max(height, width) ** 2)
     return PointClouds(x, torch.from_numpy(pictures.label).to(device), coverage)
 
 
@@ -87,19 +87,19 @@ def sample_ink(
     sample_seed: int = 0,
     device: str | torch.device = "cpu",
 ) -> tuple[Tensor, float]:
-    """Return farthest-point samples of the ink of pictures, the same on every device.
+    """Return farthest-point samples of the ink of pictures, and the mean fraction that has ink.
 
-    The picture, enlarged bilinearly, is looked at in one random place of each cell of a grid; the
-    grid is refined until there are enough places with ink. Positions, [M, N, 2], lie in [0, 1]²
-    [length units]: the longer side is 1. The mean share that has ink comes along.
+    Candidates are one random position in each cell of a grid, where the picture, enlarged
+    bilinearly, has ink; the grid is refined until there are enough. Positions, [M, N, 2], lie in
+    [0, 1]² [length units], where the longer side is 1; they are the same on every device.
     """
     darkest = ink.max((1, 2))
     if (darkest <= 0).any():
         raise NPAError(
             f"every picture must have ink, got an empty one at {int(np.argmin(darkest))}: remove it"
         )
-    least, most = (share * particle_count for share in CANDIDATES)
-    share = torch.from_numpy(ink / darkest[:, None, None])
+    least, most = (factor * particle_count for factor in CANDIDATES)
+    relative = torch.from_numpy(ink / darkest[:, None, None])
     x = torch.empty(len(ink), particle_count, 2, device=device)
     areas = torch.empty(len(ink))
     random = torch.Generator().manual_seed(sample_seed)
@@ -107,11 +107,11 @@ def sample_ink(
     waiting = torch.arange(len(ink))
     side = 1 << math.ceil(math.log2(2.0 * math.sqrt(least)))
     while len(waiting) > 0:
-        cells, places = _places(side, share.shape[1:], random)
+        cells, points = _grid_points(side, relative.shape[1:], random)
         finer = []
         for part in torch.split(waiting, max(1, min(chunk, CHUNK_CELLS // side**2))):
             enlarged = torch.nn.functional.interpolate(
-                share[part][:, None], size=(side, side), mode="bilinear", align_corners=False
+                relative[part][:, None], size=(side, side), mode="bilinear", align_corners=False
             )
             has_ink = enlarged.flatten(1)[:, cells] >= INK
             counts = has_ink.sum(1)
@@ -122,38 +122,40 @@ def sample_ink(
                 continue
             areas[part] = counts / len(cells)
             x[part.to(device)] = _farthest_points(
-                places[_first(has_ink, most)].to(device), counts.to(device), particle_count
+                points[_first(has_ink, most)].to(device), counts.to(device), particle_count
             )
         waiting = torch.cat(finer)
         side *= 2
     return (x + 0.5) / LEVELS, float(areas.mean())
 
 
-def _places(side: int, shape: tuple[int, ...], random: torch.Generator) -> tuple[Tensor, Tensor]:
-    """Return one random place in each cell of a grid, in random order."""
+def _grid_points(
+    side: int, shape: tuple[int, ...], random: torch.Generator
+) -> tuple[Tensor, Tensor]:
+    """Return the cells of a grid in random order, and a random point in each."""
     height, width = shape
     longer = max(height, width)
     order = torch.randperm(side * side, generator=random)
     corner = torch.stack((order % side, side - 1 - order // side), dim=1)
     within = torch.rand(len(order), 2, generator=random)
-    places = (corner + within) * (LEVELS / side)
-    places *= torch.tensor((width / longer, height / longer))
-    return order, places.floor().clamp(max=LEVELS - 1)
+    points = (corner + within) * (LEVELS / side)
+    points *= torch.tensor((width / longer, height / longer))
+    return order, points.floor().clamp(max=LEVELS - 1)
 
 
 def _first(has_ink: Tensor, most: int) -> Tensor:
-    """Return where the first `most` of each row are, [M, most]; 0 behind the last."""
-    # They are in random order, so these are a fair choice.
+    """Return the indices of the first `most` True entries of each row, [M, most], padded with 0."""
+    # Entries are in random order, so the first ones are a fair choice.
     slot = (has_ink.cumsum(1) - 1).where(has_ink, most).clamp(max=most)
-    place = torch.arange(has_ink.shape[1]).expand_as(slot)
-    return slot.new_zeros(len(slot), most + 1).scatter_(1, slot, place)[:, :most]
+    index = torch.arange(has_ink.shape[1]).expand_as(slot)
+    return slot.new_zeros(len(slot), most + 1).scatter_(1, slot, index)[:, :most]
 
 
 def _farthest_points(candidates: Tensor, counts: Tensor, particle_count: int) -> Tensor:
-    """Choose points one by one, each as far from those before as can be."""
+    """Return points chosen one by one, each the farthest from those before, [M, N, 2]."""
     across, up = candidates.unbind(-1)
     valid = torch.arange(across.shape[1], device=across.device) < counts[:, None]
-    # Never the farthest, even where all that may be chosen has been.
+    # Invalid candidates are never the farthest, even after all valid ones are chosen.
     distance = torch.where(valid, 1e9, -1.0)
     latest = torch.zeros(len(across), 1, dtype=torch.int64, device=across.device)
     chosen = [latest]
@@ -170,7 +172,7 @@ def _farthest_points(candidates: Tensor, counts: Tensor, particle_count: int) ->
 def varied(
     x: Tensor, *, rotation: float, stretch: float, jitter: float, generator: Randomness
 ) -> Tensor:
-    """Return clouds turned, stretched, sheared and shaken around the middle of the unit square."""
+    """Return clouds with random rotation, stretch, shear (around (0.5, 0.5)) and noise."""
     world_count, particle_count = x.shape[:2]
     if rotation > 0.0 or stretch > 0.0:
         draws = 2.0 * uniform_draws(generator, (world_count, 4), x) - 1.0
@@ -195,26 +197,26 @@ BUILT_IN = ("digits", "mnist")
 """Data sets by name; everything else is a folder of IDX files."""
 
 TEST_SHARE = 0.2
-"""Share of scikit-learn's digits, class by class, that is never trained on."""
+"""Fraction of scikit-learn's digits, class by class, in the test split."""
 
 SPLIT_SEED = 0
-"""What that share is drawn from."""
+"""Seed of that split."""
 
 IDX_NAMES = {
     "train": ("train-images-idx3-ubyte", "train-labels-idx1-ubyte"),
     "test": ("t10k-images-idx3-ubyte", "t10k-labels-idx1-ubyte"),
 }
-"""Files of pictures and of their classes, as MNIST's are called; each may end in .gz."""
+"""Names of MNIST's files of pictures and classes; each may end in .gz."""
 
 MNIST_DOWNLOAD = "import torchvision; torchvision.datasets.MNIST({folder!r}, download=True)"
 
 
 @dataclass(frozen=True)
 class DigitPictures:
-    """Pictures and what they show."""
+    """Pictures with their classes."""
 
     ink: NDArray[np.float32]
-    """How much ink there is, in [0, 1], shape [M, H, W]; the first row is the highest."""
+    """Amount of ink in [0, 1], shape [M, H, W]; the first row is the top."""
 
     label: NDArray[np.int64]
     """The class of each picture, 0 or more, shape [M]."""
@@ -268,7 +270,7 @@ def read_idx(path: Path) -> NDArray[np.uint8]:
         raise NPAError(
             f"{name} must hold {expected} bytes of data, as its head says "
             f"({' x '.join(map(str, shape))}), but holds {min(values.size, expected)}"
-            f"{' and more' if values.size > expected else ''}: get it anew"
+            f"{' and more' if values.size > expected else ''}: download it again"
         )
     return values.reshape(shape)
 
@@ -316,7 +318,7 @@ def _idx_folder(folder: Path, split: Split) -> DigitPictures:
     if images.ndim != 3 or labels.shape != images.shape[:1] or images.size == 0:
         raise NPAError(
             f"the {split} files of {shown(str(folder))} must hold pictures [M, H, W] and classes "
-            f"[M], got {list(images.shape)} and {list(labels.shape)}: get them anew"
+            f"[M], got {list(images.shape)} and {list(labels.shape)}: download them again"
         )
     # By a table: the quotients themselves would take eight bytes a pixel.
     ink = (np.arange(256) / 255.0).astype(np.float32)

@@ -22,7 +22,7 @@ _KEYCAP, _PICTURE_STYLE = "\u20e3", "\ufe0f"
 
 
 def is_emoji(text: str) -> bool:
-    """Tell whether the text looks like an emoji: a few characters, one of them a picture symbol."""
+    """Return whether text looks like an emoji: a few characters, one of them a picture symbol."""
     if not 0 < len(text) <= 16 or text.isascii():
         return False
     if _KEYCAP in text or _PICTURE_STYLE in text:
@@ -88,7 +88,7 @@ def _draw(font: ImageFont.FreeTypeFont, text: str) -> Image.Image | None:
     except (OSError, ValueError):
         return None
     pixels = np.asarray(image).astype(np.float32)
-    # Text lands on nothing with its colours already multiplied by alpha: undone, or edges darken.
+    # Text is drawn with colours multiplied by alpha; undone here, or edges would darken.
     pixels[..., :3] *= 255 / np.maximum(pixels[..., 3:], 1)
     solid = pixels[pixels[..., 3] > 127][:, :3]
     # A font without this emoji draws nothing; one without colours draws in the ink it is given.

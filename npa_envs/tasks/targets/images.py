@@ -1,4 +1,4 @@
-"""Picture files for targets: reading, cutting out of the background, resampling."""
+"""Picture files of targets: reading, removing plain backgrounds, resampling."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from npa_envs.errors import NPAError, shown
 from npa_envs.files import read_bytes
 
 OPAQUE = 128
-"""Least alpha, of 255, at which a pixel belongs to the target."""
+"""Least alpha of a pixel of the target, of 255."""
 
 _BACKGROUND_TOLERANCE = 28
 _UNIFORM_SHARE = 0.95
@@ -27,23 +27,23 @@ _LARGEST_FILE = 256 * 2**20
 _LARGEST_PADDED = 9216
 
 LARGEST_AREA = 2**26
-"""Pixels that a picture has at most, 8192 x 8192."""
+"""Largest picture [pixels]: 8192 x 8192."""
 
 FORMATS = ("PNG", "JPEG", "BMP", "GIF", "PPM", "TIFF", "WEBP")
-"""Pillow's names of the formats that are read. Others may start other programs, as EPS does."""
+"""Pillow's names of the allowed formats. Others may start other programs, as EPS does."""
 
 LARGEST_GRID = 6144
-"""Pixels along each side of the grid that a picture is resampled to, at most."""
+"""Largest side of the grid that a picture is resampled to [pixels]."""
 
 LARGEST_POINT_COUNT = 2**24
-"""Points of a target, at most."""
+"""Largest number of points of a target."""
 
 FloatImage = NDArray[np.float32]
 Mask = NDArray[np.bool_]
 
 
 def read_image(path: Path) -> Image.Image:
-    """Read a picture as RGBA; one without transparency is cut out of its plain background."""
+    """Read a picture as RGBA; without transparency, its plain background is made transparent."""
     image = open_image(path)
     if np.asarray(image.getchannel("A")).min() == 255:
         return cut_out_background(image, label=str(path))
@@ -52,24 +52,24 @@ def read_image(path: Path) -> Image.Image:
 
 
 def with_background(image: Image.Image) -> Image.Image:
-    """Return an RGBA picture whose whole rectangle is opaque: what it does not cover is white."""
+    """Return an RGBA picture over a white background."""
     white = Image.new("RGBA", image.size, (255, 255, 255, 255))
     return Image.alpha_composite(white, image)
 
 
 def open_image(path: Path) -> Image.Image:
-    """Read a picture as RGBA, as it is."""
+    """Read a picture as RGBA, with its background."""
     name = shown(str(path))
     content = read_bytes(path, limit=_LARGEST_FILE, what="target")
     if not content:
-        raise NPAError(f"target {name} is an empty file (0 bytes): save the picture anew")
+        raise NPAError(f"target {name} is an empty file (0 bytes): save the picture again")
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             with Image.open(io.BytesIO(content), formats=FORMATS) as opened:
                 _check_area(opened.size, name)
                 opened.load()
-                # A format inside of another may have a size of its own.
+                # A format inside of another may have another size.
                 _check_area(opened.size, name)
                 return _to_rgba(ImageOps.exif_transpose(opened))
     except Image.DecompressionBombError as error:
@@ -85,13 +85,13 @@ def open_image(path: Path) -> Image.Image:
         # Pillow's decoders report damaged data by exceptions of many kinds.
         raise NPAError(
             f"target {name} cannot be decoded, it is truncated or damaged ({shown(error)}): "
-            "save the picture anew, as PNG"
+            "save the picture again, as PNG"
         ) from error
 
 
 @contextlib.contextmanager
 def no_foreign_programs() -> Iterator[None]:
-    """Keep Pillow from starting other programs where a library opens pictures by it."""
+    """Keep Pillow from starting other programs while a library opens pictures with it."""
     before = EpsImagePlugin.gs_binary
     EpsImagePlugin.gs_binary = False
     try:
@@ -113,14 +113,14 @@ def _too_large(name: str, got: str) -> str:
 
 
 def looks_like_path(source: str) -> bool:
-    """Return whether text is the path of a file: by a folder or suffix in it, or that it exists."""
+    """Return whether text has a folder or suffix in it, or is the path of an existing file."""
     if "/" in source or "\\" in source or Path(source).suffix:
         return True
     return os.path.exists(source)
 
 
 def scaled_square(image: Image.Image, side: int) -> FloatImage:
-    """Return a square picture scaled: colours times alpha, and alpha, in [0, 1], [S, S, 4]."""
+    """Return a square picture scaled to [S, S, 4]: colours times alpha, and alpha, in [0, 1]."""
     kind = Image.Resampling.BOX if image.width >= side else Image.Resampling.BICUBIC
     # Pillow's premultiplied mode: colours of transparent pixels do not leak.
     scaled = image.convert("RGBa").resize((side, side), kind)
@@ -142,9 +142,9 @@ def require_opaque_pixels(image: Image.Image, *, label: str) -> None:
 def cut_out_background(image: Image.Image, *, label: str) -> Image.Image:
     """Make the plain background of an opaque picture transparent.
 
-    The background is what has the colour of the border and is connected with it; a hole that the
-    object encloses stays opaque. Pixels at the object's edge, which mix both colours, are unmixed.
-    A side above 2048 pixels is reduced to that first.
+    The background has the colour of the border and is connected with it; a hole that the object
+    encloses stays opaque. The object's colour and alpha are estimated for pixels at its edge.
+    Sides above 2048 pixels are reduced first.
     """
     image = image.reduce(math.ceil(max(image.size) / _LARGEST_CUT_OUT))
     rgb = np.asarray(image.convert("RGB")).astype(np.float32)
@@ -175,14 +175,13 @@ def cut_out_background(image: Image.Image, *, label: str) -> Image.Image:
 def resample(image: Image.Image, point_count: int, *, label: str = "picture") -> Image.Image:
     """Scale a picture so that the number of its opaque pixels is nearest to `point_count`.
 
-    The scale is continuous: the picture is sampled with a pitch found by bisection, on a square
-    grid that holds the whole picture, so that other shapes than squares are padded. Colours are
-    averaged with alpha as weight, so that those of transparent pixels never leak in.
+    The sampling pitch is continuous, found by bisection, on a square grid that contains the whole
+    picture; other shapes than squares are padded. Colours are averaged with alpha as weight.
     """
     image = image.crop(image.getchannel("A").getbbox())
     area = _opaque_count(image)
     pitch = math.sqrt(area / point_count)
-    # A picture far larger than the grid is halved first, for speed, unless that loses fine parts.
+    # A picture far larger than the grid is reduced first, for speed, unless that loses fine parts.
     factor = int(pitch / 4)
     if factor > 1:
         reduced = image.reduce(factor)
@@ -229,7 +228,7 @@ def resample(image: Image.Image, point_count: int, *, label: str = "picture") ->
 
 
 def _margin(image: Image.Image, pitch: float) -> int:
-    """Return how wide a border sampling needs: a grid reaches two of its pixels out."""
+    """Return the width of the border that sampling needs: two pixels of the grid."""
     return 2 + math.ceil(min(0.5 * max(image.size) + 4 * pitch, 2.0 * max(image.size) + 2.0))
 
 
@@ -258,18 +257,18 @@ def _to_rgba(image: Image.Image) -> Image.Image:
 
 
 def _connected_to_border(similar: Mask) -> Mask:
-    reached = np.zeros_like(similar)
-    reached[0], reached[-1] = similar[0], similar[-1]
-    reached[:, 0], reached[:, -1] = similar[:, 0], similar[:, -1]
+    connected = np.zeros_like(similar)
+    connected[0], connected[-1] = similar[0], similar[-1]
+    connected[:, 0], connected[:, -1] = similar[:, 0], similar[:, -1]
     while True:
-        before = int(reached.sum())
-        for view, free in ((reached, similar), (reached.T, similar.T)):
+        before = int(connected.sum())
+        for view, free in ((connected, similar), (connected.T, similar.T)):
             for k in range(1, len(view)):
                 view[k] |= view[k - 1] & free[k]
             for k in range(len(view) - 2, -1, -1):
                 view[k] |= view[k + 1] & free[k]
-        if int(reached.sum()) == before:
-            return reached
+        if int(connected.sum()) == before:
+            return connected
 
 
 def _unmix_edge(
@@ -288,11 +287,11 @@ def _unmix_edge(
     for r, c in shifts:
         total += weighted[r : r + height, c : c + width]
         near += weight[r : r + height, c : c + width]
-    # Where an edge pixel touches the object's inside, that is its own colour without background.
+    # The object's colour at an edge pixel is the mean of the inner pixels that touch it.
     known = edge & (near > 0)
     colour, alpha = rgb.copy(), inside.astype(np.float32)
     own = total[known] / near[known][:, None]
     contrast = np.linalg.norm(own - background, axis=-1)
-    share = np.linalg.norm(rgb[known] - background, axis=-1) / np.maximum(contrast, 1)
-    colour[known], alpha[known] = own, share.clip(0, 1)
+    ratio = np.linalg.norm(rgb[known] - background, axis=-1) / np.maximum(contrast, 1)
+    colour[known], alpha[known] = own, ratio.clip(0, 1)
     return colour, alpha

@@ -1,4 +1,4 @@
-"""Coloured triangle meshes: built-in ones, made of turned profiles, and any file by trimesh."""
+"""Coloured triangle meshes: built-in ones, and files read by trimesh; pictures of meshes."""
 
 from __future__ import annotations
 
@@ -19,41 +19,41 @@ from npa_envs.tasks.targets.images import no_foreign_programs
 FloatArray = NDArray[np.float64]
 
 RADIUS = 0.85
-"""Every mesh is scaled to reach just so far from the origin [length units]."""
+"""Largest distance from the origin to which every mesh is scaled [length units]."""
 
 _LARGEST_FILE = 256 * 2**20
 _SIZES = 1e-30, 1e30
 _LEAST_AREA = 1e-12
 
 MESH_SUFFIXES = (".glb", ".gltf", ".obj", ".off", ".ply", ".stl")
-"""Files that are taken for meshes."""
+"""Suffixes of mesh files."""
 
 ROUND = 48
-"""Corners of a turned part, and of a tube."""
+"""Corners around the axis of a surface of revolution."""
 
 
 @dataclass(frozen=True, eq=False)
 class Mesh:
-    """Triangles with colours at their corners; y is up."""
+    """Triangles with colours at their vertices; y is up."""
 
     vertices: FloatArray
-    """Corners [length units], shape [K, 3]."""
+    """Vertices [length units], shape [K, 3]."""
 
     faces: NDArray[np.int64]
-    """Corners of each triangle, against the clock from outside, shape [F, 3]."""
+    """Vertex indices of each triangle, counterclockwise from outside, shape [F, 3]."""
 
     colours: FloatArray
-    """Red, green and blue of each corner, in [0, 1], shape [K, 3]."""
+    """Red, green and blue of each vertex, in [0, 1], shape [K, 3]."""
 
     def fitted(self, radius: float = RADIUS) -> Mesh:
-        """Return the mesh with its bounding box around the origin, reaching just `radius` away."""
+        """Return the mesh with its bounding box centred, scaled into a ball of `radius`."""
         used = self.vertices[np.unique(self.faces)]
         middle = 0.5 * (used.min(axis=0) + used.max(axis=0))
-        reach = np.linalg.norm(used - middle, axis=1).max()
-        return Mesh((self.vertices - middle) * (radius / reach), self.faces, self.colours)
+        farthest = np.linalg.norm(used - middle, axis=1).max()
+        return Mesh((self.vertices - middle) * (radius / farthest), self.faces, self.colours)
 
     def normals(self) -> FloatArray:
-        """Return unit normals at the corners, weighted by the triangles' areas, shape [K, 3]."""
+        """Return unit normals at the vertices, weighted by the triangles' areas, shape [K, 3]."""
         a, b, c = (self.vertices[self.faces[:, k]] for k in range(3))
         flat = np.cross(b - a, c - a)
         sums = np.zeros_like(self.vertices)
@@ -69,7 +69,7 @@ def turned(
     paint: Callable[[FloatArray], FloatArray],
     corners: int = ROUND,
 ) -> Mesh:
-    """Return a profile (distance from the axis, height), upwards, turned around the y axis."""
+    """Return the surface of revolution of a profile (radius, y), from bottom to top."""
     rings = np.asarray(profile, dtype=np.float64)
     angle = np.linspace(0.0, 2.0 * np.pi, corners, endpoint=False)
     x = rings[:, :1] * np.sin(angle)
@@ -82,7 +82,7 @@ def turned(
 def ellipsoid(
     centre: Sequence[float], radii: Sequence[float], colour: Sequence[float], turns: int = 18
 ) -> Mesh:
-    """Return an ellipsoid of one colour with half-axes `radii` and so many rings."""
+    """Return an ellipsoid of one colour with half-axes `radii`, made of `turns` rings."""
     tilt = np.linspace(-0.5 * np.pi, 0.5 * np.pi, turns)
     profile = [(float(np.cos(t)), float(np.sin(t))) for t in tilt]
     ball = turned(profile, lambda v: np.broadcast_to(np.asarray(colour, float), v.shape).copy())
@@ -176,8 +176,8 @@ def make_doughnut() -> Mesh:
     along = np.linspace(0.0, 2.0 * np.pi, 2 * ROUND, endpoint=False)
     around = np.linspace(0.0, 2.0 * np.pi, ROUND, endpoint=False)
     u, v = np.meshgrid(along, around, indexing="ij")
-    reach = 0.6 + 0.27 * np.cos(v)
-    vertices = np.stack((reach * np.sin(u), 0.27 * np.sin(v), reach * np.cos(u)), axis=-1)
+    radius = 0.6 + 0.27 * np.cos(v)
+    vertices = np.stack((radius * np.sin(u), 0.27 * np.sin(v), radius * np.cos(u)), axis=-1)
     icing = np.sin(v) > 0.05 + 0.18 * np.sin(5.0 * u)
     colours = np.where(icing[..., None], (0.94, 0.45, 0.62), (0.80, 0.55, 0.28))
     hues = np.array([(0.2, 0.75, 0.9), (0.98, 0.9, 0.25), (0.98, 0.98, 0.98), (0.35, 0.8, 0.35)])
@@ -203,7 +203,7 @@ def builtin_meshes() -> tuple[str, ...]:
 
 
 def load_mesh(source: str | Path) -> Mesh:
-    """Return a mesh, fitted into the ball of radius 0.85 around the origin."""
+    """Return a built-in mesh or that of a file, scaled into a ball of radius 0.85."""
     if isinstance(source, str) and source in MESHES:
         return MESHES[source]().fitted()
     path = home_path(source)
@@ -235,7 +235,7 @@ def _read_mesh(path: Path) -> Mesh:
         # Its readers report damaged files by exceptions of many kinds.
         raise NPAError(
             f"target {shown(str(path))} cannot be read as a mesh ({type(error).__name__}: "
-            f"{shown(error)}): save it anew, for example as .ply or .glb"
+            f"{shown(error)}): save it again, for example as .ply or .glb"
         ) from error
     in_space = vertices.shape[1:] == (3,) and faces.shape[1:] == (3,)
     if not in_space or faces.size == 0 or vertices.size == 0 or not np.isfinite(vertices).all():
@@ -246,7 +246,7 @@ def _read_mesh(path: Path) -> Mesh:
     if faces.min() < 0 or faces.max() >= len(vertices):
         raise NPAError(
             f"the triangles of target {shown(str(path))} must have corners from 0 to "
-            f"{len(vertices) - 1}, got {faces.min()} to {faces.max()}: save it anew"
+            f"{len(vertices) - 1}, got {faces.min()} to {faces.max()}: save it again"
         )
     used = vertices[np.unique(faces)]
     extent = float((used.max(axis=0) / 2 - used.min(axis=0) / 2).max()) * 2
@@ -267,24 +267,24 @@ def _read_mesh(path: Path) -> Mesh:
 
 
 def grid_faces(rows: int, columns: int, *, closed: bool) -> NDArray[np.int64]:
-    """Return the triangles of a grid whose columns, and rows where `closed`, join up; [F, 3]."""
+    """Return the triangles of a grid, periodic in columns and, if `closed`, in rows; [F, 3]."""
     row, column = np.meshgrid(
         np.arange(rows if closed else rows - 1), np.arange(columns), indexing="ij"
     )
-    below, beside = (row + 1) % rows, (column + 1) % columns
-    a, b = row * columns + column, row * columns + beside
-    c, d = below * columns + column, below * columns + beside
+    below, right = (row + 1) % rows, (column + 1) % columns
+    a, b = row * columns + column, row * columns + right
+    c, d = below * columns + column, below * columns + right
     halves = (np.stack((a, b, d), axis=-1), np.stack((a, d, c), axis=-1))
     return np.concatenate([half.reshape(-1, 3) for half in halves])
 
 
 def _fin(outline: FloatArray, turn: float, thickness: float, colour: FloatArray) -> Mesh:
-    """Return a plate whose outline (outward, up) stands off the y axis, turned around it."""
+    """Return a plate with an outline (radius, y), at an angle around the y axis."""
     outward = np.array([np.sin(turn), 0.0, np.cos(turn)])
     across = np.array([np.cos(turn), 0.0, -np.sin(turn)])
     flat = outline[:, :1] * outward + outline[:, 1:] * np.array([0.0, 1.0, 0.0])
     half = 0.5 * thickness * across
-    # Corners of each side of their own, so that edges stay sharp.
+    # Each side has its own vertices, so that edges stay sharp.
     sides = [flat + half, flat - half]
     faces = [(0, 1, 2), (0, 2, 3), (4, 6, 5), (4, 7, 6)]
     vertices = [*sides]
@@ -301,29 +301,29 @@ def _fin(outline: FloatArray, turn: float, thickness: float, colour: FloatArray)
 # Pictures of meshes.
 
 LIGHT = (0.35, 0.80, 0.50)
-"""Direction that light comes from, fixed in the world."""
+"""Direction towards the light, fixed in the world."""
 
 AMBIENT = 0.6
-"""Share of its colour that a surface shows where no light falls on it."""
+"""Brightness of a surface that faces away from the light, as a fraction."""
 
 SAMPLES = 2
 """Samples along each side of a pixel."""
 
 TOGETHER = 2**22
-"""Samples of the views that are drawn at once, at most, and corners, and corners of triangles; one
-view may have more."""
+"""Largest number of samples, of vertices, and of triangles' vertices of views that are drawn in one
+batch; a single view may have more."""
 
 
 def draw_mesh(mesh: Mesh, cameras: Cameras) -> NDArray[np.float32]:
-    """Return pictures of a mesh, matt and lit from one side.
+    """Return pictures of a mesh [V, H, W, 4]: colours times alpha, and alpha, in [0, 1].
 
-    Light stays where it is when a camera goes round, so all views show one coloured surface. Both
-    sides of a triangle are seen. Triangles with a corner nearer than `cameras.near` are left out.
-    Colours times alpha, and alpha, lie in [0, 1], [V, H, W, 4]; the first row is the upper one.
+    Surfaces are matt and lit from a direction that is fixed in the world. Both sides of a triangle
+    are visible. Triangles with a vertex nearer than `cameras.near` are left out. The first row is
+    the top.
     """
     light = np.asarray(LIGHT) / np.linalg.norm(LIGHT)
     lit = AMBIENT + (1.0 - AMBIENT) * (mesh.normals() @ light).clip(0.0, 1.0)
-    # Copies: torch takes no array that is turned round or read-only.
+    # Copies: torch accepts no arrays with negative strides or read-only ones.
     colours, vertices = (
         torch.from_numpy(np.array(values, dtype=np.float64, order="C"))
         for values in (mesh.colours * lit[:, None], mesh.vertices)
@@ -336,14 +336,14 @@ def draw_mesh(mesh: Mesh, cameras: Cameras) -> NDArray[np.float32]:
     pictures = []
     parts = (torch.split(each, together) for each in (motions, lenses))
     for motion, lens in zip(*parts, strict=True):
-        seen = vertices @ motion[:, :3, :3].mT + motion[:, None, :3, 3]
-        depth = seen[..., 2].clamp(min=cameras.near)
+        local = vertices @ motion[:, :3, :3].mT + motion[:, None, :3, 3]
+        depth = local[..., 2].clamp(min=cameras.near)
         fine = nearest_triangles(
-            seen[..., :2] / depth[..., None] * lens[..., :2] + lens[..., 2:],
+            local[..., :2] / depth[..., None] * lens[..., :2] + lens[..., 2:],
             1.0 / depth,
             colours,
             faces,
-            (seen[..., 2] >= cameras.near)[:, faces].all(dim=-1),
+            (local[..., 2] >= cameras.near)[:, faces].all(dim=-1),
             width=width,
             height=height,
         )

@@ -46,7 +46,7 @@ class PointTarget:
     """Red, green and blue of each point in [0, 1] (dimensionless), shape [M, 3], float32."""
 
     pixel_size: float
-    """Distance h of two neighbouring points [length units]."""
+    """Distance h between neighbouring points [length units]."""
 
     @property
     def point_count(self) -> int:
@@ -78,20 +78,17 @@ def load_target(
 ) -> PointTarget:
     """Make a target from a built-in name, a picture file or an emoji.
 
-    A string is taken as a built-in name if it is one, else as a path if the file exists or the
-    string has a suffix or a folder in it, else as an emoji. A `Path` is always a path. Pixels with
-    an alpha of at least one half become points; a picture without transparency is cut out of its
-    plain background.
+    A string is a built-in name if there is one, else a path if the file exists or the string has a
+    suffix or a folder in it, else an emoji. A `Path` is always a path. Pixels with an alpha of at
+    least one half become points; the plain background of a picture without transparency is removed.
 
     Args:
         source: A name from `builtin_targets`, the path of a PNG, JPEG or WebP file, or one emoji.
-        point_count: The number of points aimed at; the target's own may differ by a few, where the
-            picture does not allow it more closely.
-        extent: Side of the smallest square around the origin, the mean of the points, that holds
-            the whole target [length units]. The picture shows [-1, 1]; the default leaves a margin
-            of 0.1 on each side.
-        keep_background: The picture's whole rectangle is the target, white where it is transparent:
-            for photographs.
+        point_count: Number of points; the result may differ by a few, as the picture allows.
+        extent: Side of the smallest square around the origin, the mean of the points, that contains
+            the target [length units]. Pictures show [-1, 1]; the default leaves a margin of 0.1.
+        keep_background: Use the picture's whole rectangle, white where it is transparent: for
+            photographs.
         device: Where the tensors are made.
 
     Raises:
@@ -137,7 +134,7 @@ def load_target_image(
 
 @functools.cache
 def _drawing(name: str) -> Image.Image:
-    """Return a built-in picture, drawn once: every environment and task asks for one."""
+    """Return a built-in picture, from a cache."""
     return DRAWINGS[name]()
 
 
@@ -156,7 +153,7 @@ def target_from_image(
     rows, columns = np.nonzero(pixels[..., 3] >= OPAQUE)
     grid = np.stack([columns, -rows], axis=1).astype(np.float64)
     grid -= grid.mean(axis=0)
-    # Half a pixel more on either side: a point stands for a square of one pixel.
+    # Half a pixel more on either side: a point represents a square of one pixel.
     pixel_size = extent / (2 * float(np.abs(grid).max()) + 1)
     colours = pixels[rows, columns, :3].astype(np.float32) / 255
     return PointTarget(
@@ -180,7 +177,7 @@ Points = Sequence[tuple[float, float]]
 
 
 def smooth_curve(points: Points, *, closed: bool = False, steps: int = 16) -> Points:
-    """Return a Catmull-Rom curve through the points, of `steps` samples from one to the next."""
+    """Return a Catmull-Rom curve through the points, with `steps` samples between two."""
     corner = np.asarray(points, dtype=np.float64)
     if closed:
         padded = np.concatenate([corner[-1:], corner, corner[:2]])
@@ -197,7 +194,7 @@ def smooth_curve(points: Points, *, closed: bool = False, steps: int = 16) -> Po
 
 
 def place(points: Points, *, centre: tuple[float, float] = (0, 0), angle: float = 0) -> Points:
-    """Turn the points about the origin by `angle` [degrees, counter-clockwise], then move them."""
+    """Return the points rotated by `angle` [degrees, counterclockwise], then moved by `centre`."""
     c, s = math.cos(math.radians(angle)), math.sin(math.radians(angle))
     return [(centre[0] + c * x - s * y, centre[1] + s * x + c * y) for x, y in points]
 
@@ -208,7 +205,7 @@ def mirror(points: Points) -> Points:
 
 
 def union(*masks: Image.Image) -> Image.Image:
-    """Return the silhouette that covers all of the masks."""
+    """Return the union of the masks."""
     whole = masks[0]
     for mask in masks[1:]:
         whole = ImageChops.lighter(whole, mask)
@@ -216,7 +213,7 @@ def union(*masks: Image.Image) -> Image.Image:
 
 
 def polygon(points: Points, *, grow: float = 0) -> Image.Image:
-    """Return the mask of a filled polygon, widened on every side by `grow`."""
+    """Return the mask of a filled polygon, dilated by `grow`."""
     mask, draw = _blank()
     corners = [_pixel(p) for p in points]
     draw.polygon(corners, fill=255)
@@ -231,7 +228,7 @@ def polygon(points: Points, *, grow: float = 0) -> Image.Image:
 def ellipse(
     centre: tuple[float, float], radii: tuple[float, float], *, angle: float = 0, grow: float = 0
 ) -> Image.Image:
-    """Return the mask of an ellipse with the two radii, turned by `angle` [degrees]."""
+    """Return the mask of an ellipse with the two radii, rotated by `angle` [degrees]."""
     a, b = radii[0] + grow, radii[1] + grow
     turn = np.linspace(0, 2 * math.pi, 96, endpoint=False)
     outline = [(a * math.cos(t), b * math.sin(t)) for t in turn]
@@ -239,7 +236,7 @@ def ellipse(
 
 
 def stroke(points: Points, widths: Sequence[float], *, grow: float = 0) -> Image.Image:
-    """Return the mask of a brush stroke along a smooth curve; widths are spread evenly along it."""
+    """Return the mask of a brush stroke along a smooth curve, with widths at even distances."""
     mask, draw = _blank()
     curve = np.asarray(smooth_curve(points))
     lengths = np.hypot(*np.diff(curve, axis=0).T)
@@ -262,7 +259,7 @@ def grid() -> tuple[NDArray[np.floating[Any]], NDArray[np.floating[Any]]]:
 
 
 def gradient(amount: NDArray[np.floating[Any]], *colours: str) -> Image.Image:
-    """Return an RGBA picture that runs through the colours as `amount` goes from 0 to 1."""
+    """Return an RGBA picture that maps `amount` in [0, 1] to a gradient of colours."""
     stops = np.linspace(0, 1, len(colours))
     rgb = np.array([ImageColor.getrgb(c)[:3] for c in colours], dtype=np.float32)
     channels = [np.interp(amount, stops, rgb[:, k]) for k in range(3)]
@@ -278,7 +275,7 @@ class Canvas:
     def paint(
         self, mask: Image.Image, paint: str | Image.Image, *, within: Image.Image | None = None
     ) -> None:
-        """Cover the mask, or what of it lies within another one, with a colour or a picture."""
+        """Paint the mask, or its intersection with `within`, with a colour or a picture."""
         if within is not None:
             mask = ImageChops.darker(mask, within)
         if isinstance(paint, str):
@@ -293,7 +290,7 @@ class Canvas:
         *,
         within: Image.Image | None = None,
     ) -> None:
-        """Cover disks, each given by x, y and radius, with a colour."""
+        """Paint disks (x, y, radius) with a colour."""
         disks = union(*(ellipse((x, y), (radius, radius)) for x, y, radius in dots))
         self.paint(disks, colour, within=within)
 
@@ -542,8 +539,8 @@ def draw_flower() -> Image.Image:
     canvas.paint(ellipse(middle, (0.24, 0.24)), "#7c2d12")
     seeds = []
     for k in range(40):
-        reach, turn = 0.215 * math.sqrt((k + 0.5) / 40), k * math.pi * (3 - math.sqrt(5))
-        seeds.append((reach * math.cos(turn), middle[1] + reach * math.sin(turn), 0.018))
+        radius, turn = 0.215 * math.sqrt((k + 0.5) / 40), k * math.pi * (3 - math.sqrt(5))
+        seeds.append((radius * math.cos(turn), middle[1] + radius * math.sin(turn), 0.018))
     canvas.paint_dots("#fbbf24", seeds)
     return canvas.finish()
 

@@ -1,7 +1,7 @@
-"""Textures to learn: picture files, and built-in patterns that tile at any resolution.
+"""Target textures: picture files, and built-in patterns that tile at any resolution.
 
-A pattern is a function of places on the unit torus. It returns red, green, blue and alpha in
-[0, 1]; where alpha is 0 no particles belong.
+A pattern is a function of positions (u, v) in the periodic unit square. It returns red, green, blue
+and alpha in [0, 1]; alpha is the target's density.
 """
 
 from __future__ import annotations
@@ -50,33 +50,33 @@ class TextureTarget:
 
     @property
     def coverage(self) -> float:
-        """Mean density: how much of the square particles should cover (dimensionless)."""
+        """Mean density: the fraction of the square that particles should cover (dimensionless)."""
         return float(self.picture[..., 3].double().mean())
 
     @property
     def gap(self) -> float:
-        """Median way from a thing to the nearest other one, as a share of the square's side.
+        """Median distance from a thing to the nearest other one, as a fraction of the side.
 
-        A thing is a patch of covered pixels that touch each other; things at opposite edges are
-        neighbours. Where fewer than two things are told apart there is no gap: 0.
+        Things are connected components of covered pixels; opposite edges are connected. 0 with
+        fewer than two things.
         """
         covered = self.picture[..., 3] > COVERED
         side = len(covered)
         edge = covered & (_around(~covered) > 0.0)
-        owner, place = _things(covered)[edge], edge.nonzero().double()
+        owner, position = _things(covered)[edge], edge.nonzero().double()
         gaps = []
         for own in sorted(set(owner.tolist())):
-            way = place[owner == own][:, None] - place[owner != own]
-            if way.numel() == 0:
+            apart = position[owner == own][:, None] - position[owner != own]
+            if apart.numel() == 0:
                 return 0.0
-            way -= side * (way / side).round()
-            # Between the middles of pixels that touch lies the side of one, and no gap.
-            gaps.append(max(0.0, float(way.square().sum(dim=-1).min()) ** 0.5 - 1.0))
+            apart -= side * (apart / side).round()
+            # Centres of touching pixels are one pixel apart, with no gap.
+            gaps.append(max(0.0, float(apart.square().sum(dim=-1).min()) ** 0.5 - 1.0))
         return median(gaps) / side if gaps else 0.0
 
     @property
     def mean_colour(self) -> Tensor:
-        """Mean red, green and blue of what is covered (dimensionless), shape [3]."""
+        """Mean red, green and blue of the covered part (dimensionless), shape [3]."""
         sums = self.picture.double().sum(dim=(0, 1))
         return (sums[:3] / sums[3]).to(self.picture)
 
@@ -86,11 +86,11 @@ COVERED = 0.5
 
 
 def _things(covered: Tensor) -> Tensor:
-    """Return a number for the thing that each pixel belongs to, 0 where nothing is; [R, R]."""
+    """Return the label of each pixel's connected component, 0 where not covered; [R, R]."""
     numbers = torch.arange(1, covered.numel() + 1, dtype=torch.float64, device=covered.device)
     number = numbers.view_as(covered) * covered
     while True:
-        # The largest number of a thing spreads over all of it.
+        # The largest number in a component spreads over all of it.
         spread = _around(number) * covered
         if torch.equal(spread, number):
             return number
@@ -98,7 +98,7 @@ def _things(covered: Tensor) -> Tensor:
 
 
 def _around(values: Tensor) -> Tensor:
-    """Return the largest of each pixel and the eight around it, round the edges, [R, R]."""
+    """Return the maximum of each pixel and its eight neighbours, across edges too, [R, R]."""
     wrapped = pad(values.double()[None, None], (1, 1, 1, 1), mode="circular")
     return max_pool2d(wrapped, kernel_size=3, stride=1)[0, 0]
 
@@ -117,9 +117,9 @@ def load_texture(
 ) -> TextureTarget:
     """Make a target from a built-in name or a picture file.
 
-    The density is the picture's alpha: a picture without transparency is to be covered evenly, and
-    shows its background in colour; of one with transparency the background stays empty. The largest
-    square in the middle of a picture is taken, scaled to the resolution.
+    The density is the picture's alpha: transparent parts stay empty, and a picture without
+    transparency is covered evenly. The largest square in the middle of the picture is scaled to the
+    resolution.
 
     Args:
         source: A name from `builtin_textures`, or the path of a PNG, JPEG or WebP file.
@@ -165,10 +165,10 @@ def _target(name: str, picture: Array, tiles: bool, device: str | torch.device) 
 
 
 LARGEST_RESOLUTION = 2048
-"""Pixels along each side of a target, at most."""
+"""Largest side of a target [pixels]."""
 
 STRIP_SAMPLES = 2**20
-"""Samples that are drawn at once, about."""
+"""Samples that are drawn in one strip, about."""
 
 OVERSAMPLING = 4
 """Samples along each side of a pixel."""
@@ -188,9 +188,10 @@ def draw_pattern(name: str, resolution: int, *, seed: int = 0) -> Array:
     strips = []
     rows = max(1, STRIP_SAMPLES // samples // OVERSAMPLING) * OVERSAMPLING
     for first in range(0, samples, rows):
-        places = np.meshgrid(axis, axis[first : first + rows])
-        # Each strip draws the same numbers: what is scattered has one place in all of them.
-        rgba = PATTERNS[name](*places, np.random.default_rng(seed))
+        positions = np.meshgrid(axis, axis[first : first + rows])
+        # The same random numbers for each strip: scattered things are where they were in the
+        # others.
+        rgba = PATTERNS[name](*positions, np.random.default_rng(seed))
         rgba[..., :3] *= rgba[..., 3:]
         blocks = rgba.reshape(-1, OVERSAMPLING, resolution, OVERSAMPLING, 4)
         strips.append(blocks.mean(axis=(1, 3)))
@@ -288,13 +289,13 @@ def maze(u: Array, v: Array, random: np.random.Generator) -> Array:
 
 
 def hearts(u: Array, v: Array, _: np.random.Generator) -> Array:
-    """Upright hearts in rows, red and pink by turns, nothing between them."""
+    """Upright hearts in rows, alternately red and pink, nothing between them."""
     places = [((k + 0.5 * (j % 2)) / 4.0, j / 4.0) for j in range(4) for k in range(4)]
     colour = np.zeros((*u.shape, 3))
     covered = np.zeros(u.shape, dtype=bool)
     inner, rim = _colours("#e63946", "#ffafcc"), _colours("#8d0f20", "#d6407f")
     for number, place in enumerate(places):
-        across, up = (way / 0.084 for way in _away(u, v, np.array(place)))
+        across, up = (offset / 0.084 for offset in _away(u, v, np.array(place)))
         # Two round halves above a point.
         depth = across**2 + (1.15 * up - 0.25 - 0.72 * np.sqrt(np.abs(across))) ** 2
         depth = np.where(np.abs(across) < 1.5, depth, np.inf)
@@ -311,7 +312,7 @@ def droplets(u: Array, v: Array, random: np.random.Generator) -> Array:
     colour = np.zeros((*u.shape, 3))
     covered = np.zeros(u.shape, dtype=bool)
     for number, place in enumerate(places):
-        across, up = (way / 0.068 for way in _away(u, v, place))
+        across, up = (offset / 0.068 for offset in _away(u, v, place))
         across, up = 0.94 * across + 0.34 * up, 0.94 * up - 0.34 * across
         # A disk below, drawn out to a point above.
         taper = np.where(up > 0.0, np.clip(1.0 - up / 2.0, 0.0, 1.0) ** 0.9, 1.0)
@@ -372,18 +373,18 @@ def _opaque(colour: Array) -> Array:
 
 
 def _away(u: Any, v: Any, place: Array) -> tuple[Any, Any]:
-    """Return the way from a place to others on the torus, the short way round."""
+    """Return the shortest offsets of positions (u, v) from `place` in the periodic unit square."""
     across, along = u - place[0], v - place[1]
     return across - np.round(across), along - np.round(along)
 
 
 def _scattered(random: np.random.Generator, count: int, gap: float) -> list[Array]:
-    """Return places that keep a distance from each other, as far as that can be had."""
+    """Return random positions at least `gap` apart, or less where that is too hard to find."""
     places: list[Array] = []
     while len(places) < count:
         place = random.random(2)
         if all(math.hypot(*_away(place[0], place[1], other)) >= gap for other in places):
             places.append(place)
-        # Drawn less far apart rather than never.
+        # Lowered at each try, so that the loop ends.
         gap *= 0.999
     return places

@@ -1,4 +1,4 @@
-"""Views of a thing to grow in 3D: pictures with alpha from known cameras, some held out."""
+"""Views of a 3D target: pictures with alpha from known cameras, some of them held out."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ from npa_envs.tasks.targets.images import open_image, scaled_square
 from npa_envs.tasks.targets.meshes import RADIUS, Mesh, draw_mesh, load_mesh
 
 DISTANCE = 3.2
-"""How far cameras are from the origin [length units]."""
+"""Distance of cameras from the origin [length units]."""
 
 LARGEST_VIEWS = 2**27
-"""Pixels of all views of a target together, at most; they take 16 bytes each."""
+"""Largest number of pixels of all views of a target; a pixel takes 16 bytes."""
 
 ANGLE = 40.0
-"""Their angle of view [degrees]: the unit ball fits into the picture."""
+"""Cameras' angle of view [degrees]: the unit ball fits into the picture."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,16 +46,16 @@ class Views:
 
 @dataclass(frozen=True, eq=False)
 class ViewTarget:
-    """A thing to grow, seen from all sides."""
+    """A 3D target as pictures from all sides."""
 
     name: str
     """The built-in name, or the file's or folder's name."""
 
     training: Views
-    """What the loss compares with."""
+    """The views that the loss compares."""
 
     held_out: Views
-    """What rules are measured by."""
+    """The views that metrics compare."""
 
     def to(self, device: str | torch.device) -> ViewTarget:
         """Return the target on another device."""
@@ -70,18 +70,17 @@ def load_views(
     held_out_count: int = 12,
     device: str | torch.device = "cpu",
 ) -> ViewTarget:
-    """Make a target from a built-in mesh, a mesh file, or a folder as NeRF-synthetic scenes are.
+    """Make a target from a built-in mesh, a mesh file, or a folder in the format of NeRF-synthetic.
 
-    A mesh is drawn from cameras all around. A folder gives pictures and cameras, evenly spaced ones
-    where it holds more than asked for; its scene is turned so that y is up, and scaled so that what
-    is seen lies within 0.85 of the origin.
+    A mesh is drawn from cameras all around. Of a folder's pictures and cameras evenly spaced ones
+    are taken; the scene is rotated so that y is up, and scaled into the ball of radius 0.85.
 
     Args:
-        source: A name from `builtin_meshes`, the path of a mesh file, or a folder that holds
+        source: A name from `builtin_meshes`, the path of a mesh file, or a folder with
             `transforms_train.json`.
         resolution: Pixels along each side of a view.
-        training_count: Views to train with, at most.
-        held_out_count: Views to measure by, at most.
+        training_count: Largest number of views to train with.
+        held_out_count: Largest number of other views, for metrics.
         device: Where the tensors are made.
 
     Raises:
@@ -112,7 +111,7 @@ def load_views(
 def views_of_mesh(
     mesh: Mesh, name: str, resolution: int, training_count: int, held_out_count: int
 ) -> ViewTarget:
-    """Draw a mesh that fits into the ball of radius 0.85 from cameras all around."""
+    """Return views of a mesh that fits into the ball of radius 0.85, from cameras all around."""
     views = []
     for count, turn in ((training_count, 0.0), (held_out_count, 0.5)):
         cameras = surrounding_cameras(count, resolution, turn=turn)
@@ -121,17 +120,17 @@ def views_of_mesh(
 
 
 def surrounding_cameras(count: int, resolution: int, *, turn: float = 0.0) -> Cameras:
-    """Return cameras evenly spread over a sphere around the origin, which they look at.
+    """Return cameras evenly spread over a sphere, pointing at its centre, the origin.
 
-    They lie on a Fibonacci spiral from below to above, so that any number of them is spread evenly.
-    The spiral is turned by a share `turn` of a full turn.
+    They lie on a Fibonacci spiral from bottom to top, rotated by the fraction `turn` of a full
+    turn.
     """
     k = torch.arange(count, dtype=torch.float64)
     height = (2.0 * k + 1.0) / count - 1.0
     angle = math.tau * (k * (0.5 * (math.sqrt(5.0) - 1.0)) + turn)
     flat = (1.0 - height * height).sqrt()
     outward = torch.stack((flat * angle.sin(), height, flat * angle.cos()), dim=-1)
-    # A single camera would lie on the horizon, as those of an orbit do; it gives the lens.
+    # Only the intrinsics of this camera are used.
     lens = orbit(1, 0.0, DISTANCE, ANGLE, width=resolution, height=resolution)
     return Cameras(
         world_to_camera=look_at(DISTANCE * outward, (0.0, 0.0, 0.0)).float(),
@@ -142,12 +141,12 @@ def surrounding_cameras(count: int, resolution: int, *, turn: float = 0.0) -> Ca
 
 
 def over(views: Tensor, background: Tensor) -> Tensor:
-    """Return colours before a background [..., 3], shape [..., 3]."""
+    """Return views [..., 4] composited over a background [..., 3], shape [..., 3]."""
     return views[..., :3] + (1.0 - views[..., 3:]) * background
 
 
 def some_views(views: Views, index: Tensor) -> Views:
-    """Return some of the views."""
+    """Return the views of these indices."""
     cameras = views.cameras
     intrinsics = cameras.intrinsics
     chosen = replace(
@@ -159,30 +158,30 @@ def some_views(views: Views, index: Tensor) -> Views:
 
 
 def nearest_camera(cameras: Cameras, elevation: float) -> int:
-    """Return which camera is nearest to the front, where z points, at an elevation [degrees]."""
+    """Return the index of the camera nearest to the front (+z) at an elevation [degrees]."""
     motions = cameras.world_to_camera.double().cpu()
-    places = -(motions[:, :3, :3].mT @ motions[:, :3, 3:])[..., 0]
+    positions = -(motions[:, :3, :3].mT @ motions[:, :3, 3:])[..., 0]
     tilt = math.radians(elevation)
-    front = places.new_tensor((0.0, math.sin(tilt), math.cos(tilt)))
-    return int((places @ front / places.norm(dim=1)).argmax())
+    front = positions.new_tensor((0.0, math.sin(tilt), math.cos(tilt)))
+    return int((positions @ front / positions.norm(dim=1)).argmax())
 
 
-# Folders of pictures and cameras as the NeRF-synthetic scenes are (Mildenhall et al. 2020).
+# Folders of pictures and cameras in the format of NeRF-synthetic (Mildenhall et al. 2020).
 
 TRAINING = "transforms_train.json"
 HELD_OUT = ("transforms_test.json", "transforms_val.json")
 
-SEEN = 0.5
+OPAQUE_ALPHA = 0.5
 """Alpha above which a pixel belongs to the scene."""
 
 UPRIGHT = ((1.0, 0.0, 0.0), (0.0, 0.0, 1.0), (0.0, -1.0, 0.0))
-"""Rotation from their world, whose z is up, to ours, whose y is."""
+"""Rotation from the format's coordinates, z up, to ours, y up."""
 
 
 def read_nerf(
     folder: Path, resolution: int, training_count: int, held_out_count: int
 ) -> ViewTarget:
-    """Read a scene; `load_views` says what becomes of it."""
+    """Return the views of a NeRF-synthetic folder, as `load_views` describes."""
     held_out = next((folder / name for name in HELD_OUT if (folder / name).is_file()), None)
     if held_out is None:
         raise NPAError(
@@ -191,28 +190,29 @@ def read_nerf(
         )
     training = _views(folder / TRAINING, resolution, training_count)
     measured = _views(held_out, resolution, held_out_count)
-    reach = max(scene_reach(training), scene_reach(measured))
-    if reach == 0.0:
+    radius = max(scene_radius(training), scene_radius(measured))
+    if radius == 0.0:
         raise NPAError(
             f"views must show something, but no picture of {shown(str(folder))} has a pixel of "
-            f"alpha above {SEEN}: give pictures with a transparent background"
+            f"alpha above {OPAQUE_ALPHA}: give pictures with a transparent background"
         )
-    scale = RADIUS / reach
+    scale = RADIUS / radius
     return ViewTarget(folder.name, _scaled(training, scale), _scaled(measured, scale))
 
 
-def scene_reach(views: Views) -> float:
-    """Return how far from the origin what is seen reaches, at least [length units].
+def scene_radius(views: Views) -> float:
+    """Return a lower bound on the scene's radius: the largest distance of a visible ray [length
+    units].
 
-    Every point of the scene is at least as far from the origin as the ray on which it is seen; from
-    many sides the farthest is seen on such a ray.
+    A point of the scene is at least as far from the origin as the camera rays on which it is
+    visible; with many views, one of these rays nearly touches the farthest point.
     """
-    cameras, reach = views.cameras, 0.0
+    cameras, radius = views.cameras, 0.0
     lenses = cameras.intrinsics.double().expand(cameras.count, 4)
     for motion, lens, picture in zip(
         cameras.world_to_camera.double(), lenses, views.pictures, strict=True
     ):
-        row, column = (picture[..., 3] > SEEN).nonzero(as_tuple=True)
+        row, column = (picture[..., 3] > OPAQUE_ALPHA).nonzero(as_tuple=True)
         if len(row) == 0:
             continue
         pixel = torch.stack((column, row), dim=-1) + 0.5
@@ -220,8 +220,8 @@ def scene_reach(views: Views) -> float:
         ray /= ray.norm(dim=1, keepdim=True)
         # The origin in the camera's frame, and its distance from each ray.
         away = torch.linalg.cross(ray, motion[:3, 3].expand_as(ray)).norm(dim=1)
-        reach = max(reach, float(away.max()))
-    return reach
+        radius = max(radius, float(away.max()))
+    return radius
 
 
 def _scaled(views: Views, scale: float) -> Views:
@@ -236,7 +236,7 @@ def _read_picture(path: Path, resolution: int) -> Tensor:
     if image.width != image.height:
         raise NPAError(
             f"views must be square, {shown(str(path))} has {image.width} x {image.height} pixels: "
-            "cut them to squares around the middle, and mend camera_angle_x"
+            "cut them to squares around the middle, and correct camera_angle_x"
         )
     return torch.from_numpy(scaled_square(image, resolution))
 
@@ -298,8 +298,8 @@ def _read_frame(path: Path, number: int, frame: Any) -> tuple[Path, Tensor]:
     if os.path.isabs(name) or inside == os.curdir or inside.split(os.sep)[0] == os.pardir:
         raise NPAError(
             f"file_path of frame {number} in {shown(str(path))} must name a file in that folder, "
-            f"got {shown(name)}: put the pictures beside it"
+            f"got {shown(name)}: put the pictures next to it"
         )
     file = path.parent / inside
-    # Their file_path has no suffix.
+    # The format's file_path has no suffix.
     return (file if file.suffix else file.with_name(file.name + ".png")), pose

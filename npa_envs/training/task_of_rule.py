@@ -1,4 +1,4 @@
-"""Tasks that rules were trained on, read from their files."""
+"""The task that a rule was trained on, read from the rule's file."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ from npa_envs.training.presets import override, preset, task_entry
 
 @dataclass(frozen=True)
 class TrainedTask:
-    """The task of a rule, and whether its target is the one that the rule was trained on."""
+    """The task of a rule, and whether its target is known."""
 
     task: Task
 
     doubt: str | None
-    """Why figures against the target would mean nothing; None where they do mean something."""
+    """Why comparisons with the target are meaningless; None where they are meaningful."""
     task_name: str
 
 
@@ -41,19 +41,18 @@ def task_of_rule(
 ) -> TrainedTask:
     """Return the task that a rule was trained on, read from its file.
 
-    A rule whose file says nothing of a task, as the authors' do, is run in the paper's world of
-    2D morphogenesis with the rule's own sizes, or in the one that it was found in where
-    `npa-envs search` wrote the file. Of a rule of many pictures it is the task of one of
-    them: of the code that `target` names, else the first. Where the target is not known, or is a
-    picture that is not there any more, a built-in one stands in for it: worlds can still be run and
-    drawn.
+    A rule whose file names no task, as those of the paper's authors, is run in the paper's world of
+    2D morphogenesis with the rule's own sizes; a file of `npa-envs search` names the world that it
+    was found in. Of a rule of many pictures it is the task of the code that `target` names, else of
+    the first one. Where the target is unknown or its picture is missing, a built-in target replaces
+    it, so that worlds can still be run and drawn.
 
     Args:
-        source: What the rule was loaded from.
+        source: The name or file that the rule was loaded from.
         rule: The rule.
-        device: Where the task keeps its target.
+        device: Device of the task's target.
         particle_count: Particles N; None: as trained.
-        fields: Fields of the task's configuration to change; None leaves one as it is.
+        fields: Fields of the task's configuration to change; None: unchanged.
 
     Raises:
         NPAError: The rule does not fit the task, or a field is wrong.
@@ -65,7 +64,7 @@ def task_of_rule(
     still = task_name == "point_classification"
     if rule.space_dim != entry.space_dim or rule.static != still:
         raise NPAError(
-            f"the command line shows {'static' if still else 'moving'} rules in the "
+            f"the command line runs {'static' if still else 'moving'} rules in the "
             f"{entry.space_dim}D worlds of {task_name}, got space_dim={rule.space_dim}, "
             f"static={rule.static}: run this one in Python with npa_envs.rollout"
         )
@@ -84,13 +83,12 @@ def task_of_rule(
         config = override(config, task=config.task.with_particle_count(particle_count))
     chosen = fields.get("target") is not None
     if rule.codes is not None:
-        # The chosen picture or the first one, wherever it comes from.
+        # The chosen picture or the first one, from its source.
         name = config.task.target if chosen else rule.codes.names[0]
         named = _named(config.task.targets).get(name, name)
         config = override(config, targets=(), target=named)
     doubt = None if known or chosen else "its file does not say what it grows"
     try:
-        # What a rule was trained on it may know by heart.
         task = entry.make(config.task, device).held_out()
         return TrainedTask(task.for_rule(rule), doubt, task_name)
     except NPAError as error:
@@ -110,14 +108,14 @@ def task_of_rule(
 def tasks_of_codes(
     source: str, rule: NPARule, device: torch.device, **fields: Any
 ) -> list[Morphogenesis2D]:
-    """Return the task of each picture that a rule has a code for, in their order; none without."""
+    """Return the task of each picture that a rule has a code for, in order."""
     names = () if rule.codes is None else rule.codes.names
     found = [task_of_rule(source, rule, device, **(fields | {"target": name})) for name in names]
     return [cast(Morphogenesis2D, trained.task) for trained in found]
 
 
 def _world_of(path: Path, metadata: Mapping[str, str]) -> dict[str, Any]:
-    """Return the fields of the world that a rule was found in, where its file says nothing more."""
+    """Return configuration fields of the world in which a search found a rule."""
     try:
         fields = parse_json(metadata.get("world", "{}"))
     except NPAError:
@@ -133,7 +131,7 @@ def _world_of(path: Path, metadata: Mapping[str, str]) -> dict[str, Any]:
 
 
 def sources_of_codes(source: str, codes: Codes) -> dict[str, str]:
-    """Return where the picture of each code comes from: name -> what `load_target` takes."""
+    """Return the source of each code's picture: name -> argument of `load_target`."""
     path = rule_file(source)
     metadata = rule_metadata(path) if path.suffix == ".safetensors" else {}
     targets = trained_config(path, metadata).task.targets if "config" in metadata else ()
@@ -150,7 +148,7 @@ def _named(targets: Sequence[str]) -> dict[str, str]:
 
 
 def trained_config(path: Path, metadata: Mapping[str, str]) -> Any:
-    """Return the configuration that a rule's file says it was trained with."""
+    """Return the configuration that a rule was trained with, from its file's metadata."""
     try:
         fields = parse_json(metadata["config"])
         if not isinstance(fields, dict):
@@ -159,6 +157,6 @@ def trained_config(path: Path, metadata: Mapping[str, str]) -> Any:
         return override(base, **fields)
     except (ValueError, TypeError) as error:
         raise NPAError(
-            f"the metadata of {str(path)!r} must say how the rule was trained, but it is damaged "
+            f"the metadata of {str(path)!r} must have the rule's configuration, but it is damaged "
             f"or of another version ({error}): save the rule again with npa_envs.save_rule"
         ) from error
