@@ -115,6 +115,21 @@ def load_checkpoint(path: Path) -> dict[str, Any]:
     return content
 
 
+def drawn_by_world(content: Mapping[str, Any]) -> bool:
+    """Return whether a checkpoint is of a run with random streams by world."""
+    states = content.get("random_states")
+    return isinstance(states, dict) and states.keys() == {"schedule"}
+
+
+def check_task(content: Mapping[str, Any], task_name: str, path: Path) -> None:
+    """Check that a checkpoint is of a task."""
+    if content.get("task_name") != task_name:
+        raise NPAError(
+            f"the checkpoint {str(path)!r} is of task {shown(content.get('task_name'))}, "
+            f"not of {task_name!r}: resume it with that task, or choose another folder"
+        )
+
+
 def check_same_run(
     content: dict[str, Any], task_name: str, config: TrainConfig[Any], path: Path
 ) -> None:
@@ -135,11 +150,7 @@ def check_same_run(
         raise unusable_checkpoint(path, f"{', '.join(wrong)} is missing or of a wrong type")
     numbers = {name: kind() for name, kind in NEEDED.items() if kind in (int, float)}
     check_content(content, numbers, path)
-    if content["task_name"] != task_name:
-        raise NPAError(
-            f"the checkpoint {str(path)!r} is of task {shown(content['task_name'])}, not of "
-            f"{task_name!r}: resume it with that task, or choose another folder"
-        )
+    check_task(content, task_name, path)
     theirs = _flat(content["config"])
     ours = _flat(config_to_dict(config))
     differences = [

@@ -27,6 +27,7 @@ from npa_envs.tasks.train_config import TrainConfig
 from npa_envs.training.checkpoint import (
     check_content,
     check_same_run,
+    drawn_by_world,
     save_checkpoint,
     unusable_checkpoint,
 )
@@ -119,7 +120,7 @@ class Trainer:
         saved = None if content is None else content["rule_hyper_parameters"]
         self.rule = self._make_rule(schedule, saved).to(device, config.torch_dtype)
         # A run of several processes keeps its streams by world when one process resumes it.
-        by_world = ranks.together or (content or {}).get("random_states", {}).keys() == {"schedule"}
+        by_world = ranks.together or (content is not None and drawn_by_world(content))
         self._cycle = TrainingCycle(
             task, self.rule, config, device, schedule, rollout, ranks=ranks, by_world=by_world
         )
