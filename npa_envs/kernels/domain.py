@@ -17,6 +17,13 @@ import warp as wp
 from npa_envs.kernels import native
 from npa_envs.once import made_once
 
+TERMS_PER_SUM = 4096
+"""Terms that are summed before they are added to a total: of a million summed one after the other,
+too much is rounded away."""
+
+SLACK = 1.0 + 1e-5
+"""Factor on eps² within which candidates are taken, against rounding errors of their distances."""
+
 CELL_SLACK = 1.0 + 2.0**-20
 """Cells are this much larger than eps / reach: rounding a cell index cannot lose a neighbour."""
 

@@ -21,7 +21,7 @@ BOTH_DEVICES = ("access.cuh", "mathematics.cuh")
 CUDA_ONLY = (
     "cuda/sort.cuh",
     "cuda/splat.cuh",
-    "cuda/density.cuh",
+    "cuda/neighbour_list.cuh",
     "cuda/tiles.cuh",
     "cuda/perceive.cuh",
     "cuda/adjoint.cuh",

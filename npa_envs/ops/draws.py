@@ -14,14 +14,14 @@ from npa_envs.kernels.portable.draws import (
     draw_integers,
     draw_kernels,
 )
+from npa_envs.ops.custom_op import custom_op
 from npa_envs.ops.launch import launch, scalar_type
-from npa_envs.ops.opaque import opaque
 
 WORD_COUNT = 2**32
 """Values of a word of the generator."""
 
 
-@opaque("npa::draw")
+@custom_op("npa::draw")
 def draw(
     keys: Tensor,
     episodes: Tensor,

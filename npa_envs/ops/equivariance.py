@@ -27,8 +27,8 @@ from npa_envs.kernels.cuda.equivariance import (
 )
 from npa_envs.kernels.portable.equivariance import equivariance_kernels
 from npa_envs.ops.backend import KernelRequest, choose, processor_count
+from npa_envs.ops.custom_op import custom_op, once_differentiable
 from npa_envs.ops.launch import launch, scalar_type
-from npa_envs.ops.opaque import once_differentiable, opaque
 
 MIXED_VECTORS = 8
 """Mixed vectors of an equivariant rule where nothing is said."""
@@ -127,7 +127,7 @@ def _launch_blocks(kernel: Any, blocks: int, warps: int, *tensors: Tensor) -> No
     launch(kernel, blocks * block, tensors[0].device, *tensors, block_dim=block)
 
 
-@opaque("npa::read_rows")
+@custom_op("npa::read_rows")
 def _read_rows(
     rows: Tensor, mixing: Tensor, width: int, space_dim: int, scalars: int, chiral: bool
 ) -> tuple[Tensor, Tensor]:
@@ -164,7 +164,7 @@ def _(
     return mixed, rows.new_empty(rows.shape[0], width)
 
 
-@opaque("npa::read_rows_backward")
+@custom_op("npa::read_rows_backward")
 def _read_rows_backward(
     rows: Tensor,
     mixing: Tensor,
@@ -233,7 +233,7 @@ def _steers_by_warps(mixed: Tensor, gate_count: int) -> tuple[int, int, bool] | 
     return (space_dim, count, chiral) if _is_for_warps(mixed, least) else None
 
 
-@opaque("npa::steer_rows")
+@custom_op("npa::steer_rows")
 def _steer_rows(output: Tensor, mixed: Tensor, signs: Tensor, width: int) -> Tensor:
     update = output.new_empty(len(output), width)
     form = _steers_by_warps(mixed, len(signs))
@@ -252,7 +252,7 @@ def _(output: Tensor, mixed: Tensor, signs: Tensor, width: int) -> Tensor:
     return output.new_empty(output.shape[0], width)
 
 
-@opaque("npa::steer_rows_backward")
+@custom_op("npa::steer_rows_backward")
 def _steer_rows_backward(
     output: Tensor, mixed: Tensor, signs: Tensor, update_bar: Tensor
 ) -> tuple[Tensor, Tensor]:

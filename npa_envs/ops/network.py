@@ -18,8 +18,8 @@ from npa_envs.kernels.cuda.network import (
     weight_gradient_kernels,
 )
 from npa_envs.ops.backend import KernelRequest, choose, processor_count
+from npa_envs.ops.custom_op import custom_op, once_differentiable
 from npa_envs.ops.launch import aligned, launch
-from npa_envs.ops.opaque import once_differentiable, opaque
 
 
 class ArrangedWeights(NamedTuple):
@@ -46,7 +46,7 @@ def _arrange_layers(first: Tensor, second: Tensor) -> list[Tensor]:
     return [*fragments, output_unscale]
 
 
-@opaque("npa::arrange_weights")
+@custom_op("npa::arrange_weights")
 def _arrange_weights(
     hidden_weight: Tensor, output_weight: Tensor, with_backward: bool
 ) -> list[Tensor]:
@@ -126,7 +126,7 @@ SIGN_UNITS = 128
 """Hidden units whose signs are one word for each of the four lanes that share a row."""
 
 
-@opaque("npa::run_network")
+@custom_op("npa::run_network")
 def _run_network(
     rows: Tensor,
     arranged: list[Tensor],
@@ -172,7 +172,7 @@ def _empty_signs(rows: Tensor, unit_count: int, mode: str) -> Tensor:
     return rows.new_empty(rows.shape[0], words, dtype=torch.int32)
 
 
-@opaque("npa::network_weight_gradients")
+@custom_op("npa::network_weight_gradients")
 def _weight_gradients(
     rows: Tensor, update_bar: Tensor, signs: Tensor, arranged: list[Tensor], unit_count: int
 ) -> Tensor:

@@ -17,10 +17,10 @@ from npa_envs.kernels.portable.adjoint import adjoint_kernels
 from npa_envs.kernels.portable.density import density_kernels
 from npa_envs.kernels.portable.perceive import perception_kernels
 from npa_envs.ops.backend import Listing
+from npa_envs.ops.custom_op import custom_op
 from npa_envs.ops.launch import launch
-from npa_envs.ops.opaque import opaque
 from npa_envs.ops.physics import Physics
-from npa_envs.ops.sort import LARGEST_INDEX, KernelPlan, SortedWorlds, make_plan
+from npa_envs.ops.sort import LARGEST_INDEX, KernelPlan, SortedWorlds, plan_kernels
 
 LISTS_TOGETHER = 32
 """Neighbour lists that lie together."""
@@ -280,7 +280,7 @@ class SavedPerception(NamedTuple):
     """Sorted states, dimensionless, shape [B N G, W]; None where positions get no gradient."""
 
 
-@opaque("npa::perceive_rows_backward")
+@custom_op("npa::perceive_rows_backward")
 def perceive_rows_backward(
     perception_bar: Tensor,
     saved_tensors: list[Tensor],
@@ -297,7 +297,7 @@ def perceive_rows_backward(
     """
     saved = SavedPerception(*saved_tensors)
     total, space_dim = saved.particles.shape[0], saved.particles.shape[1] - 1
-    plan = make_plan(
+    plan = plan_kernels(
         saved.particles,
         (total // particle_count, particle_count, space_dim),
         state_dim,

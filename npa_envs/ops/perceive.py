@@ -22,8 +22,8 @@ from npa_envs.checks import (
     checked_moment_inverse,
 )
 from npa_envs.ops.backend import batch_listing
+from npa_envs.ops.custom_op import check_derivatives, custom_op, once_differentiable
 from npa_envs.ops.launch import Tape, launch
-from npa_envs.ops.opaque import check_derivatives, once_differentiable, opaque
 from npa_envs.ops.passes import (
     SavedPerception,
     compute_densities,
@@ -33,7 +33,7 @@ from npa_envs.ops.passes import (
     portable_kernels,
 )
 from npa_envs.ops.physics import Physics, Terms, physics
-from npa_envs.ops.sort import make_plan, sort_worlds
+from npa_envs.ops.sort import plan_kernels, sort_worlds
 from npa_envs.ops.static import StaticRows, StaticWorlds, all_rows, static_worlds
 
 
@@ -149,7 +149,7 @@ def perception_fields(
     x, s = x.contiguous(), s.contiguous()
     world_count, particle_count, space_dim = x.shape
     state_dim = s.shape[2]
-    plan = make_plan(x, x.shape, state_dim, world_count * particle_count, False, made)
+    plan = plan_kernels(x, x.shape, state_dim, world_count * particle_count, False, made)
     ordered = sort_worlds(plan, x, s, None)
     densities = compute_density_gradients(plan, ordered)
     fields = PerceptionFields(
@@ -191,7 +191,7 @@ class Rows(NamedTuple):
     row_base: int
 
 
-@opaque("npa::perceive_rows")
+@custom_op("npa::perceive_rows")
 def _perceive_rows(
     x: Tensor,
     s: Tensor,
@@ -207,7 +207,7 @@ def _perceive_rows(
 
     Of static worlds, whose rows and tensors are given, it is what does not follow from these.
     """
-    plan = make_plan(x, x.shape, s.shape[2], row_capacity, masked, physics)
+    plan = plan_kernels(x, x.shape, s.shape[2], row_capacity, masked, physics)
     if static:
         rows, worlds = StaticRows(*static[:4]), StaticWorlds.of(static[4:])
         ordered, densities = static_worlds(plan, worlds, rows, x, s)
@@ -250,7 +250,7 @@ def _(
     kernel_sum = x.new_empty(row_capacity if for_adjoint else 0, space_dim)
     if static:
         return [perception, kernel_sum]
-    plan = make_plan(x, x.shape, s.shape[2], row_capacity, masked, physics)
+    plan = plan_kernels(x, x.shape, s.shape[2], row_capacity, masked, physics)
     particle_count = plan.total if for_adjoint or plan.runs("density") == "portable" else 0
     return [
         perception,
@@ -393,7 +393,7 @@ def update_some_at_a_time(
     row. Not differentiable.
     """
     x, s = x.detach().contiguous(), s.detach().contiguous()
-    plan = make_plan(x, x.shape, s.shape[2], row_capacity, mask is not None, physics)
+    plan = plan_kernels(x, x.shape, s.shape[2], row_capacity, mask is not None, physics)
     ordered = sort_worlds(plan, x, s, mask)
     densities = compute_densities(plan, ordered, with_particles=False)
     perception = x.new_empty(min(ROWS_TOGETHER, row_capacity), row_width)
@@ -453,7 +453,7 @@ def build_neighbours(
     int64, shape [B]; default: a batch of their own.
     """
     x, s = x.contiguous(), s.contiguous()
-    plan = make_plan(x, x.shape, s.shape[2], x.shape[0] * x.shape[1], False, physics)
+    plan = plan_kernels(x, x.shape, s.shape[2], x.shape[0] * x.shape[1], False, physics)
     listed = plan.lists_neighbours
     in_place = listed and plan.state_dim % plan.width == 0 and s.data_ptr() % 16 == 0
     ordered = sort_worlds(plan, x, None if in_place else s, None, with_rows=not listed)

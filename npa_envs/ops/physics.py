@@ -105,63 +105,51 @@ class Physics(NamedTuple):
 
     @classmethod
     def of(cls, numbers: list[float]) -> Physics:
-        """Return what `numbers` made a list of: all but limits, and sizes that tensors give."""
-        eps, eps0, state_gradient, inverse, density_gradient, moving, *rest = numbers
-        terms = Terms(bool(state_gradient), INVERSES[int(inverse)], bool(density_gradient))
-        largest, update_prob, dt, noise, reflecting, *sides = rest
-        box, walls = (None, tuple(sides)) if reflecting else (tuple(sides) or None, None)
+        """Return what `numbers` packed: everything but limits and the sizes of tensors."""
+        count = len(SCALARS)
+        state_gradient, inverse, density_gradient, moving, reflecting, *packed = numbers[count:]
+        sides = tuple(packed) or None
         return cls(
-            *(0, 0, eps, eps0, box, terms, bool(moving)),
-            *(largest, update_prob, dt, noise, NO_LIMITS, walls),
+            space_dim=0,
+            state_dim=0,
+            box=None if reflecting else sides,
+            walls=sides if reflecting else None,
+            terms=Terms(bool(state_gradient), INVERSES[int(inverse)], bool(density_gradient)),
+            moving=bool(moving),
+            limits=NO_LIMITS,
+            **dict(zip(SCALARS, numbers[:count], strict=True)),
         )
 
     def numbers(self) -> list[float]:
-        """Return what torch operators take in place of this: numbers, constants to compilers."""
+        """Pack this into a list for torch operators: numbers that compilers take for constants."""
         state_gradient, inverse, density_gradient = self.terms
-        given = (
-            self.eps,
-            self.eps0,
-            float(state_gradient),
-            float(INVERSES.index(inverse)),
-            float(density_gradient),
-            float(self.moving),
-            self.max_displacement,
-            self.update_prob,
-            self.dt,
-            self.position_noise,
-            float(self.walls is not None),
-            *(self.box or self.walls or ()),
-        )
-        return [constant(number) for number in given]
+        reflecting = self.walls is not None
+        flags = state_gradient, INVERSES.index(inverse), density_gradient, self.moving, reflecting
+        scalars = [getattr(self, name) for name in SCALARS]
+        sides = self.box or self.walls or ()
+        return [constant(number) for number in (*scalars, *map(float, flags), *sides)]
 
     def scale(self) -> float:
         """Return c = eps / eps0."""
         return constant(self.eps / self.eps0)
 
     def constants(self) -> Physics:
-        """Return them with numbers that a compiler takes for constants."""
+        """Return the same with numbers that a compiler takes for constants."""
         if not torch.compiler.is_compiling():
             return self
         # Compilers lose fields that `_replace` or a default would fill in.
-        return Physics(
-            self.space_dim,
-            self.state_dim,
-            constant(self.eps),
-            constant(self.eps0),
-            _constants(self.box),
-            self.terms,
-            self.moving,
-            constant(self.max_displacement),
-            constant(self.update_prob),
-            constant(self.dt),
-            constant(self.position_noise),
-            self.limits,
-            _constants(self.walls),
-        )
+        return Physics(*[_constants(value) for value in self])
 
 
-def _constants(sides: tuple[float, ...] | None) -> tuple[float, ...] | None:
-    return None if sides is None else tuple([constant(side) for side in sides])
+SCALARS = ("eps", "eps0", "max_displacement", "update_prob", "dt", "position_noise")
+"""Fields of `Physics` that are one number."""
+
+
+def _constants(value: Any) -> Any:
+    """Return the value of a field, with constants in place of numbers."""
+    if type(value) is tuple:
+        return tuple([constant(side) for side in value])
+    return constant(value) if type(value) is float else value
 
 
 def physics(
@@ -230,19 +218,19 @@ def _checked(
     periodic = boundary != "reflecting"
     sides = checked_box(box, space_dim, radius if periodic else None, dtype)
     return Physics(
-        space_dim,
-        state_dim,
-        radius,
-        radius0,
-        sides if periodic else None,
-        terms,
-        moving,
-        constant(alpha) * radius,
-        update_prob,
-        dt,
-        position_noise,
-        NO_LIMITS,
-        None if periodic else sides,
+        space_dim=space_dim,
+        state_dim=state_dim,
+        eps=radius,
+        eps0=radius0,
+        box=sides if periodic else None,
+        walls=None if periodic else sides,
+        terms=terms,
+        moving=moving,
+        max_displacement=constant(alpha) * radius,
+        update_prob=update_prob,
+        dt=dt,
+        position_noise=position_noise,
+        limits=NO_LIMITS,
     )
 
 

@@ -140,7 +140,7 @@ class SortedWorlds(NamedTuple):
     """Sorted states, dimensionless, shape [B N G, W]: channels padded with zeros to G groups."""
 
 
-def make_plan(
+def plan_kernels(
     like: Tensor,
     shape: Sequence[int],
     state_dim: int,

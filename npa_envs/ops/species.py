@@ -19,11 +19,11 @@ from npa_envs.checks import (
 )
 from npa_envs.errors import NPAError, shown
 from npa_envs.kernels.portable.species import species_kernel
+from npa_envs.ops.custom_op import check_derivatives, custom_op
 from npa_envs.ops.launch import launch, scalar_type
-from npa_envs.ops.opaque import check_derivatives, opaque
 from npa_envs.ops.perceive import perceive
 from npa_envs.ops.physics import Physics, physics
-from npa_envs.ops.sort import make_plan, sort_worlds
+from npa_envs.ops.sort import plan_kernels, sort_worlds
 
 MOST_SPECIES = 64
 """Species of a world: a thread keeps one sum for each."""
@@ -61,13 +61,13 @@ def checked_counts(counts: Sequence[int], particle_count: int) -> tuple[int, ...
     return checked
 
 
-@opaque("npa::gather_species")
+@custom_op("npa::gather_species")
 def _gather_species(
     x: Tensor, counts: list[int], physics: Physics, scaled: bool
 ) -> tuple[Tensor, Tensor]:
     """Return densities and gradients of species, as rules perceive them if they are `scaled`."""
     world_count, particle_count, space_dim = x.shape
-    plan = make_plan(x, x.shape, 1, world_count * particle_count, False, physics)
+    plan = plan_kernels(x, x.shape, 1, world_count * particle_count, False, physics)
     ordered = sort_worlds(plan, x, None, None, with_rows=False)
     place = ordered.source % particle_count
     sorted_species = torch.zeros_like(place)

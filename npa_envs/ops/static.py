@@ -13,11 +13,11 @@ from torch import Tensor
 
 from npa_envs.kernels.portable.density import density_kernels
 from npa_envs.kernels.portable.sort import give_rows
+from npa_envs.ops.custom_op import custom_op
 from npa_envs.ops.launch import launch, scalar_type
-from npa_envs.ops.opaque import opaque
 from npa_envs.ops.passes import Densities, ListedNeighbours, NeighbourLists, compute_densities
 from npa_envs.ops.physics import Physics
-from npa_envs.ops.sort import KernelPlan, SortedWorlds, grouped_states, make_plan, sort_worlds
+from npa_envs.ops.sort import KernelPlan, SortedWorlds, grouped_states, plan_kernels, sort_worlds
 
 LARGEST_LISTS = 2**31
 """Bytes of all lists on a CPU, at most: where there would be more, each step searches anew."""
@@ -60,11 +60,11 @@ class StaticWorlds(NamedTuple):
         return cls._make([*tensors[:count], tensors[count:]])
 
 
-@opaque("npa::prepare_static")
+@custom_op("npa::prepare_static")
 def _prepare_static(x: Tensor, state_dim: int, physics: Physics) -> list[Tensor]:
     """Return what a `StaticWorlds` holds."""
     total = x.shape[0] * x.shape[1]
-    plan = make_plan(x, x.shape, state_dim, total, False, physics)
+    plan = plan_kernels(x, x.shape, state_dim, total, False, physics)
     ordered = sort_worlds(plan, x, None, None)
     densities = compute_densities(plan, ordered)
     lists: list[Tensor] = []
@@ -103,7 +103,7 @@ def _list_neighbours(plan: KernelPlan, starts: Tensor, particles: Tensor) -> lis
 @_prepare_static.register_fake
 def _(x: Tensor, state_dim: int, physics: Physics) -> list[Tensor]:
     total, space_dim = x.shape[0] * x.shape[1], x.shape[2]
-    plan = make_plan(x, x.shape, state_dim, total, False, physics)
+    plan = plan_kernels(x, x.shape, state_dim, total, False, physics)
 
     def integers(count: int | torch.SymInt) -> Tensor:
         return x.new_empty(count, dtype=torch.int32)
@@ -145,7 +145,7 @@ class StaticRows(NamedTuple):
     """Positions of the rows [length units], shape [K, D]; undefined beyond the last active row."""
 
 
-@opaque("npa::static_rows")
+@custom_op("npa::static_rows")
 def _static_rows(
     x: Tensor, masks: Tensor, source: Tensor, cell_starts: Tensor, row_capacity: int
 ) -> list[Tensor]:

@@ -20,8 +20,8 @@ from npa_envs.kernels.portable.update import (
     find_not_finite,
     update_kernels,
 )
+from npa_envs.ops.custom_op import check_derivatives, custom_op, once_differentiable
 from npa_envs.ops.launch import Tape, launch, scalar_type
-from npa_envs.ops.opaque import check_derivatives, once_differentiable, opaque
 from npa_envs.ops.perceive import Rows
 from npa_envs.ops.physics import Physics
 from npa_envs.ops.sort import LARGEST_INDEX
@@ -39,7 +39,7 @@ def _boundary(physics: Physics, space_dim: int) -> tuple[int, tuple[float, ...]]
     return (OPEN, (1.0,) * space_dim) if physics.box is None else (PERIODIC, physics.box)
 
 
-@opaque("npa::update_particles")
+@custom_op("npa::update_particles")
 def _update_particles(
     update: Tensor,
     x: Tensor,
@@ -94,7 +94,7 @@ def _(
     return torch.empty_like(x), torch.empty_like(s), torch.empty_like(path_length)
 
 
-@opaque("npa::update_particles_backward")
+@custom_op("npa::update_particles_backward")
 def _update_particles_backward(
     update: Tensor,
     new_x_bar: Tensor,

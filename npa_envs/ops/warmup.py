@@ -15,7 +15,6 @@ from npa_envs.ops.backend import SHARED_WORLD
 from npa_envs.ops.draws import draw
 from npa_envs.ops.episodes import EpisodeRules, PreparedJudgement
 from npa_envs.ops.equivariance import MIXED_VECTORS, VectorForm, read_rows, steer_rows
-from npa_envs.ops.mean import world_mean
 from npa_envs.ops.network import arrange_weights, run_network
 from npa_envs.ops.perceive import Rows, build_neighbours, perceive, perceive_rows
 from npa_envs.ops.physics import Limits, Physics, Terms
@@ -26,6 +25,7 @@ from npa_envs.ops.pictures.splat import splat
 from npa_envs.ops.pictures.triangles import nearest_triangles
 from npa_envs.ops.static import prepare_static, static_rows
 from npa_envs.ops.update import PreparedActions, update_particles
+from npa_envs.ops.world_mean import world_mean
 
 
 def warmup(

@@ -20,11 +20,11 @@ from npa_envs.ops.episodes import (
     EpisodeRules,
     PreparedJudgement,
 )
-from npa_envs.ops.mean import world_mean
 from npa_envs.ops.perceive import NeighbourState, build_neighbours
 from npa_envs.ops.physics import Boundary, Limits, Physics, Terms
 from npa_envs.ops.species import perceive_by_species
 from npa_envs.ops.update import PreparedActions, wrapped
+from npa_envs.ops.world_mean import world_mean
 from npa_envs.world.randomness import WorldRandom
 from npa_envs.world.steps import draw_step
 

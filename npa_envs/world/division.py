@@ -11,7 +11,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from npa_envs.ops.mean import world_mean
+from npa_envs.ops.world_mean import world_mean
 from npa_envs.rule.rule import LIFE
 
 FEWEST_OFFSPRING = 1e-3

@@ -28,7 +28,7 @@ from torch import Tensor
 
 from npa_envs.checks import FiniteCheck, check_finite_positions
 from npa_envs.errors import NPAError, shown
-from npa_envs.ops.opaque import once_differentiable
+from npa_envs.ops.custom_op import once_differentiable
 from npa_envs.rule.rule import NPARule
 from npa_envs.world.cuda_graph import (
     GraphSequence,
@@ -40,7 +40,7 @@ from npa_envs.world.cuda_graph import (
     prepare_capture,
     recording_lock,
 )
-from npa_envs.world.own_rules import rule_settings, rule_tensors
+from npa_envs.world.module_state import rule_settings, rule_tensors
 from npa_envs.world.particles import Particles, combined
 from npa_envs.world.randomness import (
     Randomness,

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from npa_envs.checks import Box, check_world, checked_count, checked_flag
 from npa_envs.errors import NPAError, shown
-from npa_envs.ops.opaque import check_derivatives
+from npa_envs.ops.custom_op import check_derivatives
 from npa_envs.ops.physics import Boundary, Physics, Terms, physics
 from npa_envs.rule.rule import NPARule, check_rule
 from npa_envs.world.divergence import OnDivergence, make_watch

@@ -49,7 +49,9 @@ def test_nobody_leaves_a_box_of_walls_and_worlds_in_a_batch_are_as_alone():
 
 
 def test_species_live_between_walls():
-    env = multispecies_v0.parallel_env("mixing", particle_count=24, seed_radius=0.1, seed_distance=0.2, **WALLS, **EVERYONE)
+    env = multispecies_v0.parallel_env(
+        "mixing", particle_count=24, seed_radius=0.1, seed_distance=0.2, **WALLS, **EVERYONE
+    )
     env.reset(seed=0)
     for _ in range(4):
         env.step({agent: env.action_space(agent).sample() for agent in env.agents})

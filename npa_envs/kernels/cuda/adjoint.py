@@ -30,7 +30,7 @@ from npa_envs.kernels.access import (
     thread_of,
     vote_of_warp,
 )
-from npa_envs.kernels.domain import domain_types, kernel_module
+from npa_envs.kernels.domain import SLACK, TERMS_PER_SUM, domain_types, kernel_module
 from npa_envs.kernels.mathematics import make_log_scale_pull
 from npa_envs.once import made_once
 
@@ -52,15 +52,8 @@ CUDA_REGISTERS = 64
 SHARE = 4
 """Channels of a row that one thread unscales."""
 
-BLOCK = 4096
-"""Rows whose cotangents are summed before they are added to the others: of a million summed one
-after the other, too much is rounded away."""
-
 LARGEST_LENGTH = 3.4028234663852886e38
 """As far as any particle can be: the largest float32 [length units]."""
-
-SLACK = 1.0 + 1e-5
-"""Rows are listed within this much more than eps^2, whatever was rounded on the way."""
 
 load_channels = make_wide_load(CHANNELS, wp.float32)
 store_channels = make_wide_store(CHANNELS, wp.float32)
@@ -465,7 +458,7 @@ def listed_adjoint(
                         carry_rest(address, summed, count)
                         count = wp.max(count - summed, 0)
                         block += summed
-                        if finished or block >= wp.static(BLOCK):
+                        if finished or block >= wp.static(TERMS_PER_SUM):
                             for n in range(2):
                                 if (votes & wp.uint32(1 << (4 * n))) != wp.uint32(0):
                                     total[n] += found[n]

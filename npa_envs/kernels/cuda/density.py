@@ -28,9 +28,8 @@ from npa_envs.kernels.access import (
     make_wide_store,
     thread_number,
 )
-from npa_envs.kernels.domain import domain_types, kernel_module
+from npa_envs.kernels.domain import SLACK, TERMS_PER_SUM, domain_types, kernel_module
 from npa_envs.kernels.mathematics import falloff_within, smoothing_of
-from npa_envs.kernels.portable.density import BLOCK
 from npa_envs.once import made_once
 
 AHEAD, SHARED_AHEAD = 6, 5
@@ -53,10 +52,6 @@ SHARE_OF_LIST = 2
 
 LIST_END = wp.types.vector(2, wp.uint32)
 """Where the next entry of a list goes, and how far it is from there to the one after it."""
-
-
-SLACK = 1.0 + 1e-5
-"""Cells are left out beyond this much more than eps^2, whatever was rounded on the way."""
 
 TILE = 8
 """Particles of a tile."""
@@ -214,7 +209,7 @@ def listed_density(
                 crowded = wp.bool(False)
                 if wp.static(lanes == 1):
                     # Worlds whose particles have several threads are not as large.
-                    stop = wp.min(end, j + wp.static(BLOCK))
+                    stop = wp.min(end, j + wp.static(TERMS_PER_SUM))
                     crowded = stop < end
                 # Several positions are asked for before the first is used.
                 while j + wp.static((many - 1) * lanes) < stop:

@@ -2,7 +2,7 @@
 
 namespace npa {
 
-// Mean of a world's positions, in the order of npa_envs/kernels/portable/mean.py: a warp sums CHUNK
+// Mean of a world's positions, in the order of npa_envs/kernels/portable/world_mean.py: a warp sums CHUNK
 // values, then the chunks' sums. The whole block calls it and gets it.
 template <int CAPACITY, int CHUNK>
 __device__ inline wp::vec_t<2, float> mean_of_world(

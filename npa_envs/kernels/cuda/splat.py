@@ -17,7 +17,7 @@ from npa_envs.kernels.access import (
 )
 from npa_envs.kernels.cuda.sort import BLOCKS, RESIDENT_THREADS, block_functions, store_integer
 from npa_envs.kernels.pictures.splat import splat_functions, splat_types
-from npa_envs.kernels.portable.mean import CHUNK
+from npa_envs.kernels.portable.world_mean import CHUNK
 from npa_envs.once import made_once
 
 

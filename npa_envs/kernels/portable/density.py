@@ -9,15 +9,11 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from npa_envs.kernels.domain import domain_types, kernel_module
+from npa_envs.kernels.domain import TERMS_PER_SUM, domain_types, kernel_module
 from npa_envs.kernels.mathematics import smoothing, spiky_factor_wide
 from npa_envs.kernels.native import PAIRS, in_ranges, named
 from npa_envs.kernels.portable.search import make_search
 from npa_envs.once import made_once
-
-BLOCK = 4096
-"""Candidates whose weights are summed before they are added to the others: of a million summed one
-after the other, too much is rounded away."""
 
 
 @made_once()
@@ -89,8 +85,8 @@ def density_kernels(space_dim: int, scalar: type, on_cpu: bool) -> SimpleNamespa
         for segment in range(segment_count(domain, cell)):
             first, last = segment_cells(domain, cell, segment)
             end = starts[base + last]
-            for block in range(starts[base + first], end, wp.static(BLOCK)):
-                stop = wp.min(block + wp.static(BLOCK), end)
+            for block in range(starts[base + first], end, wp.static(TERMS_PER_SUM)):
+                stop = wp.min(block + wp.static(TERMS_PER_SUM), end)
                 for j in range(block, stop):
                     neighbour = sorted_positions[j]
                     offset = minimum_image(domain, neighbour - position)
@@ -101,7 +97,7 @@ def density_kernels(space_dim: int, scalar: type, on_cpu: bool) -> SimpleNamespa
                     if row >= 0 and seen:
                         gradient += spiky_wide(domain, position, neighbour)
                 counted += stop - block
-                if counted >= wp.static(BLOCK):
+                if counted >= wp.static(TERMS_PER_SUM):
                     earlier += density
                     density = scalar(0.0)
                     counted = wp.int32(0)

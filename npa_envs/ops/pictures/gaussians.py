@@ -20,8 +20,8 @@ from npa_envs.kernels.pictures.gaussians import (
     make_frame,
     tile_total,
 )
+from npa_envs.ops.custom_op import check_derivatives, custom_op, once_differentiable
 from npa_envs.ops.launch import launch, scalar_type
-from npa_envs.ops.opaque import check_derivatives, once_differentiable, opaque
 from npa_envs.ops.pictures.cameras import Cameras
 from npa_envs.ops.sort import LARGEST_INDEX
 
@@ -233,7 +233,7 @@ class GaussianScene(NamedTuple):
         return [*shapes, colours.view(total, -1), motions.view(-1, 4, 4), lenses.view(-1, 4)]
 
 
-@opaque("npa::gaussians")
+@custom_op("npa::gaussians")
 def _gaussians(
     opacities: Tensor,
     tensors: list[Tensor],
@@ -301,7 +301,7 @@ def _(
     ]
 
 
-@opaque("npa::gaussians_backward")
+@custom_op("npa::gaussians_backward")
 def _gaussians_backward(
     picture_bar: Tensor, passing_bar: Tensor, saved: list[Tensor], near: float, dilation: float
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:

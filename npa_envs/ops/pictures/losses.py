@@ -12,9 +12,8 @@ from npa_envs.kernels.access import CUDA_BLOCK
 from npa_envs.kernels.pictures.errors import BLOCK_TILES, TURN_TILES, gather_errors, sum_errors
 from npa_envs.kernels.pictures.splat import CHANNELS, make_lens
 from npa_envs.ops.backend import processor_count
+from npa_envs.ops.custom_op import custom_op
 from npa_envs.ops.launch import aligned, launch, scalar_type
-from npa_envs.ops.mean import average_sums
-from npa_envs.ops.opaque import opaque
 from npa_envs.ops.pictures.splat import (
     Splats,
     check_particles,
@@ -22,12 +21,13 @@ from npa_envs.ops.pictures.splat import (
     scatter_splats,
     sort_splats,
 )
+from npa_envs.ops.world_mean import average_sums
 
 BLOCKS_OF_PROCESSOR = 4
 """Blocks that gather errors side by side on a processor."""
 
 
-@opaque("npa::picture_losses")
+@custom_op("npa::picture_losses")
 def _picture_losses(
     x: Tensor,
     states: Tensor,

@@ -31,10 +31,10 @@ from npa_envs.kernels.pictures.splat import (
     splat_kernels,
 )
 from npa_envs.ops.backend import KernelRequest
+from npa_envs.ops.custom_op import check_derivatives, custom_op, once_differentiable
 from npa_envs.ops.launch import aligned, launch, scalar_type
-from npa_envs.ops.mean import world_mean
-from npa_envs.ops.opaque import check_derivatives, once_differentiable, opaque
 from npa_envs.ops.sort import LARGEST_INDEX, block_capacity, slice_count
+from npa_envs.ops.world_mean import world_mean
 
 LARGEST_SPOT = 1e6
 """Pixels of a spot's standard deviation at most, and of one over it."""
@@ -161,7 +161,7 @@ def _draw(splats: Splats, lens: Any) -> tuple[Tensor, Tensor, Tensor]:
     return picture, footprints, source
 
 
-@opaque("npa::splat")
+@custom_op("npa::splat")
 def _splat(
     x: Tensor,
     colour: Tensor,
@@ -185,7 +185,7 @@ def _(x: Tensor, colour: Tensor, resolution: int, *lens: float) -> tuple[Tensor,
     )
 
 
-@opaque("npa::splat_backward")
+@custom_op("npa::splat_backward")
 def _splat_backward(
     picture_bar: Tensor,
     footprints: Tensor,

@@ -86,7 +86,7 @@ def _tensors(value: Any) -> Iterator[Tensor]:
                 yield from _tensors(entry)
 
 
-class Opaque(Generic[Arguments, Result]):
+class CustomOp(Generic[Arguments, Result]):
     """A function as a torch operator; run as it is where nobody wants to see an operator.
 
     A call of an operator takes the host as long as several launches do. Results share no memory
@@ -137,9 +137,9 @@ class Opaque(Generic[Arguments, Result]):
         return self._function(*args, **kwargs)
 
 
-def opaque(name: str) -> Callable[[Callable[Arguments, Result]], Opaque[Arguments, Result]]:
+def custom_op(name: str) -> Callable[[Callable[Arguments, Result]], CustomOp[Arguments, Result]]:
     """Return a decorator that makes a function of tensors the opaque operator "npa::..."."""
-    return lambda function: Opaque(name, function)
+    return lambda function: CustomOp(name, function)
 
 
 def without_autocast(backward: Callable[Arguments, Result]) -> Callable[Arguments, Result]:

@@ -9,9 +9,9 @@ from torch import Tensor
 
 from npa_envs.checks import check_floating
 from npa_envs.errors import NPAError
-from npa_envs.kernels.portable.mean import CHUNK, MEAN_LANES, mean_kernels
+from npa_envs.kernels.portable.world_mean import CHUNK, MEAN_LANES, mean_kernels
+from npa_envs.ops.custom_op import check_derivatives, custom_op
 from npa_envs.ops.launch import launch, scalar_type
-from npa_envs.ops.opaque import check_derivatives, opaque
 
 
 def average_sums(partial_sums: Tensor, value_count: int, like: Tensor) -> Tensor:
@@ -35,7 +35,7 @@ def _lanes(device: torch.device) -> int:
     return MEAN_LANES if device.type == "cuda" else 1
 
 
-@opaque("npa::world_mean")
+@custom_op("npa::world_mean")
 def _world_mean(values: Tensor) -> Tensor:
     world_count, value_count, width = values.shape
     lanes = _lanes(values.device)
