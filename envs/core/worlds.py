@@ -217,7 +217,7 @@ class BatchedWorlds(JudgedWorlds):
         """Do what `step` does but wait for the device, and return what is observed there then."""
         if self.x.is_cuda and self.x.shape[:2].numel() <= FEW_PARTICLES:
             # To copy actions takes less than to launch what one graph then does.
-            self._actions.hold(action)
+            self._actions.load(action)
             self._act()
             assert self._side_stream is not None, "it was CUDA just now"
             assert self._perceived is not None, "it was perceived just now"
@@ -241,7 +241,7 @@ class BatchedWorlds(JudgedWorlds):
     def _act_and_look(self) -> None:
         """Apply the actions that are held; judge the worlds and, next to that, perceive."""
         self._actions.draw()
-        self._actions.apply_held()
+        self._actions.apply_loaded()
         with self._judging_on_side():
             if self._perceived is None:
                 self._perceived = self.x.new_empty(*self.x.shape[:2], self.physics.perception_dim)

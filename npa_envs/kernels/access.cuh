@@ -14,7 +14,7 @@ CUDA_CALLABLE inline void await_earlier()
 }
 
 // Let the blocks of the next kernel, if it is launched early, take places beside this one's.
-CUDA_CALLABLE inline void let_next_in()
+CUDA_CALLABLE inline void allow_next_launch()
 {
 #if defined(__CUDA_ARCH__) && __CUDA_ARCH__ >= 900
     asm volatile("griddepcontrol.launch_dependents;" ::: "memory");
@@ -210,9 +210,9 @@ __device__ inline int block_number() { return blockIdx.x; }
 
 __device__ inline int thread_of_block() { return threadIdx.x; }
 
-__device__ inline void meet_block() { __syncthreads(); }
+__device__ inline void sync_block() { __syncthreads(); }
 
-__device__ inline void meet_warp() { __syncwarp(); }
+__device__ inline void sync_warp() { __syncwarp(); }
 
 __device__ inline bool any_in_warp(bool condition) { return __any_sync(~0u, condition); }
 

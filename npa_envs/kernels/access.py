@@ -37,7 +37,7 @@ def await_earlier():
 
 
 @native.func_native()
-def let_next_in():
+def allow_next_launch():
     """Let the next kernel's blocks take free places before this one's have ended.
 
     They take them where they find them: a kernel with few blocks for a processor then has too many
@@ -232,12 +232,12 @@ def thread_of_block() -> wp.int32:
 
 
 @native.func_native()
-def meet_block():
+def sync_block():
     """Wait until the whole block is here, and sees what it wrote."""
 
 
 @native.func_native()
-def meet_warp():
+def sync_warp():
     """Wait until the whole warp is here, and sees what it wrote."""
 
 

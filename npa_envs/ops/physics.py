@@ -20,11 +20,11 @@ from npa_envs.checks import (
 from npa_envs.errors import NPAError, shown
 
 Boundary = Literal["open", "periodic", "reflecting"]
-"""No box; a box whose opposite sides are one place; or a box of walls."""
+"""No box; a periodic box; or a box whose walls reflect particles."""
 
 
 class Terms(NamedTuple):
-    """The groups of a perception vector; the others are not computed."""
+    """Which groups of entries a perception vector has; others are not computed."""
 
     state_gradient: bool = True
     moment_inverse: str | None = "threshold"
@@ -32,7 +32,7 @@ class Terms(NamedTuple):
 
     @property
     def correction(self) -> str | None:
-        """How the state gradient is corrected, "threshold" or "smooth"; None: not at all."""
+        """Correction of the state gradient, "threshold" or "smooth"; None: no correction."""
         return self.moment_inverse if self.state_gradient else None
 
     def perception_dim(self, space_dim: int, state_dim: int) -> int:
@@ -44,11 +44,11 @@ class Terms(NamedTuple):
 ALL_TERMS = Terms()
 
 INVERSES = (None, "threshold", "smooth")
-"""How moment matrices are inverted, numbered for torch operators."""
+"""Inversions of the moment matrix; torch operators take the index."""
 
 
 class Limits(NamedTuple):
-    """What bounds the worlds of environments; rollouts have no bounds."""
+    """Bounds on the worlds of environments; rollouts have no bounds."""
 
     state_scale: float = 1.0
     """State step of an action of 1, dimensionless."""
@@ -79,11 +79,11 @@ class Physics(NamedTuple):
     terms: Terms = ALL_TERMS
     """Groups of the perception vector."""
     moving: bool = True
-    """Updates begin with a displacement; otherwise there is none, and positions stay."""
+    """Whether updates begin with a displacement; otherwise particles do not move."""
     max_displacement: float = 0.0
-    """Largest displacement α ε in a unit of time [length units]; of several species the largest."""
+    """Largest displacement α ε per unit of time [length units], over all species."""
     update_prob: float = 1.0
-    """Probability p of a particle's update in a step; of several species the highest."""
+    """Probability p of a particle's update in a step; the highest of all species."""
     dt: float = 1.0
     """Time step, dimensionless."""
     position_noise: float = 0.0
@@ -91,7 +91,7 @@ class Physics(NamedTuple):
     limits: Limits = NO_LIMITS
     """Bounds of environments."""
     walls: tuple[float, ...] | None = None
-    """Sides of the box whose walls reflect [length units]; neighbours are those of open space."""
+    """Sides of a box with reflecting walls [length units]; neighbours are those of open space."""
 
     @property
     def perception_dim(self) -> int:
@@ -168,9 +168,9 @@ def physics(
     dt: float = 1.0,
     position_noise: float = 0.0,
 ) -> Physics:
-    """Return the constants of worlds of a dtype, checked.
+    """Check the constants of worlds, and return them.
 
-    `eps0` is checked already, by default it is `eps`; α is a fraction of ε.
+    `eps0` is already checked, default: `eps`. The largest displacement is α ε.
     """
     if boundary not in get_args(Boundary):
         raise NPAError(
@@ -181,7 +181,7 @@ def physics(
     if boundary == "reflecting" and box is None:
         raise NPAError("box must be given where boundary is 'reflecting', got None: give its sides")
     numbers = (eps, eps0, box, alpha, update_prob, dt, position_noise)
-    # Numbers of other types may change, and tensors are no keys.
+    # Only immutable numbers can be keys of the cache.
     plain = all(type(value) in (float, int, bool, NoneType) for value in numbers)
     check = _known if plain and not torch.compiler.is_compiling() else _checked
     return check(space_dim, state_dim, dtype, terms, moving, boundary, *numbers)

@@ -1,4 +1,4 @@
-"""Means over worlds as torch operators: world k's is the same, bit for bit, in every batch."""
+"""Mean over each world as a torch operator: the same in every batch, bit for bit."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from npa_envs.ops.launch import launch, scalar_type
 
 
 def average_sums(partial_sums: Tensor, value_count: int, like: Tensor) -> Tensor:
-    """Return means [B, K] from partial sums [B, L, K], in an order that L alone decides."""
+    """Return means [B, K] from partial sums [B, L, K]; the order of summation depends only on L."""
     world_count, _, width = partial_sums.shape
     lanes = _lanes(like.device)
     kernels = mean_kernels(scalar_type(like.dtype), lanes)
@@ -71,13 +71,13 @@ class _WorldMean(torch.autograd.Function):
 
 
 def world_mean(values: Tensor) -> Tensor:
-    """Return each world's mean; differentiable, and independent of the other worlds.
+    """Return the mean over each world; differentiable, bit for bit independent of other worlds.
 
-    It is accumulated in float64 in an order that depends on M alone; that of torch's own means may
-    change with the number of worlds, and so may their last bit.
+    It is accumulated in float64 in an order that depends on M alone. The order of torch's own means
+    may change with the number of worlds, and with it their last bit.
 
     Args:
-        values: What is averaged over its second dimension, shape [B, M, K], float32 or float64.
+        values: Values to average over M, shape [B, M, K], float32 or float64.
 
     Returns:
         The means, shape [B, K].

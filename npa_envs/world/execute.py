@@ -312,7 +312,7 @@ class _TapedStep:
         with self.tape.recording():
             step = dataclasses.replace(step, network=stand_in)
             self.after = step.advance(particles, Draws(mask, None))
-        self.places = self.tape.places(self._updates)
+        self.places = self.tape.argument_slots(self._updates)
 
     def __call__(self, rows: Tensor) -> Tensor:
         """Note what the network reads, [B N, row_width], and its place on the tape."""
@@ -334,7 +334,7 @@ class TapedSteps:
         there = _TapedStep(step, first, self._mask)
         back = _TapedStep(step, there.after, self._mask)
         for old, new in zip(back.after.tensors(), first.tensors(), strict=True):
-            back.tape.move(back.tape.places(old), new)
+            back.tape.move(back.tape.argument_slots(old), new)
         self._places = first, there.after
         self._steps = there, back
 

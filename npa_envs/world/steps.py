@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from npa_envs.checks import constant
-from npa_envs.ops.perceive import perceive_rows, update_some_at_a_time
+from npa_envs.ops.perceive import perceive_rows, updates_in_parts
 from npa_envs.ops.physics import Physics
 from npa_envs.ops.species import perceive_by_species
 from npa_envs.ops.static import StaticRows, StaticWorlds, prepare_static, static_rows
@@ -182,7 +182,7 @@ class RuleStep(Step):
         total = row_count(mask, x, physics.update_prob) if rows is None else len(rows.row_source)
         huge = total > ROWS_KEPT and not torch.is_grad_enabled() and self.static is None
         if huge and not torch.compiler.is_compiling():
-            update, active = update_some_at_a_time(x, s, physics, mask, network, total, width)
+            update, active = updates_in_parts(x, s, physics, mask, network, total, width)
         else:
             perception, active = perceive_rows(
                 x.detach() if self.detach_positions else x,

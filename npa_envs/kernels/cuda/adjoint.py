@@ -14,12 +14,12 @@ from npa_envs.kernels import native
 from npa_envs.kernels.access import (
     CUDA_BLOCK,
     WARP,
+    allow_next_launch,
     any_in_warp,
     as_word,
     await_earlier,
     first_in_warp,
     largest_in_warp,
-    let_next_in,
     load_integer,
     load_scalar,
     make_wide_load,
@@ -190,7 +190,7 @@ def listed_adjoint(
         Those of the smoothed state are multiplied by `blur_scale`.
         """
         await_earlier()
-        let_next_in()
+        allow_next_launch()
         thread = wp.tid()
         row_parts = group_count * wp.static(parts)
         row = wp.int32(wp.uint32(thread) / wp.uint32(row_parts))
@@ -368,7 +368,7 @@ def listed_adjoint(
         are multiplied by `norm`.
         """
         await_earlier()
-        let_next_in()
+        allow_next_launch()
         thread = wp.tid()
         lane = thread & wp.static(WARP - 1)
         tile = thread / wp.static(WARP)

@@ -10,7 +10,7 @@ from typing import Any
 import warp as wp
 
 from npa_envs.kernels import native
-from npa_envs.kernels.access import WARP, await_earlier, let_next_in
+from npa_envs.kernels.access import WARP, allow_next_launch, await_earlier
 from npa_envs.once import made_once
 
 UNIT_GROUP = 16
@@ -124,7 +124,7 @@ def weight_gradient_kernels(
     ):
         """Sum both weights' gradients over each share of the rows."""
         await_earlier()
-        let_next_in()
+        allow_next_launch()
         weight_sums(
             unit_count,
             share_rows,
@@ -146,7 +146,7 @@ def weight_gradient_kernels(
     ):
         """Add the shares' sums."""
         await_earlier()
-        let_next_in()
+        allow_next_launch()
         add_partial_sums(partial_sums, total)
 
     return SimpleNamespace(sum_weight_gradients=sum_weight_gradients, add_shares=add_shares)

@@ -21,9 +21,9 @@ from npa_envs.kernels.access import (
     load_integer,
     make_lane_sum,
     make_wide_load,
-    meet_warp,
     of_lane,
     share_type,
+    sync_warp,
     thread_number,
 )
 from npa_envs.kernels.cuda.density import RECORD, make_steps_at, step_of
@@ -259,7 +259,7 @@ def listed_perception(
         density_gradient: wide,
     ):
         """Weigh the neighbours whose numbers are in the slot, from `begin` to `count`."""
-        meet_warp()
+        sync_warp()
         for first in range(lane, padded(count), wp.static(PAIR * lanes)):
             places = places_of_pair()
             found = records_of_pair()
@@ -284,7 +284,7 @@ def listed_perception(
                     moment,
                     density_gradient,
                 )
-        meet_warp()
+        sync_warp()
         return kernel_sum, moment, density_gradient
 
     @wp.func
@@ -332,7 +332,7 @@ def listed_perception(
                     moment,
                     density_gradient,
                 )
-        meet_warp()
+        sync_warp()
         return steps, kernel_sum, moment, density_gradient
 
     @wp.func
@@ -364,7 +364,7 @@ def listed_perception(
                     for d in range(wp.static(space_dim)):
                         for c in range(wp.static(share_width)):
                             gradient[d, c] += packed[a, d + 1] * difference[c]
-        meet_warp()
+        sync_warp()
         return blur, gradient
 
     @wp.func

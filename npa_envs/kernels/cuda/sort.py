@@ -20,8 +20,8 @@ from npa_envs.kernels.access import (
     make_read_channels,
     make_wide_load,
     make_wide_store,
-    meet_block,
     of_warp,
+    sync_block,
     thread_of_block,
 )
 from npa_envs.kernels.domain import domain_types, kernel_module
@@ -230,7 +230,7 @@ def sort_small_worlds(space_dim: int, capacity: int) -> wp.Kernel:
             starts[starts.shape[0] - 1] = row_base + end_of_all[1]
         for i in range(lane, particle_count, wp.static(block)):
             place_arrived(memory, i)
-        meet_block()
+        sync_block()
 
         share_of_places = (particle_count + slice_count - 1) / slice_count
         begin = slice_number * share_of_places

@@ -12,7 +12,7 @@ from npa_envs.kernels.access import (
     block_number,
     make_wide_load,
     make_wide_store,
-    meet_block,
+    sync_block,
     thread_of_block,
 )
 from npa_envs.kernels.cuda.sort import BLOCKS, RESIDENT_THREADS, block_functions, store_integer
@@ -88,7 +88,7 @@ def sort_small_splats(capacity: int) -> wp.Kernel:
             starts[starts.shape[0] - 1] = positions.shape[0]
         for i in range(lane, particle_count, wp.static(block)):
             place_arrived(memory, i)
-        meet_block()
+        sync_block()
 
         share = (particle_count + slice_count - 1) / slice_count
         begin = slice_number * share

@@ -25,7 +25,7 @@ from npa_envs.kernels.access import (
     load_integer,
     make_lane_sum,
     make_wide_load,
-    meet_block,
+    sync_block,
 )
 from npa_envs.kernels.domain import scalar_name
 from npa_envs.kernels.mathematics import make_fast_exp2
@@ -384,13 +384,13 @@ def block_kernels(scalar: type) -> SimpleNamespace:
                             )
                         total = add_warp(total)
                 keep(True, i, 0, total)
-            meet_block()
+            sync_block()
             for entry in range(k, count * wp.static(PULLS), wp.static(TILE_PIXELS)):
                 i = entry / wp.static(PULLS)
                 part = entry - i * wp.static(PULLS)
                 slot = wp.int32(places[end - 1 - i])
                 pulls[slot * wp.static(PULLS) + part] = keep(False, i, part, pulls_type())
-            meet_block()
+            sync_block()
             end -= count
 
     return SimpleNamespace(draw_blocks=draw_blocks, pull_back_blocks=pull_back_blocks)

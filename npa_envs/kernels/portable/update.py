@@ -11,8 +11,8 @@ import warp as wp
 
 from npa_envs.kernels import native
 from npa_envs.kernels.access import (
+    allow_next_launch,
     await_earlier,
-    let_next_in,
     load_integer,
     make_read_at,
     make_wide_load,
@@ -183,7 +183,7 @@ def update_kernels(space_dim: int, scalar: type) -> SimpleNamespace:
     ):
         """Write the cotangent of every row's update, zero beyond the last active row."""
         await_earlier()
-        let_next_in()
+        allow_next_launch()
         # A thread has some adjacent columns of a row.
         sharers = (update_width + wp.static(CHANNEL_SHARE - 1)) / wp.static(CHANNEL_SHARE)
         t = range_start + wp.tid()

@@ -11,7 +11,7 @@ from npa_envs.errors import NPAError
 from npa_envs.kernels.access import CUDA_BLOCK
 from npa_envs.kernels.pictures.errors import BLOCK_TILES, TURN_TILES, gather_errors, sum_errors
 from npa_envs.kernels.pictures.splat import CHANNELS, make_lens
-from npa_envs.ops.backend import processor_count
+from npa_envs.ops.backend import multiprocessor_count
 from npa_envs.ops.custom_op import custom_op
 from npa_envs.ops.launch import aligned, launch, scalar_type
 from npa_envs.ops.pictures.splat import (
@@ -46,7 +46,7 @@ def _picture_losses(
         starts, footprints, _ = sort_splats(splats, lens)
         tile_total = lens.tile_columns * lens.tile_rows
         partial_sums = x.new_empty(world_count, tile_total, 2, dtype=torch.float64)
-        tile_count = block_tiles(world_count * tile_total, processor_count(device))
+        tile_count = block_tiles(world_count * tile_total, multiprocessor_count(device))
         threads = world_count * -(-tile_total // tile_count) * CUDA_BLOCK
         pixels = aligned(target).view(-1, CHANNELS)
         gathered = (tile_count, starts, footprints, pixels, partial_sums)
