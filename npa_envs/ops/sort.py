@@ -104,7 +104,7 @@ class KernelPlan(NamedTuple):
 
     @property
     def start_count(self) -> int:
-        """Length of `starts`: an entry for each cell, with a mask another for its rows, and the end."""
+        """Length of `starts`: an entry a cell, with a mask another for its rows, and the end."""
         return self.cell_total + self.active_offset + 1
 
     @property
