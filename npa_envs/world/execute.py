@@ -1,4 +1,4 @@
-"""Execution of rollouts: resting worlds, CUDA graph, CPU tape or loop, all with the same results."""
+"""Execution of rollouts: resting worlds, CUDA graph, CPU tape or loop, with the same results."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ FEWEST_RESTING = 256
 """Fewest steps of a rollout that is checked for worlds at rest."""
 
 LARGEST_TOTAL = 4096
-"""Most particles of a batch whose steps are on a tape: larger ones hide the CPU time of launches."""
+"""Most particles of a batch whose steps are on a tape: in larger ones kernels take most time."""
 
 MOST_KINDS = 32
 """Most kinds of calls whose tapes are cached."""
@@ -187,6 +187,8 @@ class RecomputedSteps:
             self.end_forward()
 
     def end_forward(self) -> None:
+        """Store the versions of all inputs."""
+        # Tensors are kept alive, so that no other tensor gets their memory.
 
         self._read = {name: (value, _reading(value)) for name, value in self._readings()}
 
@@ -206,7 +208,7 @@ class RecomputedSteps:
 
 
 def _reading(value: Any) -> Any:
-    """Return a tensor's identity and version, which a write changes; other values unchanged."""
+    """Return a tensor's version, which each write changes; other values unchanged."""
     if not isinstance(value, Tensor):
         return value
     return value.data_ptr(), None if value.is_inference() else value._version
