@@ -1,6 +1,6 @@
-"""Density, and what follows from it of positions alone: volumes, density gradients, neighbours.
+"""Density, volumes, density gradients and neighbour lists of sorted particles.
 
-Sums run over sorted particles, run by run of cells.
+Sums run over sorted particles, one contiguous run of cells after the other.
 
 Source: arXiv 2601.16096, section 3.
 """
@@ -34,7 +34,7 @@ def density_kernels(space_dim: int, scalar: type, on_cpu: bool) -> SimpleNamespa
 
     @wp.func
     def spiky_wide(domain: Domain, centre: vector, neighbour: vector):
-        """Spiky gradient kernel of a pair in float64: a Newton step refines 1 / distance."""
+        """Return the spiky gradient kernel of a pair in float64."""
         kernel = wide()
         r = wide()
         for d in range(wp.static(space_dim)):
@@ -101,7 +101,7 @@ def density_kernels(space_dim: int, scalar: type, on_cpu: bool) -> SimpleNamespa
                     earlier += density
                     density = scalar(0.0)
                     counted = wp.int32(0)
-        # A particle always sees itself: a position that is not finite would otherwise have rho 0.
+        # Its own term is added without a search, so that rho is not 0 for positions that are NaN.
         entry = particle()
         for d in range(wp.static(space_dim)):
             entry[d] = position[d]
@@ -120,7 +120,8 @@ def density_kernels(space_dim: int, scalar: type, on_cpu: bool) -> SimpleNamespa
         begin: wp.int32,
         neighbours: wp.array(dtype=wp.int32),
     ):
-        """Write neighbours of particle k from `begin` on, where there is room; return the end."""
+        """Write neighbours of particle k from index `begin` on, unless the array is empty; return
+        the end."""
         position = position_of(particles[k])
         base = (k / particle_count) * domain.cell_count
         cell = cell_of(domain, position)
@@ -143,13 +144,13 @@ def density_kernels(space_dim: int, scalar: type, on_cpu: bool) -> SimpleNamespa
         particle_count: wp.int32,
         starts: wp.array(dtype=wp.int32),
         particles: wp.array(dtype=particle),
-        nobody: wp.array(dtype=wp.int32),
+        empty: wp.array(dtype=wp.int32),
         # outputs
         counts: wp.array(dtype=wp.int32),
     ):
-        """Write how many neighbours each particle has, itself included; `nobody` is empty."""
+        """Write each particle's number of neighbours, itself included; `empty` has no entries."""
         k = range_start + wp.tid()
-        counts[k] = list_around(domain, particle_count, starts, particles, k, 0, nobody)
+        counts[k] = list_around(domain, particle_count, starts, particles, k, 0, empty)
 
     @in_ranges(PAIRS)
     @wp.kernel(enable_backward=False, module=module)
@@ -163,7 +164,7 @@ def density_kernels(space_dim: int, scalar: type, on_cpu: bool) -> SimpleNamespa
         # outputs
         neighbours: wp.array(dtype=wp.int32),
     ):
-        """Write each particle's neighbours, from the end of those of the particle before it on."""
+        """Write each particle's neighbours after those of the particle before it."""
         k = range_start + wp.tid()
         begin = wp.int32(0)
         if k > 0:

@@ -1,4 +1,4 @@
-"""Episodes: rewards and endings of worlds that were acted on, from their losses."""
+"""Rewards, terminations and truncations of episodes, from the worlds' losses."""
 
 import warp as wp
 
@@ -6,13 +6,13 @@ from npa_envs.kernels import native
 from npa_envs.kernels.access import await_earlier
 
 SUCCESS, DIVERGED, TIME_LIMIT = 1, 2, 4
-"""Bits of an ending: why an episode is over; none is set while it runs."""
+"""Bits of an ending, the reasons why an episode is over; 0 while it runs."""
 
 NOT_FINITE = 8
-"""Bit of a world whose reward is not finite: its step is an error."""
+"""Bit of a world whose reward is not finite, which is an error."""
 
 GO_ON, TELL, END = 0, 1, 2
-"""What divergence does to an episode: nothing; its loss is not below the first one; it ends it."""
+"""Effect of divergence on an episode: none; its loss is at least the first loss; it also ends."""
 
 
 @wp.kernel(enable_backward=False, module=native.module("npa_envs.kernels.episodes"))
