@@ -1,7 +1,7 @@
-"""Splats of small worlds on CUDA: a block sorts a world's, in one launch in place of seven.
+"""Splats of small worlds on CUDA: a block sorts those of a world, in one launch instead of seven.
 
-The same footprints in the same order as those of `pictures/splat.py`. The block finds its world's
-mean, too. Where worlds are few, several blocks sort the same world, and each writes a slice.
+The same footprints in the same order as in `pictures/splat.py`. The block also computes its world's
+mean. If worlds are few, several blocks sort the same world, and each writes a slice.
 """
 
 import warp as wp
@@ -43,7 +43,7 @@ def sort_small_splats(capacity: int) -> wp.Kernel:
     def mean_of_world(
         positions: wp.array(dtype=vector), first: wp.int32, count: wp.int32
     ) -> vector:
-        """Mean of a world's positions, which the whole block asks for."""
+        """Return the mean of a world's positions; the whole block calls it."""
 
     @wp.kernel(
         enable_backward=False,
@@ -92,8 +92,8 @@ def sort_small_splats(capacity: int) -> wp.Kernel:
 
         share = (particle_count + slice_count - 1) / slice_count
         begin = slice_number * share
-        # What nobody sees may lie in any order, as there can be much of it, but that differs among
-        # the blocks of a world: the last one writes all of it.
+        # Invisible splats, which may be many, can have any order. As it differs among the blocks of
+        # a world, the last block writes all of them.
         hidden = start_of(memory, lens.cell_count - 1)[0]
         end = wp.min(begin + share, hidden)
         if slice_number == slice_count - 1:
