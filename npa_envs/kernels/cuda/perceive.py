@@ -9,6 +9,7 @@ capacity are searched for again.
 """
 
 import math
+from types import SimpleNamespace
 
 import warp as wp
 
@@ -58,79 +59,12 @@ CANDIDATES = 16
 load_record = make_wide_load(RECORD, wp.float32)
 
 
-@made_once()
-def listed_perception(
-    space_dim: int,
-    width: int,
-    lanes: int,
-    state_gradient: bool,
-    moment_inverse: str | None,
-    periodic: bool,
-    grouped: bool,
-    capacity: int,
-    for_adjoint: bool,
-    teams: int,
-    by_place: bool = False,
-    tiled: bool = False,
-) -> wp.Kernel:
-    """Return the perception kernel of one variant.
-
-    Args:
-        lanes: Lanes of a team, which share the channels of a group.
-        grouped: Whether there are several groups of channels.
-        teams: Teams of lanes that share a particle, so that few particles fill the GPU: each runs
-            through its own part of the list, for all channels.
-        by_place: Whether there is a list for each sorted particle, not for each row.
-        tiled: Whether lists have the layout of `tiled_density`.
-    """
-    scalar = wp.float32
-    moment_correction = moment_inverse is not None
-    smooth = moment_inverse == "smooth"
-    flat = space_dim == 2
-    types = domain_types(space_dim, scalar)
-    vector, Domain = types.vector, types.Domain
-    cell_place, segment_count, segment_cells = (
-        types.cell_place,
-        types.segment_count,
-        types.segment_cells,
-    )
-    periodic_image = types.periodic_image
-    wide = wp.types.vector(space_dim, wp.float64)
-    group = wp.types.vector(width, scalar)
-    share = share_type(group, scalar, lanes)
-    share_gradient = share_type(wp.types.matrix((space_dim, width), scalar), scalar, lanes)
-    share_width = width // lanes
-    share_rows = wp.types.vector(share_width * space_dim, scalar)
-    team = lanes
-    lanes *= teams
-    ahead = max(CANDIDATES // lanes, 1)
-    square = wp.types.matrix((space_dim, space_dim), scalar)
-    cell_vector = wp.types.vector(space_dim, wp.int32)
-    topic = "listed_smoothing"
-    if state_gradient:
-        topic = "listed_perception" if moment_correction else "listed_uncorrected_perception"
-        topic = "listed_smoothly_corrected_perception" if smooth else topic
-    topic += "_in_box" * periodic + "_grouped" * grouped
-    topic += f"_{capacity}" + "_for_adjoint" * for_adjoint + "_by_place" * by_place
-    topic += "_tiled" * tiled
-    module = kernel_module(topic, space_dim, scalar, width, lanes)
-    registers = CUDA_REGISTERS[space_dim] if teams == 1 else TEAM_REGISTERS
-    load_vector = make_wide_load(vector, scalar)
-    add_vector = make_lane_sum(vector, scalar, lanes, whole_warps=True)
-    add_square = make_lane_sum(square, scalar, lanes, whole_warps=True)
-    add_wide = make_lane_sum(wide, wp.float64, lanes, whole_warps=True)
-    add_share = make_lane_sum(share, scalar, lanes, whole_warps=True, stride=team)
-    add_gradient = make_lane_sum(share_gradient, scalar, lanes, whole_warps=True, stride=team)
-    steps_at = make_steps_at(capacity, tiled)
-    entries_together = wp.types.matrix((TOGETHER, space_dim + 2), scalar)
-    states_together = wp.types.matrix((TOGETHER, share_width), scalar)
-    places_of_pair = wp.types.vector(PAIR, wp.int32)
-    records_of_pair = wp.types.matrix((PAIR, 4), scalar)
-    candidates_ahead = wp.types.matrix((ahead, space_dim), scalar)
-    corrected = make_corrected(space_dim, scalar, share_width, moment_inverse)
-    stage_share, stage_rows = make_stage(share), make_stage(share_rows)
+def slot_functions(
+    space_dim: int, width: int, lanes: int, share: type, row_words: int, grouped: bool
+) -> SimpleNamespace:
+    """Return the functions on a particle's slot, on its neighbours' states and on its row."""
+    vector = wp.types.vector(space_dim, wp.float32)
     entry_type = wp.types.vector(space_dim + 2, wp.float32)
-    row_words = width * (2 + space_dim * state_gradient)
     # The additional 16 bytes spread a warp's slots over the banks of shared memory.
     slot_bytes = max(SLOT_ENTRIES * (16 if space_dim == 2 else 20), 4 * row_words) + 16
 
@@ -168,6 +102,42 @@ def listed_perception(
         rows: wp.array(dtype=wp.float32, ndim=2),
     ): ...
 
+    @wp.func
+    def padded(count: wp.int32):
+        """Return a number of neighbours, rounded up to a multiple of the lanes."""
+        return (count + wp.static(lanes - 1)) & ~wp.int32(wp.static(lanes - 1))
+
+    numbers = append_number, number_at, padded
+    return native.named(
+        slot_address, part_address, part_of_state, *numbers, put_entry, entry_at, write_rows
+    )
+
+
+def weighing_functions(
+    space_dim: int,
+    lanes: int,
+    slots: SimpleNamespace,
+    steps_at: wp.Function,
+    state_gradient: bool,
+    moment_correction: bool,
+    for_adjoint: bool,
+    periodic: bool,
+) -> SimpleNamespace:
+    """Return the functions that put neighbours' weights into a slot and add up the short sums.
+
+    These are sums whose terms have no channels: of v K, of the moment matrix, and of the density
+    gradient. Each lane sums its own neighbours.
+    """
+    scalar = wp.float32
+    flat = space_dim == 2
+    types = domain_types(space_dim, scalar)
+    vector, Domain, periodic_image = types.vector, types.Domain, types.periodic_image
+    wide = wp.types.vector(space_dim, wp.float64)
+    square = wp.types.matrix((space_dim, space_dim), scalar)
+    places_of_pair = wp.types.vector(PAIR, wp.int32)
+    records_of_pair = wp.types.matrix((PAIR, 4), scalar)
+    padded, number_at, put_entry = slots.padded, slots.number_at, slots.put_entry
+
     @wp.struct
     class Centre:
         """A row's particle, in the types that its pairs need: converted once, not for each pair."""
@@ -175,11 +145,6 @@ def listed_perception(
         position: vector
         precise: wide
         inverse_eps: wp.float64
-
-    @wp.func
-    def padded(count: wp.int32):
-        """Return a number of neighbours, rounded up to a multiple of the lanes."""
-        return (count + wp.static(lanes - 1)) & ~wp.int32(wp.static(lanes - 1))
 
     @wp.func
     def spiky_wide(domain: Domain, centre: Centre, neighbour: vector, squared: scalar):
@@ -335,6 +300,24 @@ def listed_perception(
         sync_warp()
         return steps, kernel_sum, moment, density_gradient
 
+    return SimpleNamespace(Centre=Centre, weigh_found=weigh_found, weigh_listed=weigh_listed)
+
+
+def make_add_states(
+    space_dim: int,
+    share_width: int,
+    teams: int,
+    slots: SimpleNamespace,
+    share: type,
+    share_gradient: type,
+    state_gradient: bool,
+) -> wp.Function:
+    """Return the function that adds neighbours' states to the long sums, by a slot's weights."""
+    scalar = wp.float32
+    entries_together = wp.types.matrix((TOGETHER, space_dim + 2), scalar)
+    states_together = wp.types.matrix((TOGETHER, share_width), scalar)
+    padded, entry_at, part_of_state = slots.padded, slots.entry_at, slots.part_of_state
+
     @wp.func
     def add_states(
         states: wp.uint64,
@@ -366,6 +349,84 @@ def listed_perception(
                             gradient[d, c] += packed[a, d + 1] * difference[c]
         sync_warp()
         return blur, gradient
+
+    return add_states
+
+
+@made_once()
+def listed_perception(
+    space_dim: int,
+    width: int,
+    lanes: int,
+    state_gradient: bool,
+    moment_inverse: str | None,
+    periodic: bool,
+    grouped: bool,
+    capacity: int,
+    for_adjoint: bool,
+    teams: int,
+    by_place: bool = False,
+    tiled: bool = False,
+) -> wp.Kernel:
+    """Return the perception kernel of one variant.
+
+    Args:
+        lanes: Lanes of a team, which share the channels of a group.
+        grouped: Whether there are several groups of channels.
+        teams: Teams of lanes that share a particle, so that few particles fill the GPU: each runs
+            through its own part of the list, for all channels.
+        by_place: Whether there is a list for each sorted particle, not for each row.
+        tiled: Whether lists have the layout of `tiled_density`.
+    """
+    scalar = wp.float32
+    moment_correction = moment_inverse is not None
+    types = domain_types(space_dim, scalar)
+    vector, Domain = types.vector, types.Domain
+    cell_place, segment_count = types.cell_place, types.segment_count
+    segment_cells = types.segment_cells
+    periodic_image = types.periodic_image
+    wide = wp.types.vector(space_dim, wp.float64)
+    group = wp.types.vector(width, scalar)
+    share = share_type(group, scalar, lanes)
+    share_gradient = share_type(wp.types.matrix((space_dim, width), scalar), scalar, lanes)
+    share_width = width // lanes
+    share_rows = wp.types.vector(share_width * space_dim, scalar)
+    team = lanes
+    lanes *= teams
+    ahead = max(CANDIDATES // lanes, 1)
+    square = wp.types.matrix((space_dim, space_dim), scalar)
+    cell_vector = wp.types.vector(space_dim, wp.int32)
+    topic = "listed_smoothing"
+    if state_gradient:
+        topic = "listed_perception" if moment_correction else "listed_uncorrected_perception"
+        topic = "listed_smoothly_corrected_perception" if moment_inverse == "smooth" else topic
+    topic += "_in_box" * periodic + "_grouped" * grouped
+    topic += f"_{capacity}" + "_for_adjoint" * for_adjoint + "_by_place" * by_place
+    topic += "_tiled" * tiled
+    module = kernel_module(topic, space_dim, scalar, width, lanes)
+    registers = CUDA_REGISTERS[space_dim] if teams == 1 else TEAM_REGISTERS
+    load_vector = make_wide_load(vector, scalar)
+    add_vector = make_lane_sum(vector, scalar, lanes, whole_warps=True)
+    add_square = make_lane_sum(square, scalar, lanes, whole_warps=True)
+    add_wide = make_lane_sum(wide, wp.float64, lanes, whole_warps=True)
+    add_share = make_lane_sum(share, scalar, lanes, whole_warps=True, stride=team)
+    add_gradient = make_lane_sum(share_gradient, scalar, lanes, whole_warps=True, stride=team)
+    steps_at = make_steps_at(capacity, tiled)
+    candidates_ahead = wp.types.matrix((ahead, space_dim), scalar)
+    corrected = make_corrected(space_dim, scalar, share_width, moment_inverse)
+    stage_share, stage_rows = make_stage(share), make_stage(share_rows)
+    row_words = width * (2 + space_dim * state_gradient)
+    slots = slot_functions(space_dim, width, lanes, share, row_words, grouped)
+    slot_address, append_number = slots.slot_address, slots.append_number
+    part_address, part_of_state = slots.part_address, slots.part_of_state
+    write_rows = slots.write_rows
+    options = state_gradient, moment_correction, for_adjoint, periodic
+    weighing = weighing_functions(space_dim, lanes, slots, steps_at, *options)
+    Centre, weigh_found = weighing.Centre, weighing.weigh_found
+    weigh_listed = weighing.weigh_listed
+    add_states = make_add_states(
+        space_dim, share_width, teams, slots, share, share_gradient, state_gradient
+    )
 
     @wp.func
     def scale_huge(gradient_scale: scalar, gradient: share_gradient, scaled: share_rows):
