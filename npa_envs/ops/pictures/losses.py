@@ -1,4 +1,4 @@
-"""Losses of 2D worlds' pictures against a target, without gradient and at once."""
+"""Losses of 2D worlds' pictures against a target, without gradient, in fused kernels."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from npa_envs.ops.pictures.splat import (
 from npa_envs.ops.world_mean import average_sums
 
 BLOCKS_OF_PROCESSOR = 4
-"""Blocks that gather errors side by side on a processor."""
+"""Blocks per multiprocessor that gather errors in parallel."""
 
 
 @custom_op("npa::picture_losses")
@@ -60,7 +60,7 @@ def _picture_losses(
 
 
 def block_tiles(tile_total: int, processors: int) -> int:
-    """Return how many tiles a block serves: few where many would leave processors idle."""
+    """Return the number of tiles of a block: fewer if many would leave multiprocessors idle."""
     tile_count = BLOCK_TILES
     while tile_count > TURN_TILES and tile_total < BLOCKS_OF_PROCESSOR * processors * tile_count:
         tile_count //= 2
@@ -84,7 +84,7 @@ def picture_losses(
     lo: float = -1.0,
     hi: float = 1.0,
 ) -> tuple[Tensor, Tensor]:
-    """Compare worlds with a picture at once; without gradient.
+    """Compare worlds with a picture without writing theirs (on CUDA); without gradient.
 
     Each world's mean position is moved to `goal` and drawn as by `splat`; colours are the last
     three states plus `shift`. With d the difference from the target and e = |d| + d^2, a pixel's
@@ -92,8 +92,8 @@ def picture_losses(
     exp(-(density error)). The target has shape [R, R, 4], the goal [2].
 
     Returns:
-        Means over the pixels of the density error and of the colour error, shape [B] each. World
-        k's are the same, bit for bit, in every batch.
+        Means over the pixels of the density error and of the colour error, shape [B] each, bit for
+        bit the same in every batch.
     """
     check_particles(x, states, None)
     resolution = target.shape[0] if target.ndim else 0
