@@ -97,32 +97,32 @@ def multiprocessor_count(device: torch.device) -> int:
     return int(torch.cuda.get_device_properties(device).multi_processor_count)
 
 
-def _fits_cuda(request: KernelRequest) -> bool:
+def _cuda(request: KernelRequest) -> bool:
     return request.dtype == torch.float32 and is_modern(request.device)
 
 
-def _fits_block(request: KernelRequest) -> bool:
+def _block(request: KernelRequest) -> bool:
     return (
-        _fits_cuda(request)
+        _cuda(request)
         and request.aligned
         and request.particle_count <= LARGEST_BLOCK_WORLD
         and request.cell_count <= LARGEST_BLOCK_GRID
     )
 
 
-def _fits_tiles(request: KernelRequest) -> bool:
+def _tiles(request: KernelRequest) -> bool:
     return (
-        _fits_cuda(request)
+        _cuda(request)
         and request.space_dim == 2
         and request.particle_count <= SHARED_WORLD
         and request.smallest_side >= SMALLEST_SIDE
     )
 
 
-def _fits_fused_network(request: KernelRequest) -> bool:
+def _fused(request: KernelRequest) -> bool:
     widths = request.row_width, request.update_width
     return (
-        _fits_cuda(request)
+        _cuda(request)
         and all(width % 4 == 0 for width in widths)
         and request.hidden_dim % UNIT_SHARE == 0
         and request.row_width <= LARGEST_ROW
@@ -144,14 +144,10 @@ TABLE: tuple[Implementation, ...] = (
         "kernels/cuda/sort.py",
         f"{_MODERN}, worlds of at most {LARGEST_BLOCK_WORLD} particles and "
         f"{LARGEST_BLOCK_GRID} cells: a block of threads sorts a world",
-        _fits_block,
+        _block,
     ),
     Implementation(
-        "sort",
-        "cuda",
-        "kernels/cuda/sort.py",
-        f"{_MODERN}: a warp moves states together",
-        _fits_cuda,
+        "sort", "cuda", "kernels/cuda/sort.py", f"{_MODERN}: a warp moves states together", _cuda
     ),
     Implementation(
         "sort",
@@ -170,22 +166,18 @@ TABLE: tuple[Implementation, ...] = (
         f"{_MODERN}, 2D, worlds of at most {SHARED_WORLD} particles, boxes of at least "
         f"{SMALLEST_SIDE} cells along each side; environments only above {SMALL_WORLD}: neighbours "
         "are listed in the same pass, by a warp for eight particles",
-        _fits_tiles,
+        _tiles,
     ),
     Implementation(
         "density",
         "cuda",
         "kernels/cuda/density.py",
         f"{_MODERN}: neighbours are listed in the same pass, in 16 bits each",
-        _fits_cuda,
+        _cuda,
     ),
     Implementation("density", "portable", "kernels/portable/density.py", "otherwise", _always),
     Implementation(
-        "perceive",
-        "cuda",
-        "kernels/cuda/perceive.py",
-        f"{_MODERN}: from neighbour lists",
-        _fits_cuda,
+        "perceive", "cuda", "kernels/cuda/perceive.py", f"{_MODERN}: from neighbour lists", _cuda
     ),
     Implementation("perceive", "portable", "kernels/portable/perceive.py", "otherwise", _always),
     Implementation(
@@ -193,7 +185,7 @@ TABLE: tuple[Implementation, ...] = (
         "cuda",
         "kernels/cuda/adjoint.py",
         f"{_MODERN}, positions get no gradient: tiles of eight particles on tensor cores",
-        lambda request: _fits_cuda(request) and not request.position_gradient,
+        lambda request: _cuda(request) and not request.position_gradient,
     ),
     Implementation("adjoint", "portable", "kernels/portable/adjoint.py", "otherwise", _always),
     Implementation(
@@ -202,7 +194,7 @@ TABLE: tuple[Implementation, ...] = (
         "kernels/cuda/equivariance.py",
         f"{_MODERN}, rows fit into shared memory: a warp maps a few rows of an equivariant rule",
         lambda request: (
-            request.vectors is not None and _fits_cuda(request) and fits_block(*request.vectors)
+            request.vectors is not None and _cuda(request) and fits_block(*request.vectors)
         ),
     ),
     Implementation(
@@ -218,7 +210,7 @@ TABLE: tuple[Implementation, ...] = (
         "kernels/cuda/network.py",
         f"{_MODERN}, rows of at most {LARGEST_ROW} columns, updates of {LARGEST_UPDATE}, "
         f"{LARGEST_HIDDEN} hidden units in multiples of {UNIT_SHARE}: tensor cores",
-        _fits_fused_network,
+        _fused,
     ),
     Implementation("network", "torch", "torch's products", "otherwise", _always),
     Implementation("update", "portable", "kernels/portable/update.py", "always", _always),

@@ -8,8 +8,6 @@ serves any rule of that form, and later calls do not overwrite results.
 
 Tensors for the backward pass stay in the recording's memory. Until that pass has run, the recording
 is leased, and another rollout of the kind gets another recording.
-
-The file has three parts: recording, leases and memory, replay.
 """
 
 from __future__ import annotations
@@ -82,8 +80,6 @@ logger = logging.getLogger(__name__)
 
 
 # Recording: a rollout is captured as CUDA graphs, on copies of worlds and weights.
-
-
 def rule_form(rule: NPARule) -> Hashable:
     """Return all settings of a plain rule that its steps depend on, except weights."""
     form: dict[str, Any] = {**rule.hyper_parameters()}
@@ -441,8 +437,6 @@ def _copies(tensors: list[Tensor]) -> list[Tensor]:
 
 
 # Leases and memory: which recording serves a call, and which are deleted to make room.
-
-
 class CallKind:
     """Calls of one kind: their number, and their recordings or taped steps."""
 
@@ -480,10 +474,7 @@ class CallKinds(collections.OrderedDict[Hashable, CallKind]):
 
 
 class _Lease:
-    """The use of a recording by one rollout; its deletion makes the recording free again.
-
-    Autograd keeps it alive as long as a backward pass is possible.
-    """
+    """One use of a recording, which its deletion ends; autograd keeps it until a backward pass."""
 
     def __init__(self, recording: _Recording, kind: CallKind) -> None:
         self.recording = recording
@@ -580,8 +571,6 @@ def _refuse(kind: CallKind, reason: object, *, asked: bool) -> None:
 
 
 # Replay: a call looks for a recording of its kind, and replays it.
-
-
 def check_cuda_graph(cuda_graph: CudaGraph) -> None:
     """Check the keyword `cuda_graph`."""
     if not isinstance(cuda_graph, bool | str) or cuda_graph not in (True, False, "auto"):

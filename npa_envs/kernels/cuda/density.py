@@ -81,11 +81,8 @@ def listed_density(
     flat = space_dim == 2
     types = domain_types(space_dim, scalar)
     vector, particle, Domain = types.vector, types.particle, types.Domain
-    cell_place, segment_count, segment_cells = (
-        types.cell_place,
-        types.segment_count,
-        types.segment_cells,
-    )
+    cell_place, segment_count = types.cell_place, types.segment_count
+    segment_cells = types.segment_cells
     periodic_image = types.periodic_image
     load_vector = make_wide_load(vector, scalar)
     add_scalar = make_lane_sum(scalar, scalar, lanes)

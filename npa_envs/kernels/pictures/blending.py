@@ -142,11 +142,8 @@ def tile_kernels(scalar: type) -> SimpleNamespace:
     Frame, footprint_type, pulls_type = types.Frame, types.footprint, types.pulls
     functions = blending_functions(scalar)
     strength_at, pull = functions.strength, functions.pull
-    channels_at, pixel_of, middle_of = (
-        functions.channels_at,
-        functions.pixel_of,
-        functions.middle_of,
-    )
+    channels_at, pixel_of = functions.channels_at, functions.pixel_of
+    middle_of = functions.middle_of
     covered = make_covered(scalar)
     module = native.module(f"npa_envs.kernels.blending_tiles_{scalar_name(scalar)}")
 
@@ -261,11 +258,8 @@ def block_kernels(scalar: type) -> SimpleNamespace:
     Frame, quad, footprint_type, pulls_type = types.Frame, types.quad, types.footprint, types.pulls
     functions = blending_functions(scalar)
     strength_at, colours_of, pull = functions.strength, functions.colours_of, functions.pull
-    channels_at, pixel_of, middle_of = (
-        functions.channels_at,
-        functions.pixel_of,
-        functions.middle_of,
-    )
+    channels_at, pixel_of = functions.channels_at, functions.pixel_of
+    middle_of = functions.middle_of
     name = scalar_name(scalar)
     drawing = native.module(f"npa_envs.kernels.blending_blocks_{name}")
     pulling = native.module(f"npa_envs.kernels.blending_blocks_adjoint_{name}")

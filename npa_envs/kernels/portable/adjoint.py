@@ -44,11 +44,8 @@ def adjoint_kernels(
     """Return the kernels of one variant; arguments as for `perception_kernels`."""
     types = domain_types(space_dim, scalar)
     vector, particle, Domain = types.vector, types.particle, types.Domain
-    cell_of, segment_count, segment_cells = (
-        types.cell_of,
-        types.segment_count,
-        types.segment_cells,
-    )
+    cell_of, segment_count = types.cell_of, types.segment_count
+    segment_cells = types.segment_cells
     minimum_image, position_of = types.minimum_image, types.position_of
     group = wp.types.vector(width, scalar)
     group_gradient = wp.types.matrix((space_dim, width), scalar)

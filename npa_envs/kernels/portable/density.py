@@ -21,11 +21,8 @@ def density_kernels(space_dim: int, scalar: type, on_cpu: bool) -> SimpleNamespa
     """Return the kernels of one variant: one thread a particle."""
     types = domain_types(space_dim, scalar)
     vector, particle, Domain = types.vector, types.particle, types.Domain
-    cell_of, segment_count, segment_cells = (
-        types.cell_of,
-        types.segment_count,
-        types.segment_cells,
-    )
+    cell_of, segment_count = types.cell_of, types.segment_count
+    segment_cells = types.segment_cells
     minimum_image, position_of = types.minimum_image, types.position_of
     wide = wp.types.vector(space_dim, wp.float64)
     search = make_search(space_dim, scalar, particle, on_cpu)

@@ -20,11 +20,8 @@ def species_kernel(space_dim: int, scalar: type, species_count: int) -> wp.Kerne
     """Return the kernel of one variant."""
     types = domain_types(space_dim, scalar)
     vector, Domain = types.vector, types.Domain
-    cell_of, segment_count, segment_cells = (
-        types.cell_of,
-        types.segment_count,
-        types.segment_cells,
-    )
+    cell_of, segment_count = types.cell_of, types.segment_count
+    segment_cells = types.segment_cells
     minimum_image = types.minimum_image
     wide = wp.types.vector(space_dim, wp.float64)
     densities_type = wp.types.vector(species_count, wp.float64)
