@@ -299,14 +299,14 @@ class Launch(NamedTuple):
 def noted_launches() -> Iterator[list[Launch]]:
     """Yield a list to which all launches in the block are added, of every thread."""
     noted: list[Launch] = []
-    _noting.append(noted)
+    _observers.append(noted)
     try:
         yield noted
     finally:
-        _noting.remove(noted)
+        _observers.remove(noted)
 
 
-_noting: list[list[Launch]] = []
+_observers: list[list[Launch]] = []
 """Lists to which launches are added."""
 
 
@@ -344,7 +344,7 @@ def launch(
     size = (size,) if isinstance(size, int) else size
     if 0 in size:
         return
-    for noted in _noting:
+    for noted in _observers:
         noted.append(_described(kernel, size))
     if kernel in SMALLEST_RANGES:
         arguments = (0, *arguments)

@@ -22,7 +22,7 @@ from npa_envs.ops.launch import launch
 from npa_envs.ops.physics import Physics
 from npa_envs.ops.sort import LARGEST_INDEX, KernelPlan, SortedWorlds, plan_kernels
 
-LISTS_TOGETHER = 32
+INTERLEAVED_LISTS = 32
 """Neighbour lists that are interleaved in memory."""
 
 
@@ -180,7 +180,7 @@ def perception_launch(
         destination: Row of `out` for each row, int32, shape [K]; default: the same row.
         limit: Entries are clipped to plus and minus this; 0: not clipped.
         row_kernel_sum: Output of the rows' sums of v K, shape [K, D], for the adjoint.
-        first_row: Row that is written to the first row of `out`, a multiple of `LISTS_TOGETHER`.
+        first_row: Row that is written to the first row of `out`, a multiple of `INTERLEAVED_LISTS`.
     """
     some = row_count is not None
     row_count = plan.row_capacity if row_count is None else row_count
@@ -195,7 +195,7 @@ def perception_launch(
     )
     lists = densities.lists
     if lists is not None and some:
-        shifted = lists.steps[first_row // LISTS_TOGETHER :], lists.lengths[first_row:]
+        shifted = lists.steps[first_row // INTERLEAVED_LISTS :], lists.lengths[first_row:]
         lists = lists._replace(steps=shifted[0], lengths=shifted[1])
     if lists is not None:
         kernel = listed_perception(

@@ -324,7 +324,7 @@ def _perceived(
         kernel_sum,
         row_of=rows.row_of,
         starts=rows.starts,
-        source=static.everyone,
+        source=static.all_indices,
         particles=static.particles,
         row_positions=rows.row_positions,
     )

@@ -30,7 +30,7 @@ class StaticWorlds(NamedTuple):
     """Caller's index of each sorted particle, int32, shape [B N]."""
     place: Tensor
     """Sorted index of each particle in the caller's order, int32, shape [B N]."""
-    everyone: Tensor
+    all_indices: Tensor
     """0, 1, ... B N - 1, int32: all sorted indices."""
     starts: Tensor
     """First sorted index of every cell, int32."""
@@ -75,7 +75,7 @@ def _prepare_static(x: Tensor, state_dim: int, physics: Physics) -> list[Tensor]
     return StaticWorlds(
         source=ordered.source,
         place=ordered.row_of,
-        everyone=torch.arange(total, dtype=torch.int32, device=x.device),
+        all_indices=torch.arange(total, dtype=torch.int32, device=x.device),
         starts=ordered.starts,
         # Outputs of an operator must not share memory.
         cell=ordered.cell.clone(),
@@ -118,7 +118,7 @@ def _(x: Tensor, state_dim: int, physics: Physics) -> list[Tensor]:
     return StaticWorlds(
         source=integers(total),
         place=integers(total),
-        everyone=integers(total),
+        all_indices=integers(total),
         starts=integers(plan.start_count),
         cell=integers(total),
         particles=x.new_empty(total, space_dim + 1),
@@ -215,7 +215,7 @@ def static_rows(
 
 def all_rows(worlds: StaticWorlds, x: Tensor) -> StaticRows:
     """Return the rows of a step in which all particles of worlds at x are active."""
-    return StaticRows(worlds.everyone, worlds.everyone, worlds.starts, x.flatten(0, 1))
+    return StaticRows(worlds.all_indices, worlds.all_indices, worlds.starts, x.flatten(0, 1))
 
 
 def static_worlds(
@@ -228,7 +228,7 @@ def static_worlds(
         lists = NeighbourLists(plan.listing, steps, lengths, records, by_place=True)
     ordered = SortedWorlds(
         starts=rows.starts,
-        source=worlds.everyone,
+        source=worlds.all_indices,
         cell=worlds.cell,
         row_of=rows.row_of,
         row_source=rows.row_source,

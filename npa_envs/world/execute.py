@@ -176,7 +176,7 @@ class RecomputedSteps:
         for name, value in self._readings():
             if name not in self._read or self._read[name][1] != _reading(value):
                 raise NPAError(
-                    f"{name} must stay as it is between a rollout that recomputes steps and its "
+                    f"{name} must not change between a rollout that recomputes steps and its "
                     "backward pass, got another: call backward() before it changes, or take "
                     "memory='store'"
                 )

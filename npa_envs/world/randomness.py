@@ -47,8 +47,8 @@ class WorldRandom:
     A draw is a function of its world's seed, episode, step and the number of draws before it in
     this step, and never of the other worlds: world k of a batch draws what it draws alone.
     Integers and uniform numbers are the same on every device, bit for bit; normal numbers up to
-    the last bit. Nothing here waits for the device, and a CUDA graph that begins with `advance`
-    draws anew at each replay.
+    the last bit. Nothing waits for the device, and a CUDA graph that begins with `advance` draws
+    new numbers at each replay.
 
     Args:
         seeds: Seed of each world, integers of at least 0; one integer is one world.
@@ -119,7 +119,7 @@ class WorldRandom:
         return self.keys.shape[0]
 
     def advance(self, steps: int = 1) -> None:
-        """Advance every world by a number of steps, in place; draws of a step depend only on it.
+        """Advance every world by a number of steps, in place; the count of draws restarts at 0.
 
         Args:
             steps: Number of steps; 0 restarts the current step, which repeats its draws.

@@ -479,11 +479,11 @@ class _Lease:
     def __init__(self, recording: _Recording, kind: CallKind) -> None:
         self.recording = recording
         self._kind = kind
-        self.spoilt = False
+        self.broken = False
         """Whether the recording must not be used again."""
 
     def __del__(self) -> None:
-        if not (self.spoilt or self._kind.refused):
+        if not (self.broken or self._kind.refused):
             # Appending to a deque needs no lock: any thread may drop the last reference.
             self._kind.free.append(self.recording)
 
@@ -549,7 +549,7 @@ def _lease(
         except Exception as error:
             kind.failures += 1
             if lease is not None and may_be_disturbed(kind.failures):
-                lease.spoilt = True
+                lease.broken = True
                 kind.recordings.remove(lease.recording)
                 return None
             drew = "CUDA generator" in str(error)

@@ -47,7 +47,7 @@ def two_layer_kernel(steps: int, tiles: int, mode: str) -> wp.Kernel:
 
     The kernel takes a number of hidden units H, a multiple of 16; rows [K, width] of at most 16
     `steps` columns; both layers' fragments, as `arrange_hidden` and `arrange_output` leave them;
-    the outputs' scales [8 `tiles`]; for each row, 4 words of the signs of every 128 hidden units,
+    the outputs' scales [8 `tiles`]; for each row, 4 words with the ReLU masks of 128 hidden units,
     [K, 4 ceil(H / 128)], which "note" writes and "mask" reads; and writes outputs [K, out_width]
     of at most 8 `tiles` columns. All are dimensionless. Rows are read 16 bytes at a time and
     outputs written 8 at a time: rows must be dense, begin at a multiple of 16 bytes and have a

@@ -302,8 +302,8 @@ def order_particles(space_dim: int, width: int) -> wp.Kernel:
     ):
         """Move every particle to its rank by index within its cell; give active ones rows.
 
-        States and rows are left out where their arrays are empty. Threads come in whole warps, some
-        of them beyond the last particle.
+        States and rows are left out where their arrays are empty. Warps are complete, with threads
+        beyond the last particle.
         """
         await_earlier()
         k = wp.tid()

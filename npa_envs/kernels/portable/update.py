@@ -74,7 +74,7 @@ def update_kernels(space_dim: int, scalar: type) -> SimpleNamespace:
         return result
 
     @wp.func
-    def held(value: scalar, limit: scalar):
+    def clipped(value: scalar, limit: scalar):
         """Return a value clipped to its limit, 0 for NaN, and whether it was changed."""
         result = value
         moved = wp.int32(0)
@@ -310,7 +310,7 @@ def update_kernels(space_dim: int, scalar: type) -> SimpleNamespace:
                     if part < scalar(-1.0):
                         part = scalar(-1.0)
                     state = scalar(wp.float64(state) + largest_change * wp.float64(part))
-                state, state_held = held(state, state_limit)
+                state, state_held = clipped(state, state_limit)
                 after[k] = state
                 if first + k * stride < state_dim:
                     changed += state_held
@@ -335,7 +335,7 @@ def update_kernels(space_dim: int, scalar: type) -> SimpleNamespace:
                     position = displaced(position, step, direction)
                 position = bounded(position, boundary, box)
                 for d in range(wp.static(space_dim)):
-                    coordinate, coordinate_held = held(position[d], position_limit)
+                    coordinate, coordinate_held = clipped(position[d], position_limit)
                     position[d] = coordinate
                     held_back += coordinate_held
                 positions[i] = position

@@ -179,7 +179,7 @@ def look_at(
         least = 1e-6 * lengths[0] * high.norm()
         if bool(((lengths[0] == 0.0) | ~(lengths[1] > least)).any()):
             raise NPAError(
-                f"a camera must look at another place than its own and not along up = {up}, "
+                f"a camera must look at another point than its own and not along up = {up}, "
                 f"got eyes {eyes.tolist()} and targets {goal.tolist()}: choose another up"
             )
     ahead, right = ahead / lengths[0][..., None], right / lengths[1][..., None]
@@ -269,7 +269,7 @@ def cameras_of_poses(
     """Return cameras of poses as the NeRF-synthetic scenes give them (Mildenhall et al. 2020).
 
     Their `transforms_*.json` hold a `transform_matrix` for each picture, whose camera's frame is
-    OpenGL's: x right, y up, z out of the scene. The world stays as it is; theirs has z up.
+    OpenGL's: x right, y up, z out of the scene. The world is not rotated; theirs has z up.
 
     Args:
         camera_to_world: Poses [length units], shape [V, 4, 4] or [B, V, 4, 4].
