@@ -86,7 +86,7 @@ def test_what_changes_before_the_backward_pass_is_refused_or_changes_nothing(
         # Torch itself sees it, in the last step, which is stored.
         assert change == "weight in place"
         return
-    assert "must stay as it is between a rollout that recomputes steps" in said
+    assert "must not change between a rollout that recomputes steps" in said
     name = "weight" if change == "parameter" else change.removesuffix(".data")
     assert name.split(" ")[0].split(".")[-1] in said
     assert kind != "plain" or "weight" not in name

@@ -296,7 +296,7 @@ def update_kernels(space_dim: int, scalar: type) -> SimpleNamespace:
                 for d in range(wp.static(space_dim)):
                     own = actions_begin - wp.static(space_dim) + d
                     direction[d] = wp.float64(actions[own])
-        held_back = wp.int32(0)
+        clipped_count = wp.int32(0)
         if happens != wp.uint8(0):
             after = share()
             changed = wp.int32(0)
@@ -310,11 +310,11 @@ def update_kernels(space_dim: int, scalar: type) -> SimpleNamespace:
                     if part < scalar(-1.0):
                         part = scalar(-1.0)
                     state = scalar(wp.float64(state) + largest_change * wp.float64(part))
-                state, state_held = clipped(state, state_limit)
+                state, state_clipped = clipped(state, state_limit)
                 after[k] = state
                 if first + k * stride < state_dim:
-                    changed += state_held
-            held_back += changed
+                    changed += state_clipped
+            clipped_count += changed
             if acting != wp.uint8(0) or changed != 0:
                 if aligned != 0:
                     write_share(states, states_begin + first, after)
@@ -335,11 +335,11 @@ def update_kernels(space_dim: int, scalar: type) -> SimpleNamespace:
                     position = displaced(position, step, direction)
                 position = bounded(position, boundary, box)
                 for d in range(wp.static(space_dim)):
-                    coordinate, coordinate_held = clipped(position[d], position_limit)
+                    coordinate, coordinate_clipped = clipped(position[d], position_limit)
                     position[d] = coordinate
-                    held_back += coordinate_held
+                    clipped_count += coordinate_clipped
                 positions[i] = position
-        if held_back != 0:
+        if clipped_count != 0:
             diverged[i / particle_count] = wp.uint8(1)
 
     return named(apply_update, pull_back_update, apply_actions)
