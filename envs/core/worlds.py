@@ -212,7 +212,7 @@ class BatchedWorlds(RewardedWorlds):
         """Apply actions as `step` does, without synchronising; return observations, [B, ...]."""
         if self.x.is_cuda and self.x.shape[:2].numel() <= FEW_PARTICLES:
             # Copying actions costs less than the launches that the graph replaces.
-            self._actions.hold(action)
+            self._actions.load(action)
             self._step_graph()
             assert self._side_stream is not None, "CUDA has a side stream"
             assert self._perceived is not None, "the graph writes it"
@@ -236,7 +236,7 @@ class BatchedWorlds(RewardedWorlds):
     def _act_and_evaluate(self) -> None:
         """Apply the stored actions, then evaluate and perceive at the same time."""
         self._actions.draw()
-        self._actions.apply_held()
+        self._actions.apply_loaded()
         with self._evaluating_on_side():
             if self._perceived is None:
                 self._perceived = self.x.new_empty(*self.x.shape[:2], self.physics.perception_dim)

@@ -1,1 +1,1 @@
-"""Warp kernels: cells, perception, its adjoints, updates and pictures. Imports warp alone."""
+"""Warp kernels, without torch: sorting into cells, perception, its adjoints, updates, pictures."""

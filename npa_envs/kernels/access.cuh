@@ -1,11 +1,11 @@
-// Access to memory, up to 16 bytes at a time, and to what other threads have.
+// Memory access of up to 16 bytes at a time, and access to other threads' values.
 //
-// The first half is there on the CPU too, where a particle has one thread and no wide access.
+// The first half also exists on a CPU, where a particle has one thread and no wide access.
 
 namespace npa {
 
-// Wait until all that was launched before has ended and what it wrote is there. Every kernel that is
-// launched early waits, so its end says that all before it have ended.
+// Wait until all earlier launches have ended and their writes are visible. Every kernel that is
+// launched early waits, so its end implies the end of all earlier ones.
 CUDA_CALLABLE inline void await_earlier()
 {
 #if defined(__CUDA_ARCH__) && __CUDA_ARCH__ >= 900
@@ -13,15 +13,15 @@ CUDA_CALLABLE inline void await_earlier()
 #endif
 }
 
-// Let the blocks of the next kernel, if it is launched early, take places beside this one's.
-CUDA_CALLABLE inline void let_next_in()
+// Allow the blocks of the next kernel, if it is launched early, to start beside those of this one.
+CUDA_CALLABLE inline void allow_next_launch()
 {
 #if defined(__CUDA_ARCH__) && __CUDA_ARCH__ >= 900
     asm volatile("griddepcontrol.launch_dependents;" ::: "memory");
 #endif
 }
 
-// As many bytes as 16 that divide a size.
+// The largest number of bytes, at most 16, that divides a size.
 CUDA_CALLABLE constexpr unsigned chunk_bytes(unsigned size)
 {
     return size % 16 == 0 ? 16 : size % 8 == 0 ? 8 : 4;
@@ -111,7 +111,7 @@ template <int LANES> CUDA_CALLABLE inline unsigned lane_mask()
 }
 #endif
 
-// Part: the scalar type that the value is made of. STRIDE: every so-manyth lane is added.
+// Part: the scalar type of the value's entries. STRIDE: every STRIDE-th lane is added.
 template <typename Part, int LANES, bool WHOLE_WARPS, int STRIDE, typename Value>
 CUDA_CALLABLE inline Value lane_sum(Value value)
 {
@@ -129,9 +129,8 @@ CUDA_CALLABLE inline Value lane_sum(Value value)
     return value;
 }
 
-// Share: a lane's share of the columns of a matrix of ROWS rows. Of the lanes' shares in a lane's
-// matrix the k-th is that of the lane whose number differs in the bits of k: so no lane has to look
-// for what it gives.
+// Share: a lane's columns of a matrix of ROWS rows. In lane i's matrix the k-th group of columns is
+// that of lane i ^ k, so that all indices are constants.
 template <typename Share, typename Part, int ROWS, int WIDTH, int LANES, typename Value>
 CUDA_CALLABLE inline Share lane_collect(Value value)
 {
@@ -153,7 +152,7 @@ CUDA_CALLABLE inline Share lane_collect(Value value)
     return result;
 }
 
-// A number that is kept in a register: the compiler would compute it anew in every turn of a loop.
+// A number kept in a register: the compiler would compute it again in every turn of a loop.
 CUDA_CALLABLE inline float kept(float value)
 {
 #if defined(__CUDA_ARCH__)
@@ -178,7 +177,7 @@ template <typename Scalar> CUDA_CALLABLE inline Scalar shuffle(Scalar value, int
 #endif
 }
 
-// total + factor * value. The CPU's compiler finds no vector registers for it by itself.
+// total + factor * value, in vector registers, which the CPU's compiler does not use by itself.
 template <typename Group, typename Part>
 CUDA_CALLABLE inline Group add_scaled(Group total, Part factor, Group value)
 {
@@ -198,7 +197,7 @@ CUDA_CALLABLE inline Group add_scaled(Group total, Part factor, Group value)
 
 #if defined(__CUDA_ARCH__)
 
-// Beside `shuffle`, because which thread is asked differs among the particles of a warp.
+// Unlike in `shuffle`, the source thread differs among the particles of a warp.
 __device__ inline int of_lane(int value, int lane, unsigned lanes)
 {
     return __shfl_sync(~0u, value, (threadIdx.x & 31u & ~(lanes - 1u)) + lane);
@@ -210,9 +209,9 @@ __device__ inline int block_number() { return blockIdx.x; }
 
 __device__ inline int thread_of_block() { return threadIdx.x; }
 
-__device__ inline void meet_block() { __syncthreads(); }
+__device__ inline void sync_block() { __syncthreads(); }
 
-__device__ inline void meet_warp() { __syncwarp(); }
+__device__ inline void sync_warp() { __syncwarp(); }
 
 __device__ inline bool any_in_warp(bool condition) { return __any_sync(~0u, condition); }
 
@@ -234,7 +233,7 @@ __device__ inline int largest_in_warp(int value)
 #endif
 }
 
-// The sum of a value of this thread and of those before it, of a warp or of so many lanes.
+// The sum of a value over this thread and those before it, in a warp or among LANES lanes.
 template <unsigned LANES = 32> __device__ inline int sum_up_to(int value)
 {
     const unsigned lane = threadIdx.x & (LANES - 1u);

@@ -1,12 +1,12 @@
 """Access to memory and to other threads' values: wide loads and stores, sums over lanes, votes.
 
-On CUDA a few neighbouring threads, its lanes, may share one particle and split its candidates: each
-lane sums every so-many-th candidate, and warp shuffles then add the lanes in a fixed order. Short
-sums go to every lane; of long ones each lane gets its own share. On the CPU a particle has one lane
-and the same source runs without either.
+On CUDA a few adjacent threads, called lanes, may share one particle: with n lanes each sums every
+n-th candidate, and warp shuffles then add the lanes' sums in a fixed order. Short sums go to every
+lane; of long ones each lane gets some of the columns. On a CPU a particle has one lane, and the
+same source runs without shuffles.
 
-What the factories make is for both devices, as is `of_warp`; the rest is for whole warps of CUDA:
-all of a warp's threads must take the same way to it.
+Functions of factories and `of_warp` run on both devices. The others run on CUDA only, and all
+threads of a warp must call them together.
 """
 
 from typing import Any
@@ -17,31 +17,31 @@ from npa_envs.kernels import native
 from npa_envs.once import made_once
 
 CUDA_LANES = 4
-"""Lanes of a particle on CUDA, a power of two; also the smallest channel group."""
+"""Threads that share a particle on CUDA, a power of two; also the smallest channel group."""
 
 WARP = 32
 """Threads of a warp."""
 
 CUDA_BLOCK = 128
-"""Threads of a block, where a launch does not say otherwise."""
+"""Default number of threads of a block."""
 
 
 @native.func_native()
 def await_earlier():
-    """Wait for the launches before this one; kernels begin with it, before they touch memory.
+    """Wait for earlier launches; kernels call it first, before they access memory.
 
-    On compute capability 9.0 and above such a kernel is launched before the one ahead has ended
-    (`npa_envs/ops/driver.py`): when that ends its blocks are there. It loads neither by `__ldg` nor
-    by `ld.global.nc`, which the compiler moves ahead of the wait.
+    On compute capability 9.0 and above such a kernel is started before the previous one has ended
+    (`npa_envs/ops/driver.py`). It must not load by `__ldg` or `ld.global.nc`, which the compiler
+    moves ahead of the wait.
     """
 
 
 @native.func_native()
-def let_next_in():
-    """Let the next kernel's blocks take free places before this one's have ended.
+def allow_next_launch():
+    """Allow the next kernel's blocks to start before this kernel's blocks have ended.
 
-    They take them where they find them: a kernel with few blocks for a processor then has too many
-    on some. So only kernels call it that are followed by one which does not mind.
+    They start wherever there is room, so a kernel with few blocks may get several of them on one
+    multiprocessor. Only kernels call it whose successor is not slowed down by that.
     """
 
 
@@ -49,8 +49,8 @@ def let_next_in():
 def make_wide_load(value_type: type, scalar: type) -> Any:
     """Return a Warp function that reads an entry of a flat array, on CUDA in few, wide loads.
 
-    The array must be dense and its memory aligned to an entry, or to 16 bytes; the index must not
-    be negative. Warp's own indexing, which knows neither, takes several instructions more.
+    The array must be dense and aligned to the size of an entry, or to 16 bytes; the index must not
+    be negative. Warp's own indexing, without these conditions, takes several instructions more.
     """
 
     @native.func_native()
@@ -78,9 +78,9 @@ def make_wide_store(value_type: type, scalar: type) -> Any:
 
 @made_once()
 def make_read_at(value_type: type, scalar: type, alignment: int) -> Any:
-    """Return a Warp function that reads a vector from a place of an array of scalars.
+    """Return a Warp function that reads a vector from index `place` of an array of scalars.
 
-    The place is a multiple of `alignment` bytes in memory, 4, 8 or 16, which a load takes.
+    Its address must be a multiple of `alignment` bytes, 4, 8 or 16: the width of a load.
     """
 
     @native.func_native(value_type, alignment)
@@ -91,7 +91,7 @@ def make_read_at(value_type: type, scalar: type, alignment: int) -> Any:
 
 @made_once()
 def make_read_channels(value_type: type, scalar: type) -> Any:
-    """Return a Warp function that reads adjacent channels of a particle, zeros beyond the last."""
+    """Return a Warp function that reads adjacent channels of a particle, 0 beyond the last one."""
     count = value_type._length_
     alignment = min(wp.types.type_size_in_bytes(value_type), 16)
     read_at = make_read_at(value_type, scalar, alignment)
@@ -119,9 +119,9 @@ def make_read_channels(value_type: type, scalar: type) -> Any:
 
 @made_once()
 def make_write_at(value_type: type, scalar: type) -> Any:
-    """Return a Warp function that writes a vector to a place of an array of scalars.
+    """Return a Warp function that writes a vector to index `place` of an array of scalars.
 
-    Place and size of the vector are multiples of 16 bytes.
+    Address and size of the vector must be multiples of 16 bytes.
     """
 
     @native.func_native()
@@ -131,7 +131,7 @@ def make_write_at(value_type: type, scalar: type) -> Any:
 
 
 def share_type(value_type: type, scalar: type, lanes: int) -> type:
-    """Return the type of one lane's share of a vector [W] or matrix [D, W] of channels."""
+    """Return the type of one lane's part of a vector [W] or matrix [D, W]: W / lanes columns."""
     *rows, width = value_type._shape_
     share = width // lanes
     if rows:
@@ -143,10 +143,10 @@ def share_type(value_type: type, scalar: type, lanes: int) -> type:
 def make_lane_sum(
     value_type: type, scalar: type, lanes: int, whole_warps: bool = False, stride: int = 1
 ) -> Any:
-    """Return a Warp function that adds a value over the lanes of a particle; each gets the sum.
+    """Return a Warp function that sums a value over a particle's lanes; each lane gets the sum.
 
-    There is one lane on the CPU. With `whole_warps` all threads of a warp call it together, which
-    takes fewer instructions; every so-manyth lane is added, as `stride` says, a power of two.
+    On a CPU there is one lane. With `whole_warps` all threads of a warp must call it together,
+    which takes fewer instructions. Every `stride`-th lane is summed, a power of two.
     """
 
     @native.func_native(scalar, lanes, whole_warps, stride)
@@ -157,10 +157,10 @@ def make_lane_sum(
 
 @made_once()
 def make_lane_collect(value_type: type, scalar: type, lanes: int) -> Any:
-    """Return a Warp function that adds over the lanes; each gets its share of the columns.
+    """Return a Warp function that sums matrices [D, W] over lanes; each lane gets its columns.
 
-    Of the shares in a lane's value, a matrix [D, W], the k-th is that of lane `lane ^ k`, its own
-    one the first: so no lane has to look for what it gives.
+    In lane i the k-th group of columns has to be that of lane i ^ k, so its own group comes first:
+    then all indices are constants.
     """
     rows, width = value_type._shape_
     share = share_type(value_type, scalar, lanes)
@@ -173,9 +173,9 @@ def make_lane_collect(value_type: type, scalar: type, lanes: int) -> Any:
 
 @made_once()
 def make_kept(scalar: type) -> Any:
-    """Return a Warp function that returns its argument, of `scalar`, and keeps it in a register.
+    """Return a Warp function that returns its argument, of type `scalar`, kept in a register.
 
-    CUDA's compiler would compute an integer's float anew in every turn of a loop that follows.
+    CUDA's compiler would otherwise convert an integer to float again in every turn of a loop.
     """
 
     @native.func_native()
@@ -186,9 +186,9 @@ def make_kept(scalar: type) -> Any:
 
 @made_once()
 def make_warp_sum(value_type: type) -> Any:
-    """Return a Warp function that adds a value over the 32 threads of a warp; each gets the sum.
+    """Return a Warp function that sums a value over the 32 threads of a warp; each gets the sum.
 
-    All 32 must call it. On the CPU it returns its argument.
+    All 32 must call it. On a CPU it returns its argument.
     """
 
     @native.func_native()
@@ -199,7 +199,7 @@ def make_warp_sum(value_type: type) -> Any:
 
 @made_once()
 def make_shuffle(scalar: type) -> wp.Function:
-    """Return a Warp function for a value of a thread of the warp; on the CPU, the argument."""
+    """Return a Warp function that reads another thread's value in the warp; on a CPU its own."""
 
     @native.func_native()
     def shuffle(value: scalar, thread: wp.int32) -> scalar: ...
@@ -213,79 +213,79 @@ scalar_of_warp = make_shuffle(wp.float32)
 
 @native.func_native()
 def of_lane(value: wp.int32, lane: wp.int32, lanes: wp.uint32) -> wp.int32:
-    """Another lane's value, of the same particle."""
+    """Return the value of another lane of the same particle."""
 
 
 @native.func_native()
 def thread_number() -> wp.int32:
-    """Number of this thread in its launch, without the divisions of `wp.tid`."""
+    """Return this thread's index in the launch, without the divisions of `wp.tid`."""
 
 
 @native.func_native()
 def block_number() -> wp.int32:
-    """Number of this block in its launch."""
+    """Return this block's index in the launch."""
 
 
 @native.func_native()
 def thread_of_block() -> wp.int32:
-    """Number of this thread in its block."""
+    """Return this thread's index in its block."""
 
 
 @native.func_native()
-def meet_block():
-    """Wait until the whole block is here, and sees what it wrote."""
+def sync_block():
+    """Synchronize the threads of the block, and make their writes visible to each other."""
 
 
 @native.func_native()
-def meet_warp():
-    """Wait until the whole warp is here, and sees what it wrote."""
+def sync_warp():
+    """Synchronize the threads of the warp, and make their writes visible to each other."""
 
 
 @native.func_native()
 def any_in_warp(condition: wp.bool) -> wp.bool:
-    """Whether a condition holds for some thread of the warp."""
+    """Return whether a condition is true for some thread of the warp."""
 
 
 @native.func_native()
 def first_in_warp(condition: wp.bool) -> wp.int32:
-    """The first thread for which a condition holds, -1 if there is none."""
+    """Return the first thread for which a condition is true, -1 for none."""
 
 
 @native.func_native()
 def vote_of_warp(condition: wp.bool) -> wp.uint32:
-    """For which threads a condition holds, a bit for each."""
+    """Return a bit for each thread of the warp: whether a condition is true."""
 
 
 @native.func_native()
 def largest_in_warp(value: wp.int32) -> wp.int32:
-    """The largest value of the warp's threads."""
+    """Return the largest value of the warp's threads."""
 
 
 @native.func_native()
 def sum_up_to(value: wp.int32) -> wp.int32:
-    """The sum of the values of this thread and of those before it in the warp."""
+    """Return the sum of the values of this thread and of those before it in the warp."""
 
 
 @native.func_native()
 def thread_of(ends: wp.int32, number: wp.int32) -> wp.int32:
-    """The first thread whose end, one of an ascending order, is beyond a number."""
+    """Return the first thread of the warp whose `ends` is larger than a number; they ascend."""
 
 
 @native.func_native()
 def as_number(word: wp.float32) -> wp.int32:
-    """The integer that was packed into a word."""
+    """Return the integer whose bits are those of a float32."""
 
 
 @native.func_native()
 def as_word(number: wp.int32) -> wp.float32:
-    """An integer packed into a word."""
+    """Return the float32 whose bits are those of an integer."""
 
 
 @made_once()
 def make_add_scaled(group: type, scalar: type) -> Any:
-    """Return a Warp function for total + factor * value, rounded after each operation on the CPU.
+    """Return a Warp function for total + factor * value, rounded after each operation on a CPU.
 
-    It uses vector registers of the CPU, where its compiler finds none by itself.
+    It uses vector registers of the CPU, which the compiler does not use by itself.
     """
 
     @native.func_native()

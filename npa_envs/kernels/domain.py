@@ -17,11 +17,18 @@ import warp as wp
 from npa_envs.kernels import native
 from npa_envs.once import made_once
 
+TERMS_PER_SUM = 4096
+"""Terms that are summed before they are added to a total: of a million summed one after the other,
+too much is rounded away."""
+
+SLACK = 1.0 + 1e-5
+"""Factor on eps² within which candidates are taken, against rounding errors of their distances."""
+
 CELL_SLACK = 1.0 + 2.0**-20
-"""Cells are this much larger than eps / reach: rounding a cell index cannot lose a neighbour."""
+"""Factor by which cells are larger than eps / reach, so that rounding cannot lose a neighbour."""
 
 FAR = 2.0**62
-"""Cells from the origin beyond which all are one: positions there are equal or far apart."""
+"""Largest distance of a cell from the origin; positions beyond it are in the outermost cell."""
 
 
 def scalar_name(scalar: type) -> str:
@@ -33,7 +40,7 @@ def scalar_name(scalar: type) -> str:
 def kernel_module(
     topic: str, space_dim: int, scalar: type, width: int = 0, lanes: int = 0
 ) -> wp.Module:
-    """Return the Warp module that holds one variant of a topic's kernels."""
+    """Return the Warp module for one variant of a topic's kernels."""
     variant = f"{space_dim}d_{scalar_name(scalar)}"
     if width:
         variant += f"_w{width}"
@@ -44,9 +51,9 @@ def kernel_module(
 
 @made_once()
 def domain_types(space_dim: int, scalar: type) -> SimpleNamespace:
-    """Return the vector types, the `Domain` struct and the functions on it of one variant.
+    """Return one variant's vector types, its `Domain` struct and the functions of it.
 
-    The struct holds what all worlds share: radius, kernel constants, box and cell grid.
+    The struct has the constants of all worlds: radius, norms of kernels, box and cell grid.
     """
     vector = wp.types.vector(space_dim, scalar)
     cell_vector = wp.types.vector(space_dim, wp.int32)
@@ -70,12 +77,12 @@ def domain_types(space_dim: int, scalar: type) -> SimpleNamespace:
 
     @wp.func
     def cell_of(domain: Domain, position: vector):
-        """Cell of a position; open space wraps around the grid, so that any position has one."""
+        """Return the cell of a position; in open space the grid repeats periodically."""
         cell = cell_vector()
         for d in range(wp.static(space_dim)):
             count = domain.cell_shape[d]
             place = wp.float64(position[d]) * domain.cell_scale[d]
-            # Comparisons are false for NaN: a world that blew up must still index inside its grid.
+            # Comparisons are false for NaN, whose index must also be inside the grid.
             if domain.periodic != 0:
                 place = wp.floor((place - wp.floor(place)) * wp.float64(count))
                 if place < wp.float64(count):
@@ -95,7 +102,7 @@ def domain_types(space_dim: int, scalar: type) -> SimpleNamespace:
 
     @wp.func
     def cell_place(domain: Domain, index: wp.int32):
-        """Cell of an index in row-major order within its world."""
+        """Return the cell at an index in row-major order within its world."""
         cell = cell_vector()
         rest = index
         for d in range(wp.static(space_dim - 1)):
@@ -120,7 +127,8 @@ def domain_types(space_dim: int, scalar: type) -> SimpleNamespace:
 
     @wp.func
     def segment_count(domain: Domain, cell: cell_vector):
-        """Contiguous runs of cells around a cell: one for each row, two where rows wrap around."""
+        """Return the number of contiguous runs of cells around a cell: one for each row of cells,
+        two where rows wrap around."""
         rows = wp.int32(1)
         for d in range(1, wp.static(space_dim)):
             rows *= row_width(domain, d)
@@ -131,7 +139,7 @@ def domain_types(space_dim: int, scalar: type) -> SimpleNamespace:
 
     @wp.func
     def segment_cells(domain: Domain, cell: cell_vector, segment: wp.int32):
-        """First cell and one past the last cell of a run, in row-major order within the world."""
+        """Return the first cell and one past the last cell of a run, in row-major order."""
         width = row_width(domain, 0)
         nx = domain.cell_shape[0]
         first = wrapped(cell[0] - domain.cell_reach, nx)
@@ -158,7 +166,7 @@ def domain_types(space_dim: int, scalar: type) -> SimpleNamespace:
 
     @wp.func
     def periodic_image(domain: Domain, difference: vector):
-        """Shortest image of a difference of positions in a periodic box [length units]."""
+        """Return the shortest image of a difference of positions in a box [length units]."""
         result = difference
         for d in range(wp.static(space_dim)):
             result[d] -= domain.box[d] * wp.round(difference[d] * domain.inverse_box[d])
@@ -166,7 +174,7 @@ def domain_types(space_dim: int, scalar: type) -> SimpleNamespace:
 
     @wp.func
     def minimum_image(domain: Domain, difference: vector):
-        """Shortest periodic image of a difference of positions [length units]."""
+        """Return `periodic_image` of a difference in a box, the difference in open space."""
         result = difference
         if domain.periodic != 0:
             result = periodic_image(domain, difference)
@@ -216,7 +224,7 @@ def make_domain(
     particle_count: int,
     cell_reach: int = 2,
 ) -> Any:
-    """Return the `Domain` of worlds of so many particles, with cells of eps / cell_reach."""
+    """Return the `Domain` of worlds of N particles, with cells of size eps / cell_reach."""
     types = domain_types(space_dim, scalar)
     domain = types.Domain()
     domain.inverse_eps = 1.0 / eps

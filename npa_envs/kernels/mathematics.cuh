@@ -1,4 +1,4 @@
-// Formulas of `mathematics` in fewer instructions than Warp makes of them.
+// Formulas of `mathematics.py` with fewer instructions than Warp's code for them.
 
 namespace npa {
 
@@ -24,30 +24,30 @@ CUDA_CALLABLE inline double fast_exp2(double value)
 
 #if defined(__CUDA_ARCH__)
 
-// 1 / sqrt(value), two units in the last place off at most.
+// 1 / sqrt(value), with an error of at most two units in the last place.
 __device__ inline float inverse_root(float value) { return rsqrtf(value); }
 
-// The value clipped to plus and minus a limit; as it is if the limit is NaN: fminf and fmaxf
-// return the other operand then.
+// The value clipped to plus and minus a limit; unchanged if the limit is NaN: fminf and fmaxf then
+// return the other operand.
 __device__ inline float within(float value, float limit)
 {
     return fminf(fmaxf(value, -limit), limit);
 }
 
-// 1 - r^2 / eps^2, 0 beyond eps and of what is not a number.
+// 1 - r^2 / eps^2, 0 beyond eps and for NaN.
 __device__ inline float falloff_within(float squared, float inverse_squared_eps)
 {
     return __saturatef(fmaf(-squared, inverse_squared_eps, 1.0f));
 }
 
-// Smoothing kernel W up to its norm, 0 beyond its support.
+// Smoothing kernel W without its norm, 0 beyond its support.
 __device__ inline float smoothing(float squared, float inverse_squared_eps)
 {
     const float falloff = falloff_within(squared, inverse_squared_eps);
     return falloff * falloff * falloff;
 }
 
-// Factor f of the spiky gradient kernel K(r) = f r up to its norm, 0 beyond its support.
+// Factor f of the spiky gradient kernel K(r) = f r without its norm, 0 beyond its support.
 __device__ inline float spiky_factor(float squared, float inverse_eps)
 {
     float inverse;
@@ -56,7 +56,7 @@ __device__ inline float spiky_factor(float squared, float inverse_eps)
     return near * near * inverse;
 }
 
-// log(value) of a value of at least 1, one unit in the last place off at most.
+// log(value) of a value of at least 1, with an error of at most one unit in the last place.
 __device__ inline float log_above_one(float value)
 {
     const int bits = __float_as_int(value);
@@ -81,7 +81,7 @@ __device__ inline float log_scale_of_square(float squared)
     asm("rsqrt.approx.ftz.f32 %0, %1;" : "=f"(inverse) : "f"(squared + 1e-37f));
     float length = squared * inverse;
     length = fmaf(fmaf(-length, length, squared), 0.5f * inverse, length);
-    // Of what is shorter, 1 comes out up to rounding.
+    // For shorter vectors the result is 1 up to rounding.
     const float excess = fmaxf((1.0f + length) - 1.0f, 0x1p-23f);
     asm("rcp.approx.ftz.f32 %0, %1;" : "=f"(quotient) : "f"(excess));
     quotient = fmaf(fmaf(-excess, quotient, 1.0f), quotient, quotient);

@@ -11,13 +11,13 @@ from npa_envs.kernels import native
 from npa_envs.once import made_once
 
 MOMENT_THRESHOLD = 1e-3
-"""Smallest |det M| that is inverted, dimensionless; below it the gradient stays uncorrected."""
+"""Smallest |det M| that is inverted, dimensionless; below it the gradient is not corrected."""
 
 SMALL_LOG = 5e-2
-"""Below this |z| the ratio |z| / (exp|z| - 1) is evaluated by its series: the quotient cancels."""
+"""Below this |z| the ratio |z| / (exp|z| - 1) is computed by its series: the quotient cancels."""
 
 MOMENT_SOFTENING = 1e-2
-"""τ: the smooth inverse is half way between M^-1 and I at this det M, dimensionless."""
+"""τ, the det M at which the smooth inverse is half way between M^-1 and I, dimensionless."""
 
 
 @wp.func
@@ -57,9 +57,9 @@ def spiky_factor(distance: Any, inverse_eps: Any, norm: Any):
 
 @wp.func
 def spiky_factor_wide(exact: wp.float64, start: Any, inverse_eps: Any, norm: Any):
-    """Spiky factor f in float64 from r . r: a Newton step refines a `start` of 1 / |r|.
+    """Spiky factor f in float64 from `exact` = r · r; a Newton step refines `start`, about 1 / |r|.
 
-    Sums of spiky kernels, the density gradient, cancel almost fully where particles are dense.
+    In float64, because sums of spiky kernels cancel almost fully where particles are dense.
     """
     inverse = wp.float64(start)
     inverse *= wp.float64(1.5) - wp.float64(0.5) * exact * inverse * inverse
@@ -76,7 +76,7 @@ def spiky_radial_slope(distance: Any, inverse_eps: Any, norm: Any):
 
 @wp.func
 def log1p(value: Any):
-    """log(1 + value), accurate also where value is far below one."""
+    """log(1 + value), accurate also for values near 0."""
     one_plus = type(value)(1.0) + value
     result = value
     if one_plus > type(value)(1.0):
@@ -177,7 +177,7 @@ def make_smooth_inverse(space_dim: int, scalar: type) -> wp.Function:
 def make_corrected(space_dim: int, scalar: type, width: int, moment_inverse: str | None) -> Any:
     """Return a Warp function that multiplies state gradients [D, width] by an inverse of M.
 
-    It is "smooth", or "threshold": gradients stay as they are where M is singular.
+    The inverse is "smooth", or "threshold", which leaves gradients unchanged where M is singular.
     """
     square = wp.types.matrix((space_dim, space_dim), scalar)
     gradient_type = wp.types.matrix((space_dim, width), scalar)
@@ -195,12 +195,12 @@ def make_corrected(space_dim: int, scalar: type, width: int, moment_inverse: str
     return corrected
 
 
-# The same formulas in C++, of fewer instructions.
+# The same formulas in C++, with fewer instructions.
 
 
 @made_once()
 def make_fast_exp2(scalar: type) -> Any:
-    """Return a Warp function for powers of two, in float32 on CUDA right to about 2e-7."""
+    """Return a Warp function for 2^value; in float32 on CUDA the relative error is about 2e-7."""
 
     @native.func_native()
     def fast_exp2(value: scalar) -> scalar: ...
@@ -220,7 +220,7 @@ def make_log_scale_pull(vector: type) -> Any:
 
 @native.func_native()
 def falloff_within(squared: wp.float32, inverse_squared_eps: wp.float32) -> wp.float32:
-    """1 - r^2 / eps^2 on CUDA, 0 beyond eps and of what is not a number."""
+    """1 - r^2 / eps^2 on CUDA, 0 beyond eps and for NaN."""
 
 
 @native.func_native()
@@ -230,9 +230,9 @@ def log_scale_of_square(squared: wp.float32) -> wp.float32:
 
 @native.func_native()
 def inverse_root(value: wp.float32) -> wp.float32:
-    """1 / sqrt(value) on CUDA, two units in the last place off at most."""
+    """1 / sqrt(value) on CUDA, with an error of at most two units in the last place."""
 
 
 @native.func_native()
 def within(value: wp.float32, limit: wp.float32) -> wp.float32:
-    """The value on CUDA clipped to plus and minus a limit; as it is if the limit is NaN."""
+    """The value clipped to plus and minus a limit, on CUDA; unchanged if the limit is NaN."""

@@ -1,8 +1,8 @@
-"""C++ beside Warp's Python: the `.cuh` files of this folder, and what the CPU's threads share.
+"""C++ functions for Warp kernels, from the `.cuh` files of this folder, and ranges of CPU threads.
 
-A kernel module that comes from `module` begins with the text of those files. `@native.func_native`
-then makes a Warp function of a C++ function: plain Warp has no loads of 16 bytes, no votes of a
-warp, no memory shared by a few threads, and no tensor cores.
+A kernel module made by `module` begins with the text of those files. `@native.func_native` makes a
+Warp function of a C++ function. Plain Warp has no loads of 16 bytes, no votes of a warp, no memory
+shared by a few threads, and no tensor cores.
 """
 
 import inspect
@@ -16,12 +16,12 @@ import warp as wp
 from npa_envs.once import made_once
 
 BOTH_DEVICES = ("access.cuh", "mathematics.cuh")
-"""Files that the CPU's compiler reads, too."""
+"""Files for CPU and CUDA."""
 
 CUDA_ONLY = (
     "cuda/sort.cuh",
     "cuda/splat.cuh",
-    "cuda/density.cuh",
+    "cuda/neighbour_list.cuh",
     "cuda/tiles.cuh",
     "cuda/perceive.cuh",
     "cuda/adjoint.cuh",
@@ -30,12 +30,12 @@ CUDA_ONLY = (
     "pictures/blending.cuh",
     "pictures/errors.cuh",
 )
-"""The other files; what a file uses of another one stands before it."""
+"""Files for CUDA, in an order in which each uses only earlier ones."""
 
 
 @made_once()
 def build_options() -> wp.ModuleBuildOptions:
-    """Return what puts the C++ functions into a module: their text, which its hash includes."""
+    """Return the options that put the C++ text into a module, and into its hash."""
     folder = Path(__file__).parent
     for_cpu = "".join((folder / name).read_text(encoding="utf-8") for name in BOTH_DEVICES)
     for_cuda = for_cpu + "".join((folder / name).read_text(encoding="utf-8") for name in CUDA_ONLY)
@@ -43,7 +43,7 @@ def build_options() -> wp.ModuleBuildOptions:
 
 
 def module(name: str) -> wp.Module:
-    """Return the Warp module of a name, whose kernels may call native functions."""
+    """Return the Warp module `name`, whose kernels may call native functions."""
     result = wp.get_module(name)
     wp.set_module_options({"extra_build_options": build_options()}, result)
     return result
@@ -52,9 +52,9 @@ def module(name: str) -> wp.Module:
 def func_native(*parameters: Any) -> Callable[[Any], Any]:
     """Return a decorator that makes a Warp function of the C++ function `npa::` of the same name.
 
-    What it decorates is a stub with the types of the arguments and of the result. Warp knows such a
-    stub by a decorator of this very name, an attribute of a module. The template parameters are
-    those that do not follow from the arguments: numbers, truth values, `npa`'s constants, types.
+    It decorates a stub with the types of arguments and result. Warp recognises a stub by exactly
+    this decorator's name, used as an attribute of a module. `parameters` are the C++ template
+    parameters that do not follow from the arguments: numbers, booleans, `npa`'s constants, types.
     """
     template = f"<{', '.join(map(_in_cpp, parameters))}>" if parameters else ""
 
@@ -68,12 +68,12 @@ def func_native(*parameters: Any) -> Callable[[Any], Any]:
 
 
 def named(*functions: Any, **others: Any) -> SimpleNamespace:
-    """Return kernels and Warp functions by their own names, and other values."""
+    """Return a namespace of kernels and Warp functions by their own names, and of other values."""
     return SimpleNamespace(**{function.func.__name__: function for function in functions}, **others)
 
 
 def _in_cpp(parameter: Any) -> str:
-    """Return a template parameter as C++ writes it."""
+    """Return the C++ text of a template parameter."""
     if isinstance(parameter, str):
         return f"npa::{parameter}"
     if isinstance(parameter, int):  # truth values too
@@ -86,37 +86,37 @@ def _in_cpp(parameter: Any) -> str:
     return f"wp::{'vec_t' if len(shape) == 1 else 'mat_t'}<{', '.join(map(str, shape))}, {name}>"
 
 
-# On a CPU, launches are cut into ranges for its threads. The first argument of a kernel that may be
-# cut, `range_start`, is where its range begins along the launch's first dimension: 0 where it runs
-# whole, as on CUDA. No range may read what another writes, or count in it: Warp's atomics on the
-# CPU are for one thread.
+# On a CPU, launches are split into ranges for its threads. The first argument of such a kernel,
+# `range_start`, is the beginning of its range along the launch's first dimension: 0 without a
+# split, as on CUDA. Ranges must not read each other's outputs or use atomics: those of Warp on a
+# CPU work for one thread only.
 
 SMALLEST_RANGES: dict[Any, int] = {}
-"""For each such kernel, how many indices of the first dimension are worth a thread of their own."""
+"""For each such kernel, the fewest indices of the first dimension in a range."""
 
 PAIRS = 512
-"""Smallest range of a kernel whose threads each go through a neighbourhood."""
+"""Smallest range of a kernel in which each index sums over a neighbourhood."""
 
 WORLDS = 2
-"""Smallest range of a kernel whose threads each go through a whole world."""
+"""Smallest range of a kernel in which each index runs through a complete world."""
 
 CAMERAS = 1
-"""Smallest range of a kernel whose threads each draw all that a camera sees."""
+"""Smallest range of a kernel in which each index draws the picture of a camera."""
 
 TILES = 4
-"""Smallest range of a kernel whose threads each go through a tile of a picture."""
+"""Smallest range of a kernel in which each index draws a tile of a picture."""
 
 PARTICLES = 4096
-"""Smallest range of a kernel whose threads each move a particle with its state."""
+"""Smallest range of a kernel in which each index moves a particle with its state."""
 
 ELEMENTS = 16384
-"""Smallest range of a kernel whose threads each change a few numbers."""
+"""Smallest range of a kernel in which each index changes a few numbers."""
 
 
 def in_ranges(smallest: int) -> Callable[[Any], Any]:
     """Return a decorator for a Warp kernel that takes `range_start`.
 
-    So many indices of the first dimension take about 0.15 ms: a cut costs half of that.
+    `smallest` indices of the first dimension take about 0.15 ms; a split costs half of that.
     """
 
     def mark(kernel: Any) -> Any:

@@ -1,6 +1,6 @@
 """The backend table: which implementation of each operator runs, and why.
 
-There are two engines. `kernels/portable/` is plain Warp for a CPU and for CUDA, in float32 and
+There are two backends. `kernels/portable/` is plain Warp for a CPU and for CUDA, in float32 and
 float64; it reads like `reference.py`. `kernels/cuda/` is for CUDA in float32 on compute capability
 8.0 and above: neighbour lists in 16 bits, sums shared by threads, tensor cores. An operator takes
 the first implementation in `TABLE` whose condition holds for a call. `npa-envs bench --explain`
@@ -24,32 +24,32 @@ LARGEST_ROW, LARGEST_UPDATE, LARGEST_HIDDEN = 128, 32, 512
 """Widest rows and updates, and most hidden units, that the fused network takes."""
 
 UNIT_SHARE = 32
-"""Hidden units that a warp of the fused network serves."""
+"""Hidden units that one warp of the fused network computes."""
 
 LARGEST_THREAD_WORLD = 4096
-"""Particles of the largest world that one thread of a CPU sorts."""
+"""Particles of the largest world that one CPU thread sorts."""
 
 LARGEST_BLOCK_WORLD = 4096
-"""Particles of the largest world that a block of threads sorts."""
+"""Particles of the largest world that one CUDA block sorts."""
 
 LARGEST_BLOCK_GRID = 4096
-"""Cells of the largest grid that a block of threads has room for."""
+"""Cells of the largest grid that fits into one CUDA block's shared memory."""
 
 SMALL_WORLD = 2048
-"""Particles of a small world."""
+"""Particles of the largest world that environments take as small."""
 
 SHARED_WORLD = 4096
-"""Particles of the largest worlds that are often rolled out few at a time: several threads share a
-particle."""
+"""Particles of the largest world for which several threads share a particle: batches of such worlds
+may be too small to fill a GPU."""
 
 
 class KernelRequest(NamedTuple):
-    """What is known of a call before its data: all that the table asks for."""
+    """Properties of an operator call by which the table chooses; tensors' values are not read."""
 
     device: torch.device
     dtype: torch.dtype
     particle_count: int = 0
-    """Particles of a world N."""
+    """Particles of a world, N."""
     cell_count: int = 0
     """Cells of a world's grid."""
     space_dim: int = 0
@@ -65,35 +65,35 @@ class KernelRequest(NamedTuple):
     update_width: int = 0
     """Columns of an update."""
     hidden_dim: int = 0
-    """Hidden units of the rule H."""
+    """Hidden units of the rule, H."""
     vectors: tuple[int, int, int, int, bool] | None = None
-    """Of an equivariant rule: D, scalars, perceived and mixed vectors, whether it is chiral."""
+    """The `VectorForm` of an equivariant rule."""
 
 
 class Implementation(NamedTuple):
     """A row of the table."""
 
     operator: Operator
-    """What it computes."""
+    """The operator that it implements."""
     name: str
-    """What call sites ask for."""
+    """Name to which call sites compare the result of `KernelPlan.runs`."""
     where: str
-    """Where it stands."""
+    """File of the kernels."""
     condition: str
-    """When it runs, in words."""
+    """Description of when it runs."""
     holds: Callable[[KernelRequest], bool]
-    """Whether it runs."""
+    """Returns whether it can run a call."""
 
 
 @functools.lru_cache
 def is_modern(device: torch.device) -> bool:
-    """Return whether a device has the tensor cores and warp-wide sums of compute capability 8.0."""
+    """Return whether a device is a GPU of compute capability 8.0 or above."""
     return device.type == "cuda" and torch.cuda.get_device_capability(device) >= (8, 0)
 
 
 @functools.lru_cache
-def processor_count(device: torch.device) -> int:
-    """Return how many blocks of threads a CUDA device runs at once, at least."""
+def multiprocessor_count(device: torch.device) -> int:
+    """Return the number of streaming multiprocessors of a CUDA device."""
     return int(torch.cuda.get_device_properties(device).multi_processor_count)
 
 
@@ -165,14 +165,14 @@ TABLE: tuple[Implementation, ...] = (
         "kernels/cuda/density.py",
         f"{_MODERN}, 2D, worlds of at most {SHARED_WORLD} particles, boxes of at least "
         f"{SMALLEST_SIDE} cells along each side; environments only above {SMALL_WORLD}: neighbours "
-        "are listed on the way, by a warp for eight particles",
+        "are listed in the same pass, by a warp for eight particles",
         _tiles,
     ),
     Implementation(
         "density",
         "cuda",
         "kernels/cuda/density.py",
-        f"{_MODERN}: neighbours are listed on the way, in 16 bits each",
+        f"{_MODERN}: neighbours are listed in the same pass, in 16 bits each",
         _cuda,
     ),
     Implementation("density", "portable", "kernels/portable/density.py", "otherwise", _always),
@@ -192,7 +192,7 @@ TABLE: tuple[Implementation, ...] = (
         "vectors",
         "cuda",
         "kernels/cuda/equivariance.py",
-        f"{_MODERN}, rows that a block has room for: a warp has a few rows of an equivariant rule",
+        f"{_MODERN}, rows fit into shared memory: a warp maps a few rows of an equivariant rule",
         lambda request: (
             request.vectors is not None and _cuda(request) and fits_block(*request.vectors)
         ),
@@ -215,7 +215,7 @@ TABLE: tuple[Implementation, ...] = (
     Implementation("network", "torch", "torch's products", "otherwise", _always),
     Implementation("update", "portable", "kernels/portable/update.py", "always", _always),
 )
-"""All implementations; of an operator's, the first whose condition holds runs."""
+"""All implementations. A call takes the first one of its operator whose condition is true."""
 
 
 @functools.lru_cache(maxsize=4096)
@@ -225,7 +225,7 @@ def choose(operator: Operator, request: KernelRequest) -> Implementation:
 
 
 def describe(request: KernelRequest) -> list[str]:
-    """Return a line for each operator: what a call like this takes, where it stands, and why."""
+    """Return a line for each operator: the chosen implementation, its file and its condition."""
     chosen: dict[Operator, Implementation] = {}
     for row in TABLE:
         if row.holds(request):
@@ -237,42 +237,41 @@ def describe(request: KernelRequest) -> list[str]:
 
 
 class Listing(NamedTuple):
-    """How the CUDA engine lists neighbours, and how threads share particles.
+    """How the CUDA backend lists neighbours, and how threads share particles.
 
-    It follows from a world alone, its size and its box, and from the device: the sums of a world,
-    taken in the order that this gives, are the same in every batch.
+    It depends on the device and on one world's size and box, never on the number of worlds: it
+    decides the order of a world's sums, which are the same in every batch.
     """
 
     capacity: int
-    """Neighbours that a list has room for: what is longer, perception searches for again."""
+    """Longest list; perception searches again for the neighbours of particles with more."""
     lanes: int
-    """Threads of a particle in the density pass."""
+    """Threads that share a particle in the density pass."""
     teams: int
-    """Teams of lanes of a row in the perception pass."""
+    """Groups of threads that share a row in the perception pass."""
     tiled: bool = False
-    """Whether the density pass is that of `kernels/cuda/density.py`."""
+    """Whether the density pass is `tiled_density`."""
 
     def shape(self, row_count: int) -> tuple[int, int, int]:
-        """Return the shape of so many lists: 32 of them together, or, of tiles, list after list."""
+        """Return the shape of the array that stores the lists, in groups of 32."""
         return -(-row_count // 32), self.capacity, 32
 
 
 CAPACITY, LARGE_CAPACITY, HUGE_CAPACITY, CROWDED_CAPACITY = 64, 128, 96, 256
-"""Neighbours that lists have room for: in small worlds of a batch, elsewhere, in huge worlds, in
-crowded boxes."""
+"""Longest lists: in small worlds of environments, by default, in huge worlds, in crowded boxes."""
 
 CROWD = range(80, 200)
-"""Mean neighbours in a box of which many are more than `LARGE_CAPACITY`, few `CROWDED_CAPACITY`."""
+"""Mean neighbours at which many lists are longer than `LARGE_CAPACITY`, few `CROWDED_CAPACITY`."""
 
 HUGE_WORLD = 2**22
-"""Particles of the largest world whose lists of neighbours may take more memory than its rows."""
+"""Particles of the largest world whose neighbour lists may take more memory than its rows."""
 
 DENSITY_LANES = 4
-"""Threads of a particle in the density pass of small worlds."""
+"""Threads that share a particle in the density pass of small worlds."""
 
 
 def rollout_listing(request: KernelRequest, mean_neighbours: float = 0.0) -> Listing:
-    """Return how rollouts list neighbours, by `mean_neighbours`: few worlds shall fill a GPU."""
+    """Return how rollouts list neighbours: also a few worlds have to fill a GPU."""
     if request.particle_count <= SHARED_WORLD:
         crowded = int(mean_neighbours) in CROWD
         capacity = CROWDED_CAPACITY if crowded else LARGE_CAPACITY
@@ -284,7 +283,7 @@ def rollout_listing(request: KernelRequest, mean_neighbours: float = 0.0) -> Lis
 
 
 def batch_listing(request: KernelRequest) -> Listing:
-    """Return how environments list neighbours: whole batches fill a device with less."""
+    """Return how environments list neighbours: their batches fill a GPU with less work a world."""
     if request.particle_count <= SMALL_WORLD:
         return Listing(CAPACITY, lanes=1, teams=1)
     tiled = choose("density", request).name == "tiles"

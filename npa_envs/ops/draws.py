@@ -1,4 +1,4 @@
-"""Random numbers of batched worlds as opaque torch operators; no draw depends on another world."""
+"""Random numbers of batched worlds as torch operators; no draw depends on another world."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from npa_envs.kernels.portable.draws import (
     draw_integers,
     draw_kernels,
 )
+from npa_envs.ops.custom_op import custom_op
 from npa_envs.ops.launch import launch, scalar_type
-from npa_envs.ops.opaque import opaque
 
 WORD_COUNT = 2**32
-"""Values of a word of the generator."""
+"""Number of values of one 32-bit output of the generator."""
 
 
-@opaque("npa::draw")
+@custom_op("npa::draw")
 def draw(
     keys: Tensor,
     episodes: Tensor,
@@ -32,10 +32,10 @@ def draw(
     dtype: torch.dtype,
     bound: int,
 ) -> Tensor:
-    """Return numbers of each world, shape [B, count], by the `number` of the draw in its step.
+    """Return random numbers of each world, [B, count]; `number` is the draw's index in its step.
 
-    They are "uniform" in [0, 1), of 24 or 53 random bits; standard "normal", always finite;
-    "bernoulli", ones with a probability of bound / `WORD_COUNT`; or "integers" in [0, bound).
+    Kinds are "uniform" in [0, 1), with 24 or 53 random bits; standard "normal", always finite;
+    "bernoulli", ones with a probability of bound / `WORD_COUNT`; and "integers" in [0, bound).
     """
     values = keys.new_empty(keys.shape[0], count, dtype=dtype)
     if values.numel() == 0:

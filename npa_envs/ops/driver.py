@@ -1,15 +1,15 @@
-"""Launches by CUDA's driver: less work for the host than Warp's, and overlapped in graphs.
+"""Launches through CUDA's driver API: less CPU time than Warp's, and overlapped in CUDA graphs.
 
-Rollouts and environments are chains of kernels of some microseconds each, of which the time from
-the end of one to the begin of the next is a good part. With programmatic dependent launch, of
-compute capability 9.0 and above, a kernel that begins with `await_earlier` is there before the one
-ahead of it has ended, and waits until all before it have: the numbers are the same.
+Rollouts and environments are chains of kernels of some microseconds each, and the gaps between
+kernels take a large part of the time. With programmatic dependent launch (compute capability 9.0
+and above) a kernel that begins with `await_earlier` is started before the previous kernel has
+ended, and waits inside until it has: the results are the same.
 
-Such a kernel must not load with `ld.global.nc` or `__ldg`, which promise that nobody writes while
-it is there: the compiler moves these loads ahead of the wait.
+Such a kernel must not load with `ld.global.nc` or `__ldg`, which declare that nothing writes to
+the memory while the kernel runs: the compiler moves these loads ahead of the wait.
 
-Only what follows one kernel of its own graph is launched early: the first kernel of a graph would
-not wait for what the stream did before the graph.
+Only a kernel that follows one kernel of the same graph is launched early: the first kernel of a
+graph would not wait for earlier work of the stream.
 """
 
 from __future__ import annotations
@@ -21,12 +21,12 @@ from typing import Any
 import torch
 
 OVERLAPPING_CAPABILITY = 90
-"""Compute capability, times ten, from which on kernels wait by themselves."""
+"""Lowest compute capability, times ten, with programmatic dependent launch."""
 
 MOST_THREADS = 2**31 - 1
-"""Threads of a launch, at most: kernels number them along one dimension of a grid."""
+"""Largest number of threads of a launch: kernels number them along one dimension of a grid."""
 
-# What follows is of CUDA's driver interface, cuda.h.
+# Constants and structs of CUDA's driver API, cuda.h.
 
 PROGRAMMATIC_STREAM_SERIALIZATION = 6
 
@@ -60,7 +60,7 @@ class _Config(ctypes.Structure):
 
 @functools.cache
 def _driver() -> Any:
-    """Return the driver, or None where it is not there or too old."""
+    """Return CUDA's driver library, or None where it is missing or too old."""
     for name in ("libcuda.so.1", "nvcuda.dll"):
         try:
             driver = ctypes.CDLL(name)
@@ -72,9 +72,10 @@ def _driver() -> Any:
 
 
 def new_stream(device: torch.device) -> torch.cuda.Stream:
-    """Return a CUDA stream that torch gives to nobody else; it lives as long as the process.
+    """Return a CUDA stream that torch does not use elsewhere; it lives as long as the process.
 
-    Torch hands out the same 32 streams in turn: one that is captured could be another thread's.
+    `torch.cuda.Stream` returns the same 32 streams in turn, so a captured one could also be in use
+    by another thread.
     """
     driver, handle = _driver(), ctypes.c_void_p()
     with torch.cuda.device(device):
@@ -85,7 +86,7 @@ def new_stream(device: torch.device) -> torch.cuda.Stream:
 
 
 def _follows_kernel(stream: int) -> bool:
-    """Return whether what a captured stream is given next follows one kernel of the same graph."""
+    """Return whether the next launch on a captured stream follows one kernel of the same graph."""
     driver = _driver()
     status, identifier, graph = ctypes.c_int(), ctypes.c_uint64(), ctypes.c_void_p()
     nodes, edges = ctypes.POINTER(ctypes.c_void_p)(), ctypes.c_void_p()
@@ -101,7 +102,7 @@ def _follows_kernel(stream: int) -> bool:
 
 
 class DriverLaunch:
-    """A launch of a kernel, recorded by Warp on CUDA, made again and again."""
+    """A CUDA launch recorded by Warp, to be repeated through the driver API."""
 
     def __init__(self, launch: Any, device: torch.device, addresses: Any) -> None:
         capability = launch.device.get_cuda_compile_arch() or 0
@@ -131,7 +132,7 @@ class DriverLaunch:
         self._place = ctypes.byref(self._config)
 
     def run(self, thread_count: int, stream: int) -> bool:
-        """Launch on the current stream; return whether that was done: otherwise Warp launches."""
+        """Launch on the current stream; return False where Warp has to launch instead."""
         if self._launch is None or thread_count > MOST_THREADS:
             return False
         if torch.cuda.current_device() != self._device.index:

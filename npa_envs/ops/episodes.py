@@ -1,4 +1,4 @@
-"""Rewards and endings of worlds that were acted on, in one launch instead of forty."""
+"""Rewards, terminations and truncations of batched worlds, in one launch instead of forty."""
 
 from __future__ import annotations
 
@@ -25,32 +25,32 @@ ON_DIVERGENCE = {"ignore": GO_ON, "terminate": END, "reset": TELL, "raise": TELL
 
 
 class EpisodeRules(NamedTuple):
-    """What rewards and endings follow from, the same in every step."""
+    """Settings of rewards and endings, the same in every step."""
 
     last_step: int | None
-    """Step in which an episode is cut off, or None for never."""
+    """Step at which an episode is truncated, or None for never."""
     paid_step: int | None
-    """Step at which, or earlier at its end, an episode is paid minus its loss; None: each step is
-    paid by how much the loss fell."""
+    """Step at which, or earlier at its end, an episode is rewarded with minus its loss; None: each
+    step is rewarded with the decrease of the loss."""
     on_divergence: Literal["ignore", "terminate", "reset", "raise"]
-    """"ignore": a world that diverged is judged as it is. Else its loss is at least the first one;
-    with "terminate" its episode ends."""
+    """"ignore": divergence does not change the reward. Otherwise the loss of a diverged world is at
+    least its first loss; with "terminate" its episode also ends."""
 
 
 class PreparedJudgement:
-    """Judges the same B worlds again and again, by what their losses have become.
+    """Computes rewards and endings of the same B worlds in each step, from their new losses.
 
     Args:
-        rules: What rewards and endings follow from.
-        enabled: Whether there was a step at all, uint8, shape [1]; nothing changes where not.
+        rules: Settings of rewards and endings.
+        enabled: Whether a step was made, uint8, shape [1]; 0: nothing changes.
         diverged: Which worlds diverged in the step, uint8, shape [B].
         first_loss: Loss at the start of each episode, shape [B].
         success_loss: Loss at which each episode ends in success, shape [B].
-        elapsed: Steps of each episode, int32, shape [B]; counted on.
+        elapsed: Steps of each episode, int32, shape [B]; increased by 1.
         numbers: Reward; loss; its K parts; their improvements; float32, shape [2 + 2 K, B]. Losses
             and parts are those of the step before; all become those of this step.
         flags: Terminated; truncated; success; diverged; bool, shape [4, B]; written.
-        endings: Bits of each world, then whether there was a step, uint8, shape [B + 1]; written.
+        endings: Bits of each world, then `enabled`, uint8, shape [B + 1]; written.
     """
 
     def __init__(
@@ -72,12 +72,12 @@ class PreparedJudgement:
         self._written = (elapsed, numbers, flags.view(torch.uint8), endings)
 
     def __call__(self, parts: Tensor, broken: Tensor | None = None) -> None:
-        """Judge the worlds.
+        """Compute this step's rewards and endings.
 
         Args:
             parts: Parts of each world's loss, whose sum it is, float32, contiguous, shape [K, B].
-            broken: Worlds whose losses are not finite elsewhere, uint8, shape [B]; they count where
-                the world is judged as it is.
+            broken: Worlds with another loss that is not finite, uint8, shape [B]; read with
+                `on_divergence="ignore"` only.
         """
         elapsed, numbers, flags, endings = self._written
         enabled, diverged, first_loss, success_loss = self._read

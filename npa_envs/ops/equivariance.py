@@ -1,9 +1,9 @@
-"""What equivariant rules make of perceived vectors: products that stay the same in turned worlds.
+"""The vectors of equivariant rules: rotation-invariant inputs, and displacements from vectors.
 
-v are a particle's perceived gradients, u = mixing^T v some mixtures of them. A turn of the world
-turns all of them and leaves u_a · u_b as it is, in 2D also u_a × u_b, whose sign changes in a
-mirror. Each formula stands here twice: in plain torch, for any tensors (`invariants`, `steered`),
-and as kernels with hand-written adjoints, for the rows of a rollout (`read_rows`, `steer_rows`).
+v are a particle's perceived gradients, u = mixing^T v linear combinations of them. A rotation of
+the world rotates all of them and leaves u_a · u_b unchanged, in 2D also u_a × u_b, whose sign
+changes in a mirror. Each formula exists twice: in plain torch, for any tensors (`invariants`,
+`steered`), and as kernels with hand-written adjoints, for rollouts (`read_rows`, `steer_rows`).
 """
 
 from __future__ import annotations
@@ -26,30 +26,30 @@ from npa_envs.kernels.cuda.equivariance import (
     steering_kernels,
 )
 from npa_envs.kernels.portable.equivariance import equivariance_kernels
-from npa_envs.ops.backend import KernelRequest, choose, processor_count
+from npa_envs.ops.backend import KernelRequest, choose, multiprocessor_count
+from npa_envs.ops.custom_op import custom_op, once_differentiable
 from npa_envs.ops.launch import launch, scalar_type
-from npa_envs.ops.opaque import once_differentiable, opaque
 
 MIXED_VECTORS = 8
-"""Mixed vectors of an equivariant rule where nothing is said."""
+"""Default number of mixed vectors of an equivariant rule."""
 
 LEAST_STEERING = 1e-19
-"""How far a gate of 1 moves that is not to move anything (dimensionless)."""
+"""Displacement of a gate of 1 whose steering is 0, dimensionless: small, so that it can learn."""
 
 
 class VectorForm(NamedTuple):
-    """How the perception vector is made of scalars and vectors, and what is made of these."""
+    """How many scalars and vectors an equivariant rule perceives, and how many it makes of them."""
 
     space_dim: int
     """Space dimension D."""
     scalars: int
     """Entries of the perception vector before the first vector."""
     perceived: int
-    """Vectors in it, D numbers each."""
+    """Perceived vectors, D numbers each."""
     mixed: int
     """Mixed vectors."""
     chiral: bool
-    """Whether left is told from right."""
+    """Whether the rule distinguishes left from right."""
 
     @property
     def perception_dim(self) -> int:
@@ -74,10 +74,9 @@ class VectorForm(NamedTuple):
 
 
 def invariants(perception: Tensor, mixing: Tensor, form: VectorForm) -> tuple[Tensor, Tensor]:
-    """Return mixed vectors, and the numbers that stay the same in a turned world.
+    """Return mixed vectors u, [..., mixed, D], and rotation-invariant inputs, [..., input_dim].
 
-    These are u, shape [..., mixed, D], and scalars and products, shape [..., input_dim]; the
-    weights of the mixtures have shape [perceived, mixed].
+    The inputs are scalars and products of mixed vectors. `mixing` has shape [perceived, mixed].
     """
     shape = (*perception.shape[:-1], form.perceived, form.space_dim)
     vectors = perception[..., form.scalars :].reshape(shape)
@@ -91,10 +90,10 @@ def invariants(perception: Tensor, mixing: Tensor, form: VectorForm) -> tuple[Te
 
 
 def steered(output: Tensor, mixed: Tensor, steering: Tensor, form: VectorForm) -> Tensor:
-    """Return raw updates [δ (D) ; Δs] of gates and state changes: δ = Σ relu(g_a) steering_a u_a.
+    """Return raw updates [δ (D) ; Δs] from gates and state changes: δ = Σ relu(g_a) steering_a u_a.
 
-    The output has gates and then state changes, shape [..., gate_count + C]; `steering` is how far
-    a gate of 1 moves along its vector, shape [gate_count].
+    `output` has gates and then state changes, shape [..., gate_count + C]; `steering` is the
+    displacement of a gate of 1 along its vector, in units of the vector, shape [gate_count].
     """
     gates = torch.relu(output[..., : form.gate_count]) * steering
     along = torch.cat((mixed, _turned(mixed)), dim=-2) if form.chiral else mixed
@@ -103,7 +102,7 @@ def steered(output: Tensor, mixed: Tensor, steering: Tensor, form: VectorForm) -
 
 
 def _turned(vectors: Tensor) -> Tensor:
-    """Return vectors [..., 2] turned by 90 degrees."""
+    """Return vectors [..., 2] rotated by 90 degrees."""
     x, y = vectors.unbind(dim=-1)
     return torch.stack((-y, x), dim=-1)
 
@@ -113,21 +112,21 @@ def _kernels(like: Tensor, space_dim: int) -> Any:
 
 
 def _is_for_warps(like: Tensor, form: tuple[int, int, int, int, bool]) -> bool:
-    """Return whether rows of a form have kernels of their own where a tensor is."""
+    """Return whether CUDA kernels for this form run on a tensor's device and dtype."""
     return choose("vectors", KernelRequest(like.device, like.dtype, vectors=form)).name == "cuda"
 
 
 BLOCKS_PER_PROCESSOR = 5
-"""Blocks of a multiprocessor that pull back to rows, where there are many rows."""
+"""Blocks per multiprocessor in the adjoint of `read_rows`, where there are many rows."""
 
 
 def _launch_blocks(kernel: Any, blocks: int, warps: int, *tensors: Tensor) -> None:
-    """Launch a kernel of CUDA in so many blocks of so many warps."""
+    """Launch a CUDA kernel in `blocks` blocks of `warps` warps each."""
     block = warps * WARP
     launch(kernel, blocks * block, tensors[0].device, *tensors, block_dim=block)
 
 
-@opaque("npa::read_rows")
+@custom_op("npa::read_rows")
 def _read_rows(
     rows: Tensor, mixing: Tensor, width: int, space_dim: int, scalars: int, chiral: bool
 ) -> tuple[Tensor, Tensor]:
@@ -164,7 +163,7 @@ def _(
     return mixed, rows.new_empty(rows.shape[0], width)
 
 
-@opaque("npa::read_rows_backward")
+@custom_op("npa::read_rows_backward")
 def _read_rows_backward(
     rows: Tensor,
     mixing: Tensor,
@@ -180,7 +179,7 @@ def _read_rows_backward(
     rows_bar = torch.empty_like(rows)
     if _is_for_warps(rows, form):
         blocks = -(-row_count // (rows_of_warp(count) * PULL_WARPS))
-        blocks = min(blocks, BLOCKS_PER_PROCESSOR * processor_count(device))
+        blocks = min(blocks, BLOCKS_PER_PROCESSOR * multiprocessor_count(device))
         partial_sums, mixing_bar = rows.new_empty(blocks, mixing.numel()), torch.empty_like(mixing)
         kernel = row_kernels(*form).pull_back_rows
         tensors = rows, mixing, mixed, mixed_bar, inputs_bar, rows_bar, partial_sums
@@ -213,7 +212,7 @@ def _read_rows_backward(
     )
     if not with_mixing:
         return rows_bar, torch.empty_like(mixing)
-    # One product for all pairs of axes, of which those of an axis with itself count.
+    # One matrix product gives all pairs of axes; only the pairs of an axis with itself are summed.
     seen = rows[:, scalars : scalars + len(mixing) * space_dim]
     pairs = (seen.T @ total.flatten(1)).view(len(mixing), space_dim, count, space_dim)
     return rows_bar, pairs.diagonal(dim1=1, dim2=3).sum(dim=-1)
@@ -225,15 +224,15 @@ def _(rows: Tensor, mixing: Tensor, *rest: Any) -> tuple[Tensor, Tensor]:
 
 
 def _steers_by_warps(mixed: Tensor, gate_count: int) -> tuple[int, int, bool] | None:
-    """Return the form of steering that has kernels of its own, None where it has none."""
+    """Return D, mixed vectors and chirality if CUDA kernels steer these rows, else None."""
     count, space_dim = mixed.shape[1:]
     chiral = gate_count > count
-    # Steering shares no memory: rows of one vector and no scalars fit wherever any do.
+    # Steering needs no shared memory, so it runs wherever the smallest rows fit.
     least = (space_dim, 0, 1, count, chiral)
     return (space_dim, count, chiral) if _is_for_warps(mixed, least) else None
 
 
-@opaque("npa::steer_rows")
+@custom_op("npa::steer_rows")
 def _steer_rows(output: Tensor, mixed: Tensor, signs: Tensor, width: int) -> Tensor:
     update = output.new_empty(len(output), width)
     form = _steers_by_warps(mixed, len(signs))
@@ -252,7 +251,7 @@ def _(output: Tensor, mixed: Tensor, signs: Tensor, width: int) -> Tensor:
     return output.new_empty(output.shape[0], width)
 
 
-@opaque("npa::steer_rows_backward")
+@custom_op("npa::steer_rows_backward")
 def _steer_rows_backward(
     output: Tensor, mixed: Tensor, signs: Tensor, update_bar: Tensor
 ) -> tuple[Tensor, Tensor]:
@@ -306,7 +305,7 @@ class _ReadRows(torch.autograd.Function):
 
 
 class _SteerRows(torch.autograd.Function):
-    """Updates of gates, mixed vectors and state changes."""
+    """Updates from gates, mixed vectors and state changes."""
 
     @staticmethod
     def forward(ctx: Any, output: Tensor, mixed: Tensor, signs: Tensor, width: int) -> Tensor:
@@ -323,9 +322,9 @@ class _SteerRows(torch.autograd.Function):
 
 
 def read_rows(rows: Tensor, mixing: Tensor, form: VectorForm, width: int) -> tuple[Tensor, Tensor]:
-    """Return what `invariants` does of rows [z | 1 | 0], followed by their own one and by zeros.
+    """Return mixed vectors and network inputs of rows of perception [z | 1 | 0], as `invariants`.
 
-    These are mixed vectors, shape [K, mixed, D], and [scalars | products | 1 | 0], [K, width].
+    They have shapes [K, mixed, D] and [K, width]; inputs are [scalars | products | 1 | 0].
     """
     tensors = rows.contiguous(), mixing.contiguous()
     if not (torch.is_grad_enabled() and any(tensor.requires_grad for tensor in tensors)):
@@ -335,11 +334,11 @@ def read_rows(rows: Tensor, mixing: Tensor, form: VectorForm, width: int) -> tup
 
 
 def signed_gates(weight: Tensor, steering: Tensor) -> tuple[Tensor, Tensor]:
-    """Return weights of outputs whose gates are as large as they steer, and their signs.
+    """Return output weights with gates multiplied by |steering|, and the signs of steering.
 
-    relu(g) steering = sign(steering) relu(|steering| g): the products of rows with these weights
-    take in all of `steering` but its signs, so its gradient follows from theirs, without a sum over
-    rows. Where it is 0 a gate is as good as closed, but not quite: so it still learns.
+    relu(g) steering = sign(steering) relu(|steering| g), so the gradient of `steering` follows from
+    that of the weights, without a sum over rows. A steering of 0 is replaced by a tiny one, so that
+    it still gets a gradient.
     """
     steering = torch.where(steering == 0.0, steering + LEAST_STEERING, steering)
     factors = torch.nn.functional.pad(steering.abs(), (0, len(weight) - len(steering)), value=1.0)
@@ -347,7 +346,7 @@ def signed_gates(weight: Tensor, steering: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def steer_rows(output: Tensor, mixed: Tensor, signs: Tensor, width: int) -> Tensor:
-    """Return what `steered` does of [g | Δs | 0], with gates by `signed_gates`: [δ | Δs | 0]."""
+    """Return updates [δ | Δs | 0] of outputs [g | Δs | 0] by `signed_gates`, as `steered`."""
     output = output.contiguous()
     if not (torch.is_grad_enabled() and (output.requires_grad or mixed.requires_grad)):
         return _steer_rows(output, mixed, signs, width)

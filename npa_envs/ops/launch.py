@@ -1,4 +1,4 @@
-"""Launches: tensors become arguments of Warp kernels, which join torch's stream or CPU threads."""
+"""Launches of Warp kernels on tensors, on torch's current stream or its number of CPU threads."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ SCALARS: dict[torch.dtype, Any] = {torch.float32: wp.float32, torch.float64: wp.
 """Warp's scalar type for each floating dtype that the operators take."""
 
 GROUP_WIDTHS = (4, 8, 16)
-"""Channels of a group, which are summed together; there are several beyond the largest width."""
+"""Channels that one thread sums together; worlds with more channels than 16 have several groups."""
 
 
 def scalar_type(dtype: torch.dtype) -> Any:
@@ -40,7 +40,7 @@ def scalar_type(dtype: torch.dtype) -> Any:
 
 
 def channel_width(state_dim: int) -> int:
-    """Return how many channels form a group."""
+    """Return the number of channels of a group."""
     return next((width for width in GROUP_WIDTHS if width >= state_dim), GROUP_WIDTHS[-1])
 
 
@@ -58,16 +58,16 @@ def _warp_stream(device: torch.device, handle: int) -> Any:
 def _current_stream(device: torch.device) -> int:
     """Return the handle of torch's current stream of a CUDA device."""
     index = torch.cuda.current_device() if device.index is None else device.index
-    # What `torch.cuda.current_stream` makes an object of, in a tenth of its time.
+    # Ten times faster than `torch.cuda.current_stream`, which makes an object of it.
     return torch._C._cuda_getCurrentRawStream(index)
 
 
 NEVER = (-1, -1)
-"""A size that no tensor has, nor any but for its first dimension."""
+"""A size that differs from every tensor's, also after its first dimension."""
 
 
 class _ArrayArgument:
-    """The description of a tensor within a kernel's arguments, changed in place."""
+    """Warp's array descriptor of one tensor argument, updated in place for each launch."""
 
     def __init__(self, place: Any, array_type: Any) -> None:
         self._place = place
@@ -76,12 +76,12 @@ class _ArrayArgument:
         self._size: tuple[int, ...] | None = None
         self._dtype: torch.dtype | None = None
         self._joined = 1
-        """Entries of the array for each of the tensor's first dimension."""
+        """Entries of the array for each index of the tensor's first dimension."""
 
     def set(self, tensor: Tensor | None) -> None:
-        """Describe another tensor, or none."""
+        """Write the descriptor of another tensor, or of an absent one (None)."""
         if tensor is None:
-            # Kernels ask an absent array for its size.
+            # Kernels read the size of an absent array.
             if self._size is not None:
                 _overwrite(self._place, self._type.__ctype__())
                 self._size = None
@@ -92,7 +92,7 @@ class _ArrayArgument:
         self._place.data = tensor.data_ptr() or _null(tensor)
 
     def _describe(self, tensor: Tensor, size: torch.Size) -> None:
-        """Write shape and strides: by itself where only the first dimension has changed."""
+        """Write shape and strides; only the first size where nothing else has changed."""
         last, dense = self._size, tensor.is_contiguous()
         known = last is not None and tensor.dtype is self._dtype and size[1:] == last[1:]
         # A first dimension of 1 may have had any stride.
@@ -101,12 +101,12 @@ class _ArrayArgument:
         else:
             _overwrite(self._place, _description(tensor, self._type))
             self._joined = self._shape[0] // size[0] if size[0] else 0
-        # One with strides of its own is described each time.
+        # A tensor that is not contiguous is described each time.
         self._size, self._dtype = size if dense else NEVER, tensor.dtype
 
 
 def _null(tensor: Tensor) -> int:
-    """Return 0, the address of an empty tensor; others must have memory of their own."""
+    """Return 0, the address of an empty tensor; raise for tensor subclasses without memory."""
     if tensor.numel():
         raise NPAError(
             "tensors must have memory of their own, got a tensor subclass that wraps others "
@@ -116,40 +116,40 @@ def _null(tensor: Tensor) -> int:
 
 
 def _overwrite(place: Any, made: Any) -> None:
-    """Copy a description or a struct into the memory of the arguments."""
+    """Copy a descriptor or a struct into the memory of the arguments."""
     ctypes.memmove(ctypes.addressof(place), ctypes.addressof(made), ctypes.sizeof(made))
 
 
 def _description(tensor: Tensor, array_type: Any) -> Any:
-    """Return a tensor as Warp describes arrays to kernels; one dimension takes all of a tensor."""
+    """Return Warp's array descriptor of a tensor; one of one dimension covers the whole tensor."""
     tensor = tensor.detach()
     if array_type.ndim == 1:
         entry = getattr(array_type.dtype, "_shape_", ())
         tensor = tensor.view(tensor.numel() // math.prod(entry), *entry)
     made = wp.from_torch(tensor, dtype=array_type.dtype, requires_grad=False, return_ctype=True)
-    # Launches are kept; their first tensors would be kept with them.
+    # Launches are cached, and must not keep their first tensors alive.
     made._ref = None
     return made
 
 
 class _StructArgument:
-    """A struct within a kernel's arguments, changed in place."""
+    """A struct argument, updated in place for each launch."""
 
     def __init__(self, place: Any) -> None:
         self._place = place
         self._last: Any = None
 
     def set(self, value: Any) -> None:
-        """Copy another struct, unless it is the one that is there."""
+        """Copy another struct, unless it is the current one."""
         if value is not self._last:
             _overwrite(self._place, value.__ctype__())
             self._last = value
 
 
 class _Arguments:
-    """A kernel on a device with memory for its arguments, in which each launch changes some.
+    """A kernel on a device with memory for its arguments; a launch overwrites those that changed.
 
-    Warp's own launch makes all of them anew, which takes the host ten times longer.
+    Warp's own launch packs all arguments each time, which costs ten times as much CPU time.
     """
 
     def __init__(
@@ -199,7 +199,7 @@ class _Arguments:
             self._driven = DriverLaunch(self._launch, device, self._addresses)
 
     def _setter(self, name: str, kind: Any, value: Any) -> Any:
-        """Return what changes an argument; None: a number or a vector, compared and assigned."""
+        """Return the function that sets an argument; None for a number or vector, set directly."""
         if isinstance(kind, wp.array):
             return _ArrayArgument(getattr(self._memory, name), kind).set
         if hasattr(value, "__ctype__"):
@@ -207,7 +207,7 @@ class _Arguments:
         return None
 
     def set(self, arguments: tuple[Any, ...]) -> None:
-        """Change the arguments."""
+        """Replace the kernel's arguments for the next launch."""
         for k, setter in self._described:
             setter(arguments[k])
         last = self._last
@@ -220,7 +220,7 @@ class _Arguments:
                 setattr(self._memory, self._names[k], made)
 
     def set_address(self, index: int, tensor: Tensor) -> None:
-        """Let an array begin elsewhere."""
+        """Set the address of an array argument to that of a tensor of the same form."""
         getattr(self._memory, self._names[index]).data = tensor.data_ptr() or _null(tensor)
 
     def _bounds_of(self, size: tuple[int, ...]) -> Any:
@@ -249,7 +249,7 @@ class _Arguments:
             run_together([functools.partial(self._run_range, size, part) for part in ranges])
 
     def _run_range(self, size: tuple[int, ...], indices: range) -> None:
-        """Run a part of a launch, which shares all other arguments."""
+        """Run the part of a launch that has these indices along the first dimension."""
         memory = type(self._memory).from_buffer_copy(self._memory)
         setattr(memory, self._names[0], indices.start)
         self._run_on_cpu(memory, (len(indices), *size[1:]))
@@ -259,7 +259,7 @@ class _Arguments:
 
 
 def _first_load(kernel: Any, device: torch.device) -> contextlib.AbstractContextManager[None]:
-    """Return what other processes wait for while a kernel's module is compiled or loaded."""
+    """Return a lock of all processes, held while a kernel's module is compiled or loaded."""
     known = any(other.module is kernel.module and where == device for other, where in launched)
     return contextlib.nullcontext() if known else in_turn(kernel.module.name)
 
@@ -268,7 +268,7 @@ launched: set[tuple[Any, torch.device]] = set()
 """Kernels that have been launched, each with its device."""
 
 LARGEST_BOUNDS = 4096
-"""Sizes of launches that are remembered for a kernel."""
+"""Launch bounds that are cached for a kernel, at most."""
 
 
 @functools.lru_cache(maxsize=1024)
@@ -277,7 +277,7 @@ def _struct(fields: tuple[tuple[str, type], ...]) -> Any:
 
 
 def _ranges(kernel: Any, size: tuple[int, ...]) -> list[range]:
-    """Return what threads of the CPU run of a launch's first dimension; one range: no cut."""
+    """Return the ranges of a launch's first dimension that CPU threads run; one range: no split."""
     smallest = SMALLEST_RANGES.get(kernel)
     return [range(size[0])] if smallest is None else even_ranges(size[0], smallest)
 
@@ -297,16 +297,16 @@ class Launch(NamedTuple):
 
 @contextlib.contextmanager
 def noted_launches() -> Iterator[list[Launch]]:
-    """Yield a list to which every launch in the block is added, of all threads."""
+    """Yield a list to which all launches in the block are added, of every thread."""
     noted: list[Launch] = []
-    _noting.append(noted)
+    _observers.append(noted)
     try:
         yield noted
     finally:
-        _noting.remove(noted)
+        _observers.remove(noted)
 
 
-_noting: list[list[Launch]] = []
+_observers: list[list[Launch]] = []
 """Lists to which launches are added."""
 
 
@@ -317,12 +317,12 @@ def _described(kernel: Any, size: tuple[int, ...]) -> Launch:
 
 
 class _Ready(threading.local):
-    """A thread's kernels with memory for their arguments."""
+    """A thread's cache of kernels with memory for their arguments."""
 
     def __init__(self) -> None:
         self.by_kernel: dict[tuple[Any, torch.device, int], _Arguments] = {}
         self.tape: Tape | None = None
-        """Where launches are recorded."""
+        """The tape that records this thread's launches, if any."""
 
 
 _ready = _Ready()
@@ -335,16 +335,16 @@ def launch(
     *arguments: Any,
     block_dim: int = CUDA_BLOCK,
 ) -> None:
-    """Launch a kernel, with so many threads along each dimension, on torch's current stream.
+    """Launch a kernel with `size` threads along each dimension on torch's current stream.
 
     Arguments are tensors of the device (None for an absent one), structs and numbers, in the
-    kernel's order, without `range_start`. The kernel's own signature says how each tensor is read:
-    an array of one dimension is all of a contiguous tensor, whatever the tensor's shape.
+    kernel's order, without `range_start`. The kernel's signature decides how a tensor is read: an
+    array of one dimension is all of a contiguous tensor, whatever the tensor's shape.
     """
     size = (size,) if isinstance(size, int) else size
     if 0 in size:
         return
-    for noted in _noting:
+    for noted in _observers:
         noted.append(_described(kernel, size))
     if kernel in SMALLEST_RANGES:
         arguments = (0, *arguments)
@@ -367,27 +367,27 @@ def aligned(tensor: Tensor) -> Tensor:
 
 
 def is_recorded() -> bool:
-    """Return whether a tape records what this thread launches."""
+    """Return whether a tape records this thread's launches."""
     return _ready.tape is not None
 
 
 class Tape:
-    """Launches that are recorded once and made again and again, between tensors that stay."""
+    """A recorded sequence of launches that is replayed on the same tensors in the same memory."""
 
     def __init__(self) -> None:
         self._launches: list[tuple[_Arguments, tuple[int, ...]]] = []
         self._given: list[list[Any]] = []
-        """Their arguments, which hold addresses alone by themselves."""
+        """Tensors in the arguments, kept alive: the arguments contain only their addresses."""
 
     def add(self, kernel: Any, size: Any, device: torch.device, *arguments: Any) -> None:
-        """Record a launch, which is not made; arguments are those of `launch`."""
+        """Record a launch without making it; arguments are those of `launch`."""
         size = (size,) if isinstance(size, int) else size
         arguments = (0, *arguments) if kernel in SMALLEST_RANGES else arguments
         self.arguments(kernel, size, device, CUDA_BLOCK, arguments).set(arguments)
 
     @contextlib.contextmanager
     def recording(self) -> Iterator[None]:
-        """Record this thread's launches in the block, which are made as well."""
+        """Record this thread's launches in the block, and make them."""
         _ready.tape, before = self, _ready.tape
         try:
             yield
@@ -402,7 +402,7 @@ class Tape:
         block_dim: int,
         arguments: tuple[Any, ...],
     ) -> _Arguments:
-        """Return memory for the arguments of one more launch."""
+        """Add a launch to the tape, and return memory for its arguments."""
         made = _Arguments(kernel, size, device, block_dim, arguments)
         self._launches.append((made, size))
         self._given.append(list(arguments))
@@ -412,8 +412,8 @@ class Tape:
         """Return the number of launches."""
         return len(self._launches)
 
-    def places(self, tensor: Tensor) -> list[tuple[_Arguments, int]]:
-        """Return where a tensor is an argument; the caller keeps it from now on."""
+    def argument_slots(self, tensor: Tensor) -> list[tuple[_Arguments, int]]:
+        """Return the arguments that are this tensor, which the caller now has to keep alive."""
         places, address = [], tensor.data_ptr()
         for (made, _), arguments in zip(self._launches, self._given, strict=True):
             for k, value in enumerate(arguments):
@@ -423,14 +423,14 @@ class Tape:
         return places
 
     def move(self, places: list[tuple[_Arguments, int]], tensor: Tensor) -> None:
-        """Let arguments be another tensor of the same form, which the caller keeps."""
+        """Replace these arguments by a tensor of the same form, which the caller keeps alive."""
         for made, index in places:
             made.set_address(index, tensor)
 
     def replay(
         self, begin: int = 0, end: int | None = None, *, last_count: int | None = None
     ) -> None:
-        """Make some of the launches again, the last along `last_count` threads if that is given."""
+        """Repeat some of the launches, the last with `last_count` threads if given."""
         launches = self._launches[begin:end]
         for made, size in launches[:-1]:
             made.run(size)
@@ -438,24 +438,24 @@ class Tape:
         made.run(size if last_count is None else (last_count, *size[1:]))
 
 
-# Threads of the CPU, as many as torch is set to use. Where torch brings GNU's OpenMP, these are
-# torch's own: threads of another pool would compete for the cores with torch's, which after each
-# operation wait for the next one in a busy loop.
+# CPU threads, as many as torch is set to use. Where torch ships GNU's OpenMP, they are torch's own
+# threads: after each operation these wait for the next one in a busy loop, and would compete for
+# the cores with another pool.
 
 SHARES = 4
-"""Ranges of a thread, at most: one that is held up, as by another process, runs fewer."""
+"""Ranges per thread, at most: a thread that is delayed, as by another process, runs fewer."""
 
 _Task = ctypes.CFUNCTYPE(None, ctypes.c_void_p)
 
 _forked = False
 
 _DEFAULT_THREADS = torch.get_num_threads()
-"""What torch chose, unless somebody has chosen before."""
+"""Torch's own number of threads, unless it was set before this import."""
 
 
 @functools.cache
 def _team() -> Any:
-    """Return OpenMP's function that runs a task on each thread of a team, or None."""
+    """Return the function of GNU's OpenMP that runs a task on each thread of a team, or None."""
     try:
         parallel = ctypes.CDLL(None).GOMP_parallel if sys.platform == "linux" else None
     except AttributeError:
@@ -472,9 +472,9 @@ def _pool() -> ThreadPoolExecutor:
 
 
 def _leave_threads() -> None:
-    """Forget what a forked process has of its parent's threads: none of them runs here.
+    """Drop the pool in a forked process, in which the parent's threads do not run.
 
-    Torch would wait for its own for ever.
+    Torch would wait for its own threads for ever.
     """
     global _forked
     _forked = True
@@ -487,10 +487,10 @@ if hasattr(os, "register_at_fork"):
 
 
 def thread_count() -> int:
-    """Return how many threads kernels run on: torch's number.
+    """Return the number of CPU threads of kernels: torch's number.
 
-    In a process that Python's `multiprocessing` has started it is one, unless the number was
-    chosen: such processes, as vector environments start them, are meant to share the cores.
+    In a process started by Python's `multiprocessing` it is one, unless the number was set: such
+    processes, as of vector environments, share the cores.
     """
     threads = torch.get_num_threads()
     chosen = threads != _DEFAULT_THREADS or "OMP_NUM_THREADS" in os.environ
@@ -498,7 +498,7 @@ def thread_count() -> int:
 
 
 def even_ranges(count: int, smallest: int) -> list[range]:
-    """Return ranges of [0, count) for all threads, of `smallest` indices or more; or one."""
+    """Split [0, count) into ranges for all threads, of at least `smallest` indices each; or one."""
     if count < 2 * smallest:
         return [range(count)]
     threads = thread_count()
@@ -508,7 +508,7 @@ def even_ranges(count: int, smallest: int) -> list[range]:
 
 
 def run_together(calls: Sequence[Callable[[], object]]) -> None:
-    """Run calls that release the GIL, side by side; the first error is raised after all ran."""
+    """Run calls that release the GIL in parallel; the first error is raised after all have run."""
     pending = iter(calls)
     errors: list[BaseException] = []
 
@@ -521,14 +521,14 @@ def run_together(calls: Sequence[Callable[[], object]]) -> None:
 
     team = None if _forked else _team()
     if team is None:
-        # In this thread and, at the same time, in others of a pool of Python's.
+        # In this thread and in a pool of Python threads at the same time.
         threads = min(torch.get_num_threads(), len(calls))
         helpers = [_pool().submit(run_pending) for _ in range(threads - 1)]
         run_pending()
-        # One that has not begun by now would find nothing left to do.
+        # A task that has not begun by now would find no call left.
         wait([helper for helper in helpers if not helper.cancel()])
     else:
-        # Of all threads: OpenMP would end those that a smaller team leaves out.
+        # On all threads: OpenMP would end those that a smaller team leaves out.
         team(_Task(run_pending), None, torch.get_num_threads(), 0)
     if errors:
         raise errors[0]

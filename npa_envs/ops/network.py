@@ -17,22 +17,22 @@ from npa_envs.kernels.cuda.network import (
     two_layer_kernel,
     weight_gradient_kernels,
 )
-from npa_envs.ops.backend import KernelRequest, choose, processor_count
+from npa_envs.ops.backend import KernelRequest, choose, multiprocessor_count
+from npa_envs.ops.custom_op import custom_op, once_differentiable
 from npa_envs.ops.launch import aligned, launch
-from npa_envs.ops.opaque import once_differentiable, opaque
 
 
 class ArrangedWeights(NamedTuple):
-    """A rule's folded weights as the fused kernels read them."""
+    """A rule's weights in the memory layout of the fused kernels."""
 
     forward: list[Tensor]
-    """Fragments of W1 and of W2, float16, and the scales of updates, float32."""
+    """Fragments (tiles of tensor cores) of W1 and W2, float16, and scales of updates, float32."""
     backward: list[Tensor]
-    """The same of both transposed, then fragments of both, bfloat16; empty without gradients."""
+    """The same of W1ᵀ and W2ᵀ, then fragments of both, bfloat16; empty without gradients."""
 
 
 def _arrange_layers(first: Tensor, second: Tensor) -> list[Tensor]:
-    """Lay out two layers' weights, [H, width] and [width', H]: fragments and output scales."""
+    """Return fragments and output scales of two layers' weights, [H, width] and [width', H]."""
     hidden, width = first.shape
     steps, tiles = -(-width // 16), -(-second.shape[0] // 8)
     half = functools.partial(torch.empty, dtype=torch.float16, device=first.device)
@@ -46,7 +46,7 @@ def _arrange_layers(first: Tensor, second: Tensor) -> list[Tensor]:
     return [*fragments, output_unscale]
 
 
-@opaque("npa::arrange_weights")
+@custom_op("npa::arrange_weights")
 def _arrange_weights(
     hidden_weight: Tensor, output_weight: Tensor, with_backward: bool
 ) -> list[Tensor]:
@@ -84,7 +84,7 @@ def _(hidden_weight: Tensor, output_weight: Tensor, with_backward: bool) -> list
 def arrange(
     hidden_weight: Tensor, output_weight: Tensor, *, with_backward: bool
 ) -> ArrangedWeights:
-    """Lay out weights that fit, for the backward pass too if asked."""
+    """Lay out weights that the kernels support; `with_backward`: also for the backward pass."""
     arranged = _arrange_weights(
         hidden_weight.detach().contiguous(), output_weight.detach().contiguous(), with_backward
     )
@@ -92,10 +92,10 @@ def arrange(
 
 
 def arrange_weights(hidden_weight: Tensor, output_weight: Tensor) -> ArrangedWeights | None:
-    """Lay out a rule's folded weights for `run_network`; None where it does not take them.
+    """Lay out a rule's weights for `run_network`; None where it does not support them.
 
-    Where gradients are enabled they are laid out for the backward pass too, even of weights that
-    need none: once here, instead of at every step whose rows need one.
+    Where gradients are enabled they are also laid out for the backward pass, even if the weights
+    require no gradient: once, instead of in every step whose rows require one.
     """
     hidden, width = hidden_weight.shape
     request = KernelRequest(
@@ -114,19 +114,19 @@ ROW_GROUP = 16
 """Rows of a fragment."""
 
 LAYER_BLOCK = 64
-"""Threads of a block that maps rows: small, so that few rows still fill the device."""
+"""Threads of a block of the forward pass: few, so that also few rows fill the device."""
 
 SHARES_PER_PROCESSOR = 2
-"""Blocks of a multiprocessor that sum weight gradients side by side, where there are many rows."""
+"""Blocks per multiprocessor that sum weight gradients in parallel, where there are many rows."""
 
 FEW_ROWS = 160
-"""Rows of a multiprocessor up to which one block sums them: adding up the shares takes longer."""
+"""Rows per multiprocessor up to which one block sums them: adding partial sums takes longer."""
 
 SIGN_UNITS = 128
-"""Hidden units whose signs are one word for each of the four lanes that share a row."""
+"""Hidden units whose ReLU masks four threads store, in 32 bits each."""
 
 
-@opaque("npa::run_network")
+@custom_op("npa::run_network")
 def _run_network(
     rows: Tensor,
     arranged: list[Tensor],
@@ -135,7 +135,7 @@ def _run_network(
     mode: str,
     noted: Tensor | None,
 ) -> tuple[Tensor, Tensor]:
-    """Run two layers on rows [K, width], as `two_layer_kernel` says; "note" returns signs too."""
+    """Run `two_layer_kernel` on rows [K, width]; mode "note" also returns the ReLU masks."""
     steps, tiles = -(-rows.shape[1] // 16), -(-out_width // 8)
     signs = _empty_signs(rows, unit_count, mode)
     output = rows.new_empty(rows.shape[0], out_width)
@@ -167,12 +167,12 @@ def _(
 
 
 def _empty_signs(rows: Tensor, unit_count: int, mode: str) -> Tensor:
-    """Return words for the signs of hidden units, if these are noted."""
+    """Return memory for the ReLU masks of hidden units, empty where the mode needs none."""
     words = 4 * -(-unit_count // SIGN_UNITS) if mode == "note" else 0
     return rows.new_empty(rows.shape[0], words, dtype=torch.int32)
 
 
-@opaque("npa::network_weight_gradients")
+@custom_op("npa::network_weight_gradients")
 def _weight_gradients(
     rows: Tensor, update_bar: Tensor, signs: Tensor, arranged: list[Tensor], unit_count: int
 ) -> Tensor:
@@ -183,7 +183,7 @@ def _weight_gradients(
     kernels = weight_gradient_kernels(
         -(-width // 16), -(-width // 8), -(-out_width // 8), warps, unit_blocks, signs.shape[1]
     )
-    processors = processor_count(rows.device)
+    processors = multiprocessor_count(rows.device)
     each = 1 if count <= FEW_ROWS * processors else SHARES_PER_PROCESSOR
     most = max(each * processors // unit_blocks, 1)
     share_rows = max(-(-count // (most * ROW_GROUP)), 1) * ROW_GROUP
@@ -255,14 +255,14 @@ class _Network(torch.autograd.Function):
 def run_network(
     rows: Tensor, weights: Tensor, output_shape: tuple[int, ...], arranged: ArrangedWeights
 ) -> Tensor:
-    """Map rows to relu(rows W1.T) W2.T, as accurate as products in float32.
+    """Map rows to relu(rows W1ᵀ) W2ᵀ, as accurate as matrix products in float32.
 
-    A row's result depends on nothing but that row and the weights.
+    A row's result depends only on that row and the weights, not on the other rows.
 
     Args:
-        weights: W1 [H, row_width] and W2 [A', H], one after the other, shape [H (row_width + A')].
-        arranged: The same weights as `arrange_weights` laid them out; again where gradients were
-            not enabled then and are now.
+        weights: W1 [H, row_width] and W2 [A', H], concatenated, shape [H (row_width + A')].
+        arranged: The same weights, as `arrange_weights` laid them out; they are laid out again
+            where that was without gradients and gradients are enabled now.
     """
     out_width, unit_count = output_shape
     noting = torch.is_grad_enabled() and (rows.requires_grad or weights.requires_grad)

@@ -1,4 +1,4 @@
-"""The passes over sorted worlds, kernels and their arguments: density, perception, adjoint."""
+"""The passes over sorted worlds: arguments and launches of density, perception and adjoint."""
 
 from __future__ import annotations
 
@@ -17,52 +17,52 @@ from npa_envs.kernels.portable.adjoint import adjoint_kernels
 from npa_envs.kernels.portable.density import density_kernels
 from npa_envs.kernels.portable.perceive import perception_kernels
 from npa_envs.ops.backend import Listing
+from npa_envs.ops.custom_op import custom_op
 from npa_envs.ops.launch import launch
-from npa_envs.ops.opaque import opaque
 from npa_envs.ops.physics import Physics
-from npa_envs.ops.sort import LARGEST_INDEX, KernelPlan, SortedWorlds, make_plan
+from npa_envs.ops.sort import LARGEST_INDEX, KernelPlan, SortedWorlds, plan_kernels
 
-LISTS_TOGETHER = 32
-"""Neighbour lists that lie together."""
+INTERLEAVED_LISTS = 32
+"""Neighbour lists that are interleaved in memory."""
 
 
 class NeighbourLists(NamedTuple):
     """The neighbours of each row's particle, itself included."""
 
     listing: Listing
-    """How they were listed."""
+    """Layout of the lists."""
     steps: Tensor
-    """Steps to neighbours in the sorted order, int16: 32 particles together, or, of tiles, list
-    after list."""
+    """Differences of sorted indices from each neighbour to the next, int16; lists of 32 rows are
+    interleaved, those of tiles are stored one after the other."""
     lengths: Tensor
-    """Neighbours of each row's particle, int32, [K]."""
+    """Number of neighbours of each row's particle, int32, [K]."""
     records: Tensor
-    """Sorted positions with volumes, and in 2D places of states, shape [B N, 4]."""
+    """Sorted positions with volumes, and in 2D indices of states, shape [B N, 4]."""
     by_place: bool = False
-    """There is a list for each sorted particle, not for each row."""
+    """Whether there is a list for each sorted particle, not for each row."""
 
 
 class ListedNeighbours(NamedTuple):
     """The neighbours of each sorted particle, itself included, for the portable kernels."""
 
     neighbours: Tensor
-    """Their places in the sorted order, int32, shape [E]."""
+    """Sorted indices of the neighbours of all particles, concatenated, int32, shape [E]."""
     ends: Tensor
-    """Where each particle's neighbours end, int32, shape [B N]."""
+    """End of each particle's part of `neighbours`, int32, shape [B N]."""
 
 
 class Densities(NamedTuple):
-    """What the density pass leaves for perception."""
+    """Results of the density pass, read by perception."""
 
     particles: Tensor
-    """Sorted positions with volumes 1 / rho, shape [B N, D + 1]; empty where nobody asked."""
+    """Sorted positions with volumes 1 / rho, shape [B N, D + 1]; empty if not asked for."""
     density_gradient: Tensor
-    """Density gradients of sorted particles that have rows, float64, shape [B N, D]; undefined of
-    the others; empty where perception computes them."""
+    """Density gradients of sorted particles with rows, float64, shape [B N, D]; undefined for
+    others; empty where perception computes them."""
     lists: NeighbourLists | None = None
-    """What the density pass of `kernels/cuda/` found of neighbours."""
+    """Neighbours found by the density pass of `kernels/cuda/`."""
     listed: ListedNeighbours | None = None
-    """The neighbours of static worlds on a CPU."""
+    """Neighbours of static worlds on a CPU."""
 
 
 def portable_kernels(plan: KernelPlan, listed: bool = False) -> Any:
@@ -89,8 +89,9 @@ def compute_densities(
 ) -> Densities:
     """Compute densities, and neighbour lists or the rows' density gradients for perception.
 
-    Neighbours are listed where the plan says so, by default as in rollouts, with their states'
-    places (by default in order); `with_particles`: also leave what the adjoint reads.
+    Neighbours are listed where `plan.lists_neighbours`, by default as in rollouts. `state_place`
+    has the index of each sorted particle's state, by default in order. `with_particles`: also
+    return `particles`, which the adjoint reads.
     """
     if not plan.lists_neighbours:
         return compute_density_gradients(plan, ordered)
@@ -172,14 +173,14 @@ def perception_launch(
     first_row: int = 0,
     row_count: int | None = None,
 ) -> tuple[Any, ...]:
-    """Return what to give to `launch` so that it writes the perception of each row, or of some.
+    """Return the arguments of a `launch` that writes the perception of all or some rows to `out`.
 
     Args:
         states: States in the caller's order, where `ordered` has none.
-        destination: Row of `out` for each row, int32, shape [K]; default: its own.
-        limit: Entries are clipped to plus and minus this; 0: they are not.
-        row_kernel_sum: Where to write the rows' sums of v K, shape [K, D], for the adjoint.
-        first_row: What is written into the first row of `out`, a multiple of `LISTS_TOGETHER`.
+        destination: Row of `out` for each row, int32, shape [K]; default: the same row.
+        limit: Entries are clipped to plus and minus this; 0: not clipped.
+        row_kernel_sum: Output of the rows' sums of v K, shape [K, D], for the adjoint.
+        first_row: Row that is written to the first row of `out`, a multiple of `INTERLEAVED_LISTS`.
     """
     some = row_count is not None
     row_count = plan.row_capacity if row_count is None else row_count
@@ -194,7 +195,7 @@ def perception_launch(
     )
     lists = densities.lists
     if lists is not None and some:
-        shifted = lists.steps[first_row // LISTS_TOGETHER :], lists.lengths[first_row:]
+        shifted = lists.steps[first_row // INTERLEAVED_LISTS :], lists.lengths[first_row:]
         lists = lists._replace(steps=shifted[0], lengths=shifted[1])
     if lists is not None:
         kernel = listed_perception(
@@ -265,11 +266,11 @@ class SavedPerception(NamedTuple):
     perception: Tensor
     """Rows of perception, dimensionless, shape [K, row_width]."""
     row_kernel_sum: Tensor
-    """The rows' sums of v K [1 / length units], shape [K, D]; undefined beyond the last one."""
+    """Each row's sum of v K [1 / length units], shape [K, D]; undefined beyond active rows."""
     row_of: Tensor
-    """Row of each particle, -1 where it has none, int32, shape [B N]."""
+    """Row of each particle, -1 for none, int32, shape [B N]."""
     starts: Tensor
-    """First sorted place of every cell, then first row of every cell (shifted), int32."""
+    """First sorted index of every cell, then first row of every cell (plus `row_base`), int32."""
     source: Tensor
     """Caller's index of each sorted particle, int32, shape [B N]."""
     particles: Tensor
@@ -280,7 +281,7 @@ class SavedPerception(NamedTuple):
     """Sorted states, dimensionless, shape [B N G, W]; None where positions get no gradient."""
 
 
-@opaque("npa::perceive_rows_backward")
+@custom_op("npa::perceive_rows_backward")
 def perceive_rows_backward(
     perception_bar: Tensor,
     saved_tensors: list[Tensor],
@@ -292,12 +293,12 @@ def perceive_rows_backward(
 ) -> tuple[Tensor, Tensor]:
     """Return the cotangents of states, [B N, C], and of positions, [B N, D] or empty.
 
-    The tensors are those of a `SavedPerception`, and of the `ListedNeighbours` where there are any;
-    positions are skipped if no states were saved.
+    The tensors are those of a `SavedPerception`, and of `ListedNeighbours` if there are any.
+    Positions get a cotangent if states were saved.
     """
     saved = SavedPerception(*saved_tensors)
     total, space_dim = saved.particles.shape[0], saved.particles.shape[1] - 1
-    plan = make_plan(
+    plan = plan_kernels(
         saved.particles,
         (total // particle_count, particle_count, space_dim),
         state_dim,
@@ -333,7 +334,7 @@ def _(
 def _gather_by_cells(
     plan: KernelPlan, saved: SavedPerception, listed: list[Tensor], bar: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Return the cotangents by the portable kernels."""
+    """Compute the cotangents with the portable kernels, particle by particle."""
     entries, space_dim, width = plan.row_capacity * plan.group_count, plan.space_dim, plan.width
     largest = entries * space_dim * width
     if largest >= LARGEST_INDEX:
@@ -345,7 +346,7 @@ def _gather_by_cells(
     kernels = adjoint_kernels(
         space_dim, plan.scalar, width, plan.on_cpu, terms.state_gradient, bool(listed)
     )
-    # Cotangents of the rows' raw sums: smoothed states, and gradients before their scaling.
+    # Cotangents of each row's sums: of smoothed states, and of gradients before they are scaled.
     blur_bar = bar.new_empty(entries, width)
     gradient_bar = bar.new_empty(entries, space_dim, width)
     density_gradient_bar = bar.new_empty(plan.row_capacity if with_positions else 0, space_dim)
@@ -416,12 +417,12 @@ def _gather_by_cells(
 
 
 def _gather_by_tiles(plan: KernelPlan, saved: SavedPerception, bar: Tensor) -> Tensor:
-    """Return the cotangent of states, [B N, C], on CUDA in float32."""
+    """Compute the cotangent of states, [B N, C], with the kernels for CUDA in float32."""
     state_gradient = plan.physics.terms.state_gradient
     kernels = listed_adjoint(
         plan.space_dim, plan.width, state_gradient, plan.periodic, plan.group_count > 1
     )
-    # All cotangents are multiplied by one kernel's norm, those of the smoothed state before.
+    # The kernel multiplies by one norm; cotangents of smoothed states get the ratio of norms first.
     norm = plan.domain.spiky_norm if state_gradient else plan.domain.smoothing_norm
     kinds = 1 + plan.space_dim * state_gradient
     entries = plan.row_capacity * plan.group_count + 1

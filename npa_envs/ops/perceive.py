@@ -1,7 +1,7 @@
 """Perception: vectors and fields of whole worlds, rows of active particles in rollouts.
 
-Each is an opaque torch operator, which keeps Warp out of torch.compile's sight; the autograd
-functions over them save only what the adjoint of the case at hand reads.
+Each is a custom torch operator, which torch.compile does not trace. The autograd functions save
+only tensors that the adjoint of the case reads.
 """
 
 from __future__ import annotations
@@ -22,8 +22,8 @@ from npa_envs.checks import (
     checked_moment_inverse,
 )
 from npa_envs.ops.backend import batch_listing
+from npa_envs.ops.custom_op import check_derivatives, custom_op, once_differentiable
 from npa_envs.ops.launch import Tape, launch
-from npa_envs.ops.opaque import check_derivatives, once_differentiable, opaque
 from npa_envs.ops.passes import (
     SavedPerception,
     compute_densities,
@@ -33,7 +33,7 @@ from npa_envs.ops.passes import (
     portable_kernels,
 )
 from npa_envs.ops.physics import Physics, Terms, physics
-from npa_envs.ops.sort import make_plan, sort_worlds
+from npa_envs.ops.sort import plan_kernels, sort_worlds
 from npa_envs.ops.static import StaticRows, StaticWorlds, all_rows, static_worlds
 
 
@@ -94,7 +94,7 @@ def perceive(
 
     Raises:
         NPAError: Shapes, dtypes or devices do not fit, a position is not finite, eps or eps0 is
-            not positive and finite, a box side is below 2 eps, or `moment_inverse` is another word.
+            not positive and finite, a box side is below 2 eps, or `moment_inverse` is unknown.
     """
     check_world(x, s)
     check_derivatives(x=x, s=s)
@@ -149,7 +149,7 @@ def perception_fields(
     x, s = x.contiguous(), s.contiguous()
     world_count, particle_count, space_dim = x.shape
     state_dim = s.shape[2]
-    plan = make_plan(x, x.shape, state_dim, world_count * particle_count, False, made)
+    plan = plan_kernels(x, x.shape, state_dim, world_count * particle_count, False, made)
     ordered = sort_worlds(plan, x, s, None)
     densities = compute_density_gradients(plan, ordered)
     fields = PerceptionFields(
@@ -180,10 +180,10 @@ def perception_fields(
 
 
 class Rows(NamedTuple):
-    """Which particles a batch of rows stands for: rows follow the sorted order of the particles."""
+    """Maps between particles and rows of perception; only active particles have rows."""
 
     row_of: Tensor
-    """Row of each particle, -1 where it has none, int32, shape [B N]."""
+    """Row of each particle, -1 for none, int32, shape [B N]."""
     row_source: Tensor
     """Particle of each row, int32, shape [K]; undefined beyond the last active row."""
     starts: Tensor
@@ -191,7 +191,7 @@ class Rows(NamedTuple):
     row_base: int
 
 
-@opaque("npa::perceive_rows")
+@custom_op("npa::perceive_rows")
 def _perceive_rows(
     x: Tensor,
     s: Tensor,
@@ -203,11 +203,11 @@ def _perceive_rows(
     physics: Physics,
     for_adjoint: bool,
 ) -> list[Tensor]:
-    """Return what a `SavedPerception` holds and then the particles of the rows, `row_source`.
+    """Return the tensors of a `SavedPerception`, and then `row_source`.
 
-    Of static worlds, whose rows and tensors are given, it is what does not follow from these.
+    With `static`, the tensors that it already has are left out.
     """
-    plan = make_plan(x, x.shape, s.shape[2], row_capacity, masked, physics)
+    plan = plan_kernels(x, x.shape, s.shape[2], row_capacity, masked, physics)
     if static:
         rows, worlds = StaticRows(*static[:4]), StaticWorlds.of(static[4:])
         ordered, densities = static_worlds(plan, worlds, rows, x, s)
@@ -250,7 +250,7 @@ def _(
     kernel_sum = x.new_empty(row_capacity if for_adjoint else 0, space_dim)
     if static:
         return [perception, kernel_sum]
-    plan = make_plan(x, x.shape, s.shape[2], row_capacity, masked, physics)
+    plan = plan_kernels(x, x.shape, s.shape[2], row_capacity, masked, physics)
     particle_count = plan.total if for_adjoint or plan.runs("density") == "portable" else 0
     return [
         perception,
@@ -266,7 +266,7 @@ def _(
 
 
 class _PerceiveRows(torch.autograd.Function):
-    """Perception of the active particles, with gathered adjoints for states and positions."""
+    """Perception of the active particles; the adjoint gathers, without atomics."""
 
     @staticmethod
     def forward(ctx: Any, x: Tensor, s: Tensor, *given: Any) -> tuple[Tensor, ...]:
@@ -288,7 +288,7 @@ class _PerceiveRows(torch.autograd.Function):
     def backward(ctx: Any, bar: Tensor | None, *_: None) -> tuple[Tensor | None, ...]:
         states_bar = x_bar = None
         if bar is not None:
-            # Read once: unpacking recomputes what a checkpoint has left out.
+            # Read once: under a checkpoint each reading recomputes them.
             tensors = list(ctx.saved_tensors)
             count, shape = ctx.saved_count, ctx.shape
             saved, listed = tensors[:count], tensors[count:]
@@ -313,7 +313,7 @@ def _perceived(
     *,
     for_adjoint: bool,
 ) -> tuple[SavedPerception, Tensor]:
-    """Return perception with what its adjoint reads, and the particles of its rows."""
+    """Return perception with the tensors of its adjoint, and the particles of its rows."""
     options = masked, row_capacity, row_width, physics, for_adjoint
     if static is None or rows is None:
         *found, row_source = _perceive_rows(x, s, mask, [], *options)
@@ -324,7 +324,7 @@ def _perceived(
         kernel_sum,
         row_of=rows.row_of,
         starts=rows.starts,
-        source=static.everyone,
+        source=static.all_indices,
         particles=static.particles,
         row_positions=rows.row_positions,
     )
@@ -347,14 +347,14 @@ def perceive_rows(
     Args:
         mask: Which particles are active, uint8, shape [B, N], or None for all.
         row_capacity: Rows K of the result; active particles beyond it are left out.
-        row_width: Columns of a row, at least P: a one follows the perception vector, then zeros.
-        static: What `prepare_static` returned of worlds that stay where they are; x and s are then
-            in its order, no gradient flows into x, and the mask is not read.
+        row_width: Columns of a row, at least P: the perception vector, a one, then zeros.
+        static: Result of `prepare_static` for worlds whose particles do not move. Then x and s are
+            in its sorted order, no gradient flows into x, and the mask is not read.
         static_rows: Rows of the active particles of static worlds, or None for all.
 
     Returns:
-        Rows of perception, shape [K, row_width], zero beyond the last active row, and which
-        particles they stand for.
+        Rows of perception, shape [K, row_width], zero beyond the last active row, and the map
+        between rows and particles.
     """
     x, s, rows = x.contiguous(), s.contiguous(), static_rows
     masked = (mask if static is None else static_rows) is not None
@@ -374,10 +374,10 @@ def perceive_rows(
 
 
 ROWS_TOGETHER = 2**22
-"""Rows that are perceived before they are mapped to updates, where they need not be kept."""
+"""Rows of huge worlds that are perceived and mapped to updates at a time."""
 
 
-def update_some_at_a_time(
+def updates_in_parts(
     x: Tensor,
     s: Tensor,
     physics: Physics,
@@ -386,14 +386,14 @@ def update_some_at_a_time(
     row_capacity: int,
     row_width: int,
 ) -> tuple[Tensor, Rows]:
-    """Map the perception of huge worlds to updates, `ROWS_TOGETHER` rows at a time.
+    """Perceive huge worlds and map rows to updates, `ROWS_TOGETHER` rows at a time.
 
-    All rows of perception together would take most of the memory. The numbers are those that
-    `perceive_rows` and the network give, which maps rows [K, row_width] to updates [K, A'] row by
-    row. Not differentiable.
+    All rows of perception together would take most of the memory. The network maps rows
+    [K, row_width] to updates [K, A'], each row independently, so results equal those of
+    `perceive_rows`. Not differentiable.
     """
     x, s = x.detach().contiguous(), s.detach().contiguous()
-    plan = make_plan(x, x.shape, s.shape[2], row_capacity, mask is not None, physics)
+    plan = plan_kernels(x, x.shape, s.shape[2], row_capacity, mask is not None, physics)
     ordered = sort_worlds(plan, x, s, mask)
     densities = compute_densities(plan, ordered, with_particles=False)
     perception = x.new_empty(min(ROWS_TOGETHER, row_capacity), row_width)
@@ -425,10 +425,10 @@ class NeighbourState:
         self._tape: Tape | None = None
 
     def perceive(self, out: Tensor | None = None) -> Tensor:
-        """Return what every particle perceives, clipped, in the caller's order, shape [B, N, P].
+        """Return clipped perception of every particle, in the caller's order, shape [B, N, P].
 
-        Later calls, after the tensors read have got other numbers, take less of the host's time.
-        Where the worlds have places in a larger batch, `out` must be given, of that batch's shape.
+        Later calls read the current values of the same tensors and cost less CPU time. For worlds
+        with `places` in a larger batch, `out` must be given, of that batch's shape.
         """
         if out is None:
             out = self._like.new_empty(self._shape)
@@ -437,8 +437,8 @@ class NeighbourState:
         if self._tape is None:
             self._tape, self._form = Tape(), form
             self._tape.add(*self._launch_of(rows))
-            self._places = self._tape.places(rows)
-        assert form == self._form, "only an address is replaced"
+            self._places = self._tape.argument_slots(rows)
+        assert form == self._form, "only the address may change"
         self._tape.move(self._places, rows)
         self._tape.replay()
         return out
@@ -449,16 +449,16 @@ def build_neighbours(
 ) -> NeighbourState:
     """Sort checked worlds into cells and compute densities; valid until x or s change.
 
-    `places` are the worlds' places in a larger batch, in whose rows their perception is written,
-    int64, shape [B]; default: a batch of their own.
+    `places` are the worlds' indices in a larger batch, to which their perception is written, int64,
+    shape [B]; default: the worlds are the whole batch.
     """
     x, s = x.contiguous(), s.contiguous()
-    plan = make_plan(x, x.shape, s.shape[2], x.shape[0] * x.shape[1], False, physics)
+    plan = plan_kernels(x, x.shape, s.shape[2], x.shape[0] * x.shape[1], False, physics)
     listed = plan.lists_neighbours
     in_place = listed and plan.state_dim % plan.width == 0 and s.data_ptr() % 16 == 0
     ordered = sort_worlds(plan, x, None if in_place else s, None, with_rows=not listed)
-    # World k of a batch equals that world alone, bit for bit: nothing may follow from the number
-    # of worlds.
+    # World k of a batch equals that world alone, bit for bit: the listing must not depend on the
+    # number of worlds.
     densities = compute_densities(
         plan,
         ordered,

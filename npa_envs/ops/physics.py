@@ -20,11 +20,11 @@ from npa_envs.checks import (
 from npa_envs.errors import NPAError, shown
 
 Boundary = Literal["open", "periodic", "reflecting"]
-"""No box; a box whose opposite sides are one place; or a box of walls."""
+"""No box; a periodic box; or a box whose walls reflect particles."""
 
 
 class Terms(NamedTuple):
-    """The groups of a perception vector; the others are not computed."""
+    """Which groups of entries a perception vector has; others are not computed."""
 
     state_gradient: bool = True
     moment_inverse: str | None = "threshold"
@@ -32,7 +32,7 @@ class Terms(NamedTuple):
 
     @property
     def correction(self) -> str | None:
-        """How the state gradient is corrected, "threshold" or "smooth"; None: not at all."""
+        """Correction of the state gradient, "threshold" or "smooth"; None: no correction."""
         return self.moment_inverse if self.state_gradient else None
 
     def perception_dim(self, space_dim: int, state_dim: int) -> int:
@@ -44,11 +44,11 @@ class Terms(NamedTuple):
 ALL_TERMS = Terms()
 
 INVERSES = (None, "threshold", "smooth")
-"""How moment matrices are inverted, numbered for torch operators."""
+"""Inversions of the moment matrix; torch operators take the index."""
 
 
 class Limits(NamedTuple):
-    """What bounds the worlds of environments; rollouts have no bounds."""
+    """Bounds on the worlds of environments; rollouts have no bounds."""
 
     state_scale: float = 1.0
     """State step of an action of 1, dimensionless."""
@@ -79,11 +79,11 @@ class Physics(NamedTuple):
     terms: Terms = ALL_TERMS
     """Groups of the perception vector."""
     moving: bool = True
-    """Updates begin with a displacement; otherwise there is none, and positions stay."""
+    """Whether updates begin with a displacement; otherwise particles do not move."""
     max_displacement: float = 0.0
-    """Largest displacement α ε in a unit of time [length units]; of several species the largest."""
+    """Largest displacement α ε per unit of time [length units], over all species."""
     update_prob: float = 1.0
-    """Probability p of a particle's update in a step; of several species the highest."""
+    """Probability p of a particle's update in a step; the highest of all species."""
     dt: float = 1.0
     """Time step, dimensionless."""
     position_noise: float = 0.0
@@ -91,7 +91,7 @@ class Physics(NamedTuple):
     limits: Limits = NO_LIMITS
     """Bounds of environments."""
     walls: tuple[float, ...] | None = None
-    """Sides of the box whose walls reflect [length units]; neighbours are those of open space."""
+    """Sides of a box with reflecting walls [length units]; neighbours are those of open space."""
 
     @property
     def perception_dim(self) -> int:
@@ -105,63 +105,51 @@ class Physics(NamedTuple):
 
     @classmethod
     def of(cls, numbers: list[float]) -> Physics:
-        """Return what `numbers` made a list of: all but limits, and sizes that tensors give."""
-        eps, eps0, state_gradient, inverse, density_gradient, moving, *rest = numbers
-        terms = Terms(bool(state_gradient), INVERSES[int(inverse)], bool(density_gradient))
-        largest, update_prob, dt, noise, reflecting, *sides = rest
-        box, walls = (None, tuple(sides)) if reflecting else (tuple(sides) or None, None)
+        """Return what `numbers` packed: everything but limits and the sizes of tensors."""
+        count = len(SCALARS)
+        state_gradient, inverse, density_gradient, moving, reflecting, *packed = numbers[count:]
+        sides = tuple(packed) or None
         return cls(
-            *(0, 0, eps, eps0, box, terms, bool(moving)),
-            *(largest, update_prob, dt, noise, NO_LIMITS, walls),
+            space_dim=0,
+            state_dim=0,
+            box=None if reflecting else sides,
+            walls=sides if reflecting else None,
+            terms=Terms(bool(state_gradient), INVERSES[int(inverse)], bool(density_gradient)),
+            moving=bool(moving),
+            limits=NO_LIMITS,
+            **dict(zip(SCALARS, numbers[:count], strict=True)),
         )
 
     def numbers(self) -> list[float]:
-        """Return what torch operators take in place of this: numbers, constants to compilers."""
+        """Pack this into a list for torch operators: numbers that compilers take for constants."""
         state_gradient, inverse, density_gradient = self.terms
-        given = (
-            self.eps,
-            self.eps0,
-            float(state_gradient),
-            float(INVERSES.index(inverse)),
-            float(density_gradient),
-            float(self.moving),
-            self.max_displacement,
-            self.update_prob,
-            self.dt,
-            self.position_noise,
-            float(self.walls is not None),
-            *(self.box or self.walls or ()),
-        )
-        return [constant(number) for number in given]
+        reflecting = self.walls is not None
+        flags = state_gradient, INVERSES.index(inverse), density_gradient, self.moving, reflecting
+        scalars = [getattr(self, name) for name in SCALARS]
+        sides = self.box or self.walls or ()
+        return [constant(number) for number in (*scalars, *map(float, flags), *sides)]
 
     def scale(self) -> float:
         """Return c = eps / eps0."""
         return constant(self.eps / self.eps0)
 
     def constants(self) -> Physics:
-        """Return them with numbers that a compiler takes for constants."""
+        """Return the same with numbers that a compiler takes for constants."""
         if not torch.compiler.is_compiling():
             return self
         # Compilers lose fields that `_replace` or a default would fill in.
-        return Physics(
-            self.space_dim,
-            self.state_dim,
-            constant(self.eps),
-            constant(self.eps0),
-            _constants(self.box),
-            self.terms,
-            self.moving,
-            constant(self.max_displacement),
-            constant(self.update_prob),
-            constant(self.dt),
-            constant(self.position_noise),
-            self.limits,
-            _constants(self.walls),
-        )
+        return Physics(*[_constants(value) for value in self])
 
 
-def _constants(sides: tuple[float, ...] | None) -> tuple[float, ...] | None:
-    return None if sides is None else tuple([constant(side) for side in sides])
+SCALARS = ("eps", "eps0", "max_displacement", "update_prob", "dt", "position_noise")
+"""Fields of `Physics` that are one number."""
+
+
+def _constants(value: Any) -> Any:
+    """Return the value of a field, with constants in place of numbers."""
+    if type(value) is tuple:
+        return tuple([constant(side) for side in value])
+    return constant(value) if type(value) is float else value
 
 
 def physics(
@@ -180,9 +168,9 @@ def physics(
     dt: float = 1.0,
     position_noise: float = 0.0,
 ) -> Physics:
-    """Return the constants of worlds of a dtype, checked.
+    """Check the constants of worlds, and return them.
 
-    `eps0` is checked already, by default it is `eps`; α is a fraction of ε.
+    `eps0` is already checked, default: `eps`. The largest displacement is α ε.
     """
     if boundary not in get_args(Boundary):
         raise NPAError(
@@ -193,7 +181,7 @@ def physics(
     if boundary == "reflecting" and box is None:
         raise NPAError("box must be given where boundary is 'reflecting', got None: give its sides")
     numbers = (eps, eps0, box, alpha, update_prob, dt, position_noise)
-    # Numbers of other types may change, and tensors are no keys.
+    # Only immutable numbers can be keys of the cache.
     plain = all(type(value) in (float, int, bool, NoneType) for value in numbers)
     check = _known if plain and not torch.compiler.is_compiling() else _checked
     return check(space_dim, state_dim, dtype, terms, moving, boundary, *numbers)
@@ -230,19 +218,19 @@ def _checked(
     periodic = boundary != "reflecting"
     sides = checked_box(box, space_dim, radius if periodic else None, dtype)
     return Physics(
-        space_dim,
-        state_dim,
-        radius,
-        radius0,
-        sides if periodic else None,
-        terms,
-        moving,
-        constant(alpha) * radius,
-        update_prob,
-        dt,
-        position_noise,
-        NO_LIMITS,
-        None if periodic else sides,
+        space_dim=space_dim,
+        state_dim=state_dim,
+        eps=radius,
+        eps0=radius0,
+        box=sides if periodic else None,
+        walls=None if periodic else sides,
+        terms=terms,
+        moving=moving,
+        max_displacement=constant(alpha) * radius,
+        update_prob=update_prob,
+        dt=dt,
+        position_noise=position_noise,
+        limits=NO_LIMITS,
     )
 
 

@@ -19,27 +19,28 @@ from npa_envs.ops.backend import (
     Listing,
     Operator,
     choose,
-    processor_count,
+    multiprocessor_count,
     rollout_listing,
 )
 from npa_envs.ops.launch import channel_width, is_recorded, launch, scalar_type
 from npa_envs.ops.physics import Physics
 
 LARGEST_INDEX = 2**31 - 1
-"""Kernels index with 32 bits."""
+"""Largest index of an array in a kernel: indices have 32 bits."""
 
 LARGEST_MASK = 2**28
-"""Worlds times particles of masks that blocks sort: each block counts what is active before."""
+"""Largest worlds times entries of a mask that CUDA blocks sort: each block counts the active
+particles of all earlier worlds."""
 
 LARGEST_THREAD_MASK = 2**22
-"""The same of masks that threads of a CPU sort."""
+"""The same for masks that CPU threads sort."""
 
 SMALLEST_SLICE = 128
-"""Particles of a slice, at least."""
+"""Fewest particles of a slice."""
 
 
 class KernelPlan(NamedTuple):
-    """What is known of an operator call before any of its data: variant, sizes, domain."""
+    """Variant, sizes and domain of an operator call; none depends on values of tensors."""
 
     scalar: Any
     width: int
@@ -50,17 +51,17 @@ class KernelPlan(NamedTuple):
     row_capacity: int
     masked: bool
     physics: Physics
-    """Constants of the worlds, but for sizes."""
+    """Constants of the worlds; its sizes may be 0, those of the plan count."""
     domain: Any
     request: KernelRequest
-    """What the backend table asks for."""
+    """Properties by which the backend table chooses."""
     listing: Listing
     """How rollouts list neighbours on CUDA."""
 
     def runs(
         self, operator: Operator, *, aligned: bool = True, position_gradient: bool = False
     ) -> str:
-        """Return the name of the implementation of an operator that runs."""
+        """Return the name of the implementation that runs an operator."""
         request = self.request
         if not aligned or position_gradient:
             request = request._replace(aligned=aligned, position_gradient=position_gradient)
@@ -68,7 +69,7 @@ class KernelPlan(NamedTuple):
 
     @property
     def lists_neighbours(self) -> bool:
-        """Whether the density pass leaves lists of neighbours, as it does on CUDA."""
+        """Whether the density pass makes neighbour lists, as on CUDA."""
         return self.runs("density") != "portable"
 
     @property
@@ -98,17 +99,17 @@ class KernelPlan(NamedTuple):
 
     @property
     def active_offset(self) -> int:
-        """Where the starts of the active rows begin within `starts`."""
+        """Index in `starts` at which the starts of active rows begin."""
         return self.cell_total if self.masked else 0
 
     @property
     def start_count(self) -> int:
-        """Entries of `starts`: one for each cell, once more for active rows, and the end."""
+        """Length of `starts`: an entry a cell, with a mask another for its rows, and the end."""
         return self.cell_total + self.active_offset + 1
 
     @property
     def row_base(self) -> int:
-        """What is subtracted from a start of active rows to give a row."""
+        """Offset of the entries for active rows in `starts`: entry minus offset is a row."""
         return self.total if self.masked else 0
 
     @property
@@ -121,17 +122,17 @@ class SortedWorlds(NamedTuple):
     """Particles in the order world, cell, index; the active ones have rows in the same order."""
 
     starts: Tensor
-    """First sorted place of every cell, then first row of every cell (shifted), int32."""
+    """First sorted index of every cell, then first row of every cell (plus `row_base`), int32."""
     source: Tensor
     """Caller's index of each sorted particle, int32, shape [B N]."""
     cell: Tensor
     """Cell of each sorted particle, counted through all worlds, int32, shape [B N]."""
     row_of: Tensor
-    """Row of each particle, -1 where it is not active, int32, shape [B N]."""
+    """Row of each particle, -1 for inactive ones, int32, shape [B N]."""
     row_source: Tensor
     """Caller's index of each row, int32, shape [K]; undefined beyond the last active row."""
     row_place: Tensor
-    """Sorted place of each row, int32, shape [K]; undefined beyond the last active row."""
+    """Sorted index of each row, int32, shape [K]; undefined beyond the last active row."""
     positions: Tensor
     """Sorted positions [length units], shape [B N, D]."""
     row_positions: Tensor
@@ -140,7 +141,7 @@ class SortedWorlds(NamedTuple):
     """Sorted states, dimensionless, shape [B N G, W]: channels padded with zeros to G groups."""
 
 
-def make_plan(
+def plan_kernels(
     like: Tensor,
     shape: Sequence[int],
     state_dim: int,
@@ -148,15 +149,15 @@ def make_plan(
     masked: bool,
     physics: Physics,
 ) -> KernelPlan:
-    """Return the plan of a call on positions of a shape [B, N, D] and `state_dim` channels.
+    """Return the plan of a call on positions of shape [B, N, D] and `state_dim` channels.
 
-    `like` is any tensor of the call: its dtype and device are the worlds'.
+    `like` is any tensor with the worlds' dtype and device.
     """
-    # As integers: a shape that torch.compile left open is fixed here, another one compiled anew.
+    # As integers: symbolic sizes of torch.compile become constants, and other sizes recompile.
     world_count, particle_count, space_dim = (int(size) for size in shape)
     scalar = scalar_type(like.dtype)
     eps, sides = physics.eps, physics.box
-    # In 3D, more and smaller cells mean many short runs, which lanes share badly.
+    # In 3D smaller cells give many short runs of candidates, which threads share badly.
     cell_reach = 1 if space_dim == 3 and like.device.type == "cuda" else 2
     domain = make_domain(space_dim, scalar, eps, sides, particle_count, cell_reach)
     request = KernelRequest(
@@ -192,7 +193,7 @@ def make_plan(
 
 
 def mean_neighbours(particle_count: int, eps: float, box: Sequence[float] | None) -> float:
-    """Return how many neighbours particles spread evenly over a box have; 0 in open space."""
+    """Return the mean number of neighbours of uniform particles in a box; 0 in open space."""
     if box is None:
         return 0.0
     ball = math.pi * eps**2 if len(box) == 2 else 4.0 / 3.0 * math.pi * eps**3
@@ -200,25 +201,25 @@ def mean_neighbours(particle_count: int, eps: float, box: Sequence[float] | None
 
 
 def sorts_at_once(world_count: int, particle_count: int) -> bool:
-    """Return whether a CPU sorts small worlds in one launch, whatever the mask."""
+    """Return whether a CPU sorts small worlds in one launch with any mask."""
     return world_count * world_count * particle_count <= LARGEST_THREAD_MASK
 
 
 def sort_worlds(
     plan: KernelPlan, x: Tensor, s: Tensor | None, mask: Tensor | None, *, with_rows: bool = True
 ) -> SortedWorlds:
-    """Sort contiguous worlds into cells; `mask` (uint8, [B, N]) says which particles get rows.
+    """Sort contiguous worlds into cells; particles in `mask` (uint8, [B, N]) get rows.
 
-    What is left out is empty: states without `s`, everything about rows without `with_rows`.
+    States are empty without `s`, all tensors of rows without `with_rows`.
     """
-    # Entries of masks that are read where each world counts the rows before it.
+    # Mask entries that are read if each world counts the rows of earlier worlds.
     earlier = plan.world_count * plan.total if plan.masked else 0
     capacity = 0 if earlier > LARGEST_MASK else block_capacity(plan.request, x, s, mask)
     if capacity:
         return _sort_by_blocks(plan, capacity, x, s, mask, with_rows)
     if plan.runs("sort") == "world" and earlier <= LARGEST_THREAD_MASK:
         return _sort_by_threads(plan, x, s, mask, with_rows)
-    assert not is_recorded(), "what torch does between these launches is on no tape"
+    assert not is_recorded(), "a tape would miss torch's operations between these launches"
     kernels = sort_kernels(plan.space_dim, plan.scalar, plan.width)
     device, total = x.device, plan.total
     cell, arrival = torch.empty(2, total, dtype=torch.int32, device=device).unbind()
@@ -253,12 +254,12 @@ def sort_worlds(
 
     ordered = _empty_worlds(plan, x, s, with_rows)
     on_cuda = plan.runs("sort", aligned=False) == "cuda"
-    # A thread reads and writes so many adjacent channels at once where they are aligned.
+    # Channels that a thread reads and writes at once where they are aligned.
     share = plan.width // CUDA_LANES if on_cuda else plan.width
     aligned = s is not None and plan.state_dim % share == 0 and s.data_ptr() % 16 == 0
     launch(
         order_particles(plan.space_dim, plan.width) if on_cuda else kernels.order_particles,
-        # A warp moves the states of as many particles as it has threads.
+        # A warp moves the states of 32 particles.
         -(-total // WARP) * WARP if on_cuda else total,
         device,
         x,
@@ -277,7 +278,7 @@ def sort_worlds(
 
 
 def _empty_worlds(plan: KernelPlan, x: Tensor, s: Tensor | None, with_rows: bool) -> list[Tensor]:
-    """Return what sorting fills in: all of `SortedWorlds` but the starts."""
+    """Return empty tensors for all fields of `SortedWorlds` except `starts`."""
     total, device = plan.total, x.device
     source, sorted_cell = torch.empty(2, total, dtype=torch.int32, device=device).unbind()
     row_capacity = plan.row_capacity if with_rows else 0
@@ -292,7 +293,7 @@ def _empty_worlds(plan: KernelPlan, x: Tensor, s: Tensor | None, with_rows: bool
 
 
 def block_capacity(request: KernelRequest, *tensors: Tensor | None) -> int:
-    """Return how many particles a block that sorts such worlds has room for, 0 if none does."""
+    """Return the capacity in particles of the CUDA block that sorts such worlds; 0 for none."""
     aligned = not any(tensor is not None and tensor.data_ptr() % 16 for tensor in tensors)
     if choose("sort", request._replace(aligned=aligned)).name != "block":
         return 0
@@ -300,15 +301,15 @@ def block_capacity(request: KernelRequest, *tensors: Tensor | None) -> int:
 
 
 def slice_count(device: torch.device, world_count: int, particle_count: int) -> int:
-    """Return into how many slices worlds are cut that would leave processors idle."""
-    idle = processor_count(device) // world_count
+    """Return into how many slices to split each world: 1 unless worlds are too few for the GPU."""
+    idle = multiprocessor_count(device) // world_count
     return max(min(idle, particle_count // SMALLEST_SLICE), 1)
 
 
 def _sort_by_threads(
     plan: KernelPlan, x: Tensor, s: Tensor | None, mask: Tensor | None, with_rows: bool
 ) -> SortedWorlds:
-    """Sort small worlds on a CPU in one launch."""
+    """Sort small worlds on a CPU in one launch, a thread each."""
     ordered = _empty_worlds(plan, x, s, with_rows)
     source = ordered[0]
     starts = source.new_empty(plan.start_count)
@@ -343,7 +344,7 @@ def _sort_by_blocks(
     mask: Tensor | None,
     with_rows: bool,
 ) -> SortedWorlds:
-    """Sort small worlds in one launch."""
+    """Sort small worlds on CUDA in one launch, a block each."""
     ordered = _empty_worlds(plan, x, s, with_rows)
     starts = torch.empty(plan.start_count, dtype=torch.int32, device=x.device)
     slices = slice_count(x.device, plan.world_count, plan.particle_count)
@@ -373,9 +374,9 @@ def _sort_by_blocks(
 
 
 def grouped_states(plan: KernelPlan, s: Tensor) -> Tensor:
-    """Return states in sorted order as kernels read them, [B N G, W]: channels padded to groups."""
+    """Return sorted states in groups of channels, padded with zeros, [B N G, W]."""
     width = plan.group_count * plan.width
     states = torch.nn.functional.pad(s, (0, width - plan.state_dim))
-    # Groups are read 16 bytes at a time.
+    # Kernels read 16 bytes at a time.
     states = states.clone() if states.data_ptr() % 16 else states
     return states.contiguous().view(-1, plan.width)

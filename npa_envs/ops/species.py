@@ -1,4 +1,4 @@
-"""Perception of each species by itself: its density and its density gradient."""
+"""Perception of each species separately: its density and its density gradient."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ from npa_envs.checks import (
 )
 from npa_envs.errors import NPAError, shown
 from npa_envs.kernels.portable.species import species_kernel
+from npa_envs.ops.custom_op import check_derivatives, custom_op
 from npa_envs.ops.launch import launch, scalar_type
-from npa_envs.ops.opaque import check_derivatives, opaque
 from npa_envs.ops.perceive import perceive
 from npa_envs.ops.physics import Physics, physics
-from npa_envs.ops.sort import make_plan, sort_worlds
+from npa_envs.ops.sort import plan_kernels, sort_worlds
 
 MOST_SPECIES = 64
-"""Species of a world: a thread keeps one sum for each."""
+"""Most species of a world: a thread has a sum for each."""
 
 
 class SpeciesFields(NamedTuple):
@@ -43,7 +43,7 @@ def checked_counts(counts: Sequence[int], particle_count: int) -> tuple[int, ...
     given = entries(counts)
     if given is None:
         raise NPAError(
-            f"counts must hold one number of particles for each species, got {shown(counts)}: "
+            f"counts must have one number of particles for each species, got {shown(counts)}: "
             f"for example counts=({particle_count},)"
         )
     checked = tuple(checked_count("an entry of counts", count) for count in given)
@@ -61,17 +61,17 @@ def checked_counts(counts: Sequence[int], particle_count: int) -> tuple[int, ...
     return checked
 
 
-@opaque("npa::gather_species")
+@custom_op("npa::gather_species")
 def _gather_species(
     x: Tensor, counts: list[int], physics: Physics, scaled: bool
 ) -> tuple[Tensor, Tensor]:
-    """Return densities and gradients of species, as rules perceive them if they are `scaled`."""
+    """Return densities and density gradients of species; `scaled`: as rules perceive them."""
     world_count, particle_count, space_dim = x.shape
-    plan = make_plan(x, x.shape, 1, world_count * particle_count, False, physics)
+    plan = plan_kernels(x, x.shape, 1, world_count * particle_count, False, physics)
     ordered = sort_worlds(plan, x, None, None, with_rows=False)
     place = ordered.source % particle_count
     sorted_species = torch.zeros_like(place)
-    # Numbers of the host's, not a tensor of them: a CUDA graph must not copy from the host.
+    # Python numbers instead of a tensor: a CUDA graph must not copy from the host.
     for end in itertools.accumulate(counts[:-1]):
         sorted_species += place >= end
     density = x.new_empty(plan.total, len(counts))
@@ -103,10 +103,10 @@ def _(x: Tensor, counts: list[int], *rest: Any) -> tuple[Tensor, Tensor]:
 
 
 def perceive_by_species(x: Tensor, counts: tuple[int, ...], physics: Physics) -> Tensor:
-    """Return what checked worlds perceive of each species, scaled, shape [B, N, K (1 + D)].
+    """Return the scaled density and density gradient of each species, shape [B, N, K (1 + D)].
 
-    That is c^D ρ_k / N of each species, then L(c^(1+D) ∇ρ_k / N) of each, species by species. A
-    species may have no particles. No gradient flows into positions.
+    Entries are c^D ρ_k / N for all species, then L(c^(1+D) ∇ρ_k / N) species by species. A species
+    may have no particles. No gradient flows into positions.
     """
     density, gradient = _gather_species(x.detach().contiguous(), list(counts), physics, True)
     return torch.cat((density, gradient.flatten(2)), dim=-1)
@@ -117,8 +117,8 @@ def species_fields(
 ) -> SpeciesFields:
     """Return each species' density and density gradient at every particle; not differentiable.
 
-    A particle counts itself to its own species' density, so that the densities sum to that of
-    `perception_fields`, and the gradients likewise.
+    A particle counts itself in its own species' density. The densities sum to the density of
+    `perception_fields`, and the gradients to its density gradient.
 
     Args:
         x: Particle positions [length units], shape [B, N, D], species after species.

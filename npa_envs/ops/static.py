@@ -1,7 +1,7 @@
-"""Static worlds: sorted once, with densities and neighbour lists, for steps that move nobody.
+"""Static worlds, whose particles do not move: sorted once, with densities and neighbour lists.
 
-They stay in sorted order from the first step to the last. Each step only gives the active particles
-rows; then the ordinary kernels run.
+They stay in sorted order from the first step to the last. Each step only assigns rows to the
+active particles, and then runs the ordinary kernels.
 """
 
 from __future__ import annotations
@@ -13,27 +13,27 @@ from torch import Tensor
 
 from npa_envs.kernels.portable.density import density_kernels
 from npa_envs.kernels.portable.sort import give_rows
+from npa_envs.ops.custom_op import custom_op
 from npa_envs.ops.launch import launch, scalar_type
-from npa_envs.ops.opaque import opaque
 from npa_envs.ops.passes import Densities, ListedNeighbours, NeighbourLists, compute_densities
 from npa_envs.ops.physics import Physics
-from npa_envs.ops.sort import KernelPlan, SortedWorlds, grouped_states, make_plan, sort_worlds
+from npa_envs.ops.sort import KernelPlan, SortedWorlds, grouped_states, plan_kernels, sort_worlds
 
 LARGEST_LISTS = 2**31
-"""Bytes of all lists on a CPU, at most: where there would be more, each step searches anew."""
+"""Largest bytes of all lists on a CPU; with more neighbours, each step searches again."""
 
 
 class StaticWorlds(NamedTuple):
-    """What perception needs of positions that stay: sorted worlds, by `prepare_static`."""
+    """Sorted worlds with fixed positions, ready for perception; `prepare_static` makes them."""
 
     source: Tensor
     """Caller's index of each sorted particle, int32, shape [B N]."""
     place: Tensor
-    """Sorted place of each particle in the caller's order, int32, shape [B N]."""
-    everyone: Tensor
-    """0, 1, ... B N - 1, int32: each sorted particle's own place."""
+    """Sorted index of each particle in the caller's order, int32, shape [B N]."""
+    all_indices: Tensor
+    """0, 1, ... B N - 1, int32: all sorted indices."""
     starts: Tensor
-    """First sorted place of every cell, int32."""
+    """First sorted index of every cell, int32."""
     cell: Tensor
     """Cell of each sorted particle, counted through all worlds, int32, shape [B N]."""
     particles: Tensor
@@ -41,30 +41,30 @@ class StaticWorlds(NamedTuple):
     density_gradient: Tensor
     """Density gradients, float64, shape [B N, D]; empty where neighbours are listed for CUDA."""
     lists: list[Tensor]
-    """Of `kernels/cuda/` steps, lengths and records of neighbour lists; on a CPU neighbours of each
-    particle and where they end; empty elsewhere."""
+    """For the CUDA backend steps, lengths and records of `NeighbourLists`; on a CPU the tensors of
+    `ListedNeighbours`; empty elsewhere."""
 
     def flat(self) -> list[Tensor]:
-        """Return all tensors one after the other, as a torch operator takes or returns them."""
+        """Return all tensors in one list, for torch operators."""
         return [*self[:-1], *self.lists]
 
     @property
     def listed(self) -> ListedNeighbours | None:
-        """The neighbours as the portable kernels read them, where they were listed."""
+        """The neighbours for the portable kernels, or None if they were not listed."""
         return ListedNeighbours(*self.lists) if len(self.lists) == 2 else None
 
     @classmethod
     def of(cls, tensors: list[Tensor]) -> StaticWorlds:
-        """Return what `flat` made a list of."""
+        """Return the worlds of a list by `flat`."""
         count = len(cls._fields) - 1
         return cls._make([*tensors[:count], tensors[count:]])
 
 
-@opaque("npa::prepare_static")
+@custom_op("npa::prepare_static")
 def _prepare_static(x: Tensor, state_dim: int, physics: Physics) -> list[Tensor]:
-    """Return what a `StaticWorlds` holds."""
+    """Return the tensors of a `StaticWorlds`, as `flat`."""
     total = x.shape[0] * x.shape[1]
-    plan = make_plan(x, x.shape, state_dim, total, False, physics)
+    plan = plan_kernels(x, x.shape, state_dim, total, False, physics)
     ordered = sort_worlds(plan, x, None, None)
     densities = compute_densities(plan, ordered)
     lists: list[Tensor] = []
@@ -75,9 +75,9 @@ def _prepare_static(x: Tensor, state_dim: int, physics: Physics) -> list[Tensor]
     return StaticWorlds(
         source=ordered.source,
         place=ordered.row_of,
-        everyone=torch.arange(total, dtype=torch.int32, device=x.device),
+        all_indices=torch.arange(total, dtype=torch.int32, device=x.device),
         starts=ordered.starts,
-        # Outputs of an operator share no memory.
+        # Outputs of an operator must not share memory.
         cell=ordered.cell.clone(),
         particles=densities.particles,
         density_gradient=densities.density_gradient,
@@ -86,7 +86,7 @@ def _prepare_static(x: Tensor, state_dim: int, physics: Physics) -> list[Tensor]
 
 
 def _list_neighbours(plan: KernelPlan, starts: Tensor, particles: Tensor) -> list[Tensor]:
-    """List the neighbours of each particle on a CPU, where reading their number is free."""
+    """List the neighbours of each particle on a CPU, where reading their number does not wait."""
     kernels = density_kernels(plan.space_dim, plan.scalar, plan.on_cpu)
     common = plan.total, particles.device, plan.domain, plan.particle_count, starts, particles
     counts = starts.new_empty(plan.total)
@@ -103,7 +103,7 @@ def _list_neighbours(plan: KernelPlan, starts: Tensor, particles: Tensor) -> lis
 @_prepare_static.register_fake
 def _(x: Tensor, state_dim: int, physics: Physics) -> list[Tensor]:
     total, space_dim = x.shape[0] * x.shape[1], x.shape[2]
-    plan = make_plan(x, x.shape, state_dim, total, False, physics)
+    plan = plan_kernels(x, x.shape, state_dim, total, False, physics)
 
     def integers(count: int | torch.SymInt) -> Tensor:
         return x.new_empty(count, dtype=torch.int32)
@@ -118,7 +118,7 @@ def _(x: Tensor, state_dim: int, physics: Physics) -> list[Tensor]:
     return StaticWorlds(
         source=integers(total),
         place=integers(total),
-        everyone=integers(total),
+        all_indices=integers(total),
         starts=integers(plan.start_count),
         cell=integers(total),
         particles=x.new_empty(total, space_dim + 1),
@@ -133,26 +133,26 @@ def prepare_static(x: Tensor, physics: Physics) -> StaticWorlds:
 
 
 class StaticRows(NamedTuple):
-    """Which sorted particles a step's rows stand for."""
+    """Maps between sorted particles and the rows of one step."""
 
     row_of: Tensor
-    """Row of each sorted particle, -1 where it has none, int32, shape [B N]."""
+    """Row of each sorted particle, -1 for none, int32, shape [B N]."""
     row_source: Tensor
     """Sorted particle of each row, int32, shape [K]; undefined beyond the last active row."""
     starts: Tensor
-    """First sorted place of every cell, then first row of every cell (shifted), int32."""
+    """First sorted index of every cell, then first row of every cell (plus `row_base`), int32."""
     row_positions: Tensor
     """Positions of the rows [length units], shape [K, D]; undefined beyond the last active row."""
 
 
-@opaque("npa::static_rows")
+@custom_op("npa::static_rows")
 def _static_rows(
     x: Tensor, masks: Tensor, source: Tensor, cell_starts: Tensor, row_capacity: int
 ) -> list[Tensor]:
-    """Return what `StaticRows` hold, of all steps, and how many particles each step updates."""
+    """Return the tensors of `StaticRows` for all steps, and the active particles of each step."""
     step_count, total, space_dim = masks.shape[0], source.shape[0], x.shape[2]
     active = masks.view(step_count, total).index_select(1, source)
-    # Of all steps at once: torch sums one long row fastest.
+    # One sum over all steps: torch is fastest on one long row.
     active_before = torch.cumsum(active.view(-1), 0, dtype=torch.int32)
     rows = _empty_rows(x, step_count, cell_starts, row_capacity)
     launch(
@@ -192,10 +192,10 @@ def _empty_rows(
 def static_rows(
     worlds: StaticWorlds, x: Tensor, masks: list[Tensor], row_capacity: int
 ) -> list[StaticRows]:
-    """Give the active particles of each of some steps rows, all steps at once.
+    """Assign rows to the active particles of several steps, all steps at once.
 
-    Masks are in the caller's order. There are `row_capacity` rows on CUDA, and active particles
-    beyond them get none; on a CPU each step has as many as it needs, at least one.
+    Masks are in the caller's order. On CUDA a step has `row_capacity` rows, and active particles
+    beyond them get none; on a CPU it has a row for each active particle, at least one.
     """
     if not x.is_cuda:
         row_capacity = x.shape[0] * x.shape[1]
@@ -203,7 +203,7 @@ def static_rows(
     steps = [StaticRows(*step) for step in zip(*rows, strict=True)]
     if x.is_cuda:
         return steps
-    # Reading the number of rows is free on the CPU; on CUDA it would stall the stream.
+    # Reading the number of rows is free on a CPU; on CUDA it would wait for the device.
     return [
         step._replace(
             row_source=step.row_source[: max(count, 1)],
@@ -215,20 +215,20 @@ def static_rows(
 
 def all_rows(worlds: StaticWorlds, x: Tensor) -> StaticRows:
     """Return the rows of a step in which all particles of worlds at x are active."""
-    return StaticRows(worlds.everyone, worlds.everyone, worlds.starts, x.flatten(0, 1))
+    return StaticRows(worlds.all_indices, worlds.all_indices, worlds.starts, x.flatten(0, 1))
 
 
 def static_worlds(
     plan: KernelPlan, worlds: StaticWorlds, rows: StaticRows, x: Tensor, s: Tensor
 ) -> tuple[SortedWorlds, Densities]:
-    """Return what the perception pass of a step reads."""
+    """Return the sorted worlds and densities that a step's perception pass reads."""
     lists = None
     if plan.lists_neighbours:
         steps, lengths, records = worlds.lists
         lists = NeighbourLists(plan.listing, steps, lengths, records, by_place=True)
     ordered = SortedWorlds(
         starts=rows.starts,
-        source=worlds.everyone,
+        source=worlds.all_indices,
         cell=worlds.cell,
         row_of=rows.row_of,
         row_source=rows.row_source,

@@ -1,4 +1,4 @@
-"""Updates of particles, as torch operators: from a rule's outputs, and from actions in place."""
+"""Updates of particles: by a rule's outputs, as a torch operator, and by actions, in place."""
 
 from __future__ import annotations
 
@@ -20,26 +20,26 @@ from npa_envs.kernels.portable.update import (
     find_not_finite,
     update_kernels,
 )
+from npa_envs.ops.custom_op import check_derivatives, custom_op, once_differentiable
 from npa_envs.ops.launch import Tape, launch, scalar_type
-from npa_envs.ops.opaque import check_derivatives, once_differentiable, opaque
 from npa_envs.ops.perceive import Rows
 from npa_envs.ops.physics import Physics
 from npa_envs.ops.sort import LARGEST_INDEX
 
 
-def _sharers(count: int) -> int:
-    """Return how many threads share `count` channels."""
+def _threads_for(count: int) -> int:
+    """Return the number of threads that share `count` channels."""
     return -(-count // CHANNEL_SHARE)
 
 
 def _boundary(physics: Physics, space_dim: int) -> tuple[int, tuple[float, ...]]:
-    """Return what kernels take of the boundary: its kind, and the sides of its box."""
+    """Return the kernels' constant for the boundary, and the sides of its box."""
     if physics.walls is not None:
         return REFLECTING, physics.walls
     return (OPEN, (1.0,) * space_dim) if physics.box is None else (PERIODIC, physics.box)
 
 
-@opaque("npa::update_particles")
+@custom_op("npa::update_particles")
 def _update_particles(
     update: Tensor,
     x: Tensor,
@@ -60,14 +60,14 @@ def _update_particles(
         )
     outputs = torch.empty_like(x), torch.empty_like(s), torch.empty_like(path_length)
     update = update.contiguous()
-    # Adjacent channels are then read and written at once: their places are aligned in memory.
+    # Adjacent channels are read and written at once where their addresses are aligned.
     alignment = UPDATE_ALIGNMENT[space_dim]
     aligned = state_dim % CHANNEL_SHARE == 0 and s.data_ptr() % 16 == 0
     aligned = aligned and (4 * update.shape[1]) % alignment == 0
     aligned = aligned and update.data_ptr() % alignment == 0
     launch(
         kernels.apply_update,
-        -(-total // TEAM) * TEAM * (1 + _sharers(state_dim)),
+        -(-total // TEAM) * TEAM * (1 + _threads_for(state_dim)),
         x.device,
         physics.max_displacement * physics.dt,
         physics.dt,
@@ -94,7 +94,7 @@ def _(
     return torch.empty_like(x), torch.empty_like(s), torch.empty_like(path_length)
 
 
-@opaque("npa::update_particles_backward")
+@custom_op("npa::update_particles_backward")
 def _update_particles_backward(
     update: Tensor,
     new_x_bar: Tensor,
@@ -110,7 +110,7 @@ def _update_particles_backward(
     update_bar = torch.empty_like(update, memory_format=torch.contiguous_format)
     launch(
         kernels.pull_back_update,
-        update.shape[0] * _sharers(update.shape[1]),
+        update.shape[0] * _threads_for(update.shape[1]),
         update.device,
         physics.max_displacement * physics.dt,
         physics.dt,
@@ -157,29 +157,29 @@ class _UpdateParticles(torch.autograd.Function):
     @once_differentiable
     def backward(ctx: Any, *bars: Tensor) -> tuple[Tensor | None, ...]:
         update, row_source, starts, *places = ctx.saved_tensors
-        bars = _facing(ctx.options[1], update, *places, *bars) if places else bars
+        bars = _before_reflection(ctx.options[1], update, *places, *bars) if places else bars
         given: list[Any] = [update, *bars, row_source, starts, *ctx.options]
         update_bar = _update_particles_backward(*given)
         return (update_bar, *bars, None, None)
 
 
-def _facing(
+def _before_reflection(
     physics: Physics, update: Tensor, x: Tensor, row_of: Tensor, x_bar: Tensor, *others: Tensor
 ) -> tuple[Tensor, ...]:
-    """Return the cotangents of positions, states and paths before walls reflected positions."""
+    """Return cotangents of the update's results before its positions are reflected by walls."""
     assert physics.walls is not None
-    # Positions do not depend on states and paths, so any will do.
+    # Positions do not depend on states and paths: any tensors of their shapes will do.
     s_bar, path_bar = (bar.contiguous() for bar in others)
     free, *_ = _update_particles(update, x, s_bar, path_bar, row_of, physics, False)
-    return x_bar * _mirroring(free, physics.walls), *others
+    return x_bar * _mirror_signs(free, physics.walls), *others
 
 
 def update_particles(
     update: Tensor, x: Tensor, s: Tensor, path_length: Tensor, rows: Rows, physics: Physics
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Return positions, states and path lengths after a rule's updates of the rows' particles.
+    """Return positions, states and path lengths after a rule's updates of the active particles.
 
-    `update` is [δ (D) ; Δs (C)], shape [K, A] or wider; the columns beyond A are not read.
+    `update` is [δ (D) ; Δs (C)] for each row, shape [K, A]; further columns are not read.
     """
     x, s = x.contiguous(), s.contiguous()
     tensors = (update, x, s, path_length)
@@ -190,13 +190,13 @@ def update_particles(
 
 
 def _images(x: Tensor, sides: tuple[float, ...]) -> Tensor:
-    """Return the whole number of the image of a box in which each coordinate lies."""
+    """Return the integer index of the image of the box in which each coordinate lies."""
     own = [torch.floor(x.detach()[..., d] / side + 0.5) for d, side in enumerate(sides)]
     return torch.stack(own, dim=-1)
 
 
-def _mirroring(x: Tensor, walls: tuple[float, ...]) -> Tensor:
-    """Return -1 for coordinates in odd images of a box, which its walls mirror, and 1 in others."""
+def _mirror_signs(x: Tensor, walls: tuple[float, ...]) -> Tensor:
+    """Return -1 for coordinates in odd images of the box, which walls mirror, and 1 for others."""
     return 1.0 - 2.0 * (_images(x, walls) % 2.0)
 
 
@@ -209,9 +209,9 @@ def wrapped(x: Tensor, box: tuple[float, ...] | None) -> Tensor:
 
 
 def bounded(x: Tensor, physics: Physics) -> Tensor:
-    """Return a copy of positions, wrapped into a periodic box or reflected into one of walls."""
+    """Return a copy of positions, wrapped into a periodic box or reflected at walls."""
     inside = wrapped(x, physics.walls or physics.box)
-    return inside if physics.walls is None else inside * _mirroring(x, physics.walls)
+    return inside if physics.walls is None else inside * _mirror_signs(x, physics.walls)
 
 
 def apply_actions(
@@ -225,17 +225,16 @@ def apply_actions(
     enabled: Tensor | None,
     diverged: Tensor,
 ) -> None:
-    """Move and change particles by their actions, in place; no gradient, nothing waits.
+    """Apply actions to particles in place, without gradient and without waiting for the device.
 
     With the mask m: x ← wrap(x + noise + m dt max_displacement a_x / max(1, |a_x|)) and
-    s ← s + m dt state_scale clip(a_s, -1, 1), each computed in float64 and rounded once. A value
-    that is not a number becomes 0 and one beyond its limit is moved to it; both mark the world as
-    diverged.
+    s ← s + m dt state_scale clip(a_s, -1, 1), each computed in float64 and rounded once. NaN
+    becomes 0, and a value beyond its limit is clipped; both mark the world as diverged.
 
     Actions are [a_x (D) ; a_s (C)], shape [B, N, A], or a_s alone where particles do not move.
-    The mask (uint8, [B, N]) says which act, by default all; the noise (shape [B, N, D]) is added to
-    every position first; nothing happens where `enabled` (uint8, [1]) is 0. `diverged` (uint8, [B])
-    is set to 1 where a world diverged and left as it is elsewhere.
+    Particles in `mask` (uint8, [B, N]) act, by default all. `noise`, shape [B, N, D], is added to
+    every position. Nothing changes if `enabled` (uint8, [1]) is 0. `diverged` (uint8, [B]) is set
+    to 1 for worlds that diverged and not changed for others.
     """
     _check_worlds(action, x, s, physics, mask, noise, enabled, diverged)
     aligned = s.data_ptr() % 16 == 0 and action.data_ptr() % 16 == 0
@@ -243,10 +242,10 @@ def apply_actions(
 
 
 class PreparedActions:
-    """`apply_actions` on worlds that stay in their tensors, with launches prepared once.
+    """`apply_actions` to worlds in fixed tensors, with launches prepared once.
 
-    Arguments are those of `apply_actions`; mask and noise may get other numbers before each call,
-    and `enabled` is set to 0 where an action is not finite, and never to 1.
+    Arguments are those of `apply_actions`. The values of mask and noise may change before each
+    call. `enabled` is set to 0 if an action is not finite, and never set to 1.
     """
 
     def __init__(
@@ -268,7 +267,7 @@ class PreparedActions:
         _check_worlds(self._buffer, x, s, physics, *self._step)
 
     def __getstate__(self) -> dict[str, Any]:
-        """Leave out what cannot be pickled."""
+        """Leave out the tape, which cannot be pickled."""
         return self.__dict__ | {"_tape": None, "_places": None}
 
     def __call__(self, action: Tensor) -> None:
@@ -279,23 +278,23 @@ class PreparedActions:
         if fits and not action.data_ptr() % 16:
             self._run(action)
         else:
-            self.hold(action)
-            self.apply_held()
+            self.load(action)
+            self.apply_loaded()
 
-    def hold(self, action: Tensor) -> None:
-        """Copy actions, as `__call__` takes them, to where `apply_held` reads them."""
+    def load(self, action: Tensor) -> None:
+        """Copy actions, as for `__call__`, into the buffer that `apply_loaded` reads."""
         buffer = self._buffer
         if action.shape != buffer.shape:
             raise NPAError(
                 f"action must have shape {tuple(buffer.shape)}, got {tuple(action.shape)}"
             )
         if buffer.is_cuda and not action.is_cuda:
-            # The host would wait for a copy of memory that is not pinned.
+            # A copy from memory that is not pinned would wait for the device.
             action = action.to(buffer.dtype).pin_memory()
         buffer.copy_(action, non_blocking=True)
 
-    def apply_held(self) -> None:
-        """Apply the actions held last; may be captured in a CUDA graph."""
+    def apply_loaded(self) -> None:
+        """Apply the actions of the last `load`; may be captured in a CUDA graph."""
         self._run(self._buffer)
 
     def _run(self, action: Tensor) -> None:
@@ -308,7 +307,7 @@ class PreparedActions:
             aligned = s.data_ptr() % 16 == 0
             launched = _launch_of(action, x, s, self._physics, *self._step, aligned=aligned)
             self._tape.add(*launched)
-            self._places = self._tape.places(action)
+            self._places = self._tape.argument_slots(action)
         self._tape.move(self._places, action)
         self._tape.replay()
 
@@ -325,10 +324,10 @@ def _launch_of(
     *,
     aligned: bool,
 ) -> tuple[Any, ...]:
-    """Return what to give to `launch`; `aligned` says where actions and states lie in memory."""
+    """Return arguments of `launch`; `aligned`: actions and states are aligned to 16 bytes."""
     world_count, particle_count, space_dim = x.shape
     state_dim = s.shape[2]
-    # Adjacent channels are then read and written at once.
+    # Then adjacent channels are read and written at once.
     aligned = (
         aligned and state_dim % CHANNEL_SHARE == 0 and (space_dim % 2 == 0 or not physics.moving)
     )

@@ -15,7 +15,6 @@ from npa_envs.ops.backend import SHARED_WORLD
 from npa_envs.ops.draws import draw
 from npa_envs.ops.episodes import EpisodeRules, PreparedJudgement
 from npa_envs.ops.equivariance import MIXED_VECTORS, VectorForm, read_rows, steer_rows
-from npa_envs.ops.mean import world_mean
 from npa_envs.ops.network import arrange_weights, run_network
 from npa_envs.ops.perceive import Rows, build_neighbours, perceive, perceive_rows
 from npa_envs.ops.physics import Limits, Physics, Terms
@@ -26,6 +25,7 @@ from npa_envs.ops.pictures.splat import splat
 from npa_envs.ops.pictures.triangles import nearest_triangles
 from npa_envs.ops.static import prepare_static, static_rows
 from npa_envs.ops.update import PreparedActions, update_particles
+from npa_envs.ops.world_mean import world_mean
 
 
 def warmup(
@@ -77,7 +77,7 @@ def warmup(
 
 
 def _chosen(name: str, given: Any, known: tuple[Any, ...]) -> list[Any]:
-    """Return some of what there is."""
+    """Return the values given, one or several, after checking that each is known."""
     chosen = entries(given)
     if not chosen or not all(value in known for value in chosen):
         raise NPAError(f"{name} must be some of {known}, got {shown(given)}: name one or both")
@@ -107,13 +107,13 @@ def _physics(x: torch.Tensor, s: torch.Tensor) -> Physics:
 
 
 def _sizes(x: torch.Tensor, *others: torch.Tensor) -> Iterator[list[torch.Tensor]]:
-    """Yield worlds of all sizes: small, middling and large ones have kernels of their own."""
+    """Yield small, medium and large worlds, which run different kernels."""
     for count in (x.shape[1], SHARED_WORLD, SHARED_WORLD + 1):
         yield [value.detach()[:, :1].expand(-1, count, -1) for value in (x, *others)]
 
 
 def _warm_rows(x: torch.Tensor, s: torch.Tensor) -> None:
-    """Perception in rollouts: moving and static worlds, all particles and some."""
+    """Run perception as in rollouts: moving and static worlds, with and without a mask."""
     physics = _physics(x, s)
     width = physics.perception_dim + 1
     for places, states in _sizes(x, s):
@@ -133,7 +133,7 @@ def _warm_rows(x: torch.Tensor, s: torch.Tensor) -> None:
 
 
 def _warm_network(x: torch.Tensor, s: torch.Tensor) -> None:
-    """A rule's products, where they have kernels of their own: with displacements and without."""
+    """Run the fused network where it supports the sizes, with and without displacements."""
     space_dim, state_dim = x.shape[2], s.shape[2]
     width = Terms().perception_dim(space_dim, state_dim) + 1
     for out in (space_dim + state_dim, state_dim):
@@ -150,7 +150,7 @@ def _warm_network(x: torch.Tensor, s: torch.Tensor) -> None:
 
 
 def _warm_invariants(x: torch.Tensor, s: torch.Tensor) -> None:
-    """What equivariant rules make of vectors."""
+    """Run the vector kernels of equivariant rules."""
     space_dim, state_dim = x.shape[2], s.shape[2]
     for chiral in (False, True)[: 4 - space_dim]:
         form = VectorForm(space_dim, 2 * state_dim, state_dim + 1, MIXED_VECTORS, chiral)
@@ -171,7 +171,7 @@ def _warm_pictures(x: torch.Tensor) -> None:
 
 
 def _warm_views(x: torch.Tensor) -> None:
-    """What cameras see of worlds, and of the meshes that are targets."""
+    """Draw worlds, and meshes as targets, by cameras."""
     cameras = orbit(1, width=16, height=16)
     scales, colours = x.new_ones(x.shape), x.new_zeros(*x.shape[:2], 4, 3)
     turns = x.new_ones(*x.shape[:2], 4)

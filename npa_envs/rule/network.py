@@ -7,9 +7,9 @@ from typing import Any, NamedTuple, Protocol
 import torch
 from torch import Tensor
 
+from npa_envs.ops.custom_op import without_autocast
 from npa_envs.ops.equivariance import VectorForm, read_rows, steer_rows
 from npa_envs.ops.network import ArrangedWeights, arrange_weights, run_network
-from npa_envs.ops.opaque import without_autocast
 
 FOLD = 4
 """Rows of perception and of updates are padded to a multiple of this: 16 bytes of float32."""

@@ -20,11 +20,11 @@ from npa_envs.ops.episodes import (
     EpisodeRules,
     PreparedJudgement,
 )
-from npa_envs.ops.mean import world_mean
 from npa_envs.ops.perceive import NeighbourState, build_neighbours
 from npa_envs.ops.physics import Boundary, Limits, Physics, Terms
 from npa_envs.ops.species import perceive_by_species
 from npa_envs.ops.update import PreparedActions, wrapped
+from npa_envs.ops.world_mean import world_mean
 from npa_envs.world.randomness import WorldRandom
 from npa_envs.world.steps import draw_step
 
@@ -50,19 +50,19 @@ __all__ = [
 
 
 def perceive_each_species(x: Tensor, counts: Sequence[int], physics: Physics) -> Tensor:
-    """Return `perceive_by_species`, clipped, shape [B, N, K (1 + D)]; zeros for species gone."""
+    """Return `perceive_by_species`, clipped, shape [B, N, K (1 + D)]; zeros for empty species."""
     limit = physics.limits.perception
     return perceive_by_species(x, tuple(counts), physics).clamp(-limit, limit)
 
 
 class Actions(PreparedActions):
-    """What actions do to some worlds, in place, with the masks and the noise of `rollout`.
+    """Applies actions to worlds in place, with the update masks and the noise of `rollout`.
 
     Displacements are fractions of α ε (D, norm clipped to 1), state steps fractions of
-    `state_scale` (C, clipped to [-1, 1]). `enabled` (uint8, [1]) is set to 0 where an action is not
-    finite, and no world changes; the caller sets it to 1 again. `diverged` (uint8, [B]) is set to 1
-    for worlds in which a number left its bounds or is not finite, to 0 for the others; such numbers
-    are moved back to the bounds, NaN to 0.
+    `state_scale` (C, clipped to [-1, 1]). If an action is not finite, no world changes and
+    `enabled` (uint8, [1]) is set to 0; the caller sets it to 1 again. `diverged` (uint8, [B]) is
+    set to 1 for worlds with a value beyond its bounds or not finite, to 0 for others; such values
+    are clipped to the bounds, and NaN becomes 0.
     """
 
     def __init__(
@@ -110,14 +110,13 @@ def marginal_gains(
 ) -> Tensor | None:
     """Return marginal credit: how much each particle's action lowered the loss, times N; [B, N].
 
-    A particle's part of a step is what it changed, times the loss's slope in the middle of the
-    step. For losses that are quadratic in what particles change, that is the mean of its marginal
-    contribution to what all others did and to what they had not yet done (its Shapley value), and
-    the mean over the particles is what the loss fell; for others it is so up to third order. What a
-    task holds constant in its gradients stays constant.
+    A particle's credit is the change that it made in the step, times the gradient of the loss in
+    the middle of the step. The mean over the particles is the decrease of the loss, and the credit
+    is the particle's Shapley value: exactly for losses that are quadratic in the changes, and up to
+    third order for others. Detached parts of the loss get no credit.
 
-    `losses` gives the named parts of each world's loss, shape [B] each, of positions and states.
-    None is returned where no gradient leads from them to positions or states.
+    `losses` maps positions and states to the named parts of each world's loss, shape [B] each. The
+    result is None if no gradient flows from them to positions or states.
     """
     moved = wrapped(after[0] - before[0], box)
     changed = after[1] - before[1]
@@ -131,13 +130,13 @@ def marginal_gains(
     gains = torch.zeros_like(moved[..., 0])
     for slope, change in zip(slopes, (moved, changed), strict=True):
         if slope is not None:
-            # Added one by one: the order of torch's own sums is not promised.
+            # Added one by one, because torch's sums have no fixed order.
             for column in (slope * change).unbind(dim=-1):
                 gains = gains - column
     return gains * gains.shape[1]
 
 
 def with_mean_reward(gains: Tensor, reward: Tensor) -> Tensor:
-    """Return particles' gains, [B, N], with what they miss of the worlds' rewards, [B], shared."""
+    """Shift each world's gains, [B, N], by a constant so that their mean is its reward, [B]."""
     missed = reward - world_mean(gains[..., None])[:, 0]
     return gains + missed[:, None]

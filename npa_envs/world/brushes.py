@@ -1,13 +1,12 @@
-"""Brushes: what a hand does to a world at a place, as functions of positions and states.
+"""Brushes: local changes of worlds, as functions of positions and states.
 
-Whatever gardens a world uses these: damage of training pools, the viewer, agents. They work on
-batches, each world at its own place, and are differentiable in positions, states, places and
-amounts, but for which particles lie inside. Nothing waits for the device, except for `removed`,
-which changes how many particles there are.
+Damage of training pools, the viewer and agents use them. They work on batches, with a centre for
+each world, and are differentiable in positions, states, centres and amounts, except for the choice
+of particles inside. Only `removed`, which changes the number of particles, waits for the device.
 
 In all of them x are positions [length units], shape [B, N, D], s states (dimensionless), shape
 [B, N, C], and `box` the sides of the periodic box [length units], shape [D], across whose edges a
-brush reaches, or None in open space. Positions may leave the box; the next step wraps them.
+brush works, or None in open space. Positions may leave the box; the next step wraps them.
 """
 
 from __future__ import annotations
@@ -24,16 +23,16 @@ Sides = tuple[float, ...] | None
 
 
 def offsets_from(x: Tensor, centre: Tensor, box: Sides = None) -> Tensor:
-    """Return the way from a place to each particle, to its nearest image in a box, [B, N, D].
+    """Return the vector from a point to each particle's nearest image in the box, [B, N, D].
 
     Args:
         x: Particle positions [length units], shape [B, N, D].
-        centre: A place in each world [length units], shape [B, D].
+        centre: A point in each world [length units], shape [B, D].
         box: Sides of the periodic box [length units], or None.
 
     Raises:
-        NPAError: x is no positions of worlds, `centre` has another shape, dtype or device than x
-            asks for, or the box has not a side for each coordinate.
+        NPAError: x has another shape, the shape, dtype or device of `centre` does not fit x, or the
+            box does not have D sides.
     """
     _check_vector("centre", centre, x)
     if box is not None and len(entries(box) or ()) != x.shape[2]:
@@ -42,10 +41,10 @@ def offsets_from(x: Tensor, centre: Tensor, box: Sides = None) -> Tensor:
 
 
 def nearest_image(way: Tensor, box: Sides) -> Tensor:
-    """Return ways, or places, as their images nearest to the origin have them, [..., D]."""
+    """Return vectors [..., D] replaced by their periodic images nearest to the origin."""
     if box is None:
         return way
-    # Side by side: a tensor of the sides would be a copy to the device.
+    # One side at a time: a tensor of the sides would be copied to the device.
     parts = zip(way.unbind(dim=-1), box, strict=True)
     return torch.stack([part - side * torch.round(part / side) for part, side in parts], dim=-1)
 
@@ -67,13 +66,13 @@ def inside_ball(x: Tensor, *, centre: Tensor, radius: float | Tensor, box: Sides
 
 
 def softness(x: Tensor, *, centre: Tensor, radius: float | Tensor, box: Sides = None) -> Tensor:
-    """Return how much a soft brush holds of each particle: (1 - r²)², 0 outside, [B, N, 1].
+    """Return the weight of each particle under a soft brush: (1 - r²)², 0 outside, [B, N, 1].
 
-    r is the distance from the place in radii. Arguments and errors are those of `inside_ball`.
+    r is the distance from the centre in radii. Arguments and errors are those of `inside_ball`.
     """
     size = _per_world("radius", radius, x)
     square = offsets_from(x, centre, box).square().sum(dim=-1, keepdim=True)
-    # Masked before the division: a radius of zero holds nothing, and must not give NaN.
+    # Masked before the division: with a radius of zero weights are 0 and not NaN.
     share = square / torch.where(size > 0, size, torch.ones_like(size)).square()
     return torch.where(size > 0, (1.0 - share).clamp_min(0.0), 0.0).square()
 
@@ -84,13 +83,13 @@ def removed(x: Tensor, s: Tensor, *, gone: Tensor) -> tuple[Tensor, Tensor]:
     Args:
         x: Particle positions [length units], shape [B, N, D].
         s: Particle states (dimensionless), shape [B, N, C].
-        gone: Which particles go, as many in each world, bool, shape [B, N]: of `inside_ball`.
+        gone: Which particles to remove, bool, shape [B, N], for example by `inside_ball`.
 
     Returns:
-        Positions, shape [B, N', D], and states, shape [B, N', C], in the order that they had.
+        Positions, shape [B, N', D], and states, shape [B, N', C], in their former order.
 
     Raises:
-        NPAError: A wrong shape or dtype, or worlds would not keep equally many particles.
+        NPAError: A wrong shape or dtype, or worlds would keep different numbers of particles.
     """
     check_world(x, s)
     if not isinstance(gone, Tensor) or gone.shape != x.shape[:2] or gone.dtype != torch.bool:
@@ -102,7 +101,7 @@ def removed(x: Tensor, s: Tensor, *, gone: Tensor) -> tuple[Tensor, Tensor]:
     counts = gone.sum(dim=1).tolist()
     if len(set(counts)) > 1:
         raise NPAError(
-            f"gone must take as many particles from each world, got {shown(counts)}: change one "
+            f"gone must take equally many particles of each world, got {shown(counts)}: change one "
             "world at a time, or set states with wipe_state"
         )
     left = ~gone
@@ -119,15 +118,15 @@ def push(
     strength: float | Tensor = 1.0,
     box: Sides = None,
 ) -> Tensor:
-    """Return the positions with those under a soft brush carried along, shape [B, N, D].
+    """Return positions after a soft brush has moved the particles under it, shape [B, N, D].
 
     Args:
         x: Particle positions [length units], shape [B, N, D].
         centre: Where the brush is in each world [length units], shape [B, D].
         move: How it moves [length units], shape [B, D].
         radius: Radius of the brush [length units], a number or a tensor of shape [B].
-        strength: Share of the movement that a particle in the middle follows (dimensionless), from
-            0 to 1; a number or a tensor of shape [B].
+        strength: Fraction of the movement that a particle in the centre follows (dimensionless),
+            from 0 to 1; a number or a tensor of shape [B].
         box: Sides of the periodic box [length units], or None.
 
     Raises:
@@ -149,16 +148,16 @@ def inject(
     strength: float | Tensor = 1.0,
     box: Sides = None,
 ) -> Tensor:
-    """Return the states with those under a soft brush drawn towards a given one, [B, N, C].
+    """Return states after a soft brush has blended those under it with a given state, [B, N, C].
 
     Args:
         x: Particle positions [length units], shape [B, N, D].
         s: Particle states (dimensionless), shape [B, N, C].
         centre: Where the brush is in each world [length units], shape [B, D].
         radius: Radius of the brush [length units], a number or a tensor of shape [B].
-        state: What is injected in each world (dimensionless), shape [B, C].
-        strength: Share of the way that a particle in the middle goes (dimensionless), from 0 to 1;
-            a number or a tensor of shape [B].
+        state: State to inject in each world (dimensionless), shape [B, C].
+        strength: Weight of that state for a particle in the centre (dimensionless), from 0 to 1; a
+            number or a tensor of shape [B].
         box: Sides of the periodic box [length units], or None.
 
     Raises:
@@ -173,7 +172,7 @@ def inject(
 def state_around(
     x: Tensor, s: Tensor, *, centre: Tensor, radius: float | Tensor, box: Sides = None
 ) -> tuple[Tensor, Tensor]:
-    """Return the mean state that a soft brush holds, [B, C], and whether it holds any, bool, [B].
+    """Return the weighted mean state under a soft brush, [B, C], and whether any is, bool, [B].
 
     Args:
         x: Particle positions [length units], shape [B, N, D].
@@ -196,7 +195,7 @@ def state_around(
 def wipe_state(
     x: Tensor, s: Tensor, *, centre: Tensor, radius: float | Tensor, box: Sides = None
 ) -> Tensor:
-    """Return the states with those of the particles inside a ball set to zero.
+    """Return states, set to zero for the particles inside a ball.
 
     Args:
         x: Particle positions [length units], shape [B, N, D].
@@ -206,7 +205,7 @@ def wipe_state(
         box: Sides of the periodic box [length units], or None.
 
     Returns:
-        The new states, shape [B, N, C]; `s` itself is left as it is.
+        The new states, shape [B, N, C]; `s` does not change.
 
     Raises:
         NPAError: A wrong shape or dtype, or a radius that is negative or not finite.
@@ -226,11 +225,11 @@ def cut(
     along: Tensor | None = None,
     box: Sides = None,
 ) -> tuple[Tensor, Tensor]:
-    """Open a slit along a line (a plane in 3D), as a knife would.
+    """Open a slit along a line (a plane in 3D) by moving particles apart.
 
     Particles within `gap` of the line move away from it, those on the line by half the gap and
-    those at the distance `gap` not at all: none is left within half the gap, the bands beside the
-    slit are twice as dense, and everything further away stays where it is.
+    those at the distance `gap` not at all: none is left within half the gap, the bands on both
+    sides of the slit are twice as dense, and particles further away do not move.
 
     Args:
         x: Particle positions [length units], shape [B, N, D].
@@ -238,13 +237,13 @@ def cut(
         centre: A point on the line in each world [length units], shape [B, D].
         normal: Direction across the line, of any length, shape [B, D]; a zero vector cuts nothing.
         gap: Width of the slit [length units], a number or a tensor of shape [B].
-        along: From `centre` to one end of the slit, and back to the other end [length units], shape
-            [B, D]; a zero vector cuts nothing. None: it has no ends. In 3D it ends there too, and
-            goes on across.
+        along: Vector from `centre` to one end of the slit; minus it leads to the other end [length
+            units], shape [B, D]; a zero vector cuts nothing. None: no ends. In 3D the slit is not
+            bounded in the third direction.
         box: Sides of the periodic box [length units], or None.
 
     Returns:
-        The new positions, shape [B, N, D], and the states as they came.
+        The new positions, shape [B, N, D], and the same states.
 
     Raises:
         NPAError: A wrong shape or dtype, or a gap that is negative or not finite.
@@ -284,12 +283,12 @@ def clump(
         s: Particle states (dimensionless), shape [B, N, C].
         centre: Centre of the ball in each world [length units], shape [B, D].
         radius: Radius of the ball [length units], a number or a tensor of shape [B].
-        factor: The share of its distance from the centre that a particle loses (dimensionless),
-            from 0, nothing moves, to 1, all meet in the centre; a number or a tensor of shape [B].
+        factor: Fraction by which distances from the centre shrink (dimensionless), from 0, nothing
+            moves, to 1, all meet in the centre; a number or a tensor of shape [B].
         box: Sides of the periodic box [length units], or None.
 
     Returns:
-        The new positions, shape [B, N, D], and the states as they came.
+        The new positions, shape [B, N, D], and the same states.
 
     Raises:
         NPAError: A wrong shape or dtype, a radius that is negative or not finite, or a factor
@@ -303,14 +302,14 @@ def clump(
 
 
 def _per_world(name: str, value: float | Tensor, x: Tensor, *, highest: float = math.inf) -> Tensor:
-    """Return the number of each world in a shape [B, 1, 1] or [1, 1, 1]."""
+    """Return a checked number of each world, shape [B, 1, 1] or [1, 1, 1]."""
     if isinstance(value, Tensor):
         if value.shape not in ((), (x.shape[0],)):
             raise NPAError(
                 f"{name} must be a number or a tensor of shape [B] = [{x.shape[0]}], "
                 f"got {list(value.shape)}: give one number for each world"
             )
-        # The values stay unread: looking at them would wait for the device.
+        # Values are not checked: reading them would wait for the device.
         return value.to(x).reshape(-1, 1, 1)
     value = checked_number(name, value)
     if not 0 <= value <= min(highest, torch.finfo(x.dtype).max):
@@ -326,7 +325,7 @@ def _check_vector(name: str, vector: Tensor, x: Tensor) -> None:
 
 
 def _check_each(name: str, value: Tensor, other: Tensor, other_name: str, letter: str) -> None:
-    """Check that there is a vector for each world, of the last size of other tensors."""
+    """Check that a tensor has a vector for each world, of the last size of another tensor."""
     wanted = (other.shape[0], other.shape[2])
     shape = f"shape [B, {letter}] = {wanted}"
     cure = "give one vector for each world, for example"

@@ -1,4 +1,4 @@
-"""CUDA graphs: work that is recorded once and replayed from then on."""
+"""CUDA graphs: capture a function's work on the device once, and replay it."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ from npa_envs.ops.driver import new_stream
 
 
 def to_device_async(values: NDArray[Any], device: torch.device) -> Tensor:
-    """Return an array as a tensor on a device; the host does not wait for what the device does.
+    """Return an array as a tensor on a device, copied without synchronizing.
 
     On a CPU the tensor shares the array's memory.
     """
     tensor = torch.from_numpy(values)
-    # Unpinned memory would be copied once the stream is idle, and the host would wait for that.
+    # A copy from memory that is not pinned would wait until the stream is idle.
     return tensor.pin_memory().to(device, non_blocking=True) if device.type == "cuda" else tensor
 
 
@@ -35,32 +35,31 @@ Arguments = ParamSpec("Arguments")
 Result = TypeVar("Result")
 
 ABANDONED_POOLS = 8
-"""Pools of graphs that are gone, at most, before their memory is given back."""
+"""Memory pools of deleted graphs after which their memory is freed."""
 
 recording_lock = threading.RLock()
-"""Held while something is captured or prepared for that: all graphs share one stream and torch's
-state of captures."""
+"""Lock of captures and their preparation: all graphs share one stream and torch's capture state."""
 
 
 @functools.cache
 def can_capture() -> bool:
-    """Return whether torch's allocator keeps memory for graphs: its own one does, if it caches."""
+    """Return whether torch's allocator supports graphs: its own caching allocator does."""
     caching = "PYTORCH_NO_CUDA_MEMORY_CACHING" not in os.environ
     return caching and torch.cuda.get_allocator_backend() == "native"
 
 
 CAPTURE_ATTEMPTS = 3
-"""How often a capture is tried where other threads may have ended it."""
+"""Attempts at a capture that other threads may have invalidated."""
 
 PINNED_OFFSET = 64
-"""Bytes by which pinned memory lies further than torch's allocator knows it."""
+"""Offset [bytes] of returned pinned memory, so that torch's allocator does not recognise it."""
 
 
 def pinned_like(tensor: Tensor) -> Tensor:
-    """Return pinned memory of a tensor's form, to which captured work may write.
+    """Return pinned memory of a tensor's shape and dtype, to which captured work may write.
 
-    Torch's allocator notes which streams use its pinned memory, and asks them how far they are once
-    that is freed. A stream that another thread captures by then must not be asked.
+    Torch's allocator records the streams that use its pinned memory, and queries them when the
+    memory is freed. A query of a stream that another thread is capturing would break the capture.
     """
     whole = torch.empty(
         PINNED_OFFSET + tensor.nbytes, dtype=torch.uint8, device="cpu", pin_memory=True
@@ -70,15 +69,15 @@ def pinned_like(tensor: Tensor) -> Tensor:
 
 
 def _is_plain() -> bool:
-    """Return whether tensors are made on the CPU by default, and not in inference mode."""
+    """Return whether new tensors are on the CPU by default, and not in inference mode."""
     return not (torch.is_inference_mode_enabled() or torch._C._len_torch_function_stack())
 
 
 @contextlib.contextmanager
 def plain_tensors() -> Iterator[None]:
-    """Make tensors inside that can be written to anywhere, on the CPU unless a device is given.
+    """Leave inference mode and the caller's default device inside the block.
 
-    The caller may be in inference mode, or have set another default device.
+    New tensors can then be written to anywhere, and are on the CPU unless a device is given.
     """
     with contextlib.ExitStack() as modes:
         if torch.is_inference_mode_enabled():
@@ -90,7 +89,7 @@ def plain_tensors() -> Iterator[None]:
 
 
 def makes_plain_tensors(function: Callable[Arguments, Result]) -> Callable[Arguments, Result]:
-    """Return a function within `plain_tensors`."""
+    """Wrap a function so that it runs within `plain_tensors`."""
 
     @functools.wraps(function)
     def guarded(*args: Arguments.args, **kwargs: Arguments.kwargs) -> Result:
@@ -104,7 +103,7 @@ def makes_plain_tensors(function: Callable[Arguments, Result]) -> Callable[Argum
 
 @contextlib.contextmanager
 def no_garbage_collection() -> Iterator[None]:
-    """Collect no garbage inside: freeing an old graph would break a capture."""
+    """Disable garbage collection inside: freeing an old graph would break a capture."""
     enabled = gc.isenabled()
     gc.disable()
     try:
@@ -120,21 +119,21 @@ def _stream(device: torch.device, handle: int) -> torch.cuda.Stream:
 
 
 def current_stream(device: torch.device) -> torch.cuda.Stream:
-    """Return torch's current stream of a CUDA device, which has a number: the same object again.
+    """Return torch's current stream of an indexed CUDA device, as a cached object.
 
-    `torch.cuda.current_stream` makes a new one each time, which takes ten times as long.
+    `torch.cuda.current_stream` makes a new object each time, which takes ten times as long.
     """
     return _stream(device, torch._C._cuda_getCurrentRawStream(device.index))
 
 
 @functools.cache
 def _capture_stream(device_index: int) -> torch.cuda.Stream:
-    """The one stream of a device that is captured: graphs can share memory only within a stream."""
+    """Return a device's one stream for captures: only graphs of one stream can share memory."""
     return new_stream(torch.device("cuda", device_index))
 
 
 def prepare_capture(function: Callable[[], object], device: torch.device) -> None:
-    """Run a function on the stream that is captured: loads kernels, allocates workspaces."""
+    """Run a function on the capture stream, which loads its kernels and allocates workspaces."""
     with recording_lock, torch.cuda.device(device), plain_tensors():
         stream = _capture_stream(torch.cuda.current_device())
         stream.wait_stream(torch.cuda.current_stream())
@@ -145,13 +144,13 @@ def prepare_capture(function: Callable[[], object], device: torch.device) -> Non
 
 
 class GraphSequence:
-    """Work that was recorded: CUDA graphs, one after the other, and what is done between them.
+    """Recorded work: CUDA graphs, one after the other, and Python functions called between them.
 
-    `generator` draws anew in each replay; `alone`: nothing is drawn from torch's own generator.
+    `generator` draws new numbers in each replay; `alone`: torch's own generator is not used.
     """
 
     abandoned = 0
-    """Pools of graphs that are gone since memory was given back."""
+    """Memory pools of graphs deleted since memory was last freed."""
 
     def __init__(
         self, pool: Any = None, generator: torch.Generator | None = None, *, alone: bool = False
@@ -164,29 +163,29 @@ class GraphSequence:
         self._between: list[Callable[[], object]] = []
 
     def replay(self) -> None:
-        """Do the work on the current stream; the host waits only for what it does in between."""
+        """Replay on the current stream; waits only if a function between the graphs does."""
         self._graphs[0].replay()
         for work, graph in zip(self._between, self._graphs[1:], strict=True):
             work()
             graph.replay()
 
     def begin(self) -> None:
-        """Record what the current stream is given from now on."""
+        """Begin to record the current stream's work."""
         graph = torch.cuda.CUDAGraph()
         if self._generator is not None:
-            # Without this every replay would draw the numbers of the capture again.
+            # Without this every replay would draw the same numbers as the capture.
             graph.register_generator_state(self._generator)
         self._graphs.append(graph)
         with _stand_in(graph) if self.alone else contextlib.nullcontext():
-            # A backward pass runs on a thread of its own, whose calls the strict mode would refuse.
+            # A backward pass runs in another thread, whose calls the strict mode would refuse.
             graph.capture_begin(pool=self._pool, capture_error_mode="thread_local")
 
     def end(self) -> None:
-        """Record no more."""
+        """End the recording."""
         self._graphs[-1].capture_end()
 
     def pause(self, work: Callable[[], object]) -> None:
-        """End a graph, begin another one, and let `work` be done between them in every replay."""
+        """End a graph and begin another one; every replay calls `work` between them."""
         self.end()
         self._between.append(work)
         if self._pool is None:
@@ -194,20 +193,20 @@ class GraphSequence:
         self.begin()
 
     def __del__(self) -> None:
-        # Freed here, memory would be taken from captures of other threads.
+        # Freeing memory at this point could break captures of other threads.
         GraphSequence.abandoned += self._owns_pool and bool(self._graphs)
 
 
 @contextlib.contextmanager
 def _stand_in(graph: torch.cuda.CUDAGraph) -> Iterator[None]:
-    """Let a capture that begins inside register another generator than torch's own.
+    """Replace torch's own generator while a capture begins inside.
 
-    Torch registers its own one with every graph, and until the capture ends other threads could not
-    draw from it.
+    Torch registers its own generator with every graph, and then other threads cannot draw from it
+    until the capture ends.
     """
     own = torch.cuda.default_generators[torch.cuda.current_device()]
     stand_in = torch.Generator(own.device)
-    # What other threads draw meanwhile must not be the same each time.
+    # Draws of other threads in the meantime must not be the same each time.
     stand_in.seed()
     graph.register_generator_state(stand_in)
     state = own.graphsafe_get_state()
@@ -219,13 +218,13 @@ def _stand_in(graph: torch.cuda.CUDAGraph) -> Iterator[None]:
 
 
 _capturing: ContextVar[GraphSequence | None] = ContextVar("capturing", default=None)
-"""What this thread records, if anything."""
+"""The recording of this thread, if any."""
 
 
 def host_call(work: Callable[[], object]) -> None:
-    """Do what cannot be part of a graph: at once, or in a capture between two graphs, each replay.
+    """Call a function that cannot be part of a graph; in a capture, each replay calls it instead.
 
-    The work reads and writes tensors that stay where they are; what launches it keeps them.
+    It reads and writes the same tensors in every replay; the caller keeps them alive.
     """
     captured = _capturing.get()
     if captured is None:
@@ -235,7 +234,7 @@ def host_call(work: Callable[[], object]) -> None:
 
 
 def draws_alone() -> bool:
-    """Return whether what this thread records cannot draw from torch's own generator."""
+    """Return whether this thread records without access to torch's own generator."""
     captured = _capturing.get()
     return captured is not None and captured.alone
 
@@ -249,30 +248,30 @@ def capture(
     warm_up: Callable[[], object] | None = None,
     alone: bool = False,
 ) -> GraphSequence:
-    """Record what a function launches as CUDA graphs, without running it.
+    """Record a function's launches as CUDA graphs, without running them.
 
-    It is one graph, unless the function calls `host_call`. The function launches kernels that are
-    loaded already (by `warm_up`, on the stream that is captured), and never waits for the device.
-    A `pool` is shared with graphs that never run at the same time. Each replay draws anew from a
-    CUDA `generator`; if `alone`, a draw from torch's own one is an error, and other threads may
-    draw from that meanwhile. After an error of the function the device can be used as before.
+    It is one graph, unless the function calls `host_call`. The function must not wait for the
+    device, and its kernels must be loaded (by `warm_up`, which runs on the capture stream). A
+    `pool` of memory is shared with graphs that never run at the same time. Each replay draws new
+    numbers from a CUDA `generator`; if `alone`, a draw from torch's own generator is an error, and
+    other threads may use that meanwhile. After an error of the function the device is usable.
 
-    Without a warm-up the host waits for nothing. `torch.cuda.graph` waits for the device, frees the
-    allocator's cache and may collect garbage at each capture, which can take longer than the
-    capture itself. That makes room, as a graph's pool has no use for memory in that cache. Here
-    room is made after the warm-up, which leaves most of it, and where a capture has not enough.
+    Without `warm_up` nothing synchronizes. `torch.cuda.graph` synchronizes, frees the allocator's
+    cache and may collect garbage at each capture, which can take longer than the capture itself. A
+    graph's pool cannot use cached memory, so the cache is freed here after the warm-up, and if a
+    capture runs out of memory.
     """
     with recording_lock, torch.cuda.device(device), plain_tensors():
         stream = _capture_stream(torch.cuda.current_device())
         if GraphSequence.abandoned >= ABANDONED_POOLS:
-            # Torch keeps the memory of pools whose graphs are gone, and uses it for nothing else.
+            # Torch does not reuse the memory of pools whose graphs are deleted.
             GraphSequence.abandoned = 0
             torch.cuda.empty_cache()
         if warm_up is not None:
             prepare_capture(warm_up, device)
         with contextlib.suppress(torch.OutOfMemoryError):
             return _captured(function, stream, GraphSequence(pool, generator, alone=alone))
-        # Only here: the error that is gone by now held the memory of the first attempt.
+        # Only here is the first error gone, which kept the memory of that attempt alive.
         torch.cuda.empty_cache()
         return _captured(function, stream, GraphSequence(pool, generator, alone=alone))
 
@@ -282,8 +281,8 @@ def _captured(
 ) -> GraphSequence:
     """Capture a stream while the function runs."""
     current = torch.cuda.current_stream()
-    # A capture runs nothing, but for this: torch resets the generators' places on the device, which
-    # the graphs before read and the next replay writes. So the two streams take turns.
+    # A capture does run one thing: torch resets generator offsets on the device, which earlier
+    # graphs read and the next replay writes. So the two streams wait for each other.
     stream.wait_stream(current)
     try:
         with torch.cuda.stream(stream), no_garbage_collection():
@@ -292,7 +291,7 @@ def _captured(
             try:
                 function()
             except BaseException:
-                # What broke the capture says more than the complaint that it is broken.
+                # The error that broke the capture says more than the error that it is broken.
                 with contextlib.suppress(RuntimeError):
                     captured.end()
                 raise
@@ -308,29 +307,29 @@ def _captured(
 
 
 def may_be_disturbed(attempts: int) -> bool:
-    """Return whether a capture that failed is worth another attempt.
+    """Return whether to repeat a failed capture, which another thread may have invalidated.
 
-    A thread that waits for the whole device (`torch.cuda.synchronize`) ends all captures.
+    A thread that waits for the whole device (`torch.cuda.synchronize`) breaks all captures.
     """
     return threading.active_count() > 1 and attempts < CAPTURE_ATTEMPTS
 
 
 class WeakFunction:
-    """A function that is kept, or a method whose object is not kept alive.
+    """A reference to a function, or to a method that does not keep its object alive.
 
-    An object that keeps its own method is freed only when garbage is collected, and with it graphs
-    and their memory. What this returns is of no use once its object is gone.
+    An object that refers to its own method is freed only by garbage collection, and with it graphs
+    and their memory. The method cannot be called once its object is gone.
     """
 
     def __init__(self, function: Callable[..., Any]) -> None:
         self._get = weakref.WeakMethod(function) if inspect.ismethod(function) else lambda: function
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Copy and pickle the method of the copied object."""
+        """Support copy and pickle, as the method of the copied object."""
         return WeakFunction, (self(),)
 
     def __call__(self) -> Callable[..., Any]:
-        """Return the function, whose object must be there."""
+        """Return the function; raise an error if its object is gone."""
         function = self._get()
         if function is None:
             raise ReferenceError("the object of this method is gone: keep it as long as the method")
@@ -338,14 +337,14 @@ class WeakFunction:
 
 
 class GraphedCallable:
-    """A function without arguments that is run as it is on a CPU, and as a CUDA graph on CUDA.
+    """A function without arguments that runs as a CUDA graph on CUDA, and as it is on a CPU.
 
-    Launches of many short kernels would otherwise take longer than the kernels do. The first call
-    runs the function kernel by kernel, which loads them; the second captures it. The function reads
-    and writes the same tensors in every call, and never waits for the device; a method's object has
-    to be kept by others (`WeakFunction`). Numbers of its `generator` are the same either way. A
-    `pool` is shared with functions that never run at the same time, and of whose work nothing is
-    needed that lies there.
+    Launches of many short kernels take longer than the kernels do. The first call runs the function
+    kernel by kernel, which loads the kernels; the second captures it. The function must read and
+    write the same tensors in every call and not wait for the device; the caller keeps a method's
+    object alive (`WeakFunction`). A `generator` draws the same numbers either way. A memory `pool`
+    is shared with functions that never run at the same time and whose temporary results are not
+    needed any more.
     """
 
     def __init__(
@@ -367,7 +366,7 @@ class GraphedCallable:
         self._attempts = 0
 
     def __getstate__(self) -> dict[str, Any]:
-        """Leave out the graph, which cannot be pickled: it is captured anew."""
+        """Leave out the graph, which cannot be pickled: it is captured again."""
         return self.__dict__ | {"_warm": False, "_graph": None, "_attempts": 0}
 
     def __call__(self) -> None:
@@ -392,10 +391,10 @@ class GraphedCallable:
 
 
 class SideStream:
-    """A CUDA stream that overlaps the current one."""
+    """A second CUDA stream, whose work overlaps that of the current one."""
 
     _free: ClassVar[dict[torch.device, collections.deque[torch.cuda.Stream]]] = {}
-    """Streams whose objects are gone, by device."""
+    """Streams of deleted objects, for reuse, by device."""
 
     def __init__(self, device: torch.device) -> None:
         self._device = device
@@ -408,7 +407,7 @@ class SideStream:
     @staticmethod
     @functools.lru_cache(maxsize=64)
     def of_thread(device: torch.device, thread: int) -> SideStream:
-        """Return the one of a thread, for captures."""
+        """Return the cached side stream of a thread, for captures."""
         return SideStream(device)
 
     def __del__(self) -> None:
@@ -416,12 +415,12 @@ class SideStream:
             self._free.setdefault(self._device, collections.deque()).append(self._stream)
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Pickle the device alone: streams and events are a process's own."""
+        """Pickle only the device: streams and events belong to a process."""
         return SideStream, (self._device,)
 
     @contextlib.contextmanager
     def overlap(self) -> Iterator[None]:
-        """What is launched inside begins once the current stream has done its work so far."""
+        """Launch on this stream inside, after the current stream's work so far."""
         self._begin.record(current_stream(self._device))
         self._stream.wait_event(self._begin)
         with torch.cuda.stream(self._stream):
@@ -429,13 +428,13 @@ class SideStream:
         self._end.record(self._stream)
 
     def join(self) -> None:
-        """Let what the current stream is given from now on wait until the work is done."""
+        """Make later work of the current stream wait for this stream's work."""
         current_stream(self._device).wait_event(self._end)
 
     def mark(self) -> None:
-        """Remember what the current stream has been given so far."""
+        """Record an event after the current stream's work so far."""
         self._mark.record(current_stream(self._device))
 
     def wait(self) -> None:
-        """Wait on the host until what was remembered is done."""
+        """Block the host until the event of the last `mark` has completed."""
         self._mark.synchronize()

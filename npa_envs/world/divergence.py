@@ -1,4 +1,4 @@
-"""Divergence: worlds whose numbers become infinite or NaN, seen on the device."""
+"""Divergence: detection on the device of worlds whose values become infinite, NaN or huge."""
 
 from __future__ import annotations
 
@@ -11,22 +11,22 @@ from npa_envs.checks import check_world, checked_number
 from npa_envs.errors import DivergedError, NPAError, shown
 
 OnDivergence = Literal["ignore", "raise"]
-"""What a rollout does about worlds that diverge."""
+"""How a rollout treats worlds that diverge."""
 
 RUNAWAY = 1e6
-"""Numbers beyond this have run away: coordinates [length units] and states (dimensionless)."""
+"""Default limit of coordinates [length units] and states (dimensionless)."""
 
 LARGEST_REPORT = 8
-"""Worlds that a report names; of the others it gives the number."""
+"""Most worlds that a report describes; it counts the others."""
 
 
 class Divergence(NamedTuple):
     """Which worlds have diverged; both tensors stay on the worlds' device."""
 
     non_finite: Tensor
-    """A number of the world is infinite or NaN, bool, shape [B]."""
+    """Worlds with an infinite or NaN value, bool, shape [B]."""
     runaway: Tensor
-    """All are finite, and one is beyond the limit, bool, shape [B]."""
+    """Worlds whose values are all finite and one beyond the limit, bool, shape [B]."""
 
 
 @torch.no_grad()
@@ -36,7 +36,7 @@ def divergence(x: Tensor, s: Tensor, *, limit: float = RUNAWAY) -> Divergence:
     Args:
         x: Particle positions [length units], shape [B, N, D].
         s: Particle states, dimensionless, shape [B, N, C].
-        limit: Numbers beyond this have run away: coordinates [length units] and states.
+        limit: Largest absolute value of a coordinate [length units] or state that is not `runaway`.
 
     Returns:
         Flags, bool, shape [B] each. `x[~(flags.non_finite | flags.runaway)]` are the worlds that
@@ -49,7 +49,7 @@ def divergence(x: Tensor, s: Tensor, *, limit: float = RUNAWAY) -> Divergence:
     limit = checked_number("limit", limit)
     if not limit > 0.0:
         raise NPAError(f"limit must be positive, got {limit}")
-    # A largest number is NaN where one of the numbers is.
+    # The largest value is NaN if any value is.
     largest = torch.stack((x.abs().amax(dim=(1, 2)), s.abs().amax(dim=(1, 2)))).amax(dim=0)
     finite = largest.isfinite()
     return Divergence(~finite, finite & (largest > limit))
@@ -57,7 +57,7 @@ def divergence(x: Tensor, s: Tensor, *, limit: float = RUNAWAY) -> Divergence:
 
 @torch.no_grad()
 def describe_divergence(x: Tensor, s: Tensor, *, limit: float = RUNAWAY) -> str:
-    """Return a line for each world that has diverged, with its first number at fault.
+    """Return a line for each world that has diverged, with its first diverged value.
 
     It waits for the device.
 
@@ -96,16 +96,16 @@ def describe_divergence(x: Tensor, s: Tensor, *, limit: float = RUNAWAY) -> str:
 
 
 def term_name(entry: int, space_dim: int) -> str:
-    """Return what a number of a particle is called, in the order of coordinates and channels."""
+    """Return the name of an entry of a particle's coordinates and then channels."""
     if entry < space_dim:
         return f"positions coordinate {entry}"
     return f"states channel {entry - space_dim}"
 
 
 class DivergenceWatch:
-    """Keeps when and where each world first had a number that is infinite or NaN.
+    """Records when and where each world first had an infinite or NaN value.
 
-    It looks after each step, and nothing is read from the device before `raise_diverged`.
+    It checks after each step, on the device; only `raise_diverged` waits for the device.
     """
 
     def __init__(self, x: Tensor, s: Tensor) -> None:
@@ -119,7 +119,7 @@ class DivergenceWatch:
 
     @torch.no_grad()
     def look(self, x: Tensor, s: Tensor) -> None:
-        """Look at the worlds after a step."""
+        """Check the worlds after a step."""
         numbers = torch.cat((x.detach(), s.detach()), dim=2)
         bad = ~numbers.isfinite().all(dim=2)
         particle = bad.byte().argmax(dim=1)
@@ -131,7 +131,7 @@ class DivergenceWatch:
         self._looks += 1
 
     def raise_diverged(self) -> None:
-        """Raise an error where worlds diverged, which says when and where; waits for the device."""
+        """Raise an error that says when and where worlds diverged, if any; waits for the device."""
         first = self._first.tolist()
         worlds = sorted((step, world) for world, step in enumerate(first) if step >= 0)
         if not worlds:
@@ -155,7 +155,7 @@ class DivergenceWatch:
 
 
 def make_watch(on_divergence: str, x: Tensor, s: Tensor) -> DivergenceWatch | None:
-    """Return what watches over a rollout, or None where nothing does."""
+    """Return the watch of a rollout, None with `on_divergence="ignore"`."""
     if on_divergence not in ("ignore", "raise"):
         raise NPAError(f"on_divergence must be 'ignore' or 'raise', got {shown(on_divergence)}")
     if on_divergence == "ignore":

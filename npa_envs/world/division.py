@@ -1,7 +1,7 @@
-"""Particles that divide and die: worlds of slots, living and dead, whose tensors keep their shape.
+"""Particles that divide and die: worlds of N slots, so that tensors keep their shape.
 
-The first state of a slot is its life: 1 where its particle lives, 0 where it is dead. Nothing here
-waits for the device.
+A slot has a living particle or is dead. Its first state channel is its life: 1 for living, 0 for
+dead. Nothing in this file waits for the device.
 """
 
 from __future__ import annotations
@@ -11,38 +11,38 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from npa_envs.ops.mean import world_mean
+from npa_envs.ops.world_mean import world_mean
 from npa_envs.rule.rule import LIFE
 
 FEWEST_OFFSPRING = 1e-3
-"""Expected offspring below which nothing is to be learned from life."""
+"""Expected offspring below which life gets no gradient."""
 
 CHILD_DISTANCE = 0.5
 """Root mean square distance of a child from its parent, in perception radii."""
 
 PARKING_DISTANCE = 65536.0
-"""Where the dead are parked: coordinates in perception radii."""
+"""Coordinate far away at which dead slots are put, in perception radii."""
 
 PARKING_GAP = 2.5
-"""Distance between two of the dead, in perception radii: five cells, so each is in another one."""
+"""Distance between dead slots, in perception radii: five cells, so each has its own cell."""
 
 
 class Births(NamedTuple):
-    """What a step draws where particles divide."""
+    """Random numbers of a step with divisions."""
 
     uniform: Tensor
-    """Decides on each particle's fate, uniform in [0, 1), shape [B, N]."""
+    """Decides whether each particle divides, stays or dies, uniform in [0, 1), shape [B, N]."""
     direction: Tensor
-    """Where the child of a particle goes, standard normal, shape [B, N, D]."""
+    """Direction and distance of each particle's child, standard normal, shape [B, N, D]."""
 
 
 def living(s: Tensor) -> Tensor:
-    """Return which slots hold a living particle, bool, shape [B, N]."""
+    """Return which slots have a living particle, bool, shape [B, N]."""
     return s[..., LIFE].detach() > 0.5
 
 
 def parked(x: Tensor, alive: Tensor, eps: float) -> Tensor:
-    """Return positions with the dead far away from all others and from each other."""
+    """Return positions with dead slots far away from all particles and from each other."""
     count, space_dim = x.shape[1:]
     side = 1
     while side**space_dim < count:
@@ -65,28 +65,27 @@ def divided(
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Let updated particles divide, stay or die; differentiable.
 
-    A child is born with states of 0: who it is it learns from those around it. Parent and child
-    move apart from where the parent was, each half of the way. The k-th child of a world takes its
-    k-th dead slot; where there are more children than slots, the last are not born, and their
-    parents stay where they are. The last living particle of a world does not die. Dead slots get
-    states of 0, and the mean position of the living, so that means over all slots are those of the
-    living.
+    A child starts with states of 0, except for its life. Parent and child move half of their
+    distance each, in opposite directions from the parent's position. The k-th child of a world
+    takes its k-th dead slot; with more children than slots, the last are not born, and their
+    parents do not move. The last living particle of a world does not die. Dead slots get states of
+    0 and the mean position of the living, so that positions have the same mean over all slots.
 
-    Fates are discrete. What is differentiable is life: its value stays 1, and at each update it is
-    multiplied by m / m', with m = 1 + p - d the expected number of particles that come of one, p
-    and d its probabilities to divide and to die, and m' the same without gradient. It is all that
-    children inherit. So the gradient of a sum over the living, weighted by life, is on average that
-    of its expected value, as long as particles do not feel each other and of what parent and child
-    share: a birth is credited as if the child were like its parent.
+    The choice to divide or die is discrete. Life is differentiable: its value stays 1, and at each
+    update it is multiplied by m / m', with m = 1 + p - d the expected number of particles after
+    the update, p and d the probabilities to divide and to die, and m' the same without gradient.
+    Children inherit their parent's life. So the gradient of a sum over living particles, weighted
+    by life, is on average that of the sum's expected value, as far as particles do not interact
+    and child and parent are alike: a birth is credited as if the child were like its parent.
 
     Args:
-        path_length: How far each particle travelled [length units], shape [B, N]; of children 0.
-        division_probabilities: Of each particle to divide and to die, shape [B, N] each.
+        path_length: Length of each particle's path [length units], shape [B, N]; 0 for children.
+        division_probabilities: Probabilities to divide and to die, shape [B, N] each.
         updated: Which living particles were updated, bool, shape [B, N].
-        births: What was drawn.
+        births: Random numbers of the step.
 
     Returns:
-        Positions, states and path lengths, which do not count how parent and child move apart.
+        Positions, states and path lengths, which exclude the displacements of divisions.
     """
     count, space_dim = x.shape[1:]
     alive = living(s)
@@ -101,7 +100,7 @@ def divided(
     parents = dividing & (child_rank < slots)
     born = ~alive & (slot_rank < children)
     own = torch.arange(count, device=x.device).expand_as(child_rank)
-    # Who has no child is written to an entry that nobody reads.
+    # Slots without a child write to an extra entry that is not read.
     parent_of_rank = own.new_zeros(len(x), count + 1)
     parent_of_rank.scatter_(1, torch.where(parents, child_rank, count), own)
     source = torch.where(born, parent_of_rank.gather(1, slot_rank.clamp_min(0)), own)
@@ -118,7 +117,7 @@ def divided(
     children_x = (x + half_way).gather(1, source[..., None].expand_as(x))
     x = torch.where(born[..., None], children_x, x - half_way)
     alive = stays | born
-    # The dead are at the mean of the living. Where none lives, all are at the origin.
+    # Dead slots get the mean of the living. If none lives, all are at the origin.
     share = alive[..., None].to(x.dtype)
     middle = world_mean(x * share) / world_mean(share).clamp_min(0.5 / count)
     x = torch.where(alive[..., None], x, middle[:, None])

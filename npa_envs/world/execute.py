@@ -1,4 +1,4 @@
-"""The ways of running a rollout: at rest, CUDA graph, CPU tape, loop. All give the same numbers."""
+"""Execution of rollouts: resting worlds, CUDA graph, CPU tape or loop, with the same results."""
 
 from __future__ import annotations
 
@@ -38,23 +38,23 @@ from npa_envs.world.steps import (
 Memory = Literal["store", "recompute", "minimal"]
 
 STORED_INTERVAL: dict[Memory, int] = {"store": 1, "recompute": 3, "minimal": 2**31}
-"""The last step and every so-manyth before it store what the backward pass reads."""
+"""The last step and every k-th step before it store the tensors of the backward pass."""
 
 FEWEST_STATIC = 3
-"""Steps of a rollout, at least, for which static worlds are prepared."""
+"""Fewest steps of a rollout for which static worlds are sorted in advance."""
 
 FEWEST_RESTING = 256
-"""Steps of a rollout, at least, that is checked for worlds at rest."""
+"""Fewest steps of a rollout that is checked for worlds at rest."""
 
 LARGEST_TOTAL = 4096
-"""Particles of all worlds, at most, whose steps are on a tape: larger ones hide the host's time."""
+"""Most particles of a batch whose steps are on a tape: in larger ones kernels take most time."""
 
 MOST_KINDS = 32
-"""Kinds of calls on tapes that are remembered."""
+"""Most kinds of calls whose tapes are cached."""
 
 FIRST_PART = {"cpu": 64, "cuda": 1024}
-"""Steps until the next check, by device; each further part is twice as long. A GPU idles during a
-check."""
+"""Steps until the first check for resting worlds, by device; each further part is twice as long. A
+GPU idles during a check."""
 
 
 class RolloutSpec(NamedTuple):
@@ -65,11 +65,11 @@ class RolloutSpec(NamedTuple):
     detach_positions: bool = True
     memory: Memory = "store"
     keep_every: int | None = None
-    """Worlds are kept after each so many steps; None: at the end alone."""
+    """Interval in steps at which worlds are returned; None: only the last worlds."""
     species: tuple[SpeciesSpec, ...] = ()
-    """Where several rules share a world."""
+    """The species, if several rules share a world."""
     by_species: bool = False
-    """Rules perceive each species' density and density gradient."""
+    """Whether rules perceive each species' density and density gradient."""
 
     def make_step(self, rules: Sequence[NPARule], particles: Particles) -> Step:
         """Return the step of these worlds."""
@@ -87,7 +87,7 @@ class RolloutSpec(NamedTuple):
         moving = physics.moving or physics.position_noise > 0.0 or not self.detach_positions
         if not moving and self.steps >= FEWEST_STATIC:
             return StaticStep(rule, physics, particles.x)
-        # A rule without a network runs as the module that it is.
+        # A rule with a custom network runs as its module.
         made = DivisionStep if rule.divides else RuleStep
         return made(rule, rule.network(), physics, self.detach_positions)
 
@@ -112,18 +112,18 @@ class RolloutSpec(NamedTuple):
         keep_every = self.keep_every
         interval = STORED_INTERVAL[self.memory] if torch.is_grad_enabled() else 1
         kept: list[Particles] = []
-        # While a graph is recorded, torch's state cannot be read, and its draws are the graph's.
+        # During a capture torch's random state cannot be read, and draws belong to the graph.
         recorded = particles.x.is_cuda and torch.cuda.is_current_stream_capturing()
         with_modules = not all(rule.has_network() for rule in rules)
         redraw = with_modules and not recorded
         if with_modules and recorded and not draws_alone():
-            # Recomputed, a module that draws would draw otherwise.
+            # Recomputed, a module that draws random numbers would draw others.
             interval = 1
         again = None
         # A compiled function reads copies.
         if interval > 1 and not torch.compiler.is_compiling():
             again = RecomputedSteps(step.advance, rules, {"x": particles.x, "s": particles.s})
-        # Worlds keep their dtype under autocast: the kernels read what the rules write.
+        # Worlds keep their dtype under autocast, as kernels read the rules' outputs.
         with torch.autocast(particles.x.device.type, enabled=False):
             for number, draws in enumerate(step.draw(particles.x, self.steps, source)):
                 if (self.steps - 1 - number) % interval > 0:
@@ -144,7 +144,7 @@ class RolloutSpec(NamedTuple):
             if again is not None:
                 again.end_forward()
             if self.steps == 0:
-                # What is returned is the caller's to write to.
+                # The caller may write to the results.
                 particles = particles.map(torch.clone)
             particles = step.leave(particles) if keep_every is None else combined(torch.stack, kept)
         if watch is not None:
@@ -153,10 +153,10 @@ class RolloutSpec(NamedTuple):
 
 
 class RecomputedSteps:
-    """Steps of a rollout that its backward pass runs again.
+    """Steps of a rollout that its backward pass recomputes.
 
-    These read the rule and the first worlds where they are. Gradients would silently be wrong if
-    they had changed meanwhile, which is refused.
+    They read the rule's weights and the first worlds again. If these have changed since the forward
+    pass, gradients would be wrong: that is an error.
     """
 
     def __init__(
@@ -164,35 +164,36 @@ class RecomputedSteps:
     ) -> None:
         self._advance = advance
         self._worlds = worlds
-        # Plain rules are run by copies of their weights, except for those of the fates.
+        # Plain rules run with copies of their weights, except those of divisions.
         self._rules = [(rule, rule.divides or not rule.is_plain()) for rule in rules]
         self._read: dict[str, Any] | None = None
-        """What has been read, by name, from the end of the forward pass on."""
+        """Versions of all inputs at the end of the forward pass, by name."""
 
     def __call__(self, *arguments: Any) -> Any:
-        """Run one step, forward or again."""
+        """Run one step, in the forward pass or recomputed."""
         if self._read is None:
             return self._advance(*arguments)
         for name, value in self._readings():
             if name not in self._read or self._read[name][1] != _reading(value):
                 raise NPAError(
-                    f"{name} must stay as it is between a rollout that recomputes steps and its "
+                    f"{name} must not change between a rollout that recomputes steps and its "
                     "backward pass, got another: call backward() before it changes, or take "
                     "memory='store'"
                 )
         try:
             return self._advance(*arguments)
         finally:
-            # A module may change its own buffers, as those of normalisation.
+            # A module may change its own buffers, as in normalisation.
             self.end_forward()
 
     def end_forward(self) -> None:
-        """Note what has been read."""
-        # Tensors are held, so that no other one gets the same memory.
+        """Store the versions of all inputs."""
+        # Tensors are kept alive, so that no other tensor gets their memory.
+
         self._read = {name: (value, _reading(value)) for name, value in self._readings()}
 
     def _readings(self) -> Iterator[tuple[str, Any]]:
-        """Yield what steps read, by name: tensors and other values."""
+        """Yield all inputs of the steps, by name: tensors and other values."""
         yield from self._worlds.items()
         for number, (rule, with_weights) in enumerate(self._rules):
             of_rule = "the rule" if len(self._rules) == 1 else f"rule {number}"
@@ -207,7 +208,7 @@ class RecomputedSteps:
 
 
 def _reading(value: Any) -> Any:
-    """Return what changes with each write to a tensor; of other values, themselves."""
+    """Return a tensor's version, which each write changes; other values unchanged."""
     if not isinstance(value, Tensor):
         return value
     return value.data_ptr(), None if value.is_inference() else value._version
@@ -222,9 +223,9 @@ def execute(
     graph: CudaGraph = "auto",
     watch: DivergenceWatch | None = None,
 ) -> Particles:
-    """Run a checked rollout, in the first of the ways that can be taken.
+    """Run a checked rollout in the fastest way that its options allow.
 
-    A watch checks the worlds after each step, which then are launched.
+    With a watch for divergence, steps are launched one by one and checked.
     """
     if watch is not None or not _may_rest(spec, rules, particles):
         return run_all_steps(spec, rules, particles, source, graph=graph, watch=watch)
@@ -235,11 +236,11 @@ def execute(
         particles = run_all_steps(own, rules, particles, source, graph=graph)
         left, part = left - own.steps, 2 * part
         if left and not particles.x.isfinite().all():
-            # A world has diverged, which the next call refuses, and not this one.
+            # A world has diverged: the next call raises an error for it, this one does not.
             return spec._replace(steps=left).run(rules, particles, source)
-    # Whoever draws next gets what comes after all steps.
+    # The generator ends where it would be after all steps.
     skip_draws(particles.x, spec.physics, left, source)
-    # What is returned is the caller's to write to.
+    # The caller may write to the results.
     return particles.map(torch.clone) if left == spec.steps else particles
 
 
@@ -252,7 +253,7 @@ def run_all_steps(
     graph: CudaGraph = "auto",
     watch: DivergenceWatch | None = None,
 ) -> Particles:
-    """Run a checked rollout, as `execute`, whether or not worlds are at rest."""
+    """Run a checked rollout as `execute`, without skipping steps of resting worlds."""
     x, s, *_ = particles
     if watch is None:
         recorded = run_recorded(spec, rules, x, s, source, cuda_graph=graph)
@@ -260,7 +261,7 @@ def run_all_steps(
             return recorded
     check_finite_positions(x)
     if x.is_cuda and torch.is_grad_enabled():
-        # Gradients are added up as a recording adds them: first those of this rollout.
+        # Gradients are added in the order of a recording: first those of this rollout.
         x, s = x.view_as(x), s.view_as(s)
     return spec.run(rules, Particles(x, s, x.new_zeros(x.shape[:2])), source, watch)
 
@@ -268,7 +269,7 @@ def run_all_steps(
 def resting(
     rules: Sequence[NPARule], particles: Particles, physics: Physics, graph: CudaGraph
 ) -> Tensor:
-    """Return which worlds stay as they are if all particles are updated, bool, shape [B]."""
+    """Return which worlds do not change if all particles are updated, bool, shape [B]."""
     spec = RolloutSpec(1, physics._replace(update_prob=1.0))
     with torch.no_grad():
         after = run_all_steps(spec, rules, particles, None, graph=graph)
@@ -277,7 +278,7 @@ def resting(
 
 
 def _may_rest(spec: RolloutSpec, rules: Sequence[NPARule], particles: Particles) -> bool:
-    """Return whether a rollout checks if its worlds are at rest, whose steps are skipped."""
+    """Return whether a rollout checks for worlds at rest, to skip their steps."""
     return (
         len(rules) == 1
         and not spec.species
@@ -294,14 +295,14 @@ def _may_rest(spec: RolloutSpec, rules: Sequence[NPARule], particles: Particles)
     )
 
 
-# Small worlds on a CPU: a step is some 50 µs of work, and several times as much of Python, for
+# Small worlds on a CPU: a step takes some 50 µs in kernels and several times as much in Python, for
 # checks, memory and arguments of launches. From the third call with the same shapes and options on,
-# a rollout without gradients goes back and forth between two places in memory, by launches on a
-# tape. The same kernels run on the same numbers. Recorded rollouts on CUDA are the same idea.
+# a rollout without gradients replays launches from a tape, which go back and forth between two
+# buffers. The same kernels run on the same numbers. Recorded rollouts on CUDA are the same idea.
 
 
 class _TapedStep:
-    """A step from one place in memory to another; while recorded, the stand-in for its network."""
+    """A step from one buffer to another; during recording it is called in place of the network."""
 
     def __init__(self, step: RuleStep, particles: Particles, mask: Tensor | None) -> None:
         assert step.network is not None
@@ -312,10 +313,10 @@ class _TapedStep:
         with self.tape.recording():
             step = dataclasses.replace(step, network=stand_in)
             self.after = step.advance(particles, Draws(mask, None))
-        self.places = self.tape.places(self._updates)
+        self.places = self.tape.argument_slots(self._updates)
 
     def __call__(self, rows: Tensor) -> Tensor:
-        """Note what the network reads, [B N, row_width], and its place on the tape."""
+        """Store the network's input rows, [B N, row_width], and its position on the tape."""
         self.rows = rows
         self.split = len(self.tape)
         self._updates = rows.new_zeros(len(rows), self._update_width)
@@ -323,25 +324,25 @@ class _TapedStep:
 
 
 class TapedSteps:
-    """Steps of worlds of one shape, back and forth between two places in memory."""
+    """Taped steps of worlds of one shape, back and forth between two buffers."""
 
     def __init__(self, step: RuleStep, particles: Particles) -> None:
         # With all particles active there is a row for each.
         masked = step.physics.update_prob < 1.0
         self._mask = torch.ones(particles.x.shape[:2], dtype=torch.uint8) if masked else None
-        # Whatever the strides of the worlds: what is made contiguous in a step is on no tape.
+        # Contiguous: a copy that a step would have to make is not on the tape.
         first = particles.map(lambda value: value.clone(memory_format=torch.contiguous_format))
         there = _TapedStep(step, first, self._mask)
         back = _TapedStep(step, there.after, self._mask)
         for old, new in zip(back.after.tensors(), first.tensors(), strict=True):
-            back.tape.move(back.tape.places(old), new)
+            back.tape.move(back.tape.argument_slots(old), new)
         self._places = first, there.after
         self._steps = there, back
 
     def run(
         self, network: Network, particles: Particles, masks: Iterable[Tensor | None], every: int
     ) -> list[Particles]:
-        """Step worlds once with each mask; return copies of those after every so many steps."""
+        """Step worlds once with each mask; return copies at the given interval."""
         self._places[0].copy_(particles)
         kept: list[Particles] = []
         for number, mask in enumerate(masks):
@@ -351,7 +352,7 @@ class TapedSteps:
                 self._mask.copy_(mask)
                 count = max(int(mask.sum()), 1)
             step.tape.replay(0, step.split, last_count=count)
-            # Held until the launch has read it.
+            # Kept alive until the launch has read it.
             updates = network(step.rows[:count])
             step.tape.move(step.places, updates)
             step.tape.replay(step.split)
@@ -363,7 +364,7 @@ class TapedSteps:
 _kinds = CallKinds()
 
 _lock = threading.Lock()
-"""Held while the above changes."""
+"""Lock of `_kinds`."""
 
 
 def run_taped(
@@ -373,7 +374,7 @@ def run_taped(
     steps: int,
     keep_every: int | None,
 ) -> Particles | None:
-    """Run a rollout by taped steps; None where calls of its kind are too few so far.
+    """Run a rollout by taped steps; None in the first calls of its kind.
 
     Only steps of small worlds on a CPU, without gradients, may be on a tape.
     """
@@ -397,7 +398,7 @@ def run_taped(
         kind = _kinds.count(key, MOST_KINDS)
     if kind.calls <= LAUNCHED_FIRST:
         return None
-    # Another thread may have taken the last one meanwhile.
+    # Another thread may have taken the last one in the meantime.
     try:
         taped = kind.free.pop()
     except IndexError:

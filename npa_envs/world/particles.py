@@ -1,4 +1,4 @@
-"""Worlds of particles: their positions and states, and what goes with them."""
+"""Worlds of particles: positions, states, path lengths and goals."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from torch import Tensor
 
 
 class Particles(NamedTuple):
-    """B worlds of N particles. Shapes and units are defined here."""
+    """B worlds of N particles, with the shapes and units used everywhere."""
 
     x: Tensor
     """Positions [length units], shape [B, N, D]."""
@@ -19,10 +19,10 @@ class Particles(NamedTuple):
     path_length: Tensor | None = None
     """Length of each particle's path since the rollout began [length units], shape [B, N]."""
     goal: Tensor | None = None
-    """What a world is to become, int64, shape [B]."""
+    """Index of the target that a world is to become, int64, shape [B]."""
 
     def tensors(self) -> list[Tensor]:
-        """Return the fields that are there."""
+        """Return the fields that are not None."""
         return [value for value in self if value is not None]
 
     def map(self, function: Callable[[Tensor], Tensor]) -> Particles:
@@ -42,7 +42,7 @@ class Particles(NamedTuple):
             own.index_copy_(0, worlds, new)
 
     def where(self, worlds: Tensor, other: Particles) -> Particles:
-        """Return worlds, and those of `other` where `worlds`, bool, shape [B], is False."""
+        """Return these worlds where `worlds`, bool, shape [B], is True, and `other` elsewhere."""
         pairs = iter(zip(self.tensors(), other.tensors(), strict=True))
 
         def chosen(value: Tensor) -> Tensor:
@@ -52,7 +52,7 @@ class Particles(NamedTuple):
         return self.map(chosen)
 
     def gather(self, order: Tensor) -> Particles:
-        """Return particles in another order: indices among all B N, shape [B N]; differentiable."""
+        """Return particles reordered by indices among all B N, shape [B N]; differentiable."""
 
         def gathered(value: Tensor) -> Tensor:
             return value.flatten(0, 1).index_select(0, order).view_as(value)
@@ -62,12 +62,12 @@ class Particles(NamedTuple):
         return Particles(gathered(x), gathered(s), path_length, goal)
 
     def copy_(self, other: Particles) -> None:
-        """Write other worlds here, by one kernel."""
+        """Overwrite these worlds with others, in one kernel."""
         torch._foreach_copy_(self.tensors(), other.tensors())
 
 
 def combined(function: Callable[[list[Tensor]], Tensor], parts: Sequence[Particles]) -> Particles:
-    """Return worlds made of several ones, field by field, by `torch.stack` or `torch.cat`."""
+    """Combine several worlds field by field, by `torch.stack` or `torch.cat`."""
     fields = zip(*(part.tensors() for part in parts), strict=True)
     values = iter([function([*field]) for field in fields])
     return parts[0].map(lambda _: next(values))

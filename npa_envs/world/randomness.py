@@ -20,25 +20,25 @@ from npa_envs.ops.sort import LARGEST_INDEX
 
 
 class StreamId(enum.IntEnum):
-    """What this package draws beside a world's own stream, each kind from streams of its own.
+    """Purposes of the package's separate random streams, as for `WorldRandom.substream`.
 
-    Numbers below 1000 are the package's; take others for `WorldRandom.substream` in your own code.
+    Numbers below 1000 are reserved for the package; use others in your own code.
     """
 
     GROWTH = 1
     """A trained rule grows the world that an episode starts from."""
     DAMAGE = 2
-    """Damage in the midst of an episode."""
+    """Damage during an episode."""
     POLICY = 3
     """A policy acts at random."""
     SPECIES = 4
-    """Particles are told apart."""
+    """Tags that distinguish particles."""
     GOAL = 5
-    """What an episode is to come to."""
+    """The goal of an episode."""
     OPPONENT = 6
     """An opponent that the environment plays acts at random."""
     TEST = 7
-    """What episodes that evaluate begin with, where those to learn from would draw it too."""
+    """Starts of evaluation episodes, separate from those of training."""
 
 
 class WorldRandom:
@@ -47,15 +47,15 @@ class WorldRandom:
     A draw is a function of its world's seed, episode, step and the number of draws before it in
     this step, and never of the other worlds: world k of a batch draws what it draws alone.
     Integers and uniform numbers are the same on every device, bit for bit; normal numbers up to
-    the last bit. Nothing here waits for the device, and a CUDA graph that begins with `advance`
-    draws anew at each replay.
+    the last bit. Nothing waits for the device, and a CUDA graph that begins with `advance` draws
+    new numbers at each replay.
 
     Args:
         seeds: Seed of each world, integers of at least 0; one integer is one world.
         device: Where the numbers are drawn.
 
     Raises:
-        NPAError: A seed is no integer of at least 0, there is none, or there is no such device.
+        NPAError: A seed is not an integer of at least 0, there is no seed, or no such device.
 
     Attributes:
         keys: Key of each world, the seed's first 64 random bits, int64, shape [B].
@@ -85,13 +85,13 @@ class WorldRandom:
 
     @classmethod
     def from_keys(cls, keys: Tensor) -> WorldRandom:
-        """Return streams with given keys, at their beginning.
+        """Return streams with given keys, at episode 0 and step 0.
 
         Args:
             keys: Any 64 bits for each world, int64, shape [B]; copied.
 
         Raises:
-            NPAError: The keys are no int64 tensor of shape [B].
+            NPAError: The keys are not an int64 tensor of shape [B].
         """
         if not isinstance(keys, Tensor) or keys.dtype != torch.int64 or keys.ndim != 1:
             came = (
@@ -119,25 +119,25 @@ class WorldRandom:
         return self.keys.shape[0]
 
     def advance(self, steps: int = 1) -> None:
-        """Begin the step that comes so many steps later, in place; its draws begin anew.
+        """Advance every world by a number of steps, in place; the count of draws restarts at 0.
 
         Args:
-            steps: How many steps, of every world; with 0 the same step begins again.
+            steps: Number of steps; 0 restarts the current step, which repeats its draws.
 
         Raises:
-            NPAError: It is no integer of at least 0.
+            NPAError: `steps` is not an integer of at least 0.
         """
         self.steps += checked_count("steps", steps)
         self._draw_count = 0
 
     def restart(self) -> None:
-        """Begin the next episode of every world, in place, at step 0; its draws begin anew."""
+        """Begin the next episode of every world at step 0, in place; its draws are new."""
         self.episodes += 1
         self.steps.zero_()
         self._draw_count = 0
 
     def take(self, worlds: Tensor | slice) -> WorldRandom:
-        """Return a copy of the streams of some worlds, which goes on where these stand.
+        """Return a copy of the streams of some worlds, in the same state.
 
         Args:
             worlds: Indices of the worlds, int64, shape [K], or a slice.
@@ -150,16 +150,16 @@ class WorldRandom:
         return made
 
     def substream(self, purpose: int) -> WorldRandom:
-        """Return streams beside these, independent of them and of those of other purposes.
+        """Return streams that are independent of these and of those of other purposes.
 
-        They stand where these stand now and go on by themselves. Their draws begin anew, so made
-        twice within a step they give the same numbers twice. Nothing is drawn from these.
+        They begin at these streams' current episode and step, and advance separately. Two calls
+        within a step with one purpose give the same draws. These streams do not change.
 
         Args:
-            purpose: Any integer of at least 0; the package's own are `StreamId`.
+            purpose: Any integer of at least 0; the package uses those of `StreamId`.
 
         Raises:
-            NPAError: It is none.
+            NPAError: `purpose` is not an integer of at least 0.
         """
         made = self.take(slice(None))
         made.keys = _mixed(self.keys, checked_count("purpose", purpose))
@@ -169,8 +169,8 @@ class WorldRandom:
     def put(self, worlds: Tensor | slice, other: WorldRandom) -> None:
         """Write the keys, episodes and steps of other streams into some worlds, in place.
 
-        All worlds share the number of the next draw, so draws are what these worlds would draw
-        alone from the next `advance` on; until then no number is drawn twice.
+        All worlds share the index of the next draw in a step. So from the next `advance` on, draws
+        equal those of the other streams; until then no number is drawn twice.
 
         Args:
             worlds: Indices of the worlds, int64, shape [K], or a slice.
@@ -182,11 +182,11 @@ class WorldRandom:
         self._draw_count = max(self._draw_count, other._draw_count)
 
     def sync_with(self, other: WorldRandom, steps: int) -> None:
-        """Go on where other streams stand that began where these do, in place.
+        """Take over the state of other streams that began as copies of these, in place.
 
         Args:
-            other: Streams of as many worlds.
-            steps: How many steps those are ahead.
+            other: Streams of the same number of worlds.
+            steps: Number of steps by which they are ahead.
         """
         self.steps += steps
         self._draw_count = other._draw_count
@@ -199,7 +199,7 @@ class WorldRandom:
             dtype: `torch.float32`, with 24 random bits, or `torch.float64`, with 53.
 
         Raises:
-            NPAError: A size is no integer of at least 0, or the dtype is another one.
+            NPAError: A size is not an integer of at least 0, or the dtype is another one.
         """
         _check_dtype(dtype)
         return self._drawn("uniform", shape, dtype)
@@ -212,7 +212,7 @@ class WorldRandom:
             dtype: `torch.float32` or `torch.float64`.
 
         Raises:
-            NPAError: A size is no integer of at least 0, or the dtype is another one.
+            NPAError: A size is not an integer of at least 0, or the dtype is another one.
         """
         _check_dtype(dtype)
         return self._drawn("normal", shape, dtype)
@@ -221,11 +221,11 @@ class WorldRandom:
         """Return ones with a probability and zeros otherwise, uint8, shape [B, *shape].
 
         Args:
-            probability: Probability of a one, in [0, 1], held to 2^-32.
+            probability: Probability of a one, in [0, 1], rounded to a multiple of 2^-32.
             shape: Shape of each world's numbers.
 
         Raises:
-            NPAError: The probability lies elsewhere, or a size is no integer of at least 0.
+            NPAError: The probability is not in [0, 1], or a size is not an integer of at least 0.
         """
         chance = checked_number("probability", probability)
         if not 0.0 <= chance <= 1.0:
@@ -240,7 +240,7 @@ class WorldRandom:
             shape: Shape of each world's numbers.
 
         Raises:
-            NPAError: `high` lies elsewhere, or a size is no integer of at least 0.
+            NPAError: `high` is out of range, or a size is not an integer of at least 0.
         """
         limit = checked_count("high", high)
         if not 1 <= limit < 2**63:
@@ -265,11 +265,11 @@ class WorldRandom:
 
 
 Randomness = torch.Generator | WorldRandom
-"""What random draws can come from."""
+"""Sources of random draws."""
 
 
 def torch_generator(generator: Randomness | None, device: torch.device) -> torch.Generator:
-    """Return what torch draws from on a CUDA device: the given generator, or torch's own."""
+    """Return the torch generator of a CUDA device's draws: the given one, or torch's own."""
     if generator is None:
         return torch.cuda.default_generators[device.index]
     assert isinstance(generator, torch.Generator)
@@ -277,11 +277,11 @@ def torch_generator(generator: Randomness | None, device: torch.device) -> torch
 
 
 _reserving = threading.Lock()
-"""Held while a generator's place is read and moved on: threads may share one."""
+"""Lock held while a generator's offset is read and advanced: threads may share a generator."""
 
 
 def reserve_draws(source: torch.Generator, count: int) -> int:
-    """Move a CUDA generator on by what is to be drawn, and return where it stood."""
+    """Advance a CUDA generator's offset by a number of draws, and return the former offset."""
     with _reserving:
         begin = source.get_offset()
         source.set_offset(begin + count)
@@ -289,14 +289,14 @@ def reserve_draws(source: torch.Generator, count: int) -> int:
 
 
 def give_back_draws(source: torch.Generator, begin: int, count: int) -> None:
-    """Undo `reserve_draws`, unless somebody has drawn since."""
+    """Undo `reserve_draws`, unless other draws were made since."""
     with _reserving:
         if source.get_offset() == begin + count:
             source.set_offset(begin)
 
 
 def check_generator(generator: Randomness | None, device: torch.device, world_count: int) -> None:
-    """Check that a source of randomness is one, for B worlds, on the device where it is used."""
+    """Check type, device and number of worlds of a source of randomness."""
     if generator is None:
         return
     if not isinstance(generator, Randomness):
@@ -322,7 +322,7 @@ def check_generator(generator: Randomness | None, device: torch.device, world_co
 
 
 def uniform_draws(generator: Randomness | None, shape: Sequence[int], like: Tensor) -> Tensor:
-    """Return uniform numbers in [0, 1): worlds, then what each of them draws."""
+    """Return uniform numbers in [0, 1) of a shape whose first dimension is the worlds."""
     if isinstance(generator, WorldRandom):
         return generator.uniform(*shape[1:], dtype=like.dtype)
     return torch.rand(tuple(shape), generator=generator, device=like.device, dtype=like.dtype)
@@ -344,13 +344,13 @@ def _mixed(keys: Tensor, number: int) -> Tensor:
     # Steele, Lea and Flood, "Fast splittable pseudorandom number generators" (OOPSLA 2014).
     bits = keys + _signed((number + 1) * GOLDEN)
     for shift, factor in MIXERS:
-        # Torch's shift copies the sign, which the mask takes off again.
+        # Torch's shift copies the sign bit; the mask removes the copies.
         bits = (bits ^ ((bits >> shift) & (2 ** (64 - shift) - 1))) * _signed(factor)
     return bits
 
 
 def _signed(number: int) -> int:
-    """Return the last 64 bits of a number as torch's integers hold them."""
+    """Return the lowest 64 bits of a number as a signed integer, as in torch."""
     return (number + 2**63) % 2**64 - 2**63
 
 

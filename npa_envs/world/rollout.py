@@ -1,4 +1,4 @@
-"""Rollouts: worlds in time, one step of a rule after the other; differentiable."""
+"""Rollouts: a rule applied to worlds for a number of steps; differentiable."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from torch import Tensor
 
 from npa_envs.checks import Box, check_world, checked_count, checked_flag
 from npa_envs.errors import NPAError, shown
-from npa_envs.ops.opaque import check_derivatives
+from npa_envs.ops.custom_op import check_derivatives
 from npa_envs.ops.physics import Boundary, Physics, Terms, physics
 from npa_envs.rule.rule import NPARule, check_rule
 from npa_envs.world.divergence import OnDivergence, make_watch
@@ -21,7 +21,7 @@ __all__ = ["Memory", "at_rest", "rollout", "step"]
 
 
 class RolloutOptions(TypedDict, total=False):
-    """What rollouts of one rule and of several take by name; `rollout` says what it means."""
+    """Keywords shared by `rollout` and `rollout_species`; `rollout` documents them."""
 
     eps: float | None
     box: Box
@@ -37,7 +37,7 @@ class RolloutOptions(TypedDict, total=False):
 
 
 def check_memory(memory: Memory) -> None:
-    """Check what the backward pass shall read."""
+    """Check the name of a memory mode."""
     if not isinstance(memory, str) or memory not in STORED_INTERVAL:
         raise NPAError(f"memory must be 'store', 'recompute' or 'minimal', got {shown(memory)}")
 
@@ -54,7 +54,7 @@ def checked_physics(
     dt: float,
     position_noise: float = 0.0,
 ) -> Physics:
-    """Check that worlds and a rule fit, and return the constants of its rollouts."""
+    """Check that worlds fit a rule, and return the constants of its rollouts."""
     check_world(x, s)
     check_derivatives(x=x, s=s, rule=rule)
     if (x.shape[2], s.shape[2]) != (rule.space_dim, rule.state_dim):
@@ -92,7 +92,7 @@ def checked_physics(
 def _check_one_species(rule: NPARule) -> None:
     if rule.species_count:
         raise NPAError(
-            f"the rule must not perceive species by themselves, got species_count="
+            f"the rule must not perceive species separately, got species_count="
             f"{rule.species_count}: run it with npa_envs.rollout_species"
         )
 
@@ -100,7 +100,7 @@ def _check_one_species(rule: NPARule) -> None:
 def result(
     after: Particles, return_path_length: bool
 ) -> tuple[Tensor, Tensor] | tuple[Tensor, Tensor, Tensor]:
-    """Return what a public call gives of worlds."""
+    """Return worlds as public functions do: x, s and, if asked, path lengths."""
     if not return_path_length:
         return after.x, after.s
     assert after.path_length is not None, "rollouts measure paths"
@@ -108,7 +108,7 @@ def result(
 
 
 def checked_keep_every(keep_every: int | None, steps: int) -> int | None:
-    """Return after how many steps, a divisor of all, worlds are kept each time."""
+    """Check that `keep_every` divides the number of steps, and return it."""
     if keep_every is None:
         return None
     kept = checked_count("keep_every", keep_every)
@@ -169,11 +169,11 @@ def at_rest(
     boundary: Boundary = "periodic",
     dt: float = 1.0,
 ) -> Tensor:
-    """Return which worlds no step changes any more.
+    """Return which worlds are not changed by any further step.
 
-    All particles of such a world are updated at once and stay as they are, so they stay whichever
-    of them a step updates. On CUDA in float32 that is exact; elsewhere torch's products over fewer
-    rows may round an update otherwise that lies on the edge of the dead zone. Rules with a
+    A world is at rest if an update of all its particles changes none of them; then an update of
+    some changes none either. On CUDA in float32 that is exact; elsewhere torch's products over
+    fewer rows may round an update at the edge of the dead zone differently. Rules with a
     `dead_zone` bring worlds to rest.
 
     Args:
@@ -254,10 +254,9 @@ def rollout(
     m = 1 and updates them: x ← x + m dt Δx (+ noise), s ← s + m dt Δs, with
     Δx = alpha eps δ / (1 + |δ|) and [δ ; Δs] = rule(z) (arXiv 2601.16096, section 3).
 
-    With gradients disabled, rollouts of 256 steps or more leave out the steps of worlds that a rule
-    with a `dead_zone` has brought to rest (`at_rest` tells which those are). They wait for the
-    answer at the beginning, and then after 64, 192, 448, ... steps on a CPU and after 1024, 3072,
-    ... on CUDA.
+    With gradients disabled, rollouts of 256 steps or more skip the steps of worlds that a rule with
+    a `dead_zone` has brought to rest, as `at_rest` returns. They check, and wait for the device, at
+    the beginning and after 64, 192, 448, ... steps on a CPU, after 1024, 3072, ... on CUDA.
 
     With a rule that `divides`, particle i is slot i, whose particle may die and be replaced by
     another one's child (`npa_envs.world.division`).
@@ -269,32 +268,32 @@ def rollout(
         steps: Number of steps T, 0 or more.
         eps: Perception radius [length units]; default: the rule's eps0.
         box: Sides of a box centred on the origin [length units], or None for open space.
-        boundary: What the sides of the box do. "periodic": particles perceive nearest images, and
-            positions are wrapped. "reflecting": particles perceive as in open space, and positions
-            beyond a wall are mirrored at it, as often as they meet one. "open": there is no box.
+        boundary: "periodic": particles perceive nearest images, and positions are wrapped.
+            "reflecting": particles perceive as in open space, and positions beyond a wall of the
+            box are mirrored at it, repeatedly if needed. "open": there is no box.
         update_prob: Probability p of each particle's update in a step, in (0, 1].
         dt: Time step, dimensionless.
         position_noise: Standard deviation of the noise added to every position in each step
             [length units].
         detach_positions: Perception does not back-propagate into positions (the paper's choice).
-        memory: "store" keeps what the backward pass reads. "recompute" computes two steps in three
-            again: about half the memory, and two thirds of a forward pass more time. "minimal"
-            recomputes all but the last step: least memory, and a forward pass more time. Gradients
-            are the same.
+        memory: "store" stores all tensors of the backward pass. "recompute" recomputes two steps in
+            three: about half the memory, and the time of two thirds of a forward pass more.
+            "minimal" recomputes all but the last step: least memory, and the time of a forward pass
+            more. Gradients are the same.
         generator: Source of the masks and the noise, on x's device; default: torch's global one. A
             `WorldRandom` advances by one step before the draws of each step, so that every world
             draws the same numbers as alone.
-        on_divergence: What to do if numbers of a world become infinite or NaN. "ignore" costs
-            nothing; the next call refuses such positions. "raise" checks each step on the device,
-            and waits for the result once, at the end.
+        on_divergence: What to do if values of a world become infinite or NaN. "ignore" costs
+            nothing; the next call raises an error for such positions. "raise" checks each step on
+            the device, and waits for the result once, at the end.
         keep_every: Return the worlds after every so many steps, a divisor of `steps`: the
             trajectory. Results have one more dimension at the front, of size steps / keep_every.
         cuda_graph: On CUDA, replay repeated calls instead of launching their kernels one by one.
-            The host then needs a tenth of the time, and the numbers are the same. "auto" records
-            plain rules, from the third call with the same shapes and options on. True also records
-            rules with a network of their own, whose Python code then no longer runs. False records
-            nothing. See docs/performance.md.
-        return_path_length: Also return how far each particle travelled.
+            That takes a tenth of the CPU time, and results are the same. "auto" records plain
+            rules, from the third call with the same shapes and options on. True also records rules
+            with a custom network, whose Python code then no longer runs. False records nothing. See
+            docs/performance.md.
+        return_path_length: Also return the length of each particle's path.
 
     Returns:
         Positions [length units], shape [B, N, D]; states, dimensionless, shape [B, N, C]; and where

@@ -1,4 +1,4 @@
-"""Several rules in one world: each species follows its own rule, and all see each other."""
+"""Several rules in one world: each species follows its own rule, and all perceive each other."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ from npa_envs.world.steps import SpeciesSpec
 SpeciesPerception = Literal["shared", "per_species"]
 
 MODES: tuple[SpeciesPerception, ...] = ("shared", "per_species")
-"""What rules see of species: nothing, or the density and the density gradient of each."""
+"""Whether rules perceive each species' density and density gradient, or only those of all."""
 
 AGREEMENTS = (
     "space_dim",
@@ -42,7 +42,7 @@ AGREEMENTS = (
     "moment_inverse",
     "density_gradient",
 )
-"""What rules must have in common to read one perception pass."""
+"""Attributes in which rules must agree to share a perception pass."""
 
 
 @overload
@@ -107,14 +107,14 @@ def rollout_species(
     states of all neighbours, whatever their species. With one species this is `rollout`. With
     several species of the same rule it is `rollout` of all particles, up to rounding.
 
-    Perceived densities are divided by the number of particles in the whole world. So for a rule
-    that was trained alone, foreign particles lower the density that it perceives, however far away
-    they are. With `density_counts=counts` each species divides by its own number, as it does alone.
+    Perceived densities are divided by the number of particles in the world. So for a rule that was
+    trained alone, particles of other species lower the density that it perceives, at any distance.
+    With `density_counts=counts` each species divides by its own number of particles, as alone.
 
     Args:
         rules: One rule for each species; dtype and device of x. They agree in space dimension,
-            channels, eps0, groups of perception, and in whether particles move; not necessarily in
-            hidden units, alpha or read-out.
+            channels, eps0, groups of perception, and in whether particles move; hidden units, alpha
+            and readout may differ.
         x: Particle positions [length units], shape [B, N, D], species after species.
         s: Particle states, dimensionless, shape [B, N, C].
         steps: Number of steps T, 0 or more.
@@ -136,11 +136,11 @@ def rollout_species(
             gives them.
         density_counts: Number that each species divides densities and their gradients by, positive;
             default: N, the particles of the world, for all.
-        memory: What the backward pass reads is stored or recomputed, as in `rollout`.
+        memory: Whether tensors of the backward pass are stored or recomputed, as in `rollout`.
         on_divergence: "ignore" worlds that diverge, or "raise" at the end, as in `rollout`.
-        keep_every: Return the worlds after every so many steps, as in `rollout`.
-        cuda_graph: Whether calls that repeat are replayed on CUDA, as in `rollout`.
-        return_path_length: Also return how far each particle travelled.
+        keep_every: Interval in steps at which worlds are returned, as in `rollout`.
+        cuda_graph: Whether repeated calls are replayed on CUDA, as in `rollout`.
+        return_path_length: Also return the length of each particle's path.
 
     Returns:
         Positions [length units], shape [B, N, D]; states, dimensionless, shape [B, N, C]; and where
@@ -158,7 +158,7 @@ def rollout_species(
     probabilities = _checked_probabilities(update_prob, len(sizes))
     divisors = _checked_divisors(density_counts, sizes)
     check_memory(memory)
-    # Of one species this is `rollout`.
+    # With one species this is `rollout`.
     alone = perception == "shared" and divisors == (float(x.shape[1]),)
     kept = checked_keep_every(keep_every, steps)
     check_cuda_graph(cuda_graph)
@@ -209,7 +209,7 @@ def _checked_rules(rules: Any) -> list[NPARule]:
     given = None if isinstance(rules, NPARule) else entries(rules)
     if given is None:
         raise NPAError(
-            f"rules must hold one rule for each species, got {type(rules).__name__}: "
+            f"rules must have one rule for each species, got {type(rules).__name__}: "
             f"give (rule,) for one species"
         )
     for number, rule in enumerate(given):
@@ -252,7 +252,7 @@ def _check_agreement(rules: list[NPARule], species_count: int, perception: str) 
 
 
 def _checked_probabilities(update_prob: Any, species_count: int) -> list[Any]:
-    """Return one probability for each species; their values are checked with the rules."""
+    """Return one probability for each species; values are checked with the rules."""
     given = entries(update_prob)
     if given is None:
         return [update_prob] * species_count
@@ -265,7 +265,7 @@ def _checked_probabilities(update_prob: Any, species_count: int) -> list[Any]:
 
 
 def _checked_divisors(density_counts: Any, counts: tuple[int, ...]) -> tuple[float, ...]:
-    """Return what each species divides densities by."""
+    """Return the number by which each species divides densities."""
     if density_counts is None:
         return (float(sum(counts)),) * len(counts)
     given = entries(density_counts)
@@ -274,7 +274,7 @@ def _checked_divisors(density_counts: Any, counts: tuple[int, ...]) -> tuple[flo
     checked = tuple(checked_number("an entry of density_counts", number) for number in given)
     if len(checked) != len(counts) or not all(0.0 < number < math.inf for number in checked):
         raise NPAError(
-            f"density_counts must hold one positive number for each of {len(counts)} species, "
+            f"density_counts must have one positive number for each of {len(counts)} species, "
             f"got {shown(density_counts)}: for example density_counts={counts}"
         )
     return checked

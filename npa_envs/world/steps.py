@@ -1,4 +1,4 @@
-"""Steps of worlds: of a rule, of particles that stay, that divide, and of several species."""
+"""One step of worlds: of a rule, with static or dividing particles, and of several species."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from npa_envs.checks import constant
-from npa_envs.ops.perceive import perceive_rows, update_some_at_a_time
+from npa_envs.ops.perceive import perceive_rows, updates_in_parts
 from npa_envs.ops.physics import Physics
 from npa_envs.ops.species import perceive_by_species
 from npa_envs.ops.static import StaticRows, StaticWorlds, prepare_static, static_rows
@@ -32,23 +32,23 @@ from npa_envs.world.randomness import (
 )
 
 ROWS_TOGETHER = 2**24
-"""Rows of static worlds, at most, that are made together for several steps."""
+"""Most rows of static worlds that are assigned at once, for several steps."""
 
 ROWS_KEPT = 2**24
-"""Rows of perception, at most, that the network reads all together."""
+"""Most rows of perception that are stored for the network at once."""
 
 MOST_AHEAD = 4
-"""Steps, at most, whose draws a recording makes ahead of time: these take memory."""
+"""Most steps whose random draws a recording makes in advance: they take memory."""
 
 OVERFLOW_LOG_PROBABILITY = 34.5
-"""Row capacities hold with probability 1 - exp(-34.5), about 1 - 1e-15, for each step."""
+"""Row capacities suffice with probability 1 - exp(-34.5), about 1 - 1e-15, for each step."""
 
 
 def row_capacity(particle_total: int, update_prob: float) -> int:
-    """Return how many rows hold the active particles of a step, without reading their number.
+    """Return an upper bound on the active particles of a step, by Bernstein's inequality.
 
-    Bernstein's inequality bounds the number of active particles; a graph of kernels needs a shape
-    that does not depend on the draw. On the CPU the exact number is used instead.
+    On CUDA the number of rows must not depend on the draw: reading it would wait for the device. On
+    a CPU the exact number is used instead.
     """
     mean = particle_total * update_prob
     variance = mean * (1.0 - update_prob)
@@ -58,25 +58,25 @@ def row_capacity(particle_total: int, update_prob: float) -> int:
 
 
 def row_count(mask: Tensor | None, x: Tensor, update_prob: float) -> int:
-    """Return how many rows hold the active particles of a step of worlds at x; no mask: all."""
+    """Return the number of rows for the active particles of worlds at x; without a mask all are."""
     total = x.shape[0] * x.shape[1]
     if mask is None:
         return total
-    # Counting is free on the CPU; on CUDA it would stall the stream.
+    # Counting is free on a CPU; on CUDA it would wait for the device.
     return row_capacity(total, update_prob) if mask.is_cuda else max(int(mask.sum()), 1)
 
 
 class Draws(NamedTuple):
-    """The random numbers of a step, and what follows from them alone."""
+    """The random numbers of a step, and the rows that they imply."""
 
     mask: Tensor | None
     """Update mask, uint8, shape [B, N]; None: all particles are updated."""
     noise: Tensor | None
     """Position noise [length units], shape [B, N, D], or None."""
     rows: StaticRows | None = None
-    """Rows of the active particles, where particles never move."""
+    """Rows of the active particles, for static particles."""
     births: Births | None = None
-    """Random numbers of divisions, where particles divide."""
+    """Random numbers of divisions, for particles that divide."""
 
 
 def draw_step(x: Tensor, physics: Physics, generator: Randomness | None) -> Draws:
@@ -99,9 +99,9 @@ def draw_step(x: Tensor, physics: Physics, generator: Randomness | None) -> Draw
 def iterate_draws(draw: Callable[[], Draws], like: Tensor, steps: int) -> Iterator[Draws]:
     """Yield each step's random draws, in the same order on every device.
 
-    In a CUDA graph some steps' draws are made while the steps before them run.
+    In a CUDA graph draws are made in advance, in parallel with the steps before.
     """
-    # Asked in this order: a compiler cannot trace what a stream does.
+    # In this order: a compiler cannot trace queries of streams.
     recording = not torch.compiler.is_compiling() and like.is_cuda
     if not (recording and torch.cuda.is_current_stream_capturing()):
         for _ in range(steps):
@@ -110,7 +110,7 @@ def iterate_draws(draw: Callable[[], Draws], like: Tensor, steps: int) -> Iterat
     side_stream = SideStream.of_thread(like.device, threading.get_ident())
     ready, rest = [draw()], steps - 1
     while rest > 0:
-        # Their memory comes from steps that are over by then: these streams take turns in it.
+        # Draws reuse the memory of earlier steps, so the two streams wait for each other.
         count = min(3 * len(ready), MOST_AHEAD, rest)
         with side_stream.overlap():
             coming = [draw() for _ in range(count)]
@@ -121,14 +121,14 @@ def iterate_draws(draw: Callable[[], Draws], like: Tensor, steps: int) -> Iterat
 
 
 def skip_draws(x: Tensor, physics: Physics, steps: int, generator: Randomness | None) -> None:
-    """Bring a source of draws to where it would be after some steps of worlds at x."""
+    """Advance a random source as some steps of worlds at x would."""
     if steps == 0:
         return
     if isinstance(generator, WorldRandom):
         generator.advance(steps - 1)
         draw_step(x, physics, generator)
     elif x.is_cuda:
-        # On CUDA torch counts what it has drawn, and equal draws count the same.
+        # On CUDA torch counts draws in an offset, and equal draws add the same.
         counter = torch.Generator(x.device)
         draw_step(x, physics, counter)
         reserve_draws(torch_generator(generator, x.device), steps * counter.get_offset())
@@ -138,12 +138,12 @@ def skip_draws(x: Tensor, physics: Physics, steps: int, generator: Randomness | 
 
 
 class Step:
-    """What a rollout repeats: draws, and an advance that follows from them alone."""
+    """The repeated part of a rollout: random draws, and an advance that depends only on them."""
 
     physics: Physics
 
     def enter(self, particles: Particles) -> Particles:
-        """Return worlds as the steps take them, such as in sorted order."""
+        """Return worlds as the steps need them, for example in sorted order."""
         return particles
 
     def draw(self, like: Tensor, steps: int, source: Randomness | None) -> Iterator[Draws]:
@@ -155,7 +155,7 @@ class Step:
         raise NotImplementedError
 
     def leave(self, particles: Particles) -> Particles:
-        """Return worlds of the rollout in the caller's order."""
+        """Undo `enter`: return worlds in the caller's order."""
         return particles
 
 
@@ -165,11 +165,11 @@ class RuleStep(Step):
 
     rule: NPARule
     network: Network | None
-    """The rule's weights as they are run; None: it runs as the module that it is."""
+    """The rule's weights in the form that kernels run; None: the rule runs as its module."""
     physics: Physics
     detach_positions: bool = True
     static: StaticWorlds | None = None
-    """Sorted worlds whose particles never move."""
+    """Sorted worlds of static particles."""
 
     def advance(self, particles: Particles, draws: Draws) -> Particles:
         """Return the worlds after one step with these draws."""
@@ -182,7 +182,7 @@ class RuleStep(Step):
         total = row_count(mask, x, physics.update_prob) if rows is None else len(rows.row_source)
         huge = total > ROWS_KEPT and not torch.is_grad_enabled() and self.static is None
         if huge and not torch.compiler.is_compiling():
-            update, active = update_some_at_a_time(x, s, physics, mask, network, total, width)
+            update, active = updates_in_parts(x, s, physics, mask, network, total, width)
         else:
             perception, active = perceive_rows(
                 x.detach() if self.detach_positions else x,
@@ -200,12 +200,12 @@ class RuleStep(Step):
 
 
 class StaticStep(RuleStep):
-    """The step of a rule whose particles never move: sorted and searched once."""
+    """The step of a rule with static particles, which are sorted and searched once."""
 
     def __init__(self, rule: NPARule, physics: Physics, x: Tensor) -> None:
-        # Later parts of a rollout begin within the boundary, and so does the first.
+        # Later parts of a rollout begin inside the box, so the first must as well.
         self.x = bounded(x, physics)
-        # First: compilers trace nothing across it.
+        # Before all else: the compiler's trace breaks at it.
         self.sorted = prepare_static(self.x, physics)
         super().__init__(rule, rule.network(), physics, True, self.sorted)
 
@@ -215,7 +215,7 @@ class StaticStep(RuleStep):
         return Particles(self.x, s, path_length, goal).gather(self.sorted.source)
 
     def draw(self, like: Tensor, steps: int, source: Randomness | None) -> Iterator[Draws]:
-        """Yield each step's rows, which are given some steps at a time, in few launches."""
+        """Yield each step's rows, assigned for several steps at a time in few launches."""
         total = like.shape[0] * like.shape[1]
         physics = self.physics
         together = max(min(16, ROWS_TOGETHER // total), 1)
@@ -235,7 +235,7 @@ class StaticStep(RuleStep):
 
 
 class DivisionStep(RuleStep):
-    """The step of a rule whose particles divide: that of the living, and then their fates."""
+    """The step of a rule whose particles divide: an update of the living, then births, deaths."""
 
     def enter(self, particles: Particles) -> Particles:
         """Return the worlds with states of zero in dead slots."""
@@ -244,7 +244,7 @@ class DivisionStep(RuleStep):
         return Particles(x, torch.where(living(s)[..., None], s, 0.0), path_length, goal)
 
     def draw(self, like: Tensor, steps: int, source: Randomness | None) -> Iterator[Draws]:
-        """Yield each step's update mask, position noise, fates and directions of children."""
+        """Yield each step's update mask, position noise and random numbers of divisions."""
 
         def draw() -> Draws:
             mask, noise, *_ = draw_step(like, self.physics, source)
@@ -262,13 +262,13 @@ class DivisionStep(RuleStep):
         alive = living(s)
         updated = alive if draws.mask is None else alive & draws.mask.bool()
         life, rest = s[..., : LIFE + 1], s[..., LIFE + 1 :]
-        # Life is no weight of what is perceived, so perception gives it no gradient.
+        # Perception is not weighted by life, and so gives it no gradient.
         perceived = torch.cat((life.detach(), rest), dim=-1)
         after = super().advance(
             Particles(parked(x, alive, eps), perceived, path_length),
             Draws(updated.byte(), draws.noise, draws.rows, draws.births),
         )
-        # A rule does not change life.
+        # A rule does not update life.
         new_s = torch.cat((life, after.s[..., LIFE + 1 :]), dim=-1)
         assert after.path_length is not None
         return Particles(
@@ -288,11 +288,11 @@ class SpeciesSpec(NamedTuple):
     """The constants of one species."""
 
     size: int
-    """Its particles in a world."""
+    """Number of its particles in a world."""
     update_prob: float
     """Probability of each of its particles' updates."""
     density_count: float
-    """Particles by which it divides densities."""
+    """Number by which it divides densities."""
 
 
 class Species(NamedTuple):
@@ -300,20 +300,20 @@ class Species(NamedTuple):
 
     rule: NPARule
     network: Network | None
-    """The rule's weights as they are run; None where it runs as the module that it is."""
+    """The rule's weights in the form that kernels run; None: the rule runs as its module."""
     first: int
-    """Its first particle in a world."""
+    """Index of its first particle in a world."""
     end: int
     """One past its last particle."""
     update_prob: float
     """Probability of each of its particles' updates."""
     displacement_share: float
-    """Its largest displacement as a share of the largest of all species."""
+    """Its largest displacement as a fraction of the largest of all species."""
     count_ratio: float
-    """Particles of a world over those by which this species divides densities."""
+    """Number of particles of a world divided by this species' divisor of densities."""
 
     def capacity(self, world_count: int) -> int:
-        """Return how many rows hold its active particles of so many worlds."""
+        """Return the number of rows for its active particles in B worlds."""
         return row_capacity(world_count * (self.end - self.first), self.update_prob)
 
 
@@ -325,12 +325,12 @@ class SpeciesStep(Step):
     physics: Physics
     detach_positions: bool
     update_share: Tensor | None
-    """Share of the updates so drawn that each particle keeps, shape [N]; None: all keep all."""
+    """Fraction of its drawn updates that each particle keeps, shape [N]; None: all of them."""
     by_species: bool
     """Rules perceive each species' density and density gradient."""
 
     def draw(self, like: Tensor, steps: int, source: Randomness | None) -> Iterator[Draws]:
-        """Yield each step's update mask and position noise: as for one rule, thinned by species."""
+        """Yield each step's mask and noise as for one rule; masks are thinned out by species."""
         for _ in range(steps):
             drawn = draw_step(like, self.physics, source)
             if self.update_share is not None:
@@ -350,7 +350,7 @@ class SpeciesStep(Step):
         species, physics = self.species, self.physics
         shared_width = shared_dim = physics.perception_dim
         if not self.by_species:
-            # A folded rule's own row: a one follows the perception vector, then zeros.
+            # Rows of a rule's kernels: the perception vector, a one, then zeros.
             shared_width = max(
                 own.network.row_width if own.network else shared_dim for own in species
             )
@@ -407,7 +407,7 @@ def make_species_step(
     by_species: bool,
     detach_positions: bool,
 ) -> SpeciesStep:
-    """Return the step of species that follow one rule each, in worlds of positions x."""
+    """Return the step of several species, with a rule each, in worlds at x."""
     species = []
     first = 0
     longest = max(rule.alpha for rule in rules)
@@ -426,10 +426,10 @@ def make_species_step(
 def _rows_of_species(
     row_of: Tensor, own: Species, row_count: int, mask: Tensor | None
 ) -> tuple[Tensor, Tensor]:
-    """Return the rows of a species' active particles, and which of its particles they stand for.
+    """Return the rows of a species' active particles, and the indices of these particles.
 
-    Both are int64, of one shape [R], on CUDA a fixed one, so that nothing waits for the device;
-    entries that stand for nobody have the row `row_count`.
+    Both are int64, shape [R]. On CUDA R does not depend on the draw, so that nothing waits for the
+    device; unused entries have the row `row_count`.
     """
     row = row_of[:, own.first : own.end].reshape(-1).long()
     everyone = torch.arange(len(row), device=row.device)
@@ -450,7 +450,7 @@ def _rows_of_species(
 
 
 def _recounted(scaled: Tensor, ratio: float) -> Tensor:
-    """Return L(ratio v), given L(v) of vectors in the last dimension; differentiable."""
+    """Return L(ratio v) from L(v), of vectors in the last dimension; differentiable."""
     length = torch.linalg.vector_norm(scaled, dim=-1, keepdim=True)
     somewhere = length > 0.0
     divisor = torch.where(somewhere, length, 1.0)
@@ -459,7 +459,7 @@ def _recounted(scaled: Tensor, ratio: float) -> Tensor:
 
 
 def _recounted_by_species(appended: Tensor, species_count: int, ratio: float) -> Tensor:
-    """Return what is perceived of each species, [R, K (1 + D)], with densities times `ratio`."""
+    """Multiply the densities in perception of each species, [R, K (1 + D)], by `ratio`."""
     density, gradient = appended[:, :species_count], appended[:, species_count:]
     gradient = _recounted(gradient.view(len(gradient), species_count, -1), ratio).flatten(1)
     return torch.cat((ratio * density, gradient), dim=1)

@@ -124,7 +124,7 @@ OWN = {"cameras": made(world_to_camera=torch.eye(4).repeat(3, 1, 1, 1))}
         (turned, {"fov": 180.0}, "between 0 and 180 degrees, got 180"),
         (turned, {"fov": 0.0}, "between 0 and 180 degrees"),
         (turned, {"centre": (0.0, 0.0)}, "centre must be 3 numbers"),
-        (looking, {}, "another place than its own"),
+        (looking, {}, "another point than its own"),
         (looking, {"eyes": (4,)}, r"eyes must be .* shape \[..., 3\]"),
         (looking, {"targets": torch.zeros(3, 3)}, "targets must have shape"),
         (looking, {"targets": (1.0, 0.0, 0.0), "up": (0.0, 1.0)}, "up must be 3 numbers"),

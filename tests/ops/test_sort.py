@@ -6,7 +6,7 @@ from worlds import assert_same, random_mask, random_world
 
 from npa_envs.ops import sort as cells
 from npa_envs.ops.physics import physics
-from npa_envs.ops.sort import make_plan, sort_worlds
+from npa_envs.ops.sort import plan_kernels, sort_worlds
 
 MASKS = {"all": None, "some": 0.5, "none": 0.0, "full": 1.0}
 
@@ -17,7 +17,7 @@ def sorted_twice(monkeypatch):
 
     def sort(x, s, mask, row_capacity, box=None, *, with_states=True, with_rows=True):
         made = physics(x.shape[2], s.shape[2], x.dtype, eps=0.1, box=box)
-        plan = make_plan(x, x.shape, s.shape[2], row_capacity, mask is not None, made)
+        plan = plan_kernels(x, x.shape, s.shape[2], row_capacity, mask is not None, made)
         given = (plan, x, s if with_states else None, mask)
         found = sort_worlds(*given, with_rows=with_rows)
         monkeypatch.setattr(cells, "block_capacity", lambda *worlds: 0)

@@ -138,7 +138,7 @@ WIDE = NPARule(state_dim=2)
         (lambda: perceive(X3, S, 1e-7), r"eps .* \[1e-06, 1e\+06\] .* for torch\.float32 in 3D"),
         (lambda: perceive(X, S, 0.1, box=1e39), "box sides must be at most 3.40282e\\+32"),
         (lambda: perceive(X, S, 0.1, 0.0), "eps0 must be positive"),
-        (lambda: species_fields(X, torch.tensor(4), eps=0.1), "counts must hold one number"),
+        (lambda: species_fields(X, torch.tensor(4), eps=0.1), "counts must have one number"),
         (lambda: rollout_species(np.array(1.0), X, S, 1, counts=[4]), "rules must"),
         (rule(space_dim=4), "space_dim must be 2 or 3"),
         (rule(state_dim=0), "state_dim must be at least 1"),

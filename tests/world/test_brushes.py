@@ -163,7 +163,7 @@ PUSH = AT | {"move": places(X)}
         (lambda: inject(X, S, **AT, state=S[:, 0, :2]), r"state must have .* \[B, C\] = \(2, 3\)"),
         (lambda: removed(X, S, gone=None), "gone must be a bool tensor of shape .* got None"),
         (lambda: removed(X, S, gone=ONE.float()), r"gone must be a bool .*\[B, N\] = \[2, 12\]"),
-        (lambda: removed(X, S, gone=ONE), r"as many particles from each world, got \[1, 0\]"),
+        (lambda: removed(X, S, gone=ONE), r"equally many particles of each world, got \[1, 0\]"),
         (lambda: inside_ball(X, **AT, box=2.0), "box must have 2 sides"),
         (lambda: inside_ball(X, **AT, box=(2.0, 2.0, 2.0)), "box must have 2 sides"),
         (lambda: inside_ball(X[0], **AT), r"x must have shape \[B, N, D\]"),

@@ -86,7 +86,7 @@ def test_what_changes_before_the_backward_pass_is_refused_or_changes_nothing(
         # Torch itself sees it, in the last step, which is stored.
         assert change == "weight in place"
         return
-    assert "must stay as it is between a rollout that recomputes steps" in said
+    assert "must not change between a rollout that recomputes steps" in said
     name = "weight" if change == "parameter" else change.removesuffix(".data")
     assert name.split(" ")[0].split(".")[-1] in said
     assert kind != "plain" or "weight" not in name
@@ -99,16 +99,16 @@ def test_worlds_that_are_written_to_meanwhile_are_refused(name, memory, device):
     rule = made("plain", device)
     new_x, new_s = npa_envs.rollout(rule, x, s, 4, memory=memory)
     (x if name == "x" else s).mul_(2.0)
-    with pytest.raises(npa_envs.NPAError, match=f"^{name} must stay as it is"):
+    with pytest.raises(npa_envs.NPAError, match=f"^{name} must not change"):
         (new_x.sum() + new_s.sum()).backward()
 
 
 @pytest.mark.parametrize("memory", RECOMPUTED)
 def test_a_constant_of_an_own_network_that_changes_is_refused(memory, device):
     x, s = world(device)
-    with pytest.raises(npa_envs.NPAError, match=r"factor of the rule must stay as it is"):
+    with pytest.raises(npa_envs.NPAError, match=r"factor of the rule must not change"):
         gradients(made("own", device), x, s, memory, lambda rule: setattr(rule, "factor", 2.0))
-    with pytest.raises(npa_envs.NPAError, match=r"training of the rule must stay as it is"):
+    with pytest.raises(npa_envs.NPAError, match=r"training of the rule must not change"):
         gradients(made("own", device), x, s, memory, lambda rule: rule.eval())
 
 
@@ -156,5 +156,5 @@ def test_species_refuse_it_too(memory, device):
     ):
         _, new_s = npa_envs.rollout_species(rules, x, s, 4, counts=(25, 15), memory=memory)
         change()
-        with pytest.raises(npa_envs.NPAError, match=f"^{name} must stay as it is"):
+        with pytest.raises(npa_envs.NPAError, match=f"^{name} must not change"):
             new_s.sum().backward()

@@ -1,13 +1,13 @@
-// Tiles: what a warp does together for eight neighbouring particles, on tensor cores.
+// Tiles: a warp sums for eight neighbouring particles together, on tensor cores.
 //
-// The rows that these particles may see are listed in a block's fast memory. Eight rows at a time,
-// each thread weighs two rows for one particle; weights [particles, rows] times channels [rows, W]
-// are then products of small matrices. A tensor core multiplies numbers of 11 bits; each number is
-// therefore split into two, and three products of parts come to float32 within about 2^-21.
+// The rows that may be near these particles are listed in shared memory. For eight rows at a time,
+// each thread computes the weights of two rows for one particle; weights [particles, rows] times
+// channels [rows, W] are then small matrix products. A tensor core multiplies numbers of 11 bits, so
+// each number is split into two, and three products of parts are accurate to about 2^-21.
 
 namespace npa {
 
-// A listed row: its position, and last the number of its channels' entry.
+// A listed row: its position, and last the index of its channels.
 using RowEntry = wp::vec_t<4, float>;
 
 using FourChannels = wp::vec_t<4, float>;
@@ -59,7 +59,7 @@ __device__ inline void multiply_tiles(float* sums, const unsigned* a, const unsi
         : "r"(a[0]), "r"(a[1]), "r"(a[2]), "r"(a[3]), "r"(b[0]), "r"(b[1]));
 }
 
-// The low bits that a tensor core ignores are taken off a number to give its second part.
+// Clear the low bits of a number, which a tensor core ignores; the rest is its second part.
 __device__ inline void split_number(float number, unsigned& part, unsigned& rest)
 {
     part = __float_as_uint(number);
@@ -94,7 +94,7 @@ __device__ inline FourChannels sum_listed(
             }
             const float other[3] = {row.x, row.y, row.z};
             float offset[DIMS];
-            float squared = 1e-37f;  // which has an inverse root
+            float squared = 1e-37f;  // not 0, which has no inverse root
             #pragma unroll
             for (unsigned d = 0; d < DIMS; ++d) {
                 offset[d] = position[d] - other[d];
@@ -112,7 +112,7 @@ __device__ inline FourChannels sum_listed(
                 }
             }
         }
-        // Three short chains of products, and none that is longer: tensor cores round towards zero.
+        // Three short chains instead of a long one, because tensor cores round towards zero.
         float sums[3][4] = {};
         #pragma unroll
         for (unsigned kind = 0; kind < KINDS; ++kind) {
@@ -126,7 +126,7 @@ __device__ inline FourChannels sum_listed(
     return total;
 }
 
-// A thread has two channels of two particles: neighbours swap, for four channels of one.
+// A thread has two channels of two particles; adjacent threads swap, to have four of one particle.
 __device__ inline FourChannels share_tile(FourChannels total)
 {
     const bool odd = threadIdx.x & 4u;
@@ -149,7 +149,7 @@ __device__ inline float smallest_in_tile(float value)
     return value;
 }
 
-// Unlike `wide_load`: here a row may begin anywhere, and end before a group of columns does.
+// Unlike in `wide_load`, a row may begin at any address, and end within a group of columns.
 __device__ inline float* column_place(const wp::array_t<float>& values, int row, int column)
 {
     return values.data + (size_t)(unsigned)row * (unsigned)values.shape[1] + column;

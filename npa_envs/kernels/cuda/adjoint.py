@@ -1,9 +1,9 @@
 """The adjoint of perception for states on CUDA in float32, by tiles of particles.
 
 The same sums as the portable `gather_state_cotangents`, in another order of work. A warp serves
-eight particles that follow each other in the sorted order: it lists the rows within eps of the box
-around them, and multiplies the rows' cotangents by the weights of all eight on tensor cores. A
-row's cotangents are so read once for eight particles.
+eight consecutive particles of the sorted order: it lists the rows within eps of their bounding box,
+and multiplies the rows' cotangents by the weights of all eight on tensor cores. So a row's
+cotangents are read once for eight particles.
 """
 
 from types import SimpleNamespace
@@ -14,12 +14,12 @@ from npa_envs.kernels import native
 from npa_envs.kernels.access import (
     CUDA_BLOCK,
     WARP,
+    allow_next_launch,
     any_in_warp,
     as_word,
     await_earlier,
     first_in_warp,
     largest_in_warp,
-    let_next_in,
     load_integer,
     load_scalar,
     make_wide_load,
@@ -30,37 +30,30 @@ from npa_envs.kernels.access import (
     thread_of,
     vote_of_warp,
 )
-from npa_envs.kernels.domain import domain_types, kernel_module
+from npa_envs.kernels.domain import SLACK, TERMS_PER_SUM, domain_types, kernel_module
 from npa_envs.kernels.mathematics import make_log_scale_pull
 from npa_envs.once import made_once
 
 TILE = 8
-"""Particles that a warp serves together, and rows of one product."""
+"""Particles that a warp serves together, and rows of one matrix product."""
 
 LIST_ENTRIES = 96
-"""Rows that a list has room for; longer ones are summed in several rounds."""
+"""Rows of a full list; more rows are summed in several rounds."""
 
 ENTRY = wp.types.vector(4, wp.float32)
-"""A listed row: its position, and last the number of its channels' entry."""
+"""A listed row: its position, and last the index of its channels."""
 
 CHANNELS = wp.types.vector(4, wp.float32)
 """Four adjacent channels."""
 
 CUDA_REGISTERS = 64
-"""Registers of a thread that gathers state cotangents."""
+"""Registers per thread in the gathering of state cotangents."""
 
 SHARE = 4
 """Channels of a row that one thread unscales."""
 
-BLOCK = 4096
-"""Rows whose cotangents are summed before they are added to the others: of a million summed one
-after the other, too much is rounded away."""
-
 LARGEST_LENGTH = 3.4028234663852886e38
-"""As far as any particle can be: the largest float32 [length units]."""
-
-SLACK = 1.0 + 1e-5
-"""Rows are listed within this much more than eps^2, whatever was rounded on the way."""
+"""The largest float32, a bound on any coordinate [length units]."""
 
 load_channels = make_wide_load(CHANNELS, wp.float32)
 store_channels = make_wide_store(CHANNELS, wp.float32)
@@ -70,7 +63,7 @@ store_channels = make_wide_store(CHANNELS, wp.float32)
 def make_sum_listed(space_dim: int, width: int, kinds: int, periodic: bool) -> wp.Function:
     """Return a Warp function that adds weighted channels of listed rows for a warp's particles.
 
-    A pair has a weight of the smoothing kernel, and D more with the spiky gradient kernel.
+    A pair has one weight of the smoothing kernel; with the spiky gradient kernel, D more.
     """
     vector = wp.types.vector(space_dim, wp.float32)
 
@@ -92,12 +85,12 @@ def make_sum_listed(space_dim: int, width: int, kinds: int, periodic: bool) -> w
 
 @native.func_native(CUDA_BLOCK // WARP, LIST_ENTRIES)
 def row_list_address() -> wp.uint32:
-    """Where the warp's list of rows lies in fast memory."""
+    """Return the address in shared memory of the warp's list of rows."""
 
 
 @made_once()
 def make_read_columns(count: int) -> wp.Function:
-    """Return a Warp function that reads some adjacent columns of a row, 0 from a last one on."""
+    """Return a Warp function that reads adjacent columns of a row, and 0 beyond its end."""
     result_type = wp.types.vector(count, wp.float32)
 
     @native.func_native(count)
@@ -112,37 +105,37 @@ def make_read_columns(count: int) -> wp.Function:
 def write_columns(
     values: wp.array(dtype=wp.float32, ndim=2), row: wp.int32, column: wp.int32, entry: CHANNELS
 ):
-    """Write four adjacent columns of a row, as far as there are so many."""
+    """Write four adjacent columns of a row, except those beyond its end."""
 
 
 @native.func_native()
 def append_entry(address: wp.uint32, count: wp.int32, accepted: wp.bool, entry: ENTRY) -> wp.int32:
-    """Append the entries of the threads that accept theirs; return the new length."""
+    """Append the entries of the threads with `accepted`; return the list's new length."""
 
 
 @native.func_native()
 def pad_list(address: wp.uint32, count: wp.int32, entry: ENTRY) -> wp.int32:
-    """Fill a list up to a multiple of a tile; return the new length."""
+    """Pad a list with an entry up to a multiple of `TILE`; return its new length."""
 
 
 @native.func_native()
 def carry_rest(address: wp.uint32, summed: wp.int32, count: wp.int32):
-    """Move what is not summed yet, less than a tile, to a list's beginning."""
+    """Move entries that are not summed yet, fewer than `TILE`, to the list's beginning."""
 
 
 @native.func_native()
 def prefetch_columns(values: wp.array(dtype=wp.float32, ndim=2), row: wp.int32, column: wp.int32):
-    """Ask for a column of a row, to be read later."""
+    """Prefetch a column of a row, which is read later."""
 
 
 @native.func_native()
 def share_tile(total: CHANNELS) -> CHANNELS:
-    """Return this thread's four channels of one particle, from the sums of `sum_listed`."""
+    """Redistribute the sums of `sum_listed`: each thread gets four channels of one particle."""
 
 
 @native.func_native()
 def smallest_in_tile(value: wp.float32) -> wp.float32:
-    """The smallest value of the tile's particles, four threads each."""
+    """Return the smallest value of the tile's particles, which have four threads each."""
 
 
 read_channels = make_read_columns(SHARE)
@@ -158,9 +151,9 @@ def listed_adjoint(
 ) -> SimpleNamespace:
     """Return the kernels of one variant.
 
-    A variant is made for a box or open space, and for channels that come in several groups. The
-    cotangents of a row's group lie together: [1 + D, W], first of the smoothed state, then of the
-    state gradient. One entry of zeros follows the last row's.
+    A variant is for a box or open space, and for one or several groups of channels. Cotangents of a
+    row and group are contiguous: [1 + D, W], first of the smoothed state, then of the state
+    gradient. An entry of zeros follows that of the last row.
     """
     scalar = wp.float32
     types = domain_types(space_dim, scalar)
@@ -192,12 +185,12 @@ def listed_adjoint(
         # outputs
         cotangents: wp.array(dtype=CHANNELS),
     ):
-        """Pull the cotangent of z back through its scaling, into cotangents of the raw sums.
+        """Write the cotangents of each row's unscaled sums from the cotangent of z.
 
-        Those of the smoothed state are multiplied by `blur_scale`.
+        Those of smoothed states are multiplied by `blur_scale`.
         """
         await_earlier()
-        let_next_in()
+        allow_next_launch()
         thread = wp.tid()
         row_parts = group_count * wp.static(parts)
         row = wp.int32(wp.uint32(thread) / wp.uint32(row_parts))
@@ -232,17 +225,17 @@ def listed_adjoint(
 
     @wp.func
     def lines_around(domain: Domain, d: wp.int32):
-        """Lines of cells along which neighbours lie, in one direction across them."""
+        """Return the number of lines of cells with neighbours, along a direction across lines."""
         return wp.min(wp.int32(2) * domain.cell_reach + 1, domain.cell_shape[d])
 
     @wp.func
     def around(place: wp.int32, count: wp.int32):
-        """A place up to once around the grid off, within it."""
+        """Wrap a cell coordinate that is at most one grid size outside."""
         return wp.where(place < 0, place + count, wp.where(place < count, place, place - count))
 
     @wp.func
     def line_of(domain: Domain, cell: cell_vector):
-        """Number of the line of cells, in the grid's first direction, that a cell lies on."""
+        """Return the index of the line of cells, along the grid's first direction, of a cell."""
         line = cell[1]
         if wp.static(space_dim == 3):
             line += cell[wp.static(space_dim - 1)] * domain.cell_shape[1]
@@ -250,10 +243,10 @@ def listed_adjoint(
 
     @wp.func
     def run_cells(domain: Domain, line: wp.int32, begin: wp.int32, end: wp.int32, run: wp.int32):
-        """First cell and one past the last cell of a run, in row-major order within the world.
+        """Return the first cell and one past the last cell of a run, in row-major order.
 
-        Runs go from a column to another on the lines around a line; where the columns wrap around
-        the grid, there are two of a line.
+        Runs go from column `begin` to `end` on the lines around a line; a line has two runs if the
+        columns wrap around the grid.
         """
         nx = domain.cell_shape[0]
         first = begin
@@ -278,7 +271,7 @@ def listed_adjoint(
 
     @wp.func
     def columns_around(domain: Domain, first: wp.int32, last: wp.int32):
-        """First column around some columns of cells and one past the last, not wrapped around."""
+        """Return the range of columns with neighbours of particles in a range, not wrapped."""
         nx = domain.cell_shape[0]
         width = wp.min(last - first + 2 * domain.cell_reach + 1, nx)
         begin = wp.where(width < nx, around(first - domain.cell_reach, nx), 0)
@@ -286,7 +279,7 @@ def listed_adjoint(
 
     @wp.func
     def count_runs(domain: Domain, to_column: wp.int32):
-        """Runs of cells around particles on a line, up to a column."""
+        """Return the number of runs of cells around particles on a line, up to a column."""
         runs = lines_around(domain, 1)
         if wp.static(space_dim == 3):
             runs *= lines_around(domain, wp.static(space_dim - 1))
@@ -294,7 +287,7 @@ def listed_adjoint(
 
     @wp.func
     def box_around(domain: Domain, position: vector, origin: vector, served: wp.bool):
-        """Middle, seen from an origin, and half sides of the box around the particles served."""
+        """Return centre, relative to an origin, and half sides of served particles' bounds."""
         relative = position - origin
         if wp.static(periodic):
             relative = periodic_image(domain, relative)
@@ -309,7 +302,7 @@ def listed_adjoint(
 
     @wp.func
     def near_box(domain: Domain, offset: vector, half: vector):
-        """Whether a place off the middle of a box of these half sides is within eps of the box."""
+        """Return whether a point, relative to a box's centre, is within eps of the box."""
         nearest = offset
         if wp.static(periodic):
             nearest = periodic_image(domain, nearest)
@@ -321,7 +314,7 @@ def listed_adjoint(
 
     @wp.func
     def entry_of(position: vector, number: wp.int32):
-        """What a list holds of a row."""
+        """Return the list entry of a row."""
         entry = ENTRY()
         for d in range(wp.static(space_dim)):
             entry[d] = position[d]
@@ -330,7 +323,7 @@ def listed_adjoint(
 
     @wp.func
     def load_position(particles: wp.array(dtype=scalar), k: wp.int32):
-        """Position of a particle [length units]."""
+        """Return the position of a particle [length units]."""
         position = vector()
         for d in range(wp.static(space_dim)):
             position[d] = load_scalar(particles, k * wp.static(space_dim + 1) + d)
@@ -338,7 +331,7 @@ def listed_adjoint(
 
     @wp.func
     def is_finite(position: vector):
-        """Whether all coordinates are numbers."""
+        """Return whether all coordinates are finite."""
         finite = wp.bool(True)
         for d in range(wp.static(space_dim)):
             finite = finite and wp.isfinite(position[d])
@@ -375,7 +368,7 @@ def listed_adjoint(
         are multiplied by `norm`.
         """
         await_earlier()
-        let_next_in()
+        allow_next_launch()
         thread = wp.tid()
         lane = thread & wp.static(WARP - 1)
         tile = thread / wp.static(WARP)
@@ -387,7 +380,7 @@ def listed_adjoint(
         first = world * particle_count + (tile - world * tile_count) * wp.static(TILE)
         end = wp.min(first + wp.static(TILE), (world + 1) * particle_count)
         base = active_offset + world * domain.cell_count
-        # A thread weighs rows for one particle, and in the end writes four channels of another.
+        # A thread computes weights for one particle, and at the end writes channels of another.
         k = first + (lane >> 2)
         written = first + 2 * (lane & 3) + ((lane >> 2) & 1)
         part = lane >> 3
@@ -401,10 +394,10 @@ def listed_adjoint(
         line = line_of(domain, cell)
         address = row_list_address()
         total = CHANNELS()
-        # A position that is not a number is near to nothing.
+        # A position that is not finite has no neighbours.
         waiting = k < end and is_finite(position)
         while any_in_warp(waiting):
-            # The first particle that waits is served, and with it those on its line of cells.
+            # Serve the first particle that is left, and all others on its line of cells.
             leader = first_in_warp(waiting)
             column = of_warp(cell[0], leader)
             middle_line = of_warp(line, leader)
@@ -448,7 +441,7 @@ def listed_adjoint(
                     if finished or count > wp.static(LIST_ENTRIES - WARP):
                         summed = count & ~wp.int32(wp.static(TILE - 1))
                         if finished:
-                            # Beside the last row are cotangents of nothing.
+                            # The entry after the last row is zero.
                             nothing = entry_of(origin, row_capacity * group_count)
                             summed = pad_list(address, count, nothing)
                         found = sum_listed(
@@ -465,7 +458,7 @@ def listed_adjoint(
                         carry_rest(address, summed, count)
                         count = wp.max(count - summed, 0)
                         block += summed
-                        if finished or block >= wp.static(BLOCK):
+                        if finished or block >= wp.static(TERMS_PER_SUM):
                             for n in range(2):
                                 if (votes & wp.uint32(1 << (4 * n))) != wp.uint32(0):
                                     total[n] += found[n]

@@ -1,18 +1,18 @@
-"""Density on CUDA in float32, and on the way to it lists of neighbours, for perception.
+"""Density on CUDA in float32; the same pass lists neighbours for perception.
 
-One thread of a particle finds its neighbours with far fewer instructions than several that must
-agree on where they are in a list. A list holds the steps to neighbours in the sorted order, in 16
-bits. It is gathered in fast memory and left in an array: 32 particles together, their first two
-entries first. It has room for so many; of a longer one, only the length is known.
+`listed_density`: one thread finds a particle's neighbours with far fewer instructions than several,
+which would have to agree on positions in the list. A list has the differences of sorted indices
+from the particle to its neighbours, in 16 bits. It is made in shared memory and written to an array
+in which the lists of 32 particles are interleaved, two entries at a time. Of a list beyond the
+capacity only the length is written.
 
-In small worlds in 2D a warp serves eight particles side by side, a tile, whose lists lie one behind
-the other. They lie in one line of cells or two, so most of their candidates are the same. The warp
-brings these into fast memory once. Four lanes of a particle then test every fourth of them: a test
-takes ten instructions, no address is computed, and no end of a run of cells looked at. Whom a lane
-has found near stands in the bits of a word, of which lists are made afterwards. It takes half the
-time where neighbours are many and particles few. In sparse worlds tiles share few candidates, and
-in worlds that fill a device a thread for each particle does as well. Worlds have at most 2^15
-particles: steps of lists have 16 bits.
+`tiled_density`, for small worlds in 2D: a warp serves a tile of eight consecutive particles, whose
+lists are stored one after the other. They are in one or two lines of cells, so most candidates are
+the same, and the warp copies these into shared memory once. Each of a particle's four lanes tests
+every fourth candidate: ten instructions, without addresses or ends of runs. It stores the results
+as bits, from which lists are made afterwards. That halves the time for few particles with many
+neighbours. In sparse worlds tiles share few candidates, and worlds that fill a GPU need only a
+thread for each particle. Worlds have at most 2^15 particles: entries of lists have 16 bits.
 """
 
 import warp as wp
@@ -28,35 +28,30 @@ from npa_envs.kernels.access import (
     make_wide_store,
     thread_number,
 )
-from npa_envs.kernels.domain import domain_types, kernel_module
+from npa_envs.kernels.domain import SLACK, TERMS_PER_SUM, domain_types, kernel_module
 from npa_envs.kernels.mathematics import falloff_within, smoothing_of
-from npa_envs.kernels.portable.density import BLOCK
 from npa_envs.once import made_once
 
 AHEAD, SHARED_AHEAD = 6, 5
-"""Candidates that a thread looks at together: alone with a particle, and one of several lanes."""
+"""Candidates that a thread loads at a time, if a particle has one lane, and if it has several."""
 
 LIST_BLOCK = 64
-"""Threads of a block, few: one has fast memory for the lists of all of them."""
+"""Threads of a block: few, as their lists have to fit into shared memory."""
 
 CUDA_REGISTERS = 80
-"""Registers of a thread: told of none, the compiler takes half as many and loads one by one."""
+"""Registers per thread; by default the compiler takes half as many and issues loads one by one."""
 
 RECORD = wp.types.vector(4, wp.float32)
-"""What perception reads of a neighbour: position, volume, and in 2D where its state is."""
+"""A neighbour's data for perception: position, volume, and in 2D the index of its state."""
 
 LONGEST_STEP = wp.constant(2**15 - 1)
-"""Steps of a list's entry have 16 bits."""
+"""Largest step of a list: entries have 16 bits."""
 
 SHARE_OF_LIST = 2
-"""A lane of several has room for so many times its share of a list."""
+"""Room of each of several lanes, as a multiple of an equal part of a list."""
 
 LIST_END = wp.types.vector(2, wp.uint32)
-"""Where the next entry of a list goes, and how far it is from there to the one after it."""
-
-
-SLACK = 1.0 + 1e-5
-"""Cells are left out beyond this much more than eps^2, whatever was rounded on the way."""
+"""Address of a list's next entry, and the distance [bytes] from it to the one after."""
 
 TILE = 8
 """Particles of a tile."""
@@ -69,7 +64,7 @@ SMALLEST_SIDE = 7
 are nearest to its tile's particles may differ."""
 
 TILE_REGISTERS = 64
-"""Registers of a thread: 32 warps of a processor."""
+"""Registers per thread, so that a multiprocessor runs 32 warps."""
 
 store_record = make_wide_store(RECORD, wp.float32)
 
@@ -80,17 +75,14 @@ def listed_density(
 ) -> wp.Kernel:
     """Return the density kernel of one variant.
 
-    Launches of several lanes a particle come in whole warps, which leave their lists together.
+    With several lanes for a particle, launches have complete warps, which write lists together.
     """
     scalar = wp.float32
     flat = space_dim == 2
     types = domain_types(space_dim, scalar)
     vector, particle, Domain = types.vector, types.particle, types.Domain
-    cell_place, segment_count, segment_cells = (
-        types.cell_place,
-        types.segment_count,
-        types.segment_cells,
-    )
+    cell_place, segment_count = types.cell_place, types.segment_count
+    segment_cells = types.segment_cells
     periodic_image = types.periodic_image
     load_vector = make_wide_load(vector, scalar)
     add_scalar = make_lane_sum(scalar, scalar, lanes)
@@ -120,7 +112,7 @@ def listed_density(
 
     @wp.func
     def falloff_at(domain: Domain, offset: vector):
-        """1 - r^2 / eps^2 of a candidate, 0 beyond eps."""
+        """Return 1 - r^2 / eps^2 of a candidate, 0 beyond eps."""
         nearest = offset
         if wp.static(periodic):
             nearest = periodic_image(domain, nearest)
@@ -129,10 +121,10 @@ def listed_density(
 
     @wp.func
     def cells_beyond(within_cell: vector, line: wp.int32):
-        """How many of the five cells of a line nobody near lies in: the first ones, the last ones.
+        """Return how many of the first, and of the last, of a line's five cells are beyond eps.
 
-        `within_cell` is where the particle lies in its cell, in parts of it; lines count from 0,
-        the particle's own is 2.
+        `within_cell` is the particle's position in its cell, in units of a cell. Lines are numbered
+        from 0; that of the particle is 2.
         """
         across = wp.where(
             line < 2, within_cell[1] + scalar(1 - line), scalar(line - 2) - within_cell[1]
@@ -167,8 +159,8 @@ def listed_density(
     ):
         """Write every particle's record, and the list of each row's neighbours.
 
-        Positions with volumes 1 / rho also go to `particles`, unless that is empty. A list's length
-        is larger than the capacity where not all fits in.
+        Positions with volumes 1 / rho are also written to `particles`, unless it is empty. The
+        length of a list that does not fit is larger than the capacity.
         """
         await_earlier()
         thread = wp.tid()
@@ -186,7 +178,7 @@ def listed_density(
             row = load_integer(row_of, load_integer(source, k))
         row = wp.where(inside and row < list_lengths.shape[0], row, wp.int32(-1))
         list_begin = list_address()
-        # Of a particle without a row as if it were too long.
+        # A particle without a row is treated as if its list were too long.
         list_end = list_end_of(list_begin, wp.where(row < 0, wp.static(room + 2), 0))
         far = wp.bool(False)
         earlier = scalar(0.0)
@@ -199,7 +191,7 @@ def listed_density(
                 within_cell[d] = scalar(scaled - wp.floor(scaled))
         for segment in range(segments):
             first, last = segment_cells(domain, cell, segment)
-            # Five lines of five cells each, none of them wrapped around the grid.
+            # Five lines of five cells each, without wrapping around the grid.
             if wp.static(flat and not periodic) and segments == 5 and domain.cell_reach == 2:
                 before, behind = cells_beyond(within_cell, segment)
                 first += before
@@ -213,10 +205,10 @@ def listed_density(
                 stop = end
                 crowded = wp.bool(False)
                 if wp.static(lanes == 1):
-                    # Worlds whose particles have several threads are not as large.
-                    stop = wp.min(end, j + wp.static(BLOCK))
+                    # Worlds whose particles have several threads are smaller.
+                    stop = wp.min(end, j + wp.static(TERMS_PER_SUM))
                     crowded = stop < end
-                # Several positions are asked for before the first is used.
+                # Several positions are loaded before the first is used.
                 while j + wp.static((many - 1) * lanes) < stop:
                     ahead = positions_ahead()
                     for a in range(wp.static(many)):
@@ -243,7 +235,7 @@ def listed_density(
                     list_end = append_step(list_end, falloff, candidate - k)
                     total += smoothing_of(falloff, scalar(1.0))
                 list_end = cut_off(list_begin, list_end)
-        # A particle always sees itself: a position that is not finite would otherwise have rho 0.
+        # Its own term is added without a search, so that rho is not 0 for positions that are NaN.
         total = wp.max(add_scalar(earlier + total), scalar(1.0))
         length = leave_list(list_begin, list_end, row, lists)
         if lane == 0 and row >= 0:
@@ -270,7 +262,7 @@ def listed_density(
 
 @made_once()
 def make_steps_at(capacity: int, tiled: bool) -> wp.Function:
-    """Return a Warp function that reads two steps of a row's list, as the density pass left it."""
+    """Return a Warp function that reads two steps of a row's list, packed in 32 bits."""
 
     @native.func_native(capacity, tiled)
     def steps_at(
@@ -282,12 +274,12 @@ def make_steps_at(capacity: int, tiled: bool) -> wp.Function:
 
 @native.func_native()
 def step_of(steps: wp.int32, entry: wp.int32) -> wp.int32:
-    """The first or the second of two steps."""
+    """Return the first or the second of two packed steps."""
 
 
 @made_once()
 def tiled_density(periodic: bool, capacity: int, masked: bool) -> wp.Kernel:
-    """Return the density kernel of one variant. A block is a warp, and serves a tile."""
+    """Return the density kernel of one variant, in which a block is a warp that serves a tile."""
     types = domain_types(2, wp.float32)
     vector, particle, Domain = types.vector, types.particle, types.Domain
     load_vector = make_wide_load(vector, wp.float32)
@@ -330,14 +322,14 @@ def tiled_density(periodic: bool, capacity: int, masked: bool) -> wp.Kernel:
         lists: wp.array(dtype=wp.int16, ndim=3),
         list_lengths: wp.array(dtype=wp.int32),
     ):
-        """Write what `listed_density` writes, but each list as a whole, one behind the other."""
+        """Write the outputs of `listed_density`, with lists stored one after the other."""
         await_earlier()
         thread = thread_number()
         tile = thread >> wp.static(WARP.bit_length() - 1)
         lane = thread & wp.static(WARP - 1)
         tiles = (particle_count + wp.static(TILE - 1)) / wp.static(TILE)
         world = wp.int32(wp.uint32(tile) / wp.uint32(tiles))
-        # Tiles begin anew in each world: its sums are the same in every batch.
+        # Each world begins with a new tile, so its sums are the same in every batch.
         first = world * particle_count + (tile - world * tiles) * wp.static(TILE)
         k = first + lane / wp.static(TILE_LANES)
         inside = k < (world + 1) * particle_count
@@ -361,7 +353,7 @@ def tiled_density(periodic: bool, capacity: int, masked: bool) -> wp.Kernel:
         )
         if inside and lane % wp.static(TILE_LANES) == 0:
             position = load_vector(sorted_positions, k)
-            # A particle always sees itself: a position that is not finite would have rho 0.
+            # Its own term is added without a search, so that rho is not 0 for NaN.
             volume = 1.0 / (domain.smoothing_norm * wp.max(total, 1.0))
             if particles.shape[0] > 0:
                 particles[k] = particle(position[0], position[1], volume)

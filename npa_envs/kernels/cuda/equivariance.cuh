@@ -2,13 +2,13 @@
 
 namespace npa {
 
-// What rows [scalars | vectors | 1 | 0] and what is made of them look like.
+// Sizes of rows [scalars | vectors | 1 | 0], and of inputs and mixed vectors.
 template <int D, int SCALARS, int PERCEIVED, int MIXED, int CHIRAL> struct VectorForm {
     static constexpr int DOTS = MIXED * (MIXED + 1) / 2, CROSSES = CHIRAL ? DOTS - MIXED : 0;
     static constexpr int FIRST_CROSS = SCALARS + DOTS, PRODUCTS_END = FIRST_CROSS + CROSSES;
     static constexpr int ROW_END = SCALARS + PERCEIVED * D, WEIGHTS = PERCEIVED * MIXED;
 
-    // Number of the dot product of a and b, and of the cross product.
+    // Index of the dot product of a and b, and of their cross product.
     static __device__ int dot_of(int a, int b)
     {
         const int low = min(a, b), high = max(a, b);
@@ -22,8 +22,8 @@ template <int D, int SCALARS, int PERCEIVED, int MIXED, int CHIRAL> struct Vecto
     }
 };
 
-// Some columns of a warp's rows on their way to the memory that its block shares: all of them at
-// once, because a thread that stores what it has loaded waits for it. Of rows beyond the last: zeros.
+// Loads of some columns of a warp's rows, for shared memory: all loads come before the first store,
+// which waits for them. Rows beyond the last are zeros.
 template <int ROWS, int COLUMNS> struct RowsOnTheWay {
     static constexpr int EACH = (ROWS * COLUMNS + 31) / 32;
     float values[EACH];
@@ -115,7 +115,7 @@ __device__ inline void read_vectors(
     }
 }
 
-// Write the cotangents of rows, and each block's sum over its rows of those of the mixing weights.
+// Write the cotangents of rows, and each block's sum of the mixing weights' cotangents.
 template <int D, int SCALARS, int PERCEIVED, int MIXED, int CHIRAL, int WARPS, int ROWS>
 __device__ inline void pull_back_vectors(
     const wp::array_t<float>& rows,
@@ -129,7 +129,7 @@ __device__ inline void pull_back_vectors(
     using Form = VectorForm<D, SCALARS, PERCEIVED, MIXED, CHIRAL>;
     constexpr int OWN = (Form::WEIGHTS + 31) / 32;
     constexpr int TASKS = (ROWS * MIXED + 31) / 32, VECTORS = MIXED * D;
-    // The weights of a mixed vector beside each other, as those who read them lie.
+    // The weights of one mixed vector are adjacent, like the threads that read them.
     __shared__ float weights[Form::WEIGHTS], sums[WARPS][Form::WEIGHTS];
     __shared__ float bar_of[WARPS][ROWS][Form::PRODUCTS_END], seen_of[WARPS][ROWS][PERCEIVED * D];
     __shared__ float vectors_of[WARPS][ROWS][VECTORS], total_of[WARPS][ROWS][VECTORS];
@@ -231,8 +231,8 @@ __device__ inline void pull_back_vectors(
     }
 }
 
-// Write updates [δ | Δs | 0] of gates and state changes [g | Δs | 0]. A warp has a few rows, whose
-// loads are on their way together.
+// Write updates [δ | Δs | 0] from gates and state changes [g | Δs | 0]. A warp issues the loads of
+// all its rows before it uses them.
 template <int D, int MIXED, int CHIRAL, int WARPS, int ROWS>
 __device__ inline void steer_by_gates(
     const wp::array_t<float>& output,
@@ -290,7 +290,7 @@ __device__ inline void steer_by_gates(
     }
 }
 
-// Write the cotangents of what `steer_by_gates` reads.
+// Write the cotangents of the inputs of `steer_by_gates`.
 template <int D, int MIXED, int CHIRAL, int WARPS, int ROWS>
 __device__ inline void pull_back_gates(
     const wp::array_t<float>& output,

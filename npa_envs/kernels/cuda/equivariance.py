@@ -1,7 +1,8 @@
 """Vectors of equivariant rules on CUDA, in float32: a warp shares a few rows.
 
-The formulas are those of `npa_envs/ops/equivariance.py`, as in `kernels/portable/equivariance.py`:
-fewer passes over the rows, and the gradient of the mixing weights on the way.
+The formulas are those of `npa_envs/ops/equivariance.py`. Compared with
+`kernels/portable/equivariance.py` there are fewer passes over rows, and one of them also computes
+the gradient of the mixing weights.
 """
 
 from types import SimpleNamespace
@@ -14,7 +15,7 @@ from npa_envs.kernels.cuda.network import make_share_sum
 from npa_envs.once import made_once
 
 READ_WARPS, PULL_WARPS, STEER_WARPS, MIXING_SUM_WARPS = 4, 4, 4, 16
-"""Warps of a block that reads rows, pulls back to them, steers, and adds up blocks' sums."""
+"""Warps of a block of `read_rows`, `pull_back_rows`, the steering kernels and `add_blocks`."""
 
 STEERED_ROWS = 2
 """Rows that a warp steers."""
@@ -23,16 +24,16 @@ LARGEST_MIXING = 1024
 """Most mixing weights: each thread sums gradients of every 32nd of them."""
 
 SHARED_BYTES = 48 * 1024
-"""Memory that a block may share without asking the driver for more."""
+"""Shared memory of a block that the driver grants by default [bytes]."""
 
 
 def rows_of_warp(mixed: int) -> int:
-    """Return how many rows a warp has: a thread for each of their mixed vectors, at most four."""
+    """Return the rows of a warp: a thread for each of their mixed vectors, at most four rows."""
     return min(max(WARP // mixed, 1), 4)
 
 
 def fits_block(space_dim: int, scalars: int, perceived: int, mixed: int, chiral: bool) -> bool:
-    """Return whether blocks have room for rows of such vectors."""
+    """Return whether rows with these vectors fit into a block's shared memory."""
     weights = perceived * mixed
     products = mixed * (mixed + 1) // 2 + chiral * (mixed * (mixed - 1) // 2)
     row = scalars + products + (perceived + 2 * mixed) * space_dim
@@ -44,7 +45,7 @@ def fits_block(space_dim: int, scalars: int, perceived: int, mixed: int, chiral:
 def row_kernels(
     space_dim: int, scalars: int, perceived: int, mixed: int, chiral: bool
 ) -> SimpleNamespace:
-    """Return the kernels between rows and inputs of one form, dimensionless all of them.
+    """Return the kernels that map rows to inputs, and cotangents back, for one form.
 
     Rows are [scalars | perceived vectors | 1 | 0], inputs [scalars | products | 1 | 0]; mixed
     vectors [K, mixed, D] and mixing weights [perceived, mixed] are flat.
@@ -96,7 +97,7 @@ def row_kernels(
         rows_bar: wp.array(dtype=wp.float32, ndim=2),
         partial_sums: wp.array(dtype=wp.float32, ndim=2),
     ):
-        """Write cotangents of rows, and each block's sum of those of the mixing weights."""
+        """Write cotangents of rows, and each block's sum of cotangents of the mixing weights."""
         await_earlier()
         pull_back_vectors(rows, mixing, mixed, mixed_bar, inputs_bar, rows_bar, partial_sums)
 
@@ -105,7 +106,7 @@ def row_kernels(
 
 @made_once()
 def mixing_sum() -> wp.Kernel:
-    """Return the kernel that adds blocks' sums; its blocks are larger than those of the others."""
+    """Return the kernel that adds the sums of blocks; its own blocks are larger."""
     add_partial_sums = make_share_sum(MIXING_SUM_WARPS)
 
     @wp.kernel(
@@ -127,7 +128,7 @@ def mixing_sum() -> wp.Kernel:
 
 @made_once()
 def steering_kernels(space_dim: int, mixed: int, chiral: bool) -> SimpleNamespace:
-    """Return the kernels between outputs and updates; a warp has `STEERED_ROWS` rows.
+    """Return the kernels that map outputs to updates, and back; a warp has `STEERED_ROWS` rows.
 
     Outputs are [gates | state changes | 0], updates [displacement | state changes | 0].
     """
@@ -160,7 +161,7 @@ def steering_kernels(space_dim: int, mixed: int, chiral: bool) -> SimpleNamespac
         # outputs
         update: wp.array(dtype=wp.float32, ndim=2),
     ):
-        """Write the updates of gates and state changes."""
+        """Write updates from gates and state changes."""
         await_earlier()
         steer_by_gates(output, mixed, signs, update)
 

@@ -1,20 +1,20 @@
-// Products on CUDA's tensor cores, of float32 numbers that are each split into two halves.
+// Matrix products on CUDA's tensor cores of float32 numbers, each split into two of 16 bits.
 //
-// A number is the sum of a 16-bit number and of what that leaves, again in 16 bits; of the four
-// products of two such pairs the three larger ones are summed: 22 bits of float16, 16 of bfloat16.
-// Tensor cores cut off what does not fit when they add, so long sums are added outside of them.
+// A number is the sum of a 16-bit number and of the remainder, again in 16 bits. Of the four products
+// of two such pairs the three larger ones are summed: 22 bits with float16, 16 with bfloat16. Tensor
+// cores truncate when they add, so long sums are added outside of them.
 //
 // A group of units or of rows is a fragment of PTX's `mma.m16n8k16`: lane 4 g + t of a warp holds
 // row g (and g + 8) and columns 2 t, 2 t + 1 (and 8 further). Two results side by side are laid out
-// like the left operand of a next product: the hidden units between two products stay in registers.
+// like the left operand of a next product, so hidden units stay in registers between two products.
 
 namespace npa {
 
-// What happens to hidden units between two products: only positive ones pass, or these are noted
-// too, or those pass that were noted.
+// Treatment of hidden units between two products: ReLU, ReLU that also stores its mask, or a stored
+// mask.
 enum Between { RECTIFY, NOTE, MASK };
 
-// The first of two numbers lies in the lower half of a word.
+// The first of two numbers is in the lower half of a word.
 __device__ inline void split_half(float a, float b, unsigned& high, unsigned& low)
 {
     float upper, lower;
@@ -55,7 +55,7 @@ __device__ inline unsigned scale_exponent(float size, unsigned target)
     return min(max(__float_as_uint(size) >> 23, target + 1u), 254u);
 }
 
-// The power of two by which a positive size comes to lie in [2^target, 2^(target + 1)).
+// The power of two that scales a positive number into [2^target, 2^(target + 1)).
 __device__ inline float scale_to(float size, unsigned target)
 {
     return __uint_as_float((254u + target - scale_exponent(size, target)) << 23);
@@ -113,7 +113,7 @@ __device__ inline void two_layers(
     const uint4* outer = reinterpret_cast<const uint4*>(output_weights.data) + lane;
     #pragma unroll 1
     for (int unit = 0; unit < units; ++unit) {
-        // Three sums of products: none waits for another.
+        // Three independent sums of products.
         float sum[2][4] = {}, rest[2][2][4] = {};
         #pragma unroll
         for (int k = 0; k < STEPS; ++k) {
@@ -215,7 +215,7 @@ __device__ inline void weight_sums(
     const int base = ((blockIdx.x % UNIT_BLOCKS) * WARPS + threadIdx.x / 32) * 32;
     const int begin = share * share_rows, end = min(begin + share_rows, rows.shape[0]);
 
-    // Rows come in while the ones before them are summed. A thread splits what it asked for.
+    // Rows are loaded while the previous ones are summed. A thread splits the numbers it loads.
     const auto ask_for_rows = [&](int first) {
         #pragma unroll
         for (int i = threadIdx.x; i < ROWS * chunks; i += 32 * WARPS) {
@@ -258,7 +258,7 @@ __device__ inline void weight_sums(
             : "=r"(to[0]), "=r"(to[1]), "=r"(to[2]), "=r"(to[3])
             : "r"((unsigned)__cvta_generic_to_shared(from)) : "memory");
     };
-    // Where this lane's part of 16 rows and 16 columns begins, as it is and turned.
+    // Where this lane's part of 16 rows and 16 columns begins, as stored and transposed.
     const int straight = (lane & 7) + (lane >> 4) * 8, straight_column = (lane >> 3 & 1) * 8;
     const int turned = lane & 15, turned_column = (lane >> 4) * 8;
 

@@ -1,7 +1,7 @@
-"""The rule's network on CUDA's tensor cores, in float32: fused kernels, and the weights for them.
+"""The rule's network on CUDA's tensor cores, in float32: fused kernels, and their weight layout.
 
-Products are of numbers that are each split into two halves of 16 bits: `network.cuh` says how they
-lie in a warp. float16 has little range, so a row is first scaled by a power of two, which is exact.
+Each factor of a product is split into two numbers of 16 bits; `network.cuh` has the layout in a
+warp. float16 has a small range, so rows are first scaled by powers of two, which is exact.
 """
 
 from types import SimpleNamespace
@@ -10,43 +10,44 @@ from typing import Any
 import warp as wp
 
 from npa_envs.kernels import native
-from npa_envs.kernels.access import WARP, await_earlier, let_next_in
+from npa_envs.kernels.access import WARP, allow_next_launch, await_earlier
 from npa_envs.once import made_once
 
 UNIT_GROUP = 16
-"""Hidden units of one step: the inner extent of a product."""
+"""Hidden units of one step: the inner dimension of a matrix product."""
 
 ROW_TARGET, UNIT_TARGET, OUTPUT_TARGET = 8, 4, 7
-"""Binary exponents to which rows, hidden units' and outputs' weights are scaled, see `scale_to`.
+"""Exponents of 2 to which rows, hidden weights and output weights are scaled by `scale_to`.
 
-A hidden unit then lies below 2^(8 + 1 + 4 + 1), within float16, and its error far below."""
+A hidden unit is then below 2^(8 + 1 + 4 + 1), in the range of float16, with a far smaller error."""
 
 ROW_TILE = 32
-"""Rows that a block sums weight gradients of between two barriers."""
+"""Rows of a block's weight gradients between two barriers."""
 
 WARP_UNITS = 32
-"""Hidden units whose weight gradients a warp sums."""
+"""Hidden units whose weight gradients one warp sums."""
 
 SUM_WARPS = 4
-"""Warps of a block that adds up what shares of the rows summed."""
+"""Warps of a block that adds partial sums."""
 
 LAYER_REGISTERS, GRADIENT_REGISTERS = 168, 255
-"""Registers of a thread of the two kinds of kernels."""
+"""Registers per thread of the layer kernels and of the weight gradient kernels."""
 
 WIDE, WIDE_REGISTERS = range(81, 97), 128
-"""Columns of rows, 3D's with 16 channels, that want more warps instead of registers, and those."""
+"""Row widths (of 3D rules with 16 channels) with another number of registers, and that number."""
 
 
 @made_once()
 def two_layer_kernel(steps: int, tiles: int, mode: str) -> wp.Kernel:
-    """Return the kernel of two products, row by row, for 16 rows a warp.
+    """Return the kernel that maps rows through two layers, 16 rows a warp.
 
-    There are `steps` groups of 16 input columns and `tiles` of 8 output columns. Between the
-    products, "rectify" hidden units, "note" which are positive too, or "mask" by what was noted.
+    There are `steps` groups of 16 input columns and `tiles` of 8 output columns. Mode "rectify"
+    applies ReLU between the layers, "note" also stores the ReLU mask, and "mask" applies a stored
+    mask instead.
 
     The kernel takes a number of hidden units H, a multiple of 16; rows [K, width] of at most 16
     `steps` columns; both layers' fragments, as `arrange_hidden` and `arrange_output` leave them;
-    the outputs' scales [8 `tiles`]; for each row, 4 words of the signs of every 128 hidden units,
+    the outputs' scales [8 `tiles`]; for each row, 4 words with the ReLU masks of 128 hidden units,
     [K, 4 ceil(H / 128)], which "note" writes and "mask" reads; and writes outputs [K, out_width]
     of at most 8 `tiles` columns. All are dimensionless. Rows are read 16 bytes at a time and
     outputs written 8 at a time: rows must be dense, begin at a multiple of 16 bytes and have a
@@ -88,12 +89,12 @@ def two_layer_kernel(steps: int, tiles: int, mode: str) -> wp.Kernel:
 def weight_gradient_kernels(
     steps: int, tiles: int, out_tiles: int, warps: int, unit_blocks: int, words: int
 ) -> SimpleNamespace:
-    """Return the kernels of the weights' gradients: sums over shares of the rows, and their sum.
+    """Return the kernels of the weights' gradients: partial sums over parts of the rows, their sum.
 
-    A block sums a share of the rows, each warp of it for `WARP_UNITS` hidden units: it computes
-    their values and cotangents again, transposed, so that they are the left operands of the
-    gradients' products. Numbers are pairs of bfloat16, which need no scaling: the rows' scales
-    differ, and sums run over rows. A row has groups of 16 columns (`steps`) or of 8 (`tiles`).
+    A block sums a part of the rows, each of its warps for `WARP_UNITS` hidden units. It recomputes
+    their values and cotangents, transposed, so that they are left operands of the gradients'
+    products. Numbers are pairs of bfloat16, which need no scaling: scales differ among rows, and
+    sums run over rows. A row has groups of 16 columns (`steps`) or of 8 (`tiles`).
     """
     variant = f"{steps}_{tiles}_{out_tiles}_{warps}_{unit_blocks}_{words}"
     module = native.module(f"npa_envs.kernels.network_gradients_{variant}")
@@ -122,9 +123,9 @@ def weight_gradient_kernels(
         # outputs
         partial_sums: wp.array(dtype=wp.float32, ndim=2),
     ):
-        """Sum both weights' gradients over each share of the rows."""
+        """Sum both weights' gradients over each part of the rows."""
         await_earlier()
-        let_next_in()
+        allow_next_launch()
         weight_sums(
             unit_count,
             share_rows,
@@ -144,9 +145,9 @@ def weight_gradient_kernels(
         # outputs
         total: wp.array(dtype=wp.float32),
     ):
-        """Add the shares' sums."""
+        """Add the partial sums."""
         await_earlier()
-        let_next_in()
+        allow_next_launch()
         add_partial_sums(partial_sums, total)
 
     return SimpleNamespace(sum_weight_gradients=sum_weight_gradients, add_shares=add_shares)
@@ -154,27 +155,27 @@ def weight_gradient_kernels(
 
 @made_once()
 def make_share_sum(warps: int) -> Any:
-    """Return a Warp function that adds shares' sums; a block has so many warps, and 32 columns."""
+    """Return a Warp function that adds partial sums; a block has `warps` warps and 32 columns."""
 
     @native.func_native(warps)
     def add_partial_sums(
         partial_sums: wp.array(dtype=wp.float32, ndim=2), total: wp.array(dtype=wp.float32)
     ):
-        """Add what the shares of rows summed, in a fixed order."""
+        """Add the partial sums in a fixed order."""
 
     return add_partial_sums
 
 
 @native.func_native()
 def scale_to(size: wp.float32, target: wp.uint32) -> wp.float32:
-    """The power of two by which a positive size comes to lie in [2^target, 2^(target + 1))."""
+    """Return the power of two that scales a positive number into [2^target, 2^(target + 1))."""
 
 
 @made_once()
 def arrangement_kernels() -> SimpleNamespace:
-    """Return the kernels that lay out weights in the order in which the lanes of a warp read them.
+    """Return the kernels that lay out weights in the order in which a warp's threads read them.
 
-    Each number is split in two halves.
+    Each number is split into two numbers of 16 bits.
     """
     module = native.module("npa_envs.kernels.network_arrangement")
 

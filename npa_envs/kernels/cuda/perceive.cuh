@@ -1,9 +1,9 @@
-// Slots: what the lanes of one particle share in a CUDA block's fast memory.
+// Slots: the parts of a block's shared memory, one for each particle's lanes.
 //
-// A slot holds a short list of neighbours: first their numbers as they are found, then each with
-// its weights; at the end, the row of perception that came of them, on its way out. Votes are of
-// whole warps, all of whose threads must therefore take the same way: a vote of a few lanes would
-// make the groups of a warp run one after another.
+// A slot contains a short list of neighbours: first their indices as they are found, then each with
+// its weights; at the end, the resulting row of perception, to be written. Votes are of complete
+// warps, so all threads of a warp must take the same branches: votes among the lanes of a particle
+// would make the particles of a warp run one after the other.
 
 namespace npa {
 
@@ -13,8 +13,8 @@ template <int BYTES, int LANES, int BLOCK> __device__ inline unsigned slot_addre
     return (unsigned)__cvta_generic_to_shared(slots + threadIdx.x / LANES * BYTES);
 }
 
-// Where a part of the first state lies. The compiler shall take it as it is: with the part's number
-// added for each state, it takes two instructions more.
+// Address of a part of the first state, computed once: if the compiler added the part's index for
+// each state, that would take two instructions more.
 template <typename Share>
 __device__ inline unsigned long long part_address(const wp::array_t<Share>& states, int part)
 {
@@ -32,7 +32,7 @@ __device__ inline Share part_of_state(unsigned long long address, int part_count
     return result;
 }
 
-// Four words of an entry lie together: in 2D the last is its number; in 3D numbers follow all.
+// Four words of an entry are adjacent: in 2D the last is its index; in 3D indices follow all entries.
 template <int DIMS, int ENTRIES> __device__ inline int* number_place(unsigned slot, int entry)
 {
     const unsigned place = DIMS == 2 ? slot + 12 + 16 * entry : slot + 16 * ENTRIES + 4 * entry;
@@ -86,8 +86,8 @@ template <typename Value> __device__ inline void stage(unsigned slot, int word, 
     store_chunks<chunk_bytes(sizeof(Value))>(__cvta_shared_to_generic(slot + 4 * word), value);
 }
 
-// A whole warp writes one slot after another, so that a row leaves in few, full transactions; in
-// pairs where the channels fill their group, for then a slot holds what a row begins with.
+// A complete warp writes one slot after the other, so that rows take few, full transactions; in pairs
+// of words if the channels fill their group, as a slot then has the same layout as its row.
 template <int DIMS, int WIDTH, int LANES, int ROW_WORDS, int BYTES, bool GROUPED>
 __device__ inline void write_rows(
     unsigned slot, int destination, int group, int state_dim, float limit,
@@ -100,7 +100,7 @@ __device__ inline void write_rows(
     if (!GROUPED && state_dim == WIDTH && paired) {
         char* base = reinterpret_cast<char*>(rows.data + 2 * lane);
         unsigned from = slots + 8 * lane;
-        // What all slots share is computed once, not again beside each.
+        // Common to all slots, so computed once.
         asm volatile("" : "+l"(base), "+r"(from));
         #pragma unroll
         for (unsigned s = 0; s < 32 / LANES; ++s) {

@@ -1,13 +1,15 @@
-"""Perception on CUDA in float32, by the lists of neighbours that the density pass left.
+"""Perception on CUDA in float32, from the neighbour lists of the density pass.
 
-The same sums as the portable kernel, in another order of work. The lanes of a particle weigh the
-listed neighbours, one for each lane, and put the weights into fast memory; then they run through
-these together, a few channels for each lane: weights are computed once, and only for neighbours; a
-neighbour's state is read once, by adjacent lanes. Rows leave through fast memory too, in whole
-transactions. A list that is too long was not kept: its neighbours are searched for again.
+The same sums as the portable kernel, in another order of work. First each lane of a particle
+computes the weights of other neighbours, and stores them in a slot, the particle's part of shared
+memory. Then all lanes run through the slot together, each for a few channels. So weights are
+computed once, only for neighbours, and a neighbour's state is read once, by adjacent lanes. Rows
+are also written through shared memory, in full transactions. Neighbours of a list beyond the
+capacity are searched for again.
 """
 
 import math
+from types import SimpleNamespace
 
 import warp as wp
 
@@ -21,9 +23,9 @@ from npa_envs.kernels.access import (
     load_integer,
     make_lane_sum,
     make_wide_load,
-    meet_warp,
     of_lane,
     share_type,
+    sync_warp,
     thread_number,
 )
 from npa_envs.kernels.cuda.density import RECORD, make_steps_at, step_of
@@ -40,98 +42,30 @@ from npa_envs.kernels.mathematics import (
 from npa_envs.once import made_once
 
 CUDA_REGISTERS, TEAM_REGISTERS = {2: 80, 3: 112}, 128
-"""Registers of a thread of the perception pass: of one team, by dimension, and of several."""
+"""Registers per thread: with one team for a particle, by dimension, and with several."""
 
 PAIR = 2
-"""Listed neighbours that a lane weighs together: their steps are one word."""
+"""Listed neighbours that a lane processes at a time: their steps are packed in 32 bits."""
 
 TOGETHER = 4
-"""Weighed neighbours whose states are asked for together; a slot's number divides by it."""
+"""Neighbours whose states are loaded at a time; a divisor of `SLOT_ENTRIES`."""
 
 SLOT_ENTRIES = 32
-"""Neighbours that a slot has room for; longer neighbourhoods are summed in several rounds. A pair
-for every lane, some times over."""
+"""Neighbours of a full slot, a multiple of `PAIR` times the lanes; more take several rounds."""
 
 CANDIDATES = 16
-"""Candidates of a particle that are asked for together where its neighbours are searched for."""
+"""Candidates of a particle that are loaded at a time in a search."""
 
 load_record = make_wide_load(RECORD, wp.float32)
 
 
-@made_once()
-def listed_perception(
-    space_dim: int,
-    width: int,
-    lanes: int,
-    state_gradient: bool,
-    moment_inverse: str | None,
-    periodic: bool,
-    grouped: bool,
-    capacity: int,
-    for_adjoint: bool,
-    teams: int,
-    by_place: bool = False,
-    tiled: bool = False,
-) -> wp.Kernel:
-    """Return the perception kernel of one variant.
-
-    Args:
-        lanes: Lanes of a team, which share the channels of a group.
-        grouped: Whether channels come in several groups.
-        teams: Teams that share a particle where few particles fill the device: each runs through
-            its own part of the list, all channels of it.
-        by_place: Whether there is a list for each sorted particle, not for each row.
-        tiled: Whether the density pass was that of tiles, which lays lists out otherwise.
-    """
-    scalar = wp.float32
-    moment_correction = moment_inverse is not None
-    smooth = moment_inverse == "smooth"
-    flat = space_dim == 2
-    types = domain_types(space_dim, scalar)
-    vector, Domain = types.vector, types.Domain
-    cell_place, segment_count, segment_cells = (
-        types.cell_place,
-        types.segment_count,
-        types.segment_cells,
-    )
-    periodic_image = types.periodic_image
-    wide = wp.types.vector(space_dim, wp.float64)
-    group = wp.types.vector(width, scalar)
-    share = share_type(group, scalar, lanes)
-    share_gradient = share_type(wp.types.matrix((space_dim, width), scalar), scalar, lanes)
-    share_width = width // lanes
-    share_rows = wp.types.vector(share_width * space_dim, scalar)
-    team = lanes
-    lanes *= teams
-    ahead = max(CANDIDATES // lanes, 1)
-    square = wp.types.matrix((space_dim, space_dim), scalar)
-    cell_vector = wp.types.vector(space_dim, wp.int32)
-    topic = "listed_smoothing"
-    if state_gradient:
-        topic = "listed_perception" if moment_correction else "listed_uncorrected_perception"
-        topic = "listed_smoothly_corrected_perception" if smooth else topic
-    topic += "_in_box" * periodic + "_grouped" * grouped
-    topic += f"_{capacity}" + "_for_adjoint" * for_adjoint + "_by_place" * by_place
-    topic += "_tiled" * tiled
-    module = kernel_module(topic, space_dim, scalar, width, lanes)
-    registers = CUDA_REGISTERS[space_dim] if teams == 1 else TEAM_REGISTERS
-    load_vector = make_wide_load(vector, scalar)
-    add_vector = make_lane_sum(vector, scalar, lanes, whole_warps=True)
-    add_square = make_lane_sum(square, scalar, lanes, whole_warps=True)
-    add_wide = make_lane_sum(wide, wp.float64, lanes, whole_warps=True)
-    add_share = make_lane_sum(share, scalar, lanes, whole_warps=True, stride=team)
-    add_gradient = make_lane_sum(share_gradient, scalar, lanes, whole_warps=True, stride=team)
-    steps_at = make_steps_at(capacity, tiled)
-    entries_together = wp.types.matrix((TOGETHER, space_dim + 2), scalar)
-    states_together = wp.types.matrix((TOGETHER, share_width), scalar)
-    places_of_pair = wp.types.vector(PAIR, wp.int32)
-    records_of_pair = wp.types.matrix((PAIR, 4), scalar)
-    candidates_ahead = wp.types.matrix((ahead, space_dim), scalar)
-    corrected = make_corrected(space_dim, scalar, share_width, moment_inverse)
-    stage_share, stage_rows = make_stage(share), make_stage(share_rows)
+def slot_functions(
+    space_dim: int, width: int, lanes: int, share: type, row_words: int, grouped: bool
+) -> SimpleNamespace:
+    """Return the functions on a particle's slot, on its neighbours' states and on its row."""
+    vector = wp.types.vector(space_dim, wp.float32)
     entry_type = wp.types.vector(space_dim + 2, wp.float32)
-    row_words = width * (2 + space_dim * state_gradient)
-    # The odd 16 bytes spread the slots of a warp over the memory's banks.
+    # The additional 16 bytes spread a warp's slots over the banks of shared memory.
     slot_bytes = max(SLOT_ENTRIES * (16 if space_dim == 2 else 20), 4 * row_words) + 16
 
     @native.func_native(slot_bytes, lanes, CUDA_BLOCK)
@@ -168,22 +102,53 @@ def listed_perception(
         rows: wp.array(dtype=wp.float32, ndim=2),
     ): ...
 
+    @wp.func
+    def padded(count: wp.int32):
+        """Return a number of neighbours, rounded up to a multiple of the lanes."""
+        return (count + wp.static(lanes - 1)) & ~wp.int32(wp.static(lanes - 1))
+
+    numbers = append_number, number_at, padded
+    return native.named(
+        slot_address, part_address, part_of_state, *numbers, put_entry, entry_at, write_rows
+    )
+
+
+def weighing_functions(
+    space_dim: int,
+    lanes: int,
+    slots: SimpleNamespace,
+    steps_at: wp.Function,
+    state_gradient: bool,
+    moment_correction: bool,
+    for_adjoint: bool,
+    periodic: bool,
+) -> SimpleNamespace:
+    """Return the functions that put neighbours' weights into a slot and add up the short sums.
+
+    These are sums whose terms have no channels: of v K, of the moment matrix, and of the density
+    gradient. Each lane sums its own neighbours.
+    """
+    scalar = wp.float32
+    flat = space_dim == 2
+    types = domain_types(space_dim, scalar)
+    vector, Domain, periodic_image = types.vector, types.Domain, types.periodic_image
+    wide = wp.types.vector(space_dim, wp.float64)
+    square = wp.types.matrix((space_dim, space_dim), scalar)
+    places_of_pair = wp.types.vector(PAIR, wp.int32)
+    records_of_pair = wp.types.matrix((PAIR, 4), scalar)
+    padded, number_at, put_entry = slots.padded, slots.number_at, slots.put_entry
+
     @wp.struct
     class Centre:
-        """What the weights of all pairs of a row begin with: converted once, not for each pair."""
+        """A row's particle, in the types that its pairs need: converted once, not for each pair."""
 
         position: vector
         precise: wide
         inverse_eps: wp.float64
 
     @wp.func
-    def padded(count: wp.int32):
-        """A number of neighbours rounded up to a multiple of the lanes."""
-        return (count + wp.static(lanes - 1)) & ~wp.int32(wp.static(lanes - 1))
-
-    @wp.func
     def spiky_wide(domain: Domain, centre: Centre, neighbour: vector, squared: scalar):
-        """Spiky factor, up to its norm, and distance vector of a pair in float64."""
+        """Return a pair's spiky factor without its norm, and its offset r, in float64."""
         r = wide()
         start = squared
         for d in range(wp.static(space_dim)):
@@ -211,9 +176,9 @@ def listed_perception(
         moment: square,
         density_gradient: wide,
     ):
-        """Weigh neighbour j for all lanes, and add it to this lane's share of the short sums.
+        """Put neighbour j's weights into the slot, and add its terms to this lane's short sums.
 
-        What fills up a list does not count and lies at the centre: it adds nothing.
+        Entries that only pad a list have `counts` False and the centre's position: they add 0.
         """
         number = j
         if wp.static(flat):
@@ -258,8 +223,8 @@ def listed_perception(
         moment: square,
         density_gradient: wide,
     ):
-        """Weigh the neighbours whose numbers are in the slot, from `begin` to `count`."""
-        meet_warp()
+        """Call `weigh` for neighbours whose indices are in the slot, from `begin` to `count`."""
+        sync_warp()
         for first in range(lane, padded(count), wp.static(PAIR * lanes)):
             places = places_of_pair()
             found = records_of_pair()
@@ -284,7 +249,7 @@ def listed_perception(
                     moment,
                     density_gradient,
                 )
-        meet_warp()
+        sync_warp()
         return kernel_sum, moment, density_gradient
 
     @wp.func
@@ -305,9 +270,9 @@ def listed_perception(
         moment: square,
         density_gradient: wide,
     ):
-        """Weigh neighbours of a list from its entry `begin` on, as many as a slot has room for.
+        """Call `weigh` for a list's entries from `begin` on, up to a full slot.
 
-        The steps of a lane's next pair are asked for before those it has are used.
+        The steps of a lane's next pair are loaded before the current ones are used.
         """
         end = begin + padded(wp.clamp(length - begin, 0, wp.static(SLOT_ENTRIES)))
         for first in range(begin + wp.static(PAIR) * lane, end, wp.static(PAIR * lanes)):
@@ -332,8 +297,26 @@ def listed_perception(
                     moment,
                     density_gradient,
                 )
-        meet_warp()
+        sync_warp()
         return steps, kernel_sum, moment, density_gradient
+
+    return SimpleNamespace(Centre=Centre, weigh_found=weigh_found, weigh_listed=weigh_listed)
+
+
+def make_add_states(
+    space_dim: int,
+    share_width: int,
+    teams: int,
+    slots: SimpleNamespace,
+    share: type,
+    share_gradient: type,
+    state_gradient: bool,
+) -> wp.Function:
+    """Return the function that adds neighbours' states to the long sums, by a slot's weights."""
+    scalar = wp.float32
+    entries_together = wp.types.matrix((TOGETHER, space_dim + 2), scalar)
+    states_together = wp.types.matrix((TOGETHER, share_width), scalar)
+    padded, entry_at, part_of_state = slots.padded, slots.entry_at, slots.part_of_state
 
     @wp.func
     def add_states(
@@ -346,7 +329,7 @@ def listed_perception(
         blur: share,
         gradient: share_gradient,
     ):
-        """Add states of weighed neighbours, this team's from `first` on, to the long sums."""
+        """Add weighted states of this team's neighbours, from `first` on, to the long sums."""
         for entry in range(first, padded(count), wp.static(teams * TOGETHER)):
             packed = entries_together()
             found = states_together()
@@ -364,12 +347,90 @@ def listed_perception(
                     for d in range(wp.static(space_dim)):
                         for c in range(wp.static(share_width)):
                             gradient[d, c] += packed[a, d + 1] * difference[c]
-        meet_warp()
+        sync_warp()
         return blur, gradient
+
+    return add_states
+
+
+@made_once()
+def listed_perception(
+    space_dim: int,
+    width: int,
+    lanes: int,
+    state_gradient: bool,
+    moment_inverse: str | None,
+    periodic: bool,
+    grouped: bool,
+    capacity: int,
+    for_adjoint: bool,
+    teams: int,
+    by_place: bool = False,
+    tiled: bool = False,
+) -> wp.Kernel:
+    """Return the perception kernel of one variant.
+
+    Args:
+        lanes: Lanes of a team, which share the channels of a group.
+        grouped: Whether there are several groups of channels.
+        teams: Teams of lanes that share a particle, so that few particles fill the GPU: each runs
+            through its own part of the list, for all channels.
+        by_place: Whether there is a list for each sorted particle, not for each row.
+        tiled: Whether lists have the layout of `tiled_density`.
+    """
+    scalar = wp.float32
+    moment_correction = moment_inverse is not None
+    types = domain_types(space_dim, scalar)
+    vector, Domain = types.vector, types.Domain
+    cell_place, segment_count = types.cell_place, types.segment_count
+    segment_cells = types.segment_cells
+    periodic_image = types.periodic_image
+    wide = wp.types.vector(space_dim, wp.float64)
+    group = wp.types.vector(width, scalar)
+    share = share_type(group, scalar, lanes)
+    share_gradient = share_type(wp.types.matrix((space_dim, width), scalar), scalar, lanes)
+    share_width = width // lanes
+    share_rows = wp.types.vector(share_width * space_dim, scalar)
+    team = lanes
+    lanes *= teams
+    ahead = max(CANDIDATES // lanes, 1)
+    square = wp.types.matrix((space_dim, space_dim), scalar)
+    cell_vector = wp.types.vector(space_dim, wp.int32)
+    topic = "listed_smoothing"
+    if state_gradient:
+        topic = "listed_perception" if moment_correction else "listed_uncorrected_perception"
+        topic = "listed_smoothly_corrected_perception" if moment_inverse == "smooth" else topic
+    topic += "_in_box" * periodic + "_grouped" * grouped
+    topic += f"_{capacity}" + "_for_adjoint" * for_adjoint + "_by_place" * by_place
+    topic += "_tiled" * tiled
+    module = kernel_module(topic, space_dim, scalar, width, lanes)
+    registers = CUDA_REGISTERS[space_dim] if teams == 1 else TEAM_REGISTERS
+    load_vector = make_wide_load(vector, scalar)
+    add_vector = make_lane_sum(vector, scalar, lanes, whole_warps=True)
+    add_square = make_lane_sum(square, scalar, lanes, whole_warps=True)
+    add_wide = make_lane_sum(wide, wp.float64, lanes, whole_warps=True)
+    add_share = make_lane_sum(share, scalar, lanes, whole_warps=True, stride=team)
+    add_gradient = make_lane_sum(share_gradient, scalar, lanes, whole_warps=True, stride=team)
+    steps_at = make_steps_at(capacity, tiled)
+    candidates_ahead = wp.types.matrix((ahead, space_dim), scalar)
+    corrected = make_corrected(space_dim, scalar, share_width, moment_inverse)
+    stage_share, stage_rows = make_stage(share), make_stage(share_rows)
+    row_words = width * (2 + space_dim * state_gradient)
+    slots = slot_functions(space_dim, width, lanes, share, row_words, grouped)
+    slot_address, append_number = slots.slot_address, slots.append_number
+    part_address, part_of_state = slots.part_address, slots.part_of_state
+    write_rows = slots.write_rows
+    options = state_gradient, moment_correction, for_adjoint, periodic
+    weighing = weighing_functions(space_dim, lanes, slots, steps_at, *options)
+    Centre, weigh_found = weighing.Centre, weighing.weigh_found
+    weigh_listed = weighing.weigh_listed
+    add_states = make_add_states(
+        space_dim, share_width, teams, slots, share, share_gradient, state_gradient
+    )
 
     @wp.func
     def scale_huge(gradient_scale: scalar, gradient: share_gradient, scaled: share_rows):
-        """Scaled gradients, those whose squares overflow as well."""
+        """Return scaled gradients, correct also where the squared length overflows."""
         result = scaled
         for c in range(wp.static(share_width)):
             along = vector()
@@ -410,10 +471,10 @@ def listed_perception(
     ):
         """Write the perception vector of each row, as `perception_kernels` does.
 
-        Threads come in whole warps: lanes, teams, groups, rows, some of them beyond the last row.
-        States are read where `state_place` says, or in sorted order if it is empty (in 2D the
-        records say where); rows are written where `row_destination` says, or in their own order;
-        clipped to plus and minus `limit` unless that is zero.
+        Threads are numbered by lanes, teams, groups and rows, in complete warps, some beyond the
+        last row. `state_place` has the index of each sorted particle's state, by default (empty)
+        the same index; in 2D it is in `records`. Row k is written to row `row_destination[k]`, by
+        default to row k. Entries are clipped to plus and minus `limit` unless it is 0.
         """
         await_earlier()
         thread = thread_number()
@@ -424,7 +485,7 @@ def listed_perception(
             g = row % group_count
             row = row / group_count
         slot = slot_address()
-        # Which channels this lane sums, and which neighbours: every so-manyth from the first on.
+        # This lane's channels, and the first of its team's neighbours.
         part = lane & wp.static(team - 1)
         first = lane >> wp.static(team.bit_length() - 1)
         part_count = wp.int32(wp.static(team))
@@ -438,7 +499,7 @@ def listed_perception(
         kernel_sum = vector()
         moment = square()
         wide_sum = wide()
-        # Rows beyond the last one look at the first particle, and list nobody.
+        # Rows beyond the last one read the first particle, with no neighbours.
         safe_row = wp.where(present, row, wp.int32(0))
         k = safe_row
         if row_place.shape[0] > 0:
@@ -496,15 +557,15 @@ def listed_perception(
             base = index - local
             cell = cell_place(domain, local)
             segments = wp.where(searching, segment_count(domain, cell), wp.int32(0))
-        # Each lane looks up one run of cells; the runs are then walked one after another.
+        # Each lane looks up one run of cells; all lanes then go through the runs in order.
         run_count = largest_in_warp(segments)
         run = wp.int32(0)
         run_begin = wp.int32(0)
         run_end = wp.int32(0)
         j = lane
         end = wp.int32(0)
-        # What a round leaves over of a multiple of the lanes is kept free in the next: a
-        # neighbour's lane is then its number among all, whatever the rest of the warp does.
+        # The next round leaves as many entries free as this one has beyond a multiple of the lanes:
+        # a neighbour's lane then depends only on its index, not on the rest of the warp.
         begin = wp.int32(0)
         working = run_count > 0
         while working:
@@ -615,7 +676,7 @@ def listed_perception(
 
 @made_once()
 def make_stage(value_type: type) -> wp.Function:
-    """Return a Warp function that puts a value into a slot, some words from its beginning."""
+    """Return a Warp function that writes a value to a slot, at an offset of 32-bit words."""
 
     @native.func_native()
     def stage(slot: wp.uint32, word: wp.int32, value: value_type): ...

@@ -1,10 +1,10 @@
-// How a block sorts a world of up to CAPACITY particles, all of it in fast memory.
+// A block sorts a world of up to CAPACITY particles in shared memory.
 
 namespace npa {
 
-// Counts, later starts, of cells: of all particles, and from bit 16 on of the active ones. Then of
-// each particle its cell and its arrival there, and of each provisional place its particle:
-// arrivals and members are doubled, plus one if the particle is active.
+// Counts, later starts, of cells: of all particles in the low 16 bits, of active ones in the high.
+// Then each particle's cell and order of arrival there, and the particle at each provisional
+// position: arrivals and members are doubled, plus one if the particle is active.
 template <int CAPACITY, int BLOCK, int GRID> struct SortMemory {
     int starts[GRID + 1];
     int sums[BLOCK / 32];
@@ -60,7 +60,7 @@ __device__ inline void arrive(unsigned long long address, int particle, int cell
     memory.arrivals[particle] = (before & 0xffff) << 1 | active;
 }
 
-// A thread adds up some adjacent cells, a warp its threads, and every thread the warps before it.
+// A thread sums some adjacent cells, a warp its threads, and every thread the warps before it.
 template <int CAPACITY, int BLOCK, int GRID>
 __device__ inline void add_up_counts(unsigned long long address, int cell_count)
 {
@@ -115,7 +115,7 @@ __device__ inline wp::vec_t<2, int> span_of_slice(unsigned long long address, in
     );
 }
 
-// In the cell `unordered` provisional places are final.
+// In the cell `unordered` provisional positions are final.
 template <int CAPACITY, int BLOCK, int GRID>
 __device__ inline wp::vec_t<3, int> ranked_at(unsigned long long address, int place, int unordered)
 {

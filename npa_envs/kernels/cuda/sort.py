@@ -1,9 +1,9 @@
-"""Cell lists of small worlds on CUDA: a block sorts a world, all of it in fast memory.
+"""Cell lists of small worlds on CUDA: a block sorts a world in shared memory.
 
-The same order as that of the portable kernels, in one launch in place of six: particles are counted
-by cell, the counts are added up, particles take provisional places by arrival, and ranks among
-indices replace those. Where worlds are few, several blocks sort the same world, and each writes a
-slice.
+The same order as in the portable kernels, in one launch instead of six: particles are counted by
+cell, the counts are added up, particles get provisional positions in order of arrival, and ranks
+among indices replace these. If worlds are few, several blocks sort the same world, and each writes
+a slice.
 """
 
 from types import SimpleNamespace
@@ -20,8 +20,8 @@ from npa_envs.kernels.access import (
     make_read_channels,
     make_wide_load,
     make_wide_store,
-    meet_block,
     of_warp,
+    sync_block,
     thread_of_block,
 )
 from npa_envs.kernels.domain import domain_types, kernel_module
@@ -30,13 +30,13 @@ from npa_envs.once import made_once
 load_pair = make_wide_load(wp.vec2i, wp.int32)
 
 BLOCKS = {1024: 256, 4096: 1024}
-"""Threads of a block by the particles that it has room for."""
+"""Threads of a block by its capacity in particles."""
 
 RESIDENT_THREADS = 1024
-"""Threads that a multiprocessor has registers for, at least."""
+"""Threads for which a multiprocessor has enough registers."""
 
 LARGEST_GRID = 4096
-"""Cells that a block has room for."""
+"""Most cells of a world that a block sorts."""
 
 STATE_SHARE = 4
 """Adjacent channels that a thread moves."""
@@ -46,21 +46,21 @@ store_integer = make_wide_store(wp.int32, wp.int32)
 
 @native.func_native()
 def count_active(mask: wp.array(dtype=wp.uint8), count: wp.int32) -> wp.int32:
-    """A thread's part in counting the active ones of the first `count` particles of all worlds."""
+    """Return this thread's count of active particles among the first `count` of all worlds."""
 
 
 @made_once()
 def block_functions(capacity: int) -> SimpleNamespace:
-    """Return what kernels do whose blocks each sort a world of up to `capacity` particles."""
+    """Return the functions for blocks that each sort a world of up to `capacity` particles."""
     sizes = capacity, BLOCKS[capacity], LARGEST_GRID
 
     @native.func_native(*sizes)
     def block_memory() -> wp.uint64:
-        """The block's memory."""
+        """Return the address of the block's shared memory."""
 
     @native.func_native(*sizes)
     def clear_counts(address: wp.uint64, cell_count: wp.int32, earlier: wp.int32):
-        """Set the counts of all cells to zero, and add up every thread's count of earlier rows."""
+        """Set the counts of all cells to zero, and sum the threads' counts of earlier rows."""
 
     @native.func_native(*sizes)
     def arrive(address: wp.uint64, particle: wp.int32, cell: wp.int32, active: wp.bool):
@@ -72,26 +72,26 @@ def block_functions(capacity: int) -> SimpleNamespace:
 
     @native.func_native(*sizes)
     def start_of(address: wp.uint64, cell: wp.int32) -> wp.vec2i:
-        """First place in the world, and first row of all worlds, of a cell."""
+        """Return a cell's first sorted index in the world, and its first row among all worlds."""
 
     @native.func_native(*sizes)
     def place_arrived(address: wp.uint64, particle: wp.int32):
-        """Give a particle its provisional place."""
+        """Assign a particle its provisional position."""
 
     @native.func_native(*sizes)
     def span_of_slice(address: wp.uint64, begin: wp.int32, end: wp.int32) -> wp.vec2i:
-        """Provisional places, from and up to, of all that may belong into a slice of places."""
+        """Return the range of provisional positions whose particles may belong to a slice."""
 
     @native.func_native(*sizes)
     def ranked_at(address: wp.uint64, place: wp.int32, unordered: wp.int32) -> wp.vec3i:
-        """Final place, cell and row (-1: none) of the particle at a provisional place.
+        """Return sorted index, cell and row (-1: none) of the particle at a provisional position.
 
-        In the cell `unordered` (-1: none) provisional places are final.
+        In the cell `unordered` (-1: none) provisional positions are final.
         """
 
     @native.func_native(*sizes)
     def member_at(address: wp.uint64, place: wp.int32) -> wp.int32:
-        """Number of the particle at a provisional place."""
+        """Return the index of the particle at a provisional position."""
 
     functions = [block_memory, clear_counts, arrive, add_up_counts]
     functions += [start_of, place_arrived, span_of_slice, ranked_at, member_at]
@@ -134,7 +134,7 @@ def sort_small_worlds(space_dim: int, capacity: int) -> wp.Kernel:
         row_base: wp.int32,
         starts: wp.array(dtype=wp.int32),
     ):
-        """Write the first place, and the first row, of each of the slice's cells."""
+        """Write the first sorted index and the first row of each of the slice's cells."""
         share_of_cells = (cell_count + slice_count - 1) / slice_count
         begin = slice_number * share_of_cells
         end = wp.min(begin + share_of_cells, cell_count)
@@ -230,7 +230,7 @@ def sort_small_worlds(space_dim: int, capacity: int) -> wp.Kernel:
             starts[starts.shape[0] - 1] = row_base + end_of_all[1]
         for i in range(lane, particle_count, wp.static(block)):
             place_arrived(memory, i)
-        meet_block()
+        sync_block()
 
         share_of_places = (particle_count + slice_count - 1) / slice_count
         begin = slice_number * share_of_places
@@ -302,8 +302,8 @@ def order_particles(space_dim: int, width: int) -> wp.Kernel:
     ):
         """Move every particle to its rank by index within its cell; give active ones rows.
 
-        States and rows are left out where their arrays are empty. Threads come in whole warps, some
-        of them beyond the last particle.
+        States and rows are left out where their arrays are empty. Warps are complete, with threads
+        beyond the last particle.
         """
         await_earlier()
         k = wp.tid()
@@ -336,8 +336,8 @@ def order_particles(space_dim: int, width: int) -> wp.Kernel:
                     store_integer(row_place, row, place)
                     store_vector(row_positions, row, position)
 
-        # A warp moves the states of its particles together: neighbouring threads, neighbouring
-        # shares. All that is read is asked for before any of it is written.
+        # A warp moves the states of its particles together, adjacent threads adjacent channels. All
+        # loads come before the first store.
         if sorted_states.shape[0] > 0:
             lane = k % wp.static(WARP)
             parts = group_count * wp.static(CUDA_LANES)

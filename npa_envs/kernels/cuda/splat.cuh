@@ -2,8 +2,8 @@
 
 namespace npa {
 
-// Mean of a world's positions, in the order of npa_envs/kernels/portable/mean.py: a warp sums CHUNK
-// values, then the chunks' sums. The whole block calls it and gets it.
+// Mean of a world's positions, summed in the order of kernels/portable/world_mean.py: a warp sums
+// CHUNK values, then the chunks' sums. All threads of the block call it and get the mean.
 template <int CAPACITY, int CHUNK>
 __device__ inline wp::vec_t<2, float> mean_of_world(
     const wp::array_t<wp::vec_t<2, float>>& positions, int first, int count)

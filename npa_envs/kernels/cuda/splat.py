@@ -1,7 +1,7 @@
-"""Splats of small worlds on CUDA: a block sorts a world's, in one launch in place of seven.
+"""Splats of small worlds on CUDA: a block sorts those of a world, in one launch instead of seven.
 
-The same footprints in the same order as those of `pictures/splat.py`. The block finds its world's
-mean, too. Where worlds are few, several blocks sort the same world, and each writes a slice.
+The same footprints in the same order as in `pictures/splat.py`. The block also computes its world's
+mean. If worlds are few, several blocks sort the same world, and each writes a slice.
 """
 
 import warp as wp
@@ -12,12 +12,12 @@ from npa_envs.kernels.access import (
     block_number,
     make_wide_load,
     make_wide_store,
-    meet_block,
+    sync_block,
     thread_of_block,
 )
 from npa_envs.kernels.cuda.sort import BLOCKS, RESIDENT_THREADS, block_functions, store_integer
 from npa_envs.kernels.pictures.splat import splat_functions, splat_types
-from npa_envs.kernels.portable.mean import CHUNK
+from npa_envs.kernels.portable.world_mean import CHUNK
 from npa_envs.once import made_once
 
 
@@ -43,7 +43,7 @@ def sort_small_splats(capacity: int) -> wp.Kernel:
     def mean_of_world(
         positions: wp.array(dtype=vector), first: wp.int32, count: wp.int32
     ) -> vector:
-        """Mean of a world's positions, which the whole block asks for."""
+        """Return the mean of a world's positions; the whole block calls it."""
 
     @wp.kernel(
         enable_backward=False,
@@ -88,12 +88,12 @@ def sort_small_splats(capacity: int) -> wp.Kernel:
             starts[starts.shape[0] - 1] = positions.shape[0]
         for i in range(lane, particle_count, wp.static(block)):
             place_arrived(memory, i)
-        meet_block()
+        sync_block()
 
         share = (particle_count + slice_count - 1) / slice_count
         begin = slice_number * share
-        # What nobody sees may lie in any order, as there can be much of it, but that differs among
-        # the blocks of a world: the last one writes all of it.
+        # Invisible splats, which may be many, can have any order. As it differs among the blocks of
+        # a world, the last block writes all of them.
         hidden = start_of(memory, lens.cell_count - 1)[0]
         end = wp.min(begin + share, hidden)
         if slice_number == slice_count - 1:

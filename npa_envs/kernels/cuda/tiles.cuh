@@ -1,35 +1,35 @@
-// Density of particles that lie side by side, a warp for a tile of them: they share candidates.
+// Density by tiles of consecutive particles, a warp for each tile: they share candidates.
 
 namespace npa {
 
 // Particles of a tile, the lanes that share one, and cells on each side in which neighbours lie.
 constexpr int TILE = 8, TILE_LANES = 4, TILE_REACH = 2;
 constexpr int TILE_LINES = 2 * TILE_REACH + 1;
-// A bit for each candidate that a lane tests; one word holds so many.
+// A bit for each candidate that a lane tests, and the bits of a word.
 constexpr int TILE_TESTS = 32;
-// Tests that follow each other without a look at how many are left.
+// Tests in a row without a check of how many are left.
 constexpr int TILE_UNROLLED = 4;
-// Cells that the particles of a line may lie apart: those further on have their turn later, so that
-// few particles far from each other do not share all candidates between them.
+// Largest distance in cells of particles that are served together: those further on come later, so
+// that few distant particles do not share all candidates between them.
 constexpr int TILE_SPAN = 12;
 // Cells along each side of the smallest periodic box whose density is computed in tiles.
 constexpr int SMALLEST_TILED_BOX = 7;
 
-// Infinity, where nobody is near: any finite place is legal.
+// Infinity, as padding: every particle's position is finite.
 __device__ inline float nowhere() { return __uint_as_float(0x7f800000u); }
 
 template <int CAPACITY> struct TileMemory {
-    // Candidates that are there at once: with long lists fewer, so that a processor has room for 32
-    // blocks.
+    // Candidates in memory at a time: fewer with long lists, so that 32 blocks fit on a
+    // multiprocessor.
     static constexpr int WINDOW = CAPACITY > 128 ? 192 : 256;
     float2 positions[WINDOW];
-    // Steps to them from the tile's first particle.
+    // Differences of their sorted indices from that of the tile's first particle.
     short steps[WINDOW];
-    // The odd 16 bytes spread the lists over the memory's banks.
+    // The additional 16 bytes spread the lists over the banks of shared memory.
     alignas(16) short lists[TILE][CAPACITY + 8];
 };
 
-// Ask for 8 bytes of global memory to come into fast memory.
+// Copy 8 bytes from global to shared memory, asynchronously.
 __device__ inline void fetch(float2* to, const float2* from)
 {
     const unsigned address = (unsigned)__cvta_generic_to_shared(to);
@@ -43,9 +43,9 @@ __device__ inline void await_fetched() { asm volatile("cp.async.wait_all;" : : :
 // 3 where lines wrap around the grid and are two runs each.
 struct TileRun {
     int begin, count;
-    // Where its first candidate goes, and how many candidates all runs have.
+    // Index of its first candidate in shared memory, and the number of candidates of all runs.
     int place, total;
-    // Which of the lanes that copy it this one is, and how many they are.
+    // Index of this lane among those that copy the run, and their number.
     int copier, copiers;
 };
 
@@ -82,15 +82,15 @@ __device__ inline TileRun run_around(
         run.begin = line_starts[second ? 0 : first];
         run.count = line_starts[end] - run.begin;
     }
-    // The first lane of each run counts for it.
+    // The first lane of each run counts its candidates.
     const int end = sum_up_to(run.copier == 0 ? run.count : 0);
     run.place = end - run.count;
     run.total = __shfl_sync(~0u, end, 31);
     return run;
 }
 
-// Bring candidates from `window` on into fast memory, in a periodic box those images that are nearest
-// to an origin, and nobody behind the last one; return how many there are.
+// Copy candidates from `window` on into shared memory, in a periodic box their images nearest to an
+// origin, followed by padding; return their number.
 template <bool PERIODIC, int CAPACITY, typename Domain>
 __device__ inline int fetch_window(
     const Domain& domain, TileMemory<CAPACITY>& memory, const TileRun& run,
@@ -119,8 +119,8 @@ __device__ inline int fetch_window(
     return padded;
 }
 
-// Sum of the smoothing kernel over candidates in fast memory, without its norm; `near` has a bit for
-// each, the first in the highest bit: it is near if 1 - r^2 / eps^2 is positive.
+// Sum of the smoothing kernel over candidates in shared memory, without its norm; `near` gets a bit
+// for each, the first in the highest bit: whether 1 - r^2 / eps^2 is positive.
 __device__ inline float smoothing_of_candidates(
     const float2* candidates, int tests, float2 centre, float inverse_squared_eps, unsigned& near)
 {
@@ -132,7 +132,7 @@ __device__ inline float smoothing_of_candidates(
             const float x = candidate.x - centre.x, y = candidate.y - centre.y;
             const float squared = fmaf(x, x, y * y);
             total += smoothing(squared, inverse_squared_eps);
-            // The sign of r^2 / eps^2 - 1; what is not a number has none.
+            // The sign bit of r^2 / eps^2 - 1, which is 0 for NaN.
             const float beyond = fmaf(squared, inverse_squared_eps, -1.0f);
             near = __funnelshift_l(__float_as_uint(beyond), near, 1);
         }
@@ -141,8 +141,8 @@ __device__ inline float smoothing_of_candidates(
     return total;
 }
 
-// Append the near candidates of a particle's lanes to its list; return its new length, one more than
-// CAPACITY where they do not all fit in. The particle is the `number`-th of its tile.
+// Append the near candidates of a particle's lanes to its list; return its new length, CAPACITY + 1
+// if they do not fit. The particle is the `number`-th of its tile.
 template <int CAPACITY>
 __device__ inline int append_near(
     short* list, int length, const short* steps, int number, unsigned near)
@@ -159,9 +159,9 @@ __device__ inline int append_near(
     return total;
 }
 
-// Sum of the smoothing kernel over all neighbours of particle k, without its norm; its four lanes
-// call it together, those of a tile's other particles too, and leave the list of its row, -1 if it
-// has none. `first` is the tile's first particle, `base` the first cell of their world.
+// Sum of the smoothing kernel over all neighbours of particle k, without its norm. All lanes of the
+// tile call it together. It also writes the list of the particle's row (-1: none). `first` is the
+// tile's first particle, `base` the first cell of their world.
 template <int CAPACITY, bool PERIODIC, int SIZE, int SMALLEST_SIDE, typename Domain>
 __device__ inline float density_of_tile(
     const Domain& domain, const wp::array_t<int>& starts, const wp::array_t<int>& sorted_cell,
@@ -176,20 +176,20 @@ __device__ inline float density_of_tile(
     const int cell = sorted_cell.data[k] - base;
     const int nx = domain.cell_shape[0], ny = domain.cell_shape[1];
     const int y = (unsigned)cell / (unsigned)nx, x = cell - y * nx;
-    // One image of each candidate serves all particles of a turn: they and their neighbours lie less
-    // than half a periodic box from the first one's cell.
+    // One image of each candidate serves all particles of a turn: they and their neighbours are less
+    // than half a periodic box away from the first one's cell.
     const int span = min(PERIODIC ? (nx - SMALLEST_TILED_BOX) / 2 : nx - TILE_LINES, TILE_SPAN);
     short* list = memory.lists[lane / TILE_LANES];
     float total = 0.0f;
     int length = 0;
-    // Particles of one line have their turn together: those of a tile lie in the order of cells.
+    // Particles of one line are served together: those of a tile are in the order of cells.
     for (unsigned waiting = __ballot_sync(~0u, inside); waiting;) {
         const int leader = __ffs(waiting) - 1;
         const int line = __shfl_sync(~0u, y, leader), left = __shfl_sync(~0u, x, leader);
         const unsigned members = __ballot_sync(~0u, y == line && x - left <= span) & waiting;
         waiting &= ~members;
         const int right = __shfl_sync(~0u, x, 31 - __clz(members));
-        // Not the first particle's position, which may be no number.
+        // Not the first particle's position, which may be NaN.
         const float2 origin = make_float2(
             (left + 0.5f) * domain.box[0] / nx, (line + 0.5f) * domain.box[1] / ny);
         float2 centre = make_float2(-nowhere(), -nowhere());

@@ -1,4 +1,4 @@
-// What the warps of a block have for some pairs, in its fast memory.
+// Values of a block's warps for some pairs, in shared memory.
 
 namespace npa {
 

@@ -1,17 +1,18 @@
-"""Pictures of 3D Gaussians: footprints laid over each other, near ones first, and the adjoint.
+"""Pictures of 3D Gaussians: alpha blending of footprints, near ones first, and the adjoint.
 
-A pixel at d from a footprint's mean is covered by alpha = min(0.99, o exp(-1/2 dᵀ Q d)), nothing
-below 1/255; its colour is the sum of c alpha T with T the product of 1 - alpha of those before,
-until T would fall below 1e-4 (Kerbl et al. 2023: equation 3 and their rasterizer's limits).
+A footprint covers a pixel at offset d from its mean by alpha = min(0.99, o exp(-1/2 dᵀ Q d)), by 0
+if that is below 1/255. The pixel's colour is the sum of c alpha T, with the transmittance T the
+product of 1 - alpha of nearer Gaussians, until T would be below 1e-4 (Kerbl et al. 2023: equation 3
+and their rasterizer's limits).
 
-Backwards, T is divided by 1 - alpha on the way from the last Gaussian to the first. With b the sum
-over those behind of (c . c̄) alpha T, and T times its cotangent at the end, the cotangent of alpha
+The backward pass divides T by 1 - alpha from the last Gaussian to the first. With b the sum of
+(c . c̄) alpha T over farther Gaussians plus the final T times its cotangent, the cotangent of alpha
 is T (c . c̄) - b / (1 - alpha).
 
-On CUDA a block serves a tile, a thread a pixel; its sums over pixels are taken over warps by
-shuffles and over the block's warps in fast memory. On the CPU a thread serves a tile, one Gaussian
-after the other, each at those pixels only that it reaches. Either way every pair of a tile and a
-Gaussian has a slot of its own for what the tile pulls: no sum depends on which thread came first.
+On CUDA a block serves a tile and a thread a pixel; sums over pixels use shuffles within warps and
+shared memory among warps. On a CPU a thread serves a tile, one Gaussian after the other, each only
+at the pixels that it covers. Either way every pair of a tile and a Gaussian has its own slot for
+the cotangents from that tile (its pull): no sum depends on the order of threads.
 """
 
 from types import SimpleNamespace
@@ -25,7 +26,7 @@ from npa_envs.kernels.access import (
     load_integer,
     make_lane_sum,
     make_wide_load,
-    meet_block,
+    sync_block,
 )
 from npa_envs.kernels.domain import scalar_name
 from npa_envs.kernels.mathematics import make_fast_exp2
@@ -41,34 +42,34 @@ from npa_envs.kernels.pictures.gaussians import (
 from npa_envs.once import made_once
 
 LARGEST_ALPHA = 0.99
-"""What a Gaussian covers of a pixel, at most: the adjoint divides by the rest."""
+"""Largest alpha: the adjoint divides by 1 - alpha."""
 
 SMALLEST_PASSING = 1e-4
-"""Share of light below which nothing farther is seen."""
+"""Transmittance below which farther Gaussians are ignored."""
 
 TILE_PIXELS = TILE * TILE
 """Pixels of a tile, and threads of its block."""
 
 PATCH_WIDTH, PATCH_HEIGHT = 8, 4
-"""Pixels of a tile that a warp serves: as square as can be, for Gaussians that it may skip."""
+"""Pixels of a tile that a warp serves: nearly square, so that it can skip most Gaussians."""
 
 BATCH = 32
-"""Pairs whose pulls a block keeps in fast memory before it adds up those of its warps."""
+"""Pairs whose pulls a block keeps in shared memory before it adds those of its warps."""
 
 TO_POWER_OF_TWO = -0.7213475204444817
-"""-1/2 log2(e): of exp(-1/2 p) as a power of two."""
+"""-1/2 log2(e), the factor of p in exp(-1/2 p) as a power of two."""
 
 
 @made_once()
 def blending_functions(scalar: type) -> SimpleNamespace:
-    """Return what all kernels share: what one Gaussian does to one pixel, and its adjoint."""
+    """Return the functions of all kernels: one Gaussian's effect on one pixel, and its adjoint."""
     types = gaussian_types(scalar)
     Frame, quad, footprint_type, pulls_type = types.Frame, types.quad, types.footprint, types.pulls
     fast_exp2 = make_fast_exp2(scalar)
 
     @wp.func
     def strength(footprint: footprint_type, x: scalar, y: scalar):
-        """What a footprint covers of a pixel in its way (x, y), before it is limited."""
+        """Return a footprint's alpha at a pixel (x, y), before it is limited."""
         power = footprint[2] * x * x + footprint[4] * y * y
         power += scalar(2.0) * footprint[3] * x * y
         return footprint[5] * fast_exp2(scalar(TO_POWER_OF_TWO) * power)
@@ -87,7 +88,7 @@ def blending_functions(scalar: type) -> SimpleNamespace:
         through: scalar,
         behind: scalar,
     ):
-        """A pixel's pull at a footprint; light that comes before it, and what is behind that."""
+        """Return a pixel's pull on a footprint, the transmittance before it, and the updated b."""
         alpha = wp.min(strength, scalar(LARGEST_ALPHA))
         rest = scalar(1.0) / (scalar(1.0) - alpha)
         before = through * rest
@@ -112,7 +113,7 @@ def blending_functions(scalar: type) -> SimpleNamespace:
     @wp.func
     def channels_at(values: wp.array(dtype=scalar, ndim=2), pixel: wp.int32):
         result = quad()
-        # A loop that is unrolled leaves the vector in registers.
+        # In an unrolled loop the vector stays in registers.
         for c in range(wp.static(CHANNELS)):
             if c < values.shape[1]:
                 result[c] = values[pixel, c]
@@ -120,7 +121,7 @@ def blending_functions(scalar: type) -> SimpleNamespace:
 
     @wp.func
     def pixel_of(frame: Frame, image: wp.int32, row: wp.int32, column: wp.int32):
-        """Index of a pixel in all pictures, -1 where it lies outside."""
+        """Return the index of a pixel among all pictures, -1 outside of them."""
         pixel = wp.int32(-1)
         if row < frame.height and column < frame.width:
             pixel = (image * frame.height + row) * frame.width + column
@@ -128,7 +129,7 @@ def blending_functions(scalar: type) -> SimpleNamespace:
 
     @wp.func
     def middle_of(pixel: wp.int32):
-        """Place of the middle of a row's or a column's pixels."""
+        """Return the coordinate of the centre of a row's or column's pixels."""
         return scalar(pixel) + scalar(0.5)
 
     return named(strength, colours_of, pull, channels_at, pixel_of, middle_of)
@@ -141,17 +142,14 @@ def tile_kernels(scalar: type) -> SimpleNamespace:
     Frame, footprint_type, pulls_type = types.Frame, types.footprint, types.pulls
     functions = blending_functions(scalar)
     strength_at, pull = functions.strength, functions.pull
-    channels_at, pixel_of, middle_of = (
-        functions.channels_at,
-        functions.pixel_of,
-        functions.middle_of,
-    )
+    channels_at, pixel_of = functions.channels_at, functions.pixel_of
+    middle_of = functions.middle_of
     covered = make_covered(scalar)
     module = native.module(f"npa_envs.kernels.blending_tiles_{scalar_name(scalar)}")
 
     @wp.func
     def shared_pixels(frame: Frame, tile: wp.int32, footprint: footprint_type):
-        """First column and row of the pixels in a tile within reach, and one past the last."""
+        """Return first, and last + 1, column and row of a tile's pixels that a footprint covers."""
         place = tile % frame.tile_count
         row = place / frame.tile_columns * wp.static(TILE)
         column = place % frame.tile_columns * wp.static(TILE)
@@ -178,9 +176,9 @@ def tile_kernels(scalar: type) -> SimpleNamespace:
         # outputs
         stops: wp.array(dtype=wp.int32),
     ):
-        """Draw a tile; `stops` is one past the last pair that a pixel has seen.
+        """Draw a tile; `stops` becomes one past the last pair that a pixel blends.
 
-        `stops` must be beyond all pairs at first.
+        Its initial values must be beyond all pairs.
         """
         tile = range_start + wp.tid()
         image = tile / frame.tile_count
@@ -221,7 +219,7 @@ def tile_kernels(scalar: type) -> SimpleNamespace:
         # outputs
         pulls: wp.array(dtype=pulls_type),
     ):
-        """Write what a tile pulls at each of its Gaussians to the pair's slot."""
+        """Write a tile's pull on each of its Gaussians to the pair's slot."""
         tile = range_start + wp.tid()
         image = tile / frame.tile_count
         begin = starts[tile]
@@ -254,17 +252,14 @@ def tile_kernels(scalar: type) -> SimpleNamespace:
 def block_kernels(scalar: type) -> SimpleNamespace:
     """Return the kernels of one scalar type in which a block serves a tile; for CUDA.
 
-    Drawing runs on the CPU, too.
+    Drawing also runs on a CPU.
     """
     types = gaussian_types(scalar)
     Frame, quad, footprint_type, pulls_type = types.Frame, types.quad, types.footprint, types.pulls
     functions = blending_functions(scalar)
     strength_at, colours_of, pull = functions.strength, functions.colours_of, functions.pull
-    channels_at, pixel_of, middle_of = (
-        functions.channels_at,
-        functions.pixel_of,
-        functions.middle_of,
-    )
+    channels_at, pixel_of = functions.channels_at, functions.pixel_of
+    middle_of = functions.middle_of
     name = scalar_name(scalar)
     drawing = native.module(f"npa_envs.kernels.blending_blocks_{name}")
     pulling = native.module(f"npa_envs.kernels.blending_blocks_adjoint_{name}")
@@ -273,11 +268,11 @@ def block_kernels(scalar: type) -> SimpleNamespace:
 
     @native.func_native(BATCH, TILE_PIXELS // WARP)
     def keep(write: wp.bool, i: wp.int32, entry: wp.int32, value: pulls_type) -> scalar:
-        """Keep what a warp has for pair i, or return an entry of the sum over the warps."""
+        """Store a warp's pulls of pair i (`write`), or return an entry of their sum over warps."""
 
     @wp.func
     def own_pixel(frame: Frame, tile: wp.int32, k: wp.int32):
-        """Column and row of a thread's pixel; a warp has a patch of its tile."""
+        """Return column and row of a thread's pixel; a warp has a patch of its tile."""
         patch = k / wp.static(WARP)
         lane = k % wp.static(WARP)
         across = wp.static(TILE // PATCH_WIDTH)
@@ -299,7 +294,7 @@ def block_kernels(scalar: type) -> SimpleNamespace:
         passing: wp.array(dtype=scalar),
         stops: wp.array(dtype=wp.int32),
     ):
-        """Draw a pixel; `stops` is one past the last pair that it has seen."""
+        """Draw a pixel; `stops` becomes one past the last pair that it blends."""
         t = wp.tid()
         tile = t / wp.static(TILE_PIXELS)
         column, row = own_pixel(frame, tile, t % wp.static(TILE_PIXELS))
@@ -344,9 +339,9 @@ def block_kernels(scalar: type) -> SimpleNamespace:
         # outputs
         pulls: wp.array(dtype=scalar),
     ):
-        """Write what a tile pulls at each of its Gaussians to the pair's slot.
+        """Write a tile's pull on each of its Gaussians to the pair's slot.
 
-        A block is a tile's; all its threads go through all pairs, as they add up together.
+        A block serves a tile; all its threads go through all pairs, as they sum together.
         """
         t = wp.tid()
         tile = t / wp.static(TILE_PIXELS)
@@ -384,13 +379,13 @@ def block_kernels(scalar: type) -> SimpleNamespace:
                             )
                         total = add_warp(total)
                 keep(True, i, 0, total)
-            meet_block()
+            sync_block()
             for entry in range(k, count * wp.static(PULLS), wp.static(TILE_PIXELS)):
                 i = entry / wp.static(PULLS)
                 part = entry - i * wp.static(PULLS)
                 slot = wp.int32(places[end - 1 - i])
                 pulls[slot * wp.static(PULLS) + part] = keep(False, i, part, pulls_type())
-            meet_block()
+            sync_block()
             end -= count
 
     return SimpleNamespace(draw_blocks=draw_blocks, pull_back_blocks=pull_back_blocks)

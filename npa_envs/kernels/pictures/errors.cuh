@@ -1,4 +1,4 @@
-// Which of a block's tiles have most candidates around them.
+// A block's tiles in descending order of their numbers of candidates.
 
 namespace npa {
 
@@ -14,7 +14,7 @@ template <int CAPACITY> __device__ inline void rank_tiles(int tile_count, int ca
 {
     __shared__ int4 keys[CAPACITY / 4];
     const int tile = threadIdx.x;
-    // More make no difference: it is to be an order that saves time.
+    // More need not be distinguished: the order only saves time.
     const int key = min(candidates, (1 << 30) / CAPACITY) * CAPACITY + CAPACITY - 1 - tile;
     if (tile < tile_count) reinterpret_cast<int*>(keys)[tile] = key;
     __syncthreads();

@@ -1,9 +1,9 @@
 """Errors of pictures of 2D worlds against a target.
 
-On CUDA no picture is written: a few threads gather a tile of pixels, compare it and go on to their
-next one. The tiles of a warp are served together, as long as the one with most particles around it
-takes, and many tiles of a picture have none. So a block first ranks its tiles by their particles.
-Which threads serve a tile changes none of its sums. On the CPU a drawn picture is compared.
+On CUDA no picture is written: a few threads gather a tile of pixels, compare it and continue with
+another one. The tiles of a warp take as long as the one with most particles around it, and many
+tiles of a picture have none. So a block first sorts its tiles by their numbers of particles. Sums
+do not depend on which threads serve a tile. On a CPU a drawn picture is compared.
 """
 
 import warp as wp
@@ -31,7 +31,7 @@ from npa_envs.kernels.pictures.splat import (
 from npa_envs.once import made_once
 
 BLOCK_TILES = CUDA_BLOCK
-"""Tiles of a block, at most: each thread counts the particles around one."""
+"""Most tiles of a block: each thread counts the particles around one."""
 
 BLOCK_WARPS = CUDA_BLOCK // WARP
 """Warps of a block."""
@@ -45,7 +45,7 @@ TURN_TILES = WARP_TILES * BLOCK_WARPS
 
 @made_once()
 def make_pixel_errors(scalar: type) -> wp.Function:
-    """Return a Warp function for a pixel's density error, and three times its colour error."""
+    """Return a Warp function for a pixel's density error and three times its colour error."""
     colour_type = splat_types(scalar).colour
 
     @wp.func
@@ -77,11 +77,11 @@ def gather_errors(scalar: type) -> wp.Kernel:
 
     @native.func_native(BLOCK_TILES)
     def rank_tiles(tile_count: wp.int32, candidates: wp.int32):
-        """Rank the first tiles of a block, each thread's own, by their candidates."""
+        """Rank the block's first tiles, one of each thread, by their candidates."""
 
     @native.func_native(BLOCK_TILES)
     def ranked_tile(rank: wp.int32) -> wp.vec2i:
-        """The tile of a rank and its candidates; -1 candidates where it has none to be."""
+        """Return the tile of a rank and its number of candidates, -1 for no tile."""
 
     @wp.kernel(
         enable_backward=False,
@@ -98,9 +98,9 @@ def gather_errors(scalar: type) -> wp.Kernel:
         # outputs
         partial_sums: wp.array(dtype=wp.vec2d, ndim=2),
     ):
-        """Write the sums of both errors over each tile; a block serves so many tiles."""
+        """Write the sums of both errors over each tile."""
         await_earlier()
-        # Neighbouring tiles are of different blocks, so that all blocks of a world do as much.
+        # Adjacent tiles belong to different blocks, so that all blocks of a world do equal work.
         tiles = lens.tile_columns * lens.tile_rows
         stride = (tiles + tile_count - 1) / tile_count
         world = block_number() / stride
@@ -115,7 +115,7 @@ def gather_errors(scalar: type) -> wp.Kernel:
         warp = thread_of_block() / wp.static(WARP)
         place = thread_of_block() % wp.static(WARP) / wp.static(TILE_LANES)
         for turn in range(tile_count / wp.static(TURN_TILES)):
-            # There and back, so that all warps do as much.
+            # In alternating directions, so that all warps do equal work.
             batch = turn * wp.static(BLOCK_WARPS) + warp
             if turn % 2 == 1:
                 batch += wp.static(BLOCK_WARPS - 1) - 2 * warp

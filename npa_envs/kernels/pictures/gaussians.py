@@ -1,7 +1,7 @@
 """3D Gaussians on pictures: their footprints, the tiles that these cover, and the adjoint of both.
 
-A footprint is all that `blending` needs of a Gaussian. It reaches to where the Gaussian falls below
-the smallest alpha, so that tiles leave out nothing.
+A footprint is the data of a Gaussian on a picture that `blending` needs. It extends to where the
+Gaussian falls below the smallest alpha, so tiles miss nothing.
 
 Sources: Kerbl et al. 2023, "3D Gaussian Splatting for Real-Time Radiance Field Rendering", and
 Zwicker et al. 2002, "EWA Splatting". A Gaussian of mean p and covariance P = (R S)(R S)ᵀ (Kerbl,
@@ -31,18 +31,18 @@ FOOTPRINT = 12
 """Entries of a footprint: mean (2), conic Q (3: xx, xy, yy), opacity, colours (4), reach (2)."""
 
 PULLS = 10
-"""Entries of a pull, the cotangents that a tile has for a Gaussian: with weights α ᾱ and the way d
-to a pixel, the sums of 1, dx, dy, dx dx, dx dy, dy dy; cotangents of the colours (4)."""
+"""Entries of a pull, the cotangents of a Gaussian from a tile: with weights α ᾱ and offsets d of
+pixels, the sums of 1, dx, dy, dx dx, dx dy, dy dy; cotangents of the colours (4)."""
 
 SMALLEST_ALPHA = 1.0 / 255.0
-"""What covers less of a pixel is left out, as by Kerbl's rasterizer."""
+"""Smallest alpha that is drawn, as in Kerbl's rasterizer."""
 
 CLAMP_MARGIN = 0.3
-"""J is taken at most this share of the picture's half outside of it: far outside, the affine
-approximation makes Gaussians that fill the picture (as Kerbl's implementation does)."""
+"""J is computed at a point at most this fraction of half the picture outside of it, as in Kerbl's
+implementation: far outside, the affine approximation gives Gaussians that fill the picture."""
 
 REACH_SLACK = 1e-3
-"""Added to the exponent at which a Gaussian ends: rounding must not cut a pixel off."""
+"""Added to the exponent at which a Gaussian ends, so that rounding cannot lose a pixel."""
 
 HARMONIC_0, HARMONIC_1 = 0.28209479177387814, 0.4886025119029199
 """Factors of the real spherical harmonics of degree 0 and 1."""
@@ -99,7 +99,7 @@ def make_frame(
 
 
 def tile_total(width: int, height: int) -> int:
-    """Return how many tiles cover a picture."""
+    """Return the number of tiles of a picture."""
     return -(-width // TILE) * -(-height // TILE)
 
 
@@ -109,7 +109,7 @@ def make_covered(scalar: type) -> wp.Function:
 
     @wp.func
     def covered(middle: scalar, reach: scalar, size: wp.int32):
-        """First pixel along one direction whose middle is within reach, and one past the last."""
+        """Return first and last + 1 pixel along one direction whose centre is within reach."""
         end = scalar(size)
         first = wp.ceil(wp.clamp(middle - reach - scalar(0.5), scalar(0.0), end))
         last = wp.floor(wp.clamp(middle + reach + scalar(0.5), scalar(0.0), end))
@@ -133,11 +133,11 @@ def gaussian_kernels(scalar: type) -> SimpleNamespace:
 
     @wp.func
     def unit_quaternion(quaternion: quad):
-        """A quaternion of length 1, no rotation for one of length 0; one over its length, or 0."""
+        """Return the unit quaternion (identity for length 0), and 1 / length (0 for length 0)."""
         unit = quad(scalar(1.0), scalar(0.0), scalar(0.0), scalar(0.0))
         inverse = scalar(0.0)
         length = wp.length(quaternion)
-        # Not >, which would make a rotation of what is not a number.
+        # Not >, which would turn NaN into a rotation.
         if length != scalar(0.0):
             inverse = scalar(1.0) / length
             unit = inverse * quaternion
@@ -165,7 +165,7 @@ def gaussian_kernels(scalar: type) -> SimpleNamespace:
 
     @wp.func
     def pull_back_rotation(q: quad, bar: cube):
-        """Cotangent of a quaternion of length 1 from that of its rotation."""
+        """Return the cotangent of a unit quaternion from that of its rotation."""
         w = q[0]
         x = q[1]
         y = q[2]
@@ -201,7 +201,7 @@ def gaussian_kernels(scalar: type) -> SimpleNamespace:
 
     @wp.func
     def limited(ratio: scalar, focal: scalar, middle: scalar, size: scalar):
-        """A ratio x/z as J takes it."""
+        """Return x/z clamped to the picture with its margin, for the Jacobian of the projection."""
         margin = scalar(wp.static(0.5 * CLAMP_MARGIN)) * size
         return wp.clamp(ratio, (-middle - margin) / focal, (size - middle + margin) / focal)
 
@@ -214,7 +214,7 @@ def gaussian_kernels(scalar: type) -> SimpleNamespace:
 
     @wp.func
     def jacobian_of(frame: Frame, lens: quad, place: triple):
-        """J, the derivative of the place on the picture by that in the camera's frame."""
+        """Return J, the derivative of picture coordinates by those in the camera's frame."""
         ratios = limited_ratios(frame, lens, place)
         x = lens[0] / place[2]
         y = lens[1] / place[2]
@@ -230,7 +230,7 @@ def gaussian_kernels(scalar: type) -> SimpleNamespace:
 
     @wp.func
     def outlook(motion: motion_type, mean: triple):
-        """Way from the camera to a mean, whose direction colours depend on [length units]."""
+        """Return the vector from the camera to a mean [length units], on which colours depend."""
         return mean + wp.transpose(rotation_part(motion)) * shift_part(motion)
 
     @wp.func
@@ -255,7 +255,7 @@ def gaussian_kernels(scalar: type) -> SimpleNamespace:
     def colours_of(
         colours: wp.array(dtype=scalar, ndim=2), i: wp.int32, motion: motion_type, mean: triple
     ):
-        """A Gaussian's colours, zeros beyond its last one; of spherical harmonics if it has 12."""
+        """Return a Gaussian's colours, padded with 0; from spherical harmonics if it has 12."""
         result = quad()
         if colours.shape[1] <= wp.static(CHANNELS):
             for c in range(wp.static(CHANNELS)):
@@ -266,13 +266,13 @@ def gaussian_kernels(scalar: type) -> SimpleNamespace:
             seen = basis * harmonics_at(colours, i)
             for c in range(3):
                 value = seen[c] + scalar(0.5)
-                # Not wp.max, which would make a colour of what is not a number.
+                # Not wp.max, which would turn NaN into a colour.
                 result[c] = wp.where(value < scalar(0.0), scalar(0.0), value)
         return result
 
     @wp.func
     def covered_tiles(frame: Frame, footprint: footprint_type):
-        """First column and row of the tiles that a footprint covers, and one past the last."""
+        """Return first, and last + 1, column and row of the tiles that a footprint covers."""
         left, right = covered(footprint[0], footprint[10], frame.width)
         top, bottom = covered(footprint[1], footprint[11], frame.height)
         result = wp.vec4i()
@@ -302,9 +302,9 @@ def gaussian_kernels(scalar: type) -> SimpleNamespace:
     ):
         """Write footprint, depth and number of covered tiles of each Gaussian in each picture.
 
-        One that is not seen covers none and lies infinitely far away; neither is one seen of which
-        a number is not finite. There are as many motions, and intrinsics, as pictures, as views of
-        a world, or one.
+        An invisible Gaussian, or one with a number that is not finite, covers no tile and has
+        infinite depth. There is one motion and one set of intrinsics for each picture, for each
+        view of all worlds, or for all pictures.
         """
         entry = range_start + wp.tid()
         image = entry / frame.particle_count
@@ -326,7 +326,7 @@ def gaussian_kernels(scalar: type) -> SimpleNamespace:
             y = root[1]
             squared_x = wp.dot(x, x)
             squared_y = wp.dot(y, y)
-            # Binet and Cauchy: the difference of products would cancel for a thin Gaussian.
+            # By Cauchy-Binet: the difference of products would cancel for a thin Gaussian.
             normal = wp.cross(x, y)
             determinant = wp.dot(normal, normal)
             determinant += frame.dilation * (squared_x + squared_y + frame.dilation)
@@ -371,9 +371,9 @@ def gaussian_kernels(scalar: type) -> SimpleNamespace:
         owners: wp.array(dtype=wp.int32),
         slots: wp.array(dtype=wp.int32),
     ):
-        """List tile and Gaussian of each pair, near Gaussians first; and each one's first slot.
+        """List tile and Gaussian of each pair, near ones first, and each Gaussian's first slot.
 
-        A picture has `room` slots. What finds no room has no slot, -1, nor has what covers no tile.
+        A picture has `room` slots. Gaussians without room, or without a tile, get slot -1.
         """
         k = range_start + wp.tid()
         image = k / frame.particle_count

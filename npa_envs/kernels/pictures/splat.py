@@ -1,15 +1,14 @@
-"""Pictures of 2D worlds, every particle a small Gaussian.
+"""Pictures of 2D worlds, with a small Gaussian for every particle.
 
 A particle at pixel p covers the patch of pixels q with |q - round(p)| <= r in both directions; its
-weights exp(-|q - p|^2 / 2 sigma^2) are normalised to sum 1 over the patch, be it inside the picture
-or not. They are products of a row's weight and a column's.
+weights exp(-|q - p|^2 / 2 sigma^2) are normalised to sum 1 over the patch, also over pixels outside
+the picture. They are products of a row's weight and a column's.
 
-On CUDA a few threads gather a tile of pixels: each sums every so-manyth particle around all of it,
-and gets a row of the sums. Particles are sorted by the tile that their patch's centre lies in,
-counted from r pixels before the picture: all that cover the tiles of a row of cells are then one
-contiguous run. Small worlds are sorted by `kernels/cuda/splat.py`. On the CPU a thread draws a
-whole world, particle by particle. Either way a pixel's sum has an order that depends on its own
-world alone.
+On CUDA n threads gather a tile of pixels: each sums every n-th particle around the tile, and gets a
+row of the sums. Particles are sorted by cells, the tiles that contain their patch's centre, with an
+origin r pixels before the picture: the particles that cover tiles along a row of cells are then one
+contiguous run. Small worlds are sorted by `kernels/cuda/splat.py`. On a CPU a thread draws a world,
+particle by particle. Either way the order of a pixel's sum depends only on its own world.
 """
 
 import math
@@ -37,23 +36,23 @@ CHANNELS = 4
 """Red, green, blue and density."""
 
 TILE_WIDTH, TILE_HEIGHT = 4, 4
-"""Pixels of a tile, which a few CUDA threads gather; also of a cell, which particles lie in."""
+"""Pixels of a tile, which `TILE_LANES` CUDA threads gather, and of a cell."""
 
 TILE_LANES = 4
-"""CUDA threads that share a tile's candidates, and a particle's cotangents; one on the CPU."""
+"""CUDA threads that share a tile's candidates, or a particle's cotangents; on a CPU it is one."""
 
 RUNS = 3
-"""Runs of particles, of a row of cells each, that are gathered as one."""
+"""Runs of particles, one for each row of cells, that are gathered as one."""
 
 CUDA_REGISTERS = 128
-"""Registers of a thread that gathers float32: all sums of a tile stay in them."""
+"""Registers per thread in the gathering of float32, enough for all sums of a tile."""
 
 GROUP_WIDTH, GROUP_HEIGHT = 4, 2
-"""Tiles of a group of a picture: with their lanes they make up a warp."""
+"""Tiles of a group, which one warp gathers."""
 
 FOOTPRINT = 8
-"""Entries of a footprint: the way from its place to the patch's centre and that centre, in pixels
-(2 each); red, green, blue and one, times the weights' common factor (4)."""
+"""Entries of a footprint: vector from the particle to the patch's centre, and that centre, in
+pixels (2 each); red, green, blue and one, times the weights' common factor (4)."""
 
 PATCH_SIGMAS = 3.0
 """A particle's patch reaches this many standard deviations from its centre."""
@@ -103,7 +102,7 @@ def make_lens(
     lens.radius = radius = math.ceil(PATCH_SIGMAS * sigma * pixels)
     lens.low = low
     lens.pixels_per_length = (resolution - 1) / (high - low)
-    # Of powers of two, which is what the hardware takes.
+    # For powers of two, which the hardware computes.
     lens.falloff = 0.5 / (sigma * pixels) ** 2 / math.log(2.0)
     lens.pull = lens.pixels_per_length / (sigma * pixels) ** 2
     lens.area = pixels * pixels
@@ -112,25 +111,25 @@ def make_lens(
     lens.cells_across = (TILE_WIDTH - 1 + 2 * radius) // TILE_WIDTH + 1
     lens.cell_columns = lens.tile_columns - 1 + lens.cells_across
     lens.cells_down = (TILE_HEIGHT - 1 + 2 * radius) // TILE_HEIGHT + 1
-    # One more, for the particles that no pixel sees.
+    # One more, for invisible particles.
     lens.cell_count = lens.cell_columns * (lens.tile_rows - 1 + lens.cells_down) + 1
     return lens
 
 
 def gather_registers(scalar: type) -> int | None:
-    """Return how many registers of CUDA a thread that gathers has, None: as many as it likes."""
+    """Return the register limit of a CUDA thread that gathers; None: no limit."""
     return CUDA_REGISTERS if scalar == wp.float32 else None
 
 
 def group_count(resolution: int) -> int:
-    """Return how many groups of tiles cover a picture."""
+    """Return the number of groups of tiles of a picture."""
     across = -(-resolution // (TILE_WIDTH * GROUP_WIDTH))
     return across * -(-resolution // (TILE_HEIGHT * GROUP_HEIGHT))
 
 
 @made_once()
 def splat_functions(scalar: type) -> SimpleNamespace:
-    """Return what several kernels share: where particles are drawn, and their footprints."""
+    """Return the functions of several kernels: positions in pixels, and footprints."""
     types = splat_types(scalar)
     Lens, vector, colour_type = types.Lens, types.vector, types.colour
     footprint_type = types.footprint
@@ -138,10 +137,10 @@ def splat_functions(scalar: type) -> SimpleNamespace:
 
     @wp.func
     def patch_weight(falloff: scalar, slope: scalar, offset: scalar):
-        """Gaussian along one direction at a pixel's offset from the patch's centre.
+        """Return the Gaussian along one direction at a pixel's offset o from the patch's centre.
 
-        It is relative to the centre's, so that narrow ones stay finite: with n from the place to
-        the centre the exponent n^2 - (n + o)^2 is -o (2 n + o), and `slope` is -2 n falloff.
+        It is relative to the value at the centre, so that narrow ones stay finite: with n from the
+        particle to the centre, n^2 - (n + o)^2 is -o (2 n + o), and `slope` is -2 n falloff.
         """
         return fast_exp2(offset * (slope - falloff * offset))
 
@@ -153,7 +152,7 @@ def splat_functions(scalar: type) -> SimpleNamespace:
         mean: vector,
         goal: wp.array(dtype=vector),
     ):
-        """Place of a particle in pixels, its world's mean moved to the goal where asked for."""
+        """Return a particle's position in pixels; `centred`: its world's mean is at the goal."""
         moved = position
         if centred != 0:
             moved = (position - mean) + goal[0]
@@ -168,7 +167,7 @@ def splat_functions(scalar: type) -> SimpleNamespace:
 
     @wp.func
     def visible(lens: Lens, centre: vector):
-        """Whether a patch covers a pixel of the picture; False where its centre is not finite."""
+        """Return whether a patch covers a pixel of the picture; False for NaN."""
         begin = -scalar(lens.radius)
         end = scalar(lens.resolution - 1 + lens.radius)
         across = centre[0] >= begin and centre[0] <= end
@@ -176,7 +175,7 @@ def splat_functions(scalar: type) -> SimpleNamespace:
 
     @wp.func
     def cell_of_centre(lens: Lens, centre: vector):
-        """Cell of a patch's centre; the last one where it is not visible."""
+        """Return the cell of a patch's centre; the last cell if it is invisible."""
         cell = lens.cell_count - 1
         if visible(lens, centre):
             cell = (wp.int32(centre[1]) + lens.radius) / wp.static(TILE_HEIGHT) * lens.cell_columns
@@ -191,7 +190,7 @@ def splat_functions(scalar: type) -> SimpleNamespace:
         states: wp.array(dtype=scalar, ndim=2),
         shift: scalar,
     ):
-        """Footprint of a particle whose colours are its last three states plus a shift."""
+        """Return a particle's footprint, with its last three states plus a shift as colours."""
         centre = patch_centre(place)
         near = centre - place
         slope = scalar(-2.0) * lens.falloff * near
@@ -220,7 +219,7 @@ def splat_functions(scalar: type) -> SimpleNamespace:
 
 @made_once()
 def gather_functions(scalar: type, lanes: int) -> SimpleNamespace:
-    """Return what gathers pixels; one thread has a tile, or as many `lanes` as rows share it."""
+    """Return the functions that gather a tile, by one thread or by `lanes` threads, one a row."""
     assert lanes in (1, TILE_HEIGHT)
     types, functions = splat_types(scalar), splat_functions(scalar)
     Lens, footprint_type, tile_type = types.Lens, types.footprint, types.tile
@@ -239,7 +238,7 @@ def gather_functions(scalar: type, lanes: int) -> SimpleNamespace:
         tile_column: wp.int32,
         starts: wp.array(dtype=wp.int32),
     ):
-        """Particles in the cells around a tile."""
+        """Return the number of particles in the cells around a tile."""
         first = world * lens.cell_count + tile_row * lens.cell_columns + tile_column
         total = wp.int32(0)
         for _row in range(lens.cells_down):
@@ -257,7 +256,7 @@ def gather_functions(scalar: type, lanes: int) -> SimpleNamespace:
         starts: wp.array(dtype=wp.int32),
         footprints: wp.array(dtype=footprint_type),
     ):
-        """Return a lane's share of a tile's pixels, each the weighted sum over its particles."""
+        """Return a lane's pixels of a tile, each the weighted sum over its particles."""
         across = columns_type()
         for c in range(wp.static(TILE_WIDTH)):
             across[c] = kept(scalar(tile_column * wp.static(TILE_WIDTH) + c))
@@ -269,7 +268,7 @@ def gather_functions(scalar: type, lanes: int) -> SimpleNamespace:
         totals = tile_type()
         base = world * lens.cell_count + tile_row * lens.cell_columns + tile_column
         for first_row in range(0, lens.cells_down, wp.static(RUNS)):
-            # Lanes take turns along several runs as if they were one: few wait for the others.
+            # Lanes alternate along several runs as if these were one: few lanes are idle.
             shifts = runs_type()
             ends = runs_type()
             total = wp.int32(0)
@@ -359,7 +358,8 @@ def splat_kernels(scalar: type, lanes: int) -> SimpleNamespace:
         arrival: wp.array(dtype=wp.int32),
         counts: wp.array(dtype=wp.int32),
     ):
-        """Count the particles of each cell; counts[0] stays zero."""
+        """Store each particle's cell and order of arrival, and count particles at counts[cell + 1];
+        counts[0] stays 0 for the prefix sum."""
         await_earlier()
         i = wp.tid()
         world = i / particle_count
@@ -408,7 +408,7 @@ def splat_kernels(scalar: type, lanes: int) -> SimpleNamespace:
         footprint = footprint_of(lens, place, i, states, shift)
         begin = starts[c]
         target = k
-        # What nobody sees may lie in any order: there can be many of them.
+        # Invisible particles, which may be many, can have any order.
         if c != (world + 1) * lens.cell_count - 1:
             target = begin
             for other in range(begin, starts[c + 1]):
@@ -419,7 +419,7 @@ def splat_kernels(scalar: type, lanes: int) -> SimpleNamespace:
 
     @wp.func
     def tile_of(lens: Lens, t: wp.int32):
-        """World, row and column of tiles, and lane of a thread."""
+        """Return the world, the tile's row and column, and the lane of a thread."""
         across = (lens.tile_columns + wp.static(GROUP_WIDTH - 1)) / wp.static(GROUP_WIDTH)
         down = (lens.tile_rows + wp.static(GROUP_HEIGHT - 1)) / wp.static(GROUP_HEIGHT)
         tile = t / wp.static(lanes)
@@ -433,7 +433,7 @@ def splat_kernels(scalar: type, lanes: int) -> SimpleNamespace:
 
     @wp.func
     def pixel_of(lens: Lens, tile_row: wp.int32, tile_column: wp.int32, k: wp.int32):
-        """Index of a tile's k-th pixel within its picture, -1 where it lies outside."""
+        """Return the index of a tile's k-th pixel in its picture, -1 outside of it."""
         row = tile_row * wp.static(TILE_HEIGHT) + k / wp.static(TILE_WIDTH)
         column = tile_column * wp.static(TILE_WIDTH) + k % wp.static(TILE_WIDTH)
         pixel = row * lens.resolution + column
@@ -479,7 +479,7 @@ def splat_kernels(scalar: type, lanes: int) -> SimpleNamespace:
         footprints: wp.array(dtype=footprint_type),
         source: wp.array(dtype=wp.int32),
     ):
-        """Draw a whole world, particle after particle; for devices of few threads."""
+        """Draw a world, particle after particle; for devices with few threads."""
         world = range_start + wp.tid()
         for i in range(world * particle_count, (world + 1) * particle_count):
             place = place_in_world(lens, positions[i], centred, means, goal, world)
@@ -556,7 +556,7 @@ def splat_kernels(scalar: type, lanes: int) -> SimpleNamespace:
             position_bar = vector()
             colour_bar = colour_type()
             if seen:
-                # The normalisation keeps the patch's sum: its derivative subtracts the mean pull.
+                # Weights are normalised to sum 1, so the derivative subtracts the mean cotangent.
                 sums = vector()
                 moments = vector()
                 for o in range(-lens.radius, lens.radius + 1):

@@ -1,4 +1,4 @@
-"""Pictures of coloured triangles: at every pixel the nearest one, by a depth of each pixel.
+"""Pictures of coloured triangles: at every pixel the nearest one, by a depth buffer.
 
 They are targets, drawn once on the CPU before training, in float64.
 """
@@ -31,7 +31,7 @@ def draw_triangles(
     nearest: wp.array(dtype=wp.float64, ndim=2),
     picture: wp.array(dtype=wp.vec4d, ndim=2),
 ):
-    """Draw all triangles that a camera sees, each wherever it covers a pixel's middle."""
+    """Draw all triangles that a camera sees, at every pixel whose centre they cover."""
     camera = range_start + wp.tid()
     zero, half = wp.float64(0.0), wp.float64(0.5)
     for face in range(faces.shape[0]):
@@ -54,12 +54,12 @@ def draw_triangles(
         for row in range(top, bottom + 1):
             for column in range(left, right + 1):
                 middle = wp.vec2d(wp.float64(column) + half, wp.float64(row) + half)
-                # Inside, all three have the sign of the whole; the sides belong to it.
+                # Inside, all three areas have the sign of the total; edges count as inside.
                 u = twice_area(b, c, middle) / area
                 v = twice_area(c, a, middle) / area
                 w = twice_area(a, b, middle) / area
                 if u >= zero and v >= zero and w >= zero:
-                    # Linear on the picture is what is divided by the depth.
+                    # Quantities divided by the depth are linear on the picture.
                     u *= nearness[camera, corners[0]]
                     v *= nearness[camera, corners[1]]
                     w *= nearness[camera, corners[2]]

@@ -1,1 +1,1 @@
-"""Kernels in plain Warp, for CPU and CUDA, float32 and float64: read them beside the reference."""
+"""Kernels in plain Warp for CPU and CUDA, float32 and float64: the formulas of `reference.py`."""

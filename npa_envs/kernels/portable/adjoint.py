@@ -1,6 +1,6 @@
 """Hand-written adjoints of the perception pass, gathered: no float atomics, a fixed order of sums.
 
-Notation: centre i sees neighbour j at r = x_j - x_i with smoothing W, spiky gradient K = f r and
+Notation: centre i perceives neighbour j at r = x_j - x_i with smoothing W, spiky gradient K = f r,
 volume v_j. A bar marks a cotangent. b_i and G_i are the smoothed state and the (uncorrected) state
 gradient of centre i; the moment correction is a stopped gradient, so it has no adjoint.
 
@@ -29,7 +29,7 @@ from npa_envs.kernels.portable.search import make_search
 from npa_envs.once import made_once
 
 CUDA_REGISTERS = 64
-"""Registers of a thread that gathers state cotangents: it mostly waits for memory."""
+"""Registers per thread in the gathering of state cotangents, which mostly waits for memory."""
 
 
 @made_once()
@@ -44,11 +44,8 @@ def adjoint_kernels(
     """Return the kernels of one variant; arguments as for `perception_kernels`."""
     types = domain_types(space_dim, scalar)
     vector, particle, Domain = types.vector, types.particle, types.Domain
-    cell_of, segment_count, segment_cells = (
-        types.cell_of,
-        types.segment_count,
-        types.segment_cells,
-    )
+    cell_of, segment_count = types.cell_of, types.segment_count
+    segment_cells = types.segment_cells
     minimum_image, position_of = types.minimum_image, types.position_of
     group = wp.types.vector(width, scalar)
     group_gradient = wp.types.matrix((space_dim, width), scalar)
@@ -82,7 +79,7 @@ def adjoint_kernels(
         gradient_bar: wp.array(dtype=scalar),
         density_gradient_bar: wp.array(dtype=vector),
     ):
-        """Pull the cotangent of z back through its scaling, into cotangents of the raw sums."""
+        """Write the cotangents of each row's unscaled sums from the cotangent of z."""
         row, channel = wp.tid()
         row += range_start
         if row >= starts[starts.shape[0] - 1] - row_base:
@@ -131,7 +128,7 @@ def adjoint_kernels(
         row_base: wp.int32,
         row_capacity: wp.int32,
     ):
-        """First row and one past the last of a run around particle k, or entries of its list."""
+        """Return first and last + 1 row of a run around particle k, or entry of its list."""
         begin, end = run(domain, starts, ends, base, cell, k, r)
         if wp.static(not listed):
             begin -= row_base
@@ -148,7 +145,7 @@ def adjoint_kernels(
         first: wp.int32,
         end: wp.int32,
     ):
-        """Which rows from `first` on lie within eps of a position, and how many do."""
+        """Return the rows of a block from `first` on within eps of a position; their count."""
         near = indices()
         count = wp.int32(0)
         if wp.static(listed):
@@ -188,7 +185,7 @@ def adjoint_kernels(
     ):
         """Write the cotangent of every particle's state, from the active rows around it.
 
-        Where neighbours are listed, particles are in sorted order everywhere.
+        With listed neighbours, particles are in sorted order everywhere.
         """
         k, g = wp.tid()
         k += range_start
@@ -287,13 +284,13 @@ def adjoint_kernels(
         smoothing_bar: scalar,
         kernel_bar: vector,
     ):
-        """Cotangent of r = neighbour - centre, from the cotangents of W(r) and K(r)."""
+        """Return the cotangent of r = neighbour - centre from the cotangents of W(r) and K(r)."""
         distance = wp.sqrt(squared)
         slope = smoothing_slope(squared, domain.inverse_squared_eps, domain.smoothing_norm)
         factor = spiky_factor(distance, domain.inverse_eps, domain.spiky_norm)
         pull = smoothing_bar * slope * offset
         if distance > scalar(0.0):
-            # Where two particles nearly touch the factor is large, and pulls across alone.
+            # For nearly coincident particles the large factor contributes only across r.
             direction = offset / distance
             share = wp.dot(direction, kernel_bar) / wp.dot(direction, direction)
             along = share * direction

@@ -1,6 +1,6 @@
-"""Density, and what follows from it of positions alone: volumes, density gradients, neighbours.
+"""Density, volumes, density gradients and neighbour lists of sorted particles.
 
-Sums run over sorted particles, run by run of cells.
+Sums run over sorted particles, one contiguous run of cells after the other.
 
 Source: arXiv 2601.16096, section 3.
 """
@@ -9,15 +9,11 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from npa_envs.kernels.domain import domain_types, kernel_module
+from npa_envs.kernels.domain import TERMS_PER_SUM, domain_types, kernel_module
 from npa_envs.kernels.mathematics import smoothing, spiky_factor_wide
 from npa_envs.kernels.native import PAIRS, in_ranges, named
 from npa_envs.kernels.portable.search import make_search
 from npa_envs.once import made_once
-
-BLOCK = 4096
-"""Candidates whose weights are summed before they are added to the others: of a million summed one
-after the other, too much is rounded away."""
 
 
 @made_once()
@@ -25,11 +21,8 @@ def density_kernels(space_dim: int, scalar: type, on_cpu: bool) -> SimpleNamespa
     """Return the kernels of one variant: one thread a particle."""
     types = domain_types(space_dim, scalar)
     vector, particle, Domain = types.vector, types.particle, types.Domain
-    cell_of, segment_count, segment_cells = (
-        types.cell_of,
-        types.segment_count,
-        types.segment_cells,
-    )
+    cell_of, segment_count = types.cell_of, types.segment_count
+    segment_cells = types.segment_cells
     minimum_image, position_of = types.minimum_image, types.position_of
     wide = wp.types.vector(space_dim, wp.float64)
     search = make_search(space_dim, scalar, particle, on_cpu)
@@ -38,7 +31,7 @@ def density_kernels(space_dim: int, scalar: type, on_cpu: bool) -> SimpleNamespa
 
     @wp.func
     def spiky_wide(domain: Domain, centre: vector, neighbour: vector):
-        """Spiky gradient kernel of a pair in float64: a Newton step refines 1 / distance."""
+        """Return the spiky gradient kernel of a pair in float64."""
         kernel = wide()
         r = wide()
         for d in range(wp.static(space_dim)):
@@ -89,8 +82,8 @@ def density_kernels(space_dim: int, scalar: type, on_cpu: bool) -> SimpleNamespa
         for segment in range(segment_count(domain, cell)):
             first, last = segment_cells(domain, cell, segment)
             end = starts[base + last]
-            for block in range(starts[base + first], end, wp.static(BLOCK)):
-                stop = wp.min(block + wp.static(BLOCK), end)
+            for block in range(starts[base + first], end, wp.static(TERMS_PER_SUM)):
+                stop = wp.min(block + wp.static(TERMS_PER_SUM), end)
                 for j in range(block, stop):
                     neighbour = sorted_positions[j]
                     offset = minimum_image(domain, neighbour - position)
@@ -101,11 +94,11 @@ def density_kernels(space_dim: int, scalar: type, on_cpu: bool) -> SimpleNamespa
                     if row >= 0 and seen:
                         gradient += spiky_wide(domain, position, neighbour)
                 counted += stop - block
-                if counted >= wp.static(BLOCK):
+                if counted >= wp.static(TERMS_PER_SUM):
                     earlier += density
                     density = scalar(0.0)
                     counted = wp.int32(0)
-        # A particle always sees itself: a position that is not finite would otherwise have rho 0.
+        # Its own term is added without a search, so that rho is not 0 for positions that are NaN.
         entry = particle()
         for d in range(wp.static(space_dim)):
             entry[d] = position[d]
@@ -124,7 +117,8 @@ def density_kernels(space_dim: int, scalar: type, on_cpu: bool) -> SimpleNamespa
         begin: wp.int32,
         neighbours: wp.array(dtype=wp.int32),
     ):
-        """Write neighbours of particle k from `begin` on, where there is room; return the end."""
+        """Write neighbours of particle k from index `begin` on, unless the array is empty; return
+        the end."""
         position = position_of(particles[k])
         base = (k / particle_count) * domain.cell_count
         cell = cell_of(domain, position)
@@ -147,13 +141,13 @@ def density_kernels(space_dim: int, scalar: type, on_cpu: bool) -> SimpleNamespa
         particle_count: wp.int32,
         starts: wp.array(dtype=wp.int32),
         particles: wp.array(dtype=particle),
-        nobody: wp.array(dtype=wp.int32),
+        empty: wp.array(dtype=wp.int32),
         # outputs
         counts: wp.array(dtype=wp.int32),
     ):
-        """Write how many neighbours each particle has, itself included; `nobody` is empty."""
+        """Write each particle's number of neighbours, itself included; `empty` has no entries."""
         k = range_start + wp.tid()
-        counts[k] = list_around(domain, particle_count, starts, particles, k, 0, nobody)
+        counts[k] = list_around(domain, particle_count, starts, particles, k, 0, empty)
 
     @in_ranges(PAIRS)
     @wp.kernel(enable_backward=False, module=module)
@@ -167,7 +161,7 @@ def density_kernels(space_dim: int, scalar: type, on_cpu: bool) -> SimpleNamespa
         # outputs
         neighbours: wp.array(dtype=wp.int32),
     ):
-        """Write each particle's neighbours, from the end of those of the particle before it on."""
+        """Write each particle's neighbours after those of the particle before it."""
         k = range_start + wp.tid()
         begin = wp.int32(0)
         if k > 0:

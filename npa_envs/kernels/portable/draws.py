@@ -1,7 +1,7 @@
-"""Counter-based random draws: Philox4x32-10 and what is made of its words.
+"""Counter-based random draws: Philox4x32-10, and distributions from its 32-bit words.
 
-A word is a function of a world's key and a counter (element, step, draw, episode) and of nothing
-else, so a world's draws depend neither on the other worlds nor on the device.
+A word is a function only of a world's key and a counter (element, step, draw, episode), so a
+world's draws depend neither on other worlds nor on the device.
 
 Source: Salmon, Moraes, Dror and Shaw, "Parallel random numbers: as easy as 1, 2, 3" (SC 2011).
 """
@@ -14,7 +14,7 @@ import warp as wp
 from npa_envs.kernels.domain import scalar_name
 from npa_envs.once import made_once
 
-# Typed here: a bare number in a kernel would be an int32 or a float32.
+# Typed constants: a literal in a kernel would be an int32 or a float32.
 MULTIPLIER_0 = wp.constant(wp.uint32(0xD2511F53))
 MULTIPLIER_1 = wp.constant(wp.uint32(0xCD9E8D57))
 WEYL_0 = wp.constant(wp.uint32(0x9E3779B9))
@@ -35,7 +35,7 @@ def high_word(a: wp.uint32, b: wp.uint32):
 
 @wp.func
 def philox(counter: words, low_key: wp.uint32, high_key: wp.uint32):
-    """Return the four words of a counter and a key after ten rounds."""
+    """Return four random words of a counter and a key, after ten rounds."""
     c = counter
     k0 = low_key
     k1 = high_key
@@ -60,7 +60,7 @@ def world_words(
     episodes: wp.array(dtype=wp.int32),
     steps: wp.array(dtype=wp.int32),
 ):
-    """Return four words of a world's draw: those of its elements from 4, or 2, times `block` on."""
+    """Return the four words number `block` of a world's draw, for its next 4 or 2 elements."""
     key = wp.uint64(keys[world])
     counter = words(
         wp.uint32(block), wp.uint32(steps[world]), wp.uint32(draw), wp.uint32(episodes[world])
@@ -70,7 +70,7 @@ def world_words(
 
 @wp.func
 def joined(high: wp.uint32, low: wp.uint32):
-    """Return two words as one of 64 bits."""
+    """Join two words to 64 bits."""
     return (wp.uint64(high) << wp.uint64(32)) | wp.uint64(low)
 
 
@@ -82,7 +82,7 @@ def fraction_53(high: wp.uint32, low: wp.uint32):
 
 @made_once()
 def draw_kernels(scalar: type) -> SimpleNamespace:
-    """Return the kernels that draw numbers of one floating type, and how many a thread draws."""
+    """Return the kernels for one floating type, and how many numbers a thread of each draws."""
     module = wp.get_module(f"npa_envs.kernels.draws_{scalar_name(scalar)}")
     single = scalar is wp.float32
     per_thread = 4 if single else 2
@@ -96,7 +96,7 @@ def draw_kernels(scalar: type) -> SimpleNamespace:
         # outputs
         values: wp.array(dtype=scalar, ndim=2),
     ):
-        """Numbers in [0, 1): 24 bits from a word, or 53 bits from two."""
+        """Write numbers in [0, 1): 24 bits of a word, or 53 bits of two."""
         world, block = wp.tid()
         w = world_words(world, block, draw, keys, episodes, steps)
         for k in range(wp.static(per_thread)):
@@ -116,9 +116,9 @@ def draw_kernels(scalar: type) -> SimpleNamespace:
         # outputs
         values: wp.array(dtype=scalar, ndim=2),
     ):
-        """Pairs of standard normal numbers by Box and Muller's transform.
+        """Write pairs of standard normal numbers by the Box-Muller transform.
 
-        In float64: devices differ in the last bit of a logarithm, which rounding to float32 hides.
+        In float64: logarithms of devices differ in the last bit, which rounding to float32 removes.
         """
         world, block = wp.tid()
         w = world_words(world, block, draw, keys, episodes, steps)
@@ -146,10 +146,10 @@ def draw_kernels(scalar: type) -> SimpleNamespace:
 
 
 BITS_PER_THREAD = 4
-"""Elements that a thread of `draw_bernoulli` draws: one for each word."""
+"""Elements that a thread of `draw_bernoulli` draws, one from each word."""
 
 INTEGERS_PER_THREAD = 2
-"""Elements that a thread of `draw_integers` draws: one for each two words."""
+"""Elements that a thread of `draw_integers` draws, one from two words."""
 
 
 @wp.kernel(enable_backward=False)
@@ -162,7 +162,7 @@ def draw_bernoulli(
     # outputs
     values: wp.array(dtype=wp.uint8, ndim=2),
 ):
-    """Ones where a word lies below the threshold, which goes up to 2^32; zeros elsewhere."""
+    """Write ones for words below the threshold, at most 2^32, and zeros for others."""
     world, block = wp.tid()
     w = world_words(world, block, draw, keys, episodes, steps)
     for k in range(wp.static(BITS_PER_THREAD)):
@@ -184,7 +184,7 @@ def draw_integers(
     # outputs
     values: wp.array(dtype=wp.int64, ndim=2),
 ):
-    """Integers below `high`: 64 bits modulo it; the bias, high / 2^64, cannot be seen."""
+    """Write integers below `high`: 64 random bits modulo it, with a bias of high / 2^64."""
     world, block = wp.tid()
     w = world_words(world, block, draw, keys, episodes, steps)
     for k in range(wp.static(INTEGERS_PER_THREAD)):

@@ -1,4 +1,4 @@
-"""Episodes: rewards and endings of worlds that were acted on, from their losses."""
+"""Rewards, terminations and truncations of episodes, from the worlds' losses."""
 
 import warp as wp
 
@@ -6,13 +6,13 @@ from npa_envs.kernels import native
 from npa_envs.kernels.access import await_earlier
 
 SUCCESS, DIVERGED, TIME_LIMIT = 1, 2, 4
-"""Bits of an ending: why an episode is over; none is set while it runs."""
+"""Bits of an ending, the reasons why an episode is over; 0 while it runs."""
 
 NOT_FINITE = 8
-"""Bit of a world whose reward is not finite: its step is an error."""
+"""Bit of a world whose reward is not finite, which is an error."""
 
 GO_ON, TELL, END = 0, 1, 2
-"""What divergence does to an episode: nothing; its loss is not below the first one; it ends it."""
+"""Effect of divergence on an episode: none; its loss is at least the first loss; it also ends."""
 
 
 @wp.kernel(enable_backward=False, module=native.module("npa_envs.kernels.episodes"))
@@ -34,7 +34,7 @@ def judge_worlds(
     # outputs
     endings: wp.array(dtype=wp.uint8),
 ):
-    """Write rewards, losses, flags and endings; of no step, where not enabled, endings alone."""
+    """Write rewards, losses, flags and endings; if not enabled, only endings (all 0)."""
     await_earlier()
     world = wp.tid()
     count = elapsed.shape[0]
@@ -45,17 +45,17 @@ def judge_worlds(
         endings[world] = wp.uint8(0)
         return
     step = elapsed[world] + 1
-    fled = diverged[world] != wp.uint8(0)
-    lost = fled and on_divergence != wp.static(GO_ON)
+    escaped = diverged[world] != wp.uint8(0)
+    lost = escaped and on_divergence != wp.static(GO_ON)
     loss = parts[world]
     for k in range(1, part_count):
         loss += parts[k * count + world]
-    # Leaving the world must not pay, even where an empty picture is better than the start.
+    # Divergence must not be rewarded, even where an empty picture is better than the start.
     if lost and loss < first_loss[world]:
         loss = first_loss[world]
     success = loss <= success_loss[world] and not lost
-    ended = success or (fled and on_divergence == wp.static(END))
-    late = last_step > 0 and step >= last_step
+    ended = success or (escaped and on_divergence == wp.static(END))
+    truncated = last_step > 0 and step >= last_step
     improvement = numbers[count + world] - loss
     reward = improvement
     if paid_step > 0:
@@ -65,9 +65,9 @@ def judge_worlds(
     ending = wp.int32(0)
     if success:
         ending += wp.static(SUCCESS)
-    if fled:
+    if escaped:
         ending += wp.static(DIVERGED)
-    if late:
+    if truncated:
         ending += wp.static(TIME_LIMIT)
     unfit = not wp.isfinite(improvement)
     if broken.shape[0] > 0 and not lost:
@@ -83,7 +83,7 @@ def judge_worlds(
         numbers[place + part_count * count] = numbers[place] - part
         numbers[place] = part
     flags[world] = wp.uint8(ended)
-    flags[count + world] = wp.uint8(late)
+    flags[count + world] = wp.uint8(truncated)
     flags[2 * count + world] = wp.uint8(success)
-    flags[3 * count + world] = wp.uint8(fled)
+    flags[3 * count + world] = wp.uint8(escaped)
     endings[world] = wp.uint8(ending)

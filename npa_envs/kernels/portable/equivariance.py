@@ -1,6 +1,6 @@
-"""Vectors of equivariant rules: mixtures, products that stay the same in turned worlds, steering.
+"""Vectors of equivariant rules: mixed vectors, rotation-invariant products, steering.
 
-`npa_envs/ops/equivariance.py` has the formulas. A thread makes a few numbers of a row.
+`npa_envs/ops/equivariance.py` has the formulas. A thread computes a few numbers of a row.
 """
 
 from types import SimpleNamespace
@@ -23,7 +23,7 @@ def equivariance_kernels(space_dim: int, scalar: type) -> SimpleNamespace:
 
     @wp.func
     def turned(u: vector):
-        """Return a vector turned by 90 degrees, in 2D."""
+        """Return a vector rotated by 90 degrees, in 2D."""
         result = vector()
         if wp.static(planar):
             result[0] = -u[1]
@@ -32,7 +32,7 @@ def equivariance_kernels(space_dim: int, scalar: type) -> SimpleNamespace:
 
     @wp.func
     def place_of(a: wp.int32, b: wp.int32, first: wp.int32, count: wp.int32):
-        """Return the number of a pair (a, b), b >= a + first."""
+        """Return the index of the pair (a, b), b >= a + first, among pairs of `count` vectors."""
         return a * (count - first) - a * (a - 1) / 2 + b - a - first
 
     @in_ranges(ELEMENTS)
@@ -69,9 +69,9 @@ def equivariance_kernels(space_dim: int, scalar: type) -> SimpleNamespace:
         # outputs
         inputs: numbers,
     ):
-        """Write scalars, products, what is at column `one` of a row, and zeros."""
-        # A thread has the pairs that end with its vector, and some of the scalars: those beside it
-        # write beside it.
+        """Write the network's inputs: scalars, products, the row's constant in `one`, zeros."""
+        # A thread writes the pairs that end with its vector, and some scalars: adjacent threads
+        # write adjacent entries.
         t = range_start + wp.tid()
         count = mixed.shape[1]
         row = t / count
@@ -104,7 +104,7 @@ def equivariance_kernels(space_dim: int, scalar: type) -> SimpleNamespace:
         # outputs
         whole_bar: vectors,
     ):
-        """Write the cotangent of each mixed vector and what the products pull at it together."""
+        """Write each mixed vector's cotangent, the given one plus that through the products."""
         t = range_start + wp.tid()
         count = mixed.shape[1]
         row = t / count
@@ -136,8 +136,8 @@ def equivariance_kernels(space_dim: int, scalar: type) -> SimpleNamespace:
         # outputs
         rows_bar: numbers,
     ):
-        """Write the cotangent of each row; that of its one and zeros is zero."""
-        # A thread has a perceived vector, and some of the scalars.
+        """Write the cotangent of each row, zero for its constant and padding."""
+        # A thread writes a perceived vector, and some scalars.
         t = range_start + wp.tid()
         count = mixing.shape[0]
         row = t / count
@@ -164,9 +164,9 @@ def equivariance_kernels(space_dim: int, scalar: type) -> SimpleNamespace:
         # outputs
         update: numbers,
     ):
-        """Write the updates of gates and state changes; what is beyond these is zero."""
+        """Write updates from gates and state changes, and zeros in further columns."""
         t = range_start + wp.tid()
-        # All directions first: threads beside each other take the same way, and equally long.
+        # Directions come first, so that adjacent threads take the same branch.
         directions = update.shape[0] * wp.static(space_dim)
         turning = t < directions
         span = update.shape[1] - wp.static(space_dim)

@@ -1,7 +1,7 @@
-"""The perception pass: what each particle sees of its neighbourhood, scaled.
+"""The perception pass: the scaled perception vector of each active particle.
 
-One thread serves a particle and a group of its state channels. Sums run over sorted particles, run
-by run of cells, or over neighbours listed before in the same order.
+One thread serves a particle and a group of its state channels. Sums run over sorted particles, one
+run of cells after the other, or over neighbour lists in the same order.
 
 Source: arXiv 2601.16096, section 3 (smoothing, gradients, moment matrix, scaling).
 """
@@ -23,7 +23,7 @@ from npa_envs.kernels.portable.search import make_search
 from npa_envs.once import made_once
 
 CUDA_REGISTERS = 128
-"""Registers of a thread of the perception pass: more threads in flight are worth a few spills."""
+"""Registers per thread of the perception pass: more threads at a time are worth a few spills."""
 
 
 @made_once()
@@ -38,8 +38,8 @@ def perception_kernels(
 ) -> SimpleNamespace:
     """Return the kernels of one variant.
 
-    A variant without `state_gradient`, or without a correction of it by a `moment_inverse`, neither
-    sums nor holds what only that needs. On a CPU candidates are sifted.
+    A variant without `state_gradient`, or without its correction by a `moment_inverse`, leaves out
+    the sums that only these need.
     """
     moment_correction = moment_inverse is not None
     smooth = moment_inverse == "smooth"
@@ -144,8 +144,9 @@ def perception_kernels(
     ):
         """Write the perception vector of each row, a one and zeros up to the row's width.
 
-        Rows beyond the last active one are zero. Rows are written where `row_destination` says, or
-        in their own order if it is empty; clipped to plus and minus `limit` unless that is zero.
+        Rows beyond the last active one are zero. Row k is written to row `row_destination[k]`, or
+        to row k if that array is empty. Entries are clipped to plus and minus `limit` unless it is
+        0.
         """
         row, g = wp.tid()
         row += range_start

@@ -1,8 +1,8 @@
-"""The search for neighbours: candidates in runs of cells, or a list that was made before.
+"""The search for neighbours: candidates in runs of cells, or a neighbour list.
 
-On a CPU, candidates are sifted: those that are near are noted first, then summed over. About half
-of the candidates are near: a branch for each is often predicted wrongly, and keeps the sums in
-memory. On CUDA a sift takes a single candidate, so that this is such a branch.
+On a CPU candidates are filtered in blocks: the near ones are collected, and then summed. About half
+of the candidates are near, so a branch for each would often be predicted wrongly, and would keep
+the sums in memory. On CUDA a block is one candidate: a branch for each.
 """
 
 from types import SimpleNamespace
@@ -13,7 +13,7 @@ from npa_envs.kernels.domain import domain_types
 from npa_envs.once import made_once
 
 SIFTED = 32
-"""Candidates of a sift on the CPU."""
+"""Candidates of a block on a CPU."""
 
 
 @made_once()
@@ -40,7 +40,7 @@ def make_search(
 
     @wp.func
     def run_count(domain: Domain, cell: cell_vector):
-        """Runs of candidates around a cell."""
+        """Return the number of runs of candidates around a cell."""
         count = wp.int32(1)
         if wp.static(not listed):
             count = segment_count(domain, cell)
@@ -56,8 +56,8 @@ def make_search(
         k: wp.int32,
         r: wp.int32,
     ):
-        """First candidate and one past the last of a run of particle k, whose world begins at
-        the cell `base`."""
+        """Return first and last + 1 candidate of a run of particle k, in the world whose first cell
+        is `base`."""
         begin = wp.int32(0)
         end = wp.int32(0)
         if wp.static(listed):
@@ -88,7 +88,8 @@ def make_search(
         first: wp.int32,
         end: wp.int32,
     ):
-        """Which candidates from `first` on lie within eps of a position, and how many do."""
+        """Return the candidates of the block from `first` on within eps of a position; their
+        count."""
         near = indices()
         count = wp.int32(0)
         for c in range(first, wp.min(first + wp.static(stride), end)):

@@ -2,9 +2,9 @@
 
 Particles are sorted by world, then cell, then index. A row of cells is contiguous, so that the
 neighbourhood of a cell is a few contiguous runs of particles. The particles whose update mask is
-set ("active") get a second, compact order of the same kind: their rows. Integer atomics hand out
-provisional places; the last kernel replaces them by ranks among indices, which makes every later
-sum run in the same order on every run and device.
+set ("active") get a second, compact order of the same kind: their rows. Integer atomics assign
+provisional positions; the last kernel replaces them by ranks among indices, so that every later
+sum has the same order on every run and device.
 """
 
 from types import SimpleNamespace
@@ -67,9 +67,9 @@ def sort_kernels(space_dim: int, scalar: type, width: int) -> SimpleNamespace:
         # outputs
         arrived: wp.array(dtype=wp.vec2i),
     ):
-        """List the particles of each cell in the order in which they were counted.
+        """List the particles of each cell in the order in which atomics counted them.
 
-        Of each: twice its index, plus one if it is active, and its cell.
+        An entry is twice the particle's index, plus one if it is active; then its cell.
         """
         await_earlier()
         i = wp.tid()
@@ -200,7 +200,7 @@ def sort_kernels(space_dim: int, scalar: type, width: int) -> SimpleNamespace:
         if end == positions.shape[0]:
             starts[starts.shape[0] - 1] = wp.where(masked != 0, row, place)
 
-        # Each start counts on as places are given, to the next cell's start.
+        # Each start is increased with every particle placed, up to the next cell's start.
         for i in range(first, end):
             c = cell[i]
             place = starts[c]
@@ -238,7 +238,7 @@ def sort_kernels(space_dim: int, scalar: type, width: int) -> SimpleNamespace:
 
 @made_once()
 def give_rows(space_dim: int, scalar: type) -> wp.Kernel:
-    """Return the kernel that gives active particles of sorted worlds their rows."""
+    """Return the kernel that assigns rows to the active particles of sorted worlds."""
     vector = wp.types.vector(space_dim, scalar)
 
     @wp.kernel(enable_backward=False, module=kernel_module("rows", space_dim, scalar))
@@ -254,11 +254,11 @@ def give_rows(space_dim: int, scalar: type) -> wp.Kernel:
         starts: wp.array(dtype=wp.int32, ndim=2),
         row_positions: wp.array(dtype=vector, ndim=2),
     ):
-        """Write rows of particles, particles of rows, and where cells' particles and rows begin.
+        """Write the row of each particle, the particle of each row, and starts of cells and rows.
 
-        All of several steps. Threads of a step are as many as particles or starts, whichever are
-        more. `active_before` counts the active particles of these and earlier steps up to each one,
-        itself included.
+        It does so for several steps; a step has a thread for each particle or start, whichever are
+        more. `active_before` is the cumulative number of active particles over all steps, up to and
+        with each particle.
         """
         await_earlier()
         step, t = wp.tid()

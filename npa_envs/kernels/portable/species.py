@@ -1,8 +1,8 @@
-"""Densities and density gradients by species: what each kind of particle adds to the field.
+"""Density and density gradient of each species at every particle.
 
-One thread of a particle goes through its neighbourhood once, whatever the number of species; sums
-run over sorted particles, run by run of cells. Both are summed in float64: gradients cancel almost
-fully where particles are dense.
+One thread runs through a particle's neighbourhood once, for all species. Sums run over sorted
+particles, one run of cells after the other, in float64: gradients cancel almost fully where
+particles are dense.
 
 Sources: kernels of arXiv 2601.16096, section 3, summed over the particles of one species.
 """
@@ -20,11 +20,8 @@ def species_kernel(space_dim: int, scalar: type, species_count: int) -> wp.Kerne
     """Return the kernel of one variant."""
     types = domain_types(space_dim, scalar)
     vector, Domain = types.vector, types.Domain
-    cell_of, segment_count, segment_cells = (
-        types.cell_of,
-        types.segment_count,
-        types.segment_cells,
-    )
+    cell_of, segment_count = types.cell_of, types.segment_count
+    segment_cells = types.segment_cells
     minimum_image = types.minimum_image
     wide = wp.types.vector(space_dim, wp.float64)
     densities_type = wp.types.vector(species_count, wp.float64)
@@ -79,7 +76,7 @@ def species_kernel(space_dim: int, scalar: type, species_count: int) -> wp.Kerne
                     )
                     for d in range(wp.static(space_dim)):
                         gradients[own, d] += factor * away[d]
-        # A particle always sees itself.
+        # A particle always counts itself.
         densities[sorted_species[k]] += wp.float64(domain.smoothing_norm)
         i = source[k]
         for q in range(wp.static(species_count)):

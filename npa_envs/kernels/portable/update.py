@@ -1,7 +1,7 @@
 """Updates of positions and states, from a rule's outputs or from actions, with the adjoint.
 
-A displacement is alpha eps delta / (1 + |delta|): it never exceeds alpha eps. An action gives it
-as a fraction of alpha eps.
+A displacement is alpha eps delta / (1 + |delta|): it never exceeds alpha eps. Actions are fractions
+of alpha eps.
 Source: arXiv 2601.16096, section 3.
 """
 
@@ -11,8 +11,8 @@ import warp as wp
 
 from npa_envs.kernels import native
 from npa_envs.kernels.access import (
+    allow_next_launch,
     await_earlier,
-    let_next_in,
     load_integer,
     make_read_at,
     make_wide_load,
@@ -26,13 +26,13 @@ CHANNEL_SHARE = 4
 """Adjacent channels of a particle, or columns of a row, that one thread changes."""
 
 UPDATE_ALIGNMENT = {2: 8, 3: 4}
-"""Bytes of float32 that the state part of an update's aligned row begins at a multiple of."""
+"""Alignment [bytes] of the state part of an update in float32, by space dimension."""
 
 OPEN, PERIODIC, REFLECTING = range(3)
-"""What positions beyond a box's sides become, as kernels read it."""
+"""Kinds of boundaries, as kernels read them."""
 
 TEAM = 32
-"""Particles that a warp moves; the next warps change their states."""
+"""Particles that one warp moves; further warps change their states."""
 
 
 @made_once()
@@ -74,8 +74,8 @@ def update_kernels(space_dim: int, scalar: type) -> SimpleNamespace:
         return result
 
     @wp.func
-    def held(value: scalar, limit: scalar):
-        """Return a value within its limit, 0 where it is not a number, and whether it was moved."""
+    def clipped(value: scalar, limit: scalar):
+        """Return a value clipped to its limit, 0 for NaN, and whether it was changed."""
         result = value
         moved = wp.int32(0)
         if wp.isnan(value):
@@ -113,7 +113,7 @@ def update_kernels(space_dim: int, scalar: type) -> SimpleNamespace:
     ):
         """Move and change the particles that have a row; copy the others."""
         await_earlier()
-        # The first threads of a team move a particle each, the others change some channels each.
+        # The first threads of a team move one particle each, the others change some channels each.
         sharers = (state_dim + wp.static(CHANNEL_SHARE - 1)) / wp.static(CHANNEL_SHARE)
         t = range_start + wp.tid()
         team = t / (wp.static(TEAM) * (1 + sharers))
@@ -183,8 +183,8 @@ def update_kernels(space_dim: int, scalar: type) -> SimpleNamespace:
     ):
         """Write the cotangent of every row's update, zero beyond the last active row."""
         await_earlier()
-        let_next_in()
-        # A thread has some adjacent columns of a row.
+        allow_next_launch()
+        # A thread writes some adjacent columns of a row.
         sharers = (update_width + wp.static(CHANNEL_SHARE - 1)) / wp.static(CHANNEL_SHARE)
         t = range_start + wp.tid()
         row = t / sharers
@@ -197,7 +197,7 @@ def update_kernels(space_dim: int, scalar: type) -> SimpleNamespace:
             if moving != 0:
                 offset = wp.int32(wp.static(space_dim))
             for k in range(wp.static(CHANNEL_SHARE)):
-                # Updates may be padded with columns that nothing reads.
+                # Updates may have padding columns.
                 c = first + k - offset
                 place = i * state_dim + wp.clamp(c, 0, state_dim - 1)
                 state_bar = load_scalar(new_states_bar, place)
@@ -249,9 +249,9 @@ def update_kernels(space_dim: int, scalar: type) -> SimpleNamespace:
         # outputs
         diverged: wp.array(dtype=wp.uint8),
     ):
-        """Move and change the particles that act, and mark the worlds that had to be held back."""
+        """Apply the actions of active particles, and mark worlds in which a value was clipped."""
         await_earlier()
-        # All that is read is asked for before any of it is used: the kernel waits for memory.
+        # All loads are issued before any value is used, as the kernel waits for memory.
         sharers = (state_dim + wp.static(CHANNEL_SHARE - 1)) / wp.static(CHANNEL_SHARE)
         t = range_start + wp.tid()
         i = t / sharers
@@ -262,8 +262,8 @@ def update_kernels(space_dim: int, scalar: type) -> SimpleNamespace:
         acting = wp.uint8(1)
         if masked != 0:
             acting = mask[i]
-        # A thread has some adjacent channels of a particle, which it reads and writes at once, or
-        # every so-manyth of them, so that neighbouring threads touch neighbouring numbers.
+        # A thread has some adjacent channels of a particle, if it reads and writes them at once, or
+        # channels at a constant stride, so that adjacent threads access adjacent numbers.
         first = sharer
         stride = sharers
         if aligned != 0:
@@ -280,14 +280,14 @@ def update_kernels(space_dim: int, scalar: type) -> SimpleNamespace:
             change = read_actions(actions, actions_begin + first)
         else:
             for k in range(wp.static(CHANNEL_SHARE)):
-                # The last thread of a particle may have fewer channels, and repeats its first.
+                # The last thread of a particle may have fewer channels, and then repeats its first.
                 c = wp.where(first + k * stride < state_dim, first + k * stride, first)
                 before[k] = states[states_begin + c]
                 change[k] = actions[actions_begin + c]
         position = vector()
         push = vector()
         direction = wide()
-        # A particle's first thread moves it, too.
+        # A particle's first thread also moves it.
         if sharer == 0:
             position = positions[i]
             if noisy != 0:
@@ -296,25 +296,25 @@ def update_kernels(space_dim: int, scalar: type) -> SimpleNamespace:
                 for d in range(wp.static(space_dim)):
                     own = actions_begin - wp.static(space_dim) + d
                     direction[d] = wp.float64(actions[own])
-        held_back = wp.int32(0)
+        clipped_count = wp.int32(0)
         if happens != wp.uint8(0):
             after = share()
             changed = wp.int32(0)
             for k in range(wp.static(CHANNEL_SHARE)):
                 state = before[k]
                 if acting != wp.uint8(0):
-                    # Comparisons let a value through that is not a number; a clamp would not.
+                    # Comparisons keep NaN; a clamp would not.
                     part = change[k]
                     if part > scalar(1.0):
                         part = scalar(1.0)
                     if part < scalar(-1.0):
                         part = scalar(-1.0)
                     state = scalar(wp.float64(state) + largest_change * wp.float64(part))
-                state, state_held = held(state, state_limit)
+                state, state_clipped = clipped(state, state_limit)
                 after[k] = state
                 if first + k * stride < state_dim:
-                    changed += state_held
-            held_back += changed
+                    changed += state_clipped
+            clipped_count += changed
             if acting != wp.uint8(0) or changed != 0:
                 if aligned != 0:
                     write_share(states, states_begin + first, after)
@@ -329,17 +329,17 @@ def update_kernels(space_dim: int, scalar: type) -> SimpleNamespace:
                 if moving != 0 and acting != wp.uint8(0):
                     length = wp.length(direction)
                     step = largest_step
-                    # So written, one coordinate that is not a number makes all of them so.
+                    # Written in this way, one NaN coordinate makes all of them NaN.
                     if not (length <= wp.float64(1.0)):
                         step = largest_step / length
                     position = displaced(position, step, direction)
                 position = bounded(position, boundary, box)
                 for d in range(wp.static(space_dim)):
-                    coordinate, coordinate_held = held(position[d], position_limit)
+                    coordinate, coordinate_clipped = clipped(position[d], position_limit)
                     position[d] = coordinate
-                    held_back += coordinate_held
+                    clipped_count += coordinate_clipped
                 positions[i] = position
-        if held_back != 0:
+        if clipped_count != 0:
             diverged[i / particle_count] = wp.uint8(1)
 
     return named(apply_update, pull_back_update, apply_actions)
@@ -349,7 +349,7 @@ QUAD = 4
 """Values that a thread reads at once."""
 
 VALUES_PER_THREAD = 8
-"""Values that a thread looks at."""
+"""Values that a thread checks."""
 
 
 @made_once()
@@ -365,7 +365,7 @@ def find_not_finite(scalar: type) -> wp.Kernel:
         # outputs
         finite: wp.array(dtype=wp.uint8),
     ):
-        """Write 0 where a value, aligned to 16 bytes in memory, is infinite or not a number."""
+        """Write 0 if any of the values, aligned to 16 bytes in memory, is infinite or NaN."""
         await_earlier()
         t = wp.tid()
         found = wp.int32(0)

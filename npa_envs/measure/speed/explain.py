@@ -15,7 +15,7 @@ from npa_envs.measure.speed.timing import TimingSession, Workload, rollout_call
 from npa_envs.ops.backend import describe
 from npa_envs.ops.launch import Launch, noted_launches
 from npa_envs.ops.physics import physics
-from npa_envs.ops.sort import make_plan
+from npa_envs.ops.sort import plan_kernels
 from npa_envs.rule.rule import NPARule
 from npa_envs.world.rollout import step
 from npa_envs.world.steps import row_capacity
@@ -118,7 +118,7 @@ def _reasons(
 ) -> list[str]:
     """Return the reasons for the choice of kernels as lines of text."""
     prob, total, masked = workload.update_prob, x.shape[0] * x.shape[1], workload.update_prob < 1.0
-    plan = make_plan(
+    plan = plan_kernels(
         torch.empty(0, dtype=x.dtype, device=x.device),
         (workload.world_count, workload.particle_count, workload.space_dim),
         workload.state_dim,

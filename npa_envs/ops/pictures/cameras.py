@@ -37,10 +37,10 @@ SMALLEST_ANGLE = 1e-9
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Cameras:
-    """V cameras, the same for all worlds or V for each world; they see pictures of one size.
+    """V cameras with pictures of one size, shared by all worlds or separate for each world.
 
-    Shapes are always checked, numbers only where they lie on the CPU: elsewhere looking at them
-    would wait for the device. So make cameras on the CPU and move them with `to`.
+    Shapes are always checked, values only on the CPU: elsewhere reading them would wait for the
+    device. So make cameras on the CPU and move them with `to`.
     """
 
     world_to_camera: Tensor
@@ -57,7 +57,7 @@ class Cameras:
     """Pixels down, H."""
 
     near: float = 0.01
-    """Nothing nearer than this along z is seen [length units]."""
+    """Smallest visible depth z [length units]."""
 
     def __post_init__(self) -> None:
         """Check every field."""
@@ -80,7 +80,7 @@ class Cameras:
 
     @property
     def world_count(self) -> int | None:
-        """Worlds that have cameras of their own, B; None where all share them."""
+        """Worlds with separate cameras, B; None if all worlds share the cameras."""
         return self.world_to_camera.shape[0] if self.world_to_camera.ndim == 4 else None
 
     def to(self, like: Tensor | torch.device | torch.dtype | str) -> Cameras:
@@ -148,16 +148,16 @@ class Cameras:
 def look_at(
     eyes: Tensor, targets: Tensor | Sequence[float], up: Sequence[float] = (0.0, 1.0, 0.0)
 ) -> Tensor:
-    """Return world-to-camera matrices of cameras that look at something, shape [..., 4, 4].
+    """Return world-to-camera matrices of cameras that look at targets, shape [..., 4, 4].
 
     Args:
-        eyes: Where the cameras are [length units], shape [..., 3].
-        targets: What lies in the middle of the pictures [length units], shape [3] or [..., 3].
-        up: Direction of the world that is up in the pictures, dimensionless.
+        eyes: Positions of the cameras [length units], shape [..., 3].
+        targets: Points in the centres of the pictures [length units], shape [3] or [..., 3].
+        up: Direction of the world that points up in the pictures, dimensionless.
 
     Raises:
-        NPAError: A shape does not fit, or (on the CPU) a camera is where it looks at, or looks
-            along `up`.
+        NPAError: A shape does not fit, or (on the CPU) a camera is at its target or looks along
+            `up`.
     """
     if not isinstance(eyes, Tensor) or eyes.dtype not in DTYPES or eyes.shape[-1:] != (3,):
         got = tuple(eyes.shape) if isinstance(eyes, Tensor) else type(eyes).__name__
@@ -179,7 +179,7 @@ def look_at(
         least = 1e-6 * lengths[0] * high.norm()
         if bool(((lengths[0] == 0.0) | ~(lengths[1] > least)).any()):
             raise NPAError(
-                f"a camera must look at another place than its own and not along up = {up}, "
+                f"a camera must look at another point than its own and not along up = {up}, "
                 f"got eyes {eyes.tolist()} and targets {goal.tolist()}: choose another up"
             )
     ahead, right = ahead / lengths[0][..., None], right / lengths[1][..., None]
@@ -221,14 +221,14 @@ def orbit(
 
     Args:
         count: Cameras V, 1 or more.
-        elevation: How far above the horizon they are [degrees], between -90 and 90.
-        radius: How far from the centre they are [length units].
+        elevation: Angle above the horizon [degrees], between -90 and 90.
+        radius: Distance from the centre [length units].
         fov: Angle of view across the width [degrees].
         width: Pixels across.
         height: Pixels down.
-        azimuth: How far the first camera has gone round [degrees].
-        centre: What they look at [length units].
-        near: Nothing nearer than this is seen [length units].
+        azimuth: Azimuth of the first camera [degrees].
+        centre: Point at which they look [length units].
+        near: Smallest visible depth [length units].
 
     Raises:
         NPAError: A number is out of its range.
@@ -269,14 +269,14 @@ def cameras_of_poses(
     """Return cameras of poses as the NeRF-synthetic scenes give them (Mildenhall et al. 2020).
 
     Their `transforms_*.json` hold a `transform_matrix` for each picture, whose camera's frame is
-    OpenGL's: x right, y up, z out of the scene. The world stays as it is; theirs has z up.
+    OpenGL's: x right, y up, z out of the scene. The world is not rotated; theirs has z up.
 
     Args:
         camera_to_world: Poses [length units], shape [V, 4, 4] or [B, V, 4, 4].
         angle: Angle of view across the width [radians]: their `camera_angle_x`.
         width: Pixels across.
         height: Pixels down.
-        near: Nothing nearer than this is seen [length units].
+        near: Smallest visible depth [length units].
 
     Raises:
         NPAError: A shape does not fit, a pose is no rigid motion, or a number is out of its range.

@@ -20,8 +20,8 @@ from npa_envs.kernels.pictures.gaussians import (
     make_frame,
     tile_total,
 )
+from npa_envs.ops.custom_op import check_derivatives, custom_op, once_differentiable
 from npa_envs.ops.launch import launch, scalar_type
-from npa_envs.ops.opaque import check_derivatives, once_differentiable, opaque
 from npa_envs.ops.pictures.cameras import Cameras
 from npa_envs.ops.sort import LARGEST_INDEX
 
@@ -121,16 +121,16 @@ def check_cameras(
 
 
 class Pairs(NamedTuple):
-    """Pairs of a tile and a Gaussian that covers it: by tile, near Gaussians first."""
+    """Pairs of a tile and a Gaussian that covers it, sorted by tile and then by depth."""
 
     overflow: Tensor
-    """Whether pairs of a picture found no room, shape [B V]."""
+    """Whether a picture has more pairs than slots, shape [B V]."""
     slots: Tensor
-    """First slot of each Gaussian in each picture, -1 without one, int32, shape [B V N]."""
+    """First slot of each Gaussian in each picture, -1 for none, int32, shape [B V N]."""
     starts: Tensor
     """First pair of each tile of each picture, and the end, int32."""
     owners: Tensor
-    """Picture and Gaussian of each pair, counted through, int32, shape [slots]."""
+    """Index of picture and Gaussian of each pair, among all B V N, int32, shape [slots]."""
     places: Tensor
     """Slot of each pair, int64, shape [slots]."""
 
@@ -138,9 +138,9 @@ class Pairs(NamedTuple):
 def sort_pairs(
     frame: Any, footprints: Tensor, depths: Tensor, counts: Tensor, pairs_per_particle: int
 ) -> Pairs:
-    """Sort the pairs of pictures, whose depths and counts of tiles have shape [B V, N].
+    """Sort the pairs of all pictures; depths and numbers of tiles have shape [B V, N].
 
-    Both sorts are stable: GaussianScene of the same depth stay in the order of their indices.
+    Both sorts are stable: Gaussians of equal depth stay in the order of their indices.
     """
     device, images = depths.device, depths.shape[0]
     order = torch.sort(depths, dim=1, stable=True).indices
@@ -167,7 +167,7 @@ def sort_pairs(
 
 
 def blend(frame: Any, footprints: Tensor, pairs: Pairs, images: int) -> tuple[Tensor, ...]:
-    """Return colours [B V H W, K], what passes and where a pixel stops, [B V H W]."""
+    """Return colours [B V H W, K], final transmittance and each pixel's end of pairs, [B V H W]."""
     device, pixels = footprints.device, images * frame.width * frame.height
     scalar = scalar_type(footprints.dtype)
     listed = (pairs.starts, pairs.owners, footprints)
@@ -189,27 +189,27 @@ def blend(frame: Any, footprints: Tensor, pairs: Pairs, images: int) -> tuple[Te
 
 
 PAIRS_PER_PARTICLE = 8
-"""Tiles of a picture that its Gaussians cover on average, at most: what CUDA has room for."""
+"""Default room on CUDA, in pairs of a tile and a Gaussian for each Gaussian of a picture."""
 
 DILATION = 0.3
 """Added to variances on the picture [pixels squared]: about the blur of a pixel (Kerbl et al.)."""
 
 
 class GaussianPictures(NamedTuple):
-    """What cameras see."""
+    """Pictures of worlds by cameras."""
 
     image: Tensor
     """Colours, dimensionless, shape [B, V, H, W, K]; the first row is the upper one."""
 
     alpha: Tensor
-    """What Gaussians cover of each pixel, in [0, 1], shape [B, V, H, W]."""
+    """Opacity of each pixel, in [0, 1], shape [B, V, H, W]."""
 
     overflow: Tensor
     """Pictures without room for all pairs, whose farthest Gaussians are missing: bool, [B, V]."""
 
 
 class GaussianScene(NamedTuple):
-    """Gaussians, but for opacities, and cameras: tensors of worlds, and of views."""
+    """Tensors of Gaussians (without opacities) and of cameras."""
 
     means: Tensor
     scales: Tensor
@@ -219,21 +219,21 @@ class GaussianScene(NamedTuple):
     lenses: Tensor
 
     def frame(self, width: int, height: int, near: float, dilation: float) -> Any:
-        """Return what pictures have in common, as kernels read it."""
-        # As integers: a shape that torch.compile left open is fixed here, another compiled anew.
+        """Return the struct of sizes that all pictures share, for kernels."""
+        # As integers: symbolic sizes of torch.compile become constants, and others recompile.
         sizes = self.means.shape[1], self.motions.shape[-3], self.colours.shape[-1]
         shape = int(sizes[0]), int(sizes[1]), int(sizes[2])
         return make_frame(scalar_type(self.means.dtype), shape, (width, height), near, dilation)
 
     def flat(self) -> list[Tensor]:
-        """Return the tensors as kernels read them: worlds, or worlds and views, in one."""
+        """Return the tensors for kernels, with worlds and views flattened to one dimension."""
         means, scales, quaternions, colours, motions, lenses = self
         total = means.shape[0] * means.shape[1]
         shapes = means.view(total, 3), scales.view(total, 3), quaternions.view(total, 4)
         return [*shapes, colours.view(total, -1), motions.view(-1, 4, 4), lenses.view(-1, 4)]
 
 
-@opaque("npa::gaussians")
+@custom_op("npa::gaussians")
 def _gaussians(
     opacities: Tensor,
     tensors: list[Tensor],
@@ -243,7 +243,7 @@ def _gaussians(
     dilation: float,
     pairs_per_particle: int,
 ) -> list[Tensor]:
-    """Return pictures, whether pairs found no room, and what the adjoint reads."""
+    """Return pictures, whether pairs found no room, and the tensors of the adjoint."""
     scene = GaussianScene(*tensors)
     means, frame = scene.means, scene.frame(width, height, near, dilation)
     worlds, views = means.shape[0], frame.view_count
@@ -301,7 +301,7 @@ def _(
     ]
 
 
-@opaque("npa::gaussians_backward")
+@custom_op("npa::gaussians_backward")
 def _gaussians_backward(
     picture_bar: Tensor, passing_bar: Tensor, saved: list[Tensor], near: float, dilation: float
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
@@ -312,7 +312,7 @@ def _gaussians_backward(
     frame = scene.frame(int(passing.shape[3]), int(passing.shape[2]), near, dilation)
     picture_bar = picture_bar.contiguous().view(-1, frame.channels)
     passing, passing_bar = passing.view(-1), passing_bar.contiguous().view(-1)
-    # What tiles pull at Gaussians, a row for each slot; empty slots are undefined.
+    # Cotangents from tiles, a row for each slot; unused slots are undefined.
     pulls = footprints.new_empty(owners.shape[0], PULLS)
     tiles = starts.shape[0] - 1
     listed = (starts, owners, places, footprints, stops, picture_bar)
@@ -352,7 +352,7 @@ class _Gaussians(torch.autograd.Function):
         ctx.save_for_backward(*scene, *saved)
         ctx.mark_non_differentiable(overflow, saved[-1])
         ctx.set_materialize_grads(False)
-        # The last one for torch.compile alone, which must see every size that data decide.
+        # The last one only for torch.compile, which must know every size that depends on data.
         return picture, saved[0], overflow, saved[-1]
 
     @staticmethod
@@ -385,11 +385,11 @@ def render_gaussians(
     """Draw 3D worlds: each particle is a Gaussian, seen by cameras; differentiable.
 
     This is 3D Gaussian splatting (Kerbl et al. 2023) with EWA's local affine projection (Zwicker et
-    al. 2002): docs/mathematics.md has the formulas. Nothing differentiates by the cameras, by the
-    order of Gaussians, or by where they end, at an alpha of 1/255.
+    al. 2002): docs/mathematics.md has the formulas. There are no gradients for the cameras, the
+    order of Gaussians, or their ends, at an alpha of 1/255.
 
-    Gaussians nearer than `cameras.near`, and those of which a number is not finite, are not seen.
-    The same worlds give the same bits on every run, and alone the same as in a batch.
+    Gaussians nearer than `cameras.near`, or with a number that is not finite, are not drawn.
+    Results are the same bit for bit in every run, and in every batch.
 
     Args:
         means: Particle positions [length units], shape [B, N, 3].
@@ -397,25 +397,24 @@ def render_gaussians(
             shape [B, N, 3].
         quaternions: Rotations of these axes (w, x, y, z), of any length: they are normalised here;
             a zero stands for no rotation. Shape [B, N, 4].
-        opacities: What each covers in its middle, in [0, 1], shape [B, N].
+        opacities: Alpha at each Gaussian's centre, in [0, 1], shape [B, N].
         colours: Dimensionless; K = 1 to 4 channels, shape [B, N, K], or coefficients of real
             spherical harmonics up to degree 1 for red, green and blue, shape [B, N, 4, 3], whose
-            sum plus 0.5 is cut off below 0.
+            sum plus 0.5 is clipped to at least 0.
         cameras: V cameras, on the same device.
-        background: What is seen behind the Gaussians; its shape broadcasts to [B, V, H, W, K]. None
-            is black.
+        background: Colours behind the Gaussians; the shape broadcasts to [B, V, H, W, K]. None is
+            black.
         dilation: Added to both variances on the picture [pixels squared].
-        pairs_per_particle: Room for so many pairs of a tile (16 pixels square) and a Gaussian that
-            covers it for each particle of a picture. None is 8 on CUDA, where reading the number
-            back would stall the stream, and as many as are needed on the CPU. A pair takes about 60
-            bytes.
+        pairs_per_particle: Room in pairs of a tile (16 x 16 pixels) and a Gaussian that covers it,
+            for each particle of a picture. None: 8 on CUDA, where reading the needed number would
+            wait for the device, and as many as needed on the CPU. A pair takes about 60 bytes.
 
     Returns:
         Image, alpha, and for each picture whether its pairs found no room.
 
     Raises:
         NPAError: A shape, dtype or device does not fit, or a number is out of its range; signs of
-            scales are looked at on the CPU alone.
+            scales are checked on the CPU only.
     """
     check_gaussians(means, scales, quaternions, opacities, colours)
     check_cameras(cameras, means, background, colours.shape[-1])

@@ -1,4 +1,4 @@
-"""Losses of 2D worlds' pictures against a target, without gradient and at once."""
+"""Losses of 2D worlds' pictures against a target, without gradient, in fused kernels."""
 
 from __future__ import annotations
 
@@ -11,10 +11,9 @@ from npa_envs.errors import NPAError
 from npa_envs.kernels.access import CUDA_BLOCK
 from npa_envs.kernels.pictures.errors import BLOCK_TILES, TURN_TILES, gather_errors, sum_errors
 from npa_envs.kernels.pictures.splat import CHANNELS, make_lens
-from npa_envs.ops.backend import processor_count
+from npa_envs.ops.backend import multiprocessor_count
+from npa_envs.ops.custom_op import custom_op
 from npa_envs.ops.launch import aligned, launch, scalar_type
-from npa_envs.ops.mean import average_sums
-from npa_envs.ops.opaque import opaque
 from npa_envs.ops.pictures.splat import (
     Splats,
     check_particles,
@@ -22,12 +21,13 @@ from npa_envs.ops.pictures.splat import (
     scatter_splats,
     sort_splats,
 )
+from npa_envs.ops.world_mean import average_sums
 
 BLOCKS_OF_PROCESSOR = 4
-"""Blocks that gather errors side by side on a processor."""
+"""Blocks per multiprocessor that gather errors in parallel."""
 
 
-@opaque("npa::picture_losses")
+@custom_op("npa::picture_losses")
 def _picture_losses(
     x: Tensor,
     states: Tensor,
@@ -46,7 +46,7 @@ def _picture_losses(
         starts, footprints, _ = sort_splats(splats, lens)
         tile_total = lens.tile_columns * lens.tile_rows
         partial_sums = x.new_empty(world_count, tile_total, 2, dtype=torch.float64)
-        tile_count = block_tiles(world_count * tile_total, processor_count(device))
+        tile_count = block_tiles(world_count * tile_total, multiprocessor_count(device))
         threads = world_count * -(-tile_total // tile_count) * CUDA_BLOCK
         pixels = aligned(target).view(-1, CHANNELS)
         gathered = (tile_count, starts, footprints, pixels, partial_sums)
@@ -60,7 +60,7 @@ def _picture_losses(
 
 
 def block_tiles(tile_total: int, processors: int) -> int:
-    """Return how many tiles a block serves: few where many would leave processors idle."""
+    """Return the number of tiles of a block: fewer if many would leave multiprocessors idle."""
     tile_count = BLOCK_TILES
     while tile_count > TURN_TILES and tile_total < BLOCKS_OF_PROCESSOR * processors * tile_count:
         tile_count //= 2
@@ -84,7 +84,7 @@ def picture_losses(
     lo: float = -1.0,
     hi: float = 1.0,
 ) -> tuple[Tensor, Tensor]:
-    """Compare worlds with a picture at once; without gradient.
+    """Compare worlds with a picture without writing theirs (on CUDA); without gradient.
 
     Each world's mean position is moved to `goal` and drawn as by `splat`; colours are the last
     three states plus `shift`. With d the difference from the target and e = |d| + d^2, a pixel's
@@ -92,8 +92,8 @@ def picture_losses(
     exp(-(density error)). The target has shape [R, R, 4], the goal [2].
 
     Returns:
-        Means over the pixels of the density error and of the colour error, shape [B] each. World
-        k's are the same, bit for bit, in every batch.
+        Means over the pixels of the density error and of the colour error, shape [B] each, bit for
+        bit the same in every batch.
     """
     check_particles(x, states, None)
     resolution = target.shape[0] if target.ndim else 0

@@ -31,26 +31,26 @@ from npa_envs.kernels.pictures.splat import (
     splat_kernels,
 )
 from npa_envs.ops.backend import KernelRequest
+from npa_envs.ops.custom_op import check_derivatives, custom_op, once_differentiable
 from npa_envs.ops.launch import aligned, launch, scalar_type
-from npa_envs.ops.mean import world_mean
-from npa_envs.ops.opaque import check_derivatives, once_differentiable, opaque
 from npa_envs.ops.sort import LARGEST_INDEX, block_capacity, slice_count
+from npa_envs.ops.world_mean import world_mean
 
 LARGEST_SPOT = 1e6
-"""Pixels of a spot's standard deviation at most, and of one over it."""
+"""Largest standard deviation of a Gaussian [pixels], and of its inverse."""
 
 
 class Splats(NamedTuple):
-    """What is drawn: contiguous tensors. Colours are the last three states plus a shift."""
+    """Particles to draw, in contiguous tensors; colours are the last three states plus a shift."""
 
     x: Tensor
     """Positions [length units], shape [B, N, 2]."""
     states: Tensor
     """States, dimensionless, shape [B, N, C]."""
     shift: float = 0.0
-    """What is added to the states to give colours, dimensionless."""
+    """Added to the last three states to give colours, dimensionless."""
     goal: Tensor | None = None
-    """Where each world's mean is moved to, if anywhere [length units], shape [2]."""
+    """Point to which each world's mean is moved [length units], shape [2]; None: not moved."""
 
     @property
     def total(self) -> int:
@@ -62,17 +62,17 @@ class Splats(NamedTuple):
         return self.x.shape[1], self.x.view(-1, 2), self.states.view(self.total, -1), self.shift
 
     def aim(self) -> tuple[int, Tensor | None]:
-        """Arguments of kernels: whether worlds are moved, and where to."""
+        """Arguments of kernels: whether worlds are moved, and the goal."""
         return (0, None) if self.goal is None else (1, self.goal.view(1, 2))
 
     def places(self) -> tuple[Any, ...]:
-        """Arguments of kernels that say where particles are drawn: whether moved, means, goal."""
+        """Arguments of kernels for moving worlds: whether they are moved, means, goal."""
         moved, goal = self.aim()
         return moved, world_mean(self.x) if moved else None, goal
 
 
 def splat_lanes(device: torch.device) -> int:
-    """Return how many threads of a device share a tile, or a particle."""
+    """Return the number of threads that share a tile, or a particle, on a device."""
     return TILE_LANES if device.type == "cuda" else 1
 
 
@@ -82,7 +82,7 @@ def device_kernels(like: Tensor) -> Any:
 
 
 def gather_threads(world_count: int, resolution: int, device: torch.device) -> int:
-    """Return how many threads gather pictures."""
+    """Return the number of threads that gather pictures."""
     group = GROUP_WIDTH * GROUP_HEIGHT * splat_lanes(device)
     return world_count * group_count(resolution) * group
 
@@ -148,7 +148,7 @@ def scatter_splats(splats: Splats, lens: Any) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def _draw(splats: Splats, lens: Any) -> tuple[Tensor, Tensor, Tensor]:
-    """As `scatter_splats`, by what suits the device."""
+    """Draw as `scatter_splats`, by the kernels for the device."""
     x = splats.x
     if x.device.type != "cuda":
         return scatter_splats(splats, lens)
@@ -161,7 +161,7 @@ def _draw(splats: Splats, lens: Any) -> tuple[Tensor, Tensor, Tensor]:
     return picture, footprints, source
 
 
-@opaque("npa::splat")
+@custom_op("npa::splat")
 def _splat(
     x: Tensor,
     colour: Tensor,
@@ -185,7 +185,7 @@ def _(x: Tensor, colour: Tensor, resolution: int, *lens: float) -> tuple[Tensor,
     )
 
 
-@opaque("npa::splat_backward")
+@custom_op("npa::splat_backward")
 def _splat_backward(
     picture_bar: Tensor,
     footprints: Tensor,
@@ -252,9 +252,9 @@ def splat(
     """Draw 2D worlds: each particle is a Gaussian of about one target pixel; differentiable.
 
     Pixel p = (x - lo) / (hi - lo) (R - 1); the Gaussian's standard deviation is
-    sigma R h / (hi - lo) pixels, its weights sum to (R h / (hi - lo))^2, so that particles which
-    stand as dense as the target's pixels have density about 1 (design of arXiv 2601.16096's 2D
-    loss).
+    sigma R h / (hi - lo) pixels, and its weights sum to (R h / (hi - lo))^2, so particles at the
+    density of the target's pixels give a density of about 1 (as in the 2D loss of arXiv
+    2601.16096).
 
     Args:
         x: Particle positions [length units], shape [B, N, 2].
@@ -267,7 +267,7 @@ def splat(
 
     Returns:
         Pictures, dimensionless, shape [B, R, R, 4]: sums of colour times weight and, last, of the
-        weights. Row r lies at y = lo + r / (R - 1) (hi - lo), so y points to higher rows.
+        weights. Row r is at y = lo + r / (R - 1) (hi - lo), so y points to higher rows.
 
     Raises:
         NPAError: A shape does not fit or a number is out of its range.
@@ -281,7 +281,7 @@ def splat(
 
 
 def check_particles(x: Tensor, colour: Tensor, width: int | None) -> None:
-    """Check positions with colours of a width, or with states where that is None."""
+    """Check positions and colours of a given width, or states if the width is None."""
     check_world(x, colour)
     check_derivatives(x=x, colour=colour)
     fits = colour.shape[2] >= 3 if width is None else colour.shape[2] == width
@@ -297,7 +297,7 @@ def check_particles(x: Tensor, colour: Tensor, width: int | None) -> None:
 def checked_window(
     resolution: int, pixel_size: float, sigma: float, low: float, high: float
 ) -> tuple[int, float, float, float, float]:
-    """Return what pictures are drawn by, in this order, checked, as Python's own numbers."""
+    """Return the checked sizes of a picture, in this order, as Python numbers."""
     if checked_count("resolution", resolution) < 2:
         raise NPAError(f"resolution must be at least 2 pixels, got {resolution}")
     side = checked_side("resolution", resolution)
@@ -333,42 +333,41 @@ def periodic_splat(
     """Draw 2D worlds in a periodic box as pictures that tile without a seam; differentiable.
 
     As `splat`, but the R pixels of a row divide the box evenly: pixel q is centred at
-    lo + (q + 1/2) (hi - lo) / R, and next to the last pixel is the first. Positions may lie outside
-    the box; their images inside it are drawn. World k's picture is the same, bit for bit, in every
-    batch.
+    lo + (q + 1/2) (hi - lo) / R, and the first pixel follows the last. Of positions outside the box
+    the images inside it are drawn. Pictures are bit for bit the same in every batch.
 
-    Worlds are drawn on a canvas that is wider by a patch on each side, by the kernels of `splat`.
-    What lies in a margin is then added where it belongs, on the other side. Arguments, results and
-    errors are those of `splat`; `lo` and `hi` are the edges of the box in both directions.
+    Worlds are drawn by the kernels of `splat` on a canvas with margins. Pixels of a margin are then
+    added to those on the opposite side. Arguments, results and errors are those of `splat`; `lo`
+    and `hi` are the edges of the box in both directions.
     """
     check_particles(x, colour, 3)
     resolution, pixel_size, sigma, lo, hi = checked_window(resolution, pixel_size, sigma, lo, hi)
     step = (hi - lo) / resolution
-    # A particle at the upper edge may round to the pixel behind the last one.
+    # A particle at the upper edge may round to the pixel after the last one.
     margin = math.ceil(PATCH_SIGMAS * sigma * pixel_size / step) + 1
     side = resolution + 2 * margin
     if side > LARGEST_SIDE:
         raise NPAError(
-            f"spots must reach across so few boxes that picture and margins stay within "
+            f"Gaussians must be so small that the picture and its margins stay within "
             f"{LARGEST_SIDE} pixels, got {shown(side)}: choose a smaller sigma or pixel_size"
         )
-    # Whole boxes are taken off without gradient: what is left moves as the particle does.
+    # The images are subtracted without gradient: the result has the gradient of the position.
     boxes = ((x.detach() - lo) / (hi - lo)).floor()
     canvas = splat(
         x - boxes * (hi - lo),
         colour,
         resolution=side,
-        # Pixels on the canvas lie as dense as in the box, and spots are as wide.
+        # Pixels and Gaussians have the same sizes on the canvas as in the box.
         pixel_size=pixel_size * (side - 1) / side,
         sigma=sigma,
         lo=lo + (0.5 - margin) * step,
         hi=hi + (margin - 0.5) * step,
     )
-    return _folded(_folded(canvas, 1, margin, resolution), 2, margin, resolution)
+    return _sum_periods(_sum_periods(canvas, 1, margin, resolution), 2, margin, resolution)
 
 
-def _folded(canvas: Tensor, dim: int, margin: int, period: int) -> Tensor:
-    """Return the sum of a canvas's pixels that are a period apart; the first lies in a margin."""
+def _sum_periods(canvas: Tensor, dim: int, margin: int, period: int) -> Tensor:
+    """Sum the pixels of a canvas with a margin that are a period apart."""
     length = canvas.shape[dim]
     shape = list(canvas.shape)
     shape[dim] = period

@@ -21,14 +21,14 @@ def nearest_triangles(
 ) -> Tensor:
     """Return red, green and blue of the nearest triangle at each pixel, and 1; elsewhere 0.
 
-    Everything is on the CPU, in float64. A triangle covers a pixel where it covers its middle.
+    Everything is on the CPU, in float64. A triangle covers a pixel if it covers the centre.
 
     Args:
-        place: Where V cameras see K corners [pixels], shape [V, K, 2].
-        nearness: One over the corners' depth [1 / length units], shape [V, K].
-        colours: Of the corners, shape [K, 3].
+        place: Coordinates of K corners in the pictures of V cameras [pixels], shape [V, K, 2].
+        nearness: 1 / depth of the corners [1 / length units], shape [V, K].
+        colours: Colours of the corners, shape [K, 3].
         faces: Corners of each triangle, from 0 to K − 1, shape [F, 3].
-        seen: Whether a camera sees a triangle, shape [V, F].
+        seen: Whether a triangle is visible to a camera, shape [V, F].
     """
     count = len(place)
     nearest = place.new_zeros(count, height * width)

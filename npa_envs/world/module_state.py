@@ -1,4 +1,7 @@
-"""What a rule with a network of its own depends on, as far as that can be read off its modules."""
+"""Inputs of a custom network: its modules' tensors, attributes, hooks and modes.
+
+A recording of a rule with such a network is replayed only as long as these are the same.
+"""
 
 from __future__ import annotations
 
@@ -14,14 +17,14 @@ NUMBERS = (int, float, complex, bool, str, bytes, type(None), torch.dtype, torch
 """Types of attributes that are compared by value."""
 
 HOOKS = ("_forward_hooks", "_forward_pre_hooks", "_backward_hooks", "_backward_pre_hooks")
-"""Where modules keep their hooks, by numbers that are given once."""
+"""Attributes of modules that map unique numbers to hooks."""
 
 OF_EVERY_MODULE = frozenset(vars(nn.Module()))
-"""Attributes that torch gives every module, which are looked at by themselves."""
+"""Attributes that torch gives every module, which are compared separately."""
 
 
 def rule_tensors(rule: nn.Module, device: torch.device) -> list[Tensor]:
-    """Return a rule's parameters, buffers and plain attributes that lie on a device, each once."""
+    """Return all tensors of a rule on a device, once each: parameters, buffers and attributes."""
     found: dict[int, Tensor] = {}
     for module in rule.modules():
         for values in (module._parameters, module._buffers, vars(module)):
@@ -32,11 +35,11 @@ def rule_tensors(rule: nn.Module, device: torch.device) -> list[Tensor]:
 
 
 def rule_settings(rule: nn.Module, device: torch.device) -> dict[str, Hashable]:
-    """Return what a rule's network depends on besides the numbers of its tensors on a device.
+    """Return all settings of a rule's network except the values of its tensors on a device.
 
-    That is: its modules, their hooks and modes, and their attributes: numbers and words by value,
-    others by what they are, those within lists, tuples and dictionaries alike. What else Python
-    code reads, such as global variables, is not seen.
+    These are its modules with their hooks and modes, and their attributes: numbers and strings by
+    value, other objects by identity, also within lists, tuples and dictionaries. Other inputs of
+    Python code, such as global variables, are not included.
     """
     settings: dict[str, Hashable] = {}
     for path, module in rule.named_modules():
@@ -54,12 +57,14 @@ def _setting(value: Any, device: torch.device) -> Hashable:
         return type(value), value
     if isinstance(value, Tensor):
         form = (value.shape, value.dtype, value.device)
-        # The numbers of those on the device are read anew in each call.
+        # Values of tensors on the device are read again in each call.
         return form if value.device == device else (form, id(value), value._version)
     if isinstance(value, list | tuple):
-        return type(value), tuple(_held(entry, device) for entry in value)
+        return type(value), tuple(_contained(entry, device) for entry in value)
     if isinstance(value, dict):
-        return tuple((_held(key, device), _held(entry, device)) for key, entry in value.items())
+        return tuple(
+            (_contained(key, device), _contained(entry, device)) for key, entry in value.items()
+        )
     if inspect.ismethod(value):
         return id(value.__self__), value.__func__
     try:
@@ -70,7 +75,7 @@ def _setting(value: Any, device: torch.device) -> Hashable:
     return reference
 
 
-def _held(value: Any, device: torch.device) -> Hashable:
-    """Return the setting of what a list or a dictionary holds, whose tensors are not read anew."""
+def _contained(value: Any, device: torch.device) -> Hashable:
+    """Return the setting of an entry of a container, whose tensors are not read again."""
     setting = _setting(value, device)
     return (setting, id(value), value._version) if isinstance(value, Tensor) else setting

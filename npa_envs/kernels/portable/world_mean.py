@@ -1,4 +1,4 @@
-"""Means over each world whose order of summation depends on nothing but the world's own size.
+"""Means over each world, in an order of summation that depends only on the world's size.
 
 On CUDA the threads of a warp share a sum, first of a chunk of values, then of the chunks' sums.
 """
@@ -13,10 +13,10 @@ from npa_envs.kernels.domain import scalar_name
 from npa_envs.once import made_once
 
 CHUNK = 256
-"""Values whose sum is one partial sum."""
+"""Values of one partial sum."""
 
 MEAN_LANES = 32
-"""CUDA threads that share a sum: a warp; one on the CPU."""
+"""CUDA threads that share a sum, a warp; on a CPU it is one."""
 
 
 @made_once()

@@ -1,17 +1,17 @@
-// Lists of neighbours: the density pass makes them in fast memory and leaves them for perception.
+// Neighbour lists: the density pass makes them in shared memory and writes them for perception.
 
 namespace npa {
 
-// A thread has a column of words, a block's width apart, with two entries each: no two threads of a
-// warp share a bank. ROOM: entries that a thread has room for; behind it lies room for those of one
-// look at candidates, before the list is cut off.
+// A thread has a column of 32-bit words, a block's width apart, with two entries each, so that no two
+// threads of a warp use the same bank. ROOM: entries of a list; there is further room for the MANY
+// candidates of one round, after which the list is cut off.
 template <int ROOM, int MANY, int BLOCK> __device__ inline unsigned list_address()
 {
     __shared__ ushort2 lists[(ROOM / 2 + 1 + MANY) * BLOCK];
     return (unsigned)__cvta_generic_to_shared(lists + threadIdx.x);
 }
 
-// Where the next entry goes, and how far it is from there to the one after it.
+// Address of the next entry, and the distance [bytes] from it to the one after.
 using ListEnd = wp::vec_t<2, unsigned>;
 
 template <int BLOCK> __device__ inline ListEnd list_end_of(unsigned address, int entries)
@@ -19,7 +19,7 @@ template <int BLOCK> __device__ inline ListEnd list_end_of(unsigned address, int
     return ListEnd(address + 4 * BLOCK * (entries / 2), 2);
 }
 
-// As assembly, so that loads of global memory may be moved ahead of it, and without branches.
+// In assembly, without branches and so that the compiler may move global loads ahead of it.
 template <int BLOCK>
 __device__ inline ListEnd append_step(ListEnd end, float weight, int step)
 {
@@ -34,15 +34,15 @@ __device__ inline ListEnd append_step(ListEnd end, float weight, int step)
     return end;
 }
 
-// What is too long ends behind its room, wherever further entries went.
+// Set the end of a list that is too long to just beyond its room.
 template <int ROOM, int BLOCK> __device__ inline ListEnd cut_off(unsigned address, ListEnd end)
 {
     end.c[0] = min(end.c[0], address + 4 * BLOCK * (ROOM / 2 + 1));
     return end;
 }
 
-// Where a row's list begins: 32 rows lie together, their first two entries first. (Those that
-// `tiles.cuh` leaves lie one after the other.)
+// Index at which a row's list begins: lists of 32 rows are interleaved, two entries at a time. (Those
+// of `tiles.cuh` are stored one after the other.)
 template <int CAPACITY> __device__ inline size_t place_of_list(int row)
 {
     return (size_t)(row / 32) * (32 * CAPACITY) + row % 32 * 2;
@@ -50,7 +50,7 @@ template <int CAPACITY> __device__ inline size_t place_of_list(int row)
 
 __device__ inline int place_of_entry(int entry) { return entry / 2 * 64 + entry % 2; }
 
-// Each lane's entries follow those of the lanes before it.
+// Write a row's list, each lane's entries after those of the lanes before it; return its length.
 template <int ROOM, int BLOCK, int CAPACITY, int LANES>
 __device__ inline int leave_list(
     unsigned address, ListEnd list_end, int row, const wp::array_t<wp::int16>& lists)
@@ -63,7 +63,7 @@ __device__ inline int leave_list(
     if (row < 0 || total > CAPACITY) return total;
     short* to = lists.data + place_of_list<CAPACITY>(row);
     if (LANES == 1) {
-        // With an entry behind the last one, which nobody reads, where their number is odd.
+        // If their number is odd, with one more entry, which is not read.
         for (int pair = 0; pair < (length + 1) / 2; ++pair) {
             int steps;
             asm volatile("ld.shared.u32 %0, [%1];" : "=r"(steps) : "r"(address + 4 * BLOCK * pair));
@@ -80,8 +80,8 @@ __device__ inline int leave_list(
     return total;
 }
 
-// Two steps of a row's list, of the entries 2 pair and 2 pair + 1, as one word; of a pair that lists
-// have no room for, those of another one. TILED: lists lie one after the other.
+// Entries 2 pair and 2 pair + 1 of a row's list, packed in 32 bits; beyond the capacity, those of
+// another pair. TILED: lists are stored one after the other.
 template <int CAPACITY, bool TILED>
 __device__ inline int steps_at(const wp::array_t<wp::int16>& lists, int row, int pair)
 {

@@ -1,7 +1,7 @@
-"""Opaque torch operators: kernels that `torch.compile` calls and does not look into.
+"""Custom torch operators around kernels, which `torch.compile` calls without tracing them.
 
-Their derivatives are kernels as well, of which there are no derivatives: gradients are computed
-backwards, one at a time. Whatever else torch can derive is refused.
+Backward passes are kernels as well and have no derivatives of their own. Second derivatives,
+forward-mode derivatives and functions of `torch.func` are refused with an error.
 """
 
 from __future__ import annotations
@@ -27,21 +27,21 @@ Result = TypeVar("Result")
 _transforms_active = torch._C._are_functorch_transforms_active
 
 PLAIN_TYPES = {Tensor, nn.Parameter, Physics, torch.dtype, bool, int, float, str, list, NoneType}
-"""Types of arguments that kernels read as they are; other tensors may wrap some."""
+"""Types of arguments that kernels can read; a tensor subclass may wrap other tensors."""
 
 CURE = "or take small worlds with the slow operators of npa_envs.reference, which are plain torch"
 
 
 def check_derivatives(**given: Any) -> None:
-    """Check that torch derives nothing but backward passes from what kernels compute.
+    """Check that no forward-mode derivative and no function of `torch.func` uses these arguments.
 
-    Forward-mode derivatives would vanish without a word where nothing requires a gradient.
+    Forward-mode derivatives would be lost silently where no tensor requires a gradient.
 
     Raises:
         NPAError: A tensor carries a tangent of forward-mode derivatives, or a function of
             `torch.func` makes the call.
     """
-    # Asked in this order: a compiler cannot trace the other question.
+    # In this order: a compiler cannot trace the second condition.
     if not torch.compiler.is_compiling() and _transforms_active():
         raise NPAError(
             f"{', '.join(given)} must not be given within a function of torch.func (grad, vjp, "
@@ -56,7 +56,7 @@ def check_derivatives(**given: Any) -> None:
 def _check_tangents(given: dict[str, Any]) -> None:
     """Check within a `dual_level` that no tensor carries a tangent."""
     if torch.compiler.is_compiling():
-        # Only calls that a compiler does not trace show tangents.
+        # Tangents are visible only to calls that a compiler does not trace.
         torch.compiler.disable(_check_tangents)(given)  # type: ignore[no-untyped-call]
         return
     for name, value in given.items():
@@ -72,7 +72,7 @@ def _check_tangents(given: dict[str, Any]) -> None:
 
 
 def _tensors(value: Any) -> Iterator[Tensor]:
-    """Yield the tensors that something is or holds; a module's weights may be plain attributes."""
+    """Yield the tensors in an argument; a module's weights may be plain attributes."""
     if isinstance(value, Tensor):
         yield value
     elif isinstance(value, nn.Module):
@@ -86,26 +86,29 @@ def _tensors(value: Any) -> Iterator[Tensor]:
                 yield from _tensors(entry)
 
 
-class Opaque(Generic[Arguments, Result]):
-    """A function as a torch operator; run as it is where nobody wants to see an operator.
+class CustomOp(Generic[Arguments, Result]):
+    """A function of tensors that becomes a torch operator only where torch has to see one.
 
-    A call of an operator takes the host as long as several launches do. Results share no memory
-    with each other or with arguments, which are given by place. The operator takes a `Physics` as
-    a list of its numbers.
+    That is under torch.compile, in dispatch modes and for tensor subclasses. Other calls run the
+    plain function, as an operator's call costs as much CPU time as several launches. Arguments are
+    positional. Results share no memory with each other or with arguments. The operator takes a
+    `Physics` as the list `Physics.numbers`.
     """
 
     def __init__(self, name: str, function: Callable[Arguments, Result]) -> None:
         self._function = function
         self._signature = inspect.signature(function, eval_str=True)
-        self._operator = torch.library.custom_op(name, self._of_numbers(function), mutates_args=())
+        self._operator = torch.library.custom_op(
+            name, self._taking_lists(function), mutates_args=()
+        )
 
     def register_fake(self, fake: Callable[..., Any]) -> Callable[..., Any]:
-        """Say what the operator returns of tensors without numbers, by a function like itself."""
-        self._operator.register_fake(self._of_numbers(fake))
+        """Register a function that returns empty results of the right shapes, for tracing."""
+        self._operator.register_fake(self._taking_lists(fake))
         return fake
 
-    def _of_numbers(self, function: Callable[..., Any]) -> Callable[..., Any]:
-        """Return a function of what the operator takes."""
+    def _taking_lists(self, function: Callable[..., Any]) -> Callable[..., Any]:
+        """Return the function with a list of numbers in place of each `Physics`."""
         parameters = self._signature.parameters.values()
         packed = [parameter.annotation is Physics for parameter in parameters]
 
@@ -122,10 +125,10 @@ class Opaque(Generic[Arguments, Result]):
 
     def __call__(self, *args: Arguments.args, **kwargs: Arguments.kwargs) -> Result:
         """Run the function on plain tensors, and the operator on all others."""
-        assert not kwargs, "given by place"
+        assert not kwargs, "arguments are positional"
         if forward_ad._current_level >= 0:
             _check_tangents(dict(zip(self._signature.parameters, args, strict=False)))
-        # Asked in this order: a compiler cannot trace the other questions.
+        # In this order: a compiler cannot trace the other conditions.
         if (
             torch.compiler.is_compiling()
             or not PLAIN_TYPES.issuperset(map(type, args))
@@ -137,15 +140,15 @@ class Opaque(Generic[Arguments, Result]):
         return self._function(*args, **kwargs)
 
 
-def opaque(name: str) -> Callable[[Callable[Arguments, Result]], Opaque[Arguments, Result]]:
-    """Return a decorator that makes a function of tensors the opaque operator "npa::..."."""
-    return lambda function: Opaque(name, function)
+def custom_op(name: str) -> Callable[[Callable[Arguments, Result]], CustomOp[Arguments, Result]]:
+    """Return a decorator that makes a function of tensors the operator `name`, "npa::..."."""
+    return lambda function: CustomOp(name, function)
 
 
 def without_autocast(backward: Callable[Arguments, Result]) -> Callable[Arguments, Result]:
-    """Return the backward pass of an autograd function, in its tensors' own dtypes.
+    """Wrap the backward pass of an autograd function, so that it runs without autocast.
 
-    Forward passes are run without autocast; a backward pass may be asked for within it.
+    Forward passes run without autocast; `backward()` may be called within it.
     """
 
     @functools.wraps(backward)
@@ -160,11 +163,11 @@ def without_autocast(backward: Callable[Arguments, Result]) -> Callable[Argument
 
 
 def once_differentiable(backward: Callable[Arguments, Result]) -> Callable[Arguments, Result]:
-    """Return the backward pass of an autograd function, made to refuse what it cannot derive.
+    """Wrap the backward pass of an autograd function, so that it refuses second derivatives.
 
-    Torch's own `once_differentiable` says nothing where the cotangent needs no gradient, as that of
-    a sum: second derivatives are then zero. Functions that `torch.compile` has taken refuse them by
-    themselves, but for its backend "eager", which is there to look for faults.
+    Torch's own `once_differentiable` raises no error where the cotangent requires no gradient, as
+    that of a sum: second derivatives are then silently zero. Compiled functions refuse them
+    themselves, except under torch.compile's debugging backend "eager".
 
     Raises:
         NPAError: When called with `create_graph=True`, or with several cotangents at once.

@@ -1,4 +1,4 @@
-"""Means over worlds as torch operators: world k's is the same, bit for bit, in every batch."""
+"""Mean over each world as a torch operator: the same in every batch, bit for bit."""
 
 from __future__ import annotations
 
@@ -9,13 +9,13 @@ from torch import Tensor
 
 from npa_envs.checks import check_floating
 from npa_envs.errors import NPAError
-from npa_envs.kernels.portable.mean import CHUNK, MEAN_LANES, mean_kernels
+from npa_envs.kernels.portable.world_mean import CHUNK, MEAN_LANES, mean_kernels
+from npa_envs.ops.custom_op import check_derivatives, custom_op
 from npa_envs.ops.launch import launch, scalar_type
-from npa_envs.ops.opaque import check_derivatives, opaque
 
 
 def average_sums(partial_sums: Tensor, value_count: int, like: Tensor) -> Tensor:
-    """Return means [B, K] from partial sums [B, L, K], in an order that L alone decides."""
+    """Return means [B, K] from partial sums [B, L, K]; the order of summation depends only on L."""
     world_count, _, width = partial_sums.shape
     lanes = _lanes(like.device)
     kernels = mean_kernels(scalar_type(like.dtype), lanes)
@@ -35,7 +35,7 @@ def _lanes(device: torch.device) -> int:
     return MEAN_LANES if device.type == "cuda" else 1
 
 
-@opaque("npa::world_mean")
+@custom_op("npa::world_mean")
 def _world_mean(values: Tensor) -> Tensor:
     world_count, value_count, width = values.shape
     lanes = _lanes(values.device)
@@ -71,13 +71,13 @@ class _WorldMean(torch.autograd.Function):
 
 
 def world_mean(values: Tensor) -> Tensor:
-    """Return each world's mean; differentiable, and independent of the other worlds.
+    """Return the mean over each world; differentiable, bit for bit independent of other worlds.
 
-    It is accumulated in float64 in an order that depends on M alone; that of torch's own means may
-    change with the number of worlds, and so may their last bit.
+    It is accumulated in float64 in an order that depends on M alone. The order of torch's own means
+    may change with the number of worlds, and with it their last bit.
 
     Args:
-        values: What is averaged over its second dimension, shape [B, M, K], float32 or float64.
+        values: Values to average over M, shape [B, M, K], float32 or float64.
 
     Returns:
         The means, shape [B, K].
