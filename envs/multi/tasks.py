@@ -138,7 +138,9 @@ class PictureLossTask(SpeciesTask):
 
     def __init__(self, config: Any, device: torch.device, *pictures: tuple[str, int]) -> None:
         super().__init__(config, device)
-        self.tasks = [Morphogenesis2D(config.task_config(*picture), device=device) for picture in pictures]
+        self.tasks = [
+            Morphogenesis2D(config.task_config(*picture), device=device) for picture in pictures
+        ]
         """Training tasks, with target and loss, of each picture."""
         self.task = self.tasks[0]
         """The first of them, whose target scripted policies use."""

@@ -184,9 +184,9 @@ def _kernel_cache() -> list[DoctorLine]:
         fix = "each run would compile all kernels: set WARP_CACHE_PATH to a folder of yours"
         return [DoctorLine("kernel cache", f"{folder} (cannot be written to)", fix)]
     count = len(list(folder.glob("wp_npa_envs*")))
-    fix = None if count else "the first use of each kernel compiles it; npa-envs warmup does so now"
-    text = f"{folder} ({count} modules of npa-envs)"
-    return [DoctorLine("kernel cache", text, fix, optional=True)]
+    compiled = f"{folder} ({count} modules of npa-envs)"
+    fix = "the first use of each kernel compiles it; npa-envs warmup does so now"
+    return [DoctorLine("kernel cache", compiled, None if count else fix, optional=True)]
 
 
 def _films_and_screen() -> list[DoctorLine]:
