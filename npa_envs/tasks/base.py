@@ -299,7 +299,7 @@ class ParticleTask(Generic[ConfigT]):
         return bound
 
 
-Task = ParticleTask[Any]
+Task = PictureTask = ParticleTask[Any]
 """Any task."""
 
 

@@ -8,7 +8,7 @@ from typing import Any
 
 from npa_envs.devices import check_device
 from npa_envs.errors import DivergedError, NPAError, shown
-from npa_envs.tasks.base import ParticleTask, Task
+from npa_envs.tasks.base import ParticleTask, PictureTask, Task
 from npa_envs.tasks.morphogenesis2d import Morphogenesis2DTrainConfig
 from npa_envs.tasks.train_config import JointTrainConfig, TrainConfig
 from npa_envs.training.presets import (
@@ -37,6 +37,7 @@ __all__ = [
     "JsonlLog",
     "Morphogenesis2DTrainConfig",
     "ParticleTask",
+    "PictureTask",
     "RunFolder",
     "Task",
     "TaskEntry",

@@ -188,7 +188,7 @@ def test_a_policy_of_another_garden_or_a_file_of_something_else_is_refused(tmp_p
     seen, _ = problem.make_envs().reset(seed=0)
     assert GardenPolicy.load(path)(seen).shape[0] == 2
     seen, _ = garden("Shepherd2DSmall").make_envs().reset(seed=0)
-    refused("observation must be of a garden like that which", GardenPolicy.load(path), seen)
+    refused("of the garden that the policy was trained in", GardenPolicy.load(path), seen)
     path.write_text("no archive", encoding="utf-8")
     refused(r"path must be of a file that sac's `save` wrote, got", GardenPolicy.load, path)
 

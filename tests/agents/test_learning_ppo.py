@@ -215,10 +215,10 @@ def test_a_world_s_policy_in_stable_baselines_means_over_particles(world_policy)
 
 def test_stable_baselines_ends_a_round_at_the_divergence_of_particles():
     pytest.importorskip("stable_baselines3")
-    from npa_envs.agents.learning.sb3 import EXCESS, world_kl
+    from npa_envs.agents.learning.sb3 import KL_FACTOR, world_kl
 
     # A world's log-ratio is close to minus the divergence of its particles.
-    assert EXCESS * world_kl(0.02) == pytest.approx(math.expm1(-0.02) + 0.02, rel=0.01)
+    assert KL_FACTOR * world_kl(0.02) == pytest.approx(math.expm1(-0.02) + 0.02, rel=0.01)
 
 
 def test_gains_are_clipped_where_the_ratio_has_gone_where_it_pays():

@@ -147,10 +147,12 @@ def test_a_step_after_divergence_rewards_particles_by_their_losses_and_the_world
     """The loss that a diverged episode ends with may exceed the sum of its parts."""
     env = begun(make(IDS[0], reward="particle", observation_limit=0.5, state_scale=1.0))
     still = np.zeros(env.action_space.shape, np.float32)
-    grown, s = env.unwrapped.particles()
-    env.unwrapped.place_particles(0.9 * grown, s + 0.4)
+    target = env.unwrapped.task.task.target
+    s = torch.full((61, 16), 0.4)
+    s[:, -3:] = (target.colours - 0.5).clamp(-0.4, 0.4)
+    env.unwrapped.place_particles(target.points, s)
     wild = still.copy()
-    wild[:, -1] = 1.0
+    wild[:, 2] = 1.0
     *_, before = env.step(wild)
     assert before["diverged"]
     _, reward, _, _, after = env.step(-0.1 * wild)

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from npa_envs.ops import cameras_of_poses, look_at, orbit
-from npa_envs.render.worlds import _seen_from
+from npa_envs.render.worlds import _projected
 
 SIZE = {"width": 40, "height": 30}
 
@@ -30,7 +30,7 @@ def test_a_turntable_agrees_with_the_one_of_drawn_worlds(elevation):
     points = torch.randn(50, 3, generator=torch.Generator().manual_seed(0))
     cameras = orbit(3, elevation, 4.0, 30.0, azimuth=15.0, **SIZE)
     for frame, azimuth in zip(frames(cameras, points), (15.0, 135.0, 255.0), strict=True):
-        places, near = _seen_from(points[None], azimuth, elevation)
+        places, near = _projected(points[None], azimuth, elevation)
         expected = torch.cat((places * torch.tensor([1.0, -1.0]), 4.0 - near), dim=-1)[0]
         torch.testing.assert_close(frame, expected, rtol=0.0, atol=3e-6)
 

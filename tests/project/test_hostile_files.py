@@ -284,7 +284,7 @@ def scaled(factor=1.0, shift=0.0):
 
 
 MOST_POINTS = "point_count must be at most 16777216, got 1000000000"
-OUTSIDE = r"must name a file in that folder|no characters"
+OUTSIDE = r"must name a file in that folder|no null or invalid characters"
 NUMBER = r"transform_matrix|camera_angle_x"
 REFUSED = [
     (corners, "few and far apart: fill more of the picture"),

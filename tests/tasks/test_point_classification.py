@@ -270,7 +270,7 @@ def test_a_static_rule_of_no_known_task_is_refused(task, tmp_path, capsys):
     path = tmp_path / "rule.safetensors"
     save_rule(task.make_rule(random()), path)
     assert main(["evaluate", str(path), "--no-progress"]) != 0
-    told = "shows moving rules in the 2D worlds of morphogenesis2d, got space_dim=2, static=True"
+    told = "runs moving rules in the 2D worlds of morphogenesis2d, got space_dim=2, static=True"
     assert told in capsys.readouterr().err
 
 

@@ -105,7 +105,7 @@ def test_rules_learn_from_a_dataset_without_a_world(monkeypatch):
     error = (trained.policy(seen) - done).square().mean() / done.var()
     assert error < 0.1
     assert trained.log[-1].particle_steps == 60 * steps
-    with pytest.raises(NPAError, match="teacher must be None where a dataset is given"):
+    with pytest.raises(NPAError, match="teacher must be None with a dataset"):
         train("clone", problem, Budget(particle_steps=1), 0, teacher=list(teacher), **told)
     other = heart(particle_count=32)
     refused("record it in this problem", train, "clone", other, Budget(particle_steps=1), 0, **told)
