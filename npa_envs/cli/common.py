@@ -94,7 +94,7 @@ def parse_options(
     Ends the process after `--help`, and with code 2 for a wrong argument. The help begins with
     `description` or the dataclass's docstring.
     """
-    shown = "\n".join(f"  npa-envs {example}" for example in EXAMPLES[command])
+    shown = "\n".join(f"  npa-envs {example}" for example in EXAMPLES.get(command, [command]))
     given: dict[str, Any] = {} if default is None else {"default": default}
     options: OptionsT = tyro.cli(
         kind,

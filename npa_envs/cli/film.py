@@ -159,7 +159,9 @@ def large_task(
     `SCREEN`; `world` has further options of `task_of_rule`.
     """
     chosen = dict(world)
-    if resolution is not None or len(task.target_picture) < SCREEN:
+    target = getattr(task, "target_picture", None)
+    side = task.config.resolution if target is None else len(target)
+    if resolution is not None or side < SCREEN:
         chosen["resolution"] = SCREEN if resolution is None else resolution
     if style == "points":
         sigma = getattr(getattr(task, "config", None), "sigma", None)

@@ -152,7 +152,7 @@ def _card(
     tables: Mapping[str, Sequence[Any]],
 ) -> str:
     config = task.config
-    goal = getattr(config, "target", None) or config.data
+    goal = getattr(config, "data", config.goal_text)
     others = "" if rule.codes is None else f", one of {len(rule.codes)} pictures"
     space = (
         "open space" if task.box is None else f"periodic box of {' x '.join(map(str, task.box))}"

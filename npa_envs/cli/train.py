@@ -460,8 +460,7 @@ def announcement(
     species = _species(config)
     goals: list[str] = []
     for own in species:
-        targets = getattr(own, "targets", ())
-        goals += targets or (getattr(own, "target", None) or f"the data {own.data}",)
+        goals += getattr(own, "targets", ()) or (own.goal_text,)
     particles = " and ".join(str(own.particle_count) for own in species)
     named = options.preset or default_preset(task_name, config.device)
     source = f"preset {named}" if options.config is None else str(options.config)

@@ -67,6 +67,11 @@ class TaskConfig:
         check_fraction(self, "update_prob")
         check_non_negative(self, "overflow_weight")
 
+    @property
+    def goal_text(self) -> str:
+        """What rules are trained for, in a few words: the target, or else the task's name."""
+        return str(getattr(self, "target", type(self).__name__.removesuffix("Config")))
+
     def with_particle_count(self, particle_count: int) -> Self:
         """Return the same task with another number of particles."""
         return replace(self, particle_count=particle_count)

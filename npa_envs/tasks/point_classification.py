@@ -72,6 +72,11 @@ class PointClassificationConfig(TaskConfig):
     overflow_weight: float = 1.0
     """Weight of mean |s − clip(s, −1, 1)| (dimensionless)."""
 
+    @property
+    def goal_text(self) -> str:
+        """The data set whose clouds rules classify."""
+        return f"the data {self.data}"
+
     def __post_init__(self) -> None:
         """Check every field; raise NPAError where one has a wrong type or lies out of its range."""
         super().__post_init__()
