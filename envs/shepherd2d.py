@@ -49,11 +49,11 @@ class Shepherd2DEnvConfig(GardenConfig):
     axis by an angle, or "reshape" its width and height."""
 
     goal_reach: float = 0.6
-    """Largest distance of goals from the creature's start [length units, radians, or a fraction of
-    width and height]."""
+    """Largest distance of goals from the creature's start: length units to "move", the tangent of
+    an angle to "turn", a fraction of width and height to "reshape"."""
 
     tolerance: float = 0.1
-    """Distance within which a goal is reached, in the unit of `goal_reach`."""
+    """Distance at which a goal is reached; to "turn", between (cos 2φ, sin 2φ) of both angles φ."""
 
     lost_limit: float = 0.5
     """Largest lost fraction of a creature that counts as intact (dimensionless)."""
