@@ -304,8 +304,11 @@ class ParticleTask(Generic[ConfigT]):
         return bound
 
 
-Task = PictureTask = ParticleTask[Any]
+Task = ParticleTask[Any]
 """Any task."""
+
+PictureTask = Task
+"""Any task, where only its pictures are used."""
 
 
 @dataclass(frozen=True, kw_only=True)
