@@ -106,7 +106,7 @@ class ScriptedGardener(BrushPolicy):
         self._pulls = (checked_positive("share", share) * weight[..., None] * away).double()
 
     def act(self, world_count: int) -> Tensor:
-        """Return the pushes for the deficits of the worlds."""
+        """Return pushes towards places where worlds have less than the target."""
         worlds, action = self.worlds, self.still(world_count)
         deficit = self._deficit(worlds.x, worlds.s, self.task.middle(worlds.x))
         pull = torch.einsum("bq,pqd->bpd", deficit[..., 0].double(), self._pulls).to(deficit.dtype)

@@ -350,7 +350,7 @@ class SpreadPolicy(Policy):
         return self.interface.action(displacement, self.state_step(observation))
 
     def state_step(self, observation: Tensor) -> Tensor:
-        """Return changes of the states, dimensionless, shape [B, N, C]: none."""
+        """Return zeros, shape [B, N, C]: states do not change."""
         return torch.zeros_like(self.interface.states(observation))
 
 

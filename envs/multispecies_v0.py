@@ -213,7 +213,7 @@ def batched(
 
 
 def raw_env(task: str = "mixing", species_count: int | None = None, **config: Any) -> Any:
-    """Return `parallel_env` with species that act in turn, and the world after the last of them."""
+    """Return `parallel_env` with species that act in turn; a step runs after the last of them."""
     return in_turns(parallel_env(task, species_count, **config))
 
 

@@ -150,7 +150,7 @@ class CodeForm(ParticleSpaces):
 
 
 class ShapeshifterTask(RuleDriven, PictureEnvTask[Shapeshifter2DEnvConfig]):
-    """A picture that has to become others; contexts are the goals, the current one first."""
+    """A picture has to become others; a context has the current goal, then all goals in order."""
 
     config_type = Shapeshifter2DEnvConfig
     form_type = CodeForm
@@ -225,7 +225,7 @@ class ShapeshifterTask(RuleDriven, PictureEnvTask[Shapeshifter2DEnvConfig]):
     def step(
         self, x: Tensor, s: Tensor, action: Tensor, random: WorldRandom
     ) -> tuple[Tensor, Tensor]:
-        """Give all particles the codes of an action, [B, 1, K]; return worlds after the rule."""
+        """Write an action's codes, [B, 1, K], into all states, run the rule, and return x and s."""
         config = self.config
         coded = self.rule.with_code(s, action)
         return run_rule(self.rule, config, x, coded, config.rule_steps, random)

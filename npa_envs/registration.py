@@ -32,7 +32,7 @@ class Registration(NamedTuple):
 
     @property
     def entry_point(self) -> str:
-        """Entry point of the single environment."""
+        """Entry point of the environment of one world."""
         return f"{self.module}:{self.name}Env"
 
     @property

@@ -218,7 +218,7 @@ class EpisodeClock:
         """Whether the last observation is new, shape [B]; not if a reset was of other worlds."""
 
     def reset(self, options: dict[str, Any] | None) -> None:
-        """Update for a reset, of the worlds of `reset_mask` among its options, or of all."""
+        """Restart the counters of the worlds in the option `reset_mask`; without it, of all."""
         mask = None if options is None else options.get("reset_mask")
         self.restarted = np.ones_like(self.ended) if mask is None else to_host(mask).copy()
         self.observed = self.restarted
@@ -251,7 +251,7 @@ class Observations(AnyWrapper):
 
     @abstractmethod
     def observations(self, observations: Any) -> Any:
-        """Return an observation, shape [N, P], changed."""
+        """Return what the wrapper makes of a world's observation, shape [N, P]."""
 
     def new_observations(self, observations: Any) -> Any:
         """Return the observation, which is always new."""

@@ -280,7 +280,7 @@ def _held_row(
 
 
 def _joined(suite: Suite, held: Mapping[str, Any], row: dict[str, Any]) -> dict[str, Any]:
-    """Return a row with the other runs of an earlier row added."""
+    """Return `row` with the runs of the stored row `held` added that it lacks."""
     new = {(run["id"], run["seed"]) for run in row["runs"]}
     kept = [dict(run) for run in held["runs"] if (run["id"], run["seed"]) not in new]
     if not kept:

@@ -62,7 +62,7 @@ class GradientOptions:
     """What the backward pass reads: "store", "recompute" or "minimal", as in `rollout`."""
 
     def __post_init__(self) -> None:
-        """Check what `TrainConfig` does not check; raises NPAError."""
+        """Check `last_rate`, and check `steps` and make it a tuple; raises NPAError."""
         check_fraction(self, "last_rate")
         given: Any = self.steps
         if given is not None:
@@ -308,7 +308,7 @@ class ClampedRule(NPARule):
         return self.rule_is_plain
 
     def has_network(self) -> bool:
-        """Return False: the network alone would not clamp its state steps."""
+        """Return False: the network without `forward` would not clamp the state steps."""
         return False
 
     def folded(self) -> FoldedRule:

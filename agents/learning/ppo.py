@@ -380,7 +380,7 @@ class PPOLearner:
         return weights.sum()
 
     def _critic_rows(self, part: int, values: Sequence[Tensor]) -> list[Tensor]:
-        """Return the critic's rows of a minibatch, worlds, of each of the values [M, N, ...]."""
+        """Return the worlds of the critic's minibatch `part`, from each of values [M, N, ...]."""
         order = self._minibatches.parts[-1][part]
         return [value[order] for value in values]
 
@@ -401,7 +401,7 @@ class PPOLearner:
         return acted.amax(dim=1, keepdim=True) if self.options.ratio == "world" else acted
 
     def _gain(self, part: list[Round]) -> Tensor:
-        """Return the clipped objective of the rules; write the sums of the KL estimate [nats]."""
+        """Return PPO's clipped objective; write sums of the KL estimate [nats] to `_kl_sums`."""
         options, actor = self.options, self.actor
         if options.ratio == "world":
             (worlds,) = part

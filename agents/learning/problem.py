@@ -140,7 +140,7 @@ class Problem:
 
     @cached_property
     def env_type(self) -> type[NPAVectorEnv]:
-        """Class of the batched environment; not of species."""
+        """Class of the batched environment; raises NPAError where there is none, as for species."""
         spec = gymnasium.registry.get(self.env_id) if isinstance(self.env_id, str) else None
         entry: Any = None if spec is None else spec.vector_entry_point
         if isinstance(entry, str):

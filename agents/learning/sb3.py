@@ -152,7 +152,7 @@ class ProgressCallback(BaseCallback):
         self.rounds += 1
 
     def _on_step(self) -> bool:
-        """Return whether to continue; without budget a round ends at its first step."""
+        """Return whether to go on: a round that begins with no budget left ends at once."""
         return self.budget_left > 0.0
 
     def _on_rollout_end(self) -> None:

@@ -69,7 +69,7 @@ class StepReport(NamedTuple):
 
     @classmethod
     def over(cls, buffer: Tensor, world_count: int) -> StepReport:
-        """Return the report whose memory is a buffer."""
+        """Return a report whose tensors are views of a buffer."""
         flag_rows = 3 + len(FLAGS)
         rows = buffer.view(-1, world_count)
         numbers = buffer[: -flag_rows * world_count].view(torch.float32).view(-1, world_count)

@@ -83,7 +83,7 @@ class WorldTask(Generic[AnyConfig]):
 
     @property
     def open_half_width(self) -> float:
-        """Half of a picture's side in open space [length units]; smaller values count as 1."""
+        """Half of a picture's side in open space [length units]; values below 1 count as 1."""
         return 1.0
 
     @property
@@ -294,7 +294,7 @@ class TargetEnvTask(EnvTask[Config]):
     """The training task."""
 
     def seed(self, random: WorldRandom) -> tuple[Tensor, Tensor]:
-        """Return the training task's initial worlds, all states zero."""
+        """Draw initial worlds as the training task does; return positions and states."""
         x, s, *_ = self.task.seed(random.world_count, generator=random, device=self.device)
         return x, s
 

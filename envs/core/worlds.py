@@ -113,7 +113,7 @@ class BatchedWorlds(RewardedWorlds):
     @torch.no_grad()
     @makes_plain_tensors
     def start(self, worlds: Tensor, keys: Tensor | None = None) -> Start:
-        """Start episodes in some worlds, int64, [M], and return them; keys as in `next_streams`."""
+        """Start episodes of worlds, int64 indices [M]; return starts; keys as in `next_streams`."""
         random = self.next_streams(worlds, keys)
         check_default_dtype()
         # The first start is not recorded as a graph, so that it can synchronise for checks.

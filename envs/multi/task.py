@@ -161,7 +161,7 @@ class SpeciesConfig(WorldConfig):
 
 
 class Population(NamedTuple):
-    """Particles of worlds with the same N remaining ones, sorted by species."""
+    """The N remaining particles, sorted by species, of worlds that all have the same ones left."""
 
     x: Tensor
     """Positions [length units], shape [B, N, 2]."""
@@ -267,7 +267,7 @@ class SpeciesTask(WorldTask[Any]):
 
     @property
     def open_half_width(self) -> float:
-        """Half of a picture's side in open space [length units]; smaller values count as 1."""
+        """Half of a picture's side in open space [length units]; values below 1 count as 1."""
         return 1.25 * float(self.config.seed_span)
 
     def draw(self, population: Population) -> NDArray[np.uint8]:

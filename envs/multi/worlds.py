@@ -283,7 +283,7 @@ class SpeciesWorlds(WorldState):
     def perceived(self, *, stepped: bool = False) -> Tensor:
         """Return what particles perceive, shape [B, N, P]; zeros where they or their world ended.
 
-        `stepped`: the particles have not changed since the cohorts acted.
+        `stepped`: the particles are as the last step left them, so that its neighbours are used.
         """
         if self.cohorts == [self._whole]:
             return self._whole.perceived(stepped=stepped)

@@ -72,7 +72,7 @@ class InteractOptions(common.RunOptions):
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Grow the missing pairs, print, draw and write."""
+    """Grow pairs of rules that have no record yet; write record and pictures, print a table."""
     options = common.parse_options(InteractOptions, "interact", arguments)
     from npa_envs.files import plain_numbers
     from npa_envs.measure import interaction

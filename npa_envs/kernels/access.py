@@ -213,7 +213,7 @@ scalar_of_warp = make_shuffle(wp.float32)
 
 @native.func_native()
 def of_lane(value: wp.int32, lane: wp.int32, lanes: wp.uint32) -> wp.int32:
-    """Return the value of another lane of the same particle."""
+    """Return the value of one of the `lanes` threads that work on the same particle."""
 
 
 @native.func_native()
@@ -268,7 +268,7 @@ def sum_up_to(value: wp.int32) -> wp.int32:
 
 @native.func_native()
 def thread_of(ends: wp.int32, number: wp.int32) -> wp.int32:
-    """Return the first thread of the warp whose `ends` is larger than a number; they ascend."""
+    """Return the first thread of the warp whose `ends`, ascending over threads, is > `number`."""
 
 
 @native.func_native()

@@ -112,7 +112,7 @@ def _kernels(like: Tensor, space_dim: int) -> Any:
 
 
 def _is_for_warps(like: Tensor, form: tuple[int, int, int, int, bool]) -> bool:
-    """Return whether CUDA kernels for this form run on a tensor's device and dtype."""
+    """Return whether the CUDA kernels support a `VectorForm`, as a tuple, for such a tensor."""
     return choose("vectors", KernelRequest(like.device, like.dtype, vectors=form)).name == "cuda"
 
 
@@ -305,7 +305,7 @@ class _ReadRows(torch.autograd.Function):
 
 
 class _SteerRows(torch.autograd.Function):
-    """Updates from gates, mixed vectors and state changes."""
+    """Autograd function of `steer_rows`: updates from gates, mixed vectors and state changes."""
 
     @staticmethod
     def forward(ctx: Any, output: Tensor, mixed: Tensor, signs: Tensor, width: int) -> Tensor:

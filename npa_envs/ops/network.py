@@ -84,7 +84,7 @@ def _(hidden_weight: Tensor, output_weight: Tensor, with_backward: bool) -> list
 def arrange(
     hidden_weight: Tensor, output_weight: Tensor, *, with_backward: bool
 ) -> ArrangedWeights:
-    """Lay out weights that the kernels support; `with_backward`: also for the backward pass."""
+    """Return weights in the order the kernels read; `with_backward`: also for backward passes."""
     arranged = _arrange_weights(
         hidden_weight.detach().contiguous(), output_weight.detach().contiguous(), with_backward
     )

@@ -324,7 +324,7 @@ def _launch_of(
     *,
     aligned: bool,
 ) -> tuple[Any, ...]:
-    """Return arguments of `launch`; `aligned`: actions and states are aligned to 16 bytes."""
+    """Return the update's arguments of `launch`; `aligned`: tensors are aligned to 16 bytes."""
     world_count, particle_count, space_dim = x.shape
     state_dim = s.shape[2]
     # Then adjacent channels are read and written at once.

@@ -189,8 +189,8 @@ class ParticleTask(Generic[ConfigT]):
     def begin(self, iteration: int) -> None:
         """Prepare the loss of an iteration, without waiting for the device.
 
-        Recorded graphs read what is written: always into the same tensors. It must follow from the
-        iteration alone, so that a resumed run goes on as it would have.
+        Write into the same tensors each time, as CUDA graphs read them, and let values depend on
+        the iteration alone, so that a resumed run goes on as it would have.
         """
 
     def for_rule(self, rule: NPARule) -> Self:
@@ -219,7 +219,7 @@ class ParticleTask(Generic[ConfigT]):
         return self._goal
 
     def coded(self, s: Tensor) -> Tensor:
-        """Return states with their worlds' codes written again, which damage may have wiped.
+        """Return states with each world's target code restored, which damage may have erased.
 
         Without codes they are unchanged. They are differentiable in codes that are learned.
         """
@@ -278,7 +278,7 @@ class ParticleTask(Generic[ConfigT]):
         return self.metric_name
 
     def trial_metric(self, x: Tensor, s: Tensor) -> Tensor:
-        """Return the metric of robustness trials, shape [B]; by default `metric`."""
+        """Return the metric under damage or changed conditions, shape [B]; by default `metric`."""
         return self.metric(x, s)
 
     def colours(self, s: Tensor) -> Tensor:

@@ -229,8 +229,7 @@ class Texture(ParticleTask[TextureConfig]):
         return self.compare_pictures(self.picture(x - x[:, :1].detach(), s))
 
     def weights(self) -> tuple[float, float]:
-        """Return the weights of both parts of `texture_losses`; 1 for joint losses, which include
-        them."""
+        """Return weights of the two `texture_losses`; 1 for a joint loss, which includes them."""
         if is_joint(self.config.loss):
             return 1.0, 1.0
         return self.config.colour_weight, self.config.density_weight

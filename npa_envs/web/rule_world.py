@@ -445,7 +445,7 @@ class FollowedLog:
         """Iteration of the last record, or -1."""
 
     def news(self) -> tuple[list[dict[str, Any]], bool]:
-        """Return new records, and whether they are the log's first; broken lines are skipped."""
+        """Return records since the last call, and whether they start a log; skip broken lines."""
         try:
             now = self._path.stat()
         except FileNotFoundError:
@@ -598,7 +598,7 @@ class RunWorld(RuleWorld):
         self._goals = goals
 
     def _goal_choices(self) -> list[Any]:
-        """Return task name and configuration of each rule's file."""
+        """Return each file's task name and configuration, to notice that a run's task changed."""
         found: list[Any] = []
         for path in self._files.values():
             metadata = rule_metadata(path)

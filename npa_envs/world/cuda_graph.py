@@ -222,9 +222,9 @@ _capturing: ContextVar[GraphSequence | None] = ContextVar("capturing", default=N
 
 
 def host_call(work: Callable[[], object]) -> None:
-    """Call a function that cannot be part of a graph; in a capture, each replay calls it instead.
+    """Call host code; while a CUDA graph is captured, only note it: each replay then calls it.
 
-    It reads and writes the same tensors in every replay; the caller keeps them alive.
+    `work` must use the same tensors in every replay; the caller keeps them alive.
     """
     captured = _capturing.get()
     if captured is None:
@@ -279,7 +279,7 @@ def capture(
 def _captured(
     function: Callable[[], object], stream: torch.cuda.Stream, captured: GraphSequence
 ) -> GraphSequence:
-    """Capture a stream while the function runs."""
+    """Record in `captured` what a function launches on a stream; return `captured`."""
     current = torch.cuda.current_stream()
     # A capture does run one thing: torch resets generator offsets on the device, which earlier
     # graphs read and the next replay writes. So the two streams wait for each other.

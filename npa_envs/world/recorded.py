@@ -452,10 +452,10 @@ class CallKind:
 
 
 class CallKinds(collections.OrderedDict[Hashable, CallKind]):
-    """Kinds of calls so far, the least recently used first."""
+    """How often each kind of call was seen, and its recordings; the least recently used first."""
 
     def count(self, key: Hashable, most: int) -> CallKind:
-        """Count a call, and return its kind; of more than `most` kinds the oldest is deleted."""
+        """Count a call and return its kind; beyond `most` kinds delete the least recently used."""
         kind = self.get(key)
         if kind is None:
             kind = self[key] = CallKind()

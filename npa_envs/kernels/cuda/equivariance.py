@@ -82,7 +82,7 @@ def row_kernels(
         mixed: wp.array(dtype=wp.float32),
         inputs: wp.array(dtype=wp.float32, ndim=2),
     ):
-        """Write the mixed vectors and the inputs of rows."""
+        """Write the mixed vectors and the network's inputs, from rows of perception."""
         await_earlier()
         read_vectors(rows, mixing, mixed, inputs)
 

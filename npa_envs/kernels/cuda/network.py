@@ -241,7 +241,7 @@ def arrangement_kernels() -> SimpleNamespace:
         # outputs
         fragments: wp.array(dtype=wp.bfloat16),
     ):
-        """Lay out [H, width] as a left operand; threads (H / 16, width / 16, lanes)."""
+        """Write [H, width] as left operands of tensor cores; threads (H / 16, width / 16, 32)."""
         await_earlier()
         group, step, lane = wp.tid()
         place = (group * ((weights.shape[1] + 15) / 16) + step) * 2 * wp.static(WARP)

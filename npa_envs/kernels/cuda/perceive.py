@@ -148,7 +148,7 @@ def weighing_functions(
 
     @wp.func
     def spiky_wide(domain: Domain, centre: Centre, neighbour: vector, squared: scalar):
-        """Return a pair's spiky factor without its norm, and its offset r, in float64."""
+        """Return a pair's spiky factor with norm 1, and its offset r, both in float64."""
         r = wide()
         start = squared
         for d in range(wp.static(space_dim)):

@@ -300,10 +300,10 @@ def order_particles(space_dim: int, width: int) -> wp.Kernel:
         row_positions: wp.array(dtype=vector),
         sorted_states: wp.array(dtype=share),
     ):
-        """Move every particle to its rank by index within its cell; give active ones rows.
+        """Write particles sorted by cell, and by index within a cell; number active ones' rows.
 
-        States and rows are left out where their arrays are empty. Warps are complete, with threads
-        beyond the last particle.
+        States and rows are left out where their arrays are empty. Launched with whole warps;
+        threads beyond the last particle help to move states.
         """
         await_earlier()
         k = wp.tid()

@@ -120,7 +120,7 @@ def make_covered(scalar: type) -> wp.Function:
 
 @made_once()
 def gaussian_kernels(scalar: type) -> SimpleNamespace:
-    """Return the kernels of one scalar type."""
+    """Return the kernels that draw 3D Gaussians, of one scalar type."""
     types = gaussian_types(scalar)
     Frame, pair, triple, quad = types.Frame, types.pair, types.triple, types.quad
     footprint_type, pulls_type, harmonics_type = types.footprint, types.pulls, types.harmonics

@@ -219,7 +219,7 @@ def splat_functions(scalar: type) -> SimpleNamespace:
 
 @made_once()
 def gather_functions(scalar: type, lanes: int) -> SimpleNamespace:
-    """Return the functions that gather a tile, by one thread or by `lanes` threads, one a row."""
+    """Return functions that sum a tile's particles; `lanes`: 1, or a thread per pixel row."""
     assert lanes in (1, TILE_HEIGHT)
     types, functions = splat_types(scalar), splat_functions(scalar)
     Lens, footprint_type, tile_type = types.Lens, types.footprint, types.tile

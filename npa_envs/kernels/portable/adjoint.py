@@ -145,7 +145,7 @@ def adjoint_kernels(
         first: wp.int32,
         end: wp.int32,
     ):
-        """Return the rows of a block from `first` on within eps of a position; their count."""
+        """Return the rows within eps among the candidates from `first` on, and their count."""
         near = indices()
         count = wp.int32(0)
         if wp.static(listed):

@@ -22,7 +22,8 @@ def make_search(
 ) -> SimpleNamespace:
     """Return the Warp functions of a search among sorted vectors that begin with a position.
 
-    They are used as
+    For particle k in `cell`, of the world whose first cell is `base`, the first `count` of `near`
+    are candidates within eps. They are used as
 
         for r in range(run_count(domain, cell)):
             begin, end = run(domain, starts, ends, base, cell, k, r)

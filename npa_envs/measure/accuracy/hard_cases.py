@@ -100,8 +100,8 @@ def _run_threshold(space_dim: int, session: CheckSession) -> CheckResult:
 
 @check(GEOMETRY, "geometry/smooth_inverse", 2, 3)
 def _run_smooth_inverse(space_dim: int, session: CheckSession) -> CheckResult:
-    """Perception with moment_inverse='smooth' is as the float64 reference has it, and does not
-    jump where that by the threshold does."""
+    """With moment_inverse='smooth' perception matches the float64 reference, and is continuous at
+    the determinant where the inverse with a threshold jumps."""
     x, offsets = threshold_scenes(space_dim, reference.MOMENT_THRESHOLD)
     # The same states in all worlds, so that only the determinant differs.
     s = states_at(x)[:1].expand(len(x), -1, -1)

@@ -111,7 +111,7 @@ class RuleRecord(Record[Response]):
         return [response for response in self.rows if response.condition == condition]
 
     def trained(self) -> Response:
-        """Return the response under trained conditions."""
+        """Return the response with all conditions as in training."""
         return next(response for response in self.of("eps") if response.value == 1.0)
 
 
@@ -153,7 +153,7 @@ def measure_rule(
 def grow(
     ground: RuleTrial, condition: str = "", value: float | str = 1.0
 ) -> tuple[TrialWorlds, Response]:
-    """Return worlds grown from their seeds, if given under a condition, and their losses."""
+    """Grow seeds as in training, or with `condition` at `value`; return worlds and losses."""
     home = ground.home(
         share=float(value) if condition == "particles" else 1.0,
         shape=str(value) if condition == "shape" else "trained",

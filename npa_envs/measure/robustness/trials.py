@@ -198,7 +198,7 @@ class PicturesInTurn(ParticleTask[Morphogenesis2DConfig]):
         return self if goal is None else type(self)(self._tasks, goal)
 
     def coded(self, s: Tensor) -> Tensor:
-        """Return states with the codes of their pictures."""
+        """Return states with the code of each world's picture written into them."""
         s = s.clone()
         for task, worlds in self._worlds():
             s[worlds] = task.coded(s[worlds])

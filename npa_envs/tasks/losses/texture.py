@@ -385,7 +385,7 @@ class VGGFeatures:
         self._deviation = like.new_tensor(VGG_DEVIATION)[:, None, None]
 
     def __call__(self, images: Tensor, *, wrap: bool) -> list[Tensor]:
-        """Return features [B, F, R', R'] of each layer; opposite edges meet, or are mirrored."""
+        """Return features [B, F, R', R'] of each layer; pads periodically (`wrap`) or mirrored."""
         mode = "circular" if wrap else "reflect"
         # In the weights' precision.
         field = (images.to(self._mean) - self._mean) / self._deviation

@@ -236,7 +236,7 @@ def ellipse(
 
 
 def stroke(points: Points, widths: Sequence[float], *, grow: float = 0) -> Image.Image:
-    """Return the mask of a brush stroke along a smooth curve, with widths at even distances."""
+    """Return the mask of a stroke along a smooth curve: `widths` at even distances, + 2 `grow`."""
     mask, draw = _blank()
     curve = np.asarray(smooth_curve(points))
     lengths = np.hypot(*np.diff(curve, axis=0).T)

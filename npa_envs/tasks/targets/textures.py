@@ -306,7 +306,7 @@ def hearts(u: Array, v: Array, _: np.random.Generator) -> Array:
 
 
 def droplets(u: Array, v: Array, random: np.random.Generator) -> Array:
-    """Slanted drops of three blues, dark at the rim, with a glint; nothing around them."""
+    """Slanted drops of three blues, dark at the rim, with a glint; transparent background."""
     places = _scattered(random, 14, 0.21)
     body_tints, rim_tints = _colours("#90e0ef", "#4895ef", "#3f37c9"), _colours("#03045e")
     colour = np.zeros((*u.shape, 3))
