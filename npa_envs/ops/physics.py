@@ -172,17 +172,10 @@ def physics(
 
     `eps0` is already checked, default: `eps`. The largest displacement is α ε.
     """
-    if boundary not in get_args(Boundary):
-        raise NPAError(
-            f"boundary must be 'open', 'periodic' or 'reflecting', got {shown(boundary)}"
-        )
-    if boundary == "open" and box is not None:
-        raise NPAError(f"box must be None where boundary is 'open', got {shown(box)}: leave it out")
-    if boundary == "reflecting" and box is None:
-        raise NPAError("box must be given where boundary is 'reflecting', got None: give its sides")
     numbers = (eps, eps0, box, alpha, update_prob, dt, position_noise)
-    # Only immutable numbers can be keys of the cache.
+    # Only immutable values can be keys of the cache.
     plain = all(type(value) in (float, int, bool, NoneType) for value in numbers)
+    plain = plain and type(boundary) is str
     check = _known if plain and not torch.compiler.is_compiling() else _checked
     return check(space_dim, state_dim, dtype, terms, moving, boundary, *numbers)
 
@@ -202,6 +195,14 @@ def _checked(
     dt: Any,
     position_noise: Any,
 ) -> Physics:
+    if boundary not in get_args(Boundary):
+        raise NPAError(
+            f"boundary must be 'open', 'periodic' or 'reflecting', got {shown(boundary)}"
+        )
+    if boundary == "open" and box is not None:
+        raise NPAError(f"box must be None where boundary is 'open', got {shown(box)}: leave it out")
+    if boundary == "reflecting" and box is None:
+        raise NPAError("box must be given where boundary is 'reflecting', got None: give its sides")
     given: Any = eps0 if eps is None else eps
     radius = checked_eps("eps", given, space_dim, dtype)
     radius0 = radius if eps0 is None else constant(eps0)

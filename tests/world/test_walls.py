@@ -37,7 +37,7 @@ def with_gradients(run, rule, x, s):
 @pytest.mark.device
 @pytest.mark.parametrize("name", WALLS)
 @pytest.mark.parametrize("space_dim", [2, 3])
-@pytest.mark.parametrize(("dtype", "bound"), [(torch.float64, 1e-8), (torch.float32, 2e-3)])
+@pytest.mark.parametrize(("dtype", "bound"), [(torch.float64, 1e-11), (torch.float32, 2e-3)])
 def test_trajectories_and_gradients_are_the_oracles(space_dim, name, dtype, bound, device):
     rule, x, s = world(space_dim, device, dtype)
     walls = WALLS[name][:space_dim]
@@ -109,6 +109,7 @@ def test_worlds_beyond_the_walls_are_not_at_rest():
 @pytest.mark.parametrize(
     ("options", "message"),
     [
+        ({"boundary": ["reflecting"], "box": 2.0}, "boundary must be 'open', 'periodic'"),
         ({"boundary": "closed", "box": 2.0}, "boundary must be 'open', 'periodic' or 'reflecting'"),
         ({"boundary": "open", "box": 2.0}, "box must be None where boundary is 'open'"),
         ({"boundary": "reflecting"}, "box must be given where boundary is 'reflecting'"),
