@@ -262,7 +262,7 @@ TASK_STEPS = 512
 SLOW = ("dense", "neighbour_cap")
 """Strategies whose rollouts small sessions leave out."""
 
-LARGEST_SLOW = 1024
+MAX_SLOW = 1024
 """Particles of the largest gecko that they grow to its end."""
 
 
@@ -424,7 +424,7 @@ def _task_runner(
 ) -> Runner | None:
     """Return the run that grows the picture; 512 steps that take too long are left out."""
     particle_count = seed.x.shape[1]
-    slow = strategy.name in SLOW and particle_count > LARGEST_SLOW
+    slow = strategy.name in SLOW and particle_count > MAX_SLOW
     if slow or (strategy.name != "library" and (session.small or not session.cuda)):
         why = f"{TASK_STEPS} steps of {particle_count} particles take too long"
         session.leave_out(f"PSNR of {strategy.name}", why)

@@ -16,7 +16,7 @@ from npa_envs.ops import perceive, perception_fields
 NEIGHBOUR_CAP = 32
 """Neighbours, the particle included, that the capped strategy sums over."""
 
-MOST_PAIRS = {
+MAX_PAIRS = {
     "dense": {"cpu": 2**22, "cuda": 2**24},
     "neighbour_cap": {"cpu": 2**26, "cuda": 2**30},
 }
@@ -48,7 +48,7 @@ class Strategy:
             return "on a CPU the library runs these very kernels"
         if self.name == "plain" and x.dtype == torch.float64:
             return "in float64 the library runs these very kernels"
-        if self.name in MOST_PAIRS and pairs > MOST_PAIRS[self.name][x.device.type]:
+        if self.name in MAX_PAIRS and pairs > MAX_PAIRS[self.name][x.device.type]:
             return f"{pairs} pairs take too much memory or time"
         return None
 

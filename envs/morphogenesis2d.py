@@ -15,7 +15,7 @@ from npa_envs.envs.core.single import NPAEnv
 from npa_envs.envs.core.task import TargetEnvTask
 from npa_envs.envs.core.vector import vector_class
 from npa_envs.tasks.morphogenesis2d import Morphogenesis2D, Morphogenesis2DConfig
-from npa_envs.tasks.targets.images import LARGEST_POINT_COUNT
+from npa_envs.tasks.targets.images import MAX_POINT_COUNT
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -33,7 +33,7 @@ class PictureConfig(EnvConfig):
         """Check every field."""
         super().__post_init__()
         # The target has as many points as particles.
-        check_positive(self, int, "particle_count", at_most=LARGEST_POINT_COUNT)
+        check_positive(self, int, "particle_count", at_most=MAX_POINT_COUNT)
         _ = self.task_config
         self.check_start_radius(self.seed_radius)
 

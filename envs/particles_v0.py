@@ -20,7 +20,7 @@ ENVIRONMENTS = {name.replace("-v0", "Particles-v0"): task for name, task in OF_S
 PARTICLE_COUNT = 64
 """Default number of particles."""
 
-LARGEST_CROWD = 512
+MAX_CROWD = 512
 """Largest number of agents: each has an entry in five dicts a step."""
 
 
@@ -106,9 +106,9 @@ class ParticlesEnv(CrowdEnv):
 
     def __init__(self, task: str = "mixing", **config: Any) -> None:
         count = sum(task_type(task).config_type.from_keywords(config).counts)
-        if count > LARGEST_CROWD:
+        if count > MAX_CROWD:
             raise NPAError(
-                f"particle_count must be at most {LARGEST_CROWD} where every particle is an agent, "
+                f"particle_count must be at most {MAX_CROWD} where every particle is an agent, "
                 f"got {count}: make species the agents with npa_envs.envs.multispecies_v0"
             )
         super().__init__(task, config, by_particle=True)

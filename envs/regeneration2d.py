@@ -28,7 +28,7 @@ RANDOM_KINDS = ("wipe", "cut", "clump")
 SIZES = {"wipe": 0.3, "cut": 0.1, "clump": 0.2, "noise": 0.05}
 """Default radius, width, radius and standard deviation [length units]."""
 
-LEAST_RISE = 0.02
+MIN_RISE = 0.02
 """Damage that raises the loss by a smaller fraction than this has no success threshold."""
 
 PICTURE = "picture"
@@ -119,7 +119,7 @@ class RegenerationTask(GrownTask[Regeneration2DEnvConfig]):
             whole, hurt = self._loss(x, s), self._loss(hurt_x, hurt_s)
             healed = whole + (1.0 - self.config.healed_share) * (hurt - whole)
             never = torch.full_like(whole, -torch.inf)
-            threshold = torch.where(hurt - whole >= LEAST_RISE * whole, healed, never)
+            threshold = torch.where(hurt - whole >= MIN_RISE * whole, healed, never)
         return Start(hurt_x, hurt_s, threshold)
 
     def _loss(self, x: Tensor, s: Tensor) -> Tensor:

@@ -26,7 +26,7 @@ LENGTH_RANGE = {
 """Allowed perception radii [length units] by D and dtype, whose powers in the kernels are
 finite."""
 
-LARGEST_SIDE = 16384
+MAX_SIDE = 16384
 """Largest side of a picture [pixels]."""
 
 MomentInverse = Literal["threshold", "smooth"]
@@ -214,8 +214,8 @@ def checked_finite(name: str, value: Any, unit: str = "") -> float:
 def checked_side(name: str, value: Any) -> int:
     """Return the side of a picture in pixels, checked."""
     side = checked_count(name, value)
-    if not 1 <= side <= LARGEST_SIDE:
-        raise NPAError(f"{name} must lie in [1, {LARGEST_SIDE}] pixels, got {shown(side)}")
+    if not 1 <= side <= MAX_SIDE:
+        raise NPAError(f"{name} must lie in [1, {MAX_SIDE}] pixels, got {shown(side)}")
     return side
 
 

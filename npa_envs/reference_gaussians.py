@@ -9,9 +9,9 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-SMALLEST_ALPHA = 1.0 / 255.0
-LARGEST_ALPHA = 0.99
-SMALLEST_PASSING = 1e-4
+MIN_ALPHA = 1.0 / 255.0
+MAX_ALPHA = 0.99
+MIN_PASSING = 1e-4
 CLAMP_MARGIN = 0.3
 HARMONICS = (0.28209479177387814, 0.4886025119029199)
 """Factors of the real spherical harmonics of degree 0 and 1: 1/2 sqrt(1/pi), 1/2 sqrt(3/pi)."""
@@ -64,9 +64,9 @@ def projected(
 
 def blended(alphas: Tensor, colours: Tensor) -> tuple[Tensor, Tensor]:
     """Return composited colours [H, W, K] and transmittance [H, W] of sorted alphas [N, H, W]."""
-    alphas = torch.where(alphas >= SMALLEST_ALPHA, alphas, 0.0)
+    alphas = torch.where(alphas >= MIN_ALPHA, alphas, 0.0)
     after = torch.cumprod(1.0 - alphas, dim=0)
-    alphas = torch.where(after >= SMALLEST_PASSING, alphas, 0.0)
+    alphas = torch.where(after >= MIN_PASSING, alphas, 0.0)
     after = torch.cumprod(1.0 - alphas, dim=0)
     before = torch.cat((torch.ones_like(after[:1]), after[:-1]))
     return torch.einsum("nhw,nhw,nk->hwk", alphas, before, colours), after[-1]
@@ -106,7 +106,7 @@ def draw(
     pixels = torch.stack(torch.meshgrid(columns, rows, indexing="xy"), dim=-1)
     offset = pixels - centres[:, None, None, :]
     power = torch.einsum("nhwi,nij,nhwj->nhw", offset, torch.linalg.inv(covariance), offset)
-    alphas = (opacities[:, None, None] * torch.exp(-0.5 * power)).clamp(max=LARGEST_ALPHA)
+    alphas = (opacities[:, None, None] * torch.exp(-0.5 * power)).clamp(max=MAX_ALPHA)
     alphas = torch.where(visible[:, None, None], alphas, 0.0)
     order = torch.argsort(positions[:, 2].detach(), stable=True)
     return blended(alphas[order], colours[order])

@@ -15,7 +15,7 @@ from pathlib import Path
 import warp as wp
 
 from npa_envs.errors import NPAError, shown
-from npa_envs.once import made_once
+from npa_envs.kernel_lock import cached_under_lock
 
 try:
     import fcntl
@@ -74,7 +74,7 @@ def without_line(unwanted: bytes) -> Iterator[None]:
                     os.write(2, line)
 
 
-@made_once()
+@cached_under_lock()
 def start_warp() -> None:
     """Start Warp without output; later calls do nothing."""
     with without_line(_NO_DRIVER), quiet_warp():

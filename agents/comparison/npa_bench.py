@@ -1,7 +1,7 @@
 """NPA-Bench v0: frozen problems and budgets, rows of results as JSON files, and their scores.
 
 There are two suites, one for a GPU and a small one for a laptop. A row contains the results of one
-method in a suite: for each problem the returns of at least `LEAST_SEEDS` runs. It is a JSON file by
+method in a suite: for each problem the returns of at least `MIN_SEEDS` runs. It is a JSON file by
 `npa_bench_v0.schema.json`. Scores are computed from rows only; the methods `zero` and `gradient`
 have the scores 0 and 1.
 """
@@ -45,7 +45,7 @@ METHODS = {
 EPISODES = 32
 """Held-out episodes after a run."""
 
-LEAST_SEEDS = 5
+MIN_SEEDS = 5
 """Least runs of a method on a problem, from different seeds."""
 
 EXCESS = 1.25
@@ -357,9 +357,9 @@ def _check_row(row: BenchRow, name: str) -> None:
             )
         some = [run for run in row.runs if run.env_id == env_id]
         seeds = {run.seed for run in some}
-        if len(seeds) < len(some) or len(seeds) < LEAST_SEEDS:
+        if len(seeds) < len(some) or len(seeds) < MIN_SEEDS:
             raise NPAError(
-                f"{name} must have runs of {env_id} from at least {LEAST_SEEDS} seeds, each once, "
+                f"{name} must have runs of {env_id} from at least {MIN_SEEDS} seeds, each once, "
                 f"got {sorted(run.seed for run in some)}: run the missing ones"
             )
         most = EXCESS * entries[env_id].particle_steps

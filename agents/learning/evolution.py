@@ -27,7 +27,7 @@ from npa_envs.errors import MissingDependencyError, NPAError
 from npa_envs.rule.network import without_small
 from npa_envs.rule.rule import NPARule
 
-MOST_HIDDEN = 2**27
+MAX_HIDDEN = 2**27
 """Most numbers of hidden layers in memory at a time: 512 MiB of float32."""
 
 
@@ -131,7 +131,7 @@ def updates_of(rule: NPARule, weights: Tensor, rows: Tensor) -> Tensor:
         part.reshape(-1, *shape)
         for part, shape in zip(torch.split(weights, sizes, dim=1), shapes, strict=True)
     )
-    size = max(1, MOST_HIDDEN // (rows.shape[1] * rule.hidden_dim))
+    size = max(1, MAX_HIDDEN // (rows.shape[1] * rule.hidden_dim))
     updates = []
     for k in range(0, len(weights), size):
         part = slice(k, k + size)

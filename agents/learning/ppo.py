@@ -44,7 +44,7 @@ from npa_envs.wrappers.base import own_rewards
 MANY_PARTICLES = 2**17
 """Particles of all worlds on a GPU by default: fewer take hardly less time."""
 
-FEWEST_ROUNDS = 128
+MIN_ROUNDS = 128
 """Least rounds in a budget of particle-steps, which limits the default number of worlds."""
 
 MEMORY_FRACTION = 0.25
@@ -563,7 +563,7 @@ def world_count(
         counts.append(int(MEMORY_FRACTION * free) // world_bytes(problem, options, device))
     if budget.particle_steps is not None:
         round_size = ranks.count * options.steps * problem.particle_count
-        counts.append(budget.particle_steps // (FEWEST_ROUNDS * round_size))
+        counts.append(budget.particle_steps // (MIN_ROUNDS * round_size))
     return max(problem.num_envs, ranks.count * min(counts))
 
 

@@ -220,7 +220,7 @@ class GaussianRules(nn.Module):
         return (self.row_log_std() + HALF_LOG_TAU + 0.5).sum(dim=-1).mean()
 
 
-LEAST_RATE = 0.01
+MIN_RATE = 0.01
 """Least weight of a new batch in the running moments; the first batches are averaged plainly."""
 
 INPUT_LIMIT = 8.0
@@ -296,7 +296,7 @@ class Critic(nn.Module):
     def _rate(self, moment: int) -> Tensor:
         """Count a batch, and return its weight in a running moment, on the device."""
         self.updates[moment] += 1.0
-        return (1.0 / self.updates[moment]).clamp(min=LEAST_RATE)
+        return (1.0 / self.updates[moment]).clamp(min=MIN_RATE)
 
 
 def seeded_critic(problem: Problem, input_dim: int, options: Any, seed: int) -> Critic:

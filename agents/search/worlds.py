@@ -27,7 +27,7 @@ UPDATE_PROB = 0.5
 SEED_RADIUS = 0.2
 """Radius of the disk that particles start in [length units]."""
 
-LEAST_VARIANCE = 1e-12
+MIN_VARIANCE = 1e-12
 """Variance of colours that counts as a single colour."""
 
 Numbers = NDArray[np.float64]
@@ -240,5 +240,5 @@ def correlation(first: Tensor, second: Tensor) -> Tensor:
     a, b = (field - field.mean(dim=1, keepdim=True) for field in (first, second))
     together = (a * b).sum(dim=(1, 2))
     sizes = a.square().sum(dim=(1, 2)) * b.square().sum(dim=(1, 2))
-    one_colour = a.square().mean(dim=(1, 2)) <= LEAST_VARIANCE
+    one_colour = a.square().mean(dim=(1, 2)) <= MIN_VARIANCE
     return torch.where(one_colour, 1.0, together / sizes.clamp_min(1e-30).sqrt())

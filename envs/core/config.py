@@ -29,7 +29,7 @@ OnDivergence = Literal["terminate", "reset", "raise", "ignore"]
 LARGEST = 1e9
 """Largest value of a field, so that products of fields are finite in float32."""
 
-LARGEST_RATIO = 1e7
+MAX_RATIO = 1e7
 """Largest ratio of eps to eps0, and its inverse; its fourth power is finite in float32."""
 
 TaskConfig = TypeVar("TaskConfig")
@@ -154,9 +154,9 @@ class WorldConfig:
                     f"{name} must be at least {1.0 / LARGEST:g} length units, got "
                     f"{getattr(self, name)}: choose another unit of length"
                 )
-        if not 1.0 / LARGEST_RATIO <= self.eps / self.eps0 <= LARGEST_RATIO:
+        if not 1.0 / MAX_RATIO <= self.eps / self.eps0 <= MAX_RATIO:
             raise NPAError(
-                f"eps / eps0 must lie in [{1.0 / LARGEST_RATIO:g}, {LARGEST_RATIO:g}], got "
+                f"eps / eps0 must lie in [{1.0 / MAX_RATIO:g}, {MAX_RATIO:g}], got "
                 f"{self.eps:g} / {self.eps0:g}: perceive at a radius nearer to the rule's own"
             )
         check_device(self.device)

@@ -17,7 +17,7 @@ from npa_envs.world.actions import (
     SUCCESS,
     TIME_LIMIT,
     EpisodeRules,
-    PreparedJudgement,
+    EpisodeUpdate,
     with_mean_reward,
 )
 from npa_envs.world.cuda_graph import makes_plain_tensors, pinned_like
@@ -139,7 +139,7 @@ class RewardedWorlds(WorldState):
         """What a step returns apart from the observation."""
         # Each world's ending, then whether the actions were finite.
         self._endings = torch.zeros(world_count + 1, dtype=torch.uint8, device=device)
-        self._evaluation: PreparedJudgement | None = None
+        self._evaluation: EpisodeUpdate | None = None
         self._make_host_copies()
 
     def __getstate__(self) -> dict[str, Any]:
@@ -249,11 +249,11 @@ class RewardedWorlds(WorldState):
         losses = task.particle_losses(x, s)
         return checked_tensor(task, "particle_losses", "losses", losses, x.shape[:2])
 
-    def _make_evaluation(self) -> PreparedJudgement:
+    def _make_evaluation(self) -> EpisodeUpdate:
         config = self.task.config
         sparse = config.reward == "sparse"
         rewarded_step = (self.episode_steps or config.episode_steps) if sparse else None
-        return PreparedJudgement(
+        return EpisodeUpdate(
             EpisodeRules(self.episode_steps, rewarded_step, config.on_divergence),
             enabled=self.enabled,
             diverged=self.diverged,

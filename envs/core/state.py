@@ -20,7 +20,7 @@ from npa_envs.world.randomness import WorldRandom
 OBSERVATION_COPIES = 4
 """Observations in memory at once: the rows, the returned arrays, the final ones, and one spare."""
 
-LARGEST_INDEX = 2**31 - 1
+MAX_INDEX = 2**31 - 1
 """Kernels index the particles' states with 32 bits."""
 
 LISTED_BYTES = 320
@@ -70,7 +70,7 @@ def check_memory(
     """Check that B worlds fit into a device's memory and into the kernels' indices."""
     what = f"{world_count} world(s) of {particle_count} particles"
     cure = "choose a smaller particle_count or fewer worlds"
-    if world_count * particle_count * (1 + physics.state_dim) > LARGEST_INDEX:
+    if world_count * particle_count * (1 + physics.state_dim) > MAX_INDEX:
         raise NPAError(f"particle_count is too large: {what} exceed 32-bit indices: {cure}")
     needed = needed_bytes(world_count, particle_count, physics, device) + extra_bytes
     free = free_bytes(device)

@@ -41,7 +41,7 @@ from npa_envs.world.cuda_graph import (
     pinned_like,
     to_device_async,
 )
-from npa_envs.world.divergence import LARGEST_REPORT, term_name
+from npa_envs.world.divergence import MAX_REPORT, term_name
 
 FEW_PARTICLES = 8192
 """Particles of all worlds up to which a step on CUDA is one graph; larger steps hide launches."""
@@ -303,7 +303,7 @@ class BatchedWorlds(RewardedWorlds):
     def _divergence_message(self, diverged: NDArray[np.int64]) -> str:
         """Return the message of the error for `on_divergence="raise"`."""
         physics, lines = self.physics, []
-        for world in diverged[:LARGEST_REPORT].tolist():
+        for world in diverged[:MAX_REPORT].tolist():
             numbers = torch.cat((self.x[world], self.s[world]), dim=1)
             outside = self.x[world].abs() >= physics.limits.position
             outside = torch.cat((outside, self.s[world].abs() >= physics.limits.state), dim=1)
@@ -316,8 +316,8 @@ class BatchedWorlds(RewardedWorlds):
                     f"({int(outside.any(dim=1).sum())} such particles)"
                 )
             lines.append(line)
-        if len(diverged) > LARGEST_REPORT:
-            lines.append(f"and {len(diverged) - LARGEST_REPORT} more worlds")
+        if len(diverged) > MAX_REPORT:
+            lines.append(f"and {len(diverged) - MAX_REPORT} more worlds")
         return (
             f"numbers must stay within position_limit = {physics.limits.position:g} and "
             f"observation_limit = {physics.limits.state:g}, but left them in {'; '.join(lines)}: "

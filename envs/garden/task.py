@@ -287,7 +287,7 @@ class GardenTask(RuleDriven, GrownTask[Config]):
         return torch.cat((mean, world_mean(values)), dim=-1)
 
 
-LEAST_RISE = 0.1
+MIN_RISE = 0.1
 """Smallest rise of the loss by turning grey, as a fraction of the loss (dimensionless)."""
 
 
@@ -295,7 +295,7 @@ def intact_context(task: GardenTask[Config], start: Start, loss: Tensor) -> Tens
     """Return the loss of intact pictures, and its rise if they turn grey, shape [B, 2]."""
     grey = sum(task.losses(start.x, torch.zeros_like(start.s)).values(), torch.zeros_like(loss))
     # The loss of a picture that did not grow may not rise at all.
-    return torch.stack((loss, (grey - loss).maximum(LEAST_RISE * loss)), dim=1)
+    return torch.stack((loss, (grey - loss).maximum(MIN_RISE * loss)), dim=1)
 
 
 def lost_fraction(loss: Tensor, context: Tensor) -> Tensor:

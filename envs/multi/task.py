@@ -30,7 +30,7 @@ SpeciesOnDivergence = Literal["terminate", "raise", "ignore"]
 SPECIES_STYLE = "species"
 """Style of pictures that draws each species in its own colour."""
 
-LARGEST_COUNT = 64
+MAX_COUNT = 64
 """Largest number of species."""
 
 
@@ -90,7 +90,7 @@ class SpeciesConfig(WorldConfig):
         """Check every field; as `WorldConfig`."""
         super().__post_init__()
         check_positive(self, int, "max_cycles")
-        check_positive(self, int, "species_count", at_most=LARGEST_COUNT)
+        check_positive(self, int, "species_count", at_most=MAX_COUNT)
         self._check_counts()
         check_positive(self, float, "seed_radius")
         check_non_negative(self, "seed_distance")

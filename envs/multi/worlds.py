@@ -32,7 +32,7 @@ from npa_envs.world.cuda_graph import (
     makes_plain_tensors,
     to_device_async,
 )
-from npa_envs.world.divergence import LARGEST_REPORT
+from npa_envs.world.divergence import MAX_REPORT
 from npa_envs.world.randomness import WorldRandom
 
 Parts = dict[str, Tensor]
@@ -366,7 +366,7 @@ class SpeciesWorlds(WorldState):
         """Return the message of the error for agents out of bounds, shape [B, A]."""
         limits, word = self.physics.limits, "particle" if self.by_particle else "species"
         places = np.argwhere(escaped)
-        names = [f"{word}_{agent} of world {world}" for world, agent in places[:LARGEST_REPORT]]
+        names = [f"{word}_{agent} of world {world}" for world, agent in places[:MAX_REPORT]]
         more = f" and {len(places) - len(names)} more" if len(places) > len(names) else ""
         return (
             f"agents must have a particle within position_limit = {limits.position:g} and "

@@ -184,7 +184,7 @@ def make_plan(options: CompareOptions) -> ComparisonPlan:
             for task, method in itertools.product(tasks, methods)
             if suite.leaves_out(task, own.get(method, method))
         ]
-        seeds, episodes = 1 if quick else npa_bench.LEAST_SEEDS, npa_bench.EPISODES
+        seeds, episodes = 1 if quick else npa_bench.MIN_SEEDS, npa_bench.EPISODES
     else:
         if not options.methods:
             methods = [name for name in methods if name != "clone"]  # It needs a teacher.

@@ -62,7 +62,7 @@ def main(arguments: Sequence[str]) -> int:
         # One of each task.
         names = list({task_name(name): name for name in reversed(names)}.values())[::-1]
     device = options.checked_device()
-    most = options.most_particles or study.MOST_PARTICLES[device.type]
+    most = options.most_particles or study.MAX_PARTICLES[device.type]
     count = options.seed_count or (QUICK_SEEDS if options.quick else 8)
     seeds = range(options.first_seed, options.first_seed + count)
     facts = measured_facts(

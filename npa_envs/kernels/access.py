@@ -13,8 +13,8 @@ from typing import Any
 
 import warp as wp
 
+from npa_envs.kernel_lock import cached_under_lock
 from npa_envs.kernels import native
-from npa_envs.once import made_once
 
 CUDA_LANES = 4
 """Threads that share a particle on CUDA, a power of two; also the smallest channel group."""
@@ -45,7 +45,7 @@ def allow_next_launch():
     """
 
 
-@made_once()
+@cached_under_lock()
 def make_wide_load(value_type: type, scalar: type) -> Any:
     """Return a Warp function that reads an entry of a flat array, on CUDA in few, wide loads.
 
@@ -63,7 +63,7 @@ load_integer = make_wide_load(wp.int32, wp.int32)
 load_scalar = make_wide_load(wp.float32, wp.float32)
 
 
-@made_once()
+@cached_under_lock()
 def make_wide_store(value_type: type, scalar: type) -> Any:
     """Return a Warp function that writes an entry of a flat array, on CUDA in few, wide stores.
 
@@ -76,7 +76,7 @@ def make_wide_store(value_type: type, scalar: type) -> Any:
     return wide_store
 
 
-@made_once()
+@cached_under_lock()
 def make_read_at(value_type: type, scalar: type, alignment: int) -> Any:
     """Return a Warp function that reads a vector from index `place` of an array of scalars.
 
@@ -89,7 +89,7 @@ def make_read_at(value_type: type, scalar: type, alignment: int) -> Any:
     return read_at
 
 
-@made_once()
+@cached_under_lock()
 def make_read_channels(value_type: type, scalar: type) -> Any:
     """Return a Warp function that reads adjacent channels of a particle, 0 beyond the last one."""
     count = value_type._length_
@@ -117,7 +117,7 @@ def make_read_channels(value_type: type, scalar: type) -> Any:
     return read_channels
 
 
-@made_once()
+@cached_under_lock()
 def make_write_at(value_type: type, scalar: type) -> Any:
     """Return a Warp function that writes a vector to index `place` of an array of scalars.
 
@@ -139,7 +139,7 @@ def share_type(value_type: type, scalar: type, lanes: int) -> type:
     return wp.types.vector(share, scalar)
 
 
-@made_once()
+@cached_under_lock()
 def make_lane_sum(
     value_type: type, scalar: type, lanes: int, whole_warps: bool = False, stride: int = 1
 ) -> Any:
@@ -155,7 +155,7 @@ def make_lane_sum(
     return lane_sum
 
 
-@made_once()
+@cached_under_lock()
 def make_lane_collect(value_type: type, scalar: type, lanes: int) -> Any:
     """Return a Warp function that sums matrices [D, W] over lanes; each lane gets its columns.
 
@@ -171,7 +171,7 @@ def make_lane_collect(value_type: type, scalar: type, lanes: int) -> Any:
     return lane_collect
 
 
-@made_once()
+@cached_under_lock()
 def make_kept(scalar: type) -> Any:
     """Return a Warp function that returns its argument, of type `scalar`, kept in a register.
 
@@ -184,7 +184,7 @@ def make_kept(scalar: type) -> Any:
     return kept
 
 
-@made_once()
+@cached_under_lock()
 def make_warp_sum(value_type: type) -> Any:
     """Return a Warp function that sums a value over the 32 threads of a warp; each gets the sum.
 
@@ -197,7 +197,7 @@ def make_warp_sum(value_type: type) -> Any:
     return warp_sum
 
 
-@made_once()
+@cached_under_lock()
 def make_shuffle(scalar: type) -> wp.Function:
     """Return a Warp function that reads another thread's value in the warp; on a CPU its own."""
 
@@ -281,7 +281,7 @@ def as_word(number: wp.int32) -> wp.float32:
     """Return the float32 whose bits are those of an integer."""
 
 
-@made_once()
+@cached_under_lock()
 def make_add_scaled(group: type, scalar: type) -> Any:
     """Return a Warp function for total + factor * value, rounded after each operation on a CPU.
 

@@ -14,8 +14,8 @@ from typing import Any
 
 import warp as wp
 
+from npa_envs.kernel_lock import cached_under_lock
 from npa_envs.kernels import native
-from npa_envs.once import made_once
 
 TERMS_PER_SUM = 4096
 """Terms that are summed before they are added to a total: of a million summed one after the other,
@@ -36,7 +36,7 @@ def scalar_name(scalar: type) -> str:
     return {wp.float32: "f32", wp.float64: "f64"}[scalar]
 
 
-@made_once()
+@cached_under_lock()
 def kernel_module(
     topic: str, space_dim: int, scalar: type, width: int = 0, lanes: int = 0
 ) -> wp.Module:
@@ -49,7 +49,7 @@ def kernel_module(
     return native.module(f"npa_envs.kernels.{topic}_{variant}")
 
 
-@made_once()
+@cached_under_lock()
 def domain_types(space_dim: int, scalar: type) -> SimpleNamespace:
     """Return one variant's vector types, its `Domain` struct and the functions of it.
 
@@ -215,7 +215,7 @@ def cell_grid(
     return tuple(shape)
 
 
-@made_once(256)
+@cached_under_lock(256)
 def make_domain(
     space_dim: int,
     scalar: type,

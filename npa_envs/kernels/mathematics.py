@@ -7,8 +7,8 @@ from typing import Any
 
 import warp as wp
 
+from npa_envs.kernel_lock import cached_under_lock
 from npa_envs.kernels import native
-from npa_envs.once import made_once
 
 MOMENT_THRESHOLD = 1e-3
 """Smallest |det M| that is inverted, dimensionless; below it the gradient is not corrected."""
@@ -133,7 +133,7 @@ def log_scale_adjoint(scaled: Any, cotangent: Any):
     return result
 
 
-@made_once()
+@cached_under_lock()
 def make_smooth_inverse(space_dim: int, scalar: type) -> wp.Function:
     """Return a Warp function of symmetric M: (det M adj M + τ² I) / (det² M + τ²).
 
@@ -173,7 +173,7 @@ def make_smooth_inverse(space_dim: int, scalar: type) -> wp.Function:
     return smooth_inverse
 
 
-@made_once()
+@cached_under_lock()
 def make_corrected(space_dim: int, scalar: type, width: int, moment_inverse: str | None) -> Any:
     """Return a Warp function that multiplies state gradients [D, width] by an inverse of M.
 
@@ -198,7 +198,7 @@ def make_corrected(space_dim: int, scalar: type, width: int, moment_inverse: str
 # The same formulas in C++, with fewer instructions.
 
 
-@made_once()
+@cached_under_lock()
 def make_fast_exp2(scalar: type) -> Any:
     """Return a Warp function for 2^value; in float32 on CUDA the relative error is about 2e-7."""
 
@@ -208,7 +208,7 @@ def make_fast_exp2(scalar: type) -> Any:
     return fast_exp2
 
 
-@made_once()
+@cached_under_lock()
 def make_log_scale_pull(vector: type) -> Any:
     """Return `log_scale_adjoint` on CUDA for a vector type of float32."""
 

@@ -13,7 +13,7 @@ from typing import Any
 
 import warp as wp
 
-from npa_envs.once import made_once
+from npa_envs.kernel_lock import cached_under_lock
 
 BOTH_DEVICES = ("access.cuh", "mathematics.cuh")
 """Files for CPU and CUDA."""
@@ -33,7 +33,7 @@ CUDA_ONLY = (
 """Files for CUDA, in an order in which each uses only earlier ones."""
 
 
-@made_once()
+@cached_under_lock()
 def build_options() -> wp.ModuleBuildOptions:
     """Return the options that put the C++ text into a module, and into its hash."""
     folder = Path(__file__).parent
@@ -91,7 +91,7 @@ def _in_cpp(parameter: Any) -> str:
 # split, as on CUDA. Ranges must not read each other's outputs or use atomics: those of Warp on a
 # CPU work for one thread only.
 
-SMALLEST_RANGES: dict[Any, int] = {}
+MIN_RANGES: dict[Any, int] = {}
 """For each such kernel, the fewest indices of the first dimension in a range."""
 
 PAIRS = 512
@@ -121,7 +121,7 @@ def in_ranges(smallest: int) -> Callable[[Any], Any]:
 
     def mark(kernel: Any) -> Any:
         assert kernel.adj.args[0].label == "range_start"
-        SMALLEST_RANGES[kernel] = smallest
+        MIN_RANGES[kernel] = smallest
         return kernel
 
     return mark

@@ -324,7 +324,7 @@ class Encounters:
         return x, s, lost
 
 
-LARGEST_CHANGE = 4.0
+MAX_CHANGE = 4.0
 """Range of the colour map of changes: this, and its inverse."""
 
 
@@ -432,7 +432,7 @@ def _shades() -> tuple[tuple[str, str, str, Any, dict[str, Any]], ...]:
     from matplotlib.colors import LogNorm, Normalize
 
     ticks = {"ticks": [0.25, 0.5, 1.0, 2.0, 4.0], "format": "%g"}
-    changes = LogNorm(1.0 / LARGEST_CHANGE, LARGEST_CHANGE)
+    changes = LogNorm(1.0 / MAX_CHANGE, MAX_CHANGE)
     return (
         ("change", "loss together / alone", "RdBu_r", changes, ticks),
         ("mixing", "mixing index", "viridis", Normalize(0.0, 1.0), {}),

@@ -15,24 +15,24 @@ from typing import Literal, NamedTuple
 
 import torch
 
-from npa_envs.kernels.cuda.density import SMALLEST_SIDE
+from npa_envs.kernels.cuda.density import MIN_SIDE
 from npa_envs.kernels.cuda.equivariance import fits_block
 
 Operator = Literal["sort", "density", "perceive", "adjoint", "vectors", "network", "update"]
 
-LARGEST_ROW, LARGEST_UPDATE, LARGEST_HIDDEN = 128, 32, 512
+MAX_ROW, MAX_UPDATE, MAX_HIDDEN = 128, 32, 512
 """Widest rows and updates, and most hidden units, that the fused network takes."""
 
 UNIT_SHARE = 32
 """Hidden units that one warp of the fused network computes."""
 
-LARGEST_THREAD_WORLD = 4096
+MAX_THREAD_WORLD = 4096
 """Particles of the largest world that one CPU thread sorts."""
 
-LARGEST_BLOCK_WORLD = 4096
+MAX_BLOCK_WORLD = 4096
 """Particles of the largest world that one CUDA block sorts."""
 
-LARGEST_BLOCK_GRID = 4096
+MAX_BLOCK_GRID = 4096
 """Cells of the largest grid that fits into one CUDA block's shared memory."""
 
 SMALL_WORLD = 2048
@@ -105,8 +105,8 @@ def _block(request: KernelRequest) -> bool:
     return (
         _cuda(request)
         and request.aligned
-        and request.particle_count <= LARGEST_BLOCK_WORLD
-        and request.cell_count <= LARGEST_BLOCK_GRID
+        and request.particle_count <= MAX_BLOCK_WORLD
+        and request.cell_count <= MAX_BLOCK_GRID
     )
 
 
@@ -115,7 +115,7 @@ def _tiles(request: KernelRequest) -> bool:
         _cuda(request)
         and request.space_dim == 2
         and request.particle_count <= SHARED_WORLD
-        and request.smallest_side >= SMALLEST_SIDE
+        and request.smallest_side >= MIN_SIDE
     )
 
 
@@ -125,9 +125,9 @@ def _fused(request: KernelRequest) -> bool:
         _cuda(request)
         and all(width % 4 == 0 for width in widths)
         and request.hidden_dim % UNIT_SHARE == 0
-        and request.row_width <= LARGEST_ROW
-        and request.update_width <= LARGEST_UPDATE
-        and request.hidden_dim <= LARGEST_HIDDEN
+        and request.row_width <= MAX_ROW
+        and request.update_width <= MAX_UPDATE
+        and request.hidden_dim <= MAX_HIDDEN
     )
 
 
@@ -142,8 +142,8 @@ TABLE: tuple[Implementation, ...] = (
         "sort",
         "block",
         "kernels/cuda/sort.py",
-        f"{_MODERN}, worlds of at most {LARGEST_BLOCK_WORLD} particles and "
-        f"{LARGEST_BLOCK_GRID} cells: a block of threads sorts a world",
+        f"{_MODERN}, worlds of at most {MAX_BLOCK_WORLD} particles and "
+        f"{MAX_BLOCK_GRID} cells: a block of threads sorts a world",
         _block,
     ),
     Implementation(
@@ -153,10 +153,8 @@ TABLE: tuple[Implementation, ...] = (
         "sort",
         "world",
         "kernels/portable/sort.py",
-        f"a CPU, worlds of at most {LARGEST_THREAD_WORLD} particles: a thread sorts a world",
-        lambda request: (
-            request.device.type == "cpu" and request.particle_count <= LARGEST_THREAD_WORLD
-        ),
+        f"a CPU, worlds of at most {MAX_THREAD_WORLD} particles: a thread sorts a world",
+        lambda request: request.device.type == "cpu" and request.particle_count <= MAX_THREAD_WORLD,
     ),
     Implementation("sort", "portable", "kernels/portable/sort.py", "otherwise", _always),
     Implementation(
@@ -164,7 +162,7 @@ TABLE: tuple[Implementation, ...] = (
         "tiles",
         "kernels/cuda/density.py",
         f"{_MODERN}, 2D, worlds of at most {SHARED_WORLD} particles, boxes of at least "
-        f"{SMALLEST_SIDE} cells along each side; environments only above {SMALL_WORLD}: neighbours "
+        f"{MIN_SIDE} cells along each side; environments only above {SMALL_WORLD}: neighbours "
         "are listed in the same pass, by a warp for eight particles",
         _tiles,
     ),
@@ -208,8 +206,8 @@ TABLE: tuple[Implementation, ...] = (
         "network",
         "cuda",
         "kernels/cuda/network.py",
-        f"{_MODERN}, rows of at most {LARGEST_ROW} columns, updates of {LARGEST_UPDATE}, "
-        f"{LARGEST_HIDDEN} hidden units in multiples of {UNIT_SHARE}: tensor cores",
+        f"{_MODERN}, rows of at most {MAX_ROW} columns, updates of {MAX_UPDATE}, "
+        f"{MAX_HIDDEN} hidden units in multiples of {UNIT_SHARE}: tensor cores",
         _fused,
     ),
     Implementation("network", "torch", "torch's products", "otherwise", _always),

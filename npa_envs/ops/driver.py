@@ -23,7 +23,7 @@ import torch
 OVERLAPPING_CAPABILITY = 90
 """Lowest compute capability, times ten, with programmatic dependent launch."""
 
-MOST_THREADS = 2**31 - 1
+MAX_THREADS = 2**31 - 1
 """Largest number of threads of a launch: kernels number them along one dimension of a grid."""
 
 # Constants and structs of CUDA's driver API, cuda.h.
@@ -133,7 +133,7 @@ class DriverLaunch:
 
     def run(self, thread_count: int, stream: int) -> bool:
         """Launch on the current stream; return False where Warp has to launch instead."""
-        if self._launch is None or thread_count > MOST_THREADS:
+        if self._launch is None or thread_count > MAX_THREADS:
             return False
         if torch.cuda.current_device() != self._device.index:
             return False

@@ -8,20 +8,20 @@ import torch
 from torch import Tensor
 
 from npa_envs.kernels.portable.episodes import (
+    CONTINUE,
     DIVERGED,
     END,
-    GO_ON,
+    LIMIT_LOSS,
     NOT_FINITE,
     SUCCESS,
-    TELL,
     TIME_LIMIT,
-    judge_worlds,
+    update_episodes,
 )
 from npa_envs.ops.launch import launch
 
-__all__ = ["DIVERGED", "NOT_FINITE", "SUCCESS", "TIME_LIMIT", "EpisodeRules", "PreparedJudgement"]
+__all__ = ["DIVERGED", "NOT_FINITE", "SUCCESS", "TIME_LIMIT", "EpisodeRules", "EpisodeUpdate"]
 
-ON_DIVERGENCE = {"ignore": GO_ON, "terminate": END, "reset": TELL, "raise": TELL}
+ON_DIVERGENCE = {"ignore": CONTINUE, "terminate": END, "reset": LIMIT_LOSS, "raise": LIMIT_LOSS}
 
 
 class EpisodeRules(NamedTuple):
@@ -29,7 +29,7 @@ class EpisodeRules(NamedTuple):
 
     last_step: int | None
     """Step at which an episode is truncated, or None for never."""
-    paid_step: int | None
+    rewarded_step: int | None
     """Step at which, or earlier at its end, an episode is rewarded with minus its loss; None: each
     step is rewarded with the decrease of the loss."""
     on_divergence: Literal["ignore", "terminate", "reset", "raise"]
@@ -37,7 +37,7 @@ class EpisodeRules(NamedTuple):
     least its first loss; with "terminate" its episode also ends."""
 
 
-class PreparedJudgement:
+class EpisodeUpdate:
     """Computes rewards and endings of the same B worlds in each step, from their new losses.
 
     Args:
@@ -67,7 +67,7 @@ class PreparedJudgement:
         endings: Tensor,
     ) -> None:
         way = ON_DIVERGENCE[rules.on_divergence]
-        self._rules = (rules.last_step or 0, rules.paid_step or 0, way)
+        self._rules = (rules.last_step or 0, rules.rewarded_step or 0, way)
         self._read = (enabled, diverged, first_loss, success_loss)
         self._written = (elapsed, numbers, flags.view(torch.uint8), endings)
 
@@ -82,7 +82,7 @@ class PreparedJudgement:
         elapsed, numbers, flags, endings = self._written
         enabled, diverged, first_loss, success_loss = self._read
         launch(
-            judge_worlds,
+            update_episodes,
             len(elapsed),
             parts.device,
             len(parts),

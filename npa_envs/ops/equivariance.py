@@ -33,7 +33,7 @@ from npa_envs.ops.launch import launch, scalar_type
 MIXED_VECTORS = 8
 """Default number of mixed vectors of an equivariant rule."""
 
-LEAST_STEERING = 1e-19
+MIN_STEERING = 1e-19
 """Displacement of a gate of 1 whose steering is 0, dimensionless: small, so that it can learn."""
 
 
@@ -340,7 +340,7 @@ def signed_gates(weight: Tensor, steering: Tensor) -> tuple[Tensor, Tensor]:
     that of the weights, without a sum over rows. A steering of 0 is replaced by a tiny one, so that
     it still gets a gradient.
     """
-    steering = torch.where(steering == 0.0, steering + LEAST_STEERING, steering)
+    steering = torch.where(steering == 0.0, steering + MIN_STEERING, steering)
     factors = torch.nn.functional.pad(steering.abs(), (0, len(weight) - len(steering)), value=1.0)
     return weight * factors[:, None], steering.detach().sign()
 

@@ -21,9 +21,9 @@ import warp as wp
 from torch import Tensor
 
 from npa_envs.errors import NPAError
+from npa_envs.kernel_lock import cached_under_lock, kernel_lock
 from npa_envs.kernels.access import CUDA_BLOCK
-from npa_envs.kernels.native import SMALLEST_RANGES
-from npa_envs.once import alone, made_once
+from npa_envs.kernels.native import MIN_RANGES
 from npa_envs.ops.driver import DriverLaunch
 from npa_envs.runtime import in_turn, quiet_warp, start_warp
 
@@ -50,7 +50,7 @@ def warp_device(device: torch.device) -> Any:
     return wp.device_from_torch(device)
 
 
-@made_once(64)
+@cached_under_lock(64)
 def _warp_stream(device: torch.device, handle: int) -> Any:
     return wp.Stream(wp.device_from_torch(device), cuda_stream=handle)
 
@@ -166,7 +166,7 @@ class _Arguments:
             _description(value, kind) if isinstance(value, Tensor) else value
             for value, kind in zip(arguments, types, strict=True)
         ]
-        with alone, quiet_warp(), _first_load(kernel, device):
+        with kernel_lock, quiet_warp(), _first_load(kernel, device):
             self._launch = wp.launch(
                 kernel,
                 size,
@@ -226,7 +226,7 @@ class _Arguments:
     def _bounds_of(self, size: tuple[int, ...]) -> Any:
         bounds = self._bounds.get(size)
         if bounds is None:
-            if len(self._bounds) > LARGEST_BOUNDS:
+            if len(self._bounds) > MAX_BOUNDS:
                 self._bounds.clear()
             self._launch.set_dim(size)
             bounds = self._bounds[size] = self._launch.bounds
@@ -267,7 +267,7 @@ def _first_load(kernel: Any, device: torch.device) -> contextlib.AbstractContext
 launched: set[tuple[Any, torch.device]] = set()
 """Kernels that have been launched, each with its device."""
 
-LARGEST_BOUNDS = 4096
+MAX_BOUNDS = 4096
 """Launch bounds that are cached for a kernel, at most."""
 
 
@@ -278,7 +278,7 @@ def _struct(fields: tuple[tuple[str, type], ...]) -> Any:
 
 def _ranges(kernel: Any, size: tuple[int, ...]) -> list[range]:
     """Return the ranges of a launch's first dimension that CPU threads run; one range: no split."""
-    smallest = SMALLEST_RANGES.get(kernel)
+    smallest = MIN_RANGES.get(kernel)
     return [range(size[0])] if smallest is None else even_ranges(size[0], smallest)
 
 
@@ -346,7 +346,7 @@ def launch(
         return
     for noted in _observers:
         noted.append(_described(kernel, size))
-    if kernel in SMALLEST_RANGES:
+    if kernel in MIN_RANGES:
         arguments = (0, *arguments)
     if _ready.tape is not None:
         ready = _ready.tape.arguments(kernel, size, device, block_dim, arguments)
@@ -382,7 +382,7 @@ class Tape:
     def add(self, kernel: Any, size: Any, device: torch.device, *arguments: Any) -> None:
         """Record a launch without making it; arguments are those of `launch`."""
         size = (size,) if isinstance(size, int) else size
-        arguments = (0, *arguments) if kernel in SMALLEST_RANGES else arguments
+        arguments = (0, *arguments) if kernel in MIN_RANGES else arguments
         self.arguments(kernel, size, device, CUDA_BLOCK, arguments).set(arguments)
 
     @contextlib.contextmanager

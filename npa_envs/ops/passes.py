@@ -20,7 +20,7 @@ from npa_envs.ops.backend import Listing
 from npa_envs.ops.custom_op import custom_op
 from npa_envs.ops.launch import launch
 from npa_envs.ops.physics import Physics
-from npa_envs.ops.sort import LARGEST_INDEX, KernelPlan, SortedWorlds, plan_kernels
+from npa_envs.ops.sort import MAX_INDEX, KernelPlan, SortedWorlds, plan_kernels
 
 INTERLEAVED_LISTS = 32
 """Neighbour lists that are interleaved in memory."""
@@ -337,9 +337,9 @@ def _gather_by_cells(
     """Compute the cotangents with the portable kernels, particle by particle."""
     entries, space_dim, width = plan.row_capacity * plan.group_count, plan.space_dim, plan.width
     largest = entries * space_dim * width
-    if largest >= LARGEST_INDEX:
+    if largest >= MAX_INDEX:
         raise NPAError(
-            f"gradients must stay below {LARGEST_INDEX} numbers in one batch, got {largest}: split "
+            f"gradients must stay below {MAX_INDEX} numbers in one batch, got {largest}: split "
             "the batch, or take float32 and detach_positions=True"
         )
     terms, with_positions = plan.physics.terms, saved.states is not None

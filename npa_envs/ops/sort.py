@@ -25,17 +25,17 @@ from npa_envs.ops.backend import (
 from npa_envs.ops.launch import channel_width, is_recorded, launch, scalar_type
 from npa_envs.ops.physics import Physics
 
-LARGEST_INDEX = 2**31 - 1
+MAX_INDEX = 2**31 - 1
 """Largest index of an array in a kernel: indices have 32 bits."""
 
-LARGEST_MASK = 2**28
+MAX_MASK = 2**28
 """Largest worlds times entries of a mask that CUDA blocks sort: each block counts the active
 particles of all earlier worlds."""
 
-LARGEST_THREAD_MASK = 2**22
+MAX_THREAD_MASK = 2**22
 """The same for masks that CPU threads sort."""
 
-SMALLEST_SLICE = 128
+MIN_SLICE = 128
 """Fewest particles of a slice."""
 
 
@@ -183,9 +183,9 @@ def plan_kernels(
         listing=rollout_listing(request, mean_neighbours(particle_count, eps, sides)),
     )
     largest = max(2 * plan.cell_total, plan.total * (1 + plan.state_dim))
-    if largest >= LARGEST_INDEX:
+    if largest >= MAX_INDEX:
         raise NPAError(
-            f"worlds must stay below {LARGEST_INDEX} cells and state entries in one batch, got "
+            f"worlds must stay below {MAX_INDEX} cells and state entries in one batch, got "
             f"{world_count} worlds of {particle_count} particles and {plan.state_dim} channels: "
             f"split the batch"
         )
@@ -202,7 +202,7 @@ def mean_neighbours(particle_count: int, eps: float, box: Sequence[float] | None
 
 def sorts_at_once(world_count: int, particle_count: int) -> bool:
     """Return whether a CPU sorts small worlds in one launch with any mask."""
-    return world_count * world_count * particle_count <= LARGEST_THREAD_MASK
+    return world_count * world_count * particle_count <= MAX_THREAD_MASK
 
 
 def sort_worlds(
@@ -214,10 +214,10 @@ def sort_worlds(
     """
     # Mask entries that are read if each world counts the rows of earlier worlds.
     earlier = plan.world_count * plan.total if plan.masked else 0
-    capacity = 0 if earlier > LARGEST_MASK else block_capacity(plan.request, x, s, mask)
+    capacity = 0 if earlier > MAX_MASK else block_capacity(plan.request, x, s, mask)
     if capacity:
         return _sort_by_blocks(plan, capacity, x, s, mask, with_rows)
-    if plan.runs("sort") == "world" and earlier <= LARGEST_THREAD_MASK:
+    if plan.runs("sort") == "world" and earlier <= MAX_THREAD_MASK:
         return _sort_by_threads(plan, x, s, mask, with_rows)
     assert not is_recorded(), "a tape would miss torch's operations between these launches"
     kernels = sort_kernels(plan.space_dim, plan.scalar, plan.width)
@@ -303,7 +303,7 @@ def block_capacity(request: KernelRequest, *tensors: Tensor | None) -> int:
 def slice_count(device: torch.device, world_count: int, particle_count: int) -> int:
     """Return into how many slices to split each world: 1 unless worlds are too few for the GPU."""
     idle = multiprocessor_count(device) // world_count
-    return max(min(idle, particle_count // SMALLEST_SLICE), 1)
+    return max(min(idle, particle_count // MIN_SLICE), 1)
 
 
 def _sort_by_threads(

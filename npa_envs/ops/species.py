@@ -25,7 +25,7 @@ from npa_envs.ops.perceive import perceive
 from npa_envs.ops.physics import Physics, physics
 from npa_envs.ops.sort import plan_kernels, sort_worlds
 
-MOST_SPECIES = 64
+MAX_SPECIES = 64
 """Most species of a world: a thread has a sum for each."""
 
 
@@ -47,8 +47,8 @@ def checked_counts(counts: Sequence[int], particle_count: int) -> tuple[int, ...
             f"for example counts=({particle_count},)"
         )
     checked = tuple(checked_count("an entry of counts", count) for count in given)
-    if not 1 <= len(checked) <= MOST_SPECIES:
-        raise NPAError(f"counts must name 1 to {MOST_SPECIES} species, got {len(checked)}")
+    if not 1 <= len(checked) <= MAX_SPECIES:
+        raise NPAError(f"counts must name 1 to {MAX_SPECIES} species, got {len(checked)}")
     if min(checked) < 1:
         raise NPAError(
             f"counts must be at least 1 for every species, got {checked}: leave the empty one out"

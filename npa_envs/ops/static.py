@@ -19,7 +19,7 @@ from npa_envs.ops.passes import Densities, ListedNeighbours, NeighbourLists, com
 from npa_envs.ops.physics import Physics
 from npa_envs.ops.sort import KernelPlan, SortedWorlds, grouped_states, plan_kernels, sort_worlds
 
-LARGEST_LISTS = 2**31
+MAX_LISTS = 2**31
 """Largest bytes of all lists on a CPU; with more neighbours, each step searches again."""
 
 
@@ -92,7 +92,7 @@ def _list_neighbours(plan: KernelPlan, starts: Tensor, particles: Tensor) -> lis
     counts = starts.new_empty(plan.total)
     launch(kernels.count_neighbours, *common, starts.new_empty(0), counts)
     ends = torch.cumsum(counts, 0, dtype=torch.int64)
-    if 4 * int(ends[-1]) > LARGEST_LISTS:
+    if 4 * int(ends[-1]) > MAX_LISTS:
         return []
     neighbours = starts.new_empty(int(ends[-1]))
     ends = ends.to(torch.int32)

@@ -24,7 +24,7 @@ from npa_envs.ops.custom_op import check_derivatives, custom_op, once_differenti
 from npa_envs.ops.launch import Tape, launch, scalar_type
 from npa_envs.ops.perceive import Rows
 from npa_envs.ops.physics import Physics
-from npa_envs.ops.sort import LARGEST_INDEX
+from npa_envs.ops.sort import MAX_INDEX
 
 
 def _threads_for(count: int) -> int:
@@ -53,9 +53,9 @@ def _update_particles(
     boundary, sides = _boundary(physics, space_dim)
     total = x.shape[0] * x.shape[1]
     kernels = update_kernels(space_dim, scalar_type(x.dtype))
-    if update.numel() >= LARGEST_INDEX:
+    if update.numel() >= MAX_INDEX:
         raise NPAError(
-            f"updates must stay below {LARGEST_INDEX} numbers in one batch, got "
+            f"updates must stay below {MAX_INDEX} numbers in one batch, got "
             f"{update.numel()}: split the batch"
         )
     outputs = torch.empty_like(x), torch.empty_like(s), torch.empty_like(path_length)
@@ -394,8 +394,8 @@ def _check_worlds(
                 f"{name} must be contiguous, got strides {tensor.stride()}: "
                 f"make it so with {name}.contiguous()"
             )
-    if action.numel() >= LARGEST_INDEX:
+    if action.numel() >= MAX_INDEX:
         raise NPAError(
-            f"actions must stay below {LARGEST_INDEX} numbers in one batch, got {action.numel()}: "
+            f"actions must stay below {MAX_INDEX} numbers in one batch, got {action.numel()}: "
             f"split the batch"
         )

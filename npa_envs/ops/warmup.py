@@ -13,7 +13,7 @@ from npa_envs.devices import check_device
 from npa_envs.errors import NPAError, shown
 from npa_envs.ops.backend import SHARED_WORLD
 from npa_envs.ops.draws import draw
-from npa_envs.ops.episodes import EpisodeRules, PreparedJudgement
+from npa_envs.ops.episodes import EpisodeRules, EpisodeUpdate
 from npa_envs.ops.equivariance import MIXED_VECTORS, VectorForm, read_rows, steer_rows
 from npa_envs.ops.network import arrange_weights, run_network
 from npa_envs.ops.perceive import Rows, build_neighbours, perceive, perceive_rows
@@ -86,7 +86,7 @@ def _chosen(name: str, given: Any, known: tuple[Any, ...]) -> list[Any]:
 
 def _warm_judgement(elapsed: torch.Tensor) -> None:
     number, flag = elapsed.float(), elapsed.byte()
-    judge = PreparedJudgement(
+    judge = EpisodeUpdate(
         EpisodeRules(None, None, "terminate"),
         enabled=flag,
         diverged=flag,

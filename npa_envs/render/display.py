@@ -22,7 +22,7 @@ from npa_envs.errors import MissingDependencyError, NPAError, shown
 from npa_envs.render.film import Frame, check_rate, checked_frames, encode_frame, encode_webp
 from npa_envs.render.worlds import draw_worlds
 
-MOST_SHOWN = 16
+MAX_SHOWN = 16
 """Largest number of worlds in a picture."""
 
 _CELL_PARTICLES = 4
@@ -94,7 +94,7 @@ def show_worlds(
         raise NPAError(f"x must hold at least one particle, got shape {tuple(x.shape)}")
     spacing = _spacing(steps[-1][0]) if pixel_size is None else pixel_size
     frames = [
-        side_by_side(draw_worlds(a[:MOST_SHOWN], b[:MOST_SHOWN], pixel_size=spacing, **drawing))
+        side_by_side(draw_worlds(a[:MAX_SHOWN], b[:MAX_SHOWN], pixel_size=spacing, **drawing))
         for a, b in steps
     ]
     return Shown(frames, fps)

@@ -14,7 +14,7 @@ from npa_envs.tasks.appearance import FLAT, Gaussians
 
 Columns = dict[str, NDArray[np.generic]]
 
-LEAST_OPACITY = 1e-6
+MIN_OPACITY = 1e-6
 """Opacities are clipped to this distance from 0 and 1, so that logits are finite."""
 
 
@@ -34,7 +34,7 @@ def write_gaussians(path: str | Path, x: Tensor, gaussians: Gaussians) -> None:
     """
     positions = _checked(x)
     harmonics = _numpy(gaussians.colours)
-    opacity = _numpy(gaussians.opacities).clip(LEAST_OPACITY, 1.0 - LEAST_OPACITY)
+    opacity = _numpy(gaussians.opacities).clip(MIN_OPACITY, 1.0 - MIN_OPACITY)
     columns: Columns = {name: positions[:, k] for k, name in enumerate("xyz")}
     columns |= {f"n{name}": np.zeros(len(positions), np.float32) for name in "xyz"}
     columns |= {f"f_dc_{k}": harmonics[:, 0, k] for k in range(3)}

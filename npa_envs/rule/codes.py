@@ -12,7 +12,7 @@ from torch import Tensor, nn
 
 from npa_envs.errors import NPAError, shown, suggest
 
-LARGEST_CODE_COUNT = 65536
+MAX_CODE_COUNT = 65536
 """Largest number of codes of a rule."""
 
 PICTURE_SIDE = 32
@@ -35,9 +35,9 @@ class Codes(nn.Module):
 
     def __init__(self, names: Sequence[str], dim: int, *, encoder: bool = False) -> None:
         super().__init__()
-        if len(set(names)) < len(names) or len(names) > LARGEST_CODE_COUNT:
+        if len(set(names)) < len(names) or len(names) > MAX_CODE_COUNT:
             raise NPAError(
-                f"code_names must be different names, at most {LARGEST_CODE_COUNT}, got "
+                f"code_names must be different names, at most {MAX_CODE_COUNT}, got "
                 f"{shown(list(names))}: leave one of each"
             )
         self.names = tuple(names)

@@ -45,7 +45,7 @@ _PLAIN: dict[Any, type] = {Literal: str, Sequence: tuple}
 _FIELDS = {name: _PLAIN.get(get_origin(kind), kind) for name, kind in HYPER_PARAMETERS.items()}
 _RESERVED = {"format", "version", "checksum", *_FIELDS}
 _SUFFIXES = (".safetensors", ".pth", ".pt", ".json")
-_LARGEST_FILE = 64 * 2**20
+_MAX_FILE = 64 * 2**20
 """Largest file of a rule [bytes]; the largest shipped one has 0.1 MiB."""
 
 
@@ -106,7 +106,7 @@ def load_rule(source: str | Path, *, device: str | torch.device = "cpu") -> NPAR
             given = {name: _parse(header, name, kind) for name, kind in _FIELDS.items()}
             parts = RuleParts(given, weights)
         else:
-            content = read_bytes(path, limit=_LARGEST_FILE)
+            content = read_bytes(path, limit=_MAX_FILE)
             is_demo = path.suffix == ".json"
             parts = read_demo_json(content, name) if is_demo else read_state_dict(content)
         rule = _assemble(parts)
@@ -273,7 +273,7 @@ def _locate(source: str | Path) -> tuple[Path, str | None]:
 
 def _read_ours(path: Path, *, with_weights: bool) -> tuple[dict[str, str], dict[str, Tensor]]:
     """Return the metadata of a file that `save_rule` wrote, and its weights if asked for."""
-    check_regular(path, limit=_LARGEST_FILE)
+    check_regular(path, limit=_MAX_FILE)
     try:
         with safe_open(path, framework="pt") as file:
             header: dict[str, str] = file.metadata() or {}

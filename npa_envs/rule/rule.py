@@ -38,7 +38,7 @@ COLOUR_OFFSET = 0.5
 INIT_GAIN = 0.1
 """Gain of the Xavier-uniform initialisation: a fresh rule hardly moves its particles."""
 
-LARGEST_DIM = 65536
+MAX_DIM = 65536
 """Largest dimension of a rule."""
 
 LIFE = 0
@@ -203,8 +203,8 @@ class NPARule(nn.Module):
         if self.space_dim not in (2, 3):
             raise NPAError(f"space_dim must be 2 or 3, got {shown(self.space_dim)}")
         for name, size in sizes.items():
-            if size > LARGEST_DIM:
-                raise NPAError(f"{name} must be at most {LARGEST_DIM}, got {shown(size)}")
+            if size > MAX_DIM:
+                raise NPAError(f"{name} must be at most {MAX_DIM}, got {shown(size)}")
         for name, least in (*((name, 1) for name in positive), ("species_count", 0)):
             if sizes[name] < least:
                 raise NPAError(f"{name} must be at least {least}, got {shown(sizes[name])}")

@@ -25,14 +25,14 @@ from npa_envs.rule.codes import carrying
 from npa_envs.rule.rule import COLOUR_OFFSET, LIFE, NPARule
 from npa_envs.tasks.base import GrowthConfig, GrowthTask
 from npa_envs.tasks.damage import damage_pool
-from npa_envs.tasks.targets.images import LARGEST_POINT_COUNT
+from npa_envs.tasks.targets.images import MAX_POINT_COUNT
 from npa_envs.tasks.targets.points import PointTarget, load_target
 from npa_envs.tasks.train_config import TrainConfig, fast_run, presets_of, tiny_run
 from npa_envs.world.division import living
 from npa_envs.world.particles import Particles
 from npa_envs.world.randomness import Randomness, uniform_draws
 
-LARGEST_CODE = 1024
+MAX_CODE = 1024
 """Largest length of a code."""
 
 
@@ -114,14 +114,14 @@ class Morphogenesis2DConfig(GrowthConfig):
         """Check every field; raise NPAError where one has a wrong type or lies out of its range."""
         super().__post_init__()
         check_text(self, "target", "a built-in name, an emoji or a path")
-        check_positive(self, int, "target_point_count", at_most=LARGEST_POINT_COUNT)
+        check_positive(self, int, "target_point_count", at_most=MAX_POINT_COUNT)
         check_positive(self, float, "sigma")
         check_non_negative(self, "splat_weight", "colour_weight", "drift_weight")
         check_non_negative(self, "seed_axis", "seed_across")
         check_flag(self, "equivariant", "chiral", "encoder", "division", "keep_background")
         rule, cure = "be a tuple of names, emoji, files or folders", "targets=('gecko', 'heart')"
         check_field(self, "targets", are_texts(self.targets), rule, f"for example {cure}")
-        check_positive(self, int, "code_dim", at_most=LARGEST_CODE)
+        check_positive(self, int, "code_dim", at_most=MAX_CODE)
         check_non_negative(self, "switch_share", at_most=1.0)
         check_positive(self, int, "angles", at_least=0)
         few = 0 < self.angles < 4

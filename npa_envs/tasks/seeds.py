@@ -8,7 +8,7 @@ from torch import Tensor
 from npa_envs.checks import DTYPES, checked_count, checked_finite, entries
 from npa_envs.devices import check_device
 from npa_envs.errors import NPAError, shown
-from npa_envs.ops.sort import LARGEST_INDEX
+from npa_envs.ops.sort import MAX_INDEX
 from npa_envs.world.randomness import Randomness, WorldRandom, check_generator, uniform_draws
 
 
@@ -99,9 +99,9 @@ def drawn_worlds(x: Tensor, generator: Randomness, share: float) -> Tensor:
 def _check_points(number_count: int, dtype: torch.dtype) -> None:
     if dtype not in DTYPES:
         raise NPAError(f"dtype must be torch.float32 or torch.float64, got {dtype}")
-    if number_count > LARGEST_INDEX:
+    if number_count > MAX_INDEX:
         raise NPAError(
-            f"coordinates must be at most {LARGEST_INDEX} in one batch, got {shown(number_count)}: "
+            f"coordinates must be at most {MAX_INDEX} in one batch, got {shown(number_count)}: "
             "make fewer worlds or particles"
         )
 

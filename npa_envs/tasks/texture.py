@@ -110,7 +110,7 @@ class TextureConfig(TaskConfig):
         check_field(self, "box_size", self.box_size >= 2.0 * self.eps, rule, cure)
 
 
-LARGEST_EPS = 0.3
+MAX_EPS = 0.3
 """Largest ε that `see_across` sets [length units]."""
 
 DENSITY_FLOOR = 1e-6
@@ -155,7 +155,7 @@ class Texture(ParticleTask[TextureConfig]):
                 f"config.resolution says, got {tuple(target.picture.shape)}: load it at that size"
             )
         if config.see_across:
-            across = min(2.0 * target.gap * config.box_size, LARGEST_EPS, 0.5 * config.box_size)
+            across = min(2.0 * target.gap * config.box_size, MAX_EPS, 0.5 * config.box_size)
             config = replace(config, see_across=False, eps=max(config.eps, across))
         self.config = config
         """The configuration; its ε may be raised by `see_across`."""

@@ -42,7 +42,7 @@ LOWEST = 0.01
 DECAY = 0.3
 """Factor on the learning rate at each milestone."""
 
-LARGEST_POWER = 8.0
+MAX_POWER = 8.0
 """Largest `stillness_power`: float32 would round higher powers of small changes to 0."""
 
 
@@ -199,8 +199,8 @@ class TrainConfig(Generic[TaskConfigT]):
         for name, fits, rule, cure in (
             (
                 "stillness_power",
-                1.0 <= self.stillness_power <= LARGEST_POWER,
-                f"be at least 1 and at most {LARGEST_POWER:g}",
+                1.0 <= self.stillness_power <= MAX_POWER,
+                f"be at least 1 and at most {MAX_POWER:g}",
                 "1 for plain means",
             ),
             (

@@ -147,7 +147,7 @@ def preset(name: str, task_name: str = "morphogenesis2d", /, **fields: Any) -> T
 
 # Overrides, by field names or by a file.
 
-LARGEST_FILE = 2**20
+MAX_FILE = 2**20
 """Largest configuration file [bytes]."""
 
 MERGED = 10_000
@@ -215,7 +215,7 @@ def load_config(
     """
     path = checked_path(path)
     try:
-        text = read_bytes(path, limit=LARGEST_FILE).decode("utf-8")
+        text = read_bytes(path, limit=MAX_FILE).decode("utf-8")
     except (NPAError, UnicodeDecodeError) as error:
         raise NPAError(f"cannot read the configuration file {shown(str(path))}: {error}") from error
     fields = _parse(path, text)

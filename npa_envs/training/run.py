@@ -202,7 +202,7 @@ def stop_flag(*, patient: bool = False) -> Iterator[threading.Event]:
 
 # Files.
 
-LARGEST_LOG = 2**29
+MAX_LOG = 2**29
 """Largest log of a run [bytes]."""
 
 
@@ -370,7 +370,7 @@ class JsonlLog:
         """Return the records, up to an iteration if given, without an incomplete last line."""
         if not os.path.exists(self.path):
             return []
-        content = read_bytes(self.path, limit=LARGEST_LOG, what="the log")
+        content = read_bytes(self.path, limit=MAX_LOG, what="the log")
         lines = content.decode("utf-8", errors="replace").split("\n")
         # The part after the last newline is incomplete, or empty.
         if _parsed_record(lines[-1]) is None:

@@ -23,7 +23,7 @@ from npa_envs.rule.rule import NPARule, check_rule
 from npa_envs.tasks.damage import CLUMP_FACTOR, DAMAGE_SIZES
 from npa_envs.tasks.point_classification import PALETTE, UNDECIDED, PointClassification
 from npa_envs.web.live import CLUMP_RATE, INJECT_RATE, checked_seed, colour_ramp
-from npa_envs.web.rule_world import LEAST_SEED, SEED_FRACTION, RuleWorld, name_of
+from npa_envs.web.rule_world import MIN_SEED, SEED_FRACTION, RuleWorld, name_of
 from npa_envs.world.species import AGREEMENTS
 
 PAGE = Path(__file__).resolve().parent / "page"
@@ -35,7 +35,7 @@ PREVIEW_STEPS = 256
 PREVIEW_PIXELS = 192
 """Pixels on each side of a preview."""
 
-MOST_WEIGHTS = 2**20
+MAX_WEIGHTS = 2**20
 """Most weights of a rule in a page: 5.6 MB of text, and very slow in a browser."""
 
 POLICY = (
@@ -50,7 +50,7 @@ CONSTANTS = {
     "CLUMP_RATE": CLUMP_RATE,
     "DAMAGE_SIZES": DAMAGE_SIZES,
     "INJECT_RATE": INJECT_RATE,
-    "LEAST_SEED": LEAST_SEED,
+    "MIN_SEED": MIN_SEED,
     "SEED_FRACTION": SEED_FRACTION,
 }
 """Numbers and names of the Python worlds that live_world.js also needs."""
@@ -215,7 +215,7 @@ def check_browser_rule(rule: NPARule, name: str) -> None:
             species, "that perceive all species alike", f"has species_count={species}",
             "run it with npa_envs.rollout_species",
         ),
-        (size > MOST_WEIGHTS, f"of at most {MOST_WEIGHTS} weights", f"has {size}", view),
+        (size > MAX_WEIGHTS, f"of at most {MAX_WEIGHTS} weights", f"has {size}", view),
     ):  # fmt: skip
         if fails:
             raise NPAError(f"a page runs rules {rule_of_page}, {shown(name)} {given}: {cure}")

@@ -22,7 +22,7 @@ from npa_envs.render.colours import GOLDEN_ANGLE, STATE_CHROMA, STATE_GAIN, ramp
 from npa_envs.tasks.damage import check_damage
 from npa_envs.world.brushes import clump, cut, inject, push, state_around
 
-MOST_STEPS = 64
+MAX_STEPS = 64
 """Most steps between two frames."""
 
 LOSS_FRACTION = 0.1
@@ -37,7 +37,7 @@ INJECT_RATE = 0.5
 FARTHEST = 1e4
 """Largest coordinate in a message [length units]."""
 
-LARGEST_RADIUS = 10.0
+MAX_RADIUS = 10.0
 """Largest radius of a brush [length units]."""
 
 
@@ -223,7 +223,7 @@ class LiveWorld(ABC):
 
     def _ranges(self) -> dict[str, Range]:
         """Return the ranges of the settings, by the name of the attribute."""
-        return {"speed": Range(1, MOST_STEPS, "log", whole=True)}
+        return {"speed": Range(1, MAX_STEPS, "log", whole=True)}
 
     def _run_timed(self, steps: int) -> None:
         start = time.perf_counter()
@@ -271,7 +271,7 @@ class Touch(NamedTuple):
             str(name),
             _checked_vector("at", at, x),
             _checked_vector("move", message.get("move", [0.0] * x.shape[2]), x),
-            Range(1e-4, LARGEST_RADIUS).checked("radius", message.get("radius")),
+            Range(1e-4, MAX_RADIUS).checked("radius", message.get("radius")),
             Range(0.0, 1.0).checked("strength", message.get("strength", 1.0)),
             _checked_vector("source", message.get("source", at), x),
             None if view is None else _checked_vector("view", view, x),

@@ -25,7 +25,7 @@ from npa_envs.tasks.damage import DAMAGE_SIZES, damage_worlds
 from npa_envs.tasks.seeds import uniform_ball
 from npa_envs.tasks.train_config import TrainConfig
 from npa_envs.training.presets import load_config, preset
-from npa_envs.training.run import LARGEST_LOG, RunFolder
+from npa_envs.training.run import MAX_LOG, RunFolder
 from npa_envs.training.task_of_rule import TrainedTask, task_of_rule, trained_config
 from npa_envs.web.live import (
     ColouredWorld,
@@ -43,17 +43,17 @@ from npa_envs.world.division import living
 from npa_envs.world.rollout import at_rest, rollout
 from npa_envs.world.species import AGREEMENTS, rollout_species
 
-MOST_PARTICLES = {"cpu": 16384, "cuda": 131072}
+MAX_PARTICLES = {"cpu": 16384, "cuda": 131072}
 """Most particles of a world, by device type."""
 
-SEED_FRACTION, LEAST_SEED = 0.5, 16
+SEED_FRACTION, MIN_SEED = 0.5, 16
 """Particles that the brush `add` of strength 1 adds, as a fraction of a fresh world's; the least
 number of them."""
 
 SMALL_VIEWS = {"resolution": 64, "training_views": 1, "held_out_views": 6}
 """Options of 3D tasks for a fast start: targets of full size take many seconds to draw."""
 
-MOST_TASKS = 8
+MAX_TASKS = 8
 """Cached tasks with their targets; the slider of N makes many."""
 
 REST_CHECK_STEPS = 64
@@ -110,7 +110,7 @@ class RuleWorld(LiveWorld):
     def _task_of(self, live_rule: LiveRule, particle_count: int | None) -> TrainedTask:
         key = (live_rule.name, particle_count)
         if key not in self._trained:
-            if len(self._trained) >= MOST_TASKS:
+            if len(self._trained) >= MAX_TASKS:
                 self._trained.clear()
             self._trained[key] = task_of_rule(
                 self._choices[live_rule.name],
@@ -217,7 +217,7 @@ class RuleWorld(LiveWorld):
             "noise": Range(0.0, 0.2 * eps0),
         }
         if not self.task.classifies:
-            ranges["count"] = Range(64, MOST_PARTICLES[self._device.type], "log", whole=True)
+            ranges["count"] = Range(64, MAX_PARTICLES[self._device.type], "log", whole=True)
         return ranges
 
     def _shows(self) -> list[str]:
@@ -361,8 +361,8 @@ class RuleWorld(LiveWorld):
         self._arrange(self.x, s, torch.where(inside[0], number, self._species()))
 
     def _add(self, touch: Touch, live_rule: LiveRule) -> None:
-        count = max(LEAST_SEED, round(touch.strength * SEED_FRACTION * self.full))
-        room = MOST_PARTICLES[self._device.type] - self.x.shape[1]
+        count = max(MIN_SEED, round(touch.strength * SEED_FRACTION * self.full))
+        room = MAX_PARTICLES[self._device.type] - self.x.shape[1]
         if count > room:
             raise NPAError(f"the world has room for {max(room, 0)} particles more, got {count}")
         ball = uniform_ball(
@@ -454,13 +454,13 @@ class FollowedLog:
         if (seen := (now.st_ino, now.st_size, now.st_mtime_ns)) == self._seen:
             return [], False
         self._seen = seen
-        with open_regular(self._path, limit=LARGEST_LOG, what="the log") as file:
+        with open_regular(self._path, limit=MAX_LOG, what="the log") as file:
             file.seek(self._end - len(self._last_line))
             if file.read(len(self._last_line)) != self._last_line:
                 # The run was resumed from a checkpoint, or another one was started in its folder.
                 self._forget()
                 file.seek(0)
-            text = file.read(LARGEST_LOG)
+            text = file.read(MAX_LOG)
         # A last line without newline is not complete yet.
         text = text[: text.rfind(b"\n") + 1]
         first = self.iteration < 0

@@ -52,7 +52,7 @@ PORT = 8765
 PORTS_TRIED = 20
 """Number of default ports from `PORT` on."""
 
-MOST_SESSIONS = 4
+MAX_SESSIONS = 4
 """Most open pages; each has its own world."""
 
 FRAMES_AHEAD = 2
@@ -61,19 +61,19 @@ FRAMES_AHEAD = 2
 FRAME_SECONDS = 1.0 / 60.0
 """Least time between two frames [s]."""
 
-LARGEST_MESSAGE = 2**20
+MAX_MESSAGE = 2**20
 """Most bytes of a message."""
 
 MESSAGES_KEPT = 256
 """Most messages in a queue; others are dropped."""
 
-MOST_PICTURES = 500
+MAX_PICTURES = 500
 """Most pictures of a film, 20 seconds; each takes a megabyte of memory when it is written."""
 
 FILM_RATE = 25.0
 """Pictures of a film per second."""
 
-LARGEST_PICTURE = 1024
+MAX_PICTURE = 1024
 """Most pixels on each side of a film's pictures."""
 
 KIND = 1
@@ -181,8 +181,8 @@ def make_app(site: Site) -> Starlette:
         if not site.allows_token(reader.query_params.get("token")):
             return await reader.close(1008, "the token is missing or wrong")
         await reader.accept()
-        if len(site.open_sessions) >= MOST_SESSIONS:
-            return await reader.close(1013, f"{MOST_SESSIONS} worlds are open: close a page")
+        if len(site.open_sessions) >= MAX_SESSIONS:
+            return await reader.close(1013, f"{MAX_SESSIONS} worlds are open: close a page")
         session = ViewerSession(site, reader, asyncio.get_running_loop())
         site.open_sessions.append(session)
         try:
@@ -416,7 +416,7 @@ class ViewerSession:
         # Pictures that come after the film's end are ignored.
         if self._film is not None:
             self._film.add(data)
-            if len(self._film.pictures) >= MOST_PICTURES:
+            if len(self._film.pictures) >= MAX_PICTURES:
                 self._send_event({"type": "film", "action": "stop"})
                 self._end_film(self._film)
 
@@ -434,10 +434,9 @@ class PageFilm:
                 size = picture.size
         except (OSError, ValueError, Image.DecompressionBombError) as error:
             raise NPAError(f"a film's picture must be a JPEG, got {shown(error)}") from error
-        if max(size) > LARGEST_PICTURE:
+        if max(size) > MAX_PICTURE:
             raise NPAError(
-                f"a film's picture must have at most {LARGEST_PICTURE} pixels on each side, got "
-                f"{size}"
+                f"a film's picture must have at most {MAX_PICTURE} pixels on each side, got {size}"
             )
         self.pictures.append(data)
 
@@ -510,7 +509,7 @@ def make_server(site: Site) -> uvicorn.Server:
     config = uvicorn.Config(
         make_app(site),
         log_level="warning",
-        ws_max_size=LARGEST_MESSAGE,
+        ws_max_size=MAX_MESSAGE,
         # Compressing frames takes longer than sending them, and gains little.
         ws_per_message_deflate=False,
         server_header=False,

@@ -18,7 +18,7 @@ from npa_envs.ops.episodes import (
     SUCCESS,
     TIME_LIMIT,
     EpisodeRules,
-    PreparedJudgement,
+    EpisodeUpdate,
 )
 from npa_envs.ops.perceive import NeighbourState, build_neighbours
 from npa_envs.ops.physics import Boundary, Limits, Physics, Terms
@@ -36,11 +36,11 @@ __all__ = [
     "Actions",
     "Boundary",
     "EpisodeRules",
+    "EpisodeUpdate",
     "Limits",
     "MomentInverse",
     "NeighbourState",
     "Physics",
-    "PreparedJudgement",
     "Terms",
     "build_neighbours",
     "marginal_gains",

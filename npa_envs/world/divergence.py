@@ -16,7 +16,7 @@ OnDivergence = Literal["ignore", "raise"]
 RUNAWAY = 1e6
 """Default limit of coordinates [length units] and states (dimensionless)."""
 
-LARGEST_REPORT = 8
+MAX_REPORT = 8
 """Most worlds that a report describes; it counts the others."""
 
 
@@ -76,7 +76,7 @@ def describe_divergence(x: Tensor, s: Tensor, *, limit: float = RUNAWAY) -> str:
     flags = divergence(x, s, limit=limit)
     worlds = (flags.non_finite | flags.runaway).nonzero()[:, 0].tolist()
     lines = []
-    for world in worlds[:LARGEST_REPORT]:
+    for world in worlds[:MAX_REPORT]:
         numbers = torch.cat((x[world], s[world]), dim=1).cpu()
         bad = ~numbers.isfinite()
         beyond = ""
@@ -90,8 +90,8 @@ def describe_divergence(x: Tensor, s: Tensor, *, limit: float = RUNAWAY) -> str:
             f"{numbers[particle, entry].item():g}{beyond} ({number} such "
             f"number{'s' * (number > 1)} in {particles} particle{'s' * (particles > 1)})"
         )
-    if len(worlds) > LARGEST_REPORT:
-        lines.append(f"and {len(worlds) - LARGEST_REPORT} more worlds")
+    if len(worlds) > MAX_REPORT:
+        lines.append(f"and {len(worlds) - MAX_REPORT} more worlds")
     return "\n".join(lines)
 
 
@@ -137,7 +137,7 @@ class DivergenceWatch:
         if not worlds:
             return
         told = []
-        for step, world in worlds[:LARGEST_REPORT]:
+        for step, world in worlds[:MAX_REPORT]:
             numbers = self._numbers[world].cpu()
             entry = int((~numbers.isfinite()).nonzero()[0])
             when = f"in step {step}" if step > 0 else "before the first step"
@@ -145,8 +145,8 @@ class DivergenceWatch:
                 f"world {world}: {term_name(entry, self._space_dim)} of particle "
                 f"{int(self._particle[world])} was {numbers[entry].item():g} {when}"
             )
-        if len(worlds) > LARGEST_REPORT:
-            told.append(f"and {len(worlds) - LARGEST_REPORT} more worlds")
+        if len(worlds) > MAX_REPORT:
+            told.append(f"and {len(worlds) - MAX_REPORT} more worlds")
         raise DivergedError(
             f"worlds must stay finite, but {len(worlds)} of {len(first)} did not, {'; '.join(told)}"
             ": take smaller steps (dt) or states, or find such worlds with npa_envs.divergence and "

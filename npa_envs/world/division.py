@@ -14,7 +14,7 @@ from torch import Tensor
 from npa_envs.ops.world_mean import world_mean
 from npa_envs.rule.rule import LIFE
 
-FEWEST_OFFSPRING = 1e-3
+MIN_OFFSPRING = 1e-3
 """Expected offspring below which life gets no gradient."""
 
 CHILD_DISTANCE = 0.5
@@ -106,7 +106,7 @@ def divided(
     source = torch.where(born, parent_of_rank.gather(1, slot_rank.clamp_min(0)), own)
 
     room = parents | (children < slots)
-    offspring = (1.0 + torch.where(room, divide, 0.0) - die).clamp_min(FEWEST_OFFSPRING)
+    offspring = (1.0 + torch.where(room, divide, 0.0) - die).clamp_min(MIN_OFFSPRING)
     life = s[..., LIFE] * torch.where(updated, offspring / offspring.detach(), 1.0)
     stays = alive & ~dying
     life = torch.where(stays, life, 0.0).gather(1, source)

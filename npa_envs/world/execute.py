@@ -40,16 +40,16 @@ Memory = Literal["store", "recompute", "minimal"]
 STORED_INTERVAL: dict[Memory, int] = {"store": 1, "recompute": 3, "minimal": 2**31}
 """The last step and every k-th step before it store the tensors of the backward pass."""
 
-FEWEST_STATIC = 3
+MIN_STATIC = 3
 """Fewest steps of a rollout for which static worlds are sorted in advance."""
 
-FEWEST_RESTING = 256
+MIN_RESTING = 256
 """Fewest steps of a rollout that is checked for worlds at rest."""
 
-LARGEST_TOTAL = 4096
+MAX_TOTAL = 4096
 """Most particles of a batch whose steps are on a tape: in larger ones kernels take most time."""
 
-MOST_KINDS = 32
+MAX_KINDS = 32
 """Most kinds of calls whose tapes are cached."""
 
 FIRST_PART = {"cpu": 64, "cuda": 1024}
@@ -85,7 +85,7 @@ class RolloutSpec(NamedTuple):
         (rule,) = rules
         physics = self.physics.constants()
         moving = physics.moving or physics.position_noise > 0.0 or not self.detach_positions
-        if not moving and self.steps >= FEWEST_STATIC:
+        if not moving and self.steps >= MIN_STATIC:
             return StaticStep(rule, physics, particles.x)
         # A rule with a custom network runs as its module.
         made = DivisionStep if rule.divides else RuleStep
@@ -285,7 +285,7 @@ def _may_rest(spec: RolloutSpec, rules: Sequence[NPARule], particles: Particles)
         and rules[0].dead_zone > 0.0
         and rules[0].has_network()
         and not rules[0].divides
-        and spec.steps >= FEWEST_RESTING
+        and spec.steps >= MIN_RESTING
         and spec.keep_every is None
         and spec.physics.position_noise == 0.0
         and particles.path_length is None
@@ -383,7 +383,7 @@ def run_taped(
         torch.compiler.is_compiling()
         or torch.is_grad_enabled()
         or x.device.type != "cpu"
-        or x.shape[0] * x.shape[1] > LARGEST_TOTAL
+        or x.shape[0] * x.shape[1] > MAX_TOTAL
         or step.network is None
         or step.physics.position_noise > 0.0
         or steps == 0
@@ -395,7 +395,7 @@ def run_taped(
         return None
     key = (step.physics, rule_form(step.rule), x.shape, s.shape[2], x.dtype)
     with _lock:
-        kind = _kinds.count(key, MOST_KINDS)
+        kind = _kinds.count(key, MAX_KINDS)
     if kind.calls <= LAUNCHED_FIRST:
         return None
     # Another thread may have taken the last one in the meantime.

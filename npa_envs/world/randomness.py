@@ -16,7 +16,7 @@ from npa_envs.checks import DTYPES, check_dense, checked_count, checked_number
 from npa_envs.devices import check_device
 from npa_envs.errors import NPAError, shown
 from npa_envs.ops.draws import WORD_COUNT, draw
-from npa_envs.ops.sort import LARGEST_INDEX
+from npa_envs.ops.sort import MAX_INDEX
 
 
 class StreamId(enum.IntEnum):
@@ -251,9 +251,9 @@ class WorldRandom:
         self, kind: str, shape: tuple[int, ...], dtype: torch.dtype, bound: int = 0
     ) -> Tensor:
         count = math.prod(checked_count("a size", size) for size in shape)
-        if count * self.world_count > LARGEST_INDEX:
+        if count * self.world_count > MAX_INDEX:
             raise NPAError(
-                f"a draw must have at most {LARGEST_INDEX} numbers, got {count} for each of "
+                f"a draw must have at most {MAX_INDEX} numbers, got {count} for each of "
                 f"{self.world_count} worlds: draw several times"
             )
         number = self._draw_count

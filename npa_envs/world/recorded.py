@@ -64,13 +64,13 @@ MEMORY_SHARE = 0.5
 BLOCK_STEPS = 64
 """Steps of a graph without gradients: longer rollouts replay it several times."""
 
-MOST_STEPS = 1024
+MAX_STEPS = 1024
 """Most steps of a graph with gradients: longer rollouts are launched."""
 
-MOST_GRAPHS = 128
+MAX_GRAPHS = 128
 """Most graphs of a recording, each for one number of steps."""
 
-MOST_KINDS = 256
+MAX_KINDS = 256
 """Most kinds of calls that are counted."""
 
 WARM_UP_STEPS = 4
@@ -209,7 +209,7 @@ class _Recording:
             if self._own:
                 # Draws of their networks in the warm-up do not count.
                 shared.set_offset(place)
-        elif len(self.graphs) >= MOST_GRAPHS:
+        elif len(self.graphs) >= MAX_GRAPHS:
             self.compared.discard(self.graphs.popitem(last=False)[0])
         call = self._call._replace(steps=steps)
         before = torch.cuda.memory_reserved(self.device)
@@ -612,13 +612,13 @@ def run_recorded(
     shape = (x.shape, s.shape[2], x.dtype, x.device)
     key = call._replace(steps=0), forms, shape, wanted, by_world, precision
     with _lock:
-        kind = _kinds.count(key, MOST_KINDS)
+        kind = _kinds.count(key, MAX_KINDS)
     if kind.refused or kind.calls <= (1 if asked else LAUNCHED_FIRST):
         return None
     # The caller may have hooks for saved tensors, as checkpoints do.
     hooks = getattr(torch._C._autograd, "_top_saved_tensors_default_hooks", None)
     hooked = hooks is not None and hooks(True) is not None
-    if wanted and (hooked or call.steps > MOST_STEPS):
+    if wanted and (hooked or call.steps > MAX_STEPS):
         return None
     # Without gradients a long rollout replays several graphs one after the other.
     kept = call.keep_every or 1

@@ -37,7 +37,7 @@ ROWS_TOGETHER = 2**24
 ROWS_KEPT = 2**24
 """Most rows of perception that are stored for the network at once."""
 
-MOST_AHEAD = 4
+MAX_AHEAD = 4
 """Most steps whose random draws a recording makes in advance: they take memory."""
 
 OVERFLOW_LOG_PROBABILITY = 34.5
@@ -111,7 +111,7 @@ def iterate_draws(draw: Callable[[], Draws], like: Tensor, steps: int) -> Iterat
     ready, rest = [draw()], steps - 1
     while rest > 0:
         # Draws reuse the memory of earlier steps, so the two streams wait for each other.
-        count = min(3 * len(ready), MOST_AHEAD, rest)
+        count = min(3 * len(ready), MAX_AHEAD, rest)
         with side_stream.overlap():
             coming = [draw() for _ in range(count)]
         yield from ready

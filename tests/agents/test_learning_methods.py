@@ -536,7 +536,7 @@ def test_candidates_act_alike_however_many_are_computed_at_once(monkeypatch, dev
     population, weights = candidates_of(problem, device, 5)
     observation, _ = problem.make_envs(10, device=device).reset(seed=3)
     together = population.actions(weights, observation)
-    monkeypatch.setattr("npa_envs.agents.learning.evolution.MOST_HIDDEN", 2 * 2 * 24 * 12)
+    monkeypatch.setattr("npa_envs.agents.learning.evolution.MAX_HIDDEN", 2 * 2 * 24 * 12)
     assert torch.allclose(population.actions(weights, observation), together, atol=1e-6)
 
 

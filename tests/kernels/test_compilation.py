@@ -21,7 +21,7 @@ from npa_envs.kernels.cuda.sort import BLOCKS, order_particles, sort_small_world
 from npa_envs.kernels.cuda.splat import sort_small_splats
 from npa_envs.kernels.pictures.blending import block_kernels
 from npa_envs.kernels.pictures.errors import gather_errors
-from npa_envs.kernels.portable.episodes import judge_worlds
+from npa_envs.kernels.portable.episodes import update_episodes
 from npa_envs.ops import warmup
 from npa_envs.ops.launch import launched
 
@@ -98,7 +98,7 @@ def cuda_engine():
 
 @pytest.mark.parametrize("capability", [TURING, MODERN[-1]])
 def test_a_kernel_compiles_with_all_native_code_for_the_oldest_and_the_newest(capability, tmp_path):
-    compile_for(judge_worlds, capability, tmp_path)
+    compile_for(update_episodes, capability, tmp_path)
     assert list(tmp_path.glob(f"*.sm{capability}.cubin"))
 
 

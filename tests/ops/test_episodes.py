@@ -11,7 +11,7 @@ from npa_envs.ops.episodes import (
     SUCCESS,
     TIME_LIMIT,
     EpisodeRules,
-    PreparedJudgement,
+    EpisodeUpdate,
 )
 
 B, PARTS = 64, 3
@@ -52,8 +52,8 @@ def expected(rules, given):
     late = step >= rules.last_step if rules.last_step else torch.zeros_like(fled)
     improvement = given["numbers"][1] - loss
     reward = improvement
-    if rules.paid_step is not None:
-        reward = torch.where(success | ended | (step == rules.paid_step), -loss, 0.0)
+    if rules.rewarded_step is not None:
+        reward = torch.where(success | ended | (step == rules.rewarded_step), -loss, 0.0)
     fallen = given["numbers"][2 : 2 + PARTS] - parts
     flags = torch.stack((success | ended, late, success, fled))
     unfit = ~improvement.isfinite() | (given["broken"].bool() & ~lost)
@@ -76,7 +76,7 @@ def test_worlds_are_judged_as_torch_would(rules, happened, device):
     given = worlds(device)
     before = {name: value.clone() for name, value in given.items()}
     endings = torch.zeros(B + 1, dtype=torch.uint8, device=device)
-    judge = PreparedJudgement(
+    judge = EpisodeUpdate(
         rules,
         enabled=torch.full((1,), happened, dtype=torch.uint8, device=device),
         endings=endings,

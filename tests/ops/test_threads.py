@@ -15,7 +15,7 @@ import torch
 from worlds import assert_same, random_mask, random_world, rows_of, with_gradients
 
 import npa_envs
-from npa_envs.once import alone, made_once
+from npa_envs.kernel_lock import cached_under_lock, kernel_lock
 from npa_envs.ops import launch as threads
 from npa_envs.ops import orbit, render_gaussians
 from npa_envs.ops.launch import even_ranges, run_together
@@ -280,7 +280,7 @@ def test_a_forked_pool_rolls_out_where_environments_were_never_imported():
 def test_what_several_threads_make_at_once_is_made_once():
     barrier, made = threading.Barrier(4), []
 
-    @made_once()
+    @cached_under_lock()
     def make(name):
         made.append(name)
         time.sleep(0.02)
@@ -300,7 +300,7 @@ def test_a_fork_waits_until_no_thread_is_making_kernels():
     begun = threading.Event()
 
     def hold():
-        with alone:
+        with kernel_lock:
             begun.set()
             time.sleep(0.2)
 
@@ -309,6 +309,6 @@ def test_a_fork_waits_until_no_thread_is_making_kernels():
     assert begun.wait(10.0)
     child = os.fork()
     if child == 0:
-        os._exit(0 if alone.acquire(timeout=5.0) else 1)
+        os._exit(0 if kernel_lock.acquire(timeout=5.0) else 1)
     holder.join()
     assert os.waitpid(child, 0)[1] == 0

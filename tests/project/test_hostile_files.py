@@ -283,15 +283,15 @@ def scaled(factor=1.0, shift=0.0):
     return [[c * factor + shift for c in point] for point in TRIANGLE]
 
 
-MOST_POINTS = "point_count must be at most 16777216, got 1000000000"
+MAX_POINTS = "point_count must be at most 16777216, got 1000000000"
 OUTSIDE = r"must name a file in that folder|no null or invalid characters"
 NUMBER = r"transform_matrix|camera_angle_x"
 REFUSED = [
     (corners, "few and far apart: fill more of the picture"),
     (lambda folder: corners(folder, 2000), "few and far apart: fill more of the picture"),
     (line, "target 'line' is too thin"),
-    (lambda _: load_target("gecko", point_count=10**9), MOST_POINTS),
-    (lambda _: preset("tiny", target_point_count=10**9), f"target_{MOST_POINTS}"),
+    (lambda _: load_target("gecko", point_count=10**9), MAX_POINTS),
+    (lambda _: preset("tiny", target_point_count=10**9), f"target_{MAX_POINTS}"),
     (large, "at most 67108864 pixels, got 13300 x 13300"),
     (lambda _: load_texture("cells", resolution=16_384), "at most 2048"),
     (lambda _: load_views("duck", resolution=16_384), "at most"),

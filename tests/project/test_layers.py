@@ -40,7 +40,7 @@ LAYERS = {
     "npa_envs.checks": layer(1, "torch"),
     "npa_envs.devices": layer(1, "torch"),
     "npa_envs.files": layer(1),
-    "npa_envs.once": layer(0),
+    "npa_envs.kernel_lock": layer(0),
     "npa_envs.processes": layer(1),
     "npa_envs.runtime": layer(1, "warp"),
     "npa_envs.reference": layer(1, "torch"),

@@ -195,7 +195,7 @@ class TestRest:
         monkeypatch.setattr(execute, "FIRST_PART", {"cpu": 64, "cuda": 64})
         ways = []
         for fewest in (10**9, 256):
-            monkeypatch.setattr(execute, "FEWEST_RESTING", fewest)
+            monkeypatch.setattr(execute, "MIN_RESTING", fewest)
             generator = self.generator(device)
             if by_world:
                 generator = npa_envs.WorldRandom([3, 4], device=device)

@@ -279,6 +279,6 @@ def test_unreadable_picture_is_a_clear_error(tmp_path):
 
 def test_decompression_bomb_is_a_clear_error(tmp_path, monkeypatch):
     disk_picture().save(tmp_path / "bomb.png")
-    monkeypatch.setattr(images, "LARGEST_AREA", 1000)
+    monkeypatch.setattr(images, "MAX_AREA", 1000)
     with pytest.raises(NPAError, match="at most 1000 pixels"):
         load_target(tmp_path / "bomb.png")

@@ -323,9 +323,9 @@ def test_a_page_that_says_it_has_drawn_more_gets_no_more_ahead(tmp_path):
 
 def test_each_reader_has_a_world_and_there_is_room_for_some(client, worlds):
     with contextlib.ExitStack() as readers:
-        for _ in range(server.MOST_SESSIONS):
+        for _ in range(server.MAX_SESSIONS):
             readers.enter_context(meet(client))
-        assert len(worlds) == server.MOST_SESSIONS
+        assert len(worlds) == server.MAX_SESSIONS
         late = readers.enter_context(client.websocket_connect(SOCKET))
         with pytest.raises(WebSocketDisconnect, match=r".*"):
             late.receive_json()
@@ -378,7 +378,7 @@ def test_a_recording_is_a_film(client, site):
 
 
 def test_a_film_that_is_long_enough_ends_by_itself(client, site, monkeypatch):
-    monkeypatch.setattr(server, "MOST_PICTURES", 3)
+    monkeypatch.setattr(server, "MAX_PICTURES", 3)
     with meet(client) as reader:
         reader.send_json({"type": "film", "action": "start"})
         for _ in range(5):

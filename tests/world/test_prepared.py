@@ -126,7 +126,7 @@ def test_threads_step_worlds_of_their_own():
 
 
 def test_kinds_are_forgotten_in_turn(monkeypatch):
-    monkeypatch.setattr(execute, "MOST_KINDS", 2)
+    monkeypatch.setattr(execute, "MAX_KINDS", 2)
     rule = make_rule()
     for particle_count in (30, 31, 32):
         for _ in range(3):

@@ -15,7 +15,7 @@ from worlds import (
 
 import npa_envs
 from npa_envs.ops import launch, warmup
-from npa_envs.world.execute import FEWEST_STATIC
+from npa_envs.world.execute import MIN_STATIC
 
 STEPS = 5
 
@@ -73,7 +73,7 @@ def test_it_equals_rebuilding(world_count, space_dim, state_dim, box, update_pro
         ({"moment_correction": False}, STEPS),
         ({"density_gradient": False}, STEPS),
         ({"moment_inverse": "smooth"}, STEPS),
-        *(({}, steps) for steps in (1, FEWEST_STATIC - 1, FEWEST_STATIC)),
+        *(({}, steps) for steps in (1, MIN_STATIC - 1, MIN_STATIC)),
     ],
     ids=str,
 )

@@ -10,6 +10,7 @@ from types import SimpleNamespace
 
 import warp as wp
 
+from npa_envs.kernel_lock import cached_under_lock
 from npa_envs.kernels import native
 from npa_envs.kernels.access import (
     CUDA_BLOCK,
@@ -32,7 +33,6 @@ from npa_envs.kernels.access import (
 )
 from npa_envs.kernels.domain import SLACK, TERMS_PER_SUM, domain_types, kernel_module
 from npa_envs.kernels.mathematics import make_log_scale_pull
-from npa_envs.once import made_once
 
 TILE = 8
 """Particles that a warp serves together, and rows of one matrix product."""
@@ -52,14 +52,14 @@ CUDA_REGISTERS = 64
 SHARE = 4
 """Channels of a row that one thread unscales."""
 
-LARGEST_LENGTH = 3.4028234663852886e38
+MAX_LENGTH = 3.4028234663852886e38
 """The largest float32, a bound on any coordinate [length units]."""
 
 load_channels = make_wide_load(CHANNELS, wp.float32)
 store_channels = make_wide_store(CHANNELS, wp.float32)
 
 
-@made_once()
+@cached_under_lock()
 def make_sum_listed(space_dim: int, width: int, kinds: int, periodic: bool) -> wp.Function:
     """Return a Warp function that adds weighted channels of listed rows for a warp's particles.
 
@@ -88,7 +88,7 @@ def row_list_address() -> wp.uint32:
     """Return the address in shared memory of the warp's list of rows."""
 
 
-@made_once()
+@cached_under_lock()
 def make_read_columns(count: int) -> wp.Function:
     """Return a Warp function that reads adjacent columns of a row, and 0 beyond its end."""
     result_type = wp.types.vector(count, wp.float32)
@@ -141,7 +141,7 @@ def smallest_in_tile(value: wp.float32) -> wp.float32:
 read_channels = make_read_columns(SHARE)
 
 
-@made_once()
+@cached_under_lock()
 def listed_adjoint(
     space_dim: int,
     width: int,
@@ -294,8 +294,8 @@ def listed_adjoint(
         middle = vector()
         half = vector()
         for d in range(wp.static(space_dim)):
-            low = smallest_in_tile(wp.where(served, relative[d], scalar(LARGEST_LENGTH)))
-            high = -smallest_in_tile(wp.where(served, -relative[d], scalar(LARGEST_LENGTH)))
+            low = smallest_in_tile(wp.where(served, relative[d], scalar(MAX_LENGTH)))
+            high = -smallest_in_tile(wp.where(served, -relative[d], scalar(MAX_LENGTH)))
             middle[d] = scalar(0.5) * (low + high)
             half[d] = scalar(0.5) * (high - low)
         return middle, half

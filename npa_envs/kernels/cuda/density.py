@@ -17,6 +17,7 @@ thread for each particle. Worlds have at most 2^15 particles: entries of lists h
 
 import warp as wp
 
+from npa_envs.kernel_lock import cached_under_lock
 from npa_envs.kernels import native
 from npa_envs.kernels.access import (
     WARP,
@@ -30,7 +31,6 @@ from npa_envs.kernels.access import (
 )
 from npa_envs.kernels.domain import SLACK, TERMS_PER_SUM, domain_types, kernel_module
 from npa_envs.kernels.mathematics import falloff_within, smoothing_of
-from npa_envs.once import made_once
 
 AHEAD, SHARED_AHEAD = 6, 5
 """Candidates that a thread loads at a time, if a particle has one lane, and if it has several."""
@@ -44,7 +44,7 @@ CUDA_REGISTERS = 80
 RECORD = wp.types.vector(4, wp.float32)
 """A neighbour's data for perception: position, volume, and in 2D the index of its state."""
 
-LONGEST_STEP = wp.constant(2**15 - 1)
+MAX_STEP = wp.constant(2**15 - 1)
 """Largest step of a list: entries have 16 bits."""
 
 SHARE_OF_LIST = 2
@@ -59,7 +59,7 @@ TILE = 8
 TILE_LANES = WARP // TILE
 """Lanes of a warp that share a particle."""
 
-SMALLEST_SIDE = 7
+MIN_SIDE = 7
 """Cells along each side of the smallest periodic box: in smaller ones the images of a particle that
 are nearest to its tile's particles may differ."""
 
@@ -69,7 +69,7 @@ TILE_REGISTERS = 64
 store_record = make_wide_store(RECORD, wp.float32)
 
 
-@made_once()
+@cached_under_lock()
 def listed_density(
     space_dim: int, lanes: int, periodic: bool, capacity: int, masked: bool
 ) -> wp.Kernel:
@@ -198,7 +198,7 @@ def listed_density(
                 last -= behind
             begin = load_integer(starts, base + first)
             end = load_integer(starts, base + last)
-            far = far or (begin < end and wp.max(k - begin, end - k) > LONGEST_STEP)
+            far = far or (begin < end and wp.max(k - begin, end - k) > MAX_STEP)
             j = begin + lane
             crowded = wp.bool(True)
             while crowded:
@@ -260,7 +260,7 @@ def listed_density(
     return compute_density
 
 
-@made_once()
+@cached_under_lock()
 def make_steps_at(capacity: int, tiled: bool) -> wp.Function:
     """Return a Warp function that reads two steps of a row's list, packed in 32 bits."""
 
@@ -277,14 +277,14 @@ def step_of(steps: wp.int32, entry: wp.int32) -> wp.int32:
     """Return the first or the second of two packed steps."""
 
 
-@made_once()
+@cached_under_lock()
 def tiled_density(periodic: bool, capacity: int, masked: bool) -> wp.Kernel:
     """Return the density kernel of one variant, in which a block is a warp that serves a tile."""
     types = domain_types(2, wp.float32)
     vector, particle, Domain = types.vector, types.particle, types.Domain
     load_vector = make_wide_load(vector, wp.float32)
 
-    @native.func_native(capacity, periodic, TILE, SMALLEST_SIDE)
+    @native.func_native(capacity, periodic, TILE, MIN_SIDE)
     def density_of_tile(
         domain: Domain,
         starts: wp.array(dtype=wp.int32),

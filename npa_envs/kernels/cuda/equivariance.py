@@ -9,10 +9,10 @@ from types import SimpleNamespace
 
 import warp as wp
 
+from npa_envs.kernel_lock import cached_under_lock
 from npa_envs.kernels import native
 from npa_envs.kernels.access import WARP, await_earlier
 from npa_envs.kernels.cuda.network import make_share_sum
-from npa_envs.once import made_once
 
 READ_WARPS, PULL_WARPS, STEER_WARPS, MIXING_SUM_WARPS = 4, 4, 4, 16
 """Warps of a block of `read_rows`, `pull_back_rows`, the steering kernels and `add_blocks`."""
@@ -20,7 +20,7 @@ READ_WARPS, PULL_WARPS, STEER_WARPS, MIXING_SUM_WARPS = 4, 4, 4, 16
 STEERED_ROWS = 2
 """Rows that a warp steers."""
 
-LARGEST_MIXING = 1024
+MAX_MIXING = 1024
 """Most mixing weights: each thread sums gradients of every 32nd of them."""
 
 SHARED_BYTES = 48 * 1024
@@ -38,10 +38,10 @@ def fits_block(space_dim: int, scalars: int, perceived: int, mixed: int, chiral:
     products = mixed * (mixed + 1) // 2 + chiral * (mixed * (mixed - 1) // 2)
     row = scalars + products + (perceived + 2 * mixed) * space_dim
     floats = weights + PULL_WARPS * (weights + rows_of_warp(mixed) * row)
-    return weights <= LARGEST_MIXING and mixed < 256 and 4 * floats <= SHARED_BYTES
+    return weights <= MAX_MIXING and mixed < 256 and 4 * floats <= SHARED_BYTES
 
 
-@made_once()
+@cached_under_lock()
 def row_kernels(
     space_dim: int, scalars: int, perceived: int, mixed: int, chiral: bool
 ) -> SimpleNamespace:
@@ -104,7 +104,7 @@ def row_kernels(
     return SimpleNamespace(read_rows=read_rows, pull_back_rows=pull_back_rows)
 
 
-@made_once()
+@cached_under_lock()
 def mixing_sum() -> wp.Kernel:
     """Return the kernel that adds the sums of blocks; its own blocks are larger."""
     add_partial_sums = make_share_sum(MIXING_SUM_WARPS)
@@ -126,7 +126,7 @@ def mixing_sum() -> wp.Kernel:
     return add_blocks
 
 
-@made_once()
+@cached_under_lock()
 def steering_kernels(space_dim: int, mixed: int, chiral: bool) -> SimpleNamespace:
     """Return the kernels that map outputs to updates, and back; a warp has `STEERED_ROWS` rows.
 

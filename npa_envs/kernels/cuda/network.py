@@ -9,9 +9,9 @@ from typing import Any
 
 import warp as wp
 
+from npa_envs.kernel_lock import cached_under_lock
 from npa_envs.kernels import native
 from npa_envs.kernels.access import WARP, allow_next_launch, await_earlier
-from npa_envs.once import made_once
 
 UNIT_GROUP = 16
 """Hidden units of one step: the inner dimension of a matrix product."""
@@ -37,7 +37,7 @@ WIDE, WIDE_REGISTERS = range(81, 97), 128
 """Row widths (of 3D rules with 16 channels) with another number of registers, and that number."""
 
 
-@made_once()
+@cached_under_lock()
 def two_layer_kernel(steps: int, tiles: int, mode: str) -> wp.Kernel:
     """Return the kernel that maps rows through two layers, 16 rows a warp.
 
@@ -85,7 +85,7 @@ def two_layer_kernel(steps: int, tiles: int, mode: str) -> wp.Kernel:
     return network_layers
 
 
-@made_once()
+@cached_under_lock()
 def weight_gradient_kernels(
     steps: int, tiles: int, out_tiles: int, warps: int, unit_blocks: int, words: int
 ) -> SimpleNamespace:
@@ -153,7 +153,7 @@ def weight_gradient_kernels(
     return SimpleNamespace(sum_weight_gradients=sum_weight_gradients, add_shares=add_shares)
 
 
-@made_once()
+@cached_under_lock()
 def make_share_sum(warps: int) -> Any:
     """Return a Warp function that adds partial sums; a block has `warps` warps and 32 columns."""
 
@@ -171,7 +171,7 @@ def scale_to(size: wp.float32, target: wp.uint32) -> wp.float32:
     """Return the power of two that scales a positive number into [2^target, 2^(target + 1))."""
 
 
-@made_once()
+@cached_under_lock()
 def arrangement_kernels() -> SimpleNamespace:
     """Return the kernels that lay out weights in the order in which a warp's threads read them.
 

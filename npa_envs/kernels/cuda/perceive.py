@@ -13,6 +13,7 @@ from types import SimpleNamespace
 
 import warp as wp
 
+from npa_envs.kernel_lock import cached_under_lock
 from npa_envs.kernels import native
 from npa_envs.kernels.access import (
     CUDA_BLOCK,
@@ -39,7 +40,6 @@ from npa_envs.kernels.mathematics import (
     spiky_factor_wide,
     within,
 )
-from npa_envs.once import made_once
 
 CUDA_REGISTERS, TEAM_REGISTERS = {2: 80, 3: 112}, 128
 """Registers per thread: with one team for a particle, by dimension, and with several."""
@@ -353,7 +353,7 @@ def make_add_states(
     return add_states
 
 
-@made_once()
+@cached_under_lock()
 def listed_perception(
     space_dim: int,
     width: int,
@@ -674,7 +674,7 @@ def listed_perception(
     return perceive
 
 
-@made_once()
+@cached_under_lock()
 def make_stage(value_type: type) -> wp.Function:
     """Return a Warp function that writes a value to a slot, at an offset of 32-bit words."""
 

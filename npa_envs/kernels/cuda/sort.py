@@ -10,6 +10,7 @@ from types import SimpleNamespace
 
 import warp as wp
 
+from npa_envs.kernel_lock import cached_under_lock
 from npa_envs.kernels import native
 from npa_envs.kernels.access import (
     CUDA_LANES,
@@ -25,7 +26,6 @@ from npa_envs.kernels.access import (
     thread_of_block,
 )
 from npa_envs.kernels.domain import domain_types, kernel_module
-from npa_envs.once import made_once
 
 load_pair = make_wide_load(wp.vec2i, wp.int32)
 
@@ -35,7 +35,7 @@ BLOCKS = {1024: 256, 4096: 1024}
 RESIDENT_THREADS = 1024
 """Threads for which a multiprocessor has enough registers."""
 
-LARGEST_GRID = 4096
+MAX_GRID = 4096
 """Most cells of a world that a block sorts."""
 
 STATE_SHARE = 4
@@ -49,10 +49,10 @@ def count_active(mask: wp.array(dtype=wp.uint8), count: wp.int32) -> wp.int32:
     """Return this thread's count of active particles among the first `count` of all worlds."""
 
 
-@made_once()
+@cached_under_lock()
 def block_functions(capacity: int) -> SimpleNamespace:
     """Return the functions for blocks that each sort a world of up to `capacity` particles."""
-    sizes = capacity, BLOCKS[capacity], LARGEST_GRID
+    sizes = capacity, BLOCKS[capacity], MAX_GRID
 
     @native.func_native(*sizes)
     def block_memory() -> wp.uint64:
@@ -98,7 +98,7 @@ def block_functions(capacity: int) -> SimpleNamespace:
     return native.named(*functions)
 
 
-@made_once()
+@cached_under_lock()
 def sort_small_worlds(space_dim: int, capacity: int) -> wp.Kernel:
     """Return the kernel that sorts worlds of float32 and of up to `capacity` particles."""
     scalar = wp.float32
@@ -266,7 +266,7 @@ def sort_small_worlds(space_dim: int, capacity: int) -> wp.Kernel:
     return sort_worlds
 
 
-@made_once()
+@cached_under_lock()
 def order_particles(space_dim: int, width: int) -> wp.Kernel:
     """Return the last kernel of sorting large worlds, which moves states a warp at a time."""
     scalar = wp.float32

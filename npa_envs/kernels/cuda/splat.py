@@ -6,6 +6,7 @@ mean. If worlds are few, several blocks sort the same world, and each writes a s
 
 import warp as wp
 
+from npa_envs.kernel_lock import cached_under_lock
 from npa_envs.kernels import native
 from npa_envs.kernels.access import (
     await_earlier,
@@ -18,10 +19,9 @@ from npa_envs.kernels.access import (
 from npa_envs.kernels.cuda.sort import BLOCKS, RESIDENT_THREADS, block_functions, store_integer
 from npa_envs.kernels.pictures.splat import splat_functions, splat_types
 from npa_envs.kernels.portable.world_mean import CHUNK
-from npa_envs.once import made_once
 
 
-@made_once()
+@cached_under_lock()
 def sort_small_splats(capacity: int) -> wp.Kernel:
     """Return the kernel that sorts splats of float32, of worlds of up to `capacity` particles."""
     scalar = wp.float32

@@ -13,7 +13,7 @@ constexpr int TILE_UNROLLED = 4;
 // that few distant particles do not share all candidates between them.
 constexpr int TILE_SPAN = 12;
 // Cells along each side of the smallest periodic box whose density is computed in tiles.
-constexpr int SMALLEST_TILED_BOX = 7;
+constexpr int MIN_TILED_BOX = 7;
 
 // Infinity, as padding: every particle's position is finite.
 __device__ inline float nowhere() { return __uint_as_float(0x7f800000u); }
@@ -162,13 +162,13 @@ __device__ inline int append_near(
 // Sum of the smoothing kernel over all neighbours of particle k, without its norm. All lanes of the
 // tile call it together. It also writes the list of the particle's row (-1: none). `first` is the
 // tile's first particle, `base` the first cell of their world.
-template <int CAPACITY, bool PERIODIC, int SIZE, int SMALLEST_SIDE, typename Domain>
+template <int CAPACITY, bool PERIODIC, int SIZE, int MIN_SIDE, typename Domain>
 __device__ inline float density_of_tile(
     const Domain& domain, const wp::array_t<int>& starts, const wp::array_t<int>& sorted_cell,
     const wp::array_t<wp::vec_t<2, float>>& sorted_positions, int base, int first, int k,
     bool inside, int row, const wp::array_t<wp::int16>& lists, const wp::array_t<int>& list_lengths)
 {
-    static_assert(SIZE == TILE && SMALLEST_SIDE == SMALLEST_TILED_BOX, "as in tiles.py");
+    static_assert(SIZE == TILE && MIN_SIDE == MIN_TILED_BOX, "as in tiles.py");
     __shared__ TileMemory<CAPACITY> memory;
     const int lane = threadIdx.x & 31, part = lane & (TILE_LANES - 1);
     const float2* positions = reinterpret_cast<const float2*>(sorted_positions.data);
@@ -178,7 +178,7 @@ __device__ inline float density_of_tile(
     const int y = (unsigned)cell / (unsigned)nx, x = cell - y * nx;
     // One image of each candidate serves all particles of a turn: they and their neighbours are less
     // than half a periodic box away from the first one's cell.
-    const int span = min(PERIODIC ? (nx - SMALLEST_TILED_BOX) / 2 : nx - TILE_LINES, TILE_SPAN);
+    const int span = min(PERIODIC ? (nx - MIN_TILED_BOX) / 2 : nx - TILE_LINES, TILE_SPAN);
     short* list = memory.lists[lane / TILE_LANES];
     float total = 0.0f;
     int length = 0;

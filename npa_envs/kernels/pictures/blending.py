@@ -19,6 +19,7 @@ from types import SimpleNamespace
 
 import warp as wp
 
+from npa_envs.kernel_lock import cached_under_lock
 from npa_envs.kernels import native
 from npa_envs.kernels.access import (
     WARP,
@@ -33,18 +34,17 @@ from npa_envs.kernels.mathematics import make_fast_exp2
 from npa_envs.kernels.native import TILES, in_ranges, named
 from npa_envs.kernels.pictures.gaussians import (
     CHANNELS,
+    MIN_ALPHA,
     PULLS,
-    SMALLEST_ALPHA,
     TILE,
     gaussian_types,
     make_covered,
 )
-from npa_envs.once import made_once
 
-LARGEST_ALPHA = 0.99
+MAX_ALPHA = 0.99
 """Largest alpha: the adjoint divides by 1 - alpha."""
 
-SMALLEST_PASSING = 1e-4
+MIN_PASSING = 1e-4
 """Transmittance below which farther Gaussians are ignored."""
 
 TILE_PIXELS = TILE * TILE
@@ -60,7 +60,7 @@ TO_POWER_OF_TWO = -0.7213475204444817
 """-1/2 log2(e), the factor of p in exp(-1/2 p) as a power of two."""
 
 
-@made_once()
+@cached_under_lock()
 def blending_functions(scalar: type) -> SimpleNamespace:
     """Return the functions of all kernels: one Gaussian's effect on one pixel, and its adjoint."""
     types = gaussian_types(scalar)
@@ -89,13 +89,13 @@ def blending_functions(scalar: type) -> SimpleNamespace:
         behind: scalar,
     ):
         """Return a pixel's pull on a footprint, the transmittance before it, and the updated b."""
-        alpha = wp.min(strength, scalar(LARGEST_ALPHA))
+        alpha = wp.min(strength, scalar(MAX_ALPHA))
         rest = scalar(1.0) / (scalar(1.0) - alpha)
         before = through * rest
         gained = wp.dot(colours_of(footprint), bar)
         share = alpha * before
         slope = scalar(0.0)
-        if strength <= scalar(LARGEST_ALPHA):
+        if strength <= scalar(MAX_ALPHA):
             slope = alpha * (before * gained - behind * rest)
         slope_x = slope * x
         slope_y = slope * y
@@ -135,7 +135,7 @@ def blending_functions(scalar: type) -> SimpleNamespace:
     return named(strength, colours_of, pull, channels_at, pixel_of, middle_of)
 
 
-@made_once()
+@cached_under_lock()
 def tile_kernels(scalar: type) -> SimpleNamespace:
     """Return the kernels of one scalar type in which a thread serves a tile; for the CPU."""
     types = gaussian_types(scalar)
@@ -190,11 +190,11 @@ def tile_kernels(scalar: type) -> SimpleNamespace:
                 for column in range(pixels[0], pixels[2]):
                     strength = strength_at(footprint, middle_of(column) - footprint[0], y)
                     pixel = pixel_of(frame, image, row, column)
-                    if strength >= scalar(SMALLEST_ALPHA) and j < stops[pixel]:
+                    if strength >= scalar(MIN_ALPHA) and j < stops[pixel]:
                         before = passing[pixel]
-                        alpha = wp.min(strength, scalar(LARGEST_ALPHA))
+                        alpha = wp.min(strength, scalar(MAX_ALPHA))
                         after = before * (scalar(1.0) - alpha)
-                        if after < scalar(SMALLEST_PASSING):
+                        if after < scalar(MIN_PASSING):
                             stops[pixel] = j
                         else:
                             passing[pixel] = after
@@ -235,7 +235,7 @@ def tile_kernels(scalar: type) -> SimpleNamespace:
                     x = middle_of(column) - footprint[0]
                     strength = strength_at(footprint, x, y)
                     pixel = pixel_of(frame, image, row, column)
-                    if strength >= scalar(SMALLEST_ALPHA) and j < stops[pixel]:
+                    if strength >= scalar(MIN_ALPHA) and j < stops[pixel]:
                         bar = channels_at(picture_bar, pixel)
                         added, before, rest = pull(
                             footprint, x, y, strength, bar, through[pixel], behind[pixel]
@@ -248,7 +248,7 @@ def tile_kernels(scalar: type) -> SimpleNamespace:
     return SimpleNamespace(draw_tiles=draw_tiles, pull_back_tiles=pull_back_tiles)
 
 
-@made_once()
+@cached_under_lock()
 def block_kernels(scalar: type) -> SimpleNamespace:
     """Return the kernels of one scalar type in which a block serves a tile; for CUDA.
 
@@ -310,10 +310,10 @@ def block_kernels(scalar: type) -> SimpleNamespace:
             while j < stop:
                 footprint = load_footprint(footprints, load_integer(owners, j))
                 strength = strength_at(footprint, left - footprint[0], top - footprint[1])
-                if strength >= scalar(SMALLEST_ALPHA):
-                    alpha = wp.min(strength, scalar(LARGEST_ALPHA))
+                if strength >= scalar(MIN_ALPHA):
+                    alpha = wp.min(strength, scalar(MAX_ALPHA))
                     after = through * (scalar(1.0) - alpha)
-                    if after < scalar(SMALLEST_PASSING):
+                    if after < scalar(MIN_PASSING):
                         stop = j
                     else:
                         total += alpha * through * colours_of(footprint)
@@ -371,7 +371,7 @@ def block_kernels(scalar: type) -> SimpleNamespace:
                     x = left - footprint[0]
                     y = top - footprint[1]
                     strength = strength_at(footprint, x, y)
-                    seen = j < stop and strength >= scalar(SMALLEST_ALPHA)
+                    seen = j < stop and strength >= scalar(MIN_ALPHA)
                     if any_in_warp(seen):
                         if seen:
                             total, through, behind = pull(

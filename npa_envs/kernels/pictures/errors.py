@@ -8,6 +8,7 @@ do not depend on which threads serve a tile. On a CPU a drawn picture is compare
 
 import warp as wp
 
+from npa_envs.kernel_lock import cached_under_lock
 from npa_envs.kernels import native
 from npa_envs.kernels.access import (
     CUDA_BLOCK,
@@ -28,7 +29,6 @@ from npa_envs.kernels.pictures.splat import (
     gather_registers,
     splat_types,
 )
-from npa_envs.once import made_once
 
 BLOCK_TILES = CUDA_BLOCK
 """Most tiles of a block: each thread counts the particles around one."""
@@ -43,7 +43,7 @@ TURN_TILES = WARP_TILES * BLOCK_WARPS
 """Tiles that a block serves in a turn; it has one turn or several."""
 
 
-@made_once()
+@cached_under_lock()
 def make_pixel_errors(scalar: type) -> wp.Function:
     """Return a Warp function for a pixel's density error and three times its colour error."""
     colour_type = splat_types(scalar).colour
@@ -63,7 +63,7 @@ def make_pixel_errors(scalar: type) -> wp.Function:
     return pixel_errors
 
 
-@made_once()
+@cached_under_lock()
 def gather_errors(scalar: type) -> wp.Kernel:
     """Return the kernel of one scalar type that gathers and compares; for CUDA."""
     types = splat_types(scalar)
@@ -144,7 +144,7 @@ def gather_errors(scalar: type) -> wp.Kernel:
     return gather_errors
 
 
-@made_once()
+@cached_under_lock()
 def sum_errors(scalar: type) -> wp.Kernel:
     """Return the kernel of one scalar type that compares drawn pictures; for the CPU."""
     colour_type = splat_types(scalar).colour

@@ -15,11 +15,11 @@ from typing import Any
 
 import warp as wp
 
+from npa_envs.kernel_lock import cached_under_lock
 from npa_envs.kernels import native
 from npa_envs.kernels.access import make_wide_load, make_wide_store
 from npa_envs.kernels.domain import scalar_name
 from npa_envs.kernels.native import PAIRS, in_ranges, named
-from npa_envs.once import made_once
 
 TILE = 16
 """Pixels along each side of a tile."""
@@ -34,7 +34,7 @@ PULLS = 10
 """Entries of a pull, the cotangents of a Gaussian from a tile: with weights α ᾱ and offsets d of
 pixels, the sums of 1, dx, dy, dx dx, dx dy, dy dy; cotangents of the colours (4)."""
 
-SMALLEST_ALPHA = 1.0 / 255.0
+MIN_ALPHA = 1.0 / 255.0
 """Smallest alpha that is drawn, as in Kerbl's rasterizer."""
 
 CLAMP_MARGIN = 0.3
@@ -48,7 +48,7 @@ HARMONIC_0, HARMONIC_1 = 0.28209479177387814, 0.4886025119029199
 """Factors of the real spherical harmonics of degree 0 and 1."""
 
 
-@made_once()
+@cached_under_lock()
 def gaussian_types(scalar: type) -> SimpleNamespace:
     """Return the `Frame` struct and the vector and matrix types of one scalar type."""
 
@@ -79,7 +79,7 @@ def gaussian_types(scalar: type) -> SimpleNamespace:
     )
 
 
-@made_once(256)
+@cached_under_lock(256)
 def make_frame(
     scalar: type,
     shape: tuple[int, int, int],
@@ -103,7 +103,7 @@ def tile_total(width: int, height: int) -> int:
     return -(-width // TILE) * -(-height // TILE)
 
 
-@made_once()
+@cached_under_lock()
 def make_covered(scalar: type) -> wp.Function:
     """Return a Warp function for the pixels along one direction that a footprint covers."""
 
@@ -118,7 +118,7 @@ def make_covered(scalar: type) -> wp.Function:
     return covered
 
 
-@made_once()
+@cached_under_lock()
 def gaussian_kernels(scalar: type) -> SimpleNamespace:
     """Return the kernels that draw 3D Gaussians, of one scalar type."""
     types = gaussian_types(scalar)
@@ -318,7 +318,7 @@ def gaussian_kernels(scalar: type) -> SimpleNamespace:
         depth = scalar(wp.inf)
         count = wp.int32(0)
         footprint = footprint_type()
-        if place[2] >= frame.near and opacity >= scalar(SMALLEST_ALPHA):
+        if place[2] >= frame.near and opacity >= scalar(MIN_ALPHA):
             unit, _inverse = unit_quaternion(quaternions[i])
             spread = scaled_columns(rotation * rotation_of(unit), scales[i])
             root = jacobian_of(frame, lens, place) * spread

@@ -17,6 +17,7 @@ from typing import Any
 
 import warp as wp
 
+from npa_envs.kernel_lock import cached_under_lock
 from npa_envs.kernels import native
 from npa_envs.kernels.access import (
     await_earlier,
@@ -30,7 +31,6 @@ from npa_envs.kernels.access import (
 from npa_envs.kernels.domain import scalar_name
 from npa_envs.kernels.mathematics import make_fast_exp2
 from npa_envs.kernels.native import PAIRS, WORLDS, in_ranges, named
-from npa_envs.once import made_once
 
 CHANNELS = 4
 """Red, green, blue and density."""
@@ -58,7 +58,7 @@ PATCH_SIGMAS = 3.0
 """A particle's patch reaches this many standard deviations from its centre."""
 
 
-@made_once()
+@cached_under_lock()
 def splat_types(scalar: type) -> SimpleNamespace:
     """Return the vector types and the `Lens` struct of one scalar type."""
 
@@ -91,7 +91,7 @@ def splat_types(scalar: type) -> SimpleNamespace:
     )
 
 
-@made_once(256)
+@cached_under_lock(256)
 def make_lens(
     scalar: type, resolution: int, pixel_size: float, sigma: float, low: float, high: float
 ) -> Any:
@@ -127,7 +127,7 @@ def group_count(resolution: int) -> int:
     return across * -(-resolution // (TILE_HEIGHT * GROUP_HEIGHT))
 
 
-@made_once()
+@cached_under_lock()
 def splat_functions(scalar: type) -> SimpleNamespace:
     """Return the functions of several kernels: positions in pixels, and footprints."""
     types = splat_types(scalar)
@@ -217,7 +217,7 @@ def splat_functions(scalar: type) -> SimpleNamespace:
     return named(*functions)
 
 
-@made_once()
+@cached_under_lock()
 def gather_functions(scalar: type, lanes: int) -> SimpleNamespace:
     """Return functions that sum a tile's particles; `lanes`: 1, or a thread per pixel row."""
     assert lanes in (1, TILE_HEIGHT)
@@ -310,7 +310,7 @@ def gather_functions(scalar: type, lanes: int) -> SimpleNamespace:
     return SimpleNamespace(candidate_count=candidate_count, gather_tile=gather_tile)
 
 
-@made_once()
+@cached_under_lock()
 def splat_kernels(scalar: type, lanes: int) -> SimpleNamespace:
     """Return the kernels of one scalar type; `lanes` threads share a tile, or a particle."""
     types = splat_types(scalar)

@@ -15,6 +15,7 @@ from types import SimpleNamespace
 
 import warp as wp
 
+from npa_envs.kernel_lock import cached_under_lock
 from npa_envs.kernels.access import make_add_scaled, make_wide_load
 from npa_envs.kernels.domain import domain_types, kernel_module
 from npa_envs.kernels.mathematics import (
@@ -26,13 +27,12 @@ from npa_envs.kernels.mathematics import (
 )
 from npa_envs.kernels.native import PAIRS, in_ranges, named
 from npa_envs.kernels.portable.search import make_search
-from npa_envs.once import made_once
 
 CUDA_REGISTERS = 64
 """Registers per thread in the gathering of state cotangents, which mostly waits for memory."""
 
 
-@made_once()
+@cached_under_lock()
 def adjoint_kernels(
     space_dim: int,
     scalar: type,

@@ -9,14 +9,14 @@ from types import SimpleNamespace
 
 import warp as wp
 
+from npa_envs.kernel_lock import cached_under_lock
 from npa_envs.kernels.domain import TERMS_PER_SUM, domain_types, kernel_module
 from npa_envs.kernels.mathematics import smoothing, spiky_factor_wide
 from npa_envs.kernels.native import PAIRS, in_ranges, named
 from npa_envs.kernels.portable.search import make_search
-from npa_envs.once import made_once
 
 
-@made_once()
+@cached_under_lock()
 def density_kernels(space_dim: int, scalar: type, on_cpu: bool) -> SimpleNamespace:
     """Return the kernels of one variant: one thread a particle."""
     types = domain_types(space_dim, scalar)

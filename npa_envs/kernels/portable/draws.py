@@ -11,8 +11,8 @@ from types import SimpleNamespace
 
 import warp as wp
 
+from npa_envs.kernel_lock import cached_under_lock
 from npa_envs.kernels.domain import scalar_name
-from npa_envs.once import made_once
 
 # Typed constants: a literal in a kernel would be an int32 or a float32.
 MULTIPLIER_0 = wp.constant(wp.uint32(0xD2511F53))
@@ -80,7 +80,7 @@ def fraction_53(high: wp.uint32, low: wp.uint32):
     return wp.float64(joined(high, low) >> wp.uint64(11)) * ULP_53
 
 
-@made_once()
+@cached_under_lock()
 def draw_kernels(scalar: type) -> SimpleNamespace:
     """Return the kernels for one floating type, and how many numbers a thread of each draws."""
     module = wp.get_module(f"npa_envs.kernels.draws_{scalar_name(scalar)}")

@@ -11,15 +11,15 @@ SUCCESS, DIVERGED, TIME_LIMIT = 1, 2, 4
 NOT_FINITE = 8
 """Bit of a world whose reward is not finite, which is an error."""
 
-GO_ON, TELL, END = 0, 1, 2
+CONTINUE, LIMIT_LOSS, END = 0, 1, 2
 """Effect of divergence on an episode: none; its loss is at least the first loss; it also ends."""
 
 
 @wp.kernel(enable_backward=False, module=native.module("npa_envs.kernels.episodes"))
-def judge_worlds(
+def update_episodes(
     part_count: wp.int32,
     last_step: wp.int32,
-    paid_step: wp.int32,
+    rewarded_step: wp.int32,
     on_divergence: wp.int32,
     parts: wp.array(dtype=wp.float32),
     enabled: wp.array(dtype=wp.uint8),
@@ -46,7 +46,7 @@ def judge_worlds(
         return
     step = elapsed[world] + 1
     escaped = diverged[world] != wp.uint8(0)
-    lost = escaped and on_divergence != wp.static(GO_ON)
+    lost = escaped and on_divergence != wp.static(CONTINUE)
     loss = parts[world]
     for k in range(1, part_count):
         loss += parts[k * count + world]
@@ -58,9 +58,9 @@ def judge_worlds(
     truncated = last_step > 0 and step >= last_step
     improvement = numbers[count + world] - loss
     reward = improvement
-    if paid_step > 0:
+    if rewarded_step > 0:
         reward = wp.float32(0.0)
-        if ended or step == paid_step:
+        if ended or step == rewarded_step:
             reward = -loss
     ending = wp.int32(0)
     if success:

@@ -7,12 +7,12 @@ from types import SimpleNamespace
 
 import warp as wp
 
+from npa_envs.kernel_lock import cached_under_lock
 from npa_envs.kernels.domain import domain_types, kernel_module
 from npa_envs.kernels.native import ELEMENTS, in_ranges, named
-from npa_envs.once import made_once
 
 
-@made_once()
+@cached_under_lock()
 def equivariance_kernels(space_dim: int, scalar: type) -> SimpleNamespace:
     """Return the kernels of one variant."""
     vector = domain_types(space_dim, scalar).vector

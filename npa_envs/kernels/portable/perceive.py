@@ -10,6 +10,7 @@ from types import SimpleNamespace
 
 import warp as wp
 
+from npa_envs.kernel_lock import cached_under_lock
 from npa_envs.kernels.access import make_add_scaled, make_wide_load
 from npa_envs.kernels.domain import domain_types, kernel_module
 from npa_envs.kernels.mathematics import (
@@ -20,13 +21,12 @@ from npa_envs.kernels.mathematics import (
 )
 from npa_envs.kernels.native import PAIRS, in_ranges
 from npa_envs.kernels.portable.search import make_search
-from npa_envs.once import made_once
 
 CUDA_REGISTERS = 128
 """Registers per thread of the perception pass: more threads at a time are worth a few spills."""
 
 
-@made_once()
+@cached_under_lock()
 def perception_kernels(
     space_dim: int,
     scalar: type,

@@ -9,14 +9,14 @@ from types import SimpleNamespace
 
 import warp as wp
 
+from npa_envs.kernel_lock import cached_under_lock
 from npa_envs.kernels.domain import domain_types
-from npa_envs.once import made_once
 
 SIFTED = 32
 """Candidates of a block on a CPU."""
 
 
-@made_once()
+@cached_under_lock()
 def make_search(
     space_dim: int, scalar: type, entry_type: type, on_cpu: bool, listed: bool = False
 ) -> SimpleNamespace:

@@ -11,6 +11,7 @@ from types import SimpleNamespace
 
 import warp as wp
 
+from npa_envs.kernel_lock import cached_under_lock
 from npa_envs.kernels.access import (
     await_earlier,
     load_integer,
@@ -19,12 +20,11 @@ from npa_envs.kernels.access import (
 )
 from npa_envs.kernels.domain import domain_types, kernel_module
 from npa_envs.kernels.native import PARTICLES, WORLDS, in_ranges, named
-from npa_envs.once import made_once
 
 store_pair = make_wide_store(wp.vec2i, wp.int32)
 
 
-@made_once()
+@cached_under_lock()
 def sort_kernels(space_dim: int, scalar: type, width: int) -> SimpleNamespace:
     """Return the kernels of one variant."""
     types = domain_types(space_dim, scalar)
@@ -236,7 +236,7 @@ def sort_kernels(space_dim: int, scalar: type, width: int) -> SimpleNamespace:
     return named(count_cells, place_by_arrival, order_particles, sort_worlds)
 
 
-@made_once()
+@cached_under_lock()
 def give_rows(space_dim: int, scalar: type) -> wp.Kernel:
     """Return the kernel that assigns rows to the active particles of sorted worlds."""
     vector = wp.types.vector(space_dim, scalar)

@@ -9,6 +9,7 @@ from types import SimpleNamespace
 
 import warp as wp
 
+from npa_envs.kernel_lock import cached_under_lock
 from npa_envs.kernels import native
 from npa_envs.kernels.access import (
     allow_next_launch,
@@ -20,7 +21,6 @@ from npa_envs.kernels.access import (
 )
 from npa_envs.kernels.domain import domain_types, kernel_module, scalar_name
 from npa_envs.kernels.native import ELEMENTS, in_ranges, named
-from npa_envs.once import made_once
 
 CHANNEL_SHARE = 4
 """Adjacent channels of a particle, or columns of a row, that one thread changes."""
@@ -35,7 +35,7 @@ TEAM = 32
 """Particles that one warp moves; further warps change their states."""
 
 
-@made_once()
+@cached_under_lock()
 def update_kernels(space_dim: int, scalar: type) -> SimpleNamespace:
     """Return the kernels of one variant."""
     types = domain_types(space_dim, scalar)
@@ -352,7 +352,7 @@ VALUES_PER_THREAD = 8
 """Values that a thread checks."""
 
 
-@made_once()
+@cached_under_lock()
 def find_not_finite(scalar: type) -> wp.Kernel:
     """Return the kernel of one scalar type."""
     module = native.module(f"npa_envs.kernels.finite_{scalar_name(scalar)}")

@@ -7,10 +7,10 @@ from types import SimpleNamespace
 
 import warp as wp
 
+from npa_envs.kernel_lock import cached_under_lock
 from npa_envs.kernels import native
 from npa_envs.kernels.access import await_earlier, make_warp_sum
 from npa_envs.kernels.domain import scalar_name
-from npa_envs.once import made_once
 
 CHUNK = 256
 """Values of one partial sum."""
@@ -19,7 +19,7 @@ MEAN_LANES = 32
 """CUDA threads that share a sum, a warp; on a CPU it is one."""
 
 
-@made_once()
+@cached_under_lock()
 def mean_kernels(scalar: type, lanes: int) -> SimpleNamespace:
     """Return the kernels of one scalar type; `lanes` threads share a sum."""
     module = native.module(f"npa_envs.kernels.worlds_{scalar_name(scalar)}_l{lanes}")

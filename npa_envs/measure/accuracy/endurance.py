@@ -27,7 +27,7 @@ TASKS = ("morphogenesis2d", "morphogenesis3d", "texture", "point_classification"
 QUICK_PARTICLES, QUICK_CLOUD = 1024, 128
 """Most particles of a world, and of a cloud, in a quick run."""
 
-SMALLEST_VIEWS: dict[str, Any] = {"resolution": 16, "training_views": 1, "held_out_views": 1}
+MIN_VIEWS: dict[str, Any] = {"resolution": 16, "training_views": 1, "held_out_views": 1}
 """Fields of 3D tasks whose target is not used, as large views take long to make."""
 
 LOSS_PARTICLES = 1 << 17
@@ -103,7 +103,7 @@ def habitat(
     """
     if (name, particles) not in session.kept:
         rule = load_rule(name, device=session.device).float().requires_grad_(False)
-        fields = {} if rule.space_dim == 2 else SMALLEST_VIEWS
+        fields = {} if rule.space_dim == 2 else MIN_VIEWS
         path = rule_file(name)
         count = int(trained_config(path, rule_metadata(path)).task.particle_count)
         # Farthest point sampling of clouds is slow.

@@ -32,7 +32,7 @@ from npa_envs.world.randomness import StreamId
 WORKS = 2.0
 """A rule works under a condition if its loss is at most this many times the trained one."""
 
-MOST_PARTICLES = {"cpu": 1 << 17, "cuda": 1 << 21}
+MAX_PARTICLES = {"cpu": 1 << 17, "cuda": 1 << 21}
 """Most particles of all worlds together; values that need more are left out."""
 
 

@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from npa_envs.errors import NPAError
-from npa_envs.measure.accuracy.endurance import SMALLEST_VIEWS, LongRun, TrialWorlds, task_name
+from npa_envs.measure.accuracy.endurance import MIN_VIEWS, LongRun, TrialWorlds, task_name
 from npa_envs.ops import world_mean
 from npa_envs.rule.files import load_rule
 from npa_envs.rule.rule import NPARule
@@ -236,7 +236,7 @@ class RuleTrial:
         fields: dict[str, Any] = {"particle_count": particle_count}
         if self.rule.space_dim == 3:
             # Losses are of held-out views, so few training views are enough.
-            fields["training_views"] = SMALLEST_VIEWS["training_views"]
+            fields["training_views"] = MIN_VIEWS["training_views"]
         found = task_of_rule(name, self.rule, device, **fields)
         if found.doubt is not None:
             raise NPAError(f"cannot measure {name!r}: {found.doubt}: choose another rule")

@@ -121,7 +121,7 @@ def rollout_call(
 Sampled = tuple[Callable[[], object], torch.Generator]
 """A call, and the generator that it draws from."""
 
-LEAST_SECONDS = {"cpu": 2e-3, "cuda": 1e-2}
+MIN_SECONDS = {"cpu": 2e-3, "cuda": 1e-2}
 """Least duration of a reading, for which short calls are repeated [s]."""
 
 
@@ -212,7 +212,7 @@ def _timing(run: Callable[[], object], device: torch.device, repeats: int) -> Ti
 
 
 def _calls(seconds: float, device: torch.device) -> int:
-    return max(1, math.ceil(LEAST_SECONDS[device.type] / seconds))
+    return max(1, math.ceil(MIN_SECONDS[device.type] / seconds))
 
 
 def _reading(run: Callable[[], object], device: torch.device, calls: int) -> float:

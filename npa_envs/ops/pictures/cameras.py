@@ -17,7 +17,7 @@ from torch import Tensor
 
 from npa_envs.checks import (
     DTYPES,
-    LARGEST_SIDE,
+    MAX_SIDE,
     check_dense,
     check_floating,
     checked_count,
@@ -31,7 +31,7 @@ from npa_envs.errors import NPAError, shown
 RIGID_TOLERANCE = 1e-3
 """How far R Rᵀ may be from the unit matrix, entry by entry, dimensionless."""
 
-SMALLEST_ANGLE = 1e-9
+MIN_ANGLE = 1e-9
 """Angles of view are larger [radians]: focal lengths stay numbers of float32."""
 
 
@@ -194,7 +194,7 @@ def _intrinsics(fov: float, width: int, height: int) -> Tensor:
     for name, side in (("width", width), ("height", height)):
         checked_side(name, side)
     fov = checked_number("the angle of view", fov)
-    if not SMALLEST_ANGLE < fov < math.pi:
+    if not MIN_ANGLE < fov < math.pi:
         raise NPAError(
             f"the angle of view must lie between 0 and 180 degrees, got {math.degrees(fov):g}"
         )
@@ -235,8 +235,8 @@ def orbit(
     """
     if checked_count("count", count) < 1:
         raise NPAError(f"count must be at least 1 camera, got {shown(count)}")
-    if count > LARGEST_SIDE:
-        raise NPAError(f"count must be at most {LARGEST_SIDE} cameras, got {shown(count)}")
+    if count > MAX_SIDE:
+        raise NPAError(f"count must be at most {MAX_SIDE} cameras, got {shown(count)}")
     elevation, azimuth = checked_finite("elevation", elevation), checked_finite("azimuth", azimuth)
     radius, angle = checked_finite("radius", radius), checked_number("fov", fov)
     if not abs(elevation) < 90.0:

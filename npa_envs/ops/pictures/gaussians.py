@@ -23,7 +23,7 @@ from npa_envs.kernels.pictures.gaussians import (
 from npa_envs.ops.custom_op import check_derivatives, custom_op, once_differentiable
 from npa_envs.ops.launch import launch, scalar_type
 from npa_envs.ops.pictures.cameras import Cameras
-from npa_envs.ops.sort import LARGEST_INDEX
+from npa_envs.ops.sort import MAX_INDEX
 
 
 def check_gaussians(
@@ -100,9 +100,9 @@ def check_cameras(
         )
     image = (means.shape[0], cameras.count, cameras.height, cameras.width, channels)
     entries = means.shape[0] * cameras.count * max(means.shape[1], cameras.height * cameras.width)
-    if entries * 12 > LARGEST_INDEX:
+    if entries * 12 > MAX_INDEX:
         raise NPAError(
-            f"pictures and footprints must stay below {LARGEST_INDEX // 12} in one batch, got "
+            f"pictures and footprints must stay below {MAX_INDEX // 12} in one batch, got "
             f"{entries}, of {image[0]} worlds and {image[1]} views: split the batch"
         )
     if background is None:
@@ -146,9 +146,9 @@ def sort_pairs(
     order = torch.sort(depths, dim=1, stable=True).indices
     ends = torch.cumsum(counts.gather(1, order), 1, dtype=torch.int64)
     room = ends.shape[1] * pairs_per_particle or max(int(ends[:, -1].max()), 1)
-    if images * room * PULLS > LARGEST_INDEX:
+    if images * room * PULLS > MAX_INDEX:
         raise NPAError(
-            f"pairs of tiles and Gaussians must stay below {LARGEST_INDEX // PULLS} in one batch, "
+            f"pairs of tiles and Gaussians must stay below {MAX_INDEX // PULLS} in one batch, "
             f"got room for {room} in each of {images} pictures: split the batch or lower "
             f"pairs_per_particle"
         )
@@ -182,7 +182,7 @@ def blend(frame: Any, footprints: Tensor, pairs: Pairs, images: int) -> tuple[Te
     else:
         picture = footprints.new_zeros(pixels, frame.channels)
         passing = footprints.new_ones(pixels)
-        stops = torch.full((pixels,), LARGEST_INDEX, dtype=torch.int32, device=device)
+        stops = torch.full((pixels,), MAX_INDEX, dtype=torch.int32, device=device)
         drawn = (*listed, picture, passing, stops)
         launch(tile_kernels(scalar).draw_tiles, images * frame.tile_count, device, frame, *drawn)
     return picture, passing, stops
@@ -426,9 +426,9 @@ def render_gaussians(
     elif checked_count("pairs_per_particle", pairs_per_particle) < 1:
         raise NPAError(f"pairs_per_particle must be at least 1, got {shown(pairs_per_particle)}")
     images = means.shape[0] * cameras.count
-    if images * means.shape[1] * pairs_per_particle > LARGEST_INDEX:
+    if images * means.shape[1] * pairs_per_particle > MAX_INDEX:
         raise NPAError(
-            f"pairs must stay below {LARGEST_INDEX} in one batch, got pairs_per_particle="
+            f"pairs must stay below {MAX_INDEX} in one batch, got pairs_per_particle="
             f"{shown(pairs_per_particle)} for {images} pictures of {means.shape[1]} particles: "
             "split the batch or lower pairs_per_particle"
         )

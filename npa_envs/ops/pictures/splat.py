@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from npa_envs.checks import (
-    LARGEST_SIDE,
+    MAX_SIDE,
     check_world,
     checked_count,
     checked_number,
@@ -33,10 +33,10 @@ from npa_envs.kernels.pictures.splat import (
 from npa_envs.ops.backend import KernelRequest
 from npa_envs.ops.custom_op import check_derivatives, custom_op, once_differentiable
 from npa_envs.ops.launch import aligned, launch, scalar_type
-from npa_envs.ops.sort import LARGEST_INDEX, block_capacity, slice_count
+from npa_envs.ops.sort import MAX_INDEX, block_capacity, slice_count
 from npa_envs.ops.world_mean import world_mean
 
-LARGEST_SPOT = 1e6
+MAX_SPOT = 1e6
 """Largest standard deviation of a Gaussian [pixels], and of its inverse."""
 
 
@@ -88,9 +88,9 @@ def gather_threads(world_count: int, resolution: int, device: torch.device) -> i
 
 
 def _check_size(largest: int, world_count: int, lens: Any) -> None:
-    if largest >= LARGEST_INDEX:
+    if largest >= MAX_INDEX:
         raise NPAError(
-            f"pictures must stay below {LARGEST_INDEX} numbers in one batch, got {world_count} "
+            f"pictures must stay below {MAX_INDEX} numbers in one batch, got {world_count} "
             f"worlds of {lens.resolution} x {lens.resolution} pixels: split the batch"
         )
 
@@ -307,12 +307,12 @@ def checked_window(
         raise NPAError(f"the window must have lo < hi, got lo={begin:g} and hi={end:g}")
     pixels = side * pixel / (end - begin)
     for what, size in (("a pixel of the target", pixels), ("sigma", spread * pixels)):
-        if not 1.0 / LARGEST_SPOT <= size <= LARGEST_SPOT:
+        if not 1.0 / MAX_SPOT <= size <= MAX_SPOT:
             raise NPAError(
-                f"{what} must have a size in [{1.0 / LARGEST_SPOT:g}, {LARGEST_SPOT:g}] pixels of "
+                f"{what} must have a size in [{1.0 / MAX_SPOT:g}, {MAX_SPOT:g}] pixels of "
                 f"the picture, got {size:g}: choose pixel_size, sigma and the window alike"
             )
-    if not abs(begin) <= LARGEST_SPOT * side * (end - begin):
+    if not abs(begin) <= MAX_SPOT * side * (end - begin):
         raise NPAError(
             f"the window must not be tiny beside its distance from the origin, got lo={begin:g} "
             f"and hi={end:g}: move the particles to the origin"
@@ -346,10 +346,10 @@ def periodic_splat(
     # A particle at the upper edge may round to the pixel after the last one.
     margin = math.ceil(PATCH_SIGMAS * sigma * pixel_size / step) + 1
     side = resolution + 2 * margin
-    if side > LARGEST_SIDE:
+    if side > MAX_SIDE:
         raise NPAError(
             f"Gaussians must be so small that the picture and its margins stay within "
-            f"{LARGEST_SIDE} pixels, got {shown(side)}: choose a smaller sigma or pixel_size"
+            f"{MAX_SIDE} pixels, got {shown(side)}: choose a smaller sigma or pixel_size"
         )
     # The images are subtracted without gradient: the result has the gradient of the position.
     boxes = ((x.detach() - lo) / (hi - lo)).floor()

@@ -41,7 +41,7 @@ CHUNK = {"cpu": 256, "cuda": 1024}
 CHUNK_CELLS = 1 << 24
 """Largest number of grid cells in one batch."""
 
-LARGEST_IDX = 600_000_000
+MAX_IDX = 600_000_000
 """Largest IDX file [bytes of data]; the largest of EMNIST has 547 million."""
 
 CACHED = 4
@@ -242,7 +242,7 @@ def load_pictures(data: str, split: Split = "train", *, folder: str = "data") ->
 def read_idx(path: Path) -> NDArray[np.uint8]:
     """Return the bytes of a file in MNIST's IDX format, gzipped or not, in their shape."""
     name = f"the IDX file {shown(str(path))}"
-    with open_regular(path, limit=LARGEST_IDX, what="the IDX file") as file:
+    with open_regular(path, limit=MAX_IDX, what="the IDX file") as file:
         try:
             is_gzip = file.read(2) == b"\x1f\x8b"
             file.seek(0)
@@ -258,9 +258,9 @@ def read_idx(path: Path) -> NDArray[np.uint8]:
                 )
             shape = tuple(int(size) for size in np.frombuffer(sizes, ">u4"))
             expected = math.prod(shape)
-            if expected > LARGEST_IDX:
+            if expected > MAX_IDX:
                 raise NPAError(
-                    f"{name} must have at most {LARGEST_IDX} bytes of data, but its head says "
+                    f"{name} must have at most {MAX_IDX} bytes of data, but its head says "
                     f"{' x '.join(map(str, shape))}: take a part of it"
                 )
             values = np.frombuffer(unpacked.read(expected + 1), np.uint8)

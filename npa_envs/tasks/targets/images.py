@@ -22,20 +22,20 @@ OPAQUE = 128
 
 _BACKGROUND_TOLERANCE = 28
 _UNIFORM_SHARE = 0.95
-_LARGEST_CUT_OUT = 2048
-_LARGEST_FILE = 256 * 2**20
-_LARGEST_PADDED = 9216
+_MAX_CUT_OUT = 2048
+_MAX_FILE = 256 * 2**20
+_MAX_PADDED = 9216
 
-LARGEST_AREA = 2**26
+MAX_AREA = 2**26
 """Largest picture [pixels]: 8192 x 8192."""
 
 FORMATS = ("PNG", "JPEG", "BMP", "GIF", "PPM", "TIFF", "WEBP")
 """Pillow's names of the allowed formats. Others may start other programs, as EPS does."""
 
-LARGEST_GRID = 6144
+MAX_GRID = 6144
 """Largest side of the grid that a picture is resampled to [pixels]."""
 
-LARGEST_POINT_COUNT = 2**24
+MAX_POINT_COUNT = 2**24
 """Largest number of points of a target."""
 
 FloatImage = NDArray[np.float32]
@@ -60,7 +60,7 @@ def with_background(image: Image.Image) -> Image.Image:
 def open_image(path: Path) -> Image.Image:
     """Read a picture as RGBA, with its background."""
     name = shown(str(path))
-    content = read_bytes(path, limit=_LARGEST_FILE, what="target")
+    content = read_bytes(path, limit=_MAX_FILE, what="target")
     if not content:
         raise NPAError(f"target {name} is an empty file (0 bytes): save the picture again")
     try:
@@ -101,13 +101,13 @@ def no_foreign_programs() -> Iterator[None]:
 
 
 def _check_area(size: tuple[int, int], name: str) -> None:
-    if size[0] * size[1] > LARGEST_AREA:
+    if size[0] * size[1] > MAX_AREA:
         raise NPAError(_too_large(name, f"{size[0]} x {size[1]}"))
 
 
 def _too_large(name: str, got: str) -> str:
     return (
-        f"target {name} must have at most {LARGEST_AREA} pixels, got {got}: "
+        f"target {name} must have at most {MAX_AREA} pixels, got {got}: "
         "scale the picture down first"
     )
 
@@ -146,7 +146,7 @@ def cut_out_background(image: Image.Image, *, label: str) -> Image.Image:
     encloses stays opaque. The object's colour and alpha are estimated for pixels at its edge.
     Sides above 2048 pixels are reduced first.
     """
-    image = image.reduce(math.ceil(max(image.size) / _LARGEST_CUT_OUT))
+    image = image.reduce(math.ceil(max(image.size) / _MAX_CUT_OUT))
     rgb = np.asarray(image.convert("RGB")).astype(np.float32)
     border = np.concatenate([rgb[0], rgb[-1], rgb[:, 0], rgb[:, -1]])
     background = np.median(border, axis=0)
@@ -188,8 +188,8 @@ def resample(image: Image.Image, point_count: int, *, label: str = "picture") ->
         if _opaque_count(reduced) * factor**2 > 0.9 * area:
             image, pitch = reduced, pitch / factor
     span, margin = max(image.size), _margin(image, pitch)
-    if span + 2 * margin > _LARGEST_PADDED:
-        factor = math.ceil((span + 2 * margin) / _LARGEST_PADDED)
+    if span + 2 * margin > _MAX_PADDED:
+        factor = math.ceil((span + 2 * margin) / _MAX_PADDED)
         image = image.reduce(factor)
         pitch = math.sqrt(max(_opaque_count(image), 1) / point_count)
         span, margin = max(image.size), _margin(image, pitch)
@@ -202,12 +202,12 @@ def resample(image: Image.Image, point_count: int, *, label: str = "picture") ->
         return int((np.asarray(sampled) >= OPAQUE).sum())
 
     fine, coarse = pitch / 1.5, min(pitch * 1.5, span)
-    while span / fine <= LARGEST_GRID and count(fine) < point_count:
+    while span / fine <= MAX_GRID and count(fine) < point_count:
         fine /= 1.5
-    if span / fine > LARGEST_GRID:
+    if span / fine > MAX_GRID:
         raise NPAError(
             f"target {shown(label)} must give {point_count} points on a grid of at most "
-            f"{LARGEST_GRID} x {LARGEST_GRID} pixels, but its opaque pixels are few and far "
+            f"{MAX_GRID} x {MAX_GRID} pixels, but its opaque pixels are few and far "
             "apart: fill more of the picture, or lower target_point_count"
         )
     best, best_miss = pitch, abs(count(pitch) - point_count)

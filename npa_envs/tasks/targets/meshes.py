@@ -21,9 +21,9 @@ FloatArray = NDArray[np.float64]
 RADIUS = 0.85
 """Largest distance from the origin to which every mesh is scaled [length units]."""
 
-_LARGEST_FILE = 256 * 2**20
+_MAX_FILE = 256 * 2**20
 _SIZES = 1e-30, 1e30
-_LEAST_AREA = 1e-12
+_MIN_AREA = 1e-12
 
 MESH_SUFFIXES = (".glb", ".gltf", ".obj", ".off", ".ply", ".stl")
 """Suffixes of mesh files."""
@@ -212,7 +212,7 @@ def load_mesh(source: str | Path) -> Mesh:
             f"target must be a built-in mesh, the path of a mesh file ({', '.join(MESH_SUFFIXES)}) "
             f"or a folder of views, got {shown(str(source))}: {suggest(source, MESHES)}"
         )
-    check_regular(path, limit=_LARGEST_FILE, what="target")
+    check_regular(path, limit=_MAX_FILE, what="target")
     return _read_mesh(path).fitted()
 
 
@@ -256,7 +256,7 @@ def _read_mesh(path: Path) -> Mesh:
             f"size of at least {_SIZES[0]:g}, got a size of {extent:.3g}: scale it"
         )
     a, b, c = ((vertices[faces[:, k]] - used.min(axis=0)) / extent for k in range(3))
-    if np.linalg.norm(np.cross(b - a, c - a), axis=1).max() < _LEAST_AREA:
+    if np.linalg.norm(np.cross(b - a, c - a), axis=1).max() < _MIN_AREA:
         raise NPAError(
             f"target {shown(str(path))} must have a surface, but the corners of every triangle "
             "lie on a line: give triangles with an area"

@@ -21,7 +21,7 @@ from npa_envs.errors import NPAError, shown, suggest
 from npa_envs.files import home_path
 from npa_envs.tasks.targets.emoji import is_emoji, render_emoji
 from npa_envs.tasks.targets.images import (
-    LARGEST_POINT_COUNT,
+    MAX_POINT_COUNT,
     OPAQUE,
     looks_like_path,
     open_image,
@@ -97,7 +97,7 @@ def load_target(
             few points, or a number is out of range.
         MissingDependencyError: An emoji is asked for, and no colour-emoji font is installed.
     """
-    check_count("point_count", point_count, ": try 4096", at_most=LARGEST_POINT_COUNT)
+    check_count("point_count", point_count, ": try 4096", at_most=MAX_POINT_COUNT)
     if not is_real(extent) or extent <= 0:
         raise NPAError(
             f"extent must be finite and above 0 length units, got {shown(extent)}: try 1.8"

@@ -136,7 +136,7 @@ def load_texture(
             f"target must be a built-in texture or the path of a picture, got {shown(source)}: "
             "for example 'cells'"
         )
-    check_count("resolution", resolution, ": try 128", at_most=LARGEST_RESOLUTION)
+    check_count("resolution", resolution, ": try 128", at_most=MAX_RESOLUTION)
     if isinstance(source, str) and source in PATTERNS:
         drawn = draw_pattern(source, resolution)
         return _target(source, drawn, True, device)
@@ -164,7 +164,7 @@ def _target(name: str, picture: Array, tiles: bool, device: str | torch.device) 
     return TextureTarget(name, tensor, tiles)
 
 
-LARGEST_RESOLUTION = 2048
+MAX_RESOLUTION = 2048
 """Largest side of a target [pixels]."""
 
 STRIP_SAMPLES = 2**20

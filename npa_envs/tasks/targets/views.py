@@ -21,7 +21,7 @@ from npa_envs.tasks.targets.meshes import RADIUS, Mesh, draw_mesh, load_mesh
 DISTANCE = 3.2
 """Distance of cameras from the origin [length units]."""
 
-LARGEST_VIEWS = 2**27
+MAX_VIEWS = 2**27
 """Largest number of pixels of all views of a target; a pixel takes 16 bytes."""
 
 ANGLE = 40.0
@@ -96,9 +96,9 @@ def load_views(
     for name, value in {"resolution": resolution, **counts}.items():
         check_count(name, value)
     pixels = (training_count + held_out_count) * resolution**2
-    if pixels > LARGEST_VIEWS:
+    if pixels > MAX_VIEWS:
         raise NPAError(
-            f"all views together must have at most {LARGEST_VIEWS} pixels, got {shown(pixels)} of "
+            f"all views together must have at most {MAX_VIEWS} pixels, got {shown(pixels)} of "
             f"resolution={shown(resolution)}: lower it, or take fewer views"
         )
     folder = home_path(source)

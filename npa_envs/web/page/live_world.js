@@ -223,7 +223,7 @@ export class LiveWorld {
       for (const i of inside) species[i] = number;
     } else if (tool === "add") {
       const count = Math.round(strength * constants.SEED_FRACTION * this.full);
-      this.add(at, radius, Math.max(constants.LEAST_SEED, count), rule);
+      this.add(at, radius, Math.max(constants.MIN_SEED, count), rule);
     } else throw Error(`no brush is called ${tool}`);
     if (box !== null) wrap(this.world.x, this.world.count, box);
   }

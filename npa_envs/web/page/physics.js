@@ -16,7 +16,7 @@ const LANES = 4;
 export const TILE_OUTPUTS = 8;
 
 // Most cells on each side of the grid. Beyond it cells are reused; distances are checked in any case.
-export const MOST_CELLS = { 2: 256, 3: 64 };
+export const MAX_CELLS = { 2: 256, 3: 64 };
 
 // Cells per eps.
 export const CELLS_PER_RADIUS = { 2: 2, 3: 2 };
@@ -244,7 +244,7 @@ export class Physics {
       if (box !== null) {
         this.sides[d] = box[d];
         const fitting = Math.floor((box[d] / eps) * CELLS_PER_RADIUS[dimension] * (1 + 1e-12));
-        cells[d] = Math.max(1, Math.min(MOST_CELLS[dimension], fitting));
+        cells[d] = Math.max(1, Math.min(MAX_CELLS[dimension], fitting));
         inverse[d] = cells[d] / box[d];
       } else {
         let low = Infinity, high = -Infinity;
@@ -254,7 +254,7 @@ export class Physics {
         }
         inverse[d] = CELLS_PER_RADIUS[dimension] / eps;
         const fitting = Math.ceil((high - low) * inverse[d]) + 2 * CELLS_PER_RADIUS[dimension] + 1;
-        cells[d] = Math.min(MOST_CELLS[dimension], Number.isFinite(fitting) ? fitting : MOST_CELLS[dimension]);
+        cells[d] = Math.min(MAX_CELLS[dimension], Number.isFinite(fitting) ? fitting : MAX_CELLS[dimension]);
       }
     }
     const [nx, ny, nz] = cells;

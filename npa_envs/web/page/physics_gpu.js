@@ -1,7 +1,7 @@
 // The step of physics.js with densities, perception and networks on a graphics card, through WebGPU. The
 // processor sorts the particles before, and moves them after; both are a small part of the time.
 
-import { CELLS_PER_RADIUS, MOST_CELLS, smoothingNorm, spikyNorm } from "./physics.js";
+import { CELLS_PER_RADIUS, MAX_CELLS, smoothingNorm, spikyNorm } from "./physics.js";
 
 const GROUP = 64;
 const UNIFORM_BYTES = 96;
@@ -162,7 +162,7 @@ export class GpuPhysics {
     const given = STORAGE | COPY_DST;
     this.points = buffer(16 * capacity, given);
     this.home = buffer(4 * capacity, given);
-    this.starts = buffer(4 * (MOST_CELLS[dimension] ** dimension + 1), given);
+    this.starts = buffer(4 * (MAX_CELLS[dimension] ** dimension + 1), given);
     this.states = buffer(4 * width * capacity, given);
     this.fields = buffer(16 * capacity, STORAGE);
     const compute = GPUShaderStage.COMPUTE;

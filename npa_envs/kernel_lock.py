@@ -14,18 +14,20 @@ from typing import ParamSpec, TypeVar, cast
 P = ParamSpec("P")
 R = TypeVar("R")
 
-alone = threading.RLock()
+kernel_lock = threading.RLock()
 """Lock of the thread that makes, compiles or loads kernels."""
 
 if hasattr(os, "register_at_fork"):
     # A forked process does not have its parent's other threads: one of them could have left a
     # half-made kernel and the lock.
     os.register_at_fork(
-        before=alone.acquire, after_in_parent=alone.release, after_in_child=alone.release
+        before=kernel_lock.acquire,
+        after_in_parent=kernel_lock.release,
+        after_in_child=kernel_lock.release,
     )
 
 
-def made_once(kept: int | None = None) -> Callable[[Callable[P, R]], Callable[P, R]]:
+def cached_under_lock(kept: int | None = None) -> Callable[[Callable[P, R]], Callable[P, R]]:
     """Return a decorator like `functools.lru_cache(kept)` that calls the function under the lock.
 
     Threads that call it at the same time get the same object.
@@ -35,10 +37,10 @@ def made_once(kept: int | None = None) -> Callable[[Callable[P, R]], Callable[P,
         made = cast("Callable[P, R]", functools.lru_cache(kept)(make))
 
         @functools.wraps(make)
-        def make_alone(*arguments: P.args, **keywords: P.kwargs) -> R:
-            with alone:
+        def make_under_lock(*arguments: P.args, **keywords: P.kwargs) -> R:
+            with kernel_lock:
                 return made(*arguments, **keywords)
 
-        return cast("Callable[P, R]", functools.lru_cache(kept)(make_alone))
+        return cast("Callable[P, R]", functools.lru_cache(kept)(make_under_lock))
 
     return decorate
