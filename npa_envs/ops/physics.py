@@ -152,6 +152,10 @@ def _constants(value: Any) -> Any:
     return constant(value) if type(value) is float else value
 
 
+IMMUTABLE = frozenset((float, int, bool, str, NoneType))
+"""Types of values that can be keys of a cache."""
+
+
 def physics(
     space_dim: int,
     state_dim: int,
@@ -172,12 +176,10 @@ def physics(
 
     `eps0` is already checked, default: `eps`. The largest displacement is α ε.
     """
-    numbers = (eps, eps0, box, alpha, update_prob, dt, position_noise)
+    values: Any = (boundary, eps, eps0, box, alpha, update_prob, dt, position_noise)
     # Only immutable values can be keys of the cache.
-    plain = all(type(value) in (float, int, bool, NoneType) for value in numbers)
-    plain = plain and type(boundary) is str
-    check = _known if plain and not torch.compiler.is_compiling() else _checked
-    return check(space_dim, state_dim, dtype, terms, moving, boundary, *numbers)
+    known = not torch.compiler.is_compiling() and IMMUTABLE.issuperset(map(type, values))
+    return (_known if known else _checked)(space_dim, state_dim, dtype, terms, moving, *values)
 
 
 def _checked(

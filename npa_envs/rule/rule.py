@@ -361,8 +361,8 @@ class NPARule(nn.Module):
         hidden, output = layers[:2]
         return (
             (type(self) is NPARule or _overrides_no_part(type(self)))
-            # A loop, as torch.compile traces no set operation on these attributes.
-            and not any(name in self.__dict__ for name in STEP_PARTS)
+            # A list, as torch.compile traces no set operation on these attributes.
+            and True not in [name in self.__dict__ for name in STEP_PARTS]
             and getattr(hidden, "bias", None) is not None
             and getattr(output, "bias", None) is None
             and not any(is_altered(module) or _has_backward_hooks(module) for module in layers)
@@ -397,7 +397,10 @@ class NPARule(nn.Module):
 
     def network_weights(self) -> list[Tensor]:
         """Return the parameters that a step uses, without those of the read-out."""
-        weights = [self.hidden.weight, self.hidden.bias, self.output.weight]
+        # These are faster than attributes of modules: public calls read the weights.
+        layers: Any = self._modules
+        hidden, output = layers["hidden"]._parameters, layers["output"]._parameters
+        weights = [hidden["weight"], hidden["bias"], output["weight"]]
         weights += [self.mixing, self.steering] if self.equivariant else []
         return weights + ([self.fate.weight, self.fate.bias] if self.divides else [])
 

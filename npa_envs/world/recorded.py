@@ -18,6 +18,7 @@ import copy
 import functools
 import itertools
 import logging
+import operator
 import weakref
 from collections.abc import Callable, Hashable, Sequence
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
@@ -28,7 +29,7 @@ from torch import Tensor
 from npa_envs.checks import FiniteCheck, check_finite_positions
 from npa_envs.errors import NPAError, shown
 from npa_envs.ops.custom_op import once_differentiable
-from npa_envs.rule.rule import NPARule
+from npa_envs.rule.rule import HYPER_PARAMETERS, NPARule
 from npa_envs.world.cuda_graph import (
     GraphSequence,
     can_capture,
@@ -80,11 +81,10 @@ logger = logging.getLogger(__name__)
 
 
 # Recording: a rollout is captured as CUDA graphs, on copies of worlds and weights.
-def rule_form(rule: NPARule) -> Hashable:
-    """Return all settings of a plain rule that its steps depend on, except weights."""
-    form: dict[str, Any] = {**rule.hyper_parameters()}
-    del form["readout_dim"], form["readout_hidden_dim"]
-    return tuple(form.items())
+rule_form: Callable[[NPARule], Hashable] = operator.attrgetter(
+    *HYPER_PARAMETERS.keys() - {"readout_dim", "readout_hidden_dim", "code_names", "encoder"}
+)
+"""Returns all settings of a plain rule that its steps depend on, except weights."""
 
 
 def _form(rule: NPARule, plain: bool) -> tuple[Hashable, list[Tensor]]:
