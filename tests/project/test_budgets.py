@@ -164,14 +164,14 @@ BUDGETS = {
     "words of docs/environments": Budget(
         lambda: words(files("docs/environments", suffixes=(".md",))), 18_000, 18_000
     ),
-    "lines of CHANGELOG": Budget(lambda: lines([ROOT / "CHANGELOG.md"]), 71, 60),
+    "lines of CHANGELOG": Budget(lambda: lines([ROOT / "CHANGELOG.md"]), 60, 60),
     "bytes of images": Budget(
         lambda: sum(p.stat().st_size for p in files("docs", "benchmarks", suffixes=IMAGES)),
         9_000_000,
         9_000_000,
     ),
     "files of results": Budget(
-        lambda: sum(p.is_file() for p in (ROOT / "benchmarks" / "results").rglob("*")), 72, 70
+        lambda: sum(p.is_file() for p in (ROOT / "benchmarks" / "results").rglob("*")), 71, 70
     ),
 }
 """What is counted, the most that there may be now, and the most that there is to be."""
