@@ -7,8 +7,8 @@ import functools
 import math
 import operator
 import sys
-from collections.abc import Sequence
-from typing import Any, Literal, TypeGuard
+from collections.abc import Callable, Sequence
+from typing import Any, Literal, TypeGuard, get_args
 
 import torch
 from torch import Tensor
@@ -68,9 +68,9 @@ def check_world(x: Tensor, s: Tensor) -> None:
     for name, tensor, last in (("x", x, "D"), ("s", s, "C")):
         check_floating(name, tensor)
         if tensor.ndim != 3:
-            cure = f"add a world dimension with {name}[None]" if tensor.ndim == 2 else "reshape it"
+            hint = f"add a world dimension with {name}[None]" if tensor.ndim == 2 else "reshape it"
             raise NPAError(
-                f"{name} must have shape [B, N, {last}], got {tuple(tensor.shape)}: {cure}"
+                f"{name} must have shape [B, N, {last}], got {tuple(tensor.shape)}: {hint}"
             )
     if x.shape[2] not in (2, 3):
         raise NPAError(f"x must have 2 or 3 coordinates, got shape {tuple(x.shape)}")
@@ -108,25 +108,25 @@ class FiniteCheck:
 
     def __init__(self, x: Tensor, ready: torch.cuda.Event | None = None) -> None:
         self._x = x.detach()
-        self._arrival: torch.cuda.Event | None = None
+        self._copied: torch.cuda.Event | None = None
         if not x.is_cuda:
-            self._answer = _largest_size(self._x)
+            self._size = _largest_size(self._x)
             return
         stream = torch.cuda.current_stream(x.device)
         if ready is not None:
             stream = _side_stream(x.device)
             stream.wait_event(ready)
         with torch.cuda.stream(stream):
-            sent = torch.empty((), dtype=x.dtype, device="cpu", pin_memory=True)
-            self._answer = sent.copy_(_largest_size(self._x), non_blocking=True)
-            self._arrival = torch.cuda.Event()  # type: ignore[no-untyped-call]
-            self._arrival.record(stream)
+            on_host = torch.empty((), dtype=x.dtype, device="cpu", pin_memory=True)
+            self._size = on_host.copy_(_largest_size(self._x), non_blocking=True)
+            self._copied = torch.cuda.Event()  # type: ignore[no-untyped-call]
+            self._copied.record(stream)
 
     def wait(self) -> None:
         """Wait for the result, not for later work; raise NPAError if a position is not finite."""
-        if self._arrival is not None:
-            self._arrival.synchronize()
-        if math.isfinite(self._answer):
+        if self._copied is not None:
+            self._copied.synchronize()
+        if math.isfinite(self._size):
             return
         finite = torch.isfinite(self._x).all(dim=-1)
         world, particle = (int(k) for k in (~finite).nonzero()[0])
@@ -167,10 +167,10 @@ def checked_flag(name: str, value: Any) -> bool:
 
 def checked_moment_inverse(value: Any) -> MomentInverse:
     """Return the option `moment_inverse`, checked."""
-    if isinstance(value, str) and value == "threshold":
-        return "threshold"
-    if isinstance(value, str) and value == "smooth":
-        return "smooth"
+    for word in get_args(MomentInverse):
+        if isinstance(value, str) and value == word:
+            inverse: MomentInverse = word
+            return inverse
     raise NPAError(
         f"moment_inverse must be 'threshold' or 'smooth', got {shown(value)}: 'threshold' is the "
         "paper's"
@@ -231,13 +231,13 @@ def entries(value: Any) -> list[Any] | None:
 def number_tensor(name: str, value: Any) -> Tensor:
     """Return real numbers of any library as a tensor."""
     try:
-        made = torch.as_tensor(value)
+        numbers = torch.as_tensor(value)
     except (TypeError, ValueError, RuntimeError, OverflowError) as error:
         raise NPAError(f"{name} must be numbers, got {shown(value)}") from error
-    if made.dtype.is_complex:
+    if numbers.dtype.is_complex:
         raise NPAError(f"{name} must be real numbers, got {shown(value)}")
-    check_dense(name, made)
-    return made
+    check_dense(name, numbers)
+    return numbers
 
 
 def checked_eps(name: str, eps: float, space_dim: int, dtype: torch.dtype) -> float:
@@ -270,11 +270,11 @@ def checked_box(
     """Return the sides of a box as D floats, or None for open space; eps None: walls reflect."""
     if box is None:
         return None
-    given = entries(box)
-    if given is None:
+    several = entries(box)
+    if several is None:
         sides = (checked_number("box", box),) * space_dim
     else:
-        sides = tuple(checked_number("a side of box", side) for side in given)
+        sides = tuple(checked_number("a side of box", side) for side in several)
     if len(sides) != space_dim:
         raise NPAError(f"box must have {space_dim} sides, got {len(sides)}: {shown(sides)}")
     if eps is None and not all(math.isfinite(side) and side > 0.0 for side in sides):
@@ -300,65 +300,60 @@ def checked_box(
 
 
 def check_field(
-    config: object, name: str, ok: bool, rule: str, cure: str = "", *, otherwise: object = None
+    config: object, name: str, ok: bool, rule: str, hint: str = "", *, otherwise: object = None
 ) -> None:
-    """Raise unless `ok`; the error ends with `cure`, else the field's default or `otherwise`."""
+    """Raise unless `ok`; the error ends with `hint`, else the field's default or `otherwise`."""
     if not ok:
-        cure = cure or f"for example {name}={getattr(type(config), name, otherwise)!r}"
-        raise NPAError(f"{name} must {rule}, got {shown(getattr(config, name))}: {cure}")
+        hint = hint or f"for example {name}={getattr(type(config), name, otherwise)!r}"
+        raise NPAError(f"{name} must {rule}, got {shown(getattr(config, name))}: {hint}")
+
+
+def _check_fields(
+    config: object, names: Sequence[str], ok: Callable[[Any], bool], rule: str, otherwise: object
+) -> None:
+    for name in names:
+        check_field(config, name, ok(getattr(config, name)), rule, otherwise=otherwise)
 
 
 def check_positive(
-    config: object, kind: type, *names: str, at_least: int = 1, at_most: int = sys.maxsize
+    config: object, cls: type, *names: str, at_least: int = 1, at_most: int = sys.maxsize
 ) -> None:
-    """Check that fields are whole numbers >= `at_least` (`kind` int) or finite and > 0 (float)."""
-    for name in names:
-        value = getattr(config, name)
-        if kind is float:
-            rule = "be a finite number greater than 0"
-            check_field(config, name, is_real(value) and value > 0, rule, otherwise=1.0)
-            continue
-        rule = f"be a whole number of at least {at_least}"
-        check_field(config, name, is_whole(value) and value >= at_least, rule, otherwise=at_least)
-        check_field(config, name, value <= at_most, f"be at most {at_most}", otherwise=at_least)
+    """Check that fields are whole numbers >= `at_least` (`cls` int) or finite and > 0 (float)."""
+    if cls is float:
+        rule = "be a finite number greater than 0"
+        _check_fields(config, names, lambda v: is_real(v) and v > 0, rule, 1.0)
+        return
+    rule = f"be a whole number of at least {at_least}"
+    _check_fields(config, names, lambda v: is_whole(v) and v >= at_least, rule, at_least)
+    _check_fields(config, names, lambda v: v <= at_most, f"be at most {at_most}", at_least)
 
 
 def check_non_negative(config: object, *names: str, at_most: float = math.inf) -> None:
     """Check that fields are finite numbers of at least 0, and at most `at_most`."""
-    for name in names:
-        value = getattr(config, name)
-        rule = "be a finite number of at least 0"
-        check_field(config, name, is_real(value) and value >= 0, rule, otherwise=0.0)
-        check_field(config, name, value <= at_most, f"be at most {at_most:g}", otherwise=at_most)
+    rule = "be a finite number of at least 0"
+    _check_fields(config, names, lambda v: is_real(v) and v >= 0, rule, 0.0)
+    _check_fields(config, names, lambda v: v <= at_most, f"be at most {at_most:g}", at_most)
 
 
 def check_fraction(config: object, *names: str) -> None:
     """Check that fields are numbers in (0, 1]."""
-    for name in names:
-        value = getattr(config, name)
-        check_field(config, name, is_real(value) and 0 < value <= 1, "lie in (0, 1]", otherwise=0.5)
+    _check_fields(config, names, lambda v: is_real(v) and 0 < v <= 1, "lie in (0, 1]", 0.5)
 
 
 def check_flag(config: object, *names: str) -> None:
     """Check that fields are True or False."""
-    for name in names:
-        is_flag = isinstance(getattr(config, name), bool)
-        check_field(config, name, is_flag, "be True or False", otherwise=False)
+    _check_fields(config, names, lambda v: isinstance(v, bool), "be True or False", False)
 
 
 def check_text(config: object, name: str, what: str) -> None:
     """Check that a field is a non-empty string; the error describes it as `what`."""
-    value = getattr(config, name)
-    ok = isinstance(value, str) and value != ""
-    check_field(config, name, ok, f"be {what}", otherwise="name")
+    _check_fields(config, (name,), lambda v: isinstance(v, str) and v != "", f"be {what}", "name")
 
 
 def check_seed(config: object, name: str, *, bits: int = 63) -> None:
     """Check that a field can seed a random generator: a whole number in [0, 2**bits)."""
-    value = getattr(config, name)
-    ok = is_whole(value) and 0 <= value < 2**bits
     rule = f"be a whole number of at least 0 and below 2**{bits}"
-    check_field(config, name, ok, rule, otherwise=0)
+    _check_fields(config, (name,), lambda v: is_whole(v) and 0 <= v < 2**bits, rule, 0)
 
 
 def is_whole(value: Any) -> TypeGuard[int]:
@@ -378,9 +373,9 @@ def are_texts(value: Any) -> bool:
     return isinstance(value, tuple) and all(isinstance(part, str) and part for part in value)
 
 
-def check_count(name: str, value: object, cure: str = "", *, at_most: int = sys.maxsize) -> None:
+def check_count(name: str, value: object, hint: str = "", *, at_most: int = sys.maxsize) -> None:
     """Check that an argument is a whole number of at least 1, and at most `at_most`."""
     if not is_whole(value) or value < 1:
-        raise NPAError(f"{name} must be an integer of at least 1, got {shown(value)}{cure}")
+        raise NPAError(f"{name} must be an integer of at least 1, got {shown(value)}{hint}")
     if value > at_most:
-        raise NPAError(f"{name} must be at most {at_most}, got {shown(value)}{cure}")
+        raise NPAError(f"{name} must be at most {at_most}, got {shown(value)}{hint}")

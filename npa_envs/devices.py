@@ -9,13 +9,13 @@ from npa_envs.errors import NPAError, shown
 
 def parse_device(name: str) -> torch.device:
     """Return the torch device of a name, without checking that it exists."""
-    cure = "use 'cpu', 'cuda' or 'cuda:1'"
+    hint = "use 'cpu', 'cuda' or 'cuda:1'"
     if not isinstance(name, str):
-        raise NPAError(f"device must be text, got {shown(name)}: {cure}")
+        raise NPAError(f"device must be text, got {shown(name)}: {hint}")
     try:
         device = torch.device(name)
     except (RuntimeError, TypeError) as error:
-        raise NPAError(f"device must name a device, got {shown(name)}: {cure}") from error
+        raise NPAError(f"device must name a device, got {shown(name)}: {hint}") from error
     rule = ""
     if device.type not in ("cpu", "cuda"):
         rule = "be 'cpu' or 'cuda'"
@@ -25,7 +25,7 @@ def parse_device(name: str) -> torch.device:
         # Torch stores the number in eight bits: "cuda:256" would be the first device.
         rule = "have a number that torch can represent"
     if rule:
-        raise NPAError(f"device must {rule}, got {shown(name)}: {cure}")
+        raise NPAError(f"device must {rule}, got {shown(name)}: {hint}")
     return device
 
 

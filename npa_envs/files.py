@@ -58,13 +58,13 @@ def open_regular(path: str | Path, *, limit: int, what: str = "the file") -> IO[
         descriptor = os.open(path, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0))
     except OSError as error:
         raise NPAError(_unreadable(f"{what} {shown(str(path))}", error)) from error
-    found = os.fstat(descriptor)
+    status = os.fstat(descriptor)
     rule = ""
-    if not stat.S_ISREG(found.st_mode):
-        kind = "folder" if stat.S_ISDIR(found.st_mode) else "pipe or a device"
-        rule = f"is a {kind}, not a regular file: give the path of a file"
-    elif found.st_size > limit:
-        rule = f"must have at most {limit / _MIB:.0f} MiB, got {found.st_size / _MIB:.0f} MiB"
+    if not stat.S_ISREG(status.st_mode):
+        what_it_is = "folder" if stat.S_ISDIR(status.st_mode) else "pipe or a device"
+        rule = f"is a {what_it_is}, not a regular file: give the path of a file"
+    elif status.st_size > limit:
+        rule = f"must have at most {limit / _MIB:.0f} MiB, got {status.st_size / _MIB:.0f} MiB"
     if rule:
         os.close(descriptor)
         raise NPAError(f"{what} {shown(str(path))} {rule}")
@@ -131,8 +131,8 @@ def check_torch_archive(file: IO[bytes], *, checksums: bool = True) -> None:
 def _unreadable(what: str, error: OSError) -> str:
     if error.errno == errno.ENOENT:
         return f"{what} does not exist: check the path"
-    cure = "its permissions" if error.errno in _NO_PERMISSION else "the path"
-    return f"{what} cannot be read ({error.strerror or type(error).__name__}): check {cure}"
+    hint = "its permissions" if error.errno in _NO_PERMISSION else "the path"
+    return f"{what} cannot be read ({error.strerror or type(error).__name__}): check {hint}"
 
 
 @contextlib.contextmanager
@@ -252,12 +252,12 @@ def _disk_is_full(folder: Path) -> bool:
 def _explain(given: Path, error: OSError) -> str:
     folder = str(given.parent)
     if error.errno in _DISK_FULL:
-        rule, cure = "the disk is full", "free some space or choose another disk"
+        rule, hint = "the disk is full", "free some space or choose another disk"
     elif error.errno in _NO_PERMISSION:
-        rule, cure = "no write permission", f"choose another path, or check: ls -ld {shown(folder)}"
+        rule, hint = "no write permission", f"choose another path, or check: ls -ld {shown(folder)}"
     else:
-        rule, cure = (error.strerror or type(error).__name__), "choose another path"
-    return f"cannot write {shown(str(given))}: {rule} ({error}): {cure}; nothing was changed"
+        rule, hint = (error.strerror or type(error).__name__), "choose another path"
+    return f"cannot write {shown(str(given))}: {rule} ({error}): {hint}; nothing was changed"
 
 
 def plain_numbers(value: Any) -> Any:

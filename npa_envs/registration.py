@@ -11,74 +11,57 @@ from typing import Any, NamedTuple
 
 import gymnasium
 
-
-class Registration(NamedTuple):
-    """A row of the table: one environment."""
-
-    id: str
-    """Id for `gym.make`."""
-
-    module: str
-    """Module of its classes."""
-
-    name: str
-    """Name of its classes, without the suffixes `Env` and `VectorEnv`."""
-
-    max_episode_steps: int
-    """Steps after which an episode is truncated."""
-
-    keywords: Mapping[str, Any] = MappingProxyType({})
-    """Keywords of the classes that differ from their defaults."""
-
-    @property
-    def entry_point(self) -> str:
-        """Entry point of the environment of one world."""
-        return f"{self.module}:{self.name}Env"
-
-    @property
-    def vector_entry_point(self) -> str:
-        """Entry point of the batched environment."""
-        return f"{self.module}:{self.name}VectorEnv"
-
-
-def _row(name: str, steps: int, size: str = "", **keywords: Any) -> Registration:
-    """Return the row of an environment, or of a variant of another size."""
-    module = f"npa_envs.envs.{MODULES.get(name, name.lower())}"
-    return Registration(f"npa/{name}{size}-v0", module, name, steps, MappingProxyType(keywords))
-
-
 MODULES = {"PointClassification": "point_classification"}
 """Modules whose names are not those of their classes in lower case."""
 
+
+class Registration:
+    """An entry of the table: one environment, or a variant of another size.
+
+    Args:
+        name: Name of its classes, without the suffixes `Env` and `VectorEnv`.
+        max_episode_steps: Steps after which an episode is truncated.
+        size: End of the id's name.
+        keywords: Keywords of the classes that differ from their defaults.
+    """
+
+    def __init__(self, name: str, max_episode_steps: int, size: str = "", **keywords: Any) -> None:
+        self.id = f"npa/{name}{size}-v0"
+        self.name = name
+        self.module = f"npa_envs.envs.{MODULES.get(name, name.lower())}"
+        self.entry_point = f"{self.module}:{name}Env"
+        self.vector_entry_point = f"{self.module}:{name}VectorEnv"
+        self.max_episode_steps = max_episode_steps
+        self.keywords = MappingProxyType(keywords)
+
+
 ENVIRONMENTS = (
-    _row("Morphogenesis2D", 256),
-    _row("Regeneration2D", 128),
-    _row("Texture", 128),
-    _row("PointClassification", 64),
-    _row("Morphogenesis3D", 128),
-    _row("Pictures2D", 256),
+    Registration("Morphogenesis2D", 256),
+    Registration("Regeneration2D", 128),
+    Registration("Texture", 128),
+    Registration("PointClassification", 64),
+    Registration("Morphogenesis3D", 128),
+    Registration("Pictures2D", 256),
 )
 """Environments with an action for each particle. A change of behaviour is a new version of the
 id."""
 
-GARDENS = (_row("Gardener2D", 32), _row("Shepherd2D", 32))
+GARDENS = (Registration("Gardener2D", 32), Registration("Shepherd2D", 32))
 """Environments in which a trained rule runs the particles and actions control a few brushes."""
 
-CODED = (_row("Shapeshifter2D", 64),)
+CODED = (Registration("Shapeshifter2D", 64),)
 """Environments in which a rule of many pictures runs the particles and actions are codes."""
 
 _GUSTS = {"push_length": 0.1, "gust_chance": 0.5, "gust_radius": 0.6, "blight_chance": 0.25}
 
 SMALL = (
-    _row("Gardener2D", 32, "Small", particle_count=256, **_GUSTS),
-    _row("Shepherd2D", 32, "Small", particle_count=256),
+    Registration("Gardener2D", 32, "Small", particle_count=256, **_GUSTS),
+    Registration("Shepherd2D", 32, "Small", particle_count=256),
 )
 """Gardens with few particles; their settings never change under the same version."""
 
 
-GARDEN_IDS = tuple(
-    row.id for row in (*GARDENS, *SMALL) if row.name in {garden.name for garden in GARDENS}
-)
+GARDEN_IDS = tuple(garden.id for garden in (*GARDENS, *SMALL))
 """Ids of gardens, of any size."""
 
 
@@ -90,30 +73,30 @@ _FEW: Mapping[str, Any] = {"particle_count": 64, **_STATES, "eps": 0.2}
 _SMALL_PICTURE: Mapping[str, Any] = {**_FEW, "colour_weight": 20.0}
 
 SIZES = (
-    _row("Morphogenesis2D", 32, "Small", **_SMALL_PICTURE, target="ring", seed_radius=0.4),
-    _row(
+    Registration("Morphogenesis2D", 32, "Small", **_SMALL_PICTURE, target="ring", seed_radius=0.4),
+    Registration(
         "Regeneration2D", 24, "Small", **_SMALL_PICTURE, eps0=0.2, target="heart", rule="picture",
         damage="wipe", damage_size=0.4, resolution=32,
     ),
-    _row(
+    Registration(
         "Texture", 24, "Small", particle_count=96, **_STATES, eps=0.3, eps0=0.3, target="stripes",
         resolution=32,
     ),
-    _row(
+    Registration(
         "PointClassification", 16, "Small", particle_count=64, state_dim=12, state_scale=0.1,
         eps=0.5, eps0=0.5, update_prob=1.0, score="cross_entropy",
     ),
-    _row("Morphogenesis2D", 512, "Large", particle_count=4096, resolution=128),
-    _row("Regeneration2D", 256, "Large", particle_count=4096, resolution=128),
-    _row("Texture", 256, "Large", particle_count=4096, resolution=128),
-    _row("PointClassification", 64, "Large", particle_count=2048),
-    _row("Morphogenesis3D", 256, "Large", particle_count=4096),
+    Registration("Morphogenesis2D", 512, "Large", particle_count=4096, resolution=128),
+    Registration("Regeneration2D", 256, "Large", particle_count=4096, resolution=128),
+    Registration("Texture", 256, "Large", particle_count=4096, resolution=128),
+    Registration("PointClassification", 64, "Large", particle_count=2048),
+    Registration("Morphogenesis3D", 256, "Large", particle_count=4096),
 )  # fmt: skip
 """Variants with few particles, in which PPO learns within minutes on a laptop, and with many, for a
 GPU. Settings never change under the same version."""
 
 ALL = (*ENVIRONMENTS, *GARDENS, *CODED, *SMALL, *SIZES)
-"""All rows that are registered with Gymnasium."""
+"""All entries that are registered with Gymnasium."""
 
 
 class SpeciesRegistration(NamedTuple):

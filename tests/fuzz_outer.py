@@ -232,11 +232,11 @@ def run_species(maker: str, **keywords: Any) -> None:
 
 WRAPPERS: dict[str, dict[str, Any]] = {
     "DamageEvents": {"events": ["1:cut"], "every": 5},
-    "NormalizePerception": {"clip": 5.0, "epsilon": 1e-8, "training": True, "statistics": None},
-    "SpeciesTags": {"species_count": 2, "fractions": [0.5, 0.5], "assignment": "blocks"},
+    "NormalizePerception": {"clip": 5.0, "epsilon": 1e-8, "training": True},
+    "SpeciesTags": {"species_count": 2, "fractions": [0.5, 0.5]},
     "VectorDamageEvents": {"events": ["1:cut"], "every": 5},
     "VectorNormalizePerception": {"clip": 5.0, "epsilon": 1e-8, "training": True},
-    "VectorSpeciesTags": {"species_count": 2, "fractions": None, "assignment": "random"},
+    "VectorSpeciesTags": {"species_count": 2, "fractions": None},
     "TorchRecordEpisodeStatistics": {"buffer_length": 10, "stats_key": "episode"},
     "TorchNormalizeObservation": {"epsilon": 1e-8},
     "TorchNormalizeReward": {"gamma": 0.9, "epsilon": 1e-8},

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from npa_envs.wrappers.sb3 import RowPolicy as RowPolicy
     from npa_envs.wrappers.sb3 import SpeciesVecEnv as SpeciesVecEnv
     from npa_envs.wrappers.sb3 import WorldVecEnv as WorldVecEnv
-    from npa_envs.wrappers.species import SpeciesTags, VectorSpeciesTags
+    from npa_envs.wrappers.species_tags import SpeciesTags, VectorSpeciesTags
     from npa_envs.wrappers.statistics import (
         NormalizePerception,
         TorchNormalizeObservation,
@@ -52,13 +52,13 @@ MODULES = ON_REQUEST | {
     "DamageEvents": "damage",
     "NormalizePerception": "statistics",
     "ParticleRows": "particle_rows",
-    "SpeciesTags": "species",
+    "SpeciesTags": "species_tags",
     "TorchNormalizeObservation": "statistics",
     "TorchNormalizeReward": "statistics",
     "TorchRecordEpisodeStatistics": "statistics",
     "VectorDamageEvents": "damage",
     "VectorNormalizePerception": "statistics",
-    "VectorSpeciesTags": "species",
+    "VectorSpeciesTags": "species_tags",
 }
 
 

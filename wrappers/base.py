@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import abstractmethod
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import gymnasium
 import numpy as np
@@ -21,42 +21,38 @@ from npa_envs.errors import NPAError, shown
 
 if TYPE_CHECKING:
     AnyWrapper = gymnasium.Wrapper[Any, Any, Any, Any]
+    AnyObservationWrapper = gymnasium.ObservationWrapper[Any, Any, Any]
     AnyVectorEnv = VectorEnv[Any, Any, Any]
     AnyVectorWrapper = VectorWrapper[Any, Any, Any, Any, Any]
 else:
     # Older releases of Gymnasium have no type parameters.
-    AnyWrapper, AnyVectorEnv, AnyVectorWrapper = gymnasium.Wrapper, VectorEnv, VectorWrapper
+    AnyWrapper, AnyObservationWrapper = gymnasium.Wrapper, gymnasium.ObservationWrapper
+    AnyVectorEnv, AnyVectorWrapper = VectorEnv, VectorWrapper
 
 
 MAKE_VECTOR = "make it with gym.make_vec(..., vectorization_mode='vector_entry_point')"
 """How to make a vector environment, for error messages."""
 
+BaseEnv = TypeVar("BaseEnv", bound=NPAEnv | NPAVectorEnv)
+
 VectorStep = tuple[Any, Any, Any, Any, dict[str, Any]]
 """Observations, rewards, terminations, truncations and infos of a step of many worlds."""
 
 
-def single_env(env: Any, wrapper: str) -> NPAEnv:
-    """Return this package's environment below wrappers; `wrapper` is named in errors."""
-    base = getattr(env, "unwrapped", None)
-    if isinstance(base, NPAEnv):
-        return base
-    cure = "make one with gym.make('npa/...')"
-    if isinstance(base, NPAVectorEnv):
-        cure = f"use Vector{wrapper} for vector environments"
-    raise NPAError(f"env must be an environment of npa_envs, got {type(base).__name__}: {cure}")
-
-
 def vector_env(env: Any, wrapper: str) -> NPAVectorEnv:
     """Return this package's vector environment below wrappers; `wrapper` is named in errors."""
+    return _base_env(env, wrapper, NPAVectorEnv, "a vector environment", MAKE_VECTOR)
+
+
+def _base_env(env: Any, wrapper: str, cls: type[BaseEnv], what: str, hint: str) -> BaseEnv:
     base = getattr(env, "unwrapped", None)
-    if isinstance(base, NPAVectorEnv):
+    if isinstance(base, cls):
         return base
-    cure = MAKE_VECTOR
+    if cls is NPAEnv and isinstance(base, NPAVectorEnv):
+        hint = f"use Vector{wrapper} for vector environments"
     if isinstance(base, NPAEnv) and wrapper.startswith("Vector"):
-        cure = f"use {wrapper.removeprefix('Vector')} for a single environment"
-    raise NPAError(
-        f"env must be a vector environment of npa_envs, got {type(base).__name__}: {cure}"
-    )
+        hint = f"use {wrapper.removeprefix('Vector')} for a single environment"
+    raise NPAError(f"env must be {what} of npa_envs, got {type(base).__name__}: {hint}")
 
 
 def torch_env(env: Any, adapter: str) -> NPAVectorEnv:
@@ -75,21 +71,13 @@ def torch_env(env: Any, adapter: str) -> NPAVectorEnv:
     return base
 
 
-def check_vector_env(env: Any, wrapper: str) -> None:
-    """Check that a wrapper's argument is a Gymnasium vector environment."""
-    if not isinstance(env, VectorEnv):
-        raise NPAError(
-            f"{wrapper} needs a vector environment, got {type(env).__name__}: {MAKE_VECTOR}"
-        )
-
-
 def check_untouched(env: Any, wrapper: str) -> None:
     """Check that the wrappers below do not change the observation space."""
     name = "single_observation_space" if isinstance(env, VectorEnv) else "observation_space"
-    own, given = getattr(env, name), getattr(env.unwrapped, name)
-    if own != given:
+    space, base_space = getattr(env, name), getattr(env.unwrapped, name)
+    if space != base_space:
         raise NPAError(
-            f"env must give observations as the environment makes them, {given}, got {own}: "
+            f"env must give observations as the environment makes them, {base_space}, got {space}: "
             f"put {wrapper} under the wrappers that change observations"
         )
 
@@ -154,11 +142,11 @@ def row_space(space: Any) -> Box:
     return Box(space.low[0], space.high[0], dtype=np.float32)
 
 
-def check_row_actions(actions: Any, *wanted: int) -> None:
+def check_row_actions(actions: Any, *shape: int) -> None:
     """Check the shape of actions; a wrong one could be read as actions of other rows."""
-    if tuple(np.shape(actions)) != wanted:
+    if tuple(np.shape(actions)) != shape:
         raise NPAError(
-            f"actions must have shape [rows, A] = {wanted}, got {tuple(np.shape(actions))}: "
+            f"actions must have shape [rows, A] = {shape}, got {tuple(np.shape(actions))}: "
             "one for each row"
         )
 
@@ -205,7 +193,10 @@ class EpisodeClock:
     """
 
     def __init__(self, env: AnyVectorEnv) -> None:
-        self._mode = autoreset_mode(env)
+        mode = autoreset_mode(env)
+        self.same_step = mode is AutoresetMode.SAME_STEP
+        """Whether worlds restart in the step that ends their episodes."""
+        self._next_step = mode is AutoresetMode.NEXT_STEP
         self.elapsed = np.zeros(env.num_envs, dtype=np.int64)
         """Steps since the start of the running episode, shape [B]."""
         self.lengths = np.zeros_like(self.elapsed)
@@ -229,53 +220,47 @@ class EpisodeClock:
     def step(self, terminations: Any, truncations: Any, infos: dict[str, Any]) -> None:
         """Update for a step with these results, arrays or tensors, shape [B]."""
         self.observed = np.ones_like(self.ended)
-        next_step = self._mode is AutoresetMode.NEXT_STEP
-        self.restarted = self.ended if next_step else np.zeros_like(self.ended)
+        self.restarted = self.ended if self._next_step else np.zeros_like(self.ended)
         self.lengths = np.where(self.restarted, 0, self.elapsed + 1)
         self.elapsed = self.lengths.copy()
-        same_step = self._mode is AutoresetMode.SAME_STEP
-        if same_step and "final_obs" not in infos:
+        if self.same_step and "final_obs" not in infos:
             self.ended = np.zeros_like(self.ended)
             return
         self.ended = to_host(terminations | truncations).copy()
-        if same_step:
+        if self.same_step:
             self.restarted = self.ended
             self.elapsed[self.ended] = 0
 
 
-class Observations(AnyWrapper):
-    """Base class of wrappers that change the observations of one world."""
+class ChangesObservations:
+    """Mixin of wrappers that change observations, of one world or many."""
 
-    restarted = False
-    """Whether the last observation is the first of an episode."""
+    def count(self, observations: Any) -> None:
+        """Add new observations, [N, P] or [M, N, P], to the wrapper's statistics."""
 
     @abstractmethod
-    def observations(self, observations: Any) -> Any:
-        """Return what the wrapper makes of a world's observation, shape [N, P]."""
+    def changed(self, observations: Any) -> Any:
+        """Return changed observations, [N, P] or [B, N, P]."""
 
-    def new_observations(self, observations: Any) -> Any:
-        """Return the observation, which is always new."""
-        return observations
 
-    def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[Any, dict[str, Any]]:
-        """Start an episode; as for the environment itself."""
-        observation, info = self.env.reset(seed=seed, options=options)
-        self.restarted = True
-        return self.observations(observation), info
+class Observations(ChangesObservations, AnyObservationWrapper):
+    """Base class of wrappers that change the observations of one world."""
 
-    def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
-        """Step; as for the environment itself."""
-        observation, reward, terminated, truncated, info = self.env.step(action)
-        self.restarted = False
-        return self.observations(observation), reward, terminated, truncated, info
+    def observation(self, observation: Any) -> Any:
+        """Return an observation counted and changed, for Gymnasium's `reset` and `step`."""
+        self.count(observation)
+        return self.changed(observation)
 
 
 class EpisodeWrapper(AnyVectorWrapper):
     """Base class of wrappers of vector environments with an `EpisodeClock`."""
 
     def __init__(self, env: AnyVectorEnv) -> None:
+        if not isinstance(env, VectorEnv):
+            raise NPAError(
+                f"{type(self).__name__} needs a vector environment, got {type(env).__name__}: "
+                f"{MAKE_VECTOR}"
+            )
         super().__init__(env)
         self.clock = EpisodeClock(env)
         """Step counts and restarts of the worlds."""
@@ -304,7 +289,7 @@ class EpisodeWrapper(AnyVectorWrapper):
         """Return the results of a step, after the clock's update."""
 
 
-class VectorObservations(EpisodeWrapper):
+class VectorObservations(ChangesObservations, EpisodeWrapper):
     """Base class of wrappers that change observations of many worlds, final ones included."""
 
     @property
@@ -318,34 +303,28 @@ class VectorObservations(EpisodeWrapper):
     def observation_space(self, space: Space[Any]) -> None:
         self._observation_space = space
 
-    def new_observations(self, observations: Any) -> Any:
-        """Return the rows of observations, [B, N, P], that are new, [M, N, P]."""
-        observed = self.clock.observed
-        if observed.all():
-            return observations
-        if isinstance(observations, Tensor):
-            return observations[world_indices(observed, observations.device)]
-        return observations[observed]
-
-    @abstractmethod
-    def observations(self, observations: Any) -> Any:
-        """Return the observations of all worlds, shape [B, N, P], changed."""
-
-    @abstractmethod
-    def final_observations(self, observations: Any) -> Any:
-        """Return the final observations, [B, N, P], changed; called after `observations`."""
-
     def after_reset(self, observations: Any, infos: dict[str, Any]) -> tuple[Any, dict[str, Any]]:
         """Return changed observations and infos."""
-        return self.observations(observations), infos
+        return self._counted(observations), infos
 
     def after_step(self, outcome: VectorStep) -> VectorStep:
         """Return changed observations, the final ones included, and the rest as it is."""
         observations, rewards, terminations, truncations, infos = outcome
-        observations = self.observations(observations)
+        observations = self._counted(observations)
         if "final_obs" in infos:
-            infos = infos | {"final_obs": self.final_observations(infos["final_obs"])}
+            infos = infos | {"final_obs": self.changed(infos["final_obs"])}
         return observations, rewards, terminations, truncations, infos
+
+    def _counted(self, observations: Any) -> Any:
+        """Return observations changed, after counting those of worlds that are new."""
+        observed: Any = self.clock.observed
+        if observed.all():
+            self.count(observations)
+        else:
+            if isinstance(observations, Tensor):
+                observed = world_indices(observed, observations.device)
+            self.count(observations[observed])
+        return self.changed(observations)
 
 
 class WrapperBase(RecordConstructorArgs):
@@ -363,11 +342,7 @@ class WrapperBase(RecordConstructorArgs):
 
     def base_of(self, env: Any) -> Any:
         """Return this package's environment below wrappers, single or vector."""
-        find = vector_env if isinstance(self, EpisodeWrapper) else single_env
-        return find(env, type(self).__name__)
-
-    @property
-    def restarted_worlds(self) -> NDArray[np.bool_]:
-        """Worlds whose last observation is the first of an episode, shape [B]."""
-        mask: Any = self.clock.restarted if self.many else [self.restarted]  # type: ignore[attr-defined]
-        return np.asarray(mask)
+        name = type(self).__name__
+        if isinstance(self, EpisodeWrapper):
+            return vector_env(env, name)
+        return _base_env(env, name, NPAEnv, "an environment", "make one with gym.make('npa/...')")

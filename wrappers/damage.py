@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -10,7 +10,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from npa_envs.checks import is_whole
+from npa_envs.checks import entries, is_whole
 from npa_envs.envs.core.base import to_output
 from npa_envs.errors import NPAError, shown
 from npa_envs.tasks.damage import DamageEvent, damage_worlds, parse_damage
@@ -34,24 +34,22 @@ class _DamagesWorlds(WrapperBase):
     def __init__(
         self, env: Any, events: Event | Sequence[Event], *, every: int | None = None
     ) -> None:
-        several: Any = events
-        listed = isinstance(several, Iterable) and getattr(several, "ndim", 1) != 0
-        if isinstance(events, str | DamageEvent) or not listed:
+        several = entries(events)
+        if several is None:
             several = [events]
-        given = list(several)
-        if not given:
+        if not several:
             raise NPAError("events must have at least one event, got none: for example '100:cut'")
         if every is not None and not (is_whole(every) and 1 <= every < 2**63):
             raise NPAError(
                 f"every must be a whole number of at least 1 and below 2^63, got {shown(every)}"
             )
-        for event in given:
+        for event in several:
             if not isinstance(event, str | DamageEvent):
                 raise NPAError(
                     f"an event must be text or a DamageEvent, got {type(event).__name__}: "
                     "for example '100:cut'"
                 )
-        self.events = tuple(parse_damage(e) if isinstance(e, str) else e for e in given)
+        self.events = tuple(parse_damage(e) if isinstance(e, str) else e for e in several)
         """The events; those of one step are applied in this order."""
         self.every = every
         """Steps after which each event repeats."""

@@ -63,78 +63,73 @@ def record_episodes(
     """
     vector_env(env, "record_episodes")
     check_same_step(autoreset_mode(env))
-    given = list(seeds)
-    if not given:
+    if not len(seeds):
         raise NPAError("seeds must have at least one seed, got none: give seeds=range(8)")
-    for first in range(0, len(given), env.num_envs):
-        batch = given[first : first + env.num_envs]
+    for first in range(0, len(seeds), env.num_envs):
+        batch = list(seeds[first : first + env.num_envs])
         # Worlds beyond the last seed repeat it, and are dropped.
-        yield from _recorded(env, policy, [*batch, *batch[-1:] * (env.num_envs - len(batch))])[
-            : len(batch)
-        ]
+        padding = batch[-1:] * (env.num_envs - len(batch))
+        yield from _recorded(env, policy, batch + padding)[: len(batch)]
 
 
 def _recorded(env: Any, policy: Callable[[Any], Any], seeds: list[int]) -> list[EpisodeBuffer]:
     """Return the first episode of each world after a reset with its seed."""
     observation, infos = env.reset(seed=seeds)
     observations, losses = [_host(observation)], [_host(infos["loss"])]
-    done: list[dict[str, Any]] = []
+    steps: list[tuple[Any, ...]] = []
     lengths = np.zeros(len(seeds), np.int64)
     last: list[Any] = [None] * len(seeds)
     while not lengths.all():
-        action = _clipped(env, policy(observation))
-        observation, reward, terminated, truncated, infos = env.step(action)
-        step = {"actions": action, "rewards": reward}
-        step |= {"terminations": terminated, "truncations": truncated}
-        done.append({name: _host(value) for name, value in step.items()})
-        over = (done[-1]["terminations"] | done[-1]["truncations"]) & (lengths == 0)
+        action = policy(observation)
+        if isinstance(env.single_action_space, gymnasium.spaces.Box):
+            # As environments do.
+            action = action.clip(-1.0, 1.0)
+        observation, *outcome, infos = env.step(action)
+        steps.append(tuple(map(_host, (action, *outcome))))
+        over = (steps[-1][2] | steps[-1][3]) & (lengths == 0)
         loss = _host(infos["loss"])
         if over.any():
             final = _host(infos["final_obs"])
             loss = np.where(over, _host(infos["final_info"]["loss"]), loss)
             for k in np.flatnonzero(over).tolist():
-                last[k] = _of_world(final, k)
-                lengths[k] = len(done)
+                last[k], lengths[k] = _of_world(final, k), len(steps)
         observations.append(_host(observation))
         losses.append(loss)
+
+    def stacked(*arrays: Any) -> Any:
+        return np.stack(arrays)
+
+    names = ("actions", "rewards", "terminations", "truncations")
     episodes = []
-    for k, length in enumerate(map(int, lengths)):
-        steps = {name: np.stack([step[name][k] for step in done[:length]]) for name in done[0]}
-        of_world = [*(_of_world(one, k) for one in observations[:length]), last[k]]
-        infos_of_world = {"loss": np.array([loss[k] for loss in losses[: length + 1]], np.float64)}
-        buffer: Any = EpisodeBuffer(
-            seed=seeds[k], observations=_stacked(of_world), infos=infos_of_world, **steps
-        )
-        episodes.append(buffer)
+    for k, length in enumerate(lengths.tolist()):
+        episode: dict[str, Any] = {
+            name: np.stack([step[number][k] for step in steps[:length]])
+            for number, name in enumerate(names)
+        }
+        world = [*(_of_world(one, k) for one in observations[:length]), last[k]]
+        episode["observations"] = _mapped(stacked, *world)
+        world_losses = [loss[k] for loss in losses[: length + 1]]
+        episode["infos"] = {"loss": np.array(world_losses, np.float64)}
+        episodes.append(EpisodeBuffer(seed=seeds[k], **episode))
     return episodes
 
 
-def _clipped(env: Any, action: Any) -> Any:
-    """Return actions clipped to the space, as environments do."""
-    if isinstance(env.single_action_space, gymnasium.spaces.Box):
-        return action.clip(-1.0, 1.0)
-    return action
+def _mapped(function: Callable[..., Any], *values: Any) -> Any:
+    """Return a function's value for arrays; dictionaries entry by entry."""
+    if isinstance(values[0], dict):
+        return {name: _mapped(function, *(v[name] for v in values)) for name in values[0]}
+    return function(*values)
 
 
-def _host(value: Any) -> Any:
-    """Return a tensor or array as a new array; dictionaries entry by entry."""
-    if isinstance(value, dict):
-        return {name: _host(part) for name, part in value.items()}
-    return value.cpu().numpy().copy() if isinstance(value, Tensor) else np.array(value)
+def _host(values: Any) -> Any:
+    """Return tensors or arrays as new arrays."""
+    return _mapped(
+        lambda v: v.cpu().numpy().copy() if isinstance(v, Tensor) else np.array(v), values
+    )
 
 
 def _of_world(observation: Any, k: int) -> Any:
-    """Return the observation of world k."""
-    if isinstance(observation, dict):
-        return {name: part[k] for name, part in observation.items()}
-    return observation[k]
-
-
-def _stacked(observations: list[Any]) -> Any:
-    if isinstance(observations[0], dict):
-        first = observations[0]
-        return {name: _stacked([one[name] for one in observations]) for name in first}
-    return np.stack(observations)
+    return _mapped(lambda array: array[k], observation)
 
 
 def write_dataset(
@@ -175,7 +170,7 @@ def write_dataset(
         with _datasets_in(part), warnings.catch_warnings():
             # Minari warns about missing authors, addresses and links to code.
             warnings.simplefilter("ignore", UserWarning)
-            made = minari.create_dataset_from_buffers(
+            dataset = minari.create_dataset_from_buffers(
                 dataset_id,
                 [next(episodes)],
                 env=spec,
@@ -183,15 +178,15 @@ def write_dataset(
                 description=description,
             )
             for episode in episodes:
-                made.update_dataset_from_buffer([episode])
+                dataset.update_dataset_from_buffer([episode])
         namespace = dataset_id.rpartition("/")[0]
         if namespace and namespace not in list_local_namespaces():
             create_namespace(namespace)
         os.replace(part / dataset_id, target)
-    except NPAError:
-        # Errors of `episodes` need no other message.
-        raise
     except (OSError, ValueError) as error:
+        if isinstance(error, NPAError):
+            # Errors of `episodes` need no other message.
+            raise
         raise NPAError(
             f"dataset {shown(dataset_id)} could not be written ({shown(error)}): give an id such "
             "as npa/heart/expert-v0, and a folder with room for it"

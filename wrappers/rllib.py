@@ -18,7 +18,6 @@ from npa_envs.registration import (
     CODED,
     GARDEN_IDS,
     SPECIES_SIZES,
-    register_environments,
 )
 from npa_envs.wrappers.base import AnyVectorEnv, vector_env
 from npa_envs.wrappers.particle_rows import ParticleRows
@@ -31,9 +30,6 @@ except ImportError as error:
     raise MissingDependencyError(
         f"training with RLlib needs Ray ({error}): pip install 'npa-envs[rllib]'"
     ) from error
-
-EVERYONE = "everyone"
-"""Name of the policy that all species share with `shared=True`."""
 
 MAKERS = {
     name: (module.parallel_env, task)
@@ -49,20 +45,8 @@ WHOLE_IDS = frozenset((*GARDEN_IDS, *(row.id for row in CODED)))
 """Ids of environments whose actions are for a whole world."""
 
 
-def _agents(name: str, keywords: dict[str, Any]) -> ParallelPettingZooEnv:
-    """Make the environment of an id and keywords, as a creator for RLlib."""
-    make, task = MAKERS[name]
-    return ParallelPettingZooEnv(make(task, **dict(keywords)))
-
-
-def _policy_of(policies: dict[str, str], agent: str, *_: Any, **__: Any) -> str:
-    return policies[agent]
-
-
 def _rows(name: str, keywords: dict[str, Any]) -> AnyVectorEnv:
     """Make the worlds of an id for `num_envs` rows, as a creator for RLlib."""
-    # A process of RLlib may have imported this module only.
-    register_environments()
     fields = dict(keywords)
     count = fields.pop("num_envs")
     if name in WHOLE_IDS:
@@ -113,15 +97,13 @@ def rllib_config(name: str, *, shared: bool = False, **keywords: Any) -> PPOConf
     _, infos = env.reset(seed=0)
     env.close()
     policies = {
-        agent: EVERYONE if shared else f"species_{info['species']}" for agent, info in infos.items()
+        agent: f"species_{info['species']}" if not shared else "everyone"
+        for agent, info in infos.items()
     }
-    register_env(name, partial(_agents, name))
-    config: PPOConfig = (
-        PPOConfig()
-        .environment(name, env_config=keywords)
-        .multi_agent(
-            policies=set(policies.values()), policy_mapping_fn=partial(_policy_of, policies)
-        )
+    register_env(name, lambda fields: ParallelPettingZooEnv(make(task, **fields)))
+    config: PPOConfig = PPOConfig().environment(name, env_config=keywords)
+    config.multi_agent(
+        policies=set(policies.values()), policy_mapping_fn=lambda agent, *_, **__: policies[agent]
     )
     return config
 
@@ -147,7 +129,6 @@ def rllib_rows_config(
         NPAError: There is no such id, or a keyword is wrong.
     """
     _check_id(name, ROW_IDS, MAKERS, "rllib_config")
-    register_environments()
     fields = dict(keywords)
     if particle_count is not None:
         fields["particle_count"] = checked_count("particle_count", particle_count)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any, NoReturn
 
@@ -15,6 +16,7 @@ from torch import Tensor
 from npa_envs.envs.multi.vector import MultiSpeciesVectorEnv
 from npa_envs.errors import MissingDependencyError, NPAError, shown, suggest
 from npa_envs.wrappers.base import (
+    MAKE_VECTOR,
     AnyVectorEnv,
     as_tensor,
     autoreset_mode,
@@ -70,19 +72,22 @@ class RowVecEnv(VecEnv):
         """Gymnasium's spec of the environment."""
         self.nothing: dict[str, Any] = SharedInfo()
         """The info of all rows whose episodes go on."""
-        self._seed: int | None = None
         self._actions: NDArray[np.float32] | None = None
+        self._observations: Any = None
         super().__init__(world_count * row_count, observation_space, action_space)
 
-    def begin(self) -> tuple[Any, Any]:
-        """Reset the environment with the arguments of `seed` and `set_options`."""
-        outcome: tuple[Any, Any] = self.vector_env.reset(
-            seed=self._seed, options=self._options[0] or None
-        )
-        self._seed = None
+    def reset(self) -> Any:
+        """Start episodes in all worlds and return the rows' observations, shape [B R, ...]."""
+        # World k takes the seed of world 0 plus k.
+        seed, options = self._seeds[0], self._options[0] or None
+        self._observations, _ = self.vector_env.reset(seed=seed, options=options)
         self._reset_seeds()
         self._reset_options()
-        return outcome
+        return self._row_observations(self._observations)
+
+    @abstractmethod
+    def _row_observations(self, observations: Any) -> Any:
+        """Return the rows' observations for those of all or some worlds."""
 
     def step_async(self, actions: NDArray[Any]) -> None:
         """Store the actions of all rows, shape [B R, A], for `step_wait`."""
@@ -99,12 +104,11 @@ class RowVecEnv(VecEnv):
     def infos(self, rows: NDArray[np.int64], entries: Mapping[str, Any]) -> list[dict[str, Any]]:
         """Return infos of all rows: `entries` for some, [M], and the shared empty one for others.
 
-        Entries have a value for each of the M rows; those that are None are left out.
+        Entries have a value for each of the M rows.
         """
         infos: list[dict[str, Any]] = [self.nothing] * self.num_envs
-        given = {name: values for name, values in entries.items() if values is not None}
         for k, row in enumerate(rows.tolist()):
-            infos[row] = {name: values[k] for name, values in given.items()}
+            infos[row] = {name: values[k] for name, values in entries.items()}
         return infos
 
     def close(self) -> None:
@@ -116,11 +120,10 @@ class RowVecEnv(VecEnv):
 
         None draws a seed.
         """
-        if seed is None:
-            seed = int(np.random.default_rng().integers(2**32))
-        self._seed = int(seed)
+        first = int(np.random.default_rng().integers(2**32) if seed is None else seed)
         worlds = np.arange(self.world_count).repeat(self.row_count)
-        return [self._seed + world for world in worlds.tolist()]
+        self._seeds = [first + world for world in worlds.tolist()]
+        return self._seeds
 
     def get_images(self) -> list[NDArray[np.uint8] | None]:
         """Return a picture of each world, shape [R, R, 3]; an empty list without a render mode."""
@@ -129,11 +132,11 @@ class RowVecEnv(VecEnv):
 
     def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
         """Return an attribute of the environment or its wrappers, once for each row."""
-        return [getattr(self._holder(attr_name), attr_name)] * len(self._chosen(indices))
+        return self._for_rows(getattr(self._holder(attr_name), attr_name), indices)
 
     def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
         """Set an attribute on the wrapper or environment that has it, else on the innermost."""
-        if len(set(self._chosen(indices))) != self.num_envs:
+        if len(set(self._get_indices(indices))) != self.num_envs:
             raise NPAError("indices must be all rows, which share one environment: give None")
         try:
             holder = self._holder(attr_name)
@@ -146,15 +149,15 @@ class RowVecEnv(VecEnv):
     ) -> list[Any]:
         """Call a method of the environment once, and return its result for each row."""
         result = getattr(self._holder(method_name), method_name)(*method_args, **method_kwargs)
-        return [result] * len(self._chosen(indices))
+        return self._for_rows(result, indices)
 
     def env_is_wrapped(self, wrapper_class: type[Any], indices: Any = None) -> list[bool]:
         """Return for each row whether the environment is wrapped with a class."""
         wrapped = any(isinstance(layer, wrapper_class) for layer in self._layers())
-        return [wrapped] * len(self._chosen(indices))
+        return self._for_rows(wrapped, indices)
 
-    def _chosen(self, indices: Any) -> list[int]:
-        return list(self._get_indices(indices))
+    def _for_rows(self, value: Any, indices: Any) -> list[Any]:
+        return [value] * len(list(self._get_indices(indices)))
 
     def _layers(self) -> Iterator[Any]:
         layer: Any = self.vector_env
@@ -170,17 +173,17 @@ class RowVecEnv(VecEnv):
         raise AttributeError(f"{self.vector_env} has no attribute {name!r}")
 
 
-def on_host(*given: Any) -> list[NDArray[Any]]:
+def on_host(*batches: Any) -> list[NDArray[Any]]:
     """Return copies of arrays or tensors as arrays, synchronising once."""
     copies = []
-    for values in given:
+    for values in batches:
         tensor = as_tensor(values)
         # Pinned memory comes from torch's cache and returns to it with the array.
         copy = torch.empty(
             tensor.shape, dtype=tensor.dtype, device="cpu", pin_memory=tensor.is_cuda
         )
         copies.append(copy.copy_(tensor, non_blocking=tensor.is_cuda))
-    for device in {v.device for v in given if isinstance(v, Tensor) and v.is_cuda}:
+    for device in {v.device for v in batches if isinstance(v, Tensor) and v.is_cuda}:
         torch.cuda.current_stream(device).synchronize()
     return [copy.numpy() for copy in copies]
 
@@ -194,39 +197,27 @@ class _EpisodeRows(RowVecEnv):
     per_particle_reward = True
     """Whether rows get their particles' rewards, if there are any."""
 
-    def reset(self) -> Any:
-        """Start episodes in all worlds and return the rows' observations, shape [B R, ...]."""
-        observations, _ = self.begin()
-        return self._row_observations(observations)
-
     def step_wait(self) -> RowSteps:
         """Step all worlds; return the rows' observations, rewards, done flags and infos."""
         shape = self.vector_env.single_action_space.shape
         actions = self.taken_actions().reshape(self.world_count, *shape)
         observations, rewards, terminations, truncations, infos = self.vector_env.step(actions)
         by_particle = own_rewards(infos) if self.per_particle_reward else None
-        given = rewards if by_particle is None else by_particle
-        rewards, ended, cut = on_host(given, terminations, truncations)
+        rewards, ended, cut = on_host(
+            rewards if by_particle is None else by_particle, terminations, truncations
+        )
         if by_particle is None:
             rewards = np.repeat(rewards, self.row_count)
         done = ended | cut
         row_infos = self._end_infos(np.flatnonzero(done), cut & ~ended, infos)
         rewards = rewards.reshape(self.num_envs).astype(np.float32, copy=False)
-        return (
-            self._row_observations(observations),
-            rewards,
-            np.repeat(done, self.row_count),
-            row_infos,
-        )
+        rows = self._row_observations(observations)
+        return rows, rewards, np.repeat(done, self.row_count), row_infos
 
     def _row_observations(self, observations: Any) -> Any:
-        """Return the rows' observations for those of all or some worlds."""
         if isinstance(observations, Mapping):
             return dict(zip(observations, on_host(*observations.values()), strict=True))
-        return self._as_rows(on_host(observations)[0])
-
-    def _as_rows(self, values: NDArray[Any]) -> NDArray[Any]:
-        return values.reshape(-1, *(self.observation_space.shape or ()))
+        return on_host(observations)[0].reshape(-1, *(self.observation_space.shape or ()))
 
     def _end_infos(
         self, worlds: NDArray[np.int64], cut: NDArray[np.bool_], infos: dict[str, Any]
@@ -235,17 +226,15 @@ class _EpisodeRows(RowVecEnv):
         if not len(worlds):
             return [self.nothing] * self.num_envs
         count, final = self.row_count, infos["final_info"]
-        last: Any = None
-        cut_off: Any = None
+        entries: dict[str, Any] = {}
         success = final.get("is_success", final.get("success"))
         if success is not None:
-            success = on_host(success)[0][worlds].repeat(count).tolist()
+            entries["is_success"] = on_host(success)[0][worlds].repeat(count).tolist()
         if self.bootstrap:
-            last = self._last(infos["final_obs"], worlds)
-            cut_off = cut[worlds].repeat(count).tolist()
+            entries["TimeLimit.truncated"] = cut[worlds].repeat(count).tolist()
+            entries["terminal_observation"] = self._last(infos["final_obs"], worlds)
         rows = (worlds[:, None] * count + np.arange(count)).reshape(-1)
-        names = ("is_success", "TimeLimit.truncated", "terminal_observation")
-        return self.infos(rows, dict(zip(names, (success, cut_off, last), strict=True)))
+        return self.infos(rows, entries)
 
     def _last(self, final: Any, worlds: NDArray[np.int64]) -> Any:
         """Return the last observations of worlds that are over, one for each of their rows."""
@@ -328,16 +317,12 @@ class WorldVecEnv(_EpisodeRows):
     per_particle_reward = False
 
     def __init__(self, env: Any) -> None:
-        spaces: list[Any] = [
-            getattr(env, name, None) for name in ("single_observation_space", "single_action_space")
-        ]
-        if None in spaces:
-            raise NPAError(
-                f"env must be a vector environment, got {env}: make it with "
-                "gym.make_vec(..., vectorization_mode='vector_entry_point')"
-            )
+        if not hasattr(env, "single_action_space"):
+            raise NPAError(f"env must be a vector environment, got {env}: {MAKE_VECTOR}")
         check_same_step(autoreset_mode(env))
-        super().__init__(env, env.num_envs, 1, *spaces)
+        super().__init__(
+            env, env.num_envs, 1, env.single_observation_space, env.single_action_space
+        )
 
 
 SpeciesPolicy = Callable[[Any], Any]
@@ -434,50 +419,49 @@ class SpeciesVecEnv(RowVecEnv):
         observed = row_space(spaces[self.rows_of[0]])
         self._tags = None
         if not self.others:
-            kinds = np.eye(len(self._counts), dtype=np.float32).repeat(self._counts, axis=0)
-            self._tags = torch.from_numpy(kinds).to(env.worlds.device)
+            tags = np.eye(len(self._counts), dtype=np.float32).repeat(self._counts, axis=0)
+            self._tags = torch.from_numpy(tags).to(env.worlds.device)
             tag = np.ones(len(self._counts), np.float32)
             observed = Box(np.append(observed.low, 0.0 * tag), np.append(observed.high, tag))
-        self._seen: dict[str, Any] = {}
         acted = row_space(env.single_action_spaces[self.rows_of[0]])
         super().__init__(env, env.world_count, int(self._counts.sum()), observed, acted)
 
-    def reset(self) -> NDArray[np.float32]:
-        """Start episodes in all worlds and return the rows' observations, shape [B R, P]."""
-        self._seen, _ = self.begin()
-        return on_host(self._rows(self._seen))[0].reshape(self.num_envs, -1)
-
     def step_wait(self) -> RowSteps:
         """Step all worlds, the other species by their policies; return as `ParticleVecEnv`."""
-        if not self._seen:
+        if self._observations is None:
             raise NPAError("step needs worlds: call reset first")
-        own = np.split(self.taken_actions(), np.cumsum(self._counts)[:-1], axis=1)
-        actions: dict[str, Any] = dict(zip(self.rows_of, own, strict=True))
-        actions |= {name: policy(self._seen[name]) for name, policy in self.others.items()}
+        row_actions = np.split(self.taken_actions(), np.cumsum(self._counts)[:-1], axis=1)
+        actions: dict[str, Any] = dict(zip(self.rows_of, row_actions, strict=True))
+        for name, policy in self.others.items():
+            actions[name] = policy(self._observations[name])
         observed, rewards, terminations, truncations, infos = self.vector_env.step(actions)
-        self._seen = observed
+        self._observations = observed
         live = {name: as_tensor(infos[name]["live"]) for name in self.rows_of}
-        of_rows, of_rewards, ended, cut = on_host(
+        row_observations, row_rewards, ended, cut = on_host(
             torch.where(self._repeated(live)[..., None], self._rows(observed), 0.0),
             self._repeated(rewards),
             self._repeated(terminations),
             self._repeated(truncations),
         )
-        over = ended | cut
+        done = ended | cut
         first = infos[self.rows_of[0]]
         if "final_obs" in first:
             (restarted,) = on_host(first["_final_obs"])
-            over |= restarted[:, None]
-        rows, final = np.flatnonzero(over), None
+            done |= restarted[:, None]
+        rows, entries = np.flatnonzero(done), {}
         if len(rows):
             last = {name: infos[name].get("final_obs", observed[name]) for name in self.rows_of}
-            final = on_host(self._rows(last))[0].reshape(self.num_envs, -1)[rows]
-        cut_off = (cut & ~ended).reshape(-1)[rows].tolist()
-        row_infos = self.infos(
-            rows, {"TimeLimit.truncated": cut_off, "terminal_observation": final}
+            entries["terminal_observation"] = self._row_observations(last)[rows]
+            entries["TimeLimit.truncated"] = (cut & ~ended).reshape(-1)[rows].tolist()
+        return (
+            row_observations.reshape(self.num_envs, -1),
+            row_rewards.reshape(-1),
+            done.reshape(-1),
+            self.infos(rows, entries),
         )
-        rows_observed = of_rows.reshape(self.num_envs, -1)
-        return rows_observed, of_rewards.reshape(-1), over.reshape(-1), row_infos
+
+    def _row_observations(self, observations: Any) -> Any:
+        return on_host(self._rows(observations))[0].reshape(self.num_envs, -1)
 
     def policy(self, model: Any, species: str, *, deterministic: bool = False) -> RowPolicy:
         """Return a model that was trained on these rows as the policy of one species.

@@ -7,14 +7,14 @@ autoreset modes.
 from __future__ import annotations
 
 import time
+from abc import abstractmethod
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 import torch
 from gymnasium.spaces import Box
-from gymnasium.vector import AutoresetMode
 from numpy.typing import NDArray
 from torch import Tensor
 
@@ -29,8 +29,6 @@ from npa_envs.wrappers.base import (
     VectorStep,
     WrapperBase,
     as_tensor,
-    autoreset_mode,
-    check_vector_env,
     like,
     world_indices,
 )
@@ -57,6 +55,11 @@ class RunningMoments:
         self.var = (spread + delta.square() * (self.count * count / total)) / total
         self.count = total
 
+    def update_from(self, samples: Tensor) -> None:
+        """Add samples, in dimension 0."""
+        var, mean = torch.var_mean(samples, dim=0, correction=0)
+        self.update(mean, var, len(samples))
+
     def state_dict(self) -> dict[str, Tensor]:
         """Return mean, variance and count, float64, on the CPU."""
         count = torch.tensor(self.count, dtype=torch.float64)
@@ -68,22 +71,19 @@ class RunningMoments:
         for name in state.keys() ^ wanted.keys():
             fault = "unknown" if name in state else "missing"
             raise NPAError(f"{fault} statistic {shown(name)}: {suggest(name, wanted)}")
-        given = {name: torch.as_tensor(state[name], dtype=torch.float64) for name in wanted}
+        values = {name: torch.as_tensor(state[name], dtype=torch.float64) for name in wanted}
         for name, shape in wanted.items():
-            if given[name].shape != shape:
+            if values[name].shape != shape:
                 raise NPAError(
-                    f"{name} must have shape {tuple(shape)}, got {tuple(given[name].shape)}: "
+                    f"{name} must have shape {tuple(shape)}, got {tuple(values[name].shape)}: "
                     "load the statistics of an environment with the same observations"
                 )
-        self.mean, self.var = given["mean"].clone(), given["var"].clone()
-        self.count = float(given["count"])
+        self.mean, self.var = values["mean"].clone(), values["var"].clone()
+        self.count = float(values["count"])
 
 
-DEFAULT_CLIP, DEFAULT_EPSILON = 10.0, 1e-8
-
-
-class PerceptionStatistics:
-    """Running statistics of perception vectors z = [s; s̄; L(∇s); L(∇ρ)].
+class _NormalizesPerception(WrapperBase):
+    """Mixin that normalises perception vectors z = [s; s̄; L(∇s); L(∇ρ)], of one world or many.
 
     There is one scale for each channel of the states, the smoothed states and the state gradients,
     and one for the density gradient, each shared by all particles. States are centred as well.
@@ -92,107 +92,62 @@ class PerceptionStatistics:
     """
 
     def __init__(
-        self, physics: Physics, *, clip: float = DEFAULT_CLIP, epsilon: float = DEFAULT_EPSILON
+        self, env: Any, *, clip: float = 10.0, epsilon: float = 1e-8, training: bool = True
     ) -> None:
         self.clip, self.epsilon = above_zero("clip", clip), above_zero("epsilon", epsilon)
-        self.space_dim, self.state_dim = physics.space_dim, physics.state_dim
-        self.perception_dim = physics.perception_dim
-        self.moments = RunningMoments(3 * self.state_dim + 1)
-        """Of the states, smoothed states, state gradients (C each) and the density gradient."""
+        if not isinstance(training, bool | np.bool_):
+            raise NPAError(f"training must be True or False, got {shown(training)}")
+        super().__init__(env, clip=self.clip, epsilon=self.epsilon, training=training)
+        self.training = bool(training)
+        self._physics: Physics = self._base.worlds.physics
+        # Of the states, smoothed states, state gradients (C each) and the density gradient.
+        self.statistics = RunningMoments(3 * self._physics.state_dim + 1)
+        shape, wanted = getattr(env, self.space_name).shape or (), self._physics.perception_dim
+        if len(shape) != 2 or shape[1] != wanted:
+            raise NPAError(
+                f"observations must be perception vectors, shape [N, {wanted}], got shape "
+                f"{shape}: normalise before other wrappers change them"
+            )
+        setattr(self, self.space_name, Box(-self.clip, self.clip, shape, np.float32))
 
-    def update(self, observation: Any) -> None:
-        """Take in what particles perceive, an array or tensor of shape [..., P]."""
-        z = as_tensor(observation).flatten(0, -2)
+    def state_dict(self) -> dict[str, Tensor]:
+        """Return the statistics, for `torch.save` or safetensors."""
+        return self.statistics.state_dict()
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Set the statistics that another wrapper's `state_dict` returned."""
+        self.statistics.load_state_dict(state)
+
+    def count(self, observations: Any) -> None:
+        """While training, add new observations to the statistics."""
+        if not self.training:
+            return
+        z = as_tensor(observations).flatten(0, -2)
         var, mean = torch.var_mean(z, dim=0, correction=0)
-        centred = 2 * self.state_dim
+        state_dim, space_dim = self._physics.state_dim, self._physics.space_dim
+        centred = 2 * state_dim
         # About zero, which is the mean of a direction that the world does not prefer.
         square = (var + mean.square())[centred:]
-        gradients = square[: -self.space_dim].view(self.state_dim, self.space_dim).mean(dim=1)
-        density = square[-self.space_dim :].mean(dim=0, keepdim=True)
-        self.moments.update(
-            torch.cat((mean[:centred], torch.zeros_like(square[: self.state_dim + 1]))),
+        gradients = square[:-space_dim].view(state_dim, space_dim).mean(dim=1)
+        density = square[-space_dim:].mean(dim=0, keepdim=True)
+        self.statistics.update(
+            torch.cat((mean[:centred], torch.zeros_like(square[: state_dim + 1]))),
             torch.cat((var[:centred], gradients, density)),
             len(z),
         )
 
-    def normalize(self, observation: Any) -> Any:
-        """Return perception, shape [..., P], normalised and clipped, as new float32 values."""
-        z = as_tensor(observation)
-        mean = self._spread(self.moments.mean).to(z)
-        scale = self._spread((self.moments.var + self.epsilon).rsqrt()).to(z)
-        return like(((z - mean) * scale).clamp_(-self.clip, self.clip), observation)
-
-    def space(self, space: Any) -> Box:
-        """Return the space of normalised observations for a space of observations."""
-        shape = (*(space.shape or ()),)
-        if len(shape) != 2 or shape[1] != self.perception_dim:
-            raise NPAError(
-                f"observations must be perception vectors, shape [N, {self.perception_dim}], got "
-                f"shape {shape}: normalise before other wrappers change them"
-            )
-        return Box(-self.clip, self.clip, shape, np.float32)
+    def changed(self, observations: Any) -> Any:
+        """Return perception normalised and clipped, as new float32 values."""
+        z = as_tensor(observations)
+        mean = self._spread(self.statistics.mean).to(z)
+        scale = self._spread((self.statistics.var + self.epsilon).rsqrt()).to(z)
+        return like(((z - mean) * scale).clamp_(-self.clip, self.clip), observations)
 
     def _spread(self, statistics: Tensor) -> Tensor:
         """Expand statistics to the entries of a perception vector, shape [P]."""
-        centred = 2 * self.state_dim
-        gradients = statistics[centred:].repeat_interleave(self.space_dim)
+        centred = 2 * self._physics.state_dim
+        gradients = statistics[centred:].repeat_interleave(self._physics.space_dim)
         return torch.cat((statistics[:centred], gradients))
-
-
-class _NormalizesPerception(WrapperBase):
-    """Mixin that normalises perception by its statistics, for one world or many."""
-
-    statistics: PerceptionStatistics
-    training: bool
-    new_observations: Callable[[Any], Any]
-
-    def __init__(
-        self,
-        env: Any,
-        *,
-        clip: float | None = None,
-        epsilon: float | None = None,
-        training: bool = True,
-        statistics: PerceptionStatistics | None = None,
-    ) -> None:
-        base, named = self.base_of(env), (("clip", clip), ("epsilon", epsilon))
-        given = {name: value for name, value in named if value is not None}
-        if statistics is None:
-            statistics = PerceptionStatistics(base.worlds.physics, **given)
-        elif not isinstance(statistics, PerceptionStatistics):
-            raise NPAError(
-                f"statistics must be those of another wrapper, got {type(statistics).__name__}: "
-                "give wrapper.statistics, or load a state with load_state_dict"
-            )
-        elif given:
-            name, value = next(iter(given.items()))
-            raise NPAError(
-                f"{name} belongs to statistics, which has {getattr(statistics, name):g}, got "
-                f"{shown(value)} as well: leave {name} out"
-            )
-        if not isinstance(training, bool | np.bool_):
-            raise NPAError(f"training must be True or False, got {shown(training)}")
-        super().__init__(env, clip=statistics.clip, epsilon=statistics.epsilon, training=training)
-        self.statistics, self.training = statistics, bool(training)
-        setattr(self, self.space_name, statistics.space(getattr(env, self.space_name)))
-
-    def state_dict(self) -> dict[str, Tensor]:
-        """Return the statistics, for `torch.save` or safetensors."""
-        return self.statistics.moments.state_dict()
-
-    def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Set the statistics that another wrapper's `state_dict` returned."""
-        self.statistics.moments.load_state_dict(state)
-
-    def observations(self, observations: Any) -> Any:
-        """Return observations normalised; while training, first add new ones to the statistics."""
-        if self.training:
-            self.statistics.update(self.new_observations(observations))
-        return self.statistics.normalize(observations)
-
-    def final_observations(self, observations: Any) -> Any:
-        """Return observations normalised."""
-        return self.statistics.normalize(observations)
 
 
 class NormalizePerception(_NormalizesPerception, Observations):
@@ -202,19 +157,16 @@ class NormalizePerception(_NormalizesPerception, Observations):
 
     Args:
         env: An environment of this package.
-        clip: Normalised values are clipped to plus and minus this (dimensionless); None: 10, or
-            that of `statistics`.
-        epsilon: Added to variances (dimensionless); None: 1e-8, or that of `statistics`.
+        clip: Normalised values are clipped to plus and minus this (dimensionless).
+        epsilon: Added to variances (dimensionless).
         training: Whether new observations update the statistics.
-        statistics: Those of another wrapper, to share; None: new ones.
 
     Raises:
-        NPAError: The environment or a number is wrong, or `clip` or `epsilon` is given although
-            `statistics` has its own.
+        NPAError: The environment or a number is wrong.
 
     Attributes:
         training: Whether new observations update the statistics; set it to False to freeze them.
-        statistics: The running statistics.
+        statistics: The running statistics; set it to those of another wrapper to share them.
     """
 
 
@@ -227,7 +179,44 @@ class VectorNormalizePerception(_NormalizesPerception, VectorObservations):
     """
 
 
-class TorchRecordEpisodeStatistics(EpisodeWrapper):
+class _SumsRewards(EpisodeWrapper):
+    """Base class of wrappers with a sum of the rewards of each running episode."""
+
+    gamma = 1.0
+    """Factor on the sum in each step (dimensionless)."""
+
+    sums: Tensor | None = None
+    """Sums of the rewards, float64, shape [B]."""
+
+    @abstractmethod
+    def summed(self, rewards: Tensor, sums: Tensor) -> tuple[Tensor, dict[str, Any]]:
+        """Return the rewards, [B], changed, and entries for infos; before sums restart."""
+
+    def after_reset(self, observations: Any, infos: dict[str, Any]) -> tuple[Any, dict[str, Any]]:
+        """Set the sums of new episodes to zero."""
+        self.restart(self.clock.restarted)
+        return observations, infos
+
+    def after_step(self, outcome: VectorStep) -> VectorStep:
+        """Add the rewards to the sums."""
+        observations, rewards, terminations, truncations, infos = outcome
+        check_tensor(rewards, type(self).__name__)
+        sums = rewards.double()
+        if self.sums is not None:
+            sums = self.sums * self.gamma + sums
+        self.sums = sums
+        rewards, entries = self.summed(rewards, sums)
+        # With next-step autoreset the step that restarts belongs to no episode.
+        self.restart(self.clock.restarted)
+        return observations, rewards, terminations, truncations, infos | entries
+
+    def restart(self, worlds: NDArray[np.bool_]) -> None:
+        """Set the sums of some worlds to zero."""
+        if self.sums is not None and worlds.any():
+            self.sums = self.sums.index_fill(0, world_indices(worlds, self.sums.device), 0.0)
+
+
+class TorchRecordEpisodeStatistics(_SumsRewards):
     """Keep track of returns and lengths of episodes.
 
     A step in which episodes end has `infos["episode"]` with the tensors `r` (returns), `l` (lengths
@@ -246,7 +235,6 @@ class TorchRecordEpisodeStatistics(EpisodeWrapper):
     def __init__(
         self, env: AnyVectorEnv, buffer_length: int = 100, stats_key: str = "episode"
     ) -> None:
-        check_vector_env(env, type(self).__name__)
         super().__init__(env)
         if not is_whole(buffer_length) or not 1 <= buffer_length < 2**31:
             raise NPAError(
@@ -256,62 +244,48 @@ class TorchRecordEpisodeStatistics(EpisodeWrapper):
         self._key = stats_key
         self.episode_count = 0
         """Episodes that have ended."""
-        self.episode_returns: Tensor | None = None
-        """Sum of the rewards of each running episode, float64, shape [B]."""
         self.length_queue: deque[int] = deque(maxlen=buffer_length)
         """Lengths of the last episodes [steps]."""
         self.time_queue: deque[float] = deque(maxlen=buffer_length)
         """Times that the last episodes took [s]."""
-        self._returns: deque[float] = deque(maxlen=buffer_length)
-        # On the device until they are read; each entry has at least one episode.
-        self._unread: deque[Tensor] = deque(maxlen=buffer_length)
+        # On the device; each entry has at least one episode.
+        self._returns: deque[Tensor] = deque(maxlen=buffer_length)
         self._began = np.full(env.num_envs, time.perf_counter())
+
+    @property
+    def episode_returns(self) -> Tensor | None:
+        """Sum of the rewards of each running episode, float64, shape [B]."""
+        return self.sums
 
     @property
     def return_queue(self) -> deque[float]:
         """Returns of the last episodes; reading it synchronises."""
-        if self._unread:
-            self._returns.extend(torch.cat(tuple(self._unread)).tolist())
-            self._unread.clear()
-        return self._returns
+        returns = torch.cat(tuple(self._returns)).tolist() if self._returns else []
+        return deque(returns, maxlen=self._returns.maxlen)
 
-    def after_reset(self, observations: Any, infos: dict[str, Any]) -> tuple[Any, dict[str, Any]]:
-        """Set the sums of new episodes to zero."""
-        self._restart(self.clock.restarted)
-        return observations, infos
-
-    def after_step(self, outcome: VectorStep) -> VectorStep:
-        """Sum the rewards, and report the episodes that ended."""
-        observations, rewards, terminations, truncations, infos = outcome
-        check_tensor(rewards, type(self).__name__)
-        returns = rewards.double()
-        if self.episode_returns is not None:
-            returns = self.episode_returns + returns
-        self.episode_returns = returns
-        if self.clock.ended.any():
-            infos = infos | self._ended(returns, rewards.device)
-        # With next-step autoreset the step that restarts belongs to no episode.
-        self._restart(self.clock.restarted)
-        return observations, rewards, terminations, truncations, infos
-
-    def _ended(self, returns: Tensor, device: torch.device) -> dict[str, Any]:
-        ended, lengths = self.clock.ended, self.clock.lengths
+    def summed(self, rewards: Tensor, sums: Tensor) -> tuple[Tensor, dict[str, Any]]:
+        """Return the rewards, and the statistics of the episodes that ended."""
+        ended, device = self.clock.ended, sums.device
+        if not ended.any():
+            return rewards, {}
+        lengths = np.where(ended, self.clock.lengths, 0)
         seconds = np.where(ended, np.round(time.perf_counter() - self._began, 6), 0.0)
         mask = torch.from_numpy(ended).to(device)
         self.episode_count += int(ended.sum())
         self.length_queue.extend(lengths[ended].tolist())
         self.time_queue.extend(seconds[ended].tolist())
-        self._unread.append(returns[world_indices(ended, device)])
+        self._returns.append(sums[world_indices(ended, device)])
         episode = {
-            "r": torch.where(mask, returns, 0.0),
-            "l": torch.from_numpy(np.where(ended, lengths, 0)).to(device),
+            "r": torch.where(mask, sums, 0.0),
+            "l": torch.from_numpy(lengths).to(device),
             "t": torch.from_numpy(seconds).to(device),
         }
-        return {self._key: episode, f"_{self._key}": mask}
+        return rewards, {self._key: episode, f"_{self._key}": mask}
 
-    def _restart(self, worlds: NDArray[np.bool_]) -> None:
+    def restart(self, worlds: NDArray[np.bool_]) -> None:
+        """Set sums and times of some worlds to zero."""
+        super().restart(worlds)
         self._began[worlds] = time.perf_counter()
-        self.episode_returns = forgotten(self.episode_returns, worlds)
 
 
 class TorchNormalizeObservation(VectorObservations):
@@ -330,7 +304,6 @@ class TorchNormalizeObservation(VectorObservations):
     """
 
     def __init__(self, env: AnyVectorEnv, epsilon: float = 1e-8) -> None:
-        check_vector_env(env, type(self).__name__)
         super().__init__(env)
         self.epsilon = above_zero("epsilon", epsilon)
         shape = env.single_observation_space.shape
@@ -341,22 +314,19 @@ class TorchNormalizeObservation(VectorObservations):
         self.update_running_mean = True
         """Whether new observations update the statistics."""
 
-    def observations(self, observations: Any) -> Any:
-        """Return observations normalised, and count them unless frozen."""
+    def count(self, observations: Any) -> None:
+        """Add new observations to the statistics unless they are frozen."""
         check_tensor(observations, type(self).__name__)
         if self.update_running_mean:
-            new = self.new_observations(observations)
-            var, mean = torch.var_mean(new, dim=0, correction=0)
-            self.obs_rms.update(mean, var, len(new))
-        return self.final_observations(observations)
+            self.obs_rms.update_from(observations)
 
-    def final_observations(self, observations: Any) -> Any:
+    def changed(self, observations: Any) -> Any:
         """Return observations normalised."""
         scale = (self.obs_rms.var + self.epsilon).rsqrt().to(observations)
         return (observations - self.obs_rms.mean.to(observations)) * scale
 
 
-class TorchNormalizeReward(EpisodeWrapper):
+class TorchNormalizeReward(_SumsRewards):
     """Divide rewards by the running standard deviation of the discounted return.
 
     The return restarts at zero with each episode.
@@ -371,48 +341,29 @@ class TorchNormalizeReward(EpisodeWrapper):
     """
 
     def __init__(self, env: AnyVectorEnv, gamma: float = 0.99, epsilon: float = 1e-8) -> None:
-        check_vector_env(env, type(self).__name__)
         super().__init__(env)
         if not is_real(gamma) or not 0.0 <= gamma <= 1.0:
             raise NPAError(f"gamma must lie in [0, 1], got {shown(gamma)}: try 0.99")
         self.gamma, self.epsilon = gamma, above_zero("epsilon", epsilon)
         self.return_rms = RunningMoments()
         """Running mean and variance of the discounted return."""
-        self.accumulated_reward: Tensor | None = None
-        """Discounted return of each running episode, float64, shape [B]."""
         self.update_running_mean = True
         """Whether new rewards update the statistics."""
-        self._same_step = autoreset_mode(env) is AutoresetMode.SAME_STEP
 
-    def after_reset(self, observations: Any, infos: dict[str, Any]) -> tuple[Any, dict[str, Any]]:
-        """Set the returns of new episodes to zero."""
-        self.accumulated_reward = forgotten(self.accumulated_reward, self.clock.restarted)
-        return observations, infos
+    @property
+    def accumulated_reward(self) -> Tensor | None:
+        """Discounted return of each running episode, float64, shape [B]."""
+        return self.sums
 
-    def after_step(self, outcome: VectorStep) -> VectorStep:
+    def summed(self, rewards: Tensor, sums: Tensor) -> tuple[Tensor, dict[str, Any]]:
         """Return rewards divided by the standard deviation of the discounted return."""
-        observations, rewards, terminations, truncations, infos = outcome
-        check_tensor(rewards, type(self).__name__)
-        clock = self.clock
-        before = self.accumulated_reward
-        returns = rewards.double() if before is None else before * self.gamma + rewards.double()
-        counted = returns
-        if not self._same_step and clock.restarted.any():
+        restarted = self.clock.restarted
+        if restarted.any() and not self.clock.same_step:
             # With next-step autoreset the step that restarts belongs to no episode.
-            counted = returns[world_indices(~clock.restarted, returns.device)]
-        if self.update_running_mean and len(counted):
-            var, mean = torch.var_mean(counted, dim=0, correction=0)
-            self.return_rms.update(mean, var, len(counted))
-        self.accumulated_reward = forgotten(returns, clock.restarted)
-        scale = (self.return_rms.var + self.epsilon).rsqrt().to(rewards)
-        return observations, rewards * scale, terminations, truncations, infos
-
-
-def forgotten(sums: Tensor | None, worlds: NDArray[np.bool_]) -> Tensor | None:
-    """Return sums of each world, shape [B], set to 0 in some of them."""
-    if sums is None or not worlds.any():
-        return sums
-    return sums.index_fill(0, world_indices(worlds, sums.device), 0.0)
+            sums = sums[world_indices(~restarted, sums.device)]
+        if self.update_running_mean and len(sums):
+            self.return_rms.update_from(sums)
+        return rewards * (self.return_rms.var + self.epsilon).rsqrt().to(rewards), {}
 
 
 def check_tensor(values: Any, wrapper: str) -> None:

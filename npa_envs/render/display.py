@@ -9,15 +9,14 @@ import math
 import os
 import warnings
 from collections.abc import Iterable, Iterator
-from types import TracebackType
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from npa_envs.checks import checked_count
+from npa_envs.checks import checked_side
 from npa_envs.errors import MissingDependencyError, NPAError, shown
 from npa_envs.render.film import Frame, check_rate, checked_frames, encode_frame, encode_webp
 from npa_envs.render.worlds import draw_worlds
@@ -154,21 +153,18 @@ class Window:
 
     Args:
         title: Text of the title bar.
-        size: Width and height [screen pixels], or one number for both. Frames of another size are
-            scaled to it.
+        size: Side of the window [screen pixels]. Frames of another size are scaled to it.
         fps: Largest number of frames a second, kept by waiting in `show`; None: no limit.
 
     Raises:
         MissingDependencyError: pygame is not installed.
     """
 
-    def __init__(
-        self, title: str, size: int | tuple[int, int] = 512, *, fps: float | None = None
-    ) -> None:
+    def __init__(self, title: str, size: int = 512, *, fps: float | None = None) -> None:
         global _shown
         if fps is not None:
             check_rate(fps)
-        self.size = _checked_size(size)
+        self.size = (checked_side("size", size),) * 2
         """Width and height [screen pixels]."""
         self.fps = fps
         """Largest number of frames a second; None: no limit."""
@@ -189,15 +185,10 @@ class Window:
                 stacklevel=2,
             )
 
-    @property
-    def visible(self) -> bool:
-        """Whether it is on the screen."""
-        return self._surface is not None
-
     def show(self, frame: Frame) -> None:
         """Show a frame, uint8, shape [H, W, 3]; handle events, and wait as `fps` requires."""
         (pixels,) = checked_frames([frame])
-        self.answer_events()
+        self._handle_events()
         if self._surface is None:
             return
         # pygame counts columns first.
@@ -209,13 +200,12 @@ class Window:
         if self.fps is not None:
             self._clock.tick(self.fps)
 
-    def answer_events(self) -> None:
-        """Handle the window's events; call it between slow frames."""
+    def _handle_events(self) -> None:
         if self._surface is None:
             return
         # Another library of the process may have shut the display down.
-        lost = not self._pygame.display.get_init()
-        if lost or any(event.type == self._pygame.QUIT for event in self._pygame.event.get()):
+        shut_down = not self._pygame.display.get_init()
+        if shut_down or any(event.type == self._pygame.QUIT for event in self._pygame.event.get()):
             self.close()
 
     def close(self) -> None:
@@ -243,33 +233,6 @@ class Window:
             reason = str(error)
         display.quit()
         return reason
-
-    def __enter__(self) -> Self:
-        """Return the window itself."""
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        """Close the window."""
-        self.close()
-
-
-def _checked_size(size: Any) -> tuple[int, int]:
-    sides = size if isinstance(size, tuple | list) else (size, size)
-    try:
-        width, height = (checked_count("size", side) for side in sides)
-    except ValueError:
-        width = height = 0
-    if min(width, height) < 1:
-        raise NPAError(
-            f"size must be a whole number of pixels, at least 1, or two of them, got "
-            f"{shown(size)}: try 512"
-        )
-    return width, height
 
 
 def _import_pygame() -> Any:

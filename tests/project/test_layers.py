@@ -44,7 +44,6 @@ LAYERS = {
     "npa_envs.processes": layer(1),
     "npa_envs.runtime": layer(1, "warp"),
     "npa_envs.reference": layer(1, "torch"),
-    "npa_envs.reference_gaussians": layer(1, "torch"),
     "npa_envs.kernels": layer(1, "warp"),
     "npa_envs.world.cuda_graph": layer(3, "torch numpy", never=ORACLES),
     "npa_envs.ops": layer(2, "warp torch", never=("npa_envs.reference",)),
@@ -159,7 +158,6 @@ def violations(module: str, source: str, *, is_package: bool = False) -> list[st
             wrong.append(f"{module} imports {name}, which has no row in the table of layers")
         elif other != row and LAYERS[other].level >= here.level:
             wrong.append(f"{module} imports {name}, which is in no lower layer")
-        # By how it begins: one oracle or all.
         elif other.startswith(here.never):
             wrong.append(f"{module} imports {name}, which it must not know")
     return wrong
@@ -184,7 +182,7 @@ WRONG = [
     ("npa_envs.rule.rule", "import warp"),
     ("npa_envs.world.rollout", "def f():\n    import warp"),
     ("npa_envs.world.rollout", "from npa_envs.kernels import domain"),
-    ("npa_envs.ops.new", "from npa_envs.reference_gaussians import draw"),
+    ("npa_envs.ops.new", "from npa_envs.reference import splat"),
     ("npa_envs.world.rollout", "from ..tasks import targets"),
     ("npa_envs.tasks.new", "from npa_envs.training import trainer"),
     ("npa_envs.tasks.new", "import matplotlib.pyplot"),

@@ -20,9 +20,9 @@ def screen(monkeypatch):
     pygame.display.quit()
 
 
-def picture(height: int = 20, width: int = 30) -> np.ndarray:
-    frame = np.zeros((height, width, 3), np.uint8)
-    frame[: height // 2, width // 2 :] = (200, 100, 50)
+def picture() -> np.ndarray:
+    frame = np.zeros((20, 20, 3), np.uint8)
+    frame[:10, 10:] = (200, 100, 50)
     return frame
 
 
@@ -32,24 +32,21 @@ def shown_on(window):
 
 
 def test_a_frame_appears_as_it_is_and_one_of_another_size_fills_the_window(screen):
-    with Window("a world", (30, 20)) as window:
-        np.testing.assert_array_equal(shown_on(window), picture())
-        assert pygame.display.get_caption()[0] == "a world"
-        assert window.visible
-    with Window("a world", np.int64(60)) as window:
-        shown = shown_on(window)
+    np.testing.assert_array_equal(shown_on(Window("a world", 20)), picture())
+    assert pygame.display.get_caption()[0] == "a world"
+    shown = shown_on(Window("a world", np.int64(60)))
     assert shown.shape == (60, 60, 3)
     assert (shown[:25, 35:] == (200, 100, 50)).all()
     assert (shown[35:] == 0).all()
 
 
 def test_frames_come_no_faster_than_the_rate(screen):
-    with Window("a world", 32, fps=40) as window:
+    window = Window("a world", 32, fps=40)
+    window.show(picture())
+    start = time.perf_counter()
+    for _ in range(8):
         window.show(picture())
-        start = time.perf_counter()
-        for _ in range(8):
-            window.show(picture())
-        assert time.perf_counter() - start > 0.8 * 8 / 40
+    assert time.perf_counter() - start > 0.8 * 8 / 40
 
 
 @pytest.mark.parametrize(
@@ -68,7 +65,6 @@ def test_a_window_that_was_shut_stays_closed(screen, shut):
     shut(window)
     window.show(picture())
     assert window.closed
-    assert not window.visible
     assert not pygame.display.get_init()
     window.show(picture())
     window.close()
@@ -81,7 +77,6 @@ def test_a_new_window_takes_the_place_of_the_old_one(screen):
     old.close()
     old.show(picture())
     new.show(picture())
-    assert new.visible
     assert pygame.display.get_surface().get_size() == (48, 48)
     new.close()
 
@@ -114,10 +109,8 @@ def test_without_a_screen_it_warns_once_and_does_nothing(monkeypatch, driver):
         # A window that waits takes 40 s.
         assert time.perf_counter() - start < 20.0
         assert not window.closed
-        assert not window.visible
         window.close()
         window.close()
-    assert window.closed
 
 
 def test_pygame_starts_with_the_first_window_and_without_a_banner():

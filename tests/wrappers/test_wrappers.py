@@ -201,7 +201,6 @@ WRAPPERS = {
     "damage that comes again": (DAMAGE, (["2:wipe:0.2"],), {"every": 3}),
     "a stack of damage": ((STACK, STACKS), (), {}),
     "tags": (TAGS, (3,), {}),
-    "drawn tags": (TAGS, (3,), {"assignment": "random"}),
 }
 
 
@@ -216,18 +215,6 @@ def test_world_k_is_as_the_single_environment_over_autoresets(kind, output, mode
     actions = [envs.action_space.sample() for _ in range(2 * STEPS + 1)]
     reasons, _ = assert_batch_of_singles(envs, singles, actions, mode)
     assert reasons == {None, "time limit"}
-
-
-@pytest.mark.parametrize("output", ["numpy", "torch"])
-def test_a_mask_gives_species_anew_to_its_worlds_alone(output):
-    given = {"autoreset_mode": "disabled", "output": output}
-    envs = VectorSpeciesTags(batched(**given), 3, assignment="random")
-    envs.reset(seed=20)
-    first = np.asarray(envs.species)
-    observations, _ = envs.reset(options={"reset_mask": np.array([True, False, True])})
-    species = np.asarray(envs.species)
-    assert (species == first).all(axis=1).tolist() == [False, True, False]
-    np.testing.assert_array_equal(np.asarray(observations)[..., 66:].argmax(axis=-1), species)
 
 
 # Species tags
@@ -250,27 +237,9 @@ def test_tags_stand_behind_the_observation():
     assert env.observation_space.low[0, -1] == 0.0
 
 
-@pytest.mark.parametrize("assignment", ["blocks", "random"])
-def test_fractions_are_kept_and_the_worlds_left_as_they_are(assignment):
-    env, plain = begun(
-        SpeciesTags(single(), 3, fractions=[2, 1, 1], assignment=assignment), single()
-    )
+def test_fractions_are_kept():
+    env = SpeciesTags(single(), 3, fractions=[2, 1, 1])
     assert np.bincount(env.species).tolist() == [32, 16, 16]
-    for _ in range(3):
-        np.testing.assert_array_equal(env.step(SLOW)[0][:, :66], plain.step(SLOW)[0])
-
-
-def test_random_species_are_drawn_for_each_episode_and_hold_through_it():
-    env = SpeciesTags(single(), 2, assignment="random")
-    first, _ = env.reset(seed=4)
-    species = env.species
-    for _ in range(3):
-        observation, *_ = env.step(SLOW)
-        np.testing.assert_array_equal(observation[:, 66:], first[:, 66:])
-    env.reset()
-    assert (env.species != species).any()
-    env.reset(seed=4)
-    np.testing.assert_array_equal(env.species, species)
 
 
 def test_tags_stand_behind_what_other_wrappers_make_of_the_rows():
@@ -322,16 +291,6 @@ ACTION = actions(0)
 def test_actions_of_other_forms(wrap, given, expected):
     env, plain = begun(wrap(single()), single())
     np.testing.assert_allclose(env.step(given)[0], plain.step(expected)[0], atol=1e-4)
-
-
-def test_record_video(tmp_path):
-    pytest.importorskip("moviepy")
-    env = wrappers.RecordVideo(single(render_mode="rgb_array", render_size=32), str(tmp_path))
-    env.reset(seed=0)
-    for step in range(STEPS):
-        env.step(actions(step))
-    env.close()
-    assert [path.suffix for path in tmp_path.glob("*.mp4")] == [".mp4"]
 
 
 def test_partial_resets_pass_through_gymnasiums_statistics():

@@ -29,10 +29,6 @@ from npa_envs.wrappers import (
 )
 
 
-def shared(wrapper, make, **keywords):
-    return wrapper(make(), statistics=NormalizePerception(single()).statistics, **keywords)
-
-
 def living(name):
     return gym.make_vec(f"npa/{name}-v0", num_envs=2, autoreset_mode="next-step")
 
@@ -76,10 +72,6 @@ REFUSALS = [
     (lambda: VectorNormalizePerception(single()), "use NormalizePerception"),
     (lambda: NormalizePerception(SpeciesTags(single())), "normalise before other wrappers"),
     (lambda: NormalizePerception(FlattenObservation(single())), "normalise before other wrappers"),
-    (lambda: shared(NormalizePerception, single, clip=10.0), "clip belongs to statistics"),
-    (lambda: shared(NormalizePerception, single, epsilon=1e-3), "epsilon belongs to stat"),
-    (lambda: shared(VectorNormalizePerception, batched, clip=5.0), "has 10, got 5.0 as well"),
-    (lambda: NormalizePerception(single(), statistics={}), "got dict: give wrapper.statistics"),
     (lambda: NormalizePerception(single()).load_state_dict({}), "missing statistic"),
     (lambda: NormalizePerception(single()).load_state_dict(STATE), r"shape \(49,\), got \(3,\)"),
     (lambda: TorchRecordEpisodeStatistics(batched(), 0), "buffer_length must be"),
@@ -87,7 +79,6 @@ REFUSALS = [
     (lambda: TorchNormalizeReward(batched(), gamma=1.5), r"gamma must lie in \[0, 1\]"),
     (lambda: SpeciesTags(single(), 0), "species_count must be a whole number"),
     *((lambda f=f: SpeciesTags(single(), 2, fractions=f), message) for f, message in FRACTIONS),
-    (lambda: SpeciesTags(single(), 2, assignment="block"), "did you mean 'blocks'"),
     (lambda: SpeciesTags(FlattenObservation(single())), "each of 64 particles.* put SpeciesTags"),
     (lambda: SpeciesTags(TimeAwareObservation(single(), flatten=False)), "particles, got Dict"),
     (lambda: VectorSpeciesTags(FlattenAll(batched(**DISABLED))), "put VectorSpeciesTags"),

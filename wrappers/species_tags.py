@@ -1,0 +1,105 @@
+"""Species tags: each particle observes which species it is."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import torch
+from gymnasium.spaces import Box, Space
+from torch import Tensor
+
+from npa_envs.checks import entries, is_real, is_whole
+from npa_envs.envs.core.base import to_output
+from npa_envs.errors import NPAError, shown
+from npa_envs.wrappers.base import Observations, VectorObservations, WrapperBase
+
+
+class _TagsSpecies(WrapperBase):
+    """Mixin with the species of all particles and their tags, for one world or many."""
+
+    def __init__(
+        self,
+        env: Any,
+        species_count: int = 2,
+        *,
+        fractions: Sequence[float] | None = None,
+    ) -> None:
+        super().__init__(env, species_count=species_count, fractions=fractions)
+        particle_count = self._base.config.particle_count
+        if not is_whole(species_count) or species_count < 1:
+            raise NPAError(
+                f"species_count must be a whole number of at least 1, got {shown(species_count)}"
+            )
+        if species_count > particle_count:
+            raise NPAError(
+                f"species_count must be at most the {particle_count} particles, got {species_count}"
+            )
+        sizes = [1.0] * species_count if fractions is None else entries(fractions) or []
+        if len(sizes) != species_count or not all(is_real(size) and size > 0 for size in sizes):
+            raise NPAError(
+                f"fractions must be {species_count} numbers greater than 0, one for each species, "
+                f"got {fractions}: for example {[1.0] * species_count}"
+            )
+        bounds = np.round(np.cumsum(sizes) / np.sum(sizes) * particle_count).astype(np.int64)
+        counts = np.diff(bounds, prepend=0)
+        if counts.min() < 1:
+            raise NPAError(
+                f"fractions must leave each species a particle, got {counts.tolist()} of "
+                f"{particle_count}: give more particles or larger fractions"
+            )
+        species = torch.arange(species_count).repeat_interleave(torch.from_numpy(counts))
+        species = species.to(self._base.task.device)
+        tags = torch.nn.functional.one_hot(species, species_count).to(torch.float32)
+        if self.many:
+            species, tags = (
+                values.expand(self._base.num_envs, *values.shape).clone()
+                for values in (species, tags)
+            )
+        output = self._base.config.output
+        self._tags = to_output(tags, output)
+        self.species = to_output(species, output)
+        """Species of each particle from 0 on, int64, shape [N], or [B, N] of several worlds."""
+        space = self._tagged_space(getattr(env, self.space_name), particle_count, species_count)
+        setattr(self, self.space_name, space)
+
+    def _tagged_space(self, space: Space[Any], particle_count: int, species_count: int) -> Box:
+        if not isinstance(space, Box) or len(space.shape) != 2 or space.shape[0] != particle_count:
+            raise NPAError(
+                f"observations must be a row for each of {particle_count} particles, got {space}: "
+                f"put {type(self).__name__} under the wrappers that reshape observations"
+            )
+        shape = (particle_count, species_count)
+        low = np.concatenate((space.low, np.zeros(shape, np.float32)), axis=1)
+        high = np.concatenate((space.high, np.ones(shape, np.float32)), axis=1)
+        return Box(low, high, dtype=np.float32)
+
+    def changed(self, observations: Any) -> Any:
+        """Return observations with tags as their last columns."""
+        if isinstance(observations, Tensor):
+            return torch.cat((observations, self._tags), dim=-1)
+        return np.concatenate((observations, self._tags), axis=-1)
+
+
+class SpeciesTags(_TagsSpecies, Observations):
+    """Give each particle a species, and append it to its observation as one-hot.
+
+    The first particles are species 0, the next species 1, and so on.
+
+    Args:
+        env: An environment of this package.
+        species_count: Species K.
+        fractions: Relative size of each species, with any sum; None: equal sizes.
+
+    Raises:
+        NPAError: An argument is wrong, or a species would have no particle.
+    """
+
+
+class VectorSpeciesTags(_TagsSpecies, VectorObservations):
+    """`SpeciesTags` for vector environments.
+
+    Arguments and errors are those of `SpeciesTags`, except `env`, a vector environment of this
+    package.
+    """
