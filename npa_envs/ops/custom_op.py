@@ -18,6 +18,7 @@ from torch.autograd import forward_ad
 from torch.utils._python_dispatch import is_in_torch_dispatch_mode
 
 from npa_envs.errors import NPAError
+from npa_envs.ops.launch import tracing
 from npa_envs.ops.physics import Physics
 
 Arguments = ParamSpec("Arguments")
@@ -92,7 +93,8 @@ class CustomOp(Generic[Arguments, Result]):
     That is under torch.compile, in dispatch modes and for tensor subclasses. Other calls run the
     plain function, as an operator's call costs as much CPU time as several launches. Arguments are
     positional. Results share no memory with each other or with arguments. The operator takes a
-    `Physics` as the list `Physics.numbers`.
+    `Physics` as the list `Physics.numbers`. For tensors without memory, as in tracing, the function
+    runs without its launches.
     """
 
     def __init__(self, name: str, function: Callable[Arguments, Result]) -> None:
@@ -101,9 +103,10 @@ class CustomOp(Generic[Arguments, Result]):
         self._operator = torch.library.custom_op(
             name, self._taking_lists(function), mutates_args=()
         )
+        self.register_fake(tracing()(function))
 
     def register_fake(self, fake: Callable[..., Any]) -> Callable[..., Any]:
-        """Register a function that returns empty results of the right shapes, for tracing."""
+        """Register another function that returns results of the right shapes, for tracing."""
         self._operator.register_fake(self._taking_lists(fake))
         return fake
 

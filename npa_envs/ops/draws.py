@@ -51,17 +51,3 @@ def draw(
         per_thread = kernels.per_thread
     launch(kernel, (values.shape[0], -(-count // per_thread)), keys.device, *arguments)
     return values
-
-
-@draw.register_fake
-def _(
-    keys: Tensor,
-    episodes: Tensor,
-    steps: Tensor,
-    number: int,
-    kind: str,
-    count: int,
-    dtype: torch.dtype,
-    bound: int,
-) -> Tensor:
-    return keys.new_empty(keys.shape[0], count, dtype=dtype)

@@ -130,20 +130,20 @@ def _launch_blocks(kernel: Any, blocks: int, warps: int, *tensors: Tensor) -> No
 def _read_rows(
     rows: Tensor, mixing: Tensor, width: int, space_dim: int, scalars: int, chiral: bool
 ) -> tuple[Tensor, Tensor]:
-    perceived, count = mixing.shape
-    mixed = rows.new_empty(len(rows), count, space_dim)
-    inputs = rows.new_empty(len(rows), width)
+    perceived, count = map(int, mixing.shape)
+    mixed = rows.new_empty(rows.shape[0], count, space_dim)
+    inputs = rows.new_empty(rows.shape[0], width)
     device, form = rows.device, (space_dim, scalars, perceived, count, chiral)
     if _is_for_warps(rows, form):
-        blocks = -(-len(rows) // (rows_of_warp(count) * READ_WARPS))
+        blocks = -(-rows.shape[0] // (rows_of_warp(count) * READ_WARPS))
         kernel = row_kernels(*form).read_rows
         _launch_blocks(kernel, blocks, READ_WARPS, rows, mixing, mixed, inputs)
         return mixed, inputs
     kernels = _kernels(rows, space_dim)
-    launch(kernels.mix_vectors, len(rows) * count, device, scalars, rows, mixing, mixed)
+    launch(kernels.mix_vectors, rows.shape[0] * count, device, scalars, rows, mixing, mixed)
     launch(
         kernels.write_inputs,
-        len(rows) * count,
+        rows.shape[0] * count,
         device,
         scalars,
         scalars + perceived * space_dim,
@@ -153,14 +153,6 @@ def _read_rows(
         inputs,
     )
     return mixed, inputs
-
-
-@_read_rows.register_fake
-def _(
-    rows: Tensor, mixing: Tensor, width: int, space_dim: int, *rest: Any
-) -> tuple[Tensor, Tensor]:
-    mixed = rows.new_empty(rows.shape[0], mixing.shape[1], space_dim)
-    return mixed, rows.new_empty(rows.shape[0], width)
 
 
 @custom_op("npa::read_rows_backward")
@@ -174,8 +166,8 @@ def _read_rows_backward(
     chiral: bool,
     with_mixing: bool,
 ) -> tuple[Tensor, Tensor]:
-    row_count, count, space_dim = mixed.shape
-    device, form = rows.device, (space_dim, scalars, len(mixing), count, chiral)
+    row_count, count, space_dim = mixed.shape[0], *map(int, mixed.shape[1:])
+    device, form = rows.device, (space_dim, scalars, int(mixing.shape[0]), count, chiral)
     rows_bar = torch.empty_like(rows)
     if _is_for_warps(rows, form):
         blocks = -(-row_count // (rows_of_warp(count) * PULL_WARPS))
@@ -218,14 +210,9 @@ def _read_rows_backward(
     return rows_bar, pairs.diagonal(dim1=1, dim2=3).sum(dim=-1)
 
 
-@_read_rows_backward.register_fake
-def _(rows: Tensor, mixing: Tensor, *rest: Any) -> tuple[Tensor, Tensor]:
-    return torch.empty_like(rows), torch.empty_like(mixing)
-
-
 def _steers_by_warps(mixed: Tensor, gate_count: int) -> tuple[int, int, bool] | None:
     """Return D, mixed vectors and chirality if CUDA kernels steer these rows, else None."""
-    count, space_dim = mixed.shape[1:]
+    count, space_dim = map(int, mixed.shape[1:])
     chiral = gate_count > count
     # Steering needs no shared memory, so it runs wherever the smallest rows fit.
     least = (space_dim, 0, 1, count, chiral)
@@ -234,21 +221,16 @@ def _steers_by_warps(mixed: Tensor, gate_count: int) -> tuple[int, int, bool] | 
 
 @custom_op("npa::steer_rows")
 def _steer_rows(output: Tensor, mixed: Tensor, signs: Tensor, width: int) -> Tensor:
-    update = output.new_empty(len(output), width)
+    update = output.new_empty(output.shape[0], width)
     form = _steers_by_warps(mixed, len(signs))
     if form is not None:
-        blocks = -(-len(output) // (STEERED_ROWS * STEER_WARPS))
+        blocks = -(-output.shape[0] // (STEERED_ROWS * STEER_WARPS))
         kernel = steering_kernels(*form).steer
         _launch_blocks(kernel, blocks, STEER_WARPS, output, mixed, signs, update)
         return update
-    kernel = _kernels(output, mixed.shape[2]).steer
+    kernel = _kernels(output, int(mixed.shape[2])).steer
     launch(kernel, update.numel(), output.device, len(signs), output, mixed, signs, update)
     return update
-
-
-@_steer_rows.register_fake
-def _(output: Tensor, mixed: Tensor, signs: Tensor, width: int) -> Tensor:
-    return output.new_empty(output.shape[0], width)
 
 
 @custom_op("npa::steer_rows_backward")
@@ -259,17 +241,12 @@ def _steer_rows_backward(
     tensors = output, mixed, signs, update_bar, output_bar, mixed_bar
     form = _steers_by_warps(mixed, len(signs))
     if form is not None:
-        blocks = -(-len(output) // (STEERED_ROWS * STEER_WARPS))
+        blocks = -(-output.shape[0] // (STEERED_ROWS * STEER_WARPS))
         _launch_blocks(steering_kernels(*form).pull_back_steering, blocks, STEER_WARPS, *tensors)
         return output_bar, mixed_bar
-    kernel = _kernels(output, mixed.shape[2]).pull_back_steering
+    kernel = _kernels(output, int(mixed.shape[2])).pull_back_steering
     launch(kernel, output.numel(), output.device, len(signs), *tensors)
     return output_bar, mixed_bar
-
-
-@_steer_rows_backward.register_fake
-def _(output: Tensor, mixed: Tensor, *rest: Any) -> tuple[Tensor, Tensor]:
-    return torch.empty_like(output), torch.empty_like(mixed)
 
 
 class _ReadRows(torch.autograd.Function):

@@ -323,6 +323,8 @@ class _Ready(threading.local):
         self.by_kernel: dict[tuple[Any, torch.device, int], _Arguments] = {}
         self.tape: Tape | None = None
         """The tape that records this thread's launches, if any."""
+        self.traced = False
+        """Whether tensors have no memory, so that nothing is launched."""
 
 
 _ready = _Ready()
@@ -341,6 +343,8 @@ def launch(
     kernel's order, without `range_start`. The kernel's signature decides how a tensor is read: an
     array of one dimension is all of a contiguous tensor, whatever the tensor's shape.
     """
+    if _ready.traced:
+        return
     size = (size,) if isinstance(size, int) else size
     if 0 in size:
         return
@@ -348,8 +352,9 @@ def launch(
         noted.append(_described(kernel, size))
     if kernel in MIN_RANGES:
         arguments = (0, *arguments)
-    if _ready.tape is not None:
-        ready = _ready.tape.arguments(kernel, size, device, block_dim, arguments)
+    tape = _ready.tape
+    if tape is not None:
+        ready = tape.arguments(kernel, size, device, block_dim, arguments)
     else:
         key = (kernel, device, block_dim)
         found = _ready.by_kernel.get(key)
@@ -360,10 +365,30 @@ def launch(
     ready.run(size)
 
 
+@contextlib.contextmanager
+def tracing() -> Iterator[None]:
+    """Launch nothing in the block, in this thread: torch only asks for the shapes of results."""
+    _ready.traced, before = True, _ready.traced
+    try:
+        yield
+    finally:
+        _ready.traced = before
+
+
+def is_traced() -> bool:
+    """Return whether this thread's tensors have shapes but no memory."""
+    return _ready.traced
+
+
+def is_aligned(tensor: Tensor, size: int = 16) -> bool:
+    """Return whether a tensor begins at a multiple of `size` bytes in memory."""
+    return _ready.traced or tensor.data_ptr() % size == 0
+
+
 def aligned(tensor: Tensor) -> Tensor:
     """Return a contiguous tensor that can be read 16 bytes at a time."""
     tensor = tensor.contiguous()
-    return tensor if tensor.data_ptr() % 16 == 0 else tensor.clone()
+    return tensor if is_aligned(tensor) else tensor.clone()
 
 
 def is_recorded() -> bool:

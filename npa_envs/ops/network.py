@@ -63,24 +63,6 @@ def _arrange_weights(
     return arranged
 
 
-@_arrange_weights.register_fake
-def _(hidden_weight: Tensor, output_weight: Tensor, with_backward: bool) -> list[Tensor]:
-    def layers(hidden: int, width: int, out_width: int) -> list[Tensor]:
-        steps, tiles = -(-width // 16), -(-out_width // 8)
-        half = functools.partial(hidden_weight.new_empty, dtype=torch.float16)
-        fragments = [half(hidden * steps * 32), half(hidden * tiles * 16)]
-        return [*fragments, hidden_weight.new_empty(8 * tiles)]
-
-    (hidden, width), out_width = hidden_weight.shape, output_weight.shape[0]
-    arranged = layers(hidden, width, out_width)
-    if with_backward:
-        arranged += layers(hidden, out_width, width)
-        for columns in (width, out_width):
-            size = hidden * -(-columns // 16) * 32
-            arranged.append(hidden_weight.new_empty(size, dtype=torch.bfloat16))
-    return arranged
-
-
 def arrange(
     hidden_weight: Tensor, output_weight: Tensor, *, with_backward: bool
 ) -> ArrangedWeights:
@@ -136,7 +118,7 @@ def _run_network(
     noted: Tensor | None,
 ) -> tuple[Tensor, Tensor]:
     """Run `two_layer_kernel` on rows [K, width]; mode "note" also returns the ReLU masks."""
-    steps, tiles = -(-rows.shape[1] // 16), -(-out_width // 8)
+    steps, tiles = -(-int(rows.shape[1]) // 16), -(-out_width // 8)
     signs = _empty_signs(rows, unit_count, mode)
     output = rows.new_empty(rows.shape[0], out_width)
     warps = -(-rows.shape[0] // ROW_GROUP)
@@ -154,18 +136,6 @@ def _run_network(
     return output, signs
 
 
-@_run_network.register_fake
-def _(
-    rows: Tensor,
-    arranged: list[Tensor],
-    out_width: int,
-    unit_count: int,
-    mode: str,
-    noted: Tensor | None,
-) -> tuple[Tensor, Tensor]:
-    return rows.new_empty(rows.shape[0], out_width), _empty_signs(rows, unit_count, mode)
-
-
 def _empty_signs(rows: Tensor, unit_count: int, mode: str) -> Tensor:
     """Return memory for the ReLU masks of hidden units, empty where the mode needs none."""
     words = 4 * -(-unit_count // SIGN_UNITS) if mode == "note" else 0
@@ -176,12 +146,11 @@ def _empty_signs(rows: Tensor, unit_count: int, mode: str) -> Tensor:
 def _weight_gradients(
     rows: Tensor, update_bar: Tensor, signs: Tensor, arranged: list[Tensor], unit_count: int
 ) -> Tensor:
-    count, width = rows.shape
-    out_width = update_bar.shape[1]
+    count, width, out_width = rows.shape[0], int(rows.shape[1]), int(update_bar.shape[1])
     warps = next(n for n in (4, 3, 2, 1) if unit_count // WARP_UNITS % n == 0)
     unit_blocks = unit_count // WARP_UNITS // warps
     kernels = weight_gradient_kernels(
-        -(-width // 16), -(-width // 8), -(-out_width // 8), warps, unit_blocks, signs.shape[1]
+        -(-width // 16), -(-width // 8), -(-out_width // 8), warps, unit_blocks, int(signs.shape[1])
     )
     processors = multiprocessor_count(rows.device)
     each = 1 if count <= FEW_ROWS * processors else SHARES_PER_PROCESSOR
@@ -212,13 +181,6 @@ def _weight_gradients(
         block_dim=SUM_WARPS * WARP,
     )
     return total
-
-
-@_weight_gradients.register_fake
-def _(
-    rows: Tensor, update_bar: Tensor, signs: Tensor, arranged: list[Tensor], unit_count: int
-) -> Tensor:
-    return rows.new_empty(unit_count * (rows.shape[1] + update_bar.shape[1]))
 
 
 class _Network(torch.autograd.Function):

@@ -313,24 +313,6 @@ def perceive_rows_backward(
     return _gather_by_cells(plan, saved, listed, bar)
 
 
-@perceive_rows_backward.register_fake
-def _(
-    perception_bar: Tensor,
-    saved_tensors: list[Tensor],
-    listed: list[Tensor],
-    particle_count: int,
-    state_dim: int,
-    *options: Any,
-) -> tuple[Tensor, Tensor]:
-    saved = SavedPerception(*saved_tensors)
-    particles = saved.particles
-    total, space_dim = particles.shape[0], particles.shape[1] - 1
-    positions_bar = (
-        particles.new_empty(0) if saved.states is None else particles.new_empty(total, space_dim)
-    )
-    return particles.new_empty(total, state_dim), positions_bar
-
-
 def _gather_by_cells(
     plan: KernelPlan, saved: SavedPerception, listed: list[Tensor], bar: Tensor
 ) -> tuple[Tensor, Tensor]:

@@ -23,7 +23,7 @@ from npa_envs.checks import (
 )
 from npa_envs.ops.backend import batch_listing
 from npa_envs.ops.custom_op import check_derivatives, custom_op, once_differentiable
-from npa_envs.ops.launch import Tape, launch
+from npa_envs.ops.launch import Tape, is_aligned, launch
 from npa_envs.ops.passes import (
     SavedPerception,
     compute_densities,
@@ -233,38 +233,6 @@ def _perceive_rows(
     ]
 
 
-@_perceive_rows.register_fake
-def _(
-    x: Tensor,
-    s: Tensor,
-    mask: Tensor | None,
-    static: list[Tensor],
-    masked: bool,
-    row_capacity: int,
-    row_width: int,
-    physics: Physics,
-    for_adjoint: bool,
-) -> list[Tensor]:
-    space_dim = x.shape[2]
-    perception = x.new_empty(row_capacity, row_width)
-    kernel_sum = x.new_empty(row_capacity if for_adjoint else 0, space_dim)
-    if static:
-        return [perception, kernel_sum]
-    plan = plan_kernels(x, x.shape, s.shape[2], row_capacity, masked, physics)
-    particle_count = plan.total if for_adjoint or plan.runs("density") == "portable" else 0
-    return [
-        perception,
-        kernel_sum,
-        x.new_empty(plan.total, dtype=torch.int32),
-        x.new_empty(plan.start_count, dtype=torch.int32),
-        x.new_empty(plan.total, dtype=torch.int32),
-        x.new_empty(particle_count, space_dim + 1),
-        x.new_empty(row_capacity, space_dim),
-        s.new_empty(plan.total * plan.group_count, plan.width),
-        x.new_empty(row_capacity, dtype=torch.int32),
-    ]
-
-
 class _PerceiveRows(torch.autograd.Function):
     """Perception of the active particles; the adjoint gathers, without atomics."""
 
@@ -455,7 +423,7 @@ def build_neighbours(
     x, s = x.contiguous(), s.contiguous()
     plan = plan_kernels(x, x.shape, s.shape[2], x.shape[0] * x.shape[1], False, physics)
     listed = plan.lists_neighbours
-    in_place = listed and plan.state_dim % plan.width == 0 and s.data_ptr() % 16 == 0
+    in_place = listed and plan.state_dim % plan.width == 0 and is_aligned(s)
     ordered = sort_worlds(plan, x, None if in_place else s, None, with_rows=not listed)
     # World k of a batch equals that world alone, bit for bit: the listing must not depend on the
     # number of worlds.

@@ -22,7 +22,14 @@ from npa_envs.ops.backend import (
     multiprocessor_count,
     rollout_listing,
 )
-from npa_envs.ops.launch import channel_width, is_recorded, launch, scalar_type
+from npa_envs.ops.launch import (
+    aligned,
+    channel_width,
+    is_aligned,
+    is_recorded,
+    launch,
+    scalar_type,
+)
 from npa_envs.ops.physics import Physics
 
 MAX_INDEX = 2**31 - 1
@@ -256,7 +263,7 @@ def sort_worlds(
     on_cuda = plan.runs("sort", aligned=False) == "cuda"
     # Channels that a thread reads and writes at once where they are aligned.
     share = plan.width // CUDA_LANES if on_cuda else plan.width
-    aligned = s is not None and plan.state_dim % share == 0 and s.data_ptr() % 16 == 0
+    aligned = s is not None and plan.state_dim % share == 0 and is_aligned(s)
     launch(
         order_particles(plan.space_dim, plan.width) if on_cuda else kernels.order_particles,
         # A warp moves the states of 32 particles.
@@ -294,7 +301,7 @@ def _empty_worlds(plan: KernelPlan, x: Tensor, s: Tensor | None, with_rows: bool
 
 def block_capacity(request: KernelRequest, *tensors: Tensor | None) -> int:
     """Return the capacity in particles of the CUDA block that sorts such worlds; 0 for none."""
-    aligned = not any(tensor is not None and tensor.data_ptr() % 16 for tensor in tensors)
+    aligned = all(tensor is None or is_aligned(tensor) for tensor in tensors)
     if choose("sort", request._replace(aligned=aligned)).name != "block":
         return 0
     return next(size for size in sorted(BLOCKS) if size >= request.particle_count)
@@ -324,7 +331,7 @@ def _sort_by_threads(
         plan.particle_count,
         plan.state_dim,
         plan.group_count,
-        int(s is not None and plan.state_dim % plan.width == 0 and s.data_ptr() % 16 == 0),
+        int(s is not None and plan.state_dim % plan.width == 0 and is_aligned(s)),
         s,
         plan.active_offset,
         plan.row_base,
@@ -376,7 +383,4 @@ def _sort_by_blocks(
 def grouped_states(plan: KernelPlan, s: Tensor) -> Tensor:
     """Return sorted states in groups of channels, padded with zeros, [B N G, W]."""
     width = plan.group_count * plan.width
-    states = torch.nn.functional.pad(s, (0, width - plan.state_dim))
-    # Kernels read 16 bytes at a time.
-    states = states.clone() if states.data_ptr() % 16 else states
-    return states.contiguous().view(-1, plan.width)
+    return aligned(torch.nn.functional.pad(s, (0, width - plan.state_dim))).view(-1, plan.width)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -66,7 +66,7 @@ def _gather_species(
     x: Tensor, counts: list[int], physics: Physics, scaled: bool
 ) -> tuple[Tensor, Tensor]:
     """Return densities and density gradients of species; `scaled`: as rules perceive them."""
-    world_count, particle_count, space_dim = x.shape
+    world_count, particle_count, space_dim = map(int, x.shape)
     plan = plan_kernels(x, x.shape, 1, world_count * particle_count, False, physics)
     ordered = sort_worlds(plan, x, None, None, with_rows=False)
     place = ordered.source % particle_count
@@ -94,12 +94,6 @@ def _gather_species(
     )
     shape = (world_count, particle_count, len(counts))
     return density.view(shape), gradient.view(*shape, space_dim)
-
-
-@_gather_species.register_fake
-def _(x: Tensor, counts: list[int], *rest: Any) -> tuple[Tensor, Tensor]:
-    shape = (*x.shape[:2], len(counts))
-    return x.new_empty(shape), x.new_empty(*shape, x.shape[2])
 
 
 def perceive_by_species(x: Tensor, counts: tuple[int, ...], physics: Physics) -> Tensor:

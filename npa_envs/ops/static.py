@@ -14,7 +14,7 @@ from torch import Tensor
 from npa_envs.kernels.portable.density import density_kernels
 from npa_envs.kernels.portable.sort import give_rows
 from npa_envs.ops.custom_op import custom_op
-from npa_envs.ops.launch import launch, scalar_type
+from npa_envs.ops.launch import is_traced, launch, scalar_type
 from npa_envs.ops.passes import Densities, ListedNeighbours, NeighbourLists, compute_densities
 from npa_envs.ops.physics import Physics
 from npa_envs.ops.sort import KernelPlan, SortedWorlds, grouped_states, plan_kernels, sort_worlds
@@ -91,6 +91,8 @@ def _list_neighbours(plan: KernelPlan, starts: Tensor, particles: Tensor) -> lis
     common = plan.total, particles.device, plan.domain, plan.particle_count, starts, particles
     counts = starts.new_empty(plan.total)
     launch(kernels.count_neighbours, *common, starts.new_empty(0), counts)
+    if is_traced():
+        return [starts.new_empty(torch.library.get_ctx().new_dynamic_size()), counts]
     ends = torch.cumsum(counts, 0, dtype=torch.int64)
     if 4 * int(ends[-1]) > MAX_LISTS:
         return []
@@ -98,33 +100,6 @@ def _list_neighbours(plan: KernelPlan, starts: Tensor, particles: Tensor) -> lis
     ends = ends.to(torch.int32)
     launch(kernels.list_neighbours, *common, ends, neighbours)
     return [neighbours, ends]
-
-
-@_prepare_static.register_fake
-def _(x: Tensor, state_dim: int, physics: Physics) -> list[Tensor]:
-    total, space_dim = x.shape[0] * x.shape[1], x.shape[2]
-    plan = plan_kernels(x, x.shape, state_dim, total, False, physics)
-
-    def integers(count: int | torch.SymInt) -> Tensor:
-        return x.new_empty(count, dtype=torch.int32)
-
-    lists: list[Tensor] = []
-    on_cuda = plan.lists_neighbours
-    if on_cuda:
-        shape = plan.listing.shape(total)
-        lists = [x.new_empty(shape, dtype=torch.int16), integers(total), x.new_empty(total, 4)]
-    elif plan.on_cpu:
-        lists = [integers(torch.library.get_ctx().new_dynamic_size()), integers(total)]
-    return StaticWorlds(
-        source=integers(total),
-        place=integers(total),
-        all_indices=integers(total),
-        starts=integers(plan.start_count),
-        cell=integers(total),
-        particles=x.new_empty(total, space_dim + 1),
-        density_gradient=x.new_empty(0 if on_cuda else total, space_dim, dtype=torch.float64),
-        lists=lists,
-    ).flat()
 
 
 def prepare_static(x: Tensor, physics: Physics) -> StaticWorlds:
@@ -150,7 +125,7 @@ def _static_rows(
     x: Tensor, masks: Tensor, source: Tensor, cell_starts: Tensor, row_capacity: int
 ) -> list[Tensor]:
     """Return the tensors of `StaticRows` for all steps, and the active particles of each step."""
-    step_count, total, space_dim = masks.shape[0], source.shape[0], x.shape[2]
+    step_count, total, space_dim = masks.shape[0], source.shape[0], int(x.shape[2])
     active = masks.view(step_count, total).index_select(1, source)
     # One sum over all steps: torch is fastest on one long row.
     active_before = torch.cumsum(active.view(-1), 0, dtype=torch.int32)
@@ -167,14 +142,6 @@ def _static_rows(
         *rows,
     )
     return [*rows, active_before.view(step_count, total)[:, -1].diff(prepend=rows[0].new_zeros(1))]
-
-
-@_static_rows.register_fake
-def _(
-    x: Tensor, masks: Tensor, source: Tensor, cell_starts: Tensor, row_capacity: int
-) -> list[Tensor]:
-    rows = _empty_rows(x, masks.shape[0], cell_starts, row_capacity)
-    return [*rows, source.new_empty(masks.shape[0])]
 
 
 def _empty_rows(

@@ -21,7 +21,7 @@ from npa_envs.kernels.portable.update import (
     update_kernels,
 )
 from npa_envs.ops.custom_op import check_derivatives, custom_op, once_differentiable
-from npa_envs.ops.launch import Tape, launch, scalar_type
+from npa_envs.ops.launch import Tape, is_aligned, launch, scalar_type
 from npa_envs.ops.perceive import Rows
 from npa_envs.ops.physics import Physics
 from npa_envs.ops.sort import MAX_INDEX
@@ -49,7 +49,7 @@ def _update_particles(
     physics: Physics,
     within: bool,
 ) -> tuple[Tensor, Tensor, Tensor]:
-    space_dim, state_dim = x.shape[2], s.shape[2]
+    space_dim, state_dim = int(x.shape[2]), s.shape[2]
     boundary, sides = _boundary(physics, space_dim)
     total = x.shape[0] * x.shape[1]
     kernels = update_kernels(space_dim, scalar_type(x.dtype))
@@ -62,9 +62,9 @@ def _update_particles(
     update = update.contiguous()
     # Adjacent channels are read and written at once where their addresses are aligned.
     alignment = UPDATE_ALIGNMENT[space_dim]
-    aligned = state_dim % CHANNEL_SHARE == 0 and s.data_ptr() % 16 == 0
+    aligned = state_dim % CHANNEL_SHARE == 0 and is_aligned(s)
     aligned = aligned and (4 * update.shape[1]) % alignment == 0
-    aligned = aligned and update.data_ptr() % alignment == 0
+    aligned = aligned and is_aligned(update, alignment)
     launch(
         kernels.apply_update,
         -(-total // TEAM) * TEAM * (1 + _threads_for(state_dim)),
@@ -87,13 +87,6 @@ def _update_particles(
     return outputs
 
 
-@_update_particles.register_fake
-def _(
-    update: Tensor, x: Tensor, s: Tensor, path_length: Tensor, *rest: Any
-) -> tuple[Tensor, Tensor, Tensor]:
-    return torch.empty_like(x), torch.empty_like(s), torch.empty_like(path_length)
-
-
 @custom_op("npa::update_particles_backward")
 def _update_particles_backward(
     update: Tensor,
@@ -105,7 +98,7 @@ def _update_particles_backward(
     row_base: int,
     physics: Physics,
 ) -> Tensor:
-    space_dim, state_dim = new_x_bar.shape[2], new_s_bar.shape[2]
+    space_dim, state_dim = int(new_x_bar.shape[2]), new_s_bar.shape[2]
     kernels = update_kernels(space_dim, scalar_type(update.dtype))
     update_bar = torch.empty_like(update, memory_format=torch.contiguous_format)
     launch(
@@ -128,11 +121,6 @@ def _update_particles_backward(
         update_bar,
     )
     return update_bar
-
-
-@_update_particles_backward.register_fake
-def _(update: Tensor, *rest: Any) -> Tensor:
-    return torch.empty_like(update, memory_format=torch.contiguous_format)
 
 
 class _UpdateParticles(torch.autograd.Function):
@@ -237,7 +225,7 @@ def apply_actions(
     to 1 for worlds that diverged and not changed for others.
     """
     _check_worlds(action, x, s, physics, mask, noise, enabled, diverged)
-    aligned = s.data_ptr() % 16 == 0 and action.data_ptr() % 16 == 0
+    aligned = is_aligned(s) and is_aligned(action)
     launch(*_launch_of(action, x, s, physics, mask, noise, enabled, diverged, aligned=aligned))
 
 
@@ -275,7 +263,7 @@ class PreparedActions:
         buffer = self._buffer
         fits = action.dtype == buffer.dtype and action.device == buffer.device
         fits = fits and action.shape == buffer.shape and action.is_contiguous()
-        if fits and not action.data_ptr() % 16:
+        if fits and is_aligned(action):
             self._run(action)
         else:
             self.load(action)
@@ -304,7 +292,7 @@ class PreparedActions:
             threads = -(-action.numel() // VALUES_PER_THREAD)
             check = find_not_finite(scalar_type(x.dtype))
             self._tape.add(check, threads, x.device, threads, action, self._step[2])
-            aligned = s.data_ptr() % 16 == 0
+            aligned = is_aligned(s)
             launched = _launch_of(action, x, s, self._physics, *self._step, aligned=aligned)
             self._tape.add(*launched)
             self._places = self._tape.argument_slots(action)

@@ -52,11 +52,6 @@ def _world_mean(values: Tensor) -> Tensor:
     return average_sums(partial_sums, value_count, values)
 
 
-@_world_mean.register_fake
-def _(values: Tensor) -> Tensor:
-    return values.new_empty(values.shape[0], values.shape[2])
-
-
 class _WorldMean(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, values: Tensor) -> Tensor:

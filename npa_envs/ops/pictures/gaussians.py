@@ -335,13 +335,6 @@ def _gaussians_backward(
     return bars[0], bars[1], bars[2], bars[3], bars[4]
 
 
-@_gaussians_backward.register_fake
-def _(picture_bar: Tensor, passing_bar: Tensor, saved: list[Tensor], *rest: Any) -> Any:
-    means, scales, quaternions, colours, *_ = saved
-    bars = [torch.empty_like(tensor) for tensor in (means, scales, quaternions)]
-    return (*bars, means.new_empty(means.shape[:2]), torch.empty_like(colours))
-
-
 class _Gaussians(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, *given: Any) -> tuple[Tensor, ...]:

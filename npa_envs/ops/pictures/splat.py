@@ -171,18 +171,8 @@ def _splat(
     low: float,
     high: float,
 ) -> tuple[Tensor, Tensor, Tensor]:
-    lens = make_lens(scalar_type(x.dtype), resolution, pixel_size, sigma, low, high)
+    lens = make_lens(scalar_type(x.dtype), int(resolution), pixel_size, sigma, low, high)
     return _draw(Splats(x, colour), lens)
-
-
-@_splat.register_fake
-def _(x: Tensor, colour: Tensor, resolution: int, *lens: float) -> tuple[Tensor, Tensor, Tensor]:
-    total = x.shape[0] * x.shape[1]
-    return (
-        x.new_empty(x.shape[0], resolution, resolution, CHANNELS),
-        x.new_empty(total, FOOTPRINT),
-        x.new_empty(total, dtype=torch.int32),
-    )
 
 
 @custom_op("npa::splat_backward")
@@ -203,7 +193,7 @@ def _splat_backward(
         device_kernels(footprints).pull_back_splats,
         (total, splat_lanes(footprints.device)),
         footprints.device,
-        make_lens(scalar_type(footprints.dtype), resolution, pixel_size, sigma, low, high),
+        make_lens(scalar_type(footprints.dtype), int(resolution), pixel_size, sigma, low, high),
         total // world_count,
         footprints,
         source,
@@ -212,12 +202,6 @@ def _splat_backward(
         colours_bar,
     )
     return positions_bar, colours_bar
-
-
-@_splat_backward.register_fake
-def _(picture_bar: Tensor, footprints: Tensor, *rest: Any) -> tuple[Tensor, Tensor]:
-    total = footprints.shape[0]
-    return footprints.new_empty(total, 2), footprints.new_empty(total, 3)
 
 
 class _Splat(torch.autograd.Function):
