@@ -39,7 +39,7 @@ def shown(new_page, tmp_path):
             worlds.append(RuleWorld(rule, device=torch.device("cpu"), particle_count=count))
             return worlds[-1]
 
-        site = server.make_site(make_world, films=tmp_path / "films")
+        site = server.Site(make_world, films=tmp_path / "films")
         listener = server.open_port(site.host, 0)
         running.append(server.make_server(site))
         thread = threading.Thread(target=running[-1].run, kwargs={"sockets": [listener]})
