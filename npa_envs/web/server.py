@@ -328,7 +328,7 @@ class ViewerSession:
         while not self._stopped.is_set():
             changed |= self._apply_messages(world, wait=not (world.playing or changed))
             with self._site.exclusive:
-                events = world.news()
+                events = world.take_events()
             for event in events:
                 self._send_event(event)
                 changed = True

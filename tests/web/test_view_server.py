@@ -62,7 +62,7 @@ class Counter:
         colours = np.array([[255, 0, 1], [2, 3, 4]], dtype=np.uint8)
         return WorldView(self.step, positions, colours, 1.5, 0.125 if self.step == 2 else None)
 
-    def news(self):
+    def take_events(self):
         return []
 
     def close(self):
