@@ -207,7 +207,7 @@ export class LiveWorld {
       const gone = new Set(insideBall(x, dimension, at, radius, box));
       this.keep((i) => !gone.has(i));
     } else if (tool === "push") {
-      push(x, dimension, at, move, radius, Math.min(1, 0.5 + strength), box);
+      push(x, dimension, at, move, radius, Math.min(1, constants.MIN_PUSH + strength), box);
     } else if (tool === "clump") {
       clump(x, dimension, at, radius, constants.CLUMP_RATE * strength, box);
     } else if (tool === "cut") {
@@ -324,7 +324,6 @@ export class LiveWorld {
       rule: rule.name,
       others: names(this.rules.filter((own) => this.mayJoin(own))),
       species: names(this.species),
-      capabilities: ["step", "reset"],
       show, settings, playing, seed,
     });
   }

@@ -1,5 +1,5 @@
 // The page: a canvas, brushes, controls and plots. An engine runs the world: its function `connect` is
-// that of `viewer.js`, for a server in Python, or of `exported.js`, for a worker in the page.
+// that of `server_engine.js`, for a server in Python, or of `worker_engine.js`, for a worker in the page.
 //
 //   const engine = await connect(settings, listener);   // settings: those of `start`
 //   engine.send(message);                               // page -> engine, a JSON object
@@ -45,9 +45,8 @@
 //   {type: "file", name, url}                                      a file of a film is ready
 //   {type: "error", message}
 //
-// index.html loads viewer.js. npa_envs/web/export.py joins exported.js and its imports into one file.
-// For that, imports are single lines of names in braces, and exports stand before `function`, `class`
-// or `const`.
+// index.html loads server_engine.js. npa_envs/web/export.py joins worker_engine.js and its imports into one
+// script, in which all names of modules must differ.
 //
 // `show`: "colours", "density", "species", "speed", "mask", "components" (the first three principal
 // components of the state as red, green and blue), "state 0", "state 1", ...
