@@ -68,9 +68,9 @@ def main(arguments: Sequence[str]) -> int:
     with common.torch_threads(options.threads):
         # Made once before the server starts, so that errors come at once.
         make_world().close()
-    from npa_envs.web.server import address_of, make_site, open_port, serve
+    from npa_envs.web.server import Site, address_of, open_port, serve
 
-    site = make_site(
+    site = Site(
         make_world,
         films=common.writable_folder(options.out),
         host=options.host,

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from typing import Any, cast
+from collections.abc import Callable
+from typing import Any
 
 import gymnasium
 from torch import Tensor
@@ -15,17 +15,8 @@ from npa_envs.registration import ALL, CODED, GARDEN_IDS
 from npa_envs.rule.files import load_rule
 from npa_envs.rule.rule import COLOUR_OFFSET
 from npa_envs.tasks.base import Task
-from npa_envs.tasks.damage import DAMAGE_SIZES, damage_worlds
-from npa_envs.web.live import (
-    ColouredWorld,
-    Colouring,
-    LiveWorld,
-    Touch,
-    WorldView,
-    brushed,
-    checked_seed,
-    shows_of,
-)
+from npa_envs.tasks.damage import DAMAGE_SIZES
+from npa_envs.web.live import ColouredWorld, LiveWorld, shows_of
 from npa_envs.world.brushes import nearest_image
 
 
@@ -48,14 +39,14 @@ def make_environment(
         raise NPAError(f"unknown environment {shown(id)}: {suggest(id, known)}")
     simple = {"zero": ZeroPolicy, "random": RandomPolicy}
     rule = None if policy in simple else load_rule(policy, device=device).float()
-    given = {name: value for name, value in keywords.items() if value is not None}
-    limit = given.get("max_episode_steps", 1)
+    keywords = {name: value for name, value in keywords.items() if value is not None}
+    limit = keywords.get("max_episode_steps", 1)
     if not is_whole(limit) or limit < 1:
         # Checked here because Gymnasium's message does not say how to fix it.
         raise NPAError(
             f"max_episode_steps must be a whole number of at least 1, got {shown(limit)}: try 512"
         )
-    env = gymnasium.make(id, disable_env_checker=True, device=device, output="torch", **given)
+    env = gymnasium.make(id, disable_env_checker=True, device=device, output="torch", **keywords)
     return env, simple[policy](env) if rule is None else RulePolicy(rule, env)
 
 
@@ -65,63 +56,61 @@ class EnvironmentWorld(LiveWorld):
     def __init__(
         self, env: Any, policy: Callable[[Any], Any], *, seed: int = 0, title: str | None = None
     ) -> None:
-        super().__init__()
+        super().__init__(seed)
         self._env, self._inner, self._policy = env, env.unwrapped, policy
         if not hasattr(self._inner, "place_particles"):
             raise NPAError(
                 f"env must be an environment of npa_envs, got {type(env).__name__}: make it with "
                 "gymnasium.make('npa/Texture-v0')"
             )
+        self._physics = self._inner.worlds.physics
         self._title = title or (env.spec.id if env.spec is not None else type(env).__name__)
-        self._colouring = Colouring()
-        self.seed = checked_seed(seed)
         self._episode, self._ended = 0, ""
         self.reset(self.seed)
 
-    def reset(self, seed: int | None) -> None:
-        """Start an episode."""
-        self.seed = self.seed + 1 if seed is None else seed
-        self._begin(self.seed)
-
     def _begin(self, seed: int | None) -> None:
+        """Start an episode."""
+        super()._begin(seed)
         self._observation, info = self._env.reset(seed=seed)
         self._episode += 1
         self._info: dict[str, Any] = info
-        self._return, self.step, self._milliseconds = 0.0, 0, 0.0
-        self._travelled: Tensor | None = None
+        self._return = 0.0
+
+    @property
+    def box(self) -> tuple[float, ...] | None:
+        """Sides of the periodic box [length units]; None: open space."""
+        box: tuple[float, ...] | None = self._physics.box
+        return box
 
     def describe(self) -> dict[str, Any]:
         """Return the event "world"."""
-        physics, task = self._inner.worlds.physics, self._inner.task
-        box = physics.box
+        task = self._inner.task
         return super().describe() | {
             "title": self._title,
             "note": f"episode {self._episode}{self._ended}",
-            "dimension": physics.space_dim,
-            "box": None if box is None else list(box),
-            "half_width": task.half_width if box is None else 0.5 * min(box),
+            "dimension": self._physics.space_dim,
+            "half_width": task.half_width if self.box is None else 0.5 * min(self.box),
             "spot": 0.7 * float(task.pixel_size),
-            "damages": list(DAMAGE_SIZES) if physics.moving else ["wipe"],
+            "damages": list(DAMAGE_SIZES) if self._physics.moving else ["wipe"],
             "capabilities": ["step", "reset", "film", "loss"],
         }
 
     def _allowed(self) -> set[str]:
-        return {"moves", "states"} if self._inner.worlds.physics.moving else {"states"}
+        return {"moves", "states"} if self._physics.moving else {"states"}
 
     def _shows(self) -> list[str]:
-        return shows_of(self._inner.worlds.physics.state_dim, species=False)
+        return shows_of(self._physics.state_dim, species=False)
 
     def _run(self, steps: int) -> None:
         for _ in range(steps):
-            before = self._inner.particles()[0] if self.show == "speed" else None
+            before = self._particles()[0] if self.show == "speed" else None
             action = self._policy(self._observation)
             self._observation, reward, ended, truncated, self._info = self._env.step(action)
             self.step += 1
             self._return += float(reward)
             if before is not None:
-                physics = self._inner.worlds.physics
-                moved = nearest_image(self._inner.particles()[0] - before, physics.box)
-                self._travelled = moved.norm(dim=-1)[None] / max(physics.max_displacement, 1e-12)
+                moved = nearest_image(self._particles()[0] - before, self.box)
+                self._travelled = moved.norm(dim=-1) / max(self._physics.max_displacement, 1e-12)
             if ended or truncated:
                 self._ended = (
                     f"; the last one ended after {self.step} steps: "
@@ -129,42 +118,32 @@ class EnvironmentWorld(LiveWorld):
                 )
                 point = [self._episode, self._return]
                 curve = {"type": "curve", "name": "Return", "points": [point]}
-                self._news.append(curve | {"append": self._episode > 1})
+                self._events.append(curve | {"append": self._episode > 1})
                 self._begin(None)
-                self._news.append(self.describe())
+                self._events.append(self.describe())
                 return
 
-    def frame(self) -> WorldView:
-        """Return the present frame."""
-        x, s = (part[None] for part in self._inner.particles())
-        physics = self._inner.worlds.physics
-        count = x.shape[1]
-        coloured = ColouredWorld(
-            x, s, self._own_colours, physics.eps, physics.box, [count], count, self._travelled, None
-        )
-        colours = self._colouring(self.show, coloured)
-        loss = self._info.get("loss") if self._loss_wanted else None
-        loss = None if loss is None else float(loss)
-        return WorldView(self.step, x[0].cpu().numpy(), colours, self._milliseconds, loss)
-
-    def _own_colours(self, s: Tensor) -> Tensor:
-        task = getattr(self._inner.task, "task", None)
-        if getattr(task, "classifies", False):
-            return cast(Task, task).colours(s)
-        return s[..., -3:] + COLOUR_OFFSET
-
-    def _damage(self, name: str) -> None:
-        x, s = (part[None] for part in self._inner.particles())
-        self._place(*damage_worlds(x, s, kind=name))
-
-    def _brush(self, message: Mapping[str, Any]) -> bool:
-        x, s = (part[None] for part in self._inner.particles())
-        touch = Touch.read(message, x)
-        self._place(*brushed(x, s, touch, self._inner.worlds.physics.box))
-        return False
+    def _particles(self) -> tuple[Tensor, Tensor]:
+        x, s = self._inner.particles()
+        return x[None], s[None]
 
     def _place(self, x: Tensor, s: Tensor) -> None:
         self._observation = self._inner.place_particles(x[0], s[0])
+
+    def _coloured(self) -> ColouredWorld:
+        x, s = self._particles()
+        eps, count = self._physics.eps, x.shape[1]
+        return ColouredWorld(
+            x, s, self._rule_colours, eps, self.box, [count], count, self._travelled, None
+        )
+
+    def _rule_colours(self, s: Tensor) -> Tensor:
+        task: Task | None = getattr(self._inner.task, "task", None)
+        return s[..., -3:] + COLOUR_OFFSET if task is None else task.colours(s)
+
+    def _loss(self) -> float | None:
+        loss = self._info.get("loss")
+        return None if loss is None else float(loss)
 
     def close(self) -> None:
         """Close the environment."""

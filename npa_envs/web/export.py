@@ -11,6 +11,7 @@ import re
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, cast
+from urllib.parse import quote
 
 import torch
 from PIL import Image
@@ -22,7 +23,7 @@ from npa_envs.rule.files import load_rule
 from npa_envs.rule.rule import NPARule, check_rule
 from npa_envs.tasks.damage import CLUMP_FACTOR, DAMAGE_SIZES
 from npa_envs.tasks.point_classification import PALETTE, UNDECIDED, PointClassification
-from npa_envs.web.live import CLUMP_RATE, INJECT_RATE, checked_seed, colour_ramp
+from npa_envs.web.live import CLUMP_RATE, INJECT_RATE, MIN_PUSH, checked_seed, colour_ramp
 from npa_envs.web.rule_world import MIN_SEED, SEED_FRACTION, RuleWorld, name_of
 from npa_envs.world.species import AGREEMENTS
 
@@ -50,50 +51,24 @@ CONSTANTS = {
     "CLUMP_RATE": CLUMP_RATE,
     "DAMAGE_SIZES": DAMAGE_SIZES,
     "INJECT_RATE": INJECT_RATE,
+    "MIN_PUSH": MIN_PUSH,
     "MIN_SEED": MIN_SEED,
     "SEED_FRACTION": SEED_FRACTION,
 }
 """Numbers and names of the Python worlds that live_world.js also needs."""
 
-_IMPORT = re.compile(r'^import \{ ([\w, ]+) \} from "\./(\w+\.js)";$', re.MULTILINE)
-_EXPORT = re.compile(r"^export (?=(?:async function|function|class|const) (\w+))", re.MULTILINE)
-_MODULE_LINE = re.compile(r"^(?:import|export)\b.*$", re.MULTILINE)
+PAGE_MODULES = ("drawing.js", "plots.js", "page.js", "worker_engine.js")
+WORKER_MODULES = (
+    *("physics.js", "kernels_simd.js", "physics_gpu.js", "brushes.js", "colours.js"),
+    "live_world.js",
+)
+"""Modules of the page and of its worker, each after those that it imports."""
 
 
-def joined_modules(names: Sequence[str], folder: Path = PAGE) -> str:
-    """Return JavaScript modules, with those that they import, as one script.
-
-    Each module becomes a function scope; the exports of `page.js` become members of `page`.
-    """
-    order: list[str] = []
-    texts: dict[str, str] = {}
-
-    def visit(name: str, path: tuple[str, ...]) -> None:
-        if name in path:
-            raise ValueError(f"modules import each other: {' -> '.join((*path, name))}")
-        if name in texts:
-            return
-        source = (folder / name).read_text(encoding="utf-8")
-        for _, other in _IMPORT.findall(source):
-            visit(other, (*path, name))
-        exported = ", ".join(_EXPORT.findall(source))
-        source = _EXPORT.sub("", source)
-        source = _IMPORT.sub(lambda found: f"const {{ {found[1]} }} = {_scope(found[2])};", source)
-        left = _MODULE_LINE.search(source)
-        if left is not None:
-            raise ValueError(f"{name} must import and export as the others do, got {left[0]!r}")
-        texts[name] = (
-            f"const {_scope(name)} = (() => {{\n{source}\nreturn {{ {exported} }};\n}})();"
-        )
-        order.append(name)
-
-    for name in names:
-        visit(name, ())
-    return "\n".join(('"use strict";', *(texts[name] for name in order)))
-
-
-def _scope(module: str) -> str:
-    return module.removesuffix(".js")
+def joined_modules(names: Sequence[str]) -> str:
+    """Return JavaScript modules as one script of one scope: all their names must differ."""
+    text = "\n".join((PAGE / name).read_text(encoding="utf-8") for name in names)
+    return '"use strict";\n' + re.sub(r"^import [^;]*;\n|^export ", "", text, flags=re.MULTILINE)
 
 
 def export_web(
@@ -146,10 +121,12 @@ def export_web(
     # Opened first: an error in the path is reported before the slow growth of previews.
     with atomic_path(path) as temporary:
         rules = [page_rule(source, particle_count=particle_count) for source in words]
-        if previews:
-            for source, rule in zip(words, rules, strict=True):
-                rule["preview"] = preview(source, particle_count=particle_count)
-        text = page_text(rules, title=title or names[0], seed=seed)
+        pictures = {
+            name: preview(source, particle_count=particle_count)
+            for name, source in zip(names, words, strict=True)
+            if previews
+        }
+        text = page_text(rules, title=title or names[0], seed=seed, previews=pictures)
         temporary.write_bytes(text.encode())
 
 
@@ -185,16 +162,17 @@ def page_rule(source: str, *, particle_count: int | None = None) -> dict[str, An
             f"a page grows rules from a ball, a box or a point cloud, {shown(source)} begins with "
             f"a {type(task).__name__}: watch it with npa-envs view"
         )
-    # Fields that live_world.js adds itself.
-    own = {"type", "rules", "rule", "others", "species", "show", "capabilities", "playing", "seed"}
-    world = {name: value for name, value in live.describe().items() if name not in own}
+    world = live.describe()
+    # live_world.js adds these itself.
+    for name in ("type", "rules", "rule", "others", "species", "show", "playing", "seed"):
+        del world[name]
     classes = {"palette": PALETTE, "undecided": UNDECIDED}
     return {
         **rule.hyper_parameters(),
         "name": live.main.name,
         "classes": classes if task.classifies else None,
         "weights": {name: _packed(tensor) for name, tensor in rule.state_dict().items()},
-        "world": world | {"count": live.full, "seed": seed},
+        "world": world | {"capabilities": ["step", "reset"], "count": live.full, "seed": seed},
     }
 
 
@@ -202,14 +180,14 @@ def check_browser_rule(rule: NPARule, name: str) -> None:
     """Raise an `NPAError` if the JavaScript of the page cannot run a rule."""
     check_rule(rule)
     view = "watch it with npa-envs view"
-    kind, species, size = type(rule).__name__, rule.species_count, rule.weight_count
-    for fails, rule_of_page, given, cure in (
+    cls, species, size = type(rule).__name__, rule.species_count, rule.weight_count
+    for fails, condition, actual, hint in (
         (rule.equivariant, "that know directions only", "is equivariant", view),
         (rule.code_dim, "without codes only", f"has code_dim={rule.code_dim}", view),
         (rule.divides, "with a fixed number of particles only", "divides", view),
         (
             not rule.is_plain(), "of two plain layers only",
-            f"is a {kind} with a network of its own", "run it in Python",
+            f"is a {cls} with a network of its own", "run it in Python",
         ),
         (
             species, "that perceive all species alike", f"has species_count={species}",
@@ -218,7 +196,7 @@ def check_browser_rule(rule: NPARule, name: str) -> None:
         (size > MAX_WEIGHTS, f"of at most {MAX_WEIGHTS} weights", f"has {size}", view),
     ):  # fmt: skip
         if fails:
-            raise NPAError(f"a page runs rules {rule_of_page}, {shown(name)} {given}: {cure}")
+            raise NPAError(f"a page runs rules {condition}, {shown(name)} {actual}: {hint}")
 
 
 def preview(source: str, *, particle_count: int | None = None, seed: int = 0) -> str:
@@ -239,10 +217,15 @@ def preview(source: str, *, particle_count: int | None = None, seed: int = 0) ->
     return f"data:image/webp;base64,{base64.b64encode(file.getvalue()).decode()}"
 
 
-def page_text(rules: Sequence[Mapping[str, Any]], *, title: str, seed: int = 0) -> str:
-    """Return the HTML of a page of rules, each as `page_rule` returns it."""
+def page_text(
+    rules: Sequence[Mapping[str, Any]],
+    *,
+    title: str,
+    seed: int = 0,
+    previews: Mapping[str, str] | None = None,
+) -> str:
+    """Return the HTML of a page of rules, each as `page_rule` returns it; `previews` by name."""
     settings = {
-        "worker": "worker",
         "seed": seed,
         "ramp": base64.b64encode(colour_ramp().tobytes()).decode(),
         "constants": CONSTANTS,
@@ -250,20 +233,24 @@ def page_text(rules: Sequence[Mapping[str, Any]], *, title: str, seed: int = 0) 
     }
     # With "<" a rule's text could end the script element.
     data = json.dumps(settings, separators=(",", ":")).replace("<", "\\u003c")
-    worker = f"{joined_modules(['live_world.js'])}\nlive_world.serve(self);\n"
-    code = f"{joined_modules(['exported.js'])}\nexported.begin();\n"
+    code = f"{joined_modules(PAGE_MODULES)}\nbegin();\n"
     style = (PAGE / "page.css").read_text(encoding="utf-8")
     policy = POLICY.format(scripts=_digest(code), styles=_digest(style))
     page = (PAGE / "index.html").read_text(encoding="utf-8")
-    limits = f'<meta http-equiv="Content-Security-Policy" content="{policy}">'
     for before, after in (
-        ('<meta charset="utf-8">', f'<meta charset="utf-8">\n{limits}'),
+        (
+            '<meta charset="utf-8">',
+            '<meta charset="utf-8">\n'
+            f'<meta http-equiv="Content-Security-Policy" content="{policy}">',
+        ),
         ("<title>npa-envs</title>", f"<title>{html.escape(title)}</title>"),
         ('<link rel="stylesheet" href="page.css">', f"<style>{style}</style>"),
         (
-            '<script type="module" src="viewer.js"></script>',
+            '<script type="module" src="server_engine.js"></script>',
+            f"{_gallery(title, previews) if previews else ''}"
             f'<script type="application/json" id="rules">{data}</script>\n'
-            f'<script type="text/plain" id="worker">{worker}</script>\n'
+            f'<script type="text/plain" id="worker">{joined_modules(WORKER_MODULES)}\n'
+            "serve(self);\n</script>\n"
             f'<script type="module">{code}</script>',
         ),
     ):
@@ -271,6 +258,25 @@ def page_text(rules: Sequence[Mapping[str, Any]], *, title: str, seed: int = 0) 
             raise ValueError(f"index.html must hold {before!r} once, found {page.count(before)}")
         page = page.replace(before, after)
     return page
+
+
+def _gallery(title: str, previews: Mapping[str, str]) -> str:
+    """Return the HTML of pictures to choose from."""
+    links = "\n".join(
+        f'<li><a href="#{quote(name, safe="")}"><img src="{picture}" alt="">'
+        f"<span>{html.escape(name)}</span></a></li>"
+        for name, picture in previews.items()
+    )
+    return f"""<section id="gallery">
+<h1>{html.escape(title)}</h1>
+<p>Small neural networks, one in every particle.
+Choose one, watch it grow, then remove a part of it.</p>
+<ul>
+{links}
+</ul>
+</section>
+<a id="back" href="#" hidden>All rules</a>
+"""
 
 
 def _digest(text: str) -> str:

@@ -19,14 +19,14 @@ from npa_envs.checks import is_real, is_whole
 from npa_envs.errors import NPAError, shown, suggest
 from npa_envs.ops import species_fields
 from npa_envs.render.colours import GOLDEN_ANGLE, STATE_CHROMA, STATE_GAIN, ramp, srgb
-from npa_envs.tasks.damage import check_damage
+from npa_envs.tasks.damage import check_damage, damage_worlds
 from npa_envs.world.brushes import clump, cut, inject, push, state_around
 
 MAX_STEPS = 64
 """Most steps between two frames."""
 
-LOSS_FRACTION = 0.1
-"""Largest fraction of the time for computing losses while their plot is open."""
+MIN_PUSH = 0.5
+"""Fraction of the pointer's movement by which the brush `push` of strength 0 moves particles."""
 
 CLUMP_RATE = 0.25
 """Fraction of a particle's distance that a message of the brush `clump` of strength 1 removes."""
@@ -50,28 +50,30 @@ class Tool(NamedTuple):
     """Its tooltip."""
     needs: str
     """What a world must allow to offer it: "moves", "states", "removal", "species" or "growth"."""
+    sends: str
+    """When a stroke sends messages: "frame" (in each frame), "motion" (in frames in which the
+    pointer moves), "place" (at each new place), "once" (at its start) or "line" (at its end)."""
     takes: str
-    """Other content of its messages: "source", "rule", "line" (one message at the end of a stroke),
-    or ""."""
+    """Other content of its messages: "source", "rule" or ""."""
     icon: str
     """Path of its picture, in SVG, on a square of side 24."""
 
 
 TOOLS = (
-    Tool("remove", "Remove", "removal", "", "M4 15l8-9 7 6-7 8H8zM9 20h11"),
-    Tool("push", "Pull with the pointer", "moves", "",
+    Tool("remove", "Remove", "removal", "frame", "", "M4 15l8-9 7 6-7 8H8zM9 20h11"),
+    Tool("push", "Pull with the pointer", "moves", "motion", "",
          "M12 20c-4 0-6-3-7-7 2-1 3 0 4 2V6a1.4 1.4 0 0 1 3 0v5a1.4 1.4 0 0 1 3 0v1a1.4 1.4 0 0 1 "
          "3 0v3c0 3-2 5-6 5z"),
-    Tool("clump", "Clump", "moves", "",
+    Tool("clump", "Clump", "moves", "frame", "",
          "M4 4l5 5M20 4l-5 5M4 20l5-5M20 20l-5-5M9 6v3H6M15 6v3h3M9 18v-3H6M15 18v-3h3"),
-    Tool("cut", "Cut along a line", "moves", "line",
+    Tool("cut", "Cut along a line", "moves", "line", "",
          "M5 19L19 5M6 8a2 2 0 1 0 0-.1M16 18a2 2 0 1 0 0-.1M8 9l8 8"),
     Tool("inject", "Inject: the state of where you press spreads to where you drag", "states",
-         "source",
+         "frame", "source",
          "M4 20l3-1 8-8-2-2-8 8zM12 8l4 4M14 10l3-4a1.8 1.8 0 0 1 3 0 1.8 1.8 0 0 1-1 3l-4 2"),
-    Tool("graft", "Graft: particles take another rule", "species", "rule",
+    Tool("graft", "Graft: particles take another rule", "species", "place", "rule",
          "M12 21v-9M12 12c0-5 3-7 8-7 0 5-3 7-8 7zM12 15c0-4-3-6-8-6 0 4 3 6 8 6z"),
-    Tool("add", "Add a seed of another rule", "growth", "rule",
+    Tool("add", "Add a seed of another rule", "growth", "once", "rule",
          "M12 4a8 8 0 1 0 .1 0M12 8v8M8 12h8"),
 )  # fmt: skip
 """All brushes. `brushed`, `RuleWorld._brush` and `brush` of live_world.js apply them."""
@@ -104,34 +106,31 @@ class Range(NamedTuple):
         """Return `value` if it lies in the range; raises NPAError."""
         valid = is_whole(value) if self.whole else is_real(value)
         if not valid or not self.low <= value <= self.high:
-            kind = "a whole number" if self.whole else "a number"
+            what = "a whole number" if self.whole else "a number"
             raise NPAError(
-                f"{name} must be {kind} in [{self.low:g}, {self.high:g}], got {shown(value)}"
+                f"{name} must be {what} in [{self.low:g}, {self.high:g}], got {shown(value)}"
             )
         return int(value) if self.whole else float(value)
 
     def to_dict(self, value: float) -> dict[str, Any]:
         """Return the range and the present value as JSON for the page."""
         optional = {"scale": self.scale, "whole": self.whole}
-        given = {name: part for name, part in optional.items() if part}
-        return {"value": value, "low": self.low, "high": self.high} | given
+        fields = {name: option for name, option in optional.items() if option}
+        return {"value": value, "low": self.low, "high": self.high} | fields
 
 
 class LiveWorld(ABC):
     """A world that a page shows and changes while it runs."""
 
-    seed: int
-
-    def __init__(self) -> None:
+    def __init__(self, seed: int) -> None:
+        self.seed = checked_seed(seed)
         self.playing = True
         """Whether it runs; else it makes steps only by the message "step"."""
         self.speed = 1
         self.show = "colours"
-        self.step = 0
-        self._milliseconds = 0.0
         self._loss_wanted = False
-        self._loss_due = 0.0
-        self._news: list[dict[str, Any]] = []
+        self._colouring = Colouring()
+        self._events: list[dict[str, Any]] = []
 
     def describe(self) -> dict[str, Any]:
         """Return the event "world"."""
@@ -143,12 +142,13 @@ class LiveWorld(ABC):
             "settings": {k: r.to_dict(getattr(self, k)) for k, r in self._ranges().items()},
             "playing": self.playing,
             "seed": self.seed,
+            "box": None if self.box is None else list(self.box),
         }
 
     def handle(self, message: Mapping[str, Any]) -> bool:
         """Apply a message, and return whether `describe` has changed; raises NPAError."""
-        kind = message.get("type") if isinstance(message, Mapping) else None
-        match kind:
+        action = message.get("type") if isinstance(message, Mapping) else None
+        match action:
             case "play":
                 self.playing = checked_flag("on", message.get("on"))
             case "step":
@@ -161,43 +161,68 @@ class LiveWorld(ABC):
             case "set":
                 return self._set(str(message.get("name")), message.get("value"))
             case "brush":
-                return self._brush(message)
+                return self._brush(Touch.read(message, self._particles()[0]))
             case "damage":
                 check_damage(name := message.get("name"))
                 self._damage(str(name))
             case _:
                 known = ("play", "step", "reset", "set", "brush", "damage")
-                raise NPAError(f"unknown message {shown(kind)}: {suggest(kind, known)}")
+                raise NPAError(f"unknown message {shown(action)}: {suggest(action, known)}")
         return False
 
     def advance(self) -> None:
         """Run to the next frame."""
         self._run_timed(self.speed)
 
-    @abstractmethod
+    @torch.no_grad()
     def frame(self) -> WorldView:
         """Return the present frame."""
+        world = self._coloured()
+        colours = self._colouring(self.show, world)
+        loss = self._loss() if self._loss_wanted else None
+        positions: NDArray[np.float32] = world.x[0].cpu().numpy()
+        return WorldView(self.step, positions, colours, self._milliseconds, loss)
 
-    def news(self) -> list[dict[str, Any]]:
+    def take_events(self) -> list[dict[str, Any]]:
         """Return the other events since the last call: curves, errors, changed descriptions."""
-        events, self._news = self._news, []
+        events, self._events = self._events, []
         return events
 
     def close(self) -> None:  # noqa: B027
         """Release the world's resources."""
 
-    @abstractmethod
     def reset(self, seed: int | None) -> None:
         """Start a fresh world; `None`: of the next seed."""
+        self.seed = self.seed + 1 if seed is None else seed
+        self._begin(self.seed)
+
+    def _begin(self, seed: int | None) -> None:
+        """Start a fresh world; `None`: of any seed."""
+        self.step, self._milliseconds = 0, 0.0
+        self._travelled: Tensor | None = None
+        self._updated: Tensor | None = None
+
+    @property
+    @abstractmethod
+    def box(self) -> tuple[float, ...] | None:
+        """Sides of the periodic box [length units]; None: open space."""
 
     @abstractmethod
     def _run(self, steps: int) -> None: ...
 
     @abstractmethod
-    def _damage(self, name: str) -> None: ...
+    def _particles(self) -> tuple[Tensor, Tensor]:
+        """Return positions [1, N, D] and states [1, N, C]."""
 
     @abstractmethod
-    def _brush(self, message: Mapping[str, Any]) -> bool: ...
+    def _place(self, x: Tensor, s: Tensor) -> None:
+        """Replace positions and states."""
+
+    @abstractmethod
+    def _coloured(self) -> ColouredWorld: ...
+
+    @abstractmethod
+    def _loss(self) -> float | None: ...
 
     @abstractmethod
     def _allowed(self) -> set[str]:
@@ -205,6 +230,14 @@ class LiveWorld(ABC):
 
     @abstractmethod
     def _shows(self) -> list[str]: ...
+
+    def _damage(self, name: str) -> None:
+        self._place(*damage_worlds(*self._particles(), kind=name))
+
+    def _brush(self, touch: Touch) -> bool:
+        """Apply a brush, and return whether `describe` has changed."""
+        self._place(*brushed(*self._particles(), touch, self.box))
+        return False
 
     def _set(self, name: str, value: Any) -> bool:
         ranges = self._ranges()
@@ -232,15 +265,6 @@ class LiveWorld(ABC):
         # A moving average, as single steps may compile kernels or be interrupted.
         self._milliseconds += (0.2 if self._milliseconds else 1.0) * (each - self._milliseconds)
 
-    def _loss(self, compute: Callable[[], float]) -> float | None:
-        """Return the loss, or None if its plot is closed or it is too early (`LOSS_FRACTION`)."""
-        start = time.perf_counter()
-        if not self._loss_wanted or start < self._loss_due:
-            return None
-        loss = compute()
-        self._loss_due = start + (time.perf_counter() - start) / LOSS_FRACTION
-        return loss
-
 
 class Touch(NamedTuple):
     """The brush of a message."""
@@ -258,6 +282,8 @@ class Touch(NamedTuple):
     """Position whose state the brush `inject` spreads [length units], shape [1, D]."""
     view: Tensor | None
     """In 3D the unit vector towards the viewer, shape [1, D], or None."""
+    rule: Any
+    """What the message says as the name of another rule."""
 
     @classmethod
     def read(cls, message: Mapping[str, Any], x: Tensor) -> Touch:
@@ -275,6 +301,7 @@ class Touch(NamedTuple):
             Range(0.0, 1.0).checked("strength", message.get("strength", 1.0)),
             _checked_vector("source", message.get("source", at), x),
             None if view is None else _checked_vector("view", view, x),
+            message.get("rule"),
         )
 
 
@@ -286,7 +313,7 @@ def brushed(
         case "push":
             moved = push(
                 x, centre=touch.at, move=touch.move, radius=touch.radius, box=box,
-                strength=min(1.0, 0.5 + touch.strength),
+                strength=min(1.0, MIN_PUSH + touch.strength),
             )  # fmt: skip
             return moved, s
         case "clump":
@@ -295,13 +322,13 @@ def brushed(
         case "cut":
             half = 0.5 * touch.move
             return cut(
-                x, s, centre=touch.at + half, normal=across(touch.move, touch.view), along=half,
+                x, s, centre=touch.at + half, normal=_normal(touch), along=half,
                 gap=touch.radius, box=box,
             )  # fmt: skip
         case "inject":
             disk: dict[str, Any] = {"radius": touch.radius, "box": box}
-            state, found = state_around(x, s, centre=touch.source, **disk)
-            strength = INJECT_RATE * touch.strength * found.to(x.dtype)
+            state, exists = state_around(x, s, centre=touch.source, **disk)
+            strength = INJECT_RATE * touch.strength * exists.to(x.dtype)
             return x, inject(x, s, centre=touch.at, state=state, strength=strength, **disk)
     raise NPAError(
         f"this world keeps its particles, so that the brush {shown(touch.tool)} does nothing: take "
@@ -309,12 +336,14 @@ def brushed(
     )
 
 
-def across(move: Tensor, view: Tensor | None) -> Tensor:
-    """Return the normal of a cut along `move` [1, D]; in 3D the cut contains `view`."""
+def _normal(touch: Touch) -> Tensor:
+    """Return the normal of a cut along the movement [1, D]; in 3D the cut contains `view`."""
+    move, view = touch.move, touch.view
     if move.shape[1] == 2:
         return torch.stack((-move[:, 1], move[:, 0]), dim=1)
-    toward = move.new_tensor([[0.0, 0.0, 1.0]]) if view is None else view
-    normal: Tensor = torch.linalg.cross(toward, move)
+    normal: Tensor = torch.linalg.cross(
+        move.new_tensor([[0.0, 0.0, 1.0]]) if view is None else view, move
+    )
     return normal
 
 

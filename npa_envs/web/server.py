@@ -11,14 +11,14 @@ import contextlib
 import io
 import ipaddress
 import json
+import os
 import queue
 import secrets
 import socket
 import struct
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -33,6 +33,8 @@ from npa_envs.web.live import LiveWorld, WorldView
 try:
     import uvicorn
     from starlette.applications import Starlette
+    from starlette.middleware import Middleware
+    from starlette.middleware.base import BaseHTTPMiddleware, RequestResponseEndpoint
     from starlette.requests import Request
     from starlette.responses import FileResponse, PlainTextResponse, Response
     from starlette.routing import Route, WebSocketRoute
@@ -91,26 +93,33 @@ SECURITY = {
 """Headers of every response."""
 
 
-@dataclass(frozen=True)
 class Site:
-    """Worlds, address and token of a server."""
+    """Worlds, address and token of a server.
 
-    make_world: Callable[[], LiveWorld]
-    """Makes the world of a page, in the thread that runs it."""
-    films: Path
-    """Folder of films; created with the first one."""
-    host: str = "127.0.0.1"
-    """The bound address."""
-    token: str | None = None
-    """The required token, or None."""
-    one_at_a_time: bool = False
-    """Worlds run one at a time: a CUDA graph of one thread must not record another's work."""
-    turn: threading.Lock = field(default_factory=threading.Lock)
-    open_sessions: list[ViewerSession] = field(default_factory=list)
+    Args:
+        make_world: Makes the world of a page, in the thread that runs it.
+        films: Folder of films; created with the first one.
+        host: The address to bind; if it is no loopback address, requests need a token.
+        one_at_a_time: Run worlds one at a time: a CUDA graph of one thread must not record
+            another's work.
+    """
 
-    def alone(self) -> contextlib.AbstractContextManager[Any]:
-        """Return the context in which a world runs alone."""
-        return self.turn if self.one_at_a_time else contextlib.nullcontext()
+    def __init__(
+        self,
+        make_world: Callable[[], LiveWorld],
+        *,
+        films: Path,
+        host: str = "127.0.0.1",
+        one_at_a_time: bool = False,
+    ) -> None:
+        self.make_world, self.films, self.host = make_world, films, host
+        self.token = None if is_loopback(host) else secrets.token_urlsafe(24)
+        """The required token, or None."""
+        self.exclusive: contextlib.AbstractContextManager[Any] = (
+            threading.Lock() if one_at_a_time else contextlib.nullcontext()
+        )
+        """The context in which a world runs."""
+        self.session_count = 0
 
     def allows_host(self, host: str) -> bool:
         """Return whether a request's `Host` is a name of this server."""
@@ -133,18 +142,6 @@ class Site:
         return own is None or secrets.compare_digest((token or "").encode(), own.encode())
 
 
-def make_site(
-    make_world: Callable[[], LiveWorld],
-    *,
-    films: Path,
-    host: str = "127.0.0.1",
-    one_at_a_time: bool = False,
-) -> Site:
-    """Return a site; if `host` is no loopback address, it requires a new random token."""
-    token = None if is_loopback(host) else secrets.token_urlsafe(24)
-    return Site(make_world, films, host, token, one_at_a_time)
-
-
 def is_loopback(host: str) -> bool:
     """Return whether only this computer can connect to an address."""
     if host == "localhost":
@@ -161,74 +158,60 @@ def make_app(site: Site) -> Starlette:
     async def page(request: Request) -> Response:
         if not site.allows_token(request.query_params.get("token")):
             return _refused("open the link that npa-envs view has printed: it holds the token")
-        return FileResponse(PAGE / "index.html", headers=SECURITY)
+        return FileResponse(PAGE / "index.html")
 
-    async def part(request: Request) -> Response:
-        name = request.path_params["name"]
-        return _file(PAGE, name, {".js": "text/javascript", ".css": "text/css"})
+    async def page_file(request: Request) -> Response:
+        return _file(PAGE, request, {".js": "text/javascript", ".css": "text/css"})
 
     async def film(request: Request) -> Response:
         if not site.allows_token(request.query_params.get("token")):
             return _refused("films need the token of the page")
-        name = request.path_params["name"]
-        return _file(site.films, name, {".gif": "image/gif", ".mp4": "video/mp4"})
+        return _file(site.films, request, {".gif": "image/gif", ".mp4": "video/mp4"})
 
-    async def meet(reader: WebSocket) -> None:
-        host, origin = reader.headers.get("host", ""), reader.headers.get("origin")
-        own = {f"http://{host}", f"https://{host}"}
-        if not site.allows_host(host) or (origin is not None and origin not in own):
-            return await reader.close(1008, "this server answers its own page alone")
-        if not site.allows_token(reader.query_params.get("token")):
-            return await reader.close(1008, "the token is missing or wrong")
-        await reader.accept()
-        if len(site.open_sessions) >= MAX_SESSIONS:
-            return await reader.close(1013, f"{MAX_SESSIONS} worlds are open: close a page")
-        session = ViewerSession(site, reader, asyncio.get_running_loop())
-        site.open_sessions.append(session)
+    async def connect(page: WebSocket) -> None:
+        host, origin = page.headers.get("host", ""), page.headers.get("origin")
+        if not site.allows_host(host) or origin not in (None, f"http://{host}", f"https://{host}"):
+            return await page.close(1008, "this server answers its own page alone")
+        if not site.allows_token(page.query_params.get("token")):
+            return await page.close(1008, "the token is missing or wrong")
+        await page.accept()
+        if site.session_count >= MAX_SESSIONS:
+            return await page.close(1013, f"{MAX_SESSIONS} worlds are open: close a page")
+        site.session_count += 1
         try:
-            await session.serve()
+            await ViewerSession(site, page, asyncio.get_running_loop()).serve()
         finally:
-            site.open_sessions.remove(session)
+            site.session_count -= 1
 
-    app = Starlette(
-        routes=[
-            Route("/", page),
-            WebSocketRoute("/socket", meet),
-            Route("/films/{name}", film),
-            Route("/{name}", part),
-        ],
-    )
-    app.add_middleware(HostCheck, site=site)
-    return app
+    async def guard(request: Request, call_next: RequestResponseEndpoint) -> Response:
+        host = request.headers.get("host", "")
+        if site.allows_host(host):
+            response = await call_next(request)
+        else:
+            response = _refused(f"ask for {site.host}, got {shown(host)}")
+        response.headers.update(SECURITY)
+        return response
 
-
-class HostCheck:
-    """Refuses requests whose `Host` is not the server's."""
-
-    def __init__(self, app: Any, site: Site) -> None:
-        self._app, self._site = app, site
-
-    async def __call__(self, scope: Any, receive: Any, send: Any) -> None:
-        """Answer a request."""
-        if scope["type"] == "http":
-            host = dict(scope["headers"]).get(b"host", b"").decode("latin-1")
-            if not self._site.allows_host(host):
-                name = self._site.host
-                return await _refused(f"ask for {name}, got {shown(host)}")(scope, receive, send)
-        await self._app(scope, receive, send)
+    routes = [
+        Route("/", page),
+        WebSocketRoute("/socket", connect),
+        Route("/films/{name}", film),
+        Route("/{name}", page_file),
+    ]
+    return Starlette(routes=routes, middleware=[Middleware(BaseHTTPMiddleware, dispatch=guard)])
 
 
-def _file(folder: Path, name: str, kinds: Mapping[str, str]) -> Response:
+def _file(folder: Path, request: Request, media_types: Mapping[str, str]) -> Response:
     """Return the response with a file directly in a folder, or 404."""
-    path = folder / name
+    path = folder / request.path_params["name"]
     with contextlib.suppress(OSError, ValueError):  # Invalid file names.
-        if path.parent == folder and path.suffix in kinds and path.is_file():
-            return FileResponse(path, media_type=kinds[path.suffix], headers=SECURITY)
-    return PlainTextResponse("no such file", 404, SECURITY)
+        if path.parent == folder and path.suffix in media_types and path.is_file():
+            return FileResponse(path, media_type=media_types[path.suffix])
+    return PlainTextResponse("no such file", 404)
 
 
 def _refused(reason: str) -> Response:
-    return PlainTextResponse(f"refused: {reason}", 403, SECURITY)
+    return PlainTextResponse(f"refused: {reason}", 403)
 
 
 def frame_bytes(frame: WorldView) -> bytes:
@@ -246,13 +229,14 @@ class ViewerSession:
     The world waits for a slow or hidden page: at most `FRAMES_AHEAD` frames are not drawn yet.
     """
 
-    def __init__(self, site: Site, reader: WebSocket, loop: asyncio.AbstractEventLoop) -> None:
-        self._site, self._reader, self._loop = site, reader, loop
+    def __init__(self, site: Site, page: WebSocket, loop: asyncio.AbstractEventLoop) -> None:
+        self._site, self._page, self._loop = site, page, loop
         self._inbox: queue.Queue[dict[str, Any] | bytes] = queue.Queue(MESSAGES_KEPT)
         self._outbox: asyncio.Queue[bytes | str | None] = asyncio.Queue()
         self._free_frames = threading.BoundedSemaphore(FRAMES_AHEAD)
         self._stopped = threading.Event()
-        self._film: PageFilm | None = None
+        self._pictures: list[bytes] | None = None
+        """The film that is being recorded, or None."""
 
     async def serve(self) -> None:
         """Read and write until the page disconnects or the server stops."""
@@ -272,7 +256,7 @@ class ViewerSession:
 
     async def _read(self) -> None:
         while True:
-            received = await self._reader.receive()
+            received = await self._page.receive()
             if received["type"] == "websocket.disconnect":
                 return
             text, message = received.get("text") or "", received.get("bytes")
@@ -296,9 +280,9 @@ class ViewerSession:
         while (data := await self._outbox.get()) is not None:
             try:
                 if isinstance(data, bytes):
-                    await self._reader.send_bytes(data)
+                    await self._page.send_bytes(data)
                 else:
-                    await self._reader.send_text(data)
+                    await self._page.send_text(data)
             except (WebSocketDisconnect, RuntimeError):
                 return
 
@@ -323,7 +307,7 @@ class ViewerSession:
 
     def _world_thread(self) -> None:
         try:
-            with self._site.alone():
+            with self._site.exclusive:
                 world = self._site.make_world()
         except NPAError as error:
             return self._send_error(str(error))
@@ -343,8 +327,8 @@ class ViewerSession:
         due = clock()
         while not self._stopped.is_set():
             changed |= self._apply_messages(world, wait=not (world.playing or changed))
-            with self._site.alone():
-                events = world.news()
+            with self._site.exclusive:
+                events = world.take_events()
             for event in events:
                 self._send_event(event)
                 changed = True
@@ -356,7 +340,7 @@ class ViewerSession:
             self._stopped.wait(max(0.0, due - clock()))
             due = max(due, clock() - FRAME_SECONDS) + FRAME_SECONDS
             try:
-                with self._site.alone():
+                with self._site.exclusive:
                     if world.playing:
                         world.advance()
                     frame = world.frame()
@@ -383,7 +367,7 @@ class ViewerSession:
                 elif message.get("type") == "film":
                     self._film_action(message.get("action"))
                 else:
-                    with self._site.alone():
+                    with self._site.exclusive:
                         changed = world.handle(message)
                     if changed:
                         self._send_event(world.describe())
@@ -393,105 +377,97 @@ class ViewerSession:
 
     def _film_action(self, action: Any) -> None:
         if action == "start":
-            self._film = PageFilm()
-        elif action == "stop" and self._film is not None:
-            self._end_film(self._film)
+            self._pictures = []
+        elif action == "stop" and self._pictures is not None:
+            self._end_film(self._pictures)
         else:
             raise NPAError(f"a film's action must be 'start', then 'stop', got {shown(action)}")
 
-    def _end_film(self, film: PageFilm) -> None:
+    def _end_film(self, pictures: list[bytes]) -> None:
         def write() -> None:
             try:
-                for path in film.write(self._site.films):
+                for path in write_film(pictures, self._site.films):
                     url = f"films/{path.name}{self._site.query}"
                     self._send_event({"type": "file", "name": path.name, "url": url})
             except NPAError as error:
                 self._send_error(str(error))
 
-        self._film = None
+        self._pictures = None
         # In a thread, so that the world keeps running.
         threading.Thread(target=write, daemon=True).start()
 
     def _add_picture(self, data: bytes) -> None:
-        # Pictures that come after the film's end are ignored.
-        if self._film is not None:
-            self._film.add(data)
-            if len(self._film.pictures) >= MAX_PICTURES:
+        # Pictures that arrive after the film's end are ignored.
+        if self._pictures is not None:
+            check_picture(data)
+            self._pictures.append(data)
+            if len(self._pictures) >= MAX_PICTURES:
                 self._send_event({"type": "film", "action": "stop"})
-                self._end_film(self._film)
+                self._end_film(self._pictures)
 
 
-class PageFilm:
-    """A film of pictures that a page has drawn."""
+def check_picture(data: bytes) -> None:
+    """Check a picture of a film, a JPEG file."""
+    try:
+        with Image.open(io.BytesIO(data), formats=["JPEG"]) as picture:
+            size = picture.size
+    except (OSError, ValueError, Image.DecompressionBombError) as error:
+        raise NPAError(f"a film's picture must be a JPEG, got {shown(error)}") from error
+    if max(size) > MAX_PICTURE:
+        raise NPAError(
+            f"a film's picture must have at most {MAX_PICTURE} pixels on each side, got {size}"
+        )
 
-    def __init__(self) -> None:
-        self.pictures: list[bytes] = []
 
-    def add(self, data: bytes) -> None:
-        """Add a picture, a JPEG file."""
-        try:
-            with Image.open(io.BytesIO(data), formats=["JPEG"]) as picture:
-                size = picture.size
-        except (OSError, ValueError, Image.DecompressionBombError) as error:
-            raise NPAError(f"a film's picture must be a JPEG, got {shown(error)}") from error
-        if max(size) > MAX_PICTURE:
-            raise NPAError(
-                f"a film's picture must have at most {MAX_PICTURE} pixels on each side, got {size}"
-            )
-        self.pictures.append(data)
-
-    def write(self, folder: Path) -> Iterator[Path]:
-        """Write the film as GIF and as MP4; yield each file once it is written."""
-        if not self.pictures:
-            raise NPAError("the film has no pictures: let the world move while it records")
-        try:
-            frames = [
-                np.asarray(Image.open(io.BytesIO(data), formats=["JPEG"]).convert("RGB"))
-                for data in self.pictures
-            ]
-            # Random, as several films may end within the same second.
-            name = f"{time.strftime('film-%Y%m%d-%H%M%S')}-{secrets.token_hex(3)}"
-            with made_folder(folder):
-                # The GIF comes first, as it needs no ffmpeg.
-                for suffix, write in ((".gif", write_gif), (".mp4", write_mp4)):
-                    path = folder / f"{name}{suffix}"
-                    write(path, frames, FILM_RATE)
-                    yield path
-        except NPAError:
-            raise
-        except (OSError, ValueError) as error:
-            raise NPAError(f"the film cannot be written: {error}") from error
+def write_film(pictures: Sequence[bytes], folder: Path) -> Iterator[Path]:
+    """Write JPEG pictures as GIF and as MP4; yield each file once it is written."""
+    if not pictures:
+        raise NPAError("the film has no pictures: let the world move while it records")
+    # Random, as several films may end within the same second.
+    name = f"{time.strftime('film-%Y%m%d-%H%M%S')}-{secrets.token_hex(3)}"
+    try:
+        frames = [
+            np.asarray(Image.open(io.BytesIO(data), formats=["JPEG"]).convert("RGB"))
+            for data in pictures
+        ]
+        with made_folder(folder):
+            # The GIF comes first, as it needs no ffmpeg.
+            for suffix, write in ((".gif", write_gif), (".mp4", write_mp4)):
+                path = folder / f"{name}{suffix}"
+                write(path, frames, FILM_RATE)
+                yield path
+    except NPAError:
+        raise
+    except (OSError, ValueError) as error:
+        raise NPAError(f"the film cannot be written: {error}") from error
 
 
 def open_port(host: str, port: int | None) -> socket.socket:
     """Return a listening socket on a port; None: the first free one from `PORT` on."""
     if port is not None and not 0 <= port <= 65535:
         raise NPAError(f"port must be in [0, 65535], got {port}: leave it out for a free one")
-    tried = [port] if port is not None else [*range(PORT, PORT + PORTS_TRIED), 0]
-    reason: OSError | None = None
-    for number in tried:
+    ports = [port] if port is not None else [*range(PORT, PORT + PORTS_TRIED), 0]
+    try:
+        family, *_, address = socket.getaddrinfo(host, 0, type=socket.SOCK_STREAM)[0]
+    except (OSError, UnicodeError) as error:
+        why = getattr(error, "strerror", None) or error
+        raise NPAError(
+            f"host must be an address of this computer, got {shown(host)} ({shown(why)}): try "
+            "127.0.0.1"
+        ) from error
+    reason = ""
+    for number in ports:
+        # "::" listens to IPv4 as well.
+        both = family == socket.AF_INET6 and socket.has_dualstack_ipv6()
         try:
-            family, *_, address = socket.getaddrinfo(host, number, type=socket.SOCK_STREAM)[0]
-            listener = socket.socket(family, socket.SOCK_STREAM)
-        except (OSError, UnicodeError) as error:
-            why = getattr(error, "strerror", None) or error
-            raise NPAError(
-                f"host must be an address of this computer, got {shown(host)} ({shown(why)}): try "
-                "127.0.0.1"
-            ) from error
-        try:
-            # The port of a server that has just ended can be used at once.
-            listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-            listener.bind(address)
-            listener.listen(128)
+            return socket.create_server(
+                (address[0], number, *address[2:]), family=family, backlog=128, dualstack_ipv6=both
+            )
         except OSError as error:
-            listener.close()
-            reason = error
-            continue
-        return listener
+            reason = os.strerror(error.errno or 0)
     raise NPAError(
-        f"port {tried[0]} of {host} cannot be bound ({reason.strerror if reason else None}): it is "
-        "in use, or not allowed; leave --port out for a free one"
+        f"port {ports[0]} of {host} cannot be bound ({reason}): it is in use, or not allowed; "
+        "leave --port out for a free one"
     )
 
 
@@ -499,7 +475,7 @@ def address_of(site: Site, listener: socket.socket) -> str:
     """Return the link to the page."""
     port = listener.getsockname()[1]
     # For a server on all addresses, the link names this computer.
-    name = {"0.0.0.0": "127.0.0.1", "": "127.0.0.1", "::": "::1"}.get(site.host, site.host)
+    name = {"0.0.0.0": "127.0.0.1", "::": "::1"}.get(site.host, site.host)
     name = f"[{name}]" if ":" in name else name
     return f"http://{name}:{port}/{site.query}"
 

@@ -199,9 +199,7 @@ def write_film(folder: Path) -> None:
     server = pytest.importorskip("npa_envs.web.server")
     picture = io.BytesIO()
     Image.new("RGB", (64, 64)).save(picture, "JPEG")
-    film = server.PageFilm()
-    film.add(picture.getvalue())
-    list(film.write(folder))
+    list(server.write_film([picture.getvalue()], folder))
 
 
 @pytest.mark.parametrize(

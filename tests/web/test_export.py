@@ -29,7 +29,16 @@ from npa_envs.errors import NPAError
 from npa_envs.rule.files import load_rule, save_rule
 from npa_envs.rule.rule import NPARule
 from npa_envs.tasks.point_classification import class_colours
-from npa_envs.web.export import check_browser_rule, export_web, joined_modules, page_rule, page_text
+from npa_envs.web.export import (
+    PAGE,
+    PAGE_MODULES,
+    WORKER_MODULES,
+    check_browser_rule,
+    export_web,
+    joined_modules,
+    page_rule,
+    page_text,
+)
 from npa_envs.web.live import ColouredWorld, Colouring
 from npa_envs.world import brushes
 from npa_envs.world.rollout import rollout
@@ -343,20 +352,16 @@ def test_a_page_is_one_small_file_that_asks_for_nothing(tmp_path):
     assert "<script>alert(1)" not in page.read_text(encoding="utf-8")
 
 
-def test_modules_are_joined_in_the_order_of_their_imports(tmp_path):
-    def joined(b):
-        a = 'import { two } from "./b.js";\nexport const four = two + two;\n'
-        for name, text in (("a", a), ("b", b)):
-            (tmp_path / f"{name}.js").write_text(text, encoding="utf-8")
-        return joined_modules(["a.js"], tmp_path)
-
-    text = joined("const one = 1;\nexport const two = one + one;\n")
-    assert text.index("const b =") < text.index("const a =")
-    assert "const { two } = b;" in text
-    with pytest.raises(ValueError, match=r"a\.js -> b\.js -> a\.js"):
-        joined('import { four } from "./a.js";\nexport const two = four;\n')
-    with pytest.raises(ValueError, match="export default 2;"):
-        joined("export default 2;\n")
+@pytest.mark.parametrize("modules", [PAGE_MODULES, WORKER_MODULES])
+def test_modules_follow_those_that_they_import_and_all_their_names_differ(modules):
+    names = []
+    for k, module in enumerate(modules):
+        text = (PAGE / module).read_text(encoding="utf-8")
+        assert set(re.findall(r'from "\./([\w.]+)"', text)) <= set(modules[:k])
+        declared = r"^(?:export )?(?:async )?(?:function|class|const|let) (\S+)"
+        names += re.findall(declared, text, re.MULTILINE)
+    assert len(set(names)) == len(names) > 30
+    assert not re.search(r"^(import|export)\b", joined_modules(modules), re.MULTILINE)
 
 
 class OwnNetwork(NPARule):

@@ -146,7 +146,7 @@ def test_a_gallery_opens_a_rule_and_goes_back(exported):
 def test_solid_and_still_worlds_live_in_a_page(exported, name):
     if name == "digits":
         pytest.importorskip("sklearn")
-    page = exported(name, particle_count=None, previews=True, steps=3)
+    page = exported(name, particle_count=None, previews=True, query=f"#{name}", steps=3)
     count = {"duck": 8192, "digits": 512}[name]
     told = page.run("document.getElementById('step').textContent")
     assert re.fullmatch(rf"step \d+ · {count} particles", told)
@@ -158,17 +158,17 @@ CARD = ("--enable-unsafe-webgpu", "--use-webgpu-adapter=swiftshader", "--enable-
 CARD_STEP = """(async ({ rules, x, s, species, mask, eps, box, densityCounts }) => {
   const floats = (text) =>
     new Float32Array(Uint8Array.from(atob(text), (letter) => letter.charCodeAt(0)).buffer);
-  const kernels = physics.plainKernels();
+  const kernels = plainKernels();
   const prepared = rules.map((rule) => {
     const named = Object.entries(rule.weights).map(([name, text]) => [name, floats(text)]);
-    return physics.prepareRule({ ...rule, weights: Object.fromEntries(named) }, kernels);
+    return prepareRule({ ...rule, weights: Object.fromEntries(named) }, kernels);
   });
   const world = {
     count: species.length, x: floats(x), s: floats(s), species: Uint8Array.from(species),
   };
-  const device = await physics_gpu.openDevice();
-  const card = await physics_gpu.GpuPhysics.make(
-    device, new physics.Physics(prepared, world.count, kernels));
+  const device = await openDevice();
+  const card = await GpuPhysics.make(
+    device, new Physics(prepared, world.count, kernels));
   await card.step(world, { eps, box, densityCounts, mask: Uint8Array.from(mask) });
   return { x: [...world.x], s: [...world.s] };
 })"""
@@ -183,13 +183,12 @@ def card_page(tmp_path_factory):
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", [*WORLDS, "two species"])
 def test_a_step_on_a_graphics_card_is_that_of_python(tmp_path, card_page, kind):
-    script = joined_modules(["physics_gpu.js"])
-    shown = "Object.assign(window, { physics, physics_gpu });"
-    text = f"<!doctype html><script>{script}\n{shown}</script>"
+    script = joined_modules(["physics.js", "physics_gpu.js"])
+    text = f"<!doctype html><script>{script}</script>"
     (tmp_path / "card.html").write_text(text, encoding="utf-8")
     page = card_page()
     page.open((tmp_path / "card.html").as_uri())
-    page.wait("window.physics_gpu")
+    page.wait("typeof openDevice === 'function'")
     rules, x, s, eps, box = world_of("gecko" if kind == "two species" else kind)
     count = x.shape[1]
     mask = (torch.rand(1, count, generator=torch.Generator().manual_seed(9)) < 0.5).double()

@@ -14,7 +14,6 @@ import torch
 
 from npa_envs import NPAError, load_rule, rollout, rollout_species, save_rule
 from npa_envs.agents.policies import ZeroPolicy
-from npa_envs.files import open_regular
 from npa_envs.rule.files import preset_rules, rule_metadata, shipped_rules
 from npa_envs.rule.rule import NPARule, dividing
 from npa_envs.tasks.damage import DAMAGE_SIZES
@@ -143,9 +142,9 @@ def test_remove_takes_particles_and_the_others_feel_it_nearby_only(world, gecko)
     assert not world.handle(brush("remove", at=[-0.2, 0.0], radius=0.15))
     frame = world.frame()
     assert 0 < len(frame.positions) < COUNT
-    assert world.news() == [{"type": "reordered"}]
+    assert world.take_events() == [{"type": "reordered"}]
     world.handle(brush("remove", at=[5.0, 5.0]))
-    assert world.news() == []
+    assert world.take_events() == []
     assert np.linalg.norm(frame.positions - [-0.2, 0.0], axis=1).min() > 0.15
     assert far.sum() > 3
     for live in (world, other):
@@ -184,6 +183,7 @@ def test_a_world_at_rest_is_not_stepped_until_something_changes_it(tmp_path, dev
     assert asked == [16] * 3
     assert world.step == 128
     world.s[0, 3] = 1e4
+    put(world, show="colours")
     world.advance()
     assert asked == [16] * 4
     world.handle({"type": "reset"})
@@ -266,7 +266,7 @@ def test_grafts_follow_the_other_rule(world):
     # Species after species: those within follow the second.
     assert inside[world.counts[0] :].all()
     # The page's tracers must know.
-    assert world.news() == [{"type": "reordered"}]
+    assert world.take_events() == [{"type": "reordered"}]
     world.advance()
     put(world, show="species")
     np.testing.assert_array_equal(
@@ -525,8 +525,8 @@ def log(folder: Path, first: int, end: int) -> None:
 
 def news(world: RunWorld) -> list[dict]:
     """What a world tells after it has looked at its run."""
-    world._due = 0.0
-    return world.news()
+    world._poll_due = 0.0
+    return world.take_events()
 
 
 def points(world: RunWorld) -> list[tuple]:
@@ -542,10 +542,10 @@ def followed(tmp_path) -> RunWorld:
 
 def test_a_run_is_followed(tmp_path, followed):
     world = followed
-    curve, told = world.news()
+    curve, told = world.take_events()
     assert (curve["points"], curve["append"]) == ([[k, 1.0 / (k + 1)] for k in range(10)], False)
     assert (told["note"], told["title"]) == ("a training run, iteration 9", tmp_path.name)
-    assert world.news() == []
+    assert world.take_events() == []
     world.advance()
     x = world.x
     newer = trained_on("gecko")
@@ -571,7 +571,7 @@ def test_a_run_of_several_rules_is_one_world_of_them(tmp_path):
     assert told["title"] == "pair"
     assert told["species"] == ["rule-0", "rule-1"]
     assert world.counts == [128, 128]
-    curve, _ = world.news()
+    curve, _ = world.take_events()
     assert len(curve["points"]) > 1
     rules = [load_rule(folder / f"rule-{k}.safetensors").float() for k in (0, 1)]
     x, s, generator = world.x, world.s, torch.Generator()
@@ -595,7 +595,7 @@ def test_a_run_of_several_rules_is_one_world_of_them(tmp_path):
 
 def test_another_run_in_the_folder_is_another_world(tmp_path, followed):
     world = followed
-    world.news()
+    world.take_events()
     advance(world, 1)
     # With another picture of the same sizes, and then in a box.
     write_run(tmp_path, "heart")
@@ -629,23 +629,6 @@ def test_particles_carry_the_codes_of_the_newest_rule(tmp_path):
     assert torch.equal(world.s[0, :, :8], code.expand(64, 8))
 
 
-def test_of_a_log_only_what_is_new_is_read(tmp_path, followed, monkeypatch):
-    world, path = followed, tmp_path / "log.jsonl"
-    assert len(points(world)[0][1]) == 10
-    opened = []
-    monkeypatch.setattr(
-        rule_world, "open_regular", lambda *a, **k: opened.append(a) or open_regular(*a, **k)
-    )
-    assert points(world) == []
-    assert opened == []
-    # What was read before is not looked at again.
-    with path.open("r+", encoding="utf-8") as file:
-        file.write("X")
-    log(tmp_path, 10, 11)
-    assert points(world) == [(True, [[10, 1.0 / 11]])]
-    assert len(opened) == 1
-
-
 def test_a_log_that_begins_anew_or_goes_back_is_told_from_its_start(tmp_path, followed):
     world, path = followed, tmp_path / "log.jsonl"
     points(world)
@@ -667,7 +650,7 @@ def test_a_log_that_begins_anew_or_goes_back_is_told_from_its_start(tmp_path, fo
 
 
 def test_a_line_that_is_being_written_waits(tmp_path, followed):
-    followed.news()
+    followed.take_events()
     with (tmp_path / "log.jsonl").open("a", encoding="utf-8") as file:
         file.write('{"iteration": 10, "lo')
         file.flush()
@@ -678,7 +661,7 @@ def test_a_line_that_is_being_written_waits(tmp_path, followed):
 
 def test_a_rule_that_is_damaged_meanwhile_is_told_and_the_world_lives_on(tmp_path, followed):
     world = followed
-    world.news()
+    world.take_events()
     (tmp_path / "rule.safetensors").write_bytes(b"half")
     (error,) = news(world)
     assert error["type"] == "error"
@@ -737,9 +720,9 @@ def test_episodes_follow_each_other(episodes):
     for _ in range(2):
         episodes.advance()
     assert episodes.frame().step == 2
-    assert episodes.news() == []
+    assert episodes.take_events() == []
     episodes.advance()
-    curve, told = episodes.news()
+    curve, told = episodes.take_events()
     assert curve["name"] == "Return"
     assert curve["points"][0][0] == 1
     assert told["note"].startswith("episode 2; the last one ended after 3 steps: time limit")

@@ -39,7 +39,7 @@ def shown(new_page, tmp_path):
             worlds.append(RuleWorld(rule, device=torch.device("cpu"), particle_count=count))
             return worlds[-1]
 
-        site = server.make_site(make_world, films=tmp_path / "films")
+        site = server.Site(make_world, films=tmp_path / "films")
         listener = server.open_port(site.host, 0)
         running.append(server.make_server(site))
         thread = threading.Thread(target=running[-1].run, kwargs={"sockets": [listener]})
@@ -245,7 +245,7 @@ def test_on_a_phone_fingers_brush_and_the_settings_fold(shown):
 @pytest.mark.parametrize("painter", ["canvas", "webgl2"])
 def test_a_3d_world_turns_under_the_pointer(shown, painter, tmp_path):
     page, _ = shown("duck", 1024, query=f"?painter={painter}")
-    assert page.run("document.page.tool") == "look"
+    assert page.run("document.page.tool.name") == "look"
     page.drag([(400, 400), (450, 400), (500, 400)])
     assert page.run("document.page.camera.azimuth") == pytest.approx(-40.0)
     take(page, "remove")

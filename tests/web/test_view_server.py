@@ -62,7 +62,7 @@ class Counter:
         colours = np.array([[255, 0, 1], [2, 3, 4]], dtype=np.uint8)
         return WorldView(self.step, positions, colours, 1.5, 0.125 if self.step == 2 else None)
 
-    def news(self):
+    def take_events(self):
         return []
 
     def close(self):
@@ -80,7 +80,7 @@ def site(tmp_path, worlds):
         worlds.append(Counter())
         return worlds[-1]
 
-    return server.make_site(make_world, films=tmp_path / "films")
+    return server.Site(make_world, films=tmp_path / "films")
 
 
 @pytest.fixture
@@ -89,7 +89,7 @@ def client(site):
 
 
 def client_of(world, films, **options):
-    site = server.make_site(world, films=films, **options)
+    site = server.Site(world, films=films, **options)
     return testclient.TestClient(server.make_app(site), base_url=HERE)
 
 
@@ -132,7 +132,7 @@ def test_the_page_and_its_files_are_served(client):
     assert page.status_code == 200
     assert "frame-ancestors 'none'" in page.headers["content-security-policy"]
     assert "unsafe" not in page.headers["content-security-policy"]
-    for name in ("page.js", "drawing.js", "plots.js", "viewer.js", "page.css"):
+    for name in ("page.js", "drawing.js", "plots.js", "server_engine.js", "page.css"):
         part = client.get(f"/{name}")
         assert part.status_code == 200
         assert name.split(".")[1] in part.headers["content-type"].replace("javascript", "js")
@@ -175,7 +175,7 @@ def test_sockets_of_foreign_pages_are_refused(client, worlds, origin):
 
 
 def test_a_server_that_others_reach_asks_for_a_token(tmp_path):
-    site, other = (server.make_site(Counter, films=tmp_path, host="0.0.0.0") for _ in range(2))
+    site, other = (server.Site(Counter, films=tmp_path, host="0.0.0.0") for _ in range(2))
     assert len(site.token) >= 24
     assert site.token != other.token
     client = testclient.TestClient(server.make_app(site), base_url="http://lab.example:8765")
@@ -198,7 +198,7 @@ def test_a_server_that_others_reach_asks_for_a_token(tmp_path):
 )  # fmt: skip
 def test_loopback_addresses_are_told_from_others(tmp_path, host, loopback):
     assert server.is_loopback(host) == loopback
-    assert (server.make_site(Counter, films=tmp_path, host=host).token is None) == loopback
+    assert (server.Site(Counter, films=tmp_path, host=host).token is None) == loopback
 
 
 def test_frames_travel_as_they_are(client):
@@ -407,9 +407,7 @@ def recording(client, pictures):
 def test_films_of_one_moment_are_files_of_their_own(tmp_path, monkeypatch):
     monkeypatch.setattr(server.time, "strftime", lambda pattern: "film-20260101-120000")
     for colour in ((0, 0, 0), (255, 255, 255)):
-        film = server.PageFilm()
-        film.add(jpeg(colour=colour))
-        *_, name = (path.name for path in film.write(tmp_path))
+        *_, name = (path.name for path in server.write_film([jpeg(colour=colour)], tmp_path))
         assert name.startswith("film-20260101-120000-")
     seen = set()
     for gif in tmp_path.glob("*.gif"):
@@ -474,7 +472,7 @@ def test_wrong_addresses_are_named(host, port, error):
 
 @pytest.mark.parametrize("host", ["127.0.0.1", "0.0.0.0"])
 def test_links_open_the_page(tmp_path, host):
-    site = server.make_site(Counter, films=tmp_path, host=host)
+    site = server.Site(Counter, films=tmp_path, host=host)
     with server.open_port(host, 0) as listener:
         address = server.address_of(site, listener)
     assert address.startswith("http://127.0.0.1:")

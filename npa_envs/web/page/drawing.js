@@ -57,9 +57,9 @@ export class Camera {
 
   movement(columns, rows, width, height, near = 0) {
     const unit = this.unit(width, height);
-    const share = this.distance ? 1 - near / this.distance : 1;
+    const fraction = this.distance ? 1 - near / this.distance : 1;
     const [right, up] = this.axes;
-    return [0, 1, 2].map((k) => share * unit * (columns * right[k] - rows * up[k]));
+    return [0, 1, 2].map((k) => fraction * unit * (columns * right[k] - rows * up[k]));
   }
 
   // Moves or turns the camera by a drag [pixels].
@@ -102,8 +102,7 @@ function dot(a, b) {
 //    look: "soft" | "points", still: nothing moves, which allows slow drawing,
 //    trails: {positions: Float32Array of pairs of points [x, y, z], fades: Float32Array} or null,
 //    ink: [r, g, b] of trails}
-// `kind`: "webgl2", "canvas", or "auto": WebGL2 unless it would be a processor that draws, which is
-// faster without it.
+// `kind`: "webgl2", "canvas", or "auto": WebGL2 unless it runs on the CPU, which is faster without it.
 export function makePainter(canvas, kind = "auto") {
   const chosen = kind === "auto" ? quickest() : kind;
   const gl = chosen === "canvas" ? null : canvas.getContext("webgl2", { antialias: false, alpha: false });
@@ -124,15 +123,13 @@ function tiles(scene, width, height) {
   const { box, camera, dimension } = scene;
   if (!box || dimension !== 2) return [[0, 0, 0]];
   const unit = camera.unit(width, height);
-  const found = [];
   const range = (size, side, middle) => {
     const half = (size * unit) / 2;
     const first = Math.round((middle - half) / side), last = Math.round((middle + half) / side);
     return Array.from({ length: Math.min(last - first + 1, 8) }, (_, k) => (first + k) * side);
   };
-  for (const x of range(width, box[0], camera.centre[0]))
-    for (const y of range(height, box[1], camera.centre[1])) found.push([x, y, 0]);
-  return found;
+  const rows = range(height, box[1], camera.centre[1]);
+  return range(width, box[0], camera.centre[0]).flatMap((x) => rows.map((y) => [x, y, 0]));
 }
 
 const PLACE = `
@@ -229,7 +226,8 @@ class GlPainter {
   constructor(gl) {
     this.gl = gl;
     this.kind = "webgl2";
-    this.sums = gl.getExtension("EXT_color_buffer_float") ? this.makeSums() : null;
+    this.sums = gl.getExtension("EXT_color_buffer_float")
+      ? { texture: gl.createTexture(), frame: gl.createFramebuffer(), width: 0, height: 0 } : null;
     this.programs = {
       soft: linked(gl, SPOT_VERTEX, SOFT_FRAGMENT),
       ball: linked(gl, SPOT_VERTEX, BALL_FRAGMENT),
@@ -242,21 +240,12 @@ class GlPainter {
     this.fades = gl.createBuffer();
   }
 
-  makeSums() {
-    const gl = this.gl, texture = gl.createTexture(), frame = gl.createFramebuffer();
-    return { texture, frame, width: 0, height: 0 };
-  }
-
   draw(scene) {
     const gl = this.gl, width = gl.drawingBufferWidth, height = gl.drawingBufferHeight;
-    const { dimension, colours, background, camera } = scene;
-    const positions = dimension === 3 ? scene.positions : flat(scene.positions);
-    const count = positions.length / 3;
+    const { dimension, positions, colours, background, camera } = scene;
     const pixels = scene.spot / camera.unit(width, height);
     const soft = this.sums && dimension === 2 && scene.look === "soft";
     const shrink = soft ? Math.min(1, BUFFER_SPOT / pixels) : 1;
-    fill(gl, this.places, positions);
-    fill(gl, this.tints, colours);
     gl.disable(gl.DEPTH_TEST);
     gl.enable(gl.BLEND);
     if (soft) this.sizeSums(Math.ceil(width * shrink), Math.ceil(height * shrink));
@@ -268,8 +257,8 @@ class GlPainter {
     const program = soft ? this.programs.soft : this.programs.ball;
     gl.useProgram(program.program);
     this.look(program, scene, width, height);
-    attribute(gl, 0, this.places, 3, gl.FLOAT, false);
-    attribute(gl, 1, this.tints, 3, gl.UNSIGNED_BYTE, true);
+    attribute(gl, 0, this.places, positions, dimension);
+    attribute(gl, 1, this.tints, colours, 3);
     if (soft) {
       gl.blendFunc(gl.ONE, gl.ONE);
       gl.uniform1f(program.size, Math.max(2 * SOFT_REACH * pixels * shrink, 2));
@@ -285,7 +274,7 @@ class GlPainter {
     }
     for (const offset of tiles(scene, width, height)) {
       gl.uniform3fv(program.offset, offset);
-      gl.drawArrays(gl.POINTS, 0, count);
+      gl.drawArrays(gl.POINTS, 0, positions.length / dimension);
     }
     if (soft) {
       const show = this.programs.show;
@@ -322,10 +311,8 @@ class GlPainter {
     gl.enable(gl.BLEND);
     gl.blendFunc(gl.ONE, gl.ONE_MINUS_SRC_ALPHA);
     gl.uniform3fv(program.ink, scene.ink);
-    fill(gl, this.lines, scene.trails.positions);
-    fill(gl, this.fades, scene.trails.fades);
-    attribute(gl, 0, this.lines, 3, gl.FLOAT, false);
-    attribute(gl, 1, this.fades, 1, gl.FLOAT, false);
+    attribute(gl, 0, this.lines, scene.trails.positions, 3);
+    attribute(gl, 1, this.fades, scene.trails.fades, 1);
     gl.drawArrays(gl.LINES, 0, scene.trails.fades.length);
   }
 
@@ -345,24 +332,13 @@ class GlPainter {
   }
 }
 
-function flat(positions) {
-  const count = positions.length / 2, solid = new Float32Array(3 * count);
-  for (let k = 0; k < count; k++) {
-    solid[3 * k] = positions[2 * k];
-    solid[3 * k + 1] = positions[2 * k + 1];
-  }
-  return solid;
-}
-
-function fill(gl, buffer, data) {
+// Reads an input of shaders from an array of float32, or of bytes from 0 to 1; missing coordinates are 0.
+function attribute(gl, location, buffer, data, size) {
+  const bytes = data instanceof Uint8Array;
   gl.bindBuffer(gl.ARRAY_BUFFER, buffer);
   gl.bufferData(gl.ARRAY_BUFFER, data, gl.DYNAMIC_DRAW);
-}
-
-function attribute(gl, place, buffer, size, type, normalised) {
-  gl.bindBuffer(gl.ARRAY_BUFFER, buffer);
-  gl.enableVertexAttribArray(place);
-  gl.vertexAttribPointer(place, size, type, normalised, 0, 0);
+  gl.enableVertexAttribArray(location);
+  gl.vertexAttribPointer(location, size, bytes ? gl.UNSIGNED_BYTE : gl.FLOAT, bytes, 0, 0);
 }
 
 // A program with the locations of its uniforms by name.
@@ -376,12 +352,12 @@ function linked(gl, vertex, fragment) {
     gl.attachShader(program, shader);
   }
   gl.linkProgram(program);
-  const found = { program };
+  const linkedProgram = { program };
   for (let k = 0; k < gl.getProgramParameter(program, gl.ACTIVE_UNIFORMS); k++) {
     const { name } = gl.getActiveUniform(program, k);
-    found[name] = gl.getUniformLocation(program, name);
+    linkedProgram[name] = gl.getUniformLocation(program, name);
   }
-  return found;
+  return linkedProgram;
 }
 
 const PLAIN_PIXELS = [360, 1200]; // on the longer side of the small picture, least and most
@@ -473,9 +449,9 @@ function addSpots(sums, width, height, places, colours, spot) {
     for (let x = left; x <= last; x++) weights[x - left] = Math.exp(fall * (x - column) ** 2);
     const red = colours[3 * k], green = colours[3 * k + 1], blue = colours[3 * k + 2];
     for (let y = top; y <= end; y++) {
-      const share = Math.exp(fall * (y - row) ** 2);
+      const factor = Math.exp(fall * (y - row) ** 2);
       for (let x = left, p = 4 * (y * width + left); x <= last; x++, p += 4) {
-        const weight = share * weights[x - left] - faint;
+        const weight = factor * weights[x - left] - faint;
         if (weight <= 0) continue;
         sums[p] += weight * red;
         sums[p + 1] += weight * green;
@@ -516,11 +492,11 @@ function addBalls(sums, width, height, places, { colours, dimension, camera }, s
 function show(data, sums, background, soft) {
   const [red, green, blue] = background.map((v) => 255 * v), full = COVERS.length - 1;
   for (let p = 0; p < sums.length; p += 4) {
-    const weight = sums[p + 3], shareOf = soft ? 1 / Math.max(weight, 1e-3) : 1;
+    const weight = sums[p + 3], scale = soft ? 1 / Math.max(weight, 1e-3) : 1;
     const cover = soft ? COVERS[Math.min(full, (weight * 256) | 0)] : weight > 0 ? 1 : 0;
-    data[p] = red + cover * (sums[p] * shareOf - red);
-    data[p + 1] = green + cover * (sums[p + 1] * shareOf - green);
-    data[p + 2] = blue + cover * (sums[p + 2] * shareOf - blue);
+    data[p] = red + cover * (sums[p] * scale - red);
+    data[p + 1] = green + cover * (sums[p + 1] * scale - green);
+    data[p + 2] = blue + cover * (sums[p + 2] * scale - blue);
     data[p + 3] = 255;
   }
 }
@@ -543,12 +519,12 @@ export class Tracers {
     const count = positions.length / dimension;
     if (count !== this.count) this.clear();
     this.count = count;
-    const traced = Math.min(TRACED, count), kept = new Float32Array(3 * traced);
+    const traced = Math.min(TRACED, count), places = new Float32Array(3 * traced);
     for (let k = 0; k < traced; k++) {
       const particle = Math.floor(((k + 0.5) * count) / traced);
-      for (let d = 0; d < dimension; d++) kept[3 * k + d] = positions[dimension * particle + d];
+      for (let d = 0; d < dimension; d++) places[3 * k + d] = positions[dimension * particle + d];
     }
-    this.frames.push(kept);
+    this.frames.push(places);
     if (this.frames.length > TRAIL_LENGTH) this.frames.shift();
   }
 

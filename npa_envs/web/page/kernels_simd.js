@@ -309,17 +309,15 @@ export function simdKernels(width, dimension) {
   const order = reserve(Uint8Array, 256);
   order.set(lanesToFront());
   const out = floats(4 + 6 * 4);
-  const found = new Int32Array(memory.buffer, out.byteOffset, 1);
+  const neighbourCount = new Int32Array(memory.buffer, out.byteOffset, 1);
 
-  function pairs(points, i, ranges, used, { eps, weight, slope, sides, width: stride }, list, moment) {
+  function pairs(points, i, ranges, used, { eps, weight, slope, sides, perSide, width: stride }, list, moment) {
     const { x, y, z, volume } = points;
     const scalars = [x[i], y[i], z[i], eps, eps * eps, weight, slope];
-    // In open space there are no images.
     probe.set(scalars);
     for (let d = 0; d < 3; d++) {
-      const periodic = sides[d] < Infinity;
-      probe[scalars.length + d] = periodic ? sides[d] : 0;
-      probe[scalars.length + 3 + d] = periodic ? 1 / sides[d] : 0;
+      probe[scalars.length + d] = sides[d];
+      probe[scalars.length + 3 + d] = perSide[d];
     }
     const at = ranges.byteOffset;
     const { place, a, slopes } = list;
@@ -328,7 +326,7 @@ export function simdKernels(width, dimension) {
       at, at + 4 * used, stride, place.byteOffset, a.byteOffset,
       slopes[0].byteOffset, slopes[1].byteOffset, slopes[2].byteOffset, out.byteOffset,
     );
-    list.count = found[0];
+    list.count = neighbourCount[0];
     for (let k = 0; k < 6; k++) moment[k] = out[4 + 4 * k] + out[5 + 4 * k] + out[6 + 4 * k] + out[7 + 4 * k];
   }
 
@@ -341,5 +339,13 @@ export function simdKernels(width, dimension) {
     );
   }
 
-  return { name: "WebAssembly", floats, integers: (length) => reserve(Int32Array, length), gather, pairs, layer: (...matrix) => tiledLayer(floats, ...matrix), product };
+  return {
+    name: "WebAssembly",
+    floats,
+    integers: (length) => reserve(Int32Array, length),
+    gather,
+    pairs,
+    layer: (...matrix) => tiledLayer(floats, ...matrix),
+    product,
+  };
 }

@@ -10,14 +10,14 @@ import { GpuPhysics, openDevice } from "./physics_gpu.js";
 // Most frames that the page has not drawn yet: the world waits for a slow or hidden page.
 const FRAMES_AHEAD = 2;
 
-// Steps that a graphics card is tried for, and the largest difference from the processor's results.
+// Steps for which the GPU is tried, and the largest difference from the CPU's results.
 const TRIAL_STEPS = 4;
 const TRIAL_TOLERANCE = 1e-3;
 
 export class LiveWorld {
   // settings: {rules, seed, ramp, constants} as npa_envs/web/export.py writes them; the first rule is shown
-  // first. send(event, transferred) sends an event to the page; device: a graphics card, or null.
-  // settings.engine: "auto" uses the card if it is faster, "gpu" always.
+  // first. send(event, transferred) sends an event to the page; device: a GPU, or null.
+  // settings.engine: "auto" uses the GPU if it is faster, "gpu" always.
   constructor(settings, send, device = null) {
     this.device = device;
     this.engine = settings.engine ?? "auto";
@@ -105,36 +105,37 @@ export class LiveWorld {
     const kernels = (this.kernels = fastestKernels(padded(this.channels), this.dimension));
     this.physics = new Physics(this.species.map((rule) => prepareRule(rule, kernels)), this.world.count, kernels);
     this.looks = this.species.map((rule) => new Look(rule, kernels));
-    this.card?.close();
-    this.card = null;
-    this.trial = { left: this.engine === "gpu" ? 0 : TRIAL_STEPS, processor: Infinity, card: Infinity };
+    this.gpu?.close();
+    this.gpu = null;
+    // Steps that are left of the trial, and the shortest time of a step on each [ms].
+    this.trial = { left: this.engine === "gpu" ? 0 : TRIAL_STEPS, cpu: Infinity, gpu: Infinity };
   }
 
-  // Makes a step of the physics, on the graphics card if it is faster and its results are right.
+  // Makes a step of the physics, on the GPU if it is faster and its results are right.
   async compute(options) {
     const { world, physics, trial } = this;
     if (this.device === null) return physics.step(world, options);
     try {
-      this.card ??= await GpuPhysics.make(this.device, physics);
-      if (trial.left === 0) return await this.card.step(world, options);
+      this.gpu ??= await GpuPhysics.make(this.device, physics);
+      if (trial.left === 0) return await this.gpu.step(world, options);
     } catch {
-      this.leaveCard();
+      this.leaveGpu();
       return physics.step(world, options);
     }
     const other = { ...world, x: world.x.slice(), s: world.s.slice() };
     const started = performance.now();
     physics.step(world, options);
     const between = performance.now();
-    const right = await this.card.step(other, options).then(() => alike(world, other), () => false);
-    trial.processor = Math.min(trial.processor, between - started);
-    trial.card = Math.min(trial.card, performance.now() - between);
+    const agrees = await this.gpu.step(other, options).then(() => alike(world, other), () => false);
+    trial.cpu = Math.min(trial.cpu, between - started);
+    trial.gpu = Math.min(trial.gpu, performance.now() - between);
     trial.left--;
-    if (!right || (trial.left === 0 && trial.card > trial.processor)) this.leaveCard();
+    if (!agrees || (trial.left === 0 && trial.gpu > trial.cpu)) this.leaveGpu();
   }
 
-  leaveCard() {
-    this.card?.close();
-    this.card = this.device = null;
+  leaveGpu() {
+    this.gpu?.close();
+    this.gpu = this.device = null;
   }
 
   async step() {
@@ -207,7 +208,7 @@ export class LiveWorld {
       const gone = new Set(insideBall(x, dimension, at, radius, box));
       this.keep((i) => !gone.has(i));
     } else if (tool === "push") {
-      push(x, dimension, at, move, radius, Math.min(1, 0.5 + strength), box);
+      push(x, dimension, at, move, radius, Math.min(1, constants.MIN_PUSH + strength), box);
     } else if (tool === "clump") {
       clump(x, dimension, at, radius, constants.CLUMP_RATE * strength, box);
     } else if (tool === "cut") {
@@ -303,7 +304,7 @@ export class LiveWorld {
     const positions = this.world.x.slice();
     const colours = this.colouring.of(this, this.show);
     const { steps: step, milliseconds } = this;
-    const engine = this.card !== null && this.trial.left === 0 ? "WebGPU" : this.kernels.name;
+    const engine = this.gpu !== null && this.trial.left === 0 ? "WebGPU" : this.kernels.name;
     this.undrawn++;
     this.changed = false;
     this.send({ type: "frame", step, positions, colours, milliseconds, engine }, [positions.buffer, colours.buffer]);
@@ -324,7 +325,6 @@ export class LiveWorld {
       rule: rule.name,
       others: names(this.rules.filter((own) => this.mayJoin(own))),
       species: names(this.species),
-      capabilities: ["step", "reset"],
       show, settings, playing, seed,
     });
   }

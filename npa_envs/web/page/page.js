@@ -1,5 +1,5 @@
 // The page: a canvas, brushes, controls and plots. An engine runs the world: its function `connect` is
-// that of `viewer.js`, for a server in Python, or of `exported.js`, for a worker in the page.
+// that of `server_engine.js`, for a server in Python, or of `worker_engine.js`, for a worker in the page.
 //
 //   const engine = await connect(settings, listener);   // settings: those of `start`
 //   engine.send(message);                               // page -> engine, a JSON object
@@ -12,11 +12,10 @@
 //   {type: "set", name, value}         name: a key of the world's `settings`, or "rule", "show",
 //                                      "loss" (true while its plot is open: else it is not computed)
 //   {type: "brush", tool, at, move, radius, strength, source?, rule?, view?}
-//                                      tool: the name of one of the world's `tools`
-//                                      at, move: [x, y] or [x, y, z] [length units]; sent for each
-//                                      drawn frame while the pointer is down, by cut once, at the
-//                                      end: the line from `at` to `at + move`, of half-width
-//                                      `radius`; strength in [0, 1]; source (inject): where the
+//                                      tool: the name of one of the world's `tools`, whose `sends`
+//                                      says when; at, move: [x, y] or [x, y, z] [length units];
+//                                      radius: of cut, whose line leads from `at` to `at + move`,
+//                                      its half-width; strength in [0, 1]; source (inject): where the
 //                                      state comes from; rule (graft, add): a name of `rules`;
 //                                      view (3D): the unit vector towards the viewer
 //   {type: "damage", name}             one of the world's `damages`, at a random place
@@ -33,7 +32,7 @@
 //       [length units]; rules: choices of `rule`; others: choices of graft and add; species: names of
 //       the rules of the world's particles; settings: {name: {value, low, high, scale?: "log",
 //       whole?: true}}, names: eps, update_prob, noise, count, speed (steps a frame);
-//       tools: [{name, label, icon, takes}], the rows of TOOLS in npa_envs/web/live.py;
+//       tools: [{name, label, icon, sends, takes}], the rows of TOOLS in npa_envs/web/live.py;
 //       capabilities: some of "step", "reset", "film", "loss".
 //       `BLANK` below has the defaults of missing keys.
 //   {type: "frame", step, positions, colours, milliseconds, loss?}
@@ -45,9 +44,8 @@
 //   {type: "file", name, url}                                      a file of a film is ready
 //   {type: "error", message}
 //
-// index.html loads viewer.js. npa_envs/web/export.py joins exported.js and its imports into one file.
-// For that, imports are single lines of names in braces, and exports stand before `function`, `class`
-// or `const`.
+// index.html loads server_engine.js. npa_envs/web/export.py joins worker_engine.js and its imports into one
+// script, in which all names of modules must differ.
 //
 // `show`: "colours", "density", "species", "speed", "mask", "components" (the first three principal
 // components of the state as red, green and blue), "state 0", "state 1", ...
@@ -63,7 +61,7 @@ const BLANK = {
 
 // The page's own tool; a world says which brushes it offers.
 const LOOK = {
-  name: "look", takes: "", label: "Look: drag to move, wheel or pinch to zoom, double click to see all",
+  name: "look", sends: "", takes: "", label: "Look: drag to move, wheel or pinch to zoom, double click to see all",
   icon: "M12 5v14M5 12h14M12 5l-2 2M12 5l2 2M12 19l-2-2M12 19l2-2M5 12l2-2M5 12l2 2M19 12l-2-2M19 12l-2 2",
 };
 
@@ -72,10 +70,7 @@ const ICONS = {
   reset: "M5 12a7 7 0 1 0 2-5L5 9M5 4v5h5", fold: "M4 7h10M18 7h2M4 17h2M10 17h10M16 5v4M8 15v4",
 };
 
-const SETTINGS = {
-  eps: "Perception radius ε", update_prob: "Update probability p", noise: "Position noise",
-  count: "Particles N",
-};
+const PHYSICS = ["eps", "update_prob", "noise", "count"];
 
 const FILM_SIZE = 640; // pixels on each side of a film's pictures, and of the middle of the canvas
 const FILM_PAUSE = 40; // milliseconds between two pictures of a film, at least
@@ -111,8 +106,7 @@ class Page {
     const wanted = new URLSearchParams(location.search).get("painter");
     this.painter = makePainter(this.canvas, wanted ?? "auto");
     this.tracers = new Tracers();
-    this.tool = LOOK.name;
-    this.takes = LOOK.takes;
+    this.tool = LOOK;
     this.pointers = new Map();
     this.recording = null;
     this.frameTimes = [];
@@ -120,7 +114,7 @@ class Page {
       loss: new Plot($("plots"), "Loss", "", { log: true }),
       milliseconds: new Plot($("plots"), "Time of a step", "ms"),
     };
-    this.curves = {};
+    this.curves = {}; // plots of the events "curve", by name
     this.dirty = true;
     this.buildControls();
     this.watchPointers();
@@ -156,8 +150,8 @@ class Page {
       this.reportDrawn();
       const has = (tool) => world.tools.some(({ name }) => name === tool);
       const first = has("remove") && world.dimension === 2 ? "remove" : LOOK.name;
-      const keep = before.dimension === world.dimension && has(this.tool);
-      this.choose(keep ? this.tool : first);
+      const keeps = before.dimension === world.dimension && has(this.tool.name);
+      this.choose(keeps ? this.tool.name : first);
     }
     if (before.rule !== world.rule || before.seed !== world.seed) {
       this.tracers.clear();
@@ -226,8 +220,8 @@ class Page {
     $("plots").ontoggle = () => this.send({ type: "set", name: "loss", value: $("plots").open });
     $("tracers").onchange = () => { this.tracers.clear(); this.dirty = true; };
     $("style").onchange = () => (this.dirty = true);
-    $("theme").value = kept("theme") ?? "";
-    $("theme").onchange = () => { keep("theme", $("theme").value); this.showTheme(); };
+    $("theme").value = storedTheme();
+    $("theme").onchange = () => { storedTheme($("theme").value); this.showTheme(); };
     matchMedia("(prefers-color-scheme: dark)").onchange = () => this.showTheme();
     this.showTheme();
     for (const name of ["radius", "strength", "size"]) {
@@ -278,16 +272,15 @@ class Page {
       button.onclick = () => this.choose(name);
       return button;
     }));
-    this.choose(this.tool);
+    this.choose(this.tool.name);
   }
 
   choose(name) {
-    this.tool = name;
-    this.takes = this.world.tools.find((tool) => tool.name === name)?.takes ?? "";
+    this.tool = this.world.tools.find((tool) => tool.name === name) ?? LOOK;
     for (const button of $("tools").children)
       button.setAttribute("aria-checked", String(button.dataset.tool === name));
-    if (name === "look") $("cursor").hidden = true;
-    this.canvas.style.cursor = name === "look" ? "grab" : "crosshair";
+    if (this.tool === LOOK) $("cursor").hidden = true;
+    this.canvas.style.cursor = this.tool === LOOK ? "grab" : "crosshair";
   }
 
   showDamages() {
@@ -301,27 +294,12 @@ class Page {
     }));
   }
 
-  // Sliders are made once and updated, so that a dragged one is not replaced.
   showSettings() {
     const { settings } = this.world;
-    $("speed-field").hidden = !settings.speed;
-    if (settings.speed) this.slider($("speed"), "speed", settings.speed);
-    $("physics").hidden = !Object.keys(SETTINGS).some((name) => name in settings);
-    for (const [name, label] of Object.entries(SETTINGS)) {
-      let input = $(name);
-      if (!settings[name]) {
-        input?.parentElement.remove();
-        continue;
-      }
-      if (!input) {
-        const field = document.createElement("label"), text = document.createElement("span");
-        field.className = "slider";
-        text.textContent = label;
-        input = Object.assign(document.createElement("input"), { type: "range", id: name });
-        field.append(text, document.createElement("output"), input);
-        $("physics").append(field);
-      }
-      this.slider(input, name, settings[name]);
+    $("physics").hidden = !PHYSICS.some((name) => name in settings);
+    for (const name of ["speed", ...PHYSICS]) {
+      $(name).parentElement.hidden = !settings[name];
+      if (settings[name]) this.slider($(name), name, settings[name]);
     }
   }
 
@@ -369,7 +347,7 @@ class Page {
     canvas.onpointermove = (event) => this.move(event);
     canvas.onpointerup = canvas.onpointercancel = (event) => this.release(event);
     canvas.onpointerleave = () => { if (!this.pointers.size) $("cursor").hidden = true; };
-    canvas.ondblclick = () => { if (this.tool === "look") this.fit(); };
+    canvas.ondblclick = () => { if (this.tool === LOOK) this.fit(); };
     canvas.oncontextmenu = (event) => event.preventDefault();
     canvas.addEventListener("wheel", (event) => {
       event.preventDefault();
@@ -394,14 +372,14 @@ class Page {
     this.canvas.setPointerCapture(event.pointerId);
     const place = this.place(event);
     this.pointers.set(event.pointerId, place);
-    this.looking = this.tool === "look" || event.button === 2 || event.shiftKey || this.pointers.size > 1;
+    this.looking = this.tool === LOOK || event.button === 2 || event.shiftKey || this.pointers.size > 1;
     if (this.looking) {
       this.stroke = null;
       return;
     }
     const near = this.nearness(place);
     this.stroke = { near, from: place, at: place, sent: place };
-    if (this.takes !== "line") this.brush(place, [0, 0]);
+    if (this.tool.sends !== "line") this.brush(place, [0, 0]);
     this.showCursor(place);
   }
 
@@ -430,7 +408,7 @@ class Page {
   release(event) {
     const { stroke } = this;
     this.pointers.delete(event.pointerId);
-    if (stroke && this.takes === "line" && event.type === "pointerup") {
+    if (stroke && this.tool.sends === "line" && event.type === "pointerup") {
       const move = [stroke.at[0] - stroke.from[0], stroke.at[1] - stroke.from[1]];
       if (Math.hypot(...move) > 4) this.brush(stroke.from, move);
     }
@@ -456,37 +434,37 @@ class Page {
 
   // Sends the brush at a place on the canvas, with its movement in pixels.
   brush(place, pixels) {
-    const { camera, canvas, world, stroke } = this;
-    const width = canvas.clientWidth, height = canvas.clientHeight, { dimension, box } = world;
+    const { camera, canvas, stroke, tool } = this, { dimension, box } = this.world;
+    const width = canvas.clientWidth, height = canvas.clientHeight;
     const near = stroke?.near ?? 0;
     const at = camera.position(...place, width, height, near).slice(0, dimension);
     const move = camera.movement(...pixels, width, height, near).slice(0, dimension);
     const wrapped = box ? at.map((v, k) => v - box[k] * Math.round(v / box[k])) : at;
     if (stroke) stroke.source ??= wrapped;
     const message = {
-      type: "brush", tool: this.tool, at: wrapped, move,
+      type: "brush", tool: tool.name, at: wrapped, move,
       radius: this.radius(), strength: +$("strength").value,
     };
-    if (this.takes === "source") message.source = stroke?.source ?? wrapped;
-    if (this.takes === "rule") message.rule = $("other").value;
+    if (tool.takes === "source") message.source = stroke?.source ?? wrapped;
+    if (tool.takes === "rule") message.rule = $("other").value;
     if (dimension === 3) message.view = camera.axes[2];
     this.send(message);
   }
 
   // The brush's radius [length units]; for a line the width of its gap.
   radius() {
-    return +$("radius").value * (this.takes === "line" ? 0.4 : 1);
+    return +$("radius").value * (this.tool.sends === "line" ? 0.4 : 1);
   }
 
   showCursor([column, row]) {
     const { canvas, stroke } = this, knife = $("knife"), cursor = $("cursor");
     const unit = this.camera.unit(canvas.clientWidth, canvas.clientHeight);
-    cursor.hidden = this.tool === "look";
+    cursor.hidden = this.tool === LOOK;
     const size = (2 * this.radius()) / unit;
     cursor.style.width = cursor.style.height = `${size}px`;
     cursor.style.transform = `translate(${column - size / 2}px, ${row - size / 2}px)`;
     cursor.classList.toggle("pressed", Boolean(stroke));
-    knife.hidden = !(stroke && this.takes === "line");
+    knife.hidden = !(stroke && this.tool.sends === "line");
     if (!knife.hidden) {
       const across = column - stroke.from[0], down = row - stroke.from[1];
       knife.style.width = `${Math.hypot(across, down)}px`;
@@ -499,14 +477,12 @@ class Page {
 
   drawIfNeeded() {
     requestAnimationFrame(() => this.drawIfNeeded());
-    const { stroke } = this;
-    if (stroke && !["line", "rule"].includes(this.takes)) {
-      const move = [stroke.at[0] - stroke.sent[0], stroke.at[1] - stroke.sent[1]];
-      if (this.tool !== "push" || Math.hypot(...move) > 0) this.brush(stroke.sent, move);
+    const { stroke, tool: { sends } } = this;
+    if (stroke) {
+      const move = [stroke.at[0] - stroke.sent[0], stroke.at[1] - stroke.sent[1]], moved = Math.hypot(...move) > 0;
+      if (sends === "frame" || (sends === "motion" && moved)) this.brush(stroke.sent, move);
+      if (sends === "place" && moved) this.brush(stroke.at, [0, 0]);
       stroke.sent = stroke.at;
-    } else if (stroke && this.tool === "graft" && stroke.at !== stroke.sent) {
-      stroke.sent = stroke.at;
-      this.brush(stroke.at, [0, 0]);
     }
     if (!this.undrawn && !this.dirty) return;
     if (this.undrawn) this.readFrame();
@@ -599,11 +575,10 @@ class Page {
 }
 
 function recorder(canvas, done) {
-  const kind = ["video/mp4", "video/webm"].find((type) => MediaRecorder.isTypeSupported(type));
-  const parts = [], media = new MediaRecorder(canvas.captureStream(30), { mimeType: kind });
-  media.ondataavailable = ({ data }) => parts.push(data);
-  media.onstop = () =>
-    done(`film.${kind.slice(6)}`, URL.createObjectURL(new Blob(parts, { type: kind })));
+  const type = ["video/mp4", "video/webm"].find((format) => MediaRecorder.isTypeSupported(format));
+  const chunks = [], media = new MediaRecorder(canvas.captureStream(30), { mimeType: type });
+  media.ondataavailable = ({ data }) => chunks.push(data);
+  media.onstop = () => done(`film.${type.slice(6)}`, URL.createObjectURL(new Blob(chunks, { type })));
   media.start(500);
   return { stop: () => media.stop() };
 }
@@ -620,11 +595,12 @@ function numbers(hex) {
   return [1, 3, 5].map((k) => parseInt(hex.trim().slice(k, k + 2), 16) / 255);
 }
 
-// Choices are stored if the browser allows it.
-function keep(name, value) {
-  try { localStorage.setItem(`npa-envs ${name}`, value); } catch { /* private windows */ }
-}
-
-function kept(name) {
-  try { return localStorage.getItem(`npa-envs ${name}`); } catch { return null; }
+// Returns the stored theme, or stores another one, if the browser allows it.
+function storedTheme(theme) {
+  const key = "npa-envs theme";
+  try {
+    if (theme === undefined) return localStorage.getItem(key) ?? "";
+    localStorage.setItem(key, theme);
+  } catch { /* private windows */ }
+  return "";
 }

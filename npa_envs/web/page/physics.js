@@ -5,8 +5,11 @@
 // particles perceive. Most of the time goes into sums over neighbours and the network, the `kernels`:
 // those of this file, or the WebAssembly ones of kernels_simd.js.
 
-const MOMENT_THRESHOLD = 1e-3;
-const MOMENT_SOFTENING = 1e-2;
+export const MOMENT_THRESHOLD = 1e-3;
+export const MOMENT_SOFTENING = 1e-2 ** 2;
+
+// The upper triangle of the unit matrix: xx, xy, xz, yy, yz, zz.
+const IDENTITY = [1, 0, 0, 1, 0, 1];
 
 // Rows in a batch of the network.
 const BLOCK_ROWS = 64;
@@ -18,8 +21,7 @@ export const TILE_OUTPUTS = 8;
 // Most cells on each side of the grid. Beyond it cells are reused; distances are checked in any case.
 export const MAX_CELLS = { 2: 256, 3: 64 };
 
-// Cells per eps.
-export const CELLS_PER_RADIUS = { 2: 2, 3: 2 };
+export const CELLS_PER_RADIUS = 2;
 
 export function padded(channels) {
   return LANES * Math.ceil(channels / LANES);
@@ -62,10 +64,10 @@ export function plainKernels() {
 
   // Lists the neighbours of sorted particle i among runs of particles, with their factors in `gather`,
   // and adds up their moment matrix: xx, xy, xz, yy, yz, zz.
-  function pairs({ x, y, z, volume }, i, ranges, used, { eps, weight, slope, sides, width }, list, moment) {
+  function pairs({ x, y, z, volume }, i, ranges, used, { eps, weight, slope, sides, perSide, width }, list, moment) {
     const { place, a, slopes: [kx, ky, kz] } = list;
     const [sideX, sideY, sideZ] = sides;
-    const halfX = sideX / 2, halfY = sideY / 2, halfZ = sideZ / 2;
+    const halfX = 0.5 / perSide[0], halfY = 0.5 / perSide[1], halfZ = 0.5 / perSide[2];
     const squaredRadius = eps * eps;
     const ownX = x[i], ownY = y[i], ownZ = z[i];
     let xx = 0, xy = 0, xz = 0, yy = 0, yz = 0, zz = 0;
@@ -101,12 +103,7 @@ export function plainKernels() {
       }
     }
     list.count = count;
-    moment[0] = xx;
-    moment[1] = xy;
-    moment[2] = xz;
-    moment[3] = yy;
-    moment[4] = yz;
-    moment[5] = zz;
+    moment.set([xx, xy, xz, yy, yz, zz]);
   }
 
   // out = W in + b for `count` rows; max(out, 0) where `rectified`.
@@ -239,11 +236,14 @@ export class Physics {
     const { dimension, channels, width, order, cellOf, states, points } = this;
     const three = dimension === 3;
     const cells = [1, 1, 1], inverse = [0, 0, 0];
-    this.sides = [Infinity, Infinity, Infinity];
+    // In open space both are 0: there are no images.
+    this.sides = new Float64Array(3);
+    this.perSide = new Float64Array(3);
     for (let d = 0; d < dimension; d++) {
       if (box !== null) {
         this.sides[d] = box[d];
-        const fitting = Math.floor((box[d] / eps) * CELLS_PER_RADIUS[dimension] * (1 + 1e-12));
+        this.perSide[d] = 1 / box[d];
+        const fitting = Math.floor((box[d] / eps) * CELLS_PER_RADIUS * (1 + 1e-12));
         cells[d] = Math.max(1, Math.min(MAX_CELLS[dimension], fitting));
         inverse[d] = cells[d] / box[d];
       } else {
@@ -252,8 +252,8 @@ export class Physics {
           if (x[i] < low) low = x[i];
           if (x[i] > high) high = x[i];
         }
-        inverse[d] = CELLS_PER_RADIUS[dimension] / eps;
-        const fitting = Math.ceil((high - low) * inverse[d]) + 2 * CELLS_PER_RADIUS[dimension] + 1;
+        inverse[d] = CELLS_PER_RADIUS / eps;
+        const fitting = Math.ceil((high - low) * inverse[d]) + 2 * CELLS_PER_RADIUS + 1;
         cells[d] = Math.min(MAX_CELLS[dimension], Number.isFinite(fitting) ? fitting : MAX_CELLS[dimension]);
       }
     }
@@ -279,7 +279,7 @@ export class Physics {
     for (let cell = 0; cell < total; cell++) starts[cell] = starts[cell + 1];
     starts[total] = count;
     const [sideX, sideY, sideZ] = this.sides;
-    const inBox = (position, side) => (side < Infinity ? position - side * Math.floor(position / side + 0.5) : position);
+    const inBox = (position, side) => (side > 0 ? position - side * Math.floor(position / side + 0.5) : position);
     for (let k = 0; k < count; k++) {
       const i = order[k];
       points.x[k] = inBox(x[i * dimension], sideX);
@@ -292,8 +292,8 @@ export class Physics {
   // Fills `ranges` with the runs of sorted particles that may be neighbours of those of a cell.
   rangesAround(cell) {
     const [nx, ny, nz] = this.cells;
-    const { starts, ranges, dimension } = this;
-    const span = CELLS_PER_RADIUS[dimension];
+    const { starts, ranges } = this;
+    const span = CELLS_PER_RADIUS;
     const cx = cell % nx, cy = Math.floor(cell / nx) % ny, cz = Math.floor(cell / (nx * ny));
     // In a small box each cell is visited only once.
     const around = 2 * span + 1;
@@ -323,7 +323,7 @@ export class Physics {
     const { x: px, y: py, z: pz, volume } = this.points;
     const { density, gradientX, gradientY, gradientZ, ranges, starts, dimension } = this;
     const [sideX, sideY, sideZ] = this.sides;
-    const halfX = sideX / 2, halfY = sideY / 2, halfZ = sideZ / 2;
+    const [halfX, halfY, halfZ] = this.perSide.map((per) => 0.5 / per);
     const weight = smoothingNorm(eps, dimension), slope = spikyNorm(eps, dimension);
     const squaredRadius = eps * eps;
     gradientX.fill(0, 0, count);
@@ -409,7 +409,7 @@ export class Physics {
   perceive(world, rule, i, used, at, eps, divisor) {
     const { points, list, moment, ranges, width, dimension, channels, rows, sums, states, kernels } = this;
     const weight = smoothingNorm(eps, dimension), slope = spikyNorm(eps, dimension);
-    kernels.pairs(points, i, ranges, used, { eps, weight, slope, sides: this.sides, width }, list, moment);
+    kernels.pairs(points, i, ranges, used, { eps, weight, slope, sides: this.sides, perSide: this.perSide, width }, list, moment);
     kernels.gather(states, width, dimension, i * width, list, sums);
 
     let to = at;
@@ -417,9 +417,7 @@ export class Physics {
     for (let c = 0; c < channels; c++) rows[to++] = sums[c];
     const scale = eps / rule.eps0;
     if (rule.state_gradient) {
-      const m = rule.moment_correction
-        ? momentInverse(dimension, moment, rule.moment_inverse)
-        : [1, 0, 0, 1, 0, 1];
+      const m = rule.moment_correction ? momentInverse(dimension, moment, rule.moment_inverse) : IDENTITY;
       for (let c = 0; c < channels; c++) {
         const gx = sums[width + c], gy = sums[2 * width + c], gz = dimension === 3 ? sums[3 * width + c] : 0;
         to = logScaled(
@@ -501,10 +499,9 @@ function momentInverse(dimension, [xx, xy, xz, yy, yz, zz], kind) {
     determinant = xx * adjugate[0] + xy * adjugate[1] + xz * adjugate[2];
   }
   if (kind === "smooth") {
-    const softening = MOMENT_SOFTENING ** 2;
-    const divisor = determinant * determinant + softening;
-    return adjugate.map((entry, k) => (determinant * entry + (k === 0 || k === 3 || k === 5 ? softening : 0)) / divisor);
+    const divisor = determinant * determinant + MOMENT_SOFTENING;
+    return adjugate.map((entry, k) => (determinant * entry + MOMENT_SOFTENING * IDENTITY[k]) / divisor);
   }
-  if (!(Math.abs(determinant) >= MOMENT_THRESHOLD)) return [1, 0, 0, 1, 0, 1];
+  if (!(Math.abs(determinant) >= MOMENT_THRESHOLD)) return IDENTITY;
   return adjugate.map((entry) => entry / determinant);
 }

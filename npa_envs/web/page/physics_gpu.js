@@ -1,7 +1,9 @@
-// The step of physics.js with densities, perception and networks on a graphics card, through WebGPU. The
-// processor sorts the particles before, and moves them after; both are a small part of the time.
+// The step of physics.js with densities, perception and networks on the GPU, through WebGPU. The CPU sorts the
+// particles before, and moves them after; both are a small part of the time.
 
-import { CELLS_PER_RADIUS, MAX_CELLS, smoothingNorm, spikyNorm } from "./physics.js";
+import {
+  CELLS_PER_RADIUS, MAX_CELLS, MOMENT_SOFTENING, MOMENT_THRESHOLD, smoothingNorm, spikyNorm,
+} from "./physics.js";
 
 const GROUP = 64;
 const UNIFORM_BYTES = 96;
@@ -15,7 +17,7 @@ export async function openDevice() {
 // Shaders for one rule: sizes are constants in them.
 function shaders(rule) {
   const { space_dim: dimension, state_dim: channels, inputs, hidden_dim: hidden, outputs } = rule;
-  const span = CELLS_PER_RADIUS[dimension];
+  const span = CELLS_PER_RADIUS;
   const axes = ["x", "y", "z"].slice(0, dimension);
   const smooth = rule.moment_inverse === "smooth";
   // Visits all j in the cells around sorted particle i: d is the way to it, square its length's square.
@@ -52,9 +54,11 @@ function shaders(rule) {
         let determinant = xx * adjugate[0] + xy * adjugate[1] + xz * adjugate[2];`,
   }[dimension];
   const corrected = smooth
-    ? `let divisor = determinant * determinant + 1e-4;
-       for (var k = 0; k < 6; k++) { m[k] = (determinant * adjugate[k] + 1e-4 * m[k]) / divisor; }`
-    : "if (abs(determinant) >= 1e-3) { for (var k = 0; k < 6; k++) { m[k] = adjugate[k] / determinant; } }";
+    ? `let divisor = determinant * determinant + ${MOMENT_SOFTENING};
+       for (var k = 0; k < 6; k++) { m[k] = (determinant * adjugate[k] + ${MOMENT_SOFTENING} * m[k]) / divisor; }`
+    : `if (abs(determinant) >= ${MOMENT_THRESHOLD}) {
+         for (var k = 0; k < 6; k++) { m[k] = adjugate[k] / determinant; }
+       }`;
   const stateGradient = `
     var m = array<f32, 6>(1.0, 0.0, 0.0, 1.0, 0.0, 1.0);
     ${rule.moment_correction ? `{ ${inverse} ${corrected} }` : ""}
@@ -140,16 +144,16 @@ function shaders(rule) {
   }`;
 }
 
-// Physics on the graphics card; `step` returns a promise.
+// Physics on the GPU; `step` returns a promise.
 export class GpuPhysics {
   // Makes an instance; throws if the device refuses a shader or a buffer.
   static async make(device, physics) {
     for (const kind of ["out-of-memory", "validation"]) device.pushErrorScope(kind);
-    const made = new GpuPhysics(device, physics);
+    const gpu = new GpuPhysics(device, physics);
     const errors = [await device.popErrorScope(), await device.popErrorScope()];
-    const error = errors.find((found) => found !== null);
+    const error = errors.find((entry) => entry !== null);
     if (error) throw Error(error.message);
-    return made;
+    return gpu;
   }
 
   // physics: a Physics of the same rules, whose order and updates are used.
@@ -159,32 +163,33 @@ export class GpuPhysics {
     const { capacity, width, dimension, rules } = physics;
     const { STORAGE, UNIFORM, COPY_DST, COPY_SRC, MAP_READ } = GPUBufferUsage;
     const buffer = (size, usage) => device.createBuffer({ size: 16 * Math.ceil(size / 16), usage });
-    const given = STORAGE | COPY_DST;
-    this.points = buffer(16 * capacity, given);
-    this.home = buffer(4 * capacity, given);
-    this.starts = buffer(4 * (MAX_CELLS[dimension] ** dimension + 1), given);
-    this.states = buffer(4 * width * capacity, given);
+    const input = STORAGE | COPY_DST;
+    this.points = buffer(16 * capacity, input);
+    this.home = buffer(4 * capacity, input);
+    this.starts = buffer(4 * (MAX_CELLS[dimension] ** dimension + 1), input);
+    this.states = buffer(4 * width * capacity, input);
     this.fields = buffer(16 * capacity, STORAGE);
     const compute = GPUShaderStage.COMPUTE;
     const entry = (binding, type) => ({ binding, visibility: compute, buffer: { type } });
-    const kinds = ["uniform", ...new Array(4).fill("read-only-storage"), "storage", "read-only-storage", "read-only-storage", "storage"];
-    const layout = device.createBindGroupLayout({ entries: kinds.map((kind, k) => entry(k, kind)) });
+    const read = "read-only-storage";
+    const types = ["uniform", read, read, read, read, "storage", read, read, "storage"];
+    const layout = device.createBindGroupLayout({ entries: types.map((type, k) => entry(k, type)) });
     const pipelines = device.createPipelineLayout({ bindGroupLayouts: [layout] });
     this.species = rules.map((rule) => {
       const outputs = rule.outputs;
       const module = device.createShaderModule({ code: shaders({ ...rule, width }) });
       const pipeline = (entryPoint) => device.createComputePipeline({ layout: pipelines, compute: { module, entryPoint } });
       const parts = [rule.weights["hidden.weight"], rule.weights["hidden.bias"], rule.weights["output.weight"]];
-      const weights = buffer(parts.reduce((size, part) => size + part.byteLength, 0), given);
+      const weights = buffer(parts.reduce((size, part) => size + part.byteLength, 0), input);
       parts.reduce((at, part) => (device.queue.writeBuffer(weights, at, part), at + part.byteLength), 0);
       const world = buffer(UNIFORM_BYTES, UNIFORM | COPY_DST);
-      const active = buffer(4 * capacity, given);
+      const active = buffer(4 * capacity, input);
       const updates = buffer(4 * outputs * capacity, STORAGE | COPY_SRC);
-      const read = buffer(4 * outputs * capacity, MAP_READ | COPY_DST);
+      const mapped = buffer(4 * outputs * capacity, MAP_READ | COPY_DST);
       const buffers = [world, this.points, this.home, this.starts, this.states, this.fields, active, weights, updates];
       const entries = buffers.map((each, binding) => ({ binding, resource: { buffer: each } }));
       const group = device.createBindGroup({ layout, entries });
-      return { rule, world, active, updates, read, weights, group, density: pipeline("density"), advance: pipeline("advance") };
+      return { rule, world, active, updates, mapped, weights, group, density: pipeline("density"), advance: pipeline("advance") };
     });
     this.packedPoints = new Float32Array(4 * capacity);
     this.packedHome = new Uint32Array(capacity);
@@ -194,7 +199,7 @@ export class GpuPhysics {
     const { physics, device, packedPoints, packedHome } = this;
     const { count } = world;
     physics.sort(world, eps, box);
-    const { points, order, starts, cells, dimension, width, sides } = physics;
+    const { points, order, starts, cells, dimension, width } = physics;
     const total = cells[0] * cells[1] * cells[2];
     for (let i = 0; i < count; i++) {
       packedPoints[4 * i] = points.x[i];
@@ -216,7 +221,7 @@ export class GpuPhysics {
         if (world.species[order[k]] === number && (mask === null || mask[order[k]] !== 0)) active.push(k);
       }
       const divisor = densityCounts === null ? count : densityCounts[number];
-      write(own.world, uniforms(own.rule, eps, sides, cells, count, active.length, divisor, dimension));
+      write(own.world, uniforms(physics, own.rule, eps, count, active.length, divisor));
       write(own.active, Uint32Array.from(active));
       pass.setBindGroup(0, own.group);
       if (number === 0) {
@@ -230,36 +235,33 @@ export class GpuPhysics {
     });
     pass.end();
     for (const { own, active } of running) {
-      encoder.copyBufferToBuffer(own.updates, 0, own.read, 0, 4 * own.rule.outputs * active.length);
+      encoder.copyBufferToBuffer(own.updates, 0, own.mapped, 0, 4 * own.rule.outputs * active.length);
     }
     device.queue.submit([encoder.finish()]);
     await Promise.all(running.map(async ({ own, active }) => {
-      const { rule, read } = own;
+      const { rule, mapped } = own;
       const size = 4 * rule.outputs * active.length;
-      await read.mapAsync(GPUMapMode.READ, 0, size);
-      const updates = new Float32Array(read.getMappedRange(0, size));
+      await mapped.mapAsync(GPUMapMode.READ, 0, size);
+      const updates = new Float32Array(mapped.getMappedRange(0, size));
       active.forEach((k, row) => physics.update(world, rule, order[k], updates, row * rule.outputs, eps, dt));
-      read.unmap();
+      mapped.unmap();
     }));
     physics.finish(world, noise, box);
   }
 
   close() {
     for (const buffer of [this.points, this.home, this.starts, this.states, this.fields]) buffer.destroy();
-    for (const { world, active, updates, read, weights } of this.species) {
-      for (const buffer of [world, active, updates, read, weights]) buffer.destroy();
+    for (const { world, active, updates, mapped, weights } of this.species) {
+      for (const buffer of [world, active, updates, mapped, weights]) buffer.destroy();
     }
   }
 }
 
-function uniforms(rule, eps, sides, cells, count, rows, divisor, dimension) {
+function uniforms({ sides, perSide, cells, dimension }, rule, eps, count, rows, divisor) {
   const bytes = new ArrayBuffer(UNIFORM_BYTES);
   const floats = new Float32Array(bytes), integers = new Uint32Array(bytes);
-  sides.forEach((side, d) => {
-    // In open space there are no images.
-    floats[d] = side < Infinity ? side : 0;
-    floats[4 + d] = side < Infinity ? 1 / side : 0;
-  });
+  floats.set(sides);
+  floats.set(perSide, 4);
   integers.set(cells, 8);
   const scale = eps / rule.eps0;
   floats.set([eps, smoothingNorm(eps, dimension), spikyNorm(eps, dimension), scale, scale ** (1 + dimension) / divisor], 12);
