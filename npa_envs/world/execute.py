@@ -29,9 +29,9 @@ from npa_envs.world.steps import (
     Draws,
     RuleStep,
     SpeciesSpec,
+    SpeciesStep,
     StaticStep,
     Step,
-    make_species_step,
     skip_draws,
 )
 
@@ -74,7 +74,7 @@ class RolloutSpec(NamedTuple):
     def make_step(self, rules: Sequence[NPARule], particles: Particles) -> Step:
         """Return the step of these worlds."""
         if self.species:
-            return make_species_step(
+            return SpeciesStep(
                 rules,
                 self.species,
                 self.physics.constants(),
@@ -88,8 +88,8 @@ class RolloutSpec(NamedTuple):
         if not moving and self.steps >= MIN_STATIC:
             return StaticStep(rule, physics, particles.x)
         # A rule with a custom network runs as its module.
-        made = DivisionStep if rule.divides else RuleStep
-        return made(rule, rule.network(), physics, self.detach_positions)
+        cls = DivisionStep if rule.divides else RuleStep
+        return cls(rule, rule.network(), physics, self.detach_positions)
 
     def run(
         self,
@@ -122,7 +122,7 @@ class RolloutSpec(NamedTuple):
         again = None
         # A compiled function reads copies.
         if interval > 1 and not torch.compiler.is_compiling():
-            again = RecomputedSteps(step.advance, rules, {"x": particles.x, "s": particles.s})
+            again = RecomputedSteps(step.advance, rules, particles)
         # Worlds keep their dtype under autocast, as kernels read the rules' outputs.
         with torch.autocast(particles.x.device.type, enabled=False):
             for number, draws in enumerate(step.draw(particles.x, self.steps, source)):
@@ -137,8 +137,7 @@ class RolloutSpec(NamedTuple):
                 else:
                     particles = step.advance(particles, draws)
                 if watch is not None:
-                    after = step.leave(particles.map(Tensor.detach))
-                    watch.look(after.x, after.s)
+                    watch.look(step.leave(particles.map(Tensor.detach)))
                 if keep_every is not None and (number + 1) % keep_every == 0:
                     kept.append(step.leave(particles))
             if again is not None:
@@ -160,10 +159,10 @@ class RecomputedSteps:
     """
 
     def __init__(
-        self, advance: Callable[..., Any], rules: Sequence[NPARule], worlds: dict[str, Tensor]
+        self, advance: Callable[..., Any], rules: Sequence[NPARule], worlds: Particles
     ) -> None:
         self._advance = advance
-        self._worlds = worlds
+        self._worlds = worlds._asdict()
         # Plain rules run with copies of their weights, except those of divisions.
         self._rules = [(rule, rule.divides or not rule.is_plain()) for rule in rules]
         self._read: dict[str, Any] | None = None
@@ -222,26 +221,29 @@ def execute(
     *,
     graph: CudaGraph = "auto",
     watch: DivergenceWatch | None = None,
+    may_rest: bool = True,
 ) -> Particles:
     """Run a checked rollout in the fastest way that its options allow.
 
-    With a watch for divergence, steps are launched one by one and checked.
+    With a watch for divergence, steps are launched one by one and checked. `may_rest`: steps of
+    resting worlds may be skipped.
     """
-    if watch is not None or not _may_rest(spec, rules, particles):
+    if watch is not None or not (may_rest and _may_rest(spec, rules, particles.x)):
         return run_all_steps(spec, rules, particles, source, graph=graph, watch=watch)
     # In parts, to skip the steps after all worlds are at rest.
-    left, part = spec.steps, FIRST_PART[particles.x.device.type]
-    while left and not resting(rules, particles, spec.physics, graph).all():
-        own = spec._replace(steps=min(part, left))
-        particles = run_all_steps(own, rules, particles, source, graph=graph)
-        left, part = left - own.steps, 2 * part
-        if left and not particles.x.isfinite().all():
+    remaining, part = spec.steps, FIRST_PART[particles.x.device.type]
+    while remaining and not resting(rules, particles, spec.physics, graph).all():
+        steps = min(part, remaining)
+        part_spec = spec._replace(steps=steps)
+        particles = run_all_steps(part_spec, rules, particles, source, graph=graph)
+        remaining, part = remaining - steps, 2 * part
+        if remaining and not particles.x.isfinite().all():
             # A world has diverged: the next call raises an error for it, this one does not.
-            return spec._replace(steps=left).run(rules, particles, source)
+            return spec._replace(steps=remaining).run(rules, particles.begun(), source)
     # The generator ends where it would be after all steps.
-    skip_draws(particles.x, spec.physics, left, source)
+    skip_draws(particles.x, spec.physics, remaining, source)
     # The caller may write to the results.
-    return particles.map(torch.clone) if left == spec.steps else particles
+    return particles.map(torch.clone) if remaining == spec.steps else particles
 
 
 def run_all_steps(
@@ -254,16 +256,15 @@ def run_all_steps(
     watch: DivergenceWatch | None = None,
 ) -> Particles:
     """Run a checked rollout as `execute`, without skipping steps of resting worlds."""
-    x, s, *_ = particles
     if watch is None:
-        recorded = run_recorded(spec, rules, x, s, source, cuda_graph=graph)
+        recorded = run_recorded(spec, rules, particles, source, cuda_graph=graph)
         if recorded is not None:
             return recorded
-    check_finite_positions(x)
-    if x.is_cuda and torch.is_grad_enabled():
+    check_finite_positions(particles.x)
+    if particles.x.is_cuda and torch.is_grad_enabled():
         # Gradients are added in the order of a recording: first those of this rollout.
-        x, s = x.view_as(x), s.view_as(s)
-    return spec.run(rules, Particles(x, s, x.new_zeros(x.shape[:2])), source, watch)
+        particles = particles.map(lambda value: value.view_as(value))
+    return spec.run(rules, particles.begun(), source, watch)
 
 
 def resting(
@@ -273,11 +274,10 @@ def resting(
     spec = RolloutSpec(1, physics._replace(update_prob=1.0))
     with torch.no_grad():
         after = run_all_steps(spec, rules, particles, None, graph=graph)
-    same_x, same_s = after.x == particles.x, after.s == particles.s
-    return same_x.flatten(1).all(dim=1) & same_s.flatten(1).all(dim=1)
+    return after.equal(particles)
 
 
-def _may_rest(spec: RolloutSpec, rules: Sequence[NPARule], particles: Particles) -> bool:
+def _may_rest(spec: RolloutSpec, rules: Sequence[NPARule], x: Tensor) -> bool:
     """Return whether a rollout checks for worlds at rest, to skip their steps."""
     return (
         len(rules) == 1
@@ -288,10 +288,9 @@ def _may_rest(spec: RolloutSpec, rules: Sequence[NPARule], particles: Particles)
         and spec.steps >= MIN_RESTING
         and spec.keep_every is None
         and spec.physics.position_noise == 0.0
-        and particles.path_length is None
         and not torch.is_grad_enabled()
         and not torch.compiler.is_compiling()
-        and not (particles.x.is_cuda and torch.cuda.is_current_stream_capturing())
+        and not (x.is_cuda and torch.cuda.is_current_stream_capturing())
     )
 
 
@@ -313,7 +312,7 @@ class _TapedStep:
         with self.tape.recording():
             step = dataclasses.replace(step, network=stand_in)
             self.after = step.advance(particles, Draws(mask, None))
-        self.places = self.tape.argument_slots(self._updates)
+        self.slots = self.tape.argument_slots(self._updates)
 
     def __call__(self, rows: Tensor) -> Tensor:
         """Store the network's input rows, [B N, row_width], and its position on the tape."""
@@ -336,14 +335,14 @@ class TapedSteps:
         back = _TapedStep(step, there.after, self._mask)
         for old, new in zip(back.after.tensors(), first.tensors(), strict=True):
             back.tape.move(back.tape.argument_slots(old), new)
-        self._places = first, there.after
+        self._buffers = first, there.after
         self._steps = there, back
 
     def run(
         self, network: Network, particles: Particles, masks: Iterable[Tensor | None], every: int
     ) -> list[Particles]:
         """Step worlds once with each mask; return copies at the given interval."""
-        self._places[0].copy_(particles)
+        self._buffers[0].copy_(particles)
         kept: list[Particles] = []
         for number, mask in enumerate(masks):
             step = self._steps[number % 2]
@@ -354,10 +353,10 @@ class TapedSteps:
             step.tape.replay(0, step.split, last_count=count)
             # Kept alive until the launch has read it.
             updates = network(step.rows[:count])
-            step.tape.move(step.places, updates)
+            step.tape.move(step.slots, updates)
             step.tape.replay(step.split)
             if (number + 1) % every == 0:
-                kept.append(self._places[(number + 1) % 2].map(torch.clone))
+                kept.append(self._buffers[(number + 1) % 2].map(torch.clone))
         return kept
 
 

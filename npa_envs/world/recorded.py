@@ -141,13 +141,14 @@ class _Recording:
         self,
         call: RolloutSpec,
         rules: Sequence[NPARule],
-        x: Tensor,
-        s: Tensor,
+        particles: Particles,
         wanted: tuple[bool, ...],
         by_world: bool,
     ) -> None:
+        x = particles.x
         self.device = x.device
-        self.no_path = x.new_zeros(x.shape[:2])
+        particles = particles.begun()
+        self._no_paths = particles.per_particle()[-1]
         """Path lengths at the start, zeros."""
         self.bytes = 0
         """Memory of the graphs [bytes]."""
@@ -157,11 +158,10 @@ class _Recording:
         self._rules = [_clone(rule, x) for rule in rules]
         self._own = [rule for rule in self._rules if not rule.has_network()]
         weights = [weight for rule in self._rules for weight in _form(rule, rule.has_network())[1]]
-        worlds = [
-            torch.empty(value.shape, dtype=value.dtype, device=value.device)
-            for value in (x, s, self.no_path)
-        ]
-        self._inputs = [*worlds, *weights]
+        self._worlds = particles.map(
+            lambda value: torch.empty(value.shape, dtype=value.dtype, device=value.device)
+        )
+        self._inputs = [*self._worlds.tensors(), *weights]
         self._wanted = wanted or (False,) * len(self._inputs)
         self.differentiable = any(self._wanted)
         """Whether backward passes are recorded."""
@@ -186,8 +186,12 @@ class _Recording:
         self.stream: torch.cuda.Stream | None = None
         self.token = torch.empty(0, device=self.device)
 
+    def inputs(self, particles: Particles, weights: Sequence[Tensor]) -> list[Tensor]:
+        """Return all inputs of a rollout, in the order of the fixed tensors."""
+        return [*particles.begun(self._no_paths).tensors(), *weights]
+
     def record(self, steps: int, tensors: Sequence[Tensor]) -> None:
-        """Record rollouts of a number of steps, after a warm-up with these worlds and weights."""
+        """Record rollouts of a number of steps, after a warm-up with these inputs."""
         if not self.graphs:
             first = self._call._replace(steps=min(steps, WARM_UP_STEPS), keep_every=None)
             with torch.no_grad():
@@ -275,8 +279,8 @@ class _Recording:
         count = None if every is None else steps // every
         if count not in self._bars:
             first = () if count is None else (count,)
-            worlds = self._inputs[:3]
-            self._bars[count] = [tensor.new_zeros(*first, *tensor.shape) for tensor in worlds]
+            worlds = self._worlds.tensors()
+            self._bars[count] = [value.new_zeros(*first, *value.shape) for value in worlds]
         return self._bars[count]
 
     def _run(self, call: RolloutSpec, kept: list[Tensor]) -> Particles:
@@ -289,7 +293,7 @@ class _Recording:
         generator = self._generator if self._streams is None else self._streams
         hooks = torch.autograd.graph.saved_tensors_hooks(keep, lambda tensor: tensor)
         with torch.set_grad_enabled(self.differentiable), hooks:
-            return call.run(self._rules, Particles(*self._inputs[:3]), generator)
+            return call.run(self._rules, self._worlds, generator)
 
     def _pull_back(self, results: Sequence[Tensor], bars: list[Tensor]) -> list[Tensor]:
         """Launch the backward pass, and return the gradients of inputs that require one."""
@@ -314,14 +318,14 @@ class _Recording:
         call: RolloutSpec,
         lease: _Lease,
         blocks: Sequence[int],
-        tensors: Sequence[Tensor],
+        particles: Particles,
+        weights: Sequence[Tensor],
         generator: Randomness | None,
     ) -> Particles:
         """Replay the graphs of a rollout one after the other; copy changed buffers to the rule."""
-        x, s, *weights = tensors
-        given = [x, s, self.no_path, *weights]
-        self.ready.record(current_stream(x.device))
-        found: list[Particles] = []
+        inputs = self.inputs(particles, weights)
+        self.ready.record(current_stream(self.device))
+        results: list[Particles] = []
         for steps in blocks:
             if self.differentiable:
                 # The lease takes the place of saved tensors. It ends when autograd drops these:
@@ -330,13 +334,13 @@ class _Recording:
                     lambda _: lease, lambda saved: saved.recording.token
                 )
                 with hooks:
-                    after = Particles(*_Replayed.apply(self, steps, generator, *given))  # type: ignore[no-untyped-call]
+                    after = Particles(*_Replayed.apply(self, steps, generator, *inputs))  # type: ignore[no-untyped-call]
             else:
-                after = Particles(*self.forward(steps, given, generator))
-            if not found:
+                after = Particles(*self.forward(steps, inputs, generator))
+            if not results:
                 # Only now, when the device has work: this check takes much CPU time.
                 try:
-                    FiniteCheck(x, self.ready).wait()
+                    FiniteCheck(particles.x, self.ready).wait()
                 except NPAError:
                     if self._streams is None:
                         # The caller's generator returns to its state before the rollout.
@@ -351,14 +355,14 @@ class _Recording:
             if written:
                 with torch.no_grad():
                     torch._foreach_copy_(
-                        [given[k] for k in written], [self._inputs[k] for k in written]
+                        [inputs[k] for k in written], [self._inputs[k] for k in written]
                     )
-            found.append(after)
+            results.append(after)
             last = after if call.keep_every is None else after.map(lambda value: value[-1])
-            given[:3] = last.tensors()
-        if len(found) == 1:
-            return found[0]
-        return last if call.keep_every is None else combined(torch.cat, found)
+            inputs = [*last.tensors(), *weights]
+        if len(results) == 1:
+            return results[0]
+        return last if call.keep_every is None else combined(torch.cat, results)
 
     def forward(
         self, steps: int, tensors: Sequence[Tensor], generator: Randomness | None
@@ -514,11 +518,11 @@ def _lease(
     kind: CallKind,
     steps: set[int],
     make: Callable[[], _Recording],
-    tensors: Sequence[Tensor],
+    particles: Particles,
+    weights: Sequence[Tensor],
     asked: bool,
 ) -> _Lease | None:
     """Return a free or new recording with graphs for these numbers of steps; None if impossible."""
-    x, s, *weights = tensors
     with _lock:
         lease = None
         with contextlib.suppress(IndexError):
@@ -545,7 +549,7 @@ def _lease(
                     return None
                 # Later calls may be in other modes.
                 with plain_tensors(), torch.autocast("cuda", enabled=False):
-                    recording.record(missing, [x, s, recording.no_path, *weights])
+                    recording.record(missing, recording.inputs(particles, weights))
         except Exception as error:
             kind.failures += 1
             if lease is not None and may_be_disturbed(kind.failures):
@@ -580,8 +584,7 @@ def check_cuda_graph(cuda_graph: CudaGraph) -> None:
 def run_recorded(
     call: RolloutSpec,
     rules: Sequence[NPARule],
-    x: Tensor,
-    s: Tensor,
+    particles: Particles,
     generator: Randomness | None,
     *,
     cuda_graph: CudaGraph,
@@ -591,6 +594,7 @@ def run_recorded(
     Raises:
         NPAError: A position is not finite.
     """
+    x = particles.x
     # In this order: a compiler cannot trace queries of streams.
     if cuda_graph is False or not x.is_cuda or torch.compiler.is_compiling() or call.steps == 0:
         return None
@@ -600,16 +604,17 @@ def run_recorded(
     plain = [rule.has_network() for rule in rules]
     if not all(plain) and (not asked or torch.is_autocast_enabled(x.device.type)):
         return None
-    forms, weights = zip(*map(_form, rules, plain), strict=True)
-    tensors = [x, s, *itertools.chain.from_iterable(weights)]
+    forms, rule_weights = zip(*map(_form, rules, plain), strict=True)
+    weights = list(itertools.chain.from_iterable(rule_weights))
     wanted: tuple[bool, ...] = ()
     if torch.is_grad_enabled():
-        wanted = tuple(tensor.requires_grad for tensor in tensors)
-        wanted = (*wanted[:2], False, *wanted[2:]) if any(wanted) else ()
+        flags = [[tensor.requires_grad for tensor in of] for of in (particles.tensors(), weights)]
+        # Paths, which begin at 0, need no gradient.
+        wanted = (*flags[0], False, *flags[1]) if any(map(any, flags)) else ()
     by_world = isinstance(generator, WorldRandom)
     # Torch's older getter raises an error if the precision was set in the new way.
     precision = torch.backends.cuda.matmul.fp32_precision
-    shape = (x.shape, s.shape[2], x.dtype, x.device)
+    shape = (x.shape, particles.s.shape[2], x.dtype, x.device)
     key = call._replace(steps=0), forms, shape, wanted, by_world, precision
     with _lock:
         kind = _kinds.count(key, MAX_KINDS)
@@ -625,13 +630,13 @@ def run_recorded(
     block = call.steps if wanted else max(BLOCK_STEPS // kept, 1) * kept
     rest = call.steps % block
     blocks = [block] * (call.steps // block) + [rest] * (rest > 0)
-    make = functools.partial(_Recording, call, rules, x, s, wanted, by_world)
-    lease = _lease(kind, set(blocks), make, tensors, asked)
+    make = functools.partial(_Recording, call, rules, particles, wanted, by_world)
+    lease = _lease(kind, set(blocks), make, particles, weights, asked)
     if lease is None:
         return None
     if not all(plain) and not lease.recording.compared.issuperset(blocks):
-        return _run_and_compare(call, rules, kind, lease, blocks, tensors, generator)
-    return lease.recording.replay(call, lease, blocks, tensors, generator)
+        return _run_and_compare(call, rules, kind, lease, blocks, particles, weights, generator)
+    return lease.recording.replay(call, lease, blocks, particles, weights, generator)
 
 
 def _run_and_compare(
@@ -640,30 +645,31 @@ def _run_and_compare(
     kind: CallKind,
     lease: _Lease,
     blocks: Sequence[int],
-    tensors: Sequence[Tensor],
+    particles: Particles,
+    weights: Sequence[Tensor],
     generator: Randomness | None,
 ) -> Particles:
     """Launch a rollout and compare it with its replay, which custom Python code may break.
 
     If results differ, calls of this kind are launched from then on.
     """
-    x, s, *weights = tensors
-    check_finite_positions(x)
+    device = particles.x.device
+    check_finite_positions(particles.x)
     with torch.no_grad():
-        own = [weight.clone() for weight in weights]
+        copies = [weight.clone() for weight in weights]
     source: Randomness
     if isinstance(generator, WorldRandom):
         source = generator.take(slice(None))
     else:
         # If other threads draw from a shared one in the meantime, results differ.
-        shared = torch_generator(generator, x.device)
-        source = torch.Generator(x.device).manual_seed(shared.initial_seed())
+        shared = torch_generator(generator, device)
+        source = torch.Generator(device).manual_seed(shared.initial_seed())
         source.set_offset(shared.get_offset())
-    worlds = Particles(x.view_as(x), s.view_as(s), x.new_zeros(x.shape[:2]))
+    worlds = particles.map(lambda value: value.view_as(value)).begun()
     launched = call.run(rules, worlds, generator)
     with torch.no_grad():
-        replayed = lease.recording.replay(call, lease, blocks, [x, s, *own], source)
-        pairs = zip((*launched.tensors(), *weights), (*replayed.tensors(), *own), strict=True)
+        replayed = lease.recording.replay(call, lease, blocks, particles, copies, source)
+        pairs = zip((*launched.tensors(), *weights), (*replayed.tensors(), *copies), strict=True)
         same = all(bool(((a == b) | (a.isnan() & b.isnan())).all()) for a, b in pairs)
     if same:
         lease.recording.compared.update(blocks)

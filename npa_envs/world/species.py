@@ -160,13 +160,13 @@ def rollout_species(
     check_memory(memory)
     # With one species this is `rollout`.
     alone = perception == "shared" and divisors == (float(x.shape[1]),)
-    kept = checked_keep_every(keep_every, steps)
+    interval = checked_keep_every(keep_every, steps)
     check_cuda_graph(cuda_graph)
+    worlds = Particles(x, s)
     own = [
         checked_physics(
             rule,
-            x,
-            s,
+            worlds,
             eps=eps,
             box=box,
             boundary=boundary,
@@ -190,17 +190,18 @@ def rollout_species(
         common,
         checked_flag("detach_positions", detach_positions),
         memory,
-        kept,
+        interval,
         () if alone else tuple(species),
         perception == "per_species",
     )
     after = execute(
         spec,
         species_rules,
-        Particles(x, s, x.new_zeros(x.shape[:2]) if alone else None),
+        worlds,
         generator,
         graph=cuda_graph,
-        watch=make_watch(on_divergence, x, s),
+        watch=make_watch(on_divergence, worlds),
+        may_rest=False,
     )
     return result(after, return_path_length)
 
