@@ -146,9 +146,13 @@ class Step:
         """Return worlds as the steps need them, for example in sorted order."""
         return particles
 
+    def draw_step(self, like: Tensor, source: Randomness | None) -> Draws:
+        """Return the draws of the next step, for positions like these."""
+        return draw_step(like, self.physics, source)
+
     def draw(self, like: Tensor, steps: int, source: Randomness | None) -> Iterator[Draws]:
         """Yield each step's draws, for positions like these."""
-        return iterate_draws(lambda: draw_step(like, self.physics, source), like, steps)
+        return iterate_draws(lambda: self.draw_step(like, source), like, steps)
 
     def advance(self, particles: Particles, draws: Draws) -> Particles:
         """Return the worlds after one step with these draws."""
@@ -186,8 +190,8 @@ class RuleStep(Step):
         x, s, *_ = particles
         mask, rows = draws.mask, draws.rows
         rule, physics = self.rule, self.physics
-        network = rule if self.network is None else self.network
-        width = rule.perception_dim if self.network is None else self.network.row_width
+        network = self.network or rule
+        width = self.network.row_width if self.network else rule.perception_dim
         total = row_count(mask, x, physics.update_prob) if rows is None else len(rows.row_source)
         huge = total > ROWS_KEPT and not torch.is_grad_enabled() and self.static is None
         if huge and not torch.compiler.is_compiling():
@@ -233,7 +237,7 @@ class StaticStep(RuleStep):
             if masks:
                 capacity = row_capacity(total, physics.update_prob)
                 rows = static_rows(self.sorted, like.detach(), masks, capacity)
-                drawn = [Draws(None, None, own) for own in rows]
+                drawn = [Draws(None, None, of_step) for of_step in rows]
             yield from drawn
 
     def leave(self, particles: Particles) -> Particles:
@@ -250,16 +254,11 @@ class DivisionStep(RuleStep):
         s = particles.s
         return particles._replace(s=torch.where(living(s)[..., None], s, 0.0))
 
-    def draw(self, like: Tensor, steps: int, source: Randomness | None) -> Iterator[Draws]:
-        """Yield each step's update mask, position noise and random numbers of divisions."""
-
-        def draw() -> Draws:
-            mask, noise, *_ = draw_step(like, self.physics, source)
-            chance = uniform_draws(source, like.shape[:2], like)
-            births = Births(chance, normal_draws(source, like.shape, like))
-            return Draws(mask, noise, None, births)
-
-        return iterate_draws(draw, like, steps)
+    def draw_step(self, like: Tensor, source: Randomness | None) -> Draws:
+        """Return update mask, position noise and random numbers of divisions."""
+        drawn = super().draw_step(like, source)
+        chance = uniform_draws(source, like.shape[:2], like)
+        return drawn._replace(births=Births(chance, normal_draws(source, like.shape, like)))
 
     def advance(self, particles: Particles, draws: Draws) -> Particles:
         """Return the worlds after one step with these draws."""
@@ -356,18 +355,15 @@ class SpeciesStep(Step):
             ]
             self.update_fraction = torch.cat(fractions)
 
-    def draw(self, like: Tensor, steps: int, source: Randomness | None) -> Iterator[Draws]:
-        """Yield each step's mask and noise as for one rule; masks are thinned out by species."""
-        for _ in range(steps):
-            drawn = draw_step(like, self.physics, source)
-            if self.update_fraction is not None:
-                if isinstance(source, WorldRandom):
-                    chance = source.uniform(like.shape[1])
-                else:
-                    chance = torch.rand(like.shape[:2], device=like.device, generator=source)
-                mask, kept = drawn.mask, (chance < self.update_fraction).to(torch.uint8)
-                drawn = Draws(kept if mask is None else mask * kept, drawn.noise)
-            yield drawn
+    def draw_step(self, like: Tensor, source: Randomness | None) -> Draws:
+        """Return mask and noise as for one rule; the mask is thinned out by species."""
+        drawn = super().draw_step(like, source)
+        if self.update_fraction is None:
+            return drawn
+        # Of the fractions' dtype.
+        chance = uniform_draws(source, like.shape[:2], self.update_fraction)
+        mask, kept = drawn.mask, (chance < self.update_fraction).to(torch.uint8)
+        return drawn._replace(mask=kept if mask is None else mask * kept)
 
     def advance(self, particles: Particles, draws: Draws) -> Particles:
         """Return the worlds after one step with these draws."""
