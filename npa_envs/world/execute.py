@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import threading
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any, Literal, NamedTuple
 
 import torch
@@ -119,16 +119,16 @@ class RolloutSpec(NamedTuple):
         if with_modules and recorded and not draws_alone():
             # Recomputed, a module that draws random numbers would draw others.
             interval = 1
-        again = None
+        recomputed = None
         # A compiled function reads copies.
         if interval > 1 and not torch.compiler.is_compiling():
-            again = RecomputedSteps(step.advance, rules, particles)
+            recomputed = RecomputedSteps(step.advance, rules, particles)
         # Worlds keep their dtype under autocast, as kernels read the rules' outputs.
         with torch.autocast(particles.x.device.type, enabled=False):
             for number, draws in enumerate(step.draw(particles.x, self.steps, source)):
                 if (self.steps - 1 - number) % interval > 0:
                     particles = checkpoint(
-                        again or step.advance,
+                        recomputed or step.advance,
                         particles,
                         draws,
                         use_reentrant=False,
@@ -140,8 +140,8 @@ class RolloutSpec(NamedTuple):
                     watch.look(step.leave(particles.map(Tensor.detach)))
                 if keep_every is not None and (number + 1) % keep_every == 0:
                     kept.append(step.leave(particles))
-            if again is not None:
-                again.end_forward()
+            if recomputed is not None:
+                recomputed.store_versions()
             if self.steps == 0:
                 # The caller may write to the results.
                 particles = particles.map(torch.clone)
@@ -165,15 +165,15 @@ class RecomputedSteps:
         self._worlds = worlds._asdict()
         # Plain rules run with copies of their weights, except those of divisions.
         self._rules = [(rule, rule.divides or not rule.is_plain()) for rule in rules]
-        self._read: dict[str, Any] | None = None
-        """Versions of all inputs at the end of the forward pass, by name."""
+        self._stored: dict[str, tuple[Any, Any]] | None = None
+        """All inputs and their versions at the end of the forward pass, by name."""
 
     def __call__(self, *arguments: Any) -> Any:
         """Run one step, in the forward pass or recomputed."""
-        if self._read is None:
+        if self._stored is None:
             return self._advance(*arguments)
-        for name, value in self._readings():
-            if name not in self._read or self._read[name][1] != _reading(value):
+        for name, (_, version) in self._inputs().items():
+            if name not in self._stored or self._stored[name][1] != version:
                 raise NPAError(
                     f"{name} must not change between a rollout that recomputes steps and its "
                     "backward pass, got another: call backward() before it changes, or take "
@@ -183,30 +183,30 @@ class RecomputedSteps:
             return self._advance(*arguments)
         finally:
             # A module may change its own buffers, as in normalisation.
-            self.end_forward()
+            self.store_versions()
 
-    def end_forward(self) -> None:
+    def store_versions(self) -> None:
         """Store the versions of all inputs."""
-        # Tensors are kept alive, so that no other tensor gets their memory.
+        # With the tensors, so that no other tensor gets their memory.
+        self._stored = self._inputs()
 
-        self._read = {name: (value, _reading(value)) for name, value in self._readings()}
-
-    def _readings(self) -> Iterator[tuple[str, Any]]:
-        """Yield all inputs of the steps, by name: tensors and other values."""
-        yield from self._worlds.items()
+    def _inputs(self) -> dict[str, tuple[Any, Any]]:
+        """Return all inputs of the steps by name, with versions that each write changes."""
+        values = dict(self._worlds)
         for number, (rule, with_weights) in enumerate(self._rules):
-            of_rule = "the rule" if len(self._rules) == 1 else f"rule {number}"
+            suffix = " of the rule" if len(self._rules) == 1 else f" of rule {number}"
             for name, value in rule.hyper_parameters().items():
-                yield f"{name} of {of_rule}", value
+                values[name + suffix] = value
             for path, module in rule.named_modules() if with_weights else ():
-                place = f"{path}." if path else ""
-                own = {**vars(module), **module._parameters, **module._buffers}
-                for name, value in own.items():
+                prefix = f"{path}." if path else ""
+                attributes = {**vars(module), **module._parameters, **module._buffers}
+                for name, value in attributes.items():
                     if isinstance(value, Tensor | bool | int | float | str):
-                        yield f"{place}{name} of {of_rule}", value
+                        values[prefix + name + suffix] = value
+        return {name: (value, _version(value)) for name, value in values.items()}
 
 
-def _reading(value: Any) -> Any:
+def _version(value: Any) -> Any:
     """Return a tensor's version, which each write changes; other values unchanged."""
     if not isinstance(value, Tensor):
         return value
@@ -228,7 +228,7 @@ def execute(
     With a watch for divergence, steps are launched one by one and checked. `may_rest`: steps of
     resting worlds may be skipped.
     """
-    if watch is not None or not (may_rest and _may_rest(spec, rules, particles.x)):
+    if watch is not None or not may_rest or not _can_rest(spec, rules, particles.x):
         return run_all_steps(spec, rules, particles, source, graph=graph, watch=watch)
     # In parts, to skip the steps after all worlds are at rest.
     remaining, part = spec.steps, FIRST_PART[particles.x.device.type]
@@ -277,8 +277,8 @@ def resting(
     return after.equal(particles)
 
 
-def _may_rest(spec: RolloutSpec, rules: Sequence[NPARule], x: Tensor) -> bool:
-    """Return whether a rollout checks for worlds at rest, to skip their steps."""
+def _can_rest(spec: RolloutSpec, rules: Sequence[NPARule], x: Tensor) -> bool:
+    """Return whether a rollout can skip the steps of worlds at rest."""
     return (
         len(rules) == 1
         and not spec.species
