@@ -60,9 +60,9 @@ class Particles(NamedTuple):
 
     def equal(self, other: Particles) -> Tensor:
         """Return which worlds are equal but for the lengths of paths, bool, shape [B]."""
-        pairs = zip(self._replace(path_length=None), other._replace(path_length=None), strict=True)
-        same = [(own == new).flatten(1).all(dim=1) for own, new in pairs if own is not None]
-        return torch.stack(same).all(dim=0)
+        first, second = (worlds._replace(path_length=None).tensors() for worlds in (self, other))
+        pairs = zip(first, second, strict=True)
+        return torch.stack([(a == b).flatten(1).all(dim=1) for a, b in pairs]).all(dim=0)
 
     def gather(self, order: Tensor) -> Particles:
         """Return particles reordered by indices among all B N, shape [B N]; differentiable."""

@@ -169,8 +169,8 @@ def _updated(
     """Return particles after updates of the active ones and the position noise of all."""
     if draws.noise is not None:
         particles = particles._replace(x=particles.x + draws.noise)
-    fields = update_particles(update, *particles.per_particle(), active, physics)
-    return Particles(*fields, particles.goal)
+    fields = update_particles(update, *particles.per_particle(), rows=active, physics=physics)
+    return Particles(*fields, goal=particles.goal)
 
 
 @dataclasses.dataclass
