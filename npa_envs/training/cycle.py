@@ -37,9 +37,7 @@ class WorldPool:
         runaway_limit: A world with a larger |x| or |s|, or one that is not finite, is replaced.
         max_age_range: Lifetimes of the first and the last world [steps]; those between are spaced
             geometrically. None: worlds have no lifetime.
-        indices: Indices of these worlds among those of all processes, int64, shape [W]; None: they
-            are all.
-        total: Worlds of all processes; None: W.
+        indices: Indices of these worlds among the `total` of all processes, int64, shape [W].
     """
 
     def __init__(
@@ -48,7 +46,7 @@ class WorldPool:
         *,
         runaway_limit: float,
         max_age_range: tuple[int, int] | None = None,
-        indices: Tensor | None = None,
+        indices: Tensor | slice = slice(None),
         total: int | None = None,
     ) -> None:
         self.worlds = worlds
@@ -62,8 +60,7 @@ class WorldPool:
             self.age = torch.zeros_like(x[:, 0, 0], dtype=torch.int64)
             lo, hi = map(math.log, max_age_range)
             logarithms = torch.linspace(lo, hi, total or len(x), dtype=torch.float64)
-            own = logarithms if indices is None else logarithms[indices]
-            self.lifetime = own.exp().round().to(x.device, torch.int64)
+            self.lifetime = logarithms[indices].exp().round().to(x.device, torch.int64)
         self._runaway_limit = runaway_limit
 
     def tensors(self) -> dict[str, Tensor]:
@@ -90,8 +87,8 @@ class WorldPool:
 
     def ages_of(self, index: Tensor) -> tuple[Tensor, Tensor]:
         """Return worlds' ages, and whether they have reached their lifetimes, shape [B] each."""
-        assert self.age is not None, "worlds have ages"
-        assert self.lifetime is not None, "worlds have lifetimes"
+        assert self.age is not None
+        assert self.lifetime is not None
         age = self.age.index_select(0, index)
         return age, age >= self.lifetime.index_select(0, index)
 
@@ -139,38 +136,37 @@ class TrainingCycle:
         _check_varied_eps(self.task, rule, config)
         self._config = config
         self._ranks = ranks = Ranks() if ranks is None else ranks
-        self._section = config.pool_size // config.world_count if by_world else config.pool_size
+        whole_pool, whole_batch = config.pool_size, config.world_count
+        # By world, each world of the batch draws from its own section of the pool.
+        self._section = whole_pool // whole_batch if by_world else whole_pool
         if by_world:
             ranks.check(config)
-        indices = ranks.indices(config.pool_size, self._section)
-        self.random = (
-            RunRandomness.by_world(config, device, schedule, ranks)
-            if by_world
-            else RunRandomness.of_batch(config, device, schedule)
-        )
-        self._pool_indices = indices.to(device)
-        worlds = self._seeds(len(indices), self.random.pool)
+            self.random = RunRandomness.by_world(config, device, schedule, ranks)
+        else:
+            self.random = RunRandomness.of_batch(config, device, schedule)
+        pool_indices = ranks.indices(whole_pool, self._section)
+        batch_indices = ranks.indices(whole_batch)
+        self._pool_indices = pool_indices.to(device)
+        seeds = self._seeds(len(pool_indices), self.random.pool)
         self.pool = WorldPool(
-            worlds,
+            seeds,
             runaway_limit=RUNAWAY_LIMIT,
             max_age_range=config.max_age_range if config.ages else None,
-            indices=indices,
-            total=config.pool_size,
+            indices=pool_indices,
+            total=whole_pool,
         )
-        numbers = ranks.indices(config.world_count)
-        # `by_world`, a world of the batch always draws from its own section of the pool: seeds go
-        # to each world in turn, so that they come into all sections.
-        whole, fresh = config.world_count, config.fresh_count
+        # By world, seeds replace all worlds of the batch in turn, and so come into all sections.
+        first_indices = range(0, whole_batch if by_world else 1, config.fresh_count)
         self._seeded = [
-            ((numbers - first) % whole < fresh).nonzero()[:, 0].to(device)
-            for first in range(0, whole if by_world else 1, fresh)
+            ((batch_indices - first) % whole_batch < config.fresh_count).nonzero()[:, 0].to(device)
+            for first in first_indices
         ]
         """Indices of the worlds of a batch that are replaced by seeds, taken in turn."""
-        count = len(numbers)
-        batch = worlds.map(lambda value: value[:count])
+        count = len(batch_indices)
+        batch = seeds.map(lambda value: value[:count])
         graphed = device.type == "cuda" and config.cuda_graph
-        iteration = GraphedIteration if graphed else EagerIteration
-        self.batch: EagerIteration = iteration(
+        cls = GraphedIteration if graphed else EagerIteration
+        self.batch: EagerIteration = cls(
             self.task,
             rule,
             config,
@@ -184,7 +180,7 @@ class TrainingCycle:
         self._index = torch.zeros(count, dtype=torch.int64, device=device)
         self._age = torch.zeros_like(self._index)
         self._steps = torch.zeros_like(self._index[0])
-        self._lost = torch.zeros_like(self._index[0])
+        self._replaced = torch.zeros_like(self._index[0])
         self._fresh_worlds = batch.map(torch.empty_like)
         self._draw, self._keep, self._record = (
             GraphedCallable(function, device, generator, recorded=graphed)
@@ -213,7 +209,7 @@ class TrainingCycle:
         self._steps.fill_(steps)
         self._keep()
         # Not inside a graph: torch watches NCCL only there for processes that do not answer.
-        self._ranks.reduce([*batch.gradients, batch.terms], self._lost)
+        self._ranks.reduce([*batch.gradients, batch.terms], self._replaced)
         self._record()
         self.optimiser.step(iteration, share)
         return steps
@@ -222,20 +218,20 @@ class TrainingCycle:
         """Return the state for a checkpoint, without the rule; rank 0 gets that of all
         processes."""
         collected = self._ranks.collected
-        return self._state(self.optimiser.state_dict(), lambda own: collected(own, self._section))
+        return self._state(self.optimiser.state_dict(), lambda part: collected(part, self._section))
 
     def state_like(self, iteration: int) -> dict[str, Any]:
         """Return a dict with the keys, shapes and types of `state_dict` after `iteration`."""
         moments = self.optimiser.moments_like() if iteration > 0 else {}
         size = self._config.pool_size
-        return self._state({"state": moments}, lambda own: own[:1].expand(size, *own.shape[1:]))
+        return self._state({"state": moments}, lambda part: part[:1].expand(size, *part.shape[1:]))
 
     def _state(
         self, optimiser: dict[str, Any], pooled: Callable[[Tensor], Tensor]
     ) -> dict[str, Any]:
         return {
             "optimiser": optimiser,
-            "pool": {name: pooled(own) for name, own in self.pool.tensors().items()},
+            "pool": {name: pooled(part) for name, part in self.pool.tensors().items()},
             "meter": self.meter.state_dict(),
             "random_states": self.random.state_dict(),
         }
@@ -243,8 +239,8 @@ class TrainingCycle:
     def load_state_dict(self, state: dict[str, Any], iteration: int) -> None:
         """Restore what `state_dict` returned after `iteration`; to be called before `run`."""
         self.optimiser.load_state_dict(state["optimiser"])
-        for name, own in self.pool.tensors().items():
-            own.copy_(self._ranks.own(state["pool"][name], self._section))
+        for name, part in self.pool.tensors().items():
+            part.copy_(self._ranks.own(state["pool"][name], self._section))
         self.meter.load_state_dict(state["meter"])
         self.random.load_state_dict(state["random_states"], iteration)
 
@@ -254,37 +250,38 @@ class TrainingCycle:
         config, worlds = self._config, self.random.worlds
         restart(worlds, self.random.masks)
         self._index.copy_(self.pool.sample(len(self._index), worlds))
-        begun = self.pool.worlds.take(self._index)
+        start = self.pool.worlds.take(self._index)
         damaged = self._pool_indices[self._index] < config.damage_share * config.pool_size
+        expired = None
         if config.ages:
-            age, over = self.pool.ages_of(self._index)
-            self._age.copy_(age.masked_fill(over, 0))
+            age, expired = self.pool.ages_of(self._index)
+            self._age.copy_(age.masked_fill(expired, 0))
             self.batch.grown.copy_((self._age >= config.stillness_min_age) & ~damaged)
-        if config.damage_and_keep_share > 0.0:
-            drawn = uniform_draws(worlds, (len(over), 1), begun.x)[:, 0]
-            kept = over & (drawn < config.damage_and_keep_share)
-            over, damaged = over & ~kept, damaged | kept
+            if config.damage_and_keep_share > 0.0:
+                chance = uniform_draws(worlds, (len(expired), 1), start.x)[:, 0]
+                kept = expired & (chance < config.damage_and_keep_share)
+                expired, damaged = expired & ~kept, damaged | kept
         if config.damages:
-            after = self.task.damage(begun, worlds)
-            begun = after if config.damage_share == 1.0 else after.where(damaged, begun)
-        # Drawn in every iteration: the host does not know which worlds will run away.
+            after = self.task.damage(start, worlds)
+            start = after if config.damage_share == 1.0 else after.where(damaged, start)
+        # Drawn in every iteration: the host does not know which worlds will diverge.
         fresh = self._seeds(len(self._index), worlds)
         self._fresh_worlds.copy_(fresh)
-        if config.ages:
-            begun = fresh.where(over, begun)
-        self.batch.start.copy_(begun)
+        if expired is not None:
+            start = fresh.where(expired, start)
+        self.batch.start.copy_(start)
 
     @torch.no_grad()
     def _keep_worlds(self) -> None:
         age = self._age + self._steps if self._config.ages else None
-        lost = self.pool.write(self._index, self.batch.end, self._fresh_worlds, age)
-        self._lost += lost.sum()
+        replaced = self.pool.write(self._index, self.batch.end, self._fresh_worlds, age)
+        self._replaced += replaced.sum()
 
     @torch.no_grad()
     def _record_iteration(self) -> None:
         """Add the losses of all processes to the meter, and prepare the gradients."""
-        self.meter.observe(self._lost)
-        self._lost.zero_()
+        self.meter.observe(self._replaced)
+        self._replaced.zero_()
         self.optimiser.prepare_gradients()
 
     def _seeds(self, world_count: int, random: Randomness) -> Particles:

@@ -77,9 +77,8 @@ class EagerIteration:
     ) -> None:
         self.start = worlds.map(torch.clone)
         self.end = self.start._replace(x=torch.empty_like(worlds.x), s=torch.empty_like(worlds.s))
-        x, s, _, goal = self.start
-        task = task.toward(goal)
-        self.grown = torch.zeros_like(x[:, 0, 0], dtype=torch.bool)
+        task = task.toward(self.start.goal)
+        self.grown = torch.zeros_like(worlds.x[:, 0, 0], dtype=torch.bool)
         """Worlds to which the stillness loss applies, bool, shape [B]."""
         self._stillness_weight = config.stillness_weight
         self._stillness_power = config.stillness_power
@@ -87,7 +86,7 @@ class EagerIteration:
         self._divides = bool(fate_parameters(rule))
         self._task = task
         with torch.no_grad():
-            total, parts = self._loss(x, s, torch.zeros_like(x[..., 0]))
+            total, parts = self._loss(self.start.begun())
         self.term_names: tuple[str, ...] = ("loss", *parts)
         """Names of `terms`."""
         self.terms = total.new_zeros(len(self.term_names))
@@ -107,13 +106,13 @@ class EagerIteration:
 
     def _forward_backward(self, steps: int) -> None:
         # Gradients of codes flow through these states; `start` keeps their values.
-        s0 = self._task.coded(self.start.s)
-        if s0 is not self.start.s:
-            self.start.s.copy_(s0.detach())
-        x, s, path_length = self._rollout(
+        first_states = self._task.coded(self.start.s)
+        if first_states is not self.start.s:
+            self.start.s.copy_(first_states.detach())
+        fields = self._rollout(
             self._rule,
             self.start.x,
-            s0,
+            first_states,
             steps,
             eps=self._task.eps,
             box=self._task.box,
@@ -122,9 +121,10 @@ class EagerIteration:
             generator=self._generator,
             return_path_length=True,
         )
+        end = Particles(*fields)
         single = self._mean_over_processes is None
         with contextlib.nullcontext() if single else counted_together(self._mean):
-            total, parts = self._loss(x, s, path_length)
+            total, parts = self._loss(end)
         # Not backward(): its accumulation nodes remember the stream they were first used on,
         # which a capture on another stream must not touch.
         gradients = torch.autograd.grad(
@@ -133,8 +133,8 @@ class EagerIteration:
         for buffer, gradient in zip(self.gradients, gradients, strict=True):
             buffer.copy_(gradient)
         self.terms.copy_(torch.stack([total, *parts.values()]).detach())
-        self.end.x.copy_(x.detach())
-        self.end.s.copy_(s.detach())
+        self.end.x.copy_(end.x.detach())
+        self.end.s.copy_(end.s.detach())
 
     def _mean(self, value: Tensor) -> Tensor:
         """Return the mean of a tensor over all processes, computed between two graphs."""
@@ -144,18 +144,17 @@ class EagerIteration:
         host_call(lambda: mean.copy_(over(own)))
         return mean
 
-    def _loss(self, x: Tensor, s: Tensor, path_length: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
+    def _loss(self, end: Particles) -> tuple[Tensor, dict[str, Tensor]]:
         """Return the task's loss plus the stillness loss of grown worlds, and named parts."""
-        total, parts = self._task.loss(x, s, path_length)
+        x, s, path = end.per_particle()
+        total, parts = self._task.loss(x, s, path)
         if self._stillness_weight > 0.0:
             change = s - self.start.s
             if self._divides:
                 # Births and deaths do not count.
                 stayed = (living(s) & living(self.start.s))[..., None]
                 change = torch.where(stayed, change, 0.0)[..., LIFE + 1 :]
-            moved, changed = (
-                power_mean(each, self._stillness_power) for each in (path_length, change)
-            )
+            moved, changed = (power_mean(each, self._stillness_power) for each in (path, change))
             unrest = moved / self._task.eps + changed
             parts["rest"] = (self.grown.to(x.dtype) * unrest).mean()
             total = total + self._stillness_weight * parts["rest"]
@@ -191,16 +190,16 @@ class GraphedIteration(EagerIteration):
 
     def _warm_up(self) -> None:
         """Run eagerly once, to load kernels and allocate workspaces, which a capture cannot do."""
-        # Restored, because a resumed run warms up again and must draw the same masks.
+        # A resumed run warms up again and must draw the same masks: so these draws do not count.
         generator = self._generator
         if isinstance(generator, WorldRandom):
             streams = generator.take(slice(None))
             self._forward_backward(WARM_UP_STEPS)
             generator.put(slice(None), streams)
-            return
-        state = generator.get_state()
-        self._forward_backward(WARM_UP_STEPS)
-        generator.set_state(state)
+        else:
+            state = generator.get_state()
+            self._forward_backward(WARM_UP_STEPS)
+            generator.set_state(state)
 
 
 # Loss statistics, and diagnosis of divergence.
@@ -328,11 +327,11 @@ class LossMeter:
 
     def _observed(self) -> dict[str, Tensor]:
         iteration = self._iteration
-        (x0, s0, _, goal), (x, s, *_) = iteration.start, iteration.end
-        observed = {"terms": iteration.terms, "x0": x0, "s0": s0, "x": x, "s": s}
-        flat = torch.nn.utils.parameters_to_vector(iteration.parameters).detach()
-        goals = {} if goal is None else {"goal": goal}
-        return goals | observed | {"parameters": flat}
+        start, end = iteration.start, iteration.end
+        goals = {} if start.goal is None else {"goal": start.goal}
+        worlds = {"x0": start.x, "s0": start.s, "x": end.x, "s": end.s}
+        flat = nn.utils.parameters_to_vector(iteration.parameters).detach()
+        return goals | {"terms": iteration.terms} | worlds | {"parameters": flat}
 
 
 def divergence_error(
@@ -357,16 +356,16 @@ def bad_worlds(task: Task, rule: NPARule, snapshot: dict[str, Any]) -> list[int]
     trained = [parameter for parameter in rule.parameters() if parameter.requires_grad]
     nn.utils.vector_to_parameters(snapshot["parameters"], trained)
     task = task.for_rule(rule)
-    x, s, goal = snapshot["x"], snapshot["s"], snapshot.get("goal")
-    found = []
-    for world in range(len(x)):
-        one = slice(world, world + 1)
-        finite = bool(torch.isfinite(x[one]).all() and torch.isfinite(s[one]).all())
+    worlds = Particles(snapshot["x"], snapshot["s"], goal=snapshot.get("goal"))
+    bad = []
+    for index in range(len(worlds.x)):
+        world = worlds.take(torch.tensor([index]))
+        finite = all(bool(torch.isfinite(value).all()) for value in world.tensors())
         if finite:
             with torch.no_grad():
-                goal_task = task.toward(None if goal is None else goal[one])
-                total, parts = goal_task.loss(x[one], s[one], torch.zeros_like(x[one][..., 0]))
+                fields = world.begun().per_particle()
+                total, parts = task.toward(world.goal).loss(*fields)
             finite = all(bool(torch.isfinite(v).all()) for v in (total, *parts.values()))
         if not finite:
-            found.append(world)
-    return found
+            bad.append(index)
+    return bad

@@ -98,53 +98,68 @@ class Trainer:
         self.task = task
         self.config = config
         self.task_name = task_name
-        self._schedule_share = 0.0
         self.folder = RunFolder(config.out)
         self._log = JsonlLog(self.folder.log)
         self._record: dict[str, Any] = {}
-        self._record_begun: dict[str, Any] | None = None
+        self._begun_record: dict[str, Any] | None = None
         self._board: Any = None
+        self._schedule_share = 0.0
         self._seconds_before = 0.0
         self._started: float | None = None
-        self._ranks = ranks = Ranks.current() if ranks is None else ranks
+        # On CUDA a record is finished an iteration later, so that the device does not idle.
+        device = check_device(config.device)
+        self._defer_records = device.type == "cuda"
+        self._ranks = Ranks.current() if ranks is None else ranks
 
         def check(content: dict[str, Any], path: Path) -> None:
             check_same_run(content, task_name, config, path)
 
-        self._run = Run(self.folder, ranks, check, resume=resume, overwrite=overwrite)
+        self._run = Run(self.folder, self._ranks, check, resume=resume, overwrite=overwrite)
         content, self._run.content = self._run.content, None
-        device = check_device(config.device)
-        # On CUDA a record is finished an iteration later, so that the device does not idle.
-        self._defer_records = device.type == "cuda"
+        self._make_cycle(content, device, rollout)
+        self._check_room()
+        with self._run.held(begin=True):
+            if content is not None:
+                self._restore(content)
+            self._write_config(new=content is None)
+            if content is None:
+                # Now, so that a run that is killed early can be resumed and a full disk is noticed.
+                self.save()
+
+    def _make_cycle(
+        self, content: dict[str, Any] | None, device: torch.device, rollout: Rollout | None
+    ) -> None:
+        """Make rule, pool and optimiser, as new, for the checkpoint of a resumed run if any."""
+        config, ranks = self.config, self._ranks
         schedule = torch.Generator().manual_seed(config.seed)
         saved = None if content is None else content["rule_hyper_parameters"]
         self.rule = self._make_rule(schedule, saved).to(device, config.torch_dtype)
         # A run of several processes keeps its streams by world when one process resumes it.
         by_world = ranks.together or (content is not None and drawn_by_world(content))
         self._cycle = TrainingCycle(
-            task, self.rule, config, device, schedule, rollout, ranks=ranks, by_world=by_world
+            self.task, self.rule, config, device, schedule, rollout, ranks=ranks, by_world=by_world
         )
         self.pool = self._cycle.pool
-        if ranks.first:
+
+    def _check_room(self) -> None:
+        """Create the folder, and check that the disk has room for checkpoints."""
+        if self._ranks.first:
             rule_bytes = sum(p.nbytes for p in self.rule.parameters())
-            pool_bytes = self.pool.worlds.x.nbytes + self.pool.worlds.s.nbytes
-            self.folder.prepare(ranks.count * pool_bytes + 16 * rule_bytes)
-        with self._run.held(begin=True):
-            if content is not None:
-                self._restore(content)
-            if ranks.first:
-                if content is None and self._log.records():
-                    raise NPAError(
-                        f"out must be a folder without a run, but {shown(str(self.folder.path))} "
-                        "holds a log without its checkpoint: choose another folder (--out), or "
-                        "overwrite it (--overwrite)"
-                    )
-                # Before the first checkpoint, whose resumption needs it.
-                text = json.dumps(config_to_dict(config), indent=2)
-                write_text(self.folder.config, text + "\n")
-            if content is None:
-                # Now, so that a run that is killed early can be resumed and a full disk is noticed.
-                self.save()
+            pool_bytes = sum(value.nbytes for value in self.pool.worlds.tensors())
+            self.folder.prepare(self._ranks.count * pool_bytes + 16 * rule_bytes)
+
+    def _write_config(self, *, new: bool) -> None:
+        """Write the configuration, before the first checkpoint, whose resumption needs it."""
+        if not self._ranks.first:
+            return
+        if new and self._log.records():
+            raise NPAError(
+                f"out must be a folder without a run, but {shown(str(self.folder.path))} "
+                "holds a log without its checkpoint: choose another folder (--out), or "
+                "overwrite it (--overwrite)"
+            )
+        text = json.dumps(config_to_dict(self.config), indent=2)
+        write_text(self.folder.config, text + "\n")
 
     @property
     def iteration(self) -> int:
@@ -257,11 +272,11 @@ class Trainer:
         self._finish_record()
         self._stop_if_diverged()
         self._ranks.check_same(list(self.rule.parameters()))
-        content: dict[str, Any] = {"iteration": self.iteration, "seconds": self._seconds()}
-        content |= {"rule": self.rule.state_dict(), **self._cycle.state_dict()}
+        progress = {"iteration": self.iteration, "seconds": self._seconds()}
+        state = {"rule": self.rule.state_dict(), **self._cycle.state_dict()}
         if not self._ranks.first:
             return
-        self._run.keep(self._origin() | content)
+        self._run.keep(self._origin() | progress | state)
         # Rule files are shared with others: paths and device are left out.
         config = config_to_dict(self.config)
         for private in ("out", "device", "initial_rule"):
@@ -295,7 +310,7 @@ class Trainer:
     def _begin_record(self) -> None:
         """Begin the log record of the interval that ends with this iteration."""
         self._cycle.meter.send()
-        self._record_begun = {
+        self._begun_record = {
             "iteration": self.iteration,
             "learning_rate": self.config.learning_rate_at(self.iteration - 1, self._schedule_share),
         }
@@ -303,7 +318,7 @@ class Trainer:
             self._finish_record()
 
     def _finish_record(self) -> None:
-        begun, self._record_begun = self._record_begun, None
+        begun, self._begun_record = self._begun_record, None
         if begun is None:
             return
         interval = self._cycle.meter.receive()

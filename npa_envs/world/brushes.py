@@ -4,9 +4,9 @@ Damage of training pools, the viewer and agents use them. They work on batches, 
 each world, and are differentiable in positions, states, centres and amounts, except for the choice
 of particles inside. Only `removed`, which changes the number of particles, waits for the device.
 
-In all of them x are positions [length units], shape [B, N, D], s states (dimensionless), shape
-[B, N, C], and `box` the sides of the periodic box [length units], shape [D], across whose edges a
-brush works, or None in open space. Positions may leave the box; the next step wraps them.
+Arguments that a docstring does not describe are those of `push`, in all functions. `box` has the
+sides of the periodic box [length units], across whose edges a brush works, or is None in open
+space. Positions may leave the box; the next step wraps them.
 """
 
 from __future__ import annotations
@@ -25,14 +25,7 @@ Sides = tuple[float, ...] | None
 def offsets_from(x: Tensor, centre: Tensor, box: Sides = None) -> Tensor:
     """Return the vector from a point to each particle's nearest image in the box, [B, N, D].
 
-    Args:
-        x: Particle positions [length units], shape [B, N, D].
-        centre: A point in each world [length units], shape [B, D].
-        box: Sides of the periodic box [length units], or None.
-
-    Raises:
-        NPAError: x has another shape, the shape, dtype or device of `centre` does not fit x, or the
-            box does not have D sides.
+    Arguments and errors are those of `push`.
     """
     _check_vector("centre", centre, x)
     if box is not None and len(entries(box) or ()) != x.shape[2]:
@@ -40,26 +33,19 @@ def offsets_from(x: Tensor, centre: Tensor, box: Sides = None) -> Tensor:
     return nearest_image(x - centre[:, None], box)
 
 
-def nearest_image(way: Tensor, box: Sides) -> Tensor:
+def nearest_image(vectors: Tensor, box: Sides) -> Tensor:
     """Return vectors [..., D] replaced by their periodic images nearest to the origin."""
     if box is None:
-        return way
+        return vectors
     # One side at a time: a tensor of the sides would be copied to the device.
-    parts = zip(way.unbind(dim=-1), box, strict=True)
-    return torch.stack([part - side * torch.round(part / side) for part, side in parts], dim=-1)
+    columns = zip(vectors.unbind(dim=-1), box, strict=True)
+    return torch.stack([v - side * torch.round(v / side) for v, side in columns], dim=-1)
 
 
 def inside_ball(x: Tensor, *, centre: Tensor, radius: float | Tensor, box: Sides = None) -> Tensor:
     """Return which particles lie in a ball, bool, shape [B, N].
 
-    Args:
-        x: Particle positions [length units], shape [B, N, D].
-        centre: Centre of the ball in each world [length units], shape [B, D].
-        radius: Radius [length units], a number or a tensor of shape [B].
-        box: Sides of the periodic box [length units], or None.
-
-    Raises:
-        NPAError: A wrong shape or dtype, or a radius that is negative or not finite.
+    Arguments and errors are those of `push`.
     """
     distance = torch.linalg.vector_norm(offsets_from(x, centre, box), dim=-1)
     return torch.le(distance, _per_world("radius", radius, x).squeeze(-1))
@@ -68,28 +54,26 @@ def inside_ball(x: Tensor, *, centre: Tensor, radius: float | Tensor, box: Sides
 def softness(x: Tensor, *, centre: Tensor, radius: float | Tensor, box: Sides = None) -> Tensor:
     """Return the weight of each particle under a soft brush: (1 - r²)², 0 outside, [B, N, 1].
 
-    r is the distance from the centre in radii. Arguments and errors are those of `inside_ball`.
+    r is the distance from the centre in radii. Arguments and errors are those of `push`.
     """
     size = _per_world("radius", radius, x)
     square = offsets_from(x, centre, box).square().sum(dim=-1, keepdim=True)
     # Masked before the division: with a radius of zero weights are 0 and not NaN.
-    share = square / torch.where(size > 0, size, torch.ones_like(size)).square()
-    return torch.where(size > 0, (1.0 - share).clamp_min(0.0), 0.0).square()
+    square = square / torch.where(size > 0, size, torch.ones_like(size)).square()
+    return torch.where(size > 0, (1.0 - square).clamp_min(0.0), 0.0).square()
 
 
 def removed(x: Tensor, s: Tensor, *, gone: Tensor) -> tuple[Tensor, Tensor]:
     """Return worlds without some of their particles; waits for the device.
 
+    Other arguments and errors are those of `inject`.
+
     Args:
-        x: Particle positions [length units], shape [B, N, D].
-        s: Particle states (dimensionless), shape [B, N, C].
-        gone: Which particles to remove, bool, shape [B, N], for example by `inside_ball`.
+        gone: Which particles to remove, bool, shape [B, N], for example by `inside_ball`; equally
+            many of each world.
 
     Returns:
         Positions, shape [B, N', D], and states, shape [B, N', C], in their former order.
-
-    Raises:
-        NPAError: A wrong shape or dtype, or worlds would keep different numbers of particles.
     """
     check_world(x, s)
     if not isinstance(gone, Tensor) or gone.shape != x.shape[:2] or gone.dtype != torch.bool:
@@ -104,9 +88,8 @@ def removed(x: Tensor, s: Tensor, *, gone: Tensor) -> tuple[Tensor, Tensor]:
             f"gone must take equally many particles of each world, got {shown(counts)}: change one "
             "world at a time, or set states with wipe_state"
         )
-    left = ~gone
-    kept = x.shape[1] - counts[0]
-    return x[left].view(len(x), kept, x.shape[2]), s[left].view(len(s), kept, s.shape[2])
+    count = x.shape[1] - counts[0]
+    return x[~gone].view(len(x), count, x.shape[2]), s[~gone].view(len(s), count, s.shape[2])
 
 
 def push(
@@ -124,18 +107,18 @@ def push(
         x: Particle positions [length units], shape [B, N, D].
         centre: Where the brush is in each world [length units], shape [B, D].
         move: How it moves [length units], shape [B, D].
-        radius: Radius of the brush [length units], a number or a tensor of shape [B].
+        radius: Radius of the brush [length units], at least 0; a number or a tensor of shape [B].
         strength: Fraction of the movement that a particle in the centre follows (dimensionless),
             from 0 to 1; a number or a tensor of shape [B].
-        box: Sides of the periodic box [length units], or None.
+        box: Sides of the periodic box [length units], shape [D], or None.
 
     Raises:
-        NPAError: A wrong shape or dtype, or a number out of its range.
+        NPAError: Shapes, dtypes or devices do not fit each other, or a number is out of its range.
     """
     check_world(x, x)
     _check_vector("move", move, x)
-    share = _per_world("strength", strength, x, highest=1.0)
-    return x + share * softness(x, centre=centre, radius=radius, box=box) * move[:, None]
+    strength = _per_world("strength", strength, x, highest=1.0)
+    return x + strength * softness(x, centre=centre, radius=radius, box=box) * move[:, None]
 
 
 def inject(
@@ -150,23 +133,18 @@ def inject(
 ) -> Tensor:
     """Return states after a soft brush has blended those under it with a given state, [B, N, C].
 
+    Other arguments and errors are those of `push`.
+
     Args:
-        x: Particle positions [length units], shape [B, N, D].
         s: Particle states (dimensionless), shape [B, N, C].
-        centre: Where the brush is in each world [length units], shape [B, D].
-        radius: Radius of the brush [length units], a number or a tensor of shape [B].
         state: State to inject in each world (dimensionless), shape [B, C].
         strength: Weight of that state for a particle in the centre (dimensionless), from 0 to 1; a
             number or a tensor of shape [B].
-        box: Sides of the periodic box [length units], or None.
-
-    Raises:
-        NPAError: A wrong shape or dtype, or a number out of its range.
     """
     check_world(x, s)
     _check_each("state", state, s, "s", "C")
-    share = _per_world("strength", strength, x, highest=1.0)
-    return s + share * softness(x, centre=centre, radius=radius, box=box) * (state[:, None] - s)
+    strength = _per_world("strength", strength, x, highest=1.0)
+    return s + strength * softness(x, centre=centre, radius=radius, box=box) * (state[:, None] - s)
 
 
 def state_around(
@@ -174,41 +152,22 @@ def state_around(
 ) -> tuple[Tensor, Tensor]:
     """Return the weighted mean state under a soft brush, [B, C], and whether any is, bool, [B].
 
-    Args:
-        x: Particle positions [length units], shape [B, N, D].
-        s: Particle states (dimensionless), shape [B, N, C].
-        centre: Where the brush is in each world [length units], shape [B, D].
-        radius: Radius of the brush [length units], a number or a tensor of shape [B].
-        box: Sides of the periodic box [length units], or None.
-
-    Raises:
-        NPAError: A wrong shape or dtype, or a radius that is negative or not finite.
+    Arguments and errors are those of `inject`.
     """
     check_world(x, s)
-    share = softness(x, centre=centre, radius=radius, box=box)
-    total = share.sum(dim=1)
+    weights = softness(x, centre=centre, radius=radius, box=box)
+    total = weights.sum(dim=1)
     holds = total > 0
-    mean = (share * s).sum(dim=1) / torch.where(holds, total, torch.ones_like(total))
+    mean = (weights * s).sum(dim=1) / torch.where(holds, total, torch.ones_like(total))
     return mean, holds[:, 0]
 
 
 def wipe_state(
     x: Tensor, s: Tensor, *, centre: Tensor, radius: float | Tensor, box: Sides = None
 ) -> Tensor:
-    """Return states, set to zero for the particles inside a ball.
+    """Return new states, zero for the particles inside a ball, shape [B, N, C].
 
-    Args:
-        x: Particle positions [length units], shape [B, N, D].
-        s: Particle states (dimensionless), shape [B, N, C].
-        centre: Centre of the ball in each world [length units], shape [B, D].
-        radius: Radius of the ball [length units], a number or a tensor of shape [B].
-        box: Sides of the periodic box [length units], or None.
-
-    Returns:
-        The new states, shape [B, N, C]; `s` does not change.
-
-    Raises:
-        NPAError: A wrong shape or dtype, or a radius that is negative or not finite.
+    Arguments and errors are those of `inject`.
     """
     check_world(x, s)
     inside = inside_ball(x, centre=centre, radius=radius, box=box)
@@ -229,24 +188,19 @@ def cut(
 
     Particles within `gap` of the line move away from it, those on the line by half the gap and
     those at the distance `gap` not at all: none is left within half the gap, the bands on both
-    sides of the slit are twice as dense, and particles further away do not move.
+    sides of the slit are twice as dense, and particles further away do not move. Other arguments
+    and errors are those of `inject`.
 
     Args:
-        x: Particle positions [length units], shape [B, N, D].
-        s: Particle states (dimensionless), shape [B, N, C].
         centre: A point on the line in each world [length units], shape [B, D].
         normal: Direction across the line, of any length, shape [B, D]; a zero vector cuts nothing.
-        gap: Width of the slit [length units], a number or a tensor of shape [B].
+        gap: Width of the slit [length units], at least 0; a number or a tensor of shape [B].
         along: Vector from `centre` to one end of the slit; minus it leads to the other end [length
             units], shape [B, D]; a zero vector cuts nothing. None: no ends. In 3D the slit is not
             bounded in the third direction.
-        box: Sides of the periodic box [length units], or None.
 
     Returns:
         The new positions, shape [B, N, D], and the same states.
-
-    Raises:
-        NPAError: A wrong shape or dtype, or a gap that is negative or not finite.
     """
     check_world(x, s)
     _check_vector("centre", centre, x)
@@ -261,9 +215,9 @@ def cut(
     shift = side * (width - height.abs()).clamp_min(0.0)
     if along is not None:
         _check_vector("along", along, x)
-        reach = along.square().sum(dim=-1, keepdim=True)[:, None]
-        place = (offset * along[:, None]).sum(dim=-1, keepdim=True)
-        shift = torch.where((place.abs() <= reach) & (reach > 0.0), shift, 0.0)
+        end = along.square().sum(dim=-1, keepdim=True)[:, None]
+        coordinate = (offset * along[:, None]).sum(dim=-1, keepdim=True)
+        shift = torch.where((coordinate.abs() <= end) & (end > 0.0), shift, 0.0)
     return x + shift * direction[:, None], s
 
 
@@ -278,26 +232,19 @@ def clump(
 ) -> tuple[Tensor, Tensor]:
     """Draw the particles inside a ball together.
 
+    Other arguments and errors are those of `inject`.
+
     Args:
-        x: Particle positions [length units], shape [B, N, D].
-        s: Particle states (dimensionless), shape [B, N, C].
-        centre: Centre of the ball in each world [length units], shape [B, D].
-        radius: Radius of the ball [length units], a number or a tensor of shape [B].
         factor: Fraction by which distances from the centre shrink (dimensionless), from 0, nothing
             moves, to 1, all meet in the centre; a number or a tensor of shape [B].
-        box: Sides of the periodic box [length units], or None.
 
     Returns:
         The new positions, shape [B, N, D], and the same states.
-
-    Raises:
-        NPAError: A wrong shape or dtype, a radius that is negative or not finite, or a factor
-            outside [0, 1].
     """
     check_world(x, s)
     inside = inside_ball(x, centre=centre, radius=radius, box=box)
-    share = _per_world("factor", factor, x, highest=1.0)
-    pulled = x - share * offsets_from(x, centre, box)
+    factor = _per_world("factor", factor, x, highest=1.0)
+    pulled = x - factor * offsets_from(x, centre, box)
     return torch.where(inside[..., None], pulled, x), s
 
 
@@ -326,16 +273,12 @@ def _check_vector(name: str, vector: Tensor, x: Tensor) -> None:
 
 def _check_each(name: str, value: Tensor, other: Tensor, other_name: str, letter: str) -> None:
     """Check that a tensor has a vector for each world, of the last size of another tensor."""
-    wanted = (other.shape[0], other.shape[2])
-    shape = f"shape [B, {letter}] = {wanted}"
-    cure = "give one vector for each world, for example"
-    if not isinstance(value, Tensor):
+    shape = (other.shape[0], other.shape[2])
+    if not isinstance(value, Tensor) or value.shape != shape:
+        got = tuple(value.shape) if isinstance(value, Tensor) else shown(value)
         raise NPAError(
-            f"{name} must be a tensor of {shape}, got {shown(value)}: {cure} torch.zeros{wanted}"
-        )
-    if value.shape != wanted:
-        raise NPAError(
-            f"{name} must have {shape}, got {tuple(value.shape)}: {cure} {name}.expand{wanted}"
+            f"{name} must have shape [B, {letter}] = {shape}, got {got}: give one vector for each "
+            f"world, for example torch.zeros{shape}"
         )
     if value.device != other.device or value.dtype != other.dtype:
         raise NPAError(

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from npa_envs.checks import check_world, checked_number
 from npa_envs.errors import DivergedError, NPAError, shown
+from npa_envs.world.particles import Particles
 
 OnDivergence = Literal["ignore", "raise"]
 """How a rollout treats worlds that diverge."""
@@ -108,26 +109,26 @@ class DivergenceWatch:
     It checks after each step, on the device; only `raise_diverged` waits for the device.
     """
 
-    def __init__(self, x: Tensor, s: Tensor) -> None:
+    def __init__(self, worlds: Particles) -> None:
+        x, s, *_ = worlds
         world_count, _, self._space_dim = x.shape
         self._looks = 0
         self._everyone = torch.arange(world_count, device=x.device)
         self._first = torch.full_like(self._everyone, -1)
         self._particle = torch.zeros_like(self._everyone)
         self._numbers = x.new_zeros(world_count, self._space_dim + s.shape[2])
-        self.look(x, s)
+        self.look(worlds)
 
     @torch.no_grad()
-    def look(self, x: Tensor, s: Tensor) -> None:
+    def look(self, worlds: Particles) -> None:
         """Check the worlds after a step."""
-        numbers = torch.cat((x.detach(), s.detach()), dim=2)
+        numbers = torch.cat((worlds.x.detach(), worlds.s.detach()), dim=2)
         bad = ~numbers.isfinite().all(dim=2)
         particle = bad.byte().argmax(dim=1)
         rose = bad[self._everyone, particle] & (self._first < 0)
         self._first.masked_fill_(rose, self._looks)
         self._particle = torch.where(rose, particle, self._particle)
-        found = numbers[self._everyone, particle]
-        self._numbers = torch.where(rose[:, None], found, self._numbers)
+        self._numbers = torch.where(rose[:, None], numbers[self._everyone, particle], self._numbers)
         self._looks += 1
 
     def raise_diverged(self) -> None:
@@ -136,33 +137,34 @@ class DivergenceWatch:
         worlds = sorted((step, world) for world, step in enumerate(first) if step >= 0)
         if not worlds:
             return
-        told = []
+        lines = []
         for step, world in worlds[:MAX_REPORT]:
             numbers = self._numbers[world].cpu()
             entry = int((~numbers.isfinite()).nonzero()[0])
             when = f"in step {step}" if step > 0 else "before the first step"
-            told.append(
+            lines.append(
                 f"world {world}: {term_name(entry, self._space_dim)} of particle "
                 f"{int(self._particle[world])} was {numbers[entry].item():g} {when}"
             )
         if len(worlds) > MAX_REPORT:
-            told.append(f"and {len(worlds) - MAX_REPORT} more worlds")
+            lines.append(f"and {len(worlds) - MAX_REPORT} more worlds")
         raise DivergedError(
-            f"worlds must stay finite, but {len(worlds)} of {len(first)} did not, {'; '.join(told)}"
-            ": take smaller steps (dt) or states, or find such worlds with npa_envs.divergence and "
+            f"worlds must stay finite, but {len(worlds)} of {len(first)} did not, "
+            f"{'; '.join(lines)}: "
+            "take smaller steps (dt) or states, or find such worlds with npa_envs.divergence and "
             "replace them (on_divergence='ignore')"
         )
 
 
-def make_watch(on_divergence: str, x: Tensor, s: Tensor) -> DivergenceWatch | None:
+def make_watch(on_divergence: str, worlds: Particles) -> DivergenceWatch | None:
     """Return the watch of a rollout, None with `on_divergence="ignore"`."""
     if on_divergence not in ("ignore", "raise"):
         raise NPAError(f"on_divergence must be 'ignore' or 'raise', got {shown(on_divergence)}")
     if on_divergence == "ignore":
         return None
-    if x.is_cuda and torch.cuda.is_current_stream_capturing():
+    if worlds.x.is_cuda and torch.cuda.is_current_stream_capturing():
         raise NPAError(
             "on_divergence must be 'ignore' while a CUDA graph is captured, got 'raise', which "
             "waits for the device: read npa_envs.divergence after a replay"
         )
-    return DivergenceWatch(x, s)
+    return DivergenceWatch(worlds)

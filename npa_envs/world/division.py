@@ -13,6 +13,7 @@ from torch import Tensor
 
 from npa_envs.ops.world_mean import world_mean
 from npa_envs.rule.rule import LIFE
+from npa_envs.world.particles import Particles
 
 MIN_OFFSPRING = 1e-3
 """Expected offspring below which life gets no gradient."""
@@ -54,22 +55,21 @@ def parked(x: Tensor, alive: Tensor, eps: float) -> Tensor:
 
 
 def divided(
-    x: Tensor,
-    s: Tensor,
-    path_length: Tensor,
+    particles: Particles,
     *,
     division_probabilities: tuple[Tensor, Tensor],
     updated: Tensor,
     births: Births,
     eps: float,
-) -> tuple[Tensor, Tensor, Tensor]:
+) -> Particles:
     """Let updated particles divide, stay or die; differentiable.
 
-    A child starts with states of 0, except for its life. Parent and child move half of their
-    distance each, in opposite directions from the parent's position. The k-th child of a world
-    takes its k-th dead slot; with more children than slots, the last are not born, and their
-    parents do not move. The last living particle of a world does not die. Dead slots get states of
-    0 and the mean position of the living, so that positions have the same mean over all slots.
+    A child starts with states and a path of 0, except for its life. Parent and child move half of
+    their distance each, in opposite directions from the parent's position, which paths do not
+    include. The k-th child of a world takes its k-th dead slot; with more children than slots, the
+    last are not born, and their parents do not move. The last living particle of a world does not
+    die. Dead slots get states of 0 and the mean position of the living, so that positions have the
+    same mean over all slots.
 
     The choice to divide or die is discrete. Life is differentiable: its value stays 1, and at each
     update it is multiplied by m / m', with m = 1 + p - d the expected number of particles after
@@ -79,14 +79,11 @@ def divided(
     and child and parent are alike: a birth is credited as if the child were like its parent.
 
     Args:
-        path_length: Length of each particle's path [length units], shape [B, N]; 0 for children.
         division_probabilities: Probabilities to divide and to die, shape [B, N] each.
         updated: Which living particles were updated, bool, shape [B, N].
         births: Random numbers of the step.
-
-    Returns:
-        Positions, states and path lengths, which exclude the displacements of divisions.
     """
+    x, s, *others = particles.per_particle()
     count, space_dim = x.shape[1:]
     alive = living(s)
     divide, die = division_probabilities
@@ -121,4 +118,5 @@ def divided(
     share = alive[..., None].to(x.dtype)
     middle = world_mean(x * share) / world_mean(share).clamp_min(0.5 / count)
     x = torch.where(alive[..., None], x, middle[:, None])
-    return x, s, torch.where(alive & ~born, path_length, 0.0)
+    others = [torch.where(stays.view(*stays.shape, *[1] * (v.ndim - 2)), v, 0.0) for v in others]
+    return Particles(x, s, *others, goal=particles.goal)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import threading
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any, Literal, NamedTuple
 
 import torch
@@ -29,9 +29,9 @@ from npa_envs.world.steps import (
     Draws,
     RuleStep,
     SpeciesSpec,
+    SpeciesStep,
     StaticStep,
     Step,
-    make_species_step,
     skip_draws,
 )
 
@@ -74,7 +74,7 @@ class RolloutSpec(NamedTuple):
     def make_step(self, rules: Sequence[NPARule], particles: Particles) -> Step:
         """Return the step of these worlds."""
         if self.species:
-            return make_species_step(
+            return SpeciesStep(
                 rules,
                 self.species,
                 self.physics.constants(),
@@ -88,8 +88,8 @@ class RolloutSpec(NamedTuple):
         if not moving and self.steps >= MIN_STATIC:
             return StaticStep(rule, physics, particles.x)
         # A rule with a custom network runs as its module.
-        made = DivisionStep if rule.divides else RuleStep
-        return made(rule, rule.network(), physics, self.detach_positions)
+        cls = DivisionStep if rule.divides else RuleStep
+        return cls(rule, rule.network(), physics, self.detach_positions)
 
     def run(
         self,
@@ -119,16 +119,16 @@ class RolloutSpec(NamedTuple):
         if with_modules and recorded and not draws_alone():
             # Recomputed, a module that draws random numbers would draw others.
             interval = 1
-        again = None
+        recomputed = None
         # A compiled function reads copies.
         if interval > 1 and not torch.compiler.is_compiling():
-            again = RecomputedSteps(step.advance, rules, {"x": particles.x, "s": particles.s})
+            recomputed = RecomputedSteps(step.advance, rules, particles)
         # Worlds keep their dtype under autocast, as kernels read the rules' outputs.
         with torch.autocast(particles.x.device.type, enabled=False):
             for number, draws in enumerate(step.draw(particles.x, self.steps, source)):
                 if (self.steps - 1 - number) % interval > 0:
                     particles = checkpoint(
-                        again or step.advance,
+                        recomputed or step.advance,
                         particles,
                         draws,
                         use_reentrant=False,
@@ -137,12 +137,11 @@ class RolloutSpec(NamedTuple):
                 else:
                     particles = step.advance(particles, draws)
                 if watch is not None:
-                    after = step.leave(particles.map(Tensor.detach))
-                    watch.look(after.x, after.s)
+                    watch.look(step.leave(particles.map(Tensor.detach)))
                 if keep_every is not None and (number + 1) % keep_every == 0:
                     kept.append(step.leave(particles))
-            if again is not None:
-                again.end_forward()
+            if recomputed is not None:
+                recomputed.store_versions()
             if self.steps == 0:
                 # The caller may write to the results.
                 particles = particles.map(torch.clone)
@@ -160,21 +159,21 @@ class RecomputedSteps:
     """
 
     def __init__(
-        self, advance: Callable[..., Any], rules: Sequence[NPARule], worlds: dict[str, Tensor]
+        self, advance: Callable[..., Any], rules: Sequence[NPARule], worlds: Particles
     ) -> None:
         self._advance = advance
-        self._worlds = worlds
+        self._worlds = worlds._asdict()
         # Plain rules run with copies of their weights, except those of divisions.
         self._rules = [(rule, rule.divides or not rule.is_plain()) for rule in rules]
-        self._read: dict[str, Any] | None = None
-        """Versions of all inputs at the end of the forward pass, by name."""
+        self._stored: dict[str, tuple[Any, Any]] | None = None
+        """All inputs and their versions at the end of the forward pass, by name."""
 
     def __call__(self, *arguments: Any) -> Any:
         """Run one step, in the forward pass or recomputed."""
-        if self._read is None:
+        if self._stored is None:
             return self._advance(*arguments)
-        for name, value in self._readings():
-            if name not in self._read or self._read[name][1] != _reading(value):
+        for name, (_, version) in self._inputs().items():
+            if name not in self._stored or self._stored[name][1] != version:
                 raise NPAError(
                     f"{name} must not change between a rollout that recomputes steps and its "
                     "backward pass, got another: call backward() before it changes, or take "
@@ -184,30 +183,30 @@ class RecomputedSteps:
             return self._advance(*arguments)
         finally:
             # A module may change its own buffers, as in normalisation.
-            self.end_forward()
+            self.store_versions()
 
-    def end_forward(self) -> None:
+    def store_versions(self) -> None:
         """Store the versions of all inputs."""
-        # Tensors are kept alive, so that no other tensor gets their memory.
+        # With the tensors, so that no other tensor gets their memory.
+        self._stored = self._inputs()
 
-        self._read = {name: (value, _reading(value)) for name, value in self._readings()}
-
-    def _readings(self) -> Iterator[tuple[str, Any]]:
-        """Yield all inputs of the steps, by name: tensors and other values."""
-        yield from self._worlds.items()
+    def _inputs(self) -> dict[str, tuple[Any, Any]]:
+        """Return all inputs of the steps by name, with versions that each write changes."""
+        values = dict(self._worlds)
         for number, (rule, with_weights) in enumerate(self._rules):
-            of_rule = "the rule" if len(self._rules) == 1 else f"rule {number}"
+            suffix = " of the rule" if len(self._rules) == 1 else f" of rule {number}"
             for name, value in rule.hyper_parameters().items():
-                yield f"{name} of {of_rule}", value
+                values[name + suffix] = value
             for path, module in rule.named_modules() if with_weights else ():
-                place = f"{path}." if path else ""
-                own = {**vars(module), **module._parameters, **module._buffers}
-                for name, value in own.items():
+                prefix = f"{path}." if path else ""
+                attributes = {**vars(module), **module._parameters, **module._buffers}
+                for name, value in attributes.items():
                     if isinstance(value, Tensor | bool | int | float | str):
-                        yield f"{place}{name} of {of_rule}", value
+                        values[prefix + name + suffix] = value
+        return {name: (value, _version(value)) for name, value in values.items()}
 
 
-def _reading(value: Any) -> Any:
+def _version(value: Any) -> Any:
     """Return a tensor's version, which each write changes; other values unchanged."""
     if not isinstance(value, Tensor):
         return value
@@ -222,26 +221,29 @@ def execute(
     *,
     graph: CudaGraph = "auto",
     watch: DivergenceWatch | None = None,
+    may_rest: bool = True,
 ) -> Particles:
     """Run a checked rollout in the fastest way that its options allow.
 
-    With a watch for divergence, steps are launched one by one and checked.
+    With a watch for divergence, steps are launched one by one and checked. `may_rest`: steps of
+    resting worlds may be skipped.
     """
-    if watch is not None or not _may_rest(spec, rules, particles):
+    if watch is not None or not may_rest or not _can_rest(spec, rules, particles.x):
         return run_all_steps(spec, rules, particles, source, graph=graph, watch=watch)
     # In parts, to skip the steps after all worlds are at rest.
-    left, part = spec.steps, FIRST_PART[particles.x.device.type]
-    while left and not resting(rules, particles, spec.physics, graph).all():
-        own = spec._replace(steps=min(part, left))
-        particles = run_all_steps(own, rules, particles, source, graph=graph)
-        left, part = left - own.steps, 2 * part
-        if left and not particles.x.isfinite().all():
+    remaining, part = spec.steps, FIRST_PART[particles.x.device.type]
+    while remaining and not resting(rules, particles, spec.physics, graph).all():
+        steps = min(part, remaining)
+        part_spec = spec._replace(steps=steps)
+        particles = run_all_steps(part_spec, rules, particles, source, graph=graph)
+        remaining, part = remaining - steps, 2 * part
+        if remaining and not particles.x.isfinite().all():
             # A world has diverged: the next call raises an error for it, this one does not.
-            return spec._replace(steps=left).run(rules, particles, source)
+            return spec._replace(steps=remaining).run(rules, particles.begun(), source)
     # The generator ends where it would be after all steps.
-    skip_draws(particles.x, spec.physics, left, source)
+    skip_draws(particles.x, spec.physics, remaining, source)
     # The caller may write to the results.
-    return particles.map(torch.clone) if left == spec.steps else particles
+    return particles.map(torch.clone) if remaining == spec.steps else particles
 
 
 def run_all_steps(
@@ -254,16 +256,15 @@ def run_all_steps(
     watch: DivergenceWatch | None = None,
 ) -> Particles:
     """Run a checked rollout as `execute`, without skipping steps of resting worlds."""
-    x, s, *_ = particles
     if watch is None:
-        recorded = run_recorded(spec, rules, x, s, source, cuda_graph=graph)
+        recorded = run_recorded(spec, rules, particles, source, cuda_graph=graph)
         if recorded is not None:
             return recorded
-    check_finite_positions(x)
-    if x.is_cuda and torch.is_grad_enabled():
+    check_finite_positions(particles.x)
+    if particles.x.is_cuda and torch.is_grad_enabled():
         # Gradients are added in the order of a recording: first those of this rollout.
-        x, s = x.view_as(x), s.view_as(s)
-    return spec.run(rules, Particles(x, s, x.new_zeros(x.shape[:2])), source, watch)
+        particles = particles.map(lambda value: value.view_as(value))
+    return spec.run(rules, particles.begun(), source, watch)
 
 
 def resting(
@@ -273,12 +274,11 @@ def resting(
     spec = RolloutSpec(1, physics._replace(update_prob=1.0))
     with torch.no_grad():
         after = run_all_steps(spec, rules, particles, None, graph=graph)
-    same_x, same_s = after.x == particles.x, after.s == particles.s
-    return same_x.flatten(1).all(dim=1) & same_s.flatten(1).all(dim=1)
+    return after.equal(particles)
 
 
-def _may_rest(spec: RolloutSpec, rules: Sequence[NPARule], particles: Particles) -> bool:
-    """Return whether a rollout checks for worlds at rest, to skip their steps."""
+def _can_rest(spec: RolloutSpec, rules: Sequence[NPARule], x: Tensor) -> bool:
+    """Return whether a rollout can skip the steps of worlds at rest."""
     return (
         len(rules) == 1
         and not spec.species
@@ -288,10 +288,9 @@ def _may_rest(spec: RolloutSpec, rules: Sequence[NPARule], particles: Particles)
         and spec.steps >= MIN_RESTING
         and spec.keep_every is None
         and spec.physics.position_noise == 0.0
-        and particles.path_length is None
         and not torch.is_grad_enabled()
         and not torch.compiler.is_compiling()
-        and not (particles.x.is_cuda and torch.cuda.is_current_stream_capturing())
+        and not (x.is_cuda and torch.cuda.is_current_stream_capturing())
     )
 
 
@@ -313,7 +312,7 @@ class _TapedStep:
         with self.tape.recording():
             step = dataclasses.replace(step, network=stand_in)
             self.after = step.advance(particles, Draws(mask, None))
-        self.places = self.tape.argument_slots(self._updates)
+        self.slots = self.tape.argument_slots(self._updates)
 
     def __call__(self, rows: Tensor) -> Tensor:
         """Store the network's input rows, [B N, row_width], and its position on the tape."""
@@ -336,14 +335,14 @@ class TapedSteps:
         back = _TapedStep(step, there.after, self._mask)
         for old, new in zip(back.after.tensors(), first.tensors(), strict=True):
             back.tape.move(back.tape.argument_slots(old), new)
-        self._places = first, there.after
+        self._buffers = first, there.after
         self._steps = there, back
 
     def run(
         self, network: Network, particles: Particles, masks: Iterable[Tensor | None], every: int
     ) -> list[Particles]:
         """Step worlds once with each mask; return copies at the given interval."""
-        self._places[0].copy_(particles)
+        self._buffers[0].copy_(particles)
         kept: list[Particles] = []
         for number, mask in enumerate(masks):
             step = self._steps[number % 2]
@@ -354,10 +353,10 @@ class TapedSteps:
             step.tape.replay(0, step.split, last_count=count)
             # Kept alive until the launch has read it.
             updates = network(step.rows[:count])
-            step.tape.move(step.places, updates)
+            step.tape.move(step.slots, updates)
             step.tape.replay(step.split)
             if (number + 1) % every == 0:
-                kept.append(self._places[(number + 1) % 2].map(torch.clone))
+                kept.append(self._buffers[(number + 1) % 2].map(torch.clone))
         return kept
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -19,7 +19,17 @@ class Particles(NamedTuple):
     path_length: Tensor | None = None
     """Length of each particle's path since the rollout began [length units], shape [B, N]."""
     goal: Tensor | None = None
-    """Index of the target that a world is to become, int64, shape [B]."""
+    """Index of the target that a world is to become, int64, shape [B]; after all other fields."""
+
+    def begun(self, zeros: Tensor | None = None) -> Particles:
+        """Return the worlds with paths of length 0, in `zeros` if it is given, shape [B, N]."""
+        if zeros is None:
+            zeros = self.x.new_zeros(self.x.shape[:2])
+        return self._replace(path_length=zeros)
+
+    def per_particle(self) -> tuple[Any, ...]:
+        """Return the fields of particles, without those of worlds, in the order of updates."""
+        return self[:-1]
 
     def tensors(self) -> list[Tensor]:
         """Return the fields that are not None."""
@@ -43,23 +53,24 @@ class Particles(NamedTuple):
 
     def where(self, worlds: Tensor, other: Particles) -> Particles:
         """Return these worlds where `worlds`, bool, shape [B], is True, and `other` elsewhere."""
-        pairs = iter(zip(self.tensors(), other.tensors(), strict=True))
+        others = iter(other.tensors())
+        return self.map(
+            lambda value: torch.where(worlds.view(-1, *[1] * (value.ndim - 1)), value, next(others))
+        )
 
-        def chosen(value: Tensor) -> Tensor:
-            own, new = next(pairs)
-            return torch.where(worlds.view(-1, *[1] * (value.ndim - 1)), own, new)
-
-        return self.map(chosen)
+    def equal(self, other: Particles) -> Tensor:
+        """Return which worlds are equal but for the lengths of paths, bool, shape [B]."""
+        first, second = (worlds._replace(path_length=None).tensors() for worlds in (self, other))
+        pairs = zip(first, second, strict=True)
+        return torch.stack([(a == b).flatten(1).all(dim=1) for a, b in pairs]).all(dim=0)
 
     def gather(self, order: Tensor) -> Particles:
         """Return particles reordered by indices among all B N, shape [B N]; differentiable."""
 
-        def gathered(value: Tensor) -> Tensor:
-            return value.flatten(0, 1).index_select(0, order).view_as(value)
-
-        x, s, path_length, goal = self
-        path_length = None if path_length is None else gathered(path_length)
-        return Particles(gathered(x), gathered(s), path_length, goal)
+        fields = self._replace(goal=None).map(
+            lambda value: value.flatten(0, 1).index_select(0, order).view_as(value)
+        )
+        return fields._replace(goal=self.goal)
 
     def copy_(self, other: Particles) -> None:
         """Overwrite these worlds with others, in one kernel."""
@@ -69,5 +80,4 @@ class Particles(NamedTuple):
 def combined(function: Callable[[list[Tensor]], Tensor], parts: Sequence[Particles]) -> Particles:
     """Combine several worlds field by field, by `torch.stack` or `torch.cat`."""
     fields = zip(*(part.tensors() for part in parts), strict=True)
-    values = iter([function([*field]) for field in fields])
-    return parts[0].map(lambda _: next(values))
+    return parts[0].map(lambda _: function([*next(fields)]))

@@ -66,13 +66,13 @@ class WorldRandom:
 
     def __init__(self, seeds: int | Sequence[int], *, device: str | torch.device = "cpu") -> None:
         several = isinstance(seeds, Sequence | np.ndarray) and getattr(seeds, "ndim", 1) != 0
-        given: list[Any] = list(seeds) if several else [seeds]  # type: ignore[arg-type]
-        if not given:
+        entries: list[Any] = list(seeds) if several else [seeds]  # type: ignore[arg-type]
+        if not entries:
             raise NPAError("seeds must hold at least one seed, got none: give one for each world")
         # The first draw of NumPy's generator is what Gymnasium's seeding gives as well.
         keys = [
             np.random.default_rng(checked_count("a seed", seed)).integers(2**64, dtype=np.uint64)
-            for seed in given
+            for seed in entries
         ]
         bits = torch.from_numpy(np.array(keys, dtype=np.uint64).view(np.int64))
         self._start(bits.to(check_device(device)))
@@ -94,19 +94,16 @@ class WorldRandom:
             NPAError: The keys are not an int64 tensor of shape [B].
         """
         if not isinstance(keys, Tensor) or keys.dtype != torch.int64 or keys.ndim != 1:
-            came = (
-                f"{keys.dtype} of shape {tuple(keys.shape)}"
-                if isinstance(keys, Tensor)
-                else type(keys).__name__
-            )
+            is_tensor = isinstance(keys, Tensor)
+            got = f"{keys.dtype} {tuple(keys.shape)}" if is_tensor else type(keys).__name__
             raise NPAError(
-                f"keys must be an int64 tensor of shape [B], got {came}: "
+                f"keys must be an int64 tensor of shape [B], got {got}: "
                 f"make streams from integers with WorldRandom(seeds)"
             )
         check_dense("keys", keys)
-        made = cls.__new__(cls)
-        made._start(keys.clone(memory_format=torch.contiguous_format))
-        return made
+        streams = cls.__new__(cls)
+        streams._start(keys.clone(memory_format=torch.contiguous_format))
+        return streams
 
     @property
     def device(self) -> torch.device:
@@ -142,12 +139,12 @@ class WorldRandom:
         Args:
             worlds: Indices of the worlds, int64, shape [K], or a slice.
         """
-        made = WorldRandom.__new__(WorldRandom)
-        made.keys = self.keys[worlds].clone()
-        made.episodes = self.episodes[worlds].clone()
-        made.steps = self.steps[worlds].clone()
-        made._draw_count = self._draw_count
-        return made
+        copy = WorldRandom.__new__(WorldRandom)
+        copy.keys = self.keys[worlds].clone()
+        copy.episodes = self.episodes[worlds].clone()
+        copy.steps = self.steps[worlds].clone()
+        copy._draw_count = self._draw_count
+        return copy
 
     def substream(self, purpose: int) -> WorldRandom:
         """Return streams that are independent of these and of those of other purposes.
@@ -161,10 +158,10 @@ class WorldRandom:
         Raises:
             NPAError: `purpose` is not an integer of at least 0.
         """
-        made = self.take(slice(None))
-        made.keys = _mixed(self.keys, checked_count("purpose", purpose))
-        made._draw_count = 0
-        return made
+        streams = self.take(slice(None))
+        streams.keys = _mixed(self.keys, checked_count("purpose", purpose))
+        streams._draw_count = 0
+        return streams
 
     def put(self, worlds: Tensor | slice, other: WorldRandom) -> None:
         """Write the keys, episodes and steps of other streams into some worlds, in place.
@@ -201,20 +198,13 @@ class WorldRandom:
         Raises:
             NPAError: A size is not an integer of at least 0, or the dtype is another one.
         """
-        _check_dtype(dtype)
         return self._drawn("uniform", shape, dtype)
 
     def normal(self, *shape: int, dtype: torch.dtype = torch.float32) -> Tensor:
         """Return standard normal numbers, always finite, shape [B, *shape].
 
-        Args:
-            shape: Shape of each world's numbers.
-            dtype: `torch.float32` or `torch.float64`.
-
-        Raises:
-            NPAError: A size is not an integer of at least 0, or the dtype is another one.
+        Arguments and errors are those of `uniform`.
         """
-        _check_dtype(dtype)
         return self._drawn("normal", shape, dtype)
 
     def bernoulli(self, probability: float, *shape: int) -> Tensor:
@@ -225,7 +215,7 @@ class WorldRandom:
             shape: Shape of each world's numbers.
 
         Raises:
-            NPAError: The probability is not in [0, 1], or a size is not an integer of at least 0.
+            NPAError: The probability is not in [0, 1], or as `uniform`.
         """
         chance = checked_number("probability", probability)
         if not 0.0 <= chance <= 1.0:
@@ -240,7 +230,7 @@ class WorldRandom:
             shape: Shape of each world's numbers.
 
         Raises:
-            NPAError: `high` is out of range, or a size is not an integer of at least 0.
+            NPAError: `high` is out of range, or as `uniform`.
         """
         limit = checked_count("high", high)
         if not 1 <= limit < 2**63:
@@ -250,6 +240,8 @@ class WorldRandom:
     def _drawn(
         self, kind: str, shape: tuple[int, ...], dtype: torch.dtype, bound: int = 0
     ) -> Tensor:
+        if kind in ("uniform", "normal") and dtype not in DTYPES:
+            raise NPAError(f"dtype must be torch.float32 or torch.float64, got {dtype}")
         count = math.prod(checked_count("a size", size) for size in shape)
         if count * self.world_count > MAX_INDEX:
             raise NPAError(
@@ -305,19 +297,19 @@ def check_generator(generator: Randomness | None, device: torch.device, world_co
             f"got {type(generator).__name__}: "
             f"make it with torch.Generator({shown(device.type)}).manual_seed(0)"
         )
-    by_world = isinstance(generator, WorldRandom)
-    made = f"WorldRandom(seeds, device={shown(str(device))})" if by_world else ""
-    here = generator.device
-    elsewhere = by_world and None not in (here.index, device.index) and here.index != device.index
-    if here.type != device.type or elsewhere:
+    own = generator.device
+    wrong, hint = own.type != device.type, f"torch.Generator({shown(device.type)})"
+    if isinstance(generator, WorldRandom):
+        wrong |= None not in (own.index, device.index) and own.index != device.index
+        hint = f"WorldRandom(seeds, device={shown(str(device))})"
+    if wrong:
         raise NPAError(
-            f"generator must be on the worlds' device, {device}, got {here}: "
-            f"make it with {made or f'torch.Generator({shown(device.type)})'}"
+            f"generator must be on the worlds' device, {device}, got {own}: make it with {hint}"
         )
     if isinstance(generator, WorldRandom) and generator.world_count != world_count:
         raise NPAError(
             f"generator must have one stream for each world, B = {world_count}, "
-            f"got {generator.world_count}: make it with {made} of {world_count} seeds"
+            f"got {generator.world_count}: make it with {hint} of {world_count} seeds"
         )
 
 
@@ -352,8 +344,3 @@ def _mixed(keys: Tensor, number: int) -> Tensor:
 def _signed(number: int) -> int:
     """Return the lowest 64 bits of a number as a signed integer, as in torch."""
     return (number + 2**63) % 2**64 - 2**63
-
-
-def _check_dtype(dtype: torch.dtype) -> None:
-    if dtype not in DTYPES:
-        raise NPAError(f"dtype must be torch.float32 or torch.float64, got {dtype}")

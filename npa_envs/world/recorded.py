@@ -15,12 +15,11 @@ from __future__ import annotations
 import collections
 import contextlib
 import copy
-import functools
 import itertools
 import logging
 import operator
 import weakref
-from collections.abc import Callable, Hashable, Sequence
+from collections.abc import Hashable, Sequence
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import torch
@@ -120,6 +119,23 @@ def _clone(rule: NPARule, like: Tensor) -> NPARule:
     return clone
 
 
+class _Call(NamedTuple):
+    """A checked call of a rollout, which may be recorded."""
+
+    spec: RolloutSpec
+    rules: Sequence[NPARule]
+    particles: Particles
+    weights: list[Tensor]
+    """Tensors of all rules."""
+    wanted: tuple[bool, ...]
+    """Which worlds and weights require a gradient; (): none does, or gradients are disabled."""
+    generator: Randomness | None
+    explicit: bool
+    """Whether the caller asked for a recording by `cuda_graph=True`."""
+    blocks: list[int]
+    """Steps of each graph to replay: without gradients a long rollout replays several."""
+
+
 class _Graphs(NamedTuple):
     forward: GraphSequence
     worlds: list[Tensor]
@@ -137,32 +153,25 @@ class _Recording:
     All graphs share memory, so only one rollout can use a recording at a time.
     """
 
-    def __init__(
-        self,
-        call: RolloutSpec,
-        rules: Sequence[NPARule],
-        x: Tensor,
-        s: Tensor,
-        wanted: tuple[bool, ...],
-        by_world: bool,
-    ) -> None:
+    def __init__(self, call: _Call) -> None:
+        x = call.particles.x
         self.device = x.device
-        self.no_path = x.new_zeros(x.shape[:2])
+        worlds = call.particles.begun()
+        self._no_paths = worlds.per_particle()[-1]
         """Path lengths at the start, zeros."""
         self.bytes = 0
         """Memory of the graphs [bytes]."""
         self.ready = torch.cuda.Event()  # type: ignore[no-untyped-call]
         """Event after which the first worlds are complete."""
-        self._call = call
-        self._rules = [_clone(rule, x) for rule in rules]
-        self._own = [rule for rule in self._rules if not rule.has_network()]
+        self._spec = call.spec
+        self._rules = [_clone(rule, x) for rule in call.rules]
+        self._custom_rules = [rule for rule in self._rules if not rule.has_network()]
         weights = [weight for rule in self._rules for weight in _form(rule, rule.has_network())[1]]
-        worlds = [
-            torch.empty(value.shape, dtype=value.dtype, device=value.device)
-            for value in (x, s, self.no_path)
-        ]
-        self._inputs = [*worlds, *weights]
-        self._wanted = wanted or (False,) * len(self._inputs)
+        self._worlds = worlds.map(
+            lambda value: torch.empty(value.shape, dtype=value.dtype, device=value.device)
+        )
+        self._inputs = [*self._worlds.tensors(), *weights]
+        self._wanted = call.wanted or (False,) * len(self._inputs)
         self.differentiable = any(self._wanted)
         """Whether backward passes are recorded."""
         for tensor, flag in zip(self._inputs, self._wanted, strict=True):
@@ -171,10 +180,10 @@ class _Recording:
                 tensor.requires_grad_(flag)
         self._generator = torch.Generator(self.device)
         self._streams = None
-        if by_world:
+        if isinstance(call.generator, WorldRandom):
             keys = torch.zeros(len(x), dtype=torch.int64, device=self.device)
             self._streams = WorldRandom.from_keys(keys)
-        self._bars: dict[int | None, list[Tensor]] = {}
+        self._cotangents: dict[int | None, list[Tensor]] = {}
         """Cotangents of the returned worlds, by the number of worlds returned."""
         self.graphs: collections.OrderedDict[int, _Graphs] = collections.OrderedDict()
         """Graphs by number of steps, the least recently used first."""
@@ -186,18 +195,22 @@ class _Recording:
         self.stream: torch.cuda.Stream | None = None
         self.token = torch.empty(0, device=self.device)
 
-    def record(self, steps: int, tensors: Sequence[Tensor]) -> None:
-        """Record rollouts of a number of steps, after a warm-up with these worlds and weights."""
+    def _inputs_of(self, call: _Call) -> list[Tensor]:
+        """Return all inputs of a rollout, in the order of the fixed tensors."""
+        return [*call.particles.begun(self._no_paths).tensors(), *call.weights]
+
+    def record(self, steps: int, call: _Call) -> None:
+        """Record rollouts of a number of steps, after a warm-up with the inputs of a call."""
         if not self.graphs:
-            first = self._call._replace(steps=min(steps, WARM_UP_STEPS), keep_every=None)
+            first = self._spec._replace(steps=min(steps, WARM_UP_STEPS), keep_every=None)
             with torch.no_grad():
-                torch._foreach_copy_(self._inputs, list(tensors))
+                torch._foreach_copy_(self._inputs, self._inputs_of(call))
             # Free the allocator's cache of earlier, launched calls.
             torch.cuda.synchronize(self.device)
             torch.cuda.empty_cache()
             self._generator.set_offset(0)
             shared = torch_generator(None, self.device)
-            place = shared.get_offset()
+            offset = shared.get_offset()
 
             def warm_up() -> None:
                 after = self._run(first, []).tensors()
@@ -206,20 +219,20 @@ class _Recording:
 
             prepare_capture(warm_up, self.device)
             self._draws_a_step = self._generator.get_offset() // first.steps
-            if self._own:
+            if self._custom_rules:
                 # Draws of their networks in the warm-up do not count.
-                shared.set_offset(place)
+                shared.set_offset(offset)
         elif len(self.graphs) >= MAX_GRAPHS:
             self.compared.discard(self.graphs.popitem(last=False)[0])
-        call = self._call._replace(steps=steps)
+        spec = self._spec._replace(steps=steps)
         before = torch.cuda.memory_reserved(self.device)
         results: list[Tensor] = []
-        kept: list[Tensor] = []
+        saved: list[Tensor] = []
         gradients: list[Tensor] = []
 
         def forward() -> None:
-            kept.clear()
-            results[:] = self._run(call, kept).tensors()
+            saved.clear()
+            results[:] = self._run(spec, saved).tensors()
 
         def backward() -> None:
             gradients[:] = self._pull_back(results, self._cotangents_of(steps))
@@ -227,13 +240,17 @@ class _Recording:
         draws = None if self._streams is not None else self._generator
         begin, versions = self._settings(), self._versions()
         forward_graph = capture(forward, self.device, pool=self._pool, generator=draws, alone=True)
-        own = {id(tensor) for rule in self._own for tensor in rule_tensors(rule, self.device)}
         # Not every operator that writes to a buffer changes its version.
+        buffers = {
+            id(tensor)
+            for rule in self._custom_rules
+            for tensor in rule_tensors(rule, self.device)
+            if not isinstance(tensor, torch.nn.Parameter)
+        }
         written = [
             k
             for k, (tensor, version) in enumerate(zip(self._inputs, versions, strict=True))
-            if tensor._version != version
-            or (id(tensor) in own and not isinstance(tensor, torch.nn.Parameter))
+            if tensor._version != version or id(tensor) in buffers
         ]
         versions = self._versions()
         backward_graph = None
@@ -257,7 +274,7 @@ class _Recording:
     def _settings(self) -> dict[tuple[int, str], Hashable]:
         """Return all settings of rules with custom networks that must not change."""
         settings: dict[tuple[int, str], Hashable] = {}
-        for number, rule in enumerate(self._own):
+        for number, rule in enumerate(self._custom_rules):
             for name, setting in rule_settings(rule, self.device).items():
                 # In a tuple, so that a setting of None differs from none.
                 settings[number, name] = (setting,)
@@ -271,25 +288,25 @@ class _Recording:
 
     def _cotangents_of(self, steps: int) -> list[Tensor]:
         """Return the buffers for cotangents of the worlds that this number of steps returns."""
-        every = self._call.keep_every
-        count = None if every is None else steps // every
-        if count not in self._bars:
+        interval = self._spec.keep_every
+        count = None if interval is None else steps // interval
+        if count not in self._cotangents:
             first = () if count is None else (count,)
-            worlds = self._inputs[:3]
-            self._bars[count] = [tensor.new_zeros(*first, *tensor.shape) for tensor in worlds]
-        return self._bars[count]
+            worlds = self._worlds.tensors()
+            self._cotangents[count] = [value.new_zeros(*first, *value.shape) for value in worlds]
+        return self._cotangents[count]
 
-    def _run(self, call: RolloutSpec, kept: list[Tensor]) -> Particles:
-        """Launch a rollout; tensors of its backward pass are added to `kept`."""
+    def _run(self, spec: RolloutSpec, saved: list[Tensor]) -> Particles:
+        """Launch a rollout; tensors of its backward pass are added to `saved`."""
 
-        def keep(tensor: Tensor) -> Tensor:
-            kept.append(tensor.detach())
-            return kept[-1]
+        def save(tensor: Tensor) -> Tensor:
+            saved.append(tensor.detach())
+            return saved[-1]
 
         generator = self._generator if self._streams is None else self._streams
-        hooks = torch.autograd.graph.saved_tensors_hooks(keep, lambda tensor: tensor)
+        hooks = torch.autograd.graph.saved_tensors_hooks(save, lambda tensor: tensor)
         with torch.set_grad_enabled(self.differentiable), hooks:
-            return call.run(self._rules, Particles(*self._inputs[:3]), generator)
+            return spec.run(self._rules, self._worlds, generator)
 
     def _pull_back(self, results: Sequence[Tensor], bars: list[Tensor]) -> list[Tensor]:
         """Launch the backward pass, and return the gradients of inputs that require one."""
@@ -309,20 +326,13 @@ class _Recording:
         )
         return [gradient.contiguous() for gradient in gradients]
 
-    def replay(
-        self,
-        call: RolloutSpec,
-        lease: _Lease,
-        blocks: Sequence[int],
-        tensors: Sequence[Tensor],
-        generator: Randomness | None,
-    ) -> Particles:
+    def replay(self, call: _Call, lease: _Lease) -> Particles:
         """Replay the graphs of a rollout one after the other; copy changed buffers to the rule."""
-        x, s, *weights = tensors
-        given = [x, s, self.no_path, *weights]
-        self.ready.record(current_stream(x.device))
-        found: list[Particles] = []
-        for steps in blocks:
+        generator, interval = call.generator, call.spec.keep_every
+        inputs = self._inputs_of(call)
+        self.ready.record(current_stream(self.device))
+        results: list[Particles] = []
+        for steps in call.blocks:
             if self.differentiable:
                 # The lease takes the place of saved tensors. It ends when autograd drops these:
                 # after a backward pass, unless the graph is retained, or with the last result.
@@ -330,13 +340,13 @@ class _Recording:
                     lambda _: lease, lambda saved: saved.recording.token
                 )
                 with hooks:
-                    after = Particles(*_Replayed.apply(self, steps, generator, *given))  # type: ignore[no-untyped-call]
+                    after = Particles(*_Replayed.apply(self, steps, generator, *inputs))  # type: ignore[no-untyped-call]
             else:
-                after = Particles(*self.forward(steps, given, generator))
-            if not found:
+                after = Particles(*self.forward(steps, inputs, generator))
+            if not results:
                 # Only now, when the device has work: this check takes much CPU time.
                 try:
-                    FiniteCheck(x, self.ready).wait()
+                    FiniteCheck(call.particles.x, self.ready).wait()
                 except NPAError:
                     if self._streams is None:
                         # The caller's generator returns to its state before the rollout.
@@ -351,20 +361,20 @@ class _Recording:
             if written:
                 with torch.no_grad():
                     torch._foreach_copy_(
-                        [given[k] for k in written], [self._inputs[k] for k in written]
+                        [inputs[k] for k in written], [self._inputs[k] for k in written]
                     )
-            found.append(after)
-            last = after if call.keep_every is None else after.map(lambda value: value[-1])
-            given[:3] = last.tensors()
-        if len(found) == 1:
-            return found[0]
-        return last if call.keep_every is None else combined(torch.cat, found)
+            results.append(after)
+            last = after if interval is None else after.map(lambda value: value[-1])
+            inputs = [*last.tensors(), *call.weights]
+        if len(results) == 1:
+            return results[0]
+        return last if interval is None else combined(torch.cat, results)
 
     def forward(
         self, steps: int, tensors: Sequence[Tensor], generator: Randomness | None
     ) -> list[Tensor]:
         """Replay a rollout, and return copies of the resulting worlds; not differentiable."""
-        with self._on_device():
+        with torch.cuda.device(self.device):
             self._wait_for_last_use()
             torch._foreach_copy_(self._inputs, list(tensors))
             self._load_draws(generator, steps)
@@ -374,19 +384,19 @@ class _Recording:
             return _copies(graphs.worlds)
 
     def backward(
-        self, steps: int, bars: Sequence[Tensor | None], wanted: Sequence[bool]
+        self, steps: int, cotangents: Sequence[Tensor | None], wanted: Sequence[bool]
     ) -> list[Tensor | None]:
         """Replay the backward pass of the last rollout, and return copies of the gradients."""
-        with self._on_device():
+        with torch.cuda.device(self.device):
             self._wait_for_last_use()
-            for buffer, bar in zip(self._cotangents_of(steps), bars, strict=True):
+            for buffer, bar in zip(self._cotangents_of(steps), cotangents, strict=True):
                 buffer.zero_() if bar is None else buffer.copy_(bar)
             graphs = self.graphs[steps]
             assert graphs.backward is not None, "it was recorded for gradients"
             graphs.backward.replay()
-            gradients = iter(_copies(graphs.gradients))
-            made = [next(gradients) if flag else None for flag in self._wanted]
-            return [value if flag else None for value, flag in zip(made, wanted, strict=True)]
+            recorded = iter(_copies(graphs.gradients))
+            gradients = [next(recorded) if flag else None for flag in self._wanted]
+            return [value if flag else None for value, flag in zip(gradients, wanted, strict=True)]
 
     def _load_draws(self, generator: Randomness | None, steps: int) -> None:
         if self._streams is not None:
@@ -397,12 +407,6 @@ class _Recording:
             self._generator.manual_seed(source.initial_seed())
             begin = reserve_draws(source, steps * self._draws_a_step)
             self._generator.set_offset(begin)
-
-    def _on_device(self) -> contextlib.AbstractContextManager[object]:
-        """Return a context in which this device is the current one."""
-        if torch.cuda.current_device() == self.device.index:
-            return contextlib.nullcontext()
-        return torch.cuda.device(self.device)
 
     def _wait_for_last_use(self) -> None:
         """Make the current stream wait for the stream of the last use."""
@@ -510,15 +514,8 @@ def release_recordings() -> None:
     torch.cuda.empty_cache()
 
 
-def _lease(
-    kind: CallKind,
-    steps: set[int],
-    make: Callable[[], _Recording],
-    tensors: Sequence[Tensor],
-    asked: bool,
-) -> _Lease | None:
-    """Return a free or new recording with graphs for these numbers of steps; None if impossible."""
-    x, s, *weights = tensors
+def _lease(kind: CallKind, call: _Call) -> _Lease | None:
+    """Return a free or new recording with graphs for a call; None if impossible."""
     with _lock:
         lease = None
         with contextlib.suppress(IndexError):
@@ -527,25 +524,25 @@ def _lease(
         try:
             if lease is None:
                 with plain_tensors():
-                    recording = make()
+                    recording = _Recording(call)
                 kind.recordings.append(recording)
                 lease = _Lease(recording, kind)
             recording = lease.recording
             device = recording.device
-            for missing in [number for number in steps if number not in recording.graphs]:
+            for steps in set(call.blocks) - recording.graphs.keys():
                 limit = MEMORY_SHARE * torch.cuda.get_device_properties(device).total_memory
                 # Make room by deleting other kinds, the least recently used first.
                 for key in list(_kinds)[:-1]:
                     if recorded_memory(device) < limit:
                         break
-                    if any(own.device == device for own in _kinds[key].recordings):
+                    if any(other.device == device for other in _kinds[key].recordings):
                         _kinds.forget(key)
                 if recorded_memory(device) >= limit:
                     logger.debug("a rollout is launched: recordings use all memory that they may")
                     return None
                 # Later calls may be in other modes.
                 with plain_tensors(), torch.autocast("cuda", enabled=False):
-                    recording.record(missing, [x, s, recording.no_path, *weights])
+                    recording.record(steps, call)
         except Exception as error:
             kind.failures += 1
             if lease is not None and may_be_disturbed(kind.failures):
@@ -555,14 +552,13 @@ def _lease(
             drew = "CUDA generator" in str(error)
             reason = "forward draws from torch's own generator, as dropout does" if drew else error
             # If the rollout cannot be launched either, that raises the right error.
-            _refuse(kind, reason, asked=asked)
+            _refuse(kind, reason, logging.WARNING if call.explicit else logging.DEBUG)
             return None
         return lease
 
 
-def _refuse(kind: CallKind, reason: object, *, asked: bool) -> None:
+def _refuse(kind: CallKind, reason: object, level: int) -> None:
     """Launch all calls of a kind from now on."""
-    level = logging.WARNING if asked else logging.DEBUG
     logger.log(level, "rollouts of this kind are launched, not recorded: %s", reason)
     with _lock:
         kind.refused = True
@@ -578,10 +574,9 @@ def check_cuda_graph(cuda_graph: CudaGraph) -> None:
 
 
 def run_recorded(
-    call: RolloutSpec,
+    spec: RolloutSpec,
     rules: Sequence[NPARule],
-    x: Tensor,
-    s: Tensor,
+    particles: Particles,
     generator: Randomness | None,
     *,
     cuda_graph: CudaGraph,
@@ -591,84 +586,80 @@ def run_recorded(
     Raises:
         NPAError: A position is not finite.
     """
+    x = particles.x
     # In this order: a compiler cannot trace queries of streams.
-    if cuda_graph is False or not x.is_cuda or torch.compiler.is_compiling() or call.steps == 0:
+    if cuda_graph is False or not x.is_cuda or torch.compiler.is_compiling() or spec.steps == 0:
         return None
     if not can_capture() or torch.cuda.is_current_stream_capturing():
         return None
-    asked = cuda_graph is True
+    explicit = cuda_graph is True
     plain = [rule.has_network() for rule in rules]
-    if not all(plain) and (not asked or torch.is_autocast_enabled(x.device.type)):
+    if not all(plain) and (not explicit or torch.is_autocast_enabled(x.device.type)):
         return None
-    forms, weights = zip(*map(_form, rules, plain), strict=True)
-    tensors = [x, s, *itertools.chain.from_iterable(weights)]
+    forms, rule_weights = zip(*map(_form, rules, plain), strict=True)
+    weights = list(itertools.chain.from_iterable(rule_weights))
     wanted: tuple[bool, ...] = ()
     if torch.is_grad_enabled():
-        wanted = tuple(tensor.requires_grad for tensor in tensors)
-        wanted = (*wanted[:2], False, *wanted[2:]) if any(wanted) else ()
+        flags = [[tensor.requires_grad for tensor in of] for of in (particles.tensors(), weights)]
+        # Paths, which begin at 0, need no gradient.
+        wanted = (*flags[0], False, *flags[1]) if any(map(any, flags)) else ()
     by_world = isinstance(generator, WorldRandom)
     # Torch's older getter raises an error if the precision was set in the new way.
     precision = torch.backends.cuda.matmul.fp32_precision
-    shape = (x.shape, s.shape[2], x.dtype, x.device)
-    key = call._replace(steps=0), forms, shape, wanted, by_world, precision
+    shape = (x.shape, particles.s.shape[2], x.dtype, x.device)
+    key = spec._replace(steps=0), forms, shape, wanted, by_world, precision
     with _lock:
         kind = _kinds.count(key, MAX_KINDS)
-    if kind.refused or kind.calls <= (1 if asked else LAUNCHED_FIRST):
+    if kind.refused or kind.calls <= (1 if explicit else LAUNCHED_FIRST):
         return None
     # The caller may have hooks for saved tensors, as checkpoints do.
     hooks = getattr(torch._C._autograd, "_top_saved_tensors_default_hooks", None)
     hooked = hooks is not None and hooks(True) is not None
-    if wanted and (hooked or call.steps > MAX_STEPS):
+    if wanted and (hooked or spec.steps > MAX_STEPS):
         return None
-    # Without gradients a long rollout replays several graphs one after the other.
-    kept = call.keep_every or 1
-    block = call.steps if wanted else max(BLOCK_STEPS // kept, 1) * kept
-    rest = call.steps % block
-    blocks = [block] * (call.steps // block) + [rest] * (rest > 0)
-    make = functools.partial(_Recording, call, rules, x, s, wanted, by_world)
-    lease = _lease(kind, set(blocks), make, tensors, asked)
+    interval = spec.keep_every or 1
+    block = spec.steps if wanted else max(BLOCK_STEPS // interval, 1) * interval
+    rest = spec.steps % block
+    blocks = [block] * (spec.steps // block) + [rest] * (rest > 0)
+    call = _Call(spec, rules, particles, weights, wanted, generator, explicit, blocks)
+    lease = _lease(kind, call)
     if lease is None:
         return None
-    if not all(plain) and not lease.recording.compared.issuperset(blocks):
-        return _run_and_compare(call, rules, kind, lease, blocks, tensors, generator)
-    return lease.recording.replay(call, lease, blocks, tensors, generator)
+    if not all(plain) and not lease.recording.compared.issuperset(call.blocks):
+        return _run_and_compare(call, kind, lease)
+    return lease.recording.replay(call, lease)
 
 
-def _run_and_compare(
-    call: RolloutSpec,
-    rules: Sequence[NPARule],
-    kind: CallKind,
-    lease: _Lease,
-    blocks: Sequence[int],
-    tensors: Sequence[Tensor],
-    generator: Randomness | None,
-) -> Particles:
+def _run_and_compare(call: _Call, kind: CallKind, lease: _Lease) -> Particles:
     """Launch a rollout and compare it with its replay, which custom Python code may break.
 
     If results differ, calls of this kind are launched from then on.
     """
-    x, s, *weights = tensors
-    check_finite_positions(x)
+    particles, weights, generator = call.particles, call.weights, call.generator
+    device = particles.x.device
+    check_finite_positions(particles.x)
     with torch.no_grad():
-        own = [weight.clone() for weight in weights]
+        copies = [weight.clone() for weight in weights]
     source: Randomness
     if isinstance(generator, WorldRandom):
         source = generator.take(slice(None))
     else:
         # If other threads draw from a shared one in the meantime, results differ.
-        shared = torch_generator(generator, x.device)
-        source = torch.Generator(x.device).manual_seed(shared.initial_seed())
+        shared = torch_generator(generator, device)
+        source = torch.Generator(device).manual_seed(shared.initial_seed())
         source.set_offset(shared.get_offset())
-    worlds = Particles(x.view_as(x), s.view_as(s), x.new_zeros(x.shape[:2]))
-    launched = call.run(rules, worlds, generator)
+    worlds = particles.map(lambda value: value.view_as(value)).begun()
+    launched = call.spec.run(call.rules, worlds, generator)
     with torch.no_grad():
-        replayed = lease.recording.replay(call, lease, blocks, [x, s, *own], source)
-        pairs = zip((*launched.tensors(), *weights), (*replayed.tensors(), *own), strict=True)
+        again = call._replace(weights=copies, generator=source)
+        replayed = lease.recording.replay(again, lease)
+        pairs = zip((*launched.tensors(), *weights), (*replayed.tensors(), *copies), strict=True)
         same = all(bool(((a == b) | (a.isnan() & b.isnan())).all()) for a, b in pairs)
     if same:
-        lease.recording.compared.update(blocks)
+        lease.recording.compared.update(call.blocks)
     else:
-        _refuse(kind, "a replay gives other numbers than forward, run by Python", asked=True)
+        reason = "a replay gives other numbers than forward, run by Python"
+        _refuse(kind, reason, logging.WARNING)
     return launched
 
 
@@ -686,8 +677,8 @@ class _Replayed(torch.autograd.Function):
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, *bars: Tensor | None) -> tuple[Tensor | None, ...]:
+    def backward(ctx: Any, *cotangents: Tensor | None) -> tuple[Tensor | None, ...]:
         # Raises autograd's own error if the saved tensors are freed.
         _ = ctx.saved_tensors
-        gradients = ctx.recording.backward(ctx.steps, bars, ctx.needs_input_grad[3:])
+        gradients = ctx.recording.backward(ctx.steps, cotangents, ctx.needs_input_grad[3:])
         return (None, None, None, *gradients)

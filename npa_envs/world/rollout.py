@@ -44,17 +44,17 @@ def check_memory(memory: Memory) -> None:
 
 def checked_physics(
     rule: NPARule,
-    x: Tensor,
-    s: Tensor,
+    worlds: Particles,
     *,
     eps: float | None,
     box: Box,
-    boundary: Boundary = "periodic",
+    boundary: Boundary,
     update_prob: float = 1.0,
     dt: float,
     position_noise: float = 0.0,
 ) -> Physics:
     """Check that worlds fit a rule, and return the constants of its rollouts."""
+    x, s, *_ = worlds
     check_world(x, s)
     check_derivatives(x=x, s=s, rule=rule)
     if (x.shape[2], s.shape[2]) != (rule.space_dim, rule.state_dim):
@@ -111,13 +111,13 @@ def checked_keep_every(keep_every: int | None, steps: int) -> int | None:
     """Check that `keep_every` divides the number of steps, and return it."""
     if keep_every is None:
         return None
-    kept = checked_count("keep_every", keep_every)
-    if kept == 0 or steps == 0 or steps % kept:
+    interval = checked_count("keep_every", keep_every)
+    if interval == 0 or steps == 0 or steps % interval:
         raise NPAError(
-            f"steps must be a multiple of keep_every, got {steps} and {kept}: the last world kept "
-            f"is the one at the end"
+            f"steps must be a multiple of keep_every, got {steps} and {interval}: the last world "
+            f"kept is the one at the end"
         )
-    return kept
+    return interval
 
 
 def step(
@@ -198,8 +198,9 @@ def at_rest(
             "worlds change by chance"
         )
     _check_one_species(rule)
-    made = checked_physics(rule, x, s, eps=eps, box=box, boundary=boundary, dt=dt)
-    return resting((rule,), Particles(x, s), made, "auto")
+    worlds = Particles(x, s)
+    constants = checked_physics(rule, worlds, eps=eps, box=box, boundary=boundary, dt=dt)
+    return resting((rule,), worlds, constants, "auto")
 
 
 @overload
@@ -306,15 +307,15 @@ def rollout(
             which step, and which number of which particle.
     """
     steps = checked_count("steps", steps)
-    kept = checked_keep_every(keep_every, steps)
+    interval = checked_keep_every(keep_every, steps)
     check_memory(memory)
     check_cuda_graph(cuda_graph)
     check_rule(rule)
     _check_one_species(rule)
-    made = checked_physics(
+    worlds = Particles(x, s)
+    constants = checked_physics(
         rule,
-        x,
-        s,
+        worlds,
         eps=eps,
         box=box,
         boundary=boundary,
@@ -330,11 +331,12 @@ def rollout(
             "from all others"
         )
     after = execute(
-        RolloutSpec(steps, made, detach_positions, memory, kept),
+        RolloutSpec(steps, constants, detach_positions, memory, interval),
         (rule,),
-        Particles(x, s, x.new_zeros(x.shape[:2]) if return_path_length else None),
+        worlds,
         generator,
         graph=cuda_graph,
-        watch=make_watch(on_divergence, x, s),
+        watch=make_watch(on_divergence, worlds),
+        may_rest=not return_path_length,
     )
     return result(after, return_path_length)

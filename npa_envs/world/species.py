@@ -111,6 +111,8 @@ def rollout_species(
     trained alone, particles of other species lower the density that it perceives, at any distance.
     With `density_counts=counts` each species divides by its own number of particles, as alone.
 
+    All other arguments are those of `rollout`.
+
     Args:
         rules: One rule for each species; dtype and device of x. They agree in space dimension,
             channels, eps0, groups of perception, and in whether particles move; hidden units, alpha
@@ -120,31 +122,17 @@ def rollout_species(
         steps: Number of steps T, 0 or more.
         counts: Particles of each species, which sum to N: species k owns `counts[k]` consecutive
             ones.
-        eps: Perception radius [length units]; default: the rules' eps0.
         update_prob: Probability of each particle's update in a step, in (0, 1], for all species or
             one for each.
-        box: Sides of a box centred on the origin [length units], or None for open space.
-        boundary: "periodic" or "reflecting", as in `rollout`.
-        dt: Time step, dimensionless.
-        position_noise: Standard deviation of the noise added to every position in each step
-            [length units].
-        generator: Source of the masks and the noise, on x's device; default: torch's global one.
-            With one `update_prob` it draws the same numbers as in `rollout`.
-        detach_positions: Perception does not back-propagate into positions (the paper's choice).
+        generator: As for `rollout`; with one `update_prob` it draws the same numbers.
         perception: "shared", or "per_species" for rules made with `species_count`: they also
             perceive the density and the density gradient of each species, as `perceive_species`
             gives them.
         density_counts: Number that each species divides densities and their gradients by, positive;
             default: N, the particles of the world, for all.
-        memory: Whether tensors of the backward pass are stored or recomputed, as in `rollout`.
-        on_divergence: "ignore" worlds that diverge, or "raise" at the end, as in `rollout`.
-        keep_every: Interval in steps at which worlds are returned, as in `rollout`.
-        cuda_graph: Whether repeated calls are replayed on CUDA, as in `rollout`.
-        return_path_length: Also return the length of each particle's path.
 
     Returns:
-        Positions [length units], shape [B, N, D]; states, dimensionless, shape [B, N, C]; and where
-        asked the length of each particle's path [length units], shape [B, N].
+        As `rollout`.
 
     Raises:
         NPAError: Rules do not agree, counts do not fit, or as for `rollout`.
@@ -160,13 +148,13 @@ def rollout_species(
     check_memory(memory)
     # With one species this is `rollout`.
     alone = perception == "shared" and divisors == (float(x.shape[1]),)
-    kept = checked_keep_every(keep_every, steps)
+    interval = checked_keep_every(keep_every, steps)
     check_cuda_graph(cuda_graph)
-    own = [
+    worlds = Particles(x, s)
+    constants = [
         checked_physics(
             rule,
-            x,
-            s,
+            worlds,
             eps=eps,
             box=box,
             boundary=boundary,
@@ -176,13 +164,13 @@ def rollout_species(
         )
         for rule, chance in zip(species_rules, probabilities, strict=True)
     ]
-    common = own[0]._replace(
-        update_prob=max(each.update_prob for each in own),
-        max_displacement=max(each.max_displacement for each in own),
+    common = constants[0]._replace(
+        update_prob=max(own.update_prob for own in constants),
+        max_displacement=max(own.max_displacement for own in constants),
     )
     species = [
-        SpeciesSpec(size, each.update_prob, divisor)
-        for size, each, divisor in zip(sizes, own, divisors, strict=True)
+        SpeciesSpec(size, own.update_prob, divisor)
+        for size, own, divisor in zip(sizes, constants, divisors, strict=True)
     ]
     check_generator(generator, x.device, x.shape[0])
     spec = RolloutSpec(
@@ -190,35 +178,36 @@ def rollout_species(
         common,
         checked_flag("detach_positions", detach_positions),
         memory,
-        kept,
+        interval,
         () if alone else tuple(species),
         perception == "per_species",
     )
     after = execute(
         spec,
         species_rules,
-        Particles(x, s, x.new_zeros(x.shape[:2]) if alone else None),
+        worlds,
         generator,
         graph=cuda_graph,
-        watch=make_watch(on_divergence, x, s),
+        watch=make_watch(on_divergence, worlds),
+        may_rest=False,
     )
     return result(after, return_path_length)
 
 
 def _checked_rules(rules: Any) -> list[NPARule]:
-    given = None if isinstance(rules, NPARule) else entries(rules)
-    if given is None:
+    checked = None if isinstance(rules, NPARule) else entries(rules)
+    if checked is None:
         raise NPAError(
             f"rules must have one rule for each species, got {type(rules).__name__}: "
             f"give (rule,) for one species"
         )
-    for number, rule in enumerate(given):
+    for number, rule in enumerate(checked):
         if not isinstance(rule, NPARule):
             raise NPAError(
                 f"rules must be NPARule each, got {type(rule).__name__} as rule {number}: "
                 f"load it with npa_envs.load_rule"
             )
-    return given
+    return checked
 
 
 def _check_agreement(rules: list[NPARule], species_count: int, perception: str) -> None:
@@ -253,25 +242,25 @@ def _check_agreement(rules: list[NPARule], species_count: int, perception: str) 
 
 def _checked_probabilities(update_prob: Any, species_count: int) -> list[Any]:
     """Return one probability for each species; values are checked with the rules."""
-    given = entries(update_prob)
-    if given is None:
+    probabilities = entries(update_prob)
+    if probabilities is None:
         return [update_prob] * species_count
-    if len(given) != species_count:
+    if len(probabilities) != species_count:
         raise NPAError(
             f"update_prob must be one number, or one for each of {species_count} species, "
-            f"got {len(given)}"
+            f"got {len(probabilities)}"
         )
-    return given
+    return probabilities
 
 
 def _checked_divisors(density_counts: Any, counts: tuple[int, ...]) -> tuple[float, ...]:
     """Return the number by which each species divides densities."""
     if density_counts is None:
         return (float(sum(counts)),) * len(counts)
-    given = entries(density_counts)
-    if given is None:
-        given = [density_counts]
-    checked = tuple(checked_number("an entry of density_counts", number) for number in given)
+    divisors = entries(density_counts)
+    if divisors is None:
+        divisors = [density_counts]
+    checked = tuple(checked_number("an entry of density_counts", number) for number in divisors)
     if len(checked) != len(counts) or not all(0.0 < number < math.inf for number in checked):
         raise NPAError(
             f"density_counts must have one positive number for each of {len(counts)} species, "

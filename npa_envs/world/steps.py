@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from npa_envs.checks import constant
-from npa_envs.ops.perceive import perceive_rows, updates_in_parts
+from npa_envs.ops.perceive import Rows, perceive_rows, updates_in_parts
 from npa_envs.ops.physics import Physics
 from npa_envs.ops.species import perceive_by_species
 from npa_envs.ops.static import StaticRows, StaticWorlds, prepare_static, static_rows
@@ -146,9 +146,13 @@ class Step:
         """Return worlds as the steps need them, for example in sorted order."""
         return particles
 
+    def draw_step(self, like: Tensor, source: Randomness | None) -> Draws:
+        """Return the draws of the next step, for positions like these."""
+        return draw_step(like, self.physics, source)
+
     def draw(self, like: Tensor, steps: int, source: Randomness | None) -> Iterator[Draws]:
         """Yield each step's draws, for positions like these."""
-        return iterate_draws(lambda: draw_step(like, self.physics, source), like, steps)
+        return iterate_draws(lambda: self.draw_step(like, source), like, steps)
 
     def advance(self, particles: Particles, draws: Draws) -> Particles:
         """Return the worlds after one step with these draws."""
@@ -157,6 +161,16 @@ class Step:
     def leave(self, particles: Particles) -> Particles:
         """Undo `enter`: return worlds in the caller's order."""
         return particles
+
+
+def _updated(
+    particles: Particles, update: Tensor, active: Rows, draws: Draws, physics: Physics
+) -> Particles:
+    """Return particles after updates of the active ones and the position noise of all."""
+    if draws.noise is not None:
+        particles = particles._replace(x=particles.x + draws.noise)
+    fields = update_particles(update, *particles.per_particle(), rows=active, physics=physics)
+    return Particles(*fields, goal=particles.goal)
 
 
 @dataclasses.dataclass
@@ -173,12 +187,11 @@ class RuleStep(Step):
 
     def advance(self, particles: Particles, draws: Draws) -> Particles:
         """Return the worlds after one step with these draws."""
-        x, s, path_length, _ = particles
-        mask, noise, rows, _ = draws
-        assert path_length is not None, "rollouts measure paths"
+        x, s, *_ = particles
+        mask, rows = draws.mask, draws.rows
         rule, physics = self.rule, self.physics
-        network = rule if self.network is None else self.network
-        width = rule.perception_dim if self.network is None else self.network.row_width
+        network = self.network or rule
+        width = self.network.row_width if self.network else rule.perception_dim
         total = row_count(mask, x, physics.update_prob) if rows is None else len(rows.row_source)
         huge = total > ROWS_KEPT and not torch.is_grad_enabled() and self.static is None
         if huge and not torch.compiler.is_compiling():
@@ -195,8 +208,7 @@ class RuleStep(Step):
                 static_rows=rows,
             )
             update = network(perception)
-        moved = x if noise is None else x + noise
-        return Particles(*update_particles(update, moved, s, path_length, active, physics))
+        return _updated(particles, update, active, draws, physics)
 
 
 class StaticStep(RuleStep):
@@ -211,8 +223,7 @@ class StaticStep(RuleStep):
 
     def enter(self, particles: Particles) -> Particles:
         """Return the worlds in sorted order."""
-        _, s, path_length, goal = particles
-        return Particles(self.x, s, path_length, goal).gather(self.sorted.source)
+        return particles._replace(x=self.x).gather(self.sorted.source)
 
     def draw(self, like: Tensor, steps: int, source: Randomness | None) -> Iterator[Draws]:
         """Yield each step's rows, assigned for several steps at a time in few launches."""
@@ -226,7 +237,7 @@ class StaticStep(RuleStep):
             if masks:
                 capacity = row_capacity(total, physics.update_prob)
                 rows = static_rows(self.sorted, like.detach(), masks, capacity)
-                drawn = [Draws(None, None, own) for own in rows]
+                drawn = [Draws(None, None, of_step) for of_step in rows]
             yield from drawn
 
     def leave(self, particles: Particles) -> Particles:
@@ -240,24 +251,19 @@ class DivisionStep(RuleStep):
     def enter(self, particles: Particles) -> Particles:
         """Return the worlds with states of zero in dead slots."""
         # Dead slots must not enter gradients either: 0 times NaN is NaN.
-        x, s, path_length, goal = particles
-        return Particles(x, torch.where(living(s)[..., None], s, 0.0), path_length, goal)
+        s = particles.s
+        return particles._replace(s=torch.where(living(s)[..., None], s, 0.0))
 
-    def draw(self, like: Tensor, steps: int, source: Randomness | None) -> Iterator[Draws]:
-        """Yield each step's update mask, position noise and random numbers of divisions."""
-
-        def draw() -> Draws:
-            mask, noise, *_ = draw_step(like, self.physics, source)
-            chance = uniform_draws(source, like.shape[:2], like)
-            births = Births(chance, normal_draws(source, like.shape, like))
-            return Draws(mask, noise, None, births)
-
-        return iterate_draws(draw, like, steps)
+    def draw_step(self, like: Tensor, source: Randomness | None) -> Draws:
+        """Return update mask, position noise and random numbers of divisions."""
+        drawn = super().draw_step(like, source)
+        chance = uniform_draws(source, like.shape[:2], like)
+        return drawn._replace(births=Births(chance, normal_draws(source, like.shape, like)))
 
     def advance(self, particles: Particles, draws: Draws) -> Particles:
         """Return the worlds after one step with these draws."""
         assert draws.births is not None, "drawn above"
-        x, s, path_length, _ = particles
+        x, s, *_ = particles
         eps = self.physics.eps
         alive = living(s)
         updated = alive if draws.mask is None else alive & draws.mask.bool()
@@ -265,22 +271,17 @@ class DivisionStep(RuleStep):
         # Perception is not weighted by life, and so gives it no gradient.
         perceived = torch.cat((life.detach(), rest), dim=-1)
         after = super().advance(
-            Particles(parked(x, alive, eps), perceived, path_length),
-            Draws(updated.byte(), draws.noise, draws.rows, draws.births),
+            particles._replace(x=parked(x, alive, eps), s=perceived),
+            draws._replace(mask=updated.byte()),
         )
         # A rule does not update life.
         new_s = torch.cat((life, after.s[..., LIFE + 1 :]), dim=-1)
-        assert after.path_length is not None
-        return Particles(
-            *divided(
-                after.x,
-                new_s,
-                after.path_length,
-                division_probabilities=self.rule.division_probabilities(new_s),
-                updated=updated,
-                births=draws.births,
-                eps=eps,
-            )
+        return divided(
+            after._replace(s=new_s),
+            division_probabilities=self.rule.division_probabilities(new_s),
+            updated=updated,
+            births=draws.births,
+            eps=eps,
         )
 
 
@@ -307,7 +308,7 @@ class Species(NamedTuple):
     """One past its last particle."""
     update_prob: float
     """Probability of each of its particles' updates."""
-    displacement_share: float
+    displacement_fraction: float
     """Its largest displacement as a fraction of the largest of all species."""
     count_ratio: float
     """Number of particles of a world divided by this species' divisor of densities."""
@@ -317,36 +318,57 @@ class Species(NamedTuple):
         return row_capacity(world_count * (self.end - self.first), self.update_prob)
 
 
-@dataclasses.dataclass
 class SpeciesStep(Step):
-    """The step of several rules in one world: a common perception pass, then rule by rule."""
+    """The step of several rules in one world: a common perception pass, then rule by rule.
 
-    species: list[Species]
-    physics: Physics
-    detach_positions: bool
-    update_share: Tensor | None
-    """Fraction of its drawn updates that each particle keeps, shape [N]; None: all of them."""
-    by_species: bool
-    """Rules perceive each species' density and density gradient."""
+    `by_species`: rules perceive each species' density and density gradient.
+    """
 
-    def draw(self, like: Tensor, steps: int, source: Randomness | None) -> Iterator[Draws]:
-        """Yield each step's mask and noise as for one rule; masks are thinned out by species."""
-        for _ in range(steps):
-            drawn = draw_step(like, self.physics, source)
-            if self.update_share is not None:
-                if isinstance(source, WorldRandom):
-                    chance = source.uniform(like.shape[1])
-                else:
-                    chance = torch.rand(like.shape[:2], device=like.device, generator=source)
-                mask, kept = drawn.mask, (chance < self.update_share).to(torch.uint8)
-                drawn = Draws(kept if mask is None else mask * kept, drawn.noise)
-            yield drawn
+    def __init__(
+        self,
+        rules: Sequence[NPARule],
+        specs: Sequence[SpeciesSpec],
+        physics: Physics,
+        x: Tensor,
+        *,
+        by_species: bool,
+        detach_positions: bool,
+    ) -> None:
+        self.physics = physics
+        self.by_species = by_species
+        self.detach_positions = detach_positions
+        self.species: list[Species] = []
+        longest = max(rule.alpha for rule in rules)
+        first = 0
+        for rule, spec in zip(rules, specs, strict=True):
+            end, prob = first + spec.size, constant(spec.update_prob)
+            ratio = x.shape[1] / spec.density_count
+            fraction = rule.alpha / longest
+            self.species.append(Species(rule, rule.network(), first, end, prob, fraction, ratio))
+            first = end
+        self.update_fraction: Tensor | None = None
+        """Fraction of its drawn updates that each particle keeps, shape [N]; None: all of them."""
+        if min(own.update_prob for own in self.species) < physics.update_prob:
+            fractions = [
+                torch.full((spec.size,), own.update_prob / physics.update_prob, device=x.device)
+                for spec, own in zip(specs, self.species, strict=True)
+            ]
+            self.update_fraction = torch.cat(fractions)
+
+    def draw_step(self, like: Tensor, source: Randomness | None) -> Draws:
+        """Return mask and noise as for one rule; the mask is thinned out by species."""
+        drawn = super().draw_step(like, source)
+        if self.update_fraction is None:
+            return drawn
+        # Of the fractions' dtype.
+        chance = uniform_draws(source, like.shape[:2], self.update_fraction)
+        mask, kept = drawn.mask, (chance < self.update_fraction).to(torch.uint8)
+        return drawn._replace(mask=kept if mask is None else mask * kept)
 
     def advance(self, particles: Particles, draws: Draws) -> Particles:
         """Return the worlds after one step with these draws."""
-        x, s, path_length, _ = particles
-        mask, noise, *_ = draws
-        assert path_length is not None, "rollouts measure paths"
+        x, s, *_ = particles
+        mask = draws.mask
         species, physics = self.species, self.physics
         shared_width = shared_dim = physics.perception_dim
         if not self.by_species:
@@ -371,12 +393,10 @@ class SpeciesStep(Step):
             counts = tuple(own.end - own.first for own in species)
             appended = perceive_by_species(x, counts, physics)
         row_total = len(perception)
-        outputs, places = [], []
+        outputs, rows = [], []
         for own in species:
-            place, particle = _rows_of_species(
-                active.row_of.view(x.shape[:2]), own, row_total, mask
-            )
-            z = perception.index_select(0, place.clamp(max=row_total - 1))
+            row, particle = _rows_of_species(active.row_of.view(x.shape[:2]), own, row_total, mask)
+            z = perception.index_select(0, row.clamp(max=row_total - 1))
             if own.count_ratio != 1.0 and physics.terms.density_gradient:
                 begin, end = shared_dim - physics.space_dim, shared_dim
                 gradient = _recounted(z[:, begin:end], own.count_ratio)
@@ -387,40 +407,12 @@ class SpeciesStep(Step):
                     extra = _recounted_by_species(extra, len(species), own.count_ratio)
                 z = torch.cat((z, extra), dim=1)
             outputs.append(_update_of(own, z))
-            places.append(place)
+            rows.append(row)
         width = min(output.shape[1] for output in outputs)
         update = perception.new_zeros(row_total + 1, width).index_copy(
-            0, torch.cat(places), torch.cat([output[:, :width] for output in outputs])
+            0, torch.cat(rows), torch.cat([output[:, :width] for output in outputs])
         )
-        moved = x if noise is None else x + noise
-        return Particles(
-            *update_particles(update[:row_total], moved, s, path_length, active, physics)
-        )
-
-
-def make_species_step(
-    rules: Sequence[NPARule],
-    specs: Sequence[SpeciesSpec],
-    physics: Physics,
-    x: Tensor,
-    *,
-    by_species: bool,
-    detach_positions: bool,
-) -> SpeciesStep:
-    """Return the step of several species, with a rule each, in worlds at x."""
-    species = []
-    first = 0
-    longest = max(rule.alpha for rule in rules)
-    for rule, own in zip(rules, specs, strict=True):
-        end, prob = first + own.size, constant(own.update_prob)
-        ratio = x.shape[1] / own.density_count
-        species.append(Species(rule, rule.network(), first, end, prob, rule.alpha / longest, ratio))
-        first = end
-    update_share = None
-    if min(own.update_prob for own in species) < physics.update_prob:
-        shares = [(own.end - own.first, own.update_prob / physics.update_prob) for own in species]
-        update_share = torch.cat([torch.full((n,), q, device=x.device) for n, q in shares])
-    return SpeciesStep(species, physics, detach_positions, update_share, by_species)
+        return _updated(particles, update[:row_total], active, draws, physics)
 
 
 def _rows_of_species(
@@ -476,11 +468,12 @@ def _update_of(own: Species, z: Tensor) -> Tensor:
             rest = z.new_zeros(len(z), own.network.row_width - rule.perception_dim - 1)
             z = torch.cat((z[:, : rule.perception_dim], one, rest), dim=1)
         update = own.network(z)
-    if rule.static or own.displacement_share == 1.0:
+    fraction = own.displacement_fraction
+    if rule.static or fraction == 1.0:
         return update
-    # The displacement r q δ / (1 + |δ|), a share q of the common largest one r, is that of
+    # The displacement r q δ / (1 + |δ|), a fraction q of the common largest one r, is that of
     # δ' = q δ / (1 + (1 - q) |δ|), which is pulled back by the same operator.
     delta = update[:, : rule.space_dim]
     length = torch.linalg.vector_norm(delta, dim=1, keepdim=True)
-    delta = own.displacement_share * delta / (1.0 + (1.0 - own.displacement_share) * length)
+    delta = fraction * delta / (1.0 + (1.0 - fraction) * length)
     return torch.cat((delta, update[:, rule.space_dim :]), dim=1)

@@ -48,7 +48,6 @@ LAYERS = {
     "npa_envs.world.cuda_graph": layer(3, "torch numpy", never=ORACLES),
     "npa_envs.ops": layer(2, "warp torch", never=("npa_envs.reference",)),
     "npa_envs.world.randomness": layer(3, "torch numpy", never=ORACLES),
-    "npa_envs.world.divergence": layer(3, "torch", never=ORACLES),
     "npa_envs.rule.codes": layer(2, "torch"),
     "npa_envs.rule.network": layer(3, "torch"),
     "npa_envs.rule.rule": layer(4, "torch"),

@@ -8,6 +8,7 @@ import npa_envs
 from npa_envs.errors import NPAError
 from npa_envs.rule.rule import LIFE, dividing
 from npa_envs.world.division import Births, divided, living
+from npa_envs.world.particles import Particles
 
 EPS = 0.3
 
@@ -43,10 +44,9 @@ def divide(x, s, dividing=(), dying=(), updated=None):
     odds[0, :, list(dividing)] = 1.0
     odds[1, :, list(dying)] = 1.0
     updated = living(s) if updated is None else updated
-    return divided(
-        x, s, torch.ones_like(x[..., 0]), division_probabilities=tuple(odds), updated=updated,
-        births=births_of(x), eps=EPS,
-    )  # fmt: skip
+    fates = {"division_probabilities": tuple(odds), "updated": updated, "births": births_of(x)}
+    after = divided(Particles(x, s, torch.ones_like(x[..., 0])), eps=EPS, **fates)
+    return after.per_particle()
 
 
 @pytest.mark.parametrize("update_prob", [0.5, 1.0])
@@ -166,14 +166,14 @@ def test_life_has_the_gradient_of_the_expected_number(device):
     s[:, : count // 4, LIFE] = 1.0
     odds = torch.tensor([0.35, 0.25], dtype=torch.float64, device=device).requires_grad_()
     generator = torch.Generator().manual_seed(0)
-    after, path_length = s, x[..., 0]
+    after = s
     for _ in range(2):
         chance = torch.rand(1, count, generator=generator, dtype=x.dtype).to(device)
-        _, after, path_length = divided(
-            x, after, path_length,
+        after = divided(
+            Particles(x, after, x[..., 0]),
             division_probabilities=tuple(odds.expand(1, count, 2).unbind(-1)),
             updated=living(after), births=Births(chance, torch.zeros_like(x)), eps=EPS,
-        )  # fmt: skip
+        ).s  # fmt: skip
     expected = count // 4 * (1.0 + odds[0] - odds[1]) ** 2
     assert abs(living(after).sum().item() / expected.item() - 1.0) < 0.05
     found, wanted = (
@@ -188,8 +188,8 @@ def test_where_there_is_no_slot_nothing_is_learned_of_dividing(device):
     s[:, 4, LIFE] = 0.0
     odds = x.new_tensor([0.6, 0.1])[:, None, None].repeat(1, 2, 9).requires_grad_()
     fates = {"division_probabilities": tuple(odds), "updated": living(s), "births": births_of(x)}
-    after = divided(x, s, x[..., 0], eps=EPS, **fates)
-    (found,) = torch.autograd.grad(after[1][..., LIFE].sum(), odds)
+    after = divided(Particles(x, s, x[..., 0]), eps=EPS, **fates)
+    (found,) = torch.autograd.grad(after.s[..., LIFE].sum(), odds)
     # All would divide; the first does, and both particles that come of it stand for it.
     expected = torch.zeros_like(found[0])
     expected[:, 0] = 2.0 / 1.5
