@@ -101,7 +101,6 @@ class Morphogenesis3DConfig(GrowthConfig):
     """Weight of mean |x − clip(x, −1, 1)| (per length unit)."""
 
     def __post_init__(self) -> None:
-        """Check every field; raise NPAError where one has a wrong type or lies out of its range."""
         super().__post_init__()
         check_text(self, "target", "a built-in mesh, a mesh file or a folder of views")
         check_positive(self, int, "readout_hidden_dim", "training_views", "held_out_views")
@@ -131,7 +130,7 @@ class Morphogenesis3D(GrowthTask[Morphogenesis3DConfig]):
     space_dim = 3
     metric_name = "view loss"
     has_views = True
-    _kept = ("target",)
+    _resized_with = ("target",)
 
     def __init__(
         self,

@@ -175,7 +175,6 @@ class TrainConfig(Generic[TaskConfigT]):
     """Write TensorBoard events as well as the JSONL log."""
 
     def __post_init__(self) -> None:
-        """Check every field; raise NPAError where one has a wrong type or lies out of its range."""
         check_positive(self, int, "iterations", "repeats", "world_count", "pool_size")
         check_positive(self, int, "seed_interval", "log_interval", "checkpoint_interval")
         check_positive(self, int, "stillness_min_age")
@@ -319,7 +318,6 @@ class JointTrainConfig(TrainConfig[TaskConfigT]):
     """Indices of the species, from 0, whose initial rules do not learn."""
 
     def __post_init__(self) -> None:
-        """Check every field but the number of species."""
         super().__post_init__()
         if self.initial_rule:
             raise NPAError(

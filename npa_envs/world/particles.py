@@ -61,6 +61,11 @@ class Particles(NamedTuple):
         path_length = None if path_length is None else gathered(path_length)
         return Particles(gathered(x), gathered(s), path_length, goal)
 
+    def split(self, counts: Sequence[int]) -> list[Particles]:
+        """Return the particles of each species, which lie one species after the other."""
+        species = (value.split([*counts], dim=1) for value in self.tensors())
+        return [Particles(*fields) for fields in zip(*species, strict=True)]
+
     def copy_(self, other: Particles) -> None:
         """Overwrite these worlds with others, in one kernel."""
         torch._foreach_copy_(self.tensors(), other.tensors())

@@ -170,7 +170,7 @@ def _farthest_points(candidates: Tensor, counts: Tensor, particle_count: int) ->
 
 
 def varied(
-    x: Tensor, *, rotation: float, stretch: float, jitter: float, generator: Randomness
+    x: Tensor, rotation: float, stretch: float, jitter: float, generator: Randomness
 ) -> Tensor:
     """Return clouds with random rotation, stretch, shear (around (0.5, 0.5)) and noise."""
     world_count, particle_count = x.shape[:2]
