@@ -172,7 +172,7 @@ def _outside(x: Tensor, count: int, generator: Randomness) -> Tensor:
     ball = uniform_ball(
         len(x), count, x.shape[2], 1.0, generator=generator, device=x.device, dtype=x.dtype
     )
-    length = ball.norm(dim=-1, keepdim=True)
+    length: Tensor = ball.norm(dim=-1, keepdim=True)
     return ball * ((NEAREST + (FARTHEST - NEAREST) * length) / length.clamp_min(1e-12))
 
 

@@ -63,7 +63,7 @@ class Particles(NamedTuple):
 
     def split(self, counts: Sequence[int]) -> list[Particles]:
         """Return the particles of each species, which lie one species after the other."""
-        species = (value.split([*counts], dim=1) for value in self.tensors())
+        species = (torch.split(value, [*counts], dim=1) for value in self.tensors())
         return [Particles(*fields) for fields in zip(*species, strict=True)]
 
     def copy_(self, other: Particles) -> None:
