@@ -22,8 +22,8 @@ from drift import relative_error
 from torch import Tensor
 
 import npa_envs
-from npa_envs.ops import Cameras
-from npa_envs.tasks.appearance import Gaussians, draw_gaussians
+from npa_envs.ops import Cameras, render_gaussians
+from npa_envs.tasks.appearance import Gaussians
 from npa_envs.tasks.targets.views import some_views
 from npa_envs.training.task_of_rule import task_of_rule
 from npa_envs.world.cuda_graph import capture
@@ -62,7 +62,13 @@ def gsplat_renderer(x: Tensor, gaussians: Gaussians, cameras: Cameras) -> tuple[
     return torch.stack(images), torch.stack(alphas)
 
 
-RENDERERS = {"own": draw_gaussians, "gsplat": gsplat_renderer}
+def own_renderer(x: Tensor, gaussians: Gaussians, cameras: Cameras) -> tuple[Tensor, Tensor]:
+    """Draw with this package."""
+    pictures = render_gaussians(x, *gaussians[:4], cameras)
+    return pictures.image, pictures.alpha
+
+
+RENDERERS = {"own": own_renderer, "gsplat": gsplat_renderer}
 """By name."""
 
 

@@ -117,11 +117,9 @@ class PointClassificationTask(TargetEnvTask[PointClassificationEnvConfig]):
 
     def losses(self, x: Tensor, s: Tensor) -> Mapping[str, Tensor]:
         """Return each world's loss of its outputs, and its weighted overflow."""
-        score = self.config.score
-        overflow = self.config.overflow_weight * self.task.overflow(s)
-        if score == "error":
-            return {"error": self.task.metric(x, s), "overflow": overflow}
-        return {score: world_mean(self._scores(s)[..., None])[:, 0], "overflow": overflow}
+        overflow = self.config.overflow_weight * world_mean(self.task.overflows(s)[..., None])[:, 0]
+        score = world_mean(self._scores(s)[..., None])[:, 0]
+        return {self.config.score: score, "overflow": overflow}
 
     def particle_losses(self, x: Tensor, s: Tensor) -> Tensor:
         """Return each particle's own loss and overflow."""

@@ -210,7 +210,7 @@ def _emoji_font() -> list[DoctorLine]:
 
     fonts = find_emoji_fonts()
     fix = "for emoji as targets: apt install fonts-noto-color-emoji"
-    text = str(fonts[0]) if fonts else "none"
+    text = str(fonts[0].path) if fonts else "none"
     return [DoctorLine("emoji font", text, None if fonts else fix, optional=True)]
 
 

@@ -21,7 +21,7 @@ from npa_envs.rule.rule import NPARule
 from npa_envs.tasks.base import Task
 from npa_envs.tasks.damage import random_particle
 from npa_envs.tasks.morphogenesis2d import Morphogenesis2D
-from npa_envs.tasks.point_classification import PointClassification, majority, particle_classes
+from npa_envs.tasks.point_classification import PointClassification, majority
 from npa_envs.world.brushes import cut, wipe_state
 from npa_envs.world.randomness import Randomness, WorldRandom
 from npa_envs.world.rollout import rollout
@@ -259,7 +259,7 @@ def accuracies(
         worlds = runner.at(checkpoints, positions[index], blank.to(runner.dtype), still=True)
         for row, (_, x, s) in enumerate(worlds):
             outputs = runner.task.outputs(s)
-            votes, most = particle_classes(outputs), majority(outputs)
+            votes, most = outputs.argmax(-1), majority(outputs)
             sums[row] += _sums(
                 most == label,
                 (votes == label[:, None]).double().mean(1),
@@ -306,7 +306,7 @@ def changes_of_mind(
             for row, (_, _, then) in enumerate(runner.at(steps, new_x, new_s, still=True)):
                 outputs = runner.task.outputs(then)
                 most = majority(outputs)
-                right = (particle_classes(outputs) == goal[:, None]).double().mean(1)
+                right = (outputs.argmax(-1) == goal[:, None]).double().mean(1)
                 sums[number, row] += _sums(most == goal, right, most == label)
     means = (sums / len(positions)).tolist()
     return [

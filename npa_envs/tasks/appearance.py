@@ -1,15 +1,12 @@
-"""Appearance of particles in 3D: Gaussians from a rule's outputs, and pictures of them."""
+"""Appearance of particles in 3D: Gaussians from a rule's outputs."""
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
-
-from npa_envs.ops import Cameras, render_gaussians
 
 OUTPUTS = 20
 """Read-out channels: 4 rotation, 3 log-anisotropy, 1 opacity, 9 and 3 colours of degree 1 and 0."""
@@ -37,57 +34,34 @@ class Gaussians(NamedTuple):
     """log(scales / sigma), dimensionless, shape [B, N, 3]."""
 
 
-@dataclass(frozen=True)
-class Appearance:
-    """Maps outputs of particles to Gaussians.
+def appearance(outputs: Tensor, sigma: float, anisotropy: float, opacity: float) -> Gaussians:
+    """Return the Gaussians of particles with outputs [B, N, K].
 
     20 outputs are those of a read-out: four are added to the quaternion (1, 0, 0, 0), three stretch
     the axes, one changes the opacity, nine are coefficients of view-dependent colour, and the last
     three, plus 0.5, are the colour. With any other number of outputs particles are round, and the
     last three outputs, plus 0.5, are the colour.
+
+    Args:
+        outputs: Outputs of the rule's read-out, or states (dimensionless).
+        sigma: Standard deviation of a round particle [length units].
+        anisotropy: Largest |log(scale / sigma)| (dimensionless).
+        opacity: Opacity of a particle whose output is 0, in (0, 1).
     """
-
-    sigma: float
-    """Standard deviation of a round particle [length units]."""
-
-    anisotropy: float
-    """Largest |log(scale / sigma)| (dimensionless)."""
-
-    opacity: float
-    """Opacity of a particle whose output is 0, in (0, 1)."""
-
-    def gaussians(self, outputs: Tensor) -> Gaussians:
-        """Return the Gaussians of particles with outputs [B, N, K]."""
-        lead = outputs.shape[:-1]
-        # The renderer adds one half, as `NPARule.colour` does.
-        flat = outputs[..., None, -3:]
-        if outputs.shape[-1] == OUTPUTS:
-            rotation, stretch, opacity, turning = torch.split(
-                outputs[..., :17], [4, 3, 1, 9], dim=-1
-            )
-            upright = torch.ones_like(rotation[..., :1])
-            quaternions = torch.cat((rotation[..., :1] + upright, rotation[..., 1:]), dim=-1)
-            stretch = self.anisotropy * torch.tanh(stretch)
-            rest = math.log(self.opacity / (1.0 - self.opacity))
-            opacities = torch.sigmoid(opacity[..., 0] + rest)
-            degree_one = turning.reshape(*lead, 3, 3)
-        else:
-            quaternions = outputs.new_zeros(*lead, 4)
-            stretch = outputs.new_zeros(*lead, 3)
-            opacities = outputs.new_full(lead, self.opacity)
-            degree_one = outputs.new_zeros(*lead, 3, 3)
-        colours = torch.cat((flat / FLAT, degree_one), dim=-2)
-        return Gaussians(self.sigma * torch.exp(stretch), quaternions, opacities, colours, stretch)
-
-
-def draw_gaussians(x: Tensor, gaussians: Gaussians, cameras: Cameras) -> tuple[Tensor, Tensor]:
-    """Return pictures over black [B, V, H, W, 3], and their alpha [B, V, H, W]."""
-    pictures = render_gaussians(
-        x,
-        gaussians.scales,
-        gaussians.quaternions,
-        gaussians.opacities,
-        gaussians.colours,
-        cameras,
-    )
-    return pictures.image, pictures.alpha
+    lead = outputs.shape[:-1]
+    # The renderer adds one half, as `NPARule.colour` does.
+    flat = outputs[..., None, -3:]
+    if outputs.shape[-1] == OUTPUTS:
+        rotation, stretch, log_odds, turning = torch.split(outputs[..., :17], [4, 3, 1, 9], dim=-1)
+        upright = torch.ones_like(rotation[..., :1])
+        quaternions = torch.cat((rotation[..., :1] + upright, rotation[..., 1:]), dim=-1)
+        stretch = anisotropy * torch.tanh(stretch)
+        opacities = torch.sigmoid(log_odds[..., 0] + math.log(opacity / (1.0 - opacity)))
+        degree_one = turning.reshape(*lead, 3, 3)
+    else:
+        quaternions = outputs.new_zeros(*lead, 4)
+        stretch = outputs.new_zeros(*lead, 3)
+        opacities = outputs.new_full(lead, opacity)
+        degree_one = outputs.new_zeros(*lead, 3, 3)
+    colours = torch.cat((flat / FLAT, degree_one), dim=-2)
+    return Gaussians(sigma * torch.exp(stretch), quaternions, opacities, colours, stretch)

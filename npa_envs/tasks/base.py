@@ -6,7 +6,6 @@ adds those of tasks in which a ball of particles with zero states grows into a t
 
 from __future__ import annotations
 
-import copy
 from dataclasses import dataclass, replace
 from typing import Any, Generic, NamedTuple, Self, TypeVar
 
@@ -60,7 +59,6 @@ class TaskConfig:
     """Weight of mean |s − clip(s, −1, 1)| (dimensionless)."""
 
     def __post_init__(self) -> None:
-        """Check every field; raise NPAError where one has a wrong type or lies out of its range."""
         check_positive(self, int, "particle_count", "state_dim", "hidden_dim")
         check_positive(self, int, "resolution", at_least=2)
         check_positive(self, float, "eps")
@@ -85,13 +83,12 @@ class ParticleTask(Generic[ConfigT]):
 
     A subclass defines where particles start (`places`), the loss (`compare`), a metric and a
     picture; all else has defaults. In all methods x are positions [length units], shape [B, N, D],
-    s states (dimensionless), shape [B, N, C], and path_length the length of each particle's path
-    in the rollout [length units], shape [B, N].
+    and s states (dimensionless), shape [B, N, C].
 
-    No method may wait for the device (no `.item()`, no branch on a tensor's value): the trainer
-    captures `seed`, `damage` and `loss` in CUDA graphs and never reads a number back between two
-    log lines. So these must launch the same work in every iteration, and draw from their generator
-    alone.
+    No method may synchronise with the device (no `.item()`, no branch on a tensor's value): the
+    trainer captures `seed`, `damage` and `loss` in CUDA graphs and never reads a number back
+    between two log lines. So these must launch the same work in every iteration, and draw from
+    their generator alone.
     """
 
     config: ConfigT
@@ -115,7 +112,7 @@ class ParticleTask(Generic[ConfigT]):
     goal_count: int = 0
     """Number of different goals of worlds; 0: worlds have no goals."""
 
-    _kept: tuple[str, ...] = ()
+    _resized_with: tuple[str, ...] = ()
     """Attributes that `resized` passes to the constructor."""
 
     _goal: Tensor | None = None
@@ -187,10 +184,10 @@ class ParticleTask(Generic[ConfigT]):
         return worlds
 
     def begin(self, iteration: int) -> None:
-        """Prepare the loss of an iteration, without waiting for the device.
+        """Prepare the loss of an iteration, without synchronising with the device.
 
-        Write into the same tensors each time, as CUDA graphs read them, and let values depend on
-        the iteration alone, so that a resumed run goes on as it would have.
+        Values depend on the iteration alone, so that a resumed run equals an uninterrupted one.
+        They are written to the same tensors in each iteration, because CUDA graphs read these.
         """
 
     def for_rule(self, rule: NPARule) -> Self:
@@ -204,11 +201,24 @@ class ParticleTask(Generic[ConfigT]):
     def toward(self, goal: Tensor | None) -> Self:
         """Return the task with loss and metric for worlds with these goals, int64, shape [B].
 
-        By default worlds have none. The tensor is read at each call. The task is not changed.
+        By default worlds have none. The tensor is read at each call. The task is not changed. On
+        CUDA the goals' range is not checked, which would synchronise.
         """
-        if goal is None or self.goal_count == 0:
+        count = self.goal_count
+        if goal is None or count == 0:
             return self
-        check_goal(goal, self.goal_count)
+        if not isinstance(goal, Tensor) or goal.dtype != torch.int64 or goal.ndim != 1:
+            is_tensor = isinstance(goal, Tensor)
+            got = f"{goal.dtype} {tuple(goal.shape)}" if is_tensor else shown(goal)
+            raise NPAError(
+                f"goal must be an int64 tensor of shape [B], got {got}: for example "
+                "torch.tensor([0])"
+            )
+        if goal.device.type == "cpu" and not bool(((goal >= 0) & (goal < count)).all()):
+            raise NPAError(
+                f"goal must have entries of at least 0 and below {count}, got "
+                f"{shown(goal.tolist())}: for example torch.tensor([0])"
+            )
         return self._with(_goal=goal)
 
     @property
@@ -232,24 +242,27 @@ class ParticleTask(Generic[ConfigT]):
     def resized(self, particle_count: int) -> Self:
         """Return the task with another number of particles; for a rule call `for_rule` again."""
         make: Any = type(self)
-        kept = {name: getattr(self, name) for name in self._kept}
+        options = {name: getattr(self, name) for name in self._resized_with}
         config = self.config.with_particle_count(particle_count)
-        found: Self = make(config, device=self.target_picture.device, **kept)
-        return found
+        task: Self = make(config, device=self.target_picture.device, **options)
+        return task
 
     def compare(self, x: Tensor, s: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
         """Return the weighted distance from the target, and its named parts, unweighted."""
         raise NotImplementedError
 
-    def penalties(
-        self, x: Tensor, s: Tensor, path_length: Tensor
-    ) -> dict[str, tuple[float, Tensor]]:
+    def penalties(self, worlds: Particles) -> dict[str, tuple[float, Tensor]]:
         """Return the terms that the loss adds to `compare`: name -> (weight, term)."""
-        overflow = (s - s.clamp(-1.0, 1.0)).abs().mean()
+        overflow = (worlds.s - worlds.s.clamp(-1.0, 1.0)).abs().mean()
         return {"overflow": (self.config.overflow_weight, overflow)}
 
     def loss(self, x: Tensor, s: Tensor, path_length: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
         """Return the training loss and its named parts, unweighted.
+
+        Args:
+            x: Positions [length units], shape [B, N, D].
+            s: States (dimensionless), shape [B, N, C].
+            path_length: Length of each particle's path in the rollout [length units], shape [B, N].
 
         Raises:
             NPAError: The shapes do not fit each other.
@@ -258,8 +271,12 @@ class ParticleTask(Generic[ConfigT]):
             raise NPAError(
                 f"path_length must have shape {tuple(x.shape[:2])}, got {tuple(path_length.shape)}"
             )
-        total, parts = self.compare(x, s)
-        for name, (weight, term) in self.penalties(x, s, path_length).items():
+        return self.loss_of(Particles(x, s, path_length))
+
+    def loss_of(self, worlds: Particles) -> tuple[Tensor, dict[str, Tensor]]:
+        """Return `loss` of worlds at the end of a rollout."""
+        total, parts = self.compare(worlds.x, worlds.s)
+        for name, (weight, term) in self.penalties(worlds).items():
             parts[name] = term
             total = total + weight * term
         return total, parts
@@ -299,8 +316,9 @@ class ParticleTask(Generic[ConfigT]):
 
     def _with(self, **fields: object) -> Self:
         """Return a shallow copy with some attributes replaced."""
-        bound = copy.copy(self)
-        vars(bound).update(fields)
+        # Not by copy.copy, which would leave out what `__getstate__` keeps from pickles.
+        bound = object.__new__(type(self))
+        vars(bound).update(vars(self) | fields)
         return bound
 
 
@@ -334,7 +352,6 @@ class GrowthConfig(PoolDamage, TaskConfig):
     """Weight of the mean path length of particles outside of [−1, 1] (per length unit)."""
 
     def __post_init__(self) -> None:
-        """Check every field; raise NPAError where one has a wrong type or lies out of its range."""
         TaskConfig.__post_init__(self)
         PoolDamage.__post_init__(self)
         check_positive(self, int, "state_dim", at_least=3)
@@ -367,17 +384,14 @@ class GrowthTask(ParticleTask[GrowthConfigT]):
         """Return the worlds, damaged as the configuration says, each at its own random position."""
         return damage_pool(worlds, self.config, generator=generator)
 
-    def penalties(
-        self, x: Tensor, s: Tensor, path_length: Tensor
-    ) -> dict[str, tuple[float, Tensor]]:
+    def penalties(self, worlds: Particles) -> dict[str, tuple[float, Tensor]]:
         """Return terms for motion, overflow, positions outside of [-1, 1]^D, and motion there."""
-        config = self.config
-        terms = {"motion": (config.motion_weight, path_length.mean())}
-        terms |= super().penalties(x, s, path_length)
-        inside = self.bounded(x)
-        terms["bound"] = config.bound_weight, (inside - inside.clamp(-1.0, 1.0)).abs().mean()
+        config, bounded = self.config, self.bounded(worlds.x)
+        terms = {"motion": (config.motion_weight, path_lengths(worlds).mean())}
+        terms |= super().penalties(worlds)
+        terms["bound"] = config.bound_weight, (bounded - bounded.clamp(-1.0, 1.0)).abs().mean()
         if config.escape_weight > 0.0:
-            terms["stray"] = config.escape_weight, escape_motion(inside, path_length)
+            terms["stray"] = config.escape_weight, escape_motion(bounded, path_lengths(worlds))
         return terms
 
     def bounded(self, x: Tensor) -> Tensor:
@@ -385,18 +399,10 @@ class GrowthTask(ParticleTask[GrowthConfigT]):
         return x
 
 
-def check_goal(goal: Tensor, count: int) -> None:
-    """Check int64 goals [B] in [0, count); their range only on a CPU, as no task waits for CUDA."""
-    if not isinstance(goal, Tensor) or goal.dtype != torch.int64 or goal.ndim != 1:
-        came = f"{goal.dtype} {tuple(goal.shape)}" if isinstance(goal, Tensor) else shown(goal)
-        raise NPAError(
-            f"goal must be an int64 tensor of shape [B], got {came}: for example torch.tensor([0])"
-        )
-    if goal.device.type == "cpu" and not bool(((goal >= 0) & (goal < count)).all()):
-        raise NPAError(
-            f"goal must have entries of at least 0 and below {count}, got {shown(goal.tolist())}: "
-            "for example torch.tensor([0])"
-        )
+def path_lengths(worlds: Particles) -> Tensor:
+    """Return the path lengths of worlds that a loss compares [length units], shape [B, N]."""
+    assert worlds.path_length is not None, "worlds are the end of a rollout"
+    return worlds.path_length
 
 
 def shares_of_loss(loss: Tensor, amounts: Tensor) -> Tensor:
@@ -406,8 +412,8 @@ def shares_of_loss(loss: Tensor, amounts: Tensor) -> Tensor:
     mean amount, so that the mean contribution is the loss, up to rounding. `amounts` [B, N] are the
     first-order changes of the loss by what each particle adds to the world.
     """
-    worse = amounts - world_mean(amounts[..., None])
-    return loss[:, None] + amounts.shape[1] * worse
+    excess = amounts - world_mean(amounts[..., None])
+    return loss[:, None] + amounts.shape[1] * excess
 
 
 def untrained_rule(generator: torch.Generator, **hyper_parameters: Any) -> NPARule:
@@ -417,7 +423,7 @@ def untrained_rule(generator: torch.Generator, **hyper_parameters: Any) -> NPARu
         return NPARule(**hyper_parameters)
 
 
-def differing_fields(given: NPARule, wanted: NPARule) -> list[str]:
+def differing_fields(rule: NPARule, wanted: NPARule) -> list[str]:
     """Return the names of the hyper-parameters in which a rule differs from one of a task."""
-    own, other = wanted.hyper_parameters(), given.hyper_parameters()
-    return [name for name in own | other if own.get(name) != other.get(name)]
+    own, expected = rule.hyper_parameters(), wanted.hyper_parameters()
+    return [name for name in expected if own[name] != expected[name]]

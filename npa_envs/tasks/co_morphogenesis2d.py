@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +19,6 @@ from npa_envs.tasks.morphogenesis2d import (
     MORPHOGENESIS2D_PRESETS,
     Morphogenesis2D,
     Morphogenesis2DConfig,
-    Morphogenesis2DTrainConfig,
 )
 from npa_envs.tasks.train_config import JointTrainConfig
 from npa_envs.world.particles import Particles, combined
@@ -41,12 +39,11 @@ class CoMorphogenesis2DConfig:
     """Distance between the centres of neighbouring seeds, on the x axis [length units]."""
 
     def __post_init__(self) -> None:
-        """Check every field."""
         species = self.species if isinstance(self.species, tuple | list) else ()
         if len(species) < 2 or not all(isinstance(s, Morphogenesis2DConfig) for s in species):
-            came = ", ".join(type(config).__name__ for config in species) or "nothing"
+            types = ", ".join(type(config).__name__ for config in species) or "nothing"
             raise NPAError(
-                f"species must hold two Morphogenesis2DConfig or more, got {came}: one for each "
+                f"species must hold two Morphogenesis2DConfig or more, got {types}: one for each "
                 "species"
             )
         for name in ("eps", "update_prob", "state_dim"):
@@ -80,7 +77,7 @@ class CoMorphogenesis2D(ParticleTask[Any]):
         device: str | torch.device = "cpu",
     ) -> None:
         self.config = config or CoMorphogenesis2DConfig()
-        self.tasks = [Morphogenesis2D(own, device=device) for own in self.config.species]
+        self.tasks = [Morphogenesis2D(species, device=device) for species in self.config.species]
         """The task of each species."""
 
     @property
@@ -108,32 +105,27 @@ class CoMorphogenesis2D(ParticleTask[Any]):
         self, world_count: int, *, generator: Randomness, device: str | torch.device = "cpu"
     ) -> Particles:
         """Return fresh worlds: each species uniform in its own disk, all states zero."""
-        seeds = [task.seed(world_count, generator=generator, device=device) for task in self.tasks]
-        positions = [
-            torch.stack((x[..., 0] + centre, x[..., 1]), dim=-1)
-            for (x, *_), centre in zip(seeds, self.config.centres, strict=True)
-        ]
-        return Particles(torch.cat(positions, 1), torch.cat([one.s for one in seeds], 1))
+        return _together(
+            [
+                _shifted(task.seed(world_count, generator=generator, device=device), centre)
+                for task, centre in zip(self.tasks, self.config.centres, strict=True)
+            ]
+        )
 
     def damage(self, worlds: Particles, generator: Randomness) -> Particles:
         """Return the worlds with each species damaged independently."""
-        damaged = [
-            task.damage(Particles(x, s), generator)
-            for task, x, s in zip(self.tasks, *self._split(worlds.x, worlds.s), strict=True)
-        ]
-        return combined(lambda parts: torch.cat(parts, 1), damaged)
+        species = zip(self.tasks, worlds.split(self.config.counts), strict=True)
+        return _together([task.damage(own, generator) for task, own in species])
 
-    def loss(self, x: Tensor, s: Tensor, path_length: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
+    def loss_of(self, worlds: Particles) -> tuple[Tensor, dict[str, Tensor]]:
         """Return the sum of the species' training losses and its parts, named "k.part"."""
-        total = x.new_zeros(())
+        total = worlds.x.new_zeros(())
         parts: dict[str, Tensor] = {}
-        split = zip(self.tasks, self.config.centres, *self._split(x, s, path_length), strict=True)
-        for number, (task, centre, own_x, own_s, own_path) in enumerate(split):
+        for k, species in enumerate(worlds.split(self.config.counts)):
             # Positions relative to the seed: the loss bounds each species around its own.
-            relative = torch.stack((own_x[..., 0] - centre, own_x[..., 1]), dim=-1)
-            loss, own_parts = task.loss(relative, own_s, own_path)
+            loss, terms = self.tasks[k].loss_of(_shifted(species, -self.config.centres[k]))
             total = total + loss
-            parts |= {f"{number}.{name}": value for name, value in own_parts.items()}
+            parts |= {f"{k}.{name}": term for name, term in terms.items()}
         return total, parts
 
     def picture(self, x: Tensor, s: Tensor) -> Tensor:
@@ -146,33 +138,40 @@ class CoMorphogenesis2D(ParticleTask[Any]):
     @property
     def target_picture(self) -> Tensor:
         """The picture of all targets, each around its species' seed; shape [R, R, 4]."""
-        positions, states = [], []
+        targets = []
         for task, centre in zip(self.tasks, self.config.centres, strict=True):
-            points, colours = task.target.points, task.target.colours
-            positions.append(points + points.new_tensor((centre, 0.0)))
-            states.append(colours.new_zeros(len(colours), task.config.state_dim))
-            states[-1][:, -3:] = colours - COLOUR_OFFSET
-        return self.picture(torch.cat(positions)[None], torch.cat(states)[None])[0]
+            # States of pictures are colours alone.
+            target = Particles(task.target.points[None], task.target.colours[None] - COLOUR_OFFSET)
+            targets.append(_shifted(target, centre))
+        together = _together(targets)
+        return self.picture(together.x, together.s)[0]
 
     def metrics(self, x: Tensor, s: Tensor) -> Tensor:
         """Return each species' splat loss in each world, shape [B, K]."""
-        split = zip(self.tasks, *self._split(x, s), strict=True)
-        return torch.stack([task.metric(own_x, own_s) for task, own_x, own_s in split], dim=1)
+        species = zip(self.tasks, Particles(x, s).split(self.config.counts), strict=True)
+        return torch.stack([task.metric(own.x, own.s) for task, own in species], dim=1)
 
     def metric(self, x: Tensor, s: Tensor) -> Tensor:
         """Return each world's mean splat loss of its species, shape [B]."""
         return self.metrics(x, s).mean(dim=1)
 
-    def _split(self, *tensors: Tensor) -> list[tuple[Tensor, ...]]:
-        """Return each tensor's parts, species by species."""
-        return [torch.split(tensor, list(self.config.counts), dim=1) for tensor in tensors]
+
+def _shifted(worlds: Particles, distance: float) -> Particles:
+    """Return worlds moved along the x axis."""
+    x, y = worlds.x.unbind(dim=-1)
+    return worlds._replace(x=torch.stack((x + distance, y), dim=-1))
+
+
+def _together(species: list[Particles]) -> Particles:
+    """Return worlds of several species, one species after the other."""
+    return combined(lambda fields: torch.cat(fields, 1), species)
 
 
 DISTANCE = 0.8
 """Distance between the seeds' centres in every preset [length units]: the pictures overlap."""
 
 
-_MEASURED: Mapping[str, Mapping[str, Any]] = {
+_RUNS: Mapping[str, Mapping[str, Any]] = {
     "best": {
         "optimiser": "adamw",
         "learning_rate": 2e-3,
@@ -186,26 +185,25 @@ _MEASURED: Mapping[str, Mapping[str, Any]] = {
     },
     "fast": {**HALF_SEEDS, "learning_rate": 4e-3},
 }
-"""Settings of each preset that docs/species.md measured, by AdamW."""
+"""Settings of the runs that docs/species.md measured, by AdamW."""
 
-_OWN: Mapping[str, Mapping[str, Any]] = {"best": {"cut_share": 0.25}, "fast": {"hidden_dim": 64}}
+_SPECIES: Mapping[str, Mapping[str, Any]] = {
+    "best": {"cut_share": 0.25},
+    "fast": {"hidden_dim": 64},
+}
 """Settings of each species in those measurements."""
 
 
-def _with_neighbour(
-    name: str, alone: Morphogenesis2DTrainConfig, neighbour: str
-) -> JointTrainConfig[CoMorphogenesis2DConfig]:
-    """Return the run of a species together with a second one that grows `neighbour`."""
-    own = dataclasses.replace(alone.task, **_OWN.get(name, {}))
-    species = (own, dataclasses.replace(own, target=neighbour))
-    run = {field.name: getattr(alone, field.name) for field in dataclasses.fields(alone)}
-    run["task"] = CoMorphogenesis2DConfig(species=species, distance=DISTANCE)
+def _joint_preset(name: str) -> JointTrainConfig[CoMorphogenesis2DConfig]:
+    """Return a preset of 2D morphogenesis, with a heart next to its target."""
+    alone = MORPHOGENESIS2D_PRESETS[name]
+    first = replace(alone.task, **_SPECIES.get(name, {}))
+    species = (first, replace(first, target="heart"))
+    task = CoMorphogenesis2DConfig(species=species, distance=DISTANCE)
     # A preset names no initial rules of species.
-    run |= {"initial_rule": "", "out": Path("runs/co_morphogenesis2d")}
-    return JointTrainConfig(**{**run, **_MEASURED.get(name, {})})
+    run = {**vars(alone), "task": task, "initial_rule": "", **_RUNS.get(name, {})}
+    return JointTrainConfig(**{**run, "out": Path("runs/co_morphogenesis2d")})
 
 
-CO_MORPHOGENESIS2D_PRESETS: Mapping[str, JointTrainConfig[CoMorphogenesis2DConfig]] = {
-    name: _with_neighbour(name, alone, "heart") for name, alone in MORPHOGENESIS2D_PRESETS.items()
-}
+CO_MORPHOGENESIS2D_PRESETS = {name: _joint_preset(name) for name in MORPHOGENESIS2D_PRESETS}
 """Each preset of 2D morphogenesis, with as many particles of a second species, by AdamW."""

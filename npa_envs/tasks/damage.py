@@ -16,10 +16,9 @@ from torch import Tensor
 from npa_envs.checks import (
     check_fraction,
     check_non_negative,
+    check_positive,
     check_world,
     checked_number,
-    is_real,
-    is_whole,
 )
 from npa_envs.errors import NPAError, shown, suggest
 from npa_envs.ops import world_mean
@@ -35,10 +34,10 @@ CLUMP_FACTOR = 0.9
 """Fraction of its distance from the centre by which clumping moves a particle inwards."""
 
 
-def check_damage(kind: object) -> None:
-    """Check that there is such a kind of damage."""
+def check_damage(kind: object, where: str = "") -> None:
+    """Check that there is such a kind of damage; `where` adds to the error message."""
     if not isinstance(kind, str) or kind not in DAMAGE_SIZES:
-        raise NPAError(f"unknown damage {shown(kind)}: {suggest(kind, DAMAGE_SIZES)}")
+        raise NPAError(f"unknown damage {shown(kind)}{where}: {suggest(kind, DAMAGE_SIZES)}")
 
 
 @dataclass(frozen=True)
@@ -55,12 +54,10 @@ class DamageEvent:
     """Radius, gap or standard deviation [length units]; None is the usual one."""
 
     def __post_init__(self) -> None:
-        """Check every field."""
         check_damage(self.kind)
-        if not is_whole(self.step) or self.step < 0:
-            raise NPAError(f"step must be a whole number of at least 0, got {shown(self.step)}")
-        if not is_real(self.extent) or self.extent <= 0:
-            raise NPAError(f"size must be positive and finite, got {self.size}: try 0.1")
+        check_positive(self, int, "step", at_least=0)
+        if self.size is not None:
+            check_positive(self, float, "size")
 
     @property
     def extent(self) -> float:
@@ -81,16 +78,13 @@ def parse_damage(text: str) -> DamageEvent:
     """Read "STEP:KIND" or "STEP:KIND:SIZE", for example "300:cut" or "500:wipe:0.3"."""
     if not isinstance(text, str):
         raise NPAError(f"damage must be text, got {shown(text)}: for example '300:cut'")
-    parts = text.split(":")
-    kind = parts[1] if len(parts) > 1 else ""
-    if kind and kind not in DAMAGE_SIZES:
-        raise NPAError(
-            f"unknown damage {shown(kind)} in {shown(text)}: {suggest(kind, DAMAGE_SIZES)}"
-        )
-    if len(parts) in (2, 3):
+    step, _, damage = text.partition(":")
+    kind, *sizes = damage.split(":")
+    if kind:
+        check_damage(kind, f" in {shown(text)}")
+    if kind and len(sizes) < 2:
         with suppress(ValueError):
-            size = float(parts[2]) if len(parts) == 3 else None
-            return DamageEvent(int(parts[0]), kind, size)
+            return DamageEvent(int(step), kind, *map(float, sizes))
     raise NPAError(
         f"damage must be STEP:KIND or STEP:KIND:SIZE with a positive size, got {shown(text)}: "
         "for example 300:cut or 500:wipe:0.3"
@@ -146,47 +140,38 @@ def random_particle(x: Tensor, generator: Randomness | None = None) -> Tensor:
 
 
 # A particle that escapes has no neighbours: a rule that was trained without such particles may let
-# it drift for ever, too slowly to notice in a picture. Training throws some particles out of their
-# worlds and penalises their paths, so that the rule learns to let them rest.
+# it drift for ever, too slowly to notice in a picture. Training displaces some particles far out of
+# their worlds and penalises their paths, so that the rule learns to let them rest.
 
 NEAREST, FARTHEST = 2.0, 4.0
-"""Range of distances from the origin to which particles are thrown [length units]."""
+"""Range of distances from the origin to which particles are displaced [length units]."""
 
 
-def displace(x: Tensor, *, share: float, generator: Randomness | None = None) -> Tensor:
-    """Return positions with some particles, each with probability `share`, thrown far out."""
-    world_count, particle_count, space_dim = x.shape
-    check_generator(generator, x.device, world_count)
-    chance = uniform_draws(generator, (world_count, particle_count, 1), x)
-    ball = uniform_ball(
-        world_count, particle_count, space_dim, 1.0,
-        generator=generator, device=x.device, dtype=x.dtype,
-    )  # fmt: skip
-    return torch.where(chance < share, _outside(ball), x)
+def displace(x: Tensor, *, probability: float, generator: Randomness) -> Tensor:
+    """Return positions with some particles, each with a probability, displaced far out."""
+    drawn = uniform_draws(generator, (*x.shape[:2], 1), x)
+    return torch.where(drawn < probability, _outside(x, x.shape[1], generator), x)
 
 
-def tear_off(
-    x: Tensor, *, radius: float, chance: float, generator: Randomness | None = None
-) -> Tensor:
-    """Return positions where some worlds lose a flake, which is thrown far out in one piece.
+def tear_off(x: Tensor, *, radius: float, probability: float, generator: Randomness) -> Tensor:
+    """Return positions where some worlds lose a flake, which is displaced far out in one piece.
 
     Its particles perceive each other, and may drift on where a lone particle has learned to rest.
     A flake is a ball around a random particle, of a random radius up to `radius` [length units]; a
-    world loses one with probability `chance`.
+    world loses one with a probability.
     """
-    world_count, _, space_dim = x.shape
     centre = random_particle(x, generator)
-    draws = uniform_draws(generator, (world_count, 2), x)
-    flake_radius = torch.where(draws[:, :1] < chance, radius * draws[:, 1:], -1.0)
-    target = uniform_ball(
-        world_count, 1, space_dim, 1.0, generator=generator, device=x.device, dtype=x.dtype
-    )[:, 0]
+    draws = uniform_draws(generator, (len(x), 2), x)
+    flake_radius = torch.where(draws[:, :1] < probability, radius * draws[:, 1:], -1.0)
     torn = (x - centre[:, None]).norm(dim=-1) <= flake_radius
-    return torch.where(torn[..., None], x + (_outside(target) - centre)[:, None], x)
+    return torch.where(torn[..., None], x + (_outside(x, 1, generator) - centre[:, None]), x)
 
 
-def _outside(ball: Tensor) -> Tensor:
-    """Map points of the unit ball [..., D] to distances from `NEAREST` to `FARTHEST`."""
+def _outside(x: Tensor, count: int, generator: Randomness) -> Tensor:
+    """Return random points for each world, from `NEAREST` to `FARTHEST`, [B, count, D]."""
+    ball = uniform_ball(
+        len(x), count, x.shape[2], 1.0, generator=generator, device=x.device, dtype=x.dtype
+    )
     length: Tensor = ball.norm(dim=-1, keepdim=True)
     return ball * ((NEAREST + (FARTHEST - NEAREST) * length) / length.clamp_min(1e-12))
 
@@ -205,19 +190,17 @@ def counted_together(mean: Callable[[Tensor], Tensor]) -> Iterator[None]:
         _counting.reset(before)
 
 
-def escape_motion(x: Tensor, path_length: Tensor) -> Tensor:
-    """Return the mean path length of the particles outside of [-1, 1]^D [length units], shape [].
+def escape_motion(x: Tensor, distances: Tensor) -> Tensor:
+    """Return the mean of the distances that particles outside of [-1, 1]^D have moved, shape [].
 
     It is 0 where there are none. Within `counted_together` the mean of all processes' results is
     the mean over the particles of all processes.
     """
     outside = (x.detach().abs().amax(dim=-1) > 1.0).to(x.dtype)
     count, mean = outside.sum(), _counting.get()
-    if mean is not None:
-        # The mean count of R processes is 0 or at least 1 / R.
-        count = mean(count)
-        return (outside * path_length).sum() / torch.where(count > 0.0, count, 1.0)
-    return (outside * path_length).sum() / count.clamp_min(1.0)
+    # Averaged over R processes, it is 0 or at least 1 / R.
+    count = count if mean is None else mean(count)
+    return (outside * distances).sum() / torch.where(count > 0.0, count, 1.0)
 
 
 SHARE = 0.25
@@ -249,7 +232,6 @@ class PoolDamage:
     """Probability of each particle to be thrown out of worlds from the pool (dimensionless)."""
 
     def __post_init__(self) -> None:
-        """Check every field."""
         check_fraction(self, "cut_share")
         check_non_negative(
             self, "damage_radius", "clump_radius", "cut_gap", "flake_radius", "escape_share"
@@ -257,22 +239,27 @@ class PoolDamage:
 
 
 def damage_pool(worlds: Particles, damage: PoolDamage, *, generator: Randomness) -> Particles:
-    """Return the worlds, damaged at random positions; nothing waits for the device."""
+    """Return the worlds, damaged at random positions."""
     x, s, *_ = worlds
+
+    def chosen_worlds(probability: float) -> Tensor:
+        """Return 1 for worlds that are damaged, else 0, shape [B]."""
+        return (uniform_draws(generator, (len(x), 1), x)[:, 0] < probability).to(x.dtype)
+
     if damage.damage_radius > 0.0:
         centre = random_particle(x, generator)
         s = wipe_state(x, s, centre=centre, radius=damage.damage_radius)
     if damage.clump_radius > 0.0:
         centre = random_particle(x, generator)
-        hit = (uniform_draws(generator, (len(x), 1), x)[:, 0] < SHARE).to(x.dtype)
-        x, s = clump(x, s, centre=centre, radius=damage.clump_radius * hit, factor=1.0)
+        radius = damage.clump_radius * chosen_worlds(SHARE)
+        x, s = clump(x, s, centre=centre, radius=radius, factor=1.0)
     if damage.cut_gap > 0.0:
         # Directions need not be uniform; a zero vector cuts nothing.
         normal = 2.0 * uniform_draws(generator, (len(x), x.shape[2]), x) - 1.0
-        hit = (uniform_draws(generator, (len(x), 1), x)[:, 0] < damage.cut_share).to(x.dtype)
+        hit = chosen_worlds(damage.cut_share)
         x, s = cut(x, s, centre=world_mean(x), normal=normal, gap=damage.cut_gap * hit)
     if damage.flake_radius > 0.0:
-        x = tear_off(x, radius=damage.flake_radius, chance=SHARE, generator=generator)
+        x = tear_off(x, radius=damage.flake_radius, probability=SHARE, generator=generator)
     if damage.escape_share > 0.0:
-        x = displace(x, share=damage.escape_share, generator=generator)
+        x = displace(x, probability=damage.escape_share, generator=generator)
     return worlds._replace(x=x, s=s)

@@ -151,10 +151,6 @@ class ManyPictures(Morphogenesis2D):
         """Pictures of the worlds' targets: rgb sums and density, shape [B, R, R, 4]."""
         return self._target_pictures.index_select(0, self.goal)
 
-    def splat_losses(self, x: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
-        """Return each world's density loss and colour loss, dimensionless, shape [B] each."""
-        return self._mean_errors(x, s)
-
     def picture(self, x: Tensor, s: Tensor, *, centred: bool = True) -> Tensor:
         """Return each world's picture: colour sums and density, dimensionless, [B, R, R, 4].
 

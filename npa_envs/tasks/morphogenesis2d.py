@@ -111,7 +111,6 @@ class Morphogenesis2DConfig(GrowthConfig):
     point the same way, and worlds are compared upright."""
 
     def __post_init__(self) -> None:
-        """Check every field; raise NPAError where one has a wrong type or lies out of its range."""
         super().__post_init__()
         check_text(self, "target", "a built-in name, an emoji or a path")
         check_positive(self, int, "target_point_count", at_most=MAX_POINT_COUNT)
@@ -156,7 +155,7 @@ FINER_TIMES = 4
 SURVIVING = 0.5
 """Probability of a particle to survive damage, in worlds whose particles divide (dimensionless)."""
 
-UNSEEN = 1e3
+FAR_AWAY = 1e3
 """Coordinate to which dead particles are moved, out of every picture [length units]."""
 
 UNOWNED = 0.05
@@ -189,14 +188,14 @@ class Morphogenesis2D(GrowthTask[Morphogenesis2DConfig]):
         """The target picture as points."""
         self._target_mean = self.target.points.mean(dim=0)
         radius = float((self.target.points - self._target_mean).norm(dim=1).max())
-        self._reach = max(1.0, radius)
+        self._radius = max(1.0, radius)
         self._pixel_size = self.target.pixel_size
         self._code: Tensor | None = None
         points, colours = self.target.points[None], self.target.colours[None]
         self._target_picture = self._splat(points, colours)[0]
 
     def for_rule(self, rule: NPARule) -> Self:
-        """Return the task whose fresh worlds have the rule's code for the target.
+        """Return the task whose fresh worlds have the rule's code in front of the other states.
 
         It is the code of the target's name, or else the encoder's code of its picture.
         """
@@ -204,11 +203,9 @@ class Morphogenesis2D(GrowthTask[Morphogenesis2DConfig]):
         if codes is None:
             return self
         if codes.encoder is None or self.target.name in codes.names:
-            return self.with_code(codes[self.target.name])
-        return self.with_code(codes.encode(self.target_picture[None].to(codes.table))[0])
-
-    def with_code(self, code: Tensor) -> Self:
-        """Return the task whose fresh worlds have a code [K] in front of the other states."""
+            code = codes[self.target.name]
+        else:
+            code = codes.encode(self.target_picture[None].to(codes.table))[0]
         return self._with(_code=code.detach())
 
     def seed(
@@ -244,11 +241,11 @@ class Morphogenesis2D(GrowthTask[Morphogenesis2DConfig]):
             return super().damage(worlds, generator)
         # Survivors are grown particles, among which newly divided ones must find their role.
         x, s, *_ = worlds
-        stay = uniform_draws(generator, x.shape[:2], x) < SURVIVING
-        left = torch.where(stay[..., None], s, 0.0)
-        left = torch.where(living(left).any(dim=1)[:, None, None], left, s)
-        rest = replace(self.config, damage_radius=0.0)
-        return damage_pool(worlds._replace(s=left), rest, generator=generator)
+        survive = uniform_draws(generator, x.shape[:2], x) < SURVIVING
+        survivors = torch.where(survive[..., None], s, 0.0)
+        survivors = torch.where(living(survivors).any(dim=1)[:, None, None], survivors, s)
+        others = replace(self.config, damage_radius=0.0)
+        return damage_pool(worlds._replace(s=survivors), others, generator=generator)
 
     def picture(self, x: Tensor, s: Tensor, *, centred: bool = True) -> Tensor:
         """Return each world's picture: colour sums and density, dimensionless, shape [B, R, R, 4].
@@ -257,18 +254,16 @@ class Morphogenesis2D(GrowthTask[Morphogenesis2DConfig]):
             centred: Move each world's mean to the target's, and turn worlds of an equivariant rule,
                 as the loss does.
         """
-        x, colour = self._placed(x, s) if centred else x, s[..., -3:] + COLOUR_OFFSET
-        if self.config.division:
-            return self._living_picture(x, s, colour)
-        return self._splat(x, colour)
-
-    def _living_picture(self, x: Tensor, s: Tensor, colour: Tensor) -> Tensor:
-        """Return pictures of living particles, differentiable in their first state."""
-        x, life = torch.where(living(s)[..., None], x, UNSEEN), s[..., LIFE : LIFE + 1]
+        colour = s[..., -3:] + COLOUR_OFFSET
+        if centred:
+            x = self._placed(x, s)
+        if not self.config.division:
+            return self._splat(x, colour)
+        x, life = torch.where(living(s)[..., None], x, FAR_AWAY), s[..., LIFE : LIFE + 1]
         picture = self._splat(x, colour * life)
         if not life.requires_grad:
             return picture
-        # Splats have no weights, so the density is the first state drawn as a colour.
+        # Splats have no weights: for its gradient, the density is the first state as a colour.
         density = self._splat(x, life.expand_as(colour))[..., :1]
         return torch.cat((picture[..., :3], density), dim=-1)
 
@@ -279,24 +274,22 @@ class Morphogenesis2D(GrowthTask[Morphogenesis2DConfig]):
         colour error is averaged over the colours and weighted by exp(-(density error)), without
         gradient. World k's errors are the same, bit for bit, in every batch.
         """
-        return _errors(self.picture(x, s) - self.target_picture.to(x))
+        size = (self.picture(x, s) - self.target_picture.to(x)).abs()
+        # Added one by one: the order of torch's own sums is not promised.
+        red, green, blue, density = (size + size * size).unbind(dim=-1)
+        return density, (red + green + blue) / 3.0 * torch.exp(-density.detach())
 
     def splat_losses(self, x: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
         """Return each world's density loss and colour loss, dimensionless, shape [B] each.
 
-        They are the means of `splat_errors` over the pixels. Where no gradient is needed, no
-        picture is stored.
+        They are the means of `splat_errors` over the pixels. Where neither gradients nor pictures
+        of several targets are needed, no picture is stored.
         """
-        wanted = torch.is_grad_enabled() and (x.requires_grad or s.requires_grad)
-        if not (wanted or self.config.division):
-            if self._turns:
-                x = turned(x, self.best_turn(x, s))
-            return self._picture_losses(x, s)
-        return self._mean_errors(x, s)
-
-    def _mean_errors(self, x: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
-        density, colour = self.splat_errors(x, s)
-        return _pixel_mean(density), _pixel_mean(colour)
+        with_gradient = torch.is_grad_enabled() and (x.requires_grad or s.requires_grad)
+        if with_gradient or self.config.division or self.goal_count > 0:
+            density, colour = self.splat_errors(x, s)
+            return _pixel_mean(density), _pixel_mean(colour)
+        return self._picture_losses(turned(x, self.best_turn(x, s)) if self._turns else x, s)
 
     def metric(self, x: Tensor, s: Tensor) -> Tensor:
         """Return each world's splat loss: density + colour_weight x colour, shape [B]."""
@@ -325,15 +318,13 @@ class Morphogenesis2D(GrowthTask[Morphogenesis2DConfig]):
         """
         if not self._turns:
             return x
-        return x.square().sum(dim=-1, keepdim=True).add(1e-12).sqrt() / self._reach
+        return x.square().sum(dim=-1, keepdim=True).add(1e-12).sqrt() / self._radius
 
-    def penalties(
-        self, x: Tensor, s: Tensor, path_length: Tensor
-    ) -> dict[str, tuple[float, Tensor]]:
+    def penalties(self, worlds: Particles) -> dict[str, tuple[float, Tensor]]:
         """Return the penalties of growth, and the drift of centroids from the origin."""
-        terms = super().penalties(x, s, path_length)
+        terms = super().penalties(worlds)
         if self.config.drift_weight > 0.0:
-            drift = world_mean(x).square().sum(dim=-1).add(1e-12).sqrt().mean()
+            drift = world_mean(worlds.x).square().sum(dim=-1).add(1e-12).sqrt().mean()
             terms["drift"] = self.config.drift_weight, drift
         return terms
 
@@ -368,29 +359,25 @@ class Morphogenesis2D(GrowthTask[Morphogenesis2DConfig]):
         if config.angles == 0:
             return torch.eye(2, device=x.device, dtype=x.dtype).expand(len(x), 2, 2)
         step = 2.0 * math.pi / config.angles
-        tried = torch.arange(config.angles, device=x.device, dtype=x.dtype) * step
-        handed = torch.ones_like(tried)
+        angle = torch.arange(config.angles, device=x.device, dtype=x.dtype) * step
+        hand = torch.ones_like(angle)
         if not config.chiral:
-            tried, handed = tried.repeat(2), torch.cat((handed, -handed))
-        angle, hand = (values.expand(len(x), -1) for values in (tried, handed))
-        for number in range(FINER_TIMES + 1):
-            best = self._closest(x, s, turns(angle, hand))
-            angle, hand = angle.gather(1, best), hand.gather(1, best)
-            if number < FINER_TIMES:
+            angle, hand = angle.repeat(2), torch.cat((hand, -hand))
+        angle, hand = (values.expand(len(x), -1) for values in (angle, hand))
+        finer = torch.arange(FINER_COUNT, device=x.device, dtype=x.dtype) - 0.5 * (FINER_COUNT - 1)
+        for refinement in range(FINER_TIMES + 1):
+            if refinement > 0:
                 step *= FINER_STEP
-                near = torch.arange(FINER_COUNT, device=x.device, dtype=x.dtype)
-                angle = angle + (near - 0.5 * (FINER_COUNT - 1)) * step
-                hand = hand.expand(-1, FINER_COUNT)
+                angle, hand = angle + finer * step, hand.expand(-1, FINER_COUNT)
+            # Every world at every angle is a world of one batch.
+            copies = x[:, None].expand(-1, angle.shape[1], -1, -1).flatten(0, 1)
+            colours = s[:, None, :, -3:].expand(-1, angle.shape[1], -1, -1).flatten(0, 1)
+            rotated = turned(copies, turns(angle, hand).flatten(0, 1))
+            density, colour = self._picture_losses(rotated, colours)
+            losses = (density + self.config.colour_weight * colour).view_as(angle)
+            best = losses.argmin(dim=1, keepdim=True)
+            angle, hand = angle.gather(1, best), hand.gather(1, best)
         return turns(angle, hand)[:, 0]
-
-    def _closest(self, x: Tensor, s: Tensor, tried: Tensor) -> Tensor:
-        """Return the index of the rotation [B, K, 2, 2] that brings each world closest, [B, 1]."""
-        world_count, count = tried.shape[:2]
-        every = x[:, None].expand(-1, count, -1, -1).flatten(0, 1)
-        colours = s[:, None, :, -3:].expand(-1, count, -1, -1).flatten(0, 1)
-        density, colour = self._picture_losses(turned(every, tried.flatten(0, 1)), colours)
-        losses = density + self.config.colour_weight * colour
-        return losses.view(world_count, count).argmin(dim=1, keepdim=True)
 
     def _picture_losses(self, x: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
         """Return the density and colour losses of worlds without rotation, shape [B] each."""
@@ -437,21 +424,6 @@ def turned(x: Tensor, turn: Tensor) -> Tensor:
     u, v = x.unbind(dim=-1)
     # Written out: the order of torch's own batched products may depend on the batch.
     return torch.stack((a * u + b * v, c * u + d * v), dim=-1)
-
-
-def _errors(difference: Tensor) -> tuple[Tensor, Tensor]:
-    """Return density and colour errors of picture differences, shape [B, R, R] each."""
-    density = _penalty(difference[..., 3])
-    # Added one by one: the order of torch's own sums is not promised.
-    red, green, blue = _penalty(difference[..., :3]).unbind(dim=-1)
-    colour = (red + green + blue) / 3.0
-    return density, colour * torch.exp(-density.detach())
-
-
-def _penalty(difference: Tensor) -> Tensor:
-    """Return |d| + d^2 of every pixel: linear for small differences, quadratic for large ones."""
-    size = difference.abs()
-    return size + size * size
 
 
 def _pixel_mean(errors: Tensor) -> Tensor:

@@ -19,12 +19,19 @@ from npa_envs.checks import (
     check_text,
 )
 from npa_envs.errors import NPAError
-from npa_envs.ops import Cameras, world_mean
+from npa_envs.ops import Cameras, render_gaussians, world_mean
 from npa_envs.rule.rule import NPARule
-from npa_envs.tasks.appearance import OUTPUTS, Appearance, Gaussians, draw_gaussians
+from npa_envs.tasks.appearance import OUTPUTS, Gaussians, appearance
 from npa_envs.tasks.base import GrowthConfig, GrowthTask, shares_of_loss
 from npa_envs.tasks.losses.pieces import MultiScaleSimilarity
-from npa_envs.tasks.targets.views import ViewTarget, load_views, nearest_camera, over, some_views
+from npa_envs.tasks.targets.views import (
+    Views,
+    ViewTarget,
+    load_views,
+    nearest_camera,
+    over,
+    some_views,
+)
 from npa_envs.tasks.train_config import TrainConfig, fast_run, presets_of, tiny_run
 from npa_envs.world.cuda_graph import to_device_async
 
@@ -101,7 +108,6 @@ class Morphogenesis3DConfig(GrowthConfig):
     """Weight of mean |x − clip(x, −1, 1)| (per length unit)."""
 
     def __post_init__(self) -> None:
-        """Check every field; raise NPAError where one has a wrong type or lies out of its range."""
         super().__post_init__()
         check_text(self, "target", "a built-in mesh, a mesh file or a folder of views")
         check_positive(self, int, "readout_hidden_dim", "training_views", "held_out_views")
@@ -131,7 +137,7 @@ class Morphogenesis3D(GrowthTask[Morphogenesis3DConfig]):
     space_dim = 3
     metric_name = "view loss"
     has_views = True
-    _kept = ("target",)
+    _resized_with = ("target",)
 
     def __init__(
         self,
@@ -142,8 +148,8 @@ class Morphogenesis3D(GrowthTask[Morphogenesis3DConfig]):
     ) -> None:
         self.config = config = config or Morphogenesis3DConfig()
         side = config.resolution
-        compared = config.ssim_weight > 0.0
-        self._similarity = MultiScaleSimilarity(side, device=device) if compared else None
+        with_similarity = config.ssim_weight > 0.0
+        self._similarity = MultiScaleSimilarity(side, device=device) if with_similarity else None
         if target is None:
             target = load_views(
                 config.target,
@@ -163,7 +169,6 @@ class Morphogenesis3D(GrowthTask[Morphogenesis3DConfig]):
         self._shown = some_views(self.target.held_out, torch.tensor([visible], device=device))
         # Pictures show this view; rows point up.
         self._target_picture = self._shown.pictures[0].flip(0)
-        self._appearance = Appearance(config.sigma, config.anisotropy, config.opacity)
         self.schedule = ViewSchedule(len(target.training.pictures), config, device)
         """Views, blur and backgrounds of an iteration."""
         self._rule: NPARule | None = None
@@ -190,7 +195,8 @@ class Morphogenesis3D(GrowthTask[Morphogenesis3DConfig]):
     def gaussians(self, s: Tensor) -> Gaussians:
         """Return the Gaussians that particles are drawn as."""
         outputs = s[..., -3:] if self._rule is None else self._rule.read_out(s)
-        return self._appearance.gaussians(outputs)
+        config = self.config
+        return appearance(outputs, config.sigma, config.anisotropy, config.opacity)
 
     def views(self, x: Tensor, s: Tensor, cameras: Cameras) -> Tensor:
         """Return pictures of V cameras: colours times alpha, and alpha, shape [B, V, H, W, 4]."""
@@ -207,8 +213,8 @@ class Morphogenesis3D(GrowthTask[Morphogenesis3DConfig]):
     def view_psnr(self, x: Tensor, s: Tensor) -> Tensor:
         """Return the PSNR of colours over white, mean of the held-out views [dB], shape [B]."""
         held_out, white = self.target.held_out, x.new_ones(3)
-        found, wanted = self.views(x, s, held_out.cameras), held_out.pictures.to(x)
-        error = over(found, white).clamp(0.0, 1.0) - over(wanted, white)
+        views, targets = self.views(x, s, held_out.cameras), held_out.pictures.to(x)
+        error = over(views, white).clamp(0.0, 1.0) - over(targets, white)
         return (-10.0 * error.square().mean(dim=(2, 3, 4)).log10()).mean(dim=1)
 
     def particle_shares(self, x: Tensor, s: Tensor) -> Tensor:
@@ -227,50 +233,48 @@ class Morphogenesis3D(GrowthTask[Morphogenesis3DConfig]):
         """Return the weighted loss of this iteration's views, and its parts."""
         config, schedule = self.config, self.schedule
         gaussians = self.gaussians(s)
-        chosen = some_views(self.target.training, schedule.index)
-        wanted = blurred(chosen.pictures.to(x), schedule.sigma)
+        target = some_views(self.target.training, schedule.index)
+        target = Views(target.cameras, blurred(target.pictures.to(x), schedule.sigma))
         backgrounds = schedule.backgrounds.to(x)[:, None, None]
-        found = self._draw(x, gaussians, chosen.cameras)
-        parts = {k: v.mean() for k, v in self._compare(found, wanted, backgrounds).items()}
+        terms = self._compare(x, gaussians, target, backgrounds)
+        parts = {name: term.mean() for name, term in terms.items()}
         parts["isotropy"] = gaussians.stretch.abs().mean()
         total = config.view_weight * self._weighted(parts)
         return total + config.isotropy_weight * parts["isotropy"], parts
 
     def _metric(self, x: Tensor, gaussians: Gaussians) -> Tensor:
-        held_out = self.target.held_out
-        found = self._draw(x, gaussians, held_out.cameras)
-        wanted = held_out.pictures.to(x)
-        return self._weighted(self._compare(found, wanted, x.new_full((3,), GREY)))
+        grey = x.new_full((3,), GREY)
+        return self._weighted(self._compare(x, gaussians, self.target.held_out, grey))
 
     def _draw(self, x: Tensor, gaussians: Gaussians, cameras: Cameras) -> Tensor:
-        image, alpha = draw_gaussians(x, gaussians, cameras.to(x))
-        return torch.cat((image, alpha[..., None]), dim=-1)
+        pictures = render_gaussians(x, *gaussians[:4], cameras.to(x))
+        return torch.cat((pictures.image, pictures.alpha[..., None]), dim=-1)
 
-    def _compare(self, found: Tensor, wanted: Tensor, background: Tensor) -> dict[str, Tensor]:
+    def _compare(
+        self, x: Tensor, gaussians: Gaussians, target: Views, background: Tensor
+    ) -> dict[str, Tensor]:
         """Return each world's mean |difference| of colours and alpha, and 1 − MS-SSIM, [B] each."""
-        found, wanted = (
+        drawn, pictures = (
             torch.cat((over(views, background), views[..., 3:]), dim=-1)
-            for views in (found, wanted)
+            for views in (self._draw(x, gaussians, target.cameras), target.pictures.to(x))
         )
-        size = (found - wanted).abs()
-        compared = {"views": world_mean(size.flatten(1)[..., None])[:, 0]}
+        size = (drawn - pictures).abs()
+        terms = {"views": world_mean(size.flatten(1)[..., None])[:, 0]}
         if self._similarity is not None:
-            alike = self._similarity(found.movedim(-1, 2), wanted.movedim(-1, 1))
-            compared["structure"] = 1.0 - alike.mean(dim=(1, 2))
-        return compared
+            similarity = self._similarity(drawn.movedim(-1, 2), pictures.movedim(-1, 1))
+            terms["structure"] = 1.0 - similarity.mean(dim=(1, 2))
+        return terms
 
-    def _weighted(self, parts: dict[str, Tensor]) -> Tensor:
-        total = parts["views"]
-        if "structure" in parts:
-            total = total + self.config.ssim_weight * parts["structure"]
-        return total
+    def _weighted(self, terms: dict[str, Tensor]) -> Tensor:
+        if "structure" not in terms:
+            return terms["views"]
+        return terms["views"] + self.config.ssim_weight * terms["structure"]
 
 
 class ViewSchedule:
     """Views, backgrounds and blur of an iteration, on the device.
 
-    They depend on the seed and the iteration alone, so a resumed run has the same ones. They are
-    always written to the same tensors, as recorded graphs need it.
+    They depend on the seed and the iteration alone, and are always written to the same tensors.
     """
 
     def __init__(
@@ -290,14 +294,12 @@ class ViewSchedule:
         """Write the views, backgrounds and blur of an iteration, without synchronising."""
         config = self._config
         random = np.random.default_rng((config.view_seed, iteration))
-        index = random.choice(self._view_count, len(self.index), replace=False)
+        index = random.choice(self._view_count, len(self.index), replace=False).astype(np.int64)
         backgrounds = random.random(self.backgrounds.shape, dtype=np.float32)
-        left = max(0.0, 1.0 - iteration / config.blur_iterations)
-        sigma = np.array(config.blur_sigma * left, dtype=np.float32)
-        device = self.sigma.device
-        self.index.copy_(to_device_async(index.astype(np.int64), device))
-        self.backgrounds.copy_(to_device_async(backgrounds, device))
-        self.sigma.copy_(to_device_async(sigma, device))
+        sigma = config.blur_sigma * max(0.0, 1.0 - iteration / config.blur_iterations)
+        values = index, backgrounds, np.array(sigma, dtype=np.float32)
+        for tensor, value in zip((self.index, self.backgrounds, self.sigma), values, strict=True):
+            tensor.copy_(to_device_async(value, tensor.device))
 
 
 def blurred(pictures: Tensor, sigma: Tensor) -> Tensor:

@@ -16,12 +16,7 @@ from npa_envs.ops import splat, world_mean
 from npa_envs.rule.rule import NPARule
 from npa_envs.tasks.base import Frame, ParticleTask, TaskConfig
 from npa_envs.tasks.seeds import drawn_indices, drawn_worlds
-from npa_envs.tasks.targets.clouds import (
-    PointClouds,
-    Split,
-    load_clouds,
-    varied,
-)
+from npa_envs.tasks.targets.clouds import PointClouds, Split, load_clouds, varied
 from npa_envs.tasks.train_config import TrainConfig, fast_run, presets_of, tiny_run
 from npa_envs.world.particles import Particles
 from npa_envs.world.randomness import Randomness
@@ -78,7 +73,6 @@ class PointClassificationConfig(TaskConfig):
         return f"the data {self.data}"
 
     def __post_init__(self) -> None:
-        """Check every field; raise NPAError where one has a wrong type or lies out of its range."""
         super().__post_init__()
         check_text(self, "data", "a name or a path")
         check_text(self, "data_folder", "a path")
@@ -106,7 +100,7 @@ class PointClassification(ParticleTask[PointClassificationConfig]):
     metric_name = "mean squared error to the class"
     trial_name = "share of particles that are wrong"
     classifies = True
-    _kept = ("split",)
+    _resized_with = ("split",)
 
     def __init__(
         self,
@@ -158,12 +152,9 @@ class PointClassification(ParticleTask[PointClassificationConfig]):
     @property
     def rule_shape(self) -> dict[str, Any]:
         """Further arguments of `NPARule`: all but channels, hidden width and ε0."""
-        config = self.config
-        readout = {
-            "readout_dim": config.class_count,
-            "readout_hidden_dim": config.readout_hidden_dim,
-        }
-        return {"alpha": 1.0, "static": True, **readout}
+        sizes = {"readout_dim": self.config.class_count}
+        sizes["readout_hidden_dim"] = self.config.readout_hidden_dim
+        return {"alpha": 1.0, "static": True, **sizes}
 
     def for_rule(self, rule: NPARule) -> Self:
         """Return the task whose losses and pictures use the rule's read-out."""
@@ -171,9 +162,9 @@ class PointClassification(ParticleTask[PointClassificationConfig]):
 
     def on(self, split: Split) -> Self:
         """Return the task with the clouds of "train" or "test"."""
-        other = self._with(split=split)
-        vars(other).pop("clouds", None)
-        return other
+        task = self._with(split=split)
+        vars(task).pop("clouds", None)
+        return task
 
     def held_out(self) -> Self:
         """Return the task with the clouds of "test"."""
@@ -191,13 +182,7 @@ class PointClassification(ParticleTask[PointClassificationConfig]):
         chosen = chosen.to(clouds.label.device)
         x, goal = clouds.x[chosen].to(device), clouds.label[chosen].to(device)
         if self.split == "train":
-            x = varied(
-                x,
-                rotation=config.rotation,
-                stretch=config.stretch,
-                jitter=config.jitter,
-                generator=generator,
-            )
+            x = varied(x, config.rotation, config.stretch, config.jitter, generator)
         return Particles(x, x.new_zeros(*x.shape[:2], config.state_dim), goal=goal)
 
     def damage(self, worlds: Particles, generator: Randomness) -> Particles:
@@ -252,19 +237,10 @@ class PointClassification(ParticleTask[PointClassificationConfig]):
         """Return each particle's mean |s − clip(s, −1, 1)|, [B, N]."""
         return channel_mean((s - s.clamp(-1.0, 1.0)).abs())
 
-    def overflow(self, s: Tensor) -> Tensor:
-        """Return each world's mean |s − clip(s, −1, 1)|, shape [B]."""
-        return world_mean(self.overflows(s)[..., None])[:, 0]
-
     def compare(self, x: Tensor, s: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
-        """Return the batch's mean squared error, also as a named part."""
+        """Return the batch's mean squared error; parts are the error and the accuracy."""
         error = self.errors(s).mean()
-        return error, {"error": error}
-
-    def loss(self, x: Tensor, s: Tensor, path_length: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
-        """Return the training loss and its named parts, with the accuracy among them."""
-        total, parts = super().loss(x, s, path_length)
-        return total, {**parts, "accuracy": 1.0 - self.mistakes(s.detach()).mean()}
+        return error, {"error": error, "accuracy": 1.0 - self.mistakes(s.detach()).mean()}
 
     def picture(self, x: Tensor, s: Tensor) -> Tensor:
         """Return each world's picture, coloured by class: colour sums, density, [B, R, R, 4]."""
@@ -281,10 +257,6 @@ class PointClassification(ParticleTask[PointClassificationConfig]):
     def __getstate__(self) -> dict[str, object]:
         """Return the attributes to pickle, without the clouds, which are loaded again."""
         return {name: value for name, value in vars(self).items() if name != "clouds"}
-
-    def _with(self, **fields: object) -> Self:
-        known = {"clouds": self.clouds} if "clouds" in vars(self) else {}
-        return super()._with(**(known | fields))
 
 
 PICTURE_MARGIN = 0.0625
@@ -308,11 +280,6 @@ UNDECIDED = (0.6, 0.6, 0.6)
 """Colour of a particle whose scores are 0."""
 
 
-def particle_classes(outputs: Tensor) -> Tensor:
-    """Return the class with each particle's largest score, int64, shape [B, N]."""
-    return outputs.argmax(-1)
-
-
 def majority(outputs: Tensor) -> Tensor:
     """Return the majority class of each world's particles, int64, shape [B].
 
@@ -320,7 +287,7 @@ def majority(outputs: Tensor) -> Tensor:
     """
     particle_count, class_count = outputs.shape[1:]
     classes = torch.arange(class_count, device=outputs.device)
-    votes = (particle_classes(outputs)[..., None] == classes).sum(1)
+    votes = (outputs.argmax(-1)[..., None] == classes).sum(1)
     sums = outputs.double().sum(1)
     # Less than one vote, whatever the outputs.
     tie_breaker = 0.5 * torch.softmax(sums / particle_count, dim=-1)

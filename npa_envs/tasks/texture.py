@@ -20,7 +20,7 @@ from npa_envs.checks import (
 from npa_envs.errors import NPAError
 from npa_envs.ops import periodic_splat
 from npa_envs.rule.rule import COLOUR_OFFSET
-from npa_envs.tasks.base import ParticleTask, TaskConfig, shares_of_loss
+from npa_envs.tasks.base import ParticleTask, TaskConfig, path_lengths, shares_of_loss
 from npa_envs.tasks.damage import random_particle
 from npa_envs.tasks.losses.texture import (
     DEFAULT_LOSS,
@@ -91,7 +91,6 @@ class TextureConfig(TaskConfig):
     """Weight of the path length Σ|Δx| of a rollout (per length unit)."""
 
     def __post_init__(self) -> None:
-        """Check every field; raise NPAError where one has a wrong type or lies out of its range."""
         super().__post_init__()
         check_text(self, "target", "a built-in texture or a path")
         check_flag(self, "target_tiles", "see_across")
@@ -132,7 +131,7 @@ DRAWINGS = 16
 class Texture(ParticleTask[TextureConfig]):
     """The texture task of arXiv 2601.16096, with its loss."""
 
-    _kept = ("target",)
+    _resized_with = ("target",)
 
     def __init__(
         self,
@@ -265,12 +264,10 @@ class Texture(ParticleTask[TextureConfig]):
         colour, density = (term.mean() for term in self.texture_losses(x, s))
         return self.weighted(colour, density), {"colour": colour, "density": density}
 
-    def penalties(
-        self, x: Tensor, s: Tensor, path_length: Tensor
-    ) -> dict[str, tuple[float, Tensor]]:
+    def penalties(self, worlds: Particles) -> dict[str, tuple[float, Tensor]]:
         """Return motion and overflow."""
-        motion = self.config.motion_weight, path_length.mean()
-        return {"motion": motion, **super().penalties(x, s, path_length)}
+        motion = self.config.motion_weight, path_lengths(worlds).mean()
+        return {"motion": motion, **super().penalties(worlds)}
 
     def splat(self, x: Tensor, colour: Tensor) -> Tensor:
         """Return the picture of particles at x, [B, N, 2], in colours [B, N, 3]: [B, R, R, 4]."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any, Generic, Literal, TypeVar, get_args
 
@@ -175,7 +176,6 @@ class TrainConfig(Generic[TaskConfigT]):
     """Write TensorBoard events as well as the JSONL log."""
 
     def __post_init__(self) -> None:
-        """Check every field; raise NPAError where one has a wrong type or lies out of its range."""
         check_positive(self, int, "iterations", "repeats", "world_count", "pool_size")
         check_positive(self, int, "seed_interval", "log_interval", "checkpoint_interval")
         check_positive(self, int, "stillness_min_age")
@@ -186,76 +186,47 @@ class TrainConfig(Generic[TaskConfigT]):
         check_non_negative(self, "fresh_share", "damage_share", at_most=1.0)
         check_seed(self, "seed")
         check_flag(self, "cuda_graph", "tensorboard")
+        parse_device(self.device)
+        check = partial(check_field, self)
         choices = {"optimiser": OptimiserName, "schedule": Schedule, "memory": Memory}
         choices |= {"moment_inverse": MomentInverse, "dtype": Literal["float32", "float64"]}
-        for name, kind in choices.items():
-            value, allowed = getattr(self, name), get_args(kind)
+        for name, words in choices.items():
+            value, allowed = getattr(self, name), get_args(words)
             known = isinstance(value, str) and value in allowed
-            check_field(self, name, known, f"be one of {', '.join(allowed)}")
-        parse_device(self.device)
+            check(name, known, f"be one of {', '.join(allowed)}")
+        fits = 1.0 <= self.stillness_power <= MAX_POWER
+        rule = f"be at least 1 and at most {MAX_POWER:g}"
+        check("stillness_power", fits, rule, "1 for plain means")
+        fits = self.damage_and_keep_share < 1.0
+        check("damage_and_keep_share", fits, "be below 1", "with 1 there would be no fresh seeds")
+        rule = "be the name of a rule or of a file, or '' for none"
+        check("initial_rule", isinstance(self.initial_rule, str), rule)
+        fits = _is_pair(self.steps, is_whole) and 1 <= self.steps[0] < self.steps[1]
+        rule = "be two whole numbers (lo, hi) with 1 <= lo < hi"
+        check("steps", fits, rule, "hi is exclusive, so exactly 32 steps are steps=(32, 33)")
         milestones, ages = self.milestones, self.max_age_range
-        are_ages = _is_pair(ages, is_whole)
-        are_whole = isinstance(milestones, tuple) and all(map(is_whole, milestones))
-        for name, fits, rule, cure in (
-            (
-                "stillness_power",
-                1.0 <= self.stillness_power <= MAX_POWER,
-                f"be at least 1 and at most {MAX_POWER:g}",
-                "1 for plain means",
-            ),
-            (
-                "damage_and_keep_share",
-                self.damage_and_keep_share < 1.0,
-                "be below 1",
-                "with 1 there would be no fresh seeds",
-            ),
-            (
-                "initial_rule",
-                isinstance(self.initial_rule, str),
-                "be the name of a rule or of a file, or '' for none",
-                "",
-            ),
-            (
-                "steps",
-                _is_pair(self.steps, is_whole) and 1 <= self.steps[0] < self.steps[1],
-                "be two whole numbers (lo, hi) with 1 <= lo < hi",
-                "hi is exclusive, so exactly 32 steps are steps=(32, 33)",
-            ),
-            ("milestones", are_whole, "be a tuple of whole numbers", ""),
-            (
-                "milestones",
-                are_whole and list(milestones) == sorted({m for m in milestones if m >= 1}),
-                "be positive and increasing",
-                "for example milestones=(2000, 4000)",
-            ),
-            (
-                "world_count",
-                self.world_count <= self.pool_size,
-                f"be at most pool_size={self.pool_size} (batches are drawn without replacement)",
-                f"set pool_size={self.world_count} or more",
-            ),
-            (
-                "max_age_range",
-                are_ages and (1 <= ages[0] <= ages[1] or ages == (0, 0)),
-                "be two whole numbers (lo, hi) with 1 <= lo <= hi, or (0, 0)",
-                "for example max_age_range=(64, 16384)",
-            ),
-            (
-                "pool_size",
-                not are_ages or not self.ages or self.pool_size % self.world_count == 0,
-                "be a multiple of world_count where max_age_range is set",
-                f"with world_count={self.world_count} set "
-                f"pool_size={self.pool_size // self.world_count * self.world_count}",
-            ),
-            (
-                "vary_eps",
-                _is_pair(self.vary_eps, is_real) and 0.0 < self.vary_eps[0] <= self.vary_eps[1],
-                "be two factors (lo, hi) with 0 < lo <= hi",
-                "for example vary_eps=(0.5, 2.0)",
-            ),
-            ("out", isinstance(self.out, Path), "be a pathlib.Path", f"Path({shown(self.out)})"),
-        ):
-            check_field(self, name, fits, rule, cure)
+        fits = isinstance(milestones, tuple) and all(map(is_whole, milestones))
+        check("milestones", fits, "be a tuple of whole numbers")
+        fits = list(milestones) == sorted({m for m in milestones if m >= 1})
+        rule, hint = "be positive and increasing", "for example milestones=(2000, 4000)"
+        check("milestones", fits, rule, hint)
+        rule = f"be at most pool_size={self.pool_size} (batches are drawn without replacement)"
+        fits, hint = self.world_count <= self.pool_size, f"set pool_size={self.world_count} or more"
+        check("world_count", fits, rule, hint)
+        fits = _is_pair(ages, is_whole) and (1 <= ages[0] <= ages[1] or ages == (0, 0))
+        rule = "be two whole numbers (lo, hi) with 1 <= lo <= hi, or (0, 0)"
+        check("max_age_range", fits, rule, "for example max_age_range=(64, 16384)")
+        fits = not self.ages or self.pool_size % self.world_count == 0
+        rule = "be a multiple of world_count where max_age_range is set"
+        sections = self.pool_size // self.world_count * self.world_count
+        hint = f"with world_count={self.world_count} set pool_size={sections}"
+        check("pool_size", fits, rule, hint)
+        factors = self.vary_eps
+        fits = _is_pair(factors, is_real) and 0.0 < factors[0] <= factors[1]
+        rule = "be two factors (lo, hi) with 0 < lo <= hi"
+        check("vary_eps", fits, rule, "for example vary_eps=(0.5, 2.0)")
+        is_path = isinstance(self.out, Path)
+        check("out", is_path, "be a pathlib.Path", f"Path({shown(self.out)})")
         for name in ("stillness_weight", "damage_and_keep_share"):
             if getattr(self, name) > 0 and not self.ages:
                 raise NPAError(
@@ -319,7 +290,6 @@ class JointTrainConfig(TrainConfig[TaskConfigT]):
     """Indices of the species, from 0, whose initial rules do not learn."""
 
     def __post_init__(self) -> None:
-        """Check every field but the number of species."""
         super().__post_init__()
         if self.initial_rule:
             raise NPAError(

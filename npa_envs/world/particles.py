@@ -72,6 +72,11 @@ class Particles(NamedTuple):
         )
         return fields._replace(goal=self.goal)
 
+    def split(self, counts: Sequence[int]) -> list[Particles]:
+        """Return the particles of each species, which lie one species after the other."""
+        species = (torch.split(value, [*counts], dim=1) for value in self.tensors())
+        return [Particles(*fields) for fields in zip(*species, strict=True)]
+
     def copy_(self, other: Particles) -> None:
         """Overwrite these worlds with others, in one kernel."""
         torch._foreach_copy_(self.tensors(), other.tensors())

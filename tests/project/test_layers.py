@@ -53,7 +53,7 @@ LAYERS = {
     "npa_envs.rule.rule": layer(4, "torch"),
     "npa_envs.rule": layer(5, "torch safetensors", never=INSIDES),
     "npa_envs.world": layer(6, "torch", never=ORACLES),
-    "npa_envs.tasks": layer(7, "torch numpy PIL sklearn torchvision trimesh", never=ORACLES),
+    "npa_envs.tasks": layer(7, "torch numpy PIL sklearn trimesh", never=ORACLES),
     "npa_envs.render": layer(8, "torch numpy PIL imageio imageio_ffmpeg pygame", never=ORACLES),
     "npa_envs.training": layer(9, "torch numpy tqdm yaml tensorboard", never=ORACLES),
     "npa_envs": Layer(10, frozenset({COMPUTED_NAME}), never=ORACLES),

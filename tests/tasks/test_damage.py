@@ -156,7 +156,9 @@ def test_a_clump_is_one_point():
 @pytest.mark.parametrize("space_dim", [2, 3])
 def test_a_flake_leaves_as_it_is(space_dim):
     x, _ = worlds(60, space_dim)
-    found = damage.tear_off(x, radius=0.3, chance=0.5, generator=torch.Generator().manual_seed(3))
+    found = damage.tear_off(
+        x, radius=0.3, probability=0.5, generator=torch.Generator().manual_seed(3)
+    )
     hit = changed(x, found)
     assert 15 <= int(hit.sum()) <= 45
     sizes = []
@@ -207,7 +209,7 @@ def generators(device):
 @pytest.mark.parametrize("space_dim", [2, 3])
 def test_as_many_are_thrown_out_as_was_said_and_on_all_sides(device, which, space_dim):
     x = torch.zeros(2, 4000, space_dim, device=device)
-    found = damage.displace(x, share=0.25, generator=generators(device)[which])
+    found = damage.displace(x, probability=0.25, generator=generators(device)[which])
     distance = found.norm(dim=-1)
     out = distance > 0.0
     assert ((distance[out] >= NEAREST) & (distance[out] <= FARTHEST)).all()

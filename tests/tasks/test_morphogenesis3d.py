@@ -12,7 +12,7 @@ from npa_envs.errors import NPAError
 from npa_envs.measure.quality import measure
 from npa_envs.render import turntable_frames, write_gaussians, write_points, write_splat
 from npa_envs.rule.rule import NPARule
-from npa_envs.tasks.appearance import FLAT, OUTPUTS, Appearance
+from npa_envs.tasks.appearance import FLAT, OUTPUTS, appearance
 from npa_envs.tasks.morphogenesis3d import Morphogenesis3D, Morphogenesis3DConfig
 from npa_envs.tasks.targets.meshes import AMBIENT, LIGHT, load_mesh
 from npa_envs.tasks.targets.views import ANGLE, DISTANCE, load_views, over, some_views
@@ -49,7 +49,7 @@ def test_a_task_says_what_it_has_besides(task):
 
 
 def test_outputs_of_zero_are_round_grey_particles():
-    look = Appearance(sigma=0.05, anisotropy=0.1, opacity=0.15).gaussians(torch.zeros(1, 2, 20))
+    look = appearance(torch.zeros(1, 2, 20), sigma=0.05, anisotropy=0.1, opacity=0.15)
     assert torch.equal(look.quaternions, torch.tensor([1.0, 0, 0, 0]).expand(1, 2, 4))
     torch.testing.assert_close(look.scales, torch.full((1, 2, 3), 0.05))
     torch.testing.assert_close(look.opacities, torch.full((1, 2), 0.15))

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from npa_envs.tasks.losses.pieces import EVEN, MATCHED_PATCH, PatchTransport, RandomFilters, pyramid
+from npa_envs.tasks.losses.pieces import EVEN, MATCHED_PATCH, RandomFilters, pyramid, quantiles
 from npa_envs.tasks.losses.texture import (
     FILTERS,
     FLOOR,
@@ -14,9 +14,7 @@ from npa_envs.tasks.losses.texture import (
     FilterDescriptor,
     LossOptions,
     PatchDescriptor,
-    SlicedWasserstein,
     make_texture_loss,
-    quantiles,
 )
 from npa_envs.tasks.targets.textures import load_texture
 from npa_envs.tasks.texture import Texture, TextureConfig
@@ -81,8 +79,8 @@ def plain_distance(tables, expected_tables):
 def test_patch_distance_equals_plain_arithmetic(channels):
     target = texture("dots", 48, torch.float64)[:channels]
     image = noise(channels, 48, 48)
-    descriptor = PatchDescriptor(target, seed=5)
-    directions = [d.numpy() for d in descriptor.directions]
+    loss = make_texture_loss("patch_swd", target, LossOptions(seed=5))
+    directions = [d.numpy() for d in loss.descriptor.directions]
     assert len(directions) == 3
     for d in directions:
         np.testing.assert_allclose(d.T @ d, np.eye(25 * channels), rtol=0.0, atol=1e-12)
@@ -93,21 +91,21 @@ def test_patch_distance_equals_plain_arithmetic(channels):
         ]
         for i in (image, target)
     ]
-    loss = SlicedWasserstein(target, descriptor, tiles=True)(image[None])
-    assert float(loss) == pytest.approx(plain_distance(*tables), rel=1e-12)
+    assert float(loss(image[None])) == pytest.approx(plain_distance(*tables), rel=1e-12)
 
 
 def test_filter_distance_equals_plain_arithmetic():
     target = texture("grid", 24, torch.float64)
     image = noise(3, 24, 24)
-    descriptor = FilterDescriptor(target, seed=2)
-    first, _ = descriptor.levels[0]
+    loss = make_texture_loss("filter_swd", target, LossOptions(seed=2))
+    levels = loss.descriptor.levels
+    first, _ = levels[0]
     torch.testing.assert_close(first.norm(dim=0), torch.ones(FILTERS).double())
     torch.testing.assert_close(first[:, 3:].sum(0), torch.zeros(FILTERS - 3).double())
 
     def tables(image):
         result = []
-        for level, (first, second) in zip(halves(image, 2), descriptor.levels, strict=True):
+        for level, (first, second) in zip(halves(image, 2), levels, strict=True):
             signed = rolled_patches(level, 5) @ first.numpy()
             features = np.maximum(np.concatenate([signed, -signed], axis=1), 0.0)
             side = level.shape[-1]
@@ -115,9 +113,8 @@ def test_filter_distance_equals_plain_arithmetic():
             result += [features, rolled_patches(field, 3) @ second.numpy()]
         return result
 
-    loss = SlicedWasserstein(target, descriptor, tiles=True)(image[None])
     expected = plain_distance(tables(image.numpy()), tables(target.numpy()))
-    assert float(loss) == pytest.approx(expected, rel=1e-12)
+    assert float(loss(image[None])) == pytest.approx(expected, rel=1e-12)
 
 
 def test_patch_transport_equals_plain_arithmetic():
@@ -128,17 +125,17 @@ def test_patch_transport_equals_plain_arithmetic():
         costs = ((ours[:, None] - theirs[None]) ** 2).mean(axis=2)
         spread = theirs.var(axis=0).mean() + EVEN
         total += max(costs.min(axis=1).mean(), costs.min(axis=0).mean()) / spread
-    loss = PatchTransport(target, tiles=True)(image[None])
-    assert float(loss) == pytest.approx(total / 2, rel=1e-10)
+    loss = make_texture_loss("patch_ot", target)
+    assert float(loss(image[None])) == pytest.approx(total / 2, rel=1e-10)
     # Here one of both is larger, there the other one.
     flat = target.mean(dim=(1, 2), keepdim=True).expand(-1, 24, 24)
-    assert float(PatchTransport(target, tiles=True)(flat[None])) > 0.3
+    assert float(loss(flat[None])) > 0.3
 
 
 def test_random_filters_answer_as_sums_over_patches_do():
     image = noise(2, 16, 16)
-    filters = RandomFilters(image, seed=1)
-    fields = filters(image[None], wrap=True)[0]
+    filters = RandomFilters(image, LossOptions(seed=1))
+    fields = filters(image[None], wrap=True)[0][0].T.view(-1, 8, 8)
     kernel = torch.fft.irfft2(filters.filter_waves.conj(), s=(16, 16))[40]
     by_hand = sum(
         kernel[channel, r, c] * image[channel].roll((-r, -c), (0, 1))

@@ -6,25 +6,25 @@ import pytest
 import torch
 
 from npa_envs.errors import NPAError
+from npa_envs.tasks.losses.pieces import moment_distance, relaxed_transport
 from npa_envs.tasks.losses.texture import (
-    VGG_LAYERS,
-    VGG_WIDTHS,
     WEIGHTS_FILE,
     LossOptions,
     VGGFeatures,
     load_vgg_weights,
     make_texture_loss,
-    moment_distance,
-    relaxed_transport,
 )
 from npa_envs.tasks.targets.textures import load_texture
+
+WIDTHS = ((64, 64), (128, 128), (256, 256, 256), (512, 512, 512), (512, 512, 512))
+"""Channels of VGG16's convolutions; a pooling layer follows each group."""
 
 
 @pytest.fixture(scope="module")
 def weights():
     generator = torch.Generator().manual_seed(0)
     weights, index, channels = {}, 0, 3
-    for group in VGG_WIDTHS:
+    for group in WIDTHS:
         for width in group:
             scale = math.sqrt(2.0 / (9 * channels))
             shape = (width, channels, 3, 3)
@@ -49,7 +49,7 @@ def colours(name, resolution=32):
 def plain_vgg16(weights):
     """The network as torchvision builds it, with average pooling."""
     layers = []
-    for group in VGG_WIDTHS:
+    for group in WIDTHS:
         for width in group:
             weight = weights[f"features.{len(layers)}.weight"]
             layer = torch.nn.Conv2d(weight.shape[1], width, 3, padding=1, padding_mode="circular")
@@ -59,7 +59,7 @@ def plain_vgg16(weights):
     return layers
 
 
-def test_features_are_those_of_the_layers_as_torchvision_counts_them(weights):
+def test_features_are_those_of_the_layers_as_torchvision_counts_them(weights, options):
     images = torch.rand(2, 3, 32, 32, generator=torch.Generator().manual_seed(1))
     expected = []
     mean, deviation = torch.tensor([(0.485, 0.456, 0.406), (0.229, 0.224, 0.225)])
@@ -67,16 +67,17 @@ def test_features_are_those_of_the_layers_as_torchvision_counts_them(weights):
     with torch.no_grad():
         for number, layer in enumerate(plain_vgg16(weights)):
             field = layer(field)
-            if number in VGG_LAYERS:
-                expected.append(field)
-    found = VGGFeatures(weights, VGG_LAYERS, images)(images, wrap=True)
+            if number in (1, 6, 11, 18, 25):
+                expected.append(field.flatten(2).mT)
+    features = VGGFeatures(images[0], options)
+    found = features(images, wrap=True)
     shapes = [tuple(f.shape[1:]) for f in found]
-    assert shapes == [(64, 32, 32), (128, 16, 16), (256, 8, 8), (512, 4, 4), (512, 2, 2)]
+    assert shapes == [(1024, 64), (256, 128), (64, 256), (16, 512), (4, 512)]
     for a, b in zip(found, expected, strict=True):
         torch.testing.assert_close(a, b, rtol=1e-5, atol=1e-5)
     # A density stands for all three colours.
-    features, density = VGGFeatures(weights, (1,), images), images[:, :1]
-    (grey,) = features(density.expand(2, 3, 32, 32), wrap=True)
+    density = images[:, :1]
+    grey = features(density.expand(2, 3, 32, 32), wrap=True)[0]
     assert torch.equal(features(density, wrap=True)[0], grey)
 
 

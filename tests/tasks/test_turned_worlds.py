@@ -13,6 +13,7 @@ from npa_envs.rule.files import load_rule, rule_metadata
 from npa_envs.tasks.morphogenesis2d import Morphogenesis2D, Morphogenesis2DConfig, turned, turns
 from npa_envs.training import preset
 from npa_envs.training.trainer import initial_rule
+from npa_envs.world.particles import Particles
 
 SMALL = {"target": "octopus", "target_point_count": 300, "particle_count": 300, "resolution": 48}
 ANGLES = (0.0, 0.5 * math.pi, 1.234, 3.0)
@@ -143,7 +144,7 @@ def test_penalties_know_no_direction_either():
     path = torch.rand(2, 300, generator=generator).double()
     s = torch.zeros(2, 300, 16).double()
     turn = turn_of(0.8).expand(2, 2, 2)
-    terms, others = (task.penalties(y, s, path) for y in (x, turned(x, turn)))
+    terms, others = (task.penalties(Particles(y, s, path)) for y in (x, turned(x, turn)))
     for name, (weight, term) in terms.items():
         assert torch.allclose(term, others[name][1]), name
         assert weight >= 0.0

@@ -52,7 +52,7 @@ FOREIGN = "rows need an environment that gives and takes one for"
 REFUSALS = [
     (lambda: DamageEvent(1, "burn"), "unknown damage 'burn'"),
     (lambda: DamageEvent(-1, "cut"), "whole number of at least 0"),
-    (lambda: DamageEvent(1, "cut", 0.0), "positive and finite"),
+    (lambda: DamageEvent(1, "cut", 0.0), "size must be a finite number greater than 0"),
     (lambda: parse_damage("1:cut:nan"), "STEP:KIND"),
     (lambda: parse_damage("1:cut:0.1:2"), "STEP:KIND"),
     (lambda: DamageEvents(single(), []), "at least one event"),

@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
 import torch
 from torch import Tensor
 
@@ -24,41 +28,51 @@ TINY_SQUARE = 1e-12
 """Added to the squared length of a feature vector before it is normalised."""
 
 
-def check_images(images: Tensor, shape: tuple[int, ...]) -> None:
-    """Check that images have the target's shape, (K, R, R)."""
-    if images.ndim != 4 or tuple(images.shape[1:]) != shape:
-        raise NPAError(
-            f"images must have shape [B, K, R, R] with (K, R, R) = {shape} as the target, got "
-            f"{tuple(images.shape)}: draw them at the target's resolution"
-        )
+@dataclass(frozen=True)
+class LossOptions:
+    """Options of a texture loss."""
 
+    tiles: bool = True
+    """Whether the target's opposite edges fit together, so that patches may cross them."""
 
-def check_size(target: Tensor) -> None:
-    """Check that a target [K, R, R] has at least `SMALLEST` pixels along each side."""
-    if target.shape[-1] < SMALLEST:
-        raise NPAError(
-            f"resolution must be at least {SMALLEST} pixels, got {target.shape[-1]}: for example 64"
-        )
+    seed: int = 0
+    """Seed of the loss's directions, filters and positions."""
+
+    vgg_weights: str = ""
+    """File of VGG16's weights, for `vgg_ot`; empty: torch's usual folder of downloads."""
 
 
 class TextureDistance:
-    """Base class of distances between images and a target; satisfies `TextureLoss`."""
+    """Base class of distances between images and a target, shape [K, R, R]."""
+
+    same_in_every_batch: bool = False
+    """Whether `compare` returns the same for an image, bit for bit, in every batch."""
 
     def __init__(self, target: Tensor) -> None:
+        if target.shape[-1] < SMALLEST:
+            raise NPAError(
+                f"resolution must be at least {SMALLEST} pixels, got {target.shape[-1]}: for "
+                "example 64"
+            )
         self._shape = tuple(target.shape)
 
     def __call__(self, images: Tensor) -> Tensor:
-        """Return the distance of each image (dimensionless), shape [B]; differentiable.
+        """Return the distance of each image [B, K, R, R] (dimensionless), [B]; differentiable.
 
-        Without gradient images are compared one by one, so that no result depends on the batch.
+        Without gradient no result depends on the batch.
         """
-        check_images(images, self._shape)
-        if len(images) > 1 and not (torch.is_grad_enabled() and images.requires_grad):
-            return torch.cat([self.compare(image[None]) for image in images])
-        return self.compare(images)
+        if images.ndim != 4 or tuple(images.shape[1:]) != self._shape:
+            raise NPAError(
+                f"images must have shape [B, K, R, R] with (K, R, R) = {self._shape} as the "
+                f"target, got {tuple(images.shape)}: draw them at the target's resolution"
+            )
+        with_gradient = torch.is_grad_enabled() and images.requires_grad
+        if len(images) == 1 or with_gradient or self.same_in_every_batch:
+            return self.compare(images)
+        return torch.cat([self.compare(image[None]) for image in images])
 
     def compare(self, images: Tensor) -> Tensor:
-        """Return the distance of each image [B, K, R, R], already checked; shape [B]."""
+        """Return the distance of each of some checked images, [B]."""
         raise NotImplementedError
 
 
@@ -173,7 +187,7 @@ EVEN = 0.01
 
 
 class PatchTransport(TextureDistance):
-    """Relaxed optimal transport of raw patches at several sizes; satisfies `TextureLoss`.
+    """Relaxed optimal transport of raw patches at several sizes.
 
     At each size every patch of a world is compared with the nearest patch of the target, and every
     patch of the target with the nearest of the world. The larger of both mean squared distances,
@@ -182,20 +196,19 @@ class PatchTransport(TextureDistance):
     patches in place of a network's features.
     """
 
-    def __init__(self, target: Tensor, *, tiles: bool) -> None:
-        check_size(target)
+    def __init__(self, target: Tensor, options: LossOptions) -> None:
         super().__init__(target)
         self._expected = []
         self._scales = []
         for level in pyramid(target[None], level_count(target.shape[-1])):
             stride = -(-level.shape[-1] // TARGET_PLACES)
-            rows = patches(level, MATCHED_PATCH, stride=stride, wrap=tiles)[0].contiguous()
+            rows = patches(level, MATCHED_PATCH, stride=stride, wrap=options.tiles)[0].contiguous()
             spread = (rows.double() - rows.double().mean(0)).square().mean()
             self._expected.append(rows)
             self._scales.append(1.0 / (spread + EVEN))
 
     def compare(self, images: Tensor) -> Tensor:
-        """Return the distance of each image [B, K, R, R], already checked; shape [B]."""
+        """Return the distance of each of some checked images, [B]."""
         total = images.new_zeros(len(images))
         levels = pyramid(images, len(self._expected))
         for level, expected, scale in zip(levels, self._expected, self._scales, strict=True):
@@ -241,9 +254,9 @@ class RandomFilters:
     After Ustyuzhaninov, Brendel, Gatys and Bethge, arXiv 1606.00021.
     """
 
-    def __init__(self, like: Tensor, *, seed: int) -> None:
+    def __init__(self, like: Tensor, options: LossOptions) -> None:
         channels, side, _ = like.shape
-        generator = torch.Generator().manual_seed(seed)
+        generator = torch.Generator().manual_seed(options.seed)
         banks = []
         for size in FILTER_SIZES:
             width = min(side, max(2, round(size * side / REFERENCE)))
@@ -256,38 +269,43 @@ class RandomFilters:
         self.filter_waves = torch.fft.rfft2(torch.cat(banks).to(like)).conj()
         """The filters' conjugate Fourier transforms."""
 
-    def __call__(self, images: Tensor, *, wrap: bool) -> Tensor:
-        """Return the features at every second pixel, [B, F, R', R']; `wrap`: edges meet."""
+    def __call__(self, images: Tensor, *, wrap: bool) -> list[Tensor]:
+        """Return the features at every second pixel or fewer, [B, M, F]; `wrap`: edges meet."""
         waves = torch.fft.rfft2(images)
         responses = torch.einsum("bkrc,fkrc->bfrc", waves, self.filter_waves.to(waves))
         fields = torch.fft.irfft2(responses, s=images.shape[-2:]).relu()
-        found = torch.cat((images, fields), dim=1)
         inside = images.shape[-1] - (0 if wrap else self._largest - 1)
-        return found[..., :inside:2, :inside:2]
+        features = torch.cat((images, fields), dim=1)[..., :inside:2, :inside:2]
+        stride = -(-features.shape[-1] // MATCHED_PLACES)
+        return [features[..., ::stride, ::stride].flatten(2).transpose(1, 2)]
 
 
 class FeatureTransport(TextureDistance):
-    """Relaxed optimal transport of features and their moments; satisfies `TextureLoss`.
+    """Relaxed optimal transport of features and their moments, summed over layers.
 
-    As `vgg_ot` (Kolkin, Salavon and Shakhnarovich 2019), with random filters for features.
+    For each layer it is the relaxed earth mover's distance under the cosine distance of features,
+    plus the mean absolute differences of their means and of their covariances (Kolkin, Salavon and
+    Shakhnarovich 2019).
+
+    Args:
+        features: Class of a network, which returns features of images, [B, M, F] for each layer.
     """
 
-    def __init__(self, target: Tensor, features: RandomFilters, *, tiles: bool) -> None:
-        check_size(target)
+    def __init__(
+        self, features: Callable[[Tensor, LossOptions], Any], target: Tensor, options: LossOptions
+    ) -> None:
         super().__init__(target)
-        self._features = features
-        self._expected = self._rows(features(target[None], wrap=tiles))
+        self._features = features(target, options)
+        with torch.no_grad():
+            self._expected = self._features(target[None], wrap=options.tiles)
 
     def compare(self, images: Tensor) -> Tensor:
-        """Return the distance of each image [B, K, R, R], already checked; shape [B]."""
-        found = self._rows(self._features(images, wrap=True))
-        expected = self._expected.to(found)
-        return relaxed_transport(found, expected) + moment_distance(found, expected)
-
-    @staticmethod
-    def _rows(field: Tensor) -> Tensor:
-        stride = -(-field.shape[-1] // MATCHED_PLACES)
-        return field[..., ::stride, ::stride].flatten(2).transpose(1, 2)
+        """Return the distance of each of some checked images, [B]."""
+        total = images.new_zeros(len(images))
+        for found, target in zip(self._features(images, wrap=True), self._expected, strict=True):
+            expected = target.to(found)
+            total = total + relaxed_transport(found, expected) + moment_distance(found, expected)
+        return total
 
 
 # MS-SSIM: structural similarity at several sizes (Wang et al. 2003).

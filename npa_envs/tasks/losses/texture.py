@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import os
 import pickle
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import torch
 import torch.nn.functional as F
@@ -18,53 +19,30 @@ from npa_envs.files import check_torch_archive, home_path, open_regular
 from npa_envs.ops import world_mean
 from npa_envs.tasks.losses.pieces import (
     FeatureTransport,
+    LossOptions,
     PatchTransport,
     RandomFilters,
     TextureDistance,
-    check_images,
-    check_size,
     level_count,
-    moment_distance,
     orthogonal,
     patches,
     products,
     pyramid,
     quantiles,
-    relaxed_transport,
     stride_of,
 )
 
 DEFAULT_LOSS = "patch_swd"
 """The loss that needs no weights and no options."""
 
-
-class TextureLoss(Protocol):
-    """The distance of images from a target texture.
-
-    Calls draw no random numbers and do not synchronise. A world's loss is the same, bit for bit, in
-    every batch (of `vgg_ot`: without gradient).
-    """
-
-    def __call__(self, images: Tensor) -> Tensor:
-        """Return the distance of images [B, K, R, R] (dimensionless), shape [B]; differentiable."""
-
-
-@dataclass(frozen=True)
-class LossOptions:
-    """Options of a texture loss."""
-
-    tiles: bool = True
-    """Whether the target's opposite edges fit together, so that patches may cross them."""
-
-    seed: int = 0
-    """Seed of the loss's directions, filters and positions."""
-
-    vgg_weights: str = ""
-    """File of VGG16's weights, for `vgg_ot`; empty: torch's usual folder of downloads."""
-
-
 DEFAULT_OPTIONS = LossOptions()
 """Options for a target that tiles, with seed 0."""
+
+TextureLoss = Callable[[Tensor], Tensor]
+"""The distance of images [B, K, R, R] from a target texture (dimensionless), shape [B].
+
+It is differentiable. Calls draw no random numbers and do not synchronise. A world's loss is the
+same, bit for bit, in every batch (of `vgg_ot`: without gradient)."""
 
 
 @dataclass(frozen=True)
@@ -79,42 +57,6 @@ class LossEntry:
 
     joint: bool = False
     """Whether it compares colours and density together, K = 4, with `Texture.drawable`."""
-
-
-TEXTURE_LOSSES: Mapping[str, LossEntry] = {
-    "vgg_ot": LossEntry(
-        "the paper's: optimal transport of VGG16 features; needs weights",
-        lambda target, options: VGGTransport(
-            target, weights=options.vgg_weights, tiles=options.tiles, seed=options.seed
-        ),
-    ),
-    "patch_swd": LossEntry(
-        "sliced Wasserstein distance of raw patches at several sizes",
-        lambda target, options: _sliced(PatchDescriptor, target, options),
-    ),
-    "filter_swd": LossEntry(
-        "sliced Wasserstein distance of two layers of random filters",
-        lambda target, options: _sliced(FilterDescriptor, target, options),
-    ),
-    "joint_swd": LossEntry(
-        "`patch_swd` of colours and density at once",
-        lambda target, options: _sliced(PatchDescriptor, target, options),
-        joint=True,
-    ),
-    "patch_ot": LossEntry(
-        "relaxed optimal transport of raw patches at several sizes",
-        lambda target, options: PatchTransport(target, tiles=options.tiles),
-        joint=True,
-    ),
-    "filter_ot": LossEntry(
-        "relaxed optimal transport of one layer of random filters of many sizes",
-        lambda target, options: FeatureTransport(
-            target, RandomFilters(target, seed=options.seed), tiles=options.tiles
-        ),
-        joint=True,
-    ),
-}
-"""Every texture loss by name."""
 
 
 def check_loss_name(name: str) -> None:
@@ -132,17 +74,6 @@ def check_loss_name(name: str) -> None:
 def is_joint(name: str) -> bool:
     """Return whether a loss, or a sum of losses, compares colours and density together."""
     return TEXTURE_LOSSES[name.split("+")[0]].joint
-
-
-class LossSum:
-    """The sum of several losses; satisfies `TextureLoss`."""
-
-    def __init__(self, losses: Sequence[TextureLoss]) -> None:
-        self._losses = losses
-
-    def __call__(self, images: Tensor) -> Tensor:
-        """Return the sum of each image's losses (dimensionless), shape [B]; differentiable."""
-        return torch.stack([loss(images) for loss in self._losses]).sum(0)
 
 
 def make_texture_loss(
@@ -163,8 +94,12 @@ def make_texture_loss(
             f"target must be a floating tensor of shape [K, R, R], got {target.dtype} "
             f"{tuple(target.shape)}: channels come first"
         )
-    made = [TEXTURE_LOSSES[part].make(target.detach(), options) for part in name.split("+")]
-    return made[0] if len(made) == 1 else LossSum(made)
+    losses = [TEXTURE_LOSSES[part].make(target.detach(), options) for part in name.split("+")]
+    return losses[0] if len(losses) == 1 else partial(_summed, losses)
+
+
+def _summed(losses: list[TextureLoss], images: Tensor) -> Tensor:
+    return torch.stack([loss(images) for loss in losses]).sum(0)
 
 
 # Sliced Wasserstein distances. A texture is described, at each image size, by many features at each
@@ -183,36 +118,39 @@ FLOOR = 0.01
 """Added to the target's variance, so that a uniform target works too."""
 
 
-Descriptor = Callable[..., list[Tensor]]
-"""Returns the features at each position of images, [B, M, F] for each size. With `wrap` opposite
-edges meet, else positions near them are left out; `thinned`: at most `PLACES` along each side."""
-
-
-class SlicedWasserstein:
-    """The sliced Wasserstein distance of images from a target; satisfies `TextureLoss`.
+class SlicedWasserstein(TextureDistance):
+    """The sliced Wasserstein distance of images from a target.
 
     At each image size it is the mean over the features of the squared 1D 2-Wasserstein distance
     between their distributions, divided by the target's variance; sizes are summed.
+
+    Args:
+        describe: Class of a descriptor, which returns the features at each position of images,
+            [B, M, F] for each size. With `wrap` opposite edges meet, else positions near them are
+            left out; `thinned`: at most `PLACES` along each side.
     """
 
-    def __init__(self, target: Tensor, descriptor: Descriptor, *, tiles: bool) -> None:
-        check_size(target)
-        self._descriptor = descriptor
-        self._shape = tuple(target.shape)
+    same_in_every_batch = True
+
+    def __init__(
+        self, describe: Callable[..., Any], target: Tensor, options: LossOptions = DEFAULT_OPTIONS
+    ) -> None:
+        super().__init__(target)
+        self.descriptor = describe(target, seed=options.seed)
+        """Describes images by features."""
         with torch.no_grad():
             # The target has as many quantiles as worlds have positions.
-            thinned = descriptor(target[None], wrap=True, thinned=True)
-            described = descriptor(target[None].double(), wrap=tiles, thinned=False)
+            thinned = self.descriptor(target[None], wrap=True, thinned=True)
+            described = self.descriptor(target[None].double(), wrap=options.tiles, thinned=False)
             self._quantiles = [
                 quantiles(features[0].T, found.shape[1]).to(target)
                 for features, found in zip(described, thinned, strict=True)
             ]
             self._scales = [1.0 / (each[0].var(0).mean() + FLOOR) for each in described]
 
-    def __call__(self, images: Tensor) -> Tensor:
-        """Return the distance of each image (dimensionless), shape [B]; differentiable."""
-        check_images(images, self._shape)
-        described = self._descriptor(images, wrap=True, thinned=True)
+    def compare(self, images: Tensor) -> Tensor:
+        """Return the distance of each of some checked images, [B]."""
+        described = self.descriptor(images, wrap=True, thinned=True)
         total = images.new_zeros(len(images))
         for features, expected, scale in zip(described, self._quantiles, self._scales, strict=True):
             ordered = features.transpose(1, 2).contiguous().sort(dim=-1).values
@@ -220,13 +158,6 @@ class SlicedWasserstein:
             distance = world_mean(squares.flatten(1)[..., None])[:, 0]
             total = total + scale.to(distance) * distance
         return total
-
-
-def _sliced(
-    make: Callable[..., Descriptor], target: Tensor, options: LossOptions
-) -> SlicedWasserstein:
-    descriptor = make(target, seed=options.seed)
-    return SlicedWasserstein(target, descriptor, tiles=options.tiles)
 
 
 class PatchDescriptor:
@@ -296,62 +227,11 @@ class FilterDescriptor:
 # torchvision: the layers are few. Average pooling replaces maximum pooling, and worlds are padded
 # periodically.
 
-VGG_LAYERS = (1, 6, 11, 18, 25)
-"""Layers of VGG16 that are compared, in torchvision's counting."""
-
 VGG_PLACES = 1024
 """Largest number of positions of a layer that are compared."""
 
 VGG_SMALLEST = 32
 """Least side of images with more than one position in the deepest layer [pixels]."""
-
-
-class VGGTransport(TextureDistance):
-    """The distance of VGG16 features of images from a target's; satisfies `TextureLoss`.
-
-    For each layer it is the relaxed earth mover's distance under the cosine distance of features,
-    plus the mean absolute differences of their means and of their covariances; layers are summed. A
-    layer with more than 1024 positions is compared at 1024 random ones, the same in all calls.
-    """
-
-    def __init__(self, target: Tensor, *, weights: str = "", tiles: bool, seed: int) -> None:
-        channels, height, _ = target.shape
-        if channels not in (1, 3):
-            raise NPAError(f"vgg_ot compares images of 1 or 3 channels, got {channels}")
-        if height < VGG_SMALLEST:
-            raise NPAError(
-                f"resolution must be at least {VGG_SMALLEST} pixels for vgg_ot, got {height}: "
-                "for example 128"
-            )
-        super().__init__(target)
-        self._features = VGGFeatures(load_vgg_weights(weights), VGG_LAYERS, target)
-        generator = torch.Generator().manual_seed(seed)
-        self._places: list[Tensor | None] = []
-        self._expected = []
-        with torch.no_grad():
-            for field in self._features(target[None], wrap=tiles):
-                count = field.shape[2] * field.shape[3]
-                chosen = None
-                if count > VGG_PLACES:
-                    drawn = torch.randperm(count, generator=generator)[:VGG_PLACES]
-                    chosen = drawn.sort().values.to(target.device)
-                self._places.append(chosen)
-                self._expected.append(_rows(field, chosen))
-
-    def compare(self, images: Tensor) -> Tensor:
-        """Return the distance of each of some checked images, [B]."""
-        total = images.new_zeros(len(images))
-        layers = zip(self._features(images, wrap=True), self._places, self._expected, strict=True)
-        for field, places, expected in layers:
-            found = _rows(field, places)
-            total = total + relaxed_transport(found, expected) + moment_distance(found, expected)
-        return total
-
-
-def _rows(field: Tensor, places: Tensor | None) -> Tensor:
-    rows = field.flatten(2)
-    return (rows if places is None else rows.index_select(2, places)).transpose(1, 2)
-
 
 WEIGHTS_FILE = "vgg16-397923af.pth"
 """Name of torchvision's file of weights trained on ImageNet."""
@@ -359,51 +239,67 @@ WEIGHTS_FILE = "vgg16-397923af.pth"
 WEIGHTS_URL = f"https://download.pytorch.org/models/{WEIGHTS_FILE}"
 """Address of that file."""
 
-VGG_WIDTHS = ((64, 64), (128, 128), (256, 256, 256), (512, 512, 512), (512, 512, 512))
-"""Channels of the convolutions, with a pooling layer after each group."""
+VGG_LAYERS = {(0, 2): 64, (5, 7): 128, (10, 12, 14): 256, (17, 19, 21): 512, (24,): 512}
+"""Convolutions in torchvision's counting -> their channels; a pooling layer follows each group.
+Features are read after the first rectifier of a group."""
 
 VGG_MEAN, VGG_DEVIATION = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
 """Mean and standard deviation of ImageNet's red, green and blue."""
 
 
 class VGGFeatures:
-    """VGG16's features of images at some layers."""
+    """VGG16's features of images of 1 or 3 channels at five layers.
 
-    def __init__(self, weights: Mapping[str, Any], layers: Sequence[int], like: Tensor) -> None:
-        self._layers = frozenset(layers)
-        self._steps: list[tuple[Tensor, Tensor] | None] = []
-        index, channels = 0, 3
-        for group in VGG_WIDTHS:
-            for width in group:
-                weight = _checked(weights, f"features.{index}.weight", (width, channels, 3, 3))
-                bias = _checked(weights, f"features.{index}.bias", (width,))
-                self._steps.append((weight.to(like), bias.to(like)))
-                index, channels = index + 2, width
-            self._steps.append(None)
-            index += 1
+    A layer with more than 1024 positions is read at 1024 random ones, the same in all calls.
+    """
+
+    def __init__(self, like: Tensor, options: LossOptions) -> None:
+        channels, side, _ = like.shape
+        if channels not in (1, 3):
+            raise NPAError(f"vgg_ot compares images of 1 or 3 channels, got {channels}")
+        if side < VGG_SMALLEST:
+            raise NPAError(
+                f"resolution must be at least {VGG_SMALLEST} pixels for vgg_ot, got {side}: "
+                "for example 128"
+            )
+        file = load_vgg_weights(options.vgg_weights)
+        generator = torch.Generator().manual_seed(options.seed)
+        self._groups: list[list[tuple[Tensor, Tensor]]] = []
+        self._places: list[Tensor | None] = []
+        channels = 3
+        for numbers, width in VGG_LAYERS.items():
+            group = []
+            for number in numbers:
+                weight = _checked(file, f"features.{number}.weight", (width, channels, 3, 3))
+                bias = _checked(file, f"features.{number}.bias", (width,))
+                group.append((weight.to(like), bias.to(like)))
+                channels = width
+            self._groups.append(group)
+            places = None
+            if side * side > VGG_PLACES:
+                drawn = torch.randperm(side * side, generator=generator)[:VGG_PLACES]
+                places = drawn.sort().values.to(like.device)
+            self._places.append(places)
+            side //= 2
         self._mean = like.new_tensor(VGG_MEAN)[:, None, None]
         self._deviation = like.new_tensor(VGG_DEVIATION)[:, None, None]
 
     def __call__(self, images: Tensor, *, wrap: bool) -> list[Tensor]:
-        """Return features [B, F, R', R'] of each layer; pads periodically (`wrap`) or mirrored."""
+        """Return features [B, M, F] of each layer; pads periodically (`wrap`) or mirrored."""
         mode = "circular" if wrap else "reflect"
         # In the weights' precision.
         field = (images.to(self._mean) - self._mean) / self._deviation
-        found = []
-        index, last = 0, max(self._layers)
-        for step in self._steps:
-            if step is None:
+        features: list[Tensor] = []
+        for group, places in zip(self._groups, self._places, strict=True):
+            if features:
                 field = F.avg_pool2d(field, 2)
-                index += 1
-            else:
-                field = F.conv2d(F.pad(field, (1, 1, 1, 1), mode=mode), *step).relu()
-                # A convolution and its rectifier, after which features are read.
-                index += 2
-            if index - 1 in self._layers:
-                found.append(field)
-            if index > last:
-                break
-        return found
+            for number, (weight, bias) in enumerate(group):
+                field = F.conv2d(F.pad(field, (1, 1, 1, 1), mode=mode), weight, bias).relu()
+                if number == 0:
+                    rows = field.flatten(2)
+                    rows = rows if places is None else rows.index_select(2, places)
+                    features.append(rows.transpose(1, 2))
+        return features
 
 
 def load_vgg_weights(path: str | Path = "") -> dict[str, Any]:
@@ -444,3 +340,33 @@ def _checked(weights: Mapping[str, Any], name: str, shape: tuple[int, ...]) -> T
             f"give torchvision's file, {WEIGHTS_URL}"
         )
     return tensor.detach()
+
+
+TEXTURE_LOSSES: Mapping[str, LossEntry] = {
+    "vgg_ot": LossEntry(
+        "the paper's: optimal transport of VGG16 features; needs weights",
+        partial(FeatureTransport, VGGFeatures),
+    ),
+    "patch_swd": LossEntry(
+        "sliced Wasserstein distance of raw patches at several sizes",
+        partial(SlicedWasserstein, PatchDescriptor),
+    ),
+    "filter_swd": LossEntry(
+        "sliced Wasserstein distance of two layers of random filters",
+        partial(SlicedWasserstein, FilterDescriptor),
+    ),
+    "joint_swd": LossEntry(
+        "`patch_swd` of colours and density at once",
+        partial(SlicedWasserstein, PatchDescriptor),
+        joint=True,
+    ),
+    "patch_ot": LossEntry(
+        "relaxed optimal transport of raw patches at several sizes", PatchTransport, joint=True
+    ),
+    "filter_ot": LossEntry(
+        "relaxed optimal transport of one layer of random filters of many sizes",
+        partial(FeatureTransport, RandomFilters),
+        joint=True,
+    ),
+}
+"""Every texture loss by name."""

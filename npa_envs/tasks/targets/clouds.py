@@ -170,7 +170,7 @@ def _farthest_points(candidates: Tensor, counts: Tensor, particle_count: int) ->
 
 
 def varied(
-    x: Tensor, *, rotation: float, stretch: float, jitter: float, generator: Randomness
+    x: Tensor, rotation: float, stretch: float, jitter: float, generator: Randomness
 ) -> Tensor:
     """Return clouds with random rotation, stretch, shear (around (0.5, 0.5)) and noise."""
     world_count, particle_count = x.shape[:2]
@@ -228,15 +228,26 @@ def load_pictures(data: str, split: Split = "train", *, folder: str = "data") ->
         raise NPAError(f"split must be 'train' or 'test', got {shown(split)}")
     if data == "digits":
         return _digits(split)
-    if data == "mnist":
-        return _mnist(split, folder)
-    path = home_path(data)
+    path = home_path(folder) / "MNIST" / "raw" if data == "mnist" else home_path(data)
+    if data == "mnist" and not os.path.isdir(path):
+        raise NPAError(
+            f"MNIST is not in the folder {shown(folder)}, and nothing is downloaded unasked: "
+            f'python -c "{MNIST_DOWNLOAD.format(folder=folder)}", or name its folder'
+        )
     if not os.path.isdir(path):
         raise NPAError(
             f"data must be a known data set or a folder of IDX files, got {shown(data)}: "
             f"{suggest(data, BUILT_IN)}"
         )
-    return _idx_folder(path, split)
+    images, labels = (read_idx(_find(path, name)) for name in IDX_NAMES[split])
+    if images.ndim != 3 or labels.shape != images.shape[:1] or images.size == 0:
+        raise NPAError(
+            f"the {split} files of {shown(str(path))} must hold pictures [M, H, W] and classes "
+            f"[M], got {list(images.shape)} and {list(labels.shape)}: download them again"
+        )
+    # By a table: the quotients themselves would take eight bytes a pixel.
+    ink = (np.arange(256) / 255.0).astype(np.float32)
+    return DigitPictures(ink[images], labels.astype(np.int64))
 
 
 def read_idx(path: Path) -> NDArray[np.uint8]:
@@ -294,42 +305,8 @@ def _digits(split: Split) -> DigitPictures:
     return DigitPictures(np.asarray(bunch.images, np.float32)[chosen] / 16.0, label[chosen])
 
 
-def _mnist(split: Split, folder: str) -> DigitPictures:
-    try:
-        from torchvision.datasets import MNIST
-    except ImportError as error:
-        raise MissingDependencyError(
-            "data='mnist' needs torchvision: pip install torchvision, or give the folder of "
-            "MNIST's IDX files"
-        ) from error
-    try:
-        mnist: Any = MNIST(folder, train=split == "train", download=False)
-    except RuntimeError as error:
-        raise NPAError(
-            f"MNIST is not in the folder {shown(folder)}, and nothing is downloaded unasked: "
-            f'python -c "{MNIST_DOWNLOAD.format(folder=folder)}", or name its folder'
-        ) from error
-    ink = (mnist.data.numpy() / 255.0).astype(np.float32)
-    return DigitPictures(ink, mnist.targets.numpy().astype(np.int64))
-
-
-def _idx_folder(folder: Path, split: Split) -> DigitPictures:
-    images, labels = (read_idx(_find(folder, name)) for name in IDX_NAMES[split])
-    if images.ndim != 3 or labels.shape != images.shape[:1] or images.size == 0:
-        raise NPAError(
-            f"the {split} files of {shown(str(folder))} must hold pictures [M, H, W] and classes "
-            f"[M], got {list(images.shape)} and {list(labels.shape)}: download them again"
-        )
-    # By a table: the quotients themselves would take eight bytes a pixel.
-    ink = (np.arange(256) / 255.0).astype(np.float32)
-    return DigitPictures(ink[images], labels.astype(np.int64))
-
-
 def _find(folder: Path, name: str) -> Path:
-    for candidate in (folder / name, folder / f"{name}.gz"):
-        if os.path.isfile(candidate):
-            return candidate
-    raise NPAError(
-        f"the folder {shown(str(folder))} must hold {name} or {name}.gz: MNIST's files are called "
-        "so"
-    )
+    for file in (folder / name, folder / f"{name}.gz"):
+        if os.path.isfile(file):
+            return file
+    raise NPAError(f"the folder {shown(str(folder))} must hold MNIST's file {name} or {name}.gz")

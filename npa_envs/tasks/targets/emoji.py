@@ -1,19 +1,24 @@
-"""Pictures of emoji characters, from any colour-emoji font that is installed."""
+"""Pictures of emoji characters, from a colour-emoji font that is installed."""
 
 from __future__ import annotations
 
-import os
-import shutil
-import subprocess
-import sys
+import contextlib
 import unicodedata
-from collections.abc import Iterator
-from pathlib import Path
 
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
 from npa_envs.errors import MissingDependencyError, NPAError, shown
+
+FONTS = (
+    "NotoColorEmoji.ttf",
+    "Apple Color Emoji.ttc",
+    "seguiemj.ttf",
+    "Twemoji.ttf",
+    "TwemojiMozilla.ttf",
+    "JoyPixels.ttf",
+)
+"""Files of colour-emoji fonts, of Linux, macOS, Windows and others."""
 
 # Bitmap fonts open only at the sizes that they hold: 109 is Noto's, 160, 96 ... are Apple's.
 _SIZES = (109, 160, 136, 128, 96, 72, 64, 48, 32)
@@ -30,12 +35,15 @@ def is_emoji(text: str) -> bool:
     return any(unicodedata.category(c) == "So" or ord(c) >= 0x1F000 for c in text)
 
 
-def find_emoji_fonts() -> list[Path]:
-    """Return the files of the installed fonts that may hold colour emoji, the likeliest first."""
-    found: dict[Path, None] = {}
-    for path in (*_fonts_of_fontconfig(), *_fonts_of_known_folders()):
-        found.setdefault(path.resolve())
-    return sorted(found, key=lambda path: "color" not in path.name.lower())
+def find_emoji_fonts() -> list[ImageFont.FreeTypeFont]:
+    """Return the colour-emoji fonts that Pillow finds in the system's folders of fonts."""
+    fonts = []
+    for name in FONTS:
+        for size in _SIZES:
+            with contextlib.suppress(OSError):
+                fonts.append(ImageFont.truetype(name, size))
+                break
+    return fonts
 
 
 def render_emoji(text: str) -> Image.Image:
@@ -47,19 +55,13 @@ def render_emoji(text: str) -> Image.Image:
             "none: install one, on Debian and Ubuntu with 'apt install fonts-noto-color-emoji', or "
             "give a picture file or a built-in target"
         )
-    several = False
-    for path in fonts:
-        font = _open_font(path)
-        if font is None:
-            continue
-        if font.getlength(text) > 1.5 * font.getlength("\U0001f600"):
-            several = True
-            continue
+    singles = [font for font in fonts if font.getlength(text) <= 1.5 * font.getlength("\U0001f600")]
+    for font in singles:
         image = _draw(font, text)
         if image is not None:
             return image
-    names = ", ".join(path.name for path in fonts)
-    if several:
+    names = ", ".join(font.getname()[0] or "a font" for font in fonts)
+    if len(singles) < len(fonts):
         raise NPAError(
             f"target {shown(text)} must be one emoji, but {names} draws several: give one of them"
         )
@@ -67,15 +69,6 @@ def render_emoji(text: str) -> Image.Image:
         f"target {shown(text)} must be an emoji that an installed font draws in colour, but none "
         f"of {names} does: give another emoji, a picture file, or install 'fonts-noto-color-emoji'"
     )
-
-
-def _open_font(path: Path) -> ImageFont.FreeTypeFont | None:
-    for size in _SIZES:
-        try:
-            return ImageFont.truetype(str(path), size)
-        except OSError:
-            continue
-    return None
 
 
 def _draw(font: ImageFont.FreeTypeFont, text: str) -> Image.Image | None:
@@ -96,36 +89,3 @@ def _draw(font: ImageFont.FreeTypeFont, text: str) -> Image.Image | None:
         return None
     whole = Image.fromarray(pixels.round().clip(0, 255).astype(np.uint8))
     return whole.crop(image.getbbox())
-
-
-def _fonts_of_fontconfig() -> Iterator[Path]:
-    program = shutil.which("fc-list")
-    if program is None:
-        return
-    try:
-        listing = subprocess.run(
-            [program, "--format", "%{file}\n", ":color=true"],
-            capture_output=True,
-            encoding="utf-8",
-            errors="surrogateescape",
-            timeout=20,
-            check=False,
-        ).stdout
-    except (OSError, subprocess.SubprocessError):
-        return
-    yield from (Path(line) for line in sorted(set(listing.splitlines())) if line)
-
-
-def _fonts_of_known_folders() -> Iterator[Path]:
-    home = Path.home()
-    folders = [home / ".fonts", home / ".local/share/fonts", Path("/usr/local/share/fonts")]
-    if sys.platform == "darwin":
-        folders += [home / "Library/Fonts", Path("/Library/Fonts"), Path("/System/Library/Fonts")]
-    elif sys.platform == "win32":
-        folders = [Path(os.environ.get("WINDIR", "C:/Windows")) / "Fonts"]
-    else:
-        folders.append(Path("/usr/share/fonts"))
-    for folder in folders:
-        for path in sorted(folder.rglob("*.[to]t[fc]")):
-            if any(mark in path.name.lower() for mark in ("emoji", "seguiemj")):
-                yield path

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
 import os
 from dataclasses import dataclass, replace
@@ -183,10 +184,11 @@ def read_nerf(
 ) -> ViewTarget:
     """Return the views of a NeRF-synthetic folder, as `load_views` describes."""
     held_out = next((folder / name for name in HELD_OUT if (folder / name).is_file()), None)
-    if held_out is None:
+    if held_out is None or not (folder / TRAINING).is_file():
         raise NPAError(
-            f"a folder of views must hold {' or '.join(HELD_OUT)}, {shown(str(folder))} does not: "
-            "views to measure by must be others than those trained with"
+            f"a folder of views must hold {TRAINING}, and {' or '.join(HELD_OUT)}, "
+            f"{shown(str(folder))} does not: views to measure by must be others than those trained "
+            "with"
         )
     training = _views(folder / TRAINING, resolution, training_count)
     measured = _views(held_out, resolution, held_out_count)
@@ -196,8 +198,9 @@ def read_nerf(
             f"views must show something, but no picture of {shown(str(folder))} has a pixel of "
             f"alpha above {OPAQUE_ALPHA}: give pictures with a transparent background"
         )
-    scale = RADIUS / radius
-    return ViewTarget(folder.name, _scaled(training, scale), _scaled(measured, scale))
+    for views in (training, measured):
+        views.cameras.world_to_camera[:, :3, 3] *= RADIUS / radius
+    return ViewTarget(folder.name, training, measured)
 
 
 def scene_radius(views: Views) -> float:
@@ -224,43 +227,22 @@ def scene_radius(views: Views) -> float:
     return radius
 
 
-def _scaled(views: Views, scale: float) -> Views:
-    motions = views.cameras.world_to_camera.clone()
-    motions[:, :3, 3] *= scale
-    cameras = replace(views.cameras, world_to_camera=motions)
-    return Views(cameras, views.pictures)
-
-
-def _read_picture(path: Path, resolution: int) -> Tensor:
-    image = open_image(path)
-    if image.width != image.height:
-        raise NPAError(
-            f"views must be square, {shown(str(path))} has {image.width} x {image.height} pixels: "
-            "cut them to squares around the middle, and correct camera_angle_x"
-        )
-    return torch.from_numpy(scaled_square(image, resolution))
-
-
 def _views(path: Path, resolution: int, count: int) -> Views:
     """Return evenly chosen views of a `transforms_*.json`, turned so that y is up."""
-    if not os.path.exists(path):
-        raise NPAError(
-            f"a folder of views must hold {path.name}, {shown(str(path.parent))} does not: give a "
-            "folder as NeRF-synthetic scenes are"
-        )
+    file = shown(str(path))
     try:
         content = read_json(path)
     except NPAError as error:
-        raise NPAError(f"cannot read {shown(str(path))} as JSON: {error}") from error
-    angle = content.get("camera_angle_x") if isinstance(content, dict) else None
-    frames = content.get("frames") if isinstance(content, dict) else None
-    if not is_real(angle) or not 0.0 < float(angle or 0.0) < math.pi:
+        raise NPAError(f"cannot read {file} as JSON: {error}") from error
+    content = content if isinstance(content, dict) else {}
+    angle, frames = content.get("camera_angle_x"), content.get("frames")
+    if not is_real(angle) or not 0.0 < angle < math.pi:
         raise NPAError(
-            f"camera_angle_x in {shown(str(path))} must be an angle between 0 and pi radians, "
+            f"camera_angle_x in {file} must be an angle between 0 and pi radians, "
             f"got {shown(angle)}"
         )
     if not isinstance(frames, list) or not frames:
-        raise NPAError(f"frames in {shown(str(path))} must be a list with at least one view")
+        raise NPAError(f"frames in {file} must be a list with at least one view")
     files, poses = zip(
         *(_read_frame(path, k, frame) for k, frame in enumerate(frames)), strict=True
     )
@@ -270,35 +252,38 @@ def _views(path: Path, resolution: int, count: int) -> Views:
     turned[:, :3] = torch.tensor(UPRIGHT, dtype=turned.dtype) @ turned[:, :3]
     try:
         cameras: Cameras = cameras_of_poses(
-            turned.float(), float(angle or 0.0), width=resolution, height=resolution
+            turned.float(), float(angle), width=resolution, height=resolution
         )
     except NPAError as error:
-        raise NPAError(f"in {shown(str(path))}: {error}") from error
-    pictures = [_read_picture(files[k], resolution) for k in chosen]
+        raise NPAError(f"in {file}: {error}") from error
+    pictures = []
+    for picture in (files[k] for k in chosen):
+        image = open_image(picture)
+        if image.width != image.height:
+            raise NPAError(
+                f"views must be square, {shown(str(picture))} has {image.width} x {image.height} "
+                "pixels: cut them to squares around the middle, and correct camera_angle_x"
+            )
+        pictures.append(torch.from_numpy(scaled_square(image, resolution)))
     return Views(cameras, torch.stack(pictures))
 
 
 def _read_frame(path: Path, number: int, frame: Any) -> tuple[Path, Tensor]:
-    name = frame.get("file_path") if isinstance(frame, dict) else None
+    """Return the picture's file and the pose of a frame of a `transforms_*.json`."""
+    frame, where = frame if isinstance(frame, dict) else {}, f"frame {number} in {shown(str(path))}"
+    name, matrix = frame.get("file_path"), frame.get("transform_matrix")
     if not isinstance(name, str) or not name:
-        raise NPAError(
-            f"frame {number} in {shown(str(path))} must have a file_path, got {shown(name)}"
-        )
-    fault = ""
-    try:
-        pose = torch.tensor(frame.get("transform_matrix"), dtype=torch.float64)
-    except (TypeError, ValueError, RuntimeError, OverflowError) as error:
-        pose, fault = torch.empty(0), f" ({shown(error)})"
+        raise NPAError(f"{where} must have a file_path, got {shown(name)}")
+    pose = torch.empty(0)
+    with contextlib.suppress(TypeError, ValueError, RuntimeError, OverflowError):
+        pose = torch.tensor(matrix, dtype=torch.float64)
     if pose.shape != (4, 4):
-        raise NPAError(
-            f"transform_matrix of frame {number} in {shown(str(path))} must be 4 x 4 numbers, "
-            f"got shape {tuple(pose.shape)}{fault}"
-        )
+        raise NPAError(f"transform_matrix of {where} must be 4 x 4 numbers, got {shown(matrix)}")
     inside = os.path.normpath(name)
     if os.path.isabs(name) or inside == os.curdir or inside.split(os.sep)[0] == os.pardir:
         raise NPAError(
-            f"file_path of frame {number} in {shown(str(path))} must name a file in that folder, "
-            f"got {shown(name)}: put the pictures next to it"
+            f"file_path of {where} must name a file in that folder, got {shown(name)}: put the "
+            "pictures next to it"
         )
     file = path.parent / inside
     # The format's file_path has no suffix.
