@@ -12,7 +12,7 @@ from typing import Any
 
 import torch
 
-from npa_envs.measure.plots import draw_band, legend_of, mark_decades, new_figure, png
+from npa_envs.measure.plots import draw_band, legend_of, new_figure, number_plainly, png
 from npa_envs.measure.record import NONE, Record, as_objects, markdown_table, number, short
 from npa_envs.measure.robustness.trials import (
     CONDITIONS,
@@ -373,7 +373,8 @@ def _draw_curves(panel: Any, record: RuleRecord) -> None:
     panel.set_yscale("log")
     panel.set_ylabel("loss over the twin's", fontsize=8)
     panel.set_title(record.rule, fontsize=9, loc="left")
-    mark_decades(panel)
+    number_plainly(panel.yaxis)
+    panel.tick_params(labelsize=7)
 
 
 def _draw_responses(panel: Any, record: RuleRecord, condition: str) -> None:
@@ -386,7 +387,8 @@ def _draw_responses(panel: Any, record: RuleRecord, condition: str) -> None:
     panel.set(xscale="log", yscale="log")
     panel.set_ylabel("loss", fontsize=8)
     panel.set_xticks(values, [f"{value:.2g}" for value in values], rotation=45)
-    mark_decades(panel)
+    number_plainly(panel.yaxis)
+    panel.tick_params(labelsize=7)
 
 
 def _draw_seeds(
