@@ -104,7 +104,7 @@ def main(arguments: Sequence[str]) -> int:
             progress=bar.advance,
             stop=stop.is_set,
         )
-    done = bar.done
+    done = max(film.steps.values())
     if done < options.steps:
         print(f"stopped at step {done} of {options.steps}; the film goes that far")
     if trained.doubt is not None:

@@ -16,13 +16,13 @@ import torch
 from PIL import Image
 
 from npa_envs.cli import COMMANDS, demo, doctor, main
-from npa_envs.cli.common import EXAMPLES, torch_threads
+from npa_envs.cli.common import examples_of, torch_threads
 from npa_envs.cli.train import announcement, parse, starting_configuration, thread_count
 from npa_envs.errors import NPAError
 from npa_envs.render.world_film import WorldFilm, film_world
 from npa_envs.rule.files import load_rule, save_rule
 from npa_envs.rule.rule import NPARule
-from npa_envs.training import Trainer, preset
+from npa_envs.training import TASKS, Trainer, preset
 from npa_envs.world.particles import Particles
 
 TINY = ["morphogenesis2d", "--preset", "tiny", "--no-report", "--iterations", "6", "--no-progress"]
@@ -73,18 +73,18 @@ def help_of(capsys, *words):
     return re.sub(r"\x1b\[[0-9;]*m", "", capsys.readouterr().out)
 
 
-@pytest.mark.parametrize("name", [*COMMANDS, *(name for name in EXAMPLES if " " in name)])
+@pytest.mark.parametrize("name", [*COMMANDS, *(f"train {task}" for task in TASKS)])
 def test_every_command_explains_itself_and_shows_examples_of_its_options(name, capsys):
     assert f"\n  {name.split()[0]} " in help_of(capsys, "--help")
     text = help_of(capsys, *name.split(), "--help")
     assert f"usage: npa-envs {name}" in text
     assert "{None}" not in text
-    for example in EXAMPLES.get(name, ()):
+    for example in [] if name == "train" else examples_of(name):
         assert f"  npa-envs {example}\n" in text
         assert example.startswith(name)
         for option in re.findall("--[a-z-]+", example):
             # Once more, among the options.
-            assert len(re.findall(rf"{option}[ ,\n]", text.split(EXAMPLES[name][-1])[1])) > 0
+            assert len(re.findall(rf"{option}[ ,\n]", text.split(examples_of(name)[-1])[1])) > 0
 
 
 def test_the_help_of_train_shows_the_most_used_options_and_help_all_all_of_them(
